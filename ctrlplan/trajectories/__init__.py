@@ -1,0 +1,31 @@
+"""Functions of time with exact derivatives: what a loop is asked to follow."""
+
+from ctrlplan.trajectories.combined import Joined, Scaled, Stacked, Sum, stack
+from ctrlplan.trajectories.extrema import Bounds, Extrema
+from ctrlplan.trajectories.files import derivative_name, load_trajectory, trajectory_from_dict
+from ctrlplan.trajectories.piecewise import PiecewiseSpline
+from ctrlplan.trajectories.polynomial import PolySpline
+from ctrlplan.trajectories.step import Step
+from ctrlplan.trajectories.trajectory import Trajectory
+from ctrlplan.trajectories.trigonometric import FourierCoefficients, TrigSpline
+from ctrlplan.trajectories.waypoint import Waypoint
+
+__all__ = [
+    "Bounds",
+    "Extrema",
+    "FourierCoefficients",
+    "Joined",
+    "PiecewiseSpline",
+    "PolySpline",
+    "Scaled",
+    "Stacked",
+    "Step",
+    "Sum",
+    "TrigSpline",
+    "Trajectory",
+    "Waypoint",
+    "derivative_name",
+    "load_trajectory",
+    "stack",
+    "trajectory_from_dict",
+]

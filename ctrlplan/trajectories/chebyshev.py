@@ -1,0 +1,86 @@
+"""Chebyshev polynomials that stand for an analytic function to rounding."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache
+
+import numpy as np
+from numpy.polynomial import chebyshev
+from numpy.typing import NDArray
+
+from ctrlplan.trajectories.common import Array
+
+_DEGREES = (16, 32, 64, 128)
+
+
+def chebyshev_proxy(
+    jet: Callable[[Array, int], Array], interval: tuple[float, float], low: int, high: int
+) -> Array | None:
+    """Coefficients of derivatives low to high, each fitted to its own exact values.
+
+    Returns
+    -------
+    ndarray, shape (high - low + 1, naxes, size), or None
+        None where 128 degrees do not resolve the function.
+    """
+    for degree in _DEGREES:
+        values = jet(_points(degree, *interval), high)[low:]
+        coefficients = _transform(values)
+        used = resolved_size(coefficients)
+        if used is not None:
+            return coefficients[..., :used]
+    return None
+
+
+def resolved_size(coefficients: Array, rtol: float = 3e-14) -> int | None:
+    """Number of leading coefficients that matter, None where the last ones still do.
+
+    The last quarter of a resolved series lies below `rtol` of its largest: it
+    is the rounding of the values, and so is whatever else is no larger.
+    """
+    size = np.abs(coefficients).reshape(-1, coefficients.shape[-1])
+    scale = size.max(axis=1, keepdims=True)
+    relative = size / np.where(scale > 0.0, scale, 1.0)
+    rounding = relative[:, -max(4, size.shape[1] // 4) :].max(axis=1, keepdims=True)
+    if rounding.max() > rtol:
+        return None
+    matters = np.flatnonzero((relative > 2.0 * np.maximum(rounding, 1e-16)).any(axis=0))
+    return int(matters[-1]) + 1 if matters.size else 1
+
+
+def fit(function: Callable[[Array], Array], interval: tuple[float, float], degree: int) -> Array:
+    """Coefficients (..., degree + 1) of the interpolant at Chebyshev points."""
+    return _transform(function(_points(degree, *interval)))
+
+
+def real_roots(coefficients: Array) -> Array:
+    """Roots of a Chebyshev series in [-1, 1], pairs that rounding split included."""
+    size = np.abs(coefficients)
+    matters = np.flatnonzero(size > 1e-15 * size.max()) if size.max() > 0 else np.array([], dtype=int)
+    if not matters.size or matters[-1] == 0:
+        return np.empty(0)
+    roots: NDArray[np.complex128] = np.asarray(chebyshev.chebroots(coefficients[: matters[-1] + 1]), dtype=complex)
+    near = (np.abs(roots.imag) < 1e-3) & (np.abs(roots.real) < 1.0 + 1e-6)
+    return np.clip(np.sort(roots.real[near]), -1.0, 1.0)
+
+
+@lru_cache(maxsize=16)
+def _nodes(degree: int) -> Array:
+    return np.cos(np.pi * (np.arange(degree + 1) + 0.5) / (degree + 1))
+
+
+@lru_cache(maxsize=16)
+def _matrix(degree: int) -> Array:
+    n = degree + 1
+    matrix = (2.0 / n) * np.cos(np.pi * np.outer(np.arange(n) + 0.5, np.arange(n)) / n)
+    matrix[:, 0] *= 0.5
+    return matrix
+
+
+def _points(degree: int, a: float, b: float) -> Array:
+    return 0.5 * (a + b) + 0.5 * (b - a) * _nodes(degree)
+
+
+def _transform(values: Array) -> Array:
+    return values @ _matrix(values.shape[-1] - 1)

@@ -1,0 +1,237 @@
+"""Trajectories made of others: sums, multiples, axes side by side, one after the other."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Iterable, Sequence
+from typing import Any, Self
+
+import numpy as np
+
+from ctrlplan.trajectories.common import Array, checked_labels, checked_time, default_labels, readonly
+from ctrlplan.trajectories.files import trajectory_from_dict
+from ctrlplan.trajectories.trajectory import Trajectory
+
+
+class _Combined(Trajectory):
+    """Trajectory of several parts; a new kind says how their jets combine."""
+
+    parts: tuple[Trajectory, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data that `trajectory_from_dict` reads."""
+        return {
+            "type": type(self).__name__,
+            "parts": [part.to_dict() for part in self.parts],
+            "labels": list(self.labels),
+        }
+
+    @classmethod
+    def _from_dict(cls, data: dict[str, Any]) -> Self:
+        return cls._of(tuple(trajectory_from_dict(part) for part in data["parts"]), tuple(data["labels"]))
+
+    @classmethod
+    def _of(cls, parts: tuple[Trajectory, ...], labels: tuple[str, ...]) -> Self:
+        self = cls.__new__(cls)
+        self._set(parts, labels)
+        return self
+
+    def _set(self, parts: tuple[Trajectory, ...], labels: tuple[str, ...]) -> None:
+        joined = np.unique(np.concatenate([part.breakpoints for part in parts]))
+        self.__dict__.update(
+            parts=parts,
+            labels=labels,
+            breakpoints=readonly(joined),
+            initial=self._combine([part.initial for part in parts]),
+            final=self._combine([part.final for part in parts]),
+        )
+
+    @abstractmethod
+    def _combine(self, values: list[Array]) -> Array:
+        """Jets, or held positions, of the whole from those of the parts (axes second to last)."""
+
+    def _map_time(self, origin: float, shift: float, rate: float) -> Self:
+        return self._of(tuple(part._map_time(origin, shift, rate) for part in self.parts), self.labels)
+
+    def _leg_jet(self, leg: int, s: Array, order: int) -> Array:
+        leg %= self.breakpoints.size - 1
+        origin = float(self.breakpoints[leg])
+        moment = 0.5 * (origin + float(self.breakpoints[leg + 1]))
+        return self._combine([part._jet_beside(moment, origin, s, order) for part in self.parts])
+
+
+class Sum(_Combined):
+    """Sum of trajectories with the same number of axes; labels of the first.
+
+    Parameters
+    ----------
+    parts : iterable of Trajectory
+        One or more. Each holds its ends outside its own interval.
+
+    Raises
+    ------
+    ValueError
+        If the numbers of axes differ.
+    """
+
+    def __init__(self, parts: Iterable[Trajectory]) -> None:
+        terms = _checked_parts(parts)
+        for i, part in enumerate(terms):
+            if part.naxes != terms[0].naxes:
+                raise ValueError(f"parts must have the same axes, got {part.naxes} in parts[{i}] after {terms[0].naxes}")
+        self._set(terms, terms[0].labels)
+
+    def _combine(self, values: list[Array]) -> Array:
+        return np.add.reduce(values)
+
+
+class Stacked(_Combined):
+    """Axes of several trajectories side by side; made by `stack`."""
+
+    def __init__(self, parts: Iterable[Trajectory], labels: Sequence[str] | None = None) -> None:
+        members = _checked_parts(parts)
+        names = tuple(name for part in members for name in part.labels)
+        if labels is not None:
+            names = checked_labels(labels, len(names))
+        elif all(part.labels == default_labels(part.naxes) for part in members):
+            names = default_labels(len(names))
+        self._set(members, checked_labels(names, len(names)))
+
+    def _combine(self, values: list[Array]) -> Array:
+        return np.concatenate(values, axis=0 if values[0].ndim == 1 else 1)
+
+
+class Scaled(_Combined):
+    """Multiple of a trajectory.
+
+    Parameters
+    ----------
+    part : Trajectory
+        What is multiplied.
+    factor : float
+        By what, finite.
+    """
+
+    factor: float
+
+    def __init__(self, part: Trajectory, factor: float) -> None:
+        self.__dict__["factor"] = checked_time(factor, "factor")
+        self._set((part,), part.labels)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data that `trajectory_from_dict` reads."""
+        return super().to_dict() | {"factor": self.factor}
+
+    @classmethod
+    def _from_dict(cls, data: dict[str, Any]) -> Self:
+        return cls(trajectory_from_dict(data["parts"][0]), data["factor"])
+
+    def _map_time(self, origin: float, shift: float, rate: float) -> Self:
+        return type(self)(self.parts[0]._map_time(origin, shift, rate), self.factor)
+
+    def _combine(self, values: list[Array]) -> Array:
+        return self.factor * values[0]
+
+
+class Joined(Trajectory):
+    """Trajectories one after the other; made by `then`.
+
+    Parameters
+    ----------
+    parts : iterable of Trajectory
+        Each is shifted to begin where the one before it ends.
+
+    Raises
+    ------
+    ValueError
+        If the axes differ in number, or a first position differs from the last
+        one before it by more than 1e-9 of their size.
+    """
+
+    parts: tuple[Trajectory, ...]
+
+    def __init__(self, parts: Iterable[Trajectory]) -> None:
+        members = list(_checked_parts(parts))
+        for i, (before, after) in enumerate(zip(members[:-1], members[1:], strict=True)):
+            if before.naxes != after.naxes:
+                raise ValueError(f"joined trajectories must have the same axes, got {after.naxes} after {before.naxes}")
+            last, first = before.final, after.initial
+            if np.any(np.abs(first - last) > 1e-9 * np.maximum(1e-300, np.maximum(np.abs(first), np.abs(last)))):
+                raise ValueError(
+                    f"positions must agree where trajectories join, got {first.tolist()} after {last.tolist()} "
+                    f"at {members[i].end:g} s"
+                )
+            members[i + 1] = after.shift(members[i].end - after.start)
+        self._set(tuple(members), members[0].labels)
+
+    def _set(self, parts: tuple[Trajectory, ...], labels: tuple[str, ...]) -> None:
+        times, legs = [parts[0].start], []
+        waypoints = list(parts[0].waypoints)
+        for part in parts:
+            times += part.breakpoints[1:].tolist()
+            legs += [(part, leg) for leg in range(part.breakpoints.size - 1)]
+            if part is not parts[0]:
+                waypoints += part.waypoints[1:]
+        self.__dict__.update(
+            parts=parts,
+            labels=labels,
+            waypoints=tuple(waypoints),
+            breakpoints=readonly(np.array(times)),
+            initial=parts[0].initial,
+            final=parts[-1].final,
+            _legs=legs,
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data that `trajectory_from_dict` reads."""
+        parts = [part.to_dict() for part in self.parts]
+        return {"type": "Joined", "parts": parts, "labels": list(self.labels)}
+
+    @classmethod
+    def _from_dict(cls, data: dict[str, Any]) -> Self:
+        self = cls.__new__(cls)
+        self._set(tuple(trajectory_from_dict(part) for part in data["parts"]), tuple(data["labels"]))
+        return self
+
+    def _map_time(self, origin: float, shift: float, rate: float) -> Self:
+        self_ = type(self).__new__(type(self))
+        self_._set(tuple(part._map_time(origin, shift, rate) for part in self.parts), self.labels)
+        return self_
+
+    def _leg_jet(self, leg: int, s: Array, order: int) -> Array:
+        part, own = self._legs[leg]
+        return part._leg_jet(own, s, order)
+
+    _legs: list[tuple[Trajectory, int]]
+
+
+def stack(plans: Iterable[Trajectory], labels: Sequence[str] | None = None) -> Trajectory:
+    """Axes of several trajectories side by side.
+
+    Parameters
+    ----------
+    plans : iterable of Trajectory
+        One or more, of any intervals: each holds its ends outside its own.
+    labels : sequence of str, optional
+        Names of all axes; needed where those of the plans collide.
+
+    Returns
+    -------
+    Trajectory
+
+    Raises
+    ------
+    ValueError
+        If there is no plan, or labels are not unique.
+    """
+    return Stacked(plans, labels)
+
+
+def _checked_parts(parts: Iterable[Trajectory]) -> tuple[Trajectory, ...]:
+    members = tuple(parts)
+    if not members:
+        raise ValueError("a combination needs at least one trajectory, got none")
+    for i, part in enumerate(members):
+        if not isinstance(part, Trajectory):
+            raise TypeError(f"parts[{i}] must be a Trajectory, got {type(part).__name__}")
+    return members

@@ -1,0 +1,78 @@
+"""What every module of this folder uses."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NoReturn
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+FACTORIALS: Array = np.array([float(math.factorial(k)) for k in range(171)])
+FACTORIALS.flags.writeable = False
+
+
+class Frozen:
+    """Base of the public objects: attributes are set by the constructor only."""
+
+    def __setattr__(self, name: str, value: object) -> NoReturn:
+        raise AttributeError(f"{type(self).__name__} is immutable; make a new one instead of setting {name}")
+
+    def __delattr__(self, name: str) -> NoReturn:
+        raise AttributeError(f"{type(self).__name__} is immutable; {name} cannot be deleted")
+
+
+def readonly(values: Array) -> Array:
+    """Same array, which can no longer be written to."""
+    values.flags.writeable = False
+    return values
+
+
+def default_labels(naxes: int) -> tuple[str, ...]:
+    """Names y, or y1, y2, ... for more than one axis."""
+    return ("y",) if naxes == 1 else tuple(f"y{i + 1}" for i in range(naxes))
+
+
+def checked_labels(labels: Sequence[str] | str | None, naxes: int) -> tuple[str, ...]:
+    """Labels as a tuple: as many as axes, unique, without dots."""
+    if labels is None:
+        return default_labels(naxes)
+    names = (labels,) if isinstance(labels, str) else tuple(labels)
+    if len(names) != naxes:
+        raise ValueError(f"labels must be as many as axes, {naxes}, got {len(names)}: {names}")
+    for name in names:
+        if not isinstance(name, str):
+            raise TypeError(f"labels must be strings, got {name!r}")
+        if not name or "." in name:
+            raise ValueError(f"labels must not be empty or contain a dot, got {name!r}")
+    if len(set(names)) < naxes:
+        raise ValueError(f"labels must be unique, got {names}")
+    return names
+
+
+def checked_time(time: float, name: str, positive: bool = False) -> float:
+    """Finite number of seconds, above 0 where it is a duration."""
+    try:
+        value = float(time)
+    except (TypeError, ValueError):
+        raise TypeError(f"{name} must be a number, got {time!r}") from None
+    if not math.isfinite(value) or (positive and value <= 0.0):
+        raise ValueError(f"{name} must be finite{' and above 0' if positive else ''}, got {value}")
+    return value
+
+
+def checked_timepts(t: ArrayLike) -> Array:
+    """Times as an array of any shape, without nan."""
+    times = np.asarray(t, dtype=float)
+    # The sum is nan where an entry is (or where both infinities meet).
+    if times.size and np.isnan(np.add.reduce(times, axis=None)) and np.isnan(times).any():
+        raise ValueError(f"times must not be nan, got nan at index {int(np.isnan(times).argmax())}")
+    return times
+
+
+def mapped_time(time: float, origin: float, shift: float, rate: float) -> float:
+    """Time moved to origin + shift + (time - origin)/rate."""
+    return time + shift if rate == 1.0 else origin + shift + (time - origin) / rate

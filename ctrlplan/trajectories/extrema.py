@@ -1,0 +1,195 @@
+"""Extrema and bounds that are facts about an interval, not about samples of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.polynomial import chebyshev
+from numpy.typing import ArrayLike
+
+from ctrlplan.trajectories.chebyshev import chebyshev_proxy, fit, real_roots, resolved_size
+from ctrlplan.trajectories.common import Array
+
+if TYPE_CHECKING:
+    from ctrlplan.trajectories.trajectory import Trajectory
+
+_MAX_PIECES = 400
+
+
+@dataclass(frozen=True)
+class Extrema:
+    """Least and greatest values and where they are attained.
+
+    Attributes
+    ----------
+    minimum, maximum : ndarray, shape (naxes,)
+        Values.
+    time_min, time_max : ndarray, shape (naxes,)
+        Earliest times [s] at which they are attained.
+    """
+
+    minimum: Array
+    maximum: Array
+    time_min: Array
+    time_max: Array
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """Certified bounds of a function over a plan.
+
+    Attributes
+    ----------
+    lower, upper : float
+        Every value over the whole interval lies between them.
+    minimum, maximum : float
+        Values that are attained.
+    time_min, time_max : float
+        Where [s].
+    """
+
+    lower: float
+    upper: float
+    minimum: float
+    maximum: float
+    time_min: float
+    time_max: float
+
+
+def derivative_extrema(plan: Trajectory, nu: int) -> Extrema:
+    """Extrema of the nu-th derivative, axis by axis."""
+    found = _Candidates()
+    if nu == 0 or plan.breakpoints.size == 1:
+        held = np.zeros((2, plan.naxes)) if nu else np.stack([plan.initial, plan.final])
+        found.add(np.array([plan.start, plan.end]), held.T)
+    for leg, (origin, duration) in enumerate(_legs(plan)):
+
+        def jet(t: Array, order: int, leg: int = leg) -> Array:
+            return plan._leg_jet(leg, t, order)
+
+        times = [np.array([0.0, duration])]
+        for left, right, slopes in _pieces(jet, 0.0, duration, nu + 1):
+            for series in slopes:
+                times.append(0.5 * (left + right) + 0.5 * (right - left) * real_roots(series))
+        t = np.unique(np.concatenate(times))
+        t = np.union1d(t, _polished(jet, t, nu, duration))
+        found.add(origin + t, jet(t, nu)[nu])
+    return found.extrema()
+
+
+def function_extrema(plan: Trajectory, function: Callable[[Array], Array], order: int) -> Extrema:
+    """Extrema of a function of the jet, resolved by Chebyshev proxies."""
+    found = _Candidates()
+    for leg, (origin, duration) in enumerate(_legs(plan)):
+
+        def value(t: Array, leg: int = leg) -> Array:
+            return np.atleast_2d(np.asarray(function(plan._leg_jet(leg, t, order)), dtype=float))
+
+        todo, pieces = [(0.0, duration)], 0
+        while todo:
+            left, right = todo.pop()
+            pieces += 1
+            series = fit(value, (left, right), 32)
+            if not np.isfinite(series).all():
+                raise ValueError(f"function must be finite over the plan, got nan or inf between {origin + left:g} and {origin + right:g} s")
+            if resolved_size(series, 1e-13) is None and pieces < _MAX_PIECES and right - left > 1e-9 * duration:
+                middle = 0.5 * (left + right)
+                todo += [(left, middle), (middle, right)]
+                continue
+            roots = [real_roots(chebyshev.chebder(row)) for row in series]
+            t = np.concatenate([[left, right], *(0.5 * (left + right) + 0.5 * (right - left) * r for r in roots)])
+            found.add(origin + t, value(t))
+    if plan.breakpoints.size == 1:
+        raise ValueError("a trajectory without duration has no interval to search, got a step")
+    return found.extrema()
+
+
+def certified_bounds(
+    plan: Trajectory,
+    function: Callable[[Array], Array],
+    order: int,
+    lipschitz: ArrayLike,
+    rtol: float,
+    max_cells: int,
+) -> Bounds:
+    """Bounds by refining cells until a Lipschitz bound decides."""
+    weights = np.broadcast_to(np.asarray(lipschitz, dtype=float), (order + 1, plan.naxes))
+    peaks = np.stack([plan.peak(k + 1) for k in range(order + 1)])
+    slope = float(np.sum(weights * peaks))
+    best = Bounds(np.inf, -np.inf, np.inf, -np.inf, plan.start, plan.start)
+    for leg, (origin, duration) in enumerate(_legs(plan)):
+        centres, radius, spent = duration * (np.arange(128) + 0.5) / 128, duration / 256, 0
+        lower, upper = best.lower, best.upper
+        while centres.size:
+            spent += centres.size
+            if spent > max_cells:
+                raise ValueError(f"rtol = {rtol:g} must be reached within {max_cells} cells; raise either of them")
+            values = np.asarray(function(plan._leg_jet(leg, centres, order)), dtype=float)
+            low, high = int(values.argmin()), int(values.argmax())
+            if values[low] < best.minimum:
+                best = Bounds(lower, upper, float(values[low]), best.maximum, origin + float(centres[low]), best.time_max)
+            if values[high] > best.maximum:
+                best = Bounds(lower, upper, best.minimum, float(values[high]), best.time_min, origin + float(centres[high]))
+            gap = rtol * max(best.maximum - best.minimum, np.finfo(float).tiny)
+            reach = slope * radius
+            undecided = (values - reach < best.minimum - gap) | (values + reach > best.maximum + gap)
+            if reach <= gap:
+                undecided[:] = False
+            decided = values[~undecided]
+            if decided.size:
+                lower = min(lower, float(decided.min()) - reach)
+                upper = max(upper, float(decided.max()) + reach)
+            radius *= 0.5
+            centres = (centres[undecided, None] + np.array([-radius, radius])).ravel()
+        best = Bounds(lower, upper, best.minimum, best.maximum, best.time_min, best.time_max)
+    return best
+
+
+class _Candidates:
+    """Least and greatest of the values seen, one row an axis."""
+
+    def __init__(self) -> None:
+        self.times: list[Array] = []
+        self.values: list[Array] = []
+
+    def add(self, t: Array, values: Array) -> None:
+        self.times.append(t)
+        self.values.append(values)
+
+    def extrema(self) -> Extrema:
+        t, values = np.concatenate(self.times), np.concatenate(self.values, axis=1)
+        by_time = np.argsort(t, kind="stable")
+        t, values = t[by_time], values[:, by_time]
+        low, high = values.argmin(axis=1), values.argmax(axis=1)
+        rows = np.arange(len(values))
+        return Extrema(values[rows, low], values[rows, high], t[low], t[high])
+
+
+def _legs(plan: Trajectory) -> list[tuple[float, float]]:
+    """Beginning and duration [s] of each leg."""
+    return list(zip(plan.breakpoints[:-1].tolist(), np.diff(plan.breakpoints).tolist(), strict=True))
+
+
+def _pieces(
+    jet: Callable[[Array, int], Array], a: float, b: float, nu: int, depth: int = 6
+) -> list[tuple[float, float, Array]]:
+    """Intervals with Chebyshev coefficients (naxes, size) of the nu-th derivative."""
+    proxy = chebyshev_proxy(jet, (a, b), nu, nu)
+    if proxy is not None:
+        return [(a, b, proxy[0])]
+    if not depth:  # what is not resolved by now is rounding
+        return [(a, b, fit(lambda t: jet(t, nu)[nu], (a, b), 32))]
+    middle = 0.5 * (a + b)
+    return _pieces(jet, a, middle, nu, depth - 1) + _pieces(jet, middle, b, nu, depth - 1)
+
+
+def _polished(jet: Callable[[Array, int], Array], t: Array, nu: int, duration: float) -> Array:
+    """One Newton step on y^(nu + 1) for every axis from every candidate, kept if it stays near."""
+    slope, curve = jet(t, nu + 2)[nu + 1 :]
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        moved = t - slope / curve
+    near = np.isfinite(moved) & (np.abs(moved - t) < 1e-6 * duration) & (moved >= 0.0) & (moved <= duration)
+    return moved[near]

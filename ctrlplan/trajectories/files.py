@@ -1,0 +1,104 @@
+"""Trajectories as plain data, JSON and CSV."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ctrlplan.trajectories.common import checked_timepts
+from ctrlplan.trajectories.trajectory import Trajectory
+
+
+def trajectory_from_dict(data: dict[str, Any]) -> Trajectory:
+    """Trajectory from the plain data of its `to_dict`.
+
+    Parameters
+    ----------
+    data : dict
+        With the key "type" and what that kind needs.
+
+    Returns
+    -------
+    Trajectory
+        Equal to the one saved in every bit of its values.
+
+    Raises
+    ------
+    ValueError
+        If the kind is unknown or an entry is missing or wrong.
+    """
+    kind = data.get("type") if isinstance(data, dict) else None
+    if kind not in Trajectory.kinds:
+        raise ValueError(f"type must be one of {', '.join(sorted(Trajectory.kinds))}, got {kind!r}")
+    try:
+        return Trajectory.kinds[kind]._from_dict(data)
+    except KeyError as missing:
+        raise ValueError(f"a {kind} needs the entry {missing}, got {', '.join(data)}") from None
+
+
+def save_trajectory(plan: Trajectory, path: str | os.PathLike[str]) -> None:
+    """Write a trajectory as JSON; numbers are written so that every bit returns."""
+    text = json.dumps(plan.to_dict(), indent=1, allow_nan=False)
+    Path(path).write_text(text + "\n", encoding="utf-8")
+
+
+def load_trajectory(path: str | os.PathLike[str]) -> Trajectory:
+    """Read a trajectory that `save` wrote.
+
+    Parameters
+    ----------
+    path : str or path
+        A JSON file.
+
+    Returns
+    -------
+    Trajectory
+
+    Raises
+    ------
+    OSError
+        If the file cannot be read.
+    ValueError
+        If it does not hold a trajectory.
+    """
+    try:
+        return trajectory_from_dict(json.loads(Path(path).read_text(encoding="utf-8")))
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"{os.fspath(path)} must hold a saved trajectory: {error}") from None
+
+
+def write_csv(
+    plan: Trajectory, path: str | os.PathLike[str], timepts: ArrayLike | None = None, order: int = 2
+) -> None:
+    """Write times and jets as a table: time, then each axis with its derivatives.
+
+    Parameters
+    ----------
+    plan : Trajectory
+        What is sampled.
+    path : str or path
+        The file.
+    timepts : array_like, shape (ntime,), optional
+        Times [s]; 1001 from start to end unless given.
+    order : int, optional
+        Highest derivative; columns are x, x_d1, x_d2, ...
+    """
+    times = np.linspace(plan.start, plan.end, 1001) if timepts is None else np.atleast_1d(checked_timepts(timepts))
+    jet = plan.jet(times, order)
+    columns = np.concatenate([times[None], jet.transpose(1, 0, 2).reshape(-1, times.size)])
+    np.savetxt(path, columns.T, fmt="%.17g", delimiter=",", header=",".join(column_names(plan, order)), comments="")
+
+
+def column_names(plan: Trajectory, order: int) -> list[str]:
+    """Names of the columns: time, x, x_d1, x_d2, z, z_d1, ..."""
+    return ["time"] + [derivative_name(label, k) for label in plan.labels for k in range(order + 1)]
+
+
+def derivative_name(label: str, order: int) -> str:
+    """Name of a derivative of an axis: x, x_d1, x_d2, ..."""
+    return label if order == 0 else f"{label}_d{order}"

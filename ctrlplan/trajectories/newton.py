@@ -1,0 +1,293 @@
+r"""The confluent trigonometric Newton form.
+
+One basis serves the trigonometric spline (equation (2)) and the polynomial
+spline (equation (12)), its member at alpha = 0. In normalised time
+u = (t - start)/duration, with
+
+.. math:: q(u) = \tfrac{2}{\alpha}\sin\tfrac{\alpha u}{2},\quad c(u) = \cos\tfrac{\alpha u}{2}
+
+and nodes x_1 .. x_M (times repeated by the number of constraints there)
+
+.. math::
+    \phi_{2j} = \prod_{i\le 2j} q(u - x_i), \qquad
+    \phi_{2j-1} = c(u - x_{2j}) \prod_{i<2j} q(u - x_i).
+
+The cosine is centred on the next node, so that the last function of an even
+number is proportional to sin m(tau - gamma) plus lower harmonics, gamma the
+mean of the nodes: the span is exactly the space of (2). At alpha = 0, q(u) = u
+and c = 1, and this is Newton's polynomial. Hermite collocation is lower
+triangular, whatever alpha, where the direct solution of (2) loses all digits.
+
+Taylor jets are carried through the products two factors at a time. With
+w = u - (x_{2j-1} + x_{2j})/2, sigma = sin(alpha w)/alpha, kappa = cos(alpha w),
+
+.. math::
+    q q\,(u + h) &= q q + 2\sigma S(h) + \kappa V(h)\\
+    q c\,(u + h) &= q c + \kappa S(h) - \tfrac{\alpha^2}{2}\sigma V(h)
+
+where S(h) = sin(alpha h)/alpha and V(h) = 2 (1 - cos(alpha h))/alpha^2 do not
+depend on u: multiplying by them is one constant matrix for all times.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import lapack
+
+from ctrlplan.trajectories.common import FACTORIALS, Array, Frozen
+
+
+class NewtonSystem(Frozen):
+    """Factorised collocation for one pattern of times and given entries.
+
+    It depends on alpha, the relative times and which entries are given, not on
+    their values: new values and other durations reuse it.
+
+    Parameters
+    ----------
+    alpha : float
+        Shape parameter [rad] over the normalised interval; 0 is the polynomial.
+    times : ndarray, shape (nwaypoints,)
+        Relative times, increasing, of which the first is 0.
+    given : tuple of tuple of int
+        For each waypoint the derivative orders prescribed there, increasing.
+    gamma : float or None
+        Phase [rad of tau] of the top harmonic; None is the constraints' mean.
+    size : int or None
+        Number of basis functions, at least the number of constraints; the
+        spare coefficients minimise int (y^(smooth))^2 over [0, 1].
+    smooth : int
+        That derivative order.
+
+    Raises
+    ------
+    ValueError
+        If the constraints do not determine the plan: free entries that make
+        the (Birkhoff) system singular, or a gamma that does.
+    """
+
+    alpha: float
+    size: int
+    gamma: float | None  # of the top harmonic; None for odd sizes and for polynomials
+    waypoint_index: NDArray[np.intp]
+    order_index: NDArray[np.intp]
+
+    def __init__(
+        self,
+        alpha: float,
+        times: Array,
+        given: tuple[tuple[int, ...], ...],
+        gamma: float | None = None,
+        size: int | None = None,
+        smooth: int = 3,
+    ) -> None:
+        count = sum(map(len, given))
+        if count == 0:
+            raise ValueError("an axis needs at least one prescribed entry, got none")
+        size = count if size is None else size
+        waypoints, orders = _sequence(_leja(alpha, times, given), given)
+        nodes = times[waypoints]
+        mean = math.fsum(nodes) / count
+        nodes = np.concatenate([nodes, _spare_nodes(mean, size - count)]) if size > count else nodes
+        fold = 0.0
+        if size % 2 or not alpha:
+            if gamma is not None:
+                why = f"{size} coefficients" if size % 2 else "alpha = 0"
+                raise ValueError(f"gamma needs an even number of coefficients and alpha > 0, got {why}")
+            phase = None
+        else:
+            phase = alpha * mean if gamma is None else gamma
+            if gamma is not None:
+                fold = _fold(alpha, size, alpha * mean - gamma)
+        self.__dict__.update(
+            alpha=alpha,
+            size=size,
+            gamma=phase,
+            waypoint_index=waypoints,
+            order_index=orders,
+            _fold=fold,
+            _first=nodes[0 : size - size % 2 : 2],
+            _second=nodes[1::2],
+            _scales={},
+        )
+        jets = self.taylor(times, max(orders))
+        collocation = jets[:, orders, waypoints].T
+        hermite = all(g == tuple(range(len(g))) for g in given)
+        self.__dict__["_triangle"], self.__dict__["_spread"] = (
+            (np.asfortranarray(collocation), None)
+            if hermite and size == count
+            else _factor(collocation, hermite, self._roughness(smooth) if size > count else None)
+        )
+
+    def taylor_scale(self, duration: float) -> Array:
+        """Column that turns prescribed derivatives into normalised Taylor data."""
+        scale: Array | None = self._scales.get(duration)
+        if scale is None:
+            scale = (duration**self.order_index / FACTORIALS[self.order_index])[:, None]
+            self._scales.clear()
+            self._scales[duration] = scale
+        return scale
+
+    def coefficients(self, taylor_data: Array) -> Array:
+        """Coefficients (size, naxes) from Taylor data (nconstraints, naxes)."""
+        solved, info = lapack.dtrtrs(self._triangle, taylor_data, lower=1)
+        if info:
+            raise ValueError("the constraints do not determine the plan: the system is singular")
+        return solved if self._spread is None else self._spread @ solved
+
+    def taylor(self, u: Array, order: int) -> Array:
+        """Taylor coefficients of every basis function.
+
+        Parameters
+        ----------
+        u : ndarray, shape (ntime,)
+            Normalised times.
+        order : int
+            Highest coefficient; coefficient k is the k-th derivative / k!.
+
+        Returns
+        -------
+        ndarray, shape (size, order + 1, ntime)
+        """
+        alpha, half = self.alpha, 0.5 * self.alpha
+        npairs = len(self._second)
+        out = np.empty((2 * npairs + 1, order + 1, u.size))
+        out[0] = 0.0
+        out[0, 0] = 1.0
+        if npairs:
+            first, second = u - self._first[:, None], u - self._second[:, None]
+            middle = u - 0.5 * (self._first + self._second)[:, None]
+            factor = np.empty((npairs, 2, 3, 1, u.size))  # [q c, q q] by [1, S, V]
+            if alpha:
+                q = np.sin(half * first) / half
+                second *= half
+                sigma, kappa = np.sin(alpha * middle), np.cos(alpha * middle)
+                factor[:, 0, 0, 0] = q * np.cos(second)
+                factor[:, 1, 0, 0] = q * np.sin(second) / half
+                factor[:, 0, 1, 0] = factor[:, 1, 2, 0] = kappa
+                factor[:, 0, 2, 0] = -half * sigma
+                factor[:, 1, 1, 0] = (2.0 / alpha) * sigma
+            else:
+                factor[:, 0, 0, 0] = first
+                factor[:, 1, 0, 0] = first * second
+                factor[:, 0, 1, 0] = factor[:, 1, 2, 0] = 1.0
+                factor[:, 0, 2, 0] = 0.0
+                factor[:, 1, 1, 0] = 2.0 * middle
+            kernel = _kernel(alpha, order)
+            for j in range(npairs):
+                shifted = (kernel @ out[2 * j]).reshape(3, order + 1, u.size)
+                np.add.reduce(factor[j] * shifted, axis=1, out=out[2 * j + 1 : 2 * j + 3])
+        if self._fold:
+            out[self.size - 1] += self._fold * out[self.size]
+        return out[: self.size]
+
+    def _roughness(self, smooth: int) -> Array:
+        """Weighted samples G with int (y^(smooth))^2 = |G coefficients|^2."""
+        nodes, weights = np.polynomial.legendre.leggauss(2 * self.size + int(4 * self.alpha) + 8)
+        top = self.taylor(0.5 * (nodes + 1.0), smooth)[:, smooth]
+        return np.sqrt(weights)[:, None] * top.T
+
+    _scales: dict[float, Array]  # the last duration's, as a memory
+    _triangle: Array
+    _spread: Array | None
+    _fold: float
+    _first: Array
+    _second: Array
+
+
+def _leja(alpha: float, times: Array, given: tuple[tuple[int, ...], ...]) -> list[int]:
+    """Waypoints in Leja order: each next one farthest, in product, from those before."""
+    used = [i for i, g in enumerate(given) if g]
+    u = times[used]
+    distance = np.abs(np.sin(0.5 * alpha * (u[:, None] - u))) if alpha else np.abs(u[:, None] - u)
+    chosen = [0]
+    product = distance[0]
+    while len(chosen) < len(used):
+        # Rescaled, so that many waypoints do not underflow to a tie.
+        farthest = int(product.argmax())
+        product = product * (distance[farthest] / product[farthest])
+        chosen.append(farthest)
+    return [used[i] for i in chosen]
+
+
+def _sequence(
+    waypoints: list[int], given: tuple[tuple[int, ...], ...]
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Constraints in rounds: the first entry of each waypoint, the second of each, ..."""
+    rounds = max(map(len, given))
+    pairs = [(i, given[i][r]) for r in range(rounds) for i in waypoints if r < len(given[i])]
+    table = np.array(pairs, dtype=np.intp)
+    return table[:, 0], table[:, 1]
+
+
+def _spare_nodes(mean: float, count: int) -> Array:
+    """Nodes for spare functions, symmetric about the mean so that gamma stays."""
+    reach = min(mean, 1.0 - mean)
+    return mean + reach * np.cos(np.pi * (np.arange(count) + 0.5) / count)
+
+
+def _fold(alpha: float, size: int, offset: float) -> float:
+    """Weight of phi_M in the last function that turns the top harmonic to a given gamma.
+
+    The leading parts of phi_M and phi_{M-1} are cos and sin of m(tau - mean) in
+    the ratio 2/alpha : -1, M = 2m; the sum must have no part along cos m(tau - gamma).
+    """
+    angle = 0.5 * size * offset
+    if abs(math.cos(angle)) < 1e-9:
+        raise ValueError(
+            "gamma must not make the system singular: m (mean - gamma) must differ from pi/2 modulo pi, "
+            f"got {angle:g} with m = {size // 2}"
+        )
+    return -0.5 * alpha * math.tan(angle)
+
+
+def _factor(collocation: Array, hermite: bool, roughness: Array | None) -> tuple[Array, Array | None]:
+    """Lower triangle T and matrix B such that coefficients = B T^-1 data."""
+    count, size = collocation.shape
+    if hermite:  # spare functions vanish at every constraint
+        triangle, basis = collocation[:, :count], np.eye(size)
+    else:
+        # Rows scaled: the judgement must not depend on the units of the entries.
+        singular = np.linalg.svd(collocation / np.linalg.norm(collocation, axis=1, keepdims=True), compute_uv=False)
+        if singular[-1] < 1e-12 * singular[0]:
+            raise ValueError(
+                "the entries left free must not make the system singular: the prescribed entries conflict or leave "
+                f"the plan undetermined, got a relative singular value of {singular[-1] / singular[0]:.1g}"
+            )
+        basis, upper = np.linalg.qr(collocation.T, mode="complete")
+        triangle = upper[:count].T
+    spread = basis[:, :count]
+    if roughness is not None:
+        cost = roughness @ basis
+        free, _, rank, _ = np.linalg.lstsq(cost[:, count:], -cost[:, :count], rcond=None)
+        if rank < size - count:
+            raise ValueError(
+                "the constraints must leave no function of zero cost free; prescribe more entries or lower "
+                f"the order of smooth, got {count} constraints for {size} coefficients"
+            )
+        spread = spread + basis[:, count:] @ free
+    return np.asfortranarray(triangle), spread
+
+
+@lru_cache(maxsize=256)
+def _kernel(alpha: float, order: int) -> Array:
+    """Multiplication of a Taylor jet by 1, S(h) and V(h): shape (3 (order + 1), order + 1)."""
+    n = order + 1
+    s, v = np.zeros(n), np.zeros(n)
+    for k in range(1, n):
+        sign = (-1.0) ** (k // 2)
+        if k % 2:
+            s[k] = sign * alpha ** (k - 1) / math.factorial(k)
+        else:
+            v[k] = -2.0 * sign * alpha ** (k - 2) / math.factorial(k)
+    lag = np.subtract.outer(np.arange(n), np.arange(n))
+    kernel = np.zeros((3, n, n))
+    kernel[0] = np.eye(n)
+    kernel[1], kernel[2] = np.where(lag >= 0, s[lag], 0.0), np.where(lag >= 0, v[lag], 0.0)
+    kernel = kernel.reshape(3 * n, n)
+    kernel.flags.writeable = False
+    return kernel

@@ -1,0 +1,241 @@
+"""A plan through all its waypoints at once, in Newton form."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+
+from ctrlplan.trajectories.common import FACTORIALS, Array, checked_labels, mapped_time, readonly
+from ctrlplan.trajectories.newton import NewtonSystem
+from ctrlplan.trajectories.trajectory import Trajectory
+from ctrlplan.trajectories.waypoint import Waypoint
+
+Given = tuple[tuple[int, ...], ...]
+
+
+class Options(NamedTuple):
+    """What a spline was asked for beside its waypoints and alpha."""
+
+    labels: Sequence[str] | None = None
+    gamma: float | list[float | None] | None = None
+    degree: int | None = None
+    smooth: int = 3
+    period: float | None = None
+
+
+class NewtonSpline(Trajectory):
+    """What the trigonometric and the polynomial spline share.
+
+    Attributes
+    ----------
+    waypoints : tuple of Waypoint
+        What the plan meets.
+    alpha : float
+        Shape parameter [rad]: the plan takes this much of a turn; 0 is the polynomial.
+    """
+
+    alpha: float
+
+    def with_values(self, waypoints: Iterable[Waypoint]) -> Self:
+        """Plan with the same times and shape through new values.
+
+        The factorised system is reused: this is the fast path for many plans
+        of one pattern.
+
+        Parameters
+        ----------
+        waypoints : iterable of Waypoint
+            As many as before and at the same times.
+
+        Raises
+        ------
+        ValueError
+            If a time differs.
+        """
+        points = tuple(waypoints)
+        if [w.time for w in points] != [w.time for w in self.waypoints]:
+            times = [w.time for w in self.waypoints]
+            raise ValueError(f"waypoints must keep the times {times}, got {[w.time for w in points]}")
+        return self._again(points, self._options)
+
+    @property
+    def degree(self) -> tuple[int, ...]:
+        """Degree axis by axis: m, or that of the polynomial where alpha is 0."""
+        return tuple(s.size // 2 if self.alpha else s.size - 1 for s, _ in self._per_axis())
+
+    def _fit(
+        self,
+        waypoints: tuple[Waypoint, ...],
+        alpha: float,
+        options: Options,
+        donor: NewtonSpline | None = None,
+    ) -> None:
+        """Set every attribute; a donor of the same pattern lends its factorised systems."""
+        times = [w.time for w in waypoints]
+        start, period = times[0], options.period
+        duration = times[-1] - start if period is None else period
+        same_clock = donor is not None and donor._times == times
+        relative = donor._relative if donor and same_clock else (np.array(times) - start) / duration
+        lent = donor._systems if donor and (same_clock or np.array_equal(donor._relative, relative)) else {}
+        table, patterns = given_entries(waypoints)
+        systems: dict[tuple[Given, float | None], NewtonSystem] = {}
+        parts = []
+        for (given, gamma), axes in _groups(patterns, options.gamma).items():
+            system = lent.get((given, gamma))
+            if system is None:
+                size = _size(alpha, sum(map(len, given)), options.degree)
+                system = NewtonSystem(alpha, relative, given, gamma, size, options.smooth)
+            systems[given, gamma] = system
+            data = table[system.waypoint_index, system.order_index]
+            if len(axes) < table.shape[2]:
+                data = data[:, axes]
+            parts.append((axes, system, system.coefficients(data * system.taylor_scale(duration))))
+        if donor is not None and len(donor.labels) == table.shape[2]:
+            labels = donor.labels
+        else:
+            labels = checked_labels(options.labels or waypoints[0].labels, table.shape[2])
+        if donor is not None and same_clock:
+            breakpoints = donor.breakpoints
+        else:
+            breakpoints = readonly(np.array([start, times[-1] if period is None else start + period]))
+        self.__dict__.update(
+            waypoints=waypoints,
+            alpha=alpha,
+            labels=labels,
+            breakpoints=breakpoints,
+            _options=options,
+            _times=times,
+            _relative=relative,
+            _duration=duration,
+            _systems=systems,
+            _parts=parts,
+        )
+
+    def _again(self, waypoints: tuple[Waypoint, ...], options: Options) -> Self:
+        """Plan of this kind through other waypoints, with what can be reused of this one."""
+        plan = type(self).__new__(type(self))
+        plan._fit(_checked_waypoints(waypoints), self.alpha, options, self)
+        return plan
+
+    def _map_time(self, origin: float, shift: float, rate: float) -> Self:
+        moved = tuple(w.scaled(mapped_time(w.time, origin, shift, rate), rate) for w in self.waypoints)
+        options = self._options
+        if options.period is not None:
+            options = options._replace(period=options.period / rate)
+        return self._again(moved, options)
+
+    def _leg_jet(self, leg: int, s: Array, order: int) -> Array:
+        u = s / self._duration
+        scale = FACTORIALS[: order + 1] / self._duration ** np.arange(order + 1)
+        out = np.empty((order + 1, self.naxes, s.size))
+        for axes, system, coefficients in self._parts:
+            taylor = system.taylor(u, order)
+            values = coefficients.T @ taylor.reshape(system.size, -1)
+            values = values.reshape(len(axes), order + 1, s.size).transpose(1, 0, 2) * scale[:, None, None]
+            if len(axes) == self.naxes:
+                return values
+            out[:, list(axes)] = values
+        return out
+
+    def _per_axis(self) -> list[tuple[NewtonSystem, Array]]:
+        """System and coefficients (size,) of each axis in order."""
+        found = {a: (s, c[:, i]) for axes, s, c in self._parts for i, a in enumerate(axes)}
+        return [found[a] for a in range(self.naxes)]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data: type, waypoints, labels and whatever else was chosen."""
+        data: dict[str, Any] = {
+            "type": type(self).__name__,
+            "waypoints": [w.to_dict() for w in self.waypoints],
+            "labels": list(self.labels),
+        }
+        chosen = self._options._asdict()
+        defaults = Options()._asdict()
+        return data | {k: v for k, v in chosen.items() if k != "labels" and v != defaults[k]}
+
+    _options: Options
+    _times: list[float]
+    _relative: Array
+    _duration: float
+    _systems: dict[tuple[Given, float | None], NewtonSystem]
+    _parts: list[tuple[tuple[int, ...], NewtonSystem, Array]]
+
+
+def checked_waypoints(waypoints: Iterable[Waypoint], least: int = 2) -> tuple[Waypoint, ...]:
+    """Waypoints as a tuple: enough of them, alike, at increasing times."""
+    points = tuple(waypoints)
+    if len(points) < least:
+        number = {1: "one waypoint", 2: "two waypoints"}[least]
+        raise ValueError(f"a plan needs at least {number}, got {len(points)}")
+    return _checked_waypoints(points)
+
+
+def _checked_waypoints(points: tuple[Waypoint, ...]) -> tuple[Waypoint, ...]:
+    before: Waypoint | None = None
+    for i, point in enumerate(points):
+        if not isinstance(point, Waypoint):
+            raise TypeError(f"waypoints[{i}] must be a Waypoint, got {type(point).__name__}")
+        if before is not None:
+            if point.naxes != before.naxes or point.labels != before.labels:
+                raise ValueError(
+                    f"waypoints must have the same axes, got waypoints[{i}] with {_axes(point)} "
+                    f"after waypoints[{i - 1}] with {_axes(before)}"
+                )
+            if not point.time > before.time:
+                raise ValueError(
+                    f"times must increase strictly, got waypoints[{i}].time = {point.time} "
+                    f"after waypoints[{i - 1}].time = {before.time}"
+                )
+        before = point
+    return points
+
+
+def _size(alpha: float, count: int, degree: int | None) -> int | None:
+    """Number of coefficients at a degree, None for as many as constraints."""
+    if degree is None:
+        return None
+    least = count // 2 if alpha else count - 1
+    if degree < least:
+        raise ValueError(f"degree must be at least {least} for {count} constraints an axis, got {degree}")
+    return max(2 * degree if alpha else degree + 1, count)
+
+
+def _axes(point: Waypoint) -> str:
+    return f"{point.naxes} axes" if point.labels is None else f"axes {', '.join(point.labels)}"
+
+
+def given_entries(waypoints: Sequence[Waypoint]) -> tuple[Array, list[Given]]:
+    """Entries (waypoint, order, axis), and for each axis the orders given at each waypoint."""
+    jets = [w.jet for w in waypoints]
+    sizes = [len(j) for j in jets]
+    if min(sizes) == max(sizes) and all([w.complete for w in waypoints]):
+        return np.array(jets), [(tuple(range(sizes[0])),) * len(sizes)] * waypoints[0].naxes
+    table = np.full((len(jets), max(sizes), jets[0].shape[1]), np.nan)
+    for row, jet in zip(table, jets, strict=True):
+        row[: len(jet)] = jet
+    known = ~np.isnan(table)
+    patterns = [tuple(tuple(np.flatnonzero(k).tolist()) for k in known[:, :, a]) for a in range(known.shape[2])]
+    return table, patterns
+
+
+def _groups(
+    patterns: list[Given], gamma: float | list[float | None] | None
+) -> dict[tuple[Given, float | None], tuple[int, ...]]:
+    """Axes that share a pattern of given entries and a gamma."""
+    if gamma is None and patterns.count(patterns[0]) == len(patterns):
+        return {(patterns[0], None): tuple(range(len(patterns)))}
+    gammas = gamma if isinstance(gamma, list) else [gamma] * len(patterns)
+    groups: dict[tuple[Given, float | None], tuple[int, ...]] = {}
+    for axis, key in enumerate(zip(patterns, gammas, strict=True)):
+        groups[key] = (*groups.get(key, ()), axis)
+    return groups
+
+
+def checked_degree(degree: int | None, smooth: int) -> tuple[int | None, int]:
+    """Degree and order of smoothness as whole numbers from 1."""
+    for name, value in (("degree", degree), ("smooth", smooth)):
+        if value is not None and (value != int(value) or value < 1):
+            raise ValueError(f"{name} must be a whole number from 1, got {value}")
+    return None if degree is None else int(degree), int(smooth)

@@ -1,0 +1,165 @@
+"""One spline a leg: the paper's first approach to via points."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any, Self
+
+import numpy as np
+
+from ctrlplan.trajectories.common import FACTORIALS, Array, checked_labels, mapped_time, readonly
+from ctrlplan.trajectories.newton import NewtonSystem
+from ctrlplan.trajectories.newton_spline import NewtonSpline, checked_waypoints, given_entries
+from ctrlplan.trajectories.polynomial import PolySpline
+from ctrlplan.trajectories.trajectory import Trajectory
+from ctrlplan.trajectories.trigonometric import TrigSpline, checked_alpha
+from ctrlplan.trajectories.waypoint import Waypoint
+
+
+class PiecewiseSpline(Trajectory):
+    """One spline for each leg between waypoints.
+
+    With K - 1 the highest order that an axis prescribes anywhere, an entry of
+    order j < K left free at an inner waypoint is continuous there, and so is
+    its conjugate, the derivative of order 2K - 1 - j, which determines it. With
+    alpha = 0 that is the interpolant of least int (y^(K))^2: the cubic spline
+    where velocities are free between given ones, the minimum-jerk spline where
+    velocities and accelerations are. Entries left free at the ends lower the
+    degree of the first and last leg. What no waypoint prescribes may jump.
+
+    Parameters
+    ----------
+    waypoints : iterable of Waypoint
+        Two or more, times increasing.
+    alpha : float, optional
+        Shape parameter of every leg in [0, 2 pi) [rad]; 0 gives polynomials.
+    labels : sequence of str, optional
+        Names of the axes.
+
+    Attributes
+    ----------
+    legs : tuple of TrigSpline or PolySpline
+        The splines, with the free entries of inner waypoints filled in.
+
+    Raises
+    ------
+    ValueError
+        If alpha is outside [0, 2 pi), times do not increase, axes differ, or
+        the entries left free are not determined.
+    """
+
+    alpha: float
+    legs: tuple[NewtonSpline, ...]
+
+    def __init__(
+        self, waypoints: Iterable[Waypoint], *, alpha: float = 0.0, labels: Sequence[str] | None = None
+    ) -> None:
+        points = checked_waypoints(waypoints)
+        shape = checked_alpha(alpha)
+        names = checked_labels(labels or points[0].labels, points[0].naxes)
+        filled = _filled(points, shape)
+        legs = tuple(
+            TrigSpline(pair, alpha=shape, labels=names) if shape else PolySpline(pair, labels=names)
+            for pair in zip(filled[:-1], filled[1:], strict=True)
+        )
+        self.__dict__.update(
+            waypoints=points,
+            alpha=shape,
+            labels=names,
+            legs=legs,
+            breakpoints=readonly(np.array([p.time for p in points])),
+        )
+
+    def with_values(self, waypoints: Iterable[Waypoint]) -> Self:
+        """Plan with the same times and shape through new values.
+
+        Raises
+        ------
+        ValueError
+            If a time differs.
+        """
+        points = tuple(waypoints)
+        if [w.time for w in points] != [w.time for w in self.waypoints]:
+            times = [w.time for w in self.waypoints]
+            raise ValueError(f"waypoints must keep the times {times}, got {[w.time for w in points]}")
+        return type(self)(points, alpha=self.alpha, labels=self.labels)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data that `trajectory_from_dict` reads."""
+        return {
+            "type": "PiecewiseSpline",
+            "waypoints": [w.to_dict() for w in self.waypoints],
+            "alpha": self.alpha,
+            "labels": list(self.labels),
+        }
+
+    @classmethod
+    def _from_dict(cls, data: dict[str, Any]) -> Self:
+        points = [Waypoint.from_dict(w) for w in data["waypoints"]]
+        return cls(points, alpha=data["alpha"], labels=data["labels"])
+
+    def _map_time(self, origin: float, shift: float, rate: float) -> Self:
+        moved = [w.scaled(mapped_time(w.time, origin, shift, rate), rate) for w in self.waypoints]
+        return type(self)(moved, alpha=self.alpha, labels=self.labels)
+
+    def _leg_jet(self, leg: int, s: Array, order: int) -> Array:
+        return self.legs[leg]._leg_jet(0, s, order)
+
+
+def _filled(points: tuple[Waypoint, ...], alpha: float) -> list[Waypoint]:
+    """Waypoints whose inner ones have no free entry below the axis's highest order."""
+    table, patterns = given_entries(points)
+    filled = table.copy()
+    for pattern in dict.fromkeys(patterns):
+        axes = [a for a, p in enumerate(patterns) if p == pattern]
+        size = 1 + max((k for given in pattern for k in given), default=0)
+        free = [(i, k) for i, g in enumerate(pattern[1:-1], 1) for k in range(size) if k not in g]
+        if free:
+            where = tuple(np.array(free).T)
+            filled[where[0][:, None], where[1][:, None], axes] = _conjugate(
+                points, pattern, size, free, table[:, :size, axes], alpha
+            )
+    return [Waypoint._of(p.time, jet, None) for p, jet in zip(points, filled, strict=True)]
+
+
+def _conjugate(
+    points: tuple[Waypoint, ...],
+    pattern: tuple[tuple[int, ...], ...],
+    size: int,
+    free: list[tuple[int, int]],
+    table: Array,
+    alpha: float,
+) -> Array:
+    """Free entries (nfree, naxes): those that leave no jump of the conjugate derivatives.
+
+    The legs are linear in their data, so each free entry is tried as an axis of
+    its own beside the axes asked for; time is scaled to the mean leg.
+    """
+    last = len(points) - 1
+    unit = (points[-1].time - points[0].time) / last
+    naxes = table.shape[2]
+    columns = np.concatenate([np.nan_to_num(table), np.zeros((last + 1, size, len(free)))], axis=2)
+    columns *= (unit ** np.arange(size))[:, None]
+    for n, (i, k) in enumerate(free):
+        columns[i, k, naxes + n] = 1.0
+    jump = np.zeros((last + 1, 2 * size, columns.shape[2]))  # right limit minus left, at each waypoint
+    for leg in range(last):
+        ends = [pattern[i] if i in (0, last) else tuple(range(size)) for i in (leg, leg + 1)]
+        if not any(ends):
+            raise ValueError(f"waypoints must prescribe something on every leg, got none from {leg} to {leg + 1}")
+        duration = (points[leg + 1].time - points[leg].time) / unit
+        system = NewtonSystem(alpha, np.array([0.0, 1.0]), (ends[0], ends[1]))
+        orders = system.order_index
+        scale = duration**orders / FACTORIALS[orders]
+        coefficients = system.coefficients(columns[leg + system.waypoint_index, orders] * scale[:, None])
+        taylor = system.taylor(np.array([0.0, 1.0]), 2 * size - 1)
+        jets = np.einsum("mkt,ma->tka", taylor, coefficients)
+        jets *= (FACTORIALS[: 2 * size] / duration ** np.arange(2 * size))[:, None]
+        jump[leg] += jets[0]
+        jump[leg + 1] -= jets[1]
+    rows = np.array([jump[i, 2 * size - 1 - k] for i, k in free])
+    matrix, known = rows[:, naxes:], rows[:, :naxes]
+    if np.linalg.cond(matrix / np.abs(matrix).max(axis=1, keepdims=True)) > 1e13:
+        raise ValueError("the entries left free at inner waypoints must be determined by the others; prescribe more")
+    solution: Array = np.linalg.solve(matrix, -known)
+    return solution / unit ** np.array([k for _, k in free])[:, None]

@@ -1,0 +1,59 @@
+"""The polynomial spline of equation (12)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any, Self
+
+from ctrlplan.trajectories.newton_spline import NewtonSpline, Options, checked_degree, checked_waypoints
+from ctrlplan.trajectories.waypoint import Waypoint
+
+
+class PolySpline(NewtonSpline):
+    """Polynomial of least degree through waypoints.
+
+    Equation (12), for any number of waypoints: the member alpha = 0 of the
+    trigonometric family, computed in the same Newton form.
+
+    Parameters
+    ----------
+    waypoints : iterable of Waypoint
+        Two or more, times increasing; each axis may leave its own entries free.
+    labels : sequence of str, optional
+        Names of the axes.
+    degree : int, optional
+        Degree where it should be higher than the constraints need; the spare
+        coefficients minimise the integral of the squared derivative of order
+        `smooth`.
+    smooth : int, optional
+        That order, 3 (jerk) unless given.
+
+    Raises
+    ------
+    ValueError
+        If times do not increase, axes differ, the free entries make the system
+        singular, or the degree is too low.
+
+    Examples
+    --------
+    The minimum-jerk move, whose peak velocity is 15/8:
+
+    >>> plan = PolySpline([Waypoint(0, 0, 0, 0), Waypoint(1, 1, 0, 0)])
+    >>> plan.degree, round(float(plan.peak(1)[0]), 12)
+    ((5,), 1.875)
+    """
+
+    def __init__(
+        self,
+        waypoints: Iterable[Waypoint],
+        *,
+        labels: Sequence[str] | None = None,
+        degree: int | None = None,
+        smooth: int = 3,
+    ) -> None:
+        self._fit(checked_waypoints(waypoints), 0.0, Options(labels, None, *checked_degree(degree, smooth)))
+
+    @classmethod
+    def _from_dict(cls, data: dict[str, Any]) -> Self:
+        points = [Waypoint.from_dict(w) for w in data["waypoints"]]
+        return cls(points, **{k: data[k] for k in ("labels", "degree", "smooth") if k in data})

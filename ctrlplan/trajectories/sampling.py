@@ -1,0 +1,166 @@
+"""Many times of an analytic function from exact jets at few.
+
+Times in order are cut into cells; exact jets at the cells' centres go to the
+times around them by their Taylor series: one matrix product for all cells where
+the times are evenly spaced, one a cell where they are not. Times in no order
+take a Chebyshev proxy of each derivative, built from exact jets. All are as
+accurate as the jets: terms are kept until they fall below rounding.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from ctrlplan.trajectories.chebyshev import chebyshev_proxy
+from ctrlplan.trajectories.common import FACTORIALS, Array
+
+FEW = 4096
+"""Number of times up to which the jets themselves are taken."""
+
+_MAX_TERMS = 24
+_CHUNK = 4104  # not a power of two: rows that far apart would share cache lines
+
+
+def sample(
+    jet: Callable[[Array, int], Array], duration: float, t: Array, low: int, high: int
+) -> Array:
+    """Derivatives low to high at many times.
+
+    Parameters
+    ----------
+    jet : callable
+        Maps times (ntime,) and an order to (order + 1, naxes, ntime).
+    duration : float
+        Length [s] of the leg, from 0, in which the function is analytic.
+    t : ndarray, shape (ntime,)
+        Times [s] in that leg.
+    low, high : int
+        Orders of the derivatives.
+
+    Returns
+    -------
+    ndarray, shape (high - low + 1, naxes, ntime)
+    """
+    size = np.abs(jet(np.linspace(0.0, duration, 9), high + _MAX_TERMS + 2)).max(axis=2)
+    if _is_uniform(t, duration):
+        step = float(t[-1] - t[0]) / (t.size - 1)
+        for cell in (2048, 1024, 512, 256, 128, 64):
+            terms = _taylor_terms(size, 0.5 * cell * step, low, high)
+            if terms is not None:
+                return _sample_uniform(jet, float(t[0]), step, t.size, low, high, cell, terms)
+    elif bool(np.all(t[1:] >= t[:-1])):
+        for cell in (4096, 2048, 1024, 512, 256):
+            ncells = -(-t.size // cell)
+            terms = _taylor_terms(size, 0.5 * float(t[-1] - t[0]) / ncells, low, high)
+            if terms is not None:
+                return _sample_sorted(jet, t, ncells, low, high, terms)
+    proxy = chebyshev_proxy(jet, (0.0, duration), low, high)
+    return _sample_chunks(jet, t, low, high) if proxy is None else _sample_proxy(proxy, duration, t)
+
+
+def _is_uniform(t: Array, duration: float) -> bool:
+    """Whether the times are evenly spaced to rounding of the leg's own clock."""
+    step = (t[-1] - t[0]) / (t.size - 1)
+    slack = 4.0 * np.finfo(float).eps * duration
+    if not step > 0.0 or abs(t[1] - t[0] - step) > slack:
+        return False
+    ramp = step * np.arange(min(t.size, 2 * _CHUNK))
+    for first in range(0, t.size, ramp.size):
+        part = t[first : first + ramp.size] - (t[0] + first * step)
+        part -= ramp[: part.size]
+        if part.max() > slack or part.min() < -slack:
+            return False
+    return True
+
+
+def _taylor_terms(size: Array, radius: float, low: int, high: int) -> int | None:
+    """Terms after which the series have died, from the size (order, naxes) of the derivatives."""
+    powers = radius ** np.arange(_MAX_TERMS + 3) / FACTORIALS[: _MAX_TERMS + 3]
+    tails = np.stack([size[nu : nu + _MAX_TERMS + 3] * powers[:, None] for nu in range(low, high + 1)])
+    small = tails <= 0.25 * np.finfo(float).eps * tails.max(axis=1, keepdims=True)
+    # Two terms in a row, so that an odd or even function does not end its series early.
+    done = (small[:, 1:-1] & small[:, 2:]).all(axis=(0, 2))
+    return int(done.argmax()) + 1 if done.any() else None
+
+
+def _sample_uniform(
+    jet: Callable[[Array, int], Array],
+    first: float,
+    step: float,
+    count: int,
+    low: int,
+    high: int,
+    cell: int,
+    terms: int,
+) -> Array:
+    ncells = count // cell
+    centres = first + step * (0.5 * (cell - 1) + cell * np.arange(ncells + 1))
+    jets = jet(centres, high + terms - 1)
+    radius = 0.5 * cell * step
+    powers = np.linspace(-1.0 + 1.0 / cell, 1.0 - 1.0 / cell, cell) ** np.arange(terms)[:, None]
+    scale = radius ** np.arange(terms) / FACTORIALS[:terms]
+    out = np.empty((high - low + 1, jets.shape[1], count))
+    main = ncells * cell
+    for row in range(high - low + 1):
+        table = np.ascontiguousarray(np.moveaxis(jets[low + row : low + row + terms], 0, -1) * scale)
+        for axis in range(jets.shape[1]):
+            np.matmul(table[axis, :ncells], powers, out=out[row, axis, :main].reshape(ncells, cell))
+            if main < count:
+                np.matmul(table[axis, ncells], powers[:, : count - main], out=out[row, axis, main:])
+    return out
+
+
+def _sample_sorted(
+    jet: Callable[[Array, int], Array], t: Array, ncells: int, low: int, high: int, terms: int
+) -> Array:
+    edges = np.linspace(t[0], t[-1], ncells + 1)
+    centres, radius = 0.5 * (edges[:-1] + edges[1:]), 0.5 * float(t[-1] - t[0]) / ncells
+    jets = jet(centres, high + terms - 1)
+    naxes = jets.shape[1]
+    scale = radius ** np.arange(terms) / FACTORIALS[:terms]
+    table = np.stack([np.moveaxis(jets[nu : nu + terms], 0, -1) for nu in range(low, high + 1)]) * scale
+    table = np.moveaxis(table, 2, 0).reshape(ncells, -1, terms)
+    out = np.empty(((high - low + 1) * naxes, t.size))
+    bounds = np.searchsorted(t, edges[1:-1]).tolist()
+    for k, (first, last) in enumerate(zip([0, *bounds], [*bounds, t.size], strict=True)):
+        if first < last:
+            powers = np.empty((terms, last - first))
+            powers[0] = 1.0
+            x = (t[first:last] - centres[k]) / radius
+            for n in range(1, terms):
+                np.multiply(powers[n - 1], x, out=powers[n])
+            np.matmul(table[k], powers, out=out[:, first:last])
+    return out.reshape(high - low + 1, naxes, t.size)
+
+
+def _sample_proxy(coefficients: Array, duration: float, t: Array) -> Array:
+    nrows, naxes, size = coefficients.shape
+    flat = coefficients.reshape(nrows * naxes, size)
+    out = np.empty((nrows * naxes, t.size))
+    middle = radius = 0.5 * duration
+    basis = np.empty((max(size, 2), _CHUNK))
+    basis[0] = 1.0
+    for first in range(0, t.size, _CHUNK):
+        x = (t[first : first + _CHUNK] - middle) / radius
+        terms = basis[:, : x.size]
+        terms[1] = x
+        top = 1  # T_{top + k} = 2 T_top T_k - T_{top - k}: twice as many at each turn
+        while top < size - 1:
+            more = min(top, size - 1 - top)
+            block = terms[top + 1 : top + more + 1]
+            np.multiply(2.0 * terms[top], terms[1 : more + 1], out=block)
+            block -= terms[top - more : top][::-1]
+            top += more
+        np.matmul(flat, terms[:size], out=out[:, first : first + x.size])
+    return out.reshape(nrows, naxes, t.size)
+
+
+def _sample_chunks(jet: Callable[[Array, int], Array], t: Array, low: int, high: int) -> Array:
+    first = jet(t[:_CHUNK], high)[low:]
+    out = np.empty((*first.shape[:2], t.size))
+    out[:, :, :_CHUNK] = first
+    for begin in range(_CHUNK, t.size, _CHUNK):
+        out[:, :, begin : begin + _CHUNK] = jet(t[begin : begin + _CHUNK], high)[low:]
+    return out

@@ -1,0 +1,85 @@
+"""The step: what a plan is compared with."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ctrlplan.trajectories.common import Array, checked_labels, checked_time, mapped_time, readonly
+from ctrlplan.trajectories.trajectory import Trajectory
+
+
+class Step(Trajectory):
+    """Jump from one position to another.
+
+    Parameters
+    ----------
+    final : array_like, scalar or shape (naxes,)
+        Position from `time` on.
+    initial : array_like, optional
+        Position before.
+    time : float, optional
+        Instant of the jump [s]: start and end of this trajectory.
+    labels : sequence of str, optional
+        Names of the axes.
+
+    Raises
+    ------
+    ValueError
+        If a position is not finite or the shapes differ.
+
+    Examples
+    --------
+    >>> Step(2.0, time=1.0)([0.0, 1.0, 2.0])
+    array([0., 2., 2.])
+    """
+
+    def __init__(
+        self,
+        final: ArrayLike,
+        initial: ArrayLike = 0.0,
+        time: float = 0.0,
+        labels: Sequence[str] | None = None,
+    ) -> None:
+        try:
+            high, low = np.broadcast_arrays(
+                np.atleast_1d(np.asarray(final, dtype=float)), np.atleast_1d(np.asarray(initial, dtype=float))
+            )
+        except ValueError:
+            raise ValueError(
+                f"initial must have the shape of final {np.shape(final)} or be a scalar, got {np.shape(initial)}"
+            ) from None
+        if high.ndim != 1 or not high.size:
+            raise ValueError(f"final must be a scalar or of shape (naxes,), got shape {high.shape}")
+        for name, values in (("final", high), ("initial", low)):
+            if not np.isfinite(values).all():
+                raise ValueError(f"{name} must be finite, got {values.tolist()}")
+        self.__dict__.update(
+            initial=readonly(low.copy()),
+            final=readonly(high.copy()),
+            labels=checked_labels(labels, high.size),
+            breakpoints=readonly(np.array([checked_time(time, "time")])),
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data that `trajectory_from_dict` reads."""
+        return {
+            "type": "Step",
+            "final": self.final.tolist(),
+            "initial": self.initial.tolist(),
+            "time": self.start,
+            "labels": list(self.labels),
+        }
+
+    @classmethod
+    def _from_dict(cls, data: dict[str, Any]) -> Self:
+        return cls(data["final"], data["initial"], data["time"], data["labels"])
+
+    def _map_time(self, origin: float, shift: float, rate: float) -> Self:
+        return type(self)(self.final, self.initial, mapped_time(self.start, origin, shift, rate), self.labels)
+
+    def _leg_jet(self, leg: int, s: Array, order: int) -> Array:
+        raise AssertionError("a step has no legs")

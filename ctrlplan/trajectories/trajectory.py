@@ -1,0 +1,363 @@
+"""The interface of every planned reference."""
+
+from __future__ import annotations
+
+import os
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, ClassVar, Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ctrlplan.trajectories import extrema as _extrema
+from ctrlplan.trajectories import sampling as _sampling
+from ctrlplan.trajectories.common import Array, Frozen, checked_time, checked_timepts
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from ctrlplan.trajectories.waypoint import Waypoint
+
+
+class Trajectory(Frozen, ABC):
+    """Function of time with exact derivatives.
+
+    Between breakpoints it is analytic. Before the start it holds its first
+    position, after the end its last, with every derivative zero there. At a
+    breakpoint it takes the value and derivatives of what follows, at the end
+    its own. A new kind sets `labels` and `breakpoints` and gives the jet of
+    each of its legs; everything else is derived here.
+
+    Attributes
+    ----------
+    labels : tuple of str
+        Names of the axes: y, or y1, y2, ... unless given.
+    breakpoints : ndarray, shape (nlegs + 1,)
+        Times [s] of the start, of every join, and of the end.
+    """
+
+    labels: tuple[str, ...]
+    breakpoints: Array
+    waypoints: tuple[Waypoint, ...] = ()
+
+    kinds: ClassVar[dict[str, type[Trajectory]]] = {}
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        Trajectory.kinds[cls.__name__] = cls
+
+    @abstractmethod
+    def _leg_jet(self, leg: int, s: Array, order: int) -> Array:
+        """Jet (order + 1, naxes, ntime) of the analytic function that the leg is a part of.
+
+        Times s are counted from the leg's own beginning: what a clock that
+        started long ago has lost to rounding is lost once, in the subtraction.
+        """
+
+    @abstractmethod
+    def _map_time(self, origin: float, shift: float, rate: float) -> Trajectory:
+        """Same path with time t moved to origin + shift + (t - origin)/rate."""
+
+    @abstractmethod
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data (numbers, strings, lists) that `trajectory_from_dict` reads."""
+
+    @classmethod
+    @abstractmethod
+    def _from_dict(cls, data: dict[str, Any]) -> Trajectory:
+        """Trajectory from the plain data of `to_dict`."""
+
+    @property
+    def start(self) -> float:
+        """Time of the first waypoint [s]."""
+        return float(self.breakpoints[0])
+
+    @property
+    def end(self) -> float:
+        """Time of the last waypoint [s]."""
+        return float(self.breakpoints[-1])
+
+    @property
+    def duration(self) -> float:
+        """Time from start to end [s]."""
+        return self.end - self.start
+
+    @property
+    def naxes(self) -> int:
+        """Number of axes."""
+        return len(self.labels)
+
+    @cached_property
+    def initial(self) -> Array:
+        """Position held before the start, shape (naxes,)."""
+        return self._leg_jet(0, np.zeros(1), 0)[0, :, 0]
+
+    @cached_property
+    def final(self) -> Array:
+        """Position held after the end, shape (naxes,)."""
+        return self._leg_jet(-1, self.breakpoints[-1:] - self.breakpoints[-2], 0)[0, :, 0]
+
+    def __call__(self, t: ArrayLike, nu: int = 0) -> Array:
+        """Value, or the nu-th derivative.
+
+        Parameters
+        ----------
+        t : array_like, any shape
+            Times [s], in any order.
+        nu : int, optional
+            Order of the derivative.
+
+        Returns
+        -------
+        ndarray, shape t.shape for one axis, (naxes, *t.shape) for more
+            In units of the axis per s^nu.
+
+        Raises
+        ------
+        ValueError
+            If a time is nan or nu is negative.
+        """
+        times = checked_timepts(t)
+        values = self._sample(times.ravel(), _checked_order(nu, "nu"), nu, False)[0]
+        return values.reshape(times.shape if self.naxes == 1 else (self.naxes, *times.shape))
+
+    def jet(self, t: ArrayLike, order: int, left: bool = False) -> Array:
+        """Value and derivatives up to an order.
+
+        Parameters
+        ----------
+        t : array_like, any shape
+            Times [s], in any order.
+        order : int
+            Highest derivative.
+        left : bool, optional
+            Take the limit from the left at breakpoints (an integrator that
+            arrives at one needs it).
+
+        Returns
+        -------
+        ndarray, shape (order + 1, naxes, *t.shape)
+
+        Raises
+        ------
+        ValueError
+            If a time is nan or the order is negative.
+        """
+        times = checked_timepts(t)
+        values = self._sample(times.ravel(), 0, _checked_order(order, "order"), left)
+        return values.reshape(order + 1, self.naxes, *times.shape)
+
+    def extrema(self, nu: int = 0) -> _extrema.Extrema:
+        """Least and greatest value of the nu-th derivative, true over the whole interval.
+
+        Where a derivative jumps at a join, both of its limits count.
+
+        Parameters
+        ----------
+        nu : int, optional
+            Order of the derivative.
+
+        Returns
+        -------
+        Extrema
+            minimum, maximum, time_min, time_max, each of shape (naxes,).
+        """
+        return _extrema.derivative_extrema(self, _checked_order(nu, "nu"))
+
+    def peak(self, nu: int = 0) -> Array:
+        """Greatest magnitude of the nu-th derivative, shape (naxes,)."""
+        found = self.extrema(nu)
+        return np.maximum(np.abs(found.minimum), np.abs(found.maximum))
+
+    def extrema_of(self, function: Callable[[Array], Array], order: int) -> _extrema.Extrema:
+        """Least and greatest value of a function of the jet.
+
+        The function is resolved by Chebyshev polynomials between breakpoints
+        (bisected where it is not smooth), and its stationary points solved for.
+
+        Parameters
+        ----------
+        function : callable
+            Maps a jet (order + 1, naxes, ntime) to (ntime,) or (m, ntime).
+        order : int
+            Highest derivative that it needs.
+
+        Returns
+        -------
+        Extrema
+            Each entry of shape (m,), m = 1 for a function with one value.
+        """
+        return _extrema.function_extrema(self, function, _checked_order(order, "order"))
+
+    def bounds(
+        self,
+        function: Callable[[Array], Array],
+        order: int,
+        lipschitz: ArrayLike,
+        rtol: float = 1e-3,
+        max_cells: int = 1_000_000,
+    ) -> _extrema.Bounds:
+        """Certified bounds of a function of the jet.
+
+        Cells of the interval are refined until the value at their centre minus
+        a Lipschitz bound from the jet's own peaks decides: between `lower` and
+        `upper` lies every value, not only every sample.
+
+        Parameters
+        ----------
+        function : callable
+            Maps a jet (order + 1, naxes, ntime) to (ntime,).
+        order : int
+            Highest derivative that it needs.
+        lipschitz : array_like, broadcasts to (order + 1, naxes)
+            Bounds of its partial derivatives over the jets of this plan.
+        rtol : float, optional
+            Gap allowed between a bound and an attained value, relative to the
+            range of the function.
+        max_cells : int, optional
+            Cells at most.
+
+        Returns
+        -------
+        Bounds
+            lower, upper, and the attained minimum, maximum with their times.
+
+        Raises
+        ------
+        ValueError
+            If `rtol` is not reached with `max_cells` cells.
+        """
+        return _extrema.certified_bounds(self, function, _checked_order(order, "order"), lipschitz, rtol, max_cells)
+
+    def retime(self, duration: float) -> Trajectory:
+        """Same path from the same start, in another duration [s].
+
+        The nu-th derivative is multiplied by (old duration/new)^nu.
+        """
+        if not self.duration:
+            raise ValueError("a trajectory without duration cannot be retimed, got a step")
+        return self._map_time(self.start, 0.0, self.duration / checked_time(duration, "duration", positive=True))
+
+    def shift(self, dt: float) -> Trajectory:
+        """Same path, dt seconds later."""
+        return self._map_time(self.start, checked_time(dt, "dt"), 1.0)
+
+    def then(self, other: Trajectory) -> Trajectory:
+        """This trajectory, then the other from this one's end on.
+
+        Raises
+        ------
+        ValueError
+            If the other's first position differs from this one's last by more
+            than 1e-9 of their size, or the axes differ in number.
+        """
+        from ctrlplan.trajectories.combined import Joined
+
+        return Joined((self, other))
+
+    def to_csv(self, path: str | os.PathLike[str], timepts: ArrayLike | None = None, order: int = 2) -> None:
+        """Write times and jets as a table with one line of names."""
+        from ctrlplan.trajectories.files import write_csv
+
+        write_csv(self, path, timepts, order)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write as JSON, from which `load_trajectory` restores every bit."""
+        from ctrlplan.trajectories.files import save_trajectory
+
+        save_trajectory(self, path)
+
+    def plot(self, order: int = 2, units: Sequence[str] | None = None) -> Figure:
+        """Value and derivatives stacked, waypoints marked.
+
+        Parameters
+        ----------
+        order : int, optional
+            Highest derivative drawn.
+        units : sequence of str, optional
+            Units of the axes.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+        """
+        from ctrlplan.reports.figures import plot_trajectory
+
+        return plot_trajectory(self, order=_checked_order(order, "order"), units=units)
+
+    def __add__(self, other: Trajectory) -> Trajectory:
+        from ctrlplan.trajectories.combined import Sum
+
+        return Sum((self, other)) if isinstance(other, Trajectory) else NotImplemented
+
+    def __sub__(self, other: Trajectory) -> Trajectory:
+        return self + (-1.0) * other if isinstance(other, Trajectory) else NotImplemented
+
+    def __mul__(self, factor: float) -> Trajectory:
+        from ctrlplan.trajectories.combined import Scaled
+
+        return Scaled(self, factor) if np.isscalar(factor) else NotImplemented
+
+    __rmul__ = __mul__
+
+    def __neg__(self) -> Trajectory:
+        return self * -1.0
+
+    def __copy__(self) -> Self:
+        return self
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Self:
+        return self
+
+    def __repr__(self) -> str:
+        axes = ", ".join(self.labels)
+        return f"<{type(self).__name__} of {axes} from {self.start:g} s to {self.end:g} s>"
+
+    def _sample(self, t: Array, low: int, high: int, left: bool) -> Array:
+        """Derivatives low to high, shape (high - low + 1, naxes, ntime)."""
+        nlegs = self.breakpoints.size - 1
+        if nlegs == 1 and not left and t.size and t.min() >= self.breakpoints[0] and t.max() <= self.breakpoints[1]:
+            return self._sample_leg(0, t - self.breakpoints[0], low, high)
+        legs = np.searchsorted(self.breakpoints, t, side="left" if left else "right") - 1
+        if nlegs and not left:
+            legs[t == self.breakpoints[-1]] = nlegs - 1
+        out = np.zeros((high - low + 1, self.naxes, t.size))
+        in_order = bool(np.all(legs[1:] >= legs[:-1]))
+        for leg in range(-1, nlegs + 1):
+            where: slice | Array
+            if in_order:
+                where = slice(*np.searchsorted(legs, [leg, leg + 1]).tolist())
+                if where.start == where.stop:
+                    continue
+            else:
+                where = np.flatnonzero(legs == leg)
+                if not where.size:
+                    continue
+            if 0 <= leg < nlegs:
+                out[:, :, where] = self._sample_leg(leg, t[where] - self.breakpoints[leg], low, high)
+            elif low == 0:
+                out[0][:, where] = (self.initial if leg < 0 else self.final)[:, None]
+        return out
+
+    def _sample_leg(self, leg: int, s: Array, low: int, high: int) -> Array:
+        if s.size <= _sampling.FEW:
+            return self._leg_jet(leg, s, high)[low:]
+        duration = float(self.breakpoints[leg + 1] - self.breakpoints[leg])
+        return _sampling.sample(lambda times, order: self._leg_jet(leg, times, order), duration, s, low, high)
+
+    def _jet_beside(self, moment: float, origin: float, s: Array, order: int) -> Array:
+        """Jet at origin + s of the analytic function that holds at `moment`, which is no breakpoint."""
+        leg = int(np.searchsorted(self.breakpoints, moment)) - 1
+        if 0 <= leg < self.breakpoints.size - 1:
+            return self._leg_jet(leg, s + (origin - self.breakpoints[leg]), order)
+        held = np.zeros((order + 1, self.naxes, s.size))
+        held[0] = (self.initial if leg < 0 else self.final)[:, None]
+        return held
+
+
+def _checked_order(order: int, name: str) -> int:
+    if order != int(order) or order < 0:
+        raise ValueError(f"{name} must be a whole number from 0, got {order}")
+    return int(order)

@@ -1,0 +1,246 @@
+"""The trigonometric spline of equation (2)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, Self
+
+import numpy as np
+
+from ctrlplan.trajectories.common import Array, checked_time
+from ctrlplan.trajectories.newton import NewtonSystem
+from ctrlplan.trajectories.newton_spline import NewtonSpline, Options, checked_degree, checked_waypoints
+from ctrlplan.trajectories.waypoint import Waypoint
+
+
+class TrigSpline(NewtonSpline):
+    r"""Trigonometric spline through waypoints.
+
+    .. math::
+        y = a_0 + \sum_{k=1}^{m-1} (a_k \cos k\tau + b_k \sin k\tau)
+            + a_m \sin m(\tau - \gamma), \quad \tau = \alpha (t - t_1)/(t_n - t_1)
+
+    Equation (2) for an even number 2m of constraints an axis, with gamma the
+    mean of their abscissae; for an odd number 2m + 1 the full trigonometric
+    polynomial of degree m. It is computed in the Newton form of
+    `ctrlplan.trajectories.newton`, not by solving (3).
+
+    Parameters
+    ----------
+    waypoints : iterable of Waypoint
+        Two or more, times increasing; each axis may leave its own entries free.
+    alpha : float or "auto"
+        Shape parameter in [0, 2 pi) [rad]; 0 is the polynomial spline.
+    gamma : float or sequence of float or None, optional
+        Phase of the top harmonic [rad of tau], one for all axes or one an axis
+        (None for the mean). Needs an even number of coefficients.
+    labels : sequence of str, optional
+        Names of the axes.
+    degree : int, optional
+        Degree m where it should be higher than the constraints need; the spare
+        coefficients minimise the integral of the squared derivative of order
+        `smooth`.
+    smooth : int, optional
+        That order, 3 (jerk) unless given.
+
+    Raises
+    ------
+    ValueError
+        If alpha is outside [0, 2 pi), times do not increase, axes differ, the
+        free entries or gamma make the system singular, or the degree is too low.
+
+    Examples
+    --------
+    >>> plan = TrigSpline([Waypoint(0, 0, 0, 0), Waypoint(1, 1, 0, 0)], alpha=1.0)
+    >>> round(float(plan(0.5)), 12), plan.degree, round(plan.gamma[0], 12)
+    (0.5, (3,), 0.5)
+    """
+
+    def __init__(
+        self,
+        waypoints: Iterable[Waypoint],
+        *,
+        alpha: float | Literal["auto"],
+        gamma: float | Sequence[float | None] | None = None,
+        labels: Sequence[str] | None = None,
+        degree: int | None = None,
+        smooth: int = 3,
+    ) -> None:
+        points = checked_waypoints(waypoints)
+        chosen = Options(labels, _checked_gamma(gamma, points[0].naxes), *checked_degree(degree, smooth))
+        self._fit(points, checked_alpha(alpha), chosen)
+
+    @classmethod
+    def cyclic(
+        cls,
+        waypoints: Iterable[Waypoint],
+        period: float,
+        *,
+        gamma: float | Sequence[float | None] | None = None,
+        labels: Sequence[str] | None = None,
+        degree: int | None = None,
+        smooth: int = 3,
+    ) -> Self:
+        """Closed plan that repeats, alpha = 2 pi (remark 2 of the paper).
+
+        The plan runs from the first waypoint for one period and ends as it
+        began, every derivative included; `then` appends further rounds.
+
+        Parameters
+        ----------
+        waypoints : iterable of Waypoint
+            One or more, all within one period: the return to the first is not
+            stated.
+        period : float
+            Duration of a round [s].
+        gamma, labels, degree, smooth
+            As for `TrigSpline`.
+
+        Raises
+        ------
+        ValueError
+            If the waypoints do not fit into one period; otherwise as `TrigSpline`.
+        """
+        points = checked_waypoints(waypoints, least=1)
+        duration = checked_time(period, "period", positive=True)
+        if points[-1].time >= points[0].time + duration:
+            raise ValueError(
+                f"waypoints of a cyclic plan must lie within one period of {duration:g} s from the first, "
+                f"got waypoints[{len(points) - 1}].time = {points[-1].time}"
+            )
+        chosen = Options(labels, _checked_gamma(gamma, points[0].naxes), *checked_degree(degree, smooth), duration)
+        plan = cls.__new__(cls)
+        plan._fit(points, 2.0 * math.pi, chosen)
+        return plan
+
+    @property
+    def gamma(self) -> tuple[float | None, ...]:
+        """Phase of the top harmonic [rad of tau], axis by axis; None where it has none."""
+        return tuple(s.gamma for s, _ in self._per_axis())
+
+    def fourier(self) -> FourierCoefficients:
+        """Coefficients a0, a_k, b_k, a_m of equation (2).
+
+        For readers of the paper: at small alpha they are huge and cancel, so
+        the plan itself is never evaluated through them.
+
+        Raises
+        ------
+        ValueError
+            If alpha is 0: a polynomial has none.
+        """
+        if not self.alpha:
+            raise ValueError("alpha must be above 0 for Fourier coefficients, got 0 (a polynomial)")
+        return FourierCoefficients.of([_fourier(self.alpha, s, c) for s, c in self._per_axis()])
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data that `trajectory_from_dict` reads."""
+        return super().to_dict() | {"alpha": self.alpha}
+
+    @classmethod
+    def _from_dict(cls, data: dict[str, Any]) -> Self:
+        points = [Waypoint.from_dict(w) for w in data["waypoints"]]
+        chosen = {k: data[k] for k in ("gamma", "labels", "degree", "smooth") if k in data}
+        if "period" in data:
+            return cls.cyclic(points, data["period"], **chosen)
+        return cls(points, alpha=data["alpha"], **chosen)
+
+
+AxisCoefficients = tuple[float, Array, Array, float, int, float]
+"""a0, a, b, am, m and gamma of one axis."""
+
+
+@dataclass(frozen=True)
+class FourierCoefficients:
+    """Coefficients of equation (2), axis first.
+
+    Indexing by an axis gives that axis alone, with scalars for a0 and am.
+
+    Attributes
+    ----------
+    a0 : ndarray, shape (naxes,)
+        Constant.
+    a, b : ndarray, shape (naxes, nharmonics)
+        Cosine and sine coefficients of harmonics 1, 2, ...; up to m - 1 where
+        the top one is sin m(tau - gamma), up to m for an odd number of
+        constraints. Zero where an axis has fewer.
+    am : ndarray, shape (naxes,)
+        Coefficient of sin m(tau - gamma), 0 where there is none.
+    m : ndarray of int, shape (naxes,)
+        Degree.
+    gamma : ndarray, shape (naxes,)
+        Phase [rad of tau], nan where there is none.
+    """
+
+    a0: Array
+    a: Array
+    b: Array
+    am: Array
+    m: np.ndarray[Any, np.dtype[np.intp]]
+    gamma: Array
+
+    @classmethod
+    def of(cls, axes: list[AxisCoefficients]) -> FourierCoefficients:
+        """Coefficients of several axes, padded to the longest."""
+        longest = max(len(a) for _, a, _, _, _, _ in axes)
+        a, b = np.zeros((2, len(axes), longest))
+        for i, (_, cosines, sines, _, _, _) in enumerate(axes):
+            a[i, : len(cosines)], b[i, : len(sines)] = cosines, sines
+        a0, _, _, am, m, gamma = zip(*axes, strict=True)
+        return cls(np.array(a0), a, b, np.array(am), np.array(m, dtype=np.intp), np.array(gamma))
+
+    def __len__(self) -> int:
+        return len(self.a0)
+
+    def __getitem__(self, axis: int) -> FourierCoefficients:
+        return FourierCoefficients(*(getattr(self, name)[axis] for name in self.__dataclass_fields__))
+
+    def __iter__(self) -> Iterator[FourierCoefficients]:
+        return (self[axis] for axis in range(len(self)))
+
+
+def checked_alpha(alpha: float | str) -> float:
+    """Shape parameter in [0, 2 pi)."""
+    if isinstance(alpha, str):
+        if alpha == "auto":
+            raise ValueError('alpha = "auto" must wait until choosing is built; give a number in [0, 2 pi)')
+        raise ValueError(f'alpha must lie in [0, 2 pi) or be "auto", got {alpha!r}')
+    try:
+        value = float(alpha)
+    except (TypeError, ValueError):
+        raise TypeError(f"alpha must be a number in [0, 2 pi), got {alpha!r}") from None
+    if not 0.0 <= value < 2.0 * math.pi:
+        raise ValueError(f"alpha must lie in [0, 2 pi), got {value:g}")
+    return value
+
+
+def _checked_gamma(
+    gamma: float | Sequence[float | None] | None, naxes: int
+) -> float | list[float | None] | None:
+    if gamma is None:
+        return None
+    values = [gamma] if isinstance(gamma, (int, float)) else list(gamma)
+    for value in values:
+        if value is not None and not math.isfinite(value):
+            raise ValueError(f"gamma must be finite, got {value}")
+    if isinstance(gamma, (int, float)):
+        return float(gamma)
+    if len(values) != naxes:
+        raise ValueError(f"gamma must be one number or as many as axes, {naxes}, got {len(values)}")
+    return [None if v is None else float(v) for v in values]
+
+
+def _fourier(alpha: float, system: NewtonSystem, coefficients: Array) -> AxisCoefficients:
+    """Exact values at equal steps of a whole turn, through the discrete Fourier transform."""
+    m = system.size // 2
+    count = 2 * m + 2
+    turn = 2.0 * np.pi * np.arange(count) / count
+    spectrum = np.fft.rfft(coefficients @ system.taylor(turn / alpha, 0)[:, 0]) / count
+    cosines, sines = 2.0 * spectrum.real[1 : m + 1], -2.0 * spectrum.imag[1 : m + 1]
+    if system.gamma is None:
+        return float(spectrum[0].real), cosines, sines, 0.0, m, math.nan
+    phase = m * system.gamma
+    top = float(sines[m - 1] * math.cos(phase) - cosines[m - 1] * math.sin(phase))
+    return float(spectrum[0].real), cosines[: m - 1], sines[: m - 1], top, m, system.gamma

@@ -1,0 +1,225 @@
+"""A point in time with prescribed value and derivatives."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ctrlplan.trajectories.common import Array, Frozen, checked_time, readonly
+
+ENTRIES = ("position", "velocity", "acceleration", "jerk", "snap")
+
+
+class Waypoint(Frozen):
+    """What a plan must meet at one instant.
+
+    Parameters
+    ----------
+    time : float
+        Time [s], finite.
+    position : array_like, scalar or shape (naxes,)
+        Value of every axis. An entry that is nan is left free.
+    velocity, acceleration, jerk, snap : array_like or None, optional
+        Derivatives 1 to 4 in units of the position per s, s^2, ...; scalar
+        for one axis, shape (naxes,) for more. A scalar 0 holds for every
+        axis; None, or nan for one axis, leaves the entry free.
+
+    Attributes
+    ----------
+    jet : ndarray, shape (nentries, naxes)
+        The prescribed derivatives from order 0, nan where free.
+    labels : tuple of str or None
+        Names of the axes, given by `from_jets` only.
+    naxes : int
+        Number of axes.
+    complete : bool
+        Whether no entry of the jet is free.
+
+    Raises
+    ------
+    ValueError
+        If the time is not finite, an entry is infinite, or the entries
+        disagree in their number of axes.
+
+    Examples
+    --------
+    >>> Waypoint(6.0, [5.0, 5.0], [1.0, -1.0], 0).jet
+    array([[ 5.,  5.],
+           [ 1., -1.],
+           [ 0.,  0.]])
+    """
+
+    time: float
+    jet: Array
+    labels: tuple[str, ...] | None
+    complete: bool
+    naxes: int
+
+    def __init__(
+        self,
+        time: float,
+        position: ArrayLike,
+        velocity: ArrayLike | None = None,
+        acceleration: ArrayLike | None = None,
+        jerk: ArrayLike | None = None,
+        snap: ArrayLike | None = None,
+    ) -> None:
+        entries = [position, velocity, acceleration, jerk, snap]
+        while len(entries) > 1 and entries[-1] is None:
+            entries.pop()
+        self._set(checked_time(time, "time"), _jet(entries), None)
+
+    @classmethod
+    def from_jets(cls, time: float, **jets: Sequence[float | None]) -> Waypoint:
+        """Waypoint axis by axis, which names the axes.
+
+        Parameters
+        ----------
+        time : float
+            Time [s], finite.
+        **jets : sequence of float or None
+            For each axis its position, velocity, ...: as many as are
+            prescribed, of any order; None or nan leaves one free.
+
+        Raises
+        ------
+        ValueError
+            If no axis is given, a jet is not a sequence of numbers, or an
+            entry is infinite.
+
+        Examples
+        --------
+        >>> Waypoint.from_jets(0.0, x=[0.0, 0.0, 0.0], z=[10.0]).labels
+        ('x', 'z')
+        """
+        if not jets:
+            raise ValueError("from_jets needs at least one axis, such as x=[0.0, 0.0], got none")
+        columns = {}
+        for label, jet in jets.items():
+            column = _numbers(jet, f"jet of axis {label}")
+            if column.ndim != 1:
+                raise ValueError(f"jet of axis {label} must be a sequence of numbers, got {jet!r}")
+            columns[label] = column
+        table = np.full((max(1, *(c.size for c in columns.values())), len(columns)), np.nan)
+        for axis, column in enumerate(columns.values()):
+            table[: column.size, axis] = column
+        return cls._of(checked_time(time, "time"), table, tuple(columns))
+
+    @classmethod
+    def _of(cls, time: float, jet: Array, labels: tuple[str, ...] | None) -> Waypoint:
+        self = cls.__new__(cls)
+        self._set(time, jet, labels)
+        return self
+
+    def _set(self, time: float, jet: Array, labels: tuple[str, ...] | None) -> None:
+        # One reduction tells a table of ordinary numbers from one with gaps (nan) or inf.
+        complete = math.isfinite(float(np.add.reduce(jet, axis=None)))
+        if not complete:
+            if np.isinf(jet).any():
+                order, axis = np.argwhere(np.isinf(jet))[0]
+                name = ENTRIES[order] if order < len(ENTRIES) else f"derivative {order}"
+                raise ValueError(f"{name} must be finite or nan (free), got {jet[order, axis]} at time {time:g}")
+            complete = not bool(np.isnan(jet).any())
+        self.__dict__.update(time=time, jet=readonly(jet), labels=labels, complete=complete, naxes=jet.shape[1])
+
+    @property
+    def position(self) -> Array:
+        """Value of every axis, shape (naxes,), nan where free."""
+        return self._entry(0)
+
+    @property
+    def velocity(self) -> Array:
+        """First derivative of every axis, shape (naxes,), nan where free."""
+        return self._entry(1)
+
+    @property
+    def acceleration(self) -> Array:
+        """Second derivative of every axis, shape (naxes,), nan where free."""
+        return self._entry(2)
+
+    @property
+    def jerk(self) -> Array:
+        """Third derivative of every axis, shape (naxes,), nan where free."""
+        return self._entry(3)
+
+    @property
+    def snap(self) -> Array:
+        """Fourth derivative of every axis, shape (naxes,), nan where free."""
+        return self._entry(4)
+
+    def _entry(self, order: int) -> Array:
+        return self.jet[order] if order < len(self.jet) else np.full(self.naxes, np.nan)
+
+    def scaled(self, time: float, rate: float) -> Waypoint:
+        """Same point at another time, passed `rate` times as fast."""
+        powers = rate ** np.arange(len(self.jet))
+        return Waypoint._of(checked_time(time, "time"), self.jet * powers[:, None], self.labels)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data: time, jet by order then axis (None where free)."""
+        jet = [[None if v != v else v for v in row] for row in self.jet.tolist()]
+        data: dict[str, Any] = {"time": self.time, "jet": jet}
+        if self.labels is not None:
+            data["labels"] = list(self.labels)
+        return data
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any]) -> Waypoint:
+        """Waypoint from the plain data of `to_dict`."""
+        labels = tuple(data["labels"]) if "labels" in data else None
+        jet = np.array([[np.nan if v is None else v for v in row] for row in data["jet"]], dtype=float)
+        if jet.ndim != 2 or jet.size == 0 or (labels is not None and len(labels) != jet.shape[1]):
+            raise ValueError(f"jet must be a table of entries by axes, got {data['jet']!r}")
+        return cls._of(checked_time(data["time"], "time"), jet, labels)
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Waypoint):
+            return NotImplemented
+        same = self.time == other.time and self.labels == other.labels
+        return same and np.array_equal(self.jet, other.jet, equal_nan=True)
+
+    def __hash__(self) -> int:
+        return hash((self.time, self.labels, self.jet.tobytes()))
+
+    def __repr__(self) -> str:
+        if self.labels is not None:
+            axes = zip(self.labels, self.jet.T.tolist(), strict=True)
+            return f"Waypoint.from_jets({self.time!r}, {', '.join(f'{k}={v}' for k, v in axes)})"
+        values = self.jet[:, 0] if self.naxes == 1 else self.jet
+        named = ", ".join(f"{n}={v.tolist()}" for n, v in zip(ENTRIES, values, strict=False))
+        return f"Waypoint({self.time!r}, {named})"
+
+
+def _numbers(values: object, name: str) -> Array:
+    try:
+        return np.array(values, dtype=float)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name} must be numbers, got {values!r}") from None
+
+
+def _jet(entries: list[ArrayLike | None]) -> Array:
+    """Table (order, axis) of the entries, scalars that mean every axis spread."""
+    try:
+        table = np.array(entries, dtype=float)  # the common case: alike shapes and no gaps
+    except (TypeError, ValueError):
+        table = np.empty(())
+    if table.ndim == 2 and table.shape[1]:
+        return table
+    if table.ndim == 1:
+        return table[:, None]
+    rows = [_numbers(np.nan if e is None else e, ENTRIES[k]) for k, e in enumerate(entries)]
+    naxes = max((r.size for r in rows), default=1)
+    out = np.empty((len(rows), naxes))
+    for k, row in enumerate(rows):
+        spread = row.ndim == 0 and (naxes == 1 or row == 0 or np.isnan(row))
+        if not spread and row.shape != (naxes,):
+            given = f"scalar {row:g}" if row.ndim == 0 else f"shape {row.shape}"
+            raise ValueError(f"{ENTRIES[k]} must have shape ({naxes},) as the other entries (or be 0), got {given}")
+        out[k] = row
+    if naxes == 0:
+        raise ValueError("position must have at least one axis, got none")
+    return out
