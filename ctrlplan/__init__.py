@@ -1,0 +1,41 @@
+"""Plan the reference that a closed loop should follow, and show what that is worth.
+
+Imported beside python-control: ``import control as ct; import ctrlplan as cp``.
+"""
+
+from importlib import import_module
+from typing import Any
+
+__version__ = "0.1.0"
+
+_EXPORTS = {
+    "trajectories": (
+        "PiecewiseSpline",
+        "PolySpline",
+        "Step",
+        "Trajectory",
+        "TrigSpline",
+        "Waypoint",
+        "load_trajectory",
+        "stack",
+        "trajectory_from_dict",
+    ),
+    "systems": ("create_source_iosystem", "plants", "source_samples"),
+    "simulation": ("simulate",),
+    "studies": ("Comparison", "Sweep", "compare", "sweep"),
+}
+_HOME = {name: module for module, names in _EXPORTS.items() for name in names}
+
+__all__ = sorted([*_HOME, "metrics"])
+
+
+def __getattr__(name: str) -> Any:
+    if name == "metrics":
+        return import_module("ctrlplan.metrics")
+    if name not in _HOME:
+        raise AttributeError(f"module 'ctrlplan' has no attribute {name!r}")
+    return getattr(import_module(f"ctrlplan.{_HOME[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return [*__all__, "__version__"]

@@ -1,0 +1,110 @@
+"""What a metric accepts: times, signals and levels, checked once and in one place."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+Value = float | Array
+
+_HUGE = np.finfo(np.float64).max / 1e3
+
+
+def real(name: str, value: ArrayLike) -> Array:
+    """Return an array of floats without nan, or say what is wrong with `name`."""
+    try:
+        array = np.asarray(value)
+    except ValueError as error:
+        raise TypeError(f"{name} must be an array of real numbers, got a ragged sequence") from error
+    if array.dtype.kind not in "buif":
+        raise TypeError(f"{name} must be an array of real numbers, got dtype {array.dtype}")
+    array = array.astype(np.float64, copy=False)
+    _forbid(name, array, np.isnan(array), "hold no nan")
+    return array
+
+
+def finite(name: str, value: ArrayLike) -> Array:
+    """Return an array of finite floats, or say what is wrong with `name`."""
+    array = real(name, value)
+    _forbid(name, array, np.isinf(array), "be finite")
+    return array
+
+
+def times(timepts: ArrayLike) -> Array:
+    """Return sample times, shape (ntime,), checked to increase strictly."""
+    t = finite("timepts", timepts)
+    if t.ndim != 1 or t.size < 2:
+        raise ValueError(f"timepts must be 1-D with at least 2 samples, got shape {t.shape}")
+    late = np.flatnonzero(t[1:] <= t[:-1])
+    if late.size:
+        i = int(late[0])
+        raise ValueError(f"timepts must increase strictly, got timepts[{i + 1}] = {t[i + 1]} after {t[i]}")
+    return t
+
+
+def signal(name: str, value: ArrayLike, t: Array) -> Array:
+    """Return a signal, shape (..., ntime), with time last."""
+    array = real(name, value)
+    if array.ndim == 0 or array.shape[-1] != t.size:
+        raise ValueError(f"{name} must have {t.size} samples on its last axis, as timepts has, got shape {array.shape}")
+    return array
+
+
+def axes(name: str, value: ArrayLike, t: Array) -> Array:
+    """Return a signal of one or more axes, shape (naxes, ntime)."""
+    array = signal(name, value, t)
+    if array.ndim > 2:
+        raise ValueError(f"{name} must have shape (ntime,) or (naxes, ntime), got shape {array.shape}")
+    return np.atleast_2d(array)
+
+
+def waypoints(value: ArrayLike, path: Array) -> Array:
+    """Return the points of a polyline, shape (naxes, npoints), for a path (naxes, ntime)."""
+    points = np.atleast_2d(finite("points", value))
+    if points.ndim != 2 or points.shape[1] == 0 or points.shape[0] != path.shape[0]:
+        raise ValueError(f"points must have shape ({path.shape[0]}, npoints), as path has axes, got {points.shape}")
+    return points
+
+
+def fitted(name: str, array: Array, shape: tuple[int, ...]) -> Array:
+    """Broadcast a level or a reference to the shape of what it is compared with."""
+    try:
+        return np.broadcast_to(array, shape)
+    except ValueError as error:
+        raise ValueError(f"{name} must broadcast to shape {shape}, got shape {array.shape}") from error
+
+
+def diverged(f: Array) -> bool:
+    """Return whether a record holds inf, or values so near it that their differences would."""
+    return not np.abs(f).max() < _HUGE
+
+
+def instant(start: float | None, t: Array) -> float:
+    """Return the time that counts as zero, the first sample unless given."""
+    if start is None:
+        return float(t[0])
+    since = finite("start", start)
+    if since.ndim or since > t[-1]:
+        raise ValueError(f"start must be a time not after timepts[-1] = {t[-1]}, got {start}")
+    return float(since)
+
+
+def each(metric: Callable[..., float], lead: tuple[int, ...], *arguments: Array, **options: Any) -> Value:
+    """Apply a metric of one record along the leading axes: a float if there are none.
+
+    Overflow and inf - inf are met where they arise, so that a diverged loop gives inf and no warning.
+    """
+    values = np.empty(lead)
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        for row in np.ndindex(lead):
+            values[row] = metric(*(argument[row] for argument in arguments), **options)
+    return values if lead else float(values[()])
+
+
+def _forbid(name: str, array: Array, bad: NDArray[np.bool_], rule: str) -> None:
+    if bad.any():
+        place = tuple(int(i) for i in np.argwhere(bad)[0])
+        where = f"{name}[{', '.join(map(str, place))}]" if place else name
+        raise ValueError(f"{name} must {rule}, got {where} = {array[place]}")

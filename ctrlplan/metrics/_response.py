@@ -1,0 +1,285 @@
+"""Metrics of a response: how long it takes to settle, how far it runs ahead, how far it stays behind."""
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ctrlplan.metrics._pieces import bulges, maximum, pieces
+from ctrlplan.metrics._records import Array, Value, diverged, each, finite, fitted, instant, signal, times
+
+_ROUNDING = 4 * np.finfo(np.float64).eps  # of the levels: a response held on the edge of the band is inside
+
+
+def settling_time(
+    timepts: ArrayLike,
+    y: ArrayLike,
+    final: ArrayLike,
+    initial: ArrayLike,
+    band: float = 0.02,
+    start: float | None = None,
+) -> Value:
+    r"""Time after which a response stays near its final value.
+
+    .. math:: \inf\{t : |y(s) - y_f| \le \text{band}\,|y_f - y_0| \text{ for all } s \ge t\}
+
+    The entry into the band is the root of the cubic through the samples beside it, and a peak that leaves the band
+    between two samples counts: on a smooth response the error is of fourth order in the sample spacing.
+
+    Parameters
+    ----------
+    timepts : array_like, shape (ntime,)
+        Sample times [s], strictly increasing; need not be even.
+    y : array_like, shape (..., ntime)
+        Response, any unit; may hold inf, as after divergence.
+    final, initial : array_like, broadcast to shape (...)
+        Values after and before the planned change, in the unit of `y`.
+    band : float, default 0.02
+        Half the width of the band, as a fraction of the change.
+    start : float, optional
+        Time that counts as zero [s]; the first sample unless given.
+
+    Returns
+    -------
+    float or ndarray, shape (...)
+        Time elapsed since `start` [s]; 0 if `y` is never outside the band (or only before `start`), inf if it never
+        stays inside or enters only after the last sample but one, nan where `final` equals `initial`.
+
+    Raises
+    ------
+    ValueError
+        If the shapes disagree, `timepts` does not increase, a signal holds nan, a level is not finite, `band` is not
+        positive or `start` is after the record.
+    TypeError
+        If an argument is not made of real numbers.
+
+    Examples
+    --------
+    A first-order lag of 1 s enters the band of 2 % at log 50 s:
+
+    >>> import numpy as np
+    >>> from ctrlplan.metrics import settling_time
+    >>> t = np.linspace(0, 10, 201)
+    >>> round(settling_time(t, 1 - np.exp(-t), final=1, initial=0), 5)
+    3.91202
+    """
+    t = times(timepts)
+    response = signal("y", y, t)
+    target = fitted("final", finite("final", final), response.shape[:-1])
+    return _settling(t, response, target[..., None], target, initial, band, start)
+
+
+def tracking_settling_time(
+    timepts: ArrayLike,
+    y: ArrayLike,
+    reference: ArrayLike,
+    final: ArrayLike,
+    initial: ArrayLike,
+    band: float = 0.02,
+    start: float | None = None,
+) -> Value:
+    r"""Time after which a response stays near its reference.
+
+    .. math:: \inf\{t : |y(s) - r(s)| \le \text{band}\,|y_f - y_0| \text{ for all } s \ge t\}
+
+    Parameters
+    ----------
+    timepts : array_like, shape (ntime,)
+        Sample times [s], strictly increasing; need not be even.
+    y : array_like, shape (..., ntime)
+        Response, any unit; may hold inf, as after divergence.
+    reference : array_like, broadcast to shape (..., ntime)
+        What `y` should follow, in the unit of `y`.
+    final, initial : array_like, broadcast to shape (...)
+        Values after and before the planned change, in the unit of `y`; they set the width of the band alone.
+    band : float, default 0.02
+        Half the width of the band, as a fraction of the change.
+    start : float, optional
+        Time that counts as zero [s]; the first sample unless given.
+
+    Returns
+    -------
+    float or ndarray, shape (...)
+        Time elapsed since `start` [s]; 0, inf and nan as in `settling_time`.
+
+    Raises
+    ------
+    ValueError
+        As `settling_time`, and if `reference` does not fit `y` or is not finite.
+    TypeError
+        If an argument is not made of real numbers.
+
+    See Also
+    --------
+    settling_time : The same against the final value.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from ctrlplan.metrics import tracking_settling_time
+    >>> t = np.linspace(0, 10, 201)
+    >>> round(tracking_settling_time(t, t + np.exp(-t), t, final=1, initial=0), 5)
+    3.91202
+    """
+    t = times(timepts)
+    response = signal("y", y, t)
+    target = fitted("final", finite("final", final), response.shape[:-1])
+    return _settling(t, response, finite("reference", reference), target, initial, band, start)
+
+
+def overshoot(
+    timepts: ArrayLike, y: ArrayLike, final: ArrayLike, initial: ArrayLike, reference: ArrayLike | None = None
+) -> Value:
+    r"""Greatest excess of a response in the direction of the change.
+
+    .. math:: 100\,\max\bigl(0, \max_t \operatorname{sgn}(y_f - y_0)\,(y(t) - r(t))\bigr) / |y_f - y_0|
+
+    With a `reference` r this is the overshoot on the error of section 2 of the paper; without, r is the final value.
+    Peaks are those of the cubic through the samples beside them: of fourth order in the sample spacing.
+
+    Parameters
+    ----------
+    timepts : array_like, shape (ntime,)
+        Sample times [s], strictly increasing; need not be even.
+    y : array_like, shape (..., ntime)
+        Response, any unit; may hold inf, as after divergence.
+    final, initial : array_like, broadcast to shape (...)
+        Values after and before the planned change, in the unit of `y`.
+    reference : array_like, broadcast to shape (..., ntime), optional
+        What `y` should follow, in the unit of `y`; `final` unless given.
+
+    Returns
+    -------
+    float or ndarray, shape (...)
+        In percent of the change; nan where `final` equals `initial`.
+
+    Raises
+    ------
+    ValueError
+        If the shapes disagree, `timepts` does not increase, `y` holds nan, or a level or the reference is not finite.
+    TypeError
+        If an argument is not made of real numbers.
+
+    Examples
+    --------
+    Damping 1/sqrt 2 gives an overshoot of 100 exp(-pi), whatever the spacing of the samples:
+
+    >>> import numpy as np
+    >>> from ctrlplan.metrics import overshoot
+    >>> t = np.linspace(0, 10, 201)
+    >>> round(overshoot(t, 1 - np.exp(-t) * (np.cos(t) + np.sin(t)), final=1, initial=0), 4)
+    4.3214
+    """
+    return _excess(timepts, y, final, initial, reference, 1.0)
+
+
+def lag(
+    timepts: ArrayLike, y: ArrayLike, final: ArrayLike, initial: ArrayLike, reference: ArrayLike | None = None
+) -> Value:
+    r"""Greatest shortfall of a response against the change.
+
+    .. math:: 100\,\max\bigl(0, \max_t \operatorname{sgn}(y_f - y_0)\,(r(t) - y(t))\bigr) / |y_f - y_0|
+
+    Parameters
+    ----------
+    timepts : array_like, shape (ntime,)
+        Sample times [s], strictly increasing; need not be even.
+    y : array_like, shape (..., ntime)
+        Response, any unit; may hold inf, as after divergence.
+    final, initial : array_like, broadcast to shape (...)
+        Values after and before the planned change, in the unit of `y`.
+    reference : array_like, broadcast to shape (..., ntime), optional
+        What `y` should follow, in the unit of `y`; `final` unless given.
+
+    Returns
+    -------
+    float or ndarray, shape (...)
+        In percent of the change; nan where `final` equals `initial`.
+
+    Raises
+    ------
+    ValueError
+        As `overshoot`.
+    TypeError
+        If an argument is not made of real numbers.
+
+    See Also
+    --------
+    overshoot : The other sign.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from ctrlplan.metrics import lag
+    >>> t = np.linspace(0, 10, 201)
+    >>> round(lag(t, t - 0.25, final=10, initial=0, reference=t), 6)
+    2.5
+    """
+    return _excess(timepts, y, final, initial, reference, -1.0)
+
+
+def _settling(
+    t: Array, y: Array, reference: Array, target: Array, initial: ArrayLike, band: float, start: float | None
+) -> Value:
+    lead = y.shape[:-1]
+    origin = fitted("initial", finite("initial", initial), lead)
+    width = finite("band", band)
+    if width.ndim or width <= 0:
+        raise ValueError(f"band must be a positive fraction of the change, got {band}")
+    reference = fitted("reference", reference, y.shape)
+    since = instant(start, t)
+
+    def settled(y: Array, reference: Array, final: Array, initial: Array) -> float:
+        if final == initial:
+            return np.nan
+        edge = float(width * np.abs(final - initial) + _ROUNDING * np.maximum(np.abs(final), np.abs(initial)))
+        return max(_last_entry(t, y - reference, edge) - since, 0.0)
+
+    return each(settled, lead, y, reference, target, origin)
+
+
+def _last_entry(t: Array, e: Array, edge: float) -> float:
+    """Return the time after which abs(e) <= edge: -inf if always, inf if e is outside after the last sample but one."""
+    if diverged(e):
+        return np.inf
+    size = np.abs(e)
+    outside = np.flatnonzero(size > edge)
+    first = int(outside[-1]) if outside.size else 0
+    if size[-1] > edge:
+        return np.inf
+    reach = np.maximum(size[first:-1], size[first + 1 :]) + bulges(t[first:], e[first:])
+    near = np.flatnonzero(reach > edge) + first
+    p = pieces(t, e, near)
+    cuts = p.cuts()
+    values = p.at_cuts(cuts)
+    beyond = np.abs(values) > edge
+    leaving = np.flatnonzero(beyond.any(axis=0))
+    if not leaving.size:
+        return -np.inf
+    i = int(leaving[-1])
+    if near[i] == t.size - 2:
+        return np.inf
+    cut = int(np.flatnonzero(beyond[:, i])[-1])
+    here = p[i : i + 1]
+    level = np.copysign(edge, values[cut, i])
+    s = here.crossing(level, cuts[cut, i : i + 1], cuts[cut + 1, i : i + 1])
+    return float(here.time(s)[0])
+
+
+def _excess(
+    timepts: ArrayLike, y: ArrayLike, final: ArrayLike, initial: ArrayLike, reference: ArrayLike | None, side: float
+) -> Value:
+    t = times(timepts)
+    response = signal("y", y, t)
+    lead = response.shape[:-1]
+    target = fitted("final", finite("final", final), lead)
+    origin = fitted("initial", finite("initial", initial), lead)
+    followed = target[..., None] if reference is None else finite("reference", reference)
+    followed = fitted("reference", followed, response.shape)
+
+    def excess(y: Array, reference: Array, final: Array, initial: Array) -> float:
+        change = final - initial
+        if change == 0:
+            return np.nan
+        most = maximum(t, side * np.sign(change) * (y - reference))
+        return float(100 * max(most, 0.0) / np.abs(change))
+
+    return each(excess, lead, response, followed, target, origin)

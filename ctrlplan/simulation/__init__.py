@@ -1,0 +1,5 @@
+"""Responses of loops: exact where they are linear."""
+
+from ctrlplan.simulation.simulate import rest_state, simulate
+
+__all__ = ["rest_state", "simulate"]

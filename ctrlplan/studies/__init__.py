@@ -1,0 +1,23 @@
+"""Plans compared: one loop, many loops, and the paper's experiments."""
+
+from ctrlplan.studies.comparison import Comparison, compare, standard_plans
+from ctrlplan.studies.linear import linear_study
+from ctrlplan.studies.measures import MEASURES, Measure
+from ctrlplan.studies.study import Study
+from ctrlplan.studies.sweep import Sweep, sweep
+
+PAPER = {"linear": linear_study}
+"""Studies of the paper by name: functions of ``progress`` that return a `Study`."""
+
+__all__ = [
+    "MEASURES",
+    "PAPER",
+    "Comparison",
+    "Measure",
+    "Study",
+    "Sweep",
+    "compare",
+    "linear_study",
+    "standard_plans",
+    "sweep",
+]

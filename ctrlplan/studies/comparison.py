@@ -1,0 +1,274 @@
+"""Several plans through one loop, side by side."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ctrlplan.simulation import rest_state, simulate
+from ctrlplan.studies.measures import control_metrics, path_metrics, response_metrics
+from ctrlplan.trajectories import PiecewiseSpline, PolySpline, Step, Trajectory, TrigSpline, Waypoint
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.figure import Figure
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What each plan made of a loop; made by `compare`.
+
+    Attributes
+    ----------
+    plans : dict of str to Trajectory
+        The references by name.
+    responses : dict of str to control.TimeResponseData
+        What the loop did with each.
+    metrics : dict of str to dict of str to float
+        Plan, metric, value: see `ctrlplan.studies.MEASURES`; inf where never
+        reached, nan where undefined.
+    outputs, controls : tuple of str
+        Outputs of the loop that follow the plan, and that are its controls.
+    waypoints : tuple of Waypoint
+        What the plans were asked to meet, where known.
+    units : dict of str to str
+        Units of axes and controls by label.
+    title : str
+        Heading of figures and report.
+    parameters : dict of str to object
+        What the report says about how it was made.
+    """
+
+    plans: dict[str, Trajectory]
+    responses: dict[str, Any]
+    metrics: dict[str, dict[str, float]]
+    outputs: tuple[str, ...]
+    controls: tuple[str, ...] = ()
+    waypoints: tuple[Waypoint, ...] = ()
+    units: dict[str, str] = field(default_factory=dict)
+    title: str = "Step versus planned"
+    parameters: dict[str, object] = field(default_factory=dict)
+
+    def to_pandas(self) -> pd.DataFrame:
+        """Metrics as a table, one row a metric, one column a plan."""
+        import pandas as pd
+
+        return pd.DataFrame(self.metrics).rename_axis(index="metric", columns="plan")
+
+    def results(self) -> dict[str, Any]:
+        """Plain data for JSON: plans with their metrics, null where infinite or undefined."""
+        return {"plans": {name: {"metrics": finite_or_none(values)} for name, values in self.metrics.items()}}
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write metrics, plans and parameters as JSON."""
+        data = self.results()
+        for name, plan in self.plans.items():
+            data["plans"][name]["trajectory"] = plan.to_dict()
+        data |= {"title": self.title, "parameters": {k: str(v) for k, v in self.parameters.items()}}
+        Path(path).write_text(json.dumps(data, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+
+    def plot(self) -> Figure:
+        """Responses, errors and controls over time."""
+        from ctrlplan.reports.figures import plot_responses
+
+        return plot_responses(self)
+
+    def report(self, path: str | os.PathLike[str]) -> Path:
+        """Write one self-contained HTML page and return its path.
+
+        Parameters
+        ----------
+        path : str or path
+            The file, or a folder for ``index.html`` in it.
+        """
+        from ctrlplan.reports import write_page
+        from ctrlplan.studies.study import Study
+
+        return write_page([Study("comparison", self.title, self)], path, title=self.title)
+
+    def _repr_html_(self) -> str:
+        from ctrlplan.reports import comparison_fragment
+
+        return comparison_fragment(self)
+
+
+def compare(
+    loop: Any,
+    plans: Mapping[str, Trajectory] | Iterable[Waypoint],
+    timepts: ArrayLike,
+    *,
+    alpha: float = 1.0,
+    outputs: Iterable[str] | None = None,
+    controls: Iterable[str] | None = None,
+    waypoints: Iterable[Waypoint] = (),
+    initial_state: ArrayLike | None = None,
+    band: float = 0.02,
+    only: Collection[str] | None = None,
+    units: Mapping[str, str] | None = None,
+    title: str = "Step versus planned",
+    parameters: Mapping[str, object] | None = None,
+) -> Comparison:
+    """Run several plans through a loop and measure each response.
+
+    Parameters
+    ----------
+    loop : control system
+        As many inputs (the reference) as the plans have axes.
+    plans : mapping of str to Trajectory, or iterable of Waypoint
+        The references by name; waypoints stand for the standard set of
+        `standard_plans`: step, polynomial, trigonometric, piecewise.
+    timepts : array_like, shape (ntime,)
+        Sample times [s]; metrics are refined between them.
+    alpha : float, optional
+        Shape parameter of the standard trigonometric plan.
+    outputs : iterable of str, optional
+        Outputs that follow the plan: those named like its axes, else the first
+        ones, unless given.
+    controls : iterable of str, optional
+        Outputs that are controls: those whose names begin with u unless given.
+    waypoints : iterable of Waypoint, optional
+        What the plans were asked to meet, for the metrics of wandering.
+    initial_state : array_like, optional
+        State at the first sample time: at rest at the first position unless
+        given.
+    band : float, optional
+        Half width of the settling band relative to the planned change.
+    only : collection of str, optional
+        Metrics wanted, by their keys in `MEASURES`; all unless given.
+    units : mapping of str to str, optional
+        Units of axes and controls by label.
+    title : str, optional
+        Heading.
+    parameters : mapping, optional
+        What the report should say about how it was made.
+
+    Returns
+    -------
+    Comparison
+
+    Raises
+    ------
+    ValueError
+        If there is no plan, plans differ in axes, or an output is unknown.
+    TypeError
+        If a plan is not a trajectory.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import ctrlplan as cp
+    >>> move = [cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1, 0, 0)]
+    >>> loop = cp.plants.integrator_lag_loop(100, outputs=("y", "u"))
+    >>> result = cp.compare(loop, move, np.linspace(0, 10, 2001))
+    >>> round(result.metrics["step"]["overshoot_error"], 1)
+    85.4
+    """
+    points = tuple(waypoints)
+    if not isinstance(plans, Mapping):
+        points = tuple(plans)
+        plans = standard_plans(points, alpha)
+    references = _checked_plans(plans)
+    first = next(iter(references.values()))
+    times = np.asarray(timepts, dtype=float)
+    tracked = _tracked(loop, outputs, first)
+    acting = tuple(controls) if controls is not None else tuple(n for n in loop.output_labels if n.startswith("u"))
+    for name in acting:
+        _known(loop, name)
+    rows, acting_rows = ([loop.output_labels.index(n) for n in names] for names in (tracked, acting))
+    start = min(plan.start for plan in references.values())
+    responses, found = {}, {}
+    for name, plan in references.items():
+        state = rest_state(loop, plan.jet(times[:1], 0, left=True)[0, :, 0]) if initial_state is None else initial_state
+        response = simulate(loop, times, plan, initial_state=state)
+        signals = np.asarray(response.outputs).reshape(-1, times.size)
+        values = response_metrics(times, signals[rows], plan, start, band, first.labels, only)
+        if acting:
+            values |= control_metrics(times, signals[acting_rows], start, acting, only)
+        responses[name] = response
+        found[name] = values | (path_metrics(plan, points) if only is None else {})
+    return Comparison(
+        plans=references,
+        responses=responses,
+        metrics=found,
+        outputs=tracked,
+        controls=acting,
+        waypoints=points,
+        units=dict(units or {}),
+        title=title,
+        parameters=dict(parameters or {}) | {"settling band": f"{100 * band:g} %"},
+    )
+
+
+def standard_plans(waypoints: Iterable[Waypoint], alpha: float = 1.0) -> dict[str, Trajectory]:
+    """Plans that a designer would compare through the same waypoints.
+
+    Parameters
+    ----------
+    waypoints : iterable of Waypoint
+        Two or more.
+    alpha : float, optional
+        Shape parameter of the trigonometric one [rad].
+
+    Returns
+    -------
+    dict of str to Trajectory
+        step (from the first position to the last, at the start), polynomial,
+        trigonometric, piecewise.
+    """
+    points = tuple(waypoints)
+    polynomial = PolySpline(points)
+    return {
+        "step": Step(polynomial.final, polynomial.initial, polynomial.start, polynomial.labels),
+        "polynomial": polynomial,
+        "trigonometric": TrigSpline(points, alpha=alpha),
+        "piecewise": PiecewiseSpline(points),
+    }
+
+
+def finite_or_none(values: Mapping[str, float]) -> dict[str, float | None]:
+    """Same numbers with None for what is infinite or undefined."""
+    return {name: value if math.isfinite(value) else None for name, value in values.items()}
+
+
+def _checked_plans(plans: Mapping[str, Trajectory]) -> dict[str, Trajectory]:
+    references = dict(plans)
+    if not references:
+        raise ValueError("plans must hold at least one trajectory, got none")
+    naxes = None
+    for name, plan in references.items():
+        if not isinstance(plan, Trajectory):
+            raise TypeError(f"plans[{name!r}] must be a Trajectory, got {type(plan).__name__}")
+        if naxes is not None and plan.naxes != naxes:
+            raise ValueError(f"plans must have the same axes, got {plan.naxes} in {name!r} after {naxes}")
+        naxes = plan.naxes
+    return references
+
+
+def _tracked(loop: Any, outputs: Iterable[str] | None, plan: Trajectory) -> tuple[str, ...]:
+    labels = list(loop.output_labels)
+    if outputs is not None:
+        names = tuple(outputs)
+    elif all(label in labels for label in plan.labels):
+        names = plan.labels
+    else:
+        names = tuple(labels[: plan.naxes])
+    if len(names) != plan.naxes:
+        raise ValueError(f"outputs must be as many as the plan's axes, {plan.naxes}, got {', '.join(names) or 'none'}")
+    for name in names:
+        _known(loop, name)
+    return names
+
+
+def _known(loop: Any, name: str) -> None:
+    if name not in loop.output_labels:
+        raise ValueError(f"outputs and controls must be among {', '.join(loop.output_labels)}, got {name!r}")

@@ -1,0 +1,50 @@
+"""A comparison with what a report says around it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from ctrlplan.studies.comparison import Comparison
+from ctrlplan.studies.sweep import Sweep
+
+
+@dataclass(frozen=True)
+class Study:
+    """One section of a report.
+
+    Attributes
+    ----------
+    name : str
+        Key in ``results.json``.
+    title : str
+        Heading.
+    comparison : Comparison
+        What was compared.
+    summary : str
+        What the study is, in a paragraph.
+    notes : tuple of str
+        Findings, one sentence or two each; where a claim fails they say so.
+    sweep : Sweep or None
+        Metrics over a parameter.
+    sweep_metrics : tuple of str
+        Those that ``results.json`` keeps.
+    figures : tuple of str
+        Keys of `ctrlplan.reports.figures.FIGURES`, in order.
+    """
+
+    name: str
+    title: str
+    comparison: Comparison
+    summary: str = ""
+    notes: tuple[str, ...] = ()
+    sweep: Sweep | None = None
+    sweep_metrics: tuple[str, ...] = ("overshoot_error", "settling_time")
+    figures: tuple[str, ...] = field(default=("plans", "responses"))
+
+    def results(self) -> dict[str, Any]:
+        """Plain data for ``results.json``."""
+        data = self.comparison.results()
+        if self.sweep is not None:
+            data["sweep"] = self.sweep.results(self.sweep_metrics)
+        return data

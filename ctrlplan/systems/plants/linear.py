@@ -1,0 +1,91 @@
+"""Linear plants in unity feedback."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import control as ct
+import numpy as np
+from numpy.typing import ArrayLike
+
+
+def integrator_lag_loop(gain: float, outputs: Sequence[str] = ("y",)) -> ct.InterconnectedSystem:
+    """Linear loop of the paper's section 2: k/(s^2 + s) in unity feedback.
+
+    Parameters
+    ----------
+    gain : float
+        k, finite.
+    outputs : sequence of str, optional
+        Signals put out: of "y", the output, "u", the control k (r - y), and
+        "e", the error r - y.
+
+    Returns
+    -------
+    control.InterconnectedSystem
+        Input r; outputs as asked; states of the plant.
+
+    Raises
+    ------
+    ValueError
+        If the gain is not finite or an output is unknown.
+
+    Examples
+    --------
+    >>> loop = integrator_lag_loop(5.0)
+    >>> [round(w, 3) for w in sorted(abs(loop.poles()))]
+    [2.236, 2.236]
+    """
+    return unity_feedback_loop([1.0], [1.0, 1.0, 0.0], gain, outputs)
+
+
+def unity_feedback_loop(
+    num: ArrayLike, den: ArrayLike, gain: float = 1.0, outputs: Sequence[str] = ("y",)
+) -> ct.InterconnectedSystem:
+    """Plant num/den behind a proportional gain, in unity feedback.
+
+    Parameters
+    ----------
+    num, den : array_like
+        Coefficients of the plant, highest power of s first.
+    gain : float, optional
+        Proportional gain, finite.
+    outputs : sequence of str, optional
+        Signals put out: of "y", "u" (behind the gain) and "e".
+
+    Returns
+    -------
+    control.InterconnectedSystem
+        Blocks error, controller and plant; input r.
+
+    Raises
+    ------
+    ValueError
+        If a coefficient or the gain is not finite, the plant is improper, the
+        loop has no solution (1 + gain num/den = 0 at infinity), or an output
+        is unknown.
+    """
+    gain = float(gain)
+    if not np.isfinite(gain):
+        raise ValueError(f"gain must be finite, got {gain}")
+    above, below = (_polynomial(c, name) for c, name in ((num, "num"), (den, "den")))
+    if above.size > below.size:
+        raise ValueError(f"num must not be of higher degree than den, got {above.size - 1} over {below.size - 1}")
+    if above.size == below.size and below[0] + gain * above[0] == 0.0:
+        raise ValueError(f"the loop must have a solution, got 1 + gain num/den = 0 at infinity with gain {gain:g}")
+    for output in outputs:
+        if output not in ("y", "u", "e"):
+            raise ValueError(f'outputs must be of "y", "u", "e", got {output!r}')
+    blocks = [
+        ct.summing_junction(inputs=["r", "-y"], output="e", name="error"),
+        ct.ss([], [], [], [[gain]], inputs="e", outputs="u", name="controller", dt=0),
+        ct.ss(ct.tf(above, below), inputs="u", outputs="y", name="plant"),
+    ]
+    return ct.interconnect(blocks, inputs="r", outputs=list(outputs), name="loop")
+
+
+def _polynomial(coefficients: ArrayLike, name: str) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+    values = np.atleast_1d(np.asarray(coefficients, dtype=float))
+    if values.ndim != 1 or not np.isfinite(values).all() or not values.any():
+        raise ValueError(f"{name} must be finite coefficients, not all 0, got {values.tolist()}")
+    return np.trim_zeros(values, "f")

@@ -1,0 +1,115 @@
+"""A plan as a block of a python-control loop."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import control as ct
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ctrlplan.trajectories import Trajectory, derivative_name
+
+Array = NDArray[np.float64]
+
+
+class PlanSource(ct.NonlinearIOSystem):  # type: ignore[misc]
+    """Block that puts out a plan and its derivatives; made by `create_source_iosystem`.
+
+    Attributes
+    ----------
+    plan : Trajectory
+        What is put out.
+    derivatives : int
+        Highest derivative put out.
+    breakpoints : ndarray
+        Times [s] at which the output or a derivative of it may jump: an
+        integrator should stop there.
+    """
+
+    def __init__(self, plan: Trajectory, derivatives: int, name: str) -> None:
+        labels = [derivative_name(label, k) for label in plan.labels for k in range(derivatives + 1)]
+        super().__init__(None, self._output, inputs=0, outputs=labels, dt=None, name=name)
+        self.plan = plan
+        self.derivatives = derivatives
+        self.breakpoints = plan.breakpoints
+
+    def _output(self, t: float, x: Array, u: Array, params: dict[str, Any]) -> Array:
+        return self.plan.jet(t, self.derivatives).T.ravel()
+
+
+def create_source_iosystem(plan: Trajectory, derivatives: int = 0, name: str = "plan") -> PlanSource:
+    """Plan as an input/output system without inputs or states.
+
+    Outputs are named axis by axis after the plan's labels: x, x_d1, x_d2, z,
+    z_d1, ...; `control.interconnect` joins them by these names.
+
+    Parameters
+    ----------
+    plan : Trajectory
+        What is put out, at every time: held before its start and after its end.
+    derivatives : int, optional
+        Highest derivative put out beside the position.
+    name : str, optional
+        Name of the block.
+
+    Returns
+    -------
+    PlanSource
+        A `control.NonlinearIOSystem`, of any time base.
+
+    Raises
+    ------
+    TypeError
+        If `plan` is not a trajectory.
+    ValueError
+        If `derivatives` is not a whole number from 0.
+
+    Examples
+    --------
+    >>> import control as ct
+    >>> import ctrlplan as cp
+    >>> plan = cp.PolySpline([cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1, 0, 0)], labels=["r"])
+    >>> driven = ct.interconnect(
+    ...     [cp.create_source_iosystem(plan), cp.plants.integrator_lag_loop(5)], inputs=0, outputs=["y"]
+    ... )
+    >>> driven.output_labels
+    ['y']
+    """
+    return PlanSource(_checked_plan(plan), _checked_derivatives(derivatives), name)
+
+
+def source_samples(plan: Trajectory, timepts: ArrayLike, derivatives: int = 0) -> Array:
+    """Samples of a plan in the order of its source block's outputs.
+
+    The input signal for `control.forced_response`, which takes it for linear
+    between samples.
+
+    Parameters
+    ----------
+    plan : Trajectory
+        What is sampled.
+    timepts : array_like, shape (ntime,)
+        Times [s].
+    derivatives : int, optional
+        Highest derivative beside the position.
+
+    Returns
+    -------
+    ndarray, shape (ntime,) for a single signal, (nsignals, ntime) for more
+    """
+    jet = _checked_plan(plan).jet(np.atleast_1d(np.asarray(timepts, dtype=float)), _checked_derivatives(derivatives))
+    samples = jet.transpose(1, 0, 2).reshape(-1, jet.shape[2])
+    return samples[0] if len(samples) == 1 else samples
+
+
+def _checked_plan(plan: Trajectory) -> Trajectory:
+    if not isinstance(plan, Trajectory):
+        raise TypeError(f"plan must be a Trajectory, got {type(plan).__name__}")
+    return plan
+
+
+def _checked_derivatives(derivatives: int) -> int:
+    if derivatives != int(derivatives) or derivatives < 0:
+        raise ValueError(f"derivatives must be a whole number from 0, got {derivatives}")
+    return int(derivatives)
