@@ -1,5 +1,5 @@
 """Responses of loops: exact where they are linear."""
 
-from ctrlplan.simulation.simulate import rest_state, simulate
+from ctrlplan.simulation.simulate import rest_state, simulate, unstable_poles
 
-__all__ = ["rest_state", "simulate"]
+__all__ = ["rest_state", "simulate", "unstable_poles"]

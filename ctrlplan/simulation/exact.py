@@ -66,17 +66,15 @@ def exact_states(a: Array, b: Array, jet: Jet, breakpoints: Sequence[float], tim
     return out * scale[:, None]
 
 
-def _leg(
-    a: Array, b: Array, jet: Jet, left: float, right: float, samples: Array, state: Array
-) -> tuple[Array, Array]:
+def _leg(a: Array, b: Array, jet: Jet, left: float, right: float, samples: Array, state: Array) -> tuple[Array, Array]:
     """States at the samples (times since `left`) and at the end of one analytic leg."""
     moment, duration = 0.5 * (left + right), right - left
     ncells = _ncells(lambda s, order: jet(moment, left, s, order), duration)
     h = duration / ncells
     starts = h * np.arange(ncells)
     series = jet(moment, left, starts, _TERMS - 1)  # (terms, ninputs, ncells), about the cells' starts
-    series *= (h ** np.arange(_TERMS) / _FACTORIALS)[:, None, None]
-    levels = max(0, int(np.ceil(np.log2(max(1.0, np.linalg.norm(h * a, 1))))))
+    series *= (h ** np.arange(_TERMS, dtype=float) / _FACTORIALS)[:, None, None]
+    levels = max(0, int(np.ceil(np.log2(max(1.0, float(np.linalg.norm(h * a, 1)))))))
     *halvings, (carry_state, carry_input) = _propagators(a, b, h, levels)
     states = np.empty((len(a), ncells + 1))
     states[:, 0] = state
@@ -126,7 +124,7 @@ def _propagators(a: Array, b: Array, h: float, levels: int) -> list[tuple[Array,
     width = n + _TERMS * m
     units = np.zeros((_TERMS, m, width))
     units.reshape(-1, width)[:, n:] = np.eye(_TERMS * m)
-    carry = sum(_taylor(short * a, short * b, np.eye(n, width), units))
+    carry = np.sum(_taylor(short * a, short * b, np.eye(n, width), units), axis=0)
     maps = [(carry[:, :n], carry[:, n:])]
     first, second = (half[:, :, n:].reshape(_TERMS * m, -1) for half in _halved(units))
     for _ in range(levels):
@@ -164,6 +162,6 @@ def _evaluated(terms: list[Array], where: NDArray[np.intp], sigma: Array) -> Arr
 
 _FACTORIALS = np.cumprod(np.concatenate([[1.0], np.arange(1.0, _TERMS)]))
 _LONG_FACTORIALS = np.cumprod(np.concatenate([[1.0], np.arange(1.0, _TERMS + 8)]))
-_HALVES = 0.5 ** np.arange(_TERMS)
+_HALVES: Array = 0.5 ** np.arange(_TERMS, dtype=float)
 # The polynomial of the whole cell about its middle, in the time of its second half.
-_SECOND_HALF = np.triu(pascal(_TERMS, kind="upper")) * _HALVES
+_SECOND_HALF = np.triu(pascal(_TERMS, kind="upper")).astype(float) * _HALVES

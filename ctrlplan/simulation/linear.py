@@ -56,13 +56,15 @@ def linear_form(system: Any) -> LinearForm:
     if isinstance(system, ct.InterconnectedSystem):
         return _interconnection(system)
     if isinstance(system, ct.StateSpace):
-        return LinearForm(*(np.asarray(m, dtype=float) for m in (system.A, system.B, system.C, system.D)), ())
+        a, b, c, d = (np.asarray(m, dtype=float) for m in (system.A, system.B, system.C, system.D))
+        return LinearForm(a, b, c, d, ())
     if isinstance(system, ct.TransferFunction):
         return linear_form(ct.ss(system))
     plan = getattr(system, "plan", None)
     if isinstance(plan, Trajectory):
         n = system.noutputs
-        return LinearForm(*(np.zeros(s) for s in ((0, 0), (0, n), (n, 0))), np.eye(n), ((plan, system.derivatives),))
+        nothing, fed, read = np.zeros((0, 0)), np.zeros((0, n)), np.zeros((n, 0))
+        return LinearForm(nothing, fed, read, np.eye(n), ((plan, system.derivatives),))
     raise NotLinearError(f"block {system.name} ({type(system).__name__}) is not linear")
 
 

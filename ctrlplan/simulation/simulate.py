@@ -118,7 +118,8 @@ def _source(value: Any, name: str, times: Array) -> Trajectory | Array:
     if signal.ndim == 0:
         return Step(signal, initial=signal, time=times[0])
     if signal.shape != times.shape:
-        raise ValueError(f"input {name} must be a trajectory, a number or {times.size} samples, got shape {signal.shape}")
+        kinds = f"a trajectory, a number or {times.size} samples"
+        raise ValueError(f"input {name} must be {kinds}, got shape {signal.shape}")
     if not np.isfinite(signal).all():
         raise ValueError(f"input {name} must be finite, got nan or inf at index {int((~np.isfinite(signal)).argmax())}")
     return signal
@@ -214,6 +215,8 @@ def rest_state(system: Any, position: ArrayLike) -> Array:
         outputs and inputs are as many, and of least norm otherwise.
     """
     held = np.atleast_1d(np.asarray(position, dtype=float))
+    if not held.any():
+        return np.zeros(system.nstates or 0)
     try:
         form = linear_form(system)
     except NotLinearError:
@@ -228,3 +231,12 @@ def rest_state(system: Any, position: ArrayLike) -> Array:
     found = np.linalg.lstsq(np.vstack(rows), np.concatenate(known), rcond=None)[0]
     state: Array = found if np.abs(form.a @ found + form.b @ held).max(initial=0.0) < 1e-9 else np.zeros(len(form.a))
     return state
+
+
+def unstable_poles(system: Any) -> NDArray[np.complex128]:
+    """Poles in the right half plane of a linear continuous system; of others none are known."""
+    try:
+        poles = np.linalg.eigvals(linear_form(system).a).astype(complex)
+    except NotLinearError:
+        return np.empty(0, dtype=complex)
+    return poles[poles.real > 1e-9 * np.maximum(1e-300, np.abs(poles))]

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ctrlplan.simulation import rest_state, simulate
+from ctrlplan.simulation import rest_state, simulate, unstable_poles
 from ctrlplan.studies.measures import control_metrics, path_metrics, response_metrics
 from ctrlplan.trajectories import PiecewiseSpline, PolySpline, Step, Trajectory, TrigSpline, Waypoint
 
@@ -47,6 +47,8 @@ class Comparison:
         Heading of figures and report.
     parameters : dict of str to object
         What the report says about how it was made.
+    notes : tuple of str
+        What a reader must know of the loop: that it is unstable, or never settles.
     """
 
     plans: dict[str, Trajectory]
@@ -58,6 +60,7 @@ class Comparison:
     units: dict[str, str] = field(default_factory=dict)
     title: str = "Step versus planned"
     parameters: dict[str, object] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
 
     def to_pandas(self) -> pd.DataFrame:
         """Metrics as a table, one row a metric, one column a plan."""
@@ -67,7 +70,11 @@ class Comparison:
 
     def results(self) -> dict[str, Any]:
         """Plain data for JSON: plans with their metrics, null where infinite or undefined."""
-        return {"plans": {name: {"metrics": finite_or_none(values)} for name, values in self.metrics.items()}}
+        plans = {
+            plan: {"metrics": {name: finite_or_none(value) for name, value in found.items()}}
+            for plan, found in self.metrics.items()
+        }
+        return {"plans": plans}
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write metrics, plans and parameters as JSON."""
@@ -94,7 +101,7 @@ class Comparison:
         from ctrlplan.reports import write_page
         from ctrlplan.studies.study import Study
 
-        return write_page([Study("comparison", self.title, self)], path, title=self.title)
+        return write_page([Study("comparison", self.title, self, notes=self.notes)], path, title=self.title)
 
     def _repr_html_(self) -> str:
         from ctrlplan.reports import comparison_fragment
@@ -186,12 +193,16 @@ def compare(
         _known(loop, name)
     rows, acting_rows = ([loop.output_labels.index(n) for n in names] for names in (tracked, acting))
     start = min(plan.start for plan in references.values())
+    unstable = unstable_poles(loop)
     responses, found = {}, {}
     for name, plan in references.items():
-        state = rest_state(loop, plan.jet(times[:1], 0, left=True)[0, :, 0]) if initial_state is None else initial_state
+        first_position = plan.jet(times[:1], 0, left=True)[0, :, 0]
+        state = rest_state(loop, first_position) if initial_state is None else initial_state
         response = simulate(loop, times, plan, initial_state=state)
         signals = np.asarray(response.outputs).reshape(-1, times.size)
         values = response_metrics(times, signals[rows], plan, start, band, first.labels, only)
+        if unstable:
+            values |= {name: np.inf for name in values if "settling_time" in name}
         if acting:
             values |= control_metrics(times, signals[acting_rows], start, acting, only)
         responses[name] = response
@@ -206,6 +217,7 @@ def compare(
         units=dict(units or {}),
         title=title,
         parameters=dict(parameters or {}) | {"settling band": f"{100 * band:g} %"},
+        notes=_notes(unstable, found),
     )
 
 
@@ -235,9 +247,23 @@ def standard_plans(waypoints: Iterable[Waypoint], alpha: float = 1.0) -> dict[st
     }
 
 
-def finite_or_none(values: Mapping[str, float]) -> dict[str, float | None]:
-    """Same numbers with None for what is infinite or undefined."""
-    return {name: value if math.isfinite(value) else None for name, value in values.items()}
+def _notes(unstable: NDArray[np.complex128], found: dict[str, dict[str, float]]) -> tuple[str, ...]:
+    if unstable.size:
+        worst = unstable[unstable.real.argmax()]
+        pole = f"{worst.real:.4g}" + (f" ± {abs(worst.imag):.4g}j" if worst.imag else "")
+        return (f"The loop is unstable: it has a pole at {pole} 1/s. No reference makes it settle.",)
+    never = [name for name, values in found.items() if values.get("settling_time") == np.inf]
+    if never:
+        return (
+            f"With {', '.join(never)} the output does not settle within the run: the run is too short, or the loop "
+            "keeps an error.",
+        )
+    return ()
+
+
+def finite_or_none(value: float) -> float | None:
+    """Same number, or None where it is infinite or undefined: JSON has neither."""
+    return value if math.isfinite(value) else None
 
 
 def _checked_plans(plans: Mapping[str, Trajectory]) -> dict[str, Trajectory]:

@@ -11,6 +11,8 @@ from ctrlplan.studies.sweep import Sweep, sweep
 from ctrlplan.systems.plants import integrator_lag_loop
 from ctrlplan.trajectories import PolySpline, Step, Trajectory, TrigSpline, Waypoint
 
+Array = NDArray[np.float64]
+
 WAYPOINTS = (Waypoint(0.0, 0.0, 0.0, 0.0), Waypoint(1.0, 1.0, 0.0, 0.0))
 GAIN = 5.0
 GAINS = (0.25, 1000.0)
@@ -29,7 +31,7 @@ def linear_plans() -> dict[str, Trajectory]:
     }
 
 
-def linear_study(progress: bool = True, count: int = 161, finest: float = 1e-3) -> Study:
+def linear_study(progress: bool = True, count: int = 241, finest: float = 1e-3) -> Study:
     """Figure 1 and the figures of section 2.
 
     Parameters
@@ -37,7 +39,8 @@ def linear_study(progress: bool = True, count: int = 161, finest: float = 1e-3) 
     progress : bool, optional
         Show a bar on stderr.
     count : int, optional
-        Gains before refinement, evenly spaced in their logarithm.
+        Gains before refinement: as many evenly spaced in their square root, the
+        frequency of the loop, and a quarter as many in their logarithm.
     finest : float, optional
         Relative spacing of gains to which jumps of a settling time are located.
 
@@ -77,16 +80,15 @@ def linear_study(progress: bool = True, count: int = 161, finest: float = 1e-3) 
     )
 
 
-def jumps(values: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Between which neighbours a settling time jumps: shape (nvalues - 1,).
+def jumps(gains: Array, settling: Array, slope: float = 3.0) -> NDArray[np.bool_]:
+    """Between which neighbouring gains a settling time jumps: shape (ngains - 1,).
 
-    A jump is a change of more than 2 % that is also five times that of both
-    neighbouring intervals, or of more than 12 %.
+    Between jumps it changes about as fast as the period of the oscillation,
+    with the power -1/2 of the gain; a jump is a change of more than 0.5 % with
+    a power of more than `slope`.
     """
-    change = np.abs(np.diff(values)) / np.minimum(values[:-1], values[1:])
-    padded = np.concatenate([[np.inf], change, [np.inf]])
-    beside = np.minimum(padded[:-2], padded[2:])
-    return (change > 0.12) | ((change > 0.02) & (change > 5.0 * beside))
+    change = np.abs(np.diff(np.log(settling)))
+    return (change > 0.005) & (change > slope * np.diff(np.log(gains)))
 
 
 def _loop(gain: float) -> object:
@@ -96,14 +98,13 @@ def _loop(gain: float) -> object:
 def _refined_sweep(count: int, finest: float, progress: bool) -> Sweep:
     """Sweep over the gain, refined between gains where a settling time jumps."""
 
-    def swept(gains: NDArray[np.float64]) -> Sweep:
-        return sweep(
-            _loop, gains, linear_plans(), TIMEPTS, progress=progress, parameter="gain", only=SWEPT
-        )
+    def swept(gains: Array) -> Sweep:
+        return sweep(_loop, gains, linear_plans(), TIMEPTS, progress=progress, parameter="gain", only=SWEPT)
 
-    found = swept(np.geomspace(*GAINS, count))
+    even = np.linspace(GAINS[0] ** 0.5, GAINS[1] ** 0.5, count)[1:-1] ** 2
+    found = swept(np.union1d(even, np.geomspace(*GAINS, count // 4)))
     while True:
-        jump = np.any([jumps(rows["settling_time"]) for rows in found.metrics.values()], axis=0)
+        jump = np.any([jumps(found.values, r["settling_time"], 0.8) for r in found.metrics.values()], axis=0)
         wide = found.values[1:] / found.values[:-1] > 1.0 + finest
         left = found.values[:-1][jump & wide]
         right = found.values[1:][jump & wide]
@@ -136,7 +137,8 @@ def _notes(comparison: Comparison, swept: Sweep) -> list[str]:
         f"{enters:.4g} s: the reference itself enters the ±2 % band that early, and a stiff loop follows it. "
         f"At k = 1000 the plan settles in {trig['settling_time'][-1]:.4g} s.",
         f"The paper says that the plan's overshoot rises to about 50 % and then falls to 0. It peaks at "
-        f"{trig['overshoot_error'][top]:.4g} % at k = {gains[top]:.3g} and is {last['trigonometric']:.3g} % at k = 1000.",
+        f"{trig['overshoot_error'][top]:.4g} % at k = {gains[top]:.3g} and is {last['trigonometric']:.3g} % "
+        "at k = 1000.",
         f"The step's limit point for k → ∞ is ({STEP_LIMIT[0]:.4g} s, 100 %), as in the paper; at k = 1000 it is still "
         f"at {last['step']:.4g} %. Its settling time jumps wherever an oscillation leaves the band; gains are refined "
         "there, so that the jumps are drawn as jumps.",

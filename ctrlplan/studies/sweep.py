@@ -51,7 +51,7 @@ class Sweep:
     def results(self, names: Sequence[str]) -> dict[str, Any]:
         """Plain data for JSON: the values, and some metrics of each plan."""
         rows = {
-            plan: {name: list(finite_or_none(dict(enumerate(found[name].tolist()))).values()) for name in names}
+            plan: {name: [finite_or_none(value) for value in found[name].tolist()] for name in names}
             for plan, found in self.metrics.items()
         }
         return {self.parameter: self.values.tolist()} | rows
@@ -131,9 +131,7 @@ def sweep(
     else:
         futures = [executor.submit(one, value) for value in points.tolist()]
         found = [future.result() for future in bar(futures)]
-    rows = {
-        plan: {name: np.array([f[plan][name] for f in found]) for name in found[0][plan]} for plan in found[0]
-    }
+    rows = {plan: {name: np.array([f[plan][name] for f in found]) for name in found[0][plan]} for plan in found[0]}
     return Sweep(parameter, points, rows)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from abc import abstractmethod
 from collections.abc import Iterable, Sequence
 from typing import Any, Self
@@ -78,7 +79,9 @@ class Sum(_Combined):
         terms = _checked_parts(parts)
         for i, part in enumerate(terms):
             if part.naxes != terms[0].naxes:
-                raise ValueError(f"parts must have the same axes, got {part.naxes} in parts[{i}] after {terms[0].naxes}")
+                raise ValueError(
+                    f"parts must have the same number of axes, got {part.naxes} in parts[{i}] after {terms[0].naxes}"
+                )
         self._set(terms, terms[0].labels)
 
     def _combine(self, values: list[Array]) -> Array:
@@ -152,7 +155,7 @@ class Joined(Trajectory):
 
     def __init__(self, parts: Iterable[Trajectory]) -> None:
         members = list(_checked_parts(parts))
-        for i, (before, after) in enumerate(zip(members[:-1], members[1:], strict=True)):
+        for i, (before, after) in enumerate(itertools.pairwise(members)):
             if before.naxes != after.naxes:
                 raise ValueError(f"joined trajectories must have the same axes, got {after.naxes} after {before.naxes}")
             last, first = before.final, after.initial

@@ -72,8 +72,7 @@ def derivative_extrema(plan: Trajectory, nu: int) -> Extrema:
 
         times = [np.array([0.0, duration])]
         for left, right, slopes in _pieces(jet, 0.0, duration, nu + 1):
-            for series in slopes:
-                times.append(0.5 * (left + right) + 0.5 * (right - left) * real_roots(series))
+            times += [0.5 * (left + right) + 0.5 * (right - left) * real_roots(series) for series in slopes]
         t = np.unique(np.concatenate(times))
         t = np.union1d(t, _polished(jet, t, nu, duration))
         found.add(origin + t, jet(t, nu)[nu])
@@ -94,7 +93,8 @@ def function_extrema(plan: Trajectory, function: Callable[[Array], Array], order
             pieces += 1
             series = fit(value, (left, right), 32)
             if not np.isfinite(series).all():
-                raise ValueError(f"function must be finite over the plan, got nan or inf between {origin + left:g} and {origin + right:g} s")
+                where = f"between {origin + left:g} and {origin + right:g} s"
+                raise ValueError(f"function must be finite over the plan, got nan or inf {where}")
             if resolved_size(series, 1e-13) is None and pieces < _MAX_PIECES and right - left > 1e-9 * duration:
                 middle = 0.5 * (left + right)
                 todo += [(left, middle), (middle, right)]
@@ -117,35 +117,33 @@ def certified_bounds(
 ) -> Bounds:
     """Bounds by refining cells until a Lipschitz bound decides."""
     weights = np.broadcast_to(np.asarray(lipschitz, dtype=float), (order + 1, plan.naxes))
-    peaks = np.stack([plan.peak(k + 1) for k in range(order + 1)])
-    slope = float(np.sum(weights * peaks))
-    best = Bounds(np.inf, -np.inf, np.inf, -np.inf, plan.start, plan.start)
+    slope = float(np.sum(weights * np.stack([plan.peak(k + 1) for k in range(order + 1)])))
+    found, lower, upper = _Candidates(), np.inf, -np.inf
+    least, greatest = np.inf, -np.inf
     for leg, (origin, duration) in enumerate(_legs(plan)):
-        centres, radius, spent = duration * (np.arange(128) + 0.5) / 128, duration / 256, 0
-        lower, upper = best.lower, best.upper
+        radius, spent = duration / 256, 0
+        centres = duration * (np.arange(128) + 0.5) / 128
         while centres.size:
             spent += centres.size
             if spent > max_cells:
                 raise ValueError(f"rtol = {rtol:g} must be reached within {max_cells} cells; raise either of them")
             values = np.asarray(function(plan._leg_jet(leg, centres, order)), dtype=float)
-            low, high = int(values.argmin()), int(values.argmax())
-            if values[low] < best.minimum:
-                best = Bounds(lower, upper, float(values[low]), best.maximum, origin + float(centres[low]), best.time_max)
-            if values[high] > best.maximum:
-                best = Bounds(lower, upper, best.minimum, float(values[high]), best.time_min, origin + float(centres[high]))
-            gap = rtol * max(best.maximum - best.minimum, np.finfo(float).tiny)
-            reach = slope * radius
-            undecided = (values - reach < best.minimum - gap) | (values + reach > best.maximum + gap)
-            if reach <= gap:
-                undecided[:] = False
-            decided = values[~undecided]
-            if decided.size:
-                lower = min(lower, float(decided.min()) - reach)
-                upper = max(upper, float(decided.max()) + reach)
+            found.add(origin + centres, values[None])
+            least, greatest = min(least, float(values.min())), max(greatest, float(values.max()))
+            gap, reach = rtol * (greatest - least), slope * radius
+            undecided = (values - reach < least - gap) | (values + reach > greatest + gap)
+            undecided &= reach > gap
+            if not undecided.all():
+                decided = values[~undecided]
+                lower, upper = min(lower, float(decided.min()) - reach), max(upper, float(decided.max()) + reach)
             radius *= 0.5
             centres = (centres[undecided, None] + np.array([-radius, radius])).ravel()
-        best = Bounds(lower, upper, best.minimum, best.maximum, best.time_min, best.time_max)
-    return best
+    best = found.extrema()
+    return Bounds(
+        lower,
+        upper,
+        *(float(v[0]) for v in (best.minimum, best.maximum, best.time_min, best.time_max)),
+    )
 
 
 class _Candidates:

@@ -72,9 +72,7 @@ def load_trajectory(path: str | os.PathLike[str]) -> Trajectory:
         raise ValueError(f"{os.fspath(path)} must hold a saved trajectory: {error}") from None
 
 
-def write_csv(
-    plan: Trajectory, path: str | os.PathLike[str], timepts: ArrayLike | None = None, order: int = 2
-) -> None:
+def write_csv(plan: Trajectory, path: str | os.PathLike[str], timepts: ArrayLike | None = None, order: int = 2) -> None:
     """Write times and jets as a table: time, then each axis with its derivatives.
 
     Parameters

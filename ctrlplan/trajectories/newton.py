@@ -38,7 +38,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import lapack
 
-from ctrlplan.trajectories.common import FACTORIALS, Array, Frozen
+from ctrlplan.trajectories.common import FACTORIALS, Array, Frozen, readonly
 
 
 class NewtonSystem(Frozen):
@@ -214,9 +214,7 @@ def _leja(alpha: float, times: Array, given: tuple[tuple[int, ...], ...]) -> lis
     return [used[i] for i in chosen]
 
 
-def _sequence(
-    waypoints: list[int], given: tuple[tuple[int, ...], ...]
-) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def _sequence(waypoints: list[int], given: tuple[tuple[int, ...], ...]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Constraints in rounds: the first entry of each waypoint, the second of each, ..."""
     rounds = max(map(len, given))
     pairs = [(i, given[i][r]) for r in range(rounds) for i in waypoints if r < len(given[i])]
@@ -288,6 +286,4 @@ def _kernel(alpha: float, order: int) -> Array:
     kernel = np.zeros((3, n, n))
     kernel[0] = np.eye(n)
     kernel[1], kernel[2] = np.where(lag >= 0, s[lag], 0.0), np.where(lag >= 0, v[lag], 0.0)
-    kernel = kernel.reshape(3 * n, n)
-    kernel.flags.writeable = False
-    return kernel
+    return readonly(kernel.reshape(3 * n, n))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Sequence
 from typing import Any, Self
 
@@ -60,7 +61,7 @@ class PiecewiseSpline(Trajectory):
         filled = _filled(points, shape)
         legs = tuple(
             TrigSpline(pair, alpha=shape, labels=names) if shape else PolySpline(pair, labels=names)
-            for pair in zip(filled[:-1], filled[1:], strict=True)
+            for pair in itertools.pairwise(filled)
         )
         self.__dict__.update(
             waypoints=points,

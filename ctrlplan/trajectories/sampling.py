@@ -23,9 +23,7 @@ _MAX_TERMS = 24
 _CHUNK = 4104  # not a power of two: rows that far apart would share cache lines
 
 
-def sample(
-    jet: Callable[[Array, int], Array], duration: float, t: Array, low: int, high: int
-) -> Array:
+def sample(jet: Callable[[Array, int], Array], duration: float, t: Array, low: int, high: int) -> Array:
     """Derivatives low to high at many times.
 
     Parameters
@@ -112,10 +110,8 @@ def _sample_uniform(
     return out
 
 
-def _sample_sorted(
-    jet: Callable[[Array, int], Array], t: Array, ncells: int, low: int, high: int, terms: int
-) -> Array:
-    edges = np.linspace(t[0], t[-1], ncells + 1)
+def _sample_sorted(jet: Callable[[Array, int], Array], t: Array, ncells: int, low: int, high: int, terms: int) -> Array:
+    edges: Array = np.linspace(t[0], t[-1], ncells + 1)
     centres, radius = 0.5 * (edges[:-1] + edges[1:]), 0.5 * float(t[-1] - t[0]) / ncells
     jets = jet(centres, high + terms - 1)
     naxes = jets.shape[1]

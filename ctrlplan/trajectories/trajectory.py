@@ -6,10 +6,11 @@ import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from functools import cached_property
+from numbers import Real
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ctrlplan.trajectories import extrema as _extrema
 from ctrlplan.trajectories import sampling as _sampling
@@ -295,10 +296,10 @@ class Trajectory(Frozen, ABC):
     def __sub__(self, other: Trajectory) -> Trajectory:
         return self + (-1.0) * other if isinstance(other, Trajectory) else NotImplemented
 
-    def __mul__(self, factor: float) -> Trajectory:
+    def __mul__(self, factor: float | Real) -> Trajectory:
         from ctrlplan.trajectories.combined import Scaled
 
-        return Scaled(self, factor) if np.isscalar(factor) else NotImplemented
+        return Scaled(self, float(factor)) if isinstance(factor, Real) else NotImplemented
 
     __rmul__ = __mul__
 
@@ -326,15 +327,14 @@ class Trajectory(Frozen, ABC):
         out = np.zeros((high - low + 1, self.naxes, t.size))
         in_order = bool(np.all(legs[1:] >= legs[:-1]))
         for leg in range(-1, nlegs + 1):
-            where: slice | Array
+            where: slice | NDArray[np.intp]
             if in_order:
-                where = slice(*np.searchsorted(legs, [leg, leg + 1]).tolist())
-                if where.start == where.stop:
-                    continue
+                begin, end = np.searchsorted(legs, [leg, leg + 1]).tolist()
+                where = slice(begin, end)
             else:
                 where = np.flatnonzero(legs == leg)
-                if not where.size:
-                    continue
+            if not t[where].size:
+                continue
             if 0 <= leg < nlegs:
                 out[:, :, where] = self._sample_leg(leg, t[where] - self.breakpoints[leg], low, high)
             elif low == 0:

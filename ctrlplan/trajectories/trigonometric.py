@@ -216,9 +216,7 @@ def checked_alpha(alpha: float | str) -> float:
     return value
 
 
-def _checked_gamma(
-    gamma: float | Sequence[float | None] | None, naxes: int
-) -> float | list[float | None] | None:
+def _checked_gamma(gamma: float | Sequence[float | None] | None, naxes: int) -> float | list[float | None] | None:
     if gamma is None:
         return None
     values = [gamma] if isinstance(gamma, (int, float)) else list(gamma)

@@ -1,0 +1,100 @@
+"""The ``ctrlplan`` command."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import ctrlplan
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command and return its exit status: 0, or 2 where nothing was written."""
+    options = _parser().parse_args(arguments)
+    try:
+        paths = options.run(options)
+    except OSError as error:
+        print(f"ctrlplan: --out must be writable, got {options.out}: {error.strerror or error}", file=sys.stderr)
+        return 2
+    except ValueError as error:
+        print(f"ctrlplan: {error}", file=sys.stderr)
+        return 2
+    for path in paths:
+        print(path)
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="ctrlplan", description="Plan the reference that a closed loop should follow, and show what that is worth."
+    )
+    parser.add_argument("--version", action="version", version=f"ctrlplan {ctrlplan.__version__}")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+
+    reproduce = commands.add_parser("reproduce", help="run every study of the paper and write its report")
+    reproduce.add_argument("--out", type=Path, default=Path("report"), help="folder to write into (default: report)")
+    reproduce.set_defaults(run=_reproduce)
+
+    report = commands.add_parser("report", help="run a study of your own and write its report")
+    report.add_argument("study", type=Path, help="study file (TOML)")
+    report.add_argument("--out", type=Path, default=Path("report"), help="folder to write into (default: report)")
+    report.set_defaults(run=_report)
+
+    plan = commands.add_parser("plan", help="write only the trajectories of a study")
+    plan.add_argument("study", type=Path, help="study file (TOML)")
+    plan.add_argument("--out", type=Path, required=True, help="file to write: .csv (samples) or .json (plans)")
+    plan.set_defaults(run=_plan)
+    return parser
+
+
+def _reproduce(options: argparse.Namespace) -> list[Path]:
+    _checked_folder(options.out)
+    from ctrlplan.reports import write_report
+    from ctrlplan.studies import PAPER
+
+    studies = []
+    for name, study in PAPER.items():
+        _say(f"study {name}")
+        studies.append(study(progress=sys.stderr.isatty()))
+    _say("report")
+    return write_report(studies, options.out, "Path planning with trigonometric splines: the paper's studies")
+
+
+def _report(options: argparse.Namespace) -> list[Path]:
+    from ctrlplan.reports import write_report
+    from ctrlplan.studies.files import load_study
+
+    stated = load_study(options.study)
+    _checked_folder(options.out)
+    _say(f"study {stated.name}")
+    study = stated.run()
+    _say("report")
+    return write_report([study], options.out, stated.title)
+
+
+def _plan(options: argparse.Namespace) -> list[Path]:
+    from ctrlplan.reports import write_all
+    from ctrlplan.studies.files import load_study, plans_as_csv, plans_as_json
+
+    writers = {".csv": plans_as_csv, ".json": plans_as_json}
+    if options.out.suffix not in writers:
+        raise ValueError(f"--out must end in .csv or .json, got {options.out}")
+    stated = load_study(options.study)
+    _say(f"plans of {stated.name}")
+    return write_all({options.out: writers[options.out.suffix](stated)})
+
+
+def _checked_folder(folder: Path) -> None:
+    """Refuse, before any work, a folder that cannot be written."""
+    existing = folder
+    while not existing.exists() and existing != existing.parent:
+        existing = existing.parent
+    if not existing.is_dir() or not os.access(existing, os.W_OK):
+        raise ValueError(f"--out must be a folder that can be written, got {folder}")
+
+
+def _say(text: str) -> None:
+    print(f"ctrlplan: {text}", file=sys.stderr, flush=True)

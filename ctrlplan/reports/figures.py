@@ -1,0 +1,232 @@
+"""Figures of plans, responses and sweeps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from ctrlplan.reports.style import legend_above, line_styles, new_figure, stacked_axes, with_unit
+from ctrlplan.studies.comparison import Comparison
+from ctrlplan.studies.linear import STEP_LIMIT, jumps
+from ctrlplan.studies.measures import MEASURES
+from ctrlplan.studies.study import Study
+from ctrlplan.studies.sweep import Sweep
+from ctrlplan.trajectories import Trajectory
+
+Array = NDArray[np.float64]
+
+DERIVATIVES = ("position", "velocity", "acceleration", "jerk", "snap")
+
+
+def plot_trajectory(plan: Trajectory, order: int = 2, units: Sequence[str] | None = None) -> Figure:
+    """Value and derivatives of one trajectory stacked, waypoints marked.
+
+    Parameters
+    ----------
+    plan : Trajectory
+        What is drawn, from a little before its start to a little after its end.
+    order : int, optional
+        Highest derivative.
+    units : sequence of str, optional
+        Units of the axes.
+    """
+    names = dict(zip(plan.labels, units, strict=True)) if units is not None else {}
+    figure = new_figure(6.4, 1.2 + 1.5 * (order + 1))
+    rows = stacked_axes(figure, order + 1)
+    t = _times(plan)
+    jet = plan.jet(t, order)
+    markers = "osD^v"
+    for k, (axes,) in enumerate(rows):
+        for a, label in enumerate(plan.labels):
+            axes.plot(t, _broken(t, jet[k, a], plan), color=f"C{a}", label=label)
+            points = [(w.time, w.jet[k, a]) for w in plan.waypoints if k < len(w.jet) and not np.isnan(w.jet[k, a])]
+            if points:
+                axes.plot(*zip(*points, strict=True), markers[a % 5], color=f"C{a}", markersize=5, mfc="white")
+        axes.set_ylabel(_derivative_label(_common(names.values()), k))
+    rows[-1][0].set_xlabel("time [s]")
+    if plan.naxes > 1:
+        legend_above(figure, rows[0][0])
+    return figure
+
+
+def plot_plans(comparison: Comparison, order: int = 2) -> Figure:
+    """References side by side: a column an axis, a row a derivative."""
+    first = next(iter(comparison.plans.values()))
+    figure = new_figure(min(6.4 + 2.0 * (first.naxes - 1), 9.0), 1.4 + 1.6 * (order + 1))
+    rows = stacked_axes(figure, order + 1, first.naxes)
+    styles = line_styles(comparison.plans)
+    start = min(p.start for p in comparison.plans.values())
+    end = max(p.end for p in comparison.plans.values())
+    t = np.unique(np.concatenate([_times(p, start, end) for p in comparison.plans.values()]))
+    for name, plan in comparison.plans.items():
+        jet = plan.jet(t, order)
+        for k, row in enumerate(rows):
+            if k and not plan.duration:
+                continue  # a step has no derivative to draw
+            for a, axes in enumerate(row):
+                axes.plot(t, _broken(t, jet[k, a], plan) if k else jet[k, a], **styles[name])
+    for k, row in enumerate(rows):
+        for a, axes in enumerate(row):
+            given = [(w.time, w.jet[k, a]) for w in comparison.waypoints if k < len(w.jet)]
+            if given:
+                axes.plot(*zip(*given, strict=True), "o", color="#444444", mfc="white", markersize=5, zorder=5)
+            axes.set_ylabel(_derivative_label(comparison.units.get(first.labels[a], ""), k, first.labels[a]))
+    for axes in rows[-1]:
+        axes.set_xlabel("time [s]")
+    legend_above(figure, rows[0][0])
+    return figure
+
+
+def plot_responses(comparison: Comparison) -> Figure:
+    """Outputs with their references, errors, and controls over time."""
+    styles = line_styles(comparison.plans)
+    outputs, controls = comparison.outputs, comparison.controls
+    figure = new_figure(7.0, 1.4 + 1.9 * (2 * len(outputs) + len(controls)))
+    rows = [axes for (axes,) in stacked_axes(figure, 2 * len(outputs) + len(controls))]
+    for name, plan in comparison.plans.items():
+        response = comparison.responses[name]
+        t = np.asarray(response.time)
+        signals = np.asarray(response.outputs).reshape(-1, t.size)
+        labels = list(response.output_labels)
+        reference = plan.jet(t, 0)[0]
+        for a, output in enumerate(outputs):
+            y = signals[labels.index(output)]
+            rows[2 * a].plot(t, reference[a], color=styles[name]["color"], linewidth=0.7, alpha=0.6)
+            rows[2 * a].plot(t, y, **styles[name])
+            rows[2 * a + 1].plot(t, reference[a] - y, **styles[name])
+        for c, control in enumerate(controls):
+            rows[2 * len(outputs) + c].plot(t, signals[labels.index(control)], **styles[name])
+    first = next(iter(comparison.plans.values()))
+    for a, output in enumerate(outputs):
+        unit = comparison.units.get(first.labels[a], comparison.units.get(output, ""))
+        rows[2 * a].set_ylabel(with_unit(output, unit))
+        rows[2 * a].set_title("output (thin: reference)", loc="left", fontsize=8)
+        rows[2 * a + 1].set_ylabel(with_unit(f"error of {output}", unit))
+    for c, control in enumerate(controls):
+        rows[2 * len(outputs) + c].set_ylabel(with_unit(control, comparison.units.get(control, "")))
+    rows[-1].set_xlabel("time [s]")
+    legend_above(figure, rows[0])
+    return figure
+
+
+def plot_sweep(sweep: Sweep, names: Sequence[str] = ("settling_time", "overshoot_error")) -> Figure:
+    """Metrics over the parameter, lines broken where a settling time jumps."""
+    styles = line_styles(sweep.metrics)
+    columns = 2 if len(names) > 1 else 1
+    figure = new_figure(4.0 * columns + 0.4, 0.8 + 2.5 * -(-len(names) // columns))
+    grid = [a for row in stacked_axes(figure, -(-len(names) // columns), columns) for a in row]
+    for name, axes in zip(names, grid, strict=False):
+        for plan, rows in sweep.metrics.items():
+            x, y = sweep.values, rows[name]
+            if name.endswith("settling_time"):
+                x, y = _with_gaps(x, y)
+            axes.plot(x, y, **styles[plan])
+        measure = MEASURES.get(name)
+        axes.set_ylabel(with_unit(measure.title, "" if "{" in measure.unit else measure.unit) if measure else name)
+        finite = np.concatenate([r[name][np.isfinite(r[name])] for r in sweep.metrics.values()])
+        if finite.size and finite.min() > 0.0 and finite.max() > 100.0 * finite.min():
+            axes.set_yscale("log")
+        if sweep.values[0] > 0.0 and sweep.values[-1] > 20.0 * sweep.values[0]:
+            axes.set_xscale("log")
+    for axes in grid[-columns:]:
+        axes.set_xlabel(sweep.parameter)
+    for axes in grid[len(names) :]:
+        axes.set_visible(False)
+    legend_above(figure, grid[0])
+    return figure
+
+
+def plot_plane(sweep: Sweep, marked: Sequence[float] = (1.0, 5.0, 20.0, 100.0, 1000.0)) -> Figure:
+    """Figure 1: the settling-time/overshoot plane, each point a gain."""
+    styles = line_styles(sweep.metrics)
+    figure = new_figure(6.8, 5.0)
+    ((axes,),) = stacked_axes(figure, 1)
+    for plan, rows in sweep.metrics.items():
+        ts, overshoot = rows["settling_time"], rows["overshoot_error"]
+        x, gap = _with_gaps(sweep.values, ts)
+        axes.plot(gap, np.interp(x, sweep.values, overshoot), linewidth=1.0, **{**styles[plan], "linestyle": "-"})
+        axes.plot(ts, overshoot, ".", color=str(styles[plan]["color"]), markersize=2.5)
+        if plan == "polynomial":
+            continue  # beside the trigonometric one: the numbers would overprint
+        aside: dict[str, Any] = {"xytext": (9, -3)} if plan == "step" else {"xytext": (3, -10)}
+        for gain in marked:
+            at = int(np.argmin(np.abs(np.log(sweep.values / gain))))
+            axes.plot(ts[at], overshoot[at], "o", color=str(styles[plan]["color"]), mfc="white", markersize=5)
+            axes.annotate(f"{gain:g}", (ts[at], overshoot[at]), textcoords="offset points", fontsize=7.5, **aside)
+    axes.plot(*STEP_LIMIT, "*", color="#E69F00", markersize=13, label="limit of the step, k → ∞", zorder=5)
+    axes.set_xlabel("settling time ±2 % [s]")
+    axes.set_ylabel("overshoot on the error [%]")
+    axes.set_xlim(left=0.0)
+    axes.set_ylim(-3.0, 108.0)
+    axes.set_title("numbers at the circles: gain k", loc="left", fontsize=8)
+    legend_above(figure, axes)
+    return figure
+
+
+FIGURES: dict[str, tuple[Callable[[Study], Figure], str]] = {
+    "plane": (
+        lambda study: plot_plane(_sweep(study)),
+        "Settling time against overshoot on the error as the gain runs from 0.25 to 1000 (figure 1 of the paper). "
+        "Curves are broken where the settling time jumps.",
+    ),
+    "gain": (
+        lambda study: plot_sweep(_sweep(study), ("settling_time", "overshoot_error", "control_peak", "control_effort")),
+        "The same over the gain, with what each reference asks of the control: its peak and its effort ∫u² dt.",
+    ),
+    "plans": (
+        lambda study: plot_plans(study.comparison),
+        "The references and their derivatives; circles are prescribed values.",
+    ),
+    "responses": (
+        lambda study: plot_responses(study.comparison),
+        "What the loop does with each reference: output, error and control.",
+    ),
+}
+"""Figures that a study may ask for: how they are drawn, and their caption."""
+
+
+def _sweep(study: Study) -> Sweep:
+    if study.sweep is None:
+        raise ValueError(f"study {study.name} must have a sweep for this figure, got none")
+    return study.sweep
+
+
+def _times(plan: Trajectory, start: float | None = None, end: float | None = None) -> Array:
+    """Times that show a trajectory: close, beyond its ends, and on both sides of every breakpoint."""
+    first, last = plan.start if start is None else start, plan.end if end is None else end
+    margin = 0.06 * (last - first) or 0.5
+    t = np.linspace(first - margin, last + margin, 1001)
+    return np.unique(np.concatenate([t, plan.breakpoints, np.nextafter(plan.breakpoints, -np.inf)]))
+
+
+def _broken(t: Array, values: Array, plan: Trajectory) -> Array:
+    """Values with a gap where a derivative jumps, so that no line is drawn through the jump."""
+    out = values.copy()
+    span = np.ptp(values) or 1.0
+    for moment in plan.breakpoints:
+        after = int(np.searchsorted(t, moment))
+        if 0 < after < t.size and abs(values[after] - values[after - 1]) > 1e-3 * span:
+            out[after - 1] = np.nan
+    return out
+
+
+def _with_gaps(x: Array, y: Array) -> tuple[Array, Array]:
+    """Curve with a nan where a settling time jumps."""
+    where = np.flatnonzero(jumps(x, y)) + 1
+    return np.insert(x, where, np.sqrt(x[where - 1] * x[where])), np.insert(y, where, np.nan)
+
+
+def _derivative_label(unit: str, order: int, name: str = "") -> str:
+    word = DERIVATIVES[order] if order < len(DERIVATIVES) else f"derivative {order}"
+    suffix = ("" if order == 0 else "/s" if order == 1 else f"/s$^{order}$") if unit or order else ""
+    label = f"{name} {word}".strip() if name not in ("", "y") else word
+    return with_unit(label, f"{unit or '1'}{suffix}" if suffix or unit else "")
+
+
+def _common(units: Any) -> str:
+    found = set(units)
+    return found.pop() if len(found) == 1 else ""

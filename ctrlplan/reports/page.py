@@ -1,0 +1,163 @@
+"""One self-contained HTML page, and its data as JSON."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import platform
+import tempfile
+from collections.abc import Sequence
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
+from markupsafe import Markup
+
+import ctrlplan
+from ctrlplan.reports.figures import FIGURES
+from ctrlplan.reports.style import COLOURS, to_svg
+from ctrlplan.reports.words import number, summary, unit_of, verdicts
+from ctrlplan.studies.comparison import Comparison
+from ctrlplan.studies.measures import MEASURES
+from ctrlplan.studies.study import Study
+
+
+def write_page(studies: Sequence[Study], path: str | os.PathLike[str], title: str) -> Path:
+    """Write studies as one HTML page that opens offline.
+
+    Parameters
+    ----------
+    studies : sequence of Study
+        Sections of the page.
+    path : str or path
+        The file, or a folder for ``index.html`` in it.
+    title : str
+        Heading.
+
+    Returns
+    -------
+    pathlib.Path
+        The file written.
+
+    Raises
+    ------
+    OSError
+        If it cannot be written; nothing is left behind.
+    """
+    target = Path(path)
+    if target.suffix not in (".html", ".htm"):
+        target = target / "index.html"
+    return write_all({target: render_page(studies, title)})[0]
+
+
+def write_report(studies: Sequence[Study], folder: str | os.PathLike[str], title: str) -> list[Path]:
+    """Write ``index.html`` and ``results.json`` into a folder, which is made if need be.
+
+    Raises
+    ------
+    OSError
+        If the folder cannot be written; nothing is left behind.
+    """
+    target = Path(folder)
+    results = {"studies": {study.name: study.results() for study in studies}}
+    return write_all(
+        {
+            target / "index.html": render_page(studies, title),
+            target / "results.json": json.dumps(results, indent=1, allow_nan=False) + "\n",
+        }
+    )
+
+
+def write_all(texts: dict[Path, str]) -> list[Path]:
+    """Write files all or none: each beside its place first, then moved there."""
+    staged: list[tuple[str, Path]] = []
+    try:
+        for path, text in texts.items():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+            staged.append((name, path))
+            with os.fdopen(handle, "w", encoding="utf-8") as file:
+                file.write(text)
+            os.chmod(name, 0o644)
+        for name, path in staged:
+            os.replace(name, path)
+    except OSError:
+        for name, _ in staged:
+            Path(name).unlink(missing_ok=True)
+        raise
+    return [path for _, path in staged]
+
+
+def render_page(studies: Sequence[Study], title: str) -> str:
+    """The page as text."""
+    return _template("page.html").render(
+        title=title,
+        sections=[_section(study) for study in studies],
+        versions=_versions(),
+    )
+
+
+def comparison_fragment(comparison: Comparison) -> str:
+    """Metrics table and verdict for a notebook cell."""
+    table = _table(comparison)
+    return _template("fragment.html").render(title=comparison.title, table=table, summary=summary(comparison))
+
+
+def _template(name: str) -> Any:
+    environment = Environment(
+        loader=PackageLoader("ctrlplan.reports", "templates"),
+        autoescape=select_autoescape(),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template(name)
+
+
+def _section(study: Study) -> dict[str, Any]:
+    comparison = study.comparison
+    figures = []
+    for key in study.figures:
+        draw, caption = FIGURES[key]
+        svg = to_svg(draw(study), f"{study.name}-{key}")
+        figures.append({"key": key, "svg": Markup(svg), "caption": caption})  # noqa: S704 (our own drawing)
+    return {
+        "name": study.name,
+        "title": study.title,
+        "summary": study.summary,
+        "notes": study.notes,
+        "verdict": summary(comparison),
+        "verdicts": [v.sentence for v in verdicts(comparison)],
+        "table": _table(comparison),
+        "figures": figures,
+        "parameters": {k: str(v) for k, v in comparison.parameters.items()},
+    }
+
+
+def _table(comparison: Comparison) -> dict[str, Any]:
+    """Rows of the metrics: cells with a number to sort by, a text, and whether it wins or loses."""
+    decided = {v.key: v for v in verdicts(comparison)}
+    rows = []
+    for key, measure in MEASURES.items():
+        if not any(key in found for found in comparison.metrics.values()):
+            continue
+        verdict = decided.get(key)
+        cells = []
+        for plan, found in comparison.metrics.items():
+            value = found.get(key, math.nan)
+            mark = "" if verdict is None else "win" if plan in verdict.winners else ""
+            if verdict is not None and plan in verdict.losers:
+                mark = "lose"
+            order = "" if math.isnan(value) else "1e999" if math.isinf(value) else repr(value)
+            cells.append({"text": number(value), "order": order, "mark": mark})
+        rows.append({"title": measure.title, "unit": unit_of(comparison, key) or "", "cells": cells})
+    plans = [{"name": plan, "colour": COLOURS.get(plan, "#7F7F7F")} for plan in comparison.metrics]
+    return {"plans": plans, "rows": rows}
+
+
+def _versions() -> dict[str, str]:
+    packages = ("control", "numpy", "scipy", "matplotlib")
+    found = {"ctrlplan": ctrlplan.__version__, "Python": platform.python_version()}
+    return found | {name: metadata.version(name) for name in packages}

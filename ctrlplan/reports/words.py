@@ -1,0 +1,125 @@
+"""Verdicts: which plan wins and which loses, metric by metric, in words."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from ctrlplan.studies.comparison import Comparison
+from ctrlplan.studies.measures import MEASURES
+
+TIE = 1e-3
+"""Relative difference below which two values count as equal."""
+
+_NOTHING = 1e-9
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Winner and loser in one metric.
+
+    Attributes
+    ----------
+    key, title, unit : str
+        The metric.
+    winners, losers : tuple of str
+        Plans with the least and the greatest value, ties included; both empty
+        where all are equal.
+    least, greatest : float
+        Their values.
+    sentence : str
+        The same in words.
+    """
+
+    key: str
+    title: str
+    unit: str
+    winners: tuple[str, ...]
+    losers: tuple[str, ...]
+    least: float
+    greatest: float
+    sentence: str
+
+
+def verdicts(comparison: Comparison) -> list[Verdict]:
+    """Winner and loser of every metric that at least two plans define."""
+    found = []
+    for key, measure in MEASURES.items():
+        values = {plan: rows[key] for plan, rows in comparison.metrics.items() if key in rows}
+        values = {plan: value for plan, value in values.items() if not math.isnan(value)}
+        if len(values) > 1:
+            found.append(_verdict(key, measure.title, unit_of(comparison, key), values))
+    return found
+
+
+def summary(comparison: Comparison) -> str:
+    """How often each plan wins and loses, in one paragraph."""
+    decided = [v for v in verdicts(comparison) if v.winners]
+    if not decided:
+        return "No metric tells the plans apart."
+    parts = []
+    for plan in comparison.plans:
+        wins = sum(plan in v.winners for v in decided)
+        losses = sum(plan in v.losers for v in decided)
+        parts.append(f"{plan} is best in {wins} and worst in {losses}")
+    sentence = "; ".join(parts)
+    return f"Of {len(decided)} metrics that tell the plans apart, {sentence}. Values within 0.1 % count as equal."
+
+
+def unit_of(comparison: Comparison, key: str) -> str:
+    """Unit of a metric in the units of a comparison; empty where it has none."""
+    first = next(iter(comparison.plans.values()))
+    y = _shared([comparison.units.get(label, "") for label in first.labels])
+    u = _shared([comparison.units.get(name, "") for name in comparison.controls])
+    unit = MEASURES[key].unit
+    if "{y}" in unit:
+        unit = unit.replace("{y}", y) if y else ""
+    if "{u}" in unit:
+        unit = unit.replace("{u}", u) if u else ""
+    return unit.replace("^2", "²").replace("^5", "⁵")
+
+
+def number(value: float) -> str:
+    """Four significant digits; words for what is infinite or undefined."""
+    if math.isnan(value):
+        return "–"
+    if math.isinf(value):
+        return "never" if value > 0 else "−∞"
+    if abs(value) < _NOTHING:
+        return "0"
+    if 1e-3 <= abs(value) < 1e5:
+        digits = max(0, 3 - math.floor(math.log10(abs(value))))
+        return f"{value:.{digits}f}".replace("-", "−")
+    mantissa, exponent = f"{value:.3e}".split("e")
+    return f"{mantissa}·10^{int(exponent)}".replace("-", "−")
+
+
+def _verdict(key: str, title: str, unit: str, values: dict[str, float]) -> Verdict:
+    least, greatest = min(values.values()), max(values.values())
+    if _equal(least, greatest):
+        sentence = f"{title}: no difference between {_listed(tuple(values))}."
+        return Verdict(key, title, unit, (), (), least, greatest, sentence)
+    winners = tuple(plan for plan, value in values.items() if _equal(value, least))
+    losers = tuple(plan for plan, value in values.items() if _equal(value, greatest))
+    with_unit = f" {unit}" if unit else ""
+    verb, lose = ("wins" if len(winners) == 1 else "win"), ("loses" if len(losers) == 1 else "lose")
+    worst = number(greatest) + (with_unit if math.isfinite(greatest) else "")
+    best = number(least) + with_unit
+    sentence = f"{title}: {_listed(winners)} {verb} with {best}, {_listed(losers)} {lose} with {worst}"
+    if least > _NOTHING and math.isfinite(greatest) and greatest / least >= 1.05:
+        sentence += f" ({greatest / least:.3g} times)"
+    return Verdict(key, title, unit, winners, losers, least, greatest, sentence + ".")
+
+
+def _equal(one: float, other: float) -> bool:
+    if math.isinf(one) or math.isinf(other):
+        return one == other
+    return abs(one - other) <= max(TIE * max(abs(one), abs(other)), _NOTHING)
+
+
+def _listed(names: tuple[str, ...]) -> str:
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
+
+
+def _shared(units: list[str]) -> str:
+    return units[0] if units and len(set(units)) == 1 else ""

@@ -1,0 +1,294 @@
+"""A user's own study, stated in a TOML file."""
+
+from __future__ import annotations
+
+import importlib
+import io
+import json
+import os
+import sys
+import tomllib
+from collections.abc import Collection
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ctrlplan.studies.comparison import compare, standard_plans
+from ctrlplan.studies.study import Study
+from ctrlplan.systems.plants import unity_feedback_loop
+from ctrlplan.trajectories import PiecewiseSpline, PolySpline, Step, Trajectory, TrigSpline, Waypoint, derivative_name
+
+FAMILIES = {
+    "trigonometric": (TrigSpline, ("alpha", "gamma", "degree", "smooth")),
+    "polynomial": (PolySpline, ("degree", "smooth")),
+    "piecewise": (PiecewiseSpline, ("alpha",)),
+    "step": (Step, ()),
+}
+"""Families of plans by name, and the choices that each takes."""
+
+LOOPS = {"linear": ("num", "den", "gain")}
+"""Kinds of loops by name, and the entries that each takes; and "python:module:function"."""
+
+
+class StudyError(ValueError):
+    """A study file is wrong: one line says what must hold, what was given and where."""
+
+
+@dataclass(frozen=True)
+class StudyFile:
+    """What a study file states.
+
+    Attributes
+    ----------
+    path : pathlib.Path
+        The file.
+    name, title : str
+        Key and heading.
+    t_end : float
+        Time at which the runs end [s].
+    samples : int
+        Number of sample times.
+    waypoints : tuple of Waypoint
+        What the plans meet.
+    plans : dict of str to Trajectory
+        The plans by name.
+    loop : dict
+        The table [loop].
+    units : dict of str to str
+        Units by label.
+    """
+
+    path: Path
+    name: str
+    title: str
+    t_end: float
+    samples: int
+    waypoints: tuple[Waypoint, ...]
+    plans: dict[str, Trajectory]
+    loop: dict[str, Any]
+    units: dict[str, str] = field(default_factory=dict)
+
+    def run(self) -> Study:
+        """Simulate and measure.
+
+        Raises
+        ------
+        StudyError
+            If the loop does not fit the plans.
+        """
+        timepts = np.linspace(self.waypoints[0].time, self.t_end, self.samples)
+        timepts = np.union1d(timepts, [w.time for w in self.waypoints])
+        try:
+            comparison = compare(
+                build_loop(self.loop, self.path),
+                self.plans,
+                timepts,
+                waypoints=self.waypoints,
+                units=self.units,
+                title=self.title,
+                parameters=self.parameters(),
+            )
+        except StudyError:
+            raise
+        except (ValueError, TypeError) as error:
+            raise StudyError(f"{self.path}: loop: {error}") from error
+        return Study(self.name, self.title, comparison, notes=comparison.notes)
+
+    def parameters(self) -> dict[str, object]:
+        """What the report says about how it was made."""
+        loop = {f"loop {key}": value for key, value in self.loop.items()}
+        plans: dict[str, object] = {f"plan {name}": _described(plan) for name, plan in self.plans.items()}
+        points: dict[str, object] = {f"waypoint {i}": repr(w) for i, w in enumerate(self.waypoints)}
+        run = f"{self.waypoints[0].time:g} to {self.t_end:g} s, {self.samples} samples"
+        return loop | plans | points | {"run": run}
+
+
+def load_study(path: str | os.PathLike[str]) -> StudyFile:
+    """Read and check a study file; nothing is simulated.
+
+    Parameters
+    ----------
+    path : str or path
+        A TOML file; see the README for its entries.
+
+    Returns
+    -------
+    StudyFile
+
+    Raises
+    ------
+    StudyError
+        With one line: what must hold, what was given, where.
+    """
+    source = Path(path)
+    try:
+        data = tomllib.loads(source.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise StudyError(f"{source}: a study file must exist, got no such file") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise StudyError(f"{source}: a study file must be readable, got {error}") from None
+    except tomllib.TOMLDecodeError as error:
+        raise StudyError(f"{source}: must be valid TOML, got {error}") from None
+    reader = _Reader(source)
+    reader.known(data, ("title", "t_end", "samples", "units", "loop", "plans", "waypoints"), "the file")
+    waypoints = reader.waypoints(data)
+    t_end = reader.number(data, "t_end", "t_end", default=None)
+    if not t_end > waypoints[-1].time:
+        raise reader.error("t_end", f"must be after the last waypoint at {waypoints[-1].time:g} s, got {t_end:g}")
+    loop = reader.table(data, "loop")
+    _checked_loop(loop, reader)
+    samples = reader.number(data, "samples", "samples", default=4001.0)
+    if samples != int(samples) or not 2 <= samples <= 10_000_000:
+        raise reader.error("samples", f"must be a whole number from 2 to 10000000, got {samples:g}")
+    title = data.get("title", source.stem)
+    if not isinstance(title, str):
+        raise reader.error("title", f"must be a string, got {title!r}")
+    units = {k: str(v) for k, v in reader.table(data, "units", needed=False).items()}
+    plans = reader.plans(data, waypoints)
+    return StudyFile(source, source.stem, title, t_end, int(samples), waypoints, plans, loop, units)
+
+
+def build_loop(table: dict[str, Any], path: Path) -> Any:
+    """Loop that the table [loop] asks for.
+
+    Raises
+    ------
+    StudyError
+        If it cannot be built.
+    """
+    kind = table["kind"]
+    if kind == "linear":
+        try:
+            return unity_feedback_loop(table["num"], table["den"], table.get("gain", 1.0), outputs=("y", "u"))
+        except (ValueError, TypeError) as error:
+            raise StudyError(f"{path}: loop: {error}") from None
+    _, module, function = kind.split(":")
+    sys.path.insert(0, str(path.resolve().parent))
+    try:
+        return getattr(importlib.import_module(module), function)()
+    except (ImportError, AttributeError) as error:
+        raise StudyError(f"{path}: loop.kind must name a module and a function in it, got {kind!r}: {error}") from None
+    finally:
+        sys.path.pop(0)
+
+
+def plans_as_json(study: StudyFile) -> str:
+    """Plans of a study as JSON text: each by name, for `trajectory_from_dict`."""
+    return json.dumps({name: plan.to_dict() for name, plan in study.plans.items()}, indent=1, allow_nan=False) + "\n"
+
+
+def plans_as_csv(study: StudyFile, order: int = 2) -> str:
+    """Samples of all plans as one table: time, then plan.axis with its derivatives."""
+    times = np.linspace(study.waypoints[0].time, study.waypoints[-1].time, 1001)
+    times = np.union1d(times, [w.time for w in study.waypoints])
+    names, rows = ["time"], [times]
+    for name, plan in study.plans.items():
+        names += [f"{name}.{derivative_name(label, k)}" for label in plan.labels for k in range(order + 1)]
+        rows += list(plan.jet(times, order).transpose(1, 0, 2).reshape(-1, times.size))
+    table = io.StringIO()
+    np.savetxt(table, np.array(rows).T, fmt="%.17g", delimiter=",", header=",".join(names), comments="")
+    return table.getvalue()
+
+
+class _Reader:
+    """Checks entries of one file, naming the place in every error."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def error(self, place: str, message: object) -> StudyError:
+        return StudyError(f"{self.path}: {place}: {message}")
+
+    def known(self, table: dict[str, Any], names: Collection[str], place: str) -> None:
+        for key in table:
+            if key not in names:
+                raise self.error(place, f"entries must be among {', '.join(names)}, got {key!r}")
+
+    def table(self, data: dict[str, Any], key: str, needed: bool = True) -> dict[str, Any]:
+        found = data.get(key)
+        if found is None and not needed:
+            return {}
+        if not isinstance(found, dict):
+            raise self.error(key, f"must be a table [{key}], got {'none' if found is None else repr(found)}")
+        return found
+
+    def tables(self, data: dict[str, Any], key: str) -> list[dict[str, Any]]:
+        found = data.get(key, [])
+        if not isinstance(found, list) or not all(isinstance(t, dict) for t in found):
+            raise self.error(key, f"must be tables [[{key}]], got {found!r}")
+        return found
+
+    def number(self, table: dict[str, Any], key: str, place: str, default: float | None) -> float:
+        value = table.get(key, default)
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value):
+            raise self.error(place, f"must be a finite number, got {'none' if value is None else repr(value)}")
+        return float(value)
+
+    def waypoints(self, data: dict[str, Any]) -> tuple[Waypoint, ...]:
+        points = []
+        for i, table in enumerate(self.tables(data, "waypoints")):
+            place = f"waypoints[{i}]"
+            time = self.number(table, "time", f"{place}.time", default=None)
+            jets = {}
+            for label, jet in table.items():
+                if label == "time":
+                    continue
+                if not isinstance(jet, list) or not all(
+                    isinstance(v, (int, float)) and not isinstance(v, bool) for v in jet
+                ):
+                    raise self.error(f"{place}.{label}", f"must be numbers [position, velocity, ...], got {jet!r}")
+                jets[label] = jet
+            try:
+                points.append(Waypoint.from_jets(time, **jets))
+            except ValueError as error:
+                raise self.error(place, error) from None
+        try:
+            return PolySpline(points).waypoints
+        except ValueError as error:
+            raise self.error("waypoints", error) from None
+
+    def plans(self, data: dict[str, Any], waypoints: tuple[Waypoint, ...]) -> dict[str, Trajectory]:
+        plans: dict[str, Trajectory] = {}
+        for i, table in enumerate(self.tables(data, "plans")):
+            place = f"plans[{i}]"
+            family = table.get("family", table.get("name"))
+            if family not in FAMILIES:
+                raise self.error(f"{place}.family", f"must be one of {', '.join(FAMILIES)}, got {family!r}")
+            name = table.get("name", family)
+            if not isinstance(name, str) or not name or name in plans:
+                raise self.error(f"{place}.name", f"must be a name of its own, got {name!r}")
+            kind, choices = FAMILIES[family]
+            self.known(table, ("name", "family", *choices), place)
+            chosen = {key: table[key] for key in choices if key in table}
+            try:
+                if kind is Step:
+                    plans[name] = standard_plans(waypoints)["step"]
+                elif kind is TrigSpline and "alpha" not in chosen:
+                    raise ValueError("a trigonometric plan needs alpha, a number in [0, 2 pi), got none")
+                else:
+                    plans[name] = kind(waypoints, **chosen)
+            except (ValueError, TypeError) as error:
+                raise self.error(place, error) from None
+        return plans or standard_plans(waypoints)
+
+
+def _checked_loop(loop: dict[str, Any], reader: _Reader) -> None:
+    kind = loop.get("kind")
+    if isinstance(kind, str) and kind.startswith("python:") and kind.count(":") == 2:
+        reader.known(loop, ("kind",), "loop")
+        return
+    if kind not in LOOPS:
+        kinds = ", ".join([*LOOPS, '"python:module:function"'])
+        raise reader.error("loop.kind", f"must be one of {kinds}, got {kind!r}")
+    reader.known(loop, ("kind", *LOOPS[kind]), "loop")
+    for key in ("num", "den"):
+        if key not in loop:
+            raise reader.error(f"loop.{key}", "must be coefficients, highest power first, got none")
+    build_loop(loop, reader.path)
+
+
+def _described(plan: Trajectory) -> str:
+    shape = f", alpha = {plan.alpha:g} rad" if isinstance(plan, (TrigSpline, PiecewiseSpline)) else ""
+    return f"{type(plan).__name__}{shape}, {plan.start:g} to {plan.end:g} s"

@@ -1,0 +1,143 @@
+"""What metrics take a signal for between its samples: exact where it can be, sane where it cannot."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ctrlplan import metrics
+
+UNEVEN = np.array([-1.0, -0.7, 0.1, 0.3, 0.9, 1.0, 1.8, 2.5])
+
+
+@pytest.mark.parametrize("count", [4, 5, 6, 8])
+def test_a_cubic_is_exact_on_uneven_samples(count):
+    """x^3 - x over the first samples: turns at -+1/sqrt 3, roots at -1, 0, 1."""
+    t = UNEVEN[:count]
+    end = t[-1]
+    turn = 1 / np.sqrt(3)
+    knots = np.array([-1, -turn, *([turn] if end > turn else []), end])
+    cubic = knots**3 - knots
+    assert metrics.total_variation(t, t**3 - t) == pytest.approx(np.abs(np.diff(cubic)).sum(), rel=1e-13)
+    assert metrics.peak(t, t**3 - t) == pytest.approx(np.abs(cubic).max(), rel=1e-13)
+    roots = np.array([-1, 0, *([1] if end > 1 else []), end])
+    primitive = roots**4 / 4 - roots**2 / 2
+    assert metrics.iae(t, t**3 - t) == pytest.approx(np.abs(np.diff(primitive)).sum(), rel=1e-13)
+    square = np.polynomial.Polynomial([0, -1, 0, 1]) ** 2
+    assert metrics.ise(t, t**3 - t) == pytest.approx(square.integ()(end) - square.integ()(-1), rel=1e-13)
+
+
+def test_minimum_jerk_has_its_constants():
+    """The quintic of unit way and time: acceleration up to 10/sqrt 3, integral of the squared jerk 720."""
+    t = np.linspace(0, 1, 12)
+    acceleration = 60 * t - 180 * t**2 + 120 * t**3
+    assert metrics.peak(t, acceleration) == pytest.approx(10 / np.sqrt(3), rel=1e-14)
+    assert metrics.total_variation(t, acceleration) == pytest.approx(40 / np.sqrt(3), rel=1e-14)
+    assert metrics.iae(t, acceleration) == pytest.approx(2 * 15 / 8, rel=1e-14)
+    assert metrics.jerk_cost(t, 60 - 360 * t + 360 * t**2) == pytest.approx(720, rel=1e-14)
+
+
+def test_three_samples_are_a_parabola_and_two_a_line():
+    assert metrics.peak([0, 1, 2], [0.0, 3.0, 2.0]) == pytest.approx(3.125, rel=1e-15)
+    assert metrics.ise([0, 1, 3], [0.0, 1.0, 9.0]) == pytest.approx(3**5 / 5, rel=1e-14)
+    assert metrics.ise([0, 2], [0.0, 2.0]) == pytest.approx(8 / 3, rel=1e-15)
+    assert metrics.iae([0, 4], [-1.0, 3.0]) == pytest.approx(5.0, rel=1e-15)
+    assert metrics.settling_time([0, 1], [0.0, 1.0], 1, 0) == np.inf
+
+
+@pytest.mark.parametrize("at", range(1, 20))
+def test_a_jump_costs_what_the_samples_say(at):
+    """No swing beside the jump; the integrals are the trapezoidal rule's."""
+    t = np.arange(20.0)
+    y = np.where(t >= at, 3.0, -1.0)
+    assert metrics.total_variation(t, y) == 4.0
+    assert metrics.peak(t, y) == 3.0
+    assert metrics.overshoot(t, y, 3, -1) == 0.0
+    assert metrics.lag(t, y, 3, -1) == 100.0
+    assert metrics.iae(t, y) == pytest.approx(np.trapezoid(np.abs(y), t), rel=1e-14)
+    assert metrics.ise(t, y) == pytest.approx(np.trapezoid(y**2, t), rel=1e-14)
+    assert metrics.path_length(t, [y, -y]) == pytest.approx(4 * np.sqrt(2), rel=1e-14)
+    settled = metrics.settling_time(t, y, 3, -1)
+    assert at - 1 < settled <= at if at < 19 else settled == np.inf
+
+
+def test_a_jump_between_smooth_parts_spoils_neither():
+    """A control that kicks at t = 5 and decays: jump interval apart, fourth order on either side."""
+    t = np.linspace(0, 10, 1001)
+    u = np.where(t < 5, np.sin(t), 4 * np.exp(-(t - 5)))
+    last = np.sin(4.99)
+    smooth = 2 + (1 + np.cos(4.99)) + 4 * (1 - np.exp(-5))
+    assert metrics.iae(t, u) == pytest.approx(smooth + 0.01 * (4 + abs(last)) / 2, abs=2e-8)
+    assert metrics.peak(t, u) == 4.0
+    swings = 1 + 2 + (1 + last) + (4 - last) + 4 * (1 - np.exp(-5))
+    assert metrics.total_variation(t, u) == pytest.approx(swings, abs=2e-8)
+
+
+@pytest.mark.parametrize("shift", np.linspace(0, 1, 11))
+def test_a_kink_is_not_passed(shift):
+    """A ramp that ends in a hold, whatever the place of the corner between two samples."""
+    t = np.arange(15.0)
+    y = np.minimum(t, 7 + shift)
+    assert metrics.peak(t, y) == pytest.approx(7 + shift, rel=1e-15)
+    assert metrics.total_variation(t, y) == pytest.approx(7 + shift, rel=1e-15)
+    area = (7 + shift) ** 2 / 2 + (7 + shift) * (7 - shift)
+    sampled = np.trapezoid(y, t)
+    assert abs(metrics.iae(t, y) - area) <= abs(sampled - area) + 1e-12
+
+
+@pytest.mark.parametrize("shift", np.linspace(0, 1, 21))
+def test_a_ramp_out_of_a_slow_curve_does_not_bend_it(shift):
+    """Monotone on both sides of a corner between two samples, so that the way is the rise."""
+    t = np.arange(15.0)
+    y = 1e-6 * t**3 + 10 * np.maximum(t - 6 - shift, 0)
+    assert metrics.total_variation(t, y) == pytest.approx(y[-1], rel=1e-12)
+
+
+@pytest.mark.parametrize("shift", np.linspace(0, 1, 21))
+@pytest.mark.parametrize("held", [1, 2, 3])
+def test_a_hold_at_either_end_of_a_record_stays_a_hold(held, shift):
+    t = np.arange(15.0)
+    y = np.maximum(t - held - shift, 0)
+    assert metrics.total_variation(t, y) == pytest.approx(y[-1], rel=1e-12)
+    assert metrics.total_variation(t, y[::-1]) == pytest.approx(y[-1], rel=1e-12)
+
+
+@pytest.mark.parametrize("amplitude", [1.1, 1.5, 2.0, 3.0])
+def test_a_clipped_sine_stays_at_its_limit(amplitude):
+    t = np.linspace(0.3, 20, 400)
+    u = np.clip(amplitude * np.sin(t), -1, 1)
+    assert 1.0 <= metrics.peak(t, u) <= 1.001
+
+
+values = st.integers(-1000, 1000).map(lambda i: i / 8)
+records = st.lists(values, min_size=2, max_size=30)
+steps = st.lists(st.integers(1, 16).map(lambda i: i / 16), min_size=29, max_size=29)
+
+
+@given(records, steps)
+def test_any_record_stays_within_sane_bounds(record, spacing):
+    t, f = np.cumsum(spacing)[: len(record) - 1], np.array(record)
+    t = np.concatenate([[0.0], t])
+    top, duration = np.abs(f).max(), t[-1]
+    peak, variation = metrics.peak(t, f), metrics.total_variation(t, f)
+    tiny = 1e-12 * (1 + top)
+    assert top <= peak
+    assert peak <= np.abs(f[[0, -1]]).max() + variation + tiny
+    assert variation >= np.abs(np.diff(f)).sum() - len(f) * tiny
+    iae, ise = metrics.iae(t, f), metrics.ise(t, f)
+    assert iae <= duration * peak + tiny * (1 + duration)
+    assert ise <= duration * peak**2 * (1 + 1e-12) + tiny
+    assert iae**2 <= duration * ise * (1 + 1e-12) + tiny
+    assert 0 <= metrics.itae(t, f) <= duration * iae * (1 + 1e-12) + tiny
+    assert metrics.path_length(t, f) == pytest.approx(variation, rel=1e-9, abs=1e-9)
+    assert 0 <= metrics.saturation_time(t, f, -10, 20) <= duration + 1e-12
+
+
+@given(st.lists(st.integers(-100, 100), min_size=1, max_size=8), st.integers(3, 6))
+def test_any_staircase_is_what_its_samples_say(levels, width):
+    f = np.repeat(np.array(levels, dtype=float), width)
+    t = np.arange(f.size) / 4
+    assert metrics.peak(t, f) == np.abs(f).max()
+    assert metrics.total_variation(t, f) == pytest.approx(np.abs(np.diff(f)).sum(), rel=1e-14)
+    assert metrics.iae(t, f) == pytest.approx(np.trapezoid(np.abs(f), t), rel=1e-13)
+    assert metrics.effort(t, f) == pytest.approx(np.trapezoid(f**2, t), rel=1e-13)

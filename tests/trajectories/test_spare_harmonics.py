@@ -1,0 +1,130 @@
+"""More harmonics than constraints: the spare ones minimise int (y^(k))^2."""
+
+import numpy as np
+import pytest
+from scipy.linalg import null_space
+from trajectory_oracle import miss, waypoints
+
+from ctrlplan.trajectories import PolySpline, TrigSpline
+
+NODES, WEIGHTS = np.polynomial.legendre.leggauss(60)
+
+DATA = {
+    "rest to rest": ([0.0, 2.0], [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]),
+    "through points": ([1.0, 1.7, 2.0, 4.0], [[0.0, 0.0, 0.0], [2.0], [1.0, -1.0], [0.5, 0.0, 0.0]]),
+    "velocity free": ([0.0, 1.0, 3.0], [[0.0, 0.0, 0.0], [2.0, None, 1.0], [1.0, 0.0]]),
+}
+
+
+def functions(t, nu, degree, alpha, start, duration, gamma):
+    """Harmonics of (2), or Legendre polynomials: (size, ntime)."""
+    if not alpha:
+        x = 2 * (np.asarray(t) - start) / duration - 1
+        series = [np.polynomial.Legendre.basis(j).deriv(nu) for j in range(degree + 1)]
+        return np.array([s(x) for s in series]) * (2 / duration) ** nu
+    rate = alpha / duration
+    tau = rate * (np.asarray(t) - start)
+    rows = [np.full(tau.shape, float(nu == 0))]
+    for k in range(1, degree):
+        rows += [(k * rate) ** nu * f(k * tau + nu * np.pi / 2) for f in (np.cos, np.sin)]
+    rows.append((degree * rate) ** nu * np.sin(degree * (tau - gamma) + nu * np.pi / 2))
+    return np.array(rows)
+
+
+def least(times, jets, degree, alpha, smooth):
+    """Naive: particular solution plus null space, quadrature of the derivative, least squares. Jet function and cost."""
+    start, duration = times[0], times[-1] - times[0]
+    given = [(t, k, v) for t, jet in zip(times, jets, strict=True) for k, v in enumerate(jet) if v is not None]
+    gamma = alpha * (np.mean([t for t, _, _ in given]) - start) / duration
+    space = (degree, alpha, start, duration, gamma)
+    rows = np.array([functions(t, k, *space) for t, k, _ in given])
+    particular = np.linalg.lstsq(rows, np.array([v for _, _, v in given]), rcond=None)[0]
+    free = null_space(rows)
+    quadrature = start + 0.5 * duration * (NODES + 1)
+    weighted = np.sqrt(0.5 * duration * WEIGHTS) * functions(quadrature, smooth, *space)
+    spare = np.linalg.lstsq(weighted.T @ free, -weighted.T @ particular, rcond=None)[0]
+    best = particular + free @ spare
+    return (lambda t, nu: best @ functions(t, nu, *space)), np.sum((weighted.T @ best) ** 2)
+
+
+def cost(plan, smooth):
+    t = plan.start + 0.5 * plan.duration * (NODES + 1)
+    return 0.5 * plan.duration * WEIGHTS @ plan(t, smooth) ** 2
+
+
+@pytest.mark.parametrize("smooth", [1, 2, 3, 4])
+@pytest.mark.parametrize("alpha", [0.0, 2.0, 4.0, 5.5])
+@pytest.mark.parametrize("data", DATA)
+@pytest.mark.parametrize("extra", [1, 3])
+def test_least_squares_on_the_null_space(data, alpha, smooth, extra):
+    times, jets = DATA[data]
+    count = sum(v is not None for jet in jets for v in jet)
+    degree = (count + 1) // 2 + extra if alpha else count - 1 + 2 * extra
+    points = waypoints(times, jets)
+    options = {"degree": degree, "smooth": smooth}
+    plan = TrigSpline(points, alpha=alpha, **options) if alpha else PolySpline(points, **options)
+    exact, smallest = least(times, jets, degree, alpha, smooth)
+    assert plan.degree == (degree,)
+    assert miss(plan) <= 1e-12
+    assert cost(plan, smooth) == pytest.approx(smallest, rel=1e-9)
+    t = np.linspace(plan.start, plan.end, 41)
+    for nu in range(3):
+        values = exact(t, nu)
+        np.testing.assert_allclose(plan(t, nu), values, rtol=0, atol=1e-8 * np.abs(values).max())
+
+
+@pytest.mark.parametrize("alpha", [0.0, 3.0])
+def test_every_change_that_keeps_the_waypoints_costs_more(alpha):
+    """The cost is quadratic: least where both directions of every free function raise it alike."""
+    times, jets = DATA["through points"]
+    degree, smooth = (7 if alpha else 12), 3
+    plan = TrigSpline(waypoints(times, jets), alpha=alpha, degree=degree, smooth=smooth)
+    given = [(t, k) for t, jet in zip(times, jets, strict=True) for k in range(len(jet))]
+    gamma = alpha * (np.mean([t for t, _ in given]) - plan.start) / plan.duration
+    space = (degree, alpha, plan.start, plan.duration, gamma)
+    free = null_space(np.array([functions(t, k, *space) for t, k in given]))
+    assert free.shape[1] == (2 * degree if alpha else degree + 1) - len(given)
+    t = plan.start + 0.5 * plan.duration * (NODES + 1)
+    weights, jerk = 0.5 * plan.duration * WEIGHTS, plan(t, smooth)
+    for direction in free.T @ functions(t, smooth, *space):
+        direction = direction * np.sqrt(cost(plan, smooth) / (weights @ direction**2))
+        up, down = (weights @ (jerk + s * direction) ** 2 for s in (1e-3, -1e-3))
+        assert up > cost(plan, smooth)
+        assert down > cost(plan, smooth)
+        assert abs(up - down) <= 1e-9 * cost(plan, smooth)
+
+
+def test_the_polynomial_minimises_what_it_is_known_to():
+    """Rest to rest of m entries is the least int (y^(m))^2 of all: spare degrees change nothing."""
+    for m in (2, 3, 4):
+        points = waypoints([0.0, 1.0], [[0.0] * m, [1.0] + [0.0] * (m - 1)])
+        t = np.linspace(0, 1, 21)
+        np.testing.assert_allclose(PolySpline(points, degree=2 * m + 6, smooth=m)(t), PolySpline(points)(t), atol=1e-13)
+
+
+def test_the_degree_that_the_constraints_need_changes_nothing():
+    """N = 6 needs m = 3 or a quintic; N = 7 a full trigonometric polynomial of degree 3."""
+    t = np.linspace(0, 1, 21)
+    for lengths in ([3, 3], [4, 3]):
+        points = waypoints([0.0, 1.0], [[0.3] * k for k in lengths])
+        np.testing.assert_array_equal(TrigSpline(points, alpha=2.0, degree=3)(t), TrigSpline(points, alpha=2.0)(t))
+    points = waypoints([0.0, 1.0], [[0.3] * 3, [0.1] * 3])
+    np.testing.assert_array_equal(PolySpline(points, degree=5)(t), PolySpline(points)(t))
+
+
+def test_an_even_space_for_an_odd_number_of_constraints():
+    """Seven constraints in m = 4 of (2): gamma stays the mean of the constraints."""
+    plan = TrigSpline(waypoints([0.0, 1.0], [[0.0, 1.0, 0.0, 0.0], [1.0, 0.0, 0.0]]), alpha=2.0, degree=4)
+    assert plan.gamma[0] == pytest.approx(2.0 * 3 / 7, rel=1e-14)
+    assert plan.fourier()[0].m == 4
+    assert miss(plan) <= 1e-12
+
+
+def test_with_values_keeps_the_degree():
+    times, jets = DATA["through points"]
+    plan = TrigSpline(waypoints(times, jets), alpha=2.0, degree=7, smooth=2)
+    doubled = [[2 * v for v in jet] for jet in jets]
+    again = plan.with_values(waypoints(times, doubled))
+    t = np.linspace(1, 4, 31)
+    np.testing.assert_allclose(again(t), 2 * plan(t), rtol=1e-13)
+    assert again.degree == (7,)
