@@ -52,16 +52,16 @@ def exact_states(a: Array, b: Array, jet: Jet, breakpoints: Sequence[float], tim
     # Scaling by powers of two changes no digit and lets the cells be longer.
     balanced, scaling = matrix_balance(a, permute=False)
     scale = np.diag(scaling)
-    driven = b / scale[:, None]
+    driven: Array = b / scale[:, None]
     first, last = float(timepts[0]), float(timepts[-1])
     inner = sorted({float(t) for t in breakpoints if first < t < last})
     out = np.empty((len(a), timepts.size))
-    state = initial / scale
+    state: Array = initial / scale
     for left, right in zip([first, *inner], [*inner, last], strict=True):
         begin, end = np.searchsorted(timepts, [left, right], side="left")
         end += right == last
-        samples = timepts[begin:end] - left
-        values, state = _leg(balanced, driven, jet, left, right, samples, state)
+        samples: Array = timepts[begin:end] - left
+        values, state = _leg(np.asarray(balanced, dtype=float), driven, jet, left, right, samples, state)
         out[:, begin:end] = values
     return out * scale[:, None]
 
@@ -71,7 +71,7 @@ def _leg(a: Array, b: Array, jet: Jet, left: float, right: float, samples: Array
     moment, duration = 0.5 * (left + right), right - left
     ncells = _ncells(lambda s, order: jet(moment, left, s, order), duration)
     h = duration / ncells
-    starts = h * np.arange(ncells)
+    starts = h * np.arange(ncells, dtype=float)
     series = jet(moment, left, starts, _TERMS - 1)  # (terms, ninputs, ncells), about the cells' starts
     series *= (h ** np.arange(_TERMS, dtype=float) / _FACTORIALS)[:, None, None]
     levels = max(0, int(np.ceil(np.log2(max(1.0, float(np.linalg.norm(h * a, 1)))))))

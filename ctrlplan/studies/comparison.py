@@ -201,7 +201,7 @@ def compare(
         response = simulate(loop, times, plan, initial_state=state)
         signals = np.asarray(response.outputs).reshape(-1, times.size)
         values = response_metrics(times, signals[rows], plan, start, band, first.labels, only)
-        if unstable:
+        if unstable.size:
             values |= {name: np.inf for name in values if "settling_time" in name}
         if acting:
             values |= control_metrics(times, signals[acting_rows], start, acting, only)

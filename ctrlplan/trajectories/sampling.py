@@ -94,7 +94,7 @@ def _sample_uniform(
     terms: int,
 ) -> Array:
     ncells = count // cell
-    centres = first + step * (0.5 * (cell - 1) + cell * np.arange(ncells + 1))
+    centres = first + step * (0.5 * (cell - 1) + cell * np.arange(ncells + 1, dtype=float))
     jets = jet(centres, high + terms - 1)
     radius = 0.5 * cell * step
     powers = np.linspace(-1.0 + 1.0 / cell, 1.0 - 1.0 / cell, cell) ** np.arange(terms)[:, None]

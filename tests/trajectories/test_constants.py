@@ -22,7 +22,9 @@ def test_minimum_jerk():
     assert plan.peak(3)[0] == pytest.approx(60, rel=1e-14)
     assert plan.peak(4)[0] == pytest.approx(360, rel=1e-14)
     found = plan.extrema(2)
-    np.testing.assert_allclose([found.time_max[0], found.time_min[0]], 0.5 + np.array([-1, 1]) * np.sqrt(1 / 12), rtol=1e-9)
+    np.testing.assert_allclose(
+        [found.time_max[0], found.time_min[0]], 0.5 + np.array([-1, 1]) * np.sqrt(1 / 12), rtol=1e-9
+    )
 
 
 @pytest.mark.parametrize(
@@ -84,7 +86,9 @@ def test_alpha_zero_is_the_polynomial_of_scipy(lengths):
 @pytest.mark.parametrize("entries", range(1, 7))
 @pytest.mark.parametrize("alpha", [0.0, 0.5, 2.0, 3.0, np.pi])
 def test_rest_to_rest_is_monotone_up_to_half_a_turn(alpha, entries):
-    plan = TrigSpline(waypoints([0.0, 2.0], [[1.0] + [0.0] * (entries - 1), [4.0] + [0.0] * (entries - 1)]), alpha=alpha)
+    plan = TrigSpline(
+        waypoints([0.0, 2.0], [[1.0] + [0.0] * (entries - 1), [4.0] + [0.0] * (entries - 1)]), alpha=alpha
+    )
     slope = plan.extrema(1)
     assert slope.minimum[0] >= -1e-13 * slope.maximum[0]
     np.testing.assert_allclose([plan.extrema().minimum[0], plan.extrema().maximum[0]], [1, 4], rtol=1e-14)

@@ -36,7 +36,9 @@ def test_it_closes_with_every_derivative(name):
     plan = TrigSpline.cyclic(waypoints(times, jets), period)
     assert (plan.start, plan.end) == (times[0], times[0] + period)
     order = 8
-    size = scales(plan.jet(np.linspace(plan.start, plan.end, 101), order)[:, 0], period / (2 * np.pi * (1 + plan.degree[0])))
+    size = scales(
+        plan.jet(np.linspace(plan.start, plan.end, 101), order)[:, 0], period / (2 * np.pi * (1 + plan.degree[0]))
+    )
     first, last = plan.jet([plan.start, plan.end], order)[:, 0].T
     assert (np.abs(last - first)[:, None] <= 1e-13 * size).all()
 
@@ -87,7 +89,13 @@ def test_the_least_rough_closed_plan():
     # Lagrange: [W^2 A^T 0; A 0 1; 0 1^T 0], the constant costs nothing.
     a = rows(times)
     n, m = a.shape
-    system = np.block([[np.diag(weight**2), a, np.zeros((n, 1))], [a.T, np.zeros((m, m)), np.ones((m, 1))], [np.zeros((1, n)), np.ones((1, m)), 0]])
+    system = np.block(
+        [
+            [np.diag(weight**2), a, np.zeros((n, 1))],
+            [a.T, np.zeros((m, m)), np.ones((m, 1))],
+            [np.zeros((1, n)), np.ones((1, m)), 0],
+        ]
+    )
     solved = np.linalg.solve(system, np.concatenate([np.zeros(n), [j[0] for j in jets], [0.0]]))
     t = np.linspace(0, 1, 41)
     np.testing.assert_allclose(plan(t), solved[-1] + solved[:n] @ rows(t), rtol=0, atol=1e-12)

@@ -13,7 +13,7 @@ ALPHAS = [0.0, 1.0, 4.0, 5.5]
 # Position and acceleration with the velocity free, velocities without positions, no entry at all, a late entry alone.
 PATTERNS = {
     "velocity free": ([0.0, 0.4, 1.0], [[0.0, 0.0, 0.0], [2.0, None, 1.0], [1.0, 0.0, 0.0]]),
-    "velocities free everywhere": ([0.0, 1.0, 3.0, 4.0], [[1.0, None, 0.3], [0.5, None, 2.0], [2.0, None, -1.0], [0, None, 0]]),
+    "velocities free": ([0.0, 1.0, 3.0, 4.0], [[1.0, None, 0.3], [0.5, None, 2.0], [2.0, None, -1.0], [0.0, None]]),
     "positions free": ([0.0, 1.0, 1.5, 2.0], [[1.0], [None, 1.0], [None, -2.0], [None, 0.5]]),
     "nothing at the start": ([0.0, 1.0, 2.0], [[None], [1.0, 2.0, 3.0], [0.5, -1.0]]),
     "nothing at the end": ([0.0, 1.0, 2.0], [[0.3, 1.0], [1.0, 2.0], [None, None]]),
@@ -95,7 +95,7 @@ def test_units_do_not_decide_what_is_singular():
     ids=["paper", "shifted", "odd about the middle", "no position", "velocities"],
 )
 def test_singular_free_entries_are_refused(times, jets):
-    with pytest.raises(ValueError, match="entries left free must not make the system singular.* got a relative singular"):
+    with pytest.raises(ValueError, match=r"must not make the system singular.* got a relative singular value"):
         PolySpline(waypoints(times, jets))
 
 

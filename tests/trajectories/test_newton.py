@@ -51,7 +51,9 @@ def random_points(rng, durations=(-6, 6), nmax=24, jets=6):
     while (lengths.sum(axis=1) > nmax).any():
         lengths[lengths.sum(axis=1) > nmax, rng.integers(n)] = 1
     return [
-        Waypoint.from_jets(t, **{f"x{a}": rng.normal(size=k) / duration ** np.arange(k) for a, k in enumerate(lengths.T[i])})
+        Waypoint.from_jets(
+            t, **{f"x{a}": rng.normal(size=k) / duration ** np.arange(k) for a, k in enumerate(lengths.T[i])}
+        )
         for i, t in enumerate(times)
     ]
 
@@ -225,7 +227,9 @@ def test_a_far_start_costs_no_digit():
 
 
 def test_with_values_is_a_new_construction():
-    points = [Waypoint.from_jets(t, x=x, z=z) for t, x, z in [(0, [1, 2, 3], [1]), (2, [0, 1], [2, 1]), (5, [3], [4, 4])]]
+    points = [
+        Waypoint.from_jets(t, x=x, z=z) for t, x, z in [(0, [1, 2, 3], [1]), (2, [0, 1], [2, 1]), (5, [3], [4, 4])]
+    ]
     other = [Waypoint.from_jets(w.time, x=[7.0, *w.jet[1:, 0]], z=[-2.0, *w.jet[1:, 1]]) for w in points]
     for alpha in (0.0, 2.0):
         plan = TrigSpline(points, alpha=alpha, gamma=[0.3, None] if alpha else None)

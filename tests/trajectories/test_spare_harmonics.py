@@ -1,5 +1,6 @@
 """More harmonics than constraints: the spare ones minimise int (y^(k))^2."""
 
+import mpmath as mp
 import numpy as np
 import pytest
 from scipy.linalg import null_space
@@ -16,35 +17,60 @@ DATA = {
 }
 
 
-def functions(t, nu, degree, alpha, start, duration, gamma):
-    """Harmonics of (2), or Legendre polynomials: (size, ntime)."""
-    if not alpha:
-        x = 2 * (np.asarray(t) - start) / duration - 1
-        series = [np.polynomial.Legendre.basis(j).deriv(nu) for j in range(degree + 1)]
-        return np.array([s(x) for s in series]) * (2 / duration) ** nu
-    rate = alpha / duration
-    tau = rate * (np.asarray(t) - start)
-    rows = [np.full(tau.shape, float(nu == 0))]
-    for k in range(1, degree):
-        rows += [(k * rate) ** nu * f(k * tau + nu * np.pi / 2) for f in (np.cos, np.sin)]
-    rows.append((degree * rate) ** nu * np.sin(degree * (tau - gamma) + nu * np.pi / 2))
-    return np.array(rows)
-
-
 def least(times, jets, degree, alpha, smooth):
-    """Naive: particular solution plus null space, quadrature of the derivative, least squares. Jet function and cost."""
-    start, duration = times[0], times[-1] - times[0]
+    """Naive, in 60 digits: the conditions of Lagrange for least int (y^(smooth))^2 under the constraints."""
     given = [(t, k, v) for t, jet in zip(times, jets, strict=True) for k, v in enumerate(jet) if v is not None]
-    gamma = alpha * (np.mean([t for t, _, _ in given]) - start) / duration
-    space = (degree, alpha, start, duration, gamma)
-    rows = np.array([functions(t, k, *space) for t, k, _ in given])
-    particular = np.linalg.lstsq(rows, np.array([v for _, _, v in given]), rcond=None)[0]
-    free = null_space(rows)
-    quadrature = start + 0.5 * duration * (NODES + 1)
-    weighted = np.sqrt(0.5 * duration * WEIGHTS) * functions(quadrature, smooth, *space)
-    spare = np.linalg.lstsq(weighted.T @ free, -weighted.T @ particular, rcond=None)[0]
-    best = particular + free @ spare
-    return (lambda t, nu: best @ functions(t, nu, *space)), np.sum((weighted.T @ best) ** 2)
+    with mp.workdps(60):
+        space = Space(times, [t for t, _, _ in given], degree, alpha)
+        rows = [space(t, k) for t, k, _ in given]
+        quadrature = [
+            [mp.sqrt(w) * f for f in space(mp.mpf(float(x)), smooth)] for x, w in zip(*space.quadrature(), strict=True)
+        ]
+        n, m = space.size, len(rows)
+        system, right = mp.zeros(n + m, n + m), mp.zeros(n + m, 1)
+        weighted = mp.matrix(quadrature)
+        gram = weighted.T * weighted
+        for i in range(n):
+            for j in range(n):
+                system[i, j] = gram[i, j]
+        for i, row in enumerate(rows):
+            right[n + i] = mp.mpf(given[i][2])
+            for j, f in enumerate(row):
+                system[n + i, j] = system[j, n + i] = f
+        solved = mp.lu_solve(system, right)
+        best = mp.matrix([solved[i] for i in range(n)])
+        cost = float((best.T * gram * best)[0])
+
+    def values(t, nu):
+        with mp.workdps(60):
+            return np.array([float(mp.fdot(best, space(x, nu))) for x in t])
+
+    return values, cost
+
+
+class Space:
+    """Functions of (2) with gamma the mean of the constraints, or powers."""
+
+    def __init__(self, times, constraints, degree, alpha):
+        self.start, self.duration, self.degree, self.alpha = times[0], times[-1] - times[0], degree, mp.mpf(alpha)
+        self.size = 2 * degree if alpha else degree + 1
+        self.gamma = self.alpha * (mp.fsum(constraints) / len(constraints) - self.start) / self.duration
+
+    def quadrature(self):
+        return self.start + 0.5 * self.duration * (NODES + 1), 0.5 * self.duration * WEIGHTS
+
+    def __call__(self, t, nu):
+        u = (mp.mpf(float(t)) - self.start) / self.duration
+        if not self.alpha:
+            powers = [mp.ff(j, nu) * u ** (j - nu) if j >= nu else mp.mpf(0) for j in range(self.size)]
+            return [p / mp.mpf(self.duration) ** nu for p in powers]
+        rate = self.alpha / self.duration
+        found = [mp.mpf(nu == 0)]
+        for k in range(1, self.degree):
+            turned = k * self.alpha * u + nu * mp.pi / 2
+            found += [(k * rate) ** nu * mp.cos(turned), (k * rate) ** nu * mp.sin(turned)]
+        top = self.degree * (self.alpha * u - self.gamma) + nu * mp.pi / 2
+        return [*found, (self.degree * rate) ** nu * mp.sin(top)]
 
 
 def cost(plan, smooth):
@@ -52,11 +78,11 @@ def cost(plan, smooth):
     return 0.5 * plan.duration * WEIGHTS @ plan(t, smooth) ** 2
 
 
-@pytest.mark.parametrize("smooth", [1, 2, 3, 4])
-@pytest.mark.parametrize("alpha", [0.0, 2.0, 4.0, 5.5])
+@pytest.mark.parametrize("smooth", [1, 3])
+@pytest.mark.parametrize("alpha", [0.0, 2.0, 5.5])
 @pytest.mark.parametrize("data", DATA)
 @pytest.mark.parametrize("extra", [1, 3])
-def test_least_squares_on_the_null_space(data, alpha, smooth, extra):
+def test_the_least_rough_of_all_that_meet_the_waypoints(data, alpha, smooth, extra):
     times, jets = DATA[data]
     count = sum(v is not None for jet in jets for v in jet)
     degree = (count + 1) // 2 + extra if alpha else count - 1 + 2 * extra
@@ -66,11 +92,11 @@ def test_least_squares_on_the_null_space(data, alpha, smooth, extra):
     exact, smallest = least(times, jets, degree, alpha, smooth)
     assert plan.degree == (degree,)
     assert miss(plan) <= 1e-12
-    assert cost(plan, smooth) == pytest.approx(smallest, rel=1e-9)
-    t = np.linspace(plan.start, plan.end, 41)
+    assert cost(plan, smooth) == pytest.approx(smallest, rel=1e-13)
+    t = np.linspace(plan.start, plan.end, 21)
     for nu in range(3):
         values = exact(t, nu)
-        np.testing.assert_allclose(plan(t, nu), values, rtol=0, atol=1e-8 * np.abs(values).max())
+        np.testing.assert_allclose(plan(t, nu), values, rtol=0, atol=1e-12 * np.abs(values).max())
 
 
 @pytest.mark.parametrize("alpha", [0.0, 3.0])
@@ -80,13 +106,16 @@ def test_every_change_that_keeps_the_waypoints_costs_more(alpha):
     degree, smooth = (7 if alpha else 12), 3
     plan = TrigSpline(waypoints(times, jets), alpha=alpha, degree=degree, smooth=smooth)
     given = [(t, k) for t, jet in zip(times, jets, strict=True) for k in range(len(jet))]
-    gamma = alpha * (np.mean([t for t, _ in given]) - plan.start) / plan.duration
-    space = (degree, alpha, plan.start, plan.duration, gamma)
-    free = null_space(np.array([functions(t, k, *space) for t, k in given]))
-    assert free.shape[1] == (2 * degree if alpha else degree + 1) - len(given)
+    space = Space(times, [t for t, _ in given], degree, alpha)
+
+    def functions(t, nu):
+        return np.array([[float(f) for f in space(x, nu)] for x in t]).T
+
+    free = null_space(np.array([functions([t], k)[:, 0] for t, k in given]))
+    assert free.shape[1] == space.size - len(given)
     t = plan.start + 0.5 * plan.duration * (NODES + 1)
     weights, jerk = 0.5 * plan.duration * WEIGHTS, plan(t, smooth)
-    for direction in free.T @ functions(t, smooth, *space):
+    for direction in free.T @ functions(t, smooth):
         direction = direction * np.sqrt(cost(plan, smooth) / (weights @ direction**2))
         up, down = (weights @ (jerk + s * direction) ** 2 for s in (1e-3, -1e-3))
         assert up > cost(plan, smooth)

@@ -87,7 +87,6 @@ def miss(plan):
     worst = 0.0
     for i, point in enumerate(points):
         entries = len(point.jet)
-        with np.errstate(invalid="ignore"):
-            off = np.abs(sampled[:entries, :, i] - point.jet) / np.where(size > 0, size, 1.0)[:entries]
-        worst = max(worst, float(np.nanmax(off)))
+        off = np.abs(sampled[:entries, :, i] - point.jet) / np.where(size > 0, size, 1.0)[:entries]
+        worst = max(worst, float(off.max(initial=0.0, where=~np.isnan(point.jet))))
     return worst
