@@ -33,6 +33,15 @@ _RC: dict[Any, Any] = {
 }
 
 
+class ShownFigure(Figure):
+    """Figure that a notebook shows where it stands last in a cell, whatever its backend."""
+
+    def _repr_png_(self) -> bytes:
+        buffer = io.BytesIO()
+        self.savefig(buffer, format="png", dpi=110)
+        return buffer.getvalue()
+
+
 def line_styles(names: Iterable[str]) -> dict[str, dict[str, Any]]:
     """Colour and dashes of each plan."""
     spare = cycle(_OTHERS)
@@ -53,7 +62,7 @@ def new_figure(width: float, height: float) -> Figure:
     """Figure that a notebook shows once and a script with a window shows by ``plt.show()``."""
     with mpl.rc_context(_RC):
         if mpl.get_backend().lower().rpartition(".")[2] in _WITHOUT_WINDOW:
-            return Figure(figsize=(width, height), layout="constrained")
+            return ShownFigure(figsize=(width, height), layout="constrained")
         return plt.figure(figsize=(width, height), layout="constrained")
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from tqdm.auto import tqdm
+from tqdm import tqdm
 
 from ctrlplan.studies.comparison import compare, finite_or_none
 from ctrlplan.trajectories import Trajectory, Waypoint

@@ -33,7 +33,7 @@ def integrator_lag_loop(gain: float, outputs: Sequence[str] = ("y",)) -> ct.Inte
     Examples
     --------
     >>> loop = integrator_lag_loop(5.0)
-    >>> [round(w, 3) for w in sorted(abs(loop.poles()))]
+    >>> [round(float(abs(pole)), 3) for pole in loop.poles()]
     [2.236, 2.236]
     """
     return unity_feedback_loop([1.0], [1.0, 1.0, 0.0], gain, outputs)
