@@ -43,8 +43,8 @@ class _Combined(Trajectory):
             parts=parts,
             labels=labels,
             breakpoints=readonly(joined),
-            initial=self._combine([part.initial for part in parts]),
-            final=self._combine([part.final for part in parts]),
+            initial=readonly(self._combine([part.initial for part in parts])),
+            final=readonly(self._combine([part.final for part in parts])),
         )
 
     @abstractmethod
@@ -54,6 +54,9 @@ class _Combined(Trajectory):
     def _map_time(self, origin: float, shift: float, rate: float) -> Self:
         return self._of(tuple(part._map_time(origin, shift, rate) for part in self.parts), self.labels)
 
+    def _sample(self, t: Array, low: int, high: int, left: bool) -> Array:
+        return self._combine([part._sample(t, low, high, left) for part in self.parts])
+
     def _leg_jet(self, leg: int, s: Array, order: int) -> Array:
         leg %= self.breakpoints.size - 1
         origin = float(self.breakpoints[leg])
@@ -62,7 +65,9 @@ class _Combined(Trajectory):
 
 
 class Sum(_Combined):
-    """Sum of trajectories with the same number of axes; labels of the first.
+    """Sum of trajectories with the same number of axes.
+
+    Labels are those of the first.
 
     Parameters
     ----------
@@ -148,7 +153,7 @@ class Joined(Trajectory):
     ------
     ValueError
         If the axes differ in number, or a first position differs from the last
-        one before it by more than 1e-9 of their size.
+        one before it by more than 1e-9 of the size of either trajectory.
     """
 
     parts: tuple[Trajectory, ...]
@@ -159,7 +164,7 @@ class Joined(Trajectory):
             if before.naxes != after.naxes:
                 raise ValueError(f"joined trajectories must have the same axes, got {after.naxes} after {before.naxes}")
             last, first = before.final, after.initial
-            if np.any(np.abs(first - last) > 1e-9 * np.maximum(1e-300, np.maximum(np.abs(first), np.abs(last)))):
+            if np.any(first != last) and np.any(np.abs(first - last) > 1e-9 * np.maximum(before.peak(), after.peak())):
                 raise ValueError(
                     f"positions must agree where trajectories join, got {first.tolist()} after {last.tolist()} "
                     f"at {members[i].end:g} s"
@@ -200,6 +205,12 @@ class Joined(Trajectory):
         self_ = type(self).__new__(type(self))
         self_._set(tuple(part._map_time(origin, shift, rate) for part in self.parts), self.labels)
         return self_
+
+    def _sample(self, t: Array, low: int, high: int, left: bool) -> Array:
+        out = super()._sample(t, low, high, left)
+        if low == 0 and not left and self.parts[-1].breakpoints.size == 1:
+            out[0][:, t == self.end] = self.final[:, None]  # a step at the very end
+        return out
 
     def _leg_jet(self, leg: int, s: Array, order: int) -> Array:
         part, own = self._legs[leg]

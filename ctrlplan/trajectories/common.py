@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NoReturn
+from typing import Any, NoReturn, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -23,6 +23,18 @@ class Frozen:
 
     def __delattr__(self, name: str) -> NoReturn:
         raise AttributeError(f"{type(self).__name__} is immutable; {name} cannot be deleted")
+
+    def __copy__(self) -> Self:
+        return self
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Self:
+        return self
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        for value in state.values():
+            if isinstance(value, np.ndarray):
+                value.flags.writeable = False
+        self.__dict__.update(state)
 
 
 def readonly(values: Array) -> Array:
@@ -67,9 +79,9 @@ def checked_time(time: float, name: str, positive: bool = False) -> float:
 def checked_timepts(t: ArrayLike) -> Array:
     """Times as an array of any shape, without nan."""
     times = np.asarray(t, dtype=float)
-    # The sum is nan where an entry is (or where both infinities meet).
-    if times.size and np.isnan(np.add.reduce(times, axis=None)) and np.isnan(times).any():
-        raise ValueError(f"times must not be nan, got nan at index {int(np.isnan(times).argmax())}")
+    missing = np.isnan(times)
+    if missing.any():
+        raise ValueError(f"times must not be nan, got nan at index {int(missing.argmax())}")
     return times
 
 

@@ -73,8 +73,12 @@ def derivative_extrema(plan: Trajectory, nu: int) -> Extrema:
         times = [np.array([0.0, duration])]
         for left, right, slopes in _pieces(jet, 0.0, duration, nu + 1):
             times += [0.5 * (left + right) + 0.5 * (right - left) * real_roots(series) for series in slopes]
-        t = np.unique(np.concatenate(times))
-        t = np.union1d(t, _polished(jet, t, nu, duration))
+        t = np.concatenate(times)
+        t = np.concatenate([t, _polished(jet, t, nu, duration)])
+        # What rounding moved off an end belongs to it.
+        t[t < 1e-12 * duration] = 0.0
+        t[t > (1.0 - 1e-12) * duration] = duration
+        t = np.unique(t)
         found.add(origin + t, jet(t, nu)[nu])
     return found.extrema()
 

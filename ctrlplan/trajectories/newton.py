@@ -153,7 +153,9 @@ class NewtonSystem(Frozen):
         -------
         ndarray, shape (size, order + 1, ntime)
         """
-        alpha, half = self.alpha, 0.5 * self.alpha
+        # Below 1e-100 the family is its limit to far more than rounding, and its formulas would underflow.
+        alpha = self.alpha if self.alpha > 1e-100 else 0.0
+        half = 0.5 * alpha
         npairs = len(self._second)
         out = np.empty((2 * npairs + 1, order + 1, u.size))
         out[0] = 0.0
@@ -214,11 +216,21 @@ def _leja(alpha: float, times: Array, given: tuple[tuple[int, ...], ...]) -> lis
     return [used[i] for i in chosen]
 
 
-def _sequence(waypoints: list[int], given: tuple[tuple[int, ...], ...]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Constraints in rounds: the first entry of each waypoint, the second of each, ..."""
-    rounds = max(map(len, given))
-    pairs = [(i, given[i][r]) for r in range(rounds) for i in waypoints if r < len(given[i])]
-    table = np.array(pairs, dtype=np.intp)
+def _sequence(
+    waypoints: list[int], given: tuple[tuple[int, ...], ...]
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Constraints in rounds through the waypoints, each waypoint's spread evenly over all rounds.
+
+    Orders rise at each waypoint, as the triangle needs, and the nodes so far
+    are spread at every stage like all of them: waypoints with few entries
+    before long jets elsewhere would cost four digits.
+    """
+    pairs = [
+        ((turn + 1) / len(given[i]), rank, i, order)
+        for rank, i in enumerate(waypoints)
+        for turn, order in enumerate(given[i])
+    ]
+    table = np.array([(i, order) for _, _, i, order in sorted(pairs)], dtype=np.intp)
     return table[:, 0], table[:, 1]
 
 
@@ -249,14 +261,17 @@ def _factor(collocation: Array, hermite: bool, roughness: Array | None) -> tuple
     if hermite:  # spare functions vanish at every constraint
         triangle, basis = collocation[:, :count], np.eye(size)
     else:
-        # Rows scaled: the judgement must not depend on the units of the entries.
-        singular = np.linalg.svd(collocation / np.linalg.norm(collocation, axis=1, keepdims=True), compute_uv=False)
-        if singular[-1] < 1e-12 * singular[0]:
+        # Columns and rows scaled: neither the size of the basis functions nor the units of the entries must count.
+        weight = 1.0 / np.abs(collocation).max(axis=0)
+        scaled = collocation * weight
+        singular = np.linalg.svd(scaled / np.linalg.norm(scaled, axis=1, keepdims=True), compute_uv=False)
+        if singular[-1] < 1e-13 * singular[0]:
             raise ValueError(
                 "the entries left free must not make the system singular: the prescribed entries conflict or leave "
                 f"the plan undetermined, got a relative singular value of {singular[-1] / singular[0]:.1g}"
             )
-        basis, upper = np.linalg.qr(collocation.T, mode="complete")
+        basis, upper = np.linalg.qr(scaled.T, mode="complete")
+        basis *= weight[:, None]
         triangle = upper[:count].T
     spread = basis[:, :count]
     if roughness is not None:

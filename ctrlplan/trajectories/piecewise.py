@@ -160,7 +160,8 @@ def _conjugate(
         jump[leg + 1] -= jets[1]
     rows = np.array([jump[i, 2 * size - 1 - k] for i, k in free])
     matrix, known = rows[:, naxes:], rows[:, :naxes]
-    if np.linalg.cond(matrix / np.abs(matrix).max(axis=1, keepdims=True)) > 1e13:
+    scale = np.abs(matrix).max(axis=1, keepdims=True)
+    if scale.min() == 0.0 or np.linalg.cond(matrix / scale) > 1e13:
         raise ValueError("the entries left free at inner waypoints must be determined by the others; prescribe more")
     solution: Array = np.linalg.solve(matrix, -known)
     return solution / unit ** np.array([k for _, k in free])[:, None]

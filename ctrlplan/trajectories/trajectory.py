@@ -7,14 +7,14 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from functools import cached_property
 from numbers import Real
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ctrlplan.trajectories import extrema as _extrema
 from ctrlplan.trajectories import sampling as _sampling
-from ctrlplan.trajectories.common import Array, Frozen, checked_time, checked_timepts
+from ctrlplan.trajectories.common import Array, Frozen, checked_time, checked_timepts, readonly
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -47,7 +47,8 @@ class Trajectory(Frozen, ABC):
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
-        Trajectory.kinds[cls.__name__] = cls
+        if not (cls.__name__.startswith("_") or getattr(cls._from_dict, "__isabstractmethod__", False)):
+            Trajectory.kinds[cls.__name__] = cls
 
     @abstractmethod
     def _leg_jet(self, leg: int, s: Array, order: int) -> Array:
@@ -93,12 +94,12 @@ class Trajectory(Frozen, ABC):
     @cached_property
     def initial(self) -> Array:
         """Position held before the start, shape (naxes,)."""
-        return self._leg_jet(0, np.zeros(1), 0)[0, :, 0]
+        return readonly(self._leg_jet(0, np.zeros(1), 0)[0, :, 0].copy())
 
     @cached_property
     def final(self) -> Array:
         """Position held after the end, shape (naxes,)."""
-        return self._leg_jet(-1, self.breakpoints[-1:] - self.breakpoints[-2], 0)[0, :, 0]
+        return readonly(self._leg_jet(-1, self.breakpoints[-1:] - self.breakpoints[-2], 0)[0, :, 0].copy())
 
     def __call__(self, t: ArrayLike, nu: int = 0) -> Array:
         """Value, or the nu-th derivative.
@@ -305,12 +306,6 @@ class Trajectory(Frozen, ABC):
 
     def __neg__(self) -> Trajectory:
         return self * -1.0
-
-    def __copy__(self) -> Self:
-        return self
-
-    def __deepcopy__(self, memo: dict[int, Any]) -> Self:
-        return self
 
     def __repr__(self) -> str:
         axes = ", ".join(self.labels)

@@ -129,11 +129,15 @@ class TrigSpline(NewtonSpline):
         Raises
         ------
         ValueError
-            If alpha is 0: a polynomial has none.
+            If alpha is 0: a polynomial has none; or so small that they overflow.
         """
         if not self.alpha:
             raise ValueError("alpha must be above 0 for Fourier coefficients, got 0 (a polynomial)")
-        return FourierCoefficients.of([_fourier(self.alpha, s, c) for s, c in self._per_axis()])
+        with np.errstate(over="ignore", invalid="ignore"):
+            found = FourierCoefficients.of([_fourier(self.alpha, s, c) for s, c in self._per_axis()])
+        if not all(np.isfinite(values).all() for values in (found.a0, found.a, found.b, found.am)):
+            raise ValueError(f"alpha must be large enough for finite Fourier coefficients, got {self.alpha:g}")
+        return found
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data that `trajectory_from_dict` reads."""

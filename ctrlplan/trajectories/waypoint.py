@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -116,14 +115,12 @@ class Waypoint(Frozen):
         return self
 
     def _set(self, time: float, jet: Array, labels: tuple[str, ...] | None) -> None:
-        # One reduction tells a table of ordinary numbers from one with gaps (nan) or inf.
-        complete = math.isfinite(float(np.add.reduce(jet, axis=None)))
+        complete = bool(np.isfinite(jet).all())
         if not complete:
             if np.isinf(jet).any():
                 order, axis = np.argwhere(np.isinf(jet))[0]
                 name = ENTRIES[order] if order < len(ENTRIES) else f"derivative {order}"
                 raise ValueError(f"{name} must be finite or nan (free), got {jet[order, axis]} at time {time:g}")
-            complete = not bool(np.isnan(jet).any())
         self.__dict__.update(time=time, jet=readonly(jet), labels=labels, complete=complete, naxes=jet.shape[1])
 
     @property
@@ -183,7 +180,7 @@ class Waypoint(Frozen):
         return same and np.array_equal(self.jet, other.jet, equal_nan=True)
 
     def __hash__(self) -> int:
-        return hash((self.time, self.labels, self.jet.tobytes()))
+        return hash((self.time, self.labels, str((self.jet + 0.0).tolist())))  # -0.0 equals 0.0
 
     def __repr__(self) -> str:
         if self.labels is not None:

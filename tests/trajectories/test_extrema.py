@@ -1,0 +1,242 @@
+"""Extrema and bounds are facts about the interval: against roots in many digits, closed forms and dense samples."""
+
+import mpmath as mp
+import numpy as np
+import pytest
+import sympy
+from trajectory_oracle import Direct, waypoints
+
+from ctrlplan.trajectories import PiecewiseSpline, PolySpline, Step, TrigSpline, Waypoint, stack
+
+MOVE = PolySpline(waypoints([0.0, 2.0], [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]))
+
+
+def critical_times(oracle, nu):
+    """Roots of the derivative of order nu + 1 in the interval, by the roots of a polynomial in 50 digits."""
+    with mp.workdps(oracle.digits):
+        if not oracle.alpha:
+            powers = oracle.coefficients[nu + 1 :]
+            series = [c * mp.ff(j, nu + 1) for j, c in enumerate(powers, nu + 1)]
+            found = mp.polyroots(series[::-1], maxsteps=500, extraprec=400)
+            u = [z.real for z in found if abs(z.imag) < 1e-20 and 0 < z.real < 1]
+        else:  # the trigonometric polynomial as a polynomial in z = exp(i tau)
+            m, c = oracle.m, oracle.coefficients
+            pairs = [(c[2 * k - 1], c[2 * k]) for k in range(1, len(c) // 2 + len(c) % 2)]
+            if oracle.size % 2 == 0:
+                pairs.append((-c[-1] * mp.sin(m * oracle.gamma), c[-1] * mp.cos(m * oracle.gamma)))
+            series = [mp.mpc(0)] * (2 * m + 1)
+            for k, (a, b) in enumerate(pairs, 1):
+                turn = mp.mpc(0, k) ** (nu + 1)
+                series[m + k] = turn * mp.mpc(a, -b) / 2
+                series[m - k] = mp.conj(series[m + k])
+            found = mp.polyroots(series[::-1], maxsteps=500, extraprec=400)
+            tau = [mp.arg(z) % (2 * mp.pi) for z in found if abs(abs(z) - 1) < 1e-20]
+            u = [t / oracle.alpha for t in tau if t < oracle.alpha]
+        return [oracle.start + x * oracle.duration for x in u]
+
+
+def exact_extrema(oracle, nu):
+    with mp.workdps(oracle.digits):
+        times = [oracle.start, oracle.start + oracle.duration, *critical_times(oracle, nu)]
+        values = [mp.fdot(oracle.coefficients, oracle.functions(t, nu)) for t in times]
+        low, high = values.index(min(values)), values.index(max(values))
+        return [float(v) for v in (values[low], values[high], times[low], times[high])]
+
+
+@pytest.mark.parametrize("nu", range(4))
+@pytest.mark.parametrize("alpha", [0.0, 1.0, np.pi, 5.5])
+@pytest.mark.parametrize(
+    ("times", "lengths"),
+    [([0.0, 2.0], [3, 3]), ([1.0, 1.3, 4.0], [3, 2, 2]), ([0.0, 1.0, 1.1, 2.0], [3, 3, 3, 3])],
+    ids=["N6", "N7", "N12"],
+)
+def test_roots_in_fifty_digits(times, lengths, alpha, nu):
+    rng = np.random.default_rng(4)
+    jets = [rng.normal(size=k).tolist() for k in lengths]
+    low, high, time_low, time_high = exact_extrema(Direct(times, jets, alpha), nu)
+    found = TrigSpline(waypoints(times, jets), alpha=alpha).extrema(nu)
+    size, duration = max(-low, high), times[-1] - times[0]
+    assert abs(found.minimum[0] - low) <= 1e-13 * size
+    assert abs(found.maximum[0] - high) <= 1e-13 * size
+    assert abs(found.time_min[0] - time_low) <= 1e-6 * duration
+    assert abs(found.time_max[0] - time_high) <= 1e-6 * duration
+
+
+def test_a_polynomial_of_sympy():
+    """u^4 (1 - u): its derivatives have the roots 0, 4/5; 0, 3/5; 0, 2/5; 1/5."""
+    u = sympy.symbols("u")
+    y = u**4 * (1 - u)
+    jets = [[float(y.diff(u, k).subs(u, at)) for k in range(3)] for at in (0, 1)]
+    plan = PolySpline(waypoints([0.0, 1.0], jets))
+    for nu in range(4):
+        critical = [r for r in sympy.roots(y.diff(u, nu + 1), u) if 0 <= r <= 1]
+        values = {at: float(y.diff(u, nu).subs(u, at)) for at in [0, 1, *critical]}
+        found = plan.extrema(nu)
+        assert found.maximum[0] == pytest.approx(max(values.values()), abs=1e-13)
+        assert found.minimum[0] == pytest.approx(min(values.values()), abs=1e-13)
+        assert found.time_max[0] == pytest.approx(float(max(values, key=values.get)), abs=1e-7)
+
+
+@pytest.mark.parametrize("gap", [1e-2, 1e-4, 1e-6])
+def test_narrow_peaks(gap):
+    """A bump of which a thousand samples would see nothing; in closed form (1 - s^2)^3 has height 1."""
+    times = [0.0, 0.5 - gap, 0.5, 0.5 + gap, 1.0]
+    rest = [0.0, 0.0, 0.0]
+    plan = PiecewiseSpline(waypoints(times, [rest, rest, [1.0, 0.0, 0.0], rest, rest]))
+    found = plan.extrema()
+    assert (found.minimum[0], found.time_max[0]) == (0.0, 0.5)
+    assert found.maximum[0] == pytest.approx(1.0, rel=1e-13)
+    assert plan.peak(1)[0] == pytest.approx(1.875 / gap, rel=1e-9)  # the gap itself is rounded at 0.5
+    assert plan.peak(2)[0] == pytest.approx(10 / np.sqrt(3) / gap**2, rel=1e-9)
+
+
+def test_a_narrow_peak_of_a_function_of_the_jet():
+    """1/(y^2 + 1e-6) along y from -1 to 1: height 1e6 where y = 0, a thousandth wide."""
+    plan = PolySpline(waypoints([0.0, 1.0], [[-1.0, 0.3], [1.0, 2.0]]))
+    found = plan.extrema_of(lambda jet: 1 / (jet[0, 0] ** 2 + 1e-6), 0)
+    assert found.maximum[0] == pytest.approx(1e6, rel=1e-12)
+    assert plan(found.time_max[0]) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_many_extrema_of_forty_constraints():
+    """cos(39 arccos x): the Chebyshev polynomial swings between -1 and 1, and its slope reaches 39^2 at the ends."""
+    x = np.cos(np.pi * np.arange(39, -1, -1) / 39)
+    plan = PolySpline([Waypoint(t, v) for t, v in zip(x, np.cos(39 * np.arccos(x)), strict=True)])
+    assert plan.extrema().maximum[0] == pytest.approx(1, rel=1e-12)
+    assert plan.extrema().minimum[0] == pytest.approx(-1, rel=1e-12)
+    assert plan.peak(1)[0] == pytest.approx(39**2, rel=1e-10)
+
+
+def test_both_limits_of_a_jump_count():
+    """Straight legs of slopes 1 and -3; quintic legs whose jerk jumps from 60 to 60 - 120."""
+    lines = PiecewiseSpline(waypoints([0.0, 1.0, 2.0], [[0.0], [1.0], [-2.0]]))
+    found = lines.extrema(1)
+    assert (found.maximum[0], found.minimum[0]) == (pytest.approx(1, rel=1e-14), pytest.approx(-3, rel=1e-14))
+    there_and_back = MOVE.retime(1.0).then(1.0 * MOVE.retime(1.0) * -1 + Step(1.0, 1.0))
+    assert there_and_back.peak(3)[0] == pytest.approx(60, rel=1e-13)
+    found = there_and_back.extrema(3)
+    assert (found.maximum[0], found.minimum[0]) == (pytest.approx(60, rel=1e-13), pytest.approx(-60, rel=1e-13))
+    both = stack([lines, lines.shift(0.5)]).extrema_of(lambda jet: jet[1, 0] - jet[1, 1], 1)
+    assert both.maximum[0] == pytest.approx(4, rel=1e-13) or both.maximum[0] == pytest.approx(1, rel=1e-13)
+    assert both.minimum[0] == pytest.approx(-4, rel=1e-13)
+
+
+def test_held_positions_count():
+    """A step inside a sum, held values outside."""
+    plan = MOVE + Step(0.0, initial=3.0, time=-1.0)
+    found = plan.extrema()
+    assert (found.maximum[0], found.minimum[0]) == (3.0, 0.0)
+    assert Step([2.0, -1.0], initial=[0.0, 4.0]).extrema().maximum.tolist() == [2.0, 4.0]
+    assert Step([2.0, -1.0], initial=[0.0, 4.0]).extrema().minimum.tolist() == [0.0, -1.0]
+    assert Step(2.0).peak(1).tolist() == [0.0]
+
+
+def test_the_earliest_time_of_an_extremum():
+    assert PolySpline(waypoints([3.0, 4.0], [[2.0], [2.0]])).extrema().time_max[0] == 3.0
+    assert MOVE.extrema(1).time_min[0] == 0.0
+
+
+def test_several_axes_have_their_own():
+    plan = stack([MOVE, -2 * MOVE, MOVE.shift(5.0)])
+    found = plan.extrema(1)
+    np.testing.assert_allclose(found.maximum, np.array([1.875, 0, 1.875]) / 2, rtol=1e-13)
+    np.testing.assert_allclose(found.minimum, [0, -1.875, 0], rtol=1e-13)
+    np.testing.assert_allclose(found.time_max[[0, 2]], [1.0, 6.0], rtol=1e-9)
+
+
+def test_smooth_functions_of_the_jet():
+    """Speed on a circle run with minimum jerk; power y' y'' of minimum jerk in closed form."""
+    assert MOVE.extrema_of(lambda jet: jet[0, 0], 0).maximum[0] == pytest.approx(1, rel=1e-15)
+    u = sympy.symbols("u")
+    y = 10 * u**3 - 15 * u**4 + 6 * u**5
+    power = sympy.expand(y.diff(u) * y.diff(u, 2))
+    values = [float(power.subs(u, r)) for r in sympy.Poly(power.diff(u), u).nroots(n=30) if r.is_real and 0 <= r <= 1]
+    found = MOVE.extrema_of(lambda jet: jet[1, 0] * jet[2, 0], 2)
+    assert found.maximum[0] == pytest.approx(max(values) / 8, rel=1e-13)
+    assert found.minimum[0] == pytest.approx(min(values) / 8, rel=1e-13)
+
+    circle = TrigSpline.cyclic([Waypoint(t, [np.cos(t), np.sin(t)]) for t in np.arange(5.0)], 2 * np.pi)
+    speed = circle.extrema_of(lambda jet: np.hypot(jet[1, 0], jet[1, 1]), 1)
+    assert speed.maximum[0] == pytest.approx(1, rel=1e-13)
+    assert speed.minimum[0] == pytest.approx(1, rel=1e-13)
+
+
+def test_several_functions_at_once():
+    found = MOVE.extrema_of(lambda jet: np.stack([jet[1, 0], jet[0, 0] ** 2, 3 - jet[0, 0]]), 1)
+    np.testing.assert_allclose(found.maximum, [0.9375, 1.0, 3.0], rtol=1e-13)
+    np.testing.assert_allclose(found.minimum, [0.0, 0.0, 2.0], rtol=1e-13, atol=1e-15)
+
+
+KINKED = {
+    "abs": (lambda y: np.abs(y), 0.0, 1.0),
+    "abs off centre": (lambda y: np.abs(y - 0.3), 0.0, 1.3),
+    "minus abs": (lambda y: -np.abs(y), -1.0, 0.0),
+    "max": (lambda y: np.maximum(y, -2 * y), 0.0, 2.0),
+    "min": (lambda y: np.minimum(y, 0.5 - y), -1.0, 0.25),
+    "clip": (lambda y: np.clip(y, -0.2, 0.7), -0.2, 0.7),
+}
+
+
+@pytest.mark.parametrize("harmonic", [1, 3, 8])
+@pytest.mark.parametrize("name", KINKED)
+def test_kinked_functions(name, harmonic):
+    """Of a sine with up to 32 kinks: values at kinks to 1e-8, at smooth extrema exactly."""
+    function, low, high = KINKED[name]
+    times = np.arange(2 * harmonic + 1) / (2 * harmonic + 1)
+    sine = TrigSpline.cyclic(waypoints(times, np.sin(2 * np.pi * harmonic * times)[:, None]), 1.0)
+    assert sine.peak()[0] == pytest.approx(1, rel=1e-12)
+    found = sine.extrema_of(lambda jet: function(jet[0, 0]), 0)
+    assert found.minimum[0] == pytest.approx(low, rel=1e-12, abs=1e-8)
+    assert found.maximum[0] == pytest.approx(high, rel=1e-12, abs=1e-8)
+    assert function(sine(found.time_max[0])) == pytest.approx(found.maximum[0], abs=1e-8)
+
+
+def test_a_kink_of_minimum_jerk():
+    """max(y, 1 - y) is least, 1/2, where y crosses it in the middle."""
+    found = MOVE.extrema_of(lambda jet: np.maximum(jet[0, 0], 1 - jet[0, 0]), 0)
+    assert found.minimum[0] == pytest.approx(0.5, abs=1e-8)
+    assert found.time_min[0] == pytest.approx(1.0, abs=1e-8)
+    assert found.maximum[0] == 1.0
+
+
+@pytest.mark.parametrize("alpha", [0.0, 3.0])
+@pytest.mark.parametrize("rtol", [0.05, 1e-3])
+def test_bounds_contain_every_sample(rtol, alpha):
+    points = [Waypoint(0.0, [0.0, 1.0], [1.0, 0.0]), Waypoint(0.7, [2.0, -1.0]), Waypoint(2.0, [1.0, 0.0], [0.0, 3.0])]
+    plan = TrigSpline(points, alpha=alpha)
+
+    def clearance(jet):
+        return np.hypot(jet[0, 0] - 1.0, jet[0, 1] - 0.2) - 0.1 * np.abs(jet[1, 0])
+
+    found = plan.bounds(clearance, 1, [[1.0, 1.0], [0.1, 0.0]], rtol=rtol)
+    samples = clearance(plan.jet(np.linspace(0, 2, 20001), 1))
+    assert found.lower <= samples.min()
+    assert samples.max() <= found.upper
+    spread = samples.max() - samples.min()
+    assert found.minimum - found.lower <= 1.0001 * rtol * spread
+    assert found.upper - found.maximum <= 1.0001 * rtol * spread
+    assert clearance(plan.jet(found.time_min, 1)) == pytest.approx(found.minimum, rel=1e-12)
+    assert clearance(plan.jet(found.time_max, 1)) == pytest.approx(found.maximum, rel=1e-12)
+
+
+def test_bounds_see_what_samples_miss():
+    """A bump 2e-4 wide: a proof finds it, and the other legs are decided in a few cells."""
+    rest = [0.0, 0.0, 0.0]
+    plan = PiecewiseSpline(waypoints([0.0, 0.5, 0.5001, 0.5002, 1.0], [rest, rest, [1.0, 0.0, 0.0], rest, rest]))
+    found = plan.bounds(lambda jet: jet[0, 0], 0, 1.0, rtol=1e-2)
+    assert 1.0 <= found.upper <= 1.01
+    assert -0.01 <= found.lower <= 0.0
+    assert found.maximum == pytest.approx(1.0, abs=0.01)
+
+
+def test_bounds_of_a_jumping_derivative():
+    lines = PiecewiseSpline(waypoints([0.0, 1.0, 2.0], [[0.0, 0.0], [1.0], [-2.0, 0.0]]))
+    found = lines.bounds(lambda jet: jet[2, 0], 2, [[0.0], [0.0], [1.0]])
+    exact = lines.extrema(2)
+    assert found.lower <= exact.minimum[0] <= found.minimum + 1e-12
+    assert found.maximum - 1e-12 <= exact.maximum[0] <= found.upper
+
+
+def test_bounds_that_cannot_be_reached_are_refused():
+    with pytest.raises(ValueError, match="rtol = 1e-06 must be reached within 1000 cells"):
+        MOVE.bounds(lambda jet: jet[0, 0], 0, 1.0, rtol=1e-6, max_cells=1000)

@@ -1,0 +1,304 @@
+"""What every exported kind of trajectory promises: read off the exports, so that a new one is tested too."""
+
+import copy
+import inspect
+import json
+import pickle
+
+import numpy as np
+import pytest
+
+from ctrlplan import trajectories
+from ctrlplan.trajectories import Trajectory, Waypoint
+
+EXPORTED = {name: getattr(trajectories, name) for name in trajectories.__all__}
+KINDS = {
+    name: kind
+    for name, kind in EXPORTED.items()
+    if inspect.isclass(kind) and issubclass(kind, Trajectory) and not inspect.isabstract(kind)
+}
+NODES, WEIGHTS = np.polynomial.legendre.leggauss(32)
+
+POINTS = [
+    Waypoint.from_jets(-1.0, x=[0.0, 1.0, 0.0], z=[1.0, 0.0]),
+    Waypoint.from_jets(0.25, x=[2.0], z=[-1.0, 0.5, 0.0]),
+    Waypoint.from_jets(2.0, x=[1.0, 0.0, 0.0], z=[3.0, 0.0]),
+]
+BACK = [Waypoint.from_jets(5.0, x=[1.0, -0.3], z=[3.0, 0.1]), Waypoint.from_jets(6.0, x=[0.0, 0.0], z=[1.0, 2.0])]
+ARGUMENTS = {
+    "waypoints": lambda: POINTS,
+    "alpha": lambda: 1.3,
+    "parts": lambda: [trajectories.PolySpline(POINTS), trajectories.TrigSpline(BACK, alpha=2.0)],
+    "part": lambda: trajectories.PiecewiseSpline(POINTS),
+    "factor": lambda: -1 / 3,
+    "final": lambda: [1 / 3, 2.0],
+}
+
+
+def build(kind):
+    """An example from the names of the arguments that the constructor requires; labels where they may be given."""
+    given = {}
+    for name, parameter in inspect.signature(kind).parameters.items():
+        if parameter.default is inspect.Parameter.empty:
+            assert name in ARGUMENTS, f"say in ARGUMENTS what the argument {name} of {kind.__name__} may be"
+            given[name] = ARGUMENTS[name]()
+    return kind(**given, labels=["p", "q", "r", "s"]) if kind is trajectories.Stacked else kind(**given)
+
+
+PLANS = {name: build(kind) for name, kind in KINDS.items()}
+MOVES = {name: plan for name, plan in PLANS.items() if plan.duration}
+every = pytest.mark.parametrize("plan", PLANS.values(), ids=PLANS)
+moving = pytest.mark.parametrize("plan", MOVES.values(), ids=MOVES)
+
+
+def times(plan, count=41):
+    """Before, inside and after."""
+    return plan.start + np.linspace(-0.25, 1.25, count) * (plan.duration or 1.0)
+
+
+def legs(plan):
+    return list(zip(plan.breakpoints[:-1].tolist(), plan.breakpoints[1:].tolist(), strict=True))
+
+
+def sizes(plan, order):
+    """Largest of each derivative of each axis at a few hundred points."""
+    return np.abs(plan.jet(times(plan, 601), order)).max(axis=2)
+
+
+def test_there_are_as_many_as_the_design_names():
+    assert {"TrigSpline", "PolySpline", "PiecewiseSpline", "Step", "Sum", "Scaled", "Stacked", "Joined"} <= set(KINDS)
+
+
+def test_kinds_that_can_be_read_are_the_exported_ones():
+    """A private or abstract class is no kind that a file may name."""
+    own = {n for n, k in Trajectory.kinds.items() if k.__module__.startswith("ctrlplan.")}
+    assert own == set(KINDS)
+
+
+def test_all_is_what_is_visible():
+    assert len(EXPORTED) == len(trajectories.__all__)
+    assert list(trajectories.__all__) == sorted(trajectories.__all__, key=lambda n: (n.islower(), n))
+    loaded = {n for n in vars(trajectories) if not n.startswith("_") and not inspect.ismodule(getattr(trajectories, n))}
+    assert loaded == set(trajectories.__all__)
+
+
+@pytest.mark.parametrize("name", EXPORTED)
+def test_docstring(name):
+    doc = inspect.getdoc(EXPORTED[name])
+    assert doc
+    assert len(doc.splitlines()[0]) <= 64
+
+
+@every
+def test_attributes(plan):
+    assert plan.breakpoints[0] == plan.start
+    assert plan.breakpoints[-1] == plan.end
+    assert plan.duration == plan.end - plan.start
+    assert (np.diff(plan.breakpoints) > 0).all()
+    assert len(plan.labels) == len(set(plan.labels)) == plan.naxes
+    assert plan.initial.shape == plan.final.shape == (plan.naxes,)
+
+
+@every
+def test_shapes(plan):
+    for shape in [(), (3,), (0,), (2, 3)]:
+        t = np.full(shape, plan.start)
+        squeezed = shape if plan.naxes == 1 else (plan.naxes, *shape)
+        assert plan(t).shape == plan(t, 2).shape == squeezed
+        assert plan.jet(t, 2).shape == plan.jet(t, 2, left=True).shape == (3, plan.naxes, *shape)
+    np.testing.assert_array_equal(plan([0, 1, 2]), plan(np.array([0.0, 1.0, 2.0])))
+
+
+@every
+def test_value_and_jet_are_the_same_in_any_order(plan):
+    t = times(plan)
+    jet = plan.jet(t, 4)
+    tolerance = 1e-14 * sizes(plan, 4)
+    for nu in range(5):
+        values = plan(t, nu).reshape(plan.naxes, -1)
+        assert (np.abs(values - jet[nu]).max(axis=1) <= tolerance[nu]).all()
+    shuffled = np.random.default_rng(0).permutation(t.size)
+    assert (np.abs(plan.jet(t[shuffled], 4) - jet[:, :, shuffled]).max(axis=2) <= tolerance).all()
+
+
+@every
+def test_one_axis_squeezes(plan):
+    if plan.naxes == 1:
+        assert plan([0.0, 1.0]).shape == (2,)
+    else:
+        assert plan([0.0, 1.0]).shape == (plan.naxes, 2)
+
+
+@moving
+def test_jet_k_grows_by_the_integral_of_jet_k_plus_1(plan):
+    """Gauss-Legendre over part of every leg: no step size, no cancellation."""
+    for a, b in legs(plan):
+        a, b = a + 0.05 * (b - a), b - 0.1 * (b - a)
+        increase = np.diff(plan.jet([a, b], 5), axis=2)[:-1, :, 0]
+        integral = 0.5 * (b - a) * plan.jet(a + 0.5 * (b - a) * (NODES + 1), 5)[1:] @ WEIGHTS
+        assert (np.abs(increase - integral) <= 1e-12 * np.maximum(sizes(plan, 4), (b - a) * sizes(plan, 5)[1:])).all()
+
+
+@every
+def test_ends_are_held(plan):
+    far = np.array([-1e6, -1e-9, 1e-9, 1e6]) + np.array([plan.start, plan.start, plan.end, plan.end])
+    jet = plan.jet(far, 4)
+    np.testing.assert_array_equal(jet[1:], 0)
+    np.testing.assert_array_equal(jet[0], np.array([plan.initial, plan.initial, plan.final, plan.final]).T)
+    np.testing.assert_array_equal(plan.jet(plan.end, 0)[0], plan.final)
+    np.testing.assert_array_equal(plan.jet(plan.start, 0, left=True)[0], plan.initial)
+    if plan.duration:
+        assert np.abs(plan.jet(plan.end, 1)[1]).max() > 0 or np.abs(plan.jet(plan.end, 3)[3]).max() > 0
+
+
+@every
+def test_limits_at_breakpoints(plan):
+    """The right limit and, on request, the left one: what is 1e-9 s beside, to the next derivative times that."""
+    size = np.maximum(sizes(plan, 3)[1:], 1.0)
+    for t in plan.breakpoints:
+        last = t == plan.end and plan.duration
+        right, left = plan.jet(t, 2), plan.jet(t, 2, left=True)
+        if not last:
+            assert (np.abs(right - plan.jet(t + 1e-9, 2)) <= 1e-8 * size).all()
+        else:
+            np.testing.assert_array_equal(right, left)
+        assert (np.abs(left - plan.jet(t - 1e-9, 2)) <= 1e-8 * size).all()
+
+
+@every
+def test_extrema_are_attained_and_exceeded_by_no_sample(plan):
+    for nu in range(4):
+        found = plan.extrema(nu)
+        t = np.concatenate([times(plan, 2001), plan.breakpoints])
+        samples = np.concatenate([plan.jet(t, nu)[nu], plan.jet(plan.breakpoints, nu, left=True)[nu]], axis=1)
+        slack = 1e-12 * sizes(plan, nu)[nu]
+        if plan.duration and nu:  # zero outside is no value of the plan
+            inside = (t >= plan.start) & (t <= plan.end)
+            samples = np.concatenate(
+                [plan.jet(t[inside], nu)[nu], plan.jet(plan.breakpoints[1:], nu, left=True)[nu]], 1
+            )
+        assert (samples.min(axis=1) >= found.minimum - slack).all()
+        assert (samples.max(axis=1) <= found.maximum + slack).all()
+        for values, at in ((found.minimum, found.time_min), (found.maximum, found.time_max)):
+            limits = [[plan.jet(s, nu, left=side)[nu, axis] for side in (False, True)] for axis, s in enumerate(at)]
+            assert (np.abs(np.array(limits) - values[:, None]).min(axis=1) <= slack).all()
+        np.testing.assert_array_equal(plan.peak(nu), np.maximum(abs(found.minimum), abs(found.maximum)))
+
+
+@moving
+def test_retime_scales_jets_by_powers(plan):
+    slow = plan.retime(3.0 * plan.duration)
+    assert slow.start == plan.start
+    assert slow.duration == pytest.approx(3.0 * plan.duration, rel=1e-15)
+    np.testing.assert_allclose(slow.breakpoints - slow.start, 3.0 * (plan.breakpoints - plan.start), rtol=1e-14)
+    t = np.setdiff1d(times(plan), plan.breakpoints)
+    scaled = plan.jet(t, 4) / 3.0 ** np.arange(5)[:, None, None]
+    got = slow.jet(plan.start + 3.0 * (t - plan.start), 4)
+    assert (np.abs(got - scaled).max(axis=2) <= 1e-12 * sizes(slow, 4)).all()
+    np.testing.assert_allclose(slow.peak(2), plan.peak(2) / 9.0, rtol=1e-11)
+
+
+@every
+def test_shift_moves_the_clock(plan):
+    late = plan.shift(10.5)
+    np.testing.assert_allclose(late.breakpoints, plan.breakpoints + 10.5, rtol=1e-15)
+    t = np.setdiff1d(times(plan), plan.breakpoints)
+    assert (np.abs(late.jet(t + 10.5, 3) - plan.jet(t, 3)).max(axis=2) <= 1e-12 * sizes(plan, 3)).all()
+    assert late.labels == plan.labels
+
+
+@every
+def test_json_restores_every_bit(plan, tmp_path):
+    path = tmp_path / "plan.json"
+    plan.save(path)
+    t = np.concatenate([times(plan), plan.breakpoints, np.linspace(plan.start, plan.end, 5000)])
+    text = json.dumps(plan.to_dict(), allow_nan=False)
+    for again in (trajectories.trajectory_from_dict(json.loads(text)), trajectories.load_trajectory(path)):
+        assert type(again) is type(plan)
+        assert again.labels == plan.labels
+        assert again.to_dict() == plan.to_dict()
+        np.testing.assert_array_equal(again.breakpoints, plan.breakpoints)
+        np.testing.assert_array_equal(again.jet(t, 4), plan.jet(t, 4))
+        np.testing.assert_array_equal(again.jet(t, 2, left=True), plan.jet(t, 2, left=True))
+    assert json.loads(path.read_text()) == json.loads(text)
+    assert plan.to_dict()["type"] == type(plan).__name__
+
+
+@moving
+def test_json_of_a_plan_that_was_moved(plan):
+    """What retiming and shifting leave in the numbers is restored too."""
+    moved = plan.retime(plan.duration / 7).shift(1 / 3)
+    again = trajectories.trajectory_from_dict(json.loads(json.dumps(moved.to_dict())))
+    t = times(moved)
+    np.testing.assert_array_equal(again.jet(t, 3), moved.jet(t, 3))
+
+
+@every
+def test_copies(plan):
+    t = times(plan)
+    for again in (copy.copy(plan), copy.deepcopy(plan), pickle.loads(pickle.dumps(plan))):
+        assert type(again) is type(plan)
+        np.testing.assert_array_equal(again.jet(t, 3), plan.jet(t, 3))
+        assert again.to_dict() == plan.to_dict()
+        with pytest.raises(AttributeError):
+            again.labels = ()
+
+
+def arrays(plan):
+    return [plan.breakpoints, plan.initial, plan.final, *(w.jet for w in plan.waypoints)]
+
+
+@every
+def test_nothing_can_be_changed(plan):
+    for name in ("breakpoints", "labels", "anything_new"):
+        with pytest.raises(AttributeError, match="is immutable"):
+            setattr(plan, name, None)
+    with pytest.raises(AttributeError, match="is immutable"):
+        del plan.labels
+    assert not any(array.flags.writeable for array in arrays(plan))
+
+
+@every
+def test_nothing_can_be_changed_after_pickling(plan):
+    again = pickle.loads(pickle.dumps(plan))
+    assert not any(array.flags.writeable for array in arrays(again))
+
+
+@every
+def test_results_are_the_callers_own(plan):
+    """Writing into what was returned does not change the plan."""
+    t = times(plan)
+    before = plan.jet(t, 2)
+    for array in (plan(t), plan.jet(t, 2), plan.extrema().minimum, plan.peak()):
+        array[...] = 99.0
+    np.testing.assert_array_equal(plan.jet(t, 2), before)
+
+
+@every
+def test_algebra(plan):
+    t = times(plan)
+    jet = plan.jet(t, 2)
+    np.testing.assert_array_equal((plan + plan).jet(t, 2), 2 * jet)
+    np.testing.assert_array_equal((0.5 * plan).jet(t, 2), 0.5 * jet)
+    np.testing.assert_array_equal((plan - plan).jet(t, 2), 0)
+    both = trajectories.stack([plan, plan], labels=[f"axis{i}" for i in range(2 * plan.naxes)])
+    np.testing.assert_array_equal(both.jet(t, 2), np.concatenate([jet, jet], axis=1))
+    np.testing.assert_array_equal(plan.then(plan - plan + trajectories.Step(plan.final, plan.final)).final, plan.final)
+
+
+@every
+def test_repr_says_what_it_is(plan):
+    assert type(plan).__name__ in repr(plan)
+    assert plan.labels[0] in repr(plan)
+
+
+@every
+def test_csv(plan, tmp_path):
+    path = tmp_path / "plan.csv"
+    t = times(plan, 13)
+    plan.to_csv(path, t, order=1)
+    header, *rows = path.read_text().splitlines()
+    assert header.split(",") == ["time"] + [f"{name}{suffix}" for name in plan.labels for suffix in ("", "_d1")]
+    values = np.array([[float(v) for v in row.split(",")] for row in rows]).T
+    np.testing.assert_array_equal(values[0], t)
+    np.testing.assert_array_equal(values[1:], plan.jet(t, 1).transpose(1, 0, 2).reshape(-1, t.size))
