@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ctrlplan.trajectories import Trajectory, derivative_name
+from ctrlplan.trajectories.common import checked_count
 
 Array = NDArray[np.float64]
 
@@ -76,7 +77,7 @@ def create_source_iosystem(plan: Trajectory, derivatives: int = 0, name: str = "
     >>> driven.output_labels
     ['y']
     """
-    return PlanSource(_checked_plan(plan), _checked_derivatives(derivatives), name)
+    return PlanSource(_checked_plan(plan), checked_count(derivatives, "derivatives"), name)
 
 
 def source_samples(plan: Trajectory, timepts: ArrayLike, derivatives: int = 0) -> Array:
@@ -98,7 +99,8 @@ def source_samples(plan: Trajectory, timepts: ArrayLike, derivatives: int = 0) -
     -------
     ndarray, shape (ntime,) for a single signal, (nsignals, ntime) for more
     """
-    jet = _checked_plan(plan).jet(np.atleast_1d(np.asarray(timepts, dtype=float)), _checked_derivatives(derivatives))
+    times = np.atleast_1d(np.asarray(timepts, dtype=float))
+    jet = _checked_plan(plan).jet(times, checked_count(derivatives, "derivatives"))
     samples = jet.transpose(1, 0, 2).reshape(-1, jet.shape[2])
     return samples[0] if len(samples) == 1 else samples
 
@@ -107,9 +109,3 @@ def _checked_plan(plan: Trajectory) -> Trajectory:
     if not isinstance(plan, Trajectory):
         raise TypeError(f"plan must be a Trajectory, got {type(plan).__name__}")
     return plan
-
-
-def _checked_derivatives(derivatives: int) -> int:
-    if derivatives != int(derivatives) or derivatives < 0:
-        raise ValueError(f"derivatives must be a whole number from 0, got {derivatives}")
-    return int(derivatives)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import itertools
 from abc import abstractmethod
 from collections.abc import Iterable, Sequence
+from itertools import pairwise
 from typing import Any, Self
 
 import numpy as np
@@ -29,7 +29,8 @@ class _Combined(Trajectory):
 
     @classmethod
     def _from_dict(cls, data: dict[str, Any]) -> Self:
-        return cls._of(tuple(trajectory_from_dict(part) for part in data["parts"]), tuple(data["labels"]))
+        parts = _checked_parts(trajectory_from_dict(part) for part in data["parts"])
+        return cls._of(parts, tuple(data["labels"]))
 
     @classmethod
     def _of(cls, parts: tuple[Trajectory, ...], labels: tuple[str, ...]) -> Self:
@@ -38,12 +39,13 @@ class _Combined(Trajectory):
         return self
 
     def _set(self, parts: tuple[Trajectory, ...], labels: tuple[str, ...]) -> None:
+        initial = readonly(self._combine([part.initial for part in parts]))
         joined = np.unique(np.concatenate([part.breakpoints for part in parts]))
         self.__dict__.update(
             parts=parts,
-            labels=labels,
+            labels=checked_labels(labels, initial.size),
             breakpoints=readonly(joined),
-            initial=readonly(self._combine([part.initial for part in parts])),
+            initial=initial,
             final=readonly(self._combine([part.final for part in parts])),
         )
 
@@ -55,7 +57,11 @@ class _Combined(Trajectory):
         return self._of(tuple(part._map_time(origin, shift, rate) for part in self.parts), self.labels)
 
     def _sample(self, t: Array, low: int, high: int, left: bool) -> Array:
-        return self._combine([part._sample(t, low, high, left) for part in self.parts])
+        out = super()._sample(t, low, high, left)
+        at_end = t == self.end
+        if not left and at_end.any():  # the end belongs to the parts, each by its own rule
+            out[:, :, at_end] = self._combine([part._sample(t[at_end], low, high, left) for part in self.parts])
+        return out
 
     def _leg_jet(self, leg: int, s: Array, order: int) -> Array:
         leg %= self.breakpoints.size - 1
@@ -82,12 +88,10 @@ class Sum(_Combined):
 
     def __init__(self, parts: Iterable[Trajectory]) -> None:
         terms = _checked_parts(parts)
-        for i, part in enumerate(terms):
-            if part.naxes != terms[0].naxes:
-                raise ValueError(
-                    f"parts must have the same number of axes, got {part.naxes} in parts[{i}] after {terms[0].naxes}"
-                )
         self._set(terms, terms[0].labels)
+
+    def _set(self, parts: tuple[Trajectory, ...], labels: tuple[str, ...]) -> None:
+        super()._set(_same_axes(parts), labels)
 
     def _combine(self, values: list[Array]) -> Array:
         return np.add.reduce(values)
@@ -124,7 +128,7 @@ class Scaled(_Combined):
 
     def __init__(self, part: Trajectory, factor: float) -> None:
         self.__dict__["factor"] = checked_time(factor, "factor")
-        self._set((part,), part.labels)
+        self._set(_checked_parts([part]), part.labels)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data that `trajectory_from_dict` reads."""
@@ -160,19 +164,13 @@ class Joined(Trajectory):
 
     def __init__(self, parts: Iterable[Trajectory]) -> None:
         members = list(_checked_parts(parts))
-        for i, (before, after) in enumerate(itertools.pairwise(members)):
-            if before.naxes != after.naxes:
-                raise ValueError(f"joined trajectories must have the same axes, got {after.naxes} after {before.naxes}")
-            last, first = before.final, after.initial
-            if np.any(first != last) and np.any(np.abs(first - last) > 1e-9 * np.maximum(before.peak(), after.peak())):
-                raise ValueError(
-                    f"positions must agree where trajectories join, got {first.tolist()} after {last.tolist()} "
-                    f"at {members[i].end:g} s"
-                )
-            members[i + 1] = after.shift(members[i].end - after.start)
+        for i in range(1, len(members)):
+            members[i] = members[i].shift(members[i - 1].end - members[i].start)
         self._set(tuple(members), members[0].labels)
 
     def _set(self, parts: tuple[Trajectory, ...], labels: tuple[str, ...]) -> None:
+        for before, after in pairwise(_same_axes(parts)):
+            _check_join(before, after)
         times, legs = [parts[0].start], []
         waypoints = list(parts[0].waypoints)
         for part in parts:
@@ -182,7 +180,7 @@ class Joined(Trajectory):
                 waypoints += part.waypoints[1:]
         self.__dict__.update(
             parts=parts,
-            labels=labels,
+            labels=checked_labels(labels, parts[0].naxes),
             waypoints=tuple(waypoints),
             breakpoints=readonly(np.array(times)),
             initial=parts[0].initial,
@@ -198,7 +196,8 @@ class Joined(Trajectory):
     @classmethod
     def _from_dict(cls, data: dict[str, Any]) -> Self:
         self = cls.__new__(cls)
-        self._set(tuple(trajectory_from_dict(part) for part in data["parts"]), tuple(data["labels"]))
+        parts = _checked_parts(trajectory_from_dict(part) for part in data["parts"])
+        self._set(parts, tuple(data["labels"]))
         return self
 
     def _map_time(self, origin: float, shift: float, rate: float) -> Self:
@@ -249,3 +248,24 @@ def _checked_parts(parts: Iterable[Trajectory]) -> tuple[Trajectory, ...]:
         if not isinstance(part, Trajectory):
             raise TypeError(f"parts[{i}] must be a Trajectory, got {type(part).__name__}")
     return members
+
+
+def _same_axes(parts: tuple[Trajectory, ...]) -> tuple[Trajectory, ...]:
+    for i, part in enumerate(parts):
+        if part.naxes != parts[0].naxes:
+            raise ValueError(
+                f"parts must have the same number of axes, got {part.naxes} in parts[{i}] after {parts[0].naxes}"
+            )
+    return parts
+
+
+def _check_join(before: Trajectory, after: Trajectory) -> None:
+    """Refuse a jump of position, or a gap in time beyond the clock's rounding."""
+    if abs(after.start - before.end) > 4.0 * np.spacing(max(abs(after.start), abs(before.end))):
+        raise ValueError(f"parts must follow one another in time, got {after.start} s after {before.end} s")
+    last, first = before.final, after.initial
+    if np.any(first != last) and np.any(np.abs(first - last) > 1e-9 * np.maximum(before.peak(), after.peak())):
+        raise ValueError(
+            f"positions must agree where trajectories join, got {first.tolist()} after {last.tolist()} "
+            f"at {before.end:g} s"
+        )

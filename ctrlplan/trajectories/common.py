@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from numbers import Real
 from typing import Any, NoReturn, Self
 
 import numpy as np
@@ -13,6 +14,9 @@ Array = NDArray[np.float64]
 
 FACTORIALS: Array = np.array([float(math.factorial(k)) for k in range(171)])
 FACTORIALS.flags.writeable = False
+
+MOST = 100
+"""Highest order of a derivative, and highest degree."""
 
 
 class Frozen:
@@ -88,3 +92,15 @@ def checked_timepts(t: ArrayLike) -> Array:
 def mapped_time(time: float, origin: float, shift: float, rate: float) -> float:
     """Time moved to origin + shift + (time - origin)/rate."""
     return time + shift if rate == 1.0 else origin + shift + (time - origin) / rate
+
+
+def checked_count(value: float | Real, name: str, least: int = 0) -> int:
+    """Whole number of some least value."""
+    if isinstance(value, bool) or not isinstance(value, Real):
+        raise TypeError(f"{name} must be a whole number from {least}, got {value!r}")
+    number = float(value)
+    if not math.isfinite(number) or number != int(number) or number < least:
+        raise ValueError(f"{name} must be a whole number from {least}, got {value}")
+    if number > MOST:
+        raise ValueError(f"{name} must be at most {MOST}, got {value}")
+    return int(number)

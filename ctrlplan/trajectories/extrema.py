@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.polynomial import chebyshev
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from ctrlplan.trajectories.chebyshev import chebyshev_proxy, fit, real_roots, resolved_size
+from ctrlplan.trajectories.chebyshev import chebyshev_proxy, fit, real_roots
 from ctrlplan.trajectories.common import Array
 
 if TYPE_CHECKING:
     from ctrlplan.trajectories.trajectory import Trajectory
 
-_MAX_PIECES = 400
+_MAX_PIECES = 4000
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ def derivative_extrema(plan: Trajectory, nu: int) -> Extrema:
     found = _Candidates()
     if nu == 0 or plan.breakpoints.size == 1:
         held = np.zeros((2, plan.naxes)) if nu else np.stack([plan.initial, plan.final])
-        found.add(np.array([plan.start, plan.end]), held.T)
+        found.add(np.array([plan.start, plan.end]), held.T, (plan.start, plan.end))
     for leg, (origin, duration) in enumerate(_legs(plan)):
 
         def jet(t: Array, order: int, leg: int = leg) -> Array:
@@ -79,35 +79,39 @@ def derivative_extrema(plan: Trajectory, nu: int) -> Extrema:
         t[t < 1e-12 * duration] = 0.0
         t[t > (1.0 - 1e-12) * duration] = duration
         t = np.unique(t)
-        found.add(origin + t, jet(t, nu)[nu])
+        found.add(origin + t, jet(t, nu)[nu], (origin, origin + duration))
     return found.extrema()
 
 
 def function_extrema(plan: Trajectory, function: Callable[[Array], Array], order: int) -> Extrema:
     """Extrema of a function of the jet, resolved by Chebyshev proxies."""
     found = _Candidates()
-    for leg, (origin, duration) in enumerate(_legs(plan)):
+    for leg, (origin, duration) in enumerate(_searchable_legs(plan)):
 
         def value(t: Array, leg: int = leg) -> Array:
             return np.atleast_2d(np.asarray(function(plan._leg_jet(leg, t, order)), dtype=float))
 
+        scale = np.abs(value(np.linspace(0.0, duration, 65))).max(axis=1)
         todo, pieces = [(0.0, duration)], 0
         while todo:
             left, right = todo.pop()
             pieces += 1
             series = fit(value, (left, right), 32)
-            if not np.isfinite(series).all():
+            ends = value(np.array([left, right]))
+            if not np.isfinite(series).all() or not np.isfinite(ends).all():
                 where = f"between {origin + left:g} and {origin + right:g} s"
                 raise ValueError(f"function must be finite over the plan, got nan or inf {where}")
-            if resolved_size(series, 1e-13) is None and pieces < _MAX_PIECES and right - left > 1e-9 * duration:
+            # The points are inside: a kink beside an end shows only in the value there.
+            missed = np.abs(chebyshev.chebval(np.array([-1.0, 1.0]), series.T) - ends).max(axis=1)
+            scale = np.maximum(scale, np.abs(ends).max(axis=1))
+            resolved = np.all(np.maximum(missed, np.abs(series[:, -8:]).max(axis=1)) <= 1e-13 * scale)
+            if not resolved and pieces < _MAX_PIECES and right - left > 1e-9 * duration:
                 middle = 0.5 * (left + right)
                 todo += [(left, middle), (middle, right)]
                 continue
             roots = [real_roots(chebyshev.chebder(row)) for row in series]
             t = np.concatenate([[left, right], *(0.5 * (left + right) + 0.5 * (right - left) * r for r in roots)])
-            found.add(origin + t, value(t))
-    if plan.breakpoints.size == 1:
-        raise ValueError("a trajectory without duration has no interval to search, got a step")
+            found.add(origin + t, value(t), (origin, origin + duration))
     return found.extrema()
 
 
@@ -120,26 +124,51 @@ def certified_bounds(
     max_cells: int,
 ) -> Bounds:
     """Bounds by refining cells until a Lipschitz bound decides."""
-    weights = np.broadcast_to(np.asarray(lipschitz, dtype=float), (order + 1, plan.naxes))
-    slope = float(np.sum(weights * np.stack([plan.peak(k + 1) for k in range(order + 1)])))
+    legs = _searchable_legs(plan)
+    try:
+        weights = np.broadcast_to(np.asarray(lipschitz, dtype=float), (order + 1, plan.naxes))[:, :, None]
+    except ValueError:
+        shape = f"({order + 1}, {plan.naxes})"
+        raise ValueError(f"lipschitz must broadcast to shape {shape}, got shape {np.shape(lipschitz)}") from None
+    if not (np.isfinite(weights).all() and np.all(weights >= 0.0)):
+        raise ValueError(f"lipschitz must be finite and at least 0, got {lipschitz!r}")
+    if not rtol > 0.0:
+        raise ValueError(f"rtol must be above 0, got {rtol}")
+
+    def evaluated(jet: Array) -> Array:
+        values = np.asarray(function(jet), dtype=float)
+        if values.shape != jet.shape[2:]:
+            raise ValueError(f"function must return one value a time, shape {jet.shape[2:]}, got {values.shape}")
+        if not np.isfinite(values).all():
+            raise ValueError("function must be finite over the plan, got nan or inf")
+        return values
+
+    first, second = (np.stack([plan.peak(k + nu) for k in range(order + 1)])[:, :, None] for nu in (1, 2))
     found, lower, upper = _Candidates(), np.inf, -np.inf
-    least, greatest = np.inf, -np.inf
-    for leg, (origin, duration) in enumerate(_legs(plan)):
+    samples = [
+        evaluated(plan._leg_jet(leg, np.linspace(0.0, duration, 129), order)) for leg, (_, duration) in enumerate(legs)
+    ]
+    least, greatest = float(np.min(samples)), float(np.max(samples))
+    for leg, (origin, duration) in enumerate(legs):
         radius, spent = duration / 256, 0
         centres = duration * (np.arange(128) + 0.5) / 128
         while centres.size:
             spent += centres.size
             if spent > max_cells:
                 raise ValueError(f"rtol = {rtol:g} must be reached within {max_cells} cells; raise either of them")
-            values = np.asarray(function(plan._leg_jet(leg, centres, order)), dtype=float)
+            jet = plan._leg_jet(leg, centres, order + 1)
+            values = evaluated(jet[:-1])
+            # In its cell a derivative moves by no more than the next one's value at the centre and slope allow.
+            slope = np.minimum(first, np.abs(jet[1:]) + radius * second)
+            reach = radius * np.sum(weights * slope, axis=(0, 1))
             found.add(origin + centres, values[None])
             least, greatest = min(least, float(values.min())), max(greatest, float(values.max()))
-            gap, reach = rtol * (greatest - least), slope * radius
+            gap = rtol * (greatest - least)
             undecided = (values - reach < least - gap) | (values + reach > greatest + gap)
             undecided &= reach > gap
             if not undecided.all():
-                decided = values[~undecided]
-                lower, upper = min(lower, float(decided.min()) - reach), max(upper, float(decided.max()) + reach)
+                lower = min(lower, float((values - reach)[~undecided].min()))
+                upper = max(upper, float((values + reach)[~undecided].max()))
             radius *= 0.5
             centres = (centres[undecided, None] + np.array([-radius, radius])).ravel()
     best = found.extrema()
@@ -156,23 +185,40 @@ class _Candidates:
     def __init__(self) -> None:
         self.times: list[Array] = []
         self.values: list[Array] = []
+        self.ends: list[Array] = []
 
-    def add(self, t: Array, values: Array) -> None:
+    def add(self, t: Array, values: Array, ends: tuple[float, float] = (np.nan, np.nan)) -> None:
+        """Values (naxes, ntime) at some times, of which those of the `ends` of a leg go first in a tie."""
         self.times.append(t)
         self.values.append(values)
+        self.ends.append(np.where((t == ends[0]) | (t == ends[1]), 1.0, 0.0))
 
     def extrema(self) -> Extrema:
-        t, values = np.concatenate(self.times), np.concatenate(self.values, axis=1)
+        t, values, ends = np.concatenate(self.times), np.concatenate(self.values, axis=1), np.concatenate(self.ends)
         by_time = np.argsort(t, kind="stable")
-        t, values = t[by_time], values[:, by_time]
-        low, high = values.argmin(axis=1), values.argmax(axis=1)
+        t, values, ends = t[by_time], values[:, by_time], ends[by_time]
+        low, high = (self._first(sign * values, ends) for sign in (1.0, -1.0))
         rows = np.arange(len(values))
         return Extrema(values[rows, low], values[rows, high], t[low], t[high])
+
+    @staticmethod
+    def _first(values: Array, ends: Array) -> NDArray[np.intp]:
+        """Where each row is least: to rounding, at an end if it can be, and as early as it can be."""
+        slack = 8.0 * np.finfo(float).eps * np.abs(values).max(axis=1, keepdims=True)
+        tied = values <= values.min(axis=1, keepdims=True) + slack
+        return np.argmax(tied * (1.0 + ends), axis=1)
 
 
 def _legs(plan: Trajectory) -> list[tuple[float, float]]:
     """Beginning and duration [s] of each leg."""
     return list(zip(plan.breakpoints[:-1].tolist(), np.diff(plan.breakpoints).tolist(), strict=True))
+
+
+def _searchable_legs(plan: Trajectory) -> list[tuple[float, float]]:
+    legs = _legs(plan)
+    if not legs:
+        raise ValueError("a trajectory without duration has no interval to search, got a step")
+    return legs
 
 
 def _pieces(

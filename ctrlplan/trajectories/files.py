@@ -33,12 +33,14 @@ def trajectory_from_dict(data: dict[str, Any]) -> Trajectory:
         If the kind is unknown or an entry is missing or wrong.
     """
     kind = data.get("type") if isinstance(data, dict) else None
-    if kind not in Trajectory.kinds:
+    if not isinstance(kind, str) or kind not in Trajectory.kinds:
         raise ValueError(f"type must be one of {', '.join(sorted(Trajectory.kinds))}, got {kind!r}")
     try:
         return Trajectory.kinds[kind]._from_dict(data)
     except KeyError as missing:
         raise ValueError(f"a {kind} needs the entry {missing}, got {', '.join(data)}") from None
+    except (TypeError, AttributeError, IndexError) as error:
+        raise ValueError(f"a {kind} must have entries of the kinds that to_dict writes: {error}") from None
 
 
 def save_trajectory(plan: Trajectory, path: str | os.PathLike[str]) -> None:

@@ -89,7 +89,7 @@ class NewtonSystem(Frozen):
         if count == 0:
             raise ValueError("an axis needs at least one prescribed entry, got none")
         size = count if size is None else size
-        waypoints, orders = _sequence(_leja(alpha, times, given), given)
+        waypoints, orders = _sequence(_leja(_effective(alpha), times, given), given)
         nodes = times[waypoints]
         mean = math.fsum(nodes) / count
         nodes = np.concatenate([nodes, _spare_nodes(mean, size - count)]) if size > count else nodes
@@ -153,8 +153,7 @@ class NewtonSystem(Frozen):
         -------
         ndarray, shape (size, order + 1, ntime)
         """
-        # Below 1e-100 the family is its limit to far more than rounding, and its formulas would underflow.
-        alpha = self.alpha if self.alpha > 1e-100 else 0.0
+        alpha = _effective(self.alpha)
         half = 0.5 * alpha
         npairs = len(self._second)
         out = np.empty((2 * npairs + 1, order + 1, u.size))
@@ -201,6 +200,11 @@ class NewtonSystem(Frozen):
     _second: Array
 
 
+def _effective(alpha: float) -> float:
+    """Alpha for the formulas: so near 0 that they would underflow, the family is its limit to every digit."""
+    return alpha if alpha > 1e-100 else 0.0
+
+
 def _leja(alpha: float, times: Array, given: tuple[tuple[int, ...], ...]) -> list[int]:
     """Waypoints in Leja order: each next one farthest, in product, from those before."""
     used = [i for i, g in enumerate(given) if g]
@@ -216,9 +220,7 @@ def _leja(alpha: float, times: Array, given: tuple[tuple[int, ...], ...]) -> lis
     return [used[i] for i in chosen]
 
 
-def _sequence(
-    waypoints: list[int], given: tuple[tuple[int, ...], ...]
-) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def _sequence(waypoints: list[int], given: tuple[tuple[int, ...], ...]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Constraints in rounds through the waypoints, each waypoint's spread evenly over all rounds.
 
     Orders rise at each waypoint, as the triangle needs, and the nodes so far
@@ -262,7 +264,8 @@ def _factor(collocation: Array, hermite: bool, roughness: Array | None) -> tuple
         triangle, basis = collocation[:, :count], np.eye(size)
     else:
         # Columns and rows scaled: neither the size of the basis functions nor the units of the entries must count.
-        weight = 1.0 / np.abs(collocation).max(axis=0)
+        size_of = np.abs(collocation).max(axis=0)
+        weight = 1.0 / np.where(size_of > 0.0, size_of, 1.0)
         scaled = collocation * weight
         singular = np.linalg.svd(scaled / np.linalg.norm(scaled, axis=1, keepdims=True), compute_uv=False)
         if singular[-1] < 1e-13 * singular[0]:

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from ctrlplan.trajectories.common import FACTORIALS, Array, checked_labels, mapped_time, readonly
+from ctrlplan.trajectories.common import FACTORIALS, Array, checked_count, checked_labels, mapped_time, readonly
 from ctrlplan.trajectories.newton import NewtonSystem
 from ctrlplan.trajectories.trajectory import Trajectory
 from ctrlplan.trajectories.waypoint import Waypoint
@@ -54,11 +54,7 @@ class NewtonSpline(Trajectory):
         ValueError
             If a time differs.
         """
-        points = tuple(waypoints)
-        if [w.time for w in points] != [w.time for w in self.waypoints]:
-            times = [w.time for w in self.waypoints]
-            raise ValueError(f"waypoints must keep the times {times}, got {[w.time for w in points]}")
-        return self._again(points, self._options)
+        return self._again(same_times(waypoints, self.waypoints), self._options)
 
     @property
     def degree(self) -> tuple[int, ...]:
@@ -76,6 +72,8 @@ class NewtonSpline(Trajectory):
         times = [w.time for w in waypoints]
         start, period = times[0], options.period
         duration = times[-1] - start if period is None else period
+        if not 0.0 < duration < np.inf:
+            raise ValueError(f"duration must be finite and above 0, got {times[-1]} s after {start} s")
         same_clock = donor is not None and donor._times == times
         relative = donor._relative if donor and same_clock else (np.array(times) - start) / duration
         lent = donor._systems if donor and (same_clock or np.array_equal(donor._relative, relative)) else {}
@@ -206,6 +204,20 @@ def _axes(point: Waypoint) -> str:
     return f"{point.naxes} axes" if point.labels is None else f"axes {', '.join(point.labels)}"
 
 
+def same_times(waypoints: Iterable[Waypoint], before: tuple[Waypoint, ...]) -> tuple[Waypoint, ...]:
+    """Waypoints at the same times and of as many axes as others before them."""
+    points = tuple(waypoints)
+    for i, point in enumerate(points):
+        if not isinstance(point, Waypoint):
+            raise TypeError(f"waypoints[{i}] must be a Waypoint, got {type(point).__name__}")
+    times = [w.time for w in before]
+    if [w.time for w in points] != times:
+        raise ValueError(f"waypoints must keep the times {times}, got {[w.time for w in points]}")
+    if points[0].naxes != before[0].naxes:
+        raise ValueError(f"waypoints must keep the number of axes, {before[0].naxes}, got {points[0].naxes}")
+    return points
+
+
 def given_entries(waypoints: Sequence[Waypoint]) -> tuple[Array, list[Given]]:
     """Entries (waypoint, order, axis), and for each axis the orders given at each waypoint."""
     jets = [w.jet for w in waypoints]
@@ -235,7 +247,4 @@ def _groups(
 
 def checked_degree(degree: int | None, smooth: int) -> tuple[int | None, int]:
     """Degree and order of smoothness as whole numbers from 1."""
-    for name, value in (("degree", degree), ("smooth", smooth)):
-        if value is not None and (value != int(value) or value < 1):
-            raise ValueError(f"{name} must be a whole number from 1, got {value}")
-    return None if degree is None else int(degree), int(smooth)
+    return None if degree is None else checked_count(degree, "degree", 1), checked_count(smooth, "smooth", 1)

@@ -10,7 +10,7 @@ import numpy as np
 
 from ctrlplan.trajectories.common import FACTORIALS, Array, checked_labels, mapped_time, readonly
 from ctrlplan.trajectories.newton import NewtonSystem
-from ctrlplan.trajectories.newton_spline import NewtonSpline, checked_waypoints, given_entries
+from ctrlplan.trajectories.newton_spline import NewtonSpline, checked_waypoints, given_entries, same_times
 from ctrlplan.trajectories.polynomial import PolySpline
 from ctrlplan.trajectories.trajectory import Trajectory
 from ctrlplan.trajectories.trigonometric import TrigSpline, checked_alpha
@@ -79,11 +79,7 @@ class PiecewiseSpline(Trajectory):
         ValueError
             If a time differs.
         """
-        points = tuple(waypoints)
-        if [w.time for w in points] != [w.time for w in self.waypoints]:
-            times = [w.time for w in self.waypoints]
-            raise ValueError(f"waypoints must keep the times {times}, got {[w.time for w in points]}")
-        return type(self)(points, alpha=self.alpha, labels=self.labels)
+        return type(self)(same_times(waypoints, self.waypoints), alpha=self.alpha, labels=self.labels)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data that `trajectory_from_dict` reads."""

@@ -48,7 +48,7 @@ def sample(jet: Callable[[Array, int], Array], duration: float, t: Array, low: i
             terms = _taylor_terms(size, 0.5 * cell * step, low, high)
             if terms is not None:
                 return _sample_uniform(jet, float(t[0]), step, t.size, low, high, cell, terms)
-    elif bool(np.all(t[1:] >= t[:-1])):
+    elif t[-1] > t[0] and bool(np.all(t[1:] >= t[:-1])):
         for cell in (4096, 2048, 1024, 512, 256):
             ncells = -(-t.size // cell)
             terms = _taylor_terms(size, 0.5 * float(t[-1] - t[0]) / ncells, low, high)
@@ -78,6 +78,9 @@ def _taylor_terms(size: Array, radius: float, low: int, high: int) -> int | None
     powers = radius ** np.arange(_MAX_TERMS + 3) / FACTORIALS[: _MAX_TERMS + 3]
     tails = np.stack([size[nu : nu + _MAX_TERMS + 3] * powers[:, None] for nu in range(low, high + 1)])
     small = tails <= 0.25 * np.finfo(float).eps * tails.max(axis=1, keepdims=True)
+    # Larger terms than the value would cancel, and cost digits.
+    if np.any(tails.sum(axis=1) > 4.0 * tails[:, 0]):
+        return None
     # Two terms in a row, so that an odd or even function does not end its series early.
     done = (small[:, 1:-1] & small[:, 2:]).all(axis=(0, 2))
     return int(done.argmax()) + 1 if done.any() else None

@@ -44,22 +44,16 @@ class Step(Trajectory):
         time: float = 0.0,
         labels: Sequence[str] | None = None,
     ) -> None:
-        try:
-            high, low = np.broadcast_arrays(
-                np.atleast_1d(np.asarray(final, dtype=float)), np.atleast_1d(np.asarray(initial, dtype=float))
-            )
-        except ValueError:
+        high, low = _positions(final, "final"), _positions(initial, "initial")
+        if low.size == 1 and high.size > 1:
+            low = np.repeat(low, high.size)
+        if low.shape != high.shape:
             raise ValueError(
                 f"initial must have the shape of final {np.shape(final)} or be a scalar, got {np.shape(initial)}"
-            ) from None
-        if high.ndim != 1 or not high.size:
-            raise ValueError(f"final must be a scalar or of shape (naxes,), got shape {high.shape}")
-        for name, values in (("final", high), ("initial", low)):
-            if not np.isfinite(values).all():
-                raise ValueError(f"{name} must be finite, got {values.tolist()}")
+            )
         self.__dict__.update(
-            initial=readonly(low.copy()),
-            final=readonly(high.copy()),
+            initial=readonly(low),
+            final=readonly(high),
             labels=checked_labels(labels, high.size),
             breakpoints=readonly(np.array([checked_time(time, "time")])),
         )
@@ -83,3 +77,16 @@ class Step(Trajectory):
 
     def _leg_jet(self, leg: int, s: Array, order: int) -> Array:
         raise AssertionError("a step has no legs")
+
+
+def _positions(values: ArrayLike, name: str) -> Array:
+    """Positions as a new array (naxes,)."""
+    try:
+        found = np.array(values, dtype=float)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name} must be numbers, got {values!r}") from None
+    if found.ndim > 1 or not found.size:
+        raise ValueError(f"{name} must be a scalar or of shape (naxes,), got shape {found.shape}")
+    if not np.isfinite(found).all():
+        raise ValueError(f"{name} must be finite, got {found.tolist()}")
+    return np.atleast_1d(found)

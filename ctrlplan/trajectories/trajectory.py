@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ctrlplan.trajectories import extrema as _extrema
 from ctrlplan.trajectories import sampling as _sampling
-from ctrlplan.trajectories.common import Array, Frozen, checked_time, checked_timepts, readonly
+from ctrlplan.trajectories.common import Array, Frozen, checked_count, checked_time, checked_timepts, readonly
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -122,7 +122,8 @@ class Trajectory(Frozen, ABC):
             If a time is nan or nu is negative.
         """
         times = checked_timepts(t)
-        values = self._sample(times.ravel(), _checked_order(nu, "nu"), nu, False)[0]
+        derivative = checked_count(nu, "nu")
+        values = self._sample(times.ravel(), derivative, derivative, False)[0]
         return values.reshape(times.shape if self.naxes == 1 else (self.naxes, *times.shape))
 
     def jet(self, t: ArrayLike, order: int, left: bool = False) -> Array:
@@ -148,8 +149,9 @@ class Trajectory(Frozen, ABC):
             If a time is nan or the order is negative.
         """
         times = checked_timepts(t)
-        values = self._sample(times.ravel(), 0, _checked_order(order, "order"), left)
-        return values.reshape(order + 1, self.naxes, *times.shape)
+        highest = checked_count(order, "order")
+        values = self._sample(times.ravel(), 0, highest, left)
+        return values.reshape(highest + 1, self.naxes, *times.shape)
 
     def extrema(self, nu: int = 0) -> _extrema.Extrema:
         """Least and greatest value of the nu-th derivative, true over the whole interval.
@@ -166,7 +168,7 @@ class Trajectory(Frozen, ABC):
         Extrema
             minimum, maximum, time_min, time_max, each of shape (naxes,).
         """
-        return _extrema.derivative_extrema(self, _checked_order(nu, "nu"))
+        return _extrema.derivative_extrema(self, checked_count(nu, "nu"))
 
     def peak(self, nu: int = 0) -> Array:
         """Greatest magnitude of the nu-th derivative, shape (naxes,)."""
@@ -191,7 +193,7 @@ class Trajectory(Frozen, ABC):
         Extrema
             Each entry of shape (m,), m = 1 for a function with one value.
         """
-        return _extrema.function_extrema(self, function, _checked_order(order, "order"))
+        return _extrema.function_extrema(self, function, checked_count(order, "order"))
 
     def bounds(
         self,
@@ -231,7 +233,7 @@ class Trajectory(Frozen, ABC):
         ValueError
             If `rtol` is not reached with `max_cells` cells.
         """
-        return _extrema.certified_bounds(self, function, _checked_order(order, "order"), lipschitz, rtol, max_cells)
+        return _extrema.certified_bounds(self, function, checked_count(order, "order"), lipschitz, rtol, max_cells)
 
     def retime(self, duration: float) -> Trajectory:
         """Same path from the same start, in another duration [s].
@@ -287,7 +289,7 @@ class Trajectory(Frozen, ABC):
         """
         from ctrlplan.reports.figures import plot_trajectory
 
-        return plot_trajectory(self, order=_checked_order(order, "order"), units=units)
+        return plot_trajectory(self, order=checked_count(order, "order"), units=units)
 
     def __add__(self, other: Trajectory) -> Trajectory:
         from ctrlplan.trajectories.combined import Sum
@@ -350,9 +352,3 @@ class Trajectory(Frozen, ABC):
         held = np.zeros((order + 1, self.naxes, s.size))
         held[0] = (self.initial if leg < 0 else self.final)[:, None]
         return held
-
-
-def _checked_order(order: int, name: str) -> int:
-    if order != int(order) or order < 0:
-        raise ValueError(f"{name} must be a whole number from 0, got {order}")
-    return int(order)

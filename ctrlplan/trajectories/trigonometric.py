@@ -216,22 +216,27 @@ def checked_alpha(alpha: float | str) -> float:
     except (TypeError, ValueError):
         raise TypeError(f"alpha must be a number in [0, 2 pi), got {alpha!r}") from None
     if not 0.0 <= value < 2.0 * math.pi:
-        raise ValueError(f"alpha must lie in [0, 2 pi), got {value:g}")
+        raise ValueError(f"alpha must lie in [0, 2 pi), got {value}")
     return value
 
 
 def _checked_gamma(gamma: float | Sequence[float | None] | None, naxes: int) -> float | list[float | None] | None:
+    """One phase for all axes, or one an axis, as plain numbers."""
     if gamma is None:
         return None
-    values = [gamma] if isinstance(gamma, (int, float)) else list(gamma)
+    given: Any = np.asarray(gamma, dtype=object)
+    try:
+        values = [None if v is None else float(v) for v in given.ravel()]
+    except (TypeError, ValueError):
+        raise TypeError(f"gamma must be a number, or one an axis, got {gamma!r}") from None
     for value in values:
         if value is not None and not math.isfinite(value):
             raise ValueError(f"gamma must be finite, got {value}")
-    if isinstance(gamma, (int, float)):
-        return float(gamma)
+    if not given.ndim:
+        return values[0]
     if len(values) != naxes:
         raise ValueError(f"gamma must be one number or as many as axes, {naxes}, got {len(values)}")
-    return [None if v is None else float(v) for v in values]
+    return values
 
 
 def _fourier(alpha: float, system: NewtonSystem, coefficients: Array) -> AxisCoefficients:

@@ -116,11 +116,10 @@ class Waypoint(Frozen):
 
     def _set(self, time: float, jet: Array, labels: tuple[str, ...] | None) -> None:
         complete = bool(np.isfinite(jet).all())
-        if not complete:
-            if np.isinf(jet).any():
-                order, axis = np.argwhere(np.isinf(jet))[0]
-                name = ENTRIES[order] if order < len(ENTRIES) else f"derivative {order}"
-                raise ValueError(f"{name} must be finite or nan (free), got {jet[order, axis]} at time {time:g}")
+        if not complete and np.isinf(jet).any():
+            order, axis = np.argwhere(np.isinf(jet))[0]
+            name = ENTRIES[order] if order < len(ENTRIES) else f"derivative {order}"
+            raise ValueError(f"{name} must be finite or nan (free), got {jet[order, axis]} at time {time:g}")
         self.__dict__.update(time=time, jet=readonly(jet), labels=labels, complete=complete, naxes=jet.shape[1])
 
     @property
@@ -168,7 +167,10 @@ class Waypoint(Frozen):
     def from_dict(cls, data: dict[str, Any]) -> Waypoint:
         """Waypoint from the plain data of `to_dict`."""
         labels = tuple(data["labels"]) if "labels" in data else None
-        jet = np.array([[np.nan if v is None else v for v in row] for row in data["jet"]], dtype=float)
+        rows = [[np.nan if v is None else v for v in row] for row in data["jet"]]
+        if len({len(row) for row in rows}) > 1:
+            raise ValueError(f"jet must have rows of one length, got {data['jet']!r}")
+        jet = _numbers(rows, "jet")
         if jet.ndim != 2 or jet.size == 0 or (labels is not None and len(labels) != jet.shape[1]):
             raise ValueError(f"jet must be a table of entries by axes, got {data['jet']!r}")
         return cls._of(checked_time(data["time"], "time"), jet, labels)

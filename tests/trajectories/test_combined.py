@@ -156,7 +156,7 @@ def test_positions_that_differ_are_refused():
     assert MOVE.then(near).end == 2.0
     with pytest.raises(ValueError, match="positions must agree"):
         MOVE.then(PolySpline(waypoints([0.0, 1.0], [[1 + 1e-6], [2.0]])))
-    with pytest.raises(ValueError, match="same axes"):
+    with pytest.raises(ValueError, match="same number of axes"):
         MOVE.then(stack([MOVE, MOVE]))
 
 

@@ -33,7 +33,7 @@ def test_birkhoff_data(pattern, alpha):
     assert plan.degree == ((oracle.m,) if alpha else (oracle.size - 1,))
 
 
-@pytest.mark.parametrize("alpha", [0.0, 1e-4, 1.0, 4.0, 5.5])
+@pytest.mark.parametrize("alpha", [0.0, 1e-4, 1.0, 4.0, 5.0])
 @pytest.mark.parametrize("count", [4, 6, 8, 10])
 def test_many_waypoints_without_velocity(count, alpha):
     """Position and acceleration at every waypoint, rest at the ends: up to N = 22.
@@ -45,7 +45,7 @@ def test_many_waypoints_without_velocity(count, alpha):
     jets = [[0.0, 0.0, 0.0], *inner, [1.0, 0.0, 0.0]]
     plan = TrigSpline(waypoints(times, jets), alpha=alpha)
     assert miss(plan) <= 1e-12
-    assert error(plan, Direct(times, jets, alpha, digits=50 if alpha in (0, 4, 5.5) else 150), ntime=21) <= 1e-12
+    assert error(plan, Direct(times, jets, alpha, digits=150 if alpha == 1e-4 else 60), ntime=21) <= 1e-12
 
 
 def test_every_axis_has_its_own_free_entries():

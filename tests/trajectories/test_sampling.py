@@ -125,7 +125,8 @@ def test_several_legs(alpha):
     plan = stack([legs, legs.shift(0.3) + 2 * legs])
     for count in (6000, 50_000):
         for name, t in orders_of(plan, count, rng).items():
-            t[count // 2 : count // 2 + 1] = t[count // 2 : count // 2 + 1] if name != "arbitrary" else 4.0
+            if name == "arbitrary":
+                t[count // 2] = 4.0
             assert disagreement(plan, t) <= 1, (name, count)
 
 
@@ -177,7 +178,7 @@ def test_axes_that_vanish_or_stand_still():
         jet, exact = plan.jet(t, 2), few_at_a_time(plan, t, 2)
         size = np.abs(exact).max(axis=2, keepdims=True)
         np.testing.assert_array_equal(jet[:, 0], 0)
-        np.testing.assert_allclose(jet[0, 1], 5.0, rtol=1e-15)
+        np.testing.assert_allclose(jet[0, 1], 5.0, rtol=1e-14)
         assert (np.abs(jet - exact)[:, 2:] <= 1e-13 * size[:, 2:]).all()
 
 

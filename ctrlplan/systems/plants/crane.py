@@ -184,7 +184,12 @@ class Crane:
         theta = series.arctan2(-across, hanging)
         r = series.divide(series.multiply(z, pull) - b * across, hanging)
         d = x[: len(pull)] - series.divide(b * pull - series.multiply(z, across), hanging)
-        jets = {"D": series.to_jet(d), "R": series.to_jet(r), "theta": series.to_jet(theta), "T": m * series.to_jet(pull)}
+        jets = {
+            "D": series.to_jet(d),
+            "R": series.to_jet(r),
+            "theta": series.to_jet(theta),
+            "T": m * series.to_jet(pull),
+        }
         out = {name: values[0] for name, values in jets.items()}
         for nu in range(1, len(pull)):
             out |= {f"{name}_d{nu}": values[nu] for name, values in jets.items()}
@@ -334,7 +339,6 @@ class Crane:
 
     def _output(self, t: float, state: Any, inputs: Any, params: dict[str, Any]) -> Array:
         x, z, x_rate, z_rate = self._load(state)
-        # At an empty state (python-control probes blocks with zeros) no rope hangs.
         tension = self.accelerations(state, inputs[0], inputs[1])[3]
         return np.array([x, z, state[0], state[1], state[2], x_rate, z_rate, state[3], state[4], state[5], tension])
 

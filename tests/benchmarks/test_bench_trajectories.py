@@ -1,0 +1,128 @@
+"""Cost of trajectories beside scipy's, interleaved in one process; ratios are printed, none is asserted.
+
+2 axes, 4 waypoints with position, velocity and acceleration: 12 constraints an axis, over 10 s.
+"""
+
+import itertools
+from statistics import median
+from time import perf_counter
+
+import numpy as np
+import pytest
+from scipy.interpolate import BPoly, PPoly
+
+from ctrlplan.trajectories import TrigSpline, Waypoint
+
+RNG = np.random.default_rng(0)
+JETS = RNG.normal(size=(4, 3, 2))
+TIMES = np.array([0.0, 3.0, 6.0, 10.0])
+COUNT = 1_000_000
+ALPHA = 1.0
+
+
+def points(times, jets=JETS):
+    return [Waypoint(t, *jet) for t, jet in zip(times.tolist(), jets, strict=True)]
+
+
+def new_times(count):
+    """Times that no run has seen, so that nothing kept from an earlier one can help."""
+    return [np.array([0.0, *(TIMES[1:3] + RNG.uniform(-1, 1, 2)), 10.0]) for _ in range(count)]
+
+
+@pytest.fixture
+def beside(benchmark, capsys, request):
+    """Benchmark ours, then time ours and the peer in turn on the same inputs; print the median of the ratios."""
+
+    def run(ours, peer, inputs):
+        inputs = list(inputs)
+        seen = itertools.cycle(inputs)
+        benchmark.pedantic(ours, setup=lambda: ((next(seen),), {}), rounds=min(len(inputs), 20), warmup_rounds=1)
+        times = []
+        for data in inputs:
+            a = perf_counter()
+            ours(data)
+            b = perf_counter()
+            peer(data)
+            times.append((b - a, perf_counter() - b))
+        ratio = median(a / b for a, b in times)
+        benchmark.extra_info["ratio"] = ratio
+        own, other = (1e6 * median(column) for column in zip(*times, strict=True))
+        with capsys.disabled():
+            print(f"\n{request.node.name}: {own:.0f} us, peer {other:.0f} us, ratio {ratio:.3f}")
+
+    return run
+
+
+def meets(plan, times, jets=JETS):
+    return np.abs(plan.jet(times, 2).transpose(2, 0, 1) - jets).max() <= 1e-12 * np.abs(plan.jet(TIMES, 2)).max()
+
+
+@pytest.mark.benchmark(group="construct")
+@pytest.mark.parametrize("alpha", [0.0, ALPHA])
+@pytest.mark.parametrize("waypoints", ["with waypoints", "without waypoints"])
+def test_construct_at_new_times(beside, waypoints, alpha):
+    """Peer: BPoly.from_derivatives of the same data. Wanted: at most 0.8."""
+    inputs = [(times, points(times)) for times in new_times(300)]
+    if waypoints == "with waypoints":
+
+        def ours(data):
+            return TrigSpline(points(data[0]), alpha=alpha)
+
+    else:
+
+        def ours(data):
+            return TrigSpline(data[1], alpha=alpha)
+
+    def peer(data):
+        return BPoly.from_derivatives(data[0], JETS)
+
+    times = inputs[0][0]
+    assert meets(ours(inputs[0]), times)
+    np.testing.assert_allclose(peer(inputs[0])(times), JETS[:, 0], atol=1e-12)
+    beside(ours, peer, inputs)
+
+
+@pytest.mark.benchmark(group="new values")
+@pytest.mark.parametrize("waypoints", ["with waypoints", "without waypoints"])
+def test_new_values_at_the_same_times(beside, waypoints):
+    """Peer: BPoly.from_derivatives of the new data. Wanted: under 0.1."""
+    plan = TrigSpline(points(TIMES), alpha=ALPHA)
+    inputs = [(jets, points(TIMES, jets)) for jets in RNG.normal(size=(300, 4, 3, 2))]
+    if waypoints == "with waypoints":
+
+        def ours(data):
+            return plan.with_values(points(TIMES, data[0]))
+
+    else:
+
+        def ours(data):
+            return plan.with_values(data[1])
+
+    jets = inputs[0][0]
+    assert meets(ours(inputs[0]), TIMES, jets)
+    np.testing.assert_array_equal(ours(inputs[0])(TIMES), TrigSpline(points(TIMES, jets), alpha=ALPHA)(TIMES))
+    beside(ours, lambda data: BPoly.from_derivatives(TIMES, data[0]), inputs)
+
+
+SAMPLES = {
+    "uniform": np.linspace(0, 10, COUNT),
+    "sorted": np.sort(RNG.uniform(0, 10, COUNT)),
+    "unsorted": RNG.uniform(0, 10, COUNT),
+}
+
+
+@pytest.mark.benchmark(group="sample")
+@pytest.mark.parametrize("alpha", [0.0, ALPHA, 5.0])
+@pytest.mark.parametrize("name", SAMPLES)
+def test_position_and_two_derivatives_at_a_million_times(beside, name, alpha):
+    """Peer: PPoly of the same data and its derivatives. Wanted: under 0.25 at uniform times, at most 1 at others."""
+    plan = TrigSpline(points(TIMES), alpha=alpha)
+    quintics = PPoly.from_bernstein_basis(BPoly.from_derivatives(TIMES, JETS))
+    pieces = [quintics, quintics.derivative(), quintics.derivative(2)]
+    t = SAMPLES[name]
+    some = np.arange(0, COUNT, 1001)
+    few, many = plan.jet(t[some], 2), plan.jet(t, 2)
+    assert many.shape == (3, 2, COUNT)
+    assert (np.abs(many[:, :, some] - few).max(axis=2) <= 1e-12 * np.abs(few).max(axis=2)).all()
+    np.testing.assert_allclose([p(TIMES[:-1]) for p in pieces], JETS[:-1].transpose(1, 0, 2), atol=1e-12)
+    beside(lambda times: plan.jet(times, 2), lambda times: [p(times) for p in pieces], [t] * 7)

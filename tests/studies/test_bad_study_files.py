@@ -1,0 +1,347 @@
+"""Every kind of wrong file: one line that says what must hold, what was given and where; status 2; nothing written."""
+
+import math
+import re
+
+import pytest
+from study_text import Verbatim, to_toml, valid
+
+from ctrlplan.cli import main
+
+RULE = re.compile(r"\b(must|needs?)\b.*\bgot\b|alpha = \"auto\" must\b.*\bgive\b")
+
+
+def changed(*path, to):
+    """Return the valid file with one entry changed (or added)."""
+    data = valid()
+    place = data
+    for key in path[:-1]:
+        place = place[key]
+    place[path[-1]] = to
+    return data
+
+
+def without(*path):
+    """Return the valid file with one entry taken out."""
+    data = valid()
+    place = data
+    for key in path[:-1]:
+        place = place[key]
+    del place[path[-1]]
+    return data
+
+
+def plan(**choices):
+    return valid(plans=[{"name": "mine", **choices}])
+
+
+def points(*rows):
+    return valid(waypoints=[{"time": t, "x": x} for t, x in rows])
+
+
+def module(text, function="build"):
+    """Return a file whose loop is in a module beside it, and the module."""
+    return valid(loop={"kind": f"python:NAME:{function}"}, units={}), text
+
+
+REST = [0.0, 0.0, 0.0]
+END = [20.0, 0.0, 0.0]
+BIG = 10**400
+
+# What is wrong -> (data or text of the file, what the line must mention beside the file itself).
+WRONG = {
+    "not TOML": ("title = \n", ["TOML", "line 1"]),
+    "not TOML to the end": ("title = [", ["TOML"]),
+    "not TOML: a key twice": ("t_end = 1\nt_end = 2\n", ["TOML", "line 2"]),
+    "not UTF-8": (b"title = '\xff\xfe'\n", []),
+    "empty": ("", ["waypoint"]),
+    # Unknown keys, at every level
+    "unknown key": (valid(tile="Over the wall"), ["tile"]),
+    "unknown table": (valid(metrics={"band": 0.05}), ["metrics"]),
+    "unknown key of the loop": (changed("loop", "gian", to=5.0), ["loop", "gian"]),
+    "unknown key of a plan": (changed("plans", 1, "alpah", to=1.0), ["plans[1]", "alpah"]),
+    "choice of another family": (changed("plans", 1, "alpha", to=1.0), ["plans[1]", "alpha"]),
+    "unit of nothing": (changed("units", "q", to="m"), ["units", "q"]),
+    # Waypoints
+    "no waypoints": (without("waypoints"), ["waypoints", "got 0"]),
+    "empty waypoints": (valid(waypoints=[]), ["waypoints", "got 0"]),
+    "one waypoint": (points((0.0, REST)), ["waypoints", "got 1"]),
+    "waypoints are a number": (valid(waypoints=3), ["waypoints", "3"]),
+    "waypoints are a table": (valid(waypoints={"time": 0.0, "x": REST}), ["waypoints"]),
+    "waypoints are numbers": (valid(waypoints=[1.0, 2.0]), ["waypoints"]),
+    "repeated times": (points((0.0, REST), (6.0, [5.0]), (6.0, END)), ["waypoints[2].time", "6.0"]),
+    "unsorted times": (points((0.0, REST), (16.0, END), (6.0, [5.0])), ["waypoints[2].time", "6.0", "16.0"]),
+    "no time": (without("waypoints", 1, "time"), ["waypoints[1].time", "none"]),
+    "time of nan": (changed("waypoints", 1, "time", to=math.nan), ["waypoints[1].time", "nan"]),
+    "time of inf": (changed("waypoints", 2, "time", to=math.inf), ["waypoints[2].time", "inf"]),
+    "time of -inf": (changed("waypoints", 0, "time", to=-math.inf), ["waypoints[0].time", "-inf"]),
+    "time in words": (changed("waypoints", 1, "time", to="6.0"), ["waypoints[1].time", "'6.0'"]),
+    "time is true": (changed("waypoints", 1, "time", to=True), ["waypoints[1].time", "True"]),
+    "time is a list": (changed("waypoints", 1, "time", to=[6.0]), ["waypoints[1].time", "[6.0]"]),
+    "time is a date": (changed("waypoints", 1, "time", to=Verbatim("1979-05-27")), ["waypoints[1].time"]),
+    "time beyond all numbers": (changed("waypoints", 2, "time", to=BIG), ["waypoints[2].time"]),
+    "no axis": (without("waypoints", 1, "x"), ["waypoints[1]", "axis"]),
+    "jet of inf": (changed("waypoints", 1, "x", to=[5.0, math.inf]), ["waypoints[1]", "velocity", "inf"]),
+    "position of -inf": (changed("waypoints", 0, "x", to=[-math.inf]), ["waypoints[0]", "position", "-inf"]),
+    "jet is a number": (changed("waypoints", 1, "x", to=5.0), ["waypoints[1].x", "5.0"]),
+    "jet in words": (changed("waypoints", 1, "x", to="5.0"), ["waypoints[1].x", "'5.0'"]),
+    "jet with words": (changed("waypoints", 1, "x", to=[5.0, "0.0"]), ["waypoints[1].x", "'0.0'"]),
+    "jet with true": (changed("waypoints", 1, "x", to=[5.0, True]), ["waypoints[1].x", "True"]),
+    "jet of lists": (changed("waypoints", 1, "x", to=[[5.0], [0.0]]), ["waypoints[1].x", "[[5.0], [0.0]]"]),
+    "jet is a table": (changed("waypoints", 1, "x", to={"position": 5.0}), ["waypoints[1].x"]),
+    "jet beyond all numbers": (changed("waypoints", 1, "x", to=[BIG]), ["waypoints[1]"]),
+    "jets of unequal axes": (changed("waypoints", 1, "z", to=[1.0]), ["waypoints[1]", "x, z"]),
+    "another axis": (valid(waypoints=[{"time": 0.0, "x": REST}, {"time": 6.0, "z": END}]), ["waypoints[1]", "z"]),
+    "dot in a label": (
+        valid(waypoints=[{"time": 0.0, "x.y": REST}, {"time": 6.0, "x.y": END}]),
+        ["labels", "dot", "'x.y'"],
+    ),
+    "empty label": (valid(waypoints=[{"time": 0.0, "": REST}, {"time": 6.0, "": END}]), ["labels", "''"]),
+    "label cls": (valid(waypoints=[{"time": 0.0, "cls": REST}, {"time": 6.0, "cls": [0.0, "a"]}]), ["waypoints[1].cls"]),
+    "singular free entries": (points((0.0, REST), (8.0, [math.nan, 1.0]), (16.0, END)), ["singular"]),
+    "no positions at all": (points((0.0, [math.nan, 1.0]), (16.0, [math.nan, 1.0])), ["singular"]),
+    "nothing prescribed": (points((0.0, []), (16.0, [])), ["waypoints"]),
+    # Plans
+    "plans are a number": (valid(plans=3), ["plans", "3"]),
+    "plans are names": (valid(plans=["step"]), ["plans", "'step'"]),
+    "unknown family": (plan(family="bspline"), ["plans[0].family", "'bspline'", "trigonometric"]),
+    "no family": (plan(), ["plans[0].family", "'mine'"]),
+    "neither name nor family": (valid(plans=[{}]), ["plans[0].family", "None"]),
+    "family is a list": (plan(family=["step"]), ["plans[0].family", "['step']"]),
+    "family is a table": (plan(family={}), ["plans[0].family", "{}"]),
+    "name is a number": (valid(plans=[{"name": 3, "family": "step"}]), ["plans[0].name", "3"]),
+    "name is empty": (valid(plans=[{"name": "", "family": "step"}]), ["plans[0].name", "''"]),
+    "name given twice": (
+        valid(plans=[{"family": "step"}, {"name": "step", "family": "polynomial"}]),
+        ["plans[1].name", "'step'"],
+    ),
+    "no alpha": (plan(family="trigonometric"), ["plans[0]", "alpha", "none"]),
+    "alpha below 0": (plan(family="trigonometric", alpha=-0.1), ["plans[0]", "alpha", "-0.1"]),
+    "alpha of 6.5": (plan(family="trigonometric", alpha=6.5), ["plans[0]", "alpha must lie in [0, 2 pi)", "6.5"]),
+    "alpha of 2 pi": (plan(family="trigonometric", alpha=2 * math.pi), ["plans[0]", "alpha", "6.28"]),
+    "alpha out of range in legs": (plan(family="piecewise", alpha=7.0), ["plans[0]", "alpha", "7"]),
+    "alpha of nan": (plan(family="trigonometric", alpha=math.nan), ["plans[0]", "alpha", "nan"]),
+    "alpha of inf": (plan(family="trigonometric", alpha=math.inf), ["plans[0]", "alpha", "inf"]),
+    "alpha is to be chosen": (plan(family="trigonometric", alpha="auto"), ["plans[0]", '"auto"']),
+    "alpha in words": (plan(family="trigonometric", alpha="4.0"), ["plans[0]", "alpha", "'4.0'"]),
+    "alpha is true": (plan(family="trigonometric", alpha=True), ["plans[0]", "alpha", "True"]),
+    "alpha is a list": (plan(family="trigonometric", alpha=[1.0]), ["plans[0]", "alpha", "[1.0]"]),
+    "alpha beyond all numbers": (plan(family="trigonometric", alpha=BIG), ["plans[0]", "alpha"]),
+    "gamma where there is none": (plan(family="trigonometric", alpha=1.0, gamma=0.5), ["plans[0]", "gamma"]),
+    "gamma of nan": (plan(family="trigonometric", alpha=1.0, gamma=math.nan), ["plans[0]", "gamma", "nan"]),
+    "gamma in words": (plan(family="trigonometric", alpha=1.0, gamma="mean"), ["plans[0]", "gamma", "'mean'"]),
+    "gamma is true": (
+        plan(family="trigonometric", alpha=1.0, gamma=True)
+        | {"waypoints": [{"time": 0.0, "x": REST}, {"time": 16.0, "x": END}]},
+        ["plans[0]", "gamma", "True"],
+    ),
+    "gammas of other axes": (plan(family="trigonometric", alpha=1.0, gamma=[0.5, 0.5]), ["plans[0]", "gamma", "2"]),
+    "gamma that is singular": (
+        # m (gamma_mean - gamma) = pi/2 with m = 3 and the mean in the middle (MATH.md, section 1.3).
+        plan(family="trigonometric", alpha=1.0, gamma=0.5 + math.pi / 6)
+        | {"waypoints": [{"time": 0.0, "x": REST}, {"time": 16.0, "x": END}]},
+        ["plans[0]", "gamma"],
+    ),
+    "degree too low": (plan(family="polynomial", degree=3), ["plans[0]", "degree", "3"]),
+    "degree of 8.5": (plan(family="polynomial", degree=8.5), ["plans[0]", "degree", "8.5"]),
+    "degree of inf": (plan(family="polynomial", degree=math.inf), ["plans[0]", "degree", "inf"]),
+    "degree of nan": (plan(family="polynomial", degree=math.nan), ["plans[0]", "degree", "nan"]),
+    "degree in words": (plan(family="polynomial", degree="high"), ["plans[0]", "degree", "'high'"]),
+    "smooth of 0": (plan(family="polynomial", degree=9, smooth=0), ["plans[0]", "smooth", "0"]),
+    # The run
+    "no t_end": (without("t_end"), ["t_end", "none"]),
+    "t_end too early": (valid(t_end=15.0), ["t_end", "15", "16"]),
+    "t_end with the last waypoint": (valid(t_end=16.0), ["t_end", "16"]),
+    "t_end of nan": (valid(t_end=math.nan), ["t_end", "nan"]),
+    "t_end of inf": (valid(t_end=math.inf), ["t_end", "inf"]),
+    "t_end in words": (valid(t_end="30"), ["t_end", "'30'"]),
+    "t_end is true": (valid(t_end=True), ["t_end", "True"]),
+    "t_end beyond all numbers": (valid(t_end=BIG), ["t_end"]),
+    "one sample": (valid(samples=1), ["samples", "1"]),
+    "half a sample": (valid(samples=100.5), ["samples", "100.5"]),
+    "samples in words": (valid(samples="many"), ["samples", "'many'"]),
+    "samples without end": (valid(samples=10**9), ["samples", "1"]),
+    "title is a number": (valid(title=3), ["title", "3"]),
+    "units are a list": (valid(units=["m"]), ["units", "['m']"]),
+    "unit is a number": (changed("units", "x", to=1.0), ["units", "1.0"]),
+    # The loop
+    "no loop": (without("loop"), ["loop", "none"]),
+    "loop is a word": (valid(loop="linear"), ["loop", "'linear'"]),
+    "no kind": (without("loop", "kind"), ["loop.kind", "None"]),
+    "unknown kind": (changed("loop", "kind", to="quadratic"), ["loop.kind", "'quadratic'", "linear"]),
+    "kind is a number": (changed("loop", "kind", to=3), ["loop.kind", "3"]),
+    "kind is a list": (changed("loop", "kind", to=["linear"]), ["loop.kind", "['linear']"]),
+    "no num": (without("loop", "num"), ["loop.num", "none"]),
+    "no den": (without("loop", "den"), ["loop.den", "none"]),
+    "num in words": (changed("loop", "num", to=["1.0"]), ["loop", "num", "'1.0'"]),
+    "num is true": (changed("loop", "num", to=[True]), ["loop", "num", "True"]),
+    "num of nothing": (changed("loop", "num", to=[]), ["loop", "num", "[]"]),
+    "num of 0": (changed("loop", "num", to=[0.0]), ["loop", "num", "[0.0]"]),
+    "num of lists": (changed("loop", "num", to=[[1.0], [2.0]]), ["loop", "num"]),
+    "den of 0": (changed("loop", "den", to=[0.0, 0.0]), ["loop", "den", "[0.0, 0.0]"]),
+    "den of nan": (changed("loop", "den", to=[1.0, math.nan]), ["loop", "den", "nan"]),
+    "den beyond all numbers": (changed("loop", "den", to=[BIG, 1]), ["loop", "den"]),
+    "improper plant": (changed("loop", "num", to=[1.0, 0.0, 0.0, 1.0]), ["loop", "num", "3 over 2"]),
+    "gain of nan": (changed("loop", "gain", to=math.nan), ["loop", "gain", "nan"]),
+    "gain of inf": (changed("loop", "gain", to=math.inf), ["loop", "gain", "inf"]),
+    "gain in words": (changed("loop", "gain", to="5.0"), ["loop", "gain", "'5.0'"]),
+    "gain is true": (changed("loop", "gain", to=True), ["loop", "gain", "True"]),
+    "gain is a list": (changed("loop", "gain", to=[5.0]), ["loop", "gain", "[5.0]"]),
+    "gain beyond all numbers": (changed("loop", "gain", to=BIG), ["loop", "gain"]),
+    "loop without a solution": (
+        valid(loop={"kind": "linear", "num": [-1.0, 0.0], "den": [1.0, 1.0], "gain": 1.0}),
+        ["loop", "gain"],
+    ),
+    "no module": (changed("loop", "kind", to="python:"), ["loop.kind", "'python:'"]),
+    "empty module": (valid(loop={"kind": "python::build"}), ["loop.kind", "'python::build'"]),
+    "no such module": (valid(loop={"kind": "python:nowhere_to_be_found:build"}), ["loop.kind", "nowhere_to_be_found"]),
+    "key beside a module": (valid(loop={"kind": "python:a:b", "gain": 2.0}), ["loop", "gain"]),
+    "no such function": (module("def other(): pass\n"), ["loop.kind", "build"]),
+    "module with a mistake": (module("def build(:\n"), ["loop", "NAME"]),
+    "module that fails": (module("1 / 0\n"), ["loop", "NAME"]),
+    "function that fails": (module("def build():\n    raise RuntimeError('no\\nplant')\n"), ["loop", "NAME"]),
+    "function that wants more": (module("def build(gain): pass\n"), ["loop", "NAME"]),
+    "no function": (module("build = 3\n"), ["loop", "NAME"]),
+    "function without a loop": (module("def build(): return None\n"), ["loop", "NAME"]),
+    "loop of other axes": (
+        module("import control as ct\n\ndef build():\n    return ct.ss([[-1.0]], [[1.0, 1.0]], [[1.0]], [[0.0, 0.0]])\n"),
+        ["loop", "axes"],
+    ),
+}
+# What only the loop can tell is not known where only the plans are asked for.
+LOADED = [
+    name
+    for name, (case, _) in WRONG.items()
+    if not isinstance(case, tuple) and name not in ("unit of nothing", "empty module", "no such module")
+]
+
+
+@pytest.fixture
+def wrong(tmp_path, monkeypatch):
+    """Write the wrong file, in a folder of its own, and give what its line must mention."""
+    monkeypatch.chdir(tmp_path)
+
+    def write(name):
+        case, mentions = WRONG[name]
+        place = tmp_path / "given"
+        place.mkdir()
+        path = place / "study.toml"
+        if isinstance(case, tuple):
+            data, text = case
+            own = "own_" + re.sub(r"\W", "_", name)
+            (place / f"{own}.py").write_text(text)
+            mentions = [m.replace("NAME", own) for m in mentions]
+            path.write_text(to_toml(data).replace("NAME", own))
+        elif isinstance(case, bytes):
+            path.write_bytes(case)
+        else:
+            path.write_text(case if isinstance(case, str) else to_toml(case), encoding="utf-8")
+        return path, mentions
+
+    return write
+
+
+def refused(arguments, capsys):
+    """Return the one line that a refused command says, beside what it announces."""
+    assert main([str(a) for a in arguments]) == 2
+    said = capsys.readouterr()
+    assert said.out == ""
+    lines = [line for line in said.err.splitlines() if not re.match(r"ctrlplan: (study|plans of) \w+$", line)]
+    assert len(lines) == 1, lines
+    return lines[0]
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_report_refuses_it_in_one_line(name, wrong, capsys, tmp_path):
+    path, mentions = wrong(name)
+    line = refused(["report", path, "--out", tmp_path / "out"], capsys)
+    assert line.startswith("ctrlplan: ")
+    assert "study.toml" in line
+    assert RULE.search(line), line
+    for part in mentions:
+        assert part in line
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("name", LOADED)
+def test_plan_refuses_it_too(name, wrong, capsys, tmp_path):
+    path, _ = wrong(name)
+    line = refused(["plan", path, "--out", tmp_path / "out" / "plan.csv"], capsys)
+    assert "study.toml" in line
+    assert RULE.search(line), line
+    assert not (tmp_path / "out").exists()
+
+
+def test_what_was_written_before_stays(wrong, capsys, tmp_path):
+    path, _ = wrong("alpha of 6.5")
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "index.html").write_text("before")
+    refused(["report", path, "--out", out], capsys)
+    assert [(p.name, p.read_text()) for p in out.iterdir()] == [("index.html", "before")]
+
+
+@pytest.mark.parametrize("command", ["report", "plan"])
+def test_a_missing_file(command, capsys, tmp_path):
+    out = tmp_path / "plan.json"
+    line = refused([command, tmp_path / "nowhere.toml", "--out", out], capsys)
+    assert "nowhere.toml" in line
+    assert RULE.search(line)
+    assert not out.exists()
+
+
+@pytest.mark.parametrize("command", ["report", "plan"])
+def test_a_folder_for_a_file(command, capsys, tmp_path):
+    out = tmp_path / "plan.json"
+    line = refused([command, tmp_path, "--out", out], capsys)
+    assert str(tmp_path) in line
+    assert RULE.search(line)
+    assert not out.exists()
+
+
+@pytest.mark.parametrize("where", ["place", "place/deeper/still"])
+def test_an_out_folder_that_is_a_file(where, capsys, tmp_path):
+    (tmp_path / "study.toml").write_text(to_toml(valid()))
+    (tmp_path / "place").write_text("a file")
+    line = refused(["report", tmp_path / "study.toml", "--out", tmp_path / where], capsys)
+    assert "--out must be" in line
+    assert f"got {tmp_path / where}" in line
+    assert (tmp_path / "place").read_text() == "a file"
+    line = refused(["reproduce", "--out", tmp_path / where], capsys)
+    assert "--out must be" in line
+
+
+def test_an_out_folder_whose_files_cannot_be_replaced_gets_neither(capsys, tmp_path):
+    (tmp_path / "study.toml").write_text(to_toml(valid()))
+    (tmp_path / "out" / "results.json").mkdir(parents=True)
+    assert main(["report", str(tmp_path / "study.toml"), "--out", str(tmp_path / "out")]) == 2
+    assert "--out must be" in capsys.readouterr().err.splitlines()[-1]
+    assert [p.name for p in (tmp_path / "out").iterdir()] == ["results.json"]
+
+
+@pytest.mark.parametrize("name", ["plan.txt", "plan", "plan.csv.gz", ".csv", "plan.CSVX"])
+def test_an_out_file_of_another_kind(name, capsys, tmp_path):
+    (tmp_path / "study.toml").write_text(to_toml(valid()))
+    line = refused(["plan", tmp_path / "study.toml", "--out", tmp_path / name], capsys)
+    assert "--out must end in .csv or .json, got" in line
+    assert name in line
+    assert [p.name for p in tmp_path.iterdir()] == ["study.toml"]
+
+
+@pytest.mark.parametrize("where", ["plan.csv", "file/plan.csv"])
+def test_an_out_file_that_cannot_be_written(where, capsys, tmp_path):
+    (tmp_path / "study.toml").write_text(to_toml(valid()))
+    (tmp_path / "file").write_text("a file")
+    (tmp_path / "plan.csv").mkdir()
+    line = refused(["plan", tmp_path / "study.toml", "--out", tmp_path / where], capsys)
+    assert "--out must be" in line
+    assert where in line
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["file", "plan.csv", "study.toml"]
+    assert not list((tmp_path / "plan.csv").iterdir())
+
+
+def test_a_loop_that_is_unstable_is_no_error(capsys, tmp_path):
+    (tmp_path / "study.toml").write_text(to_toml(changed("loop", "gain", to=-5.0)))
+    assert main(["report", str(tmp_path / "study.toml"), "--out", str(tmp_path / "out")]) == 0
+    assert "unstable" in (tmp_path / "out" / "index.html").read_text(encoding="utf-8")
+    assert '"settling_time": null' in (tmp_path / "out" / "results.json").read_text(encoding="utf-8")

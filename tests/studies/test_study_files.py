@@ -1,0 +1,296 @@
+"""A study file is what it says: every family, loop and unit that it can state."""
+
+import tomllib
+
+import control as ct
+import numpy as np
+import pytest
+from study_text import VALID, Verbatim, to_toml, valid
+
+import ctrlplan as cp
+from ctrlplan.studies.files import FAMILIES, StudyError, StudyFile, build_loop, load_study, plans_as_csv, plans_as_json
+
+# The study file of the design, around a linear loop.
+DESIGN = """
+title = "Over the wall"
+t_end = 30.0
+[loop]
+kind = "linear"
+num = [1.0]
+den = [1.0, 1.0, 0.0]
+gain = 100.0
+[[plans]]
+name = "trigonometric"
+family = "trigonometric"  # polynomial, piecewise, step
+alpha = 4.0
+[[waypoints]]
+time = 0.0
+x = [0.0, 0.0, 0.0]       # position, velocity, acceleration, ... as many as prescribed
+[[waypoints]]
+time = 6.0
+x = [5.0, 1.0, 0.1]
+[[waypoints]]
+time = 16.0
+x = [20.0, 0.0, 0.0]
+"""
+
+
+@pytest.fixture
+def stated(tmp_path):
+    """Write data or text as a study file and load it."""
+
+    def load(data, name="study.toml"):
+        path = tmp_path / name
+        path.write_text(data if isinstance(data, str) else to_toml(data), encoding="utf-8")
+        return load_study(path)
+
+    return load
+
+
+def test_the_writer_of_these_tests_writes_toml():
+    odd = valid(when=Verbatim("1979-05-27"), odd=[1, [True, 'q"\n'], {"a b": -2.5e300}], nan=float("inf"))
+    again = tomllib.loads(to_toml(odd))
+    assert str(again.pop("when")) == odd.pop("when")
+    assert again == odd
+
+
+def test_the_example_of_the_design(stated):
+    found = stated(DESIGN, "wall.toml")
+    assert isinstance(found, StudyFile)
+    assert (found.name, found.title, found.t_end) == ("wall", "Over the wall", 30.0)
+    assert found.waypoints == (
+        cp.Waypoint.from_jets(0.0, x=[0, 0, 0]),
+        cp.Waypoint.from_jets(6.0, x=[5, 1, 0.1]),
+        cp.Waypoint.from_jets(16.0, x=[20, 0, 0]),
+    )
+    (plan,) = found.plans.values()
+    assert isinstance(plan, cp.TrigSpline)
+    assert (plan.alpha, plan.labels) == (4.0, ("x",))
+    t = np.linspace(-1, 17, 181)
+    np.testing.assert_array_equal(plan(t, 1), cp.TrigSpline(found.waypoints, alpha=4.0)(t, 1))
+
+
+def test_running_it_is_comparing_its_plans(stated):
+    study = stated(DESIGN).run()
+    plan = cp.TrigSpline([cp.Waypoint(0, 0, 0, 0), cp.Waypoint(6, 5, 1, 0.1), cp.Waypoint(16, 20, 0, 0)], alpha=4.0)
+    times = np.union1d(np.linspace(0, 30, 4001), [0.0, 6.0, 16.0])
+    loop = cp.plants.integrator_lag_loop(100.0, outputs=("y", "u"))
+    alone = cp.compare(loop, {"trigonometric": plan}, times, waypoints=plan.waypoints)
+    assert study.comparison.metrics == alone.metrics
+    assert study.comparison.title == study.title == "Over the wall"
+    assert study.name == "study"
+    assert list(study.results()["plans"]) == ["trigonometric"]
+
+
+def test_without_plans_the_standard_set_is_compared(stated):
+    data = valid()
+    del data["plans"]
+    assert list(stated(data).plans) == ["step", "polynomial", "trigonometric", "piecewise"]
+
+
+@pytest.mark.parametrize("family", sorted(FAMILIES))
+def test_every_family_can_be_asked_for(family, stated):
+    choice = {"alpha": 1.5} if "alpha" in FAMILIES[family][1] else {}
+    (plan,) = stated(valid(plans=[{"family": family, **choice}])).plans.values()
+    assert type(plan) is FAMILIES[family][0]
+    assert plan.labels == ("x",)
+    assert plan(16.0) == pytest.approx(20.0, abs=1e-12)
+    assert plan(-1.0) == pytest.approx(0.0, abs=1e-12)
+    if choice:
+        assert plan.alpha == 1.5
+
+
+def test_families_are_those_of_the_design():
+    assert set(FAMILIES) >= {"trigonometric", "polynomial", "piecewise", "step"}
+
+
+def test_choices_reach_the_plan(stated):
+    plans = [
+        {"family": "trigonometric", "alpha": 1.0, "gamma": 0.4, "name": "turned"},
+        {"family": "trigonometric", "alpha": 1.0, "degree": 7, "name": "spare"},
+        {"family": "polynomial", "degree": 9, "smooth": 4, "name": "long"},
+    ]
+    data = valid(plans=plans)
+    data["waypoints"][1]["x"] = [5.0, 1.0]  # eight constraints: an even number has a gamma
+    found = stated(data).plans
+    assert found["turned"].gamma == (0.4,)
+    assert found["spare"].degree == (7,)
+    assert found["long"].degree == (9,)
+    points = stated(data).waypoints
+    expected = cp.PolySpline(points, degree=9, smooth=4)
+    np.testing.assert_array_equal(found["long"](np.arange(17.0)), expected(np.arange(17.0)))
+
+
+def test_the_family_may_be_the_name(stated):
+    assert list(stated(valid(plans=[{"name": "polynomial"}])).plans) == ["polynomial"]
+    found = stated(valid(plans=[{"name": "mine", "family": "polynomial"}, {"family": "step"}])).plans
+    assert list(found) == ["mine", "step"]
+
+
+def test_several_axes_keep_their_order_and_their_own_jets(stated):
+    data = valid(
+        units={},
+        plans=[{"family": "polynomial"}],
+        waypoints=[
+            {"time": 0, "x": [0.0, 0.0, 0.0], "z": [10]},
+            {"time": 4, "x": [1.0], "z": [8, 0.5]},
+            {"time": 9, "x": [2.0, 0.0], "z": [11, 0, 0]},
+        ],
+    )
+    plan = stated(data).plans["polynomial"]
+    assert plan.labels == ("x", "z")
+    assert plan.degree == (5, 5)
+    np.testing.assert_allclose(plan([0, 4, 9]), [[0, 1, 2], [10, 8, 11]], rtol=0, atol=1e-12)
+    assert plan(4.0, 1)[1] == pytest.approx(0.5, abs=1e-12)
+
+
+def test_an_entry_of_nan_is_free(stated):
+    data = valid(plans=[{"family": "polynomial"}])
+    data["waypoints"][1]["x"] = [5.0, float("nan"), 0.25]
+    plan = stated(data).plans["polynomial"]
+    assert plan.degree == (7,)
+    assert plan(6.0, 2) == pytest.approx(0.25, abs=1e-12)
+
+
+def test_whole_numbers_are_numbers(stated):
+    data = valid(t_end=30)
+    data["loop"] |= {"num": [1], "den": [1, 1, 0], "gain": 5}
+    data["waypoints"][0] = {"time": 0, "x": [0, 0, 0]}
+    found = stated(data)
+    assert (found.t_end, found.waypoints[0].time) == (30.0, 0.0)
+    assert found.run().comparison.metrics == stated(valid()).run().comparison.metrics
+
+
+def test_title_samples_and_units_can_be_left_out(stated):
+    data = valid()
+    for key in ("title", "samples", "units", "plans"):
+        del data[key]
+    del data["loop"]["gain"]
+    found = stated(data, "hoist.toml")
+    assert (found.title, found.samples, found.units) == ("hoist", 4001, {})
+    loop = build_loop(found.loop, found.path)
+    np.testing.assert_allclose(np.sort(loop.poles()), np.sort(np.roots([1, 1, 1])))
+
+
+def test_units_reach_the_comparison(stated):
+    found = stated(valid()).run().comparison
+    assert found.units == {"x": "m", "u": "N"}
+
+
+def test_every_waypoint_is_a_sample(stated):
+    data = valid(samples=7)
+    data["waypoints"][1]["time"] = np.pi
+    found = stated(data).run().comparison
+    for response in found.responses.values():
+        assert {0.0, np.pi, 16.0, 30.0} <= set(response.time)
+
+
+def test_parameters_say_how_it_was_made(stated):
+    told = {k: str(v) for k, v in stated(valid()).run().comparison.parameters.items()}
+    text = " | ".join(f"{k}: {v}" for k, v in told.items())
+    for part in ("linear", "gain: 5", "[1.0, 1.0, 0.0]", "alpha = 2 rad", "alpha = 0.5 rad", "0 to 30 s", "101", "2 %"):
+        assert part in text
+    assert sum(key.startswith("waypoint") for key in told) == 3
+
+
+def test_a_plant_that_passes_its_input_on_has_a_loop(stated):
+    # (s + 2)/(s + 1) in unity feedback is (s + 2)/(2 s + 3): from 1/2 to 2/3 with a time constant of 2/3 s.
+    data = valid(loop={"kind": "linear", "num": [1.0, 2.0], "den": [1.0, 1.0]}, plans=[{"family": "step"}], units={})
+    data |= {"waypoints": [{"time": 0.0, "x": [0.0]}, {"time": 1.0, "x": [1.0]}], "samples": 61}
+    response = stated(data).run().comparison.responses["step"]
+    expected = 2 / 3 - np.exp(-1.5 * response.time) / 6
+    np.testing.assert_allclose(response.outputs[0], expected, rtol=0, atol=1e-12)
+
+
+# Loops of the user's own, beside the file
+
+LOOP = """
+import control as ct
+
+def build():
+    return ct.ss([[-{rate}]], [[{rate}]], [[1.0]], [[0.0]], inputs=["r"], outputs=["y"])
+"""
+
+
+def test_a_loop_is_found_next_to_the_file(tmp_path):
+    (tmp_path / "hoist_loop.py").write_text(LOOP.format(rate=4.0))
+    path = tmp_path / "study.toml"
+    path.write_text(to_toml(valid(loop={"kind": "python:hoist_loop:build"}, units={})))
+    study = load_study(path).run()
+    own = ct.ss([[-4.0]], [[4.0]], [[1.0]], [[0.0]], inputs=["r"], outputs=["y"])
+    times = np.union1d(np.linspace(0, 30, 101), [0.0, 6.0, 16.0])
+    alone = cp.compare(own, load_study(path).plans, times, waypoints=study.comparison.waypoints)
+    assert study.comparison.metrics == alone.metrics
+    assert study.comparison.parameters["loop kind"] == "python:hoist_loop:build"
+
+
+def test_two_studies_may_have_loops_of_one_name(tmp_path):
+    settled = []
+    for rate in (1.0, 4.0):
+        folder = tmp_path / f"rate{rate:g}"
+        folder.mkdir()
+        (folder / "twin_loop.py").write_text(LOOP.format(rate=rate))
+        path = folder / "study.toml"
+        stated = valid(loop={"kind": "python:twin_loop:build"}, units={}, plans=[{"family": "step"}], samples=4001)
+        path.write_text(to_toml(stated))
+        settled.append(load_study(path).run().comparison.metrics["step"]["settling_time"])
+    assert settled == pytest.approx([np.log(50.0), np.log(50.0) / 4], rel=1e-6)
+
+
+def test_the_search_path_is_left_as_it_was(tmp_path):
+    import sys
+
+    before = list(sys.path)
+    (tmp_path / "tidy_loop.py").write_text(LOOP.format(rate=1.0))
+    path = tmp_path / "study.toml"
+    path.write_text(to_toml(valid(loop={"kind": "python:tidy_loop:build"}, units={})))
+    load_study(path).run()
+    assert sys.path == before
+
+
+def test_a_nonlinear_loop_is_compared_too(tmp_path):
+    (tmp_path / "curved_loop.py").write_text(
+        "import control as ct\nimport numpy as np\n\n"
+        "def build():\n"
+        "    return ct.nlsys(lambda t, x, u, p: np.tanh(20 * (u - x)), None, inputs=1, outputs=['y'], states=1)\n"
+    )
+    path = tmp_path / "study.toml"
+    path.write_text(to_toml(valid(loop={"kind": "python:curved_loop:build"}, units={}, plans=[{"family": "polynomial"}])))
+    response = load_study(path).run().comparison.responses["polynomial"]
+    assert response.method != "exact"
+    assert np.ravel(response.outputs)[-1] == pytest.approx(20.0, rel=1e-3)
+
+
+# Plans as data
+
+
+def test_plans_as_json_restore_every_bit(stated):
+    import json
+
+    found = stated(valid())
+    data = json.loads(plans_as_json(found))
+    assert list(data) == ["trigonometric", "poly", "legs", "step"]
+    t = np.linspace(-1, 17, 1001)
+    for name, plan in found.plans.items():
+        np.testing.assert_array_equal(cp.trajectory_from_dict(data[name]).jet(t, 2), plan.jet(t, 2))
+
+
+def test_plans_as_csv_are_their_samples(stated):
+    found = stated(valid())
+    head, *lines = plans_as_csv(found).splitlines()
+    names = head.split(",")
+    table = np.array([line.split(",") for line in lines], dtype=float).T
+    assert names[0] == "time"
+    assert len(names) == len(set(names)) == 1 + 3 * len(found.plans)
+    assert {0.0, 6.0, 16.0} <= set(table[0])
+    for name, plan in found.plans.items():
+        rows = table[[names.index(f"{name}.{x}") for x in ("x", "x_d1", "x_d2")]]
+        np.testing.assert_array_equal(rows, plan.jet(table[0], 2)[:, 0])
+
+
+def test_a_study_error_is_a_value_error():
+    assert issubclass(StudyError, ValueError)
+
+
+def test_the_data_of_these_tests_is_valid(stated):
+    assert list(stated(VALID).plans) == ["trigonometric", "poly", "legs", "step"]

@@ -1,0 +1,119 @@
+"""Random mutations of a valid study file: it runs or it is refused in one line, and nothing else."""
+
+import copy
+import math
+import re
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from study_text import Verbatim, to_toml, valid
+
+from ctrlplan.cli import main
+from ctrlplan.studies.files import StudyError, load_study
+
+SCALARS = st.one_of(
+    st.sampled_from([0, 1, -1, 3, 0.0, -0.0, 1.0, 2.5, 6.0, 6.5, 16.0, 1e-9, 1e9, math.nan, math.inf, -math.inf, 10**30]),
+    st.sampled_from(["", "auto", "step", "polynomial", "linear", "python:", "python:a:b", "crane", "x", "y", "x.y", "a b"]),
+    st.sampled_from([True, False, Verbatim("1979-05-27T07:32:00Z"), Verbatim("07:32:00")]),
+    st.integers(-20, 20),
+    st.floats(-30, 30).map(lambda v: round(v, 3)),
+    st.text(st.characters(exclude_categories=["Cs", "Cc"]), max_size=4),
+)
+VALUES = st.recursive(
+    SCALARS,
+    lambda inner: st.one_of(
+        st.lists(inner, max_size=4), st.dictionaries(st.sampled_from(["time", "x", "name", "q"]), inner, max_size=2)
+    ),
+    max_leaves=5,
+)
+KEYS = st.sampled_from(["x", "z", "time", "alpha", "gamma", "degree", "smooth", "name", "family", "kind", "gain", "extra"])
+
+
+def places(data, path=()):
+    """Every path to an entry."""
+    pairs = data.items() if isinstance(data, dict) else enumerate(data) if isinstance(data, list) else ()
+    for key, value in pairs:
+        yield (*path, key)
+        yield from places(value, (*path, key))
+
+
+@st.composite
+def mutated(draw):
+    """A valid file with one to three entries replaced, dropped, doubled or added."""
+    data = valid()
+    data["samples"] = 41
+    for _ in range(draw(st.integers(1, 3))):
+        path = draw(st.sampled_from(sorted(places(data), key=repr)))
+        parent = data
+        for key in path[:-1]:
+            parent = parent[key]
+        action = draw(st.sampled_from(["replace", "replace", "drop", "double", "add"]))
+        if action == "replace":
+            parent[path[-1]] = draw(VALUES)
+        elif action == "drop":
+            del parent[path[-1]]
+        elif isinstance(parent, list):
+            parent.insert(path[-1], copy.deepcopy(parent[path[-1]]) if action == "double" else draw(VALUES))
+        else:
+            parent[draw(KEYS)] = copy.deepcopy(parent[path[-1]]) if action == "double" else draw(VALUES)
+    return data
+
+
+def refused_or_run(text):
+    """Load and run a file; what it says where it is refused."""
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "study.toml"
+        path.write_text(text, encoding="utf-8")
+        try:
+            study = load_study(path).run()
+        except StudyError as error:
+            said = str(error)
+            assert said.startswith(f"{path}: ")
+            assert len(said.splitlines()) == 1
+            assert re.search(r"\b(must|needs?)\b.*\b(got|give)\b", said), said
+            assert len(said) < 2000
+            return
+        assert study.comparison.metrics
+        assert study.results()
+
+
+@settings(max_examples=150, deadline=None)
+@given(mutated())
+def test_mutated_entries_are_run_or_refused(data):
+    refused_or_run(to_toml(data))
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.data())
+def test_mutated_text_is_run_or_refused(data):
+    text = to_toml(valid() | {"samples": 41})
+    for _ in range(data.draw(st.integers(1, 3))):
+        at = data.draw(st.integers(0, len(text) - 1))
+        put = data.draw(st.sampled_from(["", "", "\n", '"', "[", "]", "=", ".", ",", "-", "e", "0", "1", "9", "nan", "true", "é"]))
+        text = text[:at] + put + text[at + data.draw(st.integers(0, 3)) :]
+    refused_or_run(text)
+
+
+@settings(max_examples=40, deadline=None)
+@given(mutated(), st.sampled_from(["csv", "json"]))
+def test_the_command_ends_with_a_file_or_with_status_2(data, suffix):
+    with TemporaryDirectory() as folder:
+        path, out = Path(folder) / "study.toml", Path(folder) / f"plan.{suffix}"
+        path.write_text(to_toml(data), encoding="utf-8")
+        status = main(["plan", str(path), "--out", str(out)])
+        assert status in (0, 2)
+        assert out.exists() == (status == 0)
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_the_mutations_start_from_a_file_that_runs(count):
+    data = valid() | {"samples": 41}
+    data["plans"] = data["plans"][count:]
+    refused_or_run(to_toml(data))
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "study.toml"
+        path.write_text(to_toml(data))
+        assert load_study(path).run().comparison.metrics
