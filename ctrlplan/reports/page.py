@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import math
 import os
@@ -20,7 +21,6 @@ from ctrlplan.reports.figures import FIGURES
 from ctrlplan.reports.style import COLOURS, to_svg
 from ctrlplan.reports.words import number, summary, unit_of, verdicts
 from ctrlplan.studies.comparison import Comparison
-from ctrlplan.studies.measures import MEASURES
 from ctrlplan.studies.study import Study
 
 
@@ -74,6 +74,9 @@ def write_all(texts: dict[Path, str]) -> list[Path]:
     """Write files all or none: each beside its place first, then moved there."""
     staged: list[tuple[str, Path]] = []
     try:
+        for path, text in texts.items():
+            if path.is_dir():
+                raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
         for path, text in texts.items():
             path.parent.mkdir(parents=True, exist_ok=True)
             handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
@@ -140,7 +143,7 @@ def _table(comparison: Comparison) -> dict[str, Any]:
     """Rows of the metrics: cells with a number to sort by, a text, and whether it wins or loses."""
     decided = {v.key: v for v in verdicts(comparison)}
     rows = []
-    for key, measure in MEASURES.items():
+    for key, measure in comparison.measures.items():
         if not any(key in found for found in comparison.metrics.values()):
             continue
         verdict = decided.get(key)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 from collections.abc import Iterable
 from itertools import cycle
 from typing import Any
@@ -92,4 +93,5 @@ def to_svg(figure: Figure, salt: str) -> str:
         figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
     plt.close(figure)
     text = buffer.getvalue()
-    return text[text.index("<svg") :]
+    # Several drawings stand in one page: what they define must be their own.
+    return re.sub(r'(\bid="|url\(#|href="#)', rf"\g<1>{salt}-", text[text.index("<svg") :])

@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass
 
 from ctrlplan.studies.comparison import Comparison
-from ctrlplan.studies.measures import MEASURES
 
 TIE = 1e-3
 """Relative difference below which two values count as equal."""
@@ -44,7 +43,7 @@ class Verdict:
 def verdicts(comparison: Comparison) -> list[Verdict]:
     """Winner and loser of every metric that at least two plans define."""
     found = []
-    for key, measure in MEASURES.items():
+    for key, measure in comparison.measures.items():
         values = {plan: rows[key] for plan, rows in comparison.metrics.items() if key in rows}
         values = {plan: value for plan, value in values.items() if not math.isnan(value)}
         if len(values) > 1:
@@ -71,7 +70,7 @@ def unit_of(comparison: Comparison, key: str) -> str:
     first = next(iter(comparison.plans.values()))
     y = _shared([comparison.units.get(label, "") for label in first.labels])
     u = _shared([comparison.units.get(name, "") for name in comparison.controls])
-    unit = MEASURES[key].unit
+    unit = comparison.measures[key].unit
     if "{y}" in unit:
         unit = unit.replace("{y}", y) if y else ""
     if "{u}" in unit:

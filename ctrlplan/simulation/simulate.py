@@ -8,6 +8,7 @@ from typing import Any
 import control as ct
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import null_space
 
 from ctrlplan.simulation.exact import exact_states
 from ctrlplan.simulation.linear import LinearForm, NotLinearError, linear_form
@@ -211,8 +212,8 @@ def rest_state(system: Any, position: ArrayLike) -> Array:
     Returns
     -------
     ndarray, shape (nstates,)
-        The solution of A x + B w = 0 that is nearest to C x + D w = w where
-        outputs and inputs are as many, and of least norm otherwise.
+        A solution of A x + B w = 0, with outputs as near w as it allows; zero
+        where there is none.
     """
     held = np.atleast_1d(np.asarray(position, dtype=float))
     if not held.any():
@@ -223,13 +224,15 @@ def rest_state(system: Any, position: ArrayLike) -> Array:
         return np.zeros(system.nstates or 0)
     if form.b.shape[1] != held.size:
         return np.zeros(len(form.a))
-    rows, known = [form.a], [-form.b @ held]
-    tracked = form.c[: held.size]
-    if len(tracked) == held.size:
-        rows.append(tracked)
-        known.append(held - form.d[: held.size] @ held)
-    found = np.linalg.lstsq(np.vstack(rows), np.concatenate(known), rcond=None)[0]
-    state: Array = found if np.abs(form.a @ found + form.b @ held).max(initial=0.0) < 1e-9 else np.zeros(len(form.a))
+    supplied = form.b @ held
+    state: Array = np.linalg.lstsq(form.a, -supplied, rcond=None)[0]
+    if np.abs(form.a @ state + supplied).max(initial=0.0) > 1e-9 * np.abs(supplied).max(initial=0.0):
+        return np.zeros(len(form.a))
+    # Where integrators leave a choice, the outputs should be what is asked for.
+    idle, tracked = null_space(form.a), form.c[: held.size]
+    if idle.size and len(tracked) == held.size:
+        missing = held - tracked @ state - form.d[: held.size] @ held
+        state = state + idle @ np.linalg.lstsq(tracked @ idle, missing, rcond=None)[0]
     return state
 
 

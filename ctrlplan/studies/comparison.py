@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ctrlplan.simulation import rest_state, simulate, unstable_poles
-from ctrlplan.studies.measures import control_metrics, path_metrics, response_metrics
+from ctrlplan.studies.measures import MEASURES, Measure, control_metrics, path_metrics, response_metrics
 from ctrlplan.trajectories import PiecewiseSpline, PolySpline, Step, Trajectory, TrigSpline, Waypoint
 
 if TYPE_CHECKING:
@@ -49,6 +49,10 @@ class Comparison:
         What the report says about how it was made.
     notes : tuple of str
         What a reader must know of the loop: that it is unstable, or never settles.
+    marks : dict of str to str
+        Plans whose metrics come with a reservation, and that reservation.
+    measures : dict of str to Measure
+        How the metrics are called, in the order in which they are shown.
     """
 
     plans: dict[str, Trajectory]
@@ -61,6 +65,8 @@ class Comparison:
     title: str = "Step versus planned"
     parameters: dict[str, object] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    marks: dict[str, str] = field(default_factory=dict)
+    measures: dict[str, Measure] = field(default_factory=lambda: dict(MEASURES))
 
     def to_pandas(self) -> pd.DataFrame:
         """Metrics as a table, one row a metric, one column a plan."""
@@ -115,12 +121,14 @@ def compare(
     timepts: ArrayLike,
     *,
     alpha: float = 1.0,
-    outputs: Iterable[str] | None = None,
-    controls: Iterable[str] | None = None,
+    outputs: Sequence[str] | None = None,
+    controls: Sequence[str] | None = None,
     waypoints: Iterable[Waypoint] = (),
     initial_state: ArrayLike | None = None,
     band: float = 0.02,
     only: Collection[str] | None = None,
+    measure: Callable[[Trajectory, Any], Mapping[str, float]] | None = None,
+    measures: Mapping[str, Measure] | None = None,
     units: Mapping[str, str] | None = None,
     title: str = "Step versus planned",
     parameters: Mapping[str, object] | None = None,
@@ -129,8 +137,10 @@ def compare(
 
     Parameters
     ----------
-    loop : control system
-        As many inputs (the reference) as the plans have axes.
+    loop : control system or callable
+        As many inputs (the reference) as the plans have axes; or a function
+        that maps a plan to a loop without inputs, the plan a block inside. An
+        attribute ``initial_state`` of a loop is where it starts.
     plans : mapping of str to Trajectory, or iterable of Waypoint
         The references by name; waypoints stand for the standard set of
         `standard_plans`: step, polynomial, trigonometric, piecewise.
@@ -138,10 +148,10 @@ def compare(
         Sample times [s]; metrics are refined between them.
     alpha : float, optional
         Shape parameter of the standard trigonometric plan.
-    outputs : iterable of str, optional
+    outputs : sequence of str, optional
         Outputs that follow the plan: those named like its axes, else the first
         ones, unless given.
-    controls : iterable of str, optional
+    controls : sequence of str, optional
         Outputs that are controls: those whose names begin with u unless given.
     waypoints : iterable of Waypoint, optional
         What the plans were asked to meet, for the metrics of wandering.
@@ -152,6 +162,10 @@ def compare(
         Half width of the settling band relative to the planned change.
     only : collection of str, optional
         Metrics wanted, by their keys in `MEASURES`; all unless given.
+    measure : callable, optional
+        Maps a plan and its response to further metrics.
+    measures : mapping of str to Measure, optional
+        What those are called; they are shown before the others.
     units : mapping of str to str, optional
         Units of axes and controls by label.
     title : str, optional
@@ -187,22 +201,24 @@ def compare(
     references = _checked_plans(plans)
     first = next(iter(references.values()))
     times = np.asarray(timepts, dtype=float)
-    tracked = _tracked(loop, outputs, first)
-    acting = tuple(controls) if controls is not None else tuple(n for n in loop.output_labels if n.startswith("u"))
-    for name in acting:
-        _known(loop, name)
-    rows, acting_rows = ([loop.output_labels.index(n) for n in names] for names in (tracked, acting))
     start = min(plan.start for plan in references.values())
-    unstable = unstable_poles(loop)
-    responses, found = {}, {}
+    responses, found, unstable = {}, {}, np.empty(0, dtype=complex)
     for name, plan in references.items():
-        first_position = plan.jet(times[:1], 0, left=True)[0, :, 0]
-        state = rest_state(loop, first_position) if initial_state is None else initial_state
-        response = simulate(loop, times, plan, initial_state=state)
+        system = loop(plan) if callable(loop) and not hasattr(loop, "output_labels") else loop
+        tracked, acting = _tracked(system, outputs, first), _acting(system, controls)
+        response = simulate(
+            system,
+            times,
+            plan if system.ninputs else None,
+            initial_state=_initial_state(system, plan, times, initial_state),
+        )
         signals = np.asarray(response.outputs).reshape(-1, times.size)
-        values = response_metrics(times, signals[rows], plan, start, band, first.labels, only)
+        rows, acting_rows = ([system.output_labels.index(n) for n in names] for names in (tracked, acting))
+        values = dict(measure(plan, response)) if measure is not None else {}
+        values |= response_metrics(times, signals[rows], plan, start, band, first.labels, only)
+        unstable = unstable_poles(system)
         if unstable.size:
-            values |= {name: np.inf for name in values if "settling_time" in name}
+            values |= {key: np.inf for key in values if "settling_time" in key}
         if acting:
             values |= control_metrics(times, signals[acting_rows], start, acting, only)
         responses[name] = response
@@ -218,6 +234,7 @@ def compare(
         title=title,
         parameters=dict(parameters or {}) | {"settling band": f"{100 * band:g} %"},
         notes=_notes(unstable, found),
+        measures=dict(measures or {}) | MEASURES,
     )
 
 
@@ -280,7 +297,7 @@ def _checked_plans(plans: Mapping[str, Trajectory]) -> dict[str, Trajectory]:
     return references
 
 
-def _tracked(loop: Any, outputs: Iterable[str] | None, plan: Trajectory) -> tuple[str, ...]:
+def _tracked(loop: Any, outputs: Sequence[str] | None, plan: Trajectory) -> tuple[str, ...]:
     labels = list(loop.output_labels)
     if outputs is not None:
         names = tuple(outputs)
@@ -293,6 +310,24 @@ def _tracked(loop: Any, outputs: Iterable[str] | None, plan: Trajectory) -> tupl
     for name in names:
         _known(loop, name)
     return names
+
+
+def _acting(loop: Any, controls: Sequence[str] | None) -> tuple[str, ...]:
+    if controls is None:
+        return tuple(name for name in loop.output_labels if name.startswith("u"))
+    names = tuple(controls)
+    for name in names:
+        _known(loop, name)
+    return names
+
+
+def _initial_state(loop: Any, plan: Trajectory, times: Array, given: ArrayLike | None) -> ArrayLike:
+    """State given, or the loop's own, or rest at the plan's first position."""
+    if given is not None:
+        return given
+    if hasattr(loop, "initial_state"):
+        return np.asarray(loop.initial_state)
+    return rest_state(loop, plan.jet(times[:1], 0, left=True)[0, :, 0])
 
 
 def _known(loop: Any, name: str) -> None:

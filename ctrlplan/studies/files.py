@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import importlib
+import importlib.util
 import io
 import json
+import math
 import os
 import sys
 import tomllib
@@ -145,7 +147,13 @@ def load_study(path: str | os.PathLike[str]) -> StudyFile:
     title = data.get("title", source.stem)
     if not isinstance(title, str):
         raise reader.error("title", f"must be a string, got {title!r}")
-    units = {k: str(v) for k, v in reader.table(data, "units", needed=False).items()}
+    units = reader.table(data, "units", needed=False)
+    for label, unit in units.items():
+        if not isinstance(unit, str):
+            raise reader.error(f"units.{label}", f"must be a string, got {unit!r}")
+        known = [*(waypoints[0].labels or ()), "y", "u", "e"]
+        if label not in known and loop["kind"] == "linear":
+            raise reader.error(f"units.{label}", f"must be of one of {', '.join(known)}, got {label!r}")
     plans = reader.plans(data, waypoints)
     return StudyFile(source, source.stem, title, t_end, int(samples), waypoints, plans, loop, units)
 
@@ -165,13 +173,30 @@ def build_loop(table: dict[str, Any], path: Path) -> Any:
         except (ValueError, TypeError) as error:
             raise StudyError(f"{path}: loop: {error}") from None
     _, module, function = kind.split(":")
-    sys.path.insert(0, str(path.resolve().parent))
     try:
-        return getattr(importlib.import_module(module), function)()
-    except (ImportError, AttributeError) as error:
-        raise StudyError(f"{path}: loop.kind must name a module and a function in it, got {kind!r}: {error}") from None
+        loop = getattr(_module(module, path.resolve().parent), function)()
+    except Exception as error:  # whatever a user's own module does must end in one line
+        reason = " ".join(f"{type(error).__name__}: {error}".split())
+        must = "must name a module and a function in it that takes nothing and returns a loop"
+        raise StudyError(f"{path}: loop.kind: {must}, got {kind!r}: {reason}") from None
+    if not (hasattr(loop, "output_labels") and hasattr(loop, "ninputs")):
+        raise StudyError(f"{path}: loop.kind: {kind!r} must return a control system, got {type(loop).__name__}")
+    return loop
+
+
+def _module(name: str, folder: Path) -> Any:
+    """Module beside the study file, never one of the same name from elsewhere; or an installed one."""
+    source = folder.joinpath(*name.split(".")).with_suffix(".py")
+    spec = importlib.util.spec_from_file_location(name, source) if source.is_file() else None
+    if spec is None or spec.loader is None:
+        return importlib.import_module(name)
+    module = importlib.util.module_from_spec(spec)
+    sys.path.insert(0, str(folder))  # for what it imports itself
+    try:
+        spec.loader.exec_module(module)
     finally:
-        sys.path.pop(0)
+        sys.path.remove(str(folder))
+    return module
 
 
 def plans_as_json(study: StudyFile) -> str:
@@ -222,24 +247,26 @@ class _Reader:
 
     def number(self, table: dict[str, Any], key: str, place: str, default: float | None) -> float:
         value = table.get(key, default)
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value):
+        if not _is_number(value):
             raise self.error(place, f"must be a finite number, got {'none' if value is None else repr(value)}")
         return float(value)
+
+    def numbers(self, table: dict[str, Any], key: str, place: str, finite: bool = True) -> list[float]:
+        value = table.get(key)
+        if not isinstance(value, list) or not all(_is_number(v, finite) for v in value):
+            kind = "finite numbers" if finite else "numbers"
+            raise self.error(place, f"must be a list of {kind}, got {'none' if value is None else repr(value)}")
+        return [float(v) for v in value]
 
     def waypoints(self, data: dict[str, Any]) -> tuple[Waypoint, ...]:
         points = []
         for i, table in enumerate(self.tables(data, "waypoints")):
             place = f"waypoints[{i}]"
             time = self.number(table, "time", f"{place}.time", default=None)
-            jets = {}
-            for label, jet in table.items():
-                if label == "time":
-                    continue
-                if not isinstance(jet, list) or not all(
-                    isinstance(v, (int, float)) and not isinstance(v, bool) for v in jet
-                ):
-                    raise self.error(f"{place}.{label}", f"must be numbers [position, velocity, ...], got {jet!r}")
-                jets[label] = jet
+            labels = [label for label in table if label != "time"]
+            if "cls" in labels:
+                raise self.error(f"{place}.cls", "an axis must have a name other than cls, got 'cls'")
+            jets = {label: self.numbers(table, label, f"{place}.{label}", finite=False) for label in labels}
             try:
                 points.append(Waypoint.from_jets(time, **jets))
             except ValueError as error:
@@ -254,14 +281,18 @@ class _Reader:
         for i, table in enumerate(self.tables(data, "plans")):
             place = f"plans[{i}]"
             family = table.get("family", table.get("name"))
-            if family not in FAMILIES:
+            if not isinstance(family, str) or family not in FAMILIES:
                 raise self.error(f"{place}.family", f"must be one of {', '.join(FAMILIES)}, got {family!r}")
             name = table.get("name", family)
             if not isinstance(name, str) or not name or name in plans:
                 raise self.error(f"{place}.name", f"must be a name of its own, got {name!r}")
             kind, choices = FAMILIES[family]
             self.known(table, ("name", "family", *choices), place)
-            chosen = {key: table[key] for key in choices if key in table}
+            chosen = {
+                key: table[key] if table[key] == "auto" else self.number(table, key, f"{place}.{key}", default=None)
+                for key in choices
+                if key in table
+            }
             try:
                 if kind is Step:
                     plans[name] = standard_plans(waypoints)["step"]
@@ -279,14 +310,24 @@ def _checked_loop(loop: dict[str, Any], reader: _Reader) -> None:
     if isinstance(kind, str) and kind.startswith("python:") and kind.count(":") == 2:
         reader.known(loop, ("kind",), "loop")
         return
-    if kind not in LOOPS:
+    if not isinstance(kind, str) or kind not in LOOPS:
         kinds = ", ".join([*LOOPS, '"python:module:function"'])
         raise reader.error("loop.kind", f"must be one of {kinds}, got {kind!r}")
     reader.known(loop, ("kind", *LOOPS[kind]), "loop")
     for key in ("num", "den"):
-        if key not in loop:
-            raise reader.error(f"loop.{key}", "must be coefficients, highest power first, got none")
+        loop[key] = reader.numbers(loop, key, f"loop.{key}")
+    loop["gain"] = reader.number(loop, "gain", "loop.gain", default=1.0)
     build_loop(loop, reader.path)
+
+
+def _is_number(value: object, finite: bool = True) -> bool:
+    """Whether a TOML value is a number; true and false are none."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return False
+    try:
+        return math.isfinite(value) or not finite
+    except OverflowError:  # a whole number beyond all floating-point ones
+        return False
 
 
 def _described(plan: Trajectory) -> str:

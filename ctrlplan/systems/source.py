@@ -28,8 +28,8 @@ class PlanSource(ct.NonlinearIOSystem):  # type: ignore[misc]
         integrator should stop there.
     """
 
-    def __init__(self, plan: Trajectory, derivatives: int, name: str) -> None:
-        labels = [derivative_name(label, k) for label in plan.labels for k in range(derivatives + 1)]
+    def __init__(self, plan: Trajectory, derivatives: int, name: str, suffix: str) -> None:
+        labels = [derivative_name(label + suffix, k) for label in plan.labels for k in range(derivatives + 1)]
         super().__init__(None, self._output, inputs=0, outputs=labels, dt=None, name=name)
         self.plan = plan
         self.derivatives = derivatives
@@ -39,7 +39,9 @@ class PlanSource(ct.NonlinearIOSystem):  # type: ignore[misc]
         return self.plan.jet(t, self.derivatives).T.ravel()
 
 
-def create_source_iosystem(plan: Trajectory, derivatives: int = 0, name: str = "plan") -> PlanSource:
+def create_source_iosystem(
+    plan: Trajectory, derivatives: int = 0, name: str = "plan", *, suffix: str = ""
+) -> PlanSource:
     """Plan as an input/output system without inputs or states.
 
     Outputs are named axis by axis after the plan's labels: x, x_d1, x_d2, z,
@@ -53,6 +55,9 @@ def create_source_iosystem(plan: Trajectory, derivatives: int = 0, name: str = "
         Highest derivative put out beside the position.
     name : str, optional
         Name of the block.
+    suffix : str, optional
+        Put behind each label: ``suffix="_ref"`` gives x_ref, x_ref_d1, ...,
+        where the plant has outputs x and z of its own.
 
     Returns
     -------
@@ -77,7 +82,7 @@ def create_source_iosystem(plan: Trajectory, derivatives: int = 0, name: str = "
     >>> driven.output_labels
     ['y']
     """
-    return PlanSource(_checked_plan(plan), checked_count(derivatives, "derivatives"), name)
+    return PlanSource(_checked_plan(plan), checked_count(derivatives, "derivatives"), name, suffix)
 
 
 def source_samples(plan: Trajectory, timepts: ArrayLike, derivatives: int = 0) -> Array:

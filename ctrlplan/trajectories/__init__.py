@@ -1,6 +1,7 @@
 """Functions of time with exact derivatives: what a loop is asked to follow."""
 
 from ctrlplan.trajectories.combined import Joined, Scaled, Stacked, Sum, stack
+from ctrlplan.trajectories.continuity import Jump
 from ctrlplan.trajectories.extrema import Bounds, Extrema
 from ctrlplan.trajectories.files import derivative_name, load_trajectory, trajectory_from_dict
 from ctrlplan.trajectories.piecewise import PiecewiseSpline
@@ -15,6 +16,7 @@ __all__ = [
     "Extrema",
     "FourierCoefficients",
     "Joined",
+    "Jump",
     "PiecewiseSpline",
     "PolySpline",
     "Scaled",

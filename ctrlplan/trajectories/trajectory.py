@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from ctrlplan.trajectories import extrema as _extrema
 from ctrlplan.trajectories import sampling as _sampling
 from ctrlplan.trajectories.common import Array, Frozen, checked_count, checked_time, checked_timepts, readonly
+from ctrlplan.trajectories.continuity import Jump, find_jumps
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -234,6 +235,21 @@ class Trajectory(Frozen, ABC):
             If `rtol` is not reached with `max_cells` cells.
         """
         return _extrema.certified_bounds(self, function, checked_count(order, "order"), lipschitz, rtol, max_cells)
+
+    def jumps(self, order: int) -> tuple[Jump, ...]:
+        """Where derivatives up to an order jump, the ends at rest included.
+
+        Parameters
+        ----------
+        order : int
+            Highest derivative looked at.
+
+        Returns
+        -------
+        tuple of Jump
+            Each with order, time, label and size; lowest order first.
+        """
+        return find_jumps(self, checked_count(order, "order"))
 
     def retime(self, duration: float) -> Trajectory:
         """Same path from the same start, in another duration [s].

@@ -100,7 +100,7 @@ def reproduced(tmp_path_factory):
 def unstable(tmp_path_factory):
     """A study of a loop that never settles, with names and a title that need care."""
     place = tmp_path_factory.mktemp("unstable")
-    text = OWN.replace("gain = 5.0", "gain = -5.0").replace('"gentle"', '"a <b> & \'c\' --> d"')
+    text = OWN.replace("gain = 5.0", "gain = -5.0").replace('"gentle"', "\"a <b> & 'c' --> d\"")
     (place / "a strange name.toml").write_text(text, encoding="utf-8")
     return run("unstable", place / "report", "report", place / "a strange name.toml")
 
@@ -113,10 +113,11 @@ def written(request):
 
 @pytest.fixture(scope="session")
 def swept():
-    """The linear loop over a few gains."""
+    """The linear loop over a few gains, two of them close about the first jump of the step's settling time."""
     move = [cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1, 0, 0)]
     plans = {"step": cp.Step(1.0), "polynomial": cp.PolySpline(move), "trigonometric": cp.TrigSpline(move, alpha=1.0)}
-    gains = np.union1d(np.geomspace(0.25, 1000, 30), [1, 5, 20, 100])
+    first = 0.25 + (np.pi / (2 * np.log(50.0))) ** 2  # its first extremum is then just 2 % beyond
+    gains = np.union1d(np.geomspace(0.25, 1000, 30), [0.9995 * first, 1.0005 * first, 1, 5, 20, 100])
     times = np.linspace(0, 20, 2001)
     return cp.sweep(build, gains, plans, times, progress=False, parameter="gain")
 

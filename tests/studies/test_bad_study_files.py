@@ -97,7 +97,10 @@ WRONG = {
         ["labels", "dot", "'x.y'"],
     ),
     "empty label": (valid(waypoints=[{"time": 0.0, "": REST}, {"time": 6.0, "": END}]), ["labels", "''"]),
-    "label cls": (valid(waypoints=[{"time": 0.0, "cls": REST}, {"time": 6.0, "cls": [0.0, "a"]}]), ["waypoints[1].cls"]),
+    "label cls": (
+        valid(waypoints=[{"time": 0.0, "cls": REST}, {"time": 6.0, "cls": [0.0, "a"]}]),
+        ["waypoints[1].cls"],
+    ),
     "singular free entries": (points((0.0, REST), (8.0, [math.nan, 1.0]), (16.0, END)), ["singular"]),
     "no positions at all": (points((0.0, [math.nan, 1.0]), (16.0, [math.nan, 1.0])), ["singular"]),
     "nothing prescribed": (points((0.0, []), (16.0, [])), ["waypoints"]),
@@ -204,7 +207,9 @@ WRONG = {
     "no function": (module("build = 3\n"), ["loop", "NAME"]),
     "function without a loop": (module("def build(): return None\n"), ["loop", "NAME"]),
     "loop of other axes": (
-        module("import control as ct\n\ndef build():\n    return ct.ss([[-1.0]], [[1.0, 1.0]], [[1.0]], [[0.0, 0.0]])\n"),
+        module(
+            "import control as ct\n\ndef build():\n    return ct.ss([[-1.0]], [[1.0, 1.0]], [[1.0]], [[0.0, 0.0]])\n"
+        ),
         ["loop", "axes"],
     ),
 }

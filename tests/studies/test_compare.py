@@ -1,5 +1,6 @@
 """Several plans through one loop: what is compared, how it is measured, what is told."""
 
+import html
 import json
 
 import control as ct
@@ -42,7 +43,12 @@ def standard():
 
 def test_waypoints_alone_give_the_standard_set(standard):
     assert list(standard.plans) == ["step", "polynomial", "trigonometric", "piecewise"]
-    assert [type(p).__name__ for p in standard.plans.values()] == ["Step", "PolySpline", "TrigSpline", "PiecewiseSpline"]
+    assert [type(p).__name__ for p in standard.plans.values()] == [
+        "Step",
+        "PolySpline",
+        "TrigSpline",
+        "PiecewiseSpline",
+    ]
     assert list(standard.responses) == list(standard.metrics) == list(standard.plans)
     assert standard.waypoints == tuple(MOVE)
     assert standard.outputs == ("y",)
@@ -115,7 +121,12 @@ def test_outputs_and_controls_can_be_named():
     [
         ({}, {}, ValueError, "plans must hold at least one trajectory, got none"),
         ({"a": 1.0}, {}, TypeError, r"plans\['a'\] must be a Trajectory, got float"),
-        ({"a": cp.Step(1.0), "b": cp.Step([1.0, 2.0])}, {}, ValueError, "must have the same axes, got 2 in 'b' after 1"),
+        (
+            {"a": cp.Step(1.0), "b": cp.Step([1.0, 2.0])},
+            {},
+            ValueError,
+            "must have the same axes, got 2 in 'b' after 1",
+        ),
         ({"a": cp.Step(1.0)}, {"outputs": ["nowhere"]}, ValueError, "among y, u, got 'nowhere'"),
         ({"a": cp.Step(1.0)}, {"outputs": ["y", "u"]}, ValueError, "as many as the plan's axes, 1, got y, u"),
         ({"a": cp.Step(1.0)}, {"controls": ["force"]}, ValueError, "among y, u, got 'force'"),
@@ -343,6 +354,7 @@ def test_an_unstable_loop_is_reported_as_such(num, den, gain, pole, tmp_path):
     found = cp.compare(closed, MOVE, TIMES)
     (note,) = found.notes
     assert f"unstable: it has a pole at {pole}" in note
+    assert note in html.unescape(found._repr_html_())
     for row in found.metrics.values():
         assert row["settling_time"] == row["tracking_settling_time"] == np.inf
     found.save(tmp_path / "it.json")
@@ -430,21 +442,21 @@ def test_saved_json_holds_the_metrics_and_the_plans(standard, tmp_path):
 
 
 def test_in_a_notebook_it_is_a_table_with_a_verdict(standard):
-    html = standard._repr_html_()
-    assert html.count("<table") == html.count("</table>") == 1
+    cell = standard._repr_html_()
+    assert cell.count("<table") == cell.count("</table>") == 1
     for plan in standard.plans:
-        assert plan in html
-    assert "7.561" in html
-    assert "step is best in" in html
+        assert plan in cell
+    assert "7.561" in cell
+    assert "step is best in" in cell
 
 
 def test_names_are_escaped_wherever_they_are_shown(tmp_path):
     plans = {"<b>&": cp.Step(1.0), 'quo"te': cp.PolySpline(MOVE)}
     found = cp.compare(loop(5.0), plans, TIMES, title="<i>a & b</i>", parameters={"<u>": "<s>"})
-    for html in (found._repr_html_(), found.report(tmp_path).read_text(encoding="utf-8")):
+    for text in (found._repr_html_(), found.report(tmp_path).read_text(encoding="utf-8")):
         for raw in ("<b>", "<i>", "<u>", "<s>"):
-            assert raw not in html
-        assert "&lt;b&gt;&amp;" in html
+            assert raw not in text
+        assert "&lt;b&gt;&amp;" in text
 
 
 def test_report_writes_a_page_into_a_folder_or_a_file(standard, tmp_path):

@@ -109,7 +109,9 @@ def test_an_axis_that_rests_costs_nothing():
 @pytest.mark.parametrize("height", [1e-9, 1e9])
 @pytest.mark.parametrize("offset", [0.0, 1e3])
 def test_rounding_is_no_jump(height, offset):
-    plan = cp.TrigSpline([cp.Waypoint(0, offset * height, 0, 0), cp.Waypoint(1, (offset + 1) * height, 0, 0)], alpha=1.0)
+    plan = cp.TrigSpline(
+        [cp.Waypoint(0, offset * height, 0, 0), cp.Waypoint(1, (offset + 1) * height, 0, 0)], alpha=1.0
+    )
     assert np.isfinite(jerk_cost(plan))
 
 

@@ -255,7 +255,9 @@ def test_a_nonlinear_loop_is_compared_too(tmp_path):
         "    return ct.nlsys(lambda t, x, u, p: np.tanh(20 * (u - x)), None, inputs=1, outputs=['y'], states=1)\n"
     )
     path = tmp_path / "study.toml"
-    path.write_text(to_toml(valid(loop={"kind": "python:curved_loop:build"}, units={}, plans=[{"family": "polynomial"}])))
+    path.write_text(
+        to_toml(valid(loop={"kind": "python:curved_loop:build"}, units={}, plans=[{"family": "polynomial"}]))
+    )
     response = load_study(path).run().comparison.responses["polynomial"]
     assert response.method != "exact"
     assert np.ravel(response.outputs)[-1] == pytest.approx(20.0, rel=1e-3)

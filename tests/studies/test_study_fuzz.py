@@ -15,8 +15,12 @@ from ctrlplan.cli import main
 from ctrlplan.studies.files import StudyError, load_study
 
 SCALARS = st.one_of(
-    st.sampled_from([0, 1, -1, 3, 0.0, -0.0, 1.0, 2.5, 6.0, 6.5, 16.0, 1e-9, 1e9, math.nan, math.inf, -math.inf, 10**30]),
-    st.sampled_from(["", "auto", "step", "polynomial", "linear", "python:", "python:a:b", "crane", "x", "y", "x.y", "a b"]),
+    st.sampled_from(
+        [0, 1, -1, 3, 0.0, -0.0, 1.0, 2.5, 6.0, 6.5, 16.0, 1e-9, 1e9, math.nan, math.inf, -math.inf, 10**30]
+    ),
+    st.sampled_from(
+        ["", "auto", "step", "polynomial", "linear", "python:", "python:a:b", "crane", "x", "y", "x.y", "a b"]
+    ),
     st.sampled_from([True, False, Verbatim("1979-05-27T07:32:00Z"), Verbatim("07:32:00")]),
     st.integers(-20, 20),
     st.floats(-30, 30).map(lambda v: round(v, 3)),
@@ -29,7 +33,9 @@ VALUES = st.recursive(
     ),
     max_leaves=5,
 )
-KEYS = st.sampled_from(["x", "z", "time", "alpha", "gamma", "degree", "smooth", "name", "family", "kind", "gain", "extra"])
+KEYS = st.sampled_from(
+    ["x", "z", "time", "alpha", "gamma", "degree", "smooth", "name", "family", "kind", "gain", "extra"]
+)
 
 
 def places(data, path=()):
@@ -92,7 +98,9 @@ def test_mutated_text_is_run_or_refused(data):
     text = to_toml(valid() | {"samples": 41})
     for _ in range(data.draw(st.integers(1, 3))):
         at = data.draw(st.integers(0, len(text) - 1))
-        put = data.draw(st.sampled_from(["", "", "\n", '"', "[", "]", "=", ".", ",", "-", "e", "0", "1", "9", "nan", "true", "é"]))
+        put = data.draw(
+            st.sampled_from(["", "", "\n", '"', "[", "]", "=", ".", ",", "-", "e", "0", "1", "9", "nan", "true", "é"])
+        )
         text = text[:at] + put + text[at + data.draw(st.integers(0, 3)) :]
     refused_or_run(text)
 

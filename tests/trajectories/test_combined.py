@@ -137,6 +137,24 @@ def test_then_shifts_the_other():
     assert [w.time for w in joined.waypoints] == [0.0, 1.0, 3.0]
 
 
+def test_then_from_any_clock():
+    """What begins at 1e9 s is joined to what ends at 0.7 s as well as its clock allows, and moves with it."""
+    rng = np.random.default_rng(1)
+    for start in rng.uniform(-2, 2, 50) * 10.0 ** rng.integers(0, 10, 50):
+        end = rng.uniform(0.01, 1)
+        first = PolySpline(waypoints([0.0, end], [[0.0, 0.0], [1.0, 0.0]]))
+        second = PolySpline(waypoints([start, start + 1], [[1.0, 0.0], [2.0, 1.0]]))
+        joined = first.then(second)
+        assert joined.breakpoints[1] == end
+        t = np.linspace(0, 1, 11)
+        clock = 4 * np.spacing(abs(start) + 1)
+        np.testing.assert_allclose(joined(end + t), second(start + t), rtol=0, atol=1e-13 + 3 * clock)
+        for moved in (joined.shift(1e6 * end), joined.shift(1e6 * end).shift(-1e6 * end), joined.retime(777 * end)):
+            assert moved.initial == 0.0
+            assert moved.final == pytest.approx(2.0, rel=1e-8)
+            assert moved.breakpoints.size == 3
+
+
 @pytest.mark.parametrize("alpha", [0.0, 1.0, 3.0])
 def test_a_plan_that_returns_to_zero_can_be_continued(alpha):
     """Its last position is 0 to rounding, which is no reason to refuse what starts at 0."""

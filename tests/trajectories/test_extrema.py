@@ -224,6 +224,17 @@ def test_bounds_contain_every_sample(rtol, alpha):
     assert clearance(plan.jet(found.time_max, 1)) == pytest.approx(found.maximum, rel=1e-12)
 
 
+@pytest.mark.parametrize("rtol", [0.2, 1e-3, 1e-6])
+def test_bounds_of_a_line(rtol):
+    """Both are at the ends, and the Lipschitz bound is exact."""
+    line = PolySpline(waypoints([0.0, 2.0], [[1.0], [4.0]]))
+    found = line.bounds(lambda jet: jet[0, 0], 0, 1.0, rtol=rtol)
+    assert found.lower <= 1.0 <= found.minimum
+    assert found.maximum <= 4.0 <= found.upper
+    assert found.minimum - found.lower <= 3.001 * rtol
+    assert found.upper - found.maximum <= 3.001 * rtol
+
+
 def test_bounds_see_what_samples_miss():
     """A bump 2e-3 wide: a proof finds it."""
     rest = [0.0, 0.0, 0.0]

@@ -41,7 +41,7 @@ def integrator_lag_loop(gain: float, outputs: Sequence[str] = ("y",)) -> ct.Inte
 
 def unity_feedback_loop(
     num: ArrayLike, den: ArrayLike, gain: float = 1.0, outputs: Sequence[str] = ("y",)
-) -> ct.InterconnectedSystem:
+) -> ct.InterconnectedSystem | ct.StateSpace:
     """Plant num/den behind a proportional gain, in unity feedback.
 
     Parameters
@@ -56,7 +56,8 @@ def unity_feedback_loop(
     Returns
     -------
     control.InterconnectedSystem
-        Blocks error, controller and plant; input r.
+        Blocks error, controller and plant; input r. A `control.StateSpace`
+        where num and den are of one degree.
 
     Raises
     ------
@@ -76,12 +77,35 @@ def unity_feedback_loop(
     for output in outputs:
         if output not in ("y", "u", "e"):
             raise ValueError(f'outputs must be of "y", "u", "e", got {output!r}')
+    if above.size == below.size:
+        return _direct_loop(ct.ss(ct.tf(above, below)), gain, outputs)
     blocks = [
         ct.summing_junction(inputs=["r", "-y"], output="e", name="error"),
         ct.ss([], [], [], [[gain]], inputs="e", outputs="u", name="controller", dt=0),
         ct.ss(ct.tf(above, below), inputs="u", outputs="y", name="plant"),
     ]
     return ct.interconnect(blocks, inputs="r", outputs=list(outputs), name="loop")
+
+
+def _direct_loop(plant: ct.StateSpace, gain: float, outputs: Sequence[str]) -> ct.StateSpace:
+    """Loop around a plant that passes its input on, which `control.interconnect` cannot close."""
+    a, b, c, d = (np.asarray(m) for m in (plant.A, plant.B, plant.C, plant.D))
+    through = 1.0 / (1.0 + gain * d[0, 0])
+    rows = {
+        "e": (-through * c, np.array([[through]])),
+        "u": (-gain * through * c, np.array([[gain * through]])),
+        "y": (through * c, gain * through * d),
+    }
+    read, passed = (np.vstack([rows[name][k] for name in outputs]) for k in (0, 1))
+    return ct.ss(
+        a - gain * through * b @ c,
+        gain * through * b,
+        read,
+        passed,
+        inputs="r",
+        outputs=list(outputs),
+        name="loop",
+    )
 
 
 def _polynomial(coefficients: ArrayLike, name: str) -> np.ndarray[tuple[int], np.dtype[np.float64]]:

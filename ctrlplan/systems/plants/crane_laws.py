@@ -1,0 +1,198 @@
+"""The crane's laws: from a plan of the load to references of the drives, or to force and torque.
+
+Each is a block that `control.interconnect` joins by name to a source with the
+suffix ``_ref`` and to the crane, and is finite at zero inputs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import control as ct
+import numpy as np
+from numpy.typing import NDArray
+
+from ctrlplan.systems.flat import hurwitz_coefficients
+from ctrlplan.systems.plants.crane import Crane
+from ctrlplan.trajectories import derivative_name
+
+Array = NDArray[np.float64]
+
+
+def create_still_iosystem(crane: Crane, name: str = "still") -> ct.NonlinearIOSystem:
+    """References of trolley and rope for a load at rest: what a step is sent through.
+
+    Inputs x_ref and z_ref; outputs D_ref = x - b and R_ref = z.
+    """
+    b = crane.drum_radius
+
+    def out(t: float, state: Any, u: Any, params: dict[str, Any]) -> Array:
+        return np.array([u[0] - b, u[1]])
+
+    return ct.nlsys(None, out, inputs=["x_ref", "z_ref"], outputs=["D_ref", "R_ref"], dt=None, name=name)
+
+
+def create_generator_iosystem(crane: Crane, name: str = "generator") -> ct.NonlinearIOSystem:
+    """Figure 3's generator of references, (15a,b) of the planned jets.
+
+    Inputs x_ref, x_ref_d1, x_ref_d2 and the same of z; outputs D_ref and R_ref.
+    Without feedback from the load its sway is as undamped as the drives leave it.
+    """
+
+    def out(t: float, state: Any, u: Any, params: dict[str, Any]) -> Array:
+        return np.array(_drives(crane, u[0], u[2], u[3], u[5]))
+
+    return ct.nlsys(None, out, inputs=_jet_names(2), outputs=["D_ref", "R_ref"], dt=None, name=name)
+
+
+def create_load_feedback_iosystem(
+    crane: Crane, bandwidth: float = 1.0, damping: float = 1.0, name: str = "load_feedback"
+) -> ct.NonlinearIOSystem:
+    """Generator with feedback from the load's x, which damps the sway.
+
+    In (15a,b) x is the measured one and x'' the law
+    v = x_d'' - 2 zeta w (x' - x_d') - w^2 (x - x_d); z stays planned, because
+    feeding it back as well leaves a double zero eigenvalue.
+
+    Parameters
+    ----------
+    crane : Crane
+        The plant.
+    bandwidth : float, optional
+        w [rad/s], above 0; stable with the study's PIDs from 0.1 to 3.
+    damping : float, optional
+        zeta, above 0; 0.7 to 1.
+    name : str, optional
+        Name of the block.
+
+    Returns
+    -------
+    control.NonlinearIOSystem
+        Inputs x_ref, x_ref_d1, x_ref_d2, the same of z, x and x_d1; outputs
+        D_ref and R_ref.
+
+    Raises
+    ------
+    ValueError
+        If `bandwidth` or `damping` is not above 0.
+    """
+    for label, value in (("bandwidth", bandwidth), ("damping", damping)):
+        if not (np.isfinite(value) and value > 0.0):
+            raise ValueError(f"{label} must be finite and above 0, got {value}")
+    s0, s1 = bandwidth**2, 2.0 * damping * bandwidth
+
+    def out(t: float, state: Any, u: Any, params: dict[str, Any]) -> Array:
+        asked = u[2] - s1 * (u[7] - u[1]) - s0 * (u[6] - u[0])
+        return np.array(_drives(crane, u[6], asked, u[3], u[5]))
+
+    return ct.nlsys(None, out, inputs=[*_jet_names(2), "x", "x_d1"], outputs=["D_ref", "R_ref"], dt=None, name=name)
+
+
+def create_dynamic_law_iosystem(
+    crane: Crane, poles: Sequence[complex] = (-1.0, -1.2, -1.4, -1.6), name: str = "dynamic_law"
+) -> ct.NonlinearIOSystem:
+    """The whole law (9)-(11), by dynamic extension: two chains of four integrators.
+
+    The tension and its rate are states of the controller, kept as offsets from
+    the weight of the load, so that the zero state is rest.
+
+    Parameters
+    ----------
+    crane : Crane
+        The plant, of either model of the drum.
+    poles : sequence of complex, optional
+        Four poles [rad/s] of the error of x, and the same of z.
+    name : str, optional
+        Name of the block.
+
+    Returns
+    -------
+    control.NonlinearIOSystem
+        States tension_offset [N] and tension_rate [N/s]; inputs the jets of
+        order 4 of x_ref and z_ref, and x, z, x_d1, z_d1, R, theta, D_d1, R_d1,
+        theta_d1 of the crane; outputs F and C.
+
+    Raises
+    ------
+    ValueError
+        If the poles are not four, not conjugate pairs, or not stable.
+    """
+    sigma = hurwitz_coefficients(poles, 4)
+    m, g, b = crane.load_mass, crane.gravity, crane.drum_radius
+
+    def second(state: Any, u: Any) -> tuple[Any, Any]:
+        """T'' and theta''."""
+        tension, rate = m * g + state[0], state[1]
+        x, z, x1, z1, _, theta, _, _, theta1 = (u[10 + i] for i in range(9))
+        s, c = np.sin(theta), np.cos(theta)
+        jet_x = (x, x1, -tension * s / m, -(rate * s + tension * theta1 * c) / m)
+        jet_z = (z, z1, g - tension * c / m, -(rate * c - tension * theta1 * s) / m)
+        v_x, v_z = (
+            u[5 * a + 4] - sum(sigma[k] * (jet[k] - u[5 * a + k]) for k in range(4))
+            for a, jet in enumerate((jet_x, jet_z))
+        )
+        p = -m * v_x - (2.0 * rate * theta1 * c - tension * theta1 * theta1 * s)
+        q = -m * v_z - (-2.0 * rate * theta1 * s - tension * theta1 * theta1 * c)
+        # [s, T c; c, -T s] [T''; theta''] = [p; q]
+        return s * p + c * q, (c * p - s * q) / tension
+
+    def update(t: float, state: Any, u: Any, params: dict[str, Any]) -> Array:
+        return np.array([state[1], second(state, u)[0]])
+
+    def out(t: float, state: Any, u: Any, params: dict[str, Any]) -> Array:
+        tension, theta2 = m * g + state[0], second(state, u)[1]
+        _, _, _, _, r, theta, d1, r1, theta1 = (u[10 + i] for i in range(9))
+        s, c = np.sin(theta), np.cos(theta)
+        d2 = -(r * theta2 + g * s + 2.0 * r1 * theta1 - b * theta1 * theta1) / c
+        r2 = g * c + r * theta1 * theta1 + b * theta2 - d2 * s - tension / m
+        return np.array(_inputs(crane, tension, s, d1, d2, r1, r2, theta1, theta2))
+
+    measured = ["x", "z", "x_d1", "z_d1", "R", "theta", "D_d1", "R_d1", "theta_d1"]
+    return ct.nlsys(
+        update,
+        out,
+        states=["tension_offset", "tension_rate"],
+        inputs=[*_jet_names(4), *measured],
+        outputs=["F", "C"],
+        name=name,
+    )
+
+
+def create_crane_feedforward_iosystem(crane: Crane, name: str = "feedforward") -> ct.NonlinearIOSystem:
+    """Force and torque from the planned jets alone: the open-loop half of the law.
+
+    Inputs the jets of order 4 of x_ref and z_ref; outputs F and C, exact for
+    the model and without any correction.
+    """
+
+    def out(t: float, state: Any, u: Any, params: dict[str, Any]) -> Array:
+        found = crane.quantities(np.stack([np.asarray(u[:5]), np.asarray(u[5:10])], axis=1))
+        return np.array([found["F"], found["C"]])
+
+    return ct.nlsys(None, out, inputs=_jet_names(4), outputs=["F", "C"], dt=None, name=name)
+
+
+def _jet_names(order: int) -> list[str]:
+    return [derivative_name(axis, k) for axis in ("x_ref", "z_ref") for k in range(order + 1)]
+
+
+def _drives(crane: Crane, x: Any, x2: Any, z: Any, z2: Any) -> list[Any]:
+    """D and R of (15a,b)."""
+    b, hanging = crane.drum_radius, crane.gravity - z2
+    pull = np.sqrt(x2 * x2 + hanging * hanging)
+    return [x - (b * pull - z * x2) / hanging, (z * pull - b * x2) / hanging]
+
+
+def _inputs(
+    crane: Crane, tension: Any, sine: Any, d1: Any, d2: Any, r1: Any, r2: Any, theta1: Any, theta2: Any
+) -> list[Any]:
+    """F and C from (14)."""
+    b = crane.drum_radius
+    drum1, drum2 = r1 / b, r2 / b
+    if crane.rope_wrap:
+        drum1, drum2 = drum1 - theta1, drum2 - theta2
+    return [
+        crane.trolley_mass * d2 + crane.trolley_friction * d1 - tension * sine,
+        crane.drum_inertia * drum2 + crane.drum_friction * drum1 - b * tension,
+    ]

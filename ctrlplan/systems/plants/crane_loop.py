@@ -1,0 +1,138 @@
+"""The crane's closed loops: source, law, drives, crane."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import control as ct
+import numpy as np
+
+from ctrlplan.systems.plants.crane import OUTPUTS, Crane
+from ctrlplan.systems.plants.crane_laws import (
+    create_crane_feedforward_iosystem,
+    create_dynamic_law_iosystem,
+    create_generator_iosystem,
+    create_load_feedback_iosystem,
+    create_still_iosystem,
+)
+from ctrlplan.systems.source import create_source_iosystem
+from ctrlplan.trajectories import Trajectory
+
+# What each law asks of the plan: the highest derivative it reads, and the highest that must not jump.
+_NEEDS = {"still": (0, -1), "generator": (2, 0), "load_feedback": (2, 0), "dynamic": (4, 3), "feedforward": (4, 3)}
+LAWS = tuple(_NEEDS)
+
+
+def crane_loop(
+    crane: Crane,
+    plan: Trajectory,
+    law: str = "generator",
+    *,
+    bandwidth: float = 5.0,
+    tf: float = 0.02,
+    force_limits: Sequence[float] | None = None,
+    torque_limits: Sequence[float] | None = None,
+    name: str = "crane_loop",
+    **options: Any,
+) -> ct.InterconnectedSystem:
+    """Closed loop of figure 3: source, law, two PIDs, crane.
+
+    Parameters
+    ----------
+    crane : Crane
+        The plant.
+    plan : Trajectory
+        Plan of the load's x and z (down) [m].
+    law : {"generator", "load_feedback", "dynamic", "feedforward", "still"}, optional
+        Figure 3's generator; with feedback from the load; the whole law by
+        dynamic extension; its open-loop half; or the references of a load at
+        rest, for steps. The first two and the last drive the PIDs, the others
+        force and torque themselves.
+    bandwidth : float, optional
+        Triple pole of the PIDs [rad/s].
+    tf : float, optional
+        Their derivative filter [s].
+    force_limits, torque_limits : (float, float), optional
+        Limits of F [N] and C [N m], with anti-windup.
+    name : str, optional
+        Name of the loop.
+    **options
+        For the law: ``bandwidth`` and ``damping`` as ``load_bandwidth`` and
+        ``damping``, or ``poles``.
+
+    Returns
+    -------
+    control.InterconnectedSystem
+        Without inputs; outputs those of the crane, F and C, x_ref and z_ref.
+        Its attribute ``initial_state`` is rest at the plan's first position.
+
+    Raises
+    ------
+    ValueError
+        If the law is unknown, the crane cannot follow the plan, or a
+        derivative that the law needs jumps: the message says which and when.
+
+    Examples
+    --------
+    >>> import ctrlplan as cp
+    >>> plan = cp.PolySpline([
+    ...     cp.Waypoint.from_jets(0.0, x=[0, 0, 0], z=[10, 0, 0]),
+    ...     cp.Waypoint.from_jets(15.0, x=[20, 0, 0], z=[11, 0, 0]),
+    ... ])
+    >>> loop = cp.plants.crane_loop(cp.plants.Crane(), plan)
+    >>> loop.output_labels[:3]
+    ['x', 'z', 'D']
+    """
+    if law not in _NEEDS:
+        raise ValueError(f"law must be one of {', '.join(LAWS)}, got {law!r}")
+    order, smooth = _NEEDS[law]
+    _check_smooth(plan, smooth, law)
+    crane.check(plan)
+    source = create_source_iosystem(_named(plan), order, suffix="_ref")
+    plant = crane.iosystem()
+    if law in ("dynamic", "feedforward"):
+        if force_limits is not None or torque_limits is not None:
+            raise ValueError(f"limits must go with a law that drives the PIDs, got law {law!r}")
+        block = (
+            create_dynamic_law_iosystem(crane, **options)
+            if law == "dynamic"
+            else create_crane_feedforward_iosystem(crane)
+        )
+        blocks = [source, block, plant]
+    else:
+        if law == "still":
+            block = create_still_iosystem(crane)
+        elif law == "generator":
+            block = create_generator_iosystem(crane)
+        else:
+            block = create_load_feedback_iosystem(
+                crane, options.get("load_bandwidth", 1.0), options.get("damping", 1.0)
+            )
+        pids = [
+            crane.trolley_pid(bandwidth, tf, limits=force_limits),
+            crane.hoist_pid(bandwidth, tf, limits=torque_limits),
+        ]
+        blocks = [source, block, *pids, plant]
+    loop = ct.interconnect(blocks, inputs=0, outputs=[*OUTPUTS, "F", "C", "x_ref", "z_ref"], name=name)
+    rest = crane.equilibrium(float(plan.initial[0]), float(plan.initial[1]))[0]
+    # The crane comes last; the states of law and drives are 0 at rest.
+    loop.initial_state = np.concatenate([np.zeros(loop.nstates - rest.size), rest])
+    return loop
+
+
+def _named(plan: Trajectory) -> Trajectory:
+    """Plan whose axes are called x and z, whatever they were called."""
+    from ctrlplan.trajectories import stack
+
+    return plan if plan.labels == ("x", "z") else stack([plan], labels=["x", "z"])
+
+
+def _check_smooth(plan: Trajectory, smooth: int, law: str) -> None:
+    """Refuse a plan of which a derivative up to `smooth` jumps."""
+    for jump in plan.jumps(smooth) if smooth >= 0 else ():
+        what = "position" if jump.order == 0 else f"derivative {jump.order}"
+        raise ValueError(
+            f"the law {law!r} must be given a plan continuous up to derivative {smooth}, got one whose {what} of "
+            f"{jump.label} jumps by {jump.size:.4g} at {jump.time:g} s"
+        )

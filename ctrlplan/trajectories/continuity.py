@@ -1,0 +1,52 @@
+"""Where a derivative of a trajectory jumps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from ctrlplan.trajectories.trajectory import Trajectory
+
+
+@dataclass(frozen=True)
+class Jump:
+    """One jump of one derivative of one axis.
+
+    Attributes
+    ----------
+    order : int
+        Order of the derivative, 0 the position.
+    time : float
+        When [s].
+    label : str
+        Name of the axis.
+    size : float
+        Value after less value before.
+    """
+
+    order: int
+    time: float
+    label: str
+    size: float
+
+
+def find_jumps(plan: Trajectory, order: int) -> tuple[Jump, ...]:
+    """Jumps of the derivatives up to an order, lowest order first, then in time.
+
+    Rest before the start and after the end counts: a plan that starts at
+    speed jumps there. Differences below 1e-9 of a derivative's peak are rounding.
+    """
+    before = plan.jet(plan.breakpoints, order, left=True)
+    after = plan.jet(plan.breakpoints, order)
+    after[:, :, -1] = 0.0
+    after[0, :, -1] = plan.final
+    size = after - before
+    peaks = np.stack([plan.peak(k) for k in range(order + 1)])[:, :, None]
+    found = np.argwhere(np.abs(size) > 1e-9 * np.maximum(peaks, np.finfo(float).tiny))
+    return tuple(
+        Jump(int(k), float(plan.breakpoints[i]), plan.labels[a], float(size[k, a, i]))
+        for k, a, i in sorted(found.tolist(), key=lambda entry: (entry[0], entry[2], entry[1]))
+    )

@@ -1,0 +1,477 @@
+"""Figures: what they draw is what was given, labelled with units, every plan told from every other, nothing hidden."""
+
+import ast
+from itertools import combinations, pairwise
+from pathlib import Path
+
+import matplotlib as mpl
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_hex
+
+import ctrlplan as cp
+from ctrlplan.reports import FIGURES, plot_plane, plot_plans, plot_responses, plot_sweep, plot_trajectory, render_page
+from ctrlplan.reports.style import line_styles, to_svg
+from ctrlplan.studies import MEASURES, Study
+from ctrlplan.studies.linear import STEP_LIMIT
+
+MOVE = [cp.Waypoint(0, 0, 0, 0), cp.Waypoint(6, 5), cp.Waypoint(10, 1, 0, 0)]
+TIMES = np.linspace(0, 20, 801)
+STANDARD = ("step", "polynomial", "trigonometric", "piecewise")
+# The palette as printed: Okabe and Ito, Color Universal Design, 2008.
+OKABE_ITO = {"#000000", "#e69f00", "#56b4e9", "#009e73", "#f0e442", "#0072b2", "#d55e00", "#cc79a7"}
+
+
+@pytest.fixture(scope="module")
+def compared():
+    loop = cp.plants.integrator_lag_loop(5.0, outputs=("y", "u"))
+    points = [cp.Waypoint.from_jets(w.time, x=w.jet[:, 0]) for w in MOVE]
+    return cp.compare(loop, points, TIMES, alpha=4.0, units={"x": "m", "u": "N"})
+
+
+@pytest.fixture(scope="module")
+def two_axes():
+    import control as ct
+
+    loops = [ct.ss(cp.plants.integrator_lag_loop(k)) for k in (5.0, 20.0)]
+    side = ct.append(*loops)
+    both = ct.ss(side.A, side.B, side.C, side.D, inputs=["rx", "rth"], outputs=["x", "theta"])
+    points = [
+        cp.Waypoint.from_jets(0, x=[0, 0, 0], theta=[1, 0, 0]),
+        cp.Waypoint.from_jets(1, x=[2, 0, 0], theta=[0, 0, 0]),
+    ]
+    return cp.compare(both, points, np.linspace(0, 10, 201), units={"x": "m", "theta": "rad"})
+
+
+@pytest.fixture(params=sorted([*FIGURES, "two axes: plans", "two axes: responses", "trajectory", "one metric"]))
+def figure(request, compared, two_axes, swept):
+    """Every kind of figure, on real data."""
+    study = Study("it", "It", compared, sweep=swept)
+    others = {
+        "two axes: plans": lambda: plot_plans(two_axes),
+        "two axes: responses": lambda: plot_responses(two_axes),
+        "trajectory": lambda: two_axes.plans["polynomial"].plot(),
+        "one metric": lambda: plot_sweep(swept, ["iae"]),
+    }
+    return others[request.param]() if request.param in others else FIGURES[request.param][0](study)
+
+
+def visible(figure):
+    return [axes for axes in figure.axes if axes.get_visible()]
+
+
+def boxes(figure):
+    """Boxes of the legends and of everything that the axes cover, ticks and labels included."""
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    renderer = canvas.get_renderer()
+    return (
+        [legend.get_window_extent(renderer) for legend in figure.legends],
+        [axes.get_tightbbox(renderer) for axes in visible(figure)],
+        renderer,
+    )
+
+
+def curves(axes):
+    """Lines that are drawn, without the markers and the thin references."""
+    return [line for line in axes.lines if line.get_linestyle() != "None" and line.get_linewidth() >= 1.0]
+
+
+def by_label(axes):
+    return {line.get_label(): line for line in axes.lines if not line.get_label().startswith("_")}
+
+
+# All figures
+
+
+def test_the_legend_stands_outside_the_axes(figure):
+    legends, drawn, _ = boxes(figure)
+    assert all(axes.get_legend() is None for axes in figure.axes)
+    assert len(legends) == 1
+    for box in drawn:
+        assert not legends[0].overlaps(box)
+    width, height = figure.canvas.get_width_height()
+    assert legends[0].x0 >= 0
+    assert legends[0].x1 <= width
+    assert legends[0].y1 <= height
+
+
+def test_nothing_is_drawn_beyond_the_edge(figure):
+    _, drawn, _ = boxes(figure)
+    width, height = figure.canvas.get_width_height()
+    for box in drawn:
+        assert -1 <= box.x0 < box.x1 <= width + 1
+        assert -1 <= box.y0 < box.y1 <= height + 1
+
+
+def test_axes_do_not_run_into_each_other(figure):
+    _, drawn, _ = boxes(figure)
+    for one, other in combinations(drawn, 2):
+        overlap = min(one.x1, other.x1) - max(one.x0, other.x0), min(one.y1, other.y1) - max(one.y0, other.y0)
+        assert min(overlap) <= 2.0
+
+
+def test_every_axis_is_labelled(figure):
+    for axes in visible(figure):
+        assert axes.get_ylabel()
+    bottom = min(axes.get_position().y0 for axes in visible(figure))
+    for axes in visible(figure):
+        if axes.get_position().y0 == pytest.approx(bottom, abs=1e-6):
+            assert axes.get_xlabel()
+
+
+def test_a_figure_becomes_an_svg_for_a_page(figure):
+    svg = to_svg(figure, "it")
+    assert svg.startswith("<svg")
+    assert svg.rstrip().endswith("</svg>")
+
+
+@pytest.mark.parametrize("name", FIGURES)
+def test_every_figure_has_a_caption(name):
+    assert FIGURES[name][1].strip().endswith(".")
+
+
+@pytest.mark.parametrize("name", ["plane", "gain"])
+def test_a_figure_of_a_sweep_needs_one(name, compared):
+    with pytest.raises(ValueError, match="study it must have a sweep for this figure, got none"):
+        FIGURES[name][0](Study("it", "It", compared))
+
+
+# Told apart
+
+
+def lab(linear):
+    """CIE L*, a*, b* of linear RGB (D65)."""
+    xyz = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]) @ linear
+    f = np.cbrt(np.maximum(xyz / [0.9505, 1.0, 1.089], 1e-9))
+    return np.array([116 * f[1] - 16, 500 * (f[0] - f[1]), 200 * (f[1] - f[2])])
+
+
+# Linear RGB as it is seen without red or green cones (Machado, Oliveira and Fernandes 2009, severity 1).
+BLIND = {
+    "nobody": np.eye(3),
+    "protan": [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]],
+    "deutan": [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.011820, 0.042940, 0.968881]],
+}
+
+
+@pytest.mark.parametrize("names", [STANDARD, ("a", "b", "c", "d"), (*STANDARD, "mine", "yours")])
+@pytest.mark.parametrize("eyes", BLIND)
+def test_colours_are_told_apart_by_every_reader(names, eyes):
+    colours = [to_hex(style["color"]) for style in line_styles(names).values()]
+    assert len(set(colours)) == len(names)
+    seen = []
+    for colour in colours:
+        c = np.array([int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)])
+        linear = np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
+        seen.append(lab(np.clip(np.asarray(BLIND[eyes]) @ linear, 0, 1)))
+    for one, other in combinations(seen, 2):
+        assert np.linalg.norm(one - other) > 15
+
+
+def test_the_standard_plans_have_colours_of_okabe_and_ito():
+    assert {to_hex(style["color"]) for style in line_styles(STANDARD).values()} <= OKABE_ITO
+
+
+@pytest.mark.parametrize("names", [STANDARD, ("a", "b", "c", "d"), (*STANDARD, "mine", "yours")])
+def test_dashes_tell_them_apart_without_colours(names):
+    dashes = [repr(style["linestyle"]) for style in line_styles(names).values()]
+    assert len(set(dashes)) == len(names)
+
+
+def test_a_plan_looks_the_same_whoever_stands_beside_it():
+    alone, crowd = line_styles(["trigonometric"]), line_styles(["x", *STANDARD])
+    assert alone["trigonometric"] == crowd["trigonometric"]
+
+
+def test_a_plan_keeps_its_colour_and_dashes_in_every_panel(compared):
+    styles = line_styles(compared.plans)
+    for figure in (plot_plans(compared), plot_responses(compared)):
+        for axes in figure.axes:
+            for line in curves(axes):
+                style = styles[line.get_label()]
+                assert to_hex(line.get_color()) == to_hex(style["color"])
+
+
+def test_the_legend_names_every_plan_once(compared, swept):
+    for figure, names in (
+        (plot_plans(compared), compared.plans),
+        (plot_responses(compared), compared.plans),
+        (plot_sweep(swept), swept.metrics),
+    ):
+        (legend,) = figure.legends
+        assert [text.get_text() for text in legend.get_texts()] == list(names)
+
+
+# Plans
+
+
+def test_labels_of_plans_carry_units(compared, two_axes):
+    labels = [axes.get_ylabel() for axes in plot_plans(compared).axes]
+    assert labels == ["x position [m]", "x velocity [m/s]", "x acceleration [m/s$^2$]"]
+    labels = [axes.get_ylabel() for axes in plot_plans(two_axes, order=1).axes]
+    assert labels == ["x position [m]", "theta position [rad]", "x velocity [m/s]", "theta velocity [rad/s]"]
+    assert plot_plans(compared).axes[-1].get_xlabel() == "time [s]"
+    labels = [axes.get_ylabel() for axes in plot_plans(compared, order=4).axes]
+    assert labels[3:] == ["x jerk [m/s$^3$]", "x snap [m/s$^4$]"]
+
+
+def test_without_units_none_is_made_up(compared):
+    loop = cp.plants.integrator_lag_loop(5.0)
+    figure = plot_plans(cp.compare(loop, MOVE, TIMES))
+    assert [axes.get_ylabel() for axes in figure.axes] == ["position", "velocity [1/s]", "acceleration [1/s$^2$]"]
+
+
+def test_plans_are_drawn_as_they_are(compared):
+    for order, axes in enumerate(plot_plans(compared).axes):
+        lines = by_label(axes)
+        assert set(lines) == {name for name in compared.plans if name != "step" or order == 0}
+        for name, line in lines.items():
+            t, y = line.get_data()
+            known = ~np.isnan(y)
+            assert known.mean() > 0.98
+            np.testing.assert_allclose(y[known], compared.plans[name](t[known], order), rtol=0, atol=1e-9)
+            assert t[0] < 0 < 10 < t[-1]
+
+
+def test_prescribed_values_are_circles_and_free_ones_are_not(compared):
+    marks = []
+    for axes in plot_plans(compared).axes:
+        (line,) = (line for line in axes.lines if line.get_linestyle() == "None")
+        marks.append([tuple(p) for p in line.get_xydata() if not np.isnan(p).any()])
+    assert marks == [[(0, 0), (6, 5), (10, 1)], [(0, 0), (10, 0)], [(0, 0), (10, 0)]]
+
+
+def test_no_line_is_drawn_through_a_jump():
+    # Positions alone: the velocity jumps at both ends, and at the join.
+    plan = cp.PiecewiseSpline([cp.Waypoint(0, 0), cp.Waypoint(1, 1), cp.Waypoint(2, 0)])
+    found = cp.Comparison({"legs": plan}, {}, {}, outputs=("y",))
+    for axes in (plot_plans(found, order=1).axes[1], plot_trajectory(plan, order=1).axes[1]):
+        (line,) = curves(axes)
+        t, v = line.get_data()
+        assert {1.0, -1.0, 0.0} == set(v[~np.isnan(v)].round(9))
+        for (t0, t1), (v0, v1) in zip(pairwise(t), pairwise(v), strict=True):
+            assert np.isnan(v0) or np.isnan(v1) or abs(v1 - v0) < 1e-9, f"a line from {t0} to {t1}"
+
+
+# One trajectory
+
+
+def test_a_trajectory_marks_its_waypoints():
+    plan = cp.TrigSpline(MOVE, alpha=2.0)
+    figure = plan.plot(order=3)
+    assert len(figure.axes) == 4
+    marked = []
+    for order, axes in enumerate(figure.axes):
+        (line,) = curves(axes)
+        t, y = line.get_data()
+        known = ~np.isnan(y)
+        np.testing.assert_allclose(y[known], plan(t[known], order), rtol=0, atol=1e-9)
+        marked.append([tuple(p) for m in axes.lines if m.get_linestyle() == "None" for p in m.get_xydata()])
+    assert marked == [[(0, 0), (6, 5), (10, 1)], [(0, 0), (10, 0)], [(0, 0), (10, 0)], []]
+
+
+def test_each_axis_of_a_trajectory_is_marked_and_named():
+    points = [cp.Waypoint.from_jets(0, x=[0.0, 0.0], z=[3.0]), cp.Waypoint.from_jets(2, x=[1.0], z=[4.0, 0.5])]
+    figure = cp.PolySpline(points).plot(order=1, units=["m", "m"])
+    assert [axes.get_ylabel() for axes in figure.axes] == ["position [m]", "velocity [m/s]"]
+    (legend,) = figure.legends
+    assert [text.get_text() for text in legend.get_texts()] == ["x", "z"]
+    marks = [
+        {tuple(p) for m in axes.lines if m.get_linestyle() == "None" for p in m.get_xydata()} for axes in figure.axes
+    ]
+    assert marks == [{(0, 0), (2, 1), (0, 3), (2, 4)}, {(0, 0), (2, 0.5)}]
+    colours = {to_hex(line.get_color()) for line in curves(figure.axes[0])}
+    assert len(colours) == 2
+
+
+def test_a_trajectory_without_waypoints_or_duration_is_drawn_too():
+    assert len(cp.Step(1.0).plot().axes) == 3
+    assert len((2.0 * cp.PolySpline(MOVE) + cp.PolySpline(MOVE)).plot().axes) == 3
+
+
+def test_different_units_have_none_in_common():
+    points = [cp.Waypoint.from_jets(0, x=[0.0], th=[3.0]), cp.Waypoint.from_jets(2, x=[1.0], th=[4.0])]
+    labels = [axes.get_ylabel() for axes in cp.PolySpline(points).plot(order=0, units=["m", "rad"]).axes]
+    assert not any("[m]" in label or "[rad]" in label for label in labels)
+
+
+# Responses
+
+
+def test_labels_of_responses_carry_units(compared, two_axes):
+    assert [a.get_ylabel() for a in plot_responses(compared).axes] == ["y [m]", "error of y [m]", "u [N]"]
+    labels = [a.get_ylabel() for a in plot_responses(two_axes).axes]
+    assert labels == ["x [m]", "error of x [m]", "theta [rad]", "error of theta [rad]"]
+
+
+def test_responses_are_drawn_as_they_are(compared):
+    output, error, control = plot_responses(compared).axes
+    for name, response in compared.responses.items():
+        y, u = response.outputs
+        for axes, signal in ((output, y), (error, compared.plans[name](TIMES) - y), (control, u)):
+            line = by_label(axes)[name]
+            np.testing.assert_array_equal(line.get_xdata(), TIMES)
+            np.testing.assert_allclose(line.get_ydata(), signal, rtol=0, atol=1e-12)
+    thin = [line for line in output.lines if line.get_linewidth() < 1.0]
+    assert len(thin) == len(compared.plans)
+    for line, plan in zip(thin, compared.plans.values(), strict=True):
+        np.testing.assert_array_equal(line.get_ydata(), plan(TIMES))
+
+
+def test_a_comparison_draws_its_responses(compared):
+    assert len(compared.plot().axes) == len(plot_responses(compared).axes) == 3
+
+
+def test_a_loop_without_controls_and_one_that_explodes_are_drawn_too(tmp_path):
+    alone = cp.compare(cp.plants.integrator_lag_loop(5.0), MOVE, TIMES)
+    assert len(alone.plot().axes) == 2
+    wild = cp.compare(cp.plants.integrator_lag_loop(-1e4), MOVE, np.linspace(0, 30, 301))
+    to_svg(wild.plot(), "wild")
+
+
+# Sweeps
+
+
+def test_labels_of_a_sweep_carry_units(swept):
+    axes = plot_sweep(swept).axes
+    assert [a.get_ylabel() for a in axes] == ["Settling time [s]", "Overshoot on the error [%]"]
+    assert {a.get_xlabel() for a in axes} == {"gain"}
+    assert {a.get_xscale() for a in axes} == {"log"}
+
+
+def test_a_sweep_is_drawn_as_it_is_and_broken_where_it_jumps(swept):
+    settling, overshoot = plot_sweep(swept).axes
+    for plan, rows in swept.metrics.items():
+        line = by_label(overshoot)[plan]
+        np.testing.assert_array_equal(line.get_ydata(), rows["overshoot_error"])
+        np.testing.assert_array_equal(line.get_xdata(), swept.values)
+        k, ts = by_label(settling)[plan].get_data()
+        known = ~np.isnan(ts)
+        np.testing.assert_array_equal(k[known], swept.values)
+        np.testing.assert_array_equal(ts[known], rows["settling_time"])
+        assert np.all(np.diff(k) > 0)
+    k, ts = by_label(settling)["step"].get_data()
+    first = 0.25 + (np.pi / (2 * np.log(50.0))) ** 2
+    gap = int(np.flatnonzero(np.isnan(ts))[0])
+    assert k[gap - 1] < first < k[gap + 1] < 1.002 * first
+    assert k[gap - 1] < k[gap] < k[gap + 1]
+    assert ts[gap + 1] > ts[gap - 1] + 1.0
+
+
+def test_values_at_which_a_loop_never_settles_are_drawn_too():
+    found = cp.sweep(cp.plants.integrator_lag_loop, [-2.0, -1.0, 1.0, 2.0], MOVE, TIMES, progress=False)
+    settling, _ = found.plot().axes
+    for line in by_label(settling).values():
+        k, ts = line.get_data()
+        assert set(k[np.isfinite(ts)]) == {1.0, 2.0}
+
+
+def test_every_measure_can_be_swept_and_drawn(swept):
+    names = [name for name in MEASURES if name in swept.metrics["step"]]
+    figure = plot_sweep(swept, names)
+    assert len(visible(figure)) == len(names)
+    to_svg(figure, "all")
+
+
+def test_figure_1_is_the_plane_of_settling_and_overshoot(swept):
+    (axes,) = plot_plane(swept).axes
+    assert axes.get_xlabel() == "settling time ±2 % [s]"
+    assert axes.get_ylabel() == "overshoot on the error [%]"
+    (star,) = (line for line in axes.lines if line.get_marker() == "*")
+    assert tuple(star.get_xydata()[0]) == STEP_LIMIT == pytest.approx((7.824, 100.0), rel=1e-5)
+    dots = [line for line in axes.lines if line.get_marker() == "." and len(line.get_xdata()) == swept.values.size]
+    assert len(dots) == len(swept.metrics)
+    for line, rows in zip(dots, swept.metrics.values(), strict=True):
+        np.testing.assert_array_equal(line.get_xdata(), rows["settling_time"])
+        np.testing.assert_array_equal(line.get_ydata(), rows["overshoot_error"])
+    # Everything lies within the axes.
+    points = np.concatenate([line.get_xydata() for line in dots])
+    assert np.all(
+        (points >= [axes.get_xlim()[0], axes.get_ylim()[0]]) & (points <= [axes.get_xlim()[1], axes.get_ylim()[1]])
+    )
+
+
+def test_gains_beside_the_circles_can_be_read(swept):
+    figure = plot_plane(swept)
+    _, _, renderer = boxes(figure)
+    (axes,) = figure.axes
+    written = {text: text.get_window_extent(renderer) for text in axes.texts}
+    assert {text.get_text() for text in written} == {"1", "5", "20", "100", "1000"}
+    frame = axes.get_window_extent(renderer)
+    for text, box in written.items():
+        assert frame.x0 <= box.x0
+        assert frame.y0 <= box.y0, f"{text.get_text()} runs into the axis"
+    for (one, a), (other, b) in combinations(written.items(), 2):
+        assert not a.overlaps(b), f"{one.get_text()} and {other.get_text()} hide each other"
+
+
+def test_circles_stand_at_the_gains_written_beside_them(swept):
+    (axes,) = plot_plane(swept).axes
+    circles = {tuple(line.get_xydata()[0]) for line in axes.lines if line.get_marker() == "o"}
+    for text in axes.texts:
+        assert tuple(text.xy) in circles
+        gain = int(np.flatnonzero(swept.values == float(text.get_text()))[0])
+        rows = [(r["settling_time"][gain], r["overshoot_error"][gain]) for r in swept.metrics.values()]
+        assert tuple(text.xy) in rows
+
+
+# Manners
+
+
+def test_figures_do_not_pile_up_in_pyplot(compared, swept):
+    before = plt.get_fignums()
+    for _ in range(3):
+        compared.plot()
+        compared.plans["polynomial"].plot()
+        swept.plot()
+        plot_plans(compared)
+        plot_plane(swept)
+    assert plt.get_fignums() == before
+
+
+def test_a_page_leaves_no_window_open(compared, swept, monkeypatch):
+    monkeypatch.setattr(mpl, "get_backend", lambda: "QtAgg")  # where pyplot would manage them
+    before = plt.get_fignums()
+    render_page([Study("it", "It", compared, sweep=swept, figures=("plane", "plans"))], "It")
+    assert plt.get_fignums() == before
+
+
+def test_where_there_are_windows_a_figure_has_one(compared, monkeypatch):
+    monkeypatch.setattr(mpl, "get_backend", lambda: "TkAgg")
+    before = plt.get_fignums()
+    figure = compared.plot()
+    assert len(plt.get_fignums()) == len(before) + 1
+    plt.close(figure)
+
+
+def test_settings_of_the_user_are_left_alone(compared, swept):
+    before = dict(mpl.rcParams)
+    to_svg(plot_plane(swept), "it")
+    compared.plot()
+    assert dict(mpl.rcParams) == before
+
+
+def test_settings_of_the_user_do_not_change_a_page(compared):
+    study = Study("it", "It", compared, figures=("responses",))
+    with plt.style.context("dark_background"):
+        dark = render_page([study], "It")
+    assert dark == render_page([study], "It")
+
+
+def imports(path):
+    """Names of the modules that a file imports."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            yield node.module or ""
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+
+
+def test_only_reports_use_pyplot():
+    root = Path(cp.__file__).parent
+    users = {p.relative_to(root).parts[0] for p in root.rglob("*.py") if "matplotlib.pyplot" in set(imports(p))}
+    assert users == {"reports"}

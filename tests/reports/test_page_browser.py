@@ -1,0 +1,323 @@
+"""The page in a real browser, opened from the disk: what is seen, at any width, sorted, and printed."""
+
+import base64
+import json
+import math
+
+import pytest
+
+
+@pytest.fixture
+def opened(written, browser):
+    """The page in the browser at a width, with the logs of before taken away."""
+
+    def at(width=1100, height=900):
+        browser.execute_cdp_cmd(
+            "Emulation.setDeviceMetricsOverride",
+            {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": width < 500},
+        )
+        browser.get("about:blank")
+        browser.get_log("browser")
+        browser.get_log("performance")
+        browser.get((written.folder / "index.html").as_uri())
+        return browser
+
+    yield at
+    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": ""})
+    browser.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+
+
+# Opened offline
+
+
+def test_the_console_is_silent(opened):
+    chrome = opened()
+    for button in chrome.find_elements("css selector", "thead button"):
+        button.click()
+    assert chrome.get_log("browser") == []
+
+
+def test_no_request_leaves_the_page(opened, written):
+    chrome = opened()
+    messages = [json.loads(entry["message"])["message"] for entry in chrome.get_log("performance")]
+    asked = [m["params"]["request"]["url"] for m in messages if m["method"] == "Network.requestWillBeSent"]
+    page = (written.folder / "index.html").as_uri()
+    assert page in asked
+    assert [url for url in asked if url != page and not url.startswith("data:")] == []
+    assert chrome.execute_script("return performance.getEntriesByType('resource').map(e => e.name)") == []
+
+
+def test_it_is_drawn_by_the_standard_and_in_its_own_encoding(opened):
+    chrome = opened()
+    assert chrome.execute_script("return document.compatMode") == "CSS1Compat"
+    assert chrome.execute_script("return document.characterSet") == "UTF-8"
+    assert chrome.title
+
+
+# Seen
+
+BOXES = """
+return Array.from(document.querySelectorAll(arguments[0])).map(function (e) {
+  var b = e.getBoundingClientRect();
+  return {left: b.left, right: b.right, width: b.width, height: b.height};
+});
+"""
+
+
+@pytest.mark.parametrize("width", [1100, 390])
+def test_nothing_overflows_the_page(opened, width):
+    chrome = opened(width)
+    assert chrome.execute_script("return document.documentElement.scrollWidth") <= width
+    outside = chrome.execute_script(
+        """
+        var wide = [], limit = document.documentElement.clientWidth + 0.5;
+        document.querySelectorAll("body *").forEach(function (e) {
+          if (e.closest(".scroll, .drawing") && !e.matches(".scroll, .drawing")) { return; }
+          var b = e.getBoundingClientRect();
+          if (b.width && (b.right > limit || b.left < -0.5)) { wide.push(e.tagName + "." + e.className); }
+        });
+        return wide;
+        """
+    )
+    assert outside == []
+
+
+@pytest.mark.parametrize("width", [1100, 390])
+def test_figures_are_seen(opened, width):
+    chrome = opened(width)
+    drawings = chrome.execute_script(BOXES, "figure svg")
+    assert len(drawings) == len(chrome.find_elements("css selector", "figure")) >= 2
+    for box in drawings:
+        assert box["width"] > 300
+        assert box["height"] > 200
+        assert box["left"] >= 0
+    for box in chrome.execute_script(BOXES, "figure .drawing"):
+        assert box["left"] >= 0
+        assert box["right"] <= width
+    for colour in ("#0072b2", "#d55e00"):  # polynomial and trigonometric are on every page
+        curves = chrome.execute_script(BOXES, f"figure svg path[style*='stroke: {colour}']")
+        assert sum(box["width"] > 100 and box["height"] > 20 for box in curves) >= 3
+
+
+def test_figures_are_inside_the_window_of_a_screen(opened):
+    for box in opened(1100).execute_script(BOXES, "figure svg"):
+        assert box["right"] <= 1100
+
+
+def test_figures_wider_than_a_phone_scroll_to_their_end(opened):
+    chrome = opened(390)
+    reached = chrome.execute_script(
+        """
+        return Array.from(document.querySelectorAll("figure .drawing")).map(function (box) {
+          box.scrollLeft = 1e6;
+          return box.querySelector("svg").getBoundingClientRect().right - box.getBoundingClientRect().right;
+        });
+        """
+    )
+    assert reached
+    assert max(reached) <= 1.0
+
+
+@pytest.mark.parametrize(("width", "least"), [(1100, 10.0), (390, 7.0)])
+def test_writing_in_figures_can_be_read(opened, width, least):
+    # Axes are labelled with 9 points; the drawing's own unit is the point.
+    pixels = opened(width).execute_script(
+        """
+        return Array.from(document.querySelectorAll("figure svg[viewBox]")).map(
+          e => 9 * e.getBoundingClientRect().width / e.viewBox.baseVal.width);
+        """
+    )
+    assert min(pixels) >= least
+
+
+CONTRAST = """
+function light(c) {
+  var v = c.map(function (x) { x /= 255; return x <= 0.03928 ? x / 12.92 : Math.pow((x + 0.055) / 1.055, 2.4); });
+  return 0.2126 * v[0] + 0.7152 * v[1] + 0.0722 * v[2];
+}
+function rgb(text) { return text.match(/[\\d.]+/g).map(Number); }
+function ground(e) {
+  for (; e; e = e.parentElement) {
+    var c = rgb(getComputedStyle(e).backgroundColor);
+    if (c.length < 4 || c[3] > 0.99) { return c.slice(0, 3); }
+  }
+  return [255, 255, 255];
+}
+var low = [], seen = 0;
+var walker = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT);
+while (walker.nextNode()) {
+  var e = walker.currentNode.parentElement;
+  if (!walker.currentNode.data.trim() || e.closest("script, style, svg")) { continue; }
+  seen += 1;
+  var a = light(rgb(getComputedStyle(e).color)), b = light(ground(e));
+  var ratio = (Math.max(a, b) + 0.05) / (Math.min(a, b) + 0.05);
+  if (ratio < 4.5) { low.push([e.tagName, walker.currentNode.data.trim().slice(0, 30), ratio]); }
+}
+return {seen: seen, low: low};
+"""
+
+
+def test_writing_stands_out_from_its_ground(opened):
+    found = opened().execute_script(CONTRAST)
+    assert found["seen"] > 100
+    assert found["low"] == []
+
+
+@pytest.mark.parametrize("width", [1100, 390])
+def test_writing_is_large_enough(opened, width):
+    sizes = opened(width).execute_script(
+        """
+        return Array.from(document.querySelectorAll("p, li, td, th, dd, dt, figcaption")).map(
+          e => parseFloat(getComputedStyle(e).fontSize));
+        """
+    )
+    assert min(sizes) >= 12
+
+
+def test_the_table_of_a_phone_scrolls_in_its_own_box(opened):
+    chrome = opened(390)
+    for box in chrome.execute_script(BOXES, ".scroll"):
+        assert box["right"] <= 390
+    reached = chrome.execute_script(
+        """
+        return Array.from(document.querySelectorAll(".scroll")).map(function (box) {
+          box.scrollLeft = 1e6;
+          return box.querySelector("table").getBoundingClientRect().right - box.getBoundingClientRect().right;
+        });
+        """
+    )
+    assert reached
+    assert max(reached) <= 1.0
+
+
+# Sorted
+
+COLUMN = """
+var table = document.querySelectorAll("table.metrics")[arguments[0]], column = arguments[1];
+return Array.from(table.tBodies[0].rows).map(function (row) {
+  return [row.cells[column].dataset.order, row.cells[0].textContent, row.cells[column].textContent.trim()];
+});
+"""
+
+
+def rank(order):
+    """What a cell says it is, for sorting: numbers, then infinity; nothing where it is undefined."""
+    return None if order == "" else math.inf if order == "1e999" else float(order)
+
+
+def test_each_column_of_numbers_sorts_up_and_down(opened, written):
+    chrome = opened()
+    for table, study in enumerate(written.results["studies"].values()):
+        for column, plan in enumerate(study["plans"], 2):
+            heading = chrome.find_elements("css selector", "table.metrics")[table].find_elements(
+                "css selector", "thead th"
+            )[column]
+            before = chrome.execute_script(COLUMN, table, column)
+            for direction, sign in (("ascending", 1), ("descending", -1)):
+                heading.find_element("tag name", "button").click()
+                assert heading.get_attribute("aria-sort") == direction
+                rows = chrome.execute_script(COLUMN, table, column)
+                assert sorted(rows) == sorted(before)
+                values = [rank(order) for order, _, _ in rows]
+                known = [v for v in values if v is not None]
+                assert values[: len(known)] == known, f"undefined cells of {plan} must come last"
+                assert known == sorted(known, key=lambda v, s=sign: s * v)
+
+
+def test_what_never_happens_is_more_than_any_number_and_what_is_undefined_comes_last(opened):
+    chrome = opened()
+    heading = next(th for th in chrome.find_elements("css selector", "thead th") if th.text.split()[0] == "step")
+    button = heading.find_element("tag name", "button")
+    column = heading.get_property("cellIndex")
+    button.click()
+    texts = [text.rstrip(" ▲▽") for _, _, text in chrome.execute_script(COLUMN, 0, column)]
+    numbers = [t for t in texts if any(c.isdigit() for c in t)]
+    assert "–" in texts
+    assert len(numbers) < len(texts)
+    undefined = texts.count("–")
+    assert texts[-undefined:] == ["–"] * undefined
+    endless = len(texts) - len(numbers) - undefined
+    assert endless > 0
+    assert texts[: len(numbers)] == numbers
+    button.click()
+    texts = [text.rstrip(" ▲▽") for _, _, text in chrome.execute_script(COLUMN, 0, column)]
+    assert texts[endless : endless + len(numbers)] == numbers[::-1]
+    assert texts[-undefined:] == ["–"] * undefined
+
+
+def test_the_names_sort_as_words(opened):
+    chrome = opened()
+    button = chrome.find_element("css selector", "thead th button")
+    given = [name for _, name, _ in chrome.execute_script(COLUMN, 0, 0)]
+    button.click()
+    assert [name for _, name, _ in chrome.execute_script(COLUMN, 0, 0)] == sorted(given)
+    button.click()
+    assert [name for _, name, _ in chrome.execute_script(COLUMN, 0, 0)] == sorted(given, reverse=True)
+
+
+def test_only_the_column_sorted_by_is_marked(opened):
+    chrome = opened()
+    first, second = chrome.find_elements("css selector", "thead button")[:2]
+    first.click()
+    second.click()
+    marked = chrome.find_elements("css selector", "thead th[aria-sort]")
+    assert [th.get_attribute("aria-sort") for th in marked] == ["ascending"]
+    assert marked[0].find_element("tag name", "button") == second
+    arrow = chrome.execute_script("return getComputedStyle(arguments[0], '::after').content", second)
+    assert "↑" in arrow
+    second.click()
+    assert "↓" in chrome.execute_script("return getComputedStyle(arguments[0], '::after').content", second)
+
+
+def test_the_keyboard_sorts_too(opened):
+    from selenium.webdriver.common.keys import Keys
+
+    chrome = opened()
+    button = chrome.find_element("css selector", "thead th button")
+    button.send_keys(Keys.ENTER)
+    assert len(chrome.find_elements("css selector", "thead th[aria-sort=ascending]")) == 1
+    assert chrome.execute_script("return getComputedStyle(arguments[0]).outlineStyle", button) != "none"
+
+
+def test_rows_stay_whole_when_sorted(opened):
+    chrome = opened()
+    read = "return Array.from(document.querySelector('table.metrics').tBodies[0].rows).map(r => r.textContent)"
+    before = chrome.execute_script(read)
+    for button in chrome.find_elements("css selector", "thead button"):
+        button.click()
+    assert sorted(chrome.execute_script(read)) == sorted(before)
+
+
+# Printed
+
+
+def test_on_paper_hints_are_left_out_and_nothing_is_cut(opened):
+    chrome = opened(718)  # the width of A4 between its margins, in pixels of CSS
+    chrome.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": "print"})
+    shown = chrome.execute_script(
+        "return Array.from(document.querySelectorAll('.hint, nav')).map(e => getComputedStyle(e).display)"
+    )
+    assert shown
+    assert set(shown) == {"none"}
+    for box in chrome.execute_script(BOXES, "figure svg"):
+        assert box["right"] <= 718
+        assert box["height"] <= 1000  # a figure is not broken, so it has to fit one page
+    cut = chrome.execute_script(
+        "return Array.from(document.querySelectorAll('.scroll, .drawing')).map(e => e.scrollWidth - e.clientWidth)"
+    )
+    assert max(cut) <= 1
+    breaks = chrome.execute_script(
+        "return Array.from(document.querySelectorAll('figure, tr')).map(e => getComputedStyle(e).breakInside)"
+    )
+    assert set(breaks) == {"avoid"}
+
+
+def test_it_prints(opened):
+    chrome = opened()
+    made = chrome.execute_cdp_cmd(
+        "Page.printToPDF", {"printBackground": False, "paperWidth": 8.27, "paperHeight": 11.69}
+    )
+    pdf = base64.b64decode(made["data"])
+    assert pdf.startswith(b"%PDF-")
+    pages = pdf.count(b"/Type /Page\n") or pdf.count(b"/Type /Page ") or pdf.count(b"/Type/Page/")
+    assert 2 <= pages <= 12

@@ -1,0 +1,125 @@
+"""What may drive a system: trajectories, numbers, samples, by name or all at once."""
+
+import control as ct
+import numpy as np
+import pytest
+from simulation_oracle import both, constant, gap, response, step
+
+import ctrlplan as cp
+
+A = [[0.0, 1.0], [-4.0, -0.8]]
+B = [[0.0, 0.5], [4.0, -1.0]]
+C = [[1.0, 0.0], [0.0, 1.0], [1.0, 1.0]]
+D = [[0.0, 0.0], [0.0, 0.3], [0.0, 0.0]]
+SYSTEM = ct.ss(A, B, C, D, inputs=["r", "d"], outputs=["y", "v", "w"], name="plant")
+T = np.linspace(0.0, 6.0, 121)
+PLAN, (R,) = both([0.4, 1.1, 2.7], [[[0.0, 0.0, 0.0], [1.0, -0.3], [0.5, 0.0, 0.0]]], 1.0)
+OTHER, (S,) = both([1.0, 3.3], [[[0.0, 0.0], [-2.0, 1.0]]])
+START = [0.3, -1.0]
+
+
+@pytest.mark.parametrize(
+    ("inputs", "signals"),
+    [
+        ({"r": PLAN, "d": 0.1}, [R, constant(0.1)]),
+        ({"d": 0.1, "r": PLAN}, [R, constant(0.1)]),
+        ({"d": OTHER}, [constant(0.0), S]),
+        ({"d": cp.Step(0.7, time=1.5), "r": OTHER}, [S, step(0.7, 0.0, 1.5)]),
+        ({"r": 2, "d": np.float64(-1)}, [constant(2.0), constant(-1.0)]),
+        ({}, [constant(0.0), constant(0.0)]),
+        (None, [constant(0.0), constant(0.0)]),
+        (0, [constant(0.0), constant(0.0)]),
+        (1.5, [constant(1.5), constant(1.5)]),
+        ([1.5, -0.5], [constant(1.5), constant(-0.5)]),
+        (cp.stack([OTHER, PLAN], labels=["a", "b"]), [S, R]),
+        (cp.Step([1.0, 2.0], time=0.5), [step(1.0, 0.0, 0.5), step(2.0, 0.0, 0.5)]),
+    ],
+    ids=["names", "other order", "one named", "steps", "numbers", "nothing", "None", "0", "number", "vector", "axes", "step"],
+)
+def test_exactly(inputs, signals):
+    found = cp.simulate(SYSTEM, T, inputs, START)
+    outputs, states = response(A, B, C, D, signals, T, START)
+    assert found.method == "exact"
+    assert gap(found.outputs, outputs) <= 1e-11
+    assert gap(found.states, states) <= 1e-11
+    assert np.abs(found.inputs - [s(T) for s in signals]).max() <= 1e-13
+
+
+def saw(t):
+    return np.abs(np.mod(1.7 * t, 2) - 1)
+
+
+@pytest.mark.parametrize(("rtol", "allowed"), [(1e-8, 1e-6), (1e-11, 1e-8)])
+@pytest.mark.parametrize("kind", ["array", "names", "name and number"])
+def test_samples_are_linear_in_between(kind, rtol, allowed):
+    rows = np.array([saw(T), np.random.default_rng(1).normal(size=T.size)])
+    inputs = {
+        "array": rows,
+        "names": {"d": rows[1], "r": rows[0]},
+        "name and number": {"r": rows[0].tolist(), "d": 0.25},
+    }[kind]
+    if kind == "name and number":
+        rows[1] = 0.25
+    found = cp.simulate(SYSTEM, T, inputs, START, rtol=rtol, atol=1e-2 * rtol)
+    peer = ct.forced_response(SYSTEM, T, rows, START)
+    assert found.method == "python"
+    assert gap(found.outputs, peer.outputs) <= allowed
+    assert gap(found.states, peer.states) <= allowed
+    assert np.array_equal(found.inputs, rows)
+
+
+def test_samples_at_odd_times():
+    # A ramp of slope 1 is a ramp however it is sampled: x' = -x + t from 0 is t - 1 + exp(-t).
+    t = np.unique(np.concatenate([[0.0], np.random.default_rng(0).uniform(0, 5, 17), [5.0]]))
+    found = cp.simulate(ct.ss(-1.0, 1.0, 1.0, 0.0), t, t, rtol=1e-10, atol=1e-12)
+    assert np.abs(found.outputs - (t - 1 + np.exp(-t))).max() <= 1e-9
+
+
+def test_a_plan_beside_samples():
+    samples = np.random.default_rng(1).normal(size=T.size)
+    found = cp.simulate(SYSTEM, T, {"r": PLAN, "d": samples}, START, rtol=1e-11, atol=1e-13)
+    planned = response(A, B, C, D, [R, constant(0.0)], T, START)[0]
+    disturbed = ct.forced_response(SYSTEM, T, [0 * T, samples]).outputs
+    assert gap(found.outputs, planned + disturbed) <= 1e-8
+
+
+@pytest.mark.parametrize("count", [1001, 10_001])
+def test_a_pulse_of_samples_in_a_long_rest_is_not_skipped(count):
+    t = np.linspace(0.0, 100.0, count)
+    pulse = np.where(np.abs(t - 50.0) < 1e-9, 1.0, 0.0)
+    system = ct.ss(-1.0, 1.0, 1.0, 0.0)
+    peer = ct.forced_response(system, t, pulse).outputs
+    assert peer.max() > 0.5 * t[1]
+    assert np.abs(cp.simulate(system, t, pulse).outputs - peer).max() <= 1e-7
+
+
+def test_a_single_input_takes_a_row_or_a_matrix_of_one():
+    system = ct.ss(-1.0, 1.0, 1.0, 0.0)
+    rows = [cp.simulate(system, T, values).outputs for values in (saw(T), saw(T)[None], saw(T).tolist())]
+    assert rows[0].shape == T.shape
+    assert np.array_equal(rows[0], rows[1])
+    assert np.array_equal(rows[0], rows[2])
+
+
+def test_inputs_are_not_written_to():
+    rows, initial = np.array([saw(T), saw(2 * T)]), np.array(START)
+    kept = rows.copy()
+    for method in ("auto", "python"):
+        cp.simulate(SYSTEM, T, rows, initial)
+        cp.simulate(SYSTEM, T, {"r": PLAN}, initial, method=method)
+    assert np.array_equal(rows, kept)
+    assert initial.tolist() == START
+
+
+def test_a_number_holds_from_the_first_sample_on():
+    # Whenever the run begins: x' = -x + 2 from 0.
+    t = np.linspace(-3.0, 2.0, 50)
+    for method in ("exact", "python"):
+        found = cp.simulate(ct.ss(-1.0, 1.0, 1.0, 0.0), t, 2.0, method=method, rtol=1e-11, atol=1e-13)
+        assert np.abs(found.outputs + 2 * np.expm1(-(t + 3.0))).max() <= 1e-10
+        assert np.all(found.inputs == 2.0)
+
+
+def test_a_scalar_initial_state_is_for_all_states():
+    found = cp.simulate(SYSTEM, T, None, 0.5)
+    assert gap(found.states, response(A, B, C, D, [constant(0.0)] * 2, T, [0.5, 0.5])[1]) <= 1e-11

@@ -1,0 +1,219 @@
+"""The package as a whole: what importing it costs, what it shows, and that every name is where it is said to be."""
+
+import ast
+import importlib
+import inspect
+import pkgutil
+import re
+import subprocess
+import sys
+import tomllib
+from importlib import metadata
+from pathlib import Path
+
+import pytest
+
+import ctrlplan as cp
+
+ROOT = Path(cp.__file__).parent
+PROJECT = ROOT.parent
+SUBPACKAGES = sorted(m.name for m in pkgutil.walk_packages(cp.__path__, "ctrlplan.") if m.ispkg and "._" not in m.name)
+
+# The names that the design fixes, as far as they are built.
+FIXED = (
+    "Waypoint",
+    "TrigSpline",
+    "PolySpline",
+    "PiecewiseSpline",
+    "Step",
+    "stack",
+    "trajectory_from_dict",
+    "load_trajectory",
+    "create_source_iosystem",
+    "plants.integrator_lag_loop",
+    "simulate",
+    "compare",
+    "sweep",
+    "metrics.settling_time",
+    "metrics.overshoot",
+    "metrics.lag",
+    "metrics.iae",
+    "metrics.ise",
+    "metrics.itae",
+    "metrics.effort",
+    "metrics.wandering",
+)
+
+
+def fresh(code):
+    """Run code in an interpreter of its own, which must end well and say nothing."""
+    done = subprocess.run([sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+# What importing it loads
+
+
+@pytest.mark.parametrize(
+    ("what", "without"),
+    [
+        ("ctrlplan", {"control", "matplotlib", "scipy", "numpy", "jinja2", "tqdm", "pandas"}),
+        ("ctrlplan.trajectories", {"control", "matplotlib", "jinja2", "tqdm", "pandas"}),
+        ("ctrlplan.metrics", {"control", "matplotlib", "scipy", "jinja2", "tqdm", "pandas"}),
+        ("ctrlplan.cli", {"control", "matplotlib", "scipy", "pandas"}),
+        ("ctrlplan.studies", {"matplotlib.backends.backend_svg", "jinja2", "pandas"}),
+    ],
+)
+def test_importing_loads_only_what_it_needs(what, without):
+    fresh(f"import sys, {what}\nloaded = {without!r} & set(sys.modules)\nassert not loaded, loaded")
+
+
+def test_names_are_loaded_when_they_are_asked_for():
+    fresh(
+        "import sys, ctrlplan as cp\n"
+        "cp.Waypoint\n"
+        "assert 'ctrlplan.trajectories' in sys.modules\n"
+        "assert not {'control', 'matplotlib', 'ctrlplan.systems', 'ctrlplan.studies'} & set(sys.modules)\n"
+        "cp.metrics.iae\n"
+        "assert 'control' not in sys.modules\n"
+        "cp.simulate\n"
+        "assert 'control' in sys.modules\n"
+    )
+
+
+def test_planning_works_where_control_is_not_installed():
+    fresh(
+        "import sys\n"
+        "sys.modules['control'] = sys.modules['matplotlib'] = None\n"
+        "import ctrlplan as cp\n"
+        "plan = cp.TrigSpline([cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1, 0, 0)], alpha=1.0)\n"
+        "assert abs(plan(0.5) - 0.5) < 1e-12 and plan.peak(1)[0] > 1.875\n"
+        "assert cp.metrics.iae([0, 1, 2], [1, 1, 1]) == 2\n"
+    )
+
+
+# What it shows
+
+
+def test_every_name_is_there_and_is_listed():
+    assert len(cp.__all__) == len(set(cp.__all__))
+    for name in cp.__all__:
+        assert getattr(cp, name) is not None
+    assert set(dir(cp)) == {*cp.__all__, "__version__"}
+
+
+def test_every_name_is_that_of_its_home():
+    for name in cp.__all__:
+        thing = getattr(cp, name)
+        home = thing.__name__ if inspect.ismodule(thing) else thing.__module__
+        assert home.startswith("ctrlplan.")
+        assert thing.__doc__
+
+
+def test_a_name_that_is_not_there_is_an_attribute_error():
+    with pytest.raises(AttributeError, match="module 'ctrlplan' has no attribute 'Spline'"):
+        cp.Spline  # noqa: B018
+    assert not hasattr(cp, "_nothing")
+
+
+def test_star_brings_exactly_the_names():
+    fresh(
+        "before = set(globals())\n"
+        "from ctrlplan import *\n"
+        "import ctrlplan\n"
+        "brought = set(globals()) - before - {'before', 'ctrlplan'}\n"
+        "assert brought == set(ctrlplan.__all__), brought ^ set(ctrlplan.__all__)\n"
+    )
+
+
+@pytest.mark.parametrize("name", FIXED)
+def test_names_of_the_design_are_there(name):
+    thing = cp
+    for part in name.split("."):
+        thing = getattr(thing, part)
+    assert callable(thing)
+
+
+@pytest.mark.parametrize(
+    ("name", "parameters"),
+    [
+        ("Waypoint", ["time", "position", "velocity", "acceleration", "jerk", "snap"]),
+        ("create_source_iosystem", ["plan", "derivatives", "name"]),
+        ("plants.integrator_lag_loop", ["gain"]),
+        ("simulate", ["system", "timepts", "inputs", "initial_state", "method", "rtol", "atol", "params"]),
+        ("compare", ["loop", "plans", "timepts"]),
+        ("sweep", ["build", "values", "plans", "timepts", "executor", "progress"]),
+        ("Step", ["final", "initial", "time", "labels"]),
+        ("metrics.settling_time", ["timepts", "y", "final", "initial", "band"]),
+        ("metrics.overshoot", ["timepts", "y", "final", "initial", "reference"]),
+    ],
+)
+def test_parameters_of_the_design_come_first(name, parameters):
+    thing = cp
+    for part in name.split("."):
+        thing = getattr(thing, part)
+    known = inspect.signature(thing).parameters.values()
+    assert [p.name for p in known][: len(parameters)] == parameters
+    assert all(p.kind is p.POSITIONAL_OR_KEYWORD for p in list(known)[: len(parameters)])
+
+
+@pytest.mark.parametrize("name", SUBPACKAGES)
+def test_all_is_exactly_what_is_visible(name):
+    module = importlib.import_module(name)
+    exported = module.__all__
+    assert len(exported) == len(set(exported))
+    files = {m.name for m in pkgutil.iter_modules(module.__path__)}
+    visible = {n for n in vars(module) if not n.startswith("_")} - files
+    assert visible == set(exported) - files
+    for export in exported:
+        assert getattr(module, export).__doc__
+
+
+@pytest.mark.parametrize("name", SUBPACKAGES)
+def test_every_public_function_and_class_is_described(name):
+    module = importlib.import_module(name)
+    for export in module.__all__:
+        thing = getattr(module, export)
+        if inspect.isfunction(thing) or inspect.isclass(thing):
+            first = inspect.getdoc(thing).splitlines()[0]
+            assert re.match(r"[A-Z(].*[.:]$", first) or first.endswith(","), f"{name}.{export}: {first}"
+
+
+def test_subpackages_are_those_of_the_map():
+    assert {"ctrlplan.trajectories", "ctrlplan.systems", "ctrlplan.simulation", "ctrlplan.metrics"} <= set(SUBPACKAGES)
+    assert {"ctrlplan.studies", "ctrlplan.reports", "ctrlplan.systems.plants"} <= set(SUBPACKAGES)
+
+
+# One version, and what the package carries
+
+
+def test_the_version_is_in_one_place():
+    assert re.fullmatch(r"\d+\.\d+\.\d+", cp.__version__)
+    assert metadata.version("ctrlplan") == cp.__version__
+    written = [p for p in ROOT.rglob("*.py") if f'"{cp.__version__}"' in p.read_text(encoding="utf-8")]
+    assert written == [ROOT / "__init__.py"]
+
+
+def test_the_project_reads_its_version_from_the_package():
+    path = PROJECT / "pyproject.toml"
+    if not path.exists():
+        pytest.skip("installed without its project file")
+    project = tomllib.loads(path.read_text(encoding="utf-8"))
+    assert "version" not in project["project"]
+    assert project["project"]["dynamic"] == ["version"]
+    assert project["tool"]["setuptools"]["dynamic"]["version"] == {"attr": "ctrlplan.__version__"}
+
+
+def test_the_newest_change_is_this_version():
+    newest = re.search(r"^## (\S+)", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.MULTILINE)
+    assert newest[1] == cp.__version__
+
+
+def test_it_carries_its_licence_its_types_and_its_templates():
+    for name in ("LICENSE", "py.typed", "CHANGELOG.md", "reports/templates/page.html"):
+        assert (ROOT / name).is_file()
+
+
+@pytest.mark.parametrize("path", sorted(ROOT.rglob("*.py")), ids=lambda p: str(p.relative_to(ROOT)))
+def test_every_file_says_what_it_is(path):
+    assert ast.get_docstring(ast.parse(path.read_text(encoding="utf-8")))
