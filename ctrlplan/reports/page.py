@@ -7,6 +7,7 @@ import json
 import math
 import os
 import platform
+import re
 import tempfile
 from collections.abc import Sequence
 from importlib import metadata
@@ -18,7 +19,7 @@ from markupsafe import Markup
 
 import ctrlplan
 from ctrlplan.reports.figures import FIGURES
-from ctrlplan.reports.style import COLOURS, to_svg
+from ctrlplan.reports.style import line_styles, to_svg
 from ctrlplan.reports.words import number, summary, unit_of, verdicts
 from ctrlplan.studies.comparison import Comparison
 from ctrlplan.studies.study import Study
@@ -74,7 +75,7 @@ def write_all(texts: dict[Path, str]) -> list[Path]:
     """Write files all or none: each beside its place first, then moved there."""
     staged: list[tuple[str, Path]] = []
     try:
-        for path, text in texts.items():
+        for path in texts:
             if path.is_dir():
                 raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
         for path, text in texts.items():
@@ -124,10 +125,10 @@ def _section(study: Study) -> dict[str, Any]:
     figures = []
     for key in study.figures:
         draw, caption = FIGURES[key]
-        svg = to_svg(draw(study), f"{study.name}-{key}")
+        svg = to_svg(draw(study), re.sub(r"[^\w-]+", "-", f"{study.name}-{key}"))
         figures.append({"key": key, "svg": Markup(svg), "caption": caption})  # noqa: S704 (our own drawing)
     return {
-        "name": study.name,
+        "name": re.sub(r"[^\w-]+", "-", study.name) or "study",
         "title": study.title,
         "summary": study.summary,
         "notes": study.notes,
@@ -156,7 +157,8 @@ def _table(comparison: Comparison) -> dict[str, Any]:
             order = "" if math.isnan(value) else "1e999" if math.isinf(value) else repr(value)
             cells.append({"text": number(value), "order": order, "mark": mark})
         rows.append({"title": measure.title, "unit": unit_of(comparison, key) or "", "cells": cells})
-    plans = [{"name": plan, "colour": COLOURS.get(plan, "#7F7F7F")} for plan in comparison.metrics]
+    styles = line_styles(comparison.metrics)
+    plans = [{"name": plan, "colour": styles[plan]["color"]} for plan in comparison.metrics]
     return {"plans": plans, "rows": rows}
 
 

@@ -264,8 +264,6 @@ class _Reader:
             place = f"waypoints[{i}]"
             time = self.number(table, "time", f"{place}.time", default=None)
             labels = [label for label in table if label != "time"]
-            if "cls" in labels:
-                raise self.error(f"{place}.cls", "an axis must have a name other than cls, got 'cls'")
             jets = {label: self.numbers(table, label, f"{place}.{label}", finite=False) for label in labels}
             try:
                 points.append(Waypoint.from_jets(time, **jets))

@@ -25,6 +25,8 @@ _PROBES = 8
 _SAME = 1e-6
 """Relative difference up to which numbers count as equal, and singular values as 0."""
 
+_MUST = "static feedback must linearise flat_system"
+
 
 def create_flat_iosystem(
     flat_system: fs.FlatSystem,
@@ -107,41 +109,44 @@ def create_flat_iosystem(
     ...     [cp.create_source_iosystem(plan, 2, suffix="_ref"), law, chain], inputs=0, outputs=["y"]
     ... )
     >>> found = cp.simulate(loop, [0.0, 0.5, 1.0])
-    >>> abs(found.outputs.ravel() - plan([0.0, 0.5, 1.0])).max() < 1e-7
+    >>> bool(abs(found.outputs - plan(found.time)).max() < 1e-7)
     True
     """
     plant = _checked_plant(flat_system)
-    probes = _probes(plant)
-    names = _flat_labels(plant, probes, labels)
-    _check_linearises(plant, probes, names)
-    orders = probes[0].orders
+    drawn, planned = _probes(plant)
+    names = _flat_labels(plant, [*drawn, *planned], labels)
+    for probes in (planned, drawn):
+        _check_linearises(plant, probes, names)
+    orders = drawn[0].orders
     gains = _gains(poles, orders)
-    states, nstates = list(plant.system.state_labels), plant.nstates
     references = [
         derivative_name(f"{label}_ref", k) for label, r in zip(names, orders, strict=True) for k in range(r + 1)
     ]
+    states = list(plant.system.state_labels)
     if shared := sorted(set(references) & set(states)):
-        raise ValueError(f"labels must not give references the names of states, got {', '.join(shared)}")
+        raise ValueError(f"labels must not make references of the names of states, got {', '.join(shared)}")
+    idle = np.zeros(plant.ninputs)
 
-    def out(t: float, x: Any, u: Any, params: dict[str, Any]) -> Array:
-        measured = plant.forward(u[len(references) : len(references) + nstates], plant.idle)
+    def law(t: float, x: Any, u: Any, params: dict[str, Any]) -> Any:
+        # Below the last derivative the flag does not depend on the input.
+        measured = plant.forward(u[len(references) :], idle)
         flag, first = [], 0
         for row, sigma in zip(measured, gains, strict=True):
             r = len(sigma)
-            planned = u[first : first + r + 1]
-            v = planned[r] - sum(sigma[k] * (row[k] - planned[k]) for k in range(r))
+            wanted = u[first : first + r + 1]
+            v = wanted[r] - sum(sigma[k] * (row[k] - wanted[k]) for k in range(r))
             flag.append(np.array([*row[:r], v]))
             first += r + 1
         return plant.reverse(flag)[1]
 
-    def out_but_at_zero(t: float, x: Any, u: Any, params: dict[str, Any]) -> Array:
+    def law_off_zero(t: float, x: Any, u: Any, params: dict[str, Any]) -> Any:
         # Blocks are first evaluated with all inputs zero, where this plant is singular.
-        return out(t, x, u, params) if any(u) else np.zeros(plant.ninputs)
+        return law(t, x, u, params) if np.any(u) else idle
 
-    at_zero = _attempt(lambda: out(0.0, np.zeros(0), np.zeros(len(references) + nstates), {}))
+    zero = np.zeros(len(references) + plant.nstates)
     return ct.nlsys(
         None,
-        out_but_at_zero if at_zero is None else out,
+        law_off_zero if _finite(law, 0.0, None, zero, {}) is None else law,
         inputs=[*references, *states],
         outputs=list(plant.system.input_labels),
         dt=None,
@@ -193,10 +198,246 @@ def hurwitz_coefficients(poles: Sequence[complex], count: int, where: str = "") 
     return tuple(coefficients.real[:0:-1].tolist())
 
 
-def _gains(poles: Sequence[Any], orders: Sequence[int]) -> list[tuple[float, ...]]:
+def _gains(poles: Any, orders: Sequence[int]) -> list[tuple[float, ...]]:
     """Coefficients of each flat output's polynomial."""
-    if np.ndim(poles[0]) == 0 if len(orders) == 1 and len(poles) else False:
-        return [hurwitz_coefficients(poles, orders[0])]
-    if len(poles) != len(orders):
-        raise ValueError(f"poles must be one sequence for each of {len(orders)} flat outputs, got {poles!r}")
-    return [hurwitz_coefficients(p, r, f" in poles[{j}]") for j, (p, r) in enumerate(zip(poles, orders, strict=True))]
+    if not np.iterable(poles):
+        raise TypeError(f"poles must be one sequence for each flat output, got {poles!r}")
+    rows = list(poles)
+    if len(orders) == 1 and not any(np.iterable(row) for row in rows):
+        return [hurwitz_coefficients(rows, orders[0])]
+    if len(rows) != len(orders):
+        raise ValueError(f"poles must be one sequence for each of {len(orders)} flat outputs, got {len(rows)}")
+    return [hurwitz_coefficients(p, r, f" in poles[{j}]") for j, (p, r) in enumerate(zip(rows, orders, strict=True))]
+
+
+# What is asked of the maps
+
+
+@dataclass(frozen=True)
+class _Plant:
+    """A flat system's maps at its own parameters."""
+
+    system: Any
+    nstates: int
+    ninputs: int
+    params: dict[str, Any]
+
+    def forward(self, x: Any, u: Any) -> list[Any]:
+        return list(self.system.forward(x, u, self.params))
+
+    def reverse(self, flag: list[Any]) -> list[Any]:
+        return [np.ravel(values) for values in self.system.reverse(flag, self.params)]
+
+    def rates(self, x: Array, u: Array) -> list[Any]:
+        return [self.system.dynamics(0.0, x, u)]
+
+
+@dataclass(frozen=True)
+class _Probe:
+    """State and input at which the maps are looked at, with the flag there."""
+
+    x: Array
+    u: Array
+    flag: list[Array]
+
+    @property
+    def orders(self) -> list[int]:
+        return [len(row) - 1 for row in self.flag]
+
+
+def _checked_plant(flat_system: Any) -> _Plant:
+    if not isinstance(flat_system, fs.FlatSystem):
+        raise TypeError(f"flat_system must be a control.flatsys.FlatSystem, got {type(flat_system).__name__}")
+    if flat_system.dt not in (None, 0):
+        raise ValueError(f"flat_system must be in continuous time, got dt = {flat_system.dt}")
+    n, m = flat_system.nstates or 0, flat_system.ninputs or 0
+    if not (n and m):
+        raise ValueError(f"flat_system must have states and inputs, got {n} and {m}")
+    return _Plant(flat_system, n, m, dict(flat_system.params))
+
+
+def _finite(function: Callable[..., Any], *args: Any) -> list[Array] | None:
+    """What a map returns, row by row, or None outside of its domain."""
+    with np.errstate(all="ignore"):
+        try:
+            rows = [np.atleast_1d(np.asarray(row, dtype=float)) for row in function(*args)]
+        except (ArithmeticError, ValueError):
+            return None
+    return rows if all(np.isfinite(row).all() for row in rows) else None
+
+
+def _probes(plant: _Plant) -> tuple[list[_Probe], list[_Probe]]:
+    """Points at which the maps are looked at.
+
+    First at random; then those of random flags, which have the plant's own
+    size, with the zero state under the input that the law gives it.
+    """
+    rng = np.random.default_rng(0)
+    n, m = plant.nstates, plant.ninputs
+    draws = [(rng.normal(size=n), rng.normal(size=m)) for _ in range(_PROBES)]
+    drawn = [probe for x, u in draws for probe in _probe(plant, x, u)]
+    if not drawn:
+        with np.errstate(all="ignore"):
+            got = plant.forward(*draws[0])  # says itself what is wrong, where it fails
+        raise ValueError(f"forward must be finite in some of the states probed, got {got} and the like")
+    orders = drawn[0].orders
+    if len(orders) != m or min(orders) < 1 or any(probe.orders != orders for probe in drawn):
+        raise ValueError(
+            f"forward must return as many flags as inputs, {m}, each of two entries or more and always as long, "
+            f"got lengths {[r + 1 for r in drawn[-1].orders]}"
+        )
+    flags = [[rng.normal(size=r + 1) for r in orders] for _ in range(_PROBES)]
+    planned = [probe for flag in flags for x, u in _reversed(plant, flag) for probe in _probe(plant, x, u)]
+    for rest in _probe(plant, np.zeros(n), np.zeros(m)):
+        for _, u in _reversed(plant, [np.append(row[:-1], 0.0) for row in rest.flag]):
+            planned += _probe(plant, rest.x, u)
+    return drawn, planned
+
+
+def _probe(plant: _Plant, x: Array, u: Array) -> Iterator[_Probe]:
+    """The probe at a state and an input, if the flag is finite there."""
+    flag = _finite(plant.forward, x, u)
+    if flag is not None:
+        yield _Probe(x, u, flag)
+
+
+def _reversed(plant: _Plant, flag: list[Array]) -> Iterator[tuple[Array, Array]]:
+    """The state and the input of a flag, if they are finite."""
+    found = _finite(plant.reverse, flag)
+    if found is not None:
+        x, u = found
+        if (x.size, u.size) != (plant.nstates, plant.ninputs):
+            raise ValueError(
+                f"reverse must return {plant.nstates} states and {plant.ninputs} inputs, got {x.size} and {u.size}"
+            )
+        yield x, u
+
+
+def _flat_labels(plant: _Plant, probes: list[_Probe], labels: Sequence[str] | str | None) -> tuple[str, ...]:
+    """Names of the flat outputs: the given ones, those of the outputs that they are, or y, y1, ..."""
+    outputs = list(plant.system.output_labels or [])
+    if labels is None and len(outputs) == plant.ninputs and not any("[" in label for label in outputs):
+        first = [[row[0] for row in probe.flag] for probe in probes]
+        if np.allclose([plant.system.output(0.0, probe.x, probe.u) for probe in probes], first, rtol=_SAME):
+            labels = outputs
+    return checked_labels(labels, plant.ninputs)
+
+
+def _check_linearises(plant: _Plant, probes: list[_Probe], names: Sequence[str]) -> None:
+    """Refuse maps of which the law would not make chains of integrators."""
+    if not probes:
+        return
+    sizes = [np.max(rows, axis=0) for rows in zip(*([np.abs(row) for row in p.flag] for p in probes), strict=True)]
+    for probe in probes:
+        _check_below(plant, probe, names, sizes)
+    for probe in probes:
+        _check_decoupling(plant, probe, names)
+    orders = probes[0].orders
+    if sum(orders) != plant.nstates:
+        got = ", ".join(f"{r} of {name}" for name, r in zip(names, orders, strict=True))
+        raise ValueError(
+            f"{_MUST}: the orders of the flat outputs must add up to the number of states, {plant.nstates}, got {got}"
+        )
+    for probe in probes:
+        _check_derivatives(plant, probe, names)
+        _check_reverse(plant, probe, sizes)
+
+
+def _varied(plant: _Plant, probe: _Probe, step: float) -> Iterator[tuple[int, float, list[Array], list[Array]]]:
+    """Flags with each input in turn a step lower and higher."""
+    for j in range(plant.ninputs):
+        change = np.zeros(plant.ninputs)
+        change[j] = step * max(1.0, abs(probe.u[j]))
+        low, high = (_finite(plant.forward, probe.x, u) for u in (probe.u - change, probe.u + change))
+        if low is not None and high is not None:
+            yield j, 2.0 * change[j], low, high
+
+
+def _check_below(plant: _Plant, probe: _Probe, names: Sequence[str], sizes: list[Array]) -> None:
+    """Refuse where a derivative below the last depends on an input."""
+    for j, _, low, high in _varied(plant, probe, 0.5):
+        for name, below, above, size in zip(names, low, high, sizes, strict=True):
+            moved = np.abs(above - below)[:-1] > _SAME * size[:-1]
+            if moved.any():
+                raise ValueError(
+                    f"{_MUST}: below the last derivative of a flag none must depend on an input, got derivative "
+                    f"{moved.argmax()} of flat output {name}, of {len(below) - 1}, depending on "
+                    f"{plant.system.input_labels[j]}"
+                )
+
+
+def _check_decoupling(plant: _Plant, probe: _Probe, names: Sequence[str]) -> None:
+    """Refuse where the inputs cannot set the last derivatives."""
+    matrix = np.full((plant.ninputs, plant.ninputs), np.nan)
+    for j, change, low, high in _varied(plant, probe, 1e-4):
+        below, above = (np.array([row[-1] for row in flag]) for flag in (low, high))
+        rounding = 1e-11 * (np.abs(below) + np.abs(above))
+        matrix[:, j] = np.where(np.abs(above - below) > rounding, above - below, 0.0) / change
+    if np.isnan(matrix).any():
+        return
+    where = f"at the state {probe.x.round(4).tolist()}"
+    for name, r, row in zip(names, probe.orders, matrix, strict=True):
+        if not row.any():
+            raise ValueError(
+                f"{_MUST}: the last derivative of a flag must depend on an input, got derivative {r} of flat output "
+                f"{name}, depending on none {where}: a flag too short or a singular decoupling matrix"
+            )
+    # Inputs and flat outputs have units of their own.
+    for axis in (1, 0):
+        size = np.abs(matrix).max(axis=axis, keepdims=True)
+        matrix = matrix / np.where(size > 0.0, size, 1.0)
+    rank = int((np.linalg.svd(matrix, compute_uv=False) > _SAME).sum())
+    if rank < plant.ninputs:
+        raise ValueError(
+            f"{_MUST}: the decoupling matrix, last derivatives by inputs, must have rank {plant.ninputs}, "
+            f"got {rank} {where}"
+        )
+
+
+def _check_derivatives(plant: _Plant, probe: _Probe, names: Sequence[str]) -> None:
+    """Refuse where an entry of a flag is not the derivative of the one before."""
+    try:
+        found = _finite(plant.rates, probe.x, probe.u)
+    except NotImplementedError:  # a flat system may come without equations of motion
+        return
+    if found is None:
+        return
+    # Five points in the direction of the motion, so close that no state changes by more than about 1e-3.
+    pace = float(np.max(np.abs(found[0]) / (1.0 + np.abs(probe.x)))) or 1.0
+    h = 1e-3 / pace
+    points = [_finite(plant.forward, probe.x + steps * h * found[0], probe.u) for steps in (-2, -1, 1, 2)]
+    rows = list(zip(*(flag for flag in points if flag is not None), strict=True))
+    if None in points:
+        return
+    for name, row, (a, b, c, d) in zip(names, probe.flag, rows, strict=True):
+        rate, given = ((a - d + 8.0 * (c - b)) / (12.0 * h))[:-1], row[1:]
+        rounding = 0.1 * _SAME * pace * np.abs(row[:-1])
+        wrong = np.abs(rate - given) > _SAME * (np.abs(rate) + np.abs(given)) + rounding
+        if wrong.any():
+            k = int(wrong.argmax())
+            raise ValueError(
+                f"forward must return derivatives along the motion of flat_system, got {given[k]:.6g} as derivative "
+                f"{k + 1} of flat output {name} where derivative {k} changes at the rate {rate[k]:.6g}"
+            )
+
+
+def _check_reverse(plant: _Plant, probe: _Probe, sizes: list[Array]) -> None:
+    """Refuse where reverse does not undo forward; another state of the same flag will do."""
+
+    def same(flag: list[Array] | None) -> bool:
+        return flag is not None and all(
+            (np.abs(a - b) <= _SAME * size).all() for a, b, size in zip(flag, probe.flag, sizes, strict=True)
+        )
+
+    got = np.full(plant.nstates + plant.ninputs, np.nan)
+    for x, u in _reversed(plant, probe.flag):
+        if same(_finite(plant.forward, x, u)) and same(_finite(plant.forward, probe.x, u)):
+            return
+        got = np.concatenate([x, u])
+    given = np.concatenate([probe.x, probe.u])
+    worst = int(np.argmax(np.nan_to_num(np.abs(got - given), nan=np.inf)))
+    label = [*plant.system.state_labels, *plant.system.input_labels][worst]
+    raise ValueError(
+        f"reverse(forward(x, u)) must return x and u, got {label} = {got[worst]:.6g} for {given[worst]:.6g}: "
+        f"these are not the maps of a flat output"
+    )

@@ -53,8 +53,8 @@ class _Combined(Trajectory):
     def _combine(self, values: list[Array]) -> Array:
         """Jets, or held positions, of the whole from those of the parts (axes second to last)."""
 
-    def _map_time(self, origin: float, shift: float, rate: float) -> Self:
-        return self._of(tuple(part._map_time(origin, shift, rate) for part in self.parts), self.labels)
+    def _map_time(self, origin: float, target: float, rate: float) -> Self:
+        return self._of(tuple(part._map_time(origin, target, rate) for part in self.parts), self.labels)
 
     def _sample(self, t: Array, low: int, high: int, left: bool) -> Array:
         out = super()._sample(t, low, high, left)
@@ -138,8 +138,8 @@ class Scaled(_Combined):
     def _from_dict(cls, data: dict[str, Any]) -> Self:
         return cls(trajectory_from_dict(data["parts"][0]), data["factor"])
 
-    def _map_time(self, origin: float, shift: float, rate: float) -> Self:
-        return type(self)(self.parts[0]._map_time(origin, shift, rate), self.factor)
+    def _map_time(self, origin: float, target: float, rate: float) -> Self:
+        return type(self)(self.parts[0]._map_time(origin, target, rate), self.factor)
 
     def _combine(self, values: list[Array]) -> Array:
         return self.factor * values[0]
@@ -165,12 +165,12 @@ class Joined(Trajectory):
     def __init__(self, parts: Iterable[Trajectory]) -> None:
         members = list(_checked_parts(parts))
         for i in range(1, len(members)):
-            members[i] = members[i].shift(members[i - 1].end - members[i].start)
+            members[i] = members[i]._map_time(members[i].start, members[i - 1].end, 1.0)
+        for before, after in pairwise(_same_axes(tuple(members))):
+            _check_join(before, after)
         self._set(tuple(members), members[0].labels)
 
     def _set(self, parts: tuple[Trajectory, ...], labels: tuple[str, ...]) -> None:
-        for before, after in pairwise(_same_axes(parts)):
-            _check_join(before, after)
         times, legs = [parts[0].start], []
         waypoints = list(parts[0].waypoints)
         for part in parts:
@@ -197,12 +197,14 @@ class Joined(Trajectory):
     def _from_dict(cls, data: dict[str, Any]) -> Self:
         self = cls.__new__(cls)
         parts = _checked_parts(trajectory_from_dict(part) for part in data["parts"])
+        for before, after in pairwise(_same_axes(parts)):
+            _check_join(before, after)
         self._set(parts, tuple(data["labels"]))
         return self
 
-    def _map_time(self, origin: float, shift: float, rate: float) -> Self:
+    def _map_time(self, origin: float, target: float, rate: float) -> Self:
         self_ = type(self).__new__(type(self))
-        self_._set(tuple(part._map_time(origin, shift, rate) for part in self.parts), self.labels)
+        self_._set(tuple(part._map_time(origin, target, rate) for part in self.parts), self.labels)
         return self_
 
     def _sample(self, t: Array, low: int, high: int, left: bool) -> Array:
@@ -261,7 +263,7 @@ def _same_axes(parts: tuple[Trajectory, ...]) -> tuple[Trajectory, ...]:
 
 def _check_join(before: Trajectory, after: Trajectory) -> None:
     """Refuse a jump of position, or a gap in time beyond the clock's rounding."""
-    if abs(after.start - before.end) > 4.0 * np.spacing(max(abs(after.start), abs(before.end))):
+    if abs(after.start - before.end) > 1e-9 * (before.duration + after.duration):
         raise ValueError(f"parts must follow one another in time, got {after.start} s after {before.end} s")
     last, first = before.final, after.initial
     if np.any(first != last) and np.any(np.abs(first - last) > 1e-9 * np.maximum(before.peak(), after.peak())):

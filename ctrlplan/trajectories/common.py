@@ -89,9 +89,9 @@ def checked_timepts(t: ArrayLike) -> Array:
     return times
 
 
-def mapped_time(time: float, origin: float, shift: float, rate: float) -> float:
-    """Time moved to origin + shift + (time - origin)/rate."""
-    return time + shift if rate == 1.0 else origin + shift + (time - origin) / rate
+def mapped_time(time: float, origin: float, target: float, rate: float) -> float:
+    """Time moved to target + (time - origin)/rate: exact at the origin."""
+    return target + (time - origin) / rate
 
 
 def checked_count(value: float | Real, name: str, least: int = 0) -> int:

@@ -145,10 +145,12 @@ def certified_bounds(
 
     first, second = (np.stack([plan.peak(k + nu) for k in range(order + 1)])[:, :, None] for nu in (1, 2))
     found, lower, upper = _Candidates(), np.inf, -np.inf
-    samples = [
-        evaluated(plan._leg_jet(leg, np.linspace(0.0, duration, 129), order)) for leg, (_, duration) in enumerate(legs)
-    ]
-    least, greatest = float(np.min(samples)), float(np.max(samples))
+    least, greatest = np.inf, -np.inf
+    for leg, (origin, duration) in enumerate(legs):
+        s = np.linspace(0.0, duration, 129)
+        values = evaluated(plan._leg_jet(leg, s, order))
+        found.add(origin + s, values[None])
+        least, greatest = min(least, float(values.min())), max(greatest, float(values.max()))
     for leg, (origin, duration) in enumerate(legs):
         radius, spent = duration / 256, 0
         centres = duration * (np.arange(128) + 0.5) / 128

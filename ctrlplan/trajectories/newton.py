@@ -36,7 +36,7 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import lapack
+from scipy.linalg import blas
 
 from ctrlplan.trajectories.common import FACTORIALS, Array, Frozen, readonly
 
@@ -123,6 +123,9 @@ class NewtonSystem(Frozen):
             else _factor(collocation, hermite, self._roughness(smooth) if size > count else None)
         )
 
+        if not self._triangle.diagonal().all():
+            raise ValueError("the constraints do not determine the plan: the system is singular")
+
     def taylor_scale(self, duration: float) -> Array:
         """Column that turns prescribed derivatives into normalised Taylor data."""
         scale: Array | None = self._scales.get(duration)
@@ -134,9 +137,8 @@ class NewtonSystem(Frozen):
 
     def coefficients(self, taylor_data: Array) -> Array:
         """Coefficients (size, naxes) from Taylor data (nconstraints, naxes)."""
-        solved, info = lapack.dtrtrs(self._triangle, taylor_data, lower=1)
-        if info:
-            raise ValueError("the constraints do not determine the plan: the system is singular")
+        # Not LAPACK's dtrtrs, which waits for its threads however small the system.
+        solved = blas.dtrsm(1.0, self._triangle, taylor_data, lower=1)
         return solved if self._spread is None else self._spread @ solved
 
     def taylor(self, u: Array, order: int) -> Array:
@@ -227,6 +229,11 @@ def _sequence(waypoints: list[int], given: tuple[tuple[int, ...], ...]) -> tuple
     are spread at every stage like all of them: waypoints with few entries
     before long jets elsewhere would cost four digits.
     """
+    lengths = set(map(len, given))
+    if len(lengths) == 1:  # the same order, sooner
+        rows = [(i, given[i][turn]) for turn in range(lengths.pop()) for i in waypoints]
+        table = np.array(rows, dtype=np.intp)
+        return table[:, 0], table[:, 1]
     pairs = [
         ((turn + 1) / len(given[i]), rank, i, order)
         for rank, i in enumerate(waypoints)

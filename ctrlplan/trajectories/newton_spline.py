@@ -117,8 +117,8 @@ class NewtonSpline(Trajectory):
         plan._fit(_checked_waypoints(waypoints), self.alpha, options, self)
         return plan
 
-    def _map_time(self, origin: float, shift: float, rate: float) -> Self:
-        moved = tuple(w.scaled(mapped_time(w.time, origin, shift, rate), rate) for w in self.waypoints)
+    def _map_time(self, origin: float, target: float, rate: float) -> Self:
+        moved = tuple(w.scaled(mapped_time(w.time, origin, target, rate), rate) for w in self.waypoints)
         options = self._options
         if options.period is not None:
             options = options._replace(period=options.period / rate)

@@ -95,8 +95,8 @@ class PiecewiseSpline(Trajectory):
         points = [Waypoint.from_dict(w) for w in data["waypoints"]]
         return cls(points, alpha=data["alpha"], labels=data["labels"])
 
-    def _map_time(self, origin: float, shift: float, rate: float) -> Self:
-        moved = [w.scaled(mapped_time(w.time, origin, shift, rate), rate) for w in self.waypoints]
+    def _map_time(self, origin: float, target: float, rate: float) -> Self:
+        moved = [w.scaled(mapped_time(w.time, origin, target, rate), rate) for w in self.waypoints]
         return type(self)(moved, alpha=self.alpha, labels=self.labels)
 
     def _leg_jet(self, leg: int, s: Array, order: int) -> Array:

@@ -20,6 +20,7 @@ FEW = 4096
 """Number of times up to which the jets themselves are taken."""
 
 _MAX_TERMS = 24
+_PRODUCT = 2**18  # multiplications up to which a matrix product stays in one thread
 _CHUNK = 4104  # not a power of two: rows that far apart would share cache lines
 
 
@@ -104,10 +105,13 @@ def _sample_uniform(
     scale = radius ** np.arange(terms) / FACTORIALS[:terms]
     out = np.empty((high - low + 1, jets.shape[1], count))
     main = ncells * cell
+    block = max(1, _PRODUCT // (terms * cell))
     for row in range(high - low + 1):
         table = np.ascontiguousarray(np.moveaxis(jets[low + row : low + row + terms], 0, -1) * scale)
         for axis in range(jets.shape[1]):
-            np.matmul(table[axis, :ncells], powers, out=out[row, axis, :main].reshape(ncells, cell))
+            whole = out[row, axis, :main].reshape(ncells, cell)
+            for begin in range(0, ncells, block):
+                np.matmul(table[axis, begin : min(begin + block, ncells)], powers, out=whole[begin : begin + block])
             if main < count:
                 np.matmul(table[axis, ncells], powers[:, : count - main], out=out[row, axis, main:])
     return out
@@ -139,10 +143,11 @@ def _sample_proxy(coefficients: Array, duration: float, t: Array) -> Array:
     flat = coefficients.reshape(nrows * naxes, size)
     out = np.empty((nrows * naxes, t.size))
     middle = radius = 0.5 * duration
-    basis = np.empty((max(size, 2), _CHUNK))
+    chunk = max(1, min(_CHUNK, _PRODUCT // flat.size))
+    basis = np.empty((max(size, 2), chunk))
     basis[0] = 1.0
-    for first in range(0, t.size, _CHUNK):
-        x = (t[first : first + _CHUNK] - middle) / radius
+    for first in range(0, t.size, chunk):
+        x = (t[first : first + chunk] - middle) / radius
         terms = basis[:, : x.size]
         terms[1] = x
         top = 1  # T_{top + k} = 2 T_top T_k - T_{top - k}: twice as many at each turn

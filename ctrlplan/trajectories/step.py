@@ -72,8 +72,8 @@ class Step(Trajectory):
     def _from_dict(cls, data: dict[str, Any]) -> Self:
         return cls(data["final"], data["initial"], data["time"], data["labels"])
 
-    def _map_time(self, origin: float, shift: float, rate: float) -> Self:
-        return type(self)(self.final, self.initial, mapped_time(self.start, origin, shift, rate), self.labels)
+    def _map_time(self, origin: float, target: float, rate: float) -> Self:
+        return type(self)(self.final, self.initial, mapped_time(self.start, origin, target, rate), self.labels)
 
     def _leg_jet(self, leg: int, s: Array, order: int) -> Array:
         raise AssertionError("a step has no legs")

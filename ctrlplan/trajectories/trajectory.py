@@ -60,8 +60,8 @@ class Trajectory(Frozen, ABC):
         """
 
     @abstractmethod
-    def _map_time(self, origin: float, shift: float, rate: float) -> Trajectory:
-        """Same path with time t moved to origin + shift + (t - origin)/rate."""
+    def _map_time(self, origin: float, target: float, rate: float) -> Trajectory:
+        """Same path with time t moved to target + (t - origin)/rate."""
 
     @abstractmethod
     def to_dict(self) -> dict[str, Any]:
@@ -258,11 +258,11 @@ class Trajectory(Frozen, ABC):
         """
         if not self.duration:
             raise ValueError("a trajectory without duration cannot be retimed, got a step")
-        return self._map_time(self.start, 0.0, self.duration / checked_time(duration, "duration", positive=True))
+        return self._map_time(self.start, self.start, self.duration / checked_time(duration, "duration", positive=True))
 
     def shift(self, dt: float) -> Trajectory:
         """Same path, dt seconds later."""
-        return self._map_time(self.start, checked_time(dt, "dt"), 1.0)
+        return self._map_time(self.start, self.start + checked_time(dt, "dt"), 1.0)
 
     def then(self, other: Trajectory) -> Trajectory:
         """This trajectory, then the other from this one's end on.

@@ -73,7 +73,7 @@ class Waypoint(Frozen):
         self._set(checked_time(time, "time"), _jet(entries), None)
 
     @classmethod
-    def from_jets(cls, time: float, **jets: Sequence[float | None]) -> Waypoint:
+    def from_jets(cls, time: float, /, **jets: Sequence[float | None]) -> Waypoint:
         """Waypoint axis by axis, which names the axes.
 
         Parameters

@@ -2,6 +2,7 @@
 
 import re
 from importlib import metadata
+from itertools import pairwise
 
 import pytest
 
@@ -74,7 +75,7 @@ def test_nothing_is_fetched(written, page):
 def test_the_heads_of_the_sections_do_not_skip_a_level(page):
     levels = [int(e.tag[1]) for e in page.all() if re.fullmatch("h[1-6]", e.tag)]
     assert levels[0] == 1
-    assert all(after <= before + 1 for before, after in zip(levels[:-1], levels[1:], strict=True)), levels
+    assert all(after <= before + 1 for before, after in pairwise(levels)), levels
 
 
 # The figures
@@ -114,7 +115,7 @@ def test_the_table_has_what_results_have(written, page):
         assert len(rows) == len(known)
         for row, key in zip(rows, known, strict=True):
             assert next(row.all("th")).words() == MEASURES[key].title
-            unit, *cells = row.all("td")
+            _, *cells = row.all("td")
             assert len(cells) == len(study["plans"])
             for cell, plan in zip(cells, study["plans"].values(), strict=True):
                 value = plan["metrics"][key]

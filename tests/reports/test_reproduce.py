@@ -86,7 +86,8 @@ def test_every_jump_of_the_step_is_located(linear):
 
 def test_the_step_settles_as_its_closed_form_does_at_every_gain(linear):
     gains, settling = linear["sweep"]["gain"][1:], linear["sweep"]["step"]["settling_time"][1:]
-    np.testing.assert_allclose(settling, [step_settles(k) for k in gains], rtol=1e-7)
+    # Beside a jump the response touches the band: its settling time is as the square root of the response's error.
+    np.testing.assert_allclose(settling, [step_settles(k) for k in gains], rtol=1e-5)
 
 
 def test_the_page_says_what_the_paper_says_otherwise(reproduced, read):

@@ -82,7 +82,7 @@ def test_a_metric_may_be_negative():
 
 
 def test_verdicts_stand_in_the_order_of_the_measures():
-    found = {name: {key: value for key in reversed(MEASURES)} for name, value in (("a", 1.0), ("b", 2.0))}
+    found = {name: dict.fromkeys(reversed(MEASURES), value) for name, value in (("a", 1.0), ("b", 2.0))}
     given_ = Comparison(dict.fromkeys(found, PLAN), {}, found, outputs=("y",))
     assert [v.key for v in verdicts(given_)] == list(MEASURES)
 

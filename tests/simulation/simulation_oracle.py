@@ -5,6 +5,8 @@ harmonics of equation (2), their coefficients from plain linear algebra. In Schu
 other by variation of constants, and each is again such a sum.
 """
 
+from itertools import pairwise
+
 import mpmath as mp
 import numpy as np
 
@@ -189,9 +191,9 @@ def _mode(rate, start, level, forcing):
 def response(a, b, c, d, signals, times, initial=None):
     """Outputs and states, each (n, ntime), of x' = a x + b w, y = c x + d w at the times.
 
-    The state is `initial` (0 unless given) at the first time. Matrices may be of floats, which are taken exactly, or mpmath's.
+    The state is `initial` (0 unless given) at the first time. Floats are taken exactly.
     """
-    a, b, c, d = (m if isinstance(m, mp.matrix) else mp.matrix(np.atleast_2d(m).tolist()) for m in (a, b, c, d))
+    a, b, c, d = (mp.matrix(np.atleast_2d(m).tolist()) for m in (a, b, c, d))
     times = [mp.mpf(float(t)) for t in times]
     state = mp.matrix([mp.mpf(float(v)) for v in (np.zeros(a.rows) if initial is None else initial)])
     q, r = _schur(a)
@@ -199,7 +201,7 @@ def response(a, b, c, d, signals, times, initial=None):
     xi = q.H * state
     edges = [times[0], *sorted({x for s in signals for x in s.breaks if times[0] < x < times[-1]}), times[-1]]
     states = []
-    for left, right in zip(edges[:-1], edges[1:], strict=True):
+    for left, right in pairwise(edges):
         inputs = [s.terms(left) for s in signals]
         modes = [None] * a.rows
         for i in reversed(range(a.rows)):

@@ -35,7 +35,13 @@ def test_a_linear_recursion(method):
 
 def test_a_logistic_recursion_with_params():
     logistic = ct.nlsys(
-        lambda t, x, u, p: p["r"] * x * (1 - x) + 0.01 * u, None, inputs=1, outputs=1, states=1, params={"r": 2.0}, dt=DT
+        lambda t, x, u, p: p["r"] * x * (1 - x) + 0.01 * u,
+        None,
+        inputs=1,
+        outputs=1,
+        states=1,
+        params={"r": 2.0},
+        dt=DT,
     )
     for r in (2.0, 2.9):
         found = cp.simulate(logistic, T, PLAN, 0.3, params={"r": r} if r != 2.0 else None)
@@ -56,7 +62,9 @@ def test_samples_numbers_and_names():
     system = ct.ss(0.5, [[1.0, 2.0]], 1.0, 0.0, DT, inputs=["r", "d"], outputs="y")
     samples = np.sin(T)
     found = cp.simulate(system, T, {"d": 0.1, "r": samples})
-    states = recursion(lambda x, u: 0.5 * x + u[0] + 2 * u[1], lambda x, u: x, np.array([samples, 0.1 + 0 * T]), [0.0])[1]
+    states = recursion(lambda x, u: 0.5 * x + u[0] + 2 * u[1], lambda x, u: x, np.array([samples, 0.1 + 0 * T]), [0.0])[
+        1
+    ]
     assert np.abs(found.states - states).max() <= 1e-14
 
 

@@ -1,6 +1,7 @@
 """The exact method against closed forms in 250 digits: plans of every kind, loops of every temper."""
 
 from functools import cache
+from itertools import pairwise
 
 import control as ct
 import mpmath as mp
@@ -43,7 +44,7 @@ def check(matrices, plan, signals, times, initial=None, tolerance=SMALL):
     assert gap(found.outputs, outputs) <= tolerance
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(6))
 @pytest.mark.parametrize("alpha", ALPHAS)
 def test_random_plans_on_random_systems(alpha, seed):
     rng = np.random.default_rng([seed, int(1e4 * alpha)])
@@ -105,7 +106,7 @@ def kinds(alpha):
         "joined legs": (legs.then(back.shift(7.0)), [p.then(b)]),
         "sum of joins": (move.then(rest) + legs.then(back), [m.then(r) + p.then(b)]),
         "stack": (cp.stack([move, legs, speed], labels=["a", "b", "c"]), [m, p, s]),
-        "stack with a step": (cp.stack([rest.shift(1.5), cp.Step(1.0, time=0.77)], ["a", "b"]), [r.shift(1.5), step(1.0, 0.0, 0.77)]),
+        "stack with a step": (cp.stack([rest, cp.Step(1.0, time=0.77)], ["a", "b"]), [r, step(1.0, 0.0, 0.77)]),
     }  # fmt: skip
 
 
@@ -145,10 +146,11 @@ def test_the_step_response_in_closed_form(gain):
     with mp.workdps(50):
         natural, damping = mp.sqrt(mp.mpf(gain)), 1 / (2 * mp.sqrt(mp.mpf(gain)))
         proper = natural * mp.sqrt(1 - damping**2)  # imaginary below 1/4: the same formula holds
-        exact = [
-            1 - natural / proper * mp.exp(-damping * natural * x) * mp.sin(proper * x + mp.acos(damping)) for x in map(mp.mpf, t)
-        ]  # fmt: skip
-        exact = np.array([float(mp.re(y)) for y in exact])
+
+        def y(t):
+            return 1 - natural / proper * mp.exp(-damping * natural * t) * mp.sin(proper * t + mp.acos(damping))
+
+        exact = np.array([float(mp.re(y(mp.mpf(x)))) for x in t])
     found = cp.simulate(cp.plants.integrator_lag_loop(gain), t, cp.Step(1.0), method="exact")
     assert np.abs(found.outputs - exact).max() <= 1e-12
 
@@ -199,11 +201,11 @@ def test_an_undamped_oscillator_driven_at_its_own_frequency():
     # r = (1 - cos w t)/2 over whole turns is the trigonometric spline of these jets: x'' + w^2 x = r resonates.
     turns, w = 0.75, 2.0
     duration = turns * 2 * np.pi / w
-    jets = [[(1 - np.cos(w * x)) / 2, w * np.sin(w * x) / 2] for x in (0.0, duration / 3, duration)]
-    plan = cp.TrigSpline(
-        [cp.Waypoint(x, *jet[: 1 + (i != 1)]) for i, (x, jet) in enumerate(zip((0.0, duration / 3, duration), jets, strict=True))],
-        alpha=w * duration,
-    )  # fmt: skip
+    points = [
+        cp.Waypoint(x, (1 - np.cos(w * x)) / 2, w * np.sin(w * x) / 2 if given else None)
+        for x, given in ((0.0, True), (duration / 3, False), (duration, True))
+    ]
+    plan = cp.TrigSpline(points, alpha=w * duration)
     t = np.linspace(0.0, duration, 37)
     assert np.abs(plan(t) - (1 - np.cos(w * t)) / 2).max() <= 1e-13
     found = cp.simulate(ct.ss([[0, 1], [-(w**2), 0]], [[0], [1]], [[1, 0]], 0), t, plan, method="exact")
@@ -215,7 +217,9 @@ def test_a_chain_of_integrators_gives_back_the_plan():
     # x''' = r''' from the plan's own start: no state is anything but the plan's jet.
     plan, _ = both([0.0, 1.0, 2.5], [[[0.0, 1.0, 2.0], [3.0, -1.0], [1.0, 0.5, 0.0]]], 2.0)
     source = cp.create_source_iosystem(plan, derivatives=3)
-    chain = ct.ss(np.eye(3, k=1), [[0], [0], [1]], np.eye(3), np.zeros((3, 1)), inputs="axis0_d3", outputs=["p", "v", "a"])
+    chain = ct.ss(
+        np.eye(3, k=1), [[0], [0], [1]], np.eye(3), np.zeros((3, 1)), inputs="axis0_d3", outputs=["p", "v", "a"]
+    )
     driven = ct.interconnect([source, chain], inputs=0, outputs=["p", "v", "a"], warn_duplicate=False, ignore_outputs=[
         "axis0", "axis0_d1", "axis0_d2"
     ])  # fmt: skip
@@ -235,7 +239,7 @@ def test_beside_a_tight_numerical_integration(alpha):
     found = cp.simulate(ct.ss(a, b, np.eye(3), 0 * b), t, plan, [1.0, 0.0, -1.0], method="exact").outputs
     state, rows = np.array([1.0, 0.0, -1.0]), []
     edges = [0.0, *[x for x in plan.breakpoints if 0.0 < x < 8.0], 8.0]
-    for left, right in zip(edges[:-1], edges[1:], strict=True):
+    for left, right in pairwise(edges):
         inside = t[(t >= left) & (t < right)]
 
         def rate(x, y, left=left, right=right):
@@ -266,7 +270,12 @@ def runs(draw):
     alpha = draw(st.one_of(st.sampled_from(ALPHAS), st.floats(1e-3, 5.5)))
     nstates = draw(st.integers(1, 5))
     sampled = np.unique(np.concatenate([[0.0, 4.0], rng.uniform(0, 4, 25)]))
-    return ct.ss(*random_system(rng, nstates, naxes)), cp.TrigSpline(points, alpha=alpha), sampled, rng.normal(size=nstates)
+    return (
+        ct.ss(*random_system(rng, nstates, naxes)),
+        cp.TrigSpline(points, alpha=alpha),
+        sampled,
+        rng.normal(size=nstates),
+    )
 
 
 def close(found, other):
@@ -283,7 +292,9 @@ def test_responses_superpose(run, factor):
     apart = [cp.simulate(system, t, plan, initial), cp.simulate(system, t, other)]
     whole = cp.simulate(system, t, plan + factor * other, initial)
     scale = max(np.abs(r.outputs).max() for r in (*apart, whole))
-    assert np.abs(whole.outputs - apart[0].outputs - factor * apart[1].outputs).max() <= SMALL * scale * (1 + abs(factor))
+    assert np.abs(whole.outputs - apart[0].outputs - factor * apart[1].outputs).max() <= SMALL * scale * (
+        1 + abs(factor)
+    )
 
 
 @settings(max_examples=40, deadline=None)

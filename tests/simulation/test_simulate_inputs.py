@@ -34,7 +34,20 @@ START = [0.3, -1.0]
         (cp.stack([OTHER, PLAN], labels=["a", "b"]), [S, R]),
         (cp.Step([1.0, 2.0], time=0.5), [step(1.0, 0.0, 0.5), step(2.0, 0.0, 0.5)]),
     ],
-    ids=["names", "other order", "one named", "steps", "numbers", "nothing", "None", "0", "number", "vector", "axes", "step"],
+    ids=[
+        "names",
+        "other order",
+        "one named",
+        "steps",
+        "numbers",
+        "nothing",
+        "None",
+        "0",
+        "number",
+        "vector",
+        "axes",
+        "step",
+    ],
 )
 def test_exactly(inputs, signals):
     found = cp.simulate(SYSTEM, T, inputs, START)

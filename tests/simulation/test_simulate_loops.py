@@ -7,7 +7,7 @@ from simulation_oracle import both, constant, gap, lag_loop, response, step
 
 import ctrlplan as cp
 
-T = np.unique(np.concatenate([np.random.default_rng(0).uniform(0, 6, 60), [0.0, 0.5, 2.0, 6.0]]))
+T = np.unique(np.concatenate([np.random.default_rng(0).uniform(0, 6, 60), [0.0, 0.5, 2.0, 3.0, 6.0]]))
 MOVE = ([0.5, 1.2, 2.0], [[[0.0, 0.0, 0.0], [0.8, 1.0], [1.0, 0.0, 0.0]]])
 OTHER = ([1.0, 3.3], [[[0.0, 0.0], [-2.0, 1.0]]])
 KP, KD = 4.0, 1.5
@@ -20,9 +20,13 @@ def named(plan, *labels):
 def follower(plan):
     """u = r'' + KD (r' - v) + KP (r - p) with the plan inside, one floor down; the plant is p'' = u + d."""
     source = cp.create_source_iosystem(named(plan, "r"), derivatives=2)
-    law = ct.ss([], [], [], [[KP, KD, 1.0, -KP, -KD]], inputs=["r", "r_d1", "r_d2", "p", "v"], outputs=["u"], name="law")
+    law = ct.ss(
+        [], [], [], [[KP, KD, 1.0, -KP, -KD]], inputs=["r", "r_d1", "r_d2", "p", "v"], outputs=["u"], name="law"
+    )
     inner = ct.interconnect([source, law], inputs=["p", "v"], outputs=["u"], name="controller")
-    plant = ct.ss([[0, 1], [0, 0]], [[0], [1]], np.eye(2), np.zeros((2, 1)), inputs=["f"], outputs=["p", "v"], name="plant")
+    plant = ct.ss(
+        [[0, 1], [0, 0]], [[0], [1]], np.eye(2), np.zeros((2, 1)), inputs=["f"], outputs=["p", "v"], name="plant"
+    )
     adder = ct.summing_junction(inputs=["u", "d"], output="f", name="adder")
     return ct.interconnect([inner, adder, plant], inputs=["d"], outputs=["p", "v", "u"], name="whole")
 
@@ -46,6 +50,17 @@ def test_a_plan_with_derivatives_inside_a_nested_loop(alpha):
     assert gap(found.outputs, outputs) <= 1e-11
     assert gap(found.states, states) <= 1e-11
     assert np.abs(found.inputs - other(T)).max() <= 1e-14
+
+
+def test_a_plan_whose_derivatives_jump_inside_the_loop():
+    # The acceleration jumps at 0.5, 2 and 3 s, and samples fall there: a jump belongs to what follows, but at the end.
+    plan, (r,) = both([0.5, 2.0, 3.0], [[[0.0, 0.0], [1.0, -0.4], [0.3, 0.0]]], 1.0, each_leg=True)
+    r1 = r.derivative()
+    found = cp.simulate(follower(plan), T, None, [0.3, -1.0], method="exact")
+    a, b = [[0.0, 1.0], [-KP, -KD]], [[0.0] * 3, [KP, KD, 1.0]]
+    c, e = [[1.0, 0.0], [0.0, 1.0], [-KP, -KD]], [[0.0] * 3, [0.0] * 3, [KP, KD, 1.0]]
+    outputs, _ = response(a, b, c, e, [r, r1, r1.derivative()], T, [0.3, -1.0])
+    assert gap(found.outputs, outputs) <= 1e-11
 
 
 def test_the_command_that_makes_the_lag_loop_exact():
@@ -124,6 +139,18 @@ def test_a_controller_with_feedthrough_in_the_loop():
     outputs, states = response(a, b, [[0, 1, 0], [0, -8, -72]], [[0], [8]], signals, T, [0.2, 0.1, -0.3])
     assert gap(found.outputs, outputs) <= 1e-11
     assert gap(found.states, states) <= 1e-11
+
+
+@pytest.mark.parametrize("gain", [1.0, 20.0])
+def test_a_loop_around_a_plant_with_feedthrough(gain):
+    # P = 2 + 1/(s + 1): u = gain (r - y) = gain (r - x)/(1 + 2 gain) at the state x of 1/(s + 1).
+    plan, signals = both(*MOVE, 1.0)
+    loop = cp.plants.unity_feedback_loop([2.0, 3.0], [1.0, 1.0], gain, outputs=("y", "u", "e"))
+    through = gain / (1 + 2 * gain)
+    a, c = [[-1 - through]], [[1 - 2 * through], [-through], [-through / gain]]
+    found = cp.simulate(loop, T, plan, method="exact")
+    outputs, _ = response(a, [[through]], c, [[2 * through], [through], [through / gain]], signals, T)
+    assert gap(found.outputs, outputs) <= 1e-11
 
 
 def algebraic(plan, through, outputs=("y", "u")):

@@ -1,5 +1,7 @@
 """The numerical method: linear systems against closed forms, nonlinear ones against a tight run from break to break."""
 
+from itertools import pairwise
+
 import control as ct
 import numpy as np
 import pytest
@@ -14,10 +16,10 @@ T = np.unique(np.concatenate([np.random.default_rng(0).uniform(0, 6, 60), [0.0, 
 
 
 def tight(rate, plan, times, initial):
-    """States of x' = rate(t, x, r): DOP853 near rounding in short steps, from one breakpoint of the plan to the next."""
+    """States of x' = rate(t, x, r): DOP853 near rounding in short steps, from breakpoint to breakpoint."""
     state, rows = np.asarray(initial, dtype=float), []
     edges = [times[0], *[b for b in plan.breakpoints if times[0] < b < times[-1]], times[-1]]
-    for left, right in zip(edges[:-1], edges[1:], strict=True):
+    for left, right in pairwise(edges):
         inside = times[(times >= left) & (times < right)]
         run = solve_ivp(
             lambda t, x, right=right: rate(t, x, plan.jet(t, 0, left=t == right)[0]),
@@ -99,7 +101,9 @@ def test_a_plan_that_starts_late_from_rest_is_not_skipped(start, place):
     if place == "input":
         found = cp.simulate(loop, t, plan, method="python")
     else:
-        driven = ct.interconnect([cp.create_source_iosystem(cp.stack([plan], labels=["r"])), loop], inputs=0, outputs=["y"])
+        driven = ct.interconnect(
+            [cp.create_source_iosystem(cp.stack([plan], labels=["r"])), loop], inputs=0, outputs=["y"]
+        )
         if place == "nested block":
             behind = ct.ss([], [], [], [[1.0]], inputs="y", outputs="z", name="wire")
             driven = ct.interconnect([driven, behind], inputs=0, outputs=["z"])
@@ -157,7 +161,9 @@ def test_a_pendulum_pushed_late():
     assert np.abs(found.states[:, 1:] - states).max() <= 1e-6
 
 
-@pytest.mark.parametrize("plan", [cp.Step(3.0, time=0.7), both(*MOVE, 1.0)[0], cp.Step(1.0, time=2.0) + both(*FULL, 0.0)[0]])
+@pytest.mark.parametrize(
+    "plan", [cp.Step(3.0, time=0.7), both(*MOVE, 1.0)[0], cp.Step(1.0, time=2.0) + both(*FULL, 0.0)[0]]
+)
 def test_a_saturated_loop(plan):
     found = cp.simulate(saturated(), T, plan)
     states = tight(saturated_rate, plan, T, [0.0, 0.0])
@@ -187,7 +193,13 @@ def test_an_equation_that_depends_on_time():
 
 def test_params_reach_the_blocks():
     decay = ct.nlsys(
-        lambda t, x, u, params: -params["rate"] * x, None, inputs=0, outputs=1, states=1, params={"rate": 1.0}, name="decay"
+        lambda t, x, u, params: -params["rate"] * x,
+        None,
+        inputs=0,
+        outputs=1,
+        states=1,
+        params={"rate": 1.0},
+        name="decay",
     )
     for params, rate in ((None, 1.0), ({"rate": 3.0}, 3.0)):
         found = cp.simulate(decay, T, None, 1.0, params=params, rtol=1e-10, atol=1e-12)
@@ -195,7 +207,9 @@ def test_params_reach_the_blocks():
 
 
 def test_params_reach_outputs_and_inner_blocks():
-    scale = ct.nlsys(None, lambda t, x, u, p: p["k"] * u, inputs="y", outputs="z", params={"k": 1.0}, name="scale", dt=0)
+    scale = ct.nlsys(
+        None, lambda t, x, u, p: p["k"] * u, inputs="y", outputs="z", params={"k": 1.0}, name="scale", dt=0
+    )
     loop = ct.interconnect([cp.plants.integrator_lag_loop(5.0), scale], inputs="r", outputs=["z"])
     plan, signals = both(*MOVE, 1.0)
     y = response(*lag_loop(5.0), signals, T)[0][0]
@@ -224,7 +238,7 @@ def test_a_solution_that_ends_is_said_with_its_time():
         return x**2
 
     escaping = ct.nlsys(rate, None, inputs=0, outputs=1, states=1, name="escaping")
-    with np.errstate(all="ignore"), pytest.raises(RuntimeError, match=r"must reach 2 s, got to 0?\.?[019]"):
+    with np.errstate(all="ignore"), pytest.raises(RuntimeError, match=r"must reach 2 s, got to (0\.9\d*|1) s"):
         cp.simulate(escaping, [0.0, 0.5, 2.0], None, 1.0)
 
 

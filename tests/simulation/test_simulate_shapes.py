@@ -78,7 +78,17 @@ def test_shapes(name, method, squeeze, monkeypatch):
     assert np.array_equal(found.time, T)
     if plan is not None:
         assert found.inputs.shape == peer.inputs.shape
-    for attribute in ("issiso", "noutputs", "ninputs", "nstates", "ntraces", "squeeze", "transpose", "return_x", "sysname"):
+    for attribute in (
+        "issiso",
+        "noutputs",
+        "ninputs",
+        "nstates",
+        "ntraces",
+        "squeeze",
+        "transpose",
+        "return_x",
+        "sysname",
+    ):
         assert getattr(found, attribute) == getattr(peer, attribute), attribute
 
 

@@ -6,7 +6,7 @@ import pytest
 import ctrlplan as cp
 from ctrlplan import metrics
 
-# k: step, trigonometric (alpha = 1), quintic; overshoot on the error [%] and settling time [s] of each, move of 1 in 1 s.
+# k: step, trigonometric (alpha = 1), quintic, a move of 1 in 1 s; overshoot on the error [%] and settling time [s].
 TABLE = {
     1: (("16.3034", "8.07635"), ("16.0211", "8.56714"), ("16.0148", "8.56693")),
     5: (("48.6397", "7.56125"), ("44.5425", "8.02597"), ("44.4532", "8.02505")),

@@ -99,7 +99,7 @@ WRONG = {
     "empty label": (valid(waypoints=[{"time": 0.0, "": REST}, {"time": 6.0, "": END}]), ["labels", "''"]),
     "label cls": (
         valid(waypoints=[{"time": 0.0, "cls": REST}, {"time": 6.0, "cls": [0.0, "a"]}]),
-        ["waypoints[1].cls"],
+        ["waypoints", "cls"],
     ),
     "singular free entries": (points((0.0, REST), (8.0, [math.nan, 1.0]), (16.0, END)), ["singular"]),
     "no positions at all": (points((0.0, [math.nan, 1.0]), (16.0, [math.nan, 1.0])), ["singular"]),

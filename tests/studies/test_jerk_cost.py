@@ -1,4 +1,4 @@
-"""The integral of the squared jerk of a plan, in closed form; infinite where position, velocity or acceleration jumps."""
+"""The integral of a plan's squared jerk, in closed form; infinite where position, velocity or acceleration jumps."""
 
 import numpy as np
 import pytest

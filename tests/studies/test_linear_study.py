@@ -78,7 +78,8 @@ def test_the_gains_of_the_table_are_among_those_swept(study):
 
 def test_the_step_follows_its_closed_form_at_every_gain(study):
     gains, step = study.sweep.values[1:], study.sweep.metrics["step"]  # at 0.25 the formula is 0/0
-    np.testing.assert_allclose(step["settling_time"][1:], [step_settles(k) for k in gains], rtol=1e-7)
+    # Beside a jump the response touches the band: its settling time is as the square root of the response's error.
+    np.testing.assert_allclose(step["settling_time"][1:], [step_settles(k) for k in gains], rtol=1e-5)
     np.testing.assert_allclose(
         step["overshoot_error"][1:], 100 * np.exp(-0.5 * np.pi / np.sqrt(gains - 0.25)), rtol=1e-5, atol=1e-6
     )
@@ -149,7 +150,7 @@ def test_notes_tell_what_the_numbers_say(study):
 def test_the_limit_point_of_the_step_is_that_of_the_paper():
     from ctrlplan.studies.linear import STEP_LIMIT
 
-    assert STEP_LIMIT == pytest.approx((-np.log(0.02) / 0.5, 100.0), rel=1e-15)
+    assert list(STEP_LIMIT) == pytest.approx([-np.log(0.02) / 0.5, 100.0], rel=1e-15)
     assert f"{STEP_LIMIT[0]:.3f}" == "7.824"
 
 

@@ -28,9 +28,12 @@ def peers(num, den, gain):
     }
 
 
-def agree(found, peer):
-    """Of equal value at many points of the plane, whatever the realisation."""
-    return np.all(np.abs(found - peer) <= 1e-11 * np.maximum(np.abs(peer), 1e-3 * np.abs(peer).max()))
+def agree(loop, num, den, gain):
+    """y, u and e of equal value at many points of the plane, to the size of what they are differences of."""
+    found = np.array([loop(s).ravel() for s in S]).T
+    y, u, e = (np.array([peer(s) for s in S]) for peer in peers(num, den, gain).values())
+    sizes = np.maximum(np.abs(y), 1e-3 * np.abs(y).max()), abs(gain) * (1 + np.abs(y)), 1 + np.abs(y)
+    return all(np.all(np.abs(f - p) <= 1e-11 * size) for f, p, size in zip(found, (y, u, e), sizes, strict=True))
 
 
 @pytest.mark.parametrize("gain", GAINS)
@@ -38,15 +41,15 @@ def agree(found, peer):
 def test_transfer_functions_of_the_loop(plant, gain):
     num, den = PLANTS[plant]
     loop = plants.unity_feedback_loop(num, den, gain, outputs=("y", "u", "e"))
-    for i, (name, peer) in enumerate(peers(num, den, gain).items()):
-        assert agree(np.array([loop(s)[i, 0] for s in S]), np.array([peer(s) for s in S])), name
+    assert agree(loop, num, den, gain)
 
 
 @pytest.mark.parametrize("gain", GAINS)
 def test_the_integrator_lag_loop_by_hand(gain):
     # y/r = k/(s^2 + s + k)
     loop = plants.integrator_lag_loop(gain)
-    assert agree(np.array([loop(s) for s in S]), gain / (S**2 + S + gain))
+    exact = gain / (S**2 + S + gain)
+    assert np.all(np.abs([loop(s) for s in S] - exact) <= 1e-11 * np.abs(exact))
     assert np.allclose(np.poly(loop.poles()), [1.0, 1.0, gain], rtol=1e-9, atol=1e-9)
 
 
@@ -56,9 +59,9 @@ def test_a_plant_with_feedthrough(gain, direct):
     """Solvable as long as 1 + gain direct is not 0: u = (e of the plant's state)/(1 + gain direct)."""
     num, den = np.polyadd([direct, direct], [3.0]), [1.0, 1.0]  # direct + 3/(s + 1)
     loop = plants.unity_feedback_loop(num, den, gain, outputs=("y", "u", "e"))
-    assert loop.nstates == 1
-    for i, (name, peer) in enumerate(peers(num, den, gain).items()):
-        assert agree(np.array([loop(s)[i, 0] for s in S]), np.array([peer(s) for s in S])), name
+    assert (loop.nstates, loop.input_labels, loop.output_labels) == (1, ["r"], ["y", "u", "e"])
+    assert loop.isctime(strict=True)
+    assert agree(loop, num, den, gain)
 
 
 def test_a_plant_without_dynamics():
@@ -113,7 +116,9 @@ def test_an_improper_plant(num, den, degrees):
         plants.unity_feedback_loop(num, den)
 
 
-@pytest.mark.parametrize(("num", "den", "gain"), [([1, 0], [1, 1], -1.0), ([-2.0, 1.0], [4.0, 3.0], 2.0), ([1.0], [2.0], -2.0)])
+@pytest.mark.parametrize(
+    ("num", "den", "gain"), [([1, 0], [1, 1], -1.0), ([-2.0, 1.0], [4.0, 3.0], 2.0), ([1.0], [2.0], -2.0)]
+)
 def test_a_loop_without_a_solution(num, den, gain):
     with pytest.raises(ValueError, match=r"the loop must have a solution, got 1 \+ gain num/den = 0 at infinity"):
         plants.unity_feedback_loop(num, den, gain)
@@ -127,7 +132,9 @@ def test_coefficients(name, wrong):
         plants.unity_feedback_loop(**given)
 
 
-@pytest.mark.parametrize("make", [plants.integrator_lag_loop, lambda g, o: plants.unity_feedback_loop([1], [1, 1], g, o)])
+@pytest.mark.parametrize(
+    "make", [plants.integrator_lag_loop, lambda g, o: plants.unity_feedback_loop([1], [1, 1], g, o)]
+)
 @pytest.mark.parametrize("outputs", [["x"], ["y", "r"], ["Y"]])
 def test_an_output_that_there_is_not(make, outputs):
     with pytest.raises(ValueError, match=f'outputs must be of "y", "u", "e", got {outputs[-1]!r}'):

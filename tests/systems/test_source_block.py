@@ -30,6 +30,11 @@ def test_outputs_are_named_axis_by_axis():
     assert cp.create_source_iosystem(PLAN).name == "plan"
 
 
+def test_a_suffix_goes_behind_each_label():
+    block = cp.create_source_iosystem(PLAN, derivatives=1, suffix="_ref")
+    assert block.output_labels == ["x_ref", "x_ref_d1", "z_ref", "z_ref_d1"]
+
+
 def test_an_axis_without_a_label_is_named_as_the_plan_names_it():
     unnamed = cp.PolySpline([cp.Waypoint(0, [0, 0]), cp.Waypoint(1, [1, 2])])
     assert cp.create_source_iosystem(unnamed, 1).output_labels == ["y1", "y1_d1", "y2", "y2_d1"]
@@ -52,9 +57,11 @@ def test_it_is_a_system_of_python_control_without_inputs_or_states():
 def test_values_are_the_jet(derivatives, t):
     found = put_out(cp.create_source_iosystem(PLAN, derivatives), t)
     assert found.shape == (2 * (derivatives + 1),)
-    for axis in range(2):
-        for nu in range(derivatives + 1):
-            assert found[axis * (derivatives + 1) + nu] == PLAN(t, nu)[axis]
+    jet = PLAN.jet(t, derivatives)
+    assert found.tolist() == [jet[nu, axis] for axis in range(2) for nu in range(derivatives + 1)]
+    scale = [PLAN.peak(nu)[axis] for axis in range(2) for nu in range(derivatives + 1)]
+    separately = [PLAN(t, nu)[axis] for axis in range(2) for nu in range(derivatives + 1)]
+    assert np.abs((found - separately) / scale).max() <= 1e-14
 
 
 def test_values_where_they_are_prescribed():

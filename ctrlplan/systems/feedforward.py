@@ -1,0 +1,122 @@
+"""Feedforward of a linear loop: the command under which it follows its plan exactly."""
+
+from __future__ import annotations
+
+import control as ct
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import null_space
+
+from ctrlplan.trajectories import derivative_name
+
+Array = NDArray[np.float64]
+
+_SMALL = 1e-9
+"""Relative size up to which numbers count as 0."""
+
+
+def create_feedforward_iosystem(
+    loop: ct.StateSpace | ct.TransferFunction, label: str | None = None, name: str = "feedforward"
+) -> ct.StateSpace:
+    r"""Exact inverse of a linear loop without finite zeros.
+
+    The output y of such a loop is flat: with the transfer function
+    g/(s^n + a_(n-1) s^(n-1) + ... + a_0) from its input to y the command
+
+    .. math:: r = \frac1g \Bigl(y_d^{(n)} + \sum_{k=0}^{n-1} a_k\, y_d^{(k)}\Bigr)
+
+    makes y = y_d, from a start on the plan; for k/(s^2 + s) in unity feedback
+    it is y_d + (y_d'' + y_d')/k. The loop's own poles say how errors decay.
+
+    No states. Inputs: {label}, {label}_d1, ... up to order n, as
+    `create_source_iosystem` puts them out. Output: the input of the loop by name.
+
+    Parameters
+    ----------
+    loop : control.StateSpace or control.TransferFunction
+        Linear and continuous, with one input and one output; interconnections
+        of linear blocks are.
+    label : str, optional
+        Name of the plan's axis: {y}_ref unless given, y the output of the loop,
+        for a source with ``suffix="_ref"``.
+    name : str, optional
+        Name of the block.
+
+    Returns
+    -------
+    control.StateSpace
+        A gain of n + 1 inputs and one output, of any time base.
+
+    Raises
+    ------
+    TypeError
+        If the loop is not linear.
+    ValueError
+        If it is discrete, has more than one input or output, does not bring its
+        input to its output, or has finite zeros (its inverse is then no sum of
+        derivatives); or if `label` is a signal of the loop.
+
+    Examples
+    --------
+    >>> import control as ct
+    >>> import ctrlplan as cp
+    >>> loop = cp.plants.integrator_lag_loop(4.0)
+    >>> feedforward = create_feedforward_iosystem(loop)
+    >>> feedforward.input_labels, feedforward.D.tolist()
+    (['y_ref', 'y_ref_d1', 'y_ref_d2'], [[1.0, 0.25, 0.25]])
+    >>> plan = cp.PolySpline([cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1, 0, 0)])
+    >>> source = cp.create_source_iosystem(plan, derivatives=2, suffix="_ref")
+    >>> following = ct.interconnect([source, feedforward, loop], inputs=0, outputs=["y"])
+    >>> found = cp.simulate(following, [0.0, 0.5, 1.0])
+    >>> bool(abs(found.outputs - plan(found.time)).max() < 1e-12)
+    True
+    """
+    system = _checked_loop(loop)
+    given, reached = loop.input_labels[0], loop.output_labels[0]
+    label = f"{reached}_ref" if label is None else label
+    if label in (given, reached):
+        raise ValueError(f"label must differ from the signals of the loop, which would be added to it, got {label!r}")
+    gains = _inverse(*(np.asarray(m, dtype=float) for m in (system.A, system.B, system.C, system.D)))
+    names = [derivative_name(label, k) for k in range(gains.size)]
+    return ct.ss([], [], [], [gains], inputs=names, outputs=[given], dt=None, name=name)
+
+
+def _checked_loop(loop: ct.StateSpace | ct.TransferFunction) -> ct.StateSpace:
+    if not isinstance(loop, ct.StateSpace | ct.TransferFunction):
+        raise TypeError(f"loop must be linear, a StateSpace or TransferFunction, got {type(loop).__name__}")
+    if loop.dt not in (None, 0):
+        raise ValueError(f"loop must be in continuous time, got dt = {loop.dt}")
+    if (loop.ninputs, loop.noutputs) != (1, 1):
+        raise ValueError(f"loop must have one input and one output, got {loop.ninputs} and {loop.noutputs}")
+    if isinstance(loop, ct.TransferFunction) and loop.num[0][0].size > loop.den[0][0].size:
+        raise ValueError("loop must be proper, got a numerator of higher degree than the denominator")
+    return ct.ss(loop)
+
+
+def _inverse(a: Array, b: Array, c: Array, d: Array) -> Array:
+    """Gains of y, y', ..., y^(n) whose sum is the input.
+
+    y^(k) = c A^k x until the input appears, y^(n) = c A^n x + g r. The zeros are
+    the motions left where y and its first n - 1 derivatives are 0: they cannot
+    be seen in the input, and there are none, where c A^n is a sum of the rows
+    before it.
+    """
+    rows = [c[0]]
+    for _ in range(len(a)):
+        rows.append(rows[-1] @ a)
+    markov = [float(d[0, 0]), *(float(row @ b[:, 0]) for row in rows[:-1])]
+    sizes = [0.0, *(float(np.linalg.norm(row) * np.linalg.norm(b)) for row in rows[:-1])]
+    seen = [abs(value) > _SMALL * size for value, size in zip(markov, sizes, strict=True)]
+    if not any(seen):
+        raise ValueError("loop must bring its input to its output, got gain 0")
+    order = seen.index(True)
+    gain, last = markov[order], rows[order]
+    norms = np.array([np.linalg.norm(row) for row in rows[:order]])
+    basis = np.reshape(rows[:order], (order, len(a))) / norms[:, None]
+    parts = np.linalg.lstsq(basis.T, last, rcond=None)[0]
+    if np.linalg.norm(last - parts @ basis) > _SMALL * (np.linalg.norm(last) + np.abs(parts).sum()):
+        hidden = null_space(basis) if order else np.eye(len(a))
+        zeros = np.linalg.eigvals(hidden.T @ (a - np.outer(b, last) / gain) @ hidden)
+        got = ", ".join(f"{zero:.4g}" for zero in np.real_if_close(np.sort_complex(zeros)))
+        raise ValueError(f"loop must have no finite zeros for its inverse to be a sum of derivatives, got {got}")
+    return np.append(-parts / norms, 1.0) / gain
