@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import control as ct
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
+from ctrlplan.simulation.flattened import Map, blocks_of, flattened
 from ctrlplan.trajectories import Trajectory
 
 Array = NDArray[np.float64]
@@ -42,8 +43,9 @@ def numerical_response(
         return response.outputs.reshape(shape), response.states.reshape(shape), inputs(times)
     first, last = float(times[0]), float(times[-1])
     marks = [t for drive in drives if isinstance(drive, Trajectory) for t in drive.breakpoints]
-    marks += [t for block in _blocks(system) for t in getattr(block, "breakpoints", ())]
+    marks += [t for block in blocks_of(system) for t in getattr(block, "breakpoints", ())]
     inner = sorted({float(t) for t in marks if first < t < last})
+    dynamics, output = _maps(system, params, (first, initial, inputs(times[:1])[:, 0]))
     states = np.empty((initial.size, times.size))
     state = initial
     for left, right in zip([first, *inner], [*inner, last], strict=True):
@@ -52,7 +54,7 @@ def numerical_response(
         asked = np.union1d(times[begin:end], [left, right])
         if initial.size:
             found = solve_ivp(
-                lambda t, x: system.dynamics(t, x, inputs(np.array([t]))[:, 0], params or None),
+                lambda t, x: dynamics(t, x, inputs(np.array([t]))[:, 0]),
                 (left, right),
                 state,
                 method="LSODA",
@@ -65,8 +67,18 @@ def numerical_response(
             states[:, begin:end] = found.y[:, np.searchsorted(asked, times[begin:end])]
             state = found.y[:, -1]
     driven = inputs(times)
-    columns = [system.output(t, states[:, i], driven[:, i], params or None) for i, t in enumerate(times)]
+    columns = [output(t, states[:, i], driven[:, i]) for i, t in enumerate(times.tolist())]
     return np.array(columns).T.reshape(-1, times.size), states, driven
+
+
+def _maps(system: Any, params: dict[str, Any], probe: tuple[float, Array, Array]) -> tuple[Map, Map]:
+    """Right-hand side and outputs: flattened where the system can be, else python-control's own."""
+    if isinstance(system, ct.InterconnectedSystem):
+        maps = flattened(system, params, probe)
+        if maps is not None:
+            return maps
+    own = params or None
+    return lambda t, x, u: system.dynamics(t, x, u, own), lambda t, x, u: system.output(t, x, u, own)
 
 
 def _signals(drives: Sequence[Trajectory | Array], times: Array) -> Callable[[Array], Array]:
@@ -78,10 +90,3 @@ def _signals(drives: Sequence[Trajectory | Array], times: Array) -> Callable[[Ar
         return np.concatenate(rows) if rows else np.zeros((0, t.size))
 
     return signals
-
-
-def _blocks(system: Any) -> Iterator[Any]:
-    """The system and every block inside it, at any depth."""
-    yield system
-    for block in getattr(system, "syslist", ()):
-        yield from _blocks(block)

@@ -6,7 +6,7 @@ import json
 import math
 import os
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -90,6 +90,10 @@ class Comparison:
         data |= {"title": self.title, "parameters": {k: str(v) for k, v in self.parameters.items()}}
         Path(path).write_text(json.dumps(data, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
+    def marked(self, marks: Mapping[str, str]) -> Comparison:
+        """Same comparison with reservations about some plans."""
+        return replace(self, marks=dict(marks))
+
     def plot(self) -> Figure:
         """Responses, errors and controls over time."""
         from ctrlplan.reports.figures import plot_responses
@@ -139,7 +143,8 @@ def compare(
     ----------
     loop : control system or callable
         As many inputs (the reference) as the plans have axes; or a function
-        that maps a plan to a loop without inputs, the plan a block inside. An
+        that maps a plan's name and the plan to a loop, which may have the plan
+        as a block inside and no inputs. An
         attribute ``initial_state`` of a loop is where it starts.
     plans : mapping of str to Trajectory, or iterable of Waypoint
         The references by name; waypoints stand for the standard set of
@@ -204,7 +209,7 @@ def compare(
     start = min(plan.start for plan in references.values())
     responses, found, unstable = {}, {}, np.empty(0, dtype=complex)
     for name, plan in references.items():
-        system = loop(plan) if callable(loop) and not hasattr(loop, "output_labels") else loop
+        system = loop(name, plan) if callable(loop) and not hasattr(loop, "output_labels") else loop
         tracked, acting = _tracked(system, outputs, first), _acting(system, controls)
         response = simulate(
             system,

@@ -2,11 +2,40 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from ctrlplan.studies.comparison import Comparison
 from ctrlplan.studies.sweep import Sweep
+
+
+@dataclass(frozen=True)
+class Curves:
+    """Curves over one variable, for a figure.
+
+    Attributes
+    ----------
+    x_label, y_label : str
+        Names with units.
+    x : ndarray, shape (npoints,)
+        The variable.
+    rows : dict of str to ndarray
+        Curves by name.
+    caption : str
+        What they show.
+    log : bool
+        Whether y is drawn in its logarithm.
+    """
+
+    x_label: str
+    y_label: str
+    x: NDArray[np.float64]
+    rows: dict[str, NDArray[np.float64]]
+    caption: str
+    log: bool = False
 
 
 @dataclass(frozen=True)
@@ -31,6 +60,8 @@ class Study:
         Those that ``results.json`` keeps.
     figures : tuple of str
         Keys of `ctrlplan.reports.figures.FIGURES`, in order.
+    curves : tuple of Curves
+        What its own figures need besides.
     """
 
     name: str
@@ -40,7 +71,8 @@ class Study:
     notes: tuple[str, ...] = ()
     sweep: Sweep | None = None
     sweep_metrics: tuple[str, ...] = ("overshoot_error", "settling_time")
-    figures: tuple[str, ...] = field(default=("plans", "responses"))
+    figures: tuple[str, ...] = ("plans", "responses")
+    curves: tuple[Curves, ...] = ()
 
     def results(self) -> dict[str, Any]:
         """Plain data for ``results.json``."""

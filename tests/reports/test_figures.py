@@ -45,7 +45,9 @@ def two_axes():
     return cp.compare(both, points, np.linspace(0, 10, 201), units={"x": "m", "theta": "rad"})
 
 
-@pytest.fixture(params=sorted([*FIGURES, "two axes: plans", "two axes: responses", "trajectory", "one metric"]))
+@pytest.fixture(
+    scope="module", params=sorted([*FIGURES, "two axes: plans", "two axes: responses", "trajectory", "one metric"])
+)
 def figure(request, compared, two_axes, swept):
     """Every kind of figure, on real data."""
     study = Study("it", "It", compared, sweep=swept)
@@ -74,6 +76,12 @@ def boxes(figure):
     )
 
 
+@pytest.fixture(scope="module")
+def drawn(figure):
+    """The boxes of a figure, drawn once."""
+    return boxes(figure)
+
+
 def curves(axes):
     """Lines that are drawn, without the markers and the thin references."""
     return [line for line in axes.lines if line.get_linestyle() != "None" and line.get_linewidth() >= 1.0]
@@ -86,11 +94,11 @@ def by_label(axes):
 # All figures
 
 
-def test_the_legend_stands_outside_the_axes(figure):
-    legends, drawn, _ = boxes(figure)
+def test_the_legend_stands_outside_the_axes(figure, drawn):
+    legends, covered, _ = drawn
     assert all(axes.get_legend() is None for axes in figure.axes)
     assert len(legends) == 1
-    for box in drawn:
+    for box in covered:
         assert not legends[0].overlaps(box)
     width, height = figure.canvas.get_width_height()
     assert legends[0].x0 >= 0
@@ -98,17 +106,15 @@ def test_the_legend_stands_outside_the_axes(figure):
     assert legends[0].y1 <= height
 
 
-def test_nothing_is_drawn_beyond_the_edge(figure):
-    _, drawn, _ = boxes(figure)
+def test_nothing_is_drawn_beyond_the_edge(figure, drawn):
     width, height = figure.canvas.get_width_height()
-    for box in drawn:
+    for box in drawn[1]:
         assert -1 <= box.x0 < box.x1 <= width + 1
         assert -1 <= box.y0 < box.y1 <= height + 1
 
 
-def test_axes_do_not_run_into_each_other(figure):
-    _, drawn, _ = boxes(figure)
-    for one, other in combinations(drawn, 2):
+def test_axes_do_not_run_into_each_other(drawn):
+    for one, other in combinations(drawn[1], 2):
         overlap = min(one.x1, other.x1) - max(one.x0, other.x0), min(one.y1, other.y1) - max(one.y0, other.y0)
         assert min(overlap) <= 2.0
 
@@ -120,12 +126,6 @@ def test_every_axis_is_labelled(figure):
     for axes in visible(figure):
         if axes.get_position().y0 == pytest.approx(bottom, abs=1e-6):
             assert axes.get_xlabel()
-
-
-def test_a_figure_becomes_an_svg_for_a_page(figure):
-    svg = to_svg(figure, "it")
-    assert svg.startswith("<svg")
-    assert svg.rstrip().endswith("</svg>")
 
 
 @pytest.mark.parametrize("name", FIGURES)

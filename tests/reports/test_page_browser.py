@@ -7,11 +7,17 @@ import math
 import pytest
 
 
-@pytest.fixture
-def opened(written, browser):
-    """The page in the browser at a width, with the logs of before taken away."""
+@pytest.fixture(scope="module", params=["own", pytest.param("reproduced", marks=pytest.mark.slow)])
+def shown(request):
+    """The pages that are looked at from every side."""
+    return request.getfixturevalue(request.param)
 
-    def at(width=1100, height=900):
+
+@pytest.fixture
+def window(browser):
+    """A page in the browser at a width, with the logs of before taken away."""
+
+    def at(written, width=1100, height=900):
         browser.execute_cdp_cmd(
             "Emulation.setDeviceMetricsOverride",
             {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": width < 500},
@@ -27,21 +33,27 @@ def opened(written, browser):
     browser.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
 
 
+@pytest.fixture
+def opened(window, shown):
+    """One of those pages at a width."""
+    return lambda *size: window(shown, *size)
+
+
 # Opened offline
 
 
-def test_the_console_is_silent(opened):
-    chrome = opened()
+def test_the_console_is_silent(window, written):
+    chrome = window(written)
     for button in chrome.find_elements("css selector", "thead button"):
         button.click()
     assert chrome.get_log("browser") == []
 
 
-def test_no_request_leaves_the_page(opened, written):
+def test_no_request_leaves_the_page(opened, shown):
     chrome = opened()
     messages = [json.loads(entry["message"])["message"] for entry in chrome.get_log("performance")]
     asked = [m["params"]["request"]["url"] for m in messages if m["method"] == "Network.requestWillBeSent"]
-    page = (written.folder / "index.html").as_uri()
+    page = (shown.folder / "index.html").as_uri()
     assert page in asked
     assert [url for url in asked if url != page and not url.startswith("data:")] == []
     assert chrome.execute_script("return performance.getEntriesByType('resource').map(e => e.name)") == []
@@ -65,8 +77,8 @@ return Array.from(document.querySelectorAll(arguments[0])).map(function (e) {
 
 
 @pytest.mark.parametrize("width", [1100, 390])
-def test_nothing_overflows_the_page(opened, width):
-    chrome = opened(width)
+def test_nothing_overflows_the_page(window, written, width):
+    chrome = window(written, width)
     assert chrome.execute_script("return document.documentElement.scrollWidth") <= width
     outside = chrome.execute_script(
         """
@@ -205,9 +217,9 @@ def rank(order):
     return None if order == "" else math.inf if order == "1e999" else float(order)
 
 
-def test_each_column_of_numbers_sorts_up_and_down(opened, written):
+def test_each_column_of_numbers_sorts_up_and_down(opened, shown):
     chrome = opened()
-    for table, study in enumerate(written.results["studies"].values()):
+    for table, study in enumerate(shown.results["studies"].values()):
         for column, plan in enumerate(study["plans"], 2):
             heading = chrome.find_elements("css selector", "table.metrics")[table].find_elements(
                 "css selector", "thead th"
