@@ -79,14 +79,15 @@ def flattened(system: Any, params: dict[str, Any], probe: tuple[float, Array, Ar
         y = signals(every, t, x, u)
         return wiring.read @ y + wiring.passed @ (wiring.inner @ y + wiring.outer @ u)
 
+    own = None if isinstance(system, ct.StateSpace) else params or None
     rng = np.random.default_rng(0)
     for shift in (0.0, 1e-3, 1e-2, 0.1):
         state = x + shift * rng.standard_normal(x.size) * np.maximum(1.0, np.abs(x))
         try:
             with np.errstate(all="ignore"):
                 pairs = [
-                    (dynamics(t, state, u), system.dynamics(t, state, u, params or None)),
-                    (output(t, state, u), system.output(t, state, u, params or None)),
+                    (dynamics(t, state, u), system.dynamics(t, state, u, own)),
+                    (output(t, state, u), system.output(t, state, u, own)),
                 ]
         except (RuntimeError, ValueError):
             return None
@@ -148,7 +149,8 @@ class _Slices:
         for counts in zip(*((b.nstates or 0, b.ninputs or 0, b.noutputs) for b in blocks), strict=True):
             ends = np.cumsum(counts).tolist()
             places.append([slice(end - n, end) for n, end in zip(counts, ends, strict=True)])
-        return cls(*places, nstates=places[0][-1].stop, noutputs=places[2][-1].stop)
+        states, inputs, outputs = places
+        return cls(states, inputs, outputs, states[-1].stop, outputs[-1].stop)
 
 
 def _schedule(

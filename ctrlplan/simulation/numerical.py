@@ -39,12 +39,14 @@ def numerical_response(
     if system.dt not in (None, 0):
         sampled = inputs(times) if system.ninputs else 0
         response = ct.input_output_response(system, times, sampled, initial, params=params or None)
-        shape = (-1, times.size)
-        return response.outputs.reshape(shape), response.states.reshape(shape), inputs(times)
+        states = np.zeros((0, times.size)) if response.x is None else np.asarray(response.states)
+        return np.reshape(response.outputs, (-1, times.size)), states.reshape(-1, times.size), inputs(times)
     first, last = float(times[0]), float(times[-1])
     marks = [t for drive in drives if isinstance(drive, Trajectory) for t in drive.breakpoints]
     marks += [t for block in blocks_of(system) for t in getattr(block, "breakpoints", ())]
-    inner = sorted({float(t) for t in marks if first < t < last})
+    inner = _apart([first, *sorted(float(t) for t in marks if first < t < last), last])[1:-1]
+    # Samples are straight lines between corners: no step may pass one by.
+    longest = np.inf if all(isinstance(d, Trajectory) for d in drives) else float(np.diff(times).max())
     dynamics, output = _maps(system, params, (first, initial, inputs(times[:1])[:, 0]))
     states = np.empty((initial.size, times.size))
     state = initial
@@ -54,13 +56,14 @@ def numerical_response(
         asked = np.union1d(times[begin:end], [left, right])
         if initial.size:
             found = solve_ivp(
-                lambda t, x: dynamics(t, x, inputs(np.array([t]))[:, 0]),
+                _advancing(lambda t, x: dynamics(t, x, inputs(np.array([t]))[:, 0]), left, right),
                 (left, right),
                 state,
                 method="LSODA",
                 t_eval=asked,
                 rtol=rtol,
                 atol=atol,
+                max_step=longest,
             )
             if not found.success:
                 raise RuntimeError(f"the solver must reach {right:g} s, got to {found.t[-1]:g} s: {found.message}")
@@ -71,13 +74,38 @@ def numerical_response(
     return np.array(columns).T.reshape(-1, times.size), states, driven
 
 
+def _advancing(rate: Callable[[float, Array], Array], left: float, right: float) -> Callable[[float, Array], Array]:
+    """Right-hand side that refuses to be asked for ever about one instant: the solution ends there."""
+    farthest, asked = left, 0
+
+    def checked(t: float, x: Array) -> Array:
+        nonlocal farthest, asked
+        asked += 1
+        if t > farthest + 1e-9 * (right - left):
+            farthest, asked = t, 0
+        elif asked > 5000:
+            raise RuntimeError(f"the solver must reach {right:g} s, got to {farthest:g} s: the solution ends there")
+        return rate(t, x)
+
+    return checked
+
+
+def _apart(times: list[float]) -> list[float]:
+    """Increasing times without those that are the same but for rounding; first and last stay."""
+    kept = [times[0]]
+    for t in times[1:-1]:
+        if t - kept[-1] > 1e-14 * max(abs(t), times[-1] - times[0]) < times[-1] - t:
+            kept.append(t)
+    return [*kept, times[-1]]
+
+
 def _maps(system: Any, params: dict[str, Any], probe: tuple[float, Array, Array]) -> tuple[Map, Map]:
     """Right-hand side and outputs: flattened where the system can be, else python-control's own."""
     if isinstance(system, ct.InterconnectedSystem):
         maps = flattened(system, params, probe)
         if maps is not None:
             return maps
-    own = params or None
+    own = None if isinstance(system, ct.StateSpace) else params or None
     return lambda t, x, u: system.dynamics(t, x, u, own), lambda t, x, u: system.output(t, x, u, own)
 
 

@@ -74,6 +74,8 @@ def simulate(
         raise ValueError(f"timepts must be two or more finite times that increase strictly, got {timepts!r:.80}")
     if method not in METHODS:
         raise ValueError(f"method must be one of {', '.join(METHODS)}, got {method!r}")
+    if isinstance(system, ct.TransferFunction):
+        system = ct.ss(system, name=system.name, inputs=system.input_labels, outputs=system.output_labels)
     sources = _sources(system, inputs, times)
     form, reason = _exact_form(system, sources, params)
     if method == "exact" and form is None:
@@ -116,13 +118,13 @@ def _source(value: Any, name: str, times: Array) -> Trajectory | Array:
             raise ValueError(f"input {name} must be driven by one axis, got {value.naxes}")
         return value
     signal = np.asarray(value, dtype=float)
+    if not np.isfinite(signal).all():
+        raise ValueError(f"input {name} must be finite, got nan or inf at index {int((~np.isfinite(signal)).argmax())}")
     if signal.ndim == 0:
         return Step(signal, initial=signal, time=times[0])
     if signal.shape != times.shape:
         kinds = f"a trajectory, a number or {times.size} samples"
         raise ValueError(f"input {name} must be {kinds}, got shape {signal.shape}")
-    if not np.isfinite(signal).all():
-        raise ValueError(f"input {name} must be finite, got nan or inf at index {int((~np.isfinite(signal)).argmax())}")
     return signal
 
 
@@ -131,6 +133,8 @@ def _initial_state(system: Any, initial_state: ArrayLike) -> Array:
     count = system.nstates or 0
     if state.ndim and state.shape != (count,):
         raise ValueError(f"initial_state must be a scalar or have {count} entries, got shape {state.shape}")
+    if not np.isfinite(state).all():
+        raise ValueError(f"initial_state must be finite, got {initial_state}")
     return np.broadcast_to(state, (count,)).copy()
 
 

@@ -247,7 +247,7 @@ class _Reader:
 
     def number(self, table: dict[str, Any], key: str, place: str, default: float | None) -> float:
         value = table.get(key, default)
-        if not _is_number(value):
+        if value is None or not _is_number(value):
             raise self.error(place, f"must be a finite number, got {'none' if value is None else repr(value)}")
         return float(value)
 

@@ -119,4 +119,4 @@ def _inverse(a: Array, b: Array, c: Array, d: Array) -> Array:
         zeros = np.linalg.eigvals(hidden.T @ (a - np.outer(b, last) / gain) @ hidden)
         got = ", ".join(f"{zero:.4g}" for zero in np.real_if_close(np.sort_complex(zeros)))
         raise ValueError(f"loop must have no finite zeros for its inverse to be a sum of derivatives, got {got}")
-    return np.append(-parts / norms, 1.0) / gain
+    return np.append(-parts / norms, 1.0) / gain + 0.0  # no -0

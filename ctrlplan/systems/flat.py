@@ -188,11 +188,11 @@ def hurwitz_coefficients(poles: Sequence[complex], count: int, where: str = "") 
     if given.dtype.kind not in "iufc":
         raise TypeError(f"poles must be numbers, got {poles!r}{where}")
     if given.shape != (count,):
-        raise ValueError(f"poles must be {count} for {count} derivatives, got {given.tolist()}{where}")
+        raise ValueError(f"poles must be as many as the order of the flat output, {count}, got {given.tolist()}{where}")
     if not np.isfinite(given).all() or not (given.real < 0.0).all():
         raise ValueError(f"poles must be finite with negative real parts, got {given.tolist()}{where}")
     # A polynomial is real exactly where its roots are closed under conjugation.
-    coefficients = np.poly(given)
+    coefficients = np.atleast_1d(np.poly(given))
     if (np.abs(coefficients.imag) > 1e-9 * np.poly(-np.abs(given))).any():
         raise ValueError(f"poles must be closed under conjugation, got {given.tolist()}{where}")
     return tuple(coefficients.real[:0:-1].tolist())
@@ -203,7 +203,7 @@ def _gains(poles: Any, orders: Sequence[int]) -> list[tuple[float, ...]]:
     if not np.iterable(poles):
         raise TypeError(f"poles must be one sequence for each flat output, got {poles!r}")
     rows = list(poles)
-    if len(orders) == 1 and not any(np.iterable(row) for row in rows):
+    if len(orders) == 1 and all(np.ndim(row) == 0 for row in rows):
         return [hurwitz_coefficients(rows, orders[0])]
     if len(rows) != len(orders):
         raise ValueError(f"poles must be one sequence for each of {len(orders)} flat outputs, got {len(rows)}")

@@ -104,6 +104,25 @@ def test_several_sources_and_inputs():
     assert np.abs(found.inputs - [np.full(T.size, 0.1), q(T)]).max() <= 1e-14
 
 
+def test_several_axes_with_derivatives_each():
+    """Into the states and straight through to the outputs, a weight of its own for each of x, x', x'', z, z', z''."""
+    x, (xs,) = both(*MOVE, 1.0)
+    z, (zs,) = both(*OTHER, 0.0)
+    source = cp.create_source_iosystem(cp.stack([x, z], labels=["x", "z"]), derivatives=2)
+    b = [[1.0, -2.0, 0.3, 0.5, 1.5, -0.7], [0.2, 0.4, -0.6, 3.0, -1.0, 2.0]]
+    c, d = [[1.0, 0.0], [1.0, -1.0]], [[0.0, 1.0, 2.0, -3.0, 0.5, 0.25], [5.0, 0.0, -1.0, 0.0, 1.0, 1.5]]
+    plant = ct.ss([[-1.0, 0.5], [0.0, -3.0]], b, c, d, inputs=source.output_labels, outputs=["p", "q"], name="plant")
+    driven = ct.interconnect([plant, source], inputs=0, outputs=["p", "q"])
+    signals = [xs, xs.derivative(), xs.derivative().derivative(), zs, zs.derivative(), zs.derivative().derivative()]
+    outputs, states = response([[-1.0, 0.5], [0.0, -3.0]], b, c, d, signals, T, [0.5, -0.5])
+    for method, allowed in (("exact", 1e-11), ("python", 1e-6)):
+        found = cp.simulate(driven, T, None, [0.5, -0.5], method=method)
+        assert gap(found.outputs, outputs) <= allowed
+        assert gap(found.states, states) <= allowed
+    alone = cp.simulate(source, T).outputs
+    assert gap(alone, [s(T) for s in signals]) <= 1e-12
+
+
 def test_gains_and_sums_in_the_connections():
     """Each wire with a gain of its own, two of them into one input, an inner input read as an output."""
     plan, (r,) = both(*MOVE, 1.0)

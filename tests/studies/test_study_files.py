@@ -1,5 +1,6 @@
 """A study file is what it says: every family, loop and unit that it can state."""
 
+import csv
 import tomllib
 
 import control as ct
@@ -288,6 +289,24 @@ def test_plans_as_csv_are_their_samples(stated):
     for name, plan in found.plans.items():
         rows = table[[names.index(f"{name}.{x}") for x in ("x", "x_d1", "x_d2")]]
         np.testing.assert_array_equal(rows, plan.jet(table[0], 2)[:, 0])
+
+
+@pytest.mark.parametrize("name", ["fast, then slow", 'the "best"', "fast;slow"])
+def test_csv_has_as_many_names_as_columns_whatever_the_plan_is_called(stated, name):
+    found = stated(valid(plans=[{"name": name, "family": "polynomial"}]))
+    head, *rows = csv.reader(plans_as_csv(found).splitlines())
+    assert head == ["time", *(f"{name}.{x}" for x in ("x", "x_d1", "x_d2"))]
+    assert {len(row) for row in rows} == {4}
+
+
+def test_csv_names_no_two_columns_alike(stated):
+    points = [{"time": 0.0, "x": [0.0], "x_d1": [0.0]}, {"time": 1.0, "x": [1.0], "x_d1": [2.0]}]
+    data = valid(plans=[{"family": "polynomial"}], waypoints=points, units={})
+    try:
+        head = plans_as_csv(stated(data)).splitlines()[0].split(",")
+    except StudyError:
+        return  # names that would be alike are refused
+    assert len(head) == len(set(head))
 
 
 def test_a_study_error_is_a_value_error():

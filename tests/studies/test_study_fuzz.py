@@ -116,6 +116,37 @@ def test_the_command_ends_with_a_file_or_with_status_2(data, suffix):
         assert out.exists() == (status == 0)
 
 
+EXTREMES = {
+    "a long run": {"t_end": 1e9},
+    "a run without end": {"t_end": 1e20},
+    "a run beyond all clocks": {"t_end": 1e300},
+    "far away": {"waypoints": [{"time": 0.0, "x": [1e160, 0.0, 0.0]}, {"time": 1.0, "x": [-1e160, 0.0, 0.0]}]},
+    "as far as numbers go": {
+        "waypoints": [{"time": 0.0, "x": [1e308, 0.0, 0.0]}, {"time": 1.0, "x": [-1e308, 0.0, 0.0]}]
+    },
+    "hardly a move": {"waypoints": [{"time": 0.0, "x": [0.0, 0.0, 0.0]}, {"time": 1.0, "x": [1e-300, 0.0, 0.0]}]},
+    "hardly any time": {"waypoints": [{"time": 0.0, "x": [0.0, 0.0, 0.0]}, {"time": 1e-300, "x": [1.0, 0.0, 0.0]}]},
+    "a clock that started long ago": {
+        "t_end": 1e9 + 30,
+        "waypoints": [{"time": 1e9, "x": [0.0, 0.0, 0.0]}, {"time": 1e9 + 5, "x": [1.0, 0.0, 0.0]}],
+    },
+    "no move": {"waypoints": [{"time": 0.0, "x": [1.0, 0.0, 0.0]}, {"time": 1.0, "x": [1.0, 0.0, 0.0]}]},
+    "a stiff loop": {"loop": {"kind": "linear", "num": [1.0], "den": [1.0, 1.0, 0.0], "gain": 1e12}},
+    "a gain beyond reason": {"loop": {"kind": "linear", "num": [1.0], "den": [1.0, 1.0, 0.0], "gain": 1e300}},
+    "a plant hardly of second order": {"loop": {"kind": "linear", "num": [1.0], "den": [1e-300, 1.0, 0.0]}},
+    "a loop that explodes": {"loop": {"kind": "linear", "num": [1.0], "den": [1.0, 1.0, 0.0], "gain": -1e6}},
+    "no gain": {"loop": {"kind": "linear", "num": [1.0], "den": [1.0, 1.0, 0.0], "gain": 0.0}},
+    "two samples": {"samples": 2},
+}
+
+
+# What is promised at the end of all numbers is an answer: that it overflows there is no fault.
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+@pytest.mark.parametrize("name", EXTREMES)
+def test_extremes_are_run_or_refused(name):
+    refused_or_run(to_toml(valid(samples=41) | EXTREMES[name]))
+
+
 @pytest.mark.parametrize("count", [0, 1])
 def test_the_mutations_start_from_a_file_that_runs(count):
     data = valid() | {"samples": 41}

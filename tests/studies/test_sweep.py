@@ -29,7 +29,7 @@ def same(one, other):
     for plan, rows in one.metrics.items():
         assert list(rows) == list(other.metrics[plan])
         for name, row in rows.items():
-            np.testing.assert_array_equal(row, other.metrics[plan][name])
+            np.testing.assert_allclose(row, other.metrics[plan][name], rtol=1e-12, atol=1e-12)
 
 
 def test_each_value_is_a_comparison_of_its_own(swept):

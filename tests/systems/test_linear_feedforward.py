@@ -1,0 +1,237 @@
+"""Feedforward of linear loops: the exact inverse, and refusal where there is none."""
+
+import control as ct
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.polynomial import polynomial
+from scipy.linalg import expm
+
+import ctrlplan as cp
+from ctrlplan.systems.feedforward import create_feedforward_iosystem
+
+T = np.linspace(0.0, 4.0, 81)
+
+
+def plan_of(order, alpha=1.0, labels=None):
+    """From 0 at 0.5 s to 1 at 1.5 s with derivatives up to the order 0 at both ends."""
+    points = [cp.Waypoint(t, y, *[0.0] * order) for t, y in ((0.5, 0.0), (1.5, 1.0))]
+    return cp.TrigSpline(points, alpha=alpha, labels=labels)
+
+
+def following(plan, loop, outputs=("y",)):
+    """Source, feedforward and loop, joined by their names."""
+    feedforward = create_feedforward_iosystem(loop)
+    source = cp.create_source_iosystem(plan, feedforward.ninputs - 1, suffix="_ref")
+    return ct.interconnect([source, feedforward, loop], inputs=0, outputs=list(outputs))
+
+
+def named(num, den):
+    return ct.tf(num, den, inputs="r", outputs="y", name="loop")
+
+
+def lag_controller(gain=0.5):
+    """Loop of order 3: 5/(s^2 + s) behind a lag."""
+    blocks = [
+        ct.summing_junction(["r", "-y"], "e"),
+        ct.ss(ct.tf([20.0 * gain], [1, 20.0]), inputs="e", outputs="u", name="controller"),
+        ct.ss(ct.tf([5.0], [1, 1, 0]), inputs="u", outputs="y", name="plant"),
+    ]
+    return ct.interconnect(blocks, inputs="r", outputs="y", name="loop")
+
+
+# Exact tracking
+
+
+@pytest.mark.parametrize("alpha", [0.0, 1.0, 4.0])
+@pytest.mark.parametrize("gain", [0.25, 1.0, 5.0, 1000.0])
+def test_the_papers_loop_tracks_its_plan_exactly(gain, alpha):
+    plan = plan_of(2, alpha)
+    found = cp.simulate(following(plan, cp.plants.integrator_lag_loop(gain)), T)
+    assert found.method == "exact"
+    assert np.abs(found.outputs - plan(T)).max() < 1e-12
+
+
+@settings(deadline=None)
+@given(st.floats(0.01, 1e4))
+def test_its_command_is_the_one_of_the_closed_form(gain):
+    block = create_feedforward_iosystem(cp.plants.integrator_lag_loop(gain))
+    np.testing.assert_allclose(block.D, [[1.0, 1.0 / gain, 1.0 / gain]], rtol=1e-13)
+
+
+def test_without_it_the_loop_lags():
+    plan = plan_of(2)
+    bare = cp.simulate(cp.plants.integrator_lag_loop(5.0), T, plan)
+    assert np.abs(bare.outputs - plan(T)).max() > 0.3
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.lists(st.floats(-8.0, 2.0), max_size=3),
+    st.lists(st.tuples(st.floats(-5.0, 1.0), st.floats(0.1, 5.0)), max_size=2),
+    st.floats(0.01, 100.0),
+)
+def test_the_inverse_of_any_loop_without_zeros(real, pairs, gain):
+    # Unstable ones too: their inverse is as good.
+    den = polynomial.polyfromroots([*real, *(complex(*p) for p in pairs), *(complex(a, -b) for a, b in pairs)]).real
+    block = create_feedforward_iosystem(named([gain], den[::-1]))
+    assert block.ninputs == den.size
+    np.testing.assert_allclose(block.D[0], den / gain, rtol=1e-10, atol=1e-10 * np.abs(den).max() / gain)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_states_in_any_coordinates(seed):
+    rng = np.random.default_rng(seed)
+    order = int(rng.integers(1, 5))
+    den = np.poly(-rng.uniform(0.3, 4.0, order))
+    system = ct.ss(named([3.0], den))
+    turn, _ = np.linalg.qr(rng.normal(size=(order, order)))
+    turned = ct.ss(turn @ system.A @ turn.T, turn @ system.B, system.C @ turn.T, 0, inputs="r", outputs="y")
+    np.testing.assert_allclose(create_feedforward_iosystem(turned).D[0], den[::-1] / 3.0, rtol=1e-10)
+
+
+@pytest.mark.parametrize(
+    "loop",
+    [
+        lag_controller(),
+        ct.ss(named([3.0], [1.0, 2.0])),
+        ct.ss(named([2.0], np.poly([-1.0, -2.0, -3.0, -4.0]))),
+        ct.ss(named([2.0], [1.0, 0.0, 0.0])),
+        ct.ss(named([1.0], [1.0, -0.5])),
+        ct.ss(named([3.0], [1.0])),
+    ],
+    ids=["order 3", "order 1", "order 4", "double integrator", "unstable", "gain"],
+)
+def test_other_loops_track_their_plans(loop):
+    plan = plan_of(4)
+    found = cp.simulate(following(plan, loop), T)
+    assert np.abs(found.outputs - plan(T)).max() < 1e-11
+
+
+def test_errors_decay_as_the_loop_has_it():
+    loop, plan, start = lag_controller(), plan_of(3), np.array([0.3, -0.2, 0.5])
+    found = cp.simulate(following(plan, loop), T, initial_state=start)
+    error = [float((loop.C @ expm(loop.A * t) @ start)[0]) for t in T]
+    assert np.abs(found.outputs - plan(T) - error).max() < 1e-11
+
+
+def test_python_controls_own_response_to_the_command():
+    loop, plan, t = cp.plants.integrator_lag_loop(5.0), plan_of(3), np.linspace(0.0, 2.0, 4001)
+    feedforward = create_feedforward_iosystem(loop)
+    command = feedforward.D @ cp.source_samples(plan, t, 2)
+    # It takes the command for linear between samples, 5e-4 s apart: an error of their square.
+    peer = ct.forced_response(loop, t, command[0])
+    assert np.abs(peer.outputs - plan(t)).max() < 1e-5
+
+
+def test_a_state_that_is_not_seen_in_the_output_does_no_harm():
+    hidden = ct.ss([[-1.0, 0.0], [3.0, -2.0]], [[1.0], [1.0]], [[2.0, 0.0]], 0)
+    np.testing.assert_allclose(create_feedforward_iosystem(hidden).D, [[0.5, 0.5]])
+
+
+def test_a_zero_on_a_pole_is_none():
+    np.testing.assert_allclose(create_feedforward_iosystem(named([1, 2], np.poly([-2, -3, -1]))).D, [[3, 4, 1]])
+
+
+# The block
+
+
+def test_it_is_a_gain_of_any_time_base():
+    block = create_feedforward_iosystem(cp.plants.integrator_lag_loop(5.0))
+    assert isinstance(block, ct.StateSpace)
+    assert (block.nstates, block.dt, block.name) == (0, None, "feedforward")
+    assert block.input_labels == ["y_ref", "y_ref_d1", "y_ref_d2"]
+    assert block.output_labels == ["r"]
+    integrating = create_feedforward_iosystem(named([2.0], [1.0, 1.0, 0.0]))
+    assert str(integrating.D[0, 0]) == "0.0"
+
+
+def test_a_label_of_the_plans_own():
+    loop, plan = cp.plants.integrator_lag_loop(5.0), plan_of(2, labels=["height"])
+    block = create_feedforward_iosystem(loop, "height", name="inverse")
+    assert (block.name, block.input_labels) == ("inverse", ["height", "height_d1", "height_d2"])
+    joined = ct.interconnect([cp.create_source_iosystem(plan, 2), block, loop], inputs=0, outputs=["y", "r"])
+    found = cp.simulate(joined, T)
+    assert np.abs(found.outputs[0] - plan(T)).max() < 1e-12
+    jet = plan.jet(T, 2)[:, 0]
+    assert np.abs(found.outputs[1] - jet[0] - (jet[2] + jet[1]) / 5.0).max() < 1e-12
+
+
+# No inverse
+
+
+@pytest.mark.parametrize(
+    ("loop", "zeros"),
+    [
+        (named([1, 2], [1, 2, 3]), "-2"),
+        (named([1, 2, 5], [1, 2, 3, 4]), "-1-2j, -1+2j"),
+        (named([-1, 3], [1, 4, 3]), "3"),
+        (named([1, 0], [1, 1]), "0"),
+        (named([1, 0, 0], [1, 2, 3]), ".*0.*, .*0.*"),
+        # A state that the input does not reach but the output shows.
+        (ct.ss([[-1, 0], [0, -2]], [[1], [0]], [[1, 1]], 0), "-2"),
+    ],
+)
+def test_finite_zeros_are_refused_and_told(loop, zeros):
+    with pytest.raises(ValueError, match=f"^loop must have no finite zeros .*, got {zeros}$"):
+        create_feedforward_iosystem(loop)
+
+
+def test_the_zero_of_a_pi_controller_is_told():
+    blocks = [
+        ct.summing_junction(["r", "-y"], "e"),
+        ct.ss(ct.tf([2.0, 3.0], [1, 0]), inputs="e", outputs="u", name="controller"),
+        ct.ss(ct.tf([5.0], [1, 1]), inputs="u", outputs="y", name="plant"),
+    ]
+    with pytest.raises(ValueError, match=r"^loop must have no finite zeros .*, got -1.5$"):
+        create_feedforward_iosystem(ct.interconnect(blocks, inputs="r", outputs="y"))
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_no_zero_is_missed(seed):
+    rng = np.random.default_rng(seed)
+    order = int(rng.integers(2, 7))
+    zeros = np.sort(rng.uniform(-10, 10, rng.integers(1, order)))
+    with pytest.raises(ValueError, match="no finite zeros") as refusal:
+        create_feedforward_iosystem(named(np.poly(zeros), np.poly(-rng.uniform(0.1, 10, order))))
+    told = [float(word) for word in str(refusal.value).rpartition("got ")[2].split(", ")]
+    np.testing.assert_allclose(told, zeros, rtol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("loop", "error", "message"),
+    [
+        (named([0.0], [1, 1]), ValueError, "loop must bring its input to its output, got gain 0"),
+        (ct.ss([[-1.0]], [[0.0]], [[1.0]], 0), ValueError, "loop must bring its input to its output, got gain 0"),
+        (ct.tf([1], [1, 0.5], 0.1), ValueError, "loop must be in continuous time, got dt = 0.1"),
+        (ct.tf([1], [1, 0.5], True), ValueError, "loop must be in continuous time, got dt = True"),
+        (
+            ct.ss(-np.eye(2), np.eye(2), np.eye(2), 0),
+            ValueError,
+            "loop must have one input and one output, got 2 and 2",
+        ),
+        (
+            cp.plants.integrator_lag_loop(5.0, outputs=("y", "u")),
+            ValueError,
+            "loop must have one input and one output, got 1 and 2",
+        ),
+        (ct.tf([1, 0, 0], [1, 1]), ValueError, "loop must be proper, got a numerator of higher degree"),
+        (
+            ct.nlsys(None, lambda t, x, u, params: u, inputs=1, outputs=1),
+            TypeError,
+            "loop must be linear, a StateSpace",
+        ),
+        (ct.frd([1, 2], [1, 2]), TypeError, "loop must be linear, .* got FrequencyResponseData"),
+        (5.0, TypeError, "loop must be linear, .* got float"),
+    ],
+)
+def test_other_loops_are_refused(loop, error, message):
+    with pytest.raises(error, match=f"^{message}"):
+        create_feedforward_iosystem(loop)
+
+
+@pytest.mark.parametrize("label", ["r", "y"])
+def test_a_label_that_would_be_added_to_the_loops_own_signal_is_refused(label):
+    with pytest.raises(ValueError, match=f"^label must differ from the signals of the loop, .* got '{label}'$"):
+        create_feedforward_iosystem(cp.plants.integrator_lag_loop(5.0), label)
