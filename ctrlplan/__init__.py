@@ -20,7 +20,14 @@ _EXPORTS = {
         "stack",
         "trajectory_from_dict",
     ),
-    "systems": ("create_source_iosystem", "plants", "source_samples"),
+    "systems": (
+        "create_feedforward_iosystem",
+        "create_flat_iosystem",
+        "create_pid_iosystem",
+        "create_source_iosystem",
+        "plants",
+        "source_samples",
+    ),
     "simulation": ("simulate",),
     "studies": ("Comparison", "Sweep", "compare", "sweep"),
 }

@@ -9,7 +9,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from ctrlplan.reports.style import legend_above, line_styles, new_figure, stacked_axes, with_unit
+from ctrlplan.reports.crane_figures import CRANE_FIGURES
+from ctrlplan.reports.style import house_style, legend_above, line_styles, new_figure, stacked_axes, with_unit
 from ctrlplan.studies.comparison import Comparison
 from ctrlplan.studies.linear import STEP_LIMIT, jumps
 from ctrlplan.studies.measures import MEASURES
@@ -22,6 +23,7 @@ Array = NDArray[np.float64]
 DERIVATIVES = ("position", "velocity", "acceleration", "jerk", "snap")
 
 
+@house_style
 def plot_trajectory(plan: Trajectory, order: int = 2, units: Sequence[str] | None = None) -> Figure:
     """Value and derivatives of one trajectory stacked, waypoints marked.
 
@@ -53,6 +55,7 @@ def plot_trajectory(plan: Trajectory, order: int = 2, units: Sequence[str] | Non
     return figure
 
 
+@house_style
 def plot_plans(comparison: Comparison, order: int = 2) -> Figure:
     """References side by side: a column an axis, a row a derivative."""
     first = next(iter(comparison.plans.values()))
@@ -81,6 +84,7 @@ def plot_plans(comparison: Comparison, order: int = 2) -> Figure:
     return figure
 
 
+@house_style
 def plot_responses(comparison: Comparison) -> Figure:
     """Outputs with their references, errors, and controls over time."""
     styles = line_styles(comparison.plans)
@@ -113,6 +117,7 @@ def plot_responses(comparison: Comparison) -> Figure:
     return figure
 
 
+@house_style
 def plot_sweep(sweep: Sweep, names: Sequence[str] = ("settling_time", "overshoot_error")) -> Figure:
     """Metrics over the parameter, lines broken where a settling time jumps."""
     styles = line_styles(sweep.metrics)
@@ -140,31 +145,49 @@ def plot_sweep(sweep: Sweep, names: Sequence[str] = ("settling_time", "overshoot
     return figure
 
 
-def plot_plane(sweep: Sweep, marked: Sequence[float] = (1.0, 5.0, 20.0, 100.0, 1000.0)) -> Figure:
+@house_style
+def plot_plane(sweep: Sweep) -> Figure:
     """Figure 1: the settling-time/overshoot plane, each point a gain."""
     styles = line_styles(sweep.metrics)
-    figure = new_figure(6.8, 5.0)
+    figure = new_figure(6.8, 5.2)
     ((axes,),) = stacked_axes(figure, 1)
     for plan, rows in sweep.metrics.items():
         ts, overshoot = rows["settling_time"], rows["overshoot_error"]
         x, gap = _with_gaps(sweep.values, ts)
+        colour = styles[plan]["color"]
         axes.plot(gap, np.interp(x, sweep.values, overshoot), linewidth=1.0, **{**styles[plan], "linestyle": "-"})
-        axes.plot(ts, overshoot, ".", color=str(styles[plan]["color"]), markersize=2.5)
-        if plan == "polynomial":
+        axes.plot(ts, overshoot, ".", color=colour, markersize=2.5)
+        if plan not in _NUMBERED:
             continue  # beside the trigonometric one: the numbers would overprint
-        aside: dict[str, Any] = {"xytext": (9, -3)} if plan == "step" else {"xytext": (3, -10)}
-        for gain in marked:
-            at = int(np.argmin(np.abs(np.log(sweep.values / gain))))
-            axes.plot(ts[at], overshoot[at], "o", color=str(styles[plan]["color"]), mfc="white", markersize=5)
-            axes.annotate(f"{gain:g}", (ts[at], overshoot[at]), textcoords="offset points", fontsize=7.5, **aside)
+        for gain, offset in _NUMBERED[plan].items():
+            at = int(np.argmin(np.abs(sweep.values - gain)))
+            axes.plot(ts[at], overshoot[at], "o", color=colour, mfc="white", markersize=5, zorder=4)
+            axes.annotate(
+                f"{gain:g}",
+                (ts[at], overshoot[at]),
+                xytext=offset,
+                textcoords="offset points",
+                fontsize=8,
+                color=colour,
+                ha="center",
+                va="center",
+                arrowprops={"arrowstyle": "-", "color": colour, "linewidth": 0.5, "shrinkA": 1, "shrinkB": 3},
+            )
     axes.plot(*STEP_LIMIT, "*", color="#E69F00", markersize=13, label="limit of the step, k → ∞", zorder=5)
     axes.set_xlabel("settling time ±2 % [s]")
     axes.set_ylabel("overshoot on the error [%]")
     axes.set_xlim(left=0.0)
-    axes.set_ylim(-3.0, 108.0)
+    axes.set_ylim(-4.0, 108.0)
     axes.set_title("numbers at the circles: gain k", loc="left", fontsize=8)
     legend_above(figure, axes)
     return figure
+
+
+# Where the gains of the table stand beside their circles, in points.
+_NUMBERED = {
+    "step": {1.0: (-26, -4), 5.0: (-34, 12), 20.0: (-34, 0), 100.0: (-34, 0), 1000.0: (-36, 2)},
+    "trigonometric": {1.0: (26, 4), 5.0: (30, 0), 20.0: (44, 22), 100.0: (-14, 12), 1000.0: (24, 9)},
+}
 
 
 FIGURES: dict[str, tuple[Callable[[Study], Figure], str]] = {
@@ -189,6 +212,9 @@ FIGURES: dict[str, tuple[Callable[[Study], Figure], str]] = {
 """Figures that a study may ask for: how they are drawn, and their caption."""
 
 
+FIGURES |= CRANE_FIGURES
+
+
 def _sweep(study: Study) -> Sweep:
     if study.sweep is None:
         raise ValueError(f"study {study.name} must have a sweep for this figure, got none")
@@ -200,7 +226,8 @@ def _times(plan: Trajectory, start: float | None = None, end: float | None = Non
     first, last = plan.start if start is None else start, plan.end if end is None else end
     margin = 0.06 * (last - first) or 0.5
     t = np.linspace(first - margin, last + margin, 1001)
-    return np.unique(np.concatenate([t, plan.breakpoints, np.nextafter(plan.breakpoints, -np.inf)]))
+    beside = [np.nextafter(plan.breakpoints, side) for side in (-np.inf, np.inf)]
+    return np.unique(np.concatenate([t, plan.breakpoints, *beside]))
 
 
 def _broken(t: Array, values: Array, plan: Trajectory) -> Array:
@@ -208,16 +235,18 @@ def _broken(t: Array, values: Array, plan: Trajectory) -> Array:
     out = values.copy()
     span = np.ptp(values) or 1.0
     for moment in plan.breakpoints:
-        after = int(np.searchsorted(t, moment))
-        if 0 < after < t.size and abs(values[after] - values[after - 1]) > 1e-3 * span:
-            out[after - 1] = np.nan
+        at = int(np.searchsorted(t, moment))
+        if 0 < at < t.size and abs(values[at] - values[at - 1]) > 1e-3 * span:
+            out[at - 1] = np.nan
+        if at + 1 < t.size and abs(values[at + 1] - values[at]) > 1e-3 * span:
+            out[at + 1] = np.nan
     return out
 
 
 def _with_gaps(x: Array, y: Array) -> tuple[Array, Array]:
     """Curve with a nan where a settling time jumps."""
     where = np.flatnonzero(jumps(x, y)) + 1
-    return np.insert(x, where, np.sqrt(x[where - 1] * x[where])), np.insert(y, where, np.nan)
+    return np.insert(x, where, 0.5 * (x[where - 1] + x[where])), np.insert(y, where, np.nan)
 
 
 def _derivative_label(unit: str, order: int, name: str = "") -> str:

@@ -18,6 +18,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescap
 from markupsafe import Markup
 
 import ctrlplan
+from ctrlplan.reports.crane_figures import animation_data, is_crane, plot_curves
 from ctrlplan.reports.figures import FIGURES
 from ctrlplan.reports.style import line_styles, to_svg
 from ctrlplan.reports.words import number, summary, unit_of, verdicts
@@ -103,10 +104,36 @@ def render_page(studies: Sequence[Study], title: str) -> str:
     )
 
 
+class CraneAnimation:
+    """Animation of a crane's comparison that a notebook plays, offline as well.
+
+    Parameters
+    ----------
+    comparison : Comparison
+        Of loops made by `crane_loop`.
+
+    Raises
+    ------
+    ValueError
+        If the comparison is not of a crane.
+    """
+
+    def __init__(self, comparison: Comparison) -> None:
+        if not is_crane(comparison):
+            raise ValueError("an animation must be of a comparison of cranes, got one without D, R and theta")
+        self._data = Markup(animation_data(comparison))  # noqa: S704
+        self._name = f"crane{abs(hash(self._data)):x}"
+
+    def _repr_html_(self) -> str:
+        return str(_template("animation.html").module.crane_animation(self._name, self._data))
+
+
 def comparison_fragment(comparison: Comparison) -> str:
     """Metrics table and verdict for a notebook cell."""
     table = _table(comparison)
-    return _template("fragment.html").render(title=comparison.title, table=table, summary=summary(comparison))
+    return _template("fragment.html").render(
+        title=comparison.title, table=table, summary=summary(comparison), notes=comparison.notes
+    )
 
 
 def _template(name: str) -> Any:
@@ -126,6 +153,8 @@ def _section(study: Study) -> dict[str, Any]:
     for key in study.figures:
         draw, caption = FIGURES[key]
         svg = to_svg(draw(study), re.sub(r"[^\w-]+", "-", f"{study.name}-{key}"))
+        if draw is plot_curves:
+            caption = study.curves[0].caption
         figures.append({"key": key, "svg": Markup(svg), "caption": caption})  # noqa: S704 (our own drawing)
     return {
         "name": re.sub(r"[^\w-]+", "-", study.name) or "study",
@@ -136,6 +165,8 @@ def _section(study: Study) -> dict[str, Any]:
         "verdicts": [v.sentence for v in verdicts(comparison)],
         "table": _table(comparison),
         "figures": figures,
+        "animation": Markup(animation_data(comparison)) if is_crane(comparison) else "",  # noqa: S704
+        "marks": comparison.marks,
         "parameters": {k: str(v) for k, v in comparison.parameters.items()},
     }
 
@@ -155,10 +186,13 @@ def _table(comparison: Comparison) -> dict[str, Any]:
             if verdict is not None and plan in verdict.losers:
                 mark = "lose"
             order = "" if math.isnan(value) else "1e999" if math.isinf(value) else repr(value)
-            cells.append({"text": number(value), "order": order, "mark": mark})
+            cells.append({"text": number(value, measure.unit), "order": order, "mark": mark})
         rows.append({"title": measure.title, "unit": unit_of(comparison, key) or "", "cells": cells})
     styles = line_styles(comparison.metrics)
-    plans = [{"name": plan, "colour": styles[plan]["color"]} for plan in comparison.metrics]
+    plans = [
+        {"name": plan, "colour": styles[plan]["color"], "mark": "†" if plan in comparison.marks else ""}
+        for plan in comparison.metrics
+    ]
     return {"plans": plans, "rows": rows}
 
 

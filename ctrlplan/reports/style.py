@@ -4,19 +4,25 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from functools import wraps
 from itertools import cycle
-from typing import Any
+from typing import Any, ParamSpec
 
 import matplotlib as mpl
 import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+P = ParamSpec("P")
+
 # Okabe and Ito's colours; a plan keeps its own in every figure.
 COLOURS = {"step": "#000000", "polynomial": "#0072B2", "trigonometric": "#D55E00", "piecewise": "#009E73"}
-_OTHERS = ("#CC79A7", "#E69F00", "#56B4E9", "#7F7F7F")
+_OTHERS = ("#CC79A7", "#E69F00", "#56B4E9")
 DASHES = {"step": (0, (1, 1)), "polynomial": (0, (5, 1.5)), "trigonometric": "-", "piecewise": (0, (5, 1.5, 1, 1.5))}
+
+_OTHER_DASHES = ((0, (3, 1, 1, 1)), (0, (7, 2)), (0, (2, 2)), (0, (9, 1.5, 1, 1.5, 1, 1.5)))
 
 _WITHOUT_WINDOW = ("agg", "backend_inline", "cairo", "inline", "pdf", "pgf", "ps", "svg", "template")
 
@@ -39,16 +45,19 @@ class ShownFigure(Figure):
 
     def _repr_png_(self) -> bytes:
         buffer = io.BytesIO()
-        self.savefig(buffer, format="png", dpi=110)
+        with _house_settings():
+            self.savefig(buffer, format="png", dpi=110)
         return buffer.getvalue()
 
 
 def line_styles(names: Iterable[str]) -> dict[str, dict[str, Any]]:
     """Colour and dashes of each plan."""
-    spare = cycle(_OTHERS)
+    names = list(names)
+    spare = cycle([*_OTHERS, *(colour for name, colour in COLOURS.items() if name not in names)])
+    dashed = cycle(_OTHER_DASHES)
     styles: dict[str, dict[str, Any]] = {}
     for name in names:
-        dashes = DASHES.get(name, "-")
+        dashes = DASHES.get(name) or next(dashed)
         # Dashes over solid lines: where curves coincide both are seen.
         styles[name] = {
             "color": COLOURS.get(name) or next(spare),
@@ -59,18 +68,35 @@ def line_styles(names: Iterable[str]) -> dict[str, dict[str, Any]]:
     return styles
 
 
+def house_style(draw: Callable[P, Figure]) -> Callable[P, Figure]:
+    """Let a function draw with the settings of the house, whatever the user's are."""
+
+    @wraps(draw)
+    def styled(*args: P.args, **kwargs: P.kwargs) -> Figure:
+        with _house_settings():
+            return draw(*args, **kwargs)
+
+    return styled
+
+
+@contextmanager
+def _house_settings(**more: object) -> Iterator[None]:
+    with mpl.rc_context():
+        mpl.rcdefaults()
+        mpl.rcParams.update(_RC | more)
+        yield
+
+
 def new_figure(width: float, height: float) -> Figure:
     """Figure that a notebook shows once and a script with a window shows by ``plt.show()``."""
-    with mpl.rc_context(_RC):
-        if mpl.get_backend().lower().rpartition(".")[2] in _WITHOUT_WINDOW:
-            return ShownFigure(figsize=(width, height), layout="constrained")
-        return plt.figure(figsize=(width, height), layout="constrained")
+    if mpl.get_backend().lower().rpartition(".")[2] in _WITHOUT_WINDOW:
+        return ShownFigure(figsize=(width, height), layout="constrained")
+    return plt.figure(figsize=(width, height), layout="constrained")
 
 
 def stacked_axes(figure: Figure, rows: int, columns: int = 1, sharex: bool = True) -> list[list[Axes]]:
-    """Grid of axes in the house style, time shared down the columns."""
-    with mpl.rc_context(_RC):
-        grid = figure.subplots(rows, columns, sharex="col" if sharex else False, squeeze=False)
+    """Grid of axes, time shared down the columns."""
+    grid = figure.subplots(rows, columns, sharex="col" if sharex else False, squeeze=False)
     return [list(row) for row in grid]
 
 
@@ -89,7 +115,7 @@ def with_unit(name: str, unit: str | None) -> str:
 def to_svg(figure: Figure, salt: str) -> str:
     """Figure as an SVG element to stand in a page; `salt` keeps its ids apart from others'."""
     buffer = io.StringIO()
-    with mpl.rc_context(_RC | {"svg.hashsalt": salt}):
+    with _house_settings(**{"svg.hashsalt": salt}):
         figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
     plt.close(figure)
     text = buffer.getvalue()

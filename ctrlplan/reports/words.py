@@ -53,6 +53,8 @@ def verdicts(comparison: Comparison) -> list[Verdict]:
 
 def summary(comparison: Comparison) -> str:
     """How often each plan wins and loses, in one paragraph."""
+    if comparison.notes and "unstable" in comparison.notes[0]:
+        return comparison.notes[0]
     decided = [v for v in verdicts(comparison) if v.winners]
     if not decided:
         return "No metric tells the plans apart."
@@ -78,19 +80,24 @@ def unit_of(comparison: Comparison, key: str) -> str:
     return unit.replace("^2", "²").replace("^5", "⁵")
 
 
-def number(value: float) -> str:
+def number(value: float, unit: str = "") -> str:
     """Four significant digits; words for what is infinite or undefined."""
     if math.isnan(value):
         return "–"
     if math.isinf(value):
-        return "never" if value > 0 else "−∞"
+        if value < 0:
+            return "−∞"
+        return "never" if unit == "s" else "∞"
     if abs(value) < _NOTHING:
         return "0"
+    if value == int(value) and abs(value) < 1e4:
+        return f"{int(value)}".replace("-", "−")
     if 1e-3 <= abs(value) < 1e5:
         digits = max(0, 3 - math.floor(math.log10(abs(value))))
         return f"{value:.{digits}f}".replace("-", "−")
     mantissa, exponent = f"{value:.3e}".split("e")
-    return f"{mantissa}·10^{int(exponent)}".replace("-", "−")
+    raised = str(int(exponent)).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
+    return f"{mantissa}·10{raised}".replace("-", "−")
 
 
 def _verdict(key: str, title: str, unit: str, values: dict[str, float]) -> Verdict:
@@ -102,7 +109,7 @@ def _verdict(key: str, title: str, unit: str, values: dict[str, float]) -> Verdi
     losers = tuple(plan for plan, value in values.items() if _equal(value, greatest))
     with_unit = f" {unit}" if unit else ""
     verb, lose = ("wins" if len(winners) == 1 else "win"), ("loses" if len(losers) == 1 else "lose")
-    worst = number(greatest) + (with_unit if math.isfinite(greatest) else "")
+    worst = number(greatest, unit) + (with_unit if math.isfinite(greatest) else "")
     best = number(least) + with_unit
     sentence = f"{title}: {_listed(winners)} {verb} with {best}, {_listed(losers)} {lose} with {worst}"
     if least > _NOTHING and math.isfinite(greatest) and greatest / least >= 1.05:

@@ -44,9 +44,8 @@ def numerical_response(
     first, last = float(times[0]), float(times[-1])
     marks = [t for drive in drives if isinstance(drive, Trajectory) for t in drive.breakpoints]
     marks += [t for block in blocks_of(system) for t in getattr(block, "breakpoints", ())]
-    inner = _apart([first, *sorted(float(t) for t in marks if first < t < last), last])[1:-1]
-    # Samples are straight lines between corners: no step may pass one by.
-    longest = np.inf if all(isinstance(d, Trajectory) for d in drives) else float(np.diff(times).max())
+    corners, longest = _corners(drives, times)
+    inner = _apart([first, *sorted(float(t) for t in [*marks, *corners] if first < t < last), last])[1:-1]
     dynamics, output = _maps(system, params, (first, initial, inputs(times[:1])[:, 0]))
     states = np.empty((initial.size, times.size))
     state = initial
@@ -72,6 +71,18 @@ def numerical_response(
     driven = inputs(times)
     columns = [output(t, states[:, i], driven[:, i]) for i, t in enumerate(times.tolist())]
     return np.array(columns).T.reshape(-1, times.size), states, driven
+
+
+def _corners(drives: Sequence[Trajectory | Array], times: Array) -> tuple[list[float], float]:
+    """Where sampled inputs, straight lines in between, bend; or the longest step that passes no bend by."""
+    bends = np.zeros(times.size, dtype=bool)
+    for drive in drives:
+        if not isinstance(drive, Trajectory):
+            slope = np.diff(drive) / np.diff(times)
+            bends[1:-1] |= slope[1:] != slope[:-1]
+    if bends.sum() > 1000:
+        return [], float(np.diff(times).min())
+    return times[bends].tolist(), np.inf
 
 
 def _advancing(rate: Callable[[float, Array], Array], left: float, right: float) -> Callable[[float, Array], Array]:

@@ -134,7 +134,7 @@ def _initial_state(system: Any, initial_state: ArrayLike) -> Array:
     if state.ndim and state.shape != (count,):
         raise ValueError(f"initial_state must be a scalar or have {count} entries, got shape {state.shape}")
     if not np.isfinite(state).all():
-        raise ValueError(f"initial_state must be finite, got {initial_state}")
+        raise ValueError(f"initial_state must be finite, got {initial_state!r}")
     return np.broadcast_to(state, (count,)).copy()
 
 

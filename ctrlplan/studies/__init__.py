@@ -1,12 +1,18 @@
 """Plans compared: one loop, many loops, and the paper's experiments."""
 
 from ctrlplan.studies.comparison import Comparison, compare, standard_plans
+from ctrlplan.studies.crane import crane_first_order_study, crane_nominal_study, crane_obstacle_study
 from ctrlplan.studies.linear import linear_study
 from ctrlplan.studies.measures import MEASURES, Measure
 from ctrlplan.studies.study import Study
 from ctrlplan.studies.sweep import Sweep, sweep
 
-PAPER = {"linear": linear_study}
+PAPER = {
+    "linear": linear_study,
+    "crane-nominal": crane_nominal_study,
+    "crane-first-order": crane_first_order_study,
+    "crane-obstacle": crane_obstacle_study,
+}
 """Studies of the paper by name: functions of ``progress`` that return a `Study`."""
 
 __all__ = [
@@ -17,6 +23,9 @@ __all__ = [
     "Study",
     "Sweep",
     "compare",
+    "crane_first_order_study",
+    "crane_nominal_study",
+    "crane_obstacle_study",
     "linear_study",
     "standard_plans",
     "sweep",

@@ -136,7 +136,8 @@ def crane_first_order_study(progress: bool = True) -> Study:
             "definition 1 has it, it would start at speed as well.",
             f"The terminal oscillation that the paper reports ({rows['trigonometric']['error_after']:.3g} m here) is a "
             "choice, not a property: the figure shows the speed that is left at the end over alpha. At alpha = pi the "
-            f"plan is at rest at both ends, and {1e3 * rows['trigonometric, alpha pi']['error_after']:.2g} mm are left.",
+            f"plan is at rest at both ends, and "
+            f"{1e3 * rows['trigonometric, alpha pi']['error_after']:.2g} mm are left.",
             _step_note(found),
         ),
         figures=("crane-time", "crane-curves", "crane-motion"),
@@ -214,12 +215,18 @@ def _compared(
         title=title,
         parameters=_parameters(t_end),
     )
-    marks = {
-        name: f"the rope is slack for {values['slack_time']:.2g} s: from then on a crane does not do what the model says"
-        for name, values in found.metrics.items()
-        if values["slack_time"] > 0.0
-    }
-    return found.marked(marks)
+    return marked_slack(found)
+
+
+def marked_slack(found: Comparison) -> Comparison:
+    """Comparison with a mark on every plan whose rope goes slack."""
+    slack = {name: values["slack_time"] for name, values in found.metrics.items() if values["slack_time"] > 0.0}
+    return found.marked(
+        {
+            name: f"the rope is slack for {time:.2g} s; from then on the model is no crane"
+            for name, time in slack.items()
+        }
+    )
 
 
 def load_metrics(plan: Trajectory, response: Any, last: float) -> dict[str, float]:

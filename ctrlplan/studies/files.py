@@ -10,17 +10,20 @@ import math
 import os
 import sys
 import tomllib
-from collections.abc import Collection
-from dataclasses import dataclass, field
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ctrlplan.studies.comparison import compare, standard_plans
+from ctrlplan.studies.crane import CRANE_MEASURES, FORCE_LIMITS, TORQUE_LIMITS, load_metrics, marked_slack
 from ctrlplan.studies.study import Study
-from ctrlplan.systems.plants import unity_feedback_loop
+from ctrlplan.systems.plants import LAWS, Crane, crane_loop, unity_feedback_loop
 from ctrlplan.trajectories import PiecewiseSpline, PolySpline, Step, Trajectory, TrigSpline, Waypoint, derivative_name
+from ctrlplan.trajectories.files import csv_header
 
 FAMILIES = {
     "trigonometric": (TrigSpline, ("alpha", "gamma", "degree", "smooth")),
@@ -30,7 +33,10 @@ FAMILIES = {
 }
 """Families of plans by name, and the choices that each takes."""
 
-LOOPS = {"linear": ("num", "den", "gain")}
+LOOPS = {
+    "linear": ("num", "den", "gain"),
+    "crane": ("law", *(entry.name for entry in fields(Crane))),
+}
 """Kinds of loops by name, and the entries that each takes; and "python:module:function"."""
 
 
@@ -80,23 +86,45 @@ class StudyFile:
         StudyError
             If the loop does not fit the plans.
         """
-        timepts = np.linspace(self.waypoints[0].time, self.t_end, self.samples)
-        timepts = np.union1d(timepts, [w.time for w in self.waypoints])
+        loop = build_loop(self.loop, self.path)
         try:
             comparison = compare(
-                build_loop(self.loop, self.path),
+                loop,
                 self.plans,
-                timepts,
+                self.timepts(loop),
                 waypoints=self.waypoints,
                 units=self.units,
                 title=self.title,
                 parameters=self.parameters(),
+                **self._crane_options(),
             )
         except StudyError:
             raise
         except (ValueError, TypeError) as error:
             raise StudyError(f"{self.path}: loop: {error}") from error
-        return Study(self.name, self.title, comparison, notes=comparison.notes)
+        if self.loop["kind"] != "crane":
+            return Study(self.name, self.title, comparison, notes=comparison.notes)
+        figures = ("crane-plane", "plans", "crane-time", "crane-motion")
+        return Study(self.name, self.title, marked_slack(comparison), notes=comparison.notes, figures=figures)
+
+    def _crane_options(self) -> dict[str, Any]:
+        """What a comparison of cranes measures besides."""
+        if self.loop["kind"] != "crane":
+            return {}
+        last = self.waypoints[-1].time
+        return {
+            "controls": ("F", "C"),
+            "measure": lambda plan, response: load_metrics(plan, response, last),
+            "measures": CRANE_MEASURES,
+        }
+
+    def timepts(self, loop: Any) -> NDArray[np.float64]:
+        """Sample times: those asked for and the waypoints', or the periods of a discrete loop."""
+        start = self.waypoints[0].time
+        if getattr(loop, "dt", None):
+            period = 1.0 if loop.dt is True else float(loop.dt)
+            return start + period * np.arange(int((self.t_end - start) / period * (1 + 1e-12)) + 1, dtype=float)
+        return np.union1d(np.linspace(start, self.t_end, self.samples), [w.time for w in self.waypoints])
 
     def parameters(self) -> dict[str, object]:
         """What the report says about how it was made."""
@@ -172,6 +200,8 @@ def build_loop(table: dict[str, Any], path: Path) -> Any:
             return unity_feedback_loop(table["num"], table["den"], table.get("gain", 1.0), outputs=("y", "u"))
         except (ValueError, TypeError) as error:
             raise StudyError(f"{path}: loop: {error}") from None
+    if kind == "crane":
+        return _crane(table, path)
     _, module, function = kind.split(":")
     try:
         loop = getattr(_module(module, path.resolve().parent), function)()
@@ -182,6 +212,24 @@ def build_loop(table: dict[str, Any], path: Path) -> Any:
     if not (hasattr(loop, "output_labels") and hasattr(loop, "ninputs")):
         raise StudyError(f"{path}: loop.kind: {kind!r} must return a control system, got {type(loop).__name__}")
     return loop
+
+
+def _crane(table: dict[str, Any], path: Path) -> Callable[[str, Trajectory], Any]:
+    """Loop of each plan: a step goes to the drives at rest, every other plan through the law."""
+    try:
+        crane = Crane(**{key: value for key, value in table.items() if key not in ("kind", "law")})
+    except (ValueError, TypeError) as error:
+        raise StudyError(f"{path}: loop: {error}") from None
+    law = table.get("law", "generator")
+    if law not in LAWS:
+        raise StudyError(f"{path}: loop.law: must be one of {', '.join(LAWS)}, got {law!r}")
+
+    def build(name: str, plan: Trajectory) -> Any:
+        if plan.duration:
+            return crane_loop(crane, plan, law)
+        return crane_loop(crane, plan, "still", force_limits=FORCE_LIMITS, torque_limits=TORQUE_LIMITS)
+
+    return build
 
 
 def _module(name: str, folder: Path) -> Any:
@@ -212,8 +260,12 @@ def plans_as_csv(study: StudyFile, order: int = 2) -> str:
     for name, plan in study.plans.items():
         names += [f"{name}.{derivative_name(label, k)}" for label in plan.labels for k in range(order + 1)]
         rows += list(plan.jet(times, order).transpose(1, 0, 2).reshape(-1, times.size))
+    try:
+        header = csv_header(names)
+    except ValueError as error:
+        raise StudyError(f"{study.path}: waypoints: {error}") from None
     table = io.StringIO()
-    np.savetxt(table, np.array(rows).T, fmt="%.17g", delimiter=",", header=",".join(names), comments="")
+    np.savetxt(table, np.array(rows).T, fmt="%.17g", delimiter=",", header=header, comments="")
     return table.getvalue()
 
 
@@ -312,6 +364,9 @@ def _checked_loop(loop: dict[str, Any], reader: _Reader) -> None:
         kinds = ", ".join([*LOOPS, '"python:module:function"'])
         raise reader.error("loop.kind", f"must be one of {kinds}, got {kind!r}")
     reader.known(loop, ("kind", *LOOPS[kind]), "loop")
+    if kind == "crane":
+        build_loop(loop, reader.path)
+        return
     for key in ("num", "den"):
         loop[key] = reader.numbers(loop, key, f"loop.{key}")
     loop["gain"] = reader.number(loop, "gain", "loop.gain", default=1.0)

@@ -17,6 +17,8 @@ WAYPOINTS = (Waypoint(0.0, 0.0, 0.0, 0.0), Waypoint(1.0, 1.0, 0.0, 0.0))
 GAIN = 5.0
 GAINS = (0.25, 1000.0)
 TIMEPTS = np.linspace(0.0, 20.0, 8001)
+TABLE = (1.0, 5.0, 20.0, 100.0, 1000.0)
+"""Gains whose points figure 1 marks."""
 SWEPT = ("settling_time", "overshoot_error", "control_peak", "control_effort")
 STEP_LIMIT = (-np.log(0.02) / 0.5, 100.0)
 """Settling time [s] and overshoot [%] that the step tends to as the gain grows."""
@@ -87,8 +89,13 @@ def jumps(gains: Array, settling: Array, slope: float = 3.0) -> NDArray[np.bool_
     with the power -1/2 of the gain; a jump is a change of more than 0.5 % with
     a power of more than `slope`.
     """
-    change = np.abs(np.diff(np.log(settling)))
-    return (change > 0.005) & (change > slope * np.diff(np.log(gains)))
+    found = np.zeros(gains.size - 1, dtype=bool)
+    usable = np.isfinite(settling) & (settling > 0.0) & (gains > 0.0)
+    pairs = usable[1:] & usable[:-1]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        change, width = np.abs(np.diff(np.log(settling))), np.diff(np.log(gains))
+    found[pairs] = (change[pairs] > 0.005) & (change[pairs] > slope * width[pairs])
+    return found
 
 
 def _loop(gain: float) -> object:
@@ -102,7 +109,7 @@ def _refined_sweep(count: int, finest: float, progress: bool) -> Sweep:
         return sweep(_loop, gains, linear_plans(), TIMEPTS, progress=progress, parameter="gain", only=SWEPT)
 
     even = np.linspace(GAINS[0] ** 0.5, GAINS[1] ** 0.5, count)[1:-1] ** 2
-    found = swept(np.union1d(even, np.geomspace(*GAINS, count // 4)))
+    found = swept(np.union1d(np.union1d(even, np.geomspace(*GAINS, count // 4)), TABLE))
     while True:
         jump = np.any([jumps(found.values, r["settling_time"], 0.8) for r in found.metrics.values()], axis=0)
         wide = found.values[1:] / found.values[:-1] > 1.0 + finest

@@ -54,7 +54,8 @@ def create_feedforward_iosystem(
     ValueError
         If it is discrete, has more than one input or output, does not bring its
         input to its output, or has finite zeros (its inverse is then no sum of
-        derivatives); or if `label` is a signal of the loop.
+        derivatives; they are in the message); or if `label` is a signal of the
+        loop.
 
     Examples
     --------
@@ -88,7 +89,11 @@ def _checked_loop(loop: ct.StateSpace | ct.TransferFunction) -> ct.StateSpace:
         raise ValueError(f"loop must be in continuous time, got dt = {loop.dt}")
     if (loop.ninputs, loop.noutputs) != (1, 1):
         raise ValueError(f"loop must have one input and one output, got {loop.ninputs} and {loop.noutputs}")
-    if isinstance(loop, ct.TransferFunction) and loop.num[0][0].size > loop.den[0][0].size:
+    fraction = isinstance(loop, ct.TransferFunction)
+    given = (loop.num[0][0], loop.den[0][0]) if fraction else (loop.A, loop.B, loop.C, loop.D)
+    if not all(np.isfinite(numbers).all() for numbers in given):
+        raise ValueError(f"loop must have finite coefficients, got {' and '.join(str(n.tolist()) for n in given)}")
+    if fraction and given[0].size > given[1].size:
         raise ValueError("loop must be proper, got a numerator of higher degree than the denominator")
     return ct.ss(loop)
 

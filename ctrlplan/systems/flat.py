@@ -89,8 +89,9 @@ def create_flat_iosystem(
     seed and from `reverse`, and in the zero state where it is not singular: a
     plant is refused for what is seen there, and otherwise taken at its word.
 
-    References are of the flat outputs. Those of a `LinearFlatSystem` are chosen
-    by python-control and are its outputs only up to a factor or worse.
+    The plant of the loop must put out its states by their names, as those of
+    `ctrlplan.plants` do. References are of the flat outputs: that of a
+    `LinearFlatSystem` is chosen by python-control and need not be its output.
 
     The law keeps the parameters `flat_system` has now: a loop simulated with
     others shows what an inexact model does.
@@ -290,7 +291,9 @@ def _planned_probes(plant: _Plant, orders: list[int]) -> list[_Probe]:
     flags = [[rng.normal(size=r + 1) for r in orders] for _ in range(_PROBES)]
     probes = [probe for flag in flags for x, u in _reversed(plant, flag) for probe in _probe(plant, x, u)]
     if not probes:
-        raise ValueError("reverse must be finite for some of the flags probed, got none")
+        with np.errstate(all="ignore"):
+            got = plant.reverse(flags[0])
+        raise ValueError(f"reverse must be finite for some of the flags probed, got {got} and the like")
     for rest in _probe(plant, np.zeros(plant.nstates), np.zeros(plant.ninputs)):
         for _, u in _reversed(plant, [np.append(row[:-1], 0.0) for row in rest.flag]):
             probes += _probe(plant, rest.x, u)
@@ -361,8 +364,8 @@ def _check_below(plant: _Plant, probe: _Probe, names: Sequence[str], sizes: list
             moved = np.abs(above - below)[:-1] > _SAME * size[:-1]
             if moved.any():
                 raise ValueError(
-                    f"{_MUST}: below the last derivative of a flag none must depend on an input, got derivative "
-                    f"{moved.argmax()} of flat output {name}, of {len(below) - 1}, depending on "
+                    f"{_MUST}: no derivative below the last of a flag may depend on an input, got derivative "
+                    f"{moved.argmax()} of flat output {name} (the last is {len(below) - 1}), which depends on "
                     f"{plant.system.input_labels[j]}"
                 )
 
@@ -381,7 +384,7 @@ def _check_decoupling(plant: _Plant, probe: _Probe, names: Sequence[str]) -> Non
         if not row.any():
             raise ValueError(
                 f"{_MUST}: the last derivative of a flag must depend on an input, got derivative {r} of flat output "
-                f"{name}, depending on none {where}: a flag too short or a singular decoupling matrix"
+                f"{name}, which depends on none {where}: a flag too short or a singular decoupling matrix"
             )
     # Inputs and flat outputs have units of their own.
     for axis in (1, 0):
@@ -403,14 +406,13 @@ def _check_derivatives(plant: _Plant, probe: _Probe, names: Sequence[str]) -> No
         return
     if found is None:
         return
-    # Five points in the direction of the motion, so close that no state changes by more than about 1e-3.
+    # Points along the motion, so close that no state changes by more than about 1e-4.
     pace = float(np.max(np.abs(found[0]) / (1.0 + np.abs(probe.x)))) or 1.0
-    h = 1e-3 / pace
-    points = [_finite(plant.forward, probe.x + steps * h * found[0], probe.u) for steps in (-2, -1, 1, 2)]
-    rows = list(zip(*(flag for flag in points if flag is not None), strict=True))
-    if None in points:
+    h = 1e-4 / pace
+    flags = [flag for k in (-2, -1, 1, 2) if (flag := _finite(plant.forward, probe.x + k * h * found[0], probe.u))]
+    if len(flags) < 4:
         return
-    for name, row, (a, b, c, d) in zip(names, probe.flag, rows, strict=True):
+    for name, row, (a, b, c, d) in zip(names, probe.flag, zip(*flags, strict=True), strict=True):
         rate, given = ((a - d + 8.0 * (c - b)) / (12.0 * h))[:-1], row[1:]
         rounding = 0.1 * _SAME * pace * np.abs(row[:-1])
         wrong = np.abs(rate - given) > _SAME * (np.abs(rate) + np.abs(given)) + rounding

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import io
 import json
 import os
 from pathlib import Path
@@ -91,7 +93,17 @@ def write_csv(plan: Trajectory, path: str | os.PathLike[str], timepts: ArrayLike
     times = np.linspace(plan.start, plan.end, 1001) if timepts is None else np.atleast_1d(checked_timepts(timepts))
     jet = plan.jet(times, order)
     columns = np.concatenate([times[None], jet.transpose(1, 0, 2).reshape(-1, times.size)])
-    np.savetxt(path, columns.T, fmt="%.17g", delimiter=",", header=",".join(column_names(plan, order)), comments="")
+    np.savetxt(path, columns.T, fmt="%.17g", delimiter=",", header=csv_header(column_names(plan, order)), comments="")
+
+
+def csv_header(names: list[str]) -> str:
+    """First line of a table: names quoted where they need it, each of them once."""
+    for name in names:
+        if names.count(name) > 1:
+            raise ValueError(f"columns must have names of their own, got {name!r} twice; rename an axis")
+    line = io.StringIO()
+    csv.writer(line, lineterminator="").writerow(names)
+    return line.getvalue()
 
 
 def column_names(plan: Trajectory, order: int) -> list[str]:

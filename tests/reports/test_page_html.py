@@ -190,6 +190,8 @@ def test_the_summary_counts_wins_and_losses(page):
     for section in page.all("section"):
         (box,) = section.all("p", class_="verdict")
         (verdicts,) = section.all("ul", class_="verdicts")
+        if box.words().startswith("The loop is unstable"):
+            continue  # nothing is won there
         decided = [li.words() for li in verdicts.all("li") if "no difference" not in li.words()]
         assert box.words().startswith(f"Of {len(decided)} metrics")
         (table,) = section.all("table", class_="metrics")

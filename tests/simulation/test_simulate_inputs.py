@@ -106,6 +106,17 @@ def test_a_pulse_of_samples_in_a_long_rest_is_not_skipped(count):
     assert np.abs(cp.simulate(system, t, pulse).outputs - peer).max() <= 1e-7
 
 
+def test_a_pulse_between_close_samples_after_a_wide_gap_is_not_skipped():
+    # Samples 50 s apart but around the pulse: x' = -x + u with a triangle of height h and width 2 w at c.
+    height, width, centre = 10.0, 0.01, 50.0
+    t = np.array([0.0, centre - width, centre, centre + width, 52.0, 53.0, 100.0])
+    found = cp.simulate(ct.ss(-1.0, 1.0, 1.0, 0.0), t, np.where(t == centre, height, 0.0))
+    # After it the response is the triangle's Laplace transform at -1: exp(-(t - c)) 2 h (cosh(w) - 1)/w.
+    exact = np.exp(centre - t[3:]) * 2 * height * (np.cosh(width) - 1) / width
+    assert np.abs(found.outputs[3:] - exact).max() <= 1e-6
+    assert np.abs(found.outputs[:2]).max() == 0.0
+
+
 def test_a_single_input_takes_a_row_or_a_matrix_of_one():
     system = ct.ss(-1.0, 1.0, 1.0, 0.0)
     rows = [cp.simulate(system, T, values).outputs for values in (saw(T), saw(T)[None], saw(T).tolist())]

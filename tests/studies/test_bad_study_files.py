@@ -207,10 +207,6 @@ WRONG = {
     "no function": (module("build = 3\n"), ["loop", "NAME"]),
     "function without a loop": (module("def build(): return None\n"), ["loop", "NAME"]),
     "function without its data": (module("def build():\n    return open('nowhere.csv')\n"), ["loop", "nowhere.csv"]),
-    "loop in discrete time": (
-        module("import control as ct\n\ndef build():\n    return ct.ss([[0.5]], [[0.5]], [[1.0]], [[0.0]], dt=0.1)\n"),
-        ["loop"],
-    ),
     "loop of other axes": (
         module(
             "import control as ct\n\ndef build():\n    return ct.ss([[-1.0]], [[1.0, 1.0]], [[1.0]], [[0.0, 0.0]])\n"

@@ -1,7 +1,31 @@
 """Plants and the loops around them, one file each."""
 
 from ctrlplan.systems.plants.crane import Crane
+from ctrlplan.systems.plants.crane_laws import (
+    create_crane_feedforward_iosystem,
+    create_dynamic_law_iosystem,
+    create_generator_iosystem,
+    create_load_feedback_iosystem,
+    create_still_iosystem,
+)
 from ctrlplan.systems.plants.crane_loop import LAWS, crane_loop
+from ctrlplan.systems.plants.dc_motor import dc_motor
+from ctrlplan.systems.plants.flexible_joint import flexible_joint
+from ctrlplan.systems.plants.integrator_chain import integrator_chain
 from ctrlplan.systems.plants.linear import integrator_lag_loop, unity_feedback_loop
 
-__all__ = ["LAWS", "Crane", "crane_loop", "integrator_lag_loop", "unity_feedback_loop"]
+__all__ = [
+    "LAWS",
+    "Crane",
+    "crane_loop",
+    "create_crane_feedforward_iosystem",
+    "create_dynamic_law_iosystem",
+    "create_generator_iosystem",
+    "create_load_feedback_iosystem",
+    "create_still_iosystem",
+    "dc_motor",
+    "flexible_joint",
+    "integrator_chain",
+    "integrator_lag_loop",
+    "unity_feedback_loop",
+]
