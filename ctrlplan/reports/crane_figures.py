@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ctrlplan.reports.style import house_style, legend_above, line_styles, new_figure, stacked_axes
 from ctrlplan.studies.comparison import Comparison
-from ctrlplan.studies.crane import CRANE, WALL, nominal_waypoints
+from ctrlplan.studies.crane import CRANE, FORCE_LIMITS, TORQUE_LIMITS, WALL, nominal_waypoints
 from ctrlplan.studies.study import Study
 from ctrlplan.systems.plants import crane_loop
 from ctrlplan.trajectories import PolySpline
@@ -146,6 +146,26 @@ def plot_time(comparison: Comparison) -> Figure:
 
 
 @house_style
+def plot_step(comparison: Comparison) -> Figure:
+    """What a step asks of the drives, and the rope it leaves slack."""
+    signals = _signals(comparison, "step")
+    t, colour = signals["t"], line_styles(comparison.plans)["step"]["color"]
+    figure = new_figure(7.0, 6.4)
+    rows = [row[0] for row in stacked_axes(figure, 4)]
+    scales = (("F", 1e3, "F [kN]", FORCE_LIMITS), ("C", 1e3, "C [kN m]", TORQUE_LIMITS), ("T", 1e3, "T [kN]", (0.0,)))
+    for axes, (name, scale, label, limits) in zip(rows, scales, strict=False):
+        axes.plot(t, signals[name] / scale, color=colour, linewidth=1.0)
+        for limit in limits:
+            axes.axhline(limit / scale, color="#D55E00", linewidth=1.0, linestyle="--")
+        axes.set_ylabel(label)
+    rows[2].fill_between(t, signals["T"] / 1e3, 0.0, where=signals["T"] < 0.0, color="#D55E00", alpha=0.4)
+    rows[3].plot(t, signals["theta"], color=colour, linewidth=1.0)
+    rows[3].set_ylabel("sway [rad]")
+    rows[3].set_xlabel("time [s]")
+    return figure
+
+
+@house_style
 def plot_plane(comparison: Comparison, wall: bool) -> Figure:
     """Paths of the load in the plane, z down, with the obstacle (figure 6)."""
     styles = line_styles(comparison.plans)
@@ -263,6 +283,10 @@ CRANE_FIGURES = {
     "crane-time": (
         lambda study: plot_time(study.comparison),
         "Load, error, sway and controls over time. The error's axis is linear up to 1 mm, logarithmic above.",
+    ),
+    "crane-step": (
+        lambda study: plot_step(study.comparison),
+        "The step: force and torque at their limits (dashed), and a tension below 0 (filled), where the rope is slack.",
     ),
     "crane-plane": (
         lambda study: plot_plane(study.comparison, len(study.comparison.waypoints) > 2),

@@ -104,7 +104,10 @@ def legend_above(figure: Figure, axes: Axes) -> None:
     """One legend above all axes, where it hides no curve."""
     handles, labels = axes.get_legend_handles_labels()
     if handles:
-        figure.legend(handles, labels, loc="outside upper center", ncols=min(len(labels), 4), frameon=False)
+        fit = int(11 * figure.get_figwidth() / (max(map(len, labels)) + 6))  # of about eleven letters an inch
+        figure.legend(
+            handles, labels, loc="outside upper center", ncols=max(1, min(len(labels), 5, fit)), frameon=False
+        )
 
 
 def with_unit(name: str, unit: str | None) -> str:

@@ -90,14 +90,11 @@ def number(value: float, unit: str = "") -> str:
         return "never" if unit == "s" else "∞"
     if abs(value) < _NOTHING:
         return "0"
-    if value == int(value) and abs(value) < 1e4:
-        return f"{int(value)}".replace("-", "−")
     if 1e-3 <= abs(value) < 1e5:
         digits = max(0, 3 - math.floor(math.log10(abs(value))))
         return f"{value:.{digits}f}".replace("-", "−")
     mantissa, exponent = f"{value:.3e}".split("e")
-    raised = str(int(exponent)).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
-    return f"{mantissa}·10{raised}".replace("-", "−")
+    return f"{mantissa}·10^{int(exponent)}".replace("-", "−")
 
 
 def _verdict(key: str, title: str, unit: str, values: dict[str, float]) -> Verdict:

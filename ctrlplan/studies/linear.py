@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+import control as ct
 import numpy as np
 from numpy.typing import NDArray
 
 from ctrlplan.studies.comparison import Comparison, compare
 from ctrlplan.studies.study import Study
 from ctrlplan.studies.sweep import Sweep, sweep
+from ctrlplan.systems import create_feedforward_iosystem, create_source_iosystem
 from ctrlplan.systems.plants import integrator_lag_loop
 from ctrlplan.trajectories import PolySpline, Step, Trajectory, TrigSpline, Waypoint
 
@@ -20,6 +24,7 @@ TIMEPTS = np.linspace(0.0, 20.0, 8001)
 TABLE = (1.0, 5.0, 20.0, 100.0, 1000.0)
 """Gains whose points figure 1 marks."""
 SWEPT = ("settling_time", "overshoot_error", "control_peak", "control_effort")
+FED = "trigonometric, feedforward"
 STEP_LIMIT = (-np.log(0.02) / 0.5, 100.0)
 """Settling time [s] and overshoot [%] that the step tends to as the gain grows."""
 
@@ -51,9 +56,10 @@ def linear_study(progress: bool = True, count: int = 241, finest: float = 1e-3) 
     Study
         Named "linear": a comparison at gain 5, and a sweep from 0.25 to 1000.
     """
+    plans = linear_plans()
     comparison = compare(
-        _loop(GAIN),
-        linear_plans(),
+        _loop_of_plan,
+        plans | {FED: plans["trigonometric"]},
         TIMEPTS,
         waypoints=WAYPOINTS,
         title="Linear loop k/(s² + s), k = 5",
@@ -98,7 +104,17 @@ def jumps(gains: Array, settling: Array, slope: float = 3.0) -> NDArray[np.bool_
     return found
 
 
-def _loop(gain: float) -> object:
+def _loop_of_plan(name: str, plan: Trajectory) -> Any:
+    """Loop at the study's gain, the plan's derivatives fed forward where its name says so."""
+    loop = _loop(GAIN)
+    if name != FED:
+        return loop
+    forward = create_feedforward_iosystem(integrator_lag_loop(GAIN))
+    source = create_source_iosystem(plan, forward.ninputs - 1, suffix="_ref")
+    return ct.interconnect([source, forward, loop], inputs=0, outputs=["y", "u"], name="fed loop")
+
+
+def _loop(gain: float) -> Any:
     return integrator_lag_loop(gain, outputs=("y", "u"))
 
 
@@ -153,9 +169,17 @@ def _notes(comparison: Comparison, swept: Sweep) -> list[str]:
         f"above k = {slower.max():.3g}; the paper puts the limit at k = 10."
         if slower.size
         else "The trigonometric plan settles sooner than the step at every gain.",
+        f"With the plan's derivatives fed forward, r + (r'' + r')/k in place of r, the same loop follows the same plan "
+        f"to {_digits(comparison.metrics[FED])} at k = 5 already: what flatness is for a linear loop.",
         f"A quintic does as well as the trigonometric spline, as the paper foretells: it settles sooner at "
         f"{100 * better:.0f} % of the gains. What is gained here is gained by planning, not by the kind of spline.",
     ]
+
+
+def _digits(found: dict[str, float]) -> str:
+    """Greatest error of a plan from 0 to 1, in words."""
+    worst = max(found["overshoot_error"], found["lag_error"]) / 100.0
+    return "rounding" if worst < 1e-12 else f"{worst:.1g}"
 
 
 def _enters_band(plan: Trajectory) -> float:
