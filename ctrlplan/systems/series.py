@@ -56,8 +56,10 @@ def sqrt(a: Array) -> Array:
 
 def arctan2(y: Array, x: Array) -> Array:
     """Angle of (x, y), by integrating (y' x - y x')/(x^2 + y^2)."""
+    n = min(len(x), len(y))
+    x, y = x[:n], y[:n]
     first = np.arctan2(y[0], x[0])[None]
-    if min(len(x), len(y)) == 1:
+    if n == 1:
         return first
     turning = multiply(derivative(y), x) - multiply(y, derivative(x))
     rate = divide(turning, multiply(x, x) + multiply(y, y))

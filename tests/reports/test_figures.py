@@ -52,10 +52,13 @@ def craned():
     """Over the wall, with the curves that the studies bring along."""
     points = obstacle_waypoints()
     plans = {"polynomial": cp.PolySpline(points), "trigonometric": cp.TrigSpline(points, alpha=4.0)}
+    plans["step"] = cp.Step([20, 11], [0, 10], labels=["x", "z"])
     crane = cp.plants.Crane()
-    found = cp.compare(
-        lambda name, plan: cp.plants.crane_loop(crane, plan), plans, np.linspace(0, 20, 401), waypoints=points
-    )
+
+    def loop(name, plan):
+        return cp.plants.crane_loop(crane, plan, "still" if name == "step" else "generator")
+
+    found = cp.compare(loop, plans, np.linspace(0, 20, 401), waypoints=points)
     curves = Curves("alpha [rad]", "length [m]", TIMES[1:], {"one": TIMES[1:], "two": TIMES[1:] ** 2}, "Two curves.")
     return Study("crane", "Crane", found, curves=(curves,))
 

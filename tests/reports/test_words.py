@@ -147,7 +147,7 @@ def test_axes_of_different_units_have_none_in_common():
         (123456.0, "1.235·10^5"),
         (1.5e-7, "1.500·10^−7"),
         (NAN, "–"),
-        (INF, "never"),
+        (INF, "∞"),
         (-INF, "−∞"),
     ],
 )

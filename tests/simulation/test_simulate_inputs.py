@@ -114,7 +114,7 @@ def test_a_pulse_between_close_samples_after_a_wide_gap_is_not_skipped():
     # After it the response is the triangle's Laplace transform at -1: exp(-(t - c)) 2 h (cosh(w) - 1)/w.
     exact = np.exp(centre - t[3:]) * 2 * height * (np.cosh(width) - 1) / width
     assert np.abs(found.outputs[3:] - exact).max() <= 1e-6
-    assert np.abs(found.outputs[:2]).max() == 0.0
+    assert np.abs(found.outputs[:2]).max() <= 1e-15  # interpolating the samples rounds
 
 
 def test_a_single_input_takes_a_row_or_a_matrix_of_one():

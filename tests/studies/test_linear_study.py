@@ -52,7 +52,8 @@ def test_the_study_is_the_one_of_the_paper(study):
     assert isinstance(study, Study)
     assert study.name == "linear"
     found = study.comparison.metrics
-    assert list(found) == ["step", "polynomial", "trigonometric"]
+    assert list(found) == ["step", "polynomial", "trigonometric", "trigonometric, feedforward"]
+    assert found["trigonometric, feedforward"]["overshoot_error"] < 1e-10
     row = [found[p][m] for p in ("step", "trigonometric", "polynomial") for m in ("overshoot_error", "settling_time")]
     np.testing.assert_allclose(row, TABLE[5], rtol=1e-5)
 
@@ -157,10 +158,10 @@ def test_the_limit_point_of_the_step_is_that_of_the_paper():
 def test_results_have_the_stable_keys(study):
     results = study.results()
     assert list(results) == ["plans", "sweep"]
-    assert list(results["plans"]) == ["step", "polynomial", "trigonometric"]
+    assert list(results["plans"]) == ["step", "polynomial", "trigonometric", "trigonometric, feedforward"]
     assert list(results["sweep"]) == ["gain", "step", "polynomial", "trigonometric"]
     count = len(results["sweep"]["gain"])
-    for plan in results["plans"]:
+    for plan in ("step", "polynomial", "trigonometric"):
         assert set(results["sweep"][plan]) == {"overshoot_error", "settling_time"}
         assert all(len(row) == count for row in results["sweep"][plan].values())
 

@@ -1,0 +1,122 @@
+"""The three simulations of the paper against figures of an independent integration (Radau, 1e-9)."""
+
+import math
+
+import numpy as np
+import pytest
+
+import ctrlplan as cp
+from ctrlplan.studies import crane as studies
+from ctrlplan.systems.plants import Crane, crane_loop
+
+
+def first_order(**options):
+    return cp.TrigSpline(studies.first_order_waypoints(), **options)
+
+
+# plan, last waypoint, end of the run; greatest error on the way and after [m], greatest sway after [rad]
+TABLE = {
+    "nominal polynomial": (
+        lambda: cp.PolySpline(studies.nominal_waypoints()), 15, 30, (0.00245, 0.00254, 0.00191)),
+    "nominal trigonometric": (
+        lambda: cp.TrigSpline(studies.nominal_waypoints(), alpha=1.0), 15, 30, (0.00232, 0.00238, 0.00173)),
+    "first-order polynomial": (
+        lambda: cp.PolySpline(studies.first_order_waypoints()), 30, 60, (0.6955, 1.3266, 0.1206)),
+    "first-order trigonometric": (
+        lambda: first_order(alpha=math.pi / 3, gamma=math.pi / 2), 30, 60, (0.000518, 1.2981, 0.1180)),
+    "first-order trigonometric, alpha pi": (
+        lambda: first_order(alpha=math.pi), 30, 60, (0.00116, 0.00110, 0.0112)),
+    "obstacle polynomial": (
+        lambda: cp.PolySpline(studies.obstacle_waypoints()), 16, 30, (0.0847, 0.0718, 0.0312)),
+    "obstacle trigonometric": (
+        lambda: cp.TrigSpline(studies.obstacle_waypoints(), alpha=4.0), 16, 30, (0.0108, 0.00536, 0.00332)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("row", TABLE)
+def test_load_errors_and_sway_are_those_of_the_table(row):
+    make, last, end, expected = TABLE[row]
+    plan = make()
+    loop = crane_loop(Crane(), plan)
+    t = np.linspace(0, end, 100 * end + 1)
+    found = cp.simulate(loop, t, initial_state=loop.initial_state)
+    out = dict(zip(found.output_labels, np.asarray(found.outputs), strict=True))
+    error = np.hypot(*([out["x"], out["z"]] - plan(t)))
+    sway = np.abs(out["theta"])
+    measured = (error[t <= last].max(), error[t >= last].max(), sway[t >= last].max())
+    assert measured == pytest.approx(expected, rel=0.02)
+    metrics = studies.load_metrics(plan, found, last)
+    assert (metrics["error_travel"], metrics["error_after"], metrics["sway_after"]) == pytest.approx(measured, rel=1e-3)
+    assert metrics["slack_time"] == 0.0
+    way = np.hypot(*np.diff([out["x"], out["z"]], axis=1)).sum()
+    assert metrics["load_path"] == pytest.approx(way, rel=1e-4)
+
+
+def test_the_first_order_trigonometric_plan_is_the_papers():
+    """12 + 2 sin, here in the height of the second simulation: x and z in proportion."""
+    t = np.linspace(0, 30, 31)
+    x, z = first_order(alpha=math.pi / 3, gamma=math.pi / 2)(t)
+    angle = math.pi / 3 * t / 30 - math.pi / 2
+    np.testing.assert_allclose(z, 12 + 2 * np.sin(angle), atol=1e-12)
+    np.testing.assert_allclose(x, 40 + 40 * np.sin(angle), atol=1e-11)
+
+
+def test_path_lengths_over_the_obstacle():
+    points = studies.obstacle_waypoints()
+    for plan, expected in ((cp.PolySpline(points), 33.02), (cp.TrigSpline(points, alpha=4.0), 26.36)):
+        t = np.linspace(0, 16, 100001)
+        length = np.hypot(*np.diff(plan(t), axis=1)).sum()
+        assert length == pytest.approx(expected, abs=0.005)
+        loop = crane_loop(Crane(), plan)
+        found = cp.simulate(loop, np.linspace(0, 17, 18), initial_state=loop.initial_state)
+        assert studies.load_metrics(plan, found, 16.0)["path_length"] == pytest.approx(length, rel=1e-5)
+
+
+def test_obstacle_waypoints_are_the_papers():
+    for plan in (cp.PolySpline(studies.obstacle_waypoints()), cp.PiecewiseSpline(studies.obstacle_waypoints())):
+        np.testing.assert_allclose(plan.jet(6.0, 2), [[5, 5], [1, -1], [0.1, -0.15]], atol=1e-9)
+        np.testing.assert_allclose(plan.jet(11.0, 2), [[15, 5], [2, 1], [0.1, 1]], atol=1e-9)
+    assert [w.time for w in studies.obstacle_waypoints(8.0)] == [0, 3, 5.5, 8]
+
+
+def test_time_with_a_slack_rope_is_measured_and_marked():
+    plan = cp.Step([20, 11], [0, 10], labels=["x", "z"])
+    loop = crane_loop(Crane(), plan, "still", force_limits=studies.FORCE_LIMITS, torque_limits=studies.TORQUE_LIMITS)
+    t = np.linspace(0, 30, 3001)
+    found = cp.simulate(loop, t, initial_state=loop.initial_state)
+    tension = np.asarray(found.outputs)[found.output_labels.index("T")]
+    metrics = studies.load_metrics(plan, found, 15.0)
+    assert tension.min() < 0
+    assert metrics["slack_time"] == pytest.approx(0.01 * (tension < 0).sum(), abs=0.011)
+    assert metrics["sway_after"] > 0.1
+    assert math.isnan(metrics["path_length"])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["nominal", "first_order", "obstacle"])
+def test_studies_run_whole(name):
+    study = getattr(studies, f"crane_{name}_study")(progress=False)
+    found = study.comparison
+    assert {"step", "polynomial", "trigonometric", "piecewise"} <= found.metrics.keys()
+    for row, (_, _, _, expected) in TABLE.items():
+        case, _, plan = row.partition(" ")
+        if case.replace("-", "_") == name:
+            values = found.metrics[plan]
+            assert (values["error_travel"], values["error_after"], values["sway_after"]) == pytest.approx(
+                expected, rel=0.02
+            )
+    assert any("step" in note and "slack" in note for note in study.notes)
+    if name == "nominal":
+        assert found.metrics["C4 polynomial, dynamic law"]["error_travel"] < 1e-6
+        assert any("+0.00030" in note and "-0.87" in note for note in study.notes)
+    if name == "obstacle":
+        lengths = {plan: found.metrics[plan]["path_length"] for plan in ("polynomial", "trigonometric")}
+        assert lengths == pytest.approx({"polynomial": 33.02, "trigonometric": 26.36}, abs=0.005)
+
+
+def test_linearised_loops_of_the_study_have_the_slowest_poles_of_the_notes():
+    grows = studies._slowest(studies._linear_loop("generator"))
+    damped = studies._slowest(studies._linear_loop("load_feedback"))
+    assert grows.real == pytest.approx(0.00030, abs=5e-6)
+    assert abs(grows.imag) == pytest.approx(0.990, abs=5e-4)
+    assert damped.real == pytest.approx(-0.87, abs=5e-3)

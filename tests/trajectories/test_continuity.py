@@ -1,0 +1,88 @@
+"""Jumps of derivatives: where, of what, by how much."""
+
+import math
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import ctrlplan as cp
+
+
+def listed(plan, order):
+    return [(j.order, j.label, j.time) for j in plan.jumps(order)]
+
+
+def quintic(a, b, first=(0.0, 0.0, 0.0), last=(1.0, 0.0, 0.0)):
+    return cp.PolySpline([cp.Waypoint(a, *first), cp.Waypoint(b, *last)], labels=["y"])
+
+
+def test_a_line_starts_and_stops_at_speed():
+    line = cp.PolySpline([cp.Waypoint(1.0, [0.0, 3.0]), cp.Waypoint(5.0, [8.0, 1.0])], labels=["x", "z"])
+    assert line.jumps(0) == ()
+    found = line.jumps(3)
+    assert [(j.order, j.label, j.time) for j in found] == [(1, "x", 1.0), (1, "z", 1.0), (1, "x", 5.0), (1, "z", 5.0)]
+    assert [j.size for j in found] == pytest.approx([2.0, -0.5, -2.0, 0.5])
+
+
+def test_minimum_jerk_jumps_in_jerk_at_both_ends():
+    found = quintic(0.0, 2.0).jumps(3)
+    # y''' = 60/T^3 at both ends
+    assert [(j.order, j.time) for j in found] == [(3, 0.0), (3, 2.0)]
+    assert [j.size for j in found] == pytest.approx([60 / 8, -60 / 8])
+    assert quintic(0.0, 2.0).jumps(2) == ()
+
+
+def test_lower_orders_come_first():
+    found = listed(quintic(0.0, 2.0), 4)
+    assert found == [(3, "y", 0.0), (3, "y", 2.0), (4, "y", 0.0), (4, "y", 2.0)]
+
+
+def test_a_step_jumps_in_position_alone():
+    (x, z) = cp.Step([2.0, 5.0], [0.0, 6.0], 1.5, labels=["x", "z"]).jumps(4)
+    assert (x.order, x.label, x.time, x.size) == (0, "x", 1.5, 2.0)
+    assert (z.order, z.label, z.time, z.size) == (0, "z", 1.5, -1.0)
+    assert listed(cp.Step([2.0, 6.0], [0.0, 6.0], labels=["x", "z"]), 2) == [(0, "x", 0.0)]
+
+
+def test_a_join_jumps_by_the_difference_of_its_sides():
+    before = quintic(0.0, 1.0, last=(1.0, 0.5, 0.25))
+    after = quintic(1.0, 3.0, (1.0, 0.5, -2.0), (4.0, 0.0, 0.0))
+    found = [j for j in before.then(after).jumps(2) if j.time == 1.0]
+    assert [(j.order, j.label) for j in found] == [(2, "y")]
+    assert found[0].size == pytest.approx(-2.25)
+    assert before.then(after).jumps(1) == ()
+
+
+def test_an_interior_waypoint_of_one_polynomial_is_no_jump():
+    plan = cp.PolySpline([cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 2, 1), cp.Waypoint(3, 1, 0, 0)])
+    assert {j.time for j in plan.jumps(5)} == {0.0, 3.0}
+    legs = cp.PiecewiseSpline([cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 2, 1, 0), cp.Waypoint(3, 1, 0, 0)])
+    assert legs.jumps(2) == ()
+    assert {j.time for j in legs.jumps(3)} == {0.0, 1.0, 3.0}
+
+
+@pytest.mark.parametrize("entries", [1, 2, 3, 4, 5])
+@pytest.mark.parametrize("alpha", [None, 0.5, 3.0])
+def test_rest_to_rest_is_smooth_as_far_as_it_prescribes(entries, alpha):
+    points = [cp.Waypoint(t, y, *[0.0] * (entries - 1)) for t, y in ((0.0, -1.0), (7.0, 3.0))]
+    plan = cp.PolySpline(points) if alpha is None else cp.TrigSpline(points, alpha=alpha)
+    assert plan.jumps(entries - 1) == ()
+    assert {j.order for j in plan.jumps(entries)} == {entries}
+
+
+@given(st.floats(-1e5, 1e5), st.floats(0.01, 100.0), st.floats(1e-6, 1e6))
+@settings(deadline=None, max_examples=50)
+def test_jumps_move_with_the_clock_and_grow_with_the_plan(shift, duration, factor):
+    plan = factor * quintic(0.0, 1.0).retime(duration).shift(shift)
+    first, last = plan.jumps(3)
+    assert (first.order, last.order) == (3, 3)
+    assert (first.time, last.time) == (plan.start, plan.end)
+    size = 60 * factor / duration**3
+    assert (first.size, last.size) == pytest.approx((size, -size), rel=1e-6)
+
+
+@pytest.mark.parametrize("order", [-1, 1.5, math.nan])
+def test_order_must_be_a_count(order):
+    with pytest.raises((ValueError, TypeError), match="order"):
+        quintic(0.0, 1.0).jumps(order)
