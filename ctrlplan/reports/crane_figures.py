@@ -154,14 +154,15 @@ def plot_step(comparison: Comparison) -> Figure:
     rows = [row[0] for row in stacked_axes(figure, 4)]
     scales = (("F", 1e3, "F [kN]", FORCE_LIMITS), ("C", 1e3, "C [kN m]", TORQUE_LIMITS), ("T", 1e3, "T [kN]", (0.0,)))
     for axes, (name, scale, label, limits) in zip(rows, scales, strict=False):
-        axes.plot(t, signals[name] / scale, color=colour, linewidth=1.0)
-        for limit in limits:
-            axes.axhline(limit / scale, color="#D55E00", linewidth=1.0, linestyle="--")
+        axes.plot(t, signals[name] / scale, color=colour, linewidth=1.0, label="step")
+        for k, limit in enumerate(limits):
+            axes.axhline(limit / scale, color="#D55E00", linewidth=1.0, linestyle="--", label="" if k else "limit")
         axes.set_ylabel(label)
     rows[2].fill_between(t, signals["T"] / 1e3, 0.0, where=signals["T"] < 0.0, color="#D55E00", alpha=0.4)
     rows[3].plot(t, signals["theta"], color=colour, linewidth=1.0)
     rows[3].set_ylabel("sway [rad]")
     rows[3].set_xlabel("time [s]")
+    legend_above(figure, rows[0])
     return figure
 
 

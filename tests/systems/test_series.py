@@ -55,7 +55,7 @@ def test_derivatives(nu):
     assert_series(found, A.diff(T, nu))
 
 
-@pytest.mark.parametrize("operation", [series.multiply, series.divide])
+@pytest.mark.parametrize("operation", [series.multiply, series.divide, series.arctan2])
 def test_results_are_as_long_as_the_shorter(operation):
     whole = operation(of(A), of(B))
     for short in (0, 1, 3):
