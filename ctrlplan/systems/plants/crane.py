@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ctrlplan.systems import series
 from ctrlplan.systems.pid import create_pid_iosystem
-from ctrlplan.trajectories import Trajectory
+from ctrlplan.trajectories import Extrema, Trajectory
 
 Array = NDArray[np.float64]
 
@@ -205,8 +205,8 @@ class Crane:
         """Refuse a plan of the load that the crane cannot follow.
 
         Over the whole interval, not at samples: g - z'' and T must be above 0
-        (from the exact extrema of z''), and so must R (from the resolved
-        extrema of a function of the jet).
+        (from the exact extrema of z''), and so must R (from certified bounds of
+        a function of the jet).
 
         Parameters
         ----------
@@ -228,18 +228,29 @@ class Crane:
                 f"at {fall.time_max[1]:.4g} s (tension T <= 0)"
             )
         if not plan.duration:
-            rope = np.array([plan.initial[1], plan.final[1]])
-            least, time = float(rope.min()), plan.start
+            least, time = float(min(plan.initial[1], plan.final[1])), plan.start
         else:
-
-            def length(jet: Array) -> Array:
-                across, hanging = jet[2, 0], g - jet[2, 1]
-                return (jet[0, 1] * np.hypot(across, hanging) - b * across) / hanging
-
-            found = plan.extrema_of(length, 2)
-            least, time = float(found.minimum[0]), float(found.time_min[0])
+            least, time = self._shortest_rope(plan, fall)
         if not least > 0.0:
             raise ValueError(f"the rope length R must be above 0, got {least:.4g} m at {time:.4g} s")
+
+    def _shortest_rope(self, plan: Trajectory, acceleration: Extrema) -> tuple[float, float]:
+        """Certified lower bound of R over a plan, or its least attained value where that is not above 0."""
+        g, b = self.gravity, self.drum_radius
+
+        def length(jet: Array) -> Array:
+            across, hanging = jet[2, 0], g - jet[2, 1]
+            return (jet[0, 1] * np.hypot(across, hanging) - b * across) / hanging
+
+        depth, across = float(plan.peak()[1]), float(max(-acceleration.minimum[0], acceleration.maximum[0]))
+        least, most = g - float(acceleration.maximum[1]), g - float(acceleration.minimum[1])
+        pull = math.hypot(across, most)
+        # Bounds of dR/dz, dR/dx'' and dR/dz'' over the ranges of the plan.
+        slopes = np.zeros((3, 2))
+        slopes[0, 1] = pull / least
+        slopes[2] = (depth + b) / least, depth / least + (depth * pull + b * across) / least**2
+        found = plan.bounds(length, 2, slopes)
+        return (found.lower, found.time_min) if found.minimum > 0.0 else (found.minimum, found.time_min)
 
     # Linear models
 
