@@ -13,13 +13,14 @@ from numpy.typing import NDArray
 
 from ctrlplan.reports.style import house_style, legend_above, line_styles, new_figure, stacked_axes
 from ctrlplan.studies.comparison import Comparison
-from ctrlplan.studies.crane import CRANE, FORCE_LIMITS, TORQUE_LIMITS, WALL, nominal_waypoints
+from ctrlplan.studies.crane import CRANE, FORCE_LIMITS, TORQUE_LIMITS, nominal_waypoints
 from ctrlplan.studies.study import Study
 from ctrlplan.systems.plants import crane_loop
 from ctrlplan.trajectories import PolySpline
 
 Array = NDArray[np.float64]
 
+Wall = tuple[tuple[float, float], tuple[float, float]] | None
 MAIN = ("step", "polynomial", "trigonometric", "piecewise")
 """Plans that figures over time show; more would hide one another."""
 
@@ -140,6 +141,7 @@ def plot_time(comparison: Comparison) -> Figure:
         axes.set_ylabel(label)
     rows[1].invert_yaxis()
     rows[2].set_yscale("symlog", linthresh=1.0)
+    rows[2].set_ylim(bottom=0.0)
     rows[-1].set_xlabel("time [s]")
     legend_above(figure, rows[0])
     return figure
@@ -167,13 +169,13 @@ def plot_step(comparison: Comparison) -> Figure:
 
 
 @house_style
-def plot_plane(comparison: Comparison, wall: bool) -> Figure:
+def plot_plane(comparison: Comparison, wall: Wall) -> Figure:
     """Paths of the load in the plane, z down, with the obstacle (figure 6)."""
     styles = line_styles(comparison.plans)
     figure = new_figure(7.4, 4.6)
     ((axes,),) = stacked_axes(figure, 1)
     if wall:
-        (left, right), (top, ground) = WALL
+        (left, right), (top, ground) = wall
         axes.add_patch(Rectangle((left, top), right - left, ground - top, color="#bbbbbb", zorder=0))
         axes.text(0.5 * (left + right), 0.5 * (top + ground), "wall", ha="center", fontsize=9)
     last = comparison.waypoints[-1].time
@@ -197,7 +199,7 @@ def plot_plane(comparison: Comparison, wall: bool) -> Figure:
 
 
 @house_style
-def plot_motion(comparison: Comparison, wall: bool, steps: int = 13) -> Figure:
+def plot_motion(comparison: Comparison, wall: Wall, steps: int = 13) -> Figure:
     """Trolley, rope and load at equal time steps along each plan."""
     names = [n for n in ("polynomial", "trigonometric") if n in comparison.plans]
     figure = new_figure(7.4, 6.8)
@@ -207,7 +209,7 @@ def plot_motion(comparison: Comparison, wall: bool, steps: int = 13) -> Figure:
     for name, axes in zip(names, rows, strict=True):
         signals = _signals(comparison, name)
         if wall:
-            (left, right), (top, ground) = WALL
+            (left, right), (top, ground) = wall
             axes.add_patch(Rectangle((left, top), right - left, ground - top, color="#cccccc", zorder=0))
         axes.axhline(0.0, color="#999999", linewidth=2)
         colour = colours[name]["color"]
@@ -241,7 +243,7 @@ def plot_curves(study: Study) -> Figure:
     return figure
 
 
-def animation_data(comparison: Comparison, rate: float = 12.0) -> str:
+def animation_data(comparison: Comparison, wall: Wall = None, rate: float = 12.0) -> str:
     """JSON for the animation: trolley, rope and angle of each plan at equal time steps."""
     frames: dict[str, Any] = {"b": CRANE.drum_radius, "rate": rate, "plans": {}}
     for name in comparison.plans:
@@ -249,7 +251,7 @@ def animation_data(comparison: Comparison, rate: float = 12.0) -> str:
         t = np.arange(0.0, signals["t"][-1], 1.0 / rate)
         columns = [np.interp(t, signals["t"], signals[k]) for k in ("D", "R", "theta")]
         frames["plans"][name] = [np.round(column, 3).tolist() for column in columns]
-    frames["wall"] = WALL if len(comparison.waypoints) > 2 else None
+    frames["wall"] = wall
     return json.dumps(frames)
 
 
@@ -283,18 +285,19 @@ CRANE_FIGURES = {
     ),
     "crane-time": (
         lambda study: plot_time(study.comparison),
-        "Load, error, sway and controls over time. The error's axis is linear up to 1 mm, logarithmic above.",
+        "Load, error, sway and controls over time, the step left out. The error's axis is linear up to 1 mm, "
+        "logarithmic above.",
     ),
     "crane-step": (
         lambda study: plot_step(study.comparison),
         "The step: force and torque at their limits (dashed), and a tension below 0 (filled), where the rope is slack.",
     ),
     "crane-plane": (
-        lambda study: plot_plane(study.comparison, len(study.comparison.waypoints) > 2),
-        "Paths of the load in the plane (thin: planned), up to the time of the last waypoint.",
+        lambda study: plot_plane(study.comparison, study.wall),
+        "Paths of the load in the plane (thin: planned), up to the time of the last waypoint; the step left out.",
     ),
     "crane-motion": (
-        lambda study: plot_motion(study.comparison, len(study.comparison.waypoints) > 2),
+        lambda study: plot_motion(study.comparison, study.wall),
         "Trolley, rope and load at equal time steps.",
     ),
     "crane-sway": (plot_curves, "Sway after a push, with figure 3's generator and with feedback from the load."),

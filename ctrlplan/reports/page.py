@@ -18,7 +18,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescap
 from markupsafe import Markup
 
 import ctrlplan
-from ctrlplan.reports.crane_figures import animation_data, is_crane, plot_curves
+from ctrlplan.reports.crane_figures import Wall, animation_data, is_crane, plot_curves
 from ctrlplan.reports.figures import FIGURES
 from ctrlplan.reports.style import line_styles, to_svg
 from ctrlplan.reports.words import number, summary, unit_of, verdicts
@@ -111,6 +111,8 @@ class CraneAnimation:
     ----------
     comparison : Comparison
         Of loops made by `crane_loop`.
+    wall : ((float, float), (float, float)), optional
+        An obstacle to draw: its sides in x and in z [m].
 
     Raises
     ------
@@ -118,10 +120,10 @@ class CraneAnimation:
         If the comparison is not of a crane.
     """
 
-    def __init__(self, comparison: Comparison) -> None:
+    def __init__(self, comparison: Comparison, wall: Wall = None) -> None:
         if not is_crane(comparison):
             raise ValueError("an animation must be of a comparison of cranes, got one without D, R and theta")
-        self._data = Markup(animation_data(comparison))  # noqa: S704
+        self._data = Markup(animation_data(comparison, wall))  # noqa: S704
         self._name = f"crane{abs(hash(self._data)):x}"
 
     def _repr_html_(self) -> str:
@@ -165,7 +167,7 @@ def _section(study: Study) -> dict[str, Any]:
         "verdicts": [v.sentence for v in verdicts(comparison)],
         "table": _table(comparison),
         "figures": figures,
-        "animation": Markup(animation_data(comparison)) if is_crane(comparison) else "",  # noqa: S704
+        "animation": Markup(animation_data(comparison, study.wall)) if is_crane(comparison) else "",  # noqa: S704
         "marks": comparison.marks,
         "parameters": {k: str(v) for k, v in comparison.parameters.items()},
     }

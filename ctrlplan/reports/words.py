@@ -10,7 +10,8 @@ from ctrlplan.studies.comparison import Comparison
 TIE = 1e-3
 """Relative difference below which two values count as equal."""
 
-_NOTHING = 1e-9
+_NOTHING = 1e-7
+"""Value below which a metric is the rounding of a solver."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,9 @@ class Verdict:
 
 def verdicts(comparison: Comparison) -> list[Verdict]:
     """Winner and loser of every metric that at least two plans define."""
-    found = []
+    found: list[Verdict] = []
+    if is_unstable(comparison):
+        return found  # nothing is won where nothing settles
     for key, measure in comparison.measures.items():
         values = {plan: rows[key] for plan, rows in comparison.metrics.items() if key in rows}
         values = {plan: value for plan, value in values.items() if not math.isnan(value)}
@@ -53,7 +56,7 @@ def verdicts(comparison: Comparison) -> list[Verdict]:
 
 def summary(comparison: Comparison) -> str:
     """How often each plan wins and loses, in one paragraph."""
-    if comparison.notes and "unstable" in comparison.notes[0]:
+    if is_unstable(comparison):
         return comparison.notes[0]
     decided = [v for v in verdicts(comparison) if v.winners]
     if not decided:
@@ -65,6 +68,11 @@ def summary(comparison: Comparison) -> str:
         parts.append(f"{plan} is best in {wins} and worst in {losses}")
     sentence = "; ".join(parts)
     return f"Of {len(decided)} metrics that tell the plans apart, {sentence}. Values within 0.1 % count as equal."
+
+
+def is_unstable(comparison: Comparison) -> bool:
+    """Whether the loop is known to be unstable."""
+    return any(note.startswith("The loop is unstable") for note in comparison.notes)
 
 
 def unit_of(comparison: Comparison, key: str) -> str:
@@ -88,7 +96,7 @@ def number(value: float, unit: str = "") -> str:
         if value < 0:
             return "−∞"
         return "never" if unit == "s" else "∞"
-    if abs(value) < _NOTHING:
+    if abs(value) < 1e-9:
         return "0"
     if 1e-3 <= abs(value) < 1e5:
         digits = max(0, 3 - math.floor(math.log10(abs(value))))
@@ -109,7 +117,7 @@ def _verdict(key: str, title: str, unit: str, values: dict[str, float]) -> Verdi
     worst = number(greatest, unit) + (with_unit if math.isfinite(greatest) else "")
     best = number(least) + with_unit
     sentence = f"{title}: {_listed(winners)} {verb} with {best}, {_listed(losers)} {lose} with {worst}"
-    if least > _NOTHING and math.isfinite(greatest) and greatest / least >= 1.05:
+    if least > _NOTHING and math.isfinite(greatest) and 1.05 <= greatest / least < 1e4:
         sentence += f" ({greatest / least:.3g} times)"
     return Verdict(key, title, unit, winners, losers, least, greatest, sentence + ".")
 

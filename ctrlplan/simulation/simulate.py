@@ -49,7 +49,8 @@ def simulate(
         array (ninputs, ntime) of samples taken for linear in between; or by
         name, ``{"r": plan, "d": 0.1}``, each for one input, 0 where unnamed.
     initial_state : array_like, optional
-        State at the first sample time, a scalar for all.
+        State at the first sample time, a scalar for all; where it is 0 and the
+        system has an attribute ``initial_state`` (as `crane_loop` sets), that.
     method : {"auto", "exact", "python"}, optional
         "exact" insists on the exact solution.
     rtol, atol : float, optional
@@ -74,8 +75,7 @@ def simulate(
         raise ValueError(f"timepts must be two or more finite times that increase strictly, got {timepts!r:.80}")
     if method not in METHODS:
         raise ValueError(f"method must be one of {', '.join(METHODS)}, got {method!r}")
-    if isinstance(system, ct.TransferFunction):
-        system = ct.ss(system, name=system.name, inputs=system.input_labels, outputs=system.output_labels)
+    system = state_space(system)
     sources = _sources(system, inputs, times)
     form, reason = _exact_form(system, sources, params)
     if method == "exact" and form is None:
@@ -99,7 +99,8 @@ def _sources(system: Any, inputs: Inputs, times: Array) -> list[Trajectory | Arr
         given = [inputs.get(name, 0.0) for name in names]
     elif isinstance(inputs, Trajectory):
         if inputs.naxes != len(names):
-            raise ValueError(f"inputs must have {len(names)} axes ({', '.join(names)}), got {inputs.naxes}")
+            known = f"({', '.join(names)})" if names else "(the system has no inputs)"
+            raise ValueError(f"inputs must have {len(names)} axes {known}, got {inputs.naxes}")
         return [inputs]
     elif inputs is None or np.ndim(inputs) == 0:
         given = [0.0 if inputs is None else inputs] * len(names)
@@ -129,6 +130,8 @@ def _source(value: Any, name: str, times: Array) -> Trajectory | Array:
 
 
 def _initial_state(system: Any, initial_state: ArrayLike) -> Array:
+    if np.ndim(initial_state) == 0 and initial_state == 0 and hasattr(system, "initial_state"):
+        initial_state = system.initial_state
     state = np.asarray(initial_state, dtype=float)
     count = system.nstates or 0
     if state.ndim and state.shape != (count,):
@@ -201,6 +204,13 @@ def _response(
     )
     response.method, response.reason, response.events = method, reason, []
     return response
+
+
+def state_space(system: Any) -> Any:
+    """Same system with states, where it is a transfer function."""
+    if not isinstance(system, ct.TransferFunction):
+        return system
+    return ct.ss(system, name=system.name, inputs=system.input_labels, outputs=system.output_labels)
 
 
 def rest_state(system: Any, position: ArrayLike) -> Array:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ctrlplan.simulation import rest_state, simulate, unstable_poles
+from ctrlplan.simulation import rest_state, simulate, state_space, unstable_poles
 from ctrlplan.studies.measures import MEASURES, Measure, control_metrics, path_metrics, response_metrics
 from ctrlplan.trajectories import PiecewiseSpline, PolySpline, Step, Trajectory, TrigSpline, Waypoint
 
@@ -208,8 +208,14 @@ def compare(
     times = np.asarray(timepts, dtype=float)
     start = min(plan.start for plan in references.values())
     responses, found, unstable = {}, {}, np.empty(0, dtype=complex)
+    builds = callable(loop) and not hasattr(loop, "output_labels")
+    if not builds and not loop.ninputs:
+        raise ValueError(
+            "loop must have inputs for the plans, got one without; give a function of name and plan that returns "
+            "a loop where the plan is a block inside"
+        )
     for name, plan in references.items():
-        system = loop(name, plan) if callable(loop) and not hasattr(loop, "output_labels") else loop
+        system = state_space(loop(name, plan) if builds else loop)
         tracked, acting = _tracked(system, outputs, first), _acting(system, controls)
         response = simulate(
             system,

@@ -30,6 +30,8 @@ CRANE_MEASURES = {
     "error_travel": Measure("Greatest error of the load on the way", "m"),
     "error_after": Measure("Greatest error of the load afterwards", "m"),
     "sway_after": Measure("Greatest sway afterwards", "rad"),
+    "force_peak": Measure("Greatest force asked of the trolley", "N"),
+    "error_limited": Measure("Greatest error with the drives limited", "m"),
     "slack_time": Measure("Time with a slack rope", "s"),
     "path_length": Measure("Length of the planned path", "m"),
     "load_path": Measure("Length of the load's path", "m"),
@@ -94,6 +96,7 @@ def crane_nominal_study(progress: bool = True) -> Study:
             f"{1e3 * poly['error_travel']:.3g} mm of the polynomial and {1e3 * trig['error_travel']:.3g} mm of the "
             "trigonometric plan on the way.",
             _step_note(found),
+            _limits_note(found),
             f"Figure 3's generator has no feedback from the load. Linearised at R = 10 m, its slowest pole pair is at "
             f"{grows.real:+.5f} ± {abs(grows.imag):.3f}j 1/s: with the study's PIDs the sway is not damped, it grows "
             f"slowly (the integral action does it). Feedback from the load's x moves the slowest pole to "
@@ -139,6 +142,7 @@ def crane_first_order_study(progress: bool = True) -> Study:
             f"plan is at rest at both ends, and "
             f"{1e3 * rows['trigonometric, alpha pi']['error_after']:.2g} mm are left.",
             _step_note(found),
+            _limits_note(found),
         ),
         figures=("crane-time", "crane-curves", "crane-motion"),
         curves=(_speed_curves(points),),
@@ -178,9 +182,11 @@ def crane_obstacle_study(progress: bool = True) -> Study:
             f"{_verdict_on_legs()} What it costs is a jump of the jerk at A and B; the load follows it within "
             f"{1e3 * rows['piecewise']['error_travel']:.2g} mm.",
             _step_note(found),
+            _limits_note(found),
         ),
         figures=("crane-plane", "crane-time", "crane-curves", "crane-motion"),
         curves=(_length_curves(),),
+        wall=WALL,
     )
 
 
@@ -200,8 +206,13 @@ def _compared(
     def build(name: str, plan: Trajectory) -> Any:
         return crane_loop(CRANE, plan, **plans[name][1])
 
+    laws = {id(plan): options for plan, options in plans.values()}
+
     def measure(plan: Trajectory, response: Any) -> dict[str, float]:
-        return load_metrics(plan, response, last)
+        found, options = load_metrics(plan, response, last), laws[id(plan)]
+        if options.get("law", "generator") in ("dynamic", "feedforward"):
+            return found  # they command force and torque themselves
+        return found | {"error_limited": _limited_error(plan, options, timepts)}
 
     found = compare(
         build,
@@ -226,6 +237,26 @@ def marked_slack(found: Comparison) -> Comparison:
             name: f"the rope is slack for {time:.2g} s; from then on the model is no crane"
             for name, time in slack.items()
         }
+    )
+
+
+def _limited_error(plan: Trajectory, options: dict[str, Any], timepts: Array) -> float:
+    """Greatest error of the load with force and torque limited as the step's are."""
+    loop = crane_loop(CRANE, plan, **options | {"force_limits": FORCE_LIMITS, "torque_limits": TORQUE_LIMITS})
+    response = simulate(loop, timepts)
+    signals = dict(zip(response.output_labels, np.asarray(response.outputs), strict=True))
+    return float(np.hypot(*(np.stack([signals["x"], signals["z"]]) - plan.jet(timepts, 0)[0])).max())
+
+
+def _limits_note(found: Comparison) -> str:
+    """What the plans ask of drives that have the step's limits, and what that costs."""
+    names = ("polynomial", "trigonometric", "piecewise")
+    asked = ", ".join(f"{name} {1e-3 * found.metrics[name]['force_peak']:.3g} kN" for name in names)
+    errors = ", ".join(f"{name} {found.metrics[name]['error_limited']:.2g} m" for name in names)
+    return (
+        f"Only the step runs with limited drives above; the plans ask for a force of up to {asked}, much of it where "
+        f"their acceleration or speed begins and ends with a jump. With the step's limits (30 kN) their greatest "
+        f"errors are: {errors}."
     )
 
 
@@ -254,15 +285,21 @@ def load_metrics(plan: Trajectory, response: Any, last: float) -> dict[str, floa
     travelled = plan.jet(np.linspace(plan.start, plan.end, 4001), 0)[0] if plan.duration else None
     slack = float(metrics.saturation_time(t, signals["T"], 0.0, np.inf))
     return {
-        "error_travel": float(metrics.peak(t[way], error[way])),
-        "error_after": float(metrics.peak(t[after], error[after])),
-        "sway_after": float(metrics.peak(t[after], signals["theta"][after])),
+        "error_travel": _peak(t[way], error[way]),
+        "error_after": _peak(t[after], error[after]),
+        "sway_after": _peak(t[after], signals["theta"][after]),
+        "force_peak": _peak(t, signals["F"]),
         "slack_time": slack,
         "path_length": np.nan
         if travelled is None
         else float(metrics.path_length(np.linspace(plan.start, plan.end, 4001), travelled)),
         "load_path": float(metrics.path_length(t, load)),
     }
+
+
+def _peak(t: Array, values: Array) -> float:
+    """Greatest magnitude, nan of a record too short to have one."""
+    return float(metrics.peak(t, values)) if t.size > 1 else np.nan
 
 
 def _parameters(t_end: float) -> dict[str, object]:

@@ -12,6 +12,7 @@ import sys
 import tomllib
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, field, fields
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctrlplan.studies.comparison import compare, standard_plans
-from ctrlplan.studies.crane import CRANE_MEASURES, FORCE_LIMITS, TORQUE_LIMITS, load_metrics, marked_slack
+from ctrlplan.studies.crane import CRANE_MEASURES, load_metrics, marked_slack
 from ctrlplan.studies.study import Study
 from ctrlplan.systems.plants import LAWS, Crane, crane_loop, unity_feedback_loop
 from ctrlplan.trajectories import PiecewiseSpline, PolySpline, Step, Trajectory, TrigSpline, Waypoint, derivative_name
@@ -35,9 +36,12 @@ FAMILIES = {
 
 LOOPS = {
     "linear": ("num", "den", "gain"),
-    "crane": ("law", *(entry.name for entry in fields(Crane))),
+    "crane": ("law", "force_limits", "torque_limits", *(entry.name for entry in fields(Crane))),
 }
 """Kinds of loops by name, and the entries that each takes; and "python:module:function"."""
+
+
+_CRANE_ENTRIES = tuple(entry.name for entry in fields(Crane))
 
 
 class StudyError(ValueError):
@@ -111,6 +115,9 @@ class StudyFile:
         """What a comparison of cranes measures besides."""
         if self.loop["kind"] != "crane":
             return {}
+        if set(self.waypoints[0].labels or ()) != {"x", "z"}:
+            axes = ", ".join(self.waypoints[0].labels or ())
+            raise StudyError(f"{self.path}: waypoints: a crane's axes must be x and z (down), got {axes}")
         last = self.waypoints[-1].time
         return {
             "controls": ("F", "C"),
@@ -128,7 +135,12 @@ class StudyFile:
 
     def parameters(self) -> dict[str, object]:
         """What the report says about how it was made."""
-        loop = {f"loop {key}": value for key, value in self.loop.items()}
+        stated = dict(self.loop)
+        if stated["kind"] == "crane":
+            own = {key: value for key, value in stated.items() if key in _CRANE_ENTRIES}
+            stated = {"kind": "crane", "law": "generator", "force_limits": "none", "torque_limits": "none"} | stated
+            stated |= {entry.name: own.get(entry.name, entry.default) for entry in fields(Crane)}
+        loop = {f"loop {key}": value for key, value in stated.items()}
         plans: dict[str, object] = {f"plan {name}": _described(plan) for name, plan in self.plans.items()}
         points: dict[str, object] = {f"waypoint {i}": repr(w) for i, w in enumerate(self.waypoints)}
         run = f"{self.waypoints[0].time:g} to {self.t_end:g} s, {self.samples} samples"
@@ -217,17 +229,20 @@ def build_loop(table: dict[str, Any], path: Path) -> Any:
 def _crane(table: dict[str, Any], path: Path) -> Callable[[str, Trajectory], Any]:
     """Loop of each plan: a step goes to the drives at rest, every other plan through the law."""
     try:
-        crane = Crane(**{key: value for key, value in table.items() if key not in ("kind", "law")})
+        crane = Crane(**{key: value for key, value in table.items() if key in _CRANE_ENTRIES})
     except (ValueError, TypeError) as error:
         raise StudyError(f"{path}: loop: {error}") from None
     law = table.get("law", "generator")
     if law not in LAWS:
         raise StudyError(f"{path}: loop.law: must be one of {', '.join(LAWS)}, got {law!r}")
 
+    limits = {key: table[key] for key in ("force_limits", "torque_limits") if key in table}
+    for key, pair in limits.items():
+        if not (isinstance(pair, list) and len(pair) == 2 and all(map(_is_number, pair)) and pair[0] < pair[1]):
+            raise StudyError(f"{path}: loop.{key}: must be two increasing numbers, got {pair!r}")
+
     def build(name: str, plan: Trajectory) -> Any:
-        if plan.duration:
-            return crane_loop(crane, plan, law)
-        return crane_loop(crane, plan, "still", force_limits=FORCE_LIMITS, torque_limits=TORQUE_LIMITS)
+        return crane_loop(crane, plan, law if plan.duration else "still", **limits)
 
     return build
 
@@ -310,6 +325,12 @@ class _Reader:
             raise self.error(place, f"must be a list of {kind}, got {'none' if value is None else repr(value)}")
         return [float(v) for v in value]
 
+    def choice(self, table: dict[str, Any], key: str, place: str) -> Any:
+        """What a plan was asked for: a number, "auto", or a list with one entry an axis."""
+        if table[key] == "auto":
+            return "auto"
+        return (self.numbers if isinstance(table[key], list) else partial(self.number, default=None))(table, key, place)
+
     def waypoints(self, data: dict[str, Any]) -> tuple[Waypoint, ...]:
         points = []
         for i, table in enumerate(self.tables(data, "waypoints")):
@@ -338,11 +359,7 @@ class _Reader:
                 raise self.error(f"{place}.name", f"must be a name of its own, got {name!r}")
             kind, choices = FAMILIES[family]
             self.known(table, ("name", "family", *choices), place)
-            chosen = {
-                key: table[key] if table[key] == "auto" else self.number(table, key, f"{place}.{key}", default=None)
-                for key in choices
-                if key in table
-            }
+            chosen = {key: self.choice(table, key, f"{place}.{key}") for key in choices if key in table}
             try:
                 if kind is Step:
                     plans[name] = standard_plans(waypoints)["step"]

@@ -62,6 +62,8 @@ class Study:
         Keys of `ctrlplan.reports.figures.FIGURES`, in order.
     curves : tuple of Curves
         What its own figures need besides.
+    wall : ((float, float), (float, float)) or None
+        An obstacle to draw: its sides in x and in z [m].
     """
 
     name: str
@@ -73,6 +75,7 @@ class Study:
     sweep_metrics: tuple[str, ...] = ("overshoot_error", "settling_time")
     figures: tuple[str, ...] = ("plans", "responses")
     curves: tuple[Curves, ...] = ()
+    wall: tuple[tuple[float, float], tuple[float, float]] | None = None
 
     def results(self) -> dict[str, Any]:
         """Plain data for ``results.json``."""

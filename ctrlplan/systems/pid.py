@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from numbers import Real
 from typing import Any
 
 import control as ct
@@ -64,11 +65,16 @@ def create_pid_iosystem(
     >>> create_pid_iosystem(3.0, 1.0, 2.0, 0.1).state_labels
     ['integral', 'filter']
     """
-    for label, value in (("kp", kp), ("ki", ki), ("kd", kd), ("bias", bias)):
-        if not math.isfinite(value):
-            raise ValueError(f"{label} must be finite, got {value}")
-    if not (math.isfinite(tf) and tf > 0.0):
-        raise ValueError(f"tf must be finite and above 0, got {tf}")
+    numbers: dict[str, Any] = {"kp": kp, "ki": ki, "kd": kd, "bias": bias, "tf": tf}
+    for label, value in numbers.items():
+        if isinstance(value, bool) or not isinstance(value, Real):
+            raise TypeError(f"{label} must be a number, got {value!r}")
+        if not math.isfinite(value) or (label == "tf" and not float(value) > 0.0):
+            raise ValueError(f"{label} must be finite{' and above 0' if label == 'tf' else ''}, got {value}")
+    if limits is not None and np.shape(limits) != (2,):
+        raise ValueError(f"limits must be two numbers, got {limits!r}")
+    if tracking_time is not None and not (math.isfinite(tracking_time) and tracking_time > 0.0):
+        raise ValueError(f"tracking_time must be finite and above 0, got {tracking_time}")
     names: dict[str, Any] = {
         "inputs": list(inputs),
         "outputs": [output],
@@ -111,6 +117,4 @@ def _tracking_rate(kp: float, ki: float, kd: float, tracking_time: float | None)
             return 0.0
         ratio = kd / ki if kd else (kp / ki) ** 2
         tracking_time = math.sqrt(abs(ratio)) or 1.0
-    if not (math.isfinite(tracking_time) and tracking_time > 0.0):
-        raise ValueError(f"tracking_time must be finite and above 0, got {tracking_time}")
     return 1.0 / tracking_time

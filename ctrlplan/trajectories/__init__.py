@@ -1,6 +1,6 @@
 """Functions of time with exact derivatives: what a loop is asked to follow."""
 
-from ctrlplan.trajectories.combined import Joined, Scaled, Stacked, Sum, stack
+from ctrlplan.trajectories.combined import Joined, Scaled, Selected, Stacked, Sum, stack
 from ctrlplan.trajectories.continuity import Jump
 from ctrlplan.trajectories.extrema import Bounds, Extrema
 from ctrlplan.trajectories.files import derivative_name, load_trajectory, trajectory_from_dict
@@ -20,6 +20,7 @@ __all__ = [
     "PiecewiseSpline",
     "PolySpline",
     "Scaled",
+    "Selected",
     "Stacked",
     "Step",
     "Sum",

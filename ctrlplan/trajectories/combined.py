@@ -113,6 +113,26 @@ class Stacked(_Combined):
         return np.concatenate(values, axis=0 if values[0].ndim == 1 else 1)
 
 
+class Selected(_Combined):
+    """Some axes of a trajectory; made by `select`."""
+
+    def __init__(self, part: Trajectory, labels: Iterable[str]) -> None:
+        (member,) = _checked_parts([part])
+        self._set((member,), tuple(labels))
+
+    def _set(self, parts: tuple[Trajectory, ...], labels: tuple[str, ...]) -> None:
+        for label in labels:
+            if label not in parts[0].labels:
+                raise ValueError(f"labels must be among {', '.join(parts[0].labels)}, got {label!r}")
+        self.__dict__["_axes"] = [parts[0].labels.index(label) for label in labels]
+        super()._set(parts, labels)
+
+    def _combine(self, values: list[Array]) -> Array:
+        return values[0].take(self._axes, axis=0 if values[0].ndim == 1 else 1)
+
+    _axes: list[int]
+
+
 class Scaled(_Combined):
     """Multiple of a trajectory.
 

@@ -66,10 +66,12 @@ def _is_uniform(t: Array, duration: float) -> bool:
     if not step > 0.0 or abs(t[1] - t[0] - step) > slack:
         return False
     ramp = step * np.arange(min(t.size, 2 * _CHUNK))
+    beyond = np.empty_like(ramp)
     for first in range(0, t.size, ramp.size):
-        part = t[first : first + ramp.size] - (t[0] + first * step)
-        part -= ramp[: part.size]
-        if part.max() > slack or part.min() < -slack:
+        part = t[first : first + ramp.size]
+        excess = np.subtract(part, ramp[: part.size], out=beyond[: part.size])
+        base = t[0] + first * step
+        if excess.max() - base > slack or base - excess.min() > slack:
             return False
     return True
 

@@ -277,6 +277,12 @@ class Trajectory(Frozen, ABC):
 
         return Joined((self, other))
 
+    def select(self, labels: Sequence[str]) -> Trajectory:
+        """Some axes by name, in the order given."""
+        from ctrlplan.trajectories.combined import Selected
+
+        return Selected(self, (labels,) if isinstance(labels, str) else labels)
+
     def to_csv(self, path: str | os.PathLike[str], timepts: ArrayLike | None = None, order: int = 2) -> None:
         """Write times and jets as a table with one line of names."""
         from ctrlplan.trajectories.files import write_csv
@@ -322,12 +328,16 @@ class Trajectory(Frozen, ABC):
 
     __rmul__ = __mul__
 
+    def __truediv__(self, factor: float | Real) -> Trajectory:
+        return self * (1.0 / float(factor)) if isinstance(factor, Real) else NotImplemented
+
     def __neg__(self) -> Trajectory:
         return self * -1.0
 
     def __repr__(self) -> str:
         axes = ", ".join(self.labels)
-        return f"<{type(self).__name__} of {axes} from {self.start:g} s to {self.end:g} s>"
+        when = f"from {self.start:g} s to {self.end:g} s" if self.duration else f"at {self.start:g} s"
+        return f"<{type(self).__name__} of {axes} {when}>"
 
     def _sample(self, t: Array, low: int, high: int, left: bool) -> Array:
         """Derivatives low to high, shape (high - low + 1, naxes, ntime)."""

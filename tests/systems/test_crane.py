@@ -386,13 +386,16 @@ def test_trolley_loop_has_the_poles_of_the_study():
     assert np.sort(np.abs(slow))[:3] == pytest.approx(2.0, rel=0.03)  # the triple pole, without the filter
 
 
-def test_hoist_loop_is_its_pid_on_the_drum_alone():
-    """The PID counts the load's inertia in; the drum alone does not carry it."""
-    crane = Crane()
-    loop = crane.linear_hoist_loop()
+def test_hoist_loop_is_its_pid_on_drum_and_load():
+    """The study's poles: the PID is made for the inertia that it moves."""
+    loop = Crane().linear_hoist_loop()
     assert (loop.input_labels, loop.output_labels) == (["R_ref"], ["R"])
-    expected = characteristic(50 / 0.25 + 500 * 0.25, 20 / 0.25, 50 / 0.25, 20 / 0.25)
+    mass = 50 / 0.25 + 500 * 0.25
+    expected = characteristic(mass, 20 / 0.25, mass, 20 / 0.25)
     np.testing.assert_allclose(ordered(loop.poles()), ordered(expected), rtol=1e-6)
+    np.testing.assert_allclose(
+        ordered(loop.poles()), ordered([-3.12 + 1.36j, -3.12 - 1.36j, -22 + 7.4j, -22 - 7.4j]), atol=0.05
+    )
 
 
 def test_drive_loops_have_unit_gain_at_rest():

@@ -400,14 +400,12 @@ def test_axes_of_other_names_are_taken_in_order():
     np.testing.assert_array_equal(run(loop, t).states, run(same, t).states)
 
 
-@pytest.mark.xfail(reason="axes called z and x are taken in order, not by name")
 def test_axes_called_x_and_z_are_taken_by_name():
     points = [(0, 6, 10), (6, 7, 9)]
     plan = cp.PolySpline([cp.Waypoint.from_jets(t, z=[z, 0, 0], x=[x, 0, 0]) for t, x, z in points])
     assert crane_loop(Crane(), plan).initial_state[-6:-4].tolist() == [6 - B, 10]
 
 
-@pytest.mark.xfail(reason="options that the law does not have are dropped")
 @pytest.mark.parametrize(
     ("law", "option"), [("generator", "poles"), ("load_feedback", "dampning"), ("feedforward", "poles")]
 )

@@ -31,6 +31,7 @@ ARGUMENTS = {
     "parts": lambda: [trajectories.PolySpline(POINTS), trajectories.TrigSpline(BACK, alpha=2.0)],
     "part": lambda: trajectories.PiecewiseSpline(POINTS),
     "factor": lambda: -1 / 3,
+    "labels": lambda: ["z", "x"],
     "final": lambda: [1 / 3, 2.0],
 }
 

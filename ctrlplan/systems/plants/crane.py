@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
+from numbers import Real
 from typing import Any
 
 import control as ct
@@ -74,13 +75,15 @@ class Crane:
 
     def __post_init__(self) -> None:
         for entry in fields(self):
-            if entry.name == "rope_wrap":
-                continue
             value = getattr(self, entry.name)
+            if entry.name == "rope_wrap":
+                if not isinstance(value, bool):
+                    raise TypeError(f"rope_wrap must be True or False, got {value!r}")
+                continue
             friction = entry.name.endswith("friction")
-            if isinstance(value, bool) or not isinstance(value, (int, float)):
+            if isinstance(value, bool) or not isinstance(value, Real):
                 raise TypeError(f"{entry.name} must be a number, got {value!r}")
-            if not math.isfinite(value) or value < 0.0 or (value == 0.0 and not friction):
+            if not math.isfinite(float(value)) or float(value) < 0.0 or (float(value) == 0.0 and not friction):
                 least = "at least 0" if friction else "above 0"
                 raise ValueError(f"{entry.name} must be finite and {least}, got {value:g}")
 
@@ -112,6 +115,8 @@ class Crane:
         """
         if not z > 0.0:
             raise ValueError(f"z must be above 0 (down), got {z:g}")
+        if not math.isfinite(x + z):
+            raise ValueError(f"x and z must be finite, got {x:g} and {z:g}")
         state = np.array([x - self.drum_radius, z, 0.0, 0.0, 0.0, 0.0])
         return state, np.array([0.0, -self.drum_radius * self.load_mass * self.gravity])
 
@@ -220,7 +225,7 @@ class Crane:
         """
         if plan.naxes != 2:
             raise ValueError(f"a plan of the load must have the axes x and z, got {plan.naxes} axes")
-        g, b = self.gravity, self.drum_radius
+        g = self.gravity
         fall = plan.extrema(2)
         if not g - fall.maximum[1] > 0.0:
             raise ValueError(
@@ -235,7 +240,7 @@ class Crane:
             raise ValueError(f"the rope length R must be above 0, got {least:.4g} m at {time:.4g} s")
 
     def _shortest_rope(self, plan: Trajectory, acceleration: Extrema) -> tuple[float, float]:
-        """Certified lower bound of R over a plan, or its least attained value where that is not above 0."""
+        """Certified lower bound of R over a plan, or its least value where that decides or no bound does."""
         g, b = self.gravity, self.drum_radius
 
         def length(jet: Array) -> Array:
@@ -249,7 +254,11 @@ class Crane:
         slopes = np.zeros((3, 2))
         slopes[0, 1] = pull / least
         slopes[2] = (depth + b) / least, depth / least + (depth * pull + b * across) / least**2
-        found = plan.bounds(length, 2, slopes)
+        try:
+            found = plan.bounds(length, 2, slopes, max_cells=200_000)
+        except ValueError:  # so near to a limit that no number of cells decides
+            resolved = plan.extrema_of(length, 2)
+            return float(resolved.minimum[0]), float(resolved.time_min[0])
         return (found.lower, found.time_min) if found.minimum > 0.0 else (found.minimum, found.time_min)
 
     # Linear models
@@ -258,10 +267,14 @@ class Crane:
         """D/F = 1/(s (M_c s + f1)): trolley alone, the tension a disturbance."""
         return _double(1.0 / self.trolley_mass, self.trolley_friction / self.trolley_mass, "F", "D", name)
 
-    def linear_hoist(self, name: str = "hoist") -> ct.StateSpace:
-        """R/C = b/(s (J s + f2)): drum alone, the tension a disturbance."""
-        gain = self.drum_radius / self.drum_inertia
-        return _double(gain, self.drum_friction / self.drum_inertia, "C", "R", name)
+    def linear_hoist(self, name: str = "hoist", *, with_load: bool = False) -> ct.StateSpace:
+        """R/C = b/(s (J s + f2)): drum alone, the tension a disturbance.
+
+        With the load, whose weight is balanced, J + m b^2 stands for J: the
+        nonlinear crane linearised at rest.
+        """
+        inertia = self.drum_inertia + (self.load_mass * self.drum_radius**2 if with_load else 0.0)
+        return _double(self.drum_radius / inertia, self.drum_friction / inertia, "C", "R", name)
 
     def linear_coupled(self, rope_length: float, name: str = "crane") -> ct.InterconnectedSystem:
         """Trolley and swing about rest at a rope length, coupled by the tension.
@@ -269,8 +282,8 @@ class Crane:
         An interconnection of the trolley and the pendulum; input F, outputs D
         and theta: D/F = (R s^2 + g)/(s [(M_c s + f1)(R s^2 + g) + m g s]).
         """
-        if not rope_length > 0.0:
-            raise ValueError(f"rope_length must be above 0, got {rope_length:g}")
+        if not 0.0 < rope_length < math.inf:
+            raise ValueError(f"rope_length must be above 0 and finite, got {rope_length:g}")
         g = self.gravity
         trolley = ct.ss(
             [[0.0, 1.0], [0.0, -self.trolley_friction / self.trolley_mass]],
@@ -316,11 +329,13 @@ class Crane:
         return ct.interconnect(blocks, inputs=["D_ref"], outputs=["D"], name="trolley_loop")
 
     def linear_hoist_loop(self, bandwidth: float = 5.0, tf: float = 0.02) -> ct.InterconnectedSystem:
-        """Drum alone with its PID, about the weight of the load: input R_ref, output R."""
+        """Drum and load with their PID, about the weight of the load: input R_ref, output R."""
         b = self.drum_radius
         gains = _triple_pole(self.drum_inertia / b + self.load_mass * b, self.drum_friction / b, bandwidth)
         pid = create_pid_iosystem(*gains, tf, inputs=("R_ref", "R"), output="C", name="hoist_pid")
-        return ct.interconnect([pid, self.linear_hoist()], inputs=["R_ref"], outputs=["R"], name="hoist_loop")
+        return ct.interconnect(
+            [pid, self.linear_hoist(with_load=True)], inputs=["R_ref"], outputs=["R"], name="hoist_loop"
+        )
 
     @property
     def _numbers(self) -> tuple[float, float, float, float, float, float, float]:

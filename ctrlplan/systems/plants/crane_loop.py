@@ -17,10 +17,13 @@ from ctrlplan.systems.plants.crane_laws import (
     create_still_iosystem,
 )
 from ctrlplan.systems.source import create_source_iosystem
-from ctrlplan.trajectories import Trajectory
+from ctrlplan.trajectories import Trajectory, stack
 
 # What each law asks of the plan: the highest derivative it reads, and the highest that must not jump.
 _NEEDS = {"still": (0, -1), "generator": (2, 0), "load_feedback": (2, 0), "dynamic": (4, 3), "feedforward": (4, 3)}
+_OPTIONS = {"load_feedback": ("load_bandwidth", "damping"), "dynamic": ("poles",)} | dict.fromkeys(
+    ("still", "generator", "feedforward"), ()
+)
 LAWS = tuple(_NEEDS)
 
 
@@ -86,10 +89,15 @@ def crane_loop(
     """
     if law not in _NEEDS:
         raise ValueError(f"law must be one of {', '.join(LAWS)}, got {law!r}")
+    unknown = set(options) - set(_OPTIONS[law])
+    if unknown:
+        known = ", ".join(_OPTIONS[law]) or "none"
+        raise ValueError(f"options of the law {law!r} must be among {known}, got {', '.join(sorted(unknown))}")
     order, smooth = _NEEDS[law]
+    plan = _named(plan)
     _check_smooth(plan, smooth, law)
     crane.check(plan)
-    source = create_source_iosystem(_named(plan), order, suffix="_ref")
+    source = create_source_iosystem(plan, order, suffix="_ref")
     plant = crane.iosystem()
     if law in ("dynamic", "feedforward"):
         if force_limits is not None or torque_limits is not None:
@@ -122,10 +130,16 @@ def crane_loop(
 
 
 def _named(plan: Trajectory) -> Trajectory:
-    """Plan whose axes are called x and z, whatever they were called."""
-    from ctrlplan.trajectories import stack
-
-    return plan if plan.labels == ("x", "z") else stack([plan], labels=["x", "z"])
+    """Plan of x and z: by name where its axes are called so, else in order."""
+    if not isinstance(plan, Trajectory):
+        raise TypeError(f"plan must be a Trajectory, got {type(plan).__name__}")
+    if plan.naxes != 2:
+        raise ValueError(f"a plan of the load must have the axes x and z, got {plan.naxes} axes")
+    if plan.labels == ("x", "z"):
+        return plan
+    if set(plan.labels) == {"x", "z"}:
+        return plan.select(["x", "z"])
+    return stack([plan], labels=["x", "z"])
 
 
 def _check_smooth(plan: Trajectory, smooth: int, law: str) -> None:
