@@ -211,7 +211,7 @@ def _compared(
     def measure(plan: Trajectory, response: Any) -> dict[str, float]:
         found, options = load_metrics(plan, response, last), laws[id(plan)]
         if options.get("law", "generator") in ("dynamic", "feedforward"):
-            return found  # they command force and torque themselves
+            return found | {"error_limited": np.nan}  # they command force and torque themselves
         return found | {"error_limited": _limited_error(plan, options, timepts)}
 
     found = compare(
