@@ -343,7 +343,8 @@ class Trajectory(Frozen, ABC):
         """Derivatives low to high, shape (high - low + 1, naxes, ntime)."""
         nlegs = self.breakpoints.size - 1
         if nlegs == 1 and not left and t.size and t.min() >= self.breakpoints[0] and t.max() <= self.breakpoints[1]:
-            return self._sample_leg(0, t - self.breakpoints[0], low, high)
+            origin = self.breakpoints[0]
+            return self._sample_leg(0, t - origin if origin else t, low, high)
         legs = np.searchsorted(self.breakpoints, t, side="left" if left else "right") - 1
         if nlegs and not left:
             legs[t == self.breakpoints[-1]] = nlegs - 1
