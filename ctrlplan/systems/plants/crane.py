@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
-from numbers import Real
 from typing import Any
 
 import control as ct
@@ -18,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ctrlplan.systems import series
 from ctrlplan.systems.pid import create_pid_iosystem
+from ctrlplan.systems.plants.parameters import check_parameters
 from ctrlplan.trajectories import Extrema, Trajectory
 
 Array = NDArray[np.float64]
@@ -74,18 +74,11 @@ class Crane:
     rope_wrap: bool = False
 
     def __post_init__(self) -> None:
-        for entry in fields(self):
-            value = getattr(self, entry.name)
-            if entry.name == "rope_wrap":
-                if not isinstance(value, bool):
-                    raise TypeError(f"rope_wrap must be True or False, got {value!r}")
-                continue
-            friction = entry.name.endswith("friction")
-            if isinstance(value, bool) or not isinstance(value, Real):
-                raise TypeError(f"{entry.name} must be a number, got {value!r}")
-            if not math.isfinite(float(value)) or float(value) < 0.0 or (float(value) == 0.0 and not friction):
-                least = "at least 0" if friction else "above 0"
-                raise ValueError(f"{entry.name} must be finite and {least}, got {value:g}")
+        if not isinstance(self.rope_wrap, bool):
+            raise TypeError(f"rope_wrap must be True or False, got {self.rope_wrap!r}")
+        numbers = {entry.name: getattr(self, entry.name) for entry in fields(self) if entry.name != "rope_wrap"}
+        frictions = {name: numbers.pop(name) for name in ("trolley_friction", "drum_friction")}
+        check_parameters(numbers, frictions)
 
     # The nonlinear plant
 

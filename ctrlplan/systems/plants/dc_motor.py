@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import control.flatsys as fs
 import numpy as np
+
+from ctrlplan.systems.plants.parameters import check_parameters
 
 
 def dc_motor(
@@ -61,11 +62,7 @@ def dc_motor(
         "motor_constant": motor_constant,
         "inertia": inertia,
     }
-    for label, value in parameters.items():
-        if not (math.isfinite(value) and value > 0.0):
-            raise ValueError(f"{label} must be finite and above 0, got {value}")
-    if not (math.isfinite(friction) and friction >= 0.0):
-        raise ValueError(f"friction must be finite and at least 0, got {friction}")
+    check_parameters(parameters, {"friction": friction})
     R, L, K, J, b = resistance, inductance, motor_constant, inertia, friction
 
     def update(t: float, x: Any, u: Any, params: dict[str, Any]) -> Any:

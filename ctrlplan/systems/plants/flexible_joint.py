@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import control.flatsys as fs
 import numpy as np
+
+from ctrlplan.systems.plants.parameters import check_parameters
 
 
 def flexible_joint(
@@ -66,11 +67,7 @@ def flexible_joint(
         "mass": mass,
         "length": length,
     }
-    for label, value in parameters.items():
-        if not (math.isfinite(value) and value > 0.0):
-            raise ValueError(f"{label} must be finite and above 0, got {value}")
-    if not (math.isfinite(gravity) and gravity >= 0.0):
-        raise ValueError(f"gravity must be finite and at least 0, got {gravity}")
+    check_parameters(parameters, {"gravity": gravity})
     I, J, k, weight = link_inertia, motor_inertia, stiffness, mass * gravity * length  # noqa: E741
 
     def update(t: float, x: Any, u: Any, params: dict[str, Any]) -> Any:
