@@ -145,11 +145,11 @@ def _sample_proxy(coefficients: Array, duration: float, t: Array) -> Array:
     flat = coefficients.reshape(nrows * naxes, size)
     out = np.empty((nrows * naxes, t.size))
     middle = radius = 0.5 * duration
-    chunk = max(1, min(_CHUNK, _PRODUCT // flat.size))
-    basis = np.empty((max(size, 2), chunk))
+    part = max(1, min(_CHUNK, _PRODUCT // flat.size))
+    basis = np.empty((max(size, 2), _CHUNK))
     basis[0] = 1.0
-    for first in range(0, t.size, chunk):
-        x = (t[first : first + chunk] - middle) / radius
+    for first in range(0, t.size, _CHUNK):
+        x = (t[first : first + _CHUNK] - middle) / radius
         terms = basis[:, : x.size]
         terms[1] = x
         top = 1  # T_{top + k} = 2 T_top T_k - T_{top - k}: twice as many at each turn
@@ -159,7 +159,9 @@ def _sample_proxy(coefficients: Array, duration: float, t: Array) -> Array:
             np.multiply(2.0 * terms[top], terms[1 : more + 1], out=block)
             block -= terms[top - more : top][::-1]
             top += more
-        np.matmul(flat, terms[:size], out=out[:, first : first + x.size])
+        for begin in range(0, x.size, part):
+            end = min(begin + part, x.size)
+            np.matmul(flat, terms[:size, begin:end], out=out[:, first + begin : first + end])
     return out.reshape(nrows, naxes, t.size)
 
 
