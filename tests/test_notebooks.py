@@ -56,6 +56,7 @@ def test_it_tells_a_story(notebook):
     assert notebook.cells[0].source.startswith("# ")
 
 
+@pytest.mark.slow
 def test_it_runs(notebook, path):
     nbclient = pytest.importorskip("nbclient")
     client = nbclient.NotebookClient(
