@@ -74,7 +74,7 @@ class NewtonSpline(Trajectory):
         duration = times[-1] - start if period is None else period
         if not 0.0 < duration < np.inf:
             raise ValueError(f"duration must be finite and above 0, got {times[-1]} s after {start} s")
-        same_clock = donor is not None and donor._times == times
+        same_clock = donor is not None and donor._times == times and donor._duration == duration
         relative = donor._relative if donor and same_clock else (np.array(times) - start) / duration
         lent = donor._systems if donor and (same_clock or np.array_equal(donor._relative, relative)) else {}
         table, patterns = given_entries(waypoints)

@@ -113,3 +113,13 @@ def test_with_values_retime_and_several_axes():
     np.testing.assert_allclose(slow(2 * t, 1), plan(t, 1) / 2, rtol=0, atol=1e-14)
     np.testing.assert_array_equal(plan.with_values(points)(t), plan(t))
     np.testing.assert_allclose(plan.shift(7.0)(t + 7.0), plan(t), rtol=0, atol=1e-14)
+
+
+def test_one_waypoint_keeps_its_own_period_when_retimed():
+    """The times are the same, the period is not."""
+    plan = TrigSpline.cyclic([Waypoint(1.0, 2.0, 0.5)], 2.0)
+    slower = plan.retime(5.0)
+    assert (slower.start, slower.end) == (1.0, 6.0)
+    t = np.linspace(0.0, 1.0, 11)
+    np.testing.assert_allclose(slower(1.0 + 5.0 * t), plan(1.0 + 2.0 * t), rtol=1e-13)
+    np.testing.assert_allclose(slower(1.0 + 5.0 * t, 1), plan(1.0 + 2.0 * t, 1) * 0.4, rtol=1e-12, atol=1e-15)
