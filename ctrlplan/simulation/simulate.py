@@ -14,6 +14,7 @@ from ctrlplan.simulation.exact import exact_states
 from ctrlplan.simulation.linear import LinearForm, NotLinearError, linear_form
 from ctrlplan.simulation.numerical import numerical_response
 from ctrlplan.trajectories import Step, Trajectory
+from ctrlplan.trajectories.files import signal_rows
 
 Array = NDArray[np.float64]
 Inputs = Trajectory | ArrayLike | Mapping[str, Trajectory | ArrayLike] | None
@@ -168,7 +169,7 @@ def _exact(
     breakpoints = [t for plan, _ in plans for t in plan.breakpoints]
     with np.errstate(over="ignore", invalid="ignore"):
         states = exact_states(form.a, form.b, jet, breakpoints, times, state)
-        signals = [plan.jet(times, high).transpose(1, 0, 2).reshape(-1, times.size) for plan, high in plans]
+        signals = [signal_rows(plan, times, high) for plan, high in plans]
         driven = np.concatenate(signals) if signals else np.zeros((0, times.size))
         outputs = form.c @ states + form.d @ driven
     return _response(system, times, _finite(outputs), _finite(states), driven[: system.ninputs or 0], "exact", reason)

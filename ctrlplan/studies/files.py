@@ -23,8 +23,8 @@ from ctrlplan.studies.comparison import compare, standard_plans
 from ctrlplan.studies.crane import CRANE_MEASURES, load_metrics, marked_slack
 from ctrlplan.studies.study import Study
 from ctrlplan.systems.plants import LAWS, Crane, crane_loop, unity_feedback_loop
-from ctrlplan.trajectories import PiecewiseSpline, PolySpline, Step, Trajectory, TrigSpline, Waypoint, derivative_name
-from ctrlplan.trajectories.files import csv_header
+from ctrlplan.trajectories import PiecewiseSpline, PolySpline, Step, Trajectory, TrigSpline, Waypoint
+from ctrlplan.trajectories.files import csv_header, signal_names, signal_rows
 
 FAMILIES = {
     "trigonometric": (TrigSpline, ("alpha", "gamma", "degree", "smooth")),
@@ -273,8 +273,8 @@ def plans_as_csv(study: StudyFile, order: int = 2) -> str:
     times = np.union1d(times, [w.time for w in study.waypoints])
     names, rows = ["time"], [times]
     for name, plan in study.plans.items():
-        names += [f"{name}.{derivative_name(label, k)}" for label in plan.labels for k in range(order + 1)]
-        rows += list(plan.jet(times, order).transpose(1, 0, 2).reshape(-1, times.size))
+        names += [f"{name}.{signal}" for signal in signal_names(plan.labels, order)]
+        rows += list(signal_rows(plan, times, order))
     try:
         header = csv_header(names)
     except ValueError as error:

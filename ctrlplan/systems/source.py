@@ -8,8 +8,9 @@ import control as ct
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ctrlplan.trajectories import Trajectory, derivative_name
+from ctrlplan.trajectories import Trajectory
 from ctrlplan.trajectories.common import checked_count
+from ctrlplan.trajectories.files import signal_names, signal_rows
 
 Array = NDArray[np.float64]
 
@@ -29,7 +30,7 @@ class PlanSource(ct.NonlinearIOSystem):  # type: ignore[misc]
     """
 
     def __init__(self, plan: Trajectory, derivatives: int, name: str, suffix: str) -> None:
-        labels = [derivative_name(label + suffix, k) for label in plan.labels for k in range(derivatives + 1)]
+        labels = signal_names([label + suffix for label in plan.labels], derivatives)
         super().__init__(None, self._output, inputs=0, outputs=labels, dt=None, name=name)
         self.plan = plan
         self.derivatives = derivatives
@@ -105,8 +106,7 @@ def source_samples(plan: Trajectory, timepts: ArrayLike, derivatives: int = 0) -
     ndarray, shape (ntime,) for a single signal, (nsignals, ntime) for more
     """
     times = np.atleast_1d(np.asarray(timepts, dtype=float))
-    jet = _checked_plan(plan).jet(times, checked_count(derivatives, "derivatives"))
-    samples = jet.transpose(1, 0, 2).reshape(-1, jet.shape[2])
+    samples = signal_rows(_checked_plan(plan), times, checked_count(derivatives, "derivatives"))
     return samples[0] if len(samples) == 1 else samples
 
 

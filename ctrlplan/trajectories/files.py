@@ -6,13 +6,14 @@ import csv
 import io
 import json
 import os
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ctrlplan.trajectories.common import checked_timepts
+from ctrlplan.trajectories.common import Array, checked_timepts
 from ctrlplan.trajectories.trajectory import Trajectory
 
 
@@ -91,8 +92,7 @@ def write_csv(plan: Trajectory, path: str | os.PathLike[str], timepts: ArrayLike
         Highest derivative; columns are x, x_d1, x_d2, ...
     """
     times = np.linspace(plan.start, plan.end, 1001) if timepts is None else np.atleast_1d(checked_timepts(timepts))
-    jet = plan.jet(times, order)
-    columns = np.concatenate([times[None], jet.transpose(1, 0, 2).reshape(-1, times.size)])
+    columns = np.concatenate([times[None], signal_rows(plan, times, order)])
     np.savetxt(path, columns.T, fmt="%.17g", delimiter=",", header=csv_header(column_names(plan, order)), comments="")
 
 
@@ -108,7 +108,17 @@ def csv_header(names: list[str]) -> str:
 
 def column_names(plan: Trajectory, order: int) -> list[str]:
     """Names of the columns: time, x, x_d1, x_d2, z, z_d1, ..."""
-    return ["time"] + [derivative_name(label, k) for label in plan.labels for k in range(order + 1)]
+    return ["time", *signal_names(plan.labels, order)]
+
+
+def signal_names(labels: Iterable[str], order: int) -> list[str]:
+    """Names axis by axis: x, x_d1, x_d2, z, z_d1, ..."""
+    return [derivative_name(label, k) for label in labels for k in range(order + 1)]
+
+
+def signal_rows(plan: Trajectory, times: Array, order: int) -> Array:
+    """Values axis by axis, in the order of `signal_names`: (naxes (order + 1), ntime)."""
+    return plan.jet(times, order).transpose(1, 0, 2).reshape(-1, times.size)
 
 
 def derivative_name(label: str, order: int) -> str:
