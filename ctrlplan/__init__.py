@@ -21,14 +21,17 @@ _EXPORTS = {
         "trajectory_from_dict",
     ),
     "systems": (
+        "create_delay_iosystem",
         "create_feedforward_iosystem",
         "create_flat_iosystem",
         "create_pid_iosystem",
+        "create_saturation_iosystem",
         "create_source_iosystem",
         "plants",
+        "sample_hold",
         "source_samples",
     ),
-    "simulation": ("simulate",),
+    "simulation": ("Event", "prepare", "simulate"),
     "studies": ("Comparison", "Sweep", "compare", "sweep"),
 }
 _HOME = {name: module for module, names in _EXPORTS.items() for name in names}

@@ -1,5 +1,17 @@
-"""Responses of loops: exact where they are linear."""
+"""Responses of loops: exact where they are linear, compiled where they can be, right in any case."""
 
-from ctrlplan.simulation.simulate import rest_state, simulate, state_space, unstable_poles
+from ctrlplan.simulation.events import Event, Occurrence
+from ctrlplan.simulation.prepared import Prepared, prepare, state_space
+from ctrlplan.simulation.rest import rest_state, unstable_poles
+from ctrlplan.simulation.simulate import simulate
 
-__all__ = ["rest_state", "simulate", "state_space", "unstable_poles"]
+__all__ = [
+    "Event",
+    "Occurrence",
+    "Prepared",
+    "prepare",
+    "rest_state",
+    "simulate",
+    "state_space",
+    "unstable_poles",
+]

@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import warnings
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import control as ct
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.linalg import null_space
 
-from ctrlplan.simulation.exact import exact_states
-from ctrlplan.simulation.linear import LinearForm, NotLinearError, linear_form
-from ctrlplan.simulation.numerical import numerical_response
-from ctrlplan.trajectories import Step, Trajectory
-from ctrlplan.trajectories.files import signal_rows
+from ctrlplan.simulation.drives import Inputs, driven_signals, input_drives
+from ctrlplan.simulation.events import Event, Occurrence, crossings
+from ctrlplan.simulation.prepared import Prepared, prepared_form
+from ctrlplan.simulation.runs import METHODS, Job, Record, recorded
 
 Array = NDArray[np.float64]
-Inputs = Trajectory | ArrayLike | Mapping[str, Trajectory | ArrayLike] | None
-
-METHODS = ("auto", "exact", "python")
 
 
 def simulate(
@@ -31,18 +27,22 @@ def simulate(
     rtol: float = 1e-8,
     atol: float = 1e-10,
     params: Mapping[str, Any] | None = None,
+    events: Sequence[Event] | None = None,
 ) -> ct.TimeResponseData:
     """Response of a system to plans.
 
     A continuous linear system, interconnections and plan sources included, is
     solved exactly: the error is that of rounding whatever the sample spacing.
-    Anything else is integrated numerically from breakpoint to breakpoint, so
-    that no plan is skipped.
+    Others are flattened, each block called once a step, and integrated from
+    breakpoint to breakpoint, so that no plan is skipped: compiled by CasADi
+    under CVODES where every block can be traced, by Python and LSODA otherwise.
 
     Parameters
     ----------
-    system : control system
-        With whatever inputs; unmodified python-control objects.
+    system : control system or Prepared
+        With whatever inputs; unmodified python-control objects, or what
+        `prepare` made of one. The built form is kept, and made anew where maps,
+        parameters or blocks have changed.
     timepts : array_like, shape (ntime,)
         Sample times [s], strictly increasing, two or more.
     inputs : Trajectory, array_like, mapping or None, optional
@@ -52,209 +52,126 @@ def simulate(
     initial_state : array_like, optional
         State at the first sample time, a scalar for all; where it is 0 and the
         system has an attribute ``initial_state`` (as `crane_loop` sets), that.
-    method : {"auto", "exact", "python"}, optional
-        "exact" insists on the exact solution.
+    method : {"auto", "exact", "compiled", "python"}, optional
+        "auto" takes the first of the others that can be taken; they insist.
     rtol, atol : float, optional
         Tolerances of a numerical solver; "exact" needs none.
     params : mapping, optional
         Parameters of the blocks.
+    events : sequence of Event, optional
+        Limits of signals whose crossings are recorded, and may end the run;
+        those that blocks declare, as limits of a PID, are recorded unless an
+        empty sequence is given.
 
     Returns
     -------
     control.TimeResponseData
         Labelled and ordered as python-control does, with the attributes
-        ``method`` and ``reason`` saying what ran and why.
+        ``method`` and ``reason`` saying what ran and why, and ``events``, a
+        list of `Occurrence` in order of time. Where an event ended the run its
+        time is the last.
 
     Raises
     ------
+    TypeError
+        If `system` is no system.
     ValueError
-        If times do not increase, inputs do not fit, or ``method="exact"`` is
-        asked of a system that is not linear.
+        If times do not increase, inputs do not fit, or a method is asked for
+        that the system does not allow; the reason is in the message.
+    RuntimeError
+        If a solver fails, or an algebraic loop has no solution that is found;
+        time or blocks are in the message.
+
+    Warns
+    -----
+    UserWarning
+        If a block has equations of a kind that only python-control runs: its
+        `control.input_output_response` is then used, with the same tolerances.
     """
     times = np.asarray(timepts, dtype=float)
     if times.ndim != 1 or times.size < 2 or not np.isfinite(times).all() or not np.all(np.diff(times) > 0):
         raise ValueError(f"timepts must be two or more finite times that increase strictly, got {timepts!r:.80}")
     if method not in METHODS:
         raise ValueError(f"method must be one of {', '.join(METHODS)}, got {method!r}")
-    system = state_space(system)
-    sources = _sources(system, inputs, times)
-    form, reason = _exact_form(system, sources, params)
-    if method == "exact" and form is None:
-        raise ValueError(f'method "exact" must be given a linear continuous system and trajectories, but {reason}')
-    state = _initial_state(system, initial_state)
-    if form is not None and method != "python":
-        return _exact(system, form, [s for s in sources if isinstance(s, Trajectory)], times, state, reason)
-    outputs, states, driven = numerical_response(system, sources, times, state, rtol, atol, dict(params or {}))
-    why = reason if form is None else 'method "python" was asked for'
-    return _response(system, times, outputs, states, driven, "python", why)
+    prepared = prepared_form(system)
+    drives = input_drives(prepared.input_labels, inputs, times)
+    state = _checked_state(prepared, initial_state)
+    job = Job(prepared, times, drives, state, dict(params or {}), (rtol, atol), events)
+    if prepared.network is None and prepared.linear is None:
+        return _delegated(job)
+    return _response(job, recorded(job, method))
 
 
-def _sources(system: Any, inputs: Inputs, times: Array) -> list[Trajectory | Array]:
-    """What drives the inputs, in order: trajectories, or samples (ntime,) of one input."""
-    names = list(system.input_labels or [])
-    given: list[Any]
-    if isinstance(inputs, Mapping):
-        for name in inputs:
-            if name not in names:
-                raise ValueError(f"inputs must be among {', '.join(names) or 'none'}, got {name!r}")
-        given = [inputs.get(name, 0.0) for name in names]
-    elif isinstance(inputs, Trajectory):
-        if inputs.naxes != len(names):
-            known = f"({', '.join(names)})" if names else "(the system has no inputs)"
-            raise ValueError(f"inputs must have {len(names)} axes {known}, got {inputs.naxes}")
-        return [inputs]
-    elif inputs is None or np.ndim(inputs) == 0:
-        given = [0.0 if inputs is None else inputs] * len(names)
-    else:
-        rows = np.asarray(inputs, dtype=float)
-        rows = rows[None] if rows.ndim == 1 and len(names) == 1 else rows
-        if rows.shape not in ((len(names), times.size), (len(names),)):
-            raise ValueError(f"inputs must have shape ({len(names)}, {times.size}), got {rows.shape}")
-        given = list(rows)
-    return [_source(value, name, times) for value, name in zip(given, names, strict=True)]
+def _response(job: Job, record: Record) -> ct.TimeResponseData:
+    """Response at the times asked for, up to the event that ends it."""
+    prepared = job.prepared
+    found = _occurrences(record)
+    places = np.searchsorted(record.times, job.times[job.times <= record.times[-1]])
+    times, states = record.times[places], record.states[:, places]
+    last = next((occurrence.time for occurrence in found if occurrence.stop), None)
+    if last is not None:
+        end = record.state_at(max(0, int(np.searchsorted(record.times, last)) - 1), last)
+        times, states = np.append(times[times < last], last), np.column_stack([states[:, times < last], end])
+        found = [occurrence for occurrence in found if occurrence.time <= last]
+    seen = record.see(times, states)
+    response = ct.TimeResponseData(
+        times,
+        seen.y,
+        states,
+        seen.u if len(seen.u) else None,
+        issiso=prepared.issiso,
+        output_labels=prepared.output_labels,
+        state_labels=prepared.state_labels,
+        input_labels=prepared.input_labels if len(seen.u) else None,
+        sysname=prepared.name,
+        title=f"Response of {prepared.name}",
+        plot_inputs=bool(len(seen.u)),
+    )
+    response.method, response.reason, response.events = record.method, record.reason, found
+    return response
 
 
-def _source(value: Any, name: str, times: Array) -> Trajectory | Array:
-    if isinstance(value, Trajectory):
-        if value.naxes != 1:
-            raise ValueError(f"input {name} must be driven by one axis, got {value.naxes}")
-        return value
-    signal = np.asarray(value, dtype=float)
-    if not np.isfinite(signal).all():
-        raise ValueError(f"input {name} must be finite, got nan or inf at index {int((~np.isfinite(signal)).argmax())}")
-    if signal.ndim == 0:
-        return Step(signal, initial=signal, time=times[0])
-    if signal.shape != times.shape:
-        kinds = f"a trajectory, a number or {times.size} samples"
-        raise ValueError(f"input {name} must be {kinds}, got shape {signal.shape}")
-    return signal
+def _occurrences(record: Record) -> list[Occurrence]:
+    """Every crossing of what was watched, in order of time."""
+    if not record.watched:
+        return []
+    seen, found = record.see(record.times, record.states), []
+    for entry in record.watched:
+
+        def value_at(k: int, t: float, entry: Any = entry) -> float:
+            state = record.state_at(k, t)
+            return float(entry.value(record.see(np.array([t]), state[:, None]))[0])
+
+        found += crossings(entry, record.times, entry.value(seen), value_at)
+    return sorted(found, key=lambda occurrence: occurrence.time)
 
 
-def _initial_state(system: Any, initial_state: ArrayLike) -> Array:
-    if np.ndim(initial_state) == 0 and initial_state == 0 and hasattr(system, "initial_state"):
-        initial_state = system.initial_state
+def _delegated(job: Job) -> ct.TimeResponseData:
+    """Response by python-control, of what only it runs."""
+    prepared, (rtol, atol) = job.prepared, job.tolerances
+    warnings.warn(
+        f"{prepared.unsupported}: run by control.input_output_response, without events", UserWarning, stacklevel=3
+    )
+    response = ct.input_output_response(
+        prepared.system,
+        job.times,
+        driven_signals(job.inputs, job.times) if job.inputs else 0,
+        job.state,
+        params=job.params or None,
+        solve_ivp_method="LSODA",
+        solve_ivp_kwargs={"rtol": rtol, "atol": atol},
+    )
+    response.method, response.reason, response.events = "python", prepared.unsupported, []
+    return response
+
+
+def _checked_state(prepared: Prepared, initial_state: ArrayLike) -> Array:
+    if np.ndim(initial_state) == 0 and initial_state == 0 and prepared.initial_state is not None:
+        initial_state = prepared.initial_state
     state = np.asarray(initial_state, dtype=float)
-    count = system.nstates or 0
+    count = prepared.nstates
     if state.ndim and state.shape != (count,):
         raise ValueError(f"initial_state must be a scalar or have {count} entries, got shape {state.shape}")
     if not np.isfinite(state).all():
         raise ValueError(f"initial_state must be finite, got {initial_state!r}")
     return np.broadcast_to(state, (count,)).copy()
-
-
-def _exact_form(
-    system: Any, sources: list[Trajectory | Array], params: Mapping[str, Any] | None
-) -> tuple[LinearForm | None, str]:
-    """Linear form where the exact method holds, and why it does or not."""
-    if params:
-        return None, "params may change the blocks"
-    if not all(isinstance(s, Trajectory) for s in sources):
-        return None, "an input is given by samples"
-    try:
-        return linear_form(system), "linear, continuous, driven by trajectories"
-    except NotLinearError as error:
-        return None, str(error)
-
-
-def _exact(
-    system: Any, form: LinearForm, drives: list[Trajectory], times: Array, state: Array, reason: str
-) -> ct.TimeResponseData:
-    plans = [(drive, 0) for drive in drives] + list(form.sources)
-
-    def jet(moment: float, origin: float, s: Array, order: int) -> Array:
-        rows = [plan._jet_beside(moment, origin, s, order + high) for plan, high in plans]
-        signals = [_derivatives(row, high, order) for row, (_, high) in zip(rows, plans, strict=True)]
-        return np.concatenate(signals, axis=1) if signals else np.zeros((order + 1, 0, s.size))
-
-    breakpoints = [t for plan, _ in plans for t in plan.breakpoints]
-    with np.errstate(over="ignore", invalid="ignore"):
-        states = exact_states(form.a, form.b, jet, breakpoints, times, state)
-        signals = [signal_rows(plan, times, high) for plan, high in plans]
-        driven = np.concatenate(signals) if signals else np.zeros((0, times.size))
-        outputs = form.c @ states + form.d @ driven
-    return _response(system, times, _finite(outputs), _finite(states), driven[: system.ninputs or 0], "exact", reason)
-
-
-def _derivatives(jet: Array, high: int, order: int) -> Array:
-    """Jets (order + 1, naxes (high + 1), ntime) of a plan and its derivatives, axis by axis."""
-    shifted = np.stack([jet[k : k + order + 1] for k in range(high + 1)], axis=2)
-    return shifted.reshape(order + 1, -1, jet.shape[2])
-
-
-def _finite(values: Array) -> Array:
-    """An unstable loop that has left the range of numbers is infinite, not undefined."""
-    values[np.isnan(values)] = np.inf
-    return values
-
-
-def _response(
-    system: Any, times: Array, outputs: Array, states: Array, inputs: Array, method: str, reason: str
-) -> ct.TimeResponseData:
-    response = ct.TimeResponseData(
-        times,
-        outputs,
-        states,
-        inputs if len(inputs) else None,
-        issiso=system.issiso(),
-        output_labels=system.output_labels,
-        state_labels=system.state_labels,
-        input_labels=system.input_labels if len(inputs) else None,
-        sysname=system.name,
-        title=f"Response of {system.name}",
-        plot_inputs=bool(len(inputs)),
-    )
-    response.method, response.reason, response.events = method, reason, []
-    return response
-
-
-def state_space(system: Any) -> Any:
-    """Same system with states, where it is a transfer function."""
-    if not isinstance(system, ct.TransferFunction):
-        return system
-    return ct.ss(system, name=system.name, inputs=system.input_labels, outputs=system.output_labels)
-
-
-def rest_state(system: Any, position: ArrayLike) -> Array:
-    """State at which a linear loop rests when its inputs are held.
-
-    Parameters
-    ----------
-    system : control system
-        Linear and continuous; of others the zero state is returned.
-    position : array_like, shape (ninputs,)
-        What the inputs are held at.
-
-    Returns
-    -------
-    ndarray, shape (nstates,)
-        A solution of A x + B w = 0, with outputs as near w as it allows; zero
-        where there is none.
-    """
-    held = np.atleast_1d(np.asarray(position, dtype=float))
-    if not held.any():
-        return np.zeros(system.nstates or 0)
-    try:
-        form = linear_form(system)
-    except NotLinearError:
-        return np.zeros(system.nstates or 0)
-    if form.b.shape[1] != held.size:
-        return np.zeros(len(form.a))
-    supplied = form.b @ held
-    state: Array = np.linalg.lstsq(form.a, -supplied, rcond=None)[0]
-    if np.abs(form.a @ state + supplied).max(initial=0.0) > 1e-9 * np.abs(supplied).max(initial=0.0):
-        return np.zeros(len(form.a))
-    # Where integrators leave a choice, the outputs should be what is asked for.
-    idle, tracked = null_space(form.a), form.c[: held.size]
-    if idle.size and len(tracked) == held.size:
-        missing = held - tracked @ state - form.d[: held.size] @ held
-        state = state + idle @ np.linalg.lstsq(tracked @ idle, missing, rcond=None)[0]
-    return state
-
-
-def unstable_poles(system: Any) -> NDArray[np.complex128]:
-    """Poles in the right half plane of a linear continuous system; of others none are known."""
-    try:
-        poles = np.linalg.eigvals(linear_form(system).a).astype(complex)
-    except NotLinearError:
-        return np.empty(0, dtype=complex)
-    return poles[poles.real > 1e-9 * np.maximum(1e-300, np.abs(poles))]

@@ -3,16 +3,23 @@
 from ctrlplan.systems import plants
 from ctrlplan.systems.feedforward import create_feedforward_iosystem
 from ctrlplan.systems.flat import create_flat_iosystem, hurwitz_coefficients
+from ctrlplan.systems.hybrid import Delay, SampleHold, create_delay_iosystem, sample_hold
 from ctrlplan.systems.pid import create_pid_iosystem
+from ctrlplan.systems.saturation import create_saturation_iosystem
 from ctrlplan.systems.source import PlanSource, create_source_iosystem, source_samples
 
 __all__ = [
+    "Delay",
     "PlanSource",
+    "SampleHold",
+    "create_delay_iosystem",
     "create_feedforward_iosystem",
     "create_flat_iosystem",
     "create_pid_iosystem",
+    "create_saturation_iosystem",
     "create_source_iosystem",
     "hurwitz_coefficients",
     "plants",
+    "sample_hold",
     "source_samples",
 ]

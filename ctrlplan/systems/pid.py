@@ -106,7 +106,9 @@ def create_pid_iosystem(
         return np.array([limited(total(x, u))])
 
     block = ct.nlsys(update, out, **names)
-    block.limits = {output: (low, high)}
+    if limits is not None:
+        # What `ctrlplan.simulate` records the crossings of.
+        block.watched = {output: (lambda t, x, u, params: total(x, u), low, high)}
     return block
 
 

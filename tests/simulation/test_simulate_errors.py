@@ -90,16 +90,15 @@ def test_initial_states_that_are_not_numbers(initial, method):
 
 
 @pytest.mark.parametrize(
-    ("system", "inputs", "params", "match"),
+    ("system", "inputs", "match"),
     [
-        (BENT, PLAN, None, "bent"),
-        (LOOP, np.sin(T), None, "samples"),
-        (LOOP, PLAN, {"k": 1.0}, "params"),
+        (BENT, PLAN, "bent"),
+        (LOOP, np.sin(T), "samples"),
         (ct.interconnect([BENT, LOOP], connections=[["bent.r", "loop.y"]], inplist=["loop.r"], outlist=["bent.y[0]"]),
-         PLAN, None, "bent"),
+         PLAN, "bent"),
     ],
-    ids=["nonlinear", "samples", "params", "nonlinear inside"],
+    ids=["nonlinear", "samples", "nonlinear inside"],
 )  # fmt: skip
-def test_the_exact_method_says_why_it_cannot(system, inputs, params, match):
+def test_the_exact_method_says_why_it_cannot(system, inputs, match):
     with pytest.raises(ValueError, match=f'method "exact" .*{match}'):
-        cp.simulate(system, T, inputs, method="exact", params=params)
+        cp.simulate(system, T, inputs, method="exact")

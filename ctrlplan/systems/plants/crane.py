@@ -23,6 +23,15 @@ from ctrlplan.trajectories import Extrema, Trajectory
 Array = NDArray[np.float64]
 
 STATES = ("D", "R", "theta", "D_d1", "R_d1", "theta_d1")
+_NUMBERS = (
+    "load_mass",
+    "trolley_mass",
+    "drum_inertia",
+    "drum_radius",
+    "trolley_friction",
+    "drum_friction",
+    "gravity",
+)
 OUTPUTS = ("x", "z", "D", "R", "theta", "x_d1", "z_d1", "D_d1", "R_d1", "theta_d1", "T")
 
 
@@ -87,7 +96,9 @@ class Crane:
 
         States D, R, theta and their rates; inputs F [N] on the trolley and C
         [N m] on the drum; outputs x, z, D, R, theta, the rates x_d1, z_d1,
-        D_d1, R_d1, theta_d1, and the tension T [N].
+        D_d1, R_d1, theta_d1, and the tension T [N]. Parameters of a run named
+        as this crane's own (``params={"load_mass": 1000.0}``) overrule them in
+        the plant alone: a payload that the controller does not know of.
         """
         return ct.nlsys(
             self._update,
@@ -115,7 +126,12 @@ class Crane:
 
     def accelerations(self, state: Any, force: Any, torque: Any) -> tuple[Any, Any, Any, Any]:
         """D'', R'', theta'' and the tension T, solved from (13) and (14)."""
-        m, trolley, inertia, b, f1, f2, g = self._numbers
+        return self._accelerations(self._numbers(), state, force, torque)
+
+    def _accelerations(
+        self, numbers: tuple[Any, ...], state: Any, force: Any, torque: Any
+    ) -> tuple[Any, Any, Any, Any]:
+        m, trolley, inertia, b, f1, f2, g = numbers
         _, r, theta, d_rate, r_rate, rate = (state[i] for i in range(6))
         s, c = np.sin(theta), np.cos(theta)
         # Each acceleration is linear in T; the first equation of motion then gives T.
@@ -138,8 +154,8 @@ class Crane:
         The drum turns at R'/b, or with `rope_wrap` at R'/b - theta'.
         """
         values = np.asarray(state, dtype=float)
-        m, trolley, inertia, b, _, _, g = self._numbers
-        _, z, x_rate, z_rate = self._load(values)
+        m, trolley, inertia, b, _, _, g = self._numbers()
+        _, z, x_rate, z_rate = _load(self.drum_radius, values)
         drum = values[4] / b - (values[5] if self.rope_wrap else 0.0)
         kinetic = 0.5 * (m * (x_rate**2 + z_rate**2) + trolley * values[3] ** 2 + inertia * drum**2)
         return kinetic - m * g * z
@@ -170,7 +186,7 @@ class Crane:
         values = np.asarray(jet, dtype=float)
         if values.ndim < 2 or values.shape[1] != 2 or len(values) < 3:
             raise ValueError(f"jet must have shape (order + 1, 2, ...) with order at least 2, got {values.shape}")
-        m, trolley, inertia, b, f1, f2, g = self._numbers
+        m, trolley, inertia, b, f1, f2, g = self._numbers()
         lowest = float(np.min(g - values[2, 1], initial=np.inf))
         if not lowest > 0.0:
             raise ValueError(f"g - z'' must be above 0 for a taut rope, got {lowest:.4g} m/s^2")
@@ -330,36 +346,31 @@ class Crane:
             [pid, self.linear_hoist(with_load=True)], inputs=["R_ref"], outputs=["R"], name="hoist_loop"
         )
 
-    @property
-    def _numbers(self) -> tuple[float, float, float, float, float, float, float]:
-        return (
-            self.load_mass,
-            self.trolley_mass,
-            self.drum_inertia,
-            self.drum_radius,
-            self.trolley_friction,
-            self.drum_friction,
-            self.gravity,
-        )
-
-    def _load(self, state: Any) -> tuple[Any, Any, Any, Any]:
-        """x, z and their rates of a state."""
-        b = self.drum_radius
-        d, r, theta, d_rate, r_rate, rate = (state[i] for i in range(6))
-        s, c = np.sin(theta), np.cos(theta)
-        x, z = r * s + d + b * c, r * c - b * s
-        x_rate = r_rate * s + r * rate * c + d_rate - b * rate * s
-        z_rate = r_rate * c - r * rate * s - b * rate * c
-        return x, z, x_rate, z_rate
+    def _numbers(self, params: dict[str, Any] | None = None) -> tuple[Any, ...]:
+        """m, M_c, J, b, f1, f2, g, each overruled by a parameter of a run."""
+        if not params:
+            return tuple(getattr(self, name) for name in _NUMBERS)
+        return tuple(params.get(name, getattr(self, name)) for name in _NUMBERS)
 
     def _update(self, t: float, state: Any, inputs: Any, params: dict[str, Any]) -> Array:
-        d2, r2, theta2, _ = self.accelerations(state, inputs[0], inputs[1])
+        d2, r2, theta2, _ = self._accelerations(self._numbers(params), state, inputs[0], inputs[1])
         return np.array([state[3], state[4], state[5], d2, r2, theta2])
 
     def _output(self, t: float, state: Any, inputs: Any, params: dict[str, Any]) -> Array:
-        x, z, x_rate, z_rate = self._load(state)
-        tension = self.accelerations(state, inputs[0], inputs[1])[3]
+        numbers = self._numbers(params)
+        x, z, x_rate, z_rate = _load(numbers[3], state)
+        tension = self._accelerations(numbers, state, inputs[0], inputs[1])[3]
         return np.array([x, z, state[0], state[1], state[2], x_rate, z_rate, state[3], state[4], state[5], tension])
+
+
+def _load(b: Any, state: Any) -> tuple[Any, Any, Any, Any]:
+    """x, z and their rates of a state, b the radius of the drum."""
+    d, r, theta, d_rate, r_rate, rate = (state[i] for i in range(6))
+    s, c = np.sin(theta), np.cos(theta)
+    x, z = r * s + d + b * c, r * c - b * s
+    x_rate = r_rate * s + r * rate * c + d_rate - b * rate * s
+    z_rate = r_rate * c - r * rate * s - b * rate * c
+    return x, z, x_rate, z_rate
 
 
 def _double(gain: float, damping: float, source: str, sink: str, name: str) -> ct.StateSpace:

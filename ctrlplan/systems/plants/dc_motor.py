@@ -26,6 +26,9 @@ def dc_motor(
     States, which are the outputs as well: angle [rad], speed [rad/s], current
     [A]. Input: voltage [V]. Flat output: the angle.
 
+    Parameters of a run of the same names overrule those below in the plant
+    alone, not in its flat maps.
+
     Parameters
     ----------
     resistance : float, optional
@@ -64,12 +67,14 @@ def dc_motor(
     }
     check_parameters(parameters, {"friction": friction})
     R, L, K, J, b = resistance, inductance, motor_constant, inertia, friction
+    own = {**parameters, "friction": friction}
 
     def update(t: float, x: Any, u: Any, params: dict[str, Any]) -> Any:
+        R, L, K, J, b = ((params or {}).get(name, value) for name, value in own.items())
         return np.array([x[1], (K * x[2] - b * x[1]) / J, (u[0] - R * x[2] - K * x[1]) / L])
 
     def forward(x: Any, u: Any, params: Any = None) -> list[Any]:
-        _, second, current_rate = update(0.0, x, u, params)
+        _, second, current_rate = update(0.0, x, u, {})
         return [np.array([x[0], x[1], second, (K * current_rate - b * second) / J])]
 
     def reverse(flag: Any, params: Any = None) -> tuple[Any, Any]:

@@ -28,6 +28,9 @@ def flexible_joint(
     (0 hanging down) and motor, and their rates q1_d1 and q2_d1 [rad/s]. Input:
     u [N m]. Flat output: q1.
 
+    Parameters of a run of the same names overrule those below in the plant
+    alone, not in its flat maps.
+
     Parameters
     ----------
     link_inertia : float, optional
@@ -70,12 +73,16 @@ def flexible_joint(
     check_parameters(parameters, {"gravity": gravity})
     I, J, k, weight = link_inertia, motor_inertia, stiffness, mass * gravity * length  # noqa: E741
 
+    own = {**parameters, "gravity": gravity}
+
     def update(t: float, x: Any, u: Any, params: dict[str, Any]) -> Any:
+        I, J, k, m, l, g = ((params or {}).get(name, value) for name, value in own.items())  # noqa: E741
+        weight = m * g * l
         spring = k * (x[1] - x[0])
         return np.array([x[2], x[3], (spring - weight * np.sin(x[0])) / I, (u[0] - spring) / J])
 
     def forward(x: Any, u: Any, params: Any = None) -> list[Any]:
-        rate, motor_rate, second, motor_second = update(0.0, x, u, params)
+        rate, motor_rate, second, motor_second = update(0.0, x, u, {})
         s, c = np.sin(x[0]), np.cos(x[0])
         third = (k * (motor_rate - rate) - weight * c * rate) / I
         fourth = (k * (motor_second - second) - weight * (c * second - s * rate * rate)) / I

@@ -1,0 +1,266 @@
+"""A network compiled by CasADi, and SUNDIALS' CVODES on it with the exact Jacobian."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from ctrlplan.simulation.drives import Series
+from ctrlplan.simulation.interpreted import SolverError
+from ctrlplan.simulation.network import Network, Step
+from ctrlplan.simulation.traced import NotTraceableError, Trace, agrees
+
+Array = NDArray[np.float64]
+
+_KEPT = 64
+"""Integrators kept, one for each pattern of output times."""
+
+_FEW = 64
+
+_SAFETY = 0.1
+"""CVODES controls the error of a step by tolerances this much below those asked for: errors add up over a run."""
+
+
+class Compiled:
+    """Equations of a network as CasADi functions of (t, x, driven, p).
+
+    Parameters
+    ----------
+    network : Network
+        What is run.
+    traces : list of Trace or None
+        Of every block but the linear and the driven ones.
+    feeds : list of ndarray of bool
+        Feedthrough of every block.
+
+    Raises
+    ------
+    NotTraceableError
+        If the network has an algebraic loop that is not linear.
+    """
+
+    def __init__(self, network: Network, traces: list[Trace | None], feeds: list[NDArray[np.bool_]]) -> None:
+        self._traces = traces
+        self._places = [(i, key) for i, trace in enumerate(traces) if trace is not None for key in trace.symbols]
+        self._defaults = [(key, network.blocks[i].params.get(key)) for i, key in self._places]
+        n, nd = network.nstates, network.driven.size
+        t, x, d, p = (ca.SX.sym(name, size) for name, size in (("t", 1), ("x", n), ("d", nd), ("p", len(self._places))))
+        own = self._own_parameters(p)
+        every = np.ones(network.nsignals, dtype=bool)
+        w = _signals(network, traces, own, network.schedule(feeds, network.signals_of_inputs()), t, x, d)
+        self._functions = {}
+        self._rates = ca.Function("rates", [t, x, d, p], [_rates(network, traces, own, t, x, w)])
+        w = _signals(network, traces, own, network.schedule(feeds, every), t, x, d)
+        self._functions["signals"] = ca.Function("signals", [t, x, d, p], [ca.densify(w)])
+        self._functions["outputs"] = ca.Function("outputs", [t, x, d, p], [ca.densify(ca.DM(network.read) @ w)])
+        self._integrators: OrderedDict[Any, Any] = OrderedDict()
+        self._maps: OrderedDict[Any, Any] = OrderedDict()
+        self._equations: dict[int, dict[str, Any]] = {}
+
+    def parameters(self, params: Mapping[str, Any]) -> Array:
+        """Entries of p for a run."""
+        return np.array([float(params.get(key, default)) for key, default in self._defaults])
+
+    def outputs(self, t: Array, x: Array, driven: Array, p: Array) -> Array:
+        """Outputs of the whole at many times, (noutputs, ntime)."""
+        return self._at_many("outputs", t, x, driven, p)
+
+    def signals(self, t: Array, x: Array, driven: Array, p: Array) -> Array:
+        """All signals at many times, (nsignals, ntime)."""
+        return self._at_many("signals", t, x, driven, p)
+
+    def disagreement(self, network: Network, params: Mapping[str, Any], t: Array, x: Array, w: Array) -> str:
+        """What is wrong with a trace at visited times, states and signals; empty where nothing."""
+        for block, trace, states, inputs in zip(
+            network.blocks, self._traces, network.states, network.inputs, strict=True
+        ):
+            if trace is not None:
+                wrong = agrees(block, trace, params, t, x[states], network.wire[inputs] @ w)
+                if wrong:
+                    return f"block {block.name} cannot be traced ({wrong})"
+        return ""
+
+    def integrator(self, width: int, grid: Array, rtol: float, atol: float) -> Any:
+        """CVODES over a leg of length 1, with outputs at some of its times."""
+        key = (width, grid.tobytes(), rtol, atol)
+        if key not in self._integrators:
+            if len(self._integrators) >= _KEPT:
+                self._integrators.popitem(last=False)
+            options = {
+                "reltol": rtol * _SAFETY,
+                "abstol": atol * _SAFETY,
+                "max_num_steps": 100_000,
+                "show_eval_warnings": False,
+                "disable_internal_warnings": True,
+            }
+            equations = self._leg_equations(width)
+            self._integrators[key] = ca.integrator("leg", "cvodes", equations, 0.0, grid.tolist(), options)
+        self._integrators.move_to_end(key)
+        return self._integrators[key]
+
+    def _at_many(self, name: str, t: Array, x: Array, driven: Array, p: Array) -> Array:
+        function = self._functions[name]
+        key = (name, t.size)
+        if key not in self._maps:
+            if len(self._maps) >= _KEPT:
+                self._maps.popitem(last=False)
+            self._maps[key] = function.map(t.size)
+        return _called(self._maps[key], (t, x, driven, np.repeat(p[:, None], t.size, axis=1)), function.numel_out(0))
+
+    def _leg_equations(self, width: int) -> dict[str, Any]:
+        """Equations in s from 0 to 1, the driven signals as Chebyshev series of some width."""
+        if width not in self._equations:
+            nx, nd, np_ = (self._rates.numel_in(k) for k in (1, 2, 3))
+            s, x, p, c, span = (
+                ca.SX.sym(name, *shape)
+                for name, shape in (("s", (1,)), ("x", (nx,)), ("p", (np_,)), ("c", (nd, width)), ("span", (4,)))
+            )
+            left, length, first, last = (span[k] for k in range(4))
+            t = left + s * length
+            driven = _series(c, (2.0 * t - first - last) / (last - first))
+            self._equations[width] = {
+                "t": s,
+                "x": x,
+                "p": ca.vertcat(p, ca.vec(c), span),
+                "ode": length * self._rates(t, x, driven, p),
+            }
+        return self._equations[width]
+
+    def _own_parameters(self, p: Any) -> list[Any]:
+        """Each block's part of p."""
+        return [
+            ca.vertcat(*[p[k] for k, (j, _) in enumerate(self._places) if j == i]) for i in range(len(self._traces))
+        ]
+
+
+class CompiledSolver:
+    """CVODES on a compiled network, leg by leg."""
+
+    def __init__(self, equations: Compiled, params: Mapping[str, Any], rtol: float, atol: float) -> None:
+        self._equations, self._p = equations, equations.parameters(params)
+        self._tolerances = rtol, atol
+
+    def signals(self, times: Array, states: Array, driven: Array) -> Array:
+        """All signals (nsignals, ntime) of the network."""
+        return self._equations.signals(times, states, driven, self._p)
+
+    def outputs(self, times: Array, states: Array, driven: Array) -> Array:
+        """Outputs (noutputs, ntime) of the whole."""
+        return self._equations.outputs(times, states, driven, self._p)
+
+    def advance(self, series: Series, left: float, grid: Array, state: Array) -> Array:
+        """States (nstates, ngrid) at times of a leg, of which the last is its end."""
+        if not state.size:
+            return np.zeros((0, grid.size))
+        right = float(grid[-1])
+        relative = (grid - left) / (right - left)
+        if grid.size <= _FEW:  # a rounding error of the clock must not make a new integrator of every short leg
+            relative = np.round(relative, 12)
+        integrator = self._equations.integrator(series.coefficients.shape[1], relative, *self._tolerances)
+        span = [left, right - left, series.left, series.right]
+        p = np.concatenate([self._p, series.coefficients.ravel(order="F"), span])
+        try:
+            return _called(integrator, (state, np.empty(0), p), state.size)
+        except RuntimeError as error:
+            what = str(error).strip().splitlines()[-1]
+            raise SolverError(f"the solver must reach {right:g} s from {left:g} s, got: {what:.160}") from None
+
+
+def _called(function: Any, arguments: Sequence[Array], nrows: int) -> Array:
+    """First result (nrows, n) of a function, without a detour through CasADi's own matrices."""
+    out = np.zeros((function.numel_out(0) // nrows if nrows else 0, nrows))
+    buffer, evaluate = function.buffer()
+    kept = [np.ravel(values, order="F").astype(float) for values in arguments]
+    for k, values in enumerate(kept):
+        if values.size:
+            buffer.set_arg(k, values.data)
+    buffer.set_res(0, out.data)
+    evaluate()
+    return out.T
+
+
+def _signals(
+    network: Network, traces: list[Trace | None], own: list[Any], steps: list[Step], t: Any, x: Any, driven: Any
+) -> Any:
+    """Column of all signals."""
+    known = [ca.SX(0)] * network.nsignals
+    for k, row in enumerate(network.driven):
+        known[row] = driven[k]
+    for step in steps:
+        if step.unknown is None:
+            _evaluate(network, traces, own, step.blocks[0], t, x, known)
+            continue
+        # Unknown signals z with z = f(z): where f is linear, one solution of a small system.
+        z = ca.SX.sym("z", step.unknown.size)
+        trial = list(known)
+        for k, row in enumerate(step.unknown):
+            trial[row] = z[k]
+        after = list(trial)
+        for i in step.blocks:
+            fed = list(trial)
+            _evaluate(network, traces, own, i, t, x, fed)
+            for row in range(network.outputs[i].start, network.outputs[i].stop):
+                after[row] = fed[row]
+        left_over = ca.vertcat(*[after[row] for row in step.unknown]) - z
+        slope = ca.jacobian(left_over, z)
+        if any(ca.which_depends(slope, z, 1, True)) if slope.nnz() else False:
+            raise NotTraceableError(f"the algebraic loop of the blocks {network.names(step.blocks)} is not linear")
+        found = -ca.solve(ca.densify(slope), ca.substitute(left_over, z, ca.SX.zeros(z.numel())))
+        for k, row in enumerate(step.unknown):
+            known[row] = found[k]
+    return ca.vertcat(*known)
+
+
+def _evaluate(
+    network: Network, traces: list[Trace | None], own: list[Any], i: int, t: Any, x: Any, known: list[Any]
+) -> None:
+    """Put a block's outputs among the known signals."""
+    block, states, outs = network.blocks[i], network.states[i], network.outputs[i]
+    fed = ca.DM(network.wire[network.inputs[i]]) @ ca.vertcat(*known)
+    trace = traces[i]
+    if trace is None:
+        column = _linear(block.system.C, block.system.D, _part(x, states), fed)
+    else:
+        column = trace.output(t, _part(x, states), fed, own[i])
+    for k in range(outs.stop - outs.start):
+        known[outs.start + k] = column[k]
+
+
+def _rates(network: Network, traces: list[Trace | None], own: list[Any], t: Any, x: Any, w: Any) -> Any:
+    rows = []
+    for block, trace, states, inputs, p in zip(
+        network.blocks, traces, network.states, network.inputs, own, strict=True
+    ):
+        if states.stop == states.start:
+            continue
+        fed = ca.DM(network.wire[inputs]) @ w
+        rows.append(
+            _linear(block.system.A, block.system.B, _part(x, states), fed)
+            if trace is None
+            else trace.update(t, _part(x, states), fed, p)
+        )
+    return ca.densify(ca.vertcat(*rows))
+
+
+def _part(x: Any, rows: slice) -> Any:
+    """Rows of a column, which where there are none is still a column."""
+    return x[rows] if rows.stop > rows.start else ca.SX(0, 1)
+
+
+def _linear(a: Any, b: Any, x: Any, u: Any) -> Any:
+    """Sum a x + b u without the zeros of the matrices."""
+    return ca.sparsify(ca.DM(np.asarray(a, dtype=float))) @ x + ca.sparsify(ca.DM(np.asarray(b, dtype=float))) @ u
+
+
+def _series(coefficients: Any, u: Any) -> Any:
+    """Chebyshev series (nsignals, width) at u; the polynomials are shared by all signals."""
+    width = coefficients.shape[1]
+    values = [ca.SX(1), u]
+    while len(values) < width:
+        values.append(2.0 * u * values[-1] - values[-2])
+    return coefficients @ ca.vertcat(*values[:width])

@@ -1,0 +1,231 @@
+"""Signals that are functions of time alone, as one short Chebyshev series a leg.
+
+A plan is analytic between its breakpoints. A solver that asks for it a
+thousand times a second, at a time and for all its derivatives, is served from
+the series; what is reported at the sample times are the plan's own jets.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ctrlplan.trajectories import Step, Trajectory
+from ctrlplan.trajectories.files import signal_rows
+
+Array = NDArray[np.float64]
+
+Inputs = Trajectory | ArrayLike | Mapping[str, Trajectory | ArrayLike] | None
+
+WIDTHS = (1, 8, 16, 24, 32, 40, 48, 64)
+"""Numbers of terms of a series; a leg that needs more is halved."""
+
+RESOLVED = 4e-15
+"""Size of the last terms, relative to the greatest, at which a signal counts as resolved."""
+
+
+_NOISE = 1e-11
+"""Size of the later half of the longest series up to which it is taken for noise."""
+
+
+@dataclass(frozen=True, eq=False)
+class Series:
+    """Signals over one leg: Chebyshev coefficients (nsignals, width) from left to right."""
+
+    left: float
+    right: float
+    coefficients: Array
+
+    def __call__(self, t: float) -> Array:
+        """All signals at one time, shape (nsignals,)."""
+        width = self.coefficients.shape[1]
+        if width == 1:
+            return self.coefficients[:, 0]
+        u = (2.0 * t - self.left - self.right) / (self.right - self.left)
+        # A solver's trial step may look a little beyond the leg.
+        angle = math.acos(min(1.0, max(-1.0, u)))
+        return np.asarray(self.coefficients @ np.cos(angle * _counts(width)))
+
+    def at(self, times: Array) -> Array:
+        """All signals at many times, shape (nsignals, ntime)."""
+        u = np.clip((2.0 * times - self.left - self.right) / (self.right - self.left), -1.0, 1.0)
+        return np.asarray(self.coefficients @ np.cos(_counts(self.coefficients.shape[1])[:, None] * np.arccos(u)))
+
+
+class Drive(Protocol):
+    """Some signals that are functions of time, analytic between breakpoints."""
+
+    @property
+    def breakpoints(self) -> Array:
+        """Times at which they are not analytic [s]."""
+
+    def beside(self, moment: float, origin: float, s: Array) -> Array:
+        """Values (nsignals, ntime) at origin + s of the analytic functions that hold at `moment`."""
+
+    def at(self, times: Array) -> Array:
+        """Values (nsignals, ntime), right-continuous."""
+
+
+@dataclass(frozen=True, eq=False)
+class PlanDrive:
+    """A plan and its derivatives, axis by axis."""
+
+    plan: Trajectory
+    derivatives: int = 0
+
+    @property
+    def breakpoints(self) -> Array:
+        """Those of the plan."""
+        return self.plan.breakpoints
+
+    def beside(self, moment: float, origin: float, s: Array) -> Array:
+        """Values of the leg that holds at `moment`."""
+        jet = self.plan._jet_beside(moment, origin, s, self.derivatives)
+        return jet.transpose(1, 0, 2).reshape(-1, s.size)
+
+    def at(self, times: Array) -> Array:
+        """Values of the plan."""
+        return signal_rows(self.plan, times, self.derivatives)
+
+
+class SampledDrive:
+    """One signal given by samples, straight in between; it breaks where it bends."""
+
+    def __init__(self, times: Array, values: Array) -> None:
+        self.times, self.values = times, values
+        slope = np.diff(values) / np.diff(times)
+        self.breakpoints = times[1:-1][slope[1:] != slope[:-1]]
+
+    def beside(self, moment: float, origin: float, s: Array) -> Array:
+        """Values of the straight line that holds at `moment`."""
+        left = min(max(int(np.searchsorted(self.times, moment)) - 1, 0), self.times.size - 2)
+        (t0, t1), (v0, v1) = self.times[left : left + 2], self.values[left : left + 2]
+        return (v0 + (v1 - v0) * ((origin - t0 + s) / (t1 - t0)))[None]
+
+    def at(self, times: Array) -> Array:
+        """Values between the samples."""
+        return np.interp(times, self.times, self.values)[None]
+
+
+def input_drives(labels: Sequence[str], inputs: Inputs, times: Array) -> list[Drive]:
+    """What drives the inputs of a system, in order.
+
+    Raises
+    ------
+    ValueError
+        If an input is unknown, or what is given does not fit the inputs or the times.
+    """
+    given: list[Any]
+    if isinstance(inputs, Mapping):
+        for name in inputs:
+            if name not in labels:
+                raise ValueError(f"inputs must be among {', '.join(labels) or 'none'}, got {name!r}")
+        given = [inputs.get(name, 0.0) for name in labels]
+    elif isinstance(inputs, Trajectory):
+        if inputs.naxes != len(labels):
+            known = f"({', '.join(labels)})" if labels else "(the system has no inputs)"
+            raise ValueError(f"inputs must have {len(labels)} axes {known}, got {inputs.naxes}")
+        return [PlanDrive(inputs)]
+    elif inputs is None or np.ndim(inputs) == 0:
+        given = [0.0 if inputs is None else inputs] * len(labels)
+    else:
+        rows = np.asarray(inputs, dtype=float)
+        rows = rows[None] if rows.ndim == 1 and len(labels) == 1 else rows
+        if rows.shape not in ((len(labels), times.size), (len(labels),)):
+            raise ValueError(f"inputs must have shape ({len(labels)}, {times.size}), got {rows.shape}")
+        given = list(rows)
+    return [_drive(value, name, times) for value, name in zip(given, labels, strict=True)]
+
+
+def driven_signals(drives: Sequence[Drive], times: Array) -> Array:
+    """All signals of some drives (nsignals, ntime), right-continuous."""
+    return np.concatenate([np.zeros((0, times.size)), *(drive.at(times) for drive in drives)])
+
+
+def resolved(signals: Callable[[Array], Array], left: float, right: float, tolerance: float = RESOLVED) -> list[Series]:
+    """Series of analytic signals over a leg, as many as it takes.
+
+    Parameters
+    ----------
+    signals : callable
+        Maps times since `left` (ntime,) to values (nsignals, ntime).
+    left, right : float
+        The leg [s].
+    tolerance : float, optional
+        Greatest size of what is cut off, relative to each signal.
+    """
+    # Never at the ends, where a neighbouring leg might be asked.
+    duration = right - left
+    values = signals(duration * _LOOKS)
+    if np.all(values == values[:, :1]):
+        return [Series(left, right, values[:, :1])]
+    for width in WIDTHS[1:]:
+        coefficients = chebyshev_coefficients(signals(chebyshev_times(0.0, duration, width)))
+        size = np.abs(coefficients)
+        allowed = size.max(axis=1, keepdims=True)
+        if np.all(size[:, -3:] <= tolerance * allowed):
+            return [Series(left, right, coefficients)]
+    # Terms that no longer fall are rounding errors of the signal itself.
+    if np.all(size[:, width // 2 :] <= max(_NOISE, 10.0 * tolerance) * allowed):
+        return [Series(left, right, coefficients)]
+    middle = 0.5 * (left + right)
+    if not left < middle < right:
+        return [Series(left, right, coefficients)]
+    first = resolved(signals, left, middle, tolerance)
+    return first + resolved(lambda s: signals(s + (middle - left)), middle, right, tolerance)
+
+
+def chebyshev_times(left: float, right: float, width: int) -> Array:
+    """Increasing times of a leg at which `chebyshev_coefficients` wants values."""
+    nodes, _ = _chebyshev(width)
+    return left + (right - left) * (0.5 * (nodes + 1.0))
+
+
+def chebyshev_coefficients(values: Array) -> Array:
+    """Coefficients (nsignals, width) from values (nsignals, width) at `chebyshev_times`."""
+    return values @ _chebyshev(values.shape[1])[1]
+
+
+def _drive(value: Any, name: str, times: Array) -> Drive:
+    if isinstance(value, Trajectory):
+        if value.naxes != 1:
+            raise ValueError(f"input {name} must be driven by one axis, got {value.naxes}")
+        return PlanDrive(value)
+    signal = np.asarray(value, dtype=float)
+    if not np.isfinite(signal).all():
+        raise ValueError(f"input {name} must be finite, got nan or inf at index {int((~np.isfinite(signal)).argmax())}")
+    if signal.ndim == 0:
+        return PlanDrive(Step(signal, initial=signal, time=times[0]))
+    if signal.shape != times.shape:
+        kinds = f"a trajectory, a number or {times.size} samples"
+        raise ValueError(f"input {name} must be {kinds}, got shape {signal.shape}")
+    return SampledDrive(times, signal)
+
+
+def breakpoints_of(drives: Iterable[Drive]) -> list[float]:
+    """Times at which one of the drives is not analytic."""
+    return [float(t) for drive in drives for t in drive.breakpoints]
+
+
+_LOOKS = np.array([0.0312345, 0.1234567, 0.25, 0.3456789, 0.5, 0.6543217, 0.75, 0.8765431, 0.9712345])
+"""Where a signal is looked at to see whether it is constant over a leg."""
+
+
+@lru_cache(maxsize=32)
+def _chebyshev(width: int) -> tuple[Array, Any]:
+    """Nodes of the first kind, increasing, and the matrix from values there to coefficients."""
+    angles = np.pi * (np.arange(width)[::-1] + 0.5) / width
+    matrix = 2.0 / width * np.cos(np.outer(angles, np.arange(width)))
+    matrix[:, 0] *= 0.5
+    return np.cos(angles), matrix
+
+
+@lru_cache(maxsize=32)
+def _counts(width: int) -> Array:
+    return np.arange(width, dtype=float)

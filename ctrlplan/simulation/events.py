@@ -1,0 +1,219 @@
+"""Instants at which a signal crosses its limits."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import brentq
+
+Array = NDArray[np.float64]
+Signal = Callable[[Array, Array, Array, Array], Array]
+"""(t, x, u, y) at many times, time last -> values (ntime,)."""
+
+
+@dataclass(frozen=True)
+class Event:
+    """Limits of a signal, the crossings of which a run records.
+
+    Parameters
+    ----------
+    signal : str or callable
+        Label of an output, state or input of the system; or a function of
+        (t, x, u, y), arrays with time last, that returns (ntime,) values.
+    low, high : float, optional
+        Limits in the unit of the signal; at least one.
+    stop : bool, optional
+        End the run where the signal leaves its limits.
+    name : str, optional
+        What the crossings are called; the signal's label unless given.
+
+    Raises
+    ------
+    ValueError
+        If `low` is not below `high`, or neither is given.
+
+    Examples
+    --------
+    >>> Event("T", low=0.0, stop=True).name
+    'T'
+    """
+
+    signal: str | Signal
+    low: float = -math.inf
+    high: float = math.inf
+    stop: bool = False
+    name: str = ""
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.signal, str) and not callable(self.signal):
+            raise TypeError(f"signal must be a label or a function of (t, x, u, y), got {self.signal!r}")
+        if not self.low < self.high:
+            raise ValueError(f"low must be below high, got {self.low} and {self.high}")
+        if math.isinf(self.low) and math.isinf(self.high):
+            raise ValueError("an event must have a limit, got neither low nor high")
+        if not self.name:
+            label = self.signal if isinstance(self.signal, str) else getattr(self.signal, "__name__", "event")
+            object.__setattr__(self, "name", label)
+
+
+@dataclass(frozen=True)
+class Occurrence:
+    """One crossing.
+
+    Attributes
+    ----------
+    time : float
+        When [s], to the accuracy of the run.
+    name : str
+        Of the event.
+    kind : str
+        "below" or "above": the signal left its limits there, or began the run
+        outside; "inside": it came back.
+    stop : bool
+        Whether the run ended there.
+    """
+
+    time: float
+    name: str
+    kind: str
+    stop: bool = False
+
+    def __str__(self) -> str:
+        """In words."""
+        where = "within its limits" if self.kind == "inside" else f"{self.kind} its limit"
+        return f"{self.time:.6g} s: {self.name} {where}{', where the run ends' if self.stop else ''}"
+
+
+@dataclass(frozen=True, eq=False)
+class Snapshot:
+    """Times, states, inputs and outputs of a run, time last; and of a network all signals, where they are asked for."""
+
+    t: Array
+    x: Array
+    u: Array
+    y: Array
+    signals: Callable[[], Array] | None = None
+
+    @cached_property
+    def w(self) -> Array:
+        """All signals of the network, (nsignals, ntime)."""
+        if self.signals is None:
+            raise ValueError("a run without a network has no signals inside")
+        return self.signals()
+
+
+@dataclass(frozen=True, eq=False)
+class Watched:
+    """A signal of a run and its limits: an event with its label looked up."""
+
+    name: str
+    value: Callable[[Snapshot], Array]
+    low: float
+    high: float
+    stop: bool = False
+
+    def side(self, values: Array) -> NDArray[np.int_]:
+        """-1 below, 0 inside, 1 above the limits."""
+        return (values > self.high).astype(int) - (values < self.low).astype(int)
+
+    def limit(self, side: int, other: int) -> float:
+        """The limit between two sides next to each other."""
+        return self.high if max(side, other) > 0 else self.low
+
+
+def crossings(
+    watched: Watched, times: Array, values: Array, value_at: Callable[[int, float], float]
+) -> list[Occurrence]:
+    """Every crossing of a record, located by root finding.
+
+    Parameters
+    ----------
+    watched : Watched
+        The signal and its limits.
+    times, values : ndarray, shape (ntime,)
+        The record.
+    value_at : callable
+        Maps k and a time after times[k] and before the next to the signal.
+    """
+    sides = watched.side(values)
+    found = [Occurrence(float(times[0]), watched.name, _KINDS[int(sides[0])], watched.stop)] if sides[0] else []
+    for k in np.flatnonzero(np.diff(sides)).tolist():
+        before, after = int(sides[k]), int(sides[k + 1])
+        # From below to above both limits are crossed.
+        stages = [(before, 0), (0, after)] if before * after < 0 else [(before, after)]
+        for left, right in stages:
+            level = watched.limit(left, right)
+            time = _root(
+                partial(_beyond, value_at, k, level),
+                float(times[k]),
+                float(times[k + 1]),
+                float(values[k]) - level,
+                float(values[k + 1]) - level,
+            )
+            found.append(Occurrence(time, watched.name, _KINDS[right], watched.stop and right != 0))
+    return found
+
+
+def watched_events(events: Sequence[Event], labels: Mapping[str, tuple[str, int]]) -> list[Watched]:
+    """Events with their labels looked up.
+
+    Parameters
+    ----------
+    events : sequence of Event
+        As the user gave them.
+    labels : mapping of str to (kind, int)
+        "x", "u" or "y", and the row, of every label.
+    """
+    found = []
+    for event in events:
+        if not isinstance(event, Event):
+            raise TypeError(f"events must be Event, got {type(event).__name__}")
+        found.append(Watched(event.name, _value(event.signal, labels), event.low, event.high, event.stop))
+    return found
+
+
+_KINDS = {-1: "below", 0: "inside", 1: "above"}
+
+
+def _value(signal: str | Signal, labels: Mapping[str, tuple[str, int]]) -> Callable[[Snapshot], Array]:
+    if isinstance(signal, str):
+        if signal not in labels:
+            raise ValueError(f"signal of an event must be among {', '.join(labels)}, got {signal!r}")
+        kind, row = labels[signal]
+        return partial(_row, kind, row)
+    function = signal
+
+    def value(seen: Snapshot) -> Array:
+        values = np.asarray(function(seen.t, seen.x, seen.u, seen.y), dtype=float)
+        if values.shape != seen.t.shape:
+            raise ValueError(f"signal of an event must return {seen.t.size} values, got shape {values.shape}")
+        return values
+
+    return value
+
+
+def _beyond(value_at: Callable[[int, float], float], k: int, level: float, t: float) -> float:
+    return value_at(k, t) - level
+
+
+def _row(kind: str, row: int, seen: Snapshot) -> Array:
+    return np.asarray(getattr(seen, kind)[row])
+
+
+def _root(function: Callable[[float], float], left: float, right: float, at_left: float, at_right: float) -> float:
+    """Time of a sign change, right of which the signal is on its new side."""
+    if at_left == 0.0 or at_left * at_right >= 0.0:
+        return left if at_left == 0.0 else right
+
+    def value(t: float) -> Any:
+        if t <= left:
+            return at_left
+        return at_right if t >= right else function(t)
+
+    return float(brentq(value, left, right, xtol=1e-15 * max(abs(left), abs(right), right - left), rtol=1e-14))

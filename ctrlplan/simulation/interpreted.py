@@ -1,0 +1,258 @@
+"""A network run by Python: its equations, and the solver that takes them as they are."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.integrate import solve_ivp
+
+from ctrlplan.simulation.drives import Series
+from ctrlplan.simulation.network import Block, Map, Network, Step, feedthrough, tried_feedthrough
+
+Array = NDArray[np.float64]
+
+Call = Callable[[float, Array, Array], None]
+"""(t, state of the network, its signals): puts a block's outputs among the signals."""
+
+_CALLS = 5000
+"""Calls about one instant after which the solution is taken to end there."""
+
+
+class LoopError(RuntimeError):
+    """Blocks whose outputs depend on one another at once, without a solution found."""
+
+
+class SolverError(RuntimeError):
+    """A solver did not get through; the time is in the message."""
+
+
+class Interpreted:
+    """Equations of a network at some parameters, one call a block.
+
+    Parameters
+    ----------
+    network : Network
+        What is run.
+    params : mapping
+        Parameters of the run, which overrule the blocks' own.
+    probe : (float, ndarray)
+        Time and state about which feedthrough is tried.
+    """
+
+    def __init__(self, network: Network, params: Mapping[str, Any], probe: tuple[float, Array]) -> None:
+        self.network = network
+        self.params = dict(params)
+        self._probe = probe
+        self._outputs = [block.output(params) for block in network.blocks]
+        self._updates = [block.update(params) for block in network.blocks]
+        self.feeds = _feeds(network, params, *probe)
+        self._for_rates = self._steps(self._outputs, network.signals_of_inputs(), self.feeds)
+        self._for_all = self._steps(self._outputs, np.ones(network.nsignals, dtype=bool), self.feeds)
+        self._for_samples: dict[tuple[int, ...], tuple[dict[int, Map], list[Call]]] = {}
+        self._a, self._b, self._moving = _merged_linear(network)
+
+    def rates(self, t: float, x: Array, driven: Array) -> Array:
+        """Derivatives of all states, given the signals that are functions of time."""
+        w = self._signals(self._for_rates, t, x, driven)
+        dx = self._a @ x + self._b @ w
+        for i in self._moving:
+            place = self.network.states[i]
+            dx[place] = self._updates[i](t, x[place], self.network.wire[self.network.inputs[i]] @ w)
+        return dx
+
+    def signals(self, t: float, x: Array, driven: Array) -> Array:
+        """All signals of the network."""
+        return self._signals(self._for_all, t, x, driven)
+
+    def all_signals(self, times: Array, states: Array, driven: Array) -> Array:
+        """All signals (nsignals, ntime) at many times."""
+        rows = [self.signals(t, states[:, k], driven[:, k]) for k, t in enumerate(times.tolist())]
+        return np.array(rows).T.reshape(-1, times.size)
+
+    def sampled(self, blocks: tuple[int, ...], t: float, x: Array, driven: Array) -> Array:
+        """State after some discrete blocks have taken a sample, each seeing the others' new outputs."""
+        if blocks not in self._for_samples:
+            self._for_samples[blocks] = self._sampling(blocks)
+        samples, steps = self._for_samples[blocks]
+        w = self._signals(steps, t, x, driven)
+        after = x.copy()
+        for i, sample in samples.items():
+            place = self.network.states[i]
+            after[place] = np.ravel(sample(t, x[place], self.network.wire[self.network.inputs[i]] @ w))
+        return after
+
+    def _sampling(self, blocks: tuple[int, ...]) -> tuple[dict[int, Map], list[Call]]:
+        """What maps states on, and the steps to all signals at the instant of a sample."""
+        network, (t, x) = self.network, self._probe
+        samples = {i: network.blocks[i].sampled(self.params) for i in blocks}
+        outputs, feeds = list(self._outputs), list(self.feeds)
+
+        def renewed(i: int) -> Map:
+            return lambda t, x, u: self._outputs[i](t, np.ravel(samples[i](t, x, u)), u)
+
+        for i in blocks:
+            system = network.blocks[i].system
+            outputs[i] = renewed(i)
+            feeds[i] = tried_feedthrough(outputs[i], system.noutputs, system.ninputs or 0, t, x[network.states[i]])
+        return samples, self._steps(outputs, network.signals_of_inputs(), feeds)
+
+    def _signals(self, steps: list[Call], t: float, x: Array, driven: Array) -> Array:
+        w = np.zeros(self.network.nsignals)
+        w[self.network.driven] = driven
+        for step in steps:
+            step(t, x, w)
+        return w
+
+    def _steps(self, outputs: list[Map], needed: NDArray[np.bool_], feeds: Sequence[NDArray[np.bool_]]) -> list[Call]:
+        return [self._step(step, outputs) for step in self.network.schedule(feeds, needed)]
+
+    def _step(self, step: Step, outputs: list[Map]) -> Call:
+        calls = [self._call(i, outputs[i]) for i in step.blocks]
+        if step.unknown is None:
+            return calls[0]
+        unknown, names, outs = step.unknown, self.network.names(step.blocks), self.network.outputs
+
+        owned = [np.intersect1d(unknown, np.arange(p.start, p.stop)) for p in map(outs.__getitem__, step.blocks)]
+
+        def solve(t: float, x: Array, w: Array) -> None:
+            def left_over(z: Array) -> Array:
+                w[unknown] = z
+                after = w.copy()
+                for call, rows in zip(calls, owned, strict=True):
+                    fed = w.copy()  # every block sees the trial values, not its neighbours' new ones
+                    call(t, x, fed)
+                    after[rows] = fed[rows]
+                return np.asarray(after[unknown] - z)
+
+            w[unknown] = _root(left_over, w[unknown], names, t)
+
+        return solve
+
+    def _call(self, i: int, output: Map) -> Call:
+        network = self.network
+        states, outs = network.states[i], network.outputs[i]
+        wire = network.wire[network.inputs[i]]
+        block = network.blocks[i]
+        if block.linear and output is self._outputs[i]:
+            c, d = np.asarray(block.system.C, dtype=float), np.asarray(block.system.D, dtype=float) @ wire
+
+            def linear(t: float, x: Array, w: Array) -> None:
+                w[outs] = c @ x[states] + d @ w
+
+            return linear
+
+        def call(t: float, x: Array, w: Array) -> None:
+            w[outs] = np.ravel(output(t, x[states], wire @ w))
+
+        return call
+
+
+class InterpretedSolver:
+    """LSODA on a network's equations, leg by leg."""
+
+    def __init__(self, equations: Interpreted, rtol: float, atol: float, max_step: float = np.inf) -> None:
+        self._equations = equations
+        self._options: dict[str, Any] = {"method": "LSODA", "rtol": rtol, "atol": atol, "max_step": max_step}
+
+    def signals(self, times: Array, states: Array, driven: Array) -> Array:
+        """All signals (nsignals, ntime) of the network."""
+        return self._equations.all_signals(times, states, driven)
+
+    def outputs(self, times: Array, states: Array, driven: Array) -> Array:
+        """Outputs (noutputs, ntime) of the whole."""
+        return self._equations.network.read @ self.signals(times, states, driven)
+
+    def advance(self, series: Series, left: float, grid: Array, state: Array) -> Array:
+        """States (nstates, ngrid) at times of a leg, of which the last is its end."""
+        right = float(grid[-1])
+        if not state.size:
+            return np.zeros((0, grid.size))
+        equations = self._equations
+
+        def rates(t: float, x: Array) -> Array:
+            return equations.rates(t, x, series(t))
+
+        found = solve_ivp(_advancing(rates, left, right), (left, right), state, t_eval=grid, **self._options)
+        if not found.success:
+            raise SolverError(f"the solver must reach {right:g} s, got to {found.t[-1]:g} s: {found.message}")
+        return np.asarray(found.y)
+
+
+def _feeds(network: Network, params: Mapping[str, Any], t: float, x: Array) -> list[NDArray[np.bool_]]:
+    """Feedthrough of every block; static ones are looked at closely only where a loop seems to be."""
+
+    def feed(block: Block, place: slice, assumed: bool) -> NDArray[np.bool_]:
+        return feedthrough(block, params, t, x[place], assumed)
+
+    pairs = list(zip(network.blocks, network.states, strict=True))
+    feeds = [feed(block, place, True) for block, place in pairs]
+    every = np.ones(network.nsignals, dtype=bool)
+    if any(step.unknown is not None for step in network.schedule(feeds, every)):
+        feeds = [feed(block, place, False) for block, place in pairs]
+    return feeds
+
+
+def _merged_linear(network: Network) -> tuple[Array, Array, list[int]]:
+    """Linear blocks as one: rates a x + b w; and the other blocks with states."""
+    a = np.zeros((network.nstates, network.nstates))
+    b = np.zeros((network.nstates, network.nsignals))
+    moving = []
+    for i, (block, rows) in enumerate(zip(network.blocks, network.states, strict=True)):
+        if block.linear:
+            a[rows, rows] = block.system.A
+            b[rows] = np.asarray(block.system.B) @ network.wire[network.inputs[i]]
+        elif rows.stop > rows.start:
+            moving.append(i)
+    return a, b, moving
+
+
+def _root(left_over: Callable[[Array], Array], guess: Array, names: str, t: float) -> Array:
+    """Solution of an algebraic loop by Newton's iteration, in one step where it is linear."""
+    z = guess.copy()
+    rest = left_over(z)
+    for _ in range(50):
+        size = 1.0 + np.abs(z)
+        if np.all(np.abs(rest) <= 1e-13 * size):
+            return z
+        slope = np.empty((z.size, z.size))
+        for j in range(z.size):
+            step = np.zeros(z.size)
+            step[j] = 1e-7 * size[j]
+            slope[:, j] = (left_over(z + step) - rest) / step[j]
+        if not np.isfinite(slope).all():
+            break
+        change = np.linalg.lstsq(slope, -rest, rcond=1e-14)[0]
+        before = np.abs(rest).max()
+        for _ in range(30):
+            following = left_over(z + change)
+            if np.abs(following).max() < before:
+                break
+            change = 0.5 * change
+        else:
+            break
+        z, rest = z + change, following
+    if np.all(np.abs(rest) <= 1e-9 * (1.0 + np.abs(z))):
+        return z
+    raise LoopError(
+        f"the algebraic loop of the blocks {names} must have a solution that Newton's iteration finds, "
+        f"got a rest of {np.abs(rest).max():.3g} at {t:g} s"
+    )
+
+
+def _advancing(rate: Callable[[float, Array], Array], left: float, right: float) -> Callable[[float, Array], Array]:
+    """Right-hand side that refuses to be asked for ever about one instant: the solution ends there."""
+    farthest, asked = left, 0
+
+    def checked(t: float, x: Array) -> Array:
+        nonlocal farthest, asked
+        asked += 1
+        if t > farthest + 1e-9 * (right - left):
+            farthest, asked = t, 0
+        elif asked > _CALLS:
+            raise SolverError(f"the solver must reach {right:g} s, got to {farthest:g} s: the solution ends there")
+        return rate(t, x)
+
+    return checked

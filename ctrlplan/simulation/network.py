@@ -1,0 +1,384 @@
+"""An interconnection as one list of blocks, each called once a step in order.
+
+python-control calls every block several times to settle static connections,
+at every level of nesting. Here the connections of all levels become one matrix
+between the innermost blocks, and a schedule made from their true feedthrough
+says in which order their outputs are known. All signals stand in one vector:
+first the external inputs, then the outputs of the blocks.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import control as ct
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import block_diag
+from scipy.sparse.csgraph import connected_components
+
+from ctrlplan.trajectories import Trajectory
+
+Array = NDArray[np.float64]
+Map = Callable[[Any, Any, Any], Any]
+"""(t, state of the block, input of the block) -> outputs or rates; of numbers, or of symbols."""
+
+
+class UnsupportedError(ValueError):
+    """A construct that only python-control knows how to run; the block is named."""
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """Innermost block and the parameters that reach it, before those of a run."""
+
+    system: Any
+    params: dict[str, Any]
+
+    @property
+    def name(self) -> str:
+        """What python-control calls it."""
+        return str(self.system.name)
+
+    @property
+    def linear(self) -> bool:
+        """Whether four matrices say it all."""
+        return isinstance(self.system, ct.StateSpace)
+
+    @property
+    def plan(self) -> Trajectory | None:
+        """What the block puts out, where that is a plan."""
+        plan = getattr(self.system, "plan", None)
+        return plan if isinstance(plan, Trajectory) else None
+
+    @property
+    def delay(self) -> float | None:
+        """How much later [s] the block puts out what goes in, where it does only that."""
+        return getattr(self.system, "delay", None)
+
+    @property
+    def period(self) -> float | None:
+        """Time between the samples of a discrete block in a continuous loop [s]."""
+        return getattr(self.system, "period", None)
+
+    @property
+    def driven(self) -> bool:
+        """Whether the outputs are, over a leg, functions of time alone."""
+        return self.plan is not None or self.delay is not None
+
+    def output(self, params: Mapping[str, Any]) -> Map:
+        """Outputs, at the parameters of a run."""
+        if self.linear:
+            c, d = np.asarray(self.system.C, dtype=float), np.asarray(self.system.D, dtype=float)
+            return lambda t, x, u: c @ x + d @ u
+        out, own = self.system.outfcn, {**self.params, **params}
+        if out is None:
+            return lambda t, x, u: x
+        return lambda t, x, u: out(t, x, u, own)
+
+    def update(self, params: Mapping[str, Any]) -> Map:
+        """Rates of a continuous block, next states of a discrete one."""
+        if self.linear:
+            a, b = np.asarray(self.system.A, dtype=float), np.asarray(self.system.B, dtype=float)
+            return lambda t, x, u: a @ x + b @ u
+        update, own = self.system.updfcn, {**self.params, **params}
+        if self.period is not None:
+            return lambda t, x, u: np.zeros(len(x))
+        return lambda t, x, u: update(t, x, u, own)
+
+    def sampled(self, params: Mapping[str, Any]) -> Map:
+        """States after a sample of a discrete block in a continuous loop."""
+        sample, own = self.system.sample, {**self.params, **params}
+        return lambda t, x, u: sample(t, x, u, own)
+
+
+@dataclass(frozen=True)
+class Step:
+    """Blocks of which outputs become known together.
+
+    Attributes
+    ----------
+    blocks : tuple of int
+        One block; or those of an algebraic loop.
+    unknown : ndarray or None
+        Of a loop, where its signals stand.
+    """
+
+    blocks: tuple[int, ...]
+    unknown: NDArray[np.intp] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Network:
+    """Innermost blocks and how they are joined.
+
+    Attributes
+    ----------
+    name : str
+        Of the whole.
+    blocks : tuple of Block
+        In python-control's order of states.
+    wire : ndarray, shape (inputs of all blocks, nsignals)
+        The blocks' inputs from all signals.
+    read : ndarray, shape (noutputs, nsignals)
+        The outputs of the whole from all signals.
+    ninputs : int
+        External inputs, the first of the signals.
+    """
+
+    name: str
+    blocks: tuple[Block, ...]
+    wire: Array
+    read: Array
+    ninputs: int
+
+    @classmethod
+    def of(cls, system: Any) -> Network:
+        """Flatten a system, nested at will.
+
+        Raises
+        ------
+        UnsupportedError
+            If a block computes its states or outputs in a way of its own.
+        """
+        part = _flattened(system, {})
+        _warn_of_shared_parameters(system)
+        return cls(
+            str(system.name),
+            tuple(part.blocks),
+            np.hstack([part.outer, part.inner]),
+            np.hstack([part.passed @ part.outer, part.read + part.passed @ part.inner]),
+            system.ninputs or 0,
+        )
+
+    @cached_property
+    def states(self) -> list[slice]:
+        """Where each block's states stand."""
+        return _slices([b.system.nstates or 0 for b in self.blocks], 0)
+
+    @cached_property
+    def inputs(self) -> list[slice]:
+        """Where each block's inputs stand among the rows of `wire`."""
+        return _slices([b.system.ninputs or 0 for b in self.blocks], 0)
+
+    @cached_property
+    def outputs(self) -> list[slice]:
+        """Where each block's outputs stand among the signals."""
+        return _slices([b.system.noutputs for b in self.blocks], self.ninputs)
+
+    @property
+    def nstates(self) -> int:
+        """States of all blocks."""
+        return self.states[-1].stop
+
+    @property
+    def nsignals(self) -> int:
+        """External inputs and outputs of all blocks."""
+        return self.wire.shape[1]
+
+    @cached_property
+    def driven(self) -> NDArray[np.intp]:
+        """Signals that are functions of time alone over a leg: inputs, plans, delayed signals."""
+        rows = [np.arange(self.ninputs)]
+        rows += [
+            np.arange(place.start, place.stop)
+            for block, place in zip(self.blocks, self.outputs, strict=True)
+            if block.driven
+        ]
+        return np.concatenate(rows)
+
+    def with_state(self, kind: str) -> list[int]:
+        """Blocks of a kind: those with a ``period``, a ``delay``, ..."""
+        return [i for i, block in enumerate(self.blocks) if getattr(block, kind) is not None]
+
+    def schedule(self, feeds: Sequence[NDArray[np.bool_]], needed: NDArray[np.bool_]) -> list[Step]:
+        """Order in which the signals needed become known.
+
+        Parameters
+        ----------
+        feeds : sequence of ndarray of bool, shape (noutputs, ninputs)
+            Which outputs of each block depend on which of its inputs at once.
+        needed : ndarray of bool, shape (nsignals,)
+            Signals needed.
+
+        Returns
+        -------
+        list of Step
+            A block may stand in it twice. Signals that depend on one another
+            at once are one step.
+        """
+        known = np.zeros(self.nsignals, dtype=bool)
+        known[self.driven] = True
+        feeds_on = _dependencies(self, feeds)
+        wanted = _reached(feeds_on, needed)
+        steps: list[Step] = []
+        while not known[wanted].all():
+            ready = ~known & wanted & np.all(~feeds_on | known, axis=1)
+            if ready.any():
+                for i, place in enumerate(self.outputs):
+                    if ready[place].any():
+                        steps.append(Step((i,)))
+                known |= ready
+                continue
+            rows = _first_loop(feeds_on, ~known & wanted)
+            steps.append(Step(self._owners(rows), rows))
+            known[rows] = True
+        return steps
+
+    def signals_of_inputs(self) -> NDArray[np.bool_]:
+        """Which signals feed a block at all."""
+        return np.any(self.wire != 0.0, axis=0)
+
+    def names(self, blocks: Sequence[int]) -> str:
+        """Blocks by name, in words."""
+        return ", ".join(self.blocks[i].name for i in blocks)
+
+    def _owners(self, rows: NDArray[np.intp]) -> tuple[int, ...]:
+        return tuple(i for i, place in enumerate(self.outputs) if np.any((rows >= place.start) & (rows < place.stop)))
+
+
+def feedthrough(block: Block, params: Mapping[str, Any], t: float, x: Array, assumed: bool = True) -> NDArray[np.bool_]:
+    """Which outputs of a block depend on which inputs at once, (noutputs, ninputs).
+
+    Of linear blocks by their matrix, of others with states by trying; static
+    ones are assumed to pass everything on, or with ``assumed=False`` tried too.
+    """
+    nin = block.system.ninputs or 0
+    if block.driven:
+        return np.zeros((block.system.noutputs, nin), dtype=bool)
+    if block.linear:
+        return np.asarray(block.system.D) != 0.0
+    if assumed and not block.system.nstates:
+        return np.ones((block.system.noutputs, nin), dtype=bool)
+    return tried_feedthrough(block.output(params), block.system.noutputs, nin, t, x)
+
+
+def tried_feedthrough(output: Map, noutputs: int, nin: int, t: float, x: Array) -> NDArray[np.bool_]:
+    """Which outputs change when an input does, about a time and a state."""
+    found = np.zeros((noutputs, nin), dtype=bool)
+    rng = np.random.default_rng(1)
+    with np.errstate(all="ignore"):
+        for scale in (0.0, 1.0, 1e3):
+            u = scale * rng.standard_normal(nin)
+            state = x + 0.1 * rng.standard_normal(x.size)
+            before = np.ravel(output(t, state, u))
+            for j in range(nin):
+                for step in (1e-3, 1.0, 1e3):
+                    moved = u.copy()
+                    moved[j] += step
+                    found[:, j] |= np.ravel(output(t, state, moved)) != before
+    return found
+
+
+@dataclass(frozen=True)
+class _Part:
+    """Blocks of one level; their inputs are inner @ outputs + outer @ inputs of the level."""
+
+    blocks: list[Block]
+    inner: Array
+    outer: Array
+    read: Array  # outputs of the level from the blocks' outputs
+    passed: Array  # and from their inputs
+
+
+def _flattened(system: Any, above: dict[str, Any]) -> _Part:
+    if not isinstance(system, ct.InterconnectedSystem):
+        return _innermost(system, above)
+    # python-control lets a level's parameters overrule those inside it.
+    params = {**system.params, **above}
+    parts = [_flattened(block, params) for block in system.syslist]
+    inner, outer, read, passed = (
+        block_diag(*(getattr(p, name) for p in parts)) for name in ("inner", "outer", "read", "passed")
+    )
+    connect = np.asarray(system.connect_map, dtype=float)
+    external = np.asarray(system.input_map, dtype=float).reshape(len(connect), -1)
+    # Parts take connect @ their outputs + external @ r, and their outputs are read @ y + passed @ u.
+    closing = np.linalg.inv(np.eye(len(outer)) - outer @ connect @ passed)
+    outputs = np.asarray(system.output_map, dtype=float)
+    from_out, from_in = outputs[:, : len(read)], outputs[:, len(read) :]
+    of_part = from_out + from_in @ connect
+    return _Part(
+        [block for part in parts for block in part.blocks],
+        closing @ (inner + outer @ connect @ read),
+        closing @ outer @ external,
+        of_part @ read,
+        of_part @ passed,
+    )
+
+
+def _innermost(system: Any, above: dict[str, Any]) -> _Part:
+    if isinstance(system, ct.TransferFunction):
+        system = ct.ss(system)
+    plain = isinstance(system, ct.NonlinearIOSystem) and all(
+        getattr(type(system), name) is getattr(ct.NonlinearIOSystem, name) for name in ("_rhs", "_out")
+    )
+    if not (plain or isinstance(system, ct.StateSpace)):
+        raise UnsupportedError(f"block {system.name} ({type(system).__name__}) has equations of a kind of its own")
+    nin, nout = system.ninputs or 0, system.noutputs
+    block = Block(system, {**system.params, **above})
+    return _Part([block], np.zeros((nin, nout)), np.eye(nin), np.eye(nout), np.zeros((nout, nin)))
+
+
+def _warn_of_shared_parameters(system: Any) -> None:
+    """Two blocks with one key: python-control gives both the value of the last, and so does a run here."""
+    if not isinstance(system, ct.InterconnectedSystem):
+        return
+    seen: dict[str, tuple[str, Any]] = {}
+    for block in system.syslist:
+        _warn_of_shared_parameters(block)
+        for key, value in block.params.items():
+            name, before = seen.setdefault(key, (block.name, value))
+            if not np.array_equal(before, value):
+                warnings.warn(
+                    f"blocks {name} and {block.name} both have a parameter {key!r}, {before!r} and {value!r}: "
+                    f"inside {system.name} python-control gives both {system.params.get(key, value)!r}; "
+                    "use keys of their own",
+                    UserWarning,
+                    stacklevel=2,
+                )
+
+
+def _slices(counts: Sequence[int], first: int) -> list[slice]:
+    ends = (first + np.cumsum(counts)).tolist()
+    return [slice(end - n, end) for n, end in zip(counts, ends, strict=True)]
+
+
+def _dependencies(network: Network, feeds: Sequence[NDArray[np.bool_]]) -> NDArray[np.bool_]:
+    """Which signals depend on which at once, (nsignals, nsignals)."""
+    depends = np.zeros((network.nsignals, network.nsignals), dtype=bool)
+    for feed, rows, columns in zip(feeds, network.outputs, network.inputs, strict=True):
+        depends[rows] = feed.astype(int) @ (network.wire[columns] != 0.0).astype(int) > 0
+    return depends
+
+
+def _reached(depends: NDArray[np.bool_], needed: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Signals needed, and those they depend on."""
+    wanted = needed.copy()
+    while True:
+        more = wanted | depends[wanted].any(axis=0)
+        if (more == wanted).all():
+            return wanted
+        wanted = more
+
+
+def _first_loop(depends: NDArray[np.bool_], open_: NDArray[np.bool_]) -> NDArray[np.intp]:
+    """Signals among the open ones that depend on one another and on no other open one."""
+    rows = np.flatnonzero(open_)
+    among = depends[np.ix_(rows, rows)]
+    count, group = connected_components(among, directed=True, connection="strong")
+    for k in range(count):
+        members = group == k
+        if not among[np.ix_(members, ~members)].any():
+            return rows[members]
+    raise AssertionError("of the groups of a finite graph one depends on no other")
+
+
+def blocks_of(system: Any) -> Iterator[Any]:
+    """The system and every block inside it, at any depth."""
+    yield system
+    for block in getattr(system, "syslist", ()):
+        yield from blocks_of(block)

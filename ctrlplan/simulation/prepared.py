@@ -1,0 +1,262 @@
+"""The built form of a system, kept for many runs."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Mapping
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Any
+
+import control as ct
+import numpy as np
+from numpy.typing import NDArray
+
+from ctrlplan.simulation.drives import Drive, PlanDrive, driven_signals
+from ctrlplan.simulation.interpreted import Interpreted
+from ctrlplan.simulation.legs import DelayedDrive
+from ctrlplan.simulation.linear import LinearForm, NotLinearError, linear_form
+from ctrlplan.simulation.network import Network, UnsupportedError
+
+if TYPE_CHECKING:
+    from ctrlplan.simulation.compiled import Compiled
+    from ctrlplan.simulation.traced import Trace
+
+Array = NDArray[np.float64]
+
+_KEPT = 16
+"""Systems that `simulate` keeps by itself."""
+
+
+class NotCompiledError(ValueError):
+    """A system that cannot be compiled, and why."""
+
+
+class Prepared:
+    """Built form of a system; made by `prepare`.
+
+    Attributes
+    ----------
+    name : str
+        Of the system.
+    input_labels, output_labels, state_labels : list of str
+        Its signals, in python-control's order.
+    nstates : int
+        Number of states.
+    """
+
+    def __init__(self, system: Any) -> None:
+        self.system = state_space(system)
+        self.fingerprint = fingerprint(self.system)
+        self.name = str(self.system.name)
+        self.input_labels = list(self.system.input_labels or [])
+        self.output_labels = list(self.system.output_labels or [])
+        self.state_labels = list(self.system.state_labels or [])
+        self.nstates = len(self.state_labels)
+        self.dt = self.system.dt
+        self.issiso = bool(self.system.issiso())
+        self.initial_state = getattr(self.system, "initial_state", None)
+        self.linear: LinearForm | None = None
+        self.not_linear = ""
+        self.network: Network | None = None
+        self.unsupported = ""
+        try:
+            self.linear = linear_form(self.system)
+        except NotLinearError as error:
+            self.not_linear = str(error)
+        try:
+            self.network = Network.of(self.system)
+        except UnsupportedError as error:
+            self.unsupported = str(error)
+        for block in self._blocks():
+            if block.delay is not None or block.period is not None:
+                what = "puts out the past" if block.delay is not None else "takes samples"
+                self.linear, self.not_linear = None, f"block {block.name} {what}"
+        self._sources = [PlanDrive(b.plan, b.system.derivatives) for b in self._blocks() if b.plan is not None]
+        self._compiled: list[tuple[frozenset[str], dict[str, Any], Compiled | NotCompiledError]] = []
+
+    def __repr__(self) -> str:
+        return f"<Prepared form of {self.name}: {self.nstates} states>"
+
+    @property
+    def ninputs(self) -> int:
+        """Number of inputs."""
+        return len(self.input_labels)
+
+    def drives(self, inputs: list[Drive], first: float) -> list[Drive]:
+        """Given inputs, then the driven blocks in order."""
+        sources, found = iter(self._sources), list(inputs)
+        for block in self._blocks():
+            if block.plan is not None:
+                found.append(next(sources))
+            elif block.delay is not None:
+                initial = np.broadcast_to(np.asarray(block.system.initial, dtype=float), (block.system.ninputs,))
+                found.append(DelayedDrive(block.delay, initial, first))
+        return [*found, *sources]
+
+    def compiled(self, params: Mapping[str, Any], drives: list[Drive], first: float, state: Array) -> Compiled:
+        """Compiled form for some parameters, built once for all their values.
+
+        Raises
+        ------
+        NotCompiledError
+            If CasADi is missing, or a block cannot be traced; it is named.
+        """
+        names = frozenset(params)
+        for known, baked, form in self._compiled:
+            if known == names and all(_same(params.get(key), value) for key, value in baked.items()):
+                if isinstance(form, NotCompiledError):
+                    raise form
+                return form
+        form, baked = self._build(params, drives, first, state)
+        self._compiled = [*self._compiled[-7:], (names, baked, form)]
+        if isinstance(form, NotCompiledError):
+            raise form
+        return form
+
+    def distrust(self, form: Compiled, why: str) -> None:
+        """Never run a compiled form again that was found wrong."""
+        self._compiled = [
+            (names, baked, NotCompiledError(why) if known is form else known) for names, baked, known in self._compiled
+        ]
+
+    def _build(
+        self, params: Mapping[str, Any], drives: list[Drive], first: float, state: Array
+    ) -> tuple[Compiled | NotCompiledError, dict[str, Any]]:
+        if find_spec("casadi") is None:
+            return NotCompiledError("CasADi is not installed (pip install ctrlplan[fast])"), {}
+        from ctrlplan.simulation.compiled import Compiled
+        from ctrlplan.simulation.traced import NotTraceableError, traced
+
+        network = self.network
+        if network is None:
+            return NotCompiledError(self.unsupported), {}
+        equations = Interpreted(network, params, (first, state))
+        w = equations.signals(first, state, driven_signals(drives, np.array([first]))[:, 0])
+        traces: list[Trace | None] = []
+        baked: dict[str, Any] = {}
+        try:
+            for block, states, inputs in zip(network.blocks, network.states, network.inputs, strict=True):
+                if block.linear or block.driven:
+                    traces.append(None)
+                    continue
+                trace = traced(block, params, first, state[states], network.wire[inputs] @ w)
+                traces.append(trace)
+                # What is a constant in the trace must be so in every run of it.
+                baked |= {key: params[key] for key in params if key not in trace.symbols}
+            return Compiled(network, traces, equations.feeds), baked
+        except NotTraceableError as error:
+            return NotCompiledError(str(error)), dict(params)
+
+    def _blocks(self) -> tuple[Any, ...]:
+        return self.network.blocks if self.network is not None else ()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without python-control's objects, whose functions cannot be sent to another process."""
+        if self.linear is None:
+            usable = [entry for entry in self._compiled if not isinstance(entry[2], NotCompiledError)]
+            special = any(block.delay is not None or block.period is not None for block in self._blocks())
+            if not usable or special:
+                raise TypeError(
+                    f"{self.name} must be linear or compiled, without delays and samples, to be sent to another "
+                    "process; give a function that builds it"
+                )
+        network = self.network
+        if network is not None:
+            network = Network(network.name, (), network.wire[:0], network.read, network.ninputs)
+        return self.__dict__ | {"system": None, "fingerprint": None, "network": network}
+
+
+def prepare(system: Any) -> Prepared:
+    """Built form of a system, for many runs.
+
+    `simulate` takes it in the system's place; what it builds on the way
+    (the linear form, the compiled one) is built once, whatever the values of
+    parameters, plans on inputs and initial states.
+
+    Parameters
+    ----------
+    system : control system
+        As for `simulate`.
+
+    Returns
+    -------
+    Prepared
+
+    Examples
+    --------
+    >>> import ctrlplan as cp
+    >>> ready = cp.prepare(cp.plants.integrator_lag_loop(5.0))
+    >>> [round(float(cp.simulate(ready, [0.0, 20.0], final).outputs[-1]), 3) for final in (1.0, 2.0)]
+    [1.0, 2.0]
+    """
+    if isinstance(system, Prepared):
+        return system
+    return Prepared(_checked_system(system))
+
+
+def prepared_form(system: Any) -> Prepared:
+    """Form built before of the same system, or a new one where its maps, parameters or blocks have changed."""
+    if isinstance(system, Prepared):
+        if system.system is None or fingerprint(system.system) == system.fingerprint:
+            return system
+        system = system.system
+    _checked_system(system)
+    key = fingerprint(system)
+    if key not in _recent:
+        if len(_recent) >= _KEPT:
+            _recent.popitem(last=False)
+        _recent[key] = Prepared(system)
+    _recent.move_to_end(key)
+    return _recent[key]
+
+
+def state_space(system: Any) -> Any:
+    """Same system with states, where it is a transfer function."""
+    if not isinstance(system, ct.TransferFunction):
+        return system
+    return ct.ss(system, name=system.name, inputs=system.input_labels, outputs=system.output_labels)
+
+
+def fingerprint(system: Any) -> tuple[Any, ...]:
+    """What a run depends on: equal only where nothing has changed."""
+    own = (id(system), str(system.name), system.dt, _frozen(system.params) if hasattr(system, "params") else ())
+    labels = (tuple(system.input_labels or ()), tuple(system.output_labels or ()), tuple(system.state_labels or ()))
+    if isinstance(system, ct.InterconnectedSystem):
+        maps = tuple(np.asarray(m).tobytes() for m in (system.connect_map, system.input_map, system.output_map))
+        return (own, labels, maps, tuple(fingerprint(block) for block in system.syslist))
+    if isinstance(system, ct.StateSpace):
+        return (own, labels, tuple(np.asarray(m).tobytes() for m in (system.A, system.B, system.C, system.D)))
+    if isinstance(system, ct.TransferFunction):
+        return (own, labels, _frozen([system.num, system.den]))
+    functions = tuple(id(getattr(system, name, None)) for name in ("updfcn", "outfcn", "plan"))
+    numbers = tuple(getattr(system, name, None) for name in ("derivatives", "delay", "period", "offset"))
+    inner = getattr(system, "block", None)
+    return (own, labels, functions, numbers, () if inner is None else fingerprint(inner))
+
+
+def _checked_system(system: Any) -> Any:
+    if not isinstance(system, ct.InputOutputSystem):
+        raise TypeError(f"system must be a control system, got {type(system).__name__}")
+    return system
+
+
+_recent: OrderedDict[tuple[Any, ...], Prepared] = OrderedDict()
+
+
+def _frozen(value: Any) -> Any:
+    """Something hashable that changes with a value."""
+    if isinstance(value, Mapping):
+        return tuple((key, _frozen(entry)) for key, entry in value.items())
+    if isinstance(value, list | tuple):
+        return tuple(_frozen(entry) for entry in value)
+    if isinstance(value, np.ndarray):
+        return value.shape, value.tobytes() if value.dtype != object else tuple(map(_frozen, value.ravel()))
+    try:
+        hash(value)
+    except TypeError:
+        return id(value)
+    return value
+
+
+def _same(a: Any, b: Any) -> bool:
+    return bool(a is b or np.array_equal(a, b))

@@ -1,0 +1,59 @@
+"""Where a linear loop rests, and whether it does."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import null_space
+
+from ctrlplan.simulation.linear import NotLinearError, linear_form
+
+Array = NDArray[np.float64]
+
+
+def rest_state(system: Any, position: ArrayLike) -> Array:
+    """State at which a linear loop rests when its inputs are held.
+
+    Parameters
+    ----------
+    system : control system
+        Linear and continuous; of others the zero state is returned.
+    position : array_like, shape (ninputs,)
+        What the inputs are held at.
+
+    Returns
+    -------
+    ndarray, shape (nstates,)
+        A solution of A x + B w = 0, with outputs as near w as it allows; zero
+        where there is none.
+    """
+    held = np.atleast_1d(np.asarray(position, dtype=float))
+    if not held.any():
+        return np.zeros(system.nstates or 0)
+    try:
+        form = linear_form(system)
+    except NotLinearError:
+        return np.zeros(system.nstates or 0)
+    if form.b.shape[1] != held.size:
+        return np.zeros(len(form.a))
+    supplied = form.b @ held
+    state: Array = np.linalg.lstsq(form.a, -supplied, rcond=None)[0]
+    if np.abs(form.a @ state + supplied).max(initial=0.0) > 1e-9 * np.abs(supplied).max(initial=0.0):
+        return np.zeros(len(form.a))
+    # Where integrators leave a choice, the outputs should be what is asked for.
+    idle, tracked = null_space(form.a), form.c[: held.size]
+    if idle.size and len(tracked) == held.size:
+        missing = held - tracked @ state - form.d[: held.size] @ held
+        state = state + idle @ np.linalg.lstsq(tracked @ idle, missing, rcond=None)[0]
+    return state
+
+
+def unstable_poles(system: Any) -> NDArray[np.complex128]:
+    """Poles in the right half plane of a linear continuous system; of others none are known."""
+    try:
+        poles = np.linalg.eigvals(linear_form(system).a).astype(complex)
+    except NotLinearError:
+        return np.empty(0, dtype=complex)
+    return poles[poles.real > 1e-9 * np.maximum(1e-300, np.abs(poles))]

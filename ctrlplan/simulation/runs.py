@@ -1,0 +1,264 @@
+"""The ways to run a loop: exact, compiled, by Python, from sample to sample."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctrlplan.simulation.drives import Drive, PlanDrive, driven_signals
+from ctrlplan.simulation.events import Event, Snapshot, Watched, watched_events
+from ctrlplan.simulation.exact import exact_states
+from ctrlplan.simulation.interpreted import Interpreted, InterpretedSolver, SolverError
+from ctrlplan.simulation.legs import Solver, integrate
+from ctrlplan.simulation.linear import LinearForm
+from ctrlplan.simulation.prepared import NotCompiledError, Prepared
+
+Array = NDArray[np.float64]
+
+METHODS = ("auto", "exact", "compiled", "python")
+
+_LOOKS = 400
+"""Times, beside those asked for, at which the signals of events are looked at."""
+
+_VISITED = 12
+"""Visited states at which a compiled system is compared with Python."""
+
+
+@dataclass(frozen=True, eq=False)
+class Job:
+    """What one call of `simulate` asks for."""
+
+    prepared: Prepared
+    times: Array
+    inputs: list[Drive]
+    state: Array
+    params: dict[str, Any]
+    tolerances: tuple[float, float]
+    events: Sequence[Event] | None
+
+    @property
+    def first(self) -> float:
+        """Where the run begins [s]."""
+        return float(self.times[0])
+
+    def watched(self) -> tuple[Watched, ...]:
+        """Events asked for, and unless none are wanted those that blocks declare."""
+        prepared = self.prepared
+        # An output hides an input or a state of the same name.
+        kinds = (("u", prepared.input_labels), ("x", prepared.state_labels), ("y", prepared.output_labels))
+        labels = {label: (kind, row) for kind, names in kinds for row, label in enumerate(names)}
+        asked = watched_events(self.events or (), labels)
+        if self.events is not None and not self.events:
+            return ()
+        network, declared = prepared.network, []
+        for i, block in enumerate(network.blocks if network is not None else ()):
+            for name, (function, low, high) in getattr(block.system, "watched", {}).items():
+                wire = network.wire[network.inputs[i]]  # type: ignore[union-attr]
+                states = network.states[i]  # type: ignore[union-attr]
+                value = partial(_of_block, function, states, wire, {**block.params, **self.params})
+                declared.append(Watched(name, value, low, high))
+        return (*declared, *asked)
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    """States at the times of a run, and how to see more of it.
+
+    Attributes
+    ----------
+    times, states : ndarray, shapes (ntime,) and (nstates, ntime)
+        As far as the run went.
+    see : callable
+        Maps times and states to all signals.
+    carry : callable
+        Maps k and a time between times[k] and the next to the state there.
+    watched : tuple of Watched
+        Signals whose limits count as events.
+    method, reason : str
+        What ran, and why.
+    """
+
+    times: Array
+    states: Array
+    see: Callable[[Array, Array], Snapshot]
+    carry: Callable[[int, float], Array]
+    watched: tuple[Watched, ...]
+    method: str
+    reason: str
+
+    def state_at(self, k: int, t: float) -> Array:
+        """State at a time from times[k] to the next."""
+        return self.carry(k, t) if t > self.times[k] else self.states[:, k]
+
+
+def recorded(job: Job, method: str) -> Record:
+    """Run by the method asked for, or the first that can be taken.
+
+    Raises
+    ------
+    ValueError
+        If the method asked for cannot be taken; the reason is in the message.
+    """
+    prepared = job.prepared
+    reason = prepared.not_linear or "an input is given by samples"
+    if method in ("auto", "exact"):
+        if prepared.linear is not None and all(isinstance(drive, PlanDrive) for drive in job.inputs):
+            return _exact(job, prepared.linear)
+        if method == "exact":
+            raise ValueError(f'method "exact" must be given a linear continuous system and trajectories, but {reason}')
+    if prepared.dt not in (None, 0):
+        if method == "compiled":
+            raise ValueError(f'method "compiled" must be given a continuous system, got dt = {prepared.dt}')
+        return _discrete(job, reason)
+    if method == "python":
+        return _numerical(job, "python", 'method "python" was asked for')
+    try:
+        return _numerical(job, "compiled", reason)
+    except NotCompiledError as error:
+        if method == "compiled":
+            raise ValueError(f'method "compiled" must be given blocks that can be traced, but {error}') from None
+        return _numerical(job, "python", str(error))
+    except SolverError as error:
+        if method == "compiled":
+            raise
+        return _numerical(job, "python", f"CVODES failed: {error}")
+
+
+def _exact(job: Job, form: LinearForm) -> Record:
+    """Linear loop: one matrix exponential a leg."""
+    plans = [(drive.plan, drive.derivatives) for drive in job.inputs if isinstance(drive, PlanDrive)] + [*form.sources]
+    drives = [PlanDrive(plan, high) for plan, high in plans]
+    breakpoints = [t for plan, _ in plans for t in plan.breakpoints]
+    watched = job.watched()
+    times = _with_looks(job.times, watched)
+
+    def jet(moment: float, origin: float, s: Array, order: int) -> Array:
+        rows = [plan._jet_beside(moment, origin, s, order + high) for plan, high in plans]
+        signals = [_derivatives(row, high, order) for row, (_, high) in zip(rows, plans, strict=True)]
+        return np.concatenate(signals, axis=1) if signals else np.zeros((order + 1, 0, s.size))
+
+    def see(t: Array, x: Array) -> Snapshot:
+        driven = driven_signals(drives, t)
+        with np.errstate(over="ignore", invalid="ignore"):
+            return Snapshot(t, x, driven[: job.prepared.ninputs], _finite(form.c @ x + form.d @ driven))
+
+    def states_at(t: Array, state: Array) -> Array:
+        with np.errstate(over="ignore", invalid="ignore"):
+            return _finite(exact_states(form.a, form.b, jet, breakpoints, t, state))
+
+    def carry(k: int, t: float) -> Array:
+        return states_at(np.array([times[k], t]), states[:, k])[:, 1]
+
+    states = states_at(times, job.state)
+    return Record(times, states, see, carry, watched, "exact", "linear, continuous, driven by trajectories")
+
+
+def _numerical(job: Job, method: str, reason: str) -> Record:
+    """Leg by leg, compiled or by Python."""
+    prepared, network = job.prepared, _network(job.prepared)
+    drives = prepared.drives(job.inputs, job.first)
+    equations = Interpreted(network, job.params, (job.first, job.state)) if network.blocks else None
+    solver: Solver
+    if method == "compiled":
+        from ctrlplan.simulation.compiled import CompiledSolver
+
+        form = prepared.compiled(job.params, drives, job.first, job.state)
+        solver = CompiledSolver(form, job.params, *job.tolerances)
+    elif equations is not None:
+        solver = InterpretedSolver(equations, *job.tolerances)
+    else:
+        raise NotCompiledError(f"{prepared.name} came from another process without its blocks")
+    watched = job.watched()
+
+    def see(t: Array, x: Array) -> Snapshot:
+        driven = driven_signals(drives, t)
+        y = solver.outputs(t, x, driven)
+        return Snapshot(t, x, driven[: prepared.ninputs], y, lambda: solver.signals(t, x, driven))
+
+    def carry(k: int, t: float) -> Array:
+        start = float(run.times[k])
+        return solver.advance(run.series(start), start, np.array([t]), run.states[:, k])[:, -1]
+
+    def pause(t: Array, x: Array) -> bool:
+        seen = see(t, x)
+        return any(entry.side(entry.value(seen)).any() for entry in watched if entry.stop)
+
+    run = integrate(
+        network,
+        equations,
+        solver,
+        drives,
+        _with_looks(job.times, watched),
+        job.state,
+        resolution=10.0 * job.tolerances[0],
+        pause=pause if any(entry.stop for entry in watched) else None,
+    )
+    if method == "compiled" and equations is not None:
+        some = np.unique(np.linspace(0, run.times.size - 1, _VISITED).astype(int))
+        t, x, driven = run.times[some], run.states[:, some], driven_signals(drives, run.times[some])
+        wrong = form.disagreement(network, job.params, t, x, equations.all_signals(t, x, driven))
+        if wrong:
+            prepared.distrust(form, wrong)
+            raise NotCompiledError(wrong)
+    return Record(run.times, run.states, see, carry, watched, method, reason)
+
+
+def _discrete(job: Job, reason: str) -> Record:
+    """Discrete system, from sample to sample."""
+    prepared, network = job.prepared, _network(job.prepared)
+    period = 1.0 if prepared.dt is True else float(prepared.dt)
+    steps = (job.times - job.first) / period
+    wanted = np.round(steps).astype(int)
+    if np.abs(steps - wanted).max() > 1e-6:
+        at = float(job.times[np.abs(steps - wanted).argmax()])
+        raise ValueError(f"timepts must be whole periods of {period:g} s apart in a discrete system, got {at:g} s")
+    clock = job.first + period * np.arange(wanted[-1] + 1)
+    clock[wanted] = job.times
+    drives = prepared.drives(job.inputs, job.first)
+    equations = Interpreted(network, job.params, (job.first, job.state))
+    driven = driven_signals(drives, clock)
+    states = np.empty((job.state.size, clock.size))
+    states[:, 0] = job.state
+    for k in range(clock.size - 1):
+        states[:, k + 1] = equations.rates(float(clock[k]), states[:, k], driven[:, k])
+
+    def see(t: Array, x: Array) -> Snapshot:
+        now = driven_signals(drives, t)
+        w = equations.all_signals(t, x, now)
+        return Snapshot(t, x, now[: prepared.ninputs], network.read @ w, lambda: w)
+
+    # Between samples nothing happens: what crosses a limit does so at the later one.
+    return Record(clock, states, see, lambda k, t: states[:, k], job.watched(), "python", reason)
+
+
+def _network(prepared: Prepared) -> Any:
+    if prepared.network is None:
+        raise NotCompiledError(prepared.unsupported)
+    return prepared.network
+
+
+def _of_block(function: Any, states: slice, wire: Array, params: dict[str, Any], seen: Snapshot) -> Array:
+    """Signal that a block declares, from its states and inputs."""
+    return np.asarray(function(seen.t, seen.x[states], wire @ seen.w, params))
+
+
+def _with_looks(times: Array, watched: Sequence[Watched]) -> Array:
+    """Times asked for, and more where events are watched."""
+    return np.union1d(times, np.linspace(times[0], times[-1], _LOOKS)) if watched else times
+
+
+def _derivatives(jet: Array, high: int, order: int) -> Array:
+    """Jets (order + 1, naxes (high + 1), ntime) of a plan and its derivatives, axis by axis."""
+    shifted = np.stack([jet[k : k + order + 1] for k in range(high + 1)], axis=2)
+    return shifted.reshape(order + 1, -1, jet.shape[2])
+
+
+def _finite(values: Array) -> Array:
+    """An unstable loop that has left the range of numbers is infinite, not undefined."""
+    values[np.isnan(values)] = np.inf
+    return values
