@@ -32,7 +32,7 @@ _EXPORTS = {
         "source_samples",
     ),
     "simulation": ("Event", "prepare", "simulate"),
-    "studies": ("Comparison", "Sweep", "compare", "sweep"),
+    "studies": ("Comparison", "Ensemble", "Sweep", "compare", "draws", "sweep"),
 }
 _HOME = {name: module for module, names in _EXPORTS.items() for name in names}
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ctrlplan.reports.crane_figures import CRANE_FIGURES
 from ctrlplan.reports.style import house_style, legend_above, line_styles, new_figure, stacked_axes, with_unit
 from ctrlplan.studies.comparison import Comparison
+from ctrlplan.studies.ensemble import Ensemble
 from ctrlplan.studies.linear import STEP_LIMIT, jumps
 from ctrlplan.studies.measures import MEASURES
 from ctrlplan.studies.study import Study
@@ -146,6 +147,51 @@ def plot_sweep(sweep: Sweep, names: Sequence[str] = ("settling_time", "overshoot
 
 
 @house_style
+def plot_bands(ensemble: Ensemble) -> Figure:
+    """Quantiles over the draws of outputs, errors and controls: 5 to 95 %, 25 to 75 %, and the median."""
+    nominal = ensemble.nominal
+    styles = line_styles(nominal.plans)
+    shown = [(signal, error) for signal in nominal.outputs for error in (False, True)]
+    shown += [(signal, False) for signal in nominal.controls if signal not in nominal.outputs]
+    figure = new_figure(max(4.4, 2.6 * len(nominal.plans) + 0.6), 1.2 + 1.7 * len(shown))
+    rows = stacked_axes(figure, len(shown), len(nominal.plans))
+    t = ensemble.timepts
+    for row, (signal, error) in zip(rows, shown, strict=True):
+        bands = [ensemble.bands.get(plan, {}).get(signal) for plan in nominal.plans]
+        extent = []
+        for axes, (plan, reference), band in zip(row, nominal.plans.items(), bands, strict=True):
+            target = reference.jet(t, 0)[0, nominal.outputs.index(signal)] if signal in nominal.outputs else None
+            if target is not None and not error:
+                axes.plot(t, target, color="#444444", linewidth=0.8, linestyle=(0, (4, 2)), label="reference")
+            if band is None:
+                continue
+            if error and target is not None:
+                band = target - band[::-1]
+            colour = styles[plan]["color"]
+            axes.fill_between(t, band[0], band[4], color=colour, alpha=0.2, linewidth=0, label="5 to 95 %")
+            axes.fill_between(t, band[1], band[3], color=colour, alpha=0.35, linewidth=0, label="25 to 75 %")
+            axes.plot(t, band[2], color=colour, linewidth=1.1, label="median")
+            extent.append(band[np.isfinite(band)])
+        # One scale a row, so that the plans can be compared.
+        if extent and np.concatenate(extent).size:
+            low, high = np.min(np.concatenate(extent)), np.max(np.concatenate(extent))
+            margin = 0.05 * (high - low) or 0.5
+            for axes in row:
+                axes.set_ylim(low - margin, high + margin)
+        label = signal
+        if signal in nominal.outputs:
+            label = next(iter(nominal.plans.values())).labels[nominal.outputs.index(signal)]
+        unit = nominal.units.get(signal, nominal.units.get(label, ""))
+        row[0].set_ylabel(with_unit(f"error of {signal}" if error else signal, unit))
+    for axes, plan in zip(rows[0], nominal.plans, strict=True):
+        axes.set_title(plan, fontsize=9)
+    for axes in rows[-1]:
+        axes.set_xlabel("time [s]")
+    legend_above(figure, rows[0][0])
+    return figure
+
+
+@house_style
 def plot_plane(sweep: Sweep) -> Figure:
     """Figure 1: the settling-time/overshoot plane, each point a gain."""
     styles = line_styles(sweep.metrics)
@@ -200,6 +246,10 @@ FIGURES: dict[str, tuple[Callable[[Study], Figure], str]] = {
         lambda study: plot_sweep(_sweep(study), ("settling_time", "overshoot_error", "control_peak", "control_effort")),
         "The same over the gain, with what each reference asks of the control: its peak and its effort ∫u² dt.",
     ),
+    "bands": (
+        lambda study: plot_bands(_ensemble(study)),
+        "Spread over the draws: the median, and the bands that hold half and nine tenths of them.",
+    ),
     "plans": (
         lambda study: plot_plans(study.comparison),
         "The references and their derivatives; circles are prescribed values.",
@@ -219,6 +269,12 @@ def _sweep(study: Study) -> Sweep:
     if study.sweep is None:
         raise ValueError(f"study {study.name} must have a sweep for this figure, got none")
     return study.sweep
+
+
+def _ensemble(study: Study) -> Ensemble:
+    if study.ensemble is None:
+        raise ValueError(f"study {study.name} must have draws for this figure, got none")
+    return study.ensemble
 
 
 def _times(plan: Trajectory, start: float | None = None, end: float | None = None) -> Array:

@@ -23,6 +23,7 @@ from ctrlplan.reports.figures import FIGURES
 from ctrlplan.reports.style import line_styles, to_svg
 from ctrlplan.reports.words import number, summary, unit_of, verdicts
 from ctrlplan.studies.comparison import Comparison
+from ctrlplan.studies.ensemble import Ensemble
 from ctrlplan.studies.study import Study
 
 
@@ -166,6 +167,7 @@ def _section(study: Study) -> dict[str, Any]:
         "verdict": summary(comparison),
         "verdicts": [v.sentence for v in verdicts(comparison)],
         "table": _table(comparison),
+        "spread": _spread(study.ensemble),
         "figures": figures,
         "animation": Markup(animation_data(comparison, study.wall)) if is_crane(comparison) else "",  # noqa: S704
         "marks": comparison.marks,
@@ -196,6 +198,29 @@ def _table(comparison: Comparison) -> dict[str, Any]:
         for plan in comparison.metrics
     ]
     return {"plans": plans, "rows": rows}
+
+
+def _spread(ensemble: Ensemble | None) -> dict[str, Any] | None:
+    """Rows of metrics over draws: the median, and where nine tenths of them lie."""
+    if ensemble is None:
+        return None
+    nominal, rows = ensemble.nominal, []
+    for key, measure in nominal.measures.items():
+        if not any(key in found for found in ensemble.metrics.values()):
+            continue
+        cells = []
+        for plan in nominal.metrics:
+            low, _, middle, _, high = ensemble.quantiles(key)[plan] if key in ensemble.metrics.get(plan, {}) else _NONE
+            text = f"{number(middle, measure.unit)} ({number(low, measure.unit)} to {number(high, measure.unit)})"
+            order = "" if math.isnan(middle) else "1e999" if math.isinf(middle) else repr(float(middle))
+            cells.append({"text": text, "order": order, "mark": ""})
+        rows.append({"title": measure.title, "unit": unit_of(nominal, key) or "", "cells": cells})
+    styles = line_styles(nominal.metrics)
+    plans = [{"name": plan, "colour": styles[plan]["color"], "mark": ""} for plan in nominal.metrics]
+    return {"plans": plans, "rows": rows}
+
+
+_NONE = (math.nan,) * 5
 
 
 def _versions() -> dict[str, str]:

@@ -62,6 +62,15 @@ class Compiled:
         self._maps: OrderedDict[Any, Any] = OrderedDict()
         self._equations: dict[int, dict[str, Any]] = {}
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Without what is made anew where it is needed."""
+        return self.__dict__ | {
+            "_traces": [],
+            "_integrators": OrderedDict(),
+            "_maps": OrderedDict(),
+            "_equations": {},
+        }
+
     def parameters(self, params: Mapping[str, Any]) -> Array:
         """Entries of p for a run."""
         return np.array([float(params.get(key, default)) for key, default in self._defaults])

@@ -119,6 +119,37 @@ class Prepared:
             (names, baked, NotCompiledError(why) if known is form else known) for names, baked, known in self._compiled
         ]
 
+    def detached(self) -> Prepared:
+        """Same form without python-control's blocks, for other processes and for many runs.
+
+        Nothing is compared with Python any more.
+
+        Raises
+        ------
+        TypeError
+            If it is neither linear nor compiled, or has delays or discrete blocks.
+        """
+        other = object.__new__(Prepared)
+        other.__dict__.update(self.__getstate__())
+        return other
+
+    def feels(self, name: str, low: float, high: float) -> bool:
+        """Whether a parameter changes anything, near where a run begins."""
+        network = self.network
+        if network is None or not network.blocks:
+            return True
+        rng = np.random.default_rng(0)
+        start = np.zeros(self.nstates) if self.initial_state is None else np.asarray(self.initial_state, dtype=float)
+        one, other = (Interpreted(network, {name: value}, (0.0, start)) for value in (low, high))
+        for scale in (0.0, 0.1, 1.0):
+            x = start + scale * rng.standard_normal(start.size) * (1.0 + np.abs(start))
+            driven = scale * rng.standard_normal(network.driven.size)
+            with np.errstate(all="ignore"):
+                pairs = [(f.rates(0.0, x, driven), f.signals(0.0, x, driven)) for f in (one, other)]
+            if any(not np.array_equal(a, b, equal_nan=True) for a, b in zip(*pairs, strict=True)):
+                return True
+        return False
+
     def _build(
         self, params: Mapping[str, Any], drives: list[Drive], first: float, state: Array
     ) -> tuple[Compiled | NotCompiledError, dict[str, Any]]:
@@ -130,6 +161,8 @@ class Prepared:
         network = self.network
         if network is None:
             return NotCompiledError(self.unsupported), {}
+        if not network.blocks:
+            return NotCompiledError(f"{self.name} is without its blocks, compiled for other parameters"), {}
         equations = Interpreted(network, params, (first, state))
         w = equations.signals(first, state, driven_signals(drives, np.array([first]))[:, 0])
         traces: list[Trace | None] = []

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import null_space
 
-from ctrlplan.simulation.linear import NotLinearError, linear_form
+from ctrlplan.simulation.linear import LinearForm, NotLinearError, linear_form
+from ctrlplan.simulation.prepared import Prepared
 
 Array = NDArray[np.float64]
 
@@ -33,7 +34,7 @@ def rest_state(system: Any, position: ArrayLike) -> Array:
     if not held.any():
         return np.zeros(system.nstates or 0)
     try:
-        form = linear_form(system)
+        form = _form(system)
     except NotLinearError:
         return np.zeros(system.nstates or 0)
     if form.b.shape[1] != held.size:
@@ -53,7 +54,15 @@ def rest_state(system: Any, position: ArrayLike) -> Array:
 def unstable_poles(system: Any) -> NDArray[np.complex128]:
     """Poles in the right half plane of a linear continuous system; of others none are known."""
     try:
-        poles = np.linalg.eigvals(linear_form(system).a).astype(complex)
+        poles = np.linalg.eigvals(_form(system).a).astype(complex)
     except NotLinearError:
         return np.empty(0, dtype=complex)
     return poles[poles.real > 1e-9 * np.maximum(1e-300, np.abs(poles))]
+
+
+def _form(system: Any) -> LinearForm:
+    if not isinstance(system, Prepared):
+        return linear_form(system)
+    if system.linear is None:
+        raise NotLinearError(system.not_linear)
+    return system.linear

@@ -2,6 +2,7 @@
 
 from ctrlplan.studies.comparison import Comparison, compare, standard_plans
 from ctrlplan.studies.crane import crane_first_order_study, crane_nominal_study, crane_obstacle_study
+from ctrlplan.studies.ensemble import Ensemble, draws
 from ctrlplan.studies.linear import linear_study
 from ctrlplan.studies.measures import MEASURES, Measure
 from ctrlplan.studies.study import Study
@@ -19,6 +20,7 @@ __all__ = [
     "MEASURES",
     "PAPER",
     "Comparison",
+    "Ensemble",
     "Measure",
     "Study",
     "Sweep",
@@ -26,6 +28,7 @@ __all__ = [
     "crane_first_order_study",
     "crane_nominal_study",
     "crane_obstacle_study",
+    "draws",
     "linear_study",
     "standard_plans",
     "sweep",

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ctrlplan.simulation import rest_state, simulate, state_space, unstable_poles
+from ctrlplan.simulation import Event, rest_state, simulate, state_space, unstable_poles
 from ctrlplan.studies.measures import MEASURES, Measure, control_metrics, path_metrics, response_metrics
 from ctrlplan.trajectories import PiecewiseSpline, PolySpline, Step, Trajectory, TrigSpline, Waypoint
 
@@ -131,6 +131,8 @@ def compare(
     initial_state: ArrayLike | None = None,
     band: float = 0.02,
     only: Collection[str] | None = None,
+    params: Mapping[str, Any] | None = None,
+    events: Sequence[Event] | None = None,
     measure: Callable[[Trajectory, Any], Mapping[str, float]] | None = None,
     measures: Mapping[str, Measure] | None = None,
     units: Mapping[str, str] | None = None,
@@ -167,6 +169,8 @@ def compare(
         Half width of the settling band relative to the planned change.
     only : collection of str, optional
         Metrics wanted, by their keys in `MEASURES`; all unless given.
+    params, events : optional
+        As for `simulate`.
     measure : callable, optional
         Maps a plan and its response to further metrics.
     measures : mapping of str to Measure, optional
@@ -201,9 +205,8 @@ def compare(
     """
     points = tuple(waypoints)
     if not isinstance(plans, Mapping):
-        points = tuple(plans)
-        plans = standard_plans(points, alpha)
-    references = _checked_plans(plans)
+        plans = points = tuple(plans)
+    references = references_of(plans, alpha)
     first = next(iter(references.values()))
     times = np.asarray(timepts, dtype=float)
     start = min(plan.start for plan in references.values())
@@ -222,16 +225,19 @@ def compare(
             times,
             plan if system.ninputs else None,
             initial_state=_initial_state(system, plan, times, initial_state),
+            params=params,
+            events=events,
         )
-        signals = np.asarray(response.outputs).reshape(-1, times.size)
+        reached = np.asarray(response.time)  # an event may have ended the run
+        signals = np.asarray(response.outputs).reshape(-1, reached.size)
         rows, acting_rows = ([system.output_labels.index(n) for n in names] for names in (tracked, acting))
         values = dict(measure(plan, response)) if measure is not None else {}
-        values |= response_metrics(times, signals[rows], plan, start, band, first.labels, only)
+        values |= response_metrics(reached, signals[rows], plan, start, band, first.labels, only)
         unstable = unstable_poles(system)
         if unstable.size:
             values |= {key: np.inf for key in values if "settling_time" in key}
         if acting:
-            values |= control_metrics(times, signals[acting_rows], start, acting, only)
+            values |= control_metrics(reached, signals[acting_rows], start, acting, only)
         responses[name] = response
         found[name] = values | (path_metrics(plan, points) if only is None else {})
     return Comparison(
@@ -247,6 +253,19 @@ def compare(
         notes=_notes(unstable, found),
         measures=dict(measures or {}) | MEASURES,
     )
+
+
+def references_of(plans: Mapping[str, Trajectory] | Iterable[Waypoint], alpha: float = 1.0) -> dict[str, Trajectory]:
+    """The references by name: those given, or the standard set through waypoints.
+
+    Raises
+    ------
+    ValueError
+        If there is none, or they differ in axes.
+    TypeError
+        If one is not a trajectory.
+    """
+    return _checked_plans(plans if isinstance(plans, Mapping) else standard_plans(plans, alpha))
 
 
 def standard_plans(waypoints: Iterable[Waypoint], alpha: float = 1.0) -> dict[str, Trajectory]:
@@ -336,7 +355,7 @@ def _initial_state(loop: Any, plan: Trajectory, times: Array, given: ArrayLike |
     """State given, or the loop's own, or rest at the plan's first position."""
     if given is not None:
         return given
-    if hasattr(loop, "initial_state"):
+    if getattr(loop, "initial_state", None) is not None:
         return np.asarray(loop.initial_state)
     return rest_state(loop, plan.jet(times[:1], 0, left=True)[0, :, 0])
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctrlplan.studies.comparison import Comparison
+from ctrlplan.studies.ensemble import Ensemble
 from ctrlplan.studies.sweep import Sweep
 
 
@@ -56,6 +57,8 @@ class Study:
         Findings, one sentence or two each; where a claim fails they say so.
     sweep : Sweep or None
         Metrics over a parameter.
+    ensemble : Ensemble or None
+        Spread over draws of the loop's parameters.
     sweep_metrics : tuple of str
         Those that ``results.json`` keeps.
     figures : tuple of str
@@ -72,6 +75,7 @@ class Study:
     summary: str = ""
     notes: tuple[str, ...] = ()
     sweep: Sweep | None = None
+    ensemble: Ensemble | None = None
     sweep_metrics: tuple[str, ...] = ("overshoot_error", "settling_time")
     figures: tuple[str, ...] = ("plans", "responses")
     curves: tuple[Curves, ...] = ()
@@ -82,4 +86,6 @@ class Study:
         data = self.comparison.results()
         if self.sweep is not None:
             data["sweep"] = self.sweep.results(self.sweep_metrics)
+        if self.ensemble is not None:
+            data["draws"] = self.ensemble.results()
         return data

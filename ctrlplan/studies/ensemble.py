@@ -1,0 +1,384 @@
+"""One comparison for each of many draws of a loop's parameters."""
+
+from __future__ import annotations
+
+import os
+import pickle
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from tqdm import tqdm
+
+from ctrlplan.simulation import Prepared, prepare
+from ctrlplan.studies.comparison import Comparison, compare, finite_or_none, references_of
+from ctrlplan.trajectories import Trajectory, Waypoint
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.figure import Figure
+
+Array = NDArray[np.float64]
+Distribution = Any
+"""Two numbers, the ends of a uniform distribution, or whatever has scipy's ``rvs``."""
+
+LEVELS = (0.05, 0.25, 0.5, 0.75, 0.95)
+
+_CHUNK = 20
+"""Draws that an executor is handed at a time."""
+
+_SAMPLES = 1001
+"""Times at which bands are kept, at most."""
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A draw that could not be run.
+
+    Attributes
+    ----------
+    draw : int
+        Which.
+    params : dict of str to float
+        Its parameters.
+    message : str
+        What went wrong.
+    """
+
+    draw: int
+    params: dict[str, float]
+    message: str
+
+
+@dataclass(frozen=True)
+class Ensemble:
+    """What plans made of a loop over draws of its parameters; made by `sweep` with ``params``.
+
+    Attributes
+    ----------
+    nominal : Comparison
+        The loop with its own parameters.
+    params : dict of str to ndarray, shape (ndraws,)
+        The draws.
+    metrics : dict of str to dict of str to ndarray, shape (ndraws,)
+        Plan, metric; nan where a draw failed or was not reached.
+    timepts : ndarray, shape (ntime,)
+        Times of the bands [s].
+    bands : dict of str to dict of str to ndarray, shape (nlevels, ntime)
+        Plan, signal: quantiles over the draws, at `levels`.
+    levels : tuple of float
+        Of the quantiles.
+    failures : tuple of Failure
+        Draws that could not be run, with their parameters.
+    finished : int
+        Draws run or failed; fewer than asked for where the run was interrupted.
+    """
+
+    nominal: Comparison
+    params: dict[str, Array]
+    metrics: dict[str, dict[str, Array]]
+    timepts: Array
+    bands: dict[str, dict[str, Array]]
+    levels: tuple[float, ...] = LEVELS
+    failures: tuple[Failure, ...] = ()
+    finished: int = 0
+
+    @property
+    def ndraws(self) -> int:
+        """Draws asked for."""
+        return next(iter(self.params.values())).size
+
+    def quantiles(self, name: str) -> dict[str, Array]:
+        """Quantiles at `levels` of a metric, by plan; draws that failed do not count."""
+        found = {}
+        for plan, rows in self.metrics.items():
+            known = rows[name][~np.isnan(rows[name])]
+            found[plan] = np.quantile(known, self.levels, method="inverted_cdf") if known.size else np.full(5, np.nan)
+        return found
+
+    def to_pandas(self) -> pd.DataFrame:
+        """Table of one row a draw; columns the parameters, then plan and metric."""
+        import pandas as pd
+
+        columns = {("params", name): values for name, values in self.params.items()}
+        columns |= {(plan, name): row for plan, rows in self.metrics.items() for name, row in rows.items()}
+        return pd.DataFrame(columns).rename_axis(index="draw", columns=["plan", "metric"])
+
+    def results(self) -> dict[str, Any]:
+        """Plain data for JSON: draws, metrics, failures; null where infinite or undefined."""
+        return {
+            "params": {name: values.tolist() for name, values in self.params.items()},
+            "finished": self.finished,
+            "plans": {
+                plan: {name: [finite_or_none(value) for value in row.tolist()] for name, row in rows.items()}
+                for plan, rows in self.metrics.items()
+            },
+            "failures": [{"draw": f.draw, "params": f.params, "message": f.message} for f in self.failures],
+        }
+
+    def plot(self) -> Figure:
+        """Bands of outputs and controls over time."""
+        from ctrlplan.reports.figures import plot_bands
+
+        return plot_bands(self)
+
+    def report(self, path: str | os.PathLike[str], title: str = "Spread over draws") -> Path:
+        """Write one self-contained HTML page and return its path.
+
+        Parameters
+        ----------
+        path : str or path
+            The file, or a folder for ``index.html`` in it.
+        title : str, optional
+            Heading.
+        """
+        from ctrlplan.reports import write_page
+        from ctrlplan.studies.study import Study
+
+        notes = (*self.nominal.notes, *self.notes())
+        study = Study("draws", title, self.nominal, notes=notes, figures=("bands", "responses"), ensemble=self)
+        return write_page([study], path, title=title)
+
+    def notes(self) -> Iterator[str]:
+        """What a reader must know of the draws."""
+        ranges = ", ".join(f"{k} {v.min():.4g} to {v.max():.4g}" for k, v in self.params.items())
+        yield f"{self.finished} draws of {ranges}; the responses below are those of the loop's own parameters."
+        if self.finished < self.ndraws:
+            yield f"The run was interrupted: {self.ndraws - self.finished} draws were not reached."
+        if self.failures:
+            first = self.failures[0]
+            where = ", ".join(f"{key} = {value:.4g}" for key, value in first.params.items())
+            yield f"{len(self.failures)} draws failed; the first, with {where}: {first.message}"
+
+
+def draws(count: int, seed: int = 0, **distributions: Distribution) -> dict[str, Array]:
+    """Random parameters, the same for the same seed.
+
+    Parameters
+    ----------
+    count : int
+        Number of draws.
+    seed : int, optional
+        Of the generator; each parameter has a stream of its own, so that
+        another parameter changes none of the others.
+    **distributions
+        By the parameter's name: (low, high) of a uniform distribution, or a
+        frozen distribution of `scipy.stats`.
+
+    Returns
+    -------
+    dict of str to ndarray, shape (count,)
+        For the ``params`` of `sweep`.
+
+    Raises
+    ------
+    ValueError
+        If `count` is not above 0, or low is above high.
+    TypeError
+        If something is no distribution.
+
+    Examples
+    --------
+    >>> found = draws(3, seed=1, load_mass=(400.0, 600.0))
+    >>> bool(400.0 <= found["load_mass"].min() <= found["load_mass"].max() <= 600.0)
+    True
+    """
+    if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
+        raise ValueError(f"count must be a whole number from 1, got {count!r}")
+    found = {}
+    for name, distribution in distributions.items():
+        rng = np.random.default_rng([seed, *name.encode()])
+        if hasattr(distribution, "rvs"):
+            values = distribution.rvs(size=count, random_state=rng)
+        elif np.shape(distribution) == (2,):
+            low, high = (float(end) for end in distribution)
+            if not low <= high:
+                raise ValueError(f"{name} must be drawn from low to high, got {low} and {high}")
+            values = rng.uniform(low, high, count)
+        else:
+            raise TypeError(f"{name} must be (low, high) or a distribution of scipy.stats, got {distribution!r}")
+        found[name] = np.asarray(values, dtype=float)
+    return found
+
+
+def ensemble(
+    loop: Any,
+    plans: Mapping[str, Trajectory] | Iterable[Waypoint],
+    timepts: ArrayLike,
+    params: Mapping[str, ArrayLike],
+    executor: Any = None,
+    progress: bool = True,
+    options: Mapping[str, Any] | None = None,
+) -> Ensemble:
+    """Compare plans in a loop for each draw of its parameters; see `sweep`."""
+    table = _checked_draws(params)
+    count = next(iter(table.values())).size
+    times = np.asarray(timepts, dtype=float)
+    settings = {"events": (), **(options or {})}
+    references = references_of(plans, settings.pop("alpha", 1.0))
+    builds = callable(loop) and not hasattr(loop, "output_labels")
+    shared = None if builds else prepare(loop)
+    forms = {name: shared or prepare(loop(name, plan)) for name, plan in references.items()}
+    nominal = compare(_forms(forms), references, times, **settings)
+    _check_felt(forms, table)
+    # The forms for these parameters are built, and compared with Python, here and once.
+    first = _one(forms, references, times, settings, _draw(table, 0))
+    try:
+        light: Any = {name: form.detached() for name, form in forms.items()}
+    except TypeError as error:
+        light = _sendable(loop, error) if executor is not None else forms
+    run = partial(_chunk, light, references, times, settings)
+    tasks = [
+        [(k, _draw(table, k)) for k in range(start, min(start + _CHUNK, count))] for start in range(0, count, _CHUNK)
+    ]
+    keep = _Kept(count, first, times)
+    bar = tqdm(total=count, desc="draws", disable=not progress, leave=False)
+    futures: list[Any] = []
+    try:
+        if executor is not None:
+            futures = [executor.submit(run, task) for task in tasks]
+        for k, task in enumerate(tasks):
+            found = futures[k].result() if futures else run(task, bar.update)
+            if futures:
+                bar.update(len(task))
+            keep.add(found, task)
+    except KeyboardInterrupt:
+        for future in futures:
+            future.cancel()
+    finally:
+        bar.close()
+    return Ensemble(
+        nominal, table, keep.metrics, keep.timepts, keep.bands(), LEVELS, tuple(keep.failures), keep.finished
+    )
+
+
+Outcome = tuple[dict[str, dict[str, float]], dict[str, dict[str, Array]]]
+"""Metrics, and signals at the times of the bands, by plan."""
+
+
+class _Kept:
+    """What of all draws is kept."""
+
+    def __init__(self, count: int, first: Outcome | str, times: Array) -> None:
+        self.timepts = times[_some(times)]
+        self.metrics: dict[str, dict[str, Array]] = {}
+        self._signals: dict[str, dict[str, Array]] = {}
+        self.failures: list[Failure] = []
+        self.finished = 0
+        self._count = count
+
+    def add(self, found: list[Outcome | str], task: list[tuple[int, dict[str, float]]]) -> None:
+        for outcome, (k, params) in zip(found, task, strict=True):
+            self.finished += 1
+            if isinstance(outcome, str):
+                self.failures.append(Failure(k, params, outcome))
+                continue
+            metrics, signals = outcome
+            for plan, rows in metrics.items():
+                for name, value in rows.items():
+                    column = self.metrics.setdefault(plan, {}).setdefault(name, np.full(self._count, np.nan))
+                    column[k] = value
+            for plan, curves in signals.items():
+                for name, curve in curves.items():
+                    table = self._signals.setdefault(plan, {})
+                    if name not in table:
+                        table[name] = np.full((self._count, self.timepts.size), np.nan)
+                    table[name][k, : curve.size] = curve
+
+    def bands(self) -> dict[str, dict[str, Array]]:
+        """Quantiles over the draws that were run."""
+        return {plan: {name: _quantiles(rows) for name, rows in found.items()} for plan, found in self._signals.items()}
+
+
+def _quantiles(rows: Array) -> Array:
+    """Quantiles (nlevels, ntime) over rows, without those that are nan."""
+    known = rows[~np.isnan(rows).all(axis=1)]
+    if np.isnan(known).any():  # runs that an event ended
+        return np.asarray(np.nanquantile(known, LEVELS, axis=0))
+    return np.asarray(np.quantile(known, LEVELS, axis=0))
+
+
+def _some(times: Array) -> NDArray[np.intp]:
+    return np.unique(np.linspace(0, times.size - 1, min(times.size, _SAMPLES)).round().astype(np.intp))
+
+
+def _chunk(
+    forms: Any,
+    references: dict[str, Trajectory],
+    times: Array,
+    settings: dict[str, Any],
+    task: list[tuple[int, dict[str, float]]],
+    step: Callable[[int], Any] | None = None,
+) -> list[Outcome | str]:
+    """Some draws, in this process or another."""
+    if not isinstance(forms, Mapping):  # a function that builds the loops
+        build = forms
+        forms = {name: prepare(build(name, plan)) for name, plan in references.items()}
+    found = []
+    for _, params in task:
+        found.append(_one(forms, references, times, settings, params))
+        if step is not None:
+            step(1)
+    return found
+
+
+def _one(
+    forms: dict[str, Prepared],
+    references: dict[str, Trajectory],
+    times: Array,
+    settings: dict[str, Any],
+    params: dict[str, float],
+) -> Outcome | str:
+    """One draw, or what went wrong with it."""
+    try:
+        result = compare(_forms(forms), references, times, params=params, **settings)
+    except (ArithmeticError, ValueError, RuntimeError) as error:
+        return f"{type(error).__name__}: {error}"
+    signals: dict[str, dict[str, Array]] = {}
+    for plan, response in result.responses.items():
+        rows = np.asarray(response.outputs).reshape(len(response.output_labels), -1)
+        kept = _some(times)
+        kept = kept[kept < rows.shape[1]]
+        names = dict.fromkeys((*result.outputs, *result.controls))
+        signals[plan] = {name: rows[list(response.output_labels).index(name)][kept] for name in names}
+    return result.metrics, signals
+
+
+def _forms(forms: Mapping[str, Prepared]) -> Callable[[str, Trajectory], Prepared]:
+    return lambda name, plan: forms[name]
+
+
+def _draw(table: dict[str, Array], k: int) -> dict[str, float]:
+    return {name: float(values[k]) for name, values in table.items()}
+
+
+def _checked_draws(params: Mapping[str, ArrayLike]) -> dict[str, Array]:
+    table = {name: np.atleast_1d(np.asarray(values, dtype=float)) for name, values in params.items()}
+    sizes = {name: values.shape for name, values in table.items()}
+    if not table or len(set(sizes.values())) != 1 or any(len(shape) != 1 or not shape[0] for shape in sizes.values()):
+        raise ValueError(f"params must hold as many draws of each parameter, at least one, got shapes {sizes}")
+    for name, values in table.items():
+        if not np.isfinite(values).all():
+            raise ValueError(f"params must be finite, got {values[~np.isfinite(values)][0]} of {name!r}")
+    return table
+
+
+def _check_felt(forms: Mapping[str, Prepared], table: Mapping[str, Array]) -> None:
+    """Refuse a parameter that no block reads: it is misspelt."""
+    for name, values in table.items():
+        ends = (float(values.min()), float(values.max()))
+        if ends[0] < ends[1] and not any(form.feels(name, *ends) for form in forms.values()):
+            raise ValueError(f"params must be parameters of a block, got {name!r}, which changes nothing")
+
+
+def _sendable(loop: Any, error: TypeError) -> Any:
+    """A function that builds the loops, where the loops themselves cannot be sent to another process."""
+    try:
+        pickle.dumps(loop)
+    except Exception:  # whatever pickle meets in a user's object
+        raise ValueError(f"the loop must go to other processes, but {error}") from None
+    return loop
