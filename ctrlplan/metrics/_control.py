@@ -4,8 +4,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ctrlplan.metrics._error import squared
-from ctrlplan.metrics._pieces import maximum, pieces
-from ctrlplan.metrics._records import Array, Value, diverged, each, fitted, real, times
+from ctrlplan.metrics._pieces import maxima, pieces
+from ctrlplan.metrics._records import QUIET, Array, Value, diverged, each, fitted, plain, real, times
 from ctrlplan.metrics._records import signal as checked
 
 _AT_LIMIT = 1e-9  # of the range between the limits: nearer than this is at the limit
@@ -45,7 +45,7 @@ def effort(timepts: ArrayLike, u: ArrayLike) -> Value:
     """
     t = times(timepts)
     control = checked("u", u, t)
-    return each(lambda u: squared(t, u), control.shape[:-1], control)
+    return squared(t, control)
 
 
 def peak(timepts: ArrayLike, signal: ArrayLike) -> Value:
@@ -80,7 +80,9 @@ def peak(timepts: ArrayLike, signal: ArrayLike) -> Value:
     """
     t = times(timepts)
     record = checked("signal", signal, t)
-    return each(lambda f: max(maximum(t, f), maximum(t, -f)), record.shape[:-1], record)
+    rows = record.reshape(-1, t.size)
+    with np.errstate(**QUIET):
+        return plain(np.maximum(maxima(t, rows), maxima(t, -rows)), record.shape[:-1])
 
 
 def total_variation(timepts: ArrayLike, signal: ArrayLike) -> Value:

@@ -3,8 +3,8 @@
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ctrlplan.metrics._pieces import Pieces, pieces
-from ctrlplan.metrics._records import Array, Value, diverged, each, instant, signal, times
+from ctrlplan.metrics._pieces import Pieces, blocks, pieces
+from ctrlplan.metrics._records import QUIET, Array, Value, diverged, each, instant, plain, signal, times
 
 
 def iae(timepts: ArrayLike, error: ArrayLike) -> Value:
@@ -122,15 +122,18 @@ def ise(timepts: ArrayLike, error: ArrayLike) -> Value:
     """
     t = times(timepts)
     e = signal("error", error, t)
-    return each(lambda e: squared(t, e), e.shape[:-1], e)
+    return squared(t, e)
 
 
-def squared(t: Array, f: Array) -> float:
-    """Return the integral of f^2 for one record (ntime,)."""
-    if diverged(f):
-        return np.inf
-    p = pieces(t, f)
-    return p.integral(p.whole(), lambda s: p.held(s) ** 2)
+def squared(t: Array, f: Array) -> Value:
+    """Return the integrals of f^2, shape (...)."""
+    rows = f.reshape(-1, t.size)
+    values = np.empty(len(rows))
+    with np.errstate(**QUIET):
+        for some in blocks(rows):
+            values[some] = pieces(t, rows[some]).square()
+            values[some][[diverged(row) for row in rows[some]]] = np.inf
+    return plain(values, f.shape[:-1])
 
 
 def _absolute(t: Array, f: Array, since: float | None = None) -> float:

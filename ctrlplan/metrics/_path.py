@@ -279,7 +279,7 @@ def jerk_cost(timepts: ArrayLike, jerk: ArrayLike) -> float:
     """
     t = times(timepts)
     jerks = axes("jerk", jerk, t)
-    return float(each(lambda j: sum(squared(t, axis) for axis in j), (), jerks))
+    return float(np.sum(squared(t, jerks)))
 
 
 def _length(t: Array, path: Array) -> float:

@@ -12,7 +12,7 @@ trusted: :math:`c_k` is cut to a multiple of its neighbours and the smaller curv
 cut is of fourth order too, so that the order of every metric stays.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,8 +25,12 @@ _NEIGHBOURS = 4.0  # times a neighbouring third difference: more is a kink
 _CURVATURES = 0.5  # of the smaller curvature: two curvatures as close as this are smooth
 _ASIDE = 0.25  # of the greater curvature: a lesser one of the other sign is the smooth side of a kink
 _JUMP = 2.0  # times either neighbouring slope: more is a jump
+_BLOCK = 2**15  # samples
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(4)
 _NODES, _WEIGHTS = (_NODES + 1) / 2, _WEIGHTS / 2
+
+
+NOWHERE = np.empty(0, dtype=np.intp)
 
 
 @dataclass(frozen=True)
@@ -42,7 +46,7 @@ class Pieces:
     end: Array
     jump: NDArray[np.bool_]
 
-    def __getitem__(self, chosen: NDArray[np.bool_] | slice) -> "Pieces":
+    def __getitem__(self, chosen: Any) -> "Pieces":
         """Return the pieces of some of the intervals."""
         return Pieces(*(getattr(self, name)[chosen] for name in self.__dataclass_fields__))
 
@@ -60,7 +64,10 @@ class Pieces:
 
     def held(self, s: Any) -> Array:
         """Return the values at s with each jump in the middle of its interval, as the trapezoidal rule has it."""
-        return np.where(self.jump, np.where(s < 0.5, self.a, self.end), self(s))
+        values = self(s)
+        if self.jump.any():
+            values = np.where(self.jump, np.where(s < 0.5, self.a, self.end), values)
+        return values
 
     def whole(self) -> Array:
         """Return the two ends of each interval, shape (2, m)."""
@@ -103,6 +110,16 @@ class Pieces:
             s = new
         return s
 
+    def square(self) -> Array:
+        """Return the integrals over time of the squares (...), from the cubics' series in Legendre polynomials."""
+        bend = (self.c + 1.5 * self.d) / 6
+        mean = (self.a + self.end) / 2 - bend
+        tilt = self.end - self.a - self.d / 10
+        squares = mean * mean + tilt * tilt / 12 + bend * bend / 5 + self.d * self.d / 2800
+        if self.jump.any():
+            squares = np.where(self.jump, (self.a**2 + self.end**2) / 2, squares)
+        return np.sum(self.step * squares, axis=-1)
+
     def integral(self, cuts: Array, integrand: Callable[[Array], Array]) -> float:
         """Return the integral over time of a function of s, between successive cuts, shape (ncuts, m)."""
         width = np.diff(cuts, axis=0)
@@ -112,101 +129,155 @@ class Pieces:
         return total
 
 
-def pieces(t: Array, f: Array, chosen: NDArray[np.intp] | None = None) -> Pieces:
-    """Return the cubics of a signal (ntime,), on all intervals or on those chosen."""
-    k = np.arange(t.size - 1) if chosen is None else chosen
-    step = t[k + 1] - t[k]
-    rise = f[k + 1] - f[k]
-    curvature = curvatures(t, f)
-    if t.size > 3:
-        bow, twist, broken = _shapes(t, curvature, k)
-        jump = broken & _steep(t, f)[k]
-    else:
-        bow, twist = np.full(k.shape, curvature[0] if t.size == 3 else 0.0), np.zeros(k.shape)
-        jump = np.zeros(k.shape, dtype=np.bool_)
-    bow, twist = step**2 * bow, step**3 * twist
-    return Pieces(t[k], step, f[k], rise - bow, bow - twist, twist, f[k + 1], jump)
+def pieces(t: Array, f: Array, chosen: NDArray[np.intp] | None = None, rows: NDArray[np.intp] | None = None) -> Pieces:
+    """Return the cubics of a signal (ntime,) on all intervals, or on those chosen; of several, each of its row."""
+    if chosen is None:
+        return _cubics(t, f)
+    if rows is None:
+        return _cubics(t, f)[chosen]
+    # A cubic depends on the samples up to four intervals away: a few windows cost less than whole records.
+    width = min(t.size, 10)
+    first = np.clip(chosen - 4, 0, t.size - width)
+    window = first[:, None] + np.arange(width)
+    return _cubics(t[window], f[rows[:, None], window])[np.arange(chosen.size), chosen - first]
 
 
-def curvatures(t: Array, f: Array) -> Array:
-    """Return the second divided differences about the inner samples, shape (ntime - 2,)."""
-    d = np.diff(np.diff(f) / np.diff(t)) / (t[2:] - t[:-2])
-    d[~np.isfinite(d)] = 0.0
-    return d
+class Bulges:
+    """Bound on how far the cubics of signals at some times leave their chords."""
+
+    def __init__(self, t: Array) -> None:
+        step = np.diff(t)
+        self.pace, self.width, self.share = 1.0 / step, 1.0 / (t[2:] - t[:-2]), step[1:-1] ** 2 / 4
+
+    def __call__(self, f: Array, first: int = 0) -> Array:
+        """Return the bounds of a record from sample `first` on, one an interval: none is known for the outer two."""
+        slope = (f[first + 1 :] - f[first:-1]) * self.pace[first:]
+        d = slope[1:] - slope[:-1]
+        d *= self.width[first:]
+        np.abs(d, out=d)
+        slope[0] = slope[-1] = np.inf
+        np.multiply(np.maximum(d[:-1], d[1:]), self.share[first:], out=slope[1:-1])
+        return slope
 
 
-def bulges(t: Array, f: Array) -> Array:
-    """Return a bound on how far a cubic leaves its chord, shape (ntime - 1,); none is known for the outer two."""
-    d = np.abs(curvatures(t, f))
-    bound = np.full(t.size - 1, np.inf)
-    bound[1:-1] = np.diff(t[1:-1]) ** 2 / 4 * np.maximum(d[:-1], d[1:])
-    return bound
+def blocks(f: Array) -> Iterator[slice]:
+    """Yield rows (nrows, ntime) by as many as a cache holds: fewer calls than row by row, and quick ones."""
+    count = max(1, _BLOCK // f.shape[1])
+    return (slice(begin, begin + count) for begin in range(0, len(f), count))
 
 
 def maximum(t: Array, f: Array) -> float:
     """Return the greatest value of a signal (ntime,), between samples too."""
-    top = float(f.max())
-    if not np.isfinite(top):
-        return top
-    near = np.flatnonzero(np.maximum(f[:-1], f[1:]) + bulges(t, f) > top)
-    p = pieces(t, f, near)
-    return float(np.fmax.reduce(p(p.cuts()), axis=None, initial=top))
+    return float(maxima(t, f[None])[0])
 
 
-def _shapes(t: Array, d: Array, k: NDArray[np.intp]) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Return the bracket of the cubic at the interval's begin, its slope, and whether most of that was cut."""
-    last = t.size - 2
-    third = np.diff(d) / (t[3:] - t[:-3])
-    third[~np.isfinite(third)] = 0.0
-    j = np.clip(k, 1, last - 1)  # the first and the last interval share their neighbour's four samples
-    outer = j != k
-    left, right, c, span = d[j - 1], d[j], third[j - 1], t[j + 2] - t[j - 1]
+def maxima(t: Array, f: Array) -> Array:
+    """Return the greatest value of each of several signals (nrows, ntime)."""
+    top, bulges = f.max(axis=1), Bulges(t)
+    near = [  # what is not a number is near: it cannot be told
+        np.flatnonzero(~(np.maximum(row[:-1], row[1:]) + bulges(row) <= most)) if np.isfinite(most) else NOWHERE
+        for row, most in zip(f, top, strict=True)
+    ]
+    chosen, rows = gathered(near)
+    p = pieces(t, f, chosen, rows)
+    np.fmax.at(top, rows, np.fmax.reduce(p(p.cuts()), axis=0))
+    return top
 
-    # An outer interval sees one side only: what is cut there and next to it counts against the curvature itself.
-    inner = np.where(k == 0, min(2, last - 1), max(last - 2, 1))
-    beside = np.abs(third[inner - 1] - _cut(third, d, inner - 1)) * (t[inner + 2] - t[inner - 1]) * outer
-    cut = _cut(third, d, j - 1, beside == 0)
-    rough = np.abs(c - cut) * span + beside
-    first = _shrunk(left, rough) - (t[2] - t[0]) * cut
 
-    lesser, greater = np.minimum(np.abs(left), np.abs(right)), np.maximum(np.abs(left), np.abs(right))
-    across = (np.sign(left) * np.sign(right) <= 0) & (lesser > _ASIDE * greater)
+def gathered(chosen: list[NDArray[np.intp]]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return what is chosen in each row one after the other, and the rows."""
+    return np.concatenate([NOWHERE, *chosen]), np.repeat(np.arange(len(chosen)), [k.size for k in chosen])
+
+
+def _cubics(t: Array, f: Array) -> Pieces:
+    """Return the cubics on all intervals, in arrays (..., ntime - 1)."""
+    step, rise = np.diff(t), np.diff(f)
+    slope = rise / step
+    curvature = _finite(np.diff(slope) / (t[..., 2:] - t[..., :-2]))
+    if t.shape[-1] > 3:
+        bow, twist, jump = _shapes(t, curvature)
+        if jump.any():
+            jump &= _steep(slope)
+    else:
+        bow = np.repeat(curvature, 2, axis=-1) if t.shape[-1] == 3 else np.zeros_like(rise)
+        twist, jump = np.zeros_like(rise), np.zeros(rise.shape, dtype=np.bool_)
+    square = step * step
+    bow *= square
+    twist *= square * step
+    return Pieces(t[..., :-1], step, f[..., :-1], rise - bow, bow - twist, twist, f[..., 1:], jump)
+
+
+def _shapes(t: Array, d: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Return the bracket of each cubic at the interval's begin, its slope, and whether most of that was cut."""
+    span = t[..., 3:] - t[..., :-3]
+    change, left, right, size = np.diff(d), d[..., :-1], d[..., 1:], np.abs(d)
+    third = _finite(change / span)
+    steady = np.abs(change) <= _CURVATURES * np.minimum(size[..., :-1], size[..., 1:])
+
+    # Where the curvature is steady, all four samples are trusted; elsewhere their third difference is cut to a
+    # multiple of those beside, and the smoother side kept.
+    base, twist, broken = left.copy(), third.copy(), np.zeros_like(steady)
+    at = np.nonzero(~steady)
+    c, one, other = third[at], left[at], right[at]
+    cut = _cut(c, *_beside(third, at))
+    nearer = np.where(np.abs(one) <= np.abs(other), one, other - np.broadcast_to(span, third.shape)[at] * cut)
+    lesser, greater = np.minimum(np.abs(one), np.abs(other)), np.maximum(np.abs(one), np.abs(other))
+    across = (np.sign(one) * np.sign(other) <= 0) & (lesser > _ASIDE * greater)
     share = np.divide(cut, c, out=np.ones_like(c), where=c != 0)
-    nearer = np.where(np.abs(left) <= np.abs(right), left, right - span * cut)
-    base = np.where(k == last, _shrunk(right, rough), np.where(across, share * left, nearer))
-    bow = np.where(k == 0, first, base + (t[k] - t[np.maximum(k - 1, 0)]) * cut)
-    return bow, cut, rough > np.abs(c) * span / 2
+    base[at], twist[at] = np.where(across, share * one, nearer), cut
+    broken[at] = np.abs(c - cut) > np.abs(c) / 2
+    bow = base + (t[..., 1:-2] - t[..., :-3]) * twist
+
+    # An outer interval shares its neighbour's four samples and sees one side only: what is cut there and next to it
+    # counts against the curvature itself.
+    count = third.shape[-1]
+    outer = []
+    for end, inner, far in ((0, min(1, count - 1), min(2, count - 1)), (-1, max(count - 2, 0), max(count - 3, 0))):
+        c, wide = third[..., end], span[..., end]
+        beside = np.abs(third[..., inner] - twist[..., inner]) * span[..., inner]
+        cut = _cut(c, third[..., inner], third[..., far])
+        slope = np.where(steady[..., end] & (beside == 0), c, cut)
+        rough = np.abs(c - slope) * wide + beside
+        outer.append((_shrunk(d[..., end], rough), slope, rough > np.abs(c) * wide / 2))
+    (first, begin, jump), (last, ending, drop) = outer
+    first = first - (t[..., 2] - t[..., 0]) * begin
+    last = last + (t[..., -2] - t[..., -3]) * ending
+    return _between(first, bow, last), _between(begin, twist, ending), _between(jump, broken, drop)
 
 
-def _cut(third: Array, d: Array, i: NDArray[np.intp], trusted: NDArray[np.bool_] | bool = True) -> Array:
-    """Return third differences cut to a multiple of those beside them, or whole where a trusted curvature is steady."""
-    c, left, right = third[i], d[i], d[i + 1]
-    sign = np.sign(c)
-    beside = np.minimum(sign * third[_before(i, third.size)], sign * third[_after(i, third.size)])
-    cut = sign * np.minimum(np.abs(c), _NEIGHBOURS * np.maximum(beside, 0.0))
-    lesser = np.minimum(np.abs(left), np.abs(right))
-    steady = (np.sign(left) * np.sign(right) > 0) & (np.abs(right - left) <= _CURVATURES * lesser)
-    return np.where(steady & trusted, c, cut)
+def _beside(third: Array, at: tuple[NDArray[np.intp], ...]) -> tuple[Array, Array]:
+    """Return the third differences before and after some; the outer ones have two on one side."""
+    *rows, k = at
+    last = third.shape[-1] - 1
+    before, after = np.where(k > 0, k - 1, min(2, last)), np.where(k < last, k + 1, max(last - 2, 0))
+    return third[*rows, before], third[*rows, after]
 
 
-def _before(i: NDArray[np.intp], size: int) -> NDArray[np.intp]:
-    """Return the index before each, or at the beginning the second one after it."""
-    return np.where(i > 0, i - 1, min(2, size - 1))
+def _cut(c: Array, before: Array, after: Array) -> Array:
+    """Return third differences cut to a multiple of those beside them."""
+    low = _NEIGHBOURS * np.minimum(np.maximum(before, after), 0.0)
+    high = _NEIGHBOURS * np.maximum(np.minimum(before, after), 0.0)
+    return np.minimum(np.maximum(c, low), high)
 
 
-def _after(i: NDArray[np.intp], size: int) -> NDArray[np.intp]:
-    """Return the index after each, or at the end the second one before it."""
-    return np.where(i < size - 1, i + 1, max(size - 3, 0))
+def _between(first: Any, inner: Any, last: Any) -> Any:
+    return np.concatenate([first[..., None], inner, last[..., None]], axis=-1)
 
 
 def _shrunk(value: Array, by: Array) -> Array:
     return np.sign(value) * np.maximum(np.abs(value) - by, 0.0)
 
 
-def _steep(t: Array, f: Array) -> NDArray[np.bool_]:
+def _steep(slope: Array) -> NDArray[np.bool_]:
     """Return which intervals are much steeper than those beside them: jumps, or flat places of a smooth signal."""
-    steep = np.abs(np.diff(f) / np.diff(t))
+    steep = np.abs(slope)
     beside = np.empty_like(steep)
-    beside[1:-1] = np.maximum(steep[:-2], steep[2:])
-    beside[0], beside[-1] = steep[1:4].max(), steep[-4:-1].max()
+    beside[..., 1:-1] = np.maximum(steep[..., :-2], steep[..., 2:])
+    beside[..., 0], beside[..., -1] = steep[..., 1:4].max(axis=-1), steep[..., -4:-1].max(axis=-1)
     return steep > _JUMP * beside
+
+
+def _finite(d: Array) -> Array:
+    """Return divided differences with 0 for those that have left the range of numbers."""
+    known = np.isfinite(d)
+    return d if known.all() else np.where(known, d, 0.0)

@@ -9,7 +9,8 @@ from numpy.typing import ArrayLike, NDArray
 Array = NDArray[np.float64]
 Value = float | Array
 
-_HUGE = np.finfo(np.float64).max / 1e3
+QUIET: dict[str, Any] = {"over": "ignore", "invalid": "ignore", "divide": "ignore"}
+HUGE = np.finfo(np.float64).max / 1e3
 
 
 def real(name: str, value: ArrayLike) -> Array:
@@ -49,7 +50,8 @@ def signal(name: str, value: ArrayLike, t: Array) -> Array:
     array = real(name, value)
     if array.ndim == 0 or array.shape[-1] != t.size:
         raise ValueError(f"{name} must have {t.size} samples on its last axis, as timepts has, got shape {array.shape}")
-    return array
+    # Records are walked along time.
+    return array if array.strides[-1] == array.itemsize else np.ascontiguousarray(array)
 
 
 def axes(name: str, value: ArrayLike, t: Array) -> Array:
@@ -78,7 +80,7 @@ def fitted(name: str, array: Array, shape: tuple[int, ...]) -> Array:
 
 def diverged(f: Array) -> bool:
     """Return whether a record holds inf, or values so near it that their differences would."""
-    return not np.abs(f).max() < _HUGE
+    return not np.abs(f).max() < HUGE
 
 
 def instant(start: float | None, t: Array) -> float:
@@ -97,10 +99,15 @@ def each(metric: Callable[..., float], lead: tuple[int, ...], *arguments: Array,
     Overflow and inf - inf are met where they arise, so that a diverged loop gives inf and no warning.
     """
     values = np.empty(lead)
-    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+    with np.errstate(**QUIET):
         for row in np.ndindex(lead):
             values[row] = metric(*(argument[row] for argument in arguments), **options)
-    return values if lead else float(values[()])
+    return plain(values, lead)
+
+
+def plain(values: Array, lead: tuple[int, ...]) -> Value:
+    """Return values in the shape of the leading axes: a float if there are none."""
+    return values.reshape(lead) if lead else float(values.item())
 
 
 def _forbid(name: str, array: Array, bad: NDArray[np.bool_], rule: str) -> None:

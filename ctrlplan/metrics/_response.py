@@ -3,8 +3,8 @@
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ctrlplan.metrics._pieces import bulges, maximum, pieces
-from ctrlplan.metrics._records import Array, Value, diverged, each, finite, fitted, instant, signal, times
+from ctrlplan.metrics._pieces import NOWHERE, Bulges, gathered, maxima, pieces
+from ctrlplan.metrics._records import HUGE, QUIET, Array, Value, finite, fitted, instant, plain, signal, times
 
 _ROUNDING = 4 * np.finfo(np.float64).eps  # of the levels: a response held on the edge of the band is inside
 
@@ -226,42 +226,42 @@ def _settling(
         raise ValueError(f"band must be a positive fraction of the change, got {band}")
     reference = fitted("reference", reference, y.shape)
     since = instant(start, t)
-
-    def settled(y: Array, reference: Array, final: Array, initial: Array) -> float:
-        if final == initial:
-            return np.nan
-        edge = float(width * np.abs(final - initial) + _ROUNDING * np.maximum(np.abs(final), np.abs(initial)))
-        return max(_last_entry(t, y - reference, edge) - since, 0.0)
-
-    return each(settled, lead, y, reference, target, origin)
+    edges = width * np.abs(target - origin) + _ROUNDING * np.maximum(np.abs(target), np.abs(origin))
+    with np.errstate(**QUIET):
+        entries = _last_entries(t, (y - reference).reshape(-1, t.size), edges.ravel()).reshape(lead)
+        return plain(np.where(target == origin, np.nan, np.maximum(entries - since, 0.0)), lead)
 
 
-def _last_entry(t: Array, e: Array, edge: float) -> float:
-    """Return the time after which abs(e) <= edge: -inf if always, inf if e is outside after the last sample but one."""
-    if diverged(e):
-        return np.inf
-    size = np.abs(e)
-    outside = np.flatnonzero(size > edge)
-    first = int(outside[-1]) if outside.size else 0
-    if size[-1] > edge:
-        return np.inf
-    reach = np.maximum(size[first:-1], size[first + 1 :]) + bulges(t[first:], e[first:])
-    near = np.flatnonzero(reach > edge) + first
-    p = pieces(t, e, near)
+def _last_entries(t: Array, e: Array, edges: Array) -> Array:
+    """Return the times after which abs(e) <= edge, for rows e (nrows, ntime).
+
+    -inf if always, inf if e is outside after the last sample but one.
+    """
+    found, bulges = np.full(len(e), -np.inf), Bulges(t)
+    near = []
+    for i, (f, edge) in enumerate(zip(e, edges, strict=True)):
+        size = np.abs(f)
+        if size[-1] > edge or not size.max() < HUGE:
+            found[i] = np.inf
+            near.append(NOWHERE)
+            continue
+        outside = np.flatnonzero(size > edge)
+        first = int(outside[-1]) if outside.size else 0
+        reach = np.maximum(size[first:-1], size[first + 1 :]) + bulges(f, first)
+        near.append(np.flatnonzero(~(reach <= edge)) + first)
+    chosen, rows = gathered(near)
+    p = pieces(t, e, chosen, rows)
     cuts = p.cuts()
     values = p.at_cuts(cuts)
-    beyond = np.abs(values) > edge
+    beyond = np.abs(values) > edges[rows]
     leaving = np.flatnonzero(beyond.any(axis=0))
-    if not leaving.size:
-        return -np.inf
-    i = int(leaving[-1])
-    if near[i] == t.size - 2:
-        return np.inf
-    cut = int(np.flatnonzero(beyond[:, i])[-1])
-    here = p[i : i + 1]
-    level = np.copysign(edge, values[cut, i])
-    s = here.crossing(level, cuts[cut, i : i + 1], cuts[cut + 1, i : i + 1])
-    return float(here.time(s)[0])
+    last = leaving[np.append(np.diff(rows[leaving]) > 0, True)[: leaving.size]]
+    cut = 3 - beyond[::-1, last].argmax(axis=0)
+    level = np.copysign(edges[rows[last]], values[cut, last])
+    here = p[last]
+    entered = here.time(here.crossing(level, cuts[cut, last], cuts[cut + 1, last]))
+    found[rows[last]] = np.where(chosen[last] == t.size - 2, np.inf, entered)
+    return found
 
 
 def _excess(
@@ -275,11 +275,9 @@ def _excess(
     followed = target[..., None] if reference is None else finite("reference", reference)
     followed = fitted("reference", followed, response.shape)
 
-    def excess(y: Array, reference: Array, final: Array, initial: Array) -> float:
-        change = final - initial
-        if change == 0:
-            return np.nan
-        most = maximum(t, side * np.sign(change) * (y - reference))
-        return float(100 * max(most, 0.0) / np.abs(change))
-
-    return each(excess, lead, response, followed, target, origin)
+    change = target - origin
+    with np.errstate(**QUIET):
+        ahead = response - followed
+        ahead *= side * np.sign(change)[..., None]
+        most = maxima(t, ahead.reshape(-1, t.size)).reshape(lead)
+        return plain(np.where(change == 0, np.nan, 100 * np.maximum(most, 0.0) / np.abs(change)), lead)

@@ -22,6 +22,9 @@ _KEPT = 64
 
 _FEW = 64
 
+_STIFF = 3000.0
+"""Times that the fastest motion could die out within a leg, above which BDF takes fewer steps than Adams."""
+
 _SAFETY = 0.1
 """CVODES controls the error of a step by tolerances this much below those asked for: errors add up over a run."""
 
@@ -54,7 +57,9 @@ class Compiled:
         every = np.ones(network.nsignals, dtype=bool)
         w = _signals(network, traces, own, network.schedule(feeds, network.signals_of_inputs()), t, x, d)
         self._functions = {}
-        self._rates = ca.Function("rates", [t, x, d, p], [_rates(network, traces, own, t, x, w)])
+        rates = _rates(network, traces, own, t, x, w)
+        self._rates = ca.Function("rates", [t, x, d, p], [rates])
+        self._jacobian = ca.Function("jacobian", [t, x, d, p], [ca.densify(ca.jacobian(rates, x))])
         w = _signals(network, traces, own, network.schedule(feeds, every), t, x, d)
         self._functions["signals"] = ca.Function("signals", [t, x, d, p], [ca.densify(w)])
         self._functions["outputs"] = ca.Function("outputs", [t, x, d, p], [ca.densify(ca.DM(network.read) @ w)])
@@ -94,14 +99,20 @@ class Compiled:
                     return f"block {block.name} cannot be traced ({wrong})"
         return ""
 
-    def integrator(self, width: int, grid: Array, rtol: float, atol: float) -> Any:
+    def fastest_decay(self, t: float, x: Array, driven: Array, p: Array) -> float:
+        """Greatest rate [1/s] at which a motion about a state dies out."""
+        jacobian = _called(self._jacobian, (np.array([t]), x, driven, p), x.size)
+        return float(-np.linalg.eigvals(jacobian).real.min()) if np.isfinite(jacobian).all() else np.inf
+
+    def integrator(self, width: int, grid: Array, stiff: bool, rtol: float, atol: float) -> Any:
         """CVODES over a leg of length 1, with outputs at some of its times."""
-        key = (width, grid.tobytes(), rtol, atol)
+        key = (width, grid.tobytes(), stiff, rtol, atol)
         if key not in self._integrators:
             if len(self._integrators) >= _KEPT:
                 self._integrators.popitem(last=False)
             options = {
-                "reltol": rtol * _SAFETY,
+                "linear_multistep_method": "bdf" if stiff else "adams",
+                "reltol": max(_SAFETY * rtol, 1e-14),
                 "abstol": atol * _SAFETY,
                 "max_num_steps": 100_000,
                 "show_eval_warnings": False,
@@ -153,6 +164,7 @@ class CompiledSolver:
     def __init__(self, equations: Compiled, params: Mapping[str, Any], rtol: float, atol: float) -> None:
         self._equations, self._p = equations, equations.parameters(params)
         self._tolerances = rtol, atol
+        self._longest, self._stiff = 0.0, False
 
     def signals(self, times: Array, states: Array, driven: Array) -> Array:
         """All signals (nsignals, ntime) of the network."""
@@ -170,7 +182,11 @@ class CompiledSolver:
         relative = (grid - left) / (right - left)
         if grid.size <= _FEW:  # a rounding error of the clock must not make a new integrator of every short leg
             relative = np.round(relative, 12)
-        integrator = self._equations.integrator(series.coefficients.shape[1], relative, *self._tolerances)
+        if right - left > self._longest:
+            decay = self._equations.fastest_decay(left, state, series(left), self._p)
+            self._longest, self._stiff = right - left, decay * (right - left) > _STIFF
+        width = series.coefficients.shape[1]
+        integrator = self._equations.integrator(width, relative, self._stiff, *self._tolerances)
         span = [left, right - left, series.left, series.right]
         p = np.concatenate([self._p, series.coefficients.ravel(order="F"), span])
         try:

@@ -17,6 +17,9 @@ Array = NDArray[np.float64]
 Call = Callable[[float, Array, Array], None]
 """(t, state of the network, its signals): puts a block's outputs among the signals."""
 
+_SAFETY = 0.25
+"""LSODA controls the error of a step by tolerances this much below those asked for: errors add up over a run."""
+
 _CALLS = 5000
 """Calls about one instant after which the solution is taken to end there."""
 
@@ -155,7 +158,12 @@ class InterpretedSolver:
 
     def __init__(self, equations: Interpreted, rtol: float, atol: float, max_step: float = np.inf) -> None:
         self._equations = equations
-        self._options: dict[str, Any] = {"method": "LSODA", "rtol": rtol, "atol": atol, "max_step": max_step}
+        self._options: dict[str, Any] = {
+            "method": "LSODA",
+            "rtol": max(_SAFETY * rtol, 2.3e-14),
+            "atol": _SAFETY * atol,
+            "max_step": max_step,
+        }
 
     def signals(self, times: Array, states: Array, driven: Array) -> Array:
         """All signals (nsignals, ntime) of the network."""

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import inspect
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from tqdm import tqdm
 
-from ctrlplan.studies.comparison import compare, finite_or_none
+from ctrlplan.simulation import rest_state, state_space
+from ctrlplan.simulation.exact import exact_states
+from ctrlplan.simulation.linear import LinearForm, in_right_half, linear_forms
+from ctrlplan.studies.comparison import _acting, _tracked, compare, finite_or_none, references_of
+from ctrlplan.studies.measures import MEASURES, control_metrics, path_metrics, response_metrics
 from ctrlplan.trajectories import Trajectory, Waypoint
 
 if TYPE_CHECKING:
@@ -19,6 +25,11 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Array = NDArray[np.float64]
+Metrics = dict[str, dict[str, float]]
+"""Plan, metric, value."""
+
+_SAMPLES = 2**18
+"""Samples of a signal of all the loops that are taken together."""
 
 
 @dataclass(frozen=True)
@@ -97,6 +108,8 @@ def sweep(
     executor : concurrent.futures.Executor or alike, optional
         Where the comparisons run: anything with ``submit`` whose result has
         ``result``. A process pool needs a `build` that can be pickled.
+        Without one, linear loops that differ in numbers alone are solved and
+        measured together, which is faster by far.
     progress : bool, optional
         Show a bar on stderr.
     parameter : str, optional
@@ -123,19 +136,120 @@ def sweep(
     points = np.atleast_1d(np.asarray(values, dtype=float))
     if points.ndim != 1 or not points.size or not np.isfinite(points).all() or np.any(np.diff(points) <= 0.0):
         raise ValueError(f"values must be finite and increase strictly, got {points.tolist()!s:.80}")
-    references = plans if isinstance(plans, Mapping) else tuple(plans)
-    one = partial(_metrics, build, plans=references, timepts=np.asarray(timepts, dtype=float), options=options)
+    options["waypoints"] = tuple(options.get("waypoints", ()) if isinstance(plans, Mapping) else plans)
+    references = references_of(plans if isinstance(plans, Mapping) else options["waypoints"], options.get("alpha", 1.0))
+    given: dict[str, Any] = {"plans": references, "timepts": np.asarray(timepts, dtype=float)} | options
     bar = partial(tqdm, total=points.size, desc=parameter, disable=not progress, leave=False)
     if executor is None:
-        found = [one(value) for value in bar(points.tolist())]
+        found = list(bar(_metrics(build, points.tolist(), given)))
     else:
-        futures = [executor.submit(one, value) for value in points.tolist()]
+        futures = [executor.submit(_compared, build, value, given) for value in points.tolist()]
         found = [future.result() for future in bar(futures)]
     rows = {plan: {name: np.array([f[plan][name] for f in found]) for name in found[0][plan]} for plan in found[0]}
     return Sweep(parameter, points, rows)
 
 
-def _metrics(
-    build: Callable[[float], Any], value: float, plans: Any, timepts: Array, options: dict[str, Any]
-) -> dict[str, dict[str, float]]:
-    return compare(build(value), plans, timepts, **options).metrics
+def _compared(build: Callable[[float], Any], value: float, given: dict[str, Any]) -> Metrics:
+    return compare(build(value), **given).metrics
+
+
+def _metrics(build: Callable[[float], Any], values: list[float], given: dict[str, Any]) -> Iterator[Metrics]:
+    """Metrics for each value, of many at once where their loops are linear and differ in numbers alone."""
+    count = max(2, _SAMPLES // max(1, given["timepts"].size))
+    for begin in range(0, len(values), count):
+        loops = [build(value) for value in values[begin : begin + count]]
+        together = _together(loops, given)
+        if together is None:
+            yield from (compare(loop, **given).metrics for loop in loops)
+        else:
+            yield from together
+
+
+def _together(loops: list[Any], given: dict[str, Any]) -> list[Metrics] | None:
+    """What `compare` finds of each loop; None where they are not alike, or it has more to say."""
+    bound = inspect.signature(compare).bind(None, **given)
+    bound.apply_defaults()
+    asked = SimpleNamespace(**bound.arguments)
+    plans, times = asked.plans, asked.timepts
+    first = next(iter(plans.values()))
+    systems = [state_space(loop) for loop in loops]
+    form = _form(systems)
+    if form is None or form.b.shape[2] != first.naxes or not _ordered(times):
+        return None
+    if asked.measure is not None or asked.params or asked.events:
+        return None
+    if asked.initial_state is not None and np.shape(asked.initial_state) not in ((), form.a.shape[2:]):
+        return None
+    tracked, acting = _tracked(systems[0], asked.outputs, first), _acting(systems[0], asked.controls)
+    if asked.only is not None and not any(name.startswith("control") for name in asked.only):
+        acting = ()
+    rows = [systems[0].output_labels.index(name) for name in (*tracked, *acting)]
+    start = min(plan.start for plan in plans.values())
+    unstable = in_right_half(np.linalg.eigvals(form.a)).any(axis=1)
+    each = tuple(map(str, range(len(loops))))
+    found: list[Metrics] = [{} for _ in loops]
+    for name, plan in plans.items():
+        signals = _outputs(form, rows, plan, times, _starts(systems, plan, times, asked.initial_state)).swapaxes(0, 1)
+        axes = [plan] if plan.naxes == 1 else [plan.select([label]) for label in plan.labels]
+        # One axis of all loops is measured like the axes of one.
+        responses = [
+            response_metrics(times, y, axis, start, asked.band, each, asked.only)
+            for y, axis in zip(signals[: len(axes)], axes, strict=True)
+        ]
+        controls = [control_metrics(times, u, start, each, asked.only) for u in signals[len(axes) :]]
+        values = _of_loops(responses, first.labels, each)
+        values |= {key: np.where(unstable, np.inf, row) for key, row in values.items() if "settling_time" in key}
+        values |= _of_loops(controls, acting, each)
+        of_plan = path_metrics(plan, asked.waypoints) if asked.only is None else {}
+        for i, metrics in enumerate(found):
+            metrics[name] = {key: float(row[i]) for key, row in values.items()} | of_plan
+    return found
+
+
+def _form(systems: list[Any]) -> LinearForm | None:
+    """Linear form of loops driven by their inputs alone; None unless they differ in numbers alone."""
+    labels = getattr(systems[0], "output_labels", None)
+    if len(systems) < 2 or any(getattr(s, "output_labels", None) != labels for s in systems):
+        return None
+    if any(getattr(s, "initial_state", None) is not None for s in systems):
+        return None
+    try:
+        form = linear_forms(systems)
+    except (AttributeError, ValueError):
+        return None
+    return None if form.sources else form
+
+
+def _ordered(times: Array) -> bool:
+    return times.ndim == 1 and times.size > 1 and bool(np.isfinite(times).all() and np.all(np.diff(times) > 0.0))
+
+
+def _starts(systems: list[Any], plan: Trajectory, times: Array, given: ArrayLike | None) -> Array:
+    """States (nloops, nstates) at the first sample: as given, or at rest where the plan is."""
+    position = plan.jet(times[:1], 0, left=True)[0, :, 0]
+    if given is None and position.any():
+        return np.stack([rest_state(system, position) for system in systems])
+    return np.broadcast_to(0.0 if given is None else np.asarray(given, dtype=float), (len(systems), systems[0].nstates))
+
+
+def _of_loops(measured: list[dict[str, float]], labels: Sequence[str], each: Sequence[str]) -> dict[str, Array]:
+    """Metrics (nloops,) as `compare` names them, from those of each label: the worst, and each where there are more."""
+    names = [name for name in measured[0] if name in MEASURES] if measured else []
+    rows = {name: np.array([[found[f"{name}_{i}"] for i in each] for found in measured]) for name in names}
+    worst = {name: np.fmax.reduce(row) for name, row in rows.items()}
+    if len(labels) > 1:
+        for name, row in rows.items():
+            worst |= {f"{name}_{label}": values for label, values in zip(labels, row, strict=True)}
+    return worst
+
+
+def _outputs(form: LinearForm, rows: list[int], plan: Trajectory, times: Array, initial: Array) -> Array:
+    """Some of the outputs, shape (nloops, nrows, ntime), with a plan at the inputs."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        out = exact_states(form.a, form.b, plan._jet_beside, list(plan.breakpoints), times, initial, form.c[:, rows])
+        for k, row in enumerate(rows):
+            if form.d[:, row].any():
+                out[:, k] += form.d[:, row] @ plan.jet(times, 0)[0]
+    if not np.isfinite(out[..., -1]).all():  # what has left the range of numbers does not come back
+        out[np.isnan(out)] = np.inf
+    return out

@@ -186,10 +186,14 @@ class Crane:
         values = np.asarray(jet, dtype=float)
         if values.ndim < 2 or values.shape[1] != 2 or len(values) < 3:
             raise ValueError(f"jet must have shape (order + 1, 2, ...) with order at least 2, got {values.shape}")
-        m, trolley, inertia, b, f1, f2, g = self._numbers()
-        lowest = float(np.min(g - values[2, 1], initial=np.inf))
+        lowest = float(np.min(self.gravity - values[2, 1], initial=np.inf))
         if not lowest > 0.0:
             raise ValueError(f"g - z'' must be above 0 for a taut rope, got {lowest:.4g} m/s^2")
+        return self._quantities(values)
+
+    def _quantities(self, values: Any) -> dict[str, Any]:
+        """The same, unchecked: of symbols as well."""
+        m, trolley, inertia, b, f1, f2, g = self._numbers()
         x, z = series.from_jet(values[:, 0]), series.from_jet(values[:, 1])
         across, fall = series.derivative(x, 2), series.derivative(z, 2)
         hanging = -fall

@@ -167,7 +167,9 @@ def create_crane_feedforward_iosystem(crane: Crane, name: str = "feedforward") -
     """
 
     def out(t: float, state: Any, u: Any, params: dict[str, Any]) -> Array:
-        found = crane.quantities(np.stack([np.asarray(u[:5]), np.asarray(u[5:10])], axis=1))
+        jet = np.stack([np.asarray(u[:5]), np.asarray(u[5:10])], axis=1)
+        # Of symbols nothing can be refused; `crane_loop` has looked at the whole plan.
+        found = crane._quantities(jet) if jet.dtype == object else crane.quantities(jet)
         return np.array([found["F"], found["C"]])
 
     return ct.nlsys(None, out, inputs=_jet_names(4), outputs=["F", "C"], dt=None, name=name)

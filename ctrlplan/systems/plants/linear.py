@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 
 import control as ct
 import numpy as np
-from numpy.typing import ArrayLike
+from control.statesp import LinearICSystem
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
 
 
 def integrator_lag_loop(gain: float, outputs: Sequence[str] = ("y",)) -> ct.InterconnectedSystem:
@@ -36,7 +40,7 @@ def integrator_lag_loop(gain: float, outputs: Sequence[str] = ("y",)) -> ct.Inte
     >>> [round(float(abs(pole)), 3) for pole in loop.poles()]
     [2.236, 2.236]
     """
-    return unity_feedback_loop([1.0], [1.0, 1.0, 0.0], gain, outputs)
+    return _interconnected((1.0,), (1.0, 1.0, 0.0), _checked(gain, outputs), tuple(outputs))
 
 
 def unity_feedback_loop(
@@ -66,29 +70,58 @@ def unity_feedback_loop(
         loop has no solution (1 + gain num/den = 0 at infinity), or an output
         is unknown.
     """
-    gain = float(gain)
-    if not np.isfinite(gain):
-        raise ValueError(f"gain must be finite, got {gain}")
+    gain = _checked(gain, outputs)
     above, below = (_polynomial(c, name) for c, name in ((num, "num"), (den, "den")))
     if above.size > below.size:
         raise ValueError(f"num must not be of higher degree than den, got {above.size - 1} over {below.size - 1}")
     if above.size == below.size and below[0] + gain * above[0] == 0.0:
         raise ValueError(f"the loop must have a solution, got 1 + gain num/den = 0 at infinity with gain {gain:g}")
+    if above.size == below.size:
+        return _direct_loop(ct.ss(ct.tf(above, below)), gain, outputs)
+    return _interconnected(tuple(above.tolist()), tuple(below.tolist()), gain, tuple(outputs))
+
+
+def _checked(gain: float, outputs: Sequence[str]) -> float:
+    gain = float(gain)
+    if not np.isfinite(gain):
+        raise ValueError(f"gain must be finite, got {gain}")
     for output in outputs:
         if output not in ("y", "u", "e"):
             raise ValueError(f'outputs must be of "y", "u", "e", got {output!r}')
-    if above.size == below.size:
-        return _direct_loop(ct.ss(ct.tf(above, below)), gain, outputs)
+    return gain
+
+
+def _interconnected(
+    num: tuple[float, ...], den: tuple[float, ...], gain: float, outputs: tuple[str, ...]
+) -> ct.InterconnectedSystem:
+    """Loop of three blocks of its own: wired once for all gains, for wiring takes python-control a millisecond."""
+    wired = _wired(num, den, outputs)
+    error, controller, plant = (ct.StateSpace(block, name=block.name) for block in wired.syslist)
+    controller.D[0, 0] = gain
+    loop = LinearICSystem(wired, ct.StateSpace(*_closed(plant, gain, outputs), 0), wired.connection_type)
+    loop.syslist = [error, controller, plant]
+    for name in ("connect_map", "input_map", "output_map"):
+        setattr(loop, name, getattr(wired, name).copy())
+    return loop
+
+
+@lru_cache(maxsize=16)
+def _wired(num: tuple[float, ...], den: tuple[float, ...], outputs: tuple[str, ...]) -> ct.InterconnectedSystem:
     blocks = [
         ct.summing_junction(inputs=["r", "-y"], output="e", name="error"),
-        ct.ss([], [], [], [[gain]], inputs="e", outputs="u", name="controller", dt=0),
-        ct.ss(ct.tf(above, below), inputs="u", outputs="y", name="plant"),
+        ct.ss([], [], [], [[1.0]], inputs="e", outputs="u", name="controller", dt=0),
+        ct.ss(ct.tf(num, den), inputs="u", outputs="y", name="plant"),
     ]
     return ct.interconnect(blocks, inputs="r", outputs=list(outputs), name="loop")
 
 
 def _direct_loop(plant: ct.StateSpace, gain: float, outputs: Sequence[str]) -> ct.StateSpace:
     """Loop around a plant that passes its input on, which `control.interconnect` cannot close."""
+    return ct.ss(*_closed(plant, gain, outputs), inputs="r", outputs=list(outputs), name="loop")
+
+
+def _closed(plant: ct.StateSpace, gain: float, outputs: Sequence[str]) -> tuple[Array, Array, Array, Array]:
+    """Matrices of the closed loop, exact; python-control's own come by finite differences."""
     a, b, c, d = (np.asarray(m) for m in (plant.A, plant.B, plant.C, plant.D))
     through = 1.0 / (1.0 + gain * d[0, 0])
     rows = {
@@ -97,15 +130,7 @@ def _direct_loop(plant: ct.StateSpace, gain: float, outputs: Sequence[str]) -> c
         "y": (through * c, gain * through * d),
     }
     read, passed = (np.vstack([rows[name][k] for name in outputs]) for k in (0, 1))
-    return ct.ss(
-        a - gain * through * b @ c,
-        gain * through * b,
-        read,
-        passed,
-        inputs="r",
-        outputs=list(outputs),
-        name="loop",
-    )
+    return a - gain * through * b @ c, gain * through * b, read, passed
 
 
 def _polynomial(coefficients: ArrayLike, name: str) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
