@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import heapq
 from bisect import bisect_right
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -83,12 +83,12 @@ class DelayedDrive:
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """What a run left behind, at every time it was asked for.
+    """What a run left behind.
 
     Attributes
     ----------
     times : ndarray, shape (ntime,)
-        Times asked for [s], as far as the run went.
+        Times asked for and those at which legs begin [s], as far as the run went.
     states : ndarray, shape (nstates, ntime)
         Right-continuous where a discrete block takes a sample.
     legs : list of (float, Series)
@@ -101,7 +101,7 @@ class Run:
 
     def series(self, t: float) -> Series:
         """Driven signals over the leg that begins at or before a time."""
-        return self.legs[max(0, bisect_right([left for left, _ in self.legs], t) - 1)][1]
+        return self.legs[max(0, bisect_right(self.legs, t, key=lambda leg: leg[0]) - 1)][1]
 
 
 def integrate(
@@ -129,65 +129,87 @@ def integrate(
     resolution : float
         Relative accuracy of signals kept for delays.
     pause : callable, optional
-        Maps the times and states of a stretch to whether the run may end
-        behind it; stretches are then short.
+        Maps the times and states of a leg to whether the run may end behind
+        it; legs are then short.
+
+    Raises
+    ------
+    SolverError
+        If the solver fails, or a state is no longer finite; the time is in the message.
     """
     first, last = float(times[0]), float(times[-1])
-    delayed = [(drive, i) for drive, i in _delayed(network, drives)]
-    clock = _Clock(network, _fixed(network, drives, first, last, [d.delay for d, _ in delayed]), first, last)
-    longest = min([last - first, *(d.delay for d, _ in delayed)])
+    memory = _Memory(network, solver, drives, resolution)
+    clock = _Clock(network, _fixed(network, drives, first, last, memory.delays), first, last)
+    longest = min([last - first, *memory.delays])
     if pause is not None:
         longest = min(longest, (last - first) / 64.0)
-    wire = [(drive, network.wire[network.inputs[i]]) for drive, i in delayed]
-    states = np.empty((state.size, times.size))
+    shortest = 1e-9 * (last - first) if pause is not None else np.inf
+    known: list[tuple[Array, Array]] = []  # times and states of each leg, its end left to the next
     legs: list[tuple[float, Series]] = []
     span: list[Series] = []
-    left, x = first, clock.sample(equations, drives, first, state)
-    reach = longest
+    left, reach = first, longest
+    x = clock.sample(equations, drives, first, state)
     while left < last:
-        right = min(clock.following(left), left + reach)
-        if right > clock.following(left) - 1e-9 * (right - left):
-            right = clock.following(left)
-        if delayed or not (span and span[0].left <= left and right <= span[-1].right):
-            until = right if delayed else clock.fixed_after(left)
-            middle = 0.5 * (left + right)
-            accuracy = resolution if delayed else RESOLVED
-            span = resolved(partial(_beside, drives, middle, left), left, until, accuracy)
+        right = clock.following(left)
+        right = clock.on(times, right) if right - left <= reach * (1.0 + 1e-9) else left + reach
+        if memory.delays or not (span and span[-1].right >= right):
+            until = right if memory.delays else clock.fixed_after(left)
+            moment = 0.5 * (left + right)
+            accuracy = resolution if memory.delays else RESOLVED
+            span = resolved(partial(_beside, drives, moment, left), left, until, accuracy)
         series = next(s for s in span if left < s.right)
         right = min(right, series.right)
-        begin, end = np.searchsorted(times, [left, right])
-        nodes = chebyshev_times(left, right, _WIDTH) if delayed else np.empty(0)
-        inside = times[begin:end][times[begin:end] > left]
-        grid = np.union1d(np.append(nodes, right), inside)
+        inside = times[slice(*np.searchsorted(times, [left, right]))]
+        grid = np.union1d(np.append(memory.nodes(left, right), right), inside[inside > left])
         try:
             found = solver.advance(series, left, grid, x)
         except SolverError:
-            if pause is None or right - left < 1e-9 * (last - first):
+            if right - left < shortest:
                 raise
             reach = 0.5 * (right - left)
             continue
         if not np.isfinite(found).all():
             raise SolverError(f"the solver must reach {last:g} s, got to {left:g} s: a state is infinite beyond")
-        if delayed:
-            at_nodes = np.searchsorted(grid, nodes)
-            w = solver.signals(nodes, found[:, at_nodes], series.at(nodes))
-            pieces = [chebyshev_coefficients(rows @ w) for _, rows in wire]
-            if any(_unresolved(piece, resolution) for piece in pieces) and right - left > _SHORTEST * longest:
-                reach = 0.5 * (right - left)
-                continue
-            for (drive, _), piece in zip(wire, pieces, strict=True):
-                drive.record(Series(left, right, piece))
-        states[:, end - inside.size : end] = found[:, np.searchsorted(grid, inside)]
-        states[:, begin : end - inside.size] = x[:, None]
+        if not memory.record(left, right, series, grid, found):
+            reach = 0.5 * (right - left)
+            continue
         legs.append((left, series))
+        asked = np.isin(grid, inside)
+        known.append((np.append(left, grid[asked]), np.column_stack([x, found[:, asked]])))
         before, x = x, clock.sample(equations, drives, right, found[:, -1])
-        if pause is not None and pause(np.append(left, grid), np.column_stack([before, found])):
-            done = times <= right
-            states[:, times == right] = x[:, None]
-            return Run(times[done], states[:, done], legs)
         left, reach = right, min(longest, 2.0 * reach)
-    states[:, -1] = x
-    return Run(times, states, legs)
+        if pause is not None and pause(np.append(legs[-1][0], grid), np.column_stack([before, found])):
+            break
+    known.append((np.array([left]), x[:, None]))
+    return Run(np.concatenate([t for t, _ in known]), np.concatenate([s for _, s in known], axis=1), legs)
+
+
+class _Memory:
+    """What goes into delays, kept leg by leg."""
+
+    def __init__(self, network: Network, solver: Solver, drives: Sequence[Drive], resolution: float) -> None:
+        blocks = network.with_state("delay")
+        self._drives: list[Any] = [drive for drive in drives if isinstance(drive, DelayedDrive)]
+        self._wires = [network.wire[network.inputs[i]] for i in blocks]
+        self._solver, self._resolution = solver, resolution
+        self.delays = [drive.delay for drive in self._drives]
+
+    def nodes(self, left: float, right: float) -> Array:
+        """Times of a leg at which states are needed."""
+        return chebyshev_times(left, right, _WIDTH) if self._drives else np.empty(0)
+
+    def record(self, left: float, right: float, series: Series, grid: Array, states: Array) -> bool:
+        """Keep a leg; False where it must be shorter for its signals to be resolved."""
+        if not self._drives:
+            return True
+        nodes = self.nodes(left, right)
+        w = self._solver.signals(nodes, states[:, np.searchsorted(grid, nodes)], series.at(nodes))
+        pieces = [chebyshev_coefficients(wire @ w) for wire in self._wires]
+        if right - left > _SHORTEST * min(self.delays) and any(_unresolved(p, self._resolution) for p in pieces):
+            return False
+        for drive, piece in zip(self._drives, pieces, strict=True):
+            drive.record(Series(left, right, piece))
+        return True
 
 
 class _Clock:
@@ -215,6 +237,12 @@ class _Clock:
         """The next breakpoint after t, or the end."""
         return self._fixed[min(bisect_right(self._fixed, t + self._tolerance), len(self._fixed) - 1)]
 
+    def on(self, times: Array, t: float) -> float:
+        """The time asked for that an instant is but for rounding, so that it counts as after it."""
+        near = times[max(0, int(np.searchsorted(times, t)) - 1) :][:2]
+        close = near[np.abs(near - t) <= self._tolerance]
+        return float(close[0]) if close.size else t
+
     def sample(self, equations: Interpreted | None, drives: Sequence[Drive], t: float, x: Array) -> Array:
         """State after the blocks due at t have taken their samples."""
         due = []
@@ -233,14 +261,6 @@ class _Clock:
 
 def _beside(drives: Sequence[Drive], moment: float, origin: float, s: Array) -> Array:
     return np.concatenate([np.zeros((0, s.size)), *(drive.beside(moment, origin, s) for drive in drives)])
-
-
-def _delayed(network: Network, drives: Sequence[Drive]) -> Iterator[tuple[DelayedDrive, int]]:
-    """The drives of delays, and their blocks."""
-    blocks = iter(network.with_state("delay"))
-    for drive in drives:
-        if isinstance(drive, DelayedDrive):
-            yield drive, next(blocks)
 
 
 def _fixed(network: Network, drives: Sequence[Drive], first: float, last: float, delays: list[float]) -> list[float]:
