@@ -50,6 +50,7 @@ class Compiled:
     def __init__(self, network: Network, traces: list[Trace | None], feeds: list[NDArray[np.bool_]]) -> None:
         self._traces = traces
         self._places = [(i, key) for i, trace in enumerate(traces) if trace is not None for key in trace.symbols]
+        self.symbols = frozenset(key for _, key in self._places)
         self._defaults = [(key, network.blocks[i].params.get(key)) for i, key in self._places]
         n, nd = network.nstates, network.driven.size
         t, x, d, p = (ca.SX.sym(name, size) for name, size in (("t", 1), ("x", n), ("d", nd), ("p", len(self._places))))

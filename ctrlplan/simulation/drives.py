@@ -175,7 +175,7 @@ def resolved(signals: Callable[[Array], Array], left: float, right: float, toler
     if np.all(size[:, width // 2 :] <= max(_NOISE, 10.0 * tolerance) * allowed):
         return [Series(left, right, coefficients)]
     middle = 0.5 * (left + right)
-    if not left < middle < right:
+    if not left < middle < right or duration < 1e-12 * max(abs(left), abs(right)):
         return [Series(left, right, coefficients)]
     first = resolved(signals, left, middle, tolerance)
     return first + resolved(lambda s: signals(s + (middle - left)), middle, right, tolerance)

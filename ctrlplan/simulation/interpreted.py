@@ -63,7 +63,7 @@ class Interpreted:
         dx = self._a @ x + self._b @ w
         for i in self._moving:
             place = self.network.states[i]
-            dx[place] = self._updates[i](t, x[place], self.network.wire[self.network.inputs[i]] @ w)
+            dx[place] = np.ravel(self._updates[i](t, x[place], self.network.wire[self.network.inputs[i]] @ w))
         return dx
 
     def signals(self, t: float, x: Array, driven: Array) -> Array:

@@ -37,6 +37,10 @@ _HOPS = 6
 """Delays after which what was a jump is smooth enough to be passed over."""
 
 
+_MARKS = 20_000
+"""Instants of jumps that a run stops at, at most."""
+
+
 class Solver(Protocol):
     """What carries a state over a leg."""
 
@@ -139,7 +143,9 @@ def integrate(
     """
     first, last = float(times[0]), float(times[-1])
     memory = _Memory(network, solver, drives, resolution)
-    clock = _Clock(network, _fixed(network, drives, first, last, memory.delays), first, last)
+    for_ever = equations is not None and network.delays_feed_delays(equations.feeds)
+    hops = _MARKS if for_ever else _HOPS
+    clock = _Clock(network, _fixed(network, drives, first, last, memory.delays, hops), first, last)
     longest = min([last - first, *memory.delays])
     if pause is not None:
         longest = min(longest, (last - first) / 64.0)
@@ -263,15 +269,16 @@ def _beside(drives: Sequence[Drive], moment: float, origin: float, s: Array) -> 
     return np.concatenate([np.zeros((0, s.size)), *(drive.beside(moment, origin, s) for drive in drives)])
 
 
-def _fixed(network: Network, drives: Sequence[Drive], first: float, last: float, delays: list[float]) -> list[float]:
+def _fixed(
+    network: Network, drives: Sequence[Drive], first: float, last: float, delays: list[float], hops: int
+) -> list[float]:
     """Breakpoints inside the run, and where delays carry them to."""
-    marks = breakpoints_of(drives)
-    marks += [float(t) for block in network.blocks for t in getattr(block.system, "breakpoints", ())]
+    marks = [*breakpoints_of(drives), *network.breakpoints]
     found = {t for t in marks if first < t < last}
     fresh = {*found, first}
-    for _ in range(_HOPS if delays else 0):
+    for _ in range(hops if delays else 0):
         fresh = {t + delay for t in fresh for delay in delays if t + delay < last} - found
-        if len(found) + len(fresh) > 20_000:
+        if not fresh or len(found) + len(fresh) > _MARKS:
             break
         found |= fresh
     return apart([first, *sorted(found), last])[1:-1]

@@ -128,6 +128,8 @@ class Network:
         The outputs of the whole from all signals.
     ninputs : int
         External inputs, the first of the signals.
+    breakpoints : tuple of float
+        Times [s] that blocks name at which their equations change.
     """
 
     name: str
@@ -135,6 +137,7 @@ class Network:
     wire: Array
     read: Array
     ninputs: int
+    breakpoints: tuple[float, ...] = ()
 
     @classmethod
     def of(cls, system: Any) -> Network:
@@ -153,7 +156,12 @@ class Network:
             np.hstack([part.outer, part.inner]),
             np.hstack([part.passed @ part.outer, part.read + part.passed @ part.inner]),
             system.ninputs or 0,
+            tuple(float(t) for b in part.blocks for t in getattr(b.system, "breakpoints", ())),
         )
+
+    def without_blocks(self) -> Network:
+        """What a run of a compiled form needs."""
+        return Network(self.name, (), self.wire[:0], self.read, self.ninputs, self.breakpoints)
 
     @cached_property
     def states(self) -> list[slice]:
@@ -228,6 +236,15 @@ class Network:
             steps.append(Step(self._owners(rows), rows))
             known[rows] = True
         return steps
+
+    def delays_feed_delays(self, feeds: Sequence[NDArray[np.bool_]]) -> bool:
+        """Whether what a delay puts out goes into one at once: jumps then go round for ever."""
+        depends, delays = _dependencies(self, feeds), self.with_state("delay")
+        if not delays:
+            return False
+        needed = np.any([np.any(self.wire[self.inputs[i]] != 0.0, axis=0) for i in delays], axis=0)
+        reached = _reached(depends, needed)
+        return any(reached[self.outputs[i]].any() for i in delays)
 
     def signals_of_inputs(self) -> NDArray[np.bool_]:
         """Which signals feed a block at all."""

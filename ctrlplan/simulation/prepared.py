@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
+from copy import deepcopy
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
@@ -29,6 +31,10 @@ _KEPT = 16
 
 class NotCompiledError(ValueError):
     """A system that cannot be compiled, and why."""
+
+
+class DisagreementError(NotCompiledError):
+    """A compiled system that is not what Python says at states that a run visited."""
 
 
 class Prepared:
@@ -72,6 +78,7 @@ class Prepared:
                 what = "puts out the past" if block.delay is not None else "takes samples"
                 self.linear, self.not_linear = None, f"block {block.name} {what}"
         self._sources = [PlanDrive(b.plan, b.system.derivatives) for b in self._blocks() if b.plan is not None]
+        self.trusted = True
         self._compiled: list[tuple[frozenset[str], dict[str, Any], Compiled | NotCompiledError]] = []
 
     def __repr__(self) -> str:
@@ -103,7 +110,8 @@ class Prepared:
         """
         names = frozenset(params)
         for known, baked, form in self._compiled:
-            if known == names and all(_same(params.get(key), value) for key, value in baked.items()):
+            numbers = isinstance(form, NotCompiledError) or all(np.ndim(params.get(k, 0.0)) == 0 for k in form.symbols)
+            if known == names and numbers and all(_same(params.get(key), value) for key, value in baked.items()):
                 if isinstance(form, NotCompiledError):
                     raise form
                 return form
@@ -113,42 +121,52 @@ class Prepared:
             raise form
         return form
 
-    def distrust(self, form: Compiled, why: str) -> None:
-        """Never run a compiled form again that was found wrong."""
+    def distrust(self, form: Compiled, why: str) -> DisagreementError:
+        """Drop a compiled form that was found wrong: once, for what it was made of may have changed; then for good."""
+        again, self.trusted = not self.trusted, False
         self._compiled = [
-            (names, baked, NotCompiledError(why) if known is form else known) for names, baked, known in self._compiled
+            (names, baked, NotCompiledError(why) if known is form else known)
+            for names, baked, known in self._compiled
+            if again or known is not form
         ]
+        return DisagreementError(why)
 
-    def detached(self) -> Prepared:
-        """Same form without python-control's blocks, for other processes and for many runs.
+    def detached(self, names: Iterable[str] = ()) -> Prepared:
+        """Same form without python-control's blocks, for other processes and for many runs with some parameters.
 
         Nothing is compared with Python any more.
 
         Raises
         ------
         TypeError
-            If it is neither linear nor compiled, or has delays or discrete blocks.
+            If it is neither linear nor compiled for any values of these
+            parameters, or has delays or discrete blocks.
         """
         other = object.__new__(Prepared)
         other.__dict__.update(self.__getstate__())
+        if self.linear is None:
+            other._compiled = [entry for entry in other._compiled if entry[0] == frozenset(names) and not entry[1]]
+            if not other._compiled:
+                raise TypeError(f"{self.name} is not compiled for any values of {', '.join(names) or 'no parameters'}")
         return other
 
-    def feels(self, name: str, low: float, high: float) -> bool:
-        """Whether a parameter changes anything, near where a run begins."""
-        network = self.network
-        if network is None or not network.blocks:
+    def reads(self, name: str) -> bool:
+        """Whether a block has a parameter, or reads one of that name near where a run begins."""
+        if any(name in block.params for block in self._blocks()):
             return True
+        seen = _Noticing()
         rng = np.random.default_rng(0)
-        start = np.zeros(self.nstates) if self.initial_state is None else np.asarray(self.initial_state, dtype=float)
-        one, other = (Interpreted(network, {name: value}, (0.0, start)) for value in (low, high))
-        for scale in (0.0, 0.1, 1.0):
-            x = start + scale * rng.standard_normal(start.size) * (1.0 + np.abs(start))
-            driven = scale * rng.standard_normal(network.driven.size)
-            with np.errstate(all="ignore"):
-                pairs = [(f.rates(0.0, x, driven), f.signals(0.0, x, driven)) for f in (one, other)]
-            if any(not np.array_equal(a, b, equal_nan=True) for a, b in zip(*pairs, strict=True)):
-                return True
-        return False
+        for block in self._blocks():
+            if block.linear or block.driven:
+                continue
+            noticing = _Noticing({**block.params, name: 1.0}, seen=seen)
+            for scale in (0.0, 0.1, 1.0):
+                x, u = (scale * rng.standard_normal(n or 0) for n in (block.system.nstates, block.system.ninputs))
+                functions = (block.system.outfcn, block.system.updfcn, getattr(block.system, "sample", None))
+                for function in filter(None, functions):
+                    with np.errstate(all="ignore"), suppress(Exception):
+                        function(10.0 * scale, x, u, noticing)
+        return name in seen.read or _Noticing.ALL in seen.read
 
     def _build(
         self, params: Mapping[str, Any], drives: list[Drive], first: float, state: Array
@@ -175,18 +193,18 @@ class Prepared:
                 trace = traced(block, params, first, state[states], network.wire[inputs] @ w)
                 traces.append(trace)
                 # What is a constant in the trace must be so in every run of it.
-                baked |= {key: params[key] for key in params if key not in trace.symbols}
+                baked |= {key: deepcopy(params[key]) for key in params if key not in trace.symbols}
             return Compiled(network, traces, equations.feeds), baked
         except NotTraceableError as error:
-            return NotCompiledError(str(error)), dict(params)
+            return NotCompiledError(str(error)), deepcopy(dict(params))
 
     def _blocks(self) -> tuple[Any, ...]:
         return self.network.blocks if self.network is not None else ()
 
     def __getstate__(self) -> dict[str, Any]:
         """Without python-control's objects, whose functions cannot be sent to another process."""
+        usable = [entry for entry in self._compiled if not isinstance(entry[2], NotCompiledError)]
         if self.linear is None:
-            usable = [entry for entry in self._compiled if not isinstance(entry[2], NotCompiledError)]
             special = any(block.delay is not None or block.period is not None for block in self._blocks())
             if not usable or special:
                 raise TypeError(
@@ -195,8 +213,46 @@ class Prepared:
                 )
         network = self.network
         if network is not None:
-            network = Network(network.name, (), network.wire[:0], network.read, network.ninputs)
-        return self.__dict__ | {"system": None, "fingerprint": None, "network": network}
+            network = network.without_blocks()
+        return self.__dict__ | {"system": None, "fingerprint": None, "network": network, "_compiled": usable}
+
+
+class _Noticing(dict[str, Any]):
+    """Parameters that notice which of them are read."""
+
+    ALL = ""
+
+    def __init__(self, values: Mapping[str, Any] | None = None, seen: _Noticing | None = None) -> None:
+        super().__init__(values or {})
+        self.read: set[str] = seen.read if seen is not None else set()
+
+    def __getitem__(self, key: str) -> Any:
+        self.read.add(key)
+        return super().__getitem__(key)
+
+    def __contains__(self, key: object) -> bool:
+        self.read.add(str(key))
+        return super().__contains__(key)
+
+    def get(self, key: str, default: Any = None) -> Any:
+        self.read.add(key)
+        return super().get(key, default)
+
+    def __iter__(self) -> Iterator[str]:
+        self.read.add(self.ALL)
+        return super().__iter__()
+
+    def keys(self) -> Any:
+        self.read.add(self.ALL)
+        return super().keys()
+
+    def items(self) -> Any:
+        self.read.add(self.ALL)
+        return super().items()
+
+    def values(self) -> Any:
+        self.read.add(self.ALL)
+        return super().values()
 
 
 def prepare(system: Any) -> Prepared:
@@ -261,7 +317,8 @@ def fingerprint(system: Any) -> tuple[Any, ...]:
         return (own, labels, tuple(np.asarray(m).tobytes() for m in (system.A, system.B, system.C, system.D)))
     if isinstance(system, ct.TransferFunction):
         return (own, labels, _frozen([system.num, system.den]))
-    functions = tuple(id(getattr(system, name, None)) for name in ("updfcn", "outfcn", "plan"))
+    # The functions themselves, not their addresses: those of the dead are given to others.
+    functions = tuple(_frozen(getattr(system, name, None)) for name in ("updfcn", "outfcn", "plan"))
     numbers = tuple(getattr(system, name, None) for name in ("derivatives", "delay", "period", "offset"))
     inner = getattr(system, "block", None)
     return (own, labels, functions, numbers, () if inner is None else fingerprint(inner))

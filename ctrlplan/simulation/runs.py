@@ -16,7 +16,7 @@ from ctrlplan.simulation.exact import exact_states
 from ctrlplan.simulation.interpreted import Interpreted, InterpretedSolver, SolverError
 from ctrlplan.simulation.legs import Solver, integrate
 from ctrlplan.simulation.linear import LinearForm
-from ctrlplan.simulation.prepared import NotCompiledError, Prepared
+from ctrlplan.simulation.prepared import DisagreementError, NotCompiledError, Prepared
 
 Array = NDArray[np.float64]
 
@@ -118,7 +118,10 @@ def recorded(job: Job, method: str) -> Record:
     if method == "python":
         return _numerical(job, "python", 'method "python" was asked for')
     try:
-        return _numerical(job, "compiled", reason)
+        try:
+            return _numerical(job, "compiled", reason)
+        except DisagreementError:  # what a function refers to may have changed since it was traced
+            return _numerical(job, "compiled", reason)
     except NotCompiledError as error:
         if method == "compiled":
             raise ValueError(f'method "compiled" must be given blocks that can be traced, but {error}') from None
@@ -203,8 +206,8 @@ def _numerical(job: Job, method: str, reason: str) -> Record:
         t, x, driven = run.times[some], run.states[:, some], driven_signals(drives, run.times[some])
         wrong = form.disagreement(network, job.params, t, x, equations.all_signals(t, x, driven))
         if wrong:
-            prepared.distrust(form, wrong)
-            raise NotCompiledError(wrong)
+            raise prepared.distrust(form, wrong)
+        prepared.trusted = True
     return Record(run.times, run.states, see, carry, watched, method, reason)
 
 

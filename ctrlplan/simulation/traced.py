@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -63,7 +64,7 @@ def traced(block: Block, params: Mapping[str, Any], t: float, x: Array, u: Array
     for symbols in dict.fromkeys((numbers, ())):
         for as_objects in (True, False):
             try:
-                with warnings.catch_warnings():
+                with warnings.catch_warnings(), _no_number_is_a_symbol():
                     warnings.simplefilter("ignore")
                     trace = _trace(block, values, symbols, as_objects)
             except Exception as error:  # whatever a block does when it meets a symbol
@@ -74,6 +75,27 @@ def traced(block: Block, params: Mapping[str, Any], t: float, x: Array, u: Array
                 return trace
             why = wrong
     raise NotTraceableError(f"block {block.name} cannot be traced ({why})")
+
+
+@contextmanager
+def _no_number_is_a_symbol() -> Iterator[None]:
+    """Let a symbol that is asked for its number, or looked up, raise: CasADi answers nan, and a branch is lost."""
+
+    def refuse(symbol: Any) -> Any:
+        raise TypeError("a symbol has no number")
+
+    names = ("__float__", "__int__", "__hash__")
+    before = {name: getattr(ca.SX, name) for name in names if hasattr(ca.SX, name)}
+    for name in names:
+        setattr(ca.SX, name, refuse)
+    try:
+        yield
+    finally:
+        for name in names:
+            if name in before:
+                setattr(ca.SX, name, before[name])
+            else:
+                delattr(ca.SX, name)
 
 
 def agrees(block: Block, trace: Trace, params: Mapping[str, Any], t: Array, x: Array, u: Array) -> str:

@@ -211,12 +211,9 @@ def compare(
     times = np.asarray(timepts, dtype=float)
     start = min(plan.start for plan in references.values())
     responses, found, unstable = {}, {}, np.empty(0, dtype=complex)
-    builds = callable(loop) and not hasattr(loop, "output_labels")
-    if not builds and not loop.ninputs:
-        raise ValueError(
-            "loop must have inputs for the plans, got one without; give a function of name and plan that returns "
-            "a loop where the plan is a block inside"
-        )
+    builds = is_builder(loop)
+    if not builds:
+        check_has_inputs(loop)
     for name, plan in references.items():
         system = state_space(loop(name, plan) if builds else loop)
         tracked, acting = _tracked(system, outputs, first), _acting(system, controls)
@@ -266,6 +263,21 @@ def references_of(plans: Mapping[str, Trajectory] | Iterable[Waypoint], alpha: f
         If one is not a trajectory.
     """
     return _checked_plans(plans if isinstance(plans, Mapping) else standard_plans(plans, alpha))
+
+
+def is_builder(loop: Any) -> bool:
+    """Whether something is a function of name and plan that returns a loop; systems can be called as well."""
+    return callable(loop) and not hasattr(loop, "output_labels")
+
+
+def check_has_inputs(loop: Any) -> Any:
+    """Refuse a loop that no plan can drive."""
+    if not loop.ninputs:
+        raise ValueError(
+            "loop must have inputs for the plans, got one without; give a function of name and plan that returns "
+            "a loop where the plan is a block inside"
+        )
+    return loop
 
 
 def standard_plans(waypoints: Iterable[Waypoint], alpha: float = 1.0) -> dict[str, Trajectory]:

@@ -15,7 +15,14 @@ from numpy.typing import ArrayLike, NDArray
 from tqdm import tqdm
 
 from ctrlplan.simulation import Prepared, prepare
-from ctrlplan.studies.comparison import Comparison, compare, finite_or_none, references_of
+from ctrlplan.studies.comparison import (
+    Comparison,
+    check_has_inputs,
+    compare,
+    finite_or_none,
+    is_builder,
+    references_of,
+)
 from ctrlplan.trajectories import Trajectory, Waypoint
 
 if TYPE_CHECKING:
@@ -96,8 +103,10 @@ class Ensemble:
         """Quantiles at `levels` of a metric, by plan; draws that failed do not count."""
         found = {}
         for plan, rows in self.metrics.items():
-            known = rows[name][~np.isnan(rows[name])]
-            found[plan] = np.quantile(known, self.levels, method="inverted_cdf") if known.size else np.full(5, np.nan)
+            values = rows.get(name, np.empty(0))
+            known = values[~np.isnan(values)]
+            nothing = np.full(len(self.levels), np.nan)
+            found[plan] = np.quantile(known, self.levels, method="inverted_cdf") if known.size else nothing
         return found
 
     def to_pandas(self) -> pd.DataFrame:
@@ -196,8 +205,8 @@ def draws(count: int, seed: int = 0, **distributions: Distribution) -> dict[str,
             values = distribution.rvs(size=count, random_state=rng)
         elif np.shape(distribution) == (2,):
             low, high = (float(end) for end in distribution)
-            if not low <= high:
-                raise ValueError(f"{name} must be drawn from low to high, got {low} and {high}")
+            if not -np.inf < low <= high < np.inf:
+                raise ValueError(f"{name} must be drawn from low to high, both finite, got {low} and {high}")
             values = rng.uniform(low, high, count)
         else:
             raise TypeError(f"{name} must be (low, high) or a distribution of scipy.stats, got {distribution!r}")
@@ -218,41 +227,52 @@ def ensemble(
     table = _checked_draws(params)
     count = next(iter(table.values())).size
     times = np.asarray(timepts, dtype=float)
-    settings = {"events": (), **(options or {})}
+    settings: dict[str, Any] = {"events": (), **(options or {})}
+    points = settings.pop("waypoints", ())
+    if not isinstance(plans, Mapping):
+        plans = points = tuple(plans)
     references = references_of(plans, settings.pop("alpha", 1.0))
-    builds = callable(loop) and not hasattr(loop, "output_labels")
-    shared = None if builds else prepare(loop)
+    builds = is_builder(loop)
+    shared = None if builds else prepare(check_has_inputs(loop))
     forms = {name: shared or prepare(loop(name, plan)) for name, plan in references.items()}
-    nominal = compare(_forms(forms), references, times, **settings)
-    _check_felt(forms, table)
-    # The forms for these parameters are built, and compared with Python, here and once.
-    first = _one(forms, references, times, settings, _draw(table, 0))
+    for name in table:
+        if not any(form.reads(name) for form in forms.values()):
+            raise ValueError(f"params must be parameters of a block, got {name!r}, which none reads")
+    nominal = compare(_given(forms), references, times, waypoints=points, **settings)
+    # Compiled for these parameters, and compared with Python, here and once.
+    _one(forms, references, times, settings, _draw(table, 0))
     try:
-        light: Any = {name: form.detached() for name, form in forms.items()}
+        light: Any = {name: form.detached(table) for name, form in forms.items()}
     except TypeError as error:
-        light = _sendable(loop, error) if executor is not None else forms
-    run = partial(_chunk, light, references, times, settings)
-    tasks = [
-        [(k, _draw(table, k)) for k in range(start, min(start + _CHUNK, count))] for start in range(0, count, _CHUNK)
-    ]
-    keep = _Kept(count, first, times)
+        light = forms if executor is None else _sendable(loop, builds, error)
+    kept = _Kept(count, times)
     bar = tqdm(total=count, desc="draws", disable=not progress, leave=False)
     futures: list[Any] = []
     try:
-        if executor is not None:
-            futures = [executor.submit(run, task) for task in tasks]
-        for k, task in enumerate(tasks):
-            found = futures[k].result() if futures else run(task, bar.update)
-            if futures:
+        if executor is None:
+            for k in range(count):
+                params_k = _draw(table, k)
+                outcome = _one(light, references, times, settings, params_k)
+                if isinstance(outcome, str) and light is not forms:  # what is compiled may fail where Python does not
+                    outcome = _one(forms, references, times, settings, params_k)
+                kept.add(k, params_k, outcome)
+                bar.update()
+        else:
+            size = max(1, min(_CHUNK, -(-count // 8)))
+            tasks = [range(k, min(k + size, count)) for k in range(0, count, size)]
+            run = partial(_several, light, references, times, settings)
+            futures = [executor.submit(run, [_draw(table, k) for k in task]) for task in tasks]
+            for task, future in zip(tasks, futures, strict=True):
+                for k, outcome in zip(task, future.result(), strict=True):
+                    kept.add(k, _draw(table, k), outcome)
                 bar.update(len(task))
-            keep.add(found, task)
     except KeyboardInterrupt:
         for future in futures:
-            future.cancel()
+            getattr(future, "cancel", bool)()
     finally:
         bar.close()
     return Ensemble(
-        nominal, table, keep.metrics, keep.timepts, keep.bands(), LEVELS, tuple(keep.failures), keep.finished
+        nominal, table, kept.metrics, kept.timepts, kept.bands(), LEVELS, tuple(kept.failures), kept.finished
     )
 
 
@@ -263,31 +283,31 @@ Outcome = tuple[dict[str, dict[str, float]], dict[str, dict[str, Array]]]
 class _Kept:
     """What of all draws is kept."""
 
-    def __init__(self, count: int, first: Outcome | str, times: Array) -> None:
+    def __init__(self, count: int, times: Array) -> None:
         self.timepts = times[_some(times)]
         self.metrics: dict[str, dict[str, Array]] = {}
-        self._signals: dict[str, dict[str, Array]] = {}
         self.failures: list[Failure] = []
         self.finished = 0
+        self._signals: dict[str, dict[str, Array]] = {}
         self._count = count
 
-    def add(self, found: list[Outcome | str], task: list[tuple[int, dict[str, float]]]) -> None:
-        for outcome, (k, params) in zip(found, task, strict=True):
-            self.finished += 1
-            if isinstance(outcome, str):
-                self.failures.append(Failure(k, params, outcome))
-                continue
-            metrics, signals = outcome
-            for plan, rows in metrics.items():
-                for name, value in rows.items():
-                    column = self.metrics.setdefault(plan, {}).setdefault(name, np.full(self._count, np.nan))
-                    column[k] = value
-            for plan, curves in signals.items():
-                for name, curve in curves.items():
-                    table = self._signals.setdefault(plan, {})
-                    if name not in table:
-                        table[name] = np.full((self._count, self.timepts.size), np.nan)
-                    table[name][k, : curve.size] = curve
+    def add(self, k: int, params: dict[str, float], outcome: Outcome | str) -> None:
+        """One draw, or what went wrong with it."""
+        self.finished += 1
+        if isinstance(outcome, str):
+            self.failures.append(Failure(k, params, outcome))
+            return
+        metrics, signals = outcome
+        for plan, rows in metrics.items():
+            for name, value in rows.items():
+                column = self.metrics.setdefault(plan, {}).setdefault(name, np.full(self._count, np.nan))
+                column[k] = value
+        for plan, curves in signals.items():
+            for name, curve in curves.items():
+                known = self._signals.setdefault(plan, {})
+                if name not in known:
+                    known[name] = np.full((self._count, self.timepts.size), np.nan)
+                known[name][k, : curve.size] = curve
 
     def bands(self) -> dict[str, dict[str, Array]]:
         """Quantiles over the draws that were run."""
@@ -295,39 +315,37 @@ class _Kept:
 
 
 def _quantiles(rows: Array) -> Array:
-    """Quantiles (nlevels, ntime) over rows, without those that are nan."""
-    known = rows[~np.isnan(rows).all(axis=1)]
-    if np.isnan(known).any():  # runs that an event ended
-        return np.asarray(np.nanquantile(known, LEVELS, axis=0))
-    return np.asarray(np.quantile(known, LEVELS, axis=0))
+    """Quantiles (nlevels, ntime) over rows, of which those that an event ended are nan from there on."""
+    out = np.full((len(LEVELS), rows.shape[1]), np.nan)
+    known = ~np.isnan(rows)
+    for full in (True, False):
+        columns = known.all(axis=0) if full else known.any(axis=0) & ~known.all(axis=0)
+        if columns.any():
+            quantile = np.quantile if full else np.nanquantile
+            out[:, columns] = quantile(rows[:, columns], LEVELS, axis=0)
+    return out
 
 
 def _some(times: Array) -> NDArray[np.intp]:
     return np.unique(np.linspace(0, times.size - 1, min(times.size, _SAMPLES)).round().astype(np.intp))
 
 
-def _chunk(
+def _several(
     forms: Any,
     references: dict[str, Trajectory],
     times: Array,
     settings: dict[str, Any],
-    task: list[tuple[int, dict[str, float]]],
-    step: Callable[[int], Any] | None = None,
+    draws: list[dict[str, float]],
 ) -> list[Outcome | str]:
-    """Some draws, in this process or another."""
+    """Some draws, in another process."""
     if not isinstance(forms, Mapping):  # a function that builds the loops
         build = forms
         forms = {name: prepare(build(name, plan)) for name, plan in references.items()}
-    found = []
-    for _, params in task:
-        found.append(_one(forms, references, times, settings, params))
-        if step is not None:
-            step(1)
-    return found
+    return [_one(forms, references, times, settings, params) for params in draws]
 
 
 def _one(
-    forms: dict[str, Prepared],
+    forms: Mapping[str, Prepared],
     references: dict[str, Trajectory],
     times: Array,
     settings: dict[str, Any],
@@ -335,20 +353,21 @@ def _one(
 ) -> Outcome | str:
     """One draw, or what went wrong with it."""
     try:
-        result = compare(_forms(forms), references, times, params=params, **settings)
-    except (ArithmeticError, ValueError, RuntimeError) as error:
+        result = compare(_given(forms), references, times, params=params, **settings)
+    except Exception as error:  # whatever a block does at these parameters
         return f"{type(error).__name__}: {error}"
     signals: dict[str, dict[str, Array]] = {}
+    wanted = times[_some(times)]
     for plan, response in result.responses.items():
+        reached = np.asarray(response.time)
         rows = np.asarray(response.outputs).reshape(len(response.output_labels), -1)
-        kept = _some(times)
-        kept = kept[kept < rows.shape[1]]
+        kept = np.isin(reached, wanted)
         names = dict.fromkeys((*result.outputs, *result.controls))
         signals[plan] = {name: rows[list(response.output_labels).index(name)][kept] for name in names}
     return result.metrics, signals
 
 
-def _forms(forms: Mapping[str, Prepared]) -> Callable[[str, Trajectory], Prepared]:
+def _given(forms: Mapping[str, Prepared]) -> Callable[[str, Trajectory], Prepared]:
     return lambda name, plan: forms[name]
 
 
@@ -367,18 +386,11 @@ def _checked_draws(params: Mapping[str, ArrayLike]) -> dict[str, Array]:
     return table
 
 
-def _check_felt(forms: Mapping[str, Prepared], table: Mapping[str, Array]) -> None:
-    """Refuse a parameter that no block reads: it is misspelt."""
-    for name, values in table.items():
-        ends = (float(values.min()), float(values.max()))
-        if ends[0] < ends[1] and not any(form.feels(name, *ends) for form in forms.values()):
-            raise ValueError(f"params must be parameters of a block, got {name!r}, which changes nothing")
-
-
-def _sendable(loop: Any, error: TypeError) -> Any:
+def _sendable(loop: Any, builds: bool, error: TypeError) -> Any:
     """A function that builds the loops, where the loops themselves cannot be sent to another process."""
     try:
-        pickle.dumps(loop)
-    except Exception:  # whatever pickle meets in a user's object
-        raise ValueError(f"the loop must go to other processes, but {error}") from None
-    return loop
+        if builds and pickle.dumps(loop):
+            return loop
+    except Exception as why:  # whatever pickle meets in a user's object
+        raise ValueError(f"the loop must go to other processes, but {error} ({why})") from None
+    raise ValueError(f"the loop must go to other processes, but {error}")
