@@ -105,9 +105,9 @@ class Compiled:
         jacobian = _called(self._jacobian, (np.array([t]), x, driven, p), x.size)
         return float(-np.linalg.eigvals(jacobian).real.min()) if np.isfinite(jacobian).all() else np.inf
 
-    def integrator(self, width: int, grid: Array, stiff: bool, rtol: float, atol: float) -> Any:
+    def integrator(self, width: int, grid: Array, stiff: bool, rtol: float, atol: float, max_steps: int) -> Any:
         """CVODES over a leg of length 1, with outputs at some of its times."""
-        key = (width, grid.tobytes(), stiff, rtol, atol)
+        key = (width, grid.tobytes(), stiff, rtol, atol, max_steps)
         if key not in self._integrators:
             if len(self._integrators) >= _KEPT:
                 self._integrators.popitem(last=False)
@@ -115,7 +115,7 @@ class Compiled:
                 "linear_multistep_method": "bdf" if stiff else "adams",
                 "reltol": max(_SAFETY * rtol, 1e-14),
                 "abstol": atol * _SAFETY,
-                "max_num_steps": 100_000,
+                "max_num_steps": max_steps,
                 "show_eval_warnings": False,
                 "disable_internal_warnings": True,
             }
@@ -162,9 +162,11 @@ class Compiled:
 class CompiledSolver:
     """CVODES on a compiled network, leg by leg."""
 
-    def __init__(self, equations: Compiled, params: Mapping[str, Any], rtol: float, atol: float) -> None:
+    def __init__(
+        self, equations: Compiled, params: Mapping[str, Any], rtol: float, atol: float, max_steps: int = 100_000
+    ) -> None:
         self._equations, self._p = equations, equations.parameters(params)
-        self._tolerances = rtol, atol
+        self._options = rtol, atol, max_steps
         self._longest, self._stiff = 0.0, False
 
     def signals(self, times: Array, states: Array, driven: Array) -> Array:
@@ -187,7 +189,7 @@ class CompiledSolver:
             decay = self._equations.fastest_decay(left, state, series(left), self._p)
             self._longest, self._stiff = right - left, decay * (right - left) > _STIFF
         width = series.coefficients.shape[1]
-        integrator = self._equations.integrator(width, relative, self._stiff, *self._tolerances)
+        integrator = self._equations.integrator(width, relative, self._stiff, *self._options)
         span = [left, right - left, series.left, series.right]
         p = np.concatenate([self._p, series.coefficients.ravel(order="F"), span])
         try:

@@ -132,10 +132,10 @@ def input_drives(labels: Sequence[str], inputs: Inputs, times: Array) -> list[Dr
             known = f"({', '.join(labels)})" if labels else "(the system has no inputs)"
             raise ValueError(f"inputs must have {len(labels)} axes {known}, got {inputs.naxes}")
         return [PlanDrive(inputs)]
-    elif inputs is None or np.ndim(inputs) == 0:
+    elif inputs is None or (np.ndim(inputs) == 0 and not callable(inputs)):
         given = [0.0 if inputs is None else inputs] * len(labels)
     else:
-        rows = np.asarray(inputs, dtype=float)
+        rows = _numbers(inputs, "inputs")
         rows = rows[None] if rows.ndim == 1 and len(labels) == 1 else rows
         if rows.shape not in ((len(labels), times.size), (len(labels),)):
             raise ValueError(f"inputs must have shape ({len(labels)}, {times.size}), got {rows.shape}")
@@ -192,12 +192,19 @@ def chebyshev_coefficients(values: Array) -> Array:
     return values @ _chebyshev(values.shape[1])[1]
 
 
+def _numbers(value: Any, what: str) -> Array:
+    try:
+        return np.asarray(value, dtype=float)
+    except TypeError:
+        raise TypeError(f"{what} must be trajectories, numbers or samples, got {value!r:.80}") from None
+
+
 def _drive(value: Any, name: str, times: Array) -> Drive:
     if isinstance(value, Trajectory):
         if value.naxes != 1:
             raise ValueError(f"input {name} must be driven by one axis, got {value.naxes}")
         return PlanDrive(value)
-    signal = np.asarray(value, dtype=float)
+    signal = _numbers(value, f"input {name}")
     if not np.isfinite(signal).all():
         raise ValueError(f"input {name} must be finite, got nan or inf at index {int((~np.isfinite(signal)).argmax())}")
     if signal.ndim == 0:

@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -170,6 +169,8 @@ def watched_events(events: Sequence[Event], labels: Mapping[str, tuple[str, int]
     labels : mapping of str to (kind, int)
         "x", "u" or "y", and the row, of every label.
     """
+    if isinstance(events, Event):
+        raise TypeError("events must be a sequence of Event, got one alone")
     found = []
     for event in events:
         if not isinstance(event, Event):
@@ -207,13 +208,18 @@ def _row(kind: str, row: int, seen: Snapshot) -> Array:
 
 
 def _root(function: Callable[[float], float], left: float, right: float, at_left: float, at_right: float) -> float:
-    """Time of a sign change, right of which the signal is on its new side."""
+    """Earliest time found at which the signal is on the side where it is at `right`."""
     if at_left == 0.0 or at_left * at_right >= 0.0:
         return left if at_left == 0.0 else right
+    crossed = [right]
 
-    def value(t: float) -> Any:
+    def value(t: float) -> float:
         if t <= left:
             return at_left
-        return at_right if t >= right else function(t)
+        found = at_right if t >= right else function(t)
+        if found * at_right >= 0.0 and t < right:
+            crossed.append(t)
+        return found
 
-    return float(brentq(value, left, right, xtol=1e-15 * max(abs(left), abs(right), right - left), rtol=1e-14))
+    brentq(value, left, right, xtol=1e-15 * max(abs(left), abs(right), right - left), rtol=1e-14)
+    return min(crossed)

@@ -166,17 +166,19 @@ def _numerical(job: Job, method: str, reason: str) -> Record:
     prepared, network = job.prepared, _network(job.prepared)
     drives = prepared.drives(job.inputs, job.first)
     equations = Interpreted(network, job.params, (job.first, job.state)) if network.blocks else None
+    watched = job.watched()
+    stops = any(entry.stop for entry in watched)
     solver: Solver
     if method == "compiled":
         from ctrlplan.simulation.compiled import CompiledSolver
 
         form = prepared.compiled(job.params, drives, job.first, job.state)
-        solver = CompiledSolver(form, job.params, *job.tolerances)
+        # Beyond a stop there may be no solution: legs are short then, and must fail soon.
+        solver = CompiledSolver(form, job.params, *job.tolerances, max_steps=2_000 if stops else 100_000)
     elif equations is not None:
         solver = InterpretedSolver(equations, *job.tolerances)
     else:
         raise NotCompiledError(f"{prepared.name} came from another process without its blocks")
-    watched = job.watched()
 
     def see(t: Array, x: Array) -> Snapshot:
         driven = driven_signals(drives, t)
@@ -199,7 +201,7 @@ def _numerical(job: Job, method: str, reason: str) -> Record:
         _with_looks(job.times, watched),
         job.state,
         resolution=10.0 * job.tolerances[0],
-        pause=pause if any(entry.stop for entry in watched) else None,
+        pause=pause if stops else None,
     )
     if method == "compiled" and equations is not None:
         some = np.unique(np.linspace(0, run.times.size - 1, _VISITED).astype(int))

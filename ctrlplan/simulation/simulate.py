@@ -110,7 +110,7 @@ def _response(job: Job, record: Record) -> ct.TimeResponseData:
     times, states = record.times[places], record.states[:, places]
     last = next((occurrence.time for occurrence in found if occurrence.stop), None)
     if last is not None:
-        end = record.state_at(max(0, int(np.searchsorted(record.times, last)) - 1), last)
+        end = record.state_at(int(np.searchsorted(record.times, last, side="right")) - 1, last)
         times, states = np.append(times[times < last], last), np.column_stack([states[:, times < last], end])
         found = [occurrence for occurrence in found if occurrence.time <= last]
     seen = record.see(times, states)
