@@ -150,23 +150,29 @@ class Prepared:
                 raise TypeError(f"{self.name} is not compiled for any values of {', '.join(names) or 'no parameters'}")
         return other
 
-    def reads(self, name: str) -> bool:
-        """Whether a block has a parameter, or reads one of that name near where a run begins."""
-        if any(name in block.params for block in self._blocks()):
+    def reads(self, name: str, value: float) -> bool:
+        """Whether a block has a parameter, or reads one of that name where a run begins or near it."""
+        network = self.network
+        if network is None or any(name in block.params for block in network.blocks):
             return True
-        seen = _Noticing()
+        start = np.zeros(self.nstates) if self.initial_state is None else np.asarray(self.initial_state, dtype=float)
+        w = np.zeros(network.nsignals)
+        with np.errstate(all="ignore"), suppress(Exception):
+            equations = Interpreted(network, {name: value}, (0.0, start))
+            w = equations.signals(0.0, start, driven_signals(self.drives([], 0.0), np.zeros(1))[:, 0])
+        read: set[str] = set()
         rng = np.random.default_rng(0)
-        for block in self._blocks():
+        for i, block in enumerate(network.blocks):
             if block.linear or block.driven:
                 continue
-            noticing = _Noticing({**block.params, name: 1.0}, seen=seen)
+            functions = (block.system.outfcn, block.system.updfcn, getattr(block.system, "sample", None))
             for scale in (0.0, 0.1, 1.0):
-                x, u = (scale * rng.standard_normal(n or 0) for n in (block.system.nstates, block.system.ninputs))
-                functions = (block.system.outfcn, block.system.updfcn, getattr(block.system, "sample", None))
+                x, u = start[network.states[i]], network.wire[network.inputs[i]] @ w
+                x, u = (v + scale * rng.standard_normal(v.size) * (1.0 + np.abs(v)) for v in (x, u))
                 for function in filter(None, functions):
                     with np.errstate(all="ignore"), suppress(Exception):
-                        function(10.0 * scale, x, u, noticing)
-        return name in seen.read or _Noticing.ALL in seen.read
+                        function(10.0 * scale, x, u, _Noticing({**block.params, name: value}, read))
+        return name in read or _Noticing.ALL in read
 
     def _build(
         self, params: Mapping[str, Any], drives: list[Drive], first: float, state: Array
@@ -222,9 +228,9 @@ class _Noticing(dict[str, Any]):
 
     ALL = ""
 
-    def __init__(self, values: Mapping[str, Any] | None = None, seen: _Noticing | None = None) -> None:
-        super().__init__(values or {})
-        self.read: set[str] = seen.read if seen is not None else set()
+    def __init__(self, values: Mapping[str, Any], read: set[str]) -> None:
+        super().__init__(values)
+        self.read = read
 
     def __getitem__(self, key: str) -> Any:
         self.read.add(key)

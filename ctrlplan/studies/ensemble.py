@@ -235,8 +235,8 @@ def ensemble(
     builds = is_builder(loop)
     shared = None if builds else prepare(check_has_inputs(loop))
     forms = {name: shared or prepare(loop(name, plan)) for name, plan in references.items()}
-    for name in table:
-        if not any(form.reads(name) for form in forms.values()):
+    for name, values in table.items():
+        if not any(form.reads(name, float(values[0])) for form in forms.values()):
             raise ValueError(f"params must be parameters of a block, got {name!r}, which none reads")
     nominal = compare(_given(forms), references, times, waypoints=points, **settings)
     # Compiled for these parameters, and compared with Python, here and once.
@@ -245,17 +245,19 @@ def ensemble(
         light: Any = {name: form.detached(table) for name, form in forms.items()}
     except TypeError as error:
         light = forms if executor is None else _sendable(loop, builds, error)
+
+    def again(k: int, found: Outcome | str) -> Outcome | str:
+        """A draw that failed, by the loop itself: what is compiled may fail where Python does not."""
+        return _one(forms, references, times, settings, _draw(table, k)) if isinstance(found, str) else found
+
     kept = _Kept(count, times)
     bar = tqdm(total=count, desc="draws", disable=not progress, leave=False)
     futures: list[Any] = []
     try:
         if executor is None:
             for k in range(count):
-                params_k = _draw(table, k)
-                outcome = _one(light, references, times, settings, params_k)
-                if isinstance(outcome, str) and light is not forms:  # what is compiled may fail where Python does not
-                    outcome = _one(forms, references, times, settings, params_k)
-                kept.add(k, params_k, outcome)
+                found = _one(light, references, times, settings, _draw(table, k))
+                kept.add(k, _draw(table, k), again(k, found) if light is not forms else found)
                 bar.update()
         else:
             size = max(1, min(_CHUNK, -(-count // 8)))
@@ -263,8 +265,8 @@ def ensemble(
             run = partial(_several, light, references, times, settings)
             futures = [executor.submit(run, [_draw(table, k) for k in task]) for task in tasks]
             for task, future in zip(tasks, futures, strict=True):
-                for k, outcome in zip(task, future.result(), strict=True):
-                    kept.add(k, _draw(table, k), outcome)
+                for k, found in zip(task, future.result(), strict=True):
+                    kept.add(k, _draw(table, k), again(k, found))
                 bar.update(len(task))
     except KeyboardInterrupt:
         for future in futures:
