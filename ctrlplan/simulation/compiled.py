@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ctrlplan.simulation.drives import Series
 from ctrlplan.simulation.interpreted import SolverError
-from ctrlplan.simulation.network import Network, Step
+from ctrlplan.simulation.network import Block, Network, Step, known_feedthrough
 from ctrlplan.simulation.traced import NotTraceableError, Trace, agrees
 
 Array = NDArray[np.float64]
@@ -38,8 +38,6 @@ class Compiled:
         What is run.
     traces : list of Trace or None
         Of every block but the linear and the driven ones.
-    feeds : list of ndarray of bool
-        Feedthrough of every block.
 
     Raises
     ------
@@ -47,7 +45,8 @@ class Compiled:
         If the network has an algebraic loop that is not linear.
     """
 
-    def __init__(self, network: Network, traces: list[Trace | None], feeds: list[NDArray[np.bool_]]) -> None:
+    def __init__(self, network: Network, traces: list[Trace | None]) -> None:
+        feeds = [_feedthrough(block, trace) for block, trace in zip(network.blocks, traces, strict=True)]
         self._traces = traces
         self._places = [(i, key) for i, trace in enumerate(traces) if trace is not None for key in trace.symbols]
         self.symbols = frozenset(key for _, key in self._places)
@@ -210,6 +209,13 @@ def _called(function: Any, arguments: Sequence[Array], nrows: int) -> Array:
     buffer.set_res(0, out.data)
     evaluate()
     return out.T
+
+
+def _feedthrough(block: Block, trace: Trace | None) -> NDArray[np.bool_]:
+    if trace is not None:
+        return trace.feedthrough()
+    known = known_feedthrough(block)
+    return np.ones((block.system.noutputs, block.system.ninputs or 0), dtype=bool) if known is None else known
 
 
 def _signals(

@@ -155,6 +155,8 @@ def crossings(
                 float(values[k]) - level,
                 float(values[k + 1]) - level,
             )
+            if left != before:  # through both limits at once, a rounding error apart
+                time = max(time, found[-1].time)
             found.append(Occurrence(time, watched.name, _KINDS[right], watched.stop and right != 0))
     return found
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
 from ctrlplan.simulation.drives import Series
-from ctrlplan.simulation.network import Block, Map, Network, Step, feedthrough, tried_feedthrough
+from ctrlplan.simulation.network import Map, Network, Step, known_feedthrough, tried_feedthrough
 
 Array = NDArray[np.float64]
 
@@ -32,6 +32,10 @@ class SolverError(RuntimeError):
     """A solver did not get through; the time is in the message."""
 
 
+class FeedthroughError(RuntimeError):
+    """What depends on what at once is not what trials at the start of a run made of it."""
+
+
 class Interpreted:
     """Equations of a network at some parameters, one call a block.
 
@@ -43,15 +47,22 @@ class Interpreted:
         Parameters of the run, which overrule the blocks' own.
     probe : (float, ndarray)
         Time and state about which feedthrough is tried.
+    trials : bool, optional
+        Whether an algebraic loop that may be one may be ruled out by trying
+        what depends on what; it is then solved as one otherwise.
     """
 
-    def __init__(self, network: Network, params: Mapping[str, Any], probe: tuple[float, Array]) -> None:
+    def __init__(
+        self, network: Network, params: Mapping[str, Any], probe: tuple[float, Array], trials: bool = True
+    ) -> None:
         self.network = network
         self.params = dict(params)
         self._probe = probe
         self._outputs = [block.output(params) for block in network.blocks]
         self._updates = [block.update(params) for block in network.blocks]
-        self.feeds = _feeds(network, params, *probe)
+        self._doubtful, self._trials = False, trials
+        self.feeds = self._feeds(dict(enumerate(self._outputs)))
+        self._calls = [self._call(i, output) for i, output in enumerate(self._outputs) if not network.blocks[i].driven]
         self._for_rates = self._steps(self._outputs, network.signals_of_inputs(), self.feeds)
         self._for_all = self._steps(self._outputs, np.ones(network.nsignals, dtype=bool), self.feeds)
         self._for_samples: dict[tuple[int, ...], tuple[dict[int, Map], list[Call]]] = {}
@@ -73,6 +84,9 @@ class Interpreted:
     def all_signals(self, times: Array, states: Array, driven: Array) -> Array:
         """All signals (nsignals, ntime) at many times."""
         rows = [self.signals(t, states[:, k], driven[:, k]) for k, t in enumerate(times.tolist())]
+        if self._doubtful:
+            for k, t in enumerate(times.tolist()):
+                self._check(t, states[:, k], rows[k])
         return np.array(rows).T.reshape(-1, times.size)
 
     def sampled(self, blocks: tuple[int, ...], t: float, x: Array, driven: Array) -> Array:
@@ -89,18 +103,42 @@ class Interpreted:
 
     def _sampling(self, blocks: tuple[int, ...]) -> tuple[dict[int, Map], list[Call]]:
         """What maps states on, and the steps to all signals at the instant of a sample."""
-        network, (t, x) = self.network, self._probe
+        network = self.network
         samples = {i: network.blocks[i].sampled(self.params) for i in blocks}
-        outputs, feeds = list(self._outputs), list(self.feeds)
+        outputs = list(self._outputs)
 
         def renewed(i: int) -> Map:
             return lambda t, x, u: self._outputs[i](t, np.ravel(samples[i](t, x, u)), u)
 
         for i in blocks:
-            system = network.blocks[i].system
             outputs[i] = renewed(i)
-            feeds[i] = tried_feedthrough(outputs[i], system.noutputs, system.ninputs or 0, t, x[network.states[i]])
+        feeds = self._feeds(dict(enumerate(outputs)), frozenset(blocks))
         return samples, self._steps(outputs, network.signals_of_inputs(), feeds)
+
+    def _feeds(self, outputs: Mapping[int, Map], unsure: frozenset[int] = frozenset()) -> list[NDArray[np.bool_]]:
+        """Feedthrough of every block: assumed where nothing is known; tried only where a loop seems to be."""
+        network, (t, x) = self.network, self._probe
+        sizes = [(block.system.noutputs, block.system.ninputs or 0) for block in network.blocks]
+        known = [None if i in unsure else known_feedthrough(block) for i, block in enumerate(network.blocks)]
+        feeds = [np.ones(size, dtype=bool) if k is None else k for size, k in zip(sizes, known, strict=True)]
+        every = np.ones(network.nsignals, dtype=bool)
+        if self._trials and any(step.unknown is not None for step in network.schedule(feeds, every)):
+            for i, (size, k) in enumerate(zip(sizes, known, strict=True)):
+                if k is None:
+                    self._doubtful = True
+                    feeds[i] = tried_feedthrough(outputs[i], *size, t, x[network.states[i]])
+        return feeds
+
+    def _check(self, t: float, x: Array, w: Array) -> None:
+        """Refuse signals of which one is not what its block puts out: it depends on more than was found by trying."""
+        again = w.copy()
+        for call in self._calls:
+            fed = w.copy()
+            call(t, x, fed)
+            changed = fed != w
+            again[changed] = fed[changed]
+        if not np.allclose(again, w, rtol=1e-9, atol=1e-9 * np.abs(w).max(initial=0.0), equal_nan=True):
+            raise FeedthroughError(f"signals at {t:g} s depend on more than they did at the start")
 
     def _signals(self, steps: list[Call], t: float, x: Array, driven: Array) -> Array:
         w = np.zeros(self.network.nsignals)
@@ -187,20 +225,6 @@ class InterpretedSolver:
         if not found.success:
             raise SolverError(f"the solver must reach {right:g} s, got to {found.t[-1]:g} s: {found.message}")
         return np.asarray(found.y)
-
-
-def _feeds(network: Network, params: Mapping[str, Any], t: float, x: Array) -> list[NDArray[np.bool_]]:
-    """Feedthrough of every block; static ones are looked at closely only where a loop seems to be."""
-
-    def feed(block: Block, place: slice, assumed: bool) -> NDArray[np.bool_]:
-        return feedthrough(block, params, t, x[place], assumed)
-
-    pairs = list(zip(network.blocks, network.states, strict=True))
-    feeds = [feed(block, place, True) for block, place in pairs]
-    every = np.ones(network.nsignals, dtype=bool)
-    if any(step.unknown is not None for step in network.schedule(feeds, every)):
-        feeds = [feed(block, place, False) for block, place in pairs]
-    return feeds
 
 
 def _merged_linear(network: Network) -> tuple[Array, Array, list[int]]:

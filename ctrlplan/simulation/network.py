@@ -154,7 +154,7 @@ class Network:
             str(system.name),
             tuple(part.blocks),
             np.hstack([part.outer, part.inner]),
-            np.hstack([part.passed @ part.outer, part.read + part.passed @ part.inner]),
+            np.hstack([part.through, part.read]),
             system.ninputs or 0,
             tuple(float(t) for b in part.blocks for t in getattr(b.system, "breakpoints", ())),
         )
@@ -258,20 +258,19 @@ class Network:
         return tuple(i for i, place in enumerate(self.outputs) if np.any((rows >= place.start) & (rows < place.stop)))
 
 
-def feedthrough(block: Block, params: Mapping[str, Any], t: float, x: Array, assumed: bool = True) -> NDArray[np.bool_]:
-    """Which outputs of a block depend on which inputs at once, (noutputs, ninputs).
+def known_feedthrough(block: Block) -> NDArray[np.bool_] | None:
+    """Which outputs of a block depend on which inputs at once, (noutputs, ninputs), where that is certain.
 
-    Of linear blocks by their matrix, of others with states by trying; static
-    ones are assumed to pass everything on, or with ``assumed=False`` tried too.
+    Of linear blocks by their matrix; of others where they say so themselves,
+    by an attribute ``feedthrough``, or put out their states.
     """
-    nin = block.system.ninputs or 0
-    if block.driven:
-        return np.zeros((block.system.noutputs, nin), dtype=bool)
+    shape = (block.system.noutputs, block.system.ninputs or 0)
     if block.linear:
         return np.asarray(block.system.D) != 0.0
-    if assumed and not block.system.nstates:
-        return np.ones((block.system.noutputs, nin), dtype=bool)
-    return tried_feedthrough(block.output(params), block.system.noutputs, nin, t, x)
+    if block.driven or block.system.outfcn is None:
+        return np.zeros(shape, dtype=bool)
+    declared = getattr(block.system, "feedthrough", None)
+    return None if declared is None else np.broadcast_to(np.asarray(declared, dtype=bool), shape)
 
 
 def tried_feedthrough(output: Map, noutputs: int, nin: int, t: float, x: Array) -> NDArray[np.bool_]:
@@ -293,13 +292,13 @@ def tried_feedthrough(output: Map, noutputs: int, nin: int, t: float, x: Array) 
 
 @dataclass(frozen=True)
 class _Part:
-    """Blocks of one level; their inputs are inner @ outputs + outer @ inputs of the level."""
+    """Blocks of one level; their inputs are inner @ their outputs + outer @ inputs of the level."""
 
     blocks: list[Block]
     inner: Array
     outer: Array
     read: Array  # outputs of the level from the blocks' outputs
-    passed: Array  # and from their inputs
+    through: Array  # and from inputs of the level
 
 
 def _flattened(system: Any, above: dict[str, Any]) -> _Part:
@@ -308,22 +307,25 @@ def _flattened(system: Any, above: dict[str, Any]) -> _Part:
     # python-control lets a level's parameters overrule those inside it.
     params = {**system.params, **above}
     parts = [_flattened(block, params) for block in system.syslist]
-    inner, outer, read, passed = (
-        block_diag(*(getattr(p, name) for p in parts)) for name in ("inner", "outer", "read", "passed")
+    inner, outer, read, through = (
+        block_diag(*(getattr(p, name) for p in parts)) for name in ("inner", "outer", "read", "through")
     )
     connect = np.asarray(system.connect_map, dtype=float)
     external = np.asarray(system.input_map, dtype=float).reshape(len(connect), -1)
-    # Parts take connect @ their outputs + external @ r, and their outputs are read @ y + passed @ u.
-    closing = np.linalg.inv(np.eye(len(outer)) - outer @ connect @ passed)
     outputs = np.asarray(system.output_map, dtype=float)
     from_out, from_in = outputs[:, : len(read)], outputs[:, len(read) :]
-    of_part = from_out + from_in @ connect
+    # Parts take v = connect @ (read @ y + through @ v) + external @ r.
+    wires = np.eye(len(connect)) - connect @ through
+    if np.linalg.matrix_rank(wires) < len(wires):
+        raise ValueError(f"wires must not feed themselves, got such a one in {system.name}")
+    v_y, v_r = np.linalg.solve(wires, connect @ read), np.linalg.solve(wires, external)
+    put_out = from_out @ through + from_in
     return _Part(
         [block for part in parts for block in part.blocks],
-        closing @ (inner + outer @ connect @ read),
-        closing @ outer @ external,
-        of_part @ read,
-        of_part @ passed,
+        inner + outer @ v_y,
+        outer @ v_r,
+        from_out @ read + put_out @ v_y,
+        put_out @ v_r,
     )
 
 

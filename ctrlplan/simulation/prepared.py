@@ -79,6 +79,7 @@ class Prepared:
                 self.linear, self.not_linear = None, f"block {block.name} {what}"
         self._sources = [PlanDrive(b.plan, b.system.derivatives) for b in self._blocks() if b.plan is not None]
         self.trusted = True
+        self.trials = True
         self._compiled: list[tuple[frozenset[str], dict[str, Any], Compiled | NotCompiledError]] = []
 
     def __repr__(self) -> str:
@@ -187,7 +188,7 @@ class Prepared:
             return NotCompiledError(self.unsupported), {}
         if not network.blocks:
             return NotCompiledError(f"{self.name} is without its blocks, compiled for other parameters"), {}
-        equations = Interpreted(network, params, (first, state))
+        equations = Interpreted(network, params, (first, state), self.trials)
         w = equations.signals(first, state, driven_signals(drives, np.array([first]))[:, 0])
         traces: list[Trace | None] = []
         baked: dict[str, Any] = {}
@@ -200,7 +201,7 @@ class Prepared:
                 traces.append(trace)
                 # What is a constant in the trace must be so in every run of it.
                 baked |= {key: deepcopy(params[key]) for key in params if key not in trace.symbols}
-            return Compiled(network, traces, equations.feeds), baked
+            return Compiled(network, traces), baked
         except NotTraceableError as error:
             return NotCompiledError(str(error)), deepcopy(dict(params))
 

@@ -165,7 +165,7 @@ def _numerical(job: Job, method: str, reason: str) -> Record:
     """Leg by leg, compiled or by Python."""
     prepared, network = job.prepared, _network(job.prepared)
     drives = prepared.drives(job.inputs, job.first)
-    equations = Interpreted(network, job.params, (job.first, job.state)) if network.blocks else None
+    equations = Interpreted(network, job.params, (job.first, job.state), prepared.trials) if network.blocks else None
     watched = job.watched()
     stops = any(entry.stop for entry in watched)
     solver: Solver
@@ -225,7 +225,7 @@ def _discrete(job: Job, reason: str) -> Record:
     clock = job.first + period * np.arange(wanted[-1] + 1)
     clock[wanted] = job.times
     drives = prepared.drives(job.inputs, job.first)
-    equations = Interpreted(network, job.params, (job.first, job.state))
+    equations = Interpreted(network, job.params, (job.first, job.state), prepared.trials)
     driven = driven_signals(drives, clock)
     states = np.empty((job.state.size, clock.size))
     states[:, 0] = job.state

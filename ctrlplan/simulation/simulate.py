@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ctrlplan.simulation.drives import Inputs, driven_signals, input_drives
 from ctrlplan.simulation.events import Event, Occurrence, crossings
+from ctrlplan.simulation.interpreted import FeedthroughError
 from ctrlplan.simulation.prepared import Prepared, prepared_form
 from ctrlplan.simulation.runs import METHODS, Job, Record, recorded
 
@@ -99,7 +100,11 @@ def simulate(
     job = Job(prepared, times, drives, state, dict(params or {}), (rtol, atol), events)
     if prepared.network is None and prepared.linear is None:
         return _delegated(job)
-    return _response(job, recorded(job, method))
+    try:
+        return _response(job, recorded(job, method))
+    except FeedthroughError:  # a loop that is none at the start: solved as one from now on
+        prepared.trials = False
+        return _response(job, recorded(job, method))
 
 
 def _response(job: Job, record: Record) -> ct.TimeResponseData:

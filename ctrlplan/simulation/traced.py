@@ -44,6 +44,14 @@ class Trace:
     update: Any
     symbols: tuple[str, ...]
 
+    def feedthrough(self) -> NDArray[np.bool_]:
+        """Which outputs depend on which inputs at once, (noutputs, ninputs): by structure, at every time and state."""
+        found = np.zeros((self.output.numel_out(0), self.output.numel_in(2)), dtype=bool)
+        if found.size:
+            rows, columns = self.output.jac_sparsity(0, 2).get_triplet()
+            found[rows, columns] = True
+        return found
+
 
 def traced(block: Block, params: Mapping[str, Any], t: float, x: Array, u: Array) -> Trace:
     """Trace a block and compare with Python about a time, a state and an input.

@@ -28,7 +28,7 @@ Array = NDArray[np.float64]
 Metrics = dict[str, dict[str, float]]
 """Plan, metric, value."""
 
-_SAMPLES = 2**20
+_SAMPLES = 2**19
 """Samples of a signal of all the loops that are taken together."""
 
 
@@ -188,11 +188,8 @@ def _together(loops: list[Any], given: dict[str, Any]) -> list[Metrics] | None:
     unstable = in_right_half(np.linalg.eigvals(form.a)).any(axis=1)
     each = tuple(map(str, range(len(loops))))
     found: list[Metrics] = [{} for _ in loops]
-    outputs = np.stack(
-        [_outputs(form, rows, p, times, _starts(systems, p, times, asked.initial_state)) for p in plans.values()]
-    )
-    for (name, plan), output in zip(plans.items(), outputs, strict=True):
-        signals = output.swapaxes(0, 1)
+    for name, plan in plans.items():
+        signals = _outputs(form, rows, plan, times, _starts(systems, plan, times, asked.initial_state)).swapaxes(0, 1)
         axes = [plan] if plan.naxes == 1 else [plan.select([label]) for label in plan.labels]
         # One axis of all loops is measured like the axes of one.
         responses = [

@@ -38,6 +38,7 @@ class SampleHold(ct.NonlinearIOSystem):  # type: ignore[misc]
             params=dict(getattr(block, "params", {})),
         )
         self.block, self.period, self.offset = block, period, offset
+        self.feedthrough = False  # between samples
         self._inner = block.nstates or 0
 
     def sample(self, t: float, x: Array, u: Array, params: dict[str, Any]) -> Array:

@@ -100,7 +100,7 @@ class Crane:
         as this crane's own (``params={"load_mass": 1000.0}``) overrule them in
         the plant alone: a payload that the controller does not know of.
         """
-        return ct.nlsys(
+        block = ct.nlsys(
             self._update,
             self._output,
             states=list(STATES),
@@ -108,6 +108,9 @@ class Crane:
             outputs=list(OUTPUTS),
             name=name,
         )
+        # At once, force and torque act on the tension alone.
+        block.feedthrough = np.array([[output == "T"] * 2 for output in OUTPUTS])
+        return block
 
     def equilibrium(self, x: float, z: float) -> tuple[Array, Array]:
         """State and inputs (F, C) at which the load rests at (x, z).
