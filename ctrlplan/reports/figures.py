@@ -153,7 +153,7 @@ def plot_bands(ensemble: Ensemble) -> Figure:
     styles = line_styles(nominal.plans)
     shown = [(signal, error) for signal in nominal.outputs for error in (False, True)]
     shown += [(signal, False) for signal in nominal.controls if signal not in nominal.outputs]
-    figure = new_figure(max(4.4, 2.6 * len(nominal.plans) + 0.6), 1.2 + 1.7 * len(shown))
+    figure = new_figure(max(4.4, 2.9 * len(nominal.plans) + 0.6), 1.2 + 1.7 * len(shown))
     rows = stacked_axes(figure, len(shown), len(nominal.plans))
     t = ensemble.timepts
     for row, (signal, error) in zip(rows, shown, strict=True):
@@ -182,7 +182,8 @@ def plot_bands(ensemble: Ensemble) -> Figure:
         if signal in nominal.outputs:
             label = next(iter(nominal.plans.values())).labels[nominal.outputs.index(signal)]
         unit = nominal.units.get(signal, nominal.units.get(label, ""))
-        row[0].set_ylabel(with_unit(f"error of {signal}" if error else signal, unit))
+        for axes in row:
+            axes.set_ylabel(with_unit(f"error of {signal}" if error else signal, unit))
     for axes, plan in zip(rows[0], nominal.plans, strict=True):
         axes.set_title(plan, fontsize=9)
     for axes in rows[-1]:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import control as ct
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import block_diag
-from scipy.sparse.csgraph import connected_components
 
 from ctrlplan.trajectories import Trajectory
 
@@ -22,7 +21,7 @@ class NotLinearError(ValueError):
 
 @dataclass(frozen=True)
 class LinearForm:
-    """Loop x' = A x + B w, y = C x + D w.
+    """Loop x' = A x + B w, y = C x + D w; or several, along one axis in front of the matrices.
 
     Attributes
     ----------
@@ -52,68 +51,126 @@ def linear_form(system: Any) -> LinearForm:
     ValueError
         If blocks form an algebraic loop without a unique solution.
     """
+    form = linear_forms([system])
+    return LinearForm(form.a[0], form.b[0], form.c[0], form.d[0], form.sources)
+
+
+def linear_forms(systems: Sequence[Any]) -> LinearForm:
+    """Flatten linear systems of one wiring together, as `linear_form` does each.
+
+    Raises
+    ------
+    NotLinearError
+        If a block is nonlinear or discrete.
+    ValueError
+        If a loop has no unique solution, or the systems differ in more than
+        the numbers in their blocks.
+    """
+    kinds = {_kind(system) for system in systems}
+    if len(kinds) > 1:
+        raise _unlike(systems)
+    kind = kinds.pop()
+    if kind is ct.InterconnectedSystem:
+        return _interconnections(systems)
+    if kind is ct.TransferFunction:
+        return linear_forms([ct.ss(system) for system in systems])
+    if kind is ct.StateSpace:
+        matrices = [[np.asarray(getattr(system, name), dtype=float) for system in systems] for name in "ABCD"]
+        if any(matrix.shape != row[0].shape for row in matrices for matrix in row):
+            raise _unlike(systems)
+        a, b, c, d = map(np.stack, matrices)
+        return LinearForm(a, b, c, d, ())
+    plan, high = systems[0].plan, systems[0].derivatives
+    if any(system.plan is not plan or system.derivatives != high for system in systems):
+        raise _unlike(systems)
+    count, n = len(systems), systems[0].noutputs
+    a, b, c = map(np.zeros, ((count, 0, 0), (count, 0, n), (count, n, 0)))
+    return LinearForm(a, b, c, np.tile(np.eye(n), (count, 1, 1)), ((plan, high),))
+
+
+def in_right_half(poles: NDArray[Any]) -> NDArray[np.bool_]:
+    """Which poles lie in the right half plane, beyond rounding."""
+    return np.asarray(poles.real > 1e-9 * np.maximum(1e-300, np.abs(poles)))
+
+
+def _kind(system: Any) -> type:
     if system.dt not in (None, 0):
         raise NotLinearError(f"block {system.name} is discrete (dt = {system.dt})")
-    if isinstance(system, ct.InterconnectedSystem):
-        return _interconnection(system)
-    if isinstance(system, ct.StateSpace):
-        a, b, c, d = (np.asarray(m, dtype=float) for m in (system.A, system.B, system.C, system.D))
-        return LinearForm(a, b, c, d, ())
-    if isinstance(system, ct.TransferFunction):
-        return linear_form(ct.ss(system))
-    plan = getattr(system, "plan", None)
-    if isinstance(plan, Trajectory):
-        n = system.noutputs
-        nothing, fed, read = np.zeros((0, 0)), np.zeros((0, n)), np.zeros((n, 0))
-        return LinearForm(nothing, fed, read, np.eye(n), ((plan, system.derivatives),))
+    for kind in (ct.InterconnectedSystem, ct.StateSpace, ct.TransferFunction):
+        if isinstance(system, kind):
+            return kind
+    if isinstance(getattr(system, "plan", None), Trajectory):
+        return Trajectory
     raise NotLinearError(f"block {system.name} ({type(system).__name__}) is not linear")
 
 
-def _interconnection(system: Any) -> LinearForm:
-    forms = [linear_form(block) for block in system.syslist]
-    counts = [block.ninputs or 0 for block in system.syslist]
-    a, c = (block_diag(*(getattr(f, name) for f in forms)) for name in "ac")
-    inner_b, inner_d, source_b, source_d = [], [], [], []
-    for form, count in zip(forms, counts, strict=True):
-        inner_b.append(form.b[:, :count])
-        inner_d.append(form.d[:, :count])
-        source_b.append(form.b[:, count:])
-        source_d.append(form.d[:, count:])
-    b, d = block_diag(*inner_b), block_diag(*inner_d)
-    e, f = block_diag(*source_b), block_diag(*source_d)
-    external = np.asarray(system.input_map, dtype=float).reshape(sum(counts), -1)
-    connect = np.asarray(system.connect_map, dtype=float)
+def _unlike(systems: Sequence[Any]) -> ValueError:
+    return ValueError(f"systems must differ in numbers alone, got other blocks or wires in one named {systems[0].name}")
+
+
+def _interconnections(systems: Sequence[Any]) -> LinearForm:
+    first = systems[0]
+    names = ("connect_map", "input_map", "output_map")
+    connect, external, outputs = (np.asarray(getattr(first, name), dtype=float) for name in names)
+    for system in systems[1:]:
+        same = all(np.array_equal(getattr(system, name), getattr(first, name)) for name in names)
+        if len(system.syslist) != len(first.syslist) or not same:
+            raise _unlike(systems)
+    forms = [linear_forms(blocks) for blocks in zip(*(system.syslist for system in systems), strict=True)]
+    counts = [block.ninputs or 0 for block in first.syslist]
+    a, c = (_diagonal([getattr(form, name) for form in forms]) for name in "ac")
+    b, d = (_diagonal([getattr(form, name)[..., :k] for form, k in zip(forms, counts, strict=True)]) for name in "bd")
+    e, f = (_diagonal([getattr(form, name)[..., k:] for form, k in zip(forms, counts, strict=True)]) for name in "bd")
+    external = external.reshape(sum(counts), -1)
     # u = connect y + external r and y = c x + d u + f s, solved for y.
-    closing = np.eye(len(d)) - d @ connect
+    closing = np.eye(d.shape[1]) - d @ connect
     if _has_singular_loop(closing):
-        names = ", ".join(block.name for block in system.syslist)
-        raise ValueError(f"blocks must not form an algebraic loop without a solution, got one among {names}")
+        blocks = ", ".join(block.name for block in first.syslist)
+        raise ValueError(f"blocks must not form an algebraic loop without a solution, got one among {blocks}")
     y_x, y_r, y_s = np.split(
-        np.linalg.solve(closing, np.hstack([c, d @ external, f])), np.cumsum([len(a), external.shape[1]]), axis=1
+        np.linalg.solve(closing, np.concatenate([c, d @ external, f], axis=2)),
+        np.cumsum([a.shape[1], external.shape[1]]),
+        axis=2,
     )
     u_x, u_r, u_s = connect @ y_x, connect @ y_r + external, connect @ y_s
-    outputs = np.asarray(system.output_map, dtype=float)
-    from_y, from_u = outputs[:, : len(d)], outputs[:, len(d) :]
+    from_y, from_u = outputs[:, : d.shape[1]], outputs[:, d.shape[1] :]
     return LinearForm(
         a + b @ u_x,
-        np.hstack([b @ u_r, b @ u_s + e]),
+        np.concatenate([b @ u_r, b @ u_s + e], axis=2),
         from_y @ y_x + from_u @ u_x,
-        np.hstack([from_y @ y_r + from_u @ u_r, from_y @ y_s + from_u @ u_s]),
+        np.concatenate([from_y @ y_r + from_u @ u_r, from_y @ y_s + from_u @ u_s], axis=2),
         tuple(source for form in forms for source in form.sources),
     )
 
 
+def _diagonal(blocks: list[Array]) -> Array:
+    """Matrices (nsystems, ., .) one after the other along the diagonal."""
+    height, width = (sum(block.shape[axis] for block in blocks) for axis in (1, 2))
+    out = np.zeros((len(blocks[0]), height, width))
+    row = column = 0
+    for block in blocks:
+        height, width = block.shape[1:]
+        out[:, row : row + height, column : column + width] = block
+        row, column = row + height, column + width
+    return out
+
+
 def _has_singular_loop(closing: Array) -> bool:
-    """Whether signals that depend on one another at once have no unique solution.
+    """Whether signals that depend on one another at once have no unique solution, in any of the systems.
 
     Only such groups are judged: large gains in a row are no loop.
     """
-    count, group = connected_components(closing != 0.0, directed=True, connection="strong")
-    for k in range(count):
-        members = np.flatnonzero(group == k)
-        block = closing[np.ix_(members, members)]
-        if np.abs(block).max(axis=1).min() == 0.0:
-            return True
-        if members.size > 1 and np.linalg.cond(block / np.abs(block).max(axis=1, keepdims=True)) > 1e13:
+    size = closing.shape[1]
+    reach = (closing != 0.0) | np.eye(size, dtype=bool)
+    for _ in range(size.bit_length()):
+        reach = reach @ reach
+    group = reach & reach.swapaxes(1, 2)  # [system, signal, signals in one loop with it]
+    if np.any(closing[:, range(size), range(size)][group.sum(axis=2) == 1] == 0.0):
+        return True
+    for system, signal in np.argwhere((group.sum(axis=2) > 1) & (group.argmax(axis=2) == np.arange(size))):
+        members = np.flatnonzero(group[system, signal])
+        block = closing[system][np.ix_(members, members)]
+        largest = np.abs(block).max(axis=1, keepdims=True)
+        if largest.min() == 0.0 or np.linalg.cond(block / largest) > 1e13:
             return True
     return False

@@ -63,12 +63,32 @@ def craned():
     return Study("crane", "Crane", found, curves=(curves,))
 
 
+@pytest.fixture(scope="module")
+def spread(compared):
+    """A lag that is not known well, behind two plans."""
+    import control as ct
+
+    from ctrlplan.studies.ensemble import ensemble
+
+    loop = ct.nlsys(
+        lambda t, x, u, params: (u - x) / params["tau"],
+        lambda t, x, u, params: np.array([x[0], u[0] - x[0]]),
+        states=1,
+        inputs="r",
+        outputs=["y", "u"],
+        params={"tau": 1.0},
+        name="lag",
+    )
+    plans = {name: compared.plans[name] for name in ("step", "trigonometric")}
+    return ensemble(loop, plans, TIMES, cp.draws(20, tau=(0.5, 2.0)), None, False, {"units": {"y": "m", "u": "N"}})
+
+
 @pytest.fixture(
     scope="module", params=sorted([*FIGURES, "two axes: plans", "two axes: responses", "trajectory", "one metric"])
 )
-def figure(request, compared, two_axes, swept, craned):
+def figure(request, compared, two_axes, swept, craned, spread):
     """Every kind of figure, on real data."""
-    study = craned if request.param.startswith("crane") else Study("it", "It", compared, sweep=swept)
+    study = craned if request.param.startswith("crane") else Study("it", "It", compared, sweep=swept, ensemble=spread)
     others = {
         "two axes: plans": lambda: plot_plans(two_axes),
         "two axes: responses": lambda: plot_responses(two_axes),
