@@ -65,6 +65,10 @@ class Drive(Protocol):
     def breakpoints(self) -> Array:
         """Times at which they are not analytic [s]."""
 
+    @property
+    def width(self) -> int:
+        """How many signals."""
+
     def beside(self, moment: float, origin: float, s: Array) -> Array:
         """Values (nsignals, ntime) at origin + s of the analytic functions that hold at `moment`."""
 
@@ -84,6 +88,11 @@ class PlanDrive:
         """Those of the plan."""
         return self.plan.breakpoints
 
+    @property
+    def width(self) -> int:
+        """Signals of all axes."""
+        return self.plan.naxes * (self.derivatives + 1)
+
     def beside(self, moment: float, origin: float, s: Array) -> Array:
         """Values of the leg that holds at `moment`."""
         jet = self.plan._jet_beside(moment, origin, s, self.derivatives)
@@ -96,6 +105,8 @@ class PlanDrive:
 
 class SampledDrive:
     """One signal given by samples, straight in between; it breaks where it bends."""
+
+    width = 1
 
     def __init__(self, times: Array, values: Array) -> None:
         self.times, self.values = times, values

@@ -217,9 +217,9 @@ def _any_leg(a: Array, b: Array, series: Array, samples: Array, state: Array) ->
         h *= 0.5
         first, second = _halved(series)
         own = change[:, n:] * np.repeat(h ** -np.arange(nterms, dtype=float), b.shape[1])  # terms in their own time
-        middle = states + (change[:, :n] @ states + own @ first.reshape(own.shape[1], -1))
+        middle = states + (change[:, :n] @ states + own @ first.reshape(-1, first.shape[2]))
         states = np.stack([states, middle], axis=2).reshape(n, -1)
-        series = np.stack([first, second], axis=3).reshape(*series.shape[:2], -1)
+        series = np.stack([first, second], axis=3).reshape(nterms, b.shape[1], 2 * first.shape[2])
         cells = (2 * cells[:, None] + np.arange(2)).ravel()
         if cells.size > 4 * samples.size + 64:  # stiff: only cells with samples in them matter
             used = np.isin(cells, np.minimum(samples / h, cells[-1]).astype(np.intp))

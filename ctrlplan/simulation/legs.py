@@ -58,7 +58,7 @@ class DelayedDrive:
     """Signals of the past, kept as series of the legs they were seen on."""
 
     def __init__(self, delay: float, initial: Array, first: float) -> None:
-        self.delay = delay
+        self.delay, self.width = delay, initial.size
         self.breakpoints = np.empty(0)
         self._initial, self._first = initial, first
         self._pieces: list[Series] = []

@@ -124,9 +124,11 @@ def _interconnections(systems: Sequence[Any]) -> LinearForm:
     external = external.reshape(sum(counts), -1)
     # u = connect y + external r and y = c x + d u + f s, solved for y.
     closing = np.eye(d.shape[1]) - d @ connect
-    if _has_singular_loop(closing):
-        blocks = ", ".join(block.name for block in first.syslist)
-        raise ValueError(f"blocks must not form an algebraic loop without a solution, got one among {blocks}")
+    singular = _singular_loop(closing)
+    if singular.size:
+        owners = np.repeat([block.name for block in first.syslist], [block.noutputs for block in first.syslist])
+        blocks = ", ".join(dict.fromkeys(owners[singular].tolist()))
+        raise ValueError(f"blocks must not form an algebraic loop without a solution, got one of {blocks}")
     y_x, y_r, y_s = np.split(
         np.linalg.solve(closing, np.concatenate([c, d @ external, f], axis=2)),
         np.cumsum([a.shape[1], external.shape[1]]),
@@ -155,22 +157,23 @@ def _diagonal(blocks: list[Array]) -> Array:
     return out
 
 
-def _has_singular_loop(closing: Array) -> bool:
-    """Whether signals that depend on one another at once have no unique solution, in any of the systems.
+def _singular_loop(closing: Array) -> NDArray[np.intp]:
+    """Signals of a loop without a unique solution in any of the systems; none where there is none.
 
-    Only such groups are judged: large gains in a row are no loop.
+    Only signals that depend on one another at once are judged: large gains in a row are no loop.
     """
     size = closing.shape[1]
     reach = (closing != 0.0) | np.eye(size, dtype=bool)
     for _ in range(size.bit_length()):
         reach = reach @ reach
     group = reach & reach.swapaxes(1, 2)  # [system, signal, signals in one loop with it]
-    if np.any(closing[:, range(size), range(size)][group.sum(axis=2) == 1] == 0.0):
-        return True
+    alone = np.argwhere((closing[:, range(size), range(size)] == 0.0) & (group.sum(axis=2) == 1))
+    if alone.size:
+        return alone[0, 1:]
     for system, signal in np.argwhere((group.sum(axis=2) > 1) & (group.argmax(axis=2) == np.arange(size))):
         members = np.flatnonzero(group[system, signal])
         block = closing[system][np.ix_(members, members)]
         largest = np.abs(block).max(axis=1, keepdims=True)
         if largest.min() == 0.0 or np.linalg.cond(block / largest) > 1e13:
-            return True
-    return False
+            return members
+    return np.empty(0, dtype=np.intp)

@@ -51,8 +51,10 @@ class Prepared:
     """
 
     def __init__(self, system: Any) -> None:
+        self.original = system
+        self._initial_state: Any = None
+        self.fingerprint = fingerprint(system)
         self.system = state_space(system)
-        self.fingerprint = fingerprint(self.system)
         self.name = str(self.system.name)
         self.input_labels = list(self.system.input_labels or [])
         self.output_labels = list(self.system.output_labels or [])
@@ -60,7 +62,6 @@ class Prepared:
         self.nstates = len(self.state_labels)
         self.dt = self.system.dt
         self.issiso = bool(self.system.issiso())
-        self.initial_state = getattr(self.system, "initial_state", None)
         self.linear: LinearForm | None = None
         self.not_linear = ""
         self.network: Network | None = None
@@ -84,6 +85,11 @@ class Prepared:
 
     def __repr__(self) -> str:
         return f"<Prepared form of {self.name}: {self.nstates} states>"
+
+    @property
+    def initial_state(self) -> Any:
+        """Where the system says that it starts, or None."""
+        return self._initial_state if self.system is None else getattr(self.system, "initial_state", None)
 
     @property
     def ninputs(self) -> int:
@@ -151,12 +157,13 @@ class Prepared:
                 raise TypeError(f"{self.name} is not compiled for any values of {', '.join(names) or 'no parameters'}")
         return other
 
-    def reads(self, name: str, value: float) -> bool:
+    def reads(self, name: str, value: float, initial_state: Any = None) -> bool:
         """Whether a block has a parameter, or reads one of that name where a run begins or near it."""
         network = self.network
-        if network is None or any(name in block.params for block in network.blocks):
+        if network is None or not network.blocks or any(name in block.params for block in network.blocks):
             return True
-        start = np.zeros(self.nstates) if self.initial_state is None else np.asarray(self.initial_state, dtype=float)
+        given = self.initial_state if initial_state is None else initial_state
+        start = np.zeros(self.nstates) + (0.0 if given is None else np.asarray(given, dtype=float))
         w = np.zeros(network.nsignals)
         with np.errstate(all="ignore"), suppress(Exception):
             equations = Interpreted(network, {name: value}, (0.0, start))
@@ -221,7 +228,14 @@ class Prepared:
         network = self.network
         if network is not None:
             network = network.without_blocks()
-        return self.__dict__ | {"system": None, "fingerprint": None, "network": network, "_compiled": usable}
+        return self.__dict__ | {
+            "original": None,
+            "system": None,
+            "fingerprint": None,
+            "network": network,
+            "_compiled": usable,
+            "_initial_state": self.initial_state,
+        }
 
 
 class _Noticing(dict[str, Any]):
@@ -293,9 +307,9 @@ def prepare(system: Any) -> Prepared:
 def prepared_form(system: Any) -> Prepared:
     """Form built before of the same system, or a new one where its maps, parameters or blocks have changed."""
     if isinstance(system, Prepared):
-        if system.system is None or fingerprint(system.system) == system.fingerprint:
+        if system.original is None or fingerprint(system.original) == system.fingerprint:
             return system
-        system = system.system
+        system = system.original
     _checked_system(system)
     key = fingerprint(system)
     if key not in _recent:

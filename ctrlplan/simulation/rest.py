@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import null_space
 
-from ctrlplan.simulation.linear import LinearForm, NotLinearError, linear_form
+from ctrlplan.simulation.linear import LinearForm, NotLinearError, in_right_half, linear_form
 from ctrlplan.simulation.prepared import Prepared
 
 Array = NDArray[np.float64]
@@ -57,7 +57,7 @@ def unstable_poles(system: Any) -> NDArray[np.complex128]:
         poles = np.linalg.eigvals(_form(system).a).astype(complex)
     except NotLinearError:
         return np.empty(0, dtype=complex)
-    return poles[poles.real > 1e-9 * np.maximum(1e-300, np.abs(poles))]
+    return poles[in_right_half(poles)]
 
 
 def _form(system: Any) -> LinearForm:

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ctrlplan.simulation.drives import Drive, PlanDrive, driven_signals
+from ctrlplan.simulation.drives import Drive, PlanDrive, SampledDrive, driven_signals
 from ctrlplan.simulation.events import Event, Snapshot, Watched, watched_events
-from ctrlplan.simulation.exact import exact_states
+from ctrlplan.simulation.exact import exact_states, sampled_states
 from ctrlplan.simulation.interpreted import Interpreted, InterpretedSolver, SolverError
 from ctrlplan.simulation.legs import Solver, integrate
 from ctrlplan.simulation.linear import LinearForm
@@ -105,18 +105,19 @@ def recorded(job: Job, method: str) -> Record:
         If the method asked for cannot be taken; the reason is in the message.
     """
     prepared = job.prepared
-    reason = prepared.not_linear or "an input is given by samples"
+    reason = prepared.not_linear
     if method in ("auto", "exact"):
-        if prepared.linear is not None and all(isinstance(drive, PlanDrive) for drive in job.inputs):
+        if prepared.linear is not None:
             return _exact(job, prepared.linear)
         if method == "exact":
-            raise ValueError(f'method "exact" must be given a linear continuous system and trajectories, but {reason}')
+            raise ValueError(f'method "exact" must be given a linear continuous system, but {reason}')
     if prepared.dt not in (None, 0):
         if method == "compiled":
             raise ValueError(f'method "compiled" must be given a continuous system, got dt = {prepared.dt}')
         return _discrete(job, reason)
     if method == "python":
         return _numerical(job, "python", 'method "python" was asked for')
+    reason = reason or 'method "compiled" was asked for'
     try:
         try:
             return _numerical(job, "compiled", reason)
@@ -133,9 +134,12 @@ def recorded(job: Job, method: str) -> Record:
 
 
 def _exact(job: Job, form: LinearForm) -> Record:
-    """Linear loop: one matrix exponential a leg."""
-    plans = [(drive.plan, drive.derivatives) for drive in job.inputs if isinstance(drive, PlanDrive)] + [*form.sources]
-    drives = [PlanDrive(plan, high) for plan, high in plans]
+    """Linear loop: one matrix exponential a leg, and one for each spacing of samples."""
+    drives = [*job.inputs, *(PlanDrive(plan, high) for plan, high in form.sources)]
+    plans = [(drive.plan, drive.derivatives) for drive in drives if isinstance(drive, PlanDrive)]
+    sampled = (
+        np.concatenate([np.full(drive.width, isinstance(drive, SampledDrive)) for drive in drives] or [np.zeros(0)]) > 0
+    )
     breakpoints = [t for plan, _ in plans for t in plan.breakpoints]
     watched = job.watched()
     times = _with_looks(job.times, watched)
@@ -152,13 +156,17 @@ def _exact(job: Job, form: LinearForm) -> Record:
 
     def states_at(t: Array, state: Array) -> Array:
         with np.errstate(over="ignore", invalid="ignore"):
-            return _finite(exact_states(form.a, form.b, jet, breakpoints, t, state))
+            found = exact_states(form.a, form.b[:, ~sampled], jet, breakpoints, t, state)
+            if sampled.any():  # what plans and samples make of a linear loop adds up
+                samples = driven_signals(drives, t)[sampled]
+                found = found + sampled_states(form.a, form.b[:, sampled], samples, t, np.zeros_like(state))
+            return _finite(found)
 
     def carry(k: int, t: float) -> Array:
         return states_at(np.array([times[k], t]), states[:, k])[:, 1]
 
     states = states_at(times, job.state)
-    return Record(times, states, see, carry, watched, "exact", "linear, continuous, driven by trajectories")
+    return Record(times, states, see, carry, watched, "exact", "linear and continuous")
 
 
 def _numerical(job: Job, method: str, reason: str) -> Record:
@@ -172,6 +180,8 @@ def _numerical(job: Job, method: str, reason: str) -> Record:
     if method == "compiled":
         from ctrlplan.simulation.compiled import CompiledSolver
 
+        if equations is not None:  # an algebraic loop without a solution is better named here
+            equations.signals(job.first, job.state, driven_signals(drives, job.times[:1])[:, 0])
         form = prepared.compiled(job.params, drives, job.first, job.state)
         # Beyond a stop there may be no solution: legs are short then, and must fail soon.
         solver = CompiledSolver(form, job.params, *job.tolerances, max_steps=2_000 if stops else 100_000)

@@ -98,7 +98,7 @@ def simulate(
     drives = input_drives(prepared.input_labels, inputs, times)
     state = _checked_state(prepared, initial_state)
     job = Job(prepared, times, drives, state, dict(params or {}), (rtol, atol), events)
-    if prepared.network is None and prepared.linear is None:
+    if prepared.network is None and prepared.linear is None and method in ("auto", "python"):
         return _delegated(job)
     try:
         return _response(job, recorded(job, method))

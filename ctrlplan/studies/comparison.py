@@ -216,7 +216,7 @@ def compare(
         check_has_inputs(loop)
     for name, plan in references.items():
         system = state_space(loop(name, plan) if builds else loop)
-        tracked, acting = _tracked(system, outputs, first), _acting(system, controls)
+        tracked, acting = tracked_outputs(system, outputs, first), acting_outputs(system, controls)
         response = simulate(
             system,
             times,
@@ -339,7 +339,8 @@ def _checked_plans(plans: Mapping[str, Trajectory]) -> dict[str, Trajectory]:
     return references
 
 
-def _tracked(loop: Any, outputs: Sequence[str] | None, plan: Trajectory) -> tuple[str, ...]:
+def tracked_outputs(loop: Any, outputs: Sequence[str] | None, plan: Trajectory) -> tuple[str, ...]:
+    """Outputs that follow a plan: as given, those named like its axes, or the first ones."""
     labels = list(loop.output_labels)
     if outputs is not None:
         names = tuple(outputs)
@@ -354,7 +355,8 @@ def _tracked(loop: Any, outputs: Sequence[str] | None, plan: Trajectory) -> tupl
     return names
 
 
-def _acting(loop: Any, controls: Sequence[str] | None) -> tuple[str, ...]:
+def acting_outputs(loop: Any, controls: Sequence[str] | None) -> tuple[str, ...]:
+    """Outputs that are controls: as given, or those whose names begin with u."""
     if controls is None:
         return tuple(name for name in loop.output_labels if name.startswith("u"))
     names = tuple(controls)

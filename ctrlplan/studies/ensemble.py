@@ -236,7 +236,8 @@ def ensemble(
     shared = None if builds else prepare(check_has_inputs(loop))
     forms = {name: shared or prepare(loop(name, plan)) for name, plan in references.items()}
     for name, values in table.items():
-        if not any(form.reads(name, float(values[0])) for form in forms.values()):
+        start = settings.get("initial_state")
+        if not any(form.reads(name, float(values[0]), start) for form in forms.values()):
             raise ValueError(f"params must be parameters of a block, got {name!r}, which none reads")
     nominal = compare(_given(forms), references, times, waypoints=points, **settings)
     # Compiled for these parameters, and compared with Python, here and once.
@@ -265,7 +266,13 @@ def ensemble(
             run = partial(_several, light, references, times, settings)
             futures = [executor.submit(run, [_draw(table, k) for k in task]) for task in tasks]
             for task, future in zip(tasks, futures, strict=True):
-                for k, found in zip(task, future.result(), strict=True):
+                try:
+                    outcomes = future.result()
+                except Exception as error:  # a worker that died; where none works at all, that is what to say
+                    if not kept.finished:
+                        raise
+                    outcomes = [f"{type(error).__name__}: {error}"] * len(task)
+                for k, found in zip(task, outcomes, strict=True):
                     kept.add(k, _draw(table, k), again(k, found))
                 bar.update(len(task))
     except KeyboardInterrupt:

@@ -122,7 +122,9 @@ def _refined_sweep(count: int, finest: float, progress: bool) -> Sweep:
     """Sweep over the gain, refined between gains where a settling time jumps."""
 
     def swept(gains: Array) -> Sweep:
-        return sweep(_loop, gains, linear_plans(), TIMEPTS, progress=progress, parameter="gain", only=SWEPT)
+        found = sweep(_loop, gains, linear_plans(), TIMEPTS, progress=progress, parameter="gain", only=SWEPT)
+        assert isinstance(found, Sweep)  # noqa: S101 (of values, not of draws)
+        return found
 
     even = np.linspace(GAINS[0] ** 0.5, GAINS[1] ** 0.5, count)[1:-1] ** 2
     found = swept(np.union1d(np.union1d(even, np.geomspace(*GAINS, count // 4)), TABLE))

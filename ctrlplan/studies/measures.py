@@ -65,7 +65,7 @@ def response_metrics(
     Each is the worst over the axes; with more than one axis those of each axis
     follow, with the axis's label behind the name.
     """
-    known = timepts >= start
+    known = slice(int(np.searchsorted(timepts, start)), None)  # no copy of the rows
     t, y = timepts[known], y[:, known]
     reference = plan.jet(t, 0)[0]
     initial, final = plan.initial, plan.final
@@ -95,7 +95,7 @@ def control_metrics(
     timepts: Array, u: Array, start: float, labels: tuple[str, ...], only: Wanted = None
 ) -> dict[str, float]:
     """Metrics of the controls (ncontrols, ntime): the worst, and each where there are more."""
-    known = timepts >= start
+    known = slice(int(np.searchsorted(timepts, start)), None)  # no copy of the rows
     t, u = timepts[known], u[:, known]
     return _measured(
         {

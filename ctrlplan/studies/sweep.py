@@ -5,7 +5,6 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +15,8 @@ from tqdm import tqdm
 from ctrlplan.simulation import rest_state, state_space
 from ctrlplan.simulation.exact import exact_states
 from ctrlplan.simulation.linear import LinearForm, in_right_half, linear_forms
-from ctrlplan.studies.comparison import _acting, _tracked, compare, finite_or_none, references_of
+from ctrlplan.studies.comparison import acting_outputs, compare, finite_or_none, references_of, tracked_outputs
+from ctrlplan.studies.ensemble import Ensemble, Failure, ensemble
 from ctrlplan.studies.measures import MEASURES, control_metrics, path_metrics, response_metrics
 from ctrlplan.trajectories import Trajectory, Waypoint
 
@@ -43,12 +43,15 @@ class Sweep:
     values : ndarray, shape (nvalues,)
         Its values, increasing.
     metrics : dict of str to dict of str to ndarray
-        Plan, metric, (nvalues,).
+        Plan, metric, (nvalues,); nan where a value failed.
+    failures : tuple of Failure
+        Values that could not be run, and why.
     """
 
     parameter: str
     values: Array
     metrics: dict[str, dict[str, Array]]
+    failures: tuple[Failure, ...] = ()
 
     def to_pandas(self) -> pd.DataFrame:
         """Table of one row a value; columns plan and metric."""
@@ -75,7 +78,7 @@ class Sweep:
             plan: {name: np.concatenate([row, other.metrics[plan][name]])[order] for name, row in found.items()}
             for plan, found in self.metrics.items()
         }
-        return Sweep(self.parameter, values[order], rows)
+        return Sweep(self.parameter, values[order], rows, (*self.failures, *other.failures))
 
     def plot(self, names: Sequence[str] = ("settling_time", "overshoot_error")) -> Figure:
         """Metrics over the parameter."""
@@ -85,44 +88,55 @@ class Sweep:
 
 
 def sweep(
-    build: Callable[[float], Any],
-    values: ArrayLike,
-    plans: Mapping[str, Trajectory] | Iterable[Waypoint],
-    timepts: ArrayLike,
+    build: Any,
+    values: ArrayLike | None = None,
+    plans: Mapping[str, Trajectory] | Iterable[Waypoint] = (),
+    timepts: ArrayLike = (),
     executor: Any = None,
     progress: bool = True,
     *,
+    params: Mapping[str, ArrayLike] | None = None,
     parameter: str = "value",
     **options: Any,
-) -> Sweep:
-    """Compare plans in a loop for each value of a parameter.
+) -> Sweep | Ensemble:
+    """Compare plans in a loop for each value of a parameter, or for each of many draws.
+
+    A value or draw that cannot be run is recorded, and ends nothing; what is
+    finished when the run is interrupted is kept.
 
     Parameters
     ----------
-    build : callable
-        Maps a value to a loop.
-    values : array_like, shape (nvalues,)
+    build : callable or control system
+        Maps a value to a loop; with `params`, a loop as `compare` takes it.
+    values : array_like, shape (nvalues,), optional
         Values of the parameter, increasing.
     plans, timepts, **options
         As for `compare`.
     executor : concurrent.futures.Executor or alike, optional
         Where the comparisons run: anything with ``submit`` whose result has
-        ``result``. A process pool needs a `build` that can be pickled.
-        Without one, linear loops that differ in numbers alone are solved and
-        measured together, which is faster by far.
+        ``result``, as of `dask.distributed` or `mpi4py.futures`. A process pool
+        needs a `build` that can be pickled, or with `params` a loop that can be
+        compiled. Without one, linear loops that differ in numbers alone are
+        solved and measured together, which is faster by far.
     progress : bool, optional
         Show a bar on stderr.
+    params : mapping of str to array_like, shape (ndraws,), optional
+        In place of `values`: draws of the blocks' parameters, as `draws` makes
+        them. The loop is built once for all.
     parameter : str, optional
         Name of what is varied.
 
     Returns
     -------
-    Sweep
+    Sweep or Ensemble
+        An `Ensemble` with `params`.
 
     Raises
     ------
     ValueError
-        If the values are not finite or do not increase.
+        If the values are not finite or do not increase, draws are not as many
+        of each parameter, or a parameter is none of a block. What a comparison
+        raises at every value is raised.
 
     Examples
     --------
@@ -133,36 +147,68 @@ def sweep(
     >>> found.metrics["step"]["overshoot_error"].round(1)
     array([16.3, 85.4])
     """
-    points = np.atleast_1d(np.asarray(values, dtype=float))
+    if params is not None:
+        if values is not None:
+            raise ValueError("values must not be given beside params, got both")
+        return ensemble(build, plans, timepts, params, executor, progress, options)
+    points = np.atleast_1d(np.asarray([] if values is None else values, dtype=float))
     if points.ndim != 1 or not points.size or not np.isfinite(points).all() or np.any(np.diff(points) <= 0.0):
         raise ValueError(f"values must be finite and increase strictly, got {points.tolist()!s:.80}")
     options["waypoints"] = tuple(options.get("waypoints", ()) if isinstance(plans, Mapping) else plans)
     references = references_of(plans if isinstance(plans, Mapping) else options["waypoints"], options.get("alpha", 1.0))
     given: dict[str, Any] = {"plans": references, "timepts": np.asarray(timepts, dtype=float)} | options
-    bar = partial(tqdm, total=points.size, desc=parameter, disable=not progress, leave=False)
-    if executor is None:
-        found = list(bar(_metrics(build, points.tolist(), given)))
-    else:
-        futures = [executor.submit(_compared, build, value, given) for value in points.tolist()]
-        found = [future.result() for future in bar(futures)]
-    rows = {plan: {name: np.array([f[plan][name] for f in found]) for name in found[0][plan]} for plan in found[0]}
-    return Sweep(parameter, points, rows)
+    bar = tqdm(total=points.size, desc=parameter, disable=not progress, leave=False)
+    found: list[Metrics | Exception] = []
+    futures: list[Any] = []
+    try:
+        if executor is not None:
+            futures = [executor.submit(_tried, build, value, given) for value in points.tolist()]
+        outcomes = (future.result() for future in futures) if futures else _outcomes(build, points.tolist(), given)
+        for outcome in outcomes:
+            found.append(outcome)
+            bar.update()
+    except KeyboardInterrupt:
+        for future in futures:
+            getattr(future, "cancel", bool)()
+    finally:
+        bar.close()
+    return _swept(parameter, points[: len(found)], found)
 
 
-def _compared(build: Callable[[float], Any], value: float, given: dict[str, Any]) -> Metrics:
-    return compare(build(value), **given).metrics
+def _swept(parameter: str, points: Array, found: list[Metrics | Exception]) -> Sweep:
+    errors = [(k, error) for k, error in enumerate(found) if isinstance(error, Exception)]
+    if errors and len(errors) == len(found):
+        raise errors[0][1]
+    known = [(k, metrics) for k, metrics in enumerate(found) if not isinstance(metrics, Exception)]
+    rows: dict[str, dict[str, Array]] = {}
+    for k, metrics in known:
+        for plan, values in metrics.items():
+            for name, value in values.items():
+                rows.setdefault(plan, {}).setdefault(name, np.full(points.size, np.nan))[k] = value
+    failures = [Failure(k, {parameter: float(points[k])}, f"{type(e).__name__}: {e}") for k, e in errors]
+    return Sweep(parameter, points, rows, tuple(failures))
 
 
-def _metrics(build: Callable[[float], Any], values: list[float], given: dict[str, Any]) -> Iterator[Metrics]:
+def _tried(build: Callable[[float], Any], value: float, given: dict[str, Any]) -> Metrics | Exception:
+    """Metrics for one value, or what went wrong."""
+    try:
+        return compare(build(value), **given).metrics
+    except Exception as error:  # whatever a loop does at this value
+        return error
+
+
+def _outcomes(
+    build: Callable[[float], Any], values: list[float], given: dict[str, Any]
+) -> Iterator[Metrics | Exception]:
     """Metrics for each value, of many at once where their loops are linear and differ in numbers alone."""
     count = max(2, _SAMPLES // max(1, given["timepts"].size))
     for begin in range(0, len(values), count):
-        loops = [build(value) for value in values[begin : begin + count]]
-        together = _together(loops, given)
-        if together is None:
-            yield from (compare(loop, **given).metrics for loop in loops)
-        else:
-            yield from together
+        some = values[begin : begin + count]
+        try:
+            together = _together([build(value) for value in some], given)
+        except Exception:  # one of them, which is found below
+            together = None
+        yield from (_tried(build, value, given) for value in some) if together is None else together
 
 
 def _together(loops: list[Any], given: dict[str, Any]) -> list[Metrics] | None:
@@ -180,7 +226,7 @@ def _together(loops: list[Any], given: dict[str, Any]) -> list[Metrics] | None:
         return None
     if asked.initial_state is not None and np.shape(asked.initial_state) not in ((), form.a.shape[2:]):
         return None
-    tracked, acting = _tracked(systems[0], asked.outputs, first), _acting(systems[0], asked.controls)
+    tracked, acting = tracked_outputs(systems[0], asked.outputs, first), acting_outputs(systems[0], asked.controls)
     if asked.only is not None and not any(name.startswith("control") for name in asked.only):
         acting = ()
     rows = [systems[0].output_labels.index(name) for name in (*tracked, *acting)]

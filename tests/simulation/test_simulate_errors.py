@@ -93,11 +93,10 @@ def test_initial_states_that_are_not_numbers(initial, method):
     ("system", "inputs", "match"),
     [
         (BENT, PLAN, "bent"),
-        (LOOP, np.sin(T), "samples"),
         (ct.interconnect([BENT, LOOP], connections=[["bent.r", "loop.y"]], inplist=["loop.r"], outlist=["bent.y[0]"]),
          PLAN, "bent"),
     ],
-    ids=["nonlinear", "samples", "nonlinear inside"],
+    ids=["nonlinear", "nonlinear inside"],
 )  # fmt: skip
 def test_the_exact_method_says_why_it_cannot(system, inputs, match):
     with pytest.raises(ValueError, match=f'method "exact" .*{match}'):
