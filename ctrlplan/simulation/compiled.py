@@ -56,9 +56,9 @@ class Compiled:
         own = self._own_parameters(p)
         every = np.ones(network.nsignals, dtype=bool)
         w = _signals(network, traces, own, network.schedule(feeds, network.signals_of_inputs()), t, x, d)
-        self._functions = {}
         rates = _rates(network, traces, own, t, x, w)
         self._rates = ca.Function("rates", [t, x, d, p], [rates])
+        self._functions = {"rates": self._rates}
         self._jacobian = ca.Function("jacobian", [t, x, d, p], [ca.densify(ca.jacobian(rates, x))])
         w = _signals(network, traces, own, network.schedule(feeds, every), t, x, d)
         self._functions["signals"] = ca.Function("signals", [t, x, d, p], [ca.densify(w)])
@@ -83,6 +83,10 @@ class Compiled:
     def outputs(self, t: Array, x: Array, driven: Array, p: Array) -> Array:
         """Outputs of the whole at many times, (noutputs, ntime)."""
         return self._at_many("outputs", t, x, driven, p)
+
+    def rates(self, t: Array, x: Array, driven: Array, p: Array) -> Array:
+        """Rates of all states at many times, (nstates, ntime)."""
+        return self._at_many("rates", t, x, driven, p)
 
     def signals(self, t: Array, x: Array, driven: Array, p: Array) -> Array:
         """All signals at many times, (nsignals, ntime)."""
@@ -175,6 +179,19 @@ class CompiledSolver:
     def outputs(self, times: Array, states: Array, driven: Array) -> Array:
         """Outputs (noutputs, ntime) of the whole."""
         return self._equations.outputs(times, states, driven, self._p)
+
+    def at_edge(self, times: Array, states: Array, driven: Array) -> bool:
+        """Whether equations are undefined within the tolerances of states found.
+
+        There CVODES may stay for ever on a solution that has ended: a Newton
+        step beside an infinite slope is as small as it likes.
+        """
+        rtol, atol, _ = self._options
+        reach = rtol * np.abs(states) + atol
+        return not all(
+            np.isfinite(self._equations.rates(times, near, driven, self._p)).all()
+            for near in (states - reach, states, states + reach)
+        )
 
     def advance(self, series: Series, left: float, grid: Array, state: Array) -> Array:
         """States (nstates, ngrid) at times of a leg, of which the last is its end."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -70,11 +71,19 @@ class Interpreted:
 
     def rates(self, t: float, x: Array, driven: Array) -> Array:
         """Derivatives of all states, given the signals that are functions of time."""
-        w = self._signals(self._for_rates, t, x, driven)
+        w = self._signals(self._for_all if self._doubtful else self._for_rates, t, x, driven)
+        if self._doubtful:
+            self._check(t, x, w)
         dx = self._a @ x + self._b @ w
         for i in self._moving:
             place = self.network.states[i]
-            dx[place] = np.ravel(self._updates[i](t, x[place], self.network.wire[self.network.inputs[i]] @ w))
+            found = np.ravel(self._updates[i](t, x[place], self.network.wire[self.network.inputs[i]] @ w))
+            if found.size != place.stop - place.start:
+                raise ValueError(
+                    f"block {self.network.blocks[i].name} must return {place.stop - place.start} rates, "
+                    f"got {found.size}"
+                )
+            dx[place] = found
         return dx
 
     def signals(self, t: float, x: Array, driven: Array) -> Array:
@@ -176,7 +185,7 @@ class Interpreted:
         network = self.network
         states, outs = network.states[i], network.outputs[i]
         wire = network.wire[network.inputs[i]]
-        block = network.blocks[i]
+        block, count = network.blocks[i], outs.stop - outs.start
         if block.linear and output is self._outputs[i]:
             c, d = np.asarray(block.system.C, dtype=float), np.asarray(block.system.D, dtype=float) @ wire
 
@@ -186,7 +195,10 @@ class Interpreted:
             return linear
 
         def call(t: float, x: Array, w: Array) -> None:
-            w[outs] = np.ravel(output(t, x[states], wire @ w))
+            found = np.ravel(output(t, x[states], wire @ w))
+            if found.size != count:
+                raise ValueError(f"block {block.name} must return {count} outputs, got {found.size}")
+            w[outs] = found
 
         return call
 
@@ -218,12 +230,12 @@ class InterpretedSolver:
             return np.zeros((0, grid.size))
         equations = self._equations
 
-        def rates(t: float, x: Array) -> Array:
-            return equations.rates(t, x, series(t))
-
-        found = solve_ivp(_advancing(rates, left, right), (left, right), state, t_eval=grid, **self._options)
+        rates = _Advancing(lambda t, x: equations.rates(t, x, series(t)), left, right)
+        found = solve_ivp(rates, (left, right), state, t_eval=grid, **self._options)
         if not found.success:
-            raise SolverError(f"the solver must reach {right:g} s, got to {found.t[-1]:g} s: {found.message}")
+            raise rates.ended(found.message)
+        if not np.isfinite(found.y).all():
+            raise rates.ended("a state is infinite beyond")
         return np.asarray(found.y)
 
 
@@ -274,17 +286,23 @@ def _root(left_over: Callable[[Array], Array], guess: Array, names: str, t: floa
     )
 
 
-def _advancing(rate: Callable[[float, Array], Array], left: float, right: float) -> Callable[[float, Array], Array]:
+class _Advancing:
     """Right-hand side that refuses to be asked for ever about one instant: the solution ends there."""
-    farthest, asked = left, 0
 
-    def checked(t: float, x: Array) -> Array:
-        nonlocal farthest, asked
-        asked += 1
-        if t > farthest + 1e-9 * (right - left):
-            farthest, asked = t, 0
-        elif asked > _CALLS:
-            raise SolverError(f"the solver must reach {right:g} s, got to {farthest:g} s: the solution ends there")
-        return rate(t, x)
+    def __init__(self, rate: Callable[[float, Array], Array], left: float, right: float) -> None:
+        self._rate, self._left, self._right = rate, left, right
+        self._farthest, self._asked, self._defined = left, 0, left
 
-    return checked
+    def __call__(self, t: float, x: Array) -> Array:
+        self._asked += 1
+        if t > self._farthest + 1e-9 * (self._right - self._left):
+            self._farthest, self._asked = t, 0
+        elif self._asked > _CALLS:
+            raise self.ended("the solution ends there")
+        rates = self._rate(t, x)
+        if t > self._defined and math.isfinite(rates.sum()):
+            self._defined = t
+        return rates
+
+    def ended(self, why: str) -> SolverError:
+        return SolverError(f"the solver must reach {self._right:g} s, got to {self._defined:g} s: {why}")

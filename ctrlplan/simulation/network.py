@@ -9,6 +9,7 @@ first the external inputs, then the outputs of the blocks.
 
 from __future__ import annotations
 
+import pickle
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -113,6 +114,19 @@ class Step:
 
 
 @dataclass(frozen=True, eq=False)
+class Declared:
+    """Signal of a block that declares its limits: a function of (t, x, u, params) of the block, time last."""
+
+    name: str
+    function: Callable[..., Any]
+    low: float
+    high: float
+    states: slice
+    wire: Array
+    params: dict[str, Any]
+
+
+@dataclass(frozen=True, eq=False)
 class Network:
     """Innermost blocks and how they are joined.
 
@@ -130,6 +144,8 @@ class Network:
         External inputs, the first of the signals.
     breakpoints : tuple of float
         Times [s] that blocks name at which their equations change.
+    watched : tuple of Declared
+        Signals of blocks that declare limits, by an attribute ``watched``.
     """
 
     name: str
@@ -138,6 +154,7 @@ class Network:
     read: Array
     ninputs: int
     breakpoints: tuple[float, ...] = ()
+    watched: tuple[Declared, ...] = ()
 
     @classmethod
     def of(cls, system: Any) -> Network:
@@ -150,18 +167,31 @@ class Network:
         """
         part = _flattened(system, {})
         _warn_of_shared_parameters(system)
+        wire = np.hstack([part.outer, part.inner])
+        places = zip(
+            part.blocks,
+            _slices([b.system.nstates or 0 for b in part.blocks], 0),
+            _slices([b.system.ninputs or 0 for b in part.blocks], 0),
+            strict=True,
+        )
         return cls(
             str(system.name),
             tuple(part.blocks),
-            np.hstack([part.outer, part.inner]),
+            wire,
             np.hstack([part.through, part.read]),
             system.ninputs or 0,
             tuple(float(t) for b in part.blocks for t in getattr(b.system, "breakpoints", ())),
+            tuple(
+                Declared(name, function, low, high, states, wire[inputs], block.params)
+                for block, states, inputs in places
+                for name, (function, low, high) in getattr(block.system, "watched", {}).items()
+            ),
         )
 
     def without_blocks(self) -> Network:
-        """What a run of a compiled form needs."""
-        return Network(self.name, (), self.wire[:0], self.read, self.ninputs, self.breakpoints)
+        """What a run of a compiled form needs, without functions that cannot be sent to another process."""
+        watched = tuple(w for w in self.watched if _can_be_sent(w))
+        return Network(self.name, (), self.wire[:0], self.read, self.ninputs, self.breakpoints, watched)
 
     @cached_property
     def states(self) -> list[slice]:
@@ -394,6 +424,14 @@ def _first_loop(depends: NDArray[np.bool_], open_: NDArray[np.bool_]) -> NDArray
         if not among[np.ix_(members, ~members)].any():
             return rows[members]
     raise AssertionError("of the groups of a finite graph one depends on no other")
+
+
+def _can_be_sent(what: Any) -> bool:
+    try:
+        pickle.dumps(what)
+    except Exception:  # whatever pickle meets in a user's function
+        return False
+    return True
 
 
 def blocks_of(system: Any) -> Iterator[Any]:

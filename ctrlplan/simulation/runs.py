@@ -14,7 +14,7 @@ from ctrlplan.simulation.drives import Drive, PlanDrive, SampledDrive, driven_si
 from ctrlplan.simulation.events import Event, Snapshot, Watched, watched_events
 from ctrlplan.simulation.exact import exact_states, sampled_states
 from ctrlplan.simulation.interpreted import Interpreted, InterpretedSolver, SolverError
-from ctrlplan.simulation.legs import Solver, integrate
+from ctrlplan.simulation.legs import integrate
 from ctrlplan.simulation.linear import LinearForm
 from ctrlplan.simulation.prepared import DisagreementError, NotCompiledError, Prepared
 
@@ -55,13 +55,13 @@ class Job:
         asked = watched_events(self.events or (), labels)
         if self.events is not None and not self.events:
             return ()
-        network, declared = prepared.network, []
-        for i, block in enumerate(network.blocks if network is not None else ()):
-            for name, (function, low, high) in getattr(block.system, "watched", {}).items():
-                wire = network.wire[network.inputs[i]]  # type: ignore[union-attr]
-                states = network.states[i]  # type: ignore[union-attr]
-                value = partial(_of_block, function, states, wire, {**block.params, **self.params})
-                declared.append(Watched(name, value, low, high))
+        known = prepared.network.watched if prepared.network is not None else ()
+        declared = [
+            Watched(
+                w.name, partial(_of_block, w.function, w.states, w.wire, {**w.params, **self.params}), w.low, w.high
+            )
+            for w in known
+        ]
         return (*declared, *asked)
 
 
@@ -176,7 +176,7 @@ def _numerical(job: Job, method: str, reason: str) -> Record:
     equations = Interpreted(network, job.params, (job.first, job.state), prepared.trials) if network.blocks else None
     watched = job.watched()
     stops = any(entry.stop for entry in watched)
-    solver: Solver
+    solver: Any
     if method == "compiled":
         from ctrlplan.simulation.compiled import CompiledSolver
 
@@ -213,13 +213,18 @@ def _numerical(job: Job, method: str, reason: str) -> Record:
         resolution=10.0 * job.tolerances[0],
         pause=pause if stops else None,
     )
-    if method == "compiled" and equations is not None:
+    if method == "compiled":
         some = np.unique(np.linspace(0, run.times.size - 1, _VISITED).astype(int))
         t, x, driven = run.times[some], run.states[:, some], driven_signals(drives, run.times[some])
-        wrong = form.disagreement(network, job.params, t, x, equations.all_signals(t, x, driven))
-        if wrong:
-            raise prepared.distrust(form, wrong)
-        prepared.trusted = True
+        if solver.at_edge(t, x, driven):
+            raise SolverError(
+                f"the solver must reach {job.times[-1]:g} s, got to the edge of where equations are defined"
+            )
+        if equations is not None:
+            wrong = form.disagreement(network, job.params, t, x, equations.all_signals(t, x, driven))
+            if wrong:
+                raise prepared.distrust(form, wrong)
+            prepared.trusted = True
     return Record(run.times, run.states, see, carry, watched, method, reason)
 
 

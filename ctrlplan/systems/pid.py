@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import partial
 from numbers import Real
 from typing import Any
 
@@ -91,9 +92,7 @@ def create_pid_iosystem(
         raise ValueError(f"limits must increase, got {low} and {high}")
     back = _tracking_rate(kp, ki, kd, tracking_time) if limits is not None else 0.0
 
-    def total(x: Any, u: Any) -> Any:
-        error = u[0] - u[1]
-        return bias + kp * error + x[0] + kd / tf * (error - x[1])
+    total = partial(_total, kp, kd / tf, bias)
 
     def limited(value: Any) -> Any:
         return value if limits is None else np.fmin(np.fmax(value, low), high)
@@ -108,8 +107,18 @@ def create_pid_iosystem(
     block = ct.nlsys(update, out, **names)
     if limits is not None:
         # What `ctrlplan.simulate` records the crossings of.
-        block.watched = {output: (lambda t, x, u, params: total(x, u), low, high)}
+        block.watched = {output: (partial(_asked, kp, kd / tf, bias), low, high)}
     return block
+
+
+def _total(kp: float, kd: float, bias: float, x: Any, u: Any) -> Any:
+    """What is asked for, before the limits; kd over the filter's time constant."""
+    error = u[0] - u[1]
+    return bias + kp * error + x[0] + kd * (error - x[1])
+
+
+def _asked(kp: float, kd: float, bias: float, t: Any, x: Any, u: Any, params: dict[str, Any]) -> Any:
+    return _total(kp, kd, bias, x, u)
 
 
 def _tracking_rate(kp: float, ki: float, kd: float, tracking_time: float | None) -> float:

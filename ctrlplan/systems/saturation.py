@@ -52,5 +52,9 @@ def create_saturation_iosystem(
 
     block = ct.nlsys(None, out, inputs=[input], outputs=[output], dt=None, name=name)
     if math.isfinite(low) or math.isfinite(high):
-        block.watched = {output: (lambda t, x, u, params: u[0], low, high)}
+        block.watched = {output: (_asked, low, high)}
     return block
+
+
+def _asked(t: Any, x: Any, u: Any, params: dict[str, Any]) -> Any:
+    return u[0]

@@ -779,7 +779,6 @@ def test_a_parameter_may_be_read_in_any_way_and_need_not_be_declared(read):
     np.testing.assert_allclose(result.metrics["step"]["settling_time"], np.log(50) * result.params["tau"], rtol=1e-5)
 
 
-@pytest.mark.xfail(strict=True, reason="bug: a parameter is not seen behind a check that no state tried passes")
 def test_a_parameter_may_be_read_where_the_loop_is_allowed_to_be():
     """The lag begins at 5, and refuses to be below 4."""
 
