@@ -31,7 +31,7 @@ _EXPORTS = {
         "sample_hold",
         "source_samples",
     ),
-    "simulation": ("Event", "prepare", "simulate"),
+    "simulation": ("Event", "Occurrence", "Prepared", "SolverError", "prepare", "simulate"),
     "studies": ("Comparison", "Ensemble", "Sweep", "compare", "draws", "sweep"),
 }
 _HOME = {name: module for module, names in _EXPORTS.items() for name in names}

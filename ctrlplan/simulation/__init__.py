@@ -1,6 +1,7 @@
 """Responses of loops: exact where they are linear, compiled where they can be, right in any case."""
 
 from ctrlplan.simulation.events import Event, Occurrence
+from ctrlplan.simulation.interpreted import SolverError
 from ctrlplan.simulation.prepared import Prepared, prepare, state_space
 from ctrlplan.simulation.rest import rest_state, unstable_poles
 from ctrlplan.simulation.simulate import simulate
@@ -9,6 +10,7 @@ __all__ = [
     "Event",
     "Occurrence",
     "Prepared",
+    "SolverError",
     "prepare",
     "rest_state",
     "simulate",

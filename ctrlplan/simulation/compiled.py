@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -21,6 +22,16 @@ _KEPT = 64
 """Integrators kept, one for each pattern of output times."""
 
 _FEW = 64
+
+_FEW_STEPS = 2_000
+_CLOSE = 129
+_TOO_MANY = "it needs too many steps"
+_FAILURES = {
+    "CV_TOO_MUCH_WORK": _TOO_MANY,
+    "CV_ERR_FAILURE": "no step is small enough",
+    "CV_CONV_FAILURE": "no step is small enough",
+    "CV_FIRST_RHSFUNC_ERR": "rates are not finite at the beginning",
+}
 
 _STIFF = 3000.0
 """Times that the fastest motion could die out within a leg, above which BDF takes fewer steps than Adams."""
@@ -166,7 +177,7 @@ class CompiledSolver:
     """CVODES on a compiled network, leg by leg."""
 
     def __init__(
-        self, equations: Compiled, params: Mapping[str, Any], rtol: float, atol: float, max_steps: int = 100_000
+        self, equations: Compiled, params: Mapping[str, Any], rtol: float, atol: float, max_steps: int = 20_000
     ) -> None:
         self._equations, self._p = equations, equations.parameters(params)
         self._options = rtol, atol, max_steps
@@ -205,14 +216,22 @@ class CompiledSolver:
             decay = self._equations.fastest_decay(left, state, series(left), self._p)
             self._longest, self._stiff = right - left, decay * (right - left) > _STIFF
         width = series.coefficients.shape[1]
-        integrator = self._equations.integrator(width, relative, self._stiff, *self._options)
         span = [left, right - left, series.left, series.right]
         p = np.concatenate([self._p, series.coefficients.ravel(order="F"), span])
-        try:
-            return _called(integrator, (state, np.empty(0), p), state.size)
-        except RuntimeError as error:
-            what = str(error).strip().splitlines()[-1]
-            raise SolverError(f"the solver must reach {right:g} s from {left:g} s, got: {what:.160}") from None
+        rtol, atol, max_steps = self._options
+        # A solution that explodes takes all the steps it may: few at first, then more, between outputs close together.
+        close = np.union1d(relative, np.linspace(0.0, 1.0, _CLOSE)[1:])
+        for outputs, allowed in ((relative, min(_FEW_STEPS, max_steps)), (close, max_steps)):
+            integrator = self._equations.integrator(width, outputs, self._stiff, rtol, atol, allowed)
+            try:
+                found = _called(integrator, (state, np.empty(0), p), state.size)
+                return found[:, np.searchsorted(outputs, relative)]
+            except RuntimeError as error:
+                code = re.search(r"CV_\w+", str(error))
+                why = _FAILURES.get(code.group() if code else "", "its equations could not be evaluated")
+                if why != _TOO_MANY or allowed == max_steps:
+                    break
+        raise SolverError(f"the solver must reach {right:g} s from {left:g} s, got to where {why}")
 
 
 def _called(function: Any, arguments: Sequence[Array], nrows: int) -> Array:

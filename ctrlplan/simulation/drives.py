@@ -142,7 +142,9 @@ def input_drives(labels: Sequence[str], inputs: Inputs, times: Array) -> list[Dr
         if inputs.naxes != len(labels):
             known = f"({', '.join(labels)})" if labels else "(the system has no inputs)"
             raise ValueError(f"inputs must have {len(labels)} axes {known}, got {inputs.naxes}")
-        return [PlanDrive(inputs)]
+        # By name where the names are the same, whatever their order.
+        crossed = set(inputs.labels) == set(labels) and inputs.labels != tuple(labels)
+        return [PlanDrive(inputs.select(labels) if crossed else inputs)]
     elif inputs is None or (np.ndim(inputs) == 0 and not callable(inputs)):
         given = [0.0 if inputs is None else inputs] * len(labels)
     else:

@@ -77,7 +77,8 @@ class Interpreted:
         dx = self._a @ x + self._b @ w
         for i in self._moving:
             place = self.network.states[i]
-            found = np.ravel(self._updates[i](t, x[place], self.network.wire[self.network.inputs[i]] @ w))
+            with _named(self.network.blocks[i].name, t):
+                found = np.ravel(self._updates[i](t, x[place], self.network.wire[self.network.inputs[i]] @ w))
             if found.size != place.stop - place.start:
                 raise ValueError(
                     f"block {self.network.blocks[i].name} must return {place.stop - place.start} rates, "
@@ -195,7 +196,8 @@ class Interpreted:
             return linear
 
         def call(t: float, x: Array, w: Array) -> None:
-            found = np.ravel(output(t, x[states], wire @ w))
+            with _named(block.name, t):
+                found = np.ravel(output(t, x[states], wire @ w))
             if found.size != count:
                 raise ValueError(f"block {block.name} must return {count} outputs, got {found.size}")
             w[outs] = found
@@ -233,10 +235,26 @@ class InterpretedSolver:
         rates = _Advancing(lambda t, x: equations.rates(t, x, series(t)), left, right)
         found = solve_ivp(rates, (left, right), state, t_eval=grid, **self._options)
         if not found.success:
-            raise rates.ended(found.message)
+            raise rates.ended(f"{found.message} Equations that jump, as by floor or sign, may chatter there")
         if not np.isfinite(found.y).all():
             raise rates.ended("a state is infinite beyond")
         return np.asarray(found.y)
+
+
+class _named:  # noqa: N801 (a context, of which a run opens thousands)
+    """Context that says in which block, and when, an error happened."""
+
+    __slots__ = ("_name", "_t")
+
+    def __init__(self, name: str, t: float) -> None:
+        self._name, self._t = name, t
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
+        if error is not None:
+            error.add_note(f"in block {self._name} at {self._t:g} s")
 
 
 def _merged_linear(network: Network) -> tuple[Array, Array, list[int]]:
@@ -291,12 +309,12 @@ class _Advancing:
 
     def __init__(self, rate: Callable[[float, Array], Array], left: float, right: float) -> None:
         self._rate, self._left, self._right = rate, left, right
-        self._farthest, self._asked, self._defined = left, 0, left
+        self._about, self._asked, self._defined = left, 0, left
 
     def __call__(self, t: float, x: Array) -> Array:
         self._asked += 1
-        if t > self._farthest + 1e-9 * (self._right - self._left):
-            self._farthest, self._asked = t, 0
+        if abs(t - self._about) > 1e-9 * (self._right - self._left):
+            self._about, self._asked = t, 0
         elif self._asked > _CALLS:
             raise self.ended("the solution ends there")
         rates = self._rate(t, x)

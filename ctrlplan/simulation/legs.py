@@ -37,6 +37,8 @@ _HOPS = 6
 """Delays after which what was a jump is smooth enough to be passed over."""
 
 
+_SHORTEST_DELAY = 1e-5
+
 _MARKS = 20_000
 """Instants of jumps that a run stops at, at most."""
 
@@ -147,6 +149,10 @@ def integrate(
     hops = _MARKS if for_ever else _HOPS
     clock = _Clock(network, _fixed(network, drives, first, last, memory.delays, hops), first, last)
     longest = min([last - first, *memory.delays])
+    if longest < _SHORTEST_DELAY * (last - first):
+        raise ValueError(
+            f"a delay must be at least {_SHORTEST_DELAY:g} of the run of {last - first:g} s, got {longest:g} s"
+        )
     if pause is not None:
         longest = min(longest, (last - first) / 64.0)
     shortest = 1e-9 * (last - first) if pause is not None else np.inf

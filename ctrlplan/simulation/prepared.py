@@ -81,6 +81,7 @@ class Prepared:
         self._sources = [PlanDrive(b.plan, b.system.derivatives) for b in self._blocks() if b.plan is not None]
         self.trusted = True
         self.trials = True
+        self._read: dict[str, bool] = {}
         self._compiled: list[tuple[frozenset[str], dict[str, Any], Compiled | NotCompiledError]] = []
 
     def __repr__(self) -> str:
@@ -157,11 +158,17 @@ class Prepared:
                 raise TypeError(f"{self.name} is not compiled for any values of {', '.join(names) or 'no parameters'}")
         return other
 
-    def reads(self, name: str, value: float, initial_state: Any = None) -> bool:
+    def reads(self, name: str, value: Any, initial_state: Any = None) -> bool:
         """Whether a block has a parameter, or reads one of that name where a run begins or near it."""
         network = self.network
         if network is None or not network.blocks or any(name in block.params for block in network.blocks):
             return True
+        if name in self._read:
+            return self._read[name]
+        self._read[name] = self._is_read(network, name, value, initial_state)
+        return self._read[name]
+
+    def _is_read(self, network: Network, name: str, value: Any, initial_state: Any) -> bool:
         given = self.initial_state if initial_state is None else initial_state
         start = np.zeros(self.nstates) + (0.0 if given is None else np.asarray(given, dtype=float))
         w = np.zeros(network.nsignals)

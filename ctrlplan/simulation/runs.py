@@ -22,8 +22,11 @@ Array = NDArray[np.float64]
 
 METHODS = ("auto", "exact", "compiled", "python")
 
-_LOOKS = 400
-"""Times, beside those asked for, at which the signals of events are looked at."""
+_LOOKS = 400, 20_000
+"""Times at least and at most, beside those asked for, at which the signals of events are looked at."""
+
+_LOOKS_A_TURN = 16
+"""Such times in a turn of the fastest oscillation about the state where a run begins."""
 
 _VISITED = 12
 """Visited states at which a compiled system is compared with Python."""
@@ -142,7 +145,7 @@ def _exact(job: Job, form: LinearForm) -> Record:
     )
     breakpoints = [t for plan, _ in plans for t in plan.breakpoints]
     watched = job.watched()
-    times = _with_looks(job.times, watched)
+    times = _with_looks(job.times, watched, lambda: form.a)
 
     def jet(moment: float, origin: float, s: Array, order: int) -> Array:
         rows = [plan._jet_beside(moment, origin, s, order + high) for plan, high in plans]
@@ -184,7 +187,7 @@ def _numerical(job: Job, method: str, reason: str) -> Record:
             equations.signals(job.first, job.state, driven_signals(drives, job.times[:1])[:, 0])
         form = prepared.compiled(job.params, drives, job.first, job.state)
         # Beyond a stop there may be no solution: legs are short then, and must fail soon.
-        solver = CompiledSolver(form, job.params, *job.tolerances, max_steps=2_000 if stops else 100_000)
+        solver = CompiledSolver(form, job.params, *job.tolerances, max_steps=2_000 if stops else 20_000)
     elif equations is not None:
         solver = InterpretedSolver(equations, *job.tolerances)
     else:
@@ -203,12 +206,18 @@ def _numerical(job: Job, method: str, reason: str) -> Record:
         seen = see(t, x)
         return any(entry.side(entry.value(seen)).any() for entry in watched if entry.stop)
 
+    def slope() -> Array:
+        if equations is None:
+            return np.zeros((0, 0))
+        driven = driven_signals(drives, job.times[:1])[:, 0]
+        return _slope(lambda x: equations.rates(job.first, x, driven), job.state)
+
     run = integrate(
         network,
         equations,
         solver,
         drives,
-        _with_looks(job.times, watched),
+        _with_looks(job.times, watched, slope),
         job.state,
         resolution=10.0 * job.tolerances[0],
         pause=pause if stops else None,
@@ -267,9 +276,26 @@ def _of_block(function: Any, states: slice, wire: Array, params: dict[str, Any],
     return np.asarray(function(seen.t, seen.x[states], wire @ seen.w, params))
 
 
-def _with_looks(times: Array, watched: Sequence[Watched]) -> Array:
-    """Times asked for, and more where events are watched."""
-    return np.union1d(times, np.linspace(times[0], times[-1], _LOOKS)) if watched else times
+def _with_looks(times: Array, watched: Sequence[Watched], slope: Callable[[], Array]) -> Array:
+    """Times asked for, and more where events are watched, so that no crossing hides between two."""
+    if not watched:
+        return times
+    matrix = slope()
+    fastest = float(np.abs(np.linalg.eigvals(matrix).imag).max(initial=0.0)) if np.isfinite(matrix).all() else 0.0
+    turns = fastest * float(times[-1] - times[0]) / (2.0 * np.pi)
+    count = int(min(max(_LOOKS[0], _LOOKS_A_TURN * turns), _LOOKS[1]))
+    return np.union1d(times, np.linspace(times[0], times[-1], count))
+
+
+def _slope(rates: Callable[[Array], Array], state: Array) -> Array:
+    """Derivatives of rates by the states, by differences."""
+    steps = 1e-6 * (1.0 + np.abs(state))
+    with np.errstate(all="ignore"):
+        before = rates(state)
+        columns = [
+            (rates(state + step * unit) - before) / step for step, unit in zip(steps, np.eye(state.size), strict=True)
+        ]
+    return np.array(columns).T.reshape(state.size, state.size)
 
 
 def _derivatives(jet: Array, high: int, order: int) -> Array:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Mapping, Sequence
+from numbers import Real
 from typing import Any
 
 import control as ct
@@ -17,6 +19,9 @@ from ctrlplan.simulation.prepared import Prepared, prepared_form
 from ctrlplan.simulation.runs import METHODS, Job, Record, recorded
 
 Array = NDArray[np.float64]
+
+_LONGEST = 1e15
+"""Seconds after which a double cannot tell one microsecond from the next, by far."""
 
 
 def simulate(
@@ -60,9 +65,11 @@ def simulate(
     params : mapping, optional
         Parameters of the blocks.
     events : sequence of Event, optional
-        Limits of signals whose crossings are recorded, and may end the run;
-        those that blocks declare, as limits of a PID, are recorded unless an
-        empty sequence is given.
+        Limits of signals whose crossings are recorded, and may end the run.
+        Signals are looked at at the sample times and at sixteen instants in a
+        turn of the loop's fastest oscillation: closer crossings need closer
+        sample times. Limits that blocks declare, as a PID does, are watched as
+        well, unless an empty sequence is given.
 
     Returns
     -------
@@ -86,17 +93,24 @@ def simulate(
     Warns
     -----
     UserWarning
-        If a block has equations of a kind that only python-control runs: its
+        If a parameter is read by no block, or a block has equations of a kind that only python-control runs: its
         `control.input_output_response` is then used, with the same tolerances.
     """
     times = np.asarray(timepts, dtype=float)
     if times.ndim != 1 or times.size < 2 or not np.isfinite(times).all() or not np.all(np.diff(times) > 0):
         raise ValueError(f"timepts must be two or more finite times that increase strictly, got {timepts!r:.80}")
+    if times[-1] - times[0] > _LONGEST:
+        raise ValueError(f"timepts must span {_LONGEST:g} s at most, got {times[-1] - times[0]:g} s")
+    for label, value in (("rtol", rtol), ("atol", atol)):
+        number: Any = value
+        if isinstance(number, bool) or not isinstance(number, Real) or not 0.0 < float(number) < math.inf:
+            raise ValueError(f"{label} must be a finite number above 0, got {value!r}")
     if method not in METHODS:
         raise ValueError(f"method must be one of {', '.join(METHODS)}, got {method!r}")
     prepared = prepared_form(system)
     drives = input_drives(prepared.input_labels, inputs, times)
     state = _checked_state(prepared, initial_state)
+    _warn_of_idle(prepared, params or {})
     job = Job(prepared, times, drives, state, dict(params or {}), (rtol, atol), events)
     if prepared.network is None and prepared.linear is None and method in ("auto", "python"):
         return _delegated(job)
@@ -105,6 +119,13 @@ def simulate(
     except FeedthroughError:  # a loop that is none at the start: solved as one from now on
         prepared.trials = False
         return _response(job, recorded(job, method))
+
+
+def _warn_of_idle(prepared: Prepared, params: Mapping[str, Any]) -> None:
+    """Say which parameters are read by no block: they are misspelt."""
+    for name, value in params.items():
+        if np.ndim(value) == 0 and not prepared.reads(name, value):
+            warnings.warn(f"params {name!r} is read by no block of {prepared.name}", UserWarning, stacklevel=3)
 
 
 def _response(job: Job, record: Record) -> ct.TimeResponseData:

@@ -82,7 +82,10 @@ def traced(block: Block, params: Mapping[str, Any], t: float, x: Array, u: Array
             if not wrong:
                 return trace
             why = wrong
-    raise NotTraceableError(f"block {block.name} cannot be traced ({why})")
+    raise NotTraceableError(
+        f"block {block.name} cannot be traced ({why}); functions of numpy can be, as np.sin, np.maximum and np.where, "
+        "and lists of values, but not functions of math, branches on a state, or arrays that are filled"
+    )
 
 
 @contextmanager

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ctrlplan.simulation import Event, rest_state, simulate, state_space, unstable_poles
+from ctrlplan.simulation import Event, Occurrence, rest_state, simulate, state_space, unstable_poles
 from ctrlplan.studies.measures import MEASURES, Measure, control_metrics, path_metrics, response_metrics
 from ctrlplan.trajectories import PiecewiseSpline, PolySpline, Step, Trajectory, TrigSpline, Waypoint
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Comparison:
     """What each plan made of a loop; made by `compare`.
 
@@ -67,6 +67,9 @@ class Comparison:
     notes: tuple[str, ...] = ()
     marks: dict[str, str] = field(default_factory=dict)
     measures: dict[str, Measure] = field(default_factory=lambda: dict(MEASURES))
+
+    def __repr__(self) -> str:
+        return f"<Comparison of {', '.join(self.plans)}: {self.title}>"
 
     def to_pandas(self) -> pd.DataFrame:
         """Metrics as a table, one row a metric, one column a plan."""
@@ -130,6 +133,7 @@ def compare(
     waypoints: Iterable[Waypoint] = (),
     initial_state: ArrayLike | None = None,
     band: float = 0.02,
+    start: float | None = None,
     only: Collection[str] | None = None,
     params: Mapping[str, Any] | None = None,
     events: Sequence[Event] | None = None,
@@ -167,6 +171,8 @@ def compare(
         given.
     band : float, optional
         Half width of the settling band relative to the planned change.
+    start : float, optional
+        Time [s] from which metrics count: the earliest start of a plan unless given.
     only : collection of str, optional
         Metrics wanted, by their keys in `MEASURES`; all unless given.
     params, events : optional
@@ -205,12 +211,13 @@ def compare(
     """
     points = tuple(waypoints)
     if not isinstance(plans, Mapping):
-        plans = points = tuple(plans)
+        plans = points = waypoints_given(plans)
     references = references_of(plans, alpha)
     first = next(iter(references.values()))
     times = np.asarray(timepts, dtype=float)
-    start = min(plan.start for plan in references.values())
+    start = min(plan.start for plan in references.values()) if start is None else start
     responses, found, unstable = {}, {}, np.empty(0, dtype=complex)
+    stopped: dict[str, Occurrence] = {}
     builds = is_builder(loop)
     if not builds:
         check_has_inputs(loop)
@@ -225,16 +232,18 @@ def compare(
             params=params,
             events=events,
         )
-        reached = np.asarray(response.time)  # an event may have ended the run
-        signals = np.asarray(response.outputs).reshape(-1, reached.size)
         rows, acting_rows = ([system.output_labels.index(n) for n in names] for names in (tracked, acting))
-        values = dict(measure(plan, response)) if measure is not None else {}
-        values |= response_metrics(reached, signals[rows], plan, start, band, first.labels, only)
-        unstable = unstable_poles(system)
-        if unstable.size:
-            values |= {key: np.inf for key in values if "settling_time" in key}
-        if acting:
-            values |= control_metrics(reached, signals[acting_rows], start, acting, only)
+        values, unstable = {}, unstable_poles(system)
+        if response.time[-1] < times[-1]:
+            stopped[name] = next(event for event in response.events if event.stop)
+        else:  # what an event has ended cannot be measured beside what went on
+            signals = np.asarray(response.outputs).reshape(-1, times.size)
+            values = dict(measure(plan, response)) if measure is not None else {}
+            values |= response_metrics(times, signals[rows], plan, start, band, first.labels, only)
+            if unstable.size:
+                values |= {key: np.inf for key in values if "settling_time" in key}
+            if acting:
+                values |= control_metrics(times, signals[acting_rows], start, acting, only)
         responses[name] = response
         found[name] = values | (path_metrics(plan, points) if only is None else {})
     return Comparison(
@@ -247,7 +256,8 @@ def compare(
         units=dict(units or {}),
         title=title,
         parameters=dict(parameters or {}) | {"settling band": f"{100 * band:g} %"},
-        notes=_notes(unstable, found),
+        notes=(*_notes(unstable, found), *_notes_of_events(responses, stopped)),
+        marks={name: f"the run was ended: {event}" for name, event in stopped.items()},
         measures=dict(measures or {}) | MEASURES,
     )
 
@@ -278,6 +288,22 @@ def check_has_inputs(loop: Any) -> Any:
             "a loop where the plan is a block inside"
         )
     return loop
+
+
+def waypoints_given(plans: Any) -> tuple[Waypoint, ...]:
+    """Waypoints in the place of plans.
+
+    Raises
+    ------
+    TypeError
+        If they are plans without names, or nothing of the kind.
+    """
+    points = tuple(plans) if np.iterable(plans) else (plans,)
+    for point in points:
+        if not isinstance(point, Waypoint):
+            kinds = "a mapping of names to trajectories, or waypoints"
+            raise TypeError(f"plans must be {kinds}, got {type(point).__name__}")
+    return points
 
 
 def standard_plans(waypoints: Iterable[Waypoint], alpha: float = 1.0) -> dict[str, Trajectory]:
@@ -318,6 +344,21 @@ def _notes(unstable: NDArray[np.complex128], found: dict[str, dict[str, float]])
             "keeps an error.",
         )
     return ()
+
+
+def _notes_of_events(responses: Mapping[str, Any], stopped: Mapping[str, Occurrence]) -> tuple[str, ...]:
+    """What happened on the way, plan by plan."""
+    notes = []
+    for plan, response in responses.items():
+        names = dict.fromkeys(event.name for event in response.events if event.kind != "inside")
+        left = []
+        for name in names:
+            at = [event.time for event in response.events if event.name == name and event.kind != "inside"]
+            left.append(f"{name} left its limits {len(at)} times, first at {at[0]:.4g} s")
+        ended = f"; the run was ended at {stopped[plan].time:.4g} s, and is not measured" if plan in stopped else ""
+        if left:
+            notes.append(f"With {plan}, {', '.join(left)}{ended}.")
+    return tuple(notes)
 
 
 def finite_or_none(value: float) -> float | None:

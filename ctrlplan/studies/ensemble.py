@@ -5,7 +5,8 @@ from __future__ import annotations
 import os
 import pickle
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,6 +23,7 @@ from ctrlplan.studies.comparison import (
     finite_or_none,
     is_builder,
     references_of,
+    waypoints_given,
 )
 from ctrlplan.trajectories import Trajectory, Waypoint
 
@@ -54,14 +56,17 @@ class Failure:
         Its parameters.
     message : str
         What went wrong.
+    plan : str
+        With which plan; empty where with all.
     """
 
     draw: int
     params: dict[str, float]
     message: str
+    plan: str = ""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Ensemble:
     """What plans made of a loop over draws of its parameters; made by `sweep` with ``params``.
 
@@ -93,6 +98,12 @@ class Ensemble:
     levels: tuple[float, ...] = LEVELS
     failures: tuple[Failure, ...] = ()
     finished: int = 0
+
+    def __repr__(self) -> str:
+        return (
+            f"<Ensemble of {', '.join(self.nominal.plans)} over {self.finished} draws of {', '.join(self.params)}; "
+            f"{len(self.failures)} failures>"
+        )
 
     @property
     def ndraws(self) -> int:
@@ -126,7 +137,9 @@ class Ensemble:
                 plan: {name: [finite_or_none(value) for value in row.tolist()] for name, row in rows.items()}
                 for plan, rows in self.metrics.items()
             },
-            "failures": [{"draw": f.draw, "params": f.params, "message": f.message} for f in self.failures],
+            "failures": [
+                {"draw": f.draw, "params": f.params, "message": f.message, "plan": f.plan} for f in self.failures
+            ],
         }
 
     def plot(self) -> Figure:
@@ -161,7 +174,35 @@ class Ensemble:
         if self.failures:
             first = self.failures[0]
             where = ", ".join(f"{key} = {value:.4g}" for key, value in first.params.items())
-            yield f"{len(self.failures)} draws failed; the first, with {where}: {first.message}"
+            with_plan = f" and the plan {first.plan}" if first.plan else ""
+            count = len({failure.draw for failure in self.failures})
+            yield f"{count} draws failed; the first, with {where}{with_plan}: {first.message}"
+            yield "A draw that failed is in no band and no quantile."
+        yield from self._wins()
+
+    def best(self, name: str) -> dict[str, float]:
+        """Share of the draws, of those in which a plan has the metric, in which it is the best; ties count for each."""
+        rows = {plan: found[name] for plan, found in self.metrics.items() if name in found}
+        table = np.array(list(rows.values()))
+        with np.errstate(invalid="ignore"):
+            least = np.fmin.reduce(table)
+            won = table <= least + 1e-3 * np.abs(least)
+        known = ~np.isnan(least)
+        return {plan: float(row[known].mean()) if known.any() else np.nan for plan, row in zip(rows, won, strict=True)}
+
+    def _wins(self) -> Iterator[str]:
+        plans = list(self.metrics)
+        names = dict.fromkeys(name for found in self.metrics.values() for name in found)
+        if len(plans) < 2:
+            return
+        for name in list(names)[:3]:
+            shares = self.best(name)
+            title = self.nominal.measures[name].title.lower() if name in self.nominal.measures else name
+            yield (
+                f"Best in {title}: "
+                + ", ".join(f"{p} in {100 * s:.0f} % of the draws" for p, s in shares.items())
+                + "."
+            )
 
 
 def draws(count: int, seed: int = 0, **distributions: Distribution) -> dict[str, Array]:
@@ -230,8 +271,9 @@ def ensemble(
     settings: dict[str, Any] = {"events": (), **(options or {})}
     points = settings.pop("waypoints", ())
     if not isinstance(plans, Mapping):
-        plans = points = tuple(plans)
+        plans = points = waypoints_given(plans)
     references = references_of(plans, settings.pop("alpha", 1.0))
+    settings.setdefault("start", min(plan.start for plan in references.values()))
     builds = is_builder(loop)
     shared = None if builds else prepare(check_has_inputs(loop))
     forms = {name: shared or prepare(loop(name, plan)) for name, plan in references.items()}
@@ -239,7 +281,7 @@ def ensemble(
         start = settings.get("initial_state")
         if not any(form.reads(name, float(values[0]), start) for form in forms.values()):
             raise ValueError(f"params must be parameters of a block, got {name!r}, which none reads")
-    nominal = compare(_given(forms), references, times, waypoints=points, **settings)
+    nominal = _nominal(forms, references, times, table, {"waypoints": points, **settings})
     # Compiled for these parameters, and compared with Python, here and once.
     _one(forms, references, times, settings, _draw(table, 0))
     try:
@@ -247,9 +289,10 @@ def ensemble(
     except TypeError as error:
         light = forms if executor is None else _sendable(loop, builds, error)
 
-    def again(k: int, found: Outcome | str) -> Outcome | str:
-        """A draw that failed, by the loop itself: what is compiled may fail where Python does not."""
-        return _one(forms, references, times, settings, _draw(table, k)) if isinstance(found, str) else found
+    def again(k: int, found: Outcome) -> Outcome:
+        """Plans of a draw that failed, by the loop itself: what is compiled may fail where Python does not."""
+        failed = {plan: references[plan] for plan, one in found.items() if isinstance(one, str)}
+        return {**found, **_one(forms, failed, times, settings, _draw(table, k))} if failed else found
 
     kept = _Kept(count, times)
     bar = tqdm(total=count, desc="draws", disable=not progress, leave=False)
@@ -271,7 +314,7 @@ def ensemble(
                 except Exception as error:  # a worker that died; where none works at all, that is what to say
                     if not kept.finished:
                         raise
-                    outcomes = [f"{type(error).__name__}: {error}"] * len(task)
+                    outcomes = [dict.fromkeys(references, f"{type(error).__name__}: {error}")] * len(task)
                 for k, found in zip(task, outcomes, strict=True):
                     kept.add(k, _draw(table, k), again(k, found))
                 bar.update(len(task))
@@ -285,8 +328,32 @@ def ensemble(
     )
 
 
-Outcome = tuple[dict[str, dict[str, float]], dict[str, dict[str, Array]]]
-"""Metrics, and signals at the times of the bands, by plan."""
+Outcome = dict[str, tuple[dict[str, float], dict[str, Array]] | str]
+"""By plan: metrics, and signals at the times of the bands; or what went wrong."""
+
+
+def _nominal(
+    forms: Mapping[str, Prepared],
+    references: dict[str, Trajectory],
+    times: Array,
+    table: dict[str, Array],
+    settings: dict[str, Any],
+) -> Comparison:
+    """The loop with its own parameters; or, where that does not run, with those of the first draw that does."""
+    try:
+        return compare(_given(forms), references, times, **settings)
+    except (ArithmeticError, RuntimeError, TypeError, KeyError) as error:
+        for k in range(min(20, next(iter(table.values())).size)):
+            with suppress(Exception):
+                params = _draw(table, k)
+                found = compare(_given(forms), references, times, params=params, **settings)
+                values = ", ".join(f"{name} = {value:.4g}" for name, value in params.items())
+                return replace(
+                    found,
+                    notes=(*found.notes, f"Nominal is draw {k} ({values}): the loop's own parameters do not run."),
+                )
+        error.add_note("with the loop's own parameters, and with the first draws")
+        raise
 
 
 class _Kept:
@@ -300,19 +367,22 @@ class _Kept:
         self._signals: dict[str, dict[str, Array]] = {}
         self._count = count
 
-    def add(self, k: int, params: dict[str, float], outcome: Outcome | str) -> None:
+    def add(self, k: int, params: dict[str, float], outcome: Outcome) -> None:
         """One draw, or what went wrong with it."""
         self.finished += 1
-        if isinstance(outcome, str):
-            self.failures.append(Failure(k, params, outcome))
+        wrong = [found for found in outcome.values() if isinstance(found, str)]
+        if len(wrong) == len(outcome) and len(set(wrong)) == 1:
+            self.failures.append(Failure(k, params, wrong[0]))
             return
-        metrics, signals = outcome
-        for plan, rows in metrics.items():
-            for name, value in rows.items():
+        for plan, found in outcome.items():
+            if isinstance(found, str):
+                self.failures.append(Failure(k, params, found, plan))
+                continue
+            metrics, signals = found
+            for name, value in metrics.items():
                 column = self.metrics.setdefault(plan, {}).setdefault(name, np.full(self._count, np.nan))
                 column[k] = value
-        for plan, curves in signals.items():
-            for name, curve in curves.items():
+            for name, curve in signals.items():
                 known = self._signals.setdefault(plan, {})
                 if name not in known:
                     known[name] = np.full((self._count, self.timepts.size), np.nan)
@@ -345,7 +415,7 @@ def _several(
     times: Array,
     settings: dict[str, Any],
     draws: list[dict[str, float]],
-) -> list[Outcome | str]:
+) -> list[Outcome]:
     """Some draws, in another process."""
     if not isinstance(forms, Mapping):  # a function that builds the loops
         build = forms
@@ -359,21 +429,23 @@ def _one(
     times: Array,
     settings: dict[str, Any],
     params: dict[str, float],
-) -> Outcome | str:
-    """One draw, or what went wrong with it."""
-    try:
-        result = compare(_given(forms), references, times, params=params, **settings)
-    except Exception as error:  # whatever a block does at these parameters
-        return f"{type(error).__name__}: {error}"
-    signals: dict[str, dict[str, Array]] = {}
+) -> Outcome:
+    """One draw, plan by plan: one may get through where another does not."""
     wanted = times[_some(times)]
-    for plan, response in result.responses.items():
-        reached = np.asarray(response.time)
+    outcome: Outcome = {}
+    for plan, reference in references.items():
+        try:
+            result = compare(_given(forms), {plan: reference}, times, params=params, **settings)
+        except Exception as error:  # whatever a block does at these parameters
+            outcome[plan] = f"{type(error).__name__}: {error}"
+            continue
+        response = result.responses[plan]
         rows = np.asarray(response.outputs).reshape(len(response.output_labels), -1)
-        kept = np.isin(reached, wanted)
+        kept = np.isin(np.asarray(response.time), wanted)
         names = dict.fromkeys((*result.outputs, *result.controls))
-        signals[plan] = {name: rows[list(response.output_labels).index(name)][kept] for name in names}
-    return result.metrics, signals
+        signals = {name: rows[list(response.output_labels).index(name)][kept] for name in names}
+        outcome[plan] = (result.metrics[plan], signals)
+    return outcome
 
 
 def _given(forms: Mapping[str, Prepared]) -> Callable[[str, Trajectory], Prepared]:

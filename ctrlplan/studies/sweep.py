@@ -15,7 +15,14 @@ from tqdm import tqdm
 from ctrlplan.simulation import rest_state, state_space
 from ctrlplan.simulation.exact import exact_states
 from ctrlplan.simulation.linear import LinearForm, in_right_half, linear_forms
-from ctrlplan.studies.comparison import acting_outputs, compare, finite_or_none, references_of, tracked_outputs
+from ctrlplan.studies.comparison import (
+    acting_outputs,
+    compare,
+    finite_or_none,
+    references_of,
+    tracked_outputs,
+    waypoints_given,
+)
 from ctrlplan.studies.ensemble import Ensemble, Failure, ensemble
 from ctrlplan.studies.measures import MEASURES, control_metrics, path_metrics, response_metrics
 from ctrlplan.trajectories import Trajectory, Waypoint
@@ -32,7 +39,7 @@ _SAMPLES = 2**19
 """Samples of a signal of all the loops that are taken together."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Sweep:
     """Metrics of every plan over a parameter; made by `sweep`.
 
@@ -52,6 +59,9 @@ class Sweep:
     values: Array
     metrics: dict[str, dict[str, Array]]
     failures: tuple[Failure, ...] = ()
+
+    def __repr__(self) -> str:
+        return f"<Sweep of {', '.join(self.metrics)} over {self.values.size} values of {self.parameter}>"
 
     def to_pandas(self) -> pd.DataFrame:
         """Table of one row a value; columns plan and metric."""
@@ -151,10 +161,14 @@ def sweep(
         if values is not None:
             raise ValueError("values must not be given beside params, got both")
         return ensemble(build, plans, timepts, params, executor, progress, options)
-    points = np.atleast_1d(np.asarray([] if values is None else values, dtype=float))
+    if values is None:
+        raise ValueError("values, or draws as params, must be given, got neither")
+    points = np.atleast_1d(np.asarray(values, dtype=float))
     if points.ndim != 1 or not points.size or not np.isfinite(points).all() or np.any(np.diff(points) <= 0.0):
         raise ValueError(f"values must be finite and increase strictly, got {points.tolist()!s:.80}")
-    options["waypoints"] = tuple(options.get("waypoints", ()) if isinstance(plans, Mapping) else plans)
+    if not callable(build) or hasattr(build, "output_labels"):
+        raise TypeError(f"build must be a function from a value to a loop, got {type(build).__name__}")
+    options["waypoints"] = tuple(options.get("waypoints", ())) if isinstance(plans, Mapping) else waypoints_given(plans)
     references = references_of(plans if isinstance(plans, Mapping) else options["waypoints"], options.get("alpha", 1.0))
     given: dict[str, Any] = {"plans": references, "timepts": np.asarray(timepts, dtype=float)} | options
     bar = tqdm(total=points.size, desc=parameter, disable=not progress, leave=False)

@@ -201,7 +201,7 @@ def numbers(cell):
 def test_the_page_has_the_table_of_draws_before_that_of_the_loop(page):
     heads = [e.words() for e in page.all() if re.fullmatch("h[1-6]", e.tag)]
     assert heads[0] == "Lags & <draws>"
-    assert heads.index("Metrics over the draws") < heads.index("Metrics")
+    assert heads.index("Metrics over the draws") < heads.index("Metrics at the nominal parameters")
     rows, nominal = spread(page)
     unit, cells = rows["Settling time"]
     assert unit == "s"

@@ -1,6 +1,7 @@
 """Compiled and interpreted runs against right-hand sides written by hand, and what cannot be traced."""
 
 import math
+import warnings
 from functools import cache
 from itertools import pairwise
 
@@ -913,7 +914,11 @@ def test_a_parameter_that_bends_the_equations_beyond_a_value():
 
 
 def test_a_parameter_that_no_block_reads():
-    found = cp.simulate(cubic(), T, None, 1.0, params={"unknown": 3.0, "word": "w", "k": 2.0})
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        found = cp.simulate(cubic(), T, None, 1.0, params={"unknown": 3.0, "word": "w", "k": 2.0})
+    expected = [f"params {name!r} is read by no block of cubic" for name in ("unknown", "word")]
+    assert [str(w.message) for w in caught] == expected
     assert np.abs(found.states[0] - 1 / np.sqrt(1 + 4 * T)).max() <= 1e-6
 
 

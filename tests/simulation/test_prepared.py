@@ -292,11 +292,13 @@ def test_the_forms_that_are_kept_do_not_grow_without_bound():
     assert len(prepared_module._recent) <= prepared_module._KEPT
     ready = prepare(driven())
     for k in range(20):
-        simulate(ready, T[:2], 1.0, params={f"p{k}": 1.0})
+        with pytest.warns(UserWarning, match=f"params 'p{k}' is read by no block"):
+            simulate(ready, T[:2], 1.0, params={f"p{k}": 1.0})
     assert len(ready._compiled) <= 8
     form = ready._compiled[-1][2]
     for n in range(2, 150):
-        simulate(ready, np.linspace(0.0, 1.0 + 0.01 * n, n), 1.0, params={"p19": 1.0})
+        with pytest.warns(UserWarning, match="params 'p19' is read by no block"):
+            simulate(ready, np.linspace(0.0, 1.0 + 0.01 * n, n), 1.0, params={"p19": 1.0})
     assert max(len(kept) for kept in (form._integrators, form._maps)) <= 64
 
 

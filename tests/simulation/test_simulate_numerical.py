@@ -218,9 +218,10 @@ def test_params_reach_outputs_and_inner_blocks():
 
 
 def test_params_that_a_linear_loop_has_no_use_for():
-    # python-control's own response takes them without a word.
+    # python-control's own response takes them without a word; a misspelt one would go unseen.
     plan, signals = both(*MOVE, 1.0)
-    found = cp.simulate(cp.plants.integrator_lag_loop(5.0), T, plan, params={"k": 1.0})
+    with pytest.warns(UserWarning, match="params 'k' is read by no block of loop"):
+        found = cp.simulate(cp.plants.integrator_lag_loop(5.0), T, plan, params={"k": 1.0})
     assert found.method == "exact"
     assert gap(found.states, response(*lag_loop(5.0), signals, T)[1]) <= 1e-12
 
