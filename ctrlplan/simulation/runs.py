@@ -181,11 +181,11 @@ def _numerical(job: Job, method: str, reason: str) -> Record:
     stops = any(entry.stop for entry in watched)
     solver: Any
     if method == "compiled":
-        from ctrlplan.simulation.compiled import CompiledSolver
-
         if equations is not None:  # an algebraic loop without a solution is better named here
             equations.signals(job.first, job.state, driven_signals(drives, job.times[:1])[:, 0])
         form = prepared.compiled(job.params, drives, job.first, job.state)
+        from ctrlplan.simulation.compiled import CompiledSolver  # there is a form: so there is CasADi
+
         # Beyond a stop there may be no solution: legs are short then, and must fail soon.
         solver = CompiledSolver(form, job.params, *job.tolerances, max_steps=2_000 if stops else 20_000)
     elif equations is not None:

@@ -1,5 +1,8 @@
 """What users ran into: loops and calls that once ended in a wrong number or a raw error."""
 
+import subprocess
+import sys
+
 import control as ct
 import numpy as np
 import pytest
@@ -148,3 +151,21 @@ def test_reprs_are_short():
 def test_calls_that_cannot_be_meant(call, kind, match):
     with pytest.raises(kind, match=match):
         call()
+
+
+def test_all_runs_without_the_extra_fast():
+    """In a process of its own, where CasADi cannot be imported at all."""
+    program = """
+import sys
+sys.modules["casadi"] = None
+import numpy as np, ctrlplan as cp
+from ctrlplan.studies.crane import CRANE, obstacle_waypoints
+plan = cp.TrigSpline(obstacle_waypoints(), alpha=4.0)
+found = cp.simulate(cp.plants.crane_loop(CRANE, plan), np.linspace(0.0, 20.0, 41))
+assert found.method == "python" and "pip install ctrlplan[fast]" in found.reason, found.reason
+plans = {"trigonometric": plan}
+spread = cp.sweep(lambda n, p: cp.plants.crane_loop(CRANE, p), plans=plans, timepts=np.linspace(0.0, 2.0, 41),
+                  params={"load_mass": [400.0, 600.0]}, progress=False)
+assert not spread.failures
+"""
+    subprocess.run([sys.executable, "-W", "error", "-c", program], check=True, timeout=120)
