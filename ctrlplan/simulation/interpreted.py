@@ -208,13 +208,12 @@ class Interpreted:
 class InterpretedSolver:
     """LSODA on a network's equations, leg by leg."""
 
-    def __init__(self, equations: Interpreted, rtol: float, atol: float, max_step: float = np.inf) -> None:
+    def __init__(self, equations: Interpreted, rtol: float, atol: float) -> None:
         self._equations = equations
         self._options: dict[str, Any] = {
             "method": "LSODA",
             "rtol": max(_SAFETY * rtol, 2.3e-14),
             "atol": _SAFETY * atol,
-            "max_step": max_step,
         }
 
     def signals(self, times: Array, states: Array, driven: Array) -> Array:

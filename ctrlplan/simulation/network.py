@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import pickle
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -432,10 +432,3 @@ def _can_be_sent(what: Any) -> bool:
     except Exception:  # whatever pickle meets in a user's function
         return False
     return True
-
-
-def blocks_of(system: Any) -> Iterator[Any]:
-    """The system and every block inside it, at any depth."""
-    yield system
-    for block in getattr(system, "syslist", ()):
-        yield from blocks_of(block)
