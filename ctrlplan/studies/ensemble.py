@@ -88,6 +88,8 @@ class Ensemble:
         Draws that could not be run, with their parameters.
     finished : int
         Draws run or failed; fewer than asked for where the run was interrupted.
+    nominal_draw : int or None
+        The draw that stands for the nominal loop, where its own parameters do not run.
     """
 
     nominal: Comparison
@@ -98,6 +100,7 @@ class Ensemble:
     levels: tuple[float, ...] = LEVELS
     failures: tuple[Failure, ...] = ()
     finished: int = 0
+    nominal_draw: int | None = None
 
     def __repr__(self) -> str:
         return (
@@ -168,7 +171,8 @@ class Ensemble:
     def notes(self) -> Iterator[str]:
         """What a reader must know of the draws."""
         ranges = ", ".join(f"{k} {v.min():.4g} to {v.max():.4g}" for k, v in self.params.items())
-        yield f"{self.finished} draws of {ranges}; the responses below are those of the loop's own parameters."
+        whose = "the loop's own parameters" if self.nominal_draw is None else f"draw {self.nominal_draw}"
+        yield f"{self.finished} draws of {ranges}; the responses below are those of {whose}."
         if self.finished < self.ndraws:
             yield f"The run was interrupted: {self.ndraws - self.finished} draws were not reached."
         if self.failures:
@@ -281,7 +285,7 @@ def ensemble(
         start = settings.get("initial_state")
         if not any(form.reads(name, float(values[0]), start) for form in forms.values()):
             raise ValueError(f"params must be parameters of a block, got {name!r}, which none reads")
-    nominal = _nominal(forms, references, times, table, {"waypoints": points, **settings})
+    nominal, nominal_draw = _nominal(forms, references, times, table, {"waypoints": points, **settings})
     # Compiled for these parameters, and compared with Python, here and once.
     _one(forms, references, times, settings, _draw(table, 0))
     try:
@@ -324,7 +328,14 @@ def ensemble(
     finally:
         bar.close()
     return Ensemble(
-        nominal, table, kept.metrics, kept.timepts, kept.bands(), LEVELS, tuple(kept.failures), kept.finished
+        nominal,
+        table,
+        kept.metrics,
+        kept.timepts,
+        kept.bands(),
+        failures=tuple(kept.failures),
+        finished=kept.finished,
+        nominal_draw=nominal_draw,
     )
 
 
@@ -338,20 +349,18 @@ def _nominal(
     times: Array,
     table: dict[str, Array],
     settings: dict[str, Any],
-) -> Comparison:
+) -> tuple[Comparison, int | None]:
     """The loop with its own parameters; or, where that does not run, with those of the first draw that does."""
     try:
-        return compare(_given(forms), references, times, **settings)
+        return compare(_given(forms), references, times, **settings), None
     except (ArithmeticError, RuntimeError, TypeError, KeyError) as error:
         for k in range(min(20, next(iter(table.values())).size)):
             with suppress(Exception):
                 params = _draw(table, k)
                 found = compare(_given(forms), references, times, params=params, **settings)
                 values = ", ".join(f"{name} = {value:.4g}" for name, value in params.items())
-                return replace(
-                    found,
-                    notes=(*found.notes, f"Nominal is draw {k} ({values}): the loop's own parameters do not run."),
-                )
+                note = f"Nominal is draw {k} ({values}): the loop's own parameters do not run."
+                return replace(found, notes=(*found.notes, note)), k
         error.add_note("with the loop's own parameters, and with the first draws")
         raise
 

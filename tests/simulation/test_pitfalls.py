@@ -123,6 +123,8 @@ def test_a_draw_counts_for_the_plans_that_get_through():
     assert np.isnan(found.metrics["large"]["iae"]).tolist() == [False, False, True]
     assert [(failure.draw, failure.plan) for failure in found.failures] == [(2, "large")]
     assert any("Nominal is draw 0 (g = 0)" in note for note in found.nominal.notes)
+    assert found.nominal_draw == 0
+    assert "the responses below are those of draw 0." in next(found.notes())
 
 
 def test_reprs_are_short():
