@@ -14,17 +14,23 @@ from numpy.typing import NDArray
 from ctrlplan.simulation.drives import Series
 from ctrlplan.simulation.interpreted import SolverError
 from ctrlplan.simulation.network import Block, Network, Step, known_feedthrough
+from ctrlplan.simulation.recent import recent
 from ctrlplan.simulation.traced import NotTraceableError, Trace, agrees
 
 Array = NDArray[np.float64]
 
 _KEPT = 64
-"""Integrators kept, one for each pattern of output times."""
+"""Integrators kept, one for each pattern of output times; and functions, one for each number of times."""
 
 _FEW = 64
+"""Output times of a leg up to which their pattern is rounded, so that legs of one length share an integrator."""
 
 _FEW_STEPS = 2_000
+"""Steps from output to output at the first attempt."""
+
 _CLOSE = 129
+"""Output times of the second."""
+
 _TOO_MANY = "it needs too many steps"
 _FAILURES = {
     "CV_TOO_MUCH_WORK": _TOO_MANY,
@@ -122,9 +128,8 @@ class Compiled:
     def integrator(self, width: int, grid: Array, stiff: bool, rtol: float, atol: float, max_steps: int) -> Any:
         """CVODES over a leg of length 1, with outputs at some of its times."""
         key = (width, grid.tobytes(), stiff, rtol, atol, max_steps)
-        if key not in self._integrators:
-            if len(self._integrators) >= _KEPT:
-                self._integrators.popitem(last=False)
+
+        def made() -> Any:
             options = {
                 "linear_multistep_method": "bdf" if stiff else "adams",
                 "reltol": max(_SAFETY * rtol, 1e-14),
@@ -133,19 +138,14 @@ class Compiled:
                 "show_eval_warnings": False,
                 "disable_internal_warnings": True,
             }
-            equations = self._leg_equations(width)
-            self._integrators[key] = ca.integrator("leg", "cvodes", equations, 0.0, grid.tolist(), options)
-        self._integrators.move_to_end(key)
-        return self._integrators[key]
+            return ca.integrator("leg", "cvodes", self._leg_equations(width), 0.0, grid.tolist(), options)
+
+        return recent(self._integrators, key, _KEPT, made)
 
     def _at_many(self, name: str, t: Array, x: Array, driven: Array, p: Array) -> Array:
         function = self._functions[name]
-        key = (name, t.size)
-        if key not in self._maps:
-            if len(self._maps) >= _KEPT:
-                self._maps.popitem(last=False)
-            self._maps[key] = function.map(t.size)
-        return _called(self._maps[key], (t, x, driven, np.repeat(p[:, None], t.size, axis=1)), function.numel_out(0))
+        at_all = recent(self._maps, (name, t.size), _KEPT, lambda: function.map(t.size))
+        return _called(at_all, (t, x, driven, np.repeat(p[:, None], t.size, axis=1)), function.numel_out(0))
 
     def _leg_equations(self, width: int) -> dict[str, Any]:
         """Equations in s from 0 to 1, the driven signals as Chebyshev series of some width."""

@@ -62,7 +62,7 @@ class Interpreted:
         self._outputs = [block.output(params) for block in network.blocks]
         self._updates = [block.update(params) for block in network.blocks]
         self._doubtful, self._trials = False, trials
-        self.feeds = self._feeds(dict(enumerate(self._outputs)))
+        self.feeds = self._feeds(self._outputs)
         self._calls = [self._call(i, output) for i, output in enumerate(self._outputs) if not network.blocks[i].driven]
         self._for_rates = self._steps(self._outputs, network.signals_of_inputs(), self.feeds)
         self._for_all = self._steps(self._outputs, np.ones(network.nsignals, dtype=bool), self.feeds)
@@ -122,10 +122,10 @@ class Interpreted:
 
         for i in blocks:
             outputs[i] = renewed(i)
-        feeds = self._feeds(dict(enumerate(outputs)), frozenset(blocks))
+        feeds = self._feeds(outputs, blocks)
         return samples, self._steps(outputs, network.signals_of_inputs(), feeds)
 
-    def _feeds(self, outputs: Mapping[int, Map], unsure: frozenset[int] = frozenset()) -> list[NDArray[np.bool_]]:
+    def _feeds(self, outputs: Sequence[Map], unsure: Sequence[int] = ()) -> list[NDArray[np.bool_]]:
         """Feedthrough of every block: assumed where nothing is known; tried only where a loop seems to be."""
         network, (t, x) = self.network, self._probe
         sizes = [(block.system.noutputs, block.system.ninputs or 0) for block in network.blocks]

@@ -200,7 +200,7 @@ class _Memory:
     """What goes into delays, kept leg by leg."""
 
     def __init__(self, network: Network, solver: Solver, drives: Sequence[Drive], resolution: float) -> None:
-        blocks = network.with_state("delay")
+        blocks = network.blocks_with("delay")
         self._drives: list[Any] = [drive for drive in drives if isinstance(drive, DelayedDrive)]
         self._wires = [network.wire[network.inputs[i]] for i in blocks]
         self._solver, self._resolution = solver, resolution
@@ -233,7 +233,7 @@ class _Clock:
         self._samples: list[tuple[float, int, int]] = []
         self._first = first
         self._periods = {}
-        for i in network.with_state("period"):
+        for i in network.blocks_with("period"):
             system = network.blocks[i].system
             self._periods[i] = (float(system.period), float(getattr(system, "offset", 0.0)))
             self._push(i, 0)

@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import pickle
 import warnings
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -167,26 +167,15 @@ class Network:
         """
         part = _flattened(system, {})
         _warn_of_shared_parameters(system)
-        wire = np.hstack([part.outer, part.inner])
-        places = zip(
-            part.blocks,
-            _slices([b.system.nstates or 0 for b in part.blocks], 0),
-            _slices([b.system.ninputs or 0 for b in part.blocks], 0),
-            strict=True,
-        )
-        return cls(
+        network = cls(
             str(system.name),
             tuple(part.blocks),
-            wire,
+            np.hstack([part.outer, part.inner]),
             np.hstack([part.through, part.read]),
             system.ninputs or 0,
             tuple(float(t) for b in part.blocks for t in getattr(b.system, "breakpoints", ())),
-            tuple(
-                Declared(name, function, low, high, states, wire[inputs], block.params)
-                for block, states, inputs in places
-                for name, (function, low, high) in getattr(block.system, "watched", {}).items()
-            ),
         )
+        return replace(network, watched=tuple(network._declared()))
 
     def without_blocks(self) -> Network:
         """What a run of a compiled form needs, without functions that cannot be sent to another process."""
@@ -229,7 +218,7 @@ class Network:
         ]
         return np.concatenate(rows)
 
-    def with_state(self, kind: str) -> list[int]:
+    def blocks_with(self, kind: str) -> list[int]:
         """Blocks of a kind: those with a ``period``, a ``delay``, ..."""
         return [i for i, block in enumerate(self.blocks) if getattr(block, kind) is not None]
 
@@ -269,7 +258,7 @@ class Network:
 
     def delays_feed_delays(self, feeds: Sequence[NDArray[np.bool_]]) -> bool:
         """Whether what a delay puts out goes into one at once: jumps then go round for ever."""
-        depends, delays = _dependencies(self, feeds), self.with_state("delay")
+        depends, delays = _dependencies(self, feeds), self.blocks_with("delay")
         if not delays:
             return False
         needed = np.any([np.any(self.wire[self.inputs[i]] != 0.0, axis=0) for i in delays], axis=0)
@@ -283,6 +272,11 @@ class Network:
     def names(self, blocks: Sequence[int]) -> str:
         """Blocks by name, in words."""
         return ", ".join(self.blocks[i].name for i in blocks)
+
+    def _declared(self) -> Iterator[Declared]:
+        for block, states, inputs in zip(self.blocks, self.states, self.inputs, strict=True):
+            for name, (function, low, high) in getattr(block.system, "watched", {}).items():
+                yield Declared(name, function, low, high, states, self.wire[inputs], block.params)
 
     def _owners(self, rows: NDArray[np.intp]) -> tuple[int, ...]:
         return tuple(i for i, place in enumerate(self.outputs) if np.any((rows >= place.start) & (rows < place.stop)))

@@ -18,6 +18,7 @@ from ctrlplan.simulation.interpreted import Interpreted
 from ctrlplan.simulation.legs import DelayedDrive
 from ctrlplan.simulation.linear import LinearForm, NotLinearError, linear_form
 from ctrlplan.simulation.network import Network, UnsupportedError
+from ctrlplan.simulation.recent import recent
 
 if TYPE_CHECKING:
     from ctrlplan.simulation.compiled import Compiled
@@ -77,7 +78,7 @@ class Prepared:
         for block in self._blocks():
             if block.delay is not None or block.period is not None:
                 what = "puts out the past" if block.delay is not None else "takes samples"
-                self.linear, self.not_linear = None, f"block {block.name} {what}"
+                self.not_linear = f"block {block.name} {what}"
         self._sources = [PlanDrive(b.plan, b.system.derivatives) for b in self._blocks() if b.plan is not None]
         self.trusted = True
         self.trials = True
@@ -319,12 +320,7 @@ def prepared_form(system: Any) -> Prepared:
         system = system.original
     _checked_system(system)
     key = fingerprint(system)
-    if key not in _recent:
-        if len(_recent) >= _KEPT:
-            _recent.popitem(last=False)
-        _recent[key] = Prepared(system)
-    _recent.move_to_end(key)
-    return _recent[key]
+    return recent(_recent, key, _KEPT, lambda: Prepared(system))
 
 
 def state_space(system: Any) -> Any:

@@ -19,6 +19,7 @@ from ctrlplan.studies.comparison import (
     acting_outputs,
     compare,
     finite_or_none,
+    is_builder,
     references_of,
     tracked_outputs,
     waypoints_given,
@@ -166,7 +167,7 @@ def sweep(
     points = np.atleast_1d(np.asarray(values, dtype=float))
     if points.ndim != 1 or not points.size or not np.isfinite(points).all() or np.any(np.diff(points) <= 0.0):
         raise ValueError(f"values must be finite and increase strictly, got {points.tolist()!s:.80}")
-    if not callable(build) or hasattr(build, "output_labels"):
+    if not is_builder(build):
         raise TypeError(f"build must be a function from a value to a loop, got {type(build).__name__}")
     options["waypoints"] = tuple(options.get("waypoints", ())) if isinstance(plans, Mapping) else waypoints_given(plans)
     references = references_of(plans if isinstance(plans, Mapping) else options["waypoints"], options.get("alpha", 1.0))

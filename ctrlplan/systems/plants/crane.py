@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ctrlplan.systems import series
 from ctrlplan.systems.pid import create_pid_iosystem
-from ctrlplan.systems.plants.parameters import check_parameters
+from ctrlplan.systems.plants.parameters import check_parameters, overruled
 from ctrlplan.trajectories import Extrema, Trajectory
 
 Array = NDArray[np.float64]
@@ -355,9 +355,7 @@ class Crane:
 
     def _numbers(self, params: dict[str, Any] | None = None) -> tuple[Any, ...]:
         """m, M_c, J, b, f1, f2, g, each overruled by a parameter of a run."""
-        if not params:
-            return tuple(getattr(self, name) for name in _NUMBERS)
-        return tuple(params.get(name, getattr(self, name)) for name in _NUMBERS)
+        return overruled({name: getattr(self, name) for name in _NUMBERS}, params)
 
     def _update(self, t: float, state: Any, inputs: Any, params: dict[str, Any]) -> Array:
         d2, r2, theta2, _ = self._accelerations(self._numbers(params), state, inputs[0], inputs[1])

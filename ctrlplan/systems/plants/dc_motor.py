@@ -7,7 +7,7 @@ from typing import Any
 import control.flatsys as fs
 import numpy as np
 
-from ctrlplan.systems.plants.parameters import check_parameters
+from ctrlplan.systems.plants.parameters import check_parameters, overruled
 
 
 def dc_motor(
@@ -70,7 +70,7 @@ def dc_motor(
     own = {**parameters, "friction": friction}
 
     def update(t: float, x: Any, u: Any, params: dict[str, Any]) -> Any:
-        R, L, K, J, b = ((params or {}).get(name, value) for name, value in own.items())
+        R, L, K, J, b = overruled(own, params)
         return np.array([x[1], (K * x[2] - b * x[1]) / J, (u[0] - R * x[2] - K * x[1]) / L])
 
     def forward(x: Any, u: Any, params: Any = None) -> list[Any]:

@@ -7,7 +7,7 @@ from typing import Any
 import control.flatsys as fs
 import numpy as np
 
-from ctrlplan.systems.plants.parameters import check_parameters
+from ctrlplan.systems.plants.parameters import check_parameters, overruled
 
 
 def flexible_joint(
@@ -76,7 +76,7 @@ def flexible_joint(
     own = {**parameters, "gravity": gravity}
 
     def update(t: float, x: Any, u: Any, params: dict[str, Any]) -> Any:
-        I, J, k, m, l, g = ((params or {}).get(name, value) for name, value in own.items())  # noqa: E741
+        I, J, k, m, l, g = overruled(own, params)  # noqa: E741
         weight = m * g * l
         spring = k * (x[1] - x[0])
         return np.array([x[2], x[3], (spring - weight * np.sin(x[0])) / I, (u[0] - spring) / J])

@@ -25,3 +25,9 @@ def check_parameters(positive: Mapping[str, Any], not_negative: Mapping[str, Any
         if not math.isfinite(number) or number < 0.0 or (number == 0.0 and name in positive):
             least = "above 0" if name in positive else "at least 0"
             raise ValueError(f"{name} must be finite and {least}, got {value}")
+
+
+def overruled(own: Mapping[str, Any], params: Mapping[str, Any] | None) -> tuple[Any, ...]:
+    """A plant's own parameters in order, each overruled by the parameter of a run of its name."""
+    given = params or {}
+    return tuple(given.get(name, value) for name, value in own.items())

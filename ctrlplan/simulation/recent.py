@@ -1,0 +1,21 @@
+"""What was made lately, kept so that it need not be made again."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable, Hashable
+from typing import TypeVar
+
+K = TypeVar("K", bound=Hashable)
+V = TypeVar("V")
+
+
+def recent(store: OrderedDict[K, V], key: K, most: int, make: Callable[[], V]) -> V:
+    """What is kept under a key, made if it is not; of more than `most` the one longest unused goes."""
+    if key not in store:
+        made = make()
+        if len(store) >= most:
+            store.popitem(last=False)
+        store[key] = made
+    store.move_to_end(key)
+    return store[key]
