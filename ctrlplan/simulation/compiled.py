@@ -79,7 +79,7 @@ class Compiled:
         self._jacobian = ca.Function("jacobian", [t, x, d, p], [ca.densify(ca.jacobian(rates, x))])
         w = _signals(network, traces, own, network.schedule(feeds, every), t, x, d)
         self._functions["signals"] = ca.Function("signals", [t, x, d, p], [ca.densify(w)])
-        self._functions["outputs"] = ca.Function("outputs", [t, x, d, p], [ca.densify(ca.DM(network.read) @ w)])
+        self._functions["outputs"] = ca.Function("outputs", [t, x, d, p], [ca.densify(_sparse(network.read) @ w)])
         self._integrators: OrderedDict[Any, Any] = OrderedDict()
         self._maps: OrderedDict[Any, Any] = OrderedDict()
         self._equations: dict[int, dict[str, Any]] = {}
@@ -111,11 +111,9 @@ class Compiled:
 
     def disagreement(self, network: Network, params: Mapping[str, Any], t: Array, x: Array, w: Array) -> str:
         """What is wrong with a trace at visited times, states and signals; empty where nothing."""
-        for block, trace, states, inputs in zip(
-            network.blocks, self._traces, network.states, network.inputs, strict=True
-        ):
+        for block, trace, states, fed in zip(network.blocks, self._traces, network.states, network.fed, strict=True):
             if trace is not None:
-                wrong = agrees(block, trace, params, t, x[states], network.wire[inputs] @ w)
+                wrong = agrees(block, trace, params, t, x[states], fed(w))
                 if wrong:
                     return f"block {block.name} cannot be traced ({wrong})"
         return ""
@@ -291,7 +289,7 @@ def _evaluate(
 ) -> None:
     """Put a block's outputs among the known signals."""
     block, states, outs = network.blocks[i], network.states[i], network.outputs[i]
-    fed = ca.DM(network.wire[network.inputs[i]]) @ ca.vertcat(*known)
+    fed = _sparse(network.wire[network.inputs[i]]) @ ca.vertcat(*known)
     trace = traces[i]
     if trace is None:
         column = _linear(block.system.C, block.system.D, _part(x, states), fed)
@@ -308,7 +306,7 @@ def _rates(network: Network, traces: list[Trace | None], own: list[Any], t: Any,
     ):
         if states.stop == states.start:
             continue
-        fed = ca.DM(network.wire[inputs]) @ w
+        fed = _sparse(network.wire[inputs]) @ w
         rows.append(
             _linear(block.system.A, block.system.B, _part(x, states), fed)
             if trace is None
@@ -323,8 +321,13 @@ def _part(x: Any, rows: slice) -> Any:
 
 
 def _linear(a: Any, b: Any, x: Any, u: Any) -> Any:
-    """Sum a x + b u without the zeros of the matrices."""
-    return ca.sparsify(ca.DM(np.asarray(a, dtype=float))) @ x + ca.sparsify(ca.DM(np.asarray(b, dtype=float))) @ u
+    """Sum a x + b u."""
+    return _sparse(a) @ x + _sparse(b) @ u
+
+
+def _sparse(matrix: Any) -> Any:
+    """Matrix without its zeros: 0 times nan is 0, and the equations are shorter."""
+    return ca.sparsify(ca.DM(np.asarray(matrix, dtype=float)))
 
 
 def _series(coefficients: Any, u: Any) -> Any:

@@ -67,18 +67,18 @@ class Interpreted:
         self._for_rates = self._steps(self._outputs, network.signals_of_inputs(), self.feeds)
         self._for_all = self._steps(self._outputs, np.ones(network.nsignals, dtype=bool), self.feeds)
         self._for_samples: dict[tuple[int, ...], tuple[dict[int, Map], list[Call]]] = {}
-        self._a, self._b, self._moving = _merged_linear(network)
+        self._a, self._b, self._driving, self._moving = _merged_linear(network)
 
     def rates(self, t: float, x: Array, driven: Array) -> Array:
         """Derivatives of all states, given the signals that are functions of time."""
         w = self._signals(self._for_all if self._doubtful else self._for_rates, t, x, driven)
         if self._doubtful:
             self._check(t, x, w)
-        dx = self._a @ x + self._b @ w
+        dx = self._a @ x + self._b @ w[self._driving]
         for i in self._moving:
             place = self.network.states[i]
             with _named(self.network.blocks[i].name, t):
-                found = np.ravel(self._updates[i](t, x[place], self.network.wire[self.network.inputs[i]] @ w))
+                found = np.ravel(self._updates[i](t, x[place], self.network.fed[i](w)))
             if found.size != place.stop - place.start:
                 raise ValueError(
                     f"block {self.network.blocks[i].name} must return {place.stop - place.start} rates, "
@@ -108,7 +108,7 @@ class Interpreted:
         after = x.copy()
         for i, sample in samples.items():
             place = self.network.states[i]
-            after[place] = np.ravel(sample(t, x[place], self.network.wire[self.network.inputs[i]] @ w))
+            after[place] = np.ravel(sample(t, x[place], self.network.fed[i](w)))
         return after
 
     def _sampling(self, blocks: tuple[int, ...]) -> tuple[dict[int, Map], list[Call]]:
@@ -185,19 +185,20 @@ class Interpreted:
     def _call(self, i: int, output: Map) -> Call:
         network = self.network
         states, outs = network.states[i], network.outputs[i]
-        wire = network.wire[network.inputs[i]]
+        fed = network.fed[i]
         block, count = network.blocks[i], outs.stop - outs.start
         if block.linear and output is self._outputs[i]:
-            c, d = np.asarray(block.system.C, dtype=float), np.asarray(block.system.D, dtype=float) @ wire
+            c = np.asarray(block.system.C, dtype=float)
+            d, driving = _used(np.asarray(block.system.D, dtype=float) @ network.wire[network.inputs[i]])
 
             def linear(t: float, x: Array, w: Array) -> None:
-                w[outs] = c @ x[states] + d @ w
+                w[outs] = c @ x[states] + d @ w[driving]
 
             return linear
 
         def call(t: float, x: Array, w: Array) -> None:
             with _named(block.name, t):
-                found = np.ravel(output(t, x[states], wire @ w))
+                found = np.ravel(output(t, x[states], fed(w)))
             if found.size != count:
                 raise ValueError(f"block {block.name} must return {count} outputs, got {found.size}")
             w[outs] = found
@@ -222,7 +223,7 @@ class InterpretedSolver:
 
     def outputs(self, times: Array, states: Array, driven: Array) -> Array:
         """Outputs (noutputs, ntime) of the whole."""
-        return self._equations.network.read @ self.signals(times, states, driven)
+        return self._equations.network.put_out(self.signals(times, states, driven))
 
     def advance(self, series: Series, left: float, grid: Array, state: Array) -> Array:
         """States (nstates, ngrid) at times of a leg, of which the last is its end."""
@@ -256,8 +257,8 @@ class _named:  # noqa: N801 (a context, of which a run opens thousands)
             error.add_note(f"in block {self._name} at {self._t:g} s")
 
 
-def _merged_linear(network: Network) -> tuple[Array, Array, list[int]]:
-    """Linear blocks as one: rates a x + b w; and the other blocks with states."""
+def _merged_linear(network: Network) -> tuple[Array, Array, NDArray[np.intp], list[int]]:
+    """Linear blocks as one: rates a x + b w of some signals w, and which; and the other blocks with states."""
     a = np.zeros((network.nstates, network.nstates))
     b = np.zeros((network.nstates, network.nsignals))
     moving = []
@@ -267,7 +268,13 @@ def _merged_linear(network: Network) -> tuple[Array, Array, list[int]]:
             b[rows] = np.asarray(block.system.B) @ network.wire[network.inputs[i]]
         elif rows.stop > rows.start:
             moving.append(i)
-    return a, b, moving
+    return a, *_used(b), moving
+
+
+def _used(matrix: Array) -> tuple[Array, NDArray[np.intp]]:
+    """Columns that are not 0, and which."""
+    columns = np.flatnonzero(matrix.any(axis=0))
+    return matrix[:, columns], columns
 
 
 def _root(left_over: Callable[[Array], Array], guess: Array, names: str, t: float) -> Array:

@@ -202,7 +202,7 @@ class _Memory:
     def __init__(self, network: Network, solver: Solver, drives: Sequence[Drive], resolution: float) -> None:
         blocks = network.blocks_with("delay")
         self._drives: list[Any] = [drive for drive in drives if isinstance(drive, DelayedDrive)]
-        self._wires = [network.wire[network.inputs[i]] for i in blocks]
+        self._fed = [network.fed[i] for i in blocks]
         self._solver, self._resolution = solver, resolution
         self.delays = [drive.delay for drive in self._drives]
 
@@ -216,7 +216,7 @@ class _Memory:
             return True
         nodes = self.nodes(left, right)
         w = self._solver.signals(nodes, states[:, np.searchsorted(grid, nodes)], series.at(nodes))
-        pieces = [chebyshev_coefficients(wire @ w) for wire in self._wires]
+        pieces = [chebyshev_coefficients(fed(w)) for fed in self._fed]
         if right - left > _SHORTEST * min(self.delays) and any(_unresolved(p, self._resolution) for p in pieces):
             return False
         for drive, piece in zip(self._drives, pieces, strict=True):

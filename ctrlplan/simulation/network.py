@@ -13,13 +13,14 @@ import pickle
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import control as ct
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
+from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 from ctrlplan.trajectories import Trajectory
@@ -122,7 +123,7 @@ class Declared:
     low: float
     high: float
     states: slice
-    wire: Array
+    fed: Callable[[Array], Array]
     params: dict[str, Any]
 
 
@@ -196,6 +197,16 @@ class Network:
     def outputs(self) -> list[slice]:
         """Where each block's outputs stand among the signals."""
         return _slices([b.system.noutputs for b in self.blocks], self.ninputs)
+
+    @cached_property
+    def fed(self) -> list[Callable[[Array], Array]]:
+        """Maps of all signals, time last, to the inputs of each block."""
+        return [_product(self.wire[rows]) for rows in self.inputs]
+
+    @cached_property
+    def put_out(self) -> Callable[[Array], Array]:
+        """Map of all signals, time last, to the outputs of the whole."""
+        return _product(self.read)
 
     @property
     def nstates(self) -> int:
@@ -274,9 +285,9 @@ class Network:
         return ", ".join(self.blocks[i].name for i in blocks)
 
     def _declared(self) -> Iterator[Declared]:
-        for block, states, inputs in zip(self.blocks, self.states, self.inputs, strict=True):
+        for block, states, fed in zip(self.blocks, self.states, self.fed, strict=True):
             for name, (function, low, high) in getattr(block.system, "watched", {}).items():
-                yield Declared(name, function, low, high, states, self.wire[inputs], block.params)
+                yield Declared(name, function, low, high, states, fed, block.params)
 
     def _owners(self, rows: NDArray[np.intp]) -> tuple[int, ...]:
         return tuple(i for i, place in enumerate(self.outputs) if np.any((rows >= place.start) & (rows < place.stop)))
@@ -383,6 +394,22 @@ def _warn_of_shared_parameters(system: Any) -> None:
                     UserWarning,
                     stacklevel=2,
                 )
+
+
+def _product(matrix: Array) -> Callable[[Array], Array]:
+    """Product with a matrix in which 0 times nan is 0: a signal that is lost is lost only where it goes."""
+    rows, columns = np.nonzero(matrix)
+    if np.array_equal(rows, np.arange(len(matrix))) and np.all(matrix[rows, columns] == 1.0):
+        return partial(_taken, columns)
+    return partial(_multiplied, csr_array(matrix))
+
+
+def _taken(rows: NDArray[np.intp], signals: Array) -> Array:
+    return signals[rows]
+
+
+def _multiplied(matrix: Any, signals: Array) -> Array:
+    return np.asarray(matrix @ signals)
 
 
 def _slices(counts: Sequence[int], first: int) -> list[slice]:

@@ -183,7 +183,7 @@ class Prepared:
                 continue
             functions = (block.system.outfcn, block.system.updfcn, getattr(block.system, "sample", None))
             for scale in (0.0, 0.1, 1.0):
-                x, u = start[network.states[i]], network.wire[network.inputs[i]] @ w
+                x, u = start[network.states[i]], network.fed[i](w)
                 x, u = (v + scale * rng.standard_normal(v.size) * (1.0 + np.abs(v)) for v in (x, u))
                 for function in filter(None, functions):
                     with np.errstate(all="ignore"), suppress(Exception):
@@ -208,11 +208,11 @@ class Prepared:
         traces: list[Trace | None] = []
         baked: dict[str, Any] = {}
         try:
-            for block, states, inputs in zip(network.blocks, network.states, network.inputs, strict=True):
+            for block, states, fed in zip(network.blocks, network.states, network.fed, strict=True):
                 if block.linear or block.driven:
                     traces.append(None)
                     continue
-                trace = traced(block, params, first, state[states], network.wire[inputs] @ w)
+                trace = traced(block, params, first, state[states], fed(w))
                 traces.append(trace)
                 # What is a constant in the trace must be so in every run of it.
                 baked |= {key: deepcopy(params[key]) for key in params if key not in trace.symbols}

@@ -60,9 +60,7 @@ class Job:
             return ()
         known = prepared.network.watched if prepared.network is not None else ()
         declared = [
-            Watched(
-                w.name, partial(_of_block, w.function, w.states, w.wire, {**w.params, **self.params}), w.low, w.high
-            )
+            Watched(w.name, partial(_of_block, w.function, w.states, w.fed, {**w.params, **self.params}), w.low, w.high)
             for w in known
         ]
         return (*declared, *asked)
@@ -259,7 +257,7 @@ def _discrete(job: Job, reason: str) -> Record:
     def see(t: Array, x: Array) -> Snapshot:
         now = driven_signals(drives, t)
         w = equations.all_signals(t, x, now)
-        return Snapshot(t, x, now[: prepared.ninputs], network.read @ w, lambda: w)
+        return Snapshot(t, x, now[: prepared.ninputs], network.put_out(w), lambda: w)
 
     # Between samples nothing happens: what crosses a limit does so at the later one.
     return Record(clock, states, see, lambda k, t: states[:, k], job.watched(), "python", reason)
@@ -271,9 +269,9 @@ def _network(prepared: Prepared) -> Any:
     return prepared.network
 
 
-def _of_block(function: Any, states: slice, wire: Array, params: dict[str, Any], seen: Snapshot) -> Array:
+def _of_block(function: Any, states: slice, fed: Any, params: dict[str, Any], seen: Snapshot) -> Array:
     """Signal that a block declares, from its states and inputs."""
-    return np.asarray(function(seen.t, seen.x[states], wire @ seen.w, params))
+    return np.asarray(function(seen.t, seen.x[states], fed(seen.w), params))
 
 
 def _with_looks(times: Array, watched: Sequence[Watched], slope: Callable[[], Array]) -> Array:
