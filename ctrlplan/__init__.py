@@ -25,6 +25,7 @@ _EXPORTS = {
         "create_feedforward_iosystem",
         "create_flat_iosystem",
         "create_pid_iosystem",
+        "create_replanner_iosystem",
         "create_saturation_iosystem",
         "create_source_iosystem",
         "plants",

@@ -5,6 +5,7 @@ from ctrlplan.systems.feedforward import create_feedforward_iosystem
 from ctrlplan.systems.flat import create_flat_iosystem, hurwitz_coefficients
 from ctrlplan.systems.hybrid import Delay, SampleHold, create_delay_iosystem, sample_hold
 from ctrlplan.systems.pid import create_pid_iosystem
+from ctrlplan.systems.replanner import create_replanner_iosystem
 from ctrlplan.systems.saturation import create_saturation_iosystem
 from ctrlplan.systems.source import PlanSource, create_source_iosystem, source_samples
 
@@ -16,6 +17,7 @@ __all__ = [
     "create_feedforward_iosystem",
     "create_flat_iosystem",
     "create_pid_iosystem",
+    "create_replanner_iosystem",
     "create_saturation_iosystem",
     "create_source_iosystem",
     "hurwitz_coefficients",

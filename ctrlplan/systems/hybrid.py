@@ -53,7 +53,7 @@ class SampleHold(ct.NonlinearIOSystem):  # type: ignore[misc]
         return x[self._inner :]
 
     def _no_rates(self, t: float, x: Any, u: Any, params: dict[str, Any]) -> NoReturn:
-        _refuse(self.name, "takes samples")
+        refuse_alone(self.name, "takes samples")
 
 
 class Delay(ct.NonlinearIOSystem):  # type: ignore[misc]
@@ -72,7 +72,7 @@ class Delay(ct.NonlinearIOSystem):  # type: ignore[misc]
         self.delay, self.initial = delay, initial
 
     def _past(self, t: float, x: Any, u: Any, params: dict[str, Any]) -> NoReturn:
-        _refuse(self.name, "has a memory of its input")
+        refuse_alone(self.name, "has a memory of its input")
 
 
 def sample_hold(block: Any, dt: float, offset: float = 0.0, name: str | None = None) -> SampleHold:
@@ -194,5 +194,6 @@ def _time(label: str, value: Any, positive: bool) -> float:
     return seconds
 
 
-def _refuse(name: str, why: str) -> NoReturn:
+def refuse_alone(name: str, why: str) -> NoReturn:
+    """Say who runs a block that python-control cannot run by itself."""
     raise RuntimeError(f"a loop with the block {name}, which {why}, must be run by ctrlplan.simulate")

@@ -70,17 +70,37 @@ def derivative_extrema(plan: Trajectory, nu: int) -> Extrema:
         def jet(t: Array, order: int, leg: int = leg) -> Array:
             return plan._leg_jet(leg, t, order)
 
-        times = [np.array([0.0, duration])]
-        for left, right, slopes in _pieces(jet, 0.0, duration, nu + 1):
-            times += [0.5 * (left + right) + 0.5 * (right - left) * real_roots(series) for series in slopes]
-        t = np.concatenate(times)
-        t = np.concatenate([t, _polished(jet, t, nu, duration)])
-        # What rounding moved off an end belongs to it.
-        t[t < 1e-12 * duration] = 0.0
-        t[t > (1.0 - 1e-12) * duration] = duration
-        t = np.unique(t)
+        t = stationary_times(jet, duration, nu)
         found.add(origin + t, jet(t, nu)[nu], (origin, origin + duration))
     return found.extrema()
+
+
+def stationary_times(jet: Callable[[Array, int], Array], duration: float, nu: int) -> Array:
+    """Times in [0, duration] at which the nu-th derivative of an analytic function can be greatest or least.
+
+    Parameters
+    ----------
+    jet : callable
+        Maps times (ntime,) and an order to (order + 1, naxes, ntime).
+    duration : float
+        Length of the interval [s].
+    nu : int
+        Order of the derivative.
+
+    Returns
+    -------
+    ndarray, shape (ncandidates,)
+        Both ends and, for every axis, the stationary points; increasing.
+    """
+    times = [np.array([0.0, duration])]
+    for left, right, slopes in _pieces(jet, 0.0, duration, nu + 1):
+        times += [0.5 * (left + right) + 0.5 * (right - left) * real_roots(series) for series in slopes]
+    t = np.concatenate(times)
+    t = np.concatenate([t, _polished(jet, t, nu, duration)])
+    # What rounding moved off an end belongs to it.
+    t[t < 1e-12 * duration] = 0.0
+    t[t > (1.0 - 1e-12) * duration] = duration
+    return np.unique(t)
 
 
 def function_extrema(plan: Trajectory, function: Callable[[Array], Array], order: int) -> Extrema:

@@ -26,13 +26,18 @@ w = u - (x_{2j-1} + x_{2j})/2, sigma = sin(alpha w)/alpha, kappa = cos(alpha w),
     q c\,(u + h) &= q c + \kappa S(h) - \tfrac{\alpha^2}{2}\sigma V(h)
 
 where S(h) = sin(alpha h)/alpha and V(h) = 2 (1 - cos(alpha h))/alpha^2 do not
-depend on u: multiplying by them is one constant matrix for all times.
+depend on u: multiplying by them is one constant matrix for all times. At one
+time, which may be a symbol of a tracer, `newton_series` goes through the same
+products from the inside out.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from functools import lru_cache
+from operator import mul
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -188,6 +193,17 @@ class NewtonSystem(Frozen):
             out[self.size - 1] += self._fold * out[self.size]
         return out[: self.size]
 
+    def series(self, coefficients: Array, u: Any, order: int) -> list[list[Any]]:
+        """Taylor series axis by axis of a plan at one normalised time, a number or a symbol."""
+        factors = [
+            pair_series(self.alpha, u - first, u - second, order)
+            for first, second in zip(self._first.tolist(), self._second.tolist(), strict=True)
+        ]
+        columns = coefficients.T.tolist()
+        if self._fold:
+            columns = [[*column, self._fold * column[-1]] for column in columns]
+        return [newton_series(factors, column, order) for column in columns]
+
     def _roughness(self, smooth: int) -> Array:
         """Weighted samples G with int (y^(smooth))^2 = |G coefficients|^2."""
         nodes, weights = np.polynomial.legendre.leggauss(2 * self.size + int(4 * self.alpha) + 8)
@@ -200,6 +216,49 @@ class NewtonSystem(Frozen):
     _fold: float
     _first: Array
     _second: Array
+
+
+Pair = tuple[list[Any], list[Any]]
+"""Taylor series of q q and of q c, the factors of one pair of nodes."""
+
+
+def pair_series(alpha: float, left: Any, right: Any, order: int) -> Pair:
+    """Series of the factors of a pair about a point that lies `left` and `right` beyond its nodes."""
+    alpha = _effective(alpha)
+    if not alpha:
+        rest = [0.0] * order
+        return [left * right, left + right, 1.0, *rest][: order + 1], [left, 1.0, *rest][: order + 1]
+    half, middle = 0.5 * alpha, 0.5 * (left + right)
+    sin, cos = (math.sin, math.cos) if isinstance(middle, float) else (np.sin, np.cos)
+    q, sigma, kappa = sin(half * left) / half, sin(alpha * middle), cos(alpha * middle)
+    second = half * right
+    odd, even = (2.0 / alpha) * sigma, -half * sigma
+    qq, qc = [q * sin(second) / half], [q * cos(second)]
+    for k, weight in enumerate(_kernel_weights(alpha, order), 1):
+        qq.append((odd if k % 2 else kappa) * weight)
+        qc.append((kappa if k % 2 else even) * weight)
+    return qq, qc
+
+
+def newton_series(factors: Sequence[Pair], column: Sequence[Any], order: int) -> list[Any]:
+    """Series of a combination of the basis functions, from the last pair of factors to the first."""
+    orders = range(order + 1)
+    last = 2 * len(factors)
+    found = [column[last] if len(column) > last else 0.0, *[0.0] * order]
+    for j in range(len(factors) - 1, -1, -1):
+        (qq, qc), weight = factors[j], column[2 * j + 1]
+        found = [sum(map(mul, qq, found[k::-1]), weight * qc[k]) for k in orders]
+        found[0] = found[0] + column[2 * j]
+    return found
+
+
+@lru_cache(maxsize=256)
+def _kernel_weights(alpha: float, order: int) -> tuple[float, ...]:
+    """Coefficients 1, 2, ... of S(h) where odd, of V(h) where even."""
+    return tuple(
+        (-1.0) ** (k // 2) * (alpha ** (k - 1) if k % 2 else -2.0 * alpha ** (k - 2)) / math.factorial(k)
+        for k in range(1, order + 1)
+    )
 
 
 def _effective(alpha: float) -> float:
@@ -300,13 +359,9 @@ def _factor(collocation: Array, hermite: bool, roughness: Array | None) -> tuple
 def _kernel(alpha: float, order: int) -> Array:
     """Multiplication of a Taylor jet by 1, S(h) and V(h): shape (3 (order + 1), order + 1)."""
     n = order + 1
-    s, v = np.zeros(n), np.zeros(n)
-    for k in range(1, n):
-        sign = (-1.0) ** (k // 2)
-        if k % 2:
-            s[k] = sign * alpha ** (k - 1) / math.factorial(k)
-        else:
-            v[k] = -2.0 * sign * alpha ** (k - 2) / math.factorial(k)
+    weights = np.array([0.0, *_kernel_weights(alpha, order)])
+    s, v = weights.copy(), weights
+    s[::2] = v[1::2] = 0.0
     lag = np.subtract.outer(np.arange(n), np.arange(n))
     kernel = np.zeros((3, n, n))
     kernel[0] = np.eye(n)

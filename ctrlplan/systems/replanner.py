@@ -1,0 +1,458 @@
+"""A plan that is made again while the loop runs, as a block."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Mapping
+from functools import partial
+from typing import Any, Literal, NoReturn
+
+import control as ct
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ctrlplan.systems.hybrid import refuse_alone
+from ctrlplan.systems.source import create_source_iosystem
+from ctrlplan.trajectories import Trajectory
+from ctrlplan.trajectories.common import checked_count, checked_time
+from ctrlplan.trajectories.extrema import stationary_times
+from ctrlplan.trajectories.files import signal_names
+from ctrlplan.trajectories.newton_spline import NewtonSpline
+from ctrlplan.trajectories.transition import Transition, extrapolated, series, transition
+
+Array = NDArray[np.float64]
+
+TRIGGERS = ("period", "deviation", "goal")
+
+_START, _END, _LOST, _MISSED, _FITS = range(5)
+"""States of the correction before the goal's change and the coefficients."""
+
+
+def create_replanner_iosystem(
+    plan: Trajectory,
+    dt: float,
+    *,
+    order: int = 2,
+    horizon: float | Literal["shrinking"] = "shrinking",
+    alpha: float | None = None,
+    measured: int | None = None,
+    goal_derivatives: int | None = None,
+    trigger: Literal["period", "deviation", "goal"] = "period",
+    threshold: float | None = None,
+    min_horizon: float | None = None,
+    limits: Mapping[int, ArrayLike] | None = None,
+    derivatives: int | None = None,
+    suffix: str = "",
+    offset: float = 0.0,
+    name: str = "replanner",
+) -> ct.InterconnectedSystem:
+    r"""Plan that is made again every period, from where the reference or the plant is.
+
+    Every `dt` seconds a spline is fitted from the present jet to the goal's.
+    It is kept as a correction to `plan`: the transition of the same family from
+    the present deviation to the change of the goal. Where `plan` is one spline
+    between two jets, their sum is that spline fitted again, with angular
+    frequency and gamma kept; and nothing being in the way, every plan is
+    followed as it was made, whatever its kind.
+
+    Without `measured` the fit begins at the reference itself, so that no
+    derivative up to `order` jumps. With it the fit begins at what is measured:
+    feedback, and the reference jumps to the plant. Between fits the output is
+    the plan in continuous time. Runs in `ctrlplan.simulate` only.
+
+    Outputs: the jet of each axis, named as `create_source_iosystem` names them.
+    Inputs: with `goal_derivatives`, x_goal, x_goal_d1, ... of each axis; with
+    `measured`, x, x_d1, ....
+
+    Parameters
+    ----------
+    plan : Trajectory
+        What is followed as long as nothing happens. Its end is the goal unless
+        the goal is an input.
+    dt : float
+        Period [s], not above the horizon.
+    order : int, optional
+        Highest derivative that is joined.
+    horizon : float or "shrinking", optional
+        Time to the goal from every fit [s]; or what is left of the plan.
+    alpha : float, optional
+        Shape parameter [rad] of a transition over the horizon, or for
+        "shrinking" over the whole plan, whose angular frequency is kept: that
+        of `plan` unless given, 0 (polynomials) where it has none.
+    measured : int, optional
+        Highest derivative that is measured; those above are the reference's.
+    goal_derivatives : int, optional
+        Highest derivative of the goal that comes in. The goal is taken to go on
+        along its Taylor polynomial until it is met, and afterwards.
+    trigger : {"period", "deviation", "goal"}, optional
+        Fit every period; where what is measured lies more than `threshold` off
+        the reference; or only for a new goal, which the others heed as well.
+    threshold : float, optional
+        Distance over all axes, in their unit.
+    min_horizon : float, optional
+        With "shrinking", time to the end [s] below which the plan is left as it
+        is: the gains grow as its power -(order + 1). About five time constants
+        of the loop that follows; five periods unless given, half the plan at most.
+    limits : mapping of int to array_like, optional
+        Greatest magnitude of a derivative by its order, for all axes or one
+        each. A fit beyond them is not taken: the last one is held.
+    derivatives : int, optional
+        Highest derivative put out; `order` unless given.
+    suffix : str, optional
+        Put behind each label of an output.
+    offset : float, optional
+        Time of the first fit after a run begins [s].
+    name : str, optional
+        Name of the block.
+
+    Returns
+    -------
+    control.InterconnectedSystem
+        Of the plan's source and the block that corrects it. States of that
+        block: start and end of the correction [s], whether values were lost,
+        whether the goal is out of reach, the number of fits, the goal's change,
+        and coefficients. A run records as events when a value was not finite
+        (nan from a sensor: the last good plan is held), and when the goal could
+        not be reached within horizon and limits.
+
+    Raises
+    ------
+    TypeError
+        If `plan` is not a trajectory.
+    ValueError
+        If an argument is out of range; the period is above the horizon; the
+        sampled map from fit to fit has a spectral radius of 1 or more; the plan
+        itself breaks a limit; or outputs and inputs would have the same name.
+
+    References
+    ----------
+    The paper's conclusion; `ctrlplan.trajectories.transition.Transition` for the
+    law that this tends to as the period goes to 0, and for the radius.
+
+    Examples
+    --------
+    A goal that is moved at 4 s, met at 10 s all the same:
+
+    >>> import numpy as np
+    >>> import ctrlplan as cp
+    >>> plan = cp.PolySpline([cp.Waypoint(0, 0, 0, 0), cp.Waypoint(10, 1, 0, 0)], labels=["x"])
+    >>> replanner = cp.create_replanner_iosystem(plan, 0.1, goal_derivatives=0)
+    >>> replanner.input_labels, replanner.output_labels
+    (['x_goal'], ['x', 'x_d1', 'x_d2'])
+    >>> t = np.linspace(0, 12, 121)
+    >>> found = cp.simulate(replanner, t, cp.Step(1.5, 1.0, 4.0))
+    >>> np.round(found.outputs[:, -1], 9).tolist()
+    [1.5, 0.0, 0.0]
+    """
+    if not isinstance(plan, Trajectory):
+        raise TypeError(f"plan must be a Trajectory, got {type(plan).__name__}")
+    order = checked_count(order, "order")
+    put_out = order if derivatives is None else checked_count(derivatives, "derivatives")
+    for label, value in (("measured", measured), ("goal_derivatives", goal_derivatives)):
+        if value is not None and checked_count(value, label) > order:
+            raise ValueError(f"{label} must be at most order, {order}, got {value}")
+    horizons = _Horizons(plan, checked_time(dt, "dt", positive=True), order, horizon, alpha, min_horizon)
+    trigger_over = _checked_trigger(trigger, threshold, measured, goal_derivatives)
+    limited = _checked_limits(plan, limits)
+    signals = _Signals(plan.labels, max(put_out, order), put_out, goal_derivatives, measured, suffix)
+    core = _Correction(plan, horizons, checked_time(offset, "offset"), signals, trigger_over, limited, name)
+    source = create_source_iosystem(plan, signals.planned, name=f"{name}_plan", suffix="_planned")
+    return ct.interconnect(
+        [source, core], inputs=signals.outer or 0, outputs=signals.outputs, name=name, warn_duplicate=False
+    )
+
+
+class _Horizons:
+    """What a fit at some time goes through."""
+
+    def __init__(
+        self,
+        plan: Trajectory,
+        period: float,
+        order: int,
+        horizon: float | Literal["shrinking"],
+        alpha: float | None,
+        min_horizon: float | None,
+    ) -> None:
+        self.shrinking = horizon == "shrinking"
+        if isinstance(horizon, str) and not self.shrinking:
+            raise ValueError(f'horizon must be a number of seconds or "shrinking", got {horizon!r}')
+        if self.shrinking and not plan.duration:
+            raise ValueError('horizon must be a number of seconds for a plan without duration, got "shrinking"')
+        whole = plan.duration if self.shrinking else checked_time(horizon, "horizon", positive=True)  # type: ignore[arg-type]
+        if period > whole:
+            what = "the plan's duration" if self.shrinking else "the horizon"
+            raise ValueError(f"dt must be at most {what}, {whole:g} s, got {period:g} s")
+        if alpha is None:
+            alpha = plan.alpha if isinstance(plan, NewtonSpline) and plan.alpha < 2.0 * math.pi else 0.0
+        self._whole = Transition(order, whole, alpha)
+        self.period, self.order, self.rate = period, order, self._whole.rate
+        self.step: Array | None = None  # from coefficients to jets a period later, where that is always the same map
+        self._start, self._end = plan.start, plan.end
+        if self.shrinking:
+            self._least = _least_horizon(min_horizon, period, whole)
+            return
+        if min_horizon is not None:
+            raise ValueError(f'min_horizon must go with horizon = "shrinking", got {min_horizon} with {whole:g} s')
+        self.step = self._whole.evaluation(period, order)
+        radius = self._whole.radius(period)
+        if not radius < 1.0:
+            raise ValueError(
+                "the map from fit to fit must have a spectral radius below 1, "
+                f"got {radius:.4g} with dt = {period:g} s, horizon = {whole:g} s and alpha = {alpha:g}"
+            )
+
+    def late(self, t: float) -> bool:
+        """Whether what is left of the plan is too short for a fit."""
+        return self.shrinking and self._end - t < self._least * (1.0 - 1e-9)
+
+    def at(self, t: float) -> Transition | None:
+        """Transition to fit at a time, None where it is too early or too late for one."""
+        if not self.shrinking:
+            return self._whole
+        if t < self._start or self.late(t):
+            return None
+        return transition(self.order, self._end - t, self.rate * (self._end - t))
+
+
+class _Signals:
+    """Names of what comes in and goes out, and where it stands."""
+
+    def __init__(
+        self,
+        labels: tuple[str, ...],
+        planned: int,
+        put_out: int,
+        goal: int | None,
+        measured: int | None,
+        suffix: str,
+    ) -> None:
+        goals = [] if goal is None else signal_names([f"{label}_goal" for label in labels], goal)
+        seen = [] if measured is None else signal_names(list(labels), measured)
+        self.planned, self.put_out, self.goal, self.measured = planned, put_out, goal, measured
+        self.inner = signal_names([f"{label}_planned" for label in labels], planned)
+        self.outer = [*goals, *seen]
+        self.outputs = signal_names([label + suffix for label in labels], put_out)
+        both = [name for name in self.outputs if name in self.outer]
+        if both:
+            raise ValueError(f"suffix must tell outputs from inputs, got {suffix!r} and {', '.join(both)} among both")
+        n = len(self.inner)
+        self.goal_rows, self.seen_rows = slice(n, n + len(goals)), slice(n + len(goals), n + len(self.outer))
+
+    @property
+    def feedthrough(self) -> NDArray[np.bool_]:
+        """An output passes its own entry of the plan on; everything else waits for a fit."""
+        found = np.zeros((len(self.outputs), len(self.inner) + len(self.outer)), dtype=bool)
+        found[np.arange(len(self.outputs)), self.passed] = True
+        return found
+
+    @property
+    def passed(self) -> list[int]:
+        """Which inputs the outputs pass on."""
+        each, naxes = self.planned + 1, len(self.inner) // (self.planned + 1)
+        return [axis * each + k for axis in range(naxes) for k in range(self.put_out + 1)]
+
+
+class _Correction(ct.NonlinearIOSystem):  # type: ignore[misc]
+    """Jets of a plan plus those of the transition last fitted."""
+
+    def __init__(
+        self,
+        plan: Trajectory,
+        horizons: _Horizons,
+        offset: float,
+        signals: _Signals,
+        trigger: tuple[str, float],
+        limits: tuple[tuple[int, Array], ...],
+        name: str,
+    ) -> None:
+        naxes, order, changes = plan.naxes, horizons.order, signals.goal_rows.stop - signals.goal_rows.start
+        states = ["start", "end", "lost", "missed", "fits"]
+        states += [f"change[{k}]" for k in range(changes)]
+        states += [f"coefficient[{k}]" for k in range(naxes * 2 * (order + 1))]
+        super().__init__(
+            self._no_rates,
+            self._put_out,
+            inputs=[*signals.inner, *signals.outer],
+            outputs=signals.outputs,
+            states=states,
+            dt=0,
+            name=f"{name}_correction",
+        )
+        self.period, self.offset, self.feedthrough = horizons.period, offset, signals.feedthrough
+        self.watched = {
+            f"{name} lost a value": (partial(_state, _LOST), -math.inf, 0.5),
+            f"{name} cannot reach the goal": (partial(_state, _MISSED), -math.inf, 0.5),
+        }
+        self._plan, self._horizons, self._signals, self._trigger, self._limits = (
+            plan,
+            horizons,
+            signals,
+            trigger,
+            limits,
+        )
+        self._passed, self._naxes, self._order = signals.passed, naxes, order
+        self._change, self._fitted = slice(5, 5 + changes), slice(5 + changes, len(states))
+        self._final = np.array(plan.final)
+
+    def sample(self, t: float, x: Array, u: Array, params: dict[str, Any]) -> Array:
+        """States after a fit, or where none is due the same."""
+        after = x.copy()
+        after[_LOST] = 0.0 if math.isfinite(sum(u.tolist())) else 1.0
+        if after[_LOST]:
+            return after
+        change = self._goal_change(u)
+        moved = change.size > 0 and change.ravel().tolist() != x[self._change].tolist()
+        begins = self._deviation(t, x, u)
+        after[_MISSED] = float(moved and self._horizons.late(t))
+        found = self._horizons.at(t) if self._is_due(moved, t, x, begins) else None
+        if found is None:
+            return after
+        jets = np.zeros((2 * (self._order + 1), self._naxes))
+        jets[: self._order + 1] = begins
+        if len(change):
+            jets[self._order + 1 : self._order + 1 + len(change)] = extrapolated(change, found.horizon)
+        coefficients = found.coefficients(jets)
+        if self._limits and not self._within_limits(t, found, coefficients):
+            after[_MISSED] = 1.0
+            return after
+        after[_START], after[_END], after[_MISSED] = t, t + found.horizon, 0.0
+        after[_FITS] += 1.0
+        after[self._change] = change.ravel()
+        after[self._fitted] = coefficients.ravel()
+        return after
+
+    def _is_due(self, moved: bool, t: float, x: Array, begins: Array) -> bool:
+        kind, threshold = self._trigger
+        if moved or kind == "goal":
+            return moved
+        if kind == "deviation":
+            off = begins[0] - self._jets(t, x, 0)[0]
+            return math.hypot(*off.tolist()) > threshold
+        # From the reference to the same goal, on what is left of the plan, a fit gives the same plan.
+        return self._signals.measured is not None or not self._horizons.shrinking
+
+    def _goal_change(self, u: Array) -> Array:
+        """Jet (goal_derivatives + 1, naxes) of the goal less the plan's own; empty where none comes in."""
+        change = u[self._signals.goal_rows].reshape(self._naxes, -1).T.copy()
+        if len(change):
+            change[0] -= self._final
+        return change
+
+    def _deviation(self, t: float, x: Array, u: Array) -> Array:
+        """Jet (order + 1, naxes) from which a fit begins, less the plan's."""
+        highest = self._signals.measured
+        if highest is None:
+            return self._jets(t, x, self._order)
+        planned = u[: len(self._signals.inner)].reshape(self._naxes, -1)[:, : highest + 1]
+        seen = (u[self._signals.seen_rows].reshape(self._naxes, -1) - planned).T
+        return seen if highest == self._order else np.concatenate([seen, self._jets(t, x, self._order)[highest + 1 :]])
+
+    def _within_limits(self, t: float, found: Transition, coefficients: Array) -> bool:
+        """Whether the plan with a correction keeps its limits from now to the end of it."""
+        end, inner = t + found.horizon, self._plan.breakpoints
+        edges = [t, *inner[(inner > t) & (inner < end)].tolist(), end]
+        for left, right in itertools.pairwise(edges):
+
+            def jet(s: Array, order: int, left: float = left, right: float = right) -> Array:
+                planned = self._plan._jet_beside(0.5 * (left + right), left, s, order)
+                return planned + found.jet(coefficients, s + (left - t), order)
+
+            for nu, limit in self._limits:
+                times = stationary_times(jet, right - left, nu)
+                if (np.abs(jet(times, nu)[nu]).max(axis=1) > limit * (1.0 + 1e-9)).any():
+                    return False
+        return True
+
+    def _put_out(self, t: Any, x: Any, u: Any, params: dict[str, Any]) -> Array:
+        added = itertools.chain.from_iterable(self._corrections(t, x, self._signals.put_out))
+        return np.array([u[row] + value for row, value in zip(self._passed, added, strict=True)])
+
+    def _jets(self, t: float, x: Array, order: int) -> Array:
+        """Jet (order + 1, naxes) of the correction."""
+        step = self._horizons.step
+        if step is not None and order == self._order and abs(t - x[_START] - self.period) <= 1e-15 * abs(t):
+            return step @ x[self._fitted].reshape(-1, self._naxes)
+        return np.array(self._corrections(t, x.tolist(), order)).T
+
+    def _corrections(self, t: Any, x: Any, order: int) -> list[list[Any]]:
+        """Jets of the correction axis by axis, of numbers or of symbols."""
+        live = t <= x[_END]
+        now = (t if live else x[_END]) if isinstance(live, bool) else np.fmin(t, x[_END])
+        columns = [
+            [x[k] for k in range(self._fitted.start + axis, self._fitted.stop, self._naxes)]
+            for axis in range(self._naxes)
+        ]
+        follows = self._signals.goal or 0
+        rows = series(self._horizons.rate, columns, now - x[_START], now - x[_END], max(order, follows))
+        return [_continued(row, t - now, live, follows)[: order + 1] for row in rows]
+
+    def _no_rates(self, t: float, x: Any, u: Any, params: dict[str, Any]) -> NoReturn:
+        refuse_alone(self.name, "plans again every period")
+
+
+def _continued(row: list[Any], beyond: Any, live: Any, follows: int) -> list[Any]:
+    """Jet of a series, and after its end that of its Taylor polynomial up to the orders that the goal has."""
+    found = []
+    for k, value in enumerate(row):
+        total = value if k <= follows else value * live
+        for j in range(k + 1, follows + 1):
+            total = total + math.comb(j, k) * row[j] * beyond ** (j - k)
+        found.append(total * math.factorial(k))
+    return found
+
+
+def _state(row: int, t: Any, x: Any, u: Any, params: dict[str, Any]) -> Any:
+    return x[row]
+
+
+def _least_horizon(given: float | None, period: float, whole: float) -> float:
+    """Time to the end below which nothing is fitted."""
+    if given is None:
+        return max(period, min(5.0 * period, 0.5 * whole))
+    least = checked_time(given, "min_horizon", positive=True)
+    if not period <= least <= whole:
+        raise ValueError(
+            f"min_horizon must lie between dt, {period:g} s, and the plan's duration, {whole:g} s, got {least:g} s"
+        )
+    return least
+
+
+def _checked_trigger(
+    trigger: str, threshold: float | None, measured: int | None, goal: int | None
+) -> tuple[str, float]:
+    if trigger not in TRIGGERS:
+        raise ValueError(f"trigger must be one of {', '.join(TRIGGERS)}, got {trigger!r}")
+    if trigger == "goal" and goal is None:
+        raise ValueError('goal_derivatives must be given for trigger = "goal", got None')
+    if trigger != "deviation":
+        if threshold is not None:
+            raise ValueError(f'threshold must go with trigger = "deviation", got {threshold} with {trigger!r}')
+        return trigger, 0.0
+    if measured is None:
+        raise ValueError('measured must be given for trigger = "deviation", got None')
+    if threshold is None:
+        raise ValueError('threshold must be given for trigger = "deviation", got None')
+    return trigger, checked_time(threshold, "threshold", positive=True)
+
+
+def _checked_limits(plan: Trajectory, limits: Mapping[int, ArrayLike] | None) -> tuple[tuple[int, Array], ...]:
+    """Limits by order, one for each axis, which the plan itself keeps."""
+    found = []
+    for key, value in (limits or {}).items():
+        nu = checked_count(key, "orders of limits")
+        limit = np.asarray(value, dtype=float)
+        if limit.shape not in ((), (plan.naxes,)) or not (limit > 0.0).all():
+            raise ValueError(f"limits[{nu}] must be above 0, one number or {plan.naxes}, got {value!r}")
+        limit = np.broadcast_to(limit, (plan.naxes,))
+        extrema = plan.extrema(nu)
+        for axis, label in enumerate(plan.labels):
+            low, high = float(extrema.minimum[axis]), float(extrema.maximum[axis])
+            worst, time = (high, extrema.time_max[axis]) if high >= -low else (low, extrema.time_min[axis])
+            if abs(worst) > limit[axis] * (1.0 + 1e-9):
+                raise ValueError(
+                    f"plan must keep limits[{nu}] = {limit[axis]:g}, got {worst:.6g} of {label} at {float(time):.6g} s"
+                )
+        found.append((nu, limit))
+    return tuple(found)

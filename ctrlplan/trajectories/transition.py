@@ -1,0 +1,156 @@
+"""From one jet to another in a given time: what is planned again while a loop runs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ctrlplan.trajectories.common import FACTORIALS, Array, Frozen, checked_count, checked_time
+from ctrlplan.trajectories.newton import NewtonSystem, newton_series, pair_series
+from ctrlplan.trajectories.trigonometric import checked_alpha
+
+
+class Transition(Frozen):
+    r"""Splines from any jet to any other in one horizon, factorised once.
+
+    Replanning every instant towards 0 with the horizon kept is the constant law
+
+    .. math:: y^{(b+1)} = -\sum_{j=0}^{b} k_j\,y^{(j)}, \qquad
+        k_b = (b + 1)^2\,\tfrac{\alpha}{2}\cot\tfrac{\alpha}{2}\,/\,H
+
+    of `gains`; replanning every period it is the map of `radius`.
+
+    Parameters
+    ----------
+    order : int
+        Highest derivative b that is joined at both ends.
+    horizon : float
+        Duration H [s], above 0.
+    alpha : float, optional
+        Shape parameter in [0, 2 pi) [rad]; 0 is the polynomial of degree 2b + 1.
+
+    Attributes
+    ----------
+    order, horizon, alpha
+        As given.
+    rate : float
+        Angular frequency alpha/H [rad/s].
+
+    Raises
+    ------
+    ValueError
+        If an argument is out of range.
+
+    Examples
+    --------
+    The minimum-jerk law of horizon 1 s:
+
+    >>> Transition(2, 1.0).gains().round(9).tolist()
+    [60.0, 36.0, 9.0]
+    """
+
+    order: int
+    horizon: float
+    alpha: float
+    rate: float
+
+    def __init__(self, order: int, horizon: float, alpha: float = 0.0) -> None:
+        order = checked_count(order, "order")
+        horizon = checked_time(horizon, "horizon", positive=True)
+        alpha = checked_alpha(alpha)
+        given = tuple(range(order + 1))
+        system = NewtonSystem(alpha, np.array([0.0, 1.0]), (given, given))
+        powers = horizon ** np.arange(2.0 * order + 2.0)
+        self.__dict__.update(
+            order=order,
+            horizon=horizon,
+            alpha=alpha,
+            rate=alpha / horizon,
+            _system=system,
+            _rows=system.waypoint_index * (order + 1) + system.order_index,
+            _data_scale=system.taylor_scale(horizon),
+            _time_scale=(1.0 / powers)[:, None],
+        )
+
+    def coefficients(self, jets: Array) -> Array:
+        """Coefficients of the Newton form in time [s], which `series` reads.
+
+        Parameters
+        ----------
+        jets : ndarray, shape (2 (order + 1), naxes)
+            Derivatives 0 to `order` at the beginning, then those at the end.
+
+        Returns
+        -------
+        ndarray, shape (2 (order + 1), naxes)
+        """
+        return self._system.coefficients(jets[self._rows] * self._data_scale) * self._time_scale
+
+    def jet(self, coefficients: Array, s: Array, order: int) -> Array:
+        """Jet (order + 1, naxes, ntime) at times s [s] after the beginning."""
+        taylor = self._system.taylor(np.asarray(s, dtype=float) / self.horizon, order)
+        values = np.einsum("mkt,ma->kat", taylor, coefficients / self._time_scale)
+        return values * (FACTORIALS[: order + 1] / self.horizon ** np.arange(order + 1))[:, None, None]
+
+    def evaluation(self, s: float, order: int) -> Array:
+        """Matrix (order + 1, 2 (self.order + 1)) from coefficients to derivatives s seconds after the beginning."""
+        rows = series(self.rate, np.eye(2 * self.order + 2).tolist(), s, s - self.horizon, order)
+        return np.array(rows).T * FACTORIALS[: order + 1, None]
+
+    def gains(self) -> Array:
+        """Gains k_0, ..., k_b [1/s^(b + 1 - j)] of replanning at every instant, shape (order + 1,)."""
+        return -self._led_to_rest(0.0, self.order + 1)[-1]
+
+    def radius(self, period: float) -> float:
+        """Spectral radius of replanning every `period` [s] and following the plan in between."""
+        found = self._led_to_rest(checked_time(period, "period", positive=True), self.order)
+        return float(np.abs(np.linalg.eigvals(found)).max())
+
+    def _led_to_rest(self, s: float, order: int) -> Array:
+        """Derivatives (order + 1, self.order + 1) after s seconds of plans that lead unit derivatives to rest."""
+        first = np.eye(self.order + 1)
+        return self.evaluation(s, order) @ self.coefficients(np.concatenate([first, np.zeros_like(first)]))
+
+    _system: NewtonSystem
+    _rows: Any
+    _data_scale: Array
+    _time_scale: Array
+
+
+@lru_cache(maxsize=4096)
+def transition(order: int, horizon: float, alpha: float) -> Transition:
+    """Transition made before, or a new one: a clock that ticks evenly meets the same horizons again."""
+    return Transition(order, horizon, alpha)
+
+
+def series(rate: float, columns: Sequence[Sequence[Any]], past: Any, ahead: Any, order: int) -> list[list[Any]]:
+    """Taylor series, axis by axis, of transitions at one time; everything but the rate may be a symbol.
+
+    Parameters
+    ----------
+    rate : float
+        Angular frequency [rad/s].
+    columns : sequence of sequence
+        Coefficients of each axis.
+    past, ahead : float
+        Time since the beginning, and since the end [s].
+    order : int
+        Highest coefficient; coefficient k is the k-th derivative / k!.
+    """
+    factors = [pair_series(rate, past, ahead, order)] * (len(columns[0]) // 2)
+    return [newton_series(factors, column, order) for column in columns]
+
+
+def extrapolated(jet: ArrayLike, time: float) -> Array:
+    """Jet (order + 1, naxes) `time` seconds later, along its Taylor polynomial."""
+    values = np.asarray(jet, dtype=float)
+    n = len(values)
+    if n == 1:
+        return values
+    lag = np.subtract.outer(np.arange(n), np.arange(n)).T
+    weights = np.where(lag >= 0, time ** np.maximum(lag, 0) / FACTORIALS[np.maximum(lag, 0)], 0.0)
+    return weights @ values
