@@ -28,6 +28,7 @@ _EXPORTS = {
         "create_replanner_iosystem",
         "create_saturation_iosystem",
         "create_source_iosystem",
+        "create_time_scaling_iosystem",
         "plants",
         "sample_hold",
         "source_samples",

@@ -8,6 +8,7 @@ from ctrlplan.systems.pid import create_pid_iosystem
 from ctrlplan.systems.replanner import create_replanner_iosystem
 from ctrlplan.systems.saturation import create_saturation_iosystem
 from ctrlplan.systems.source import PlanSource, create_source_iosystem, source_samples
+from ctrlplan.systems.time_scaling import create_time_scaling_iosystem
 
 __all__ = [
     "Delay",
@@ -20,6 +21,7 @@ __all__ = [
     "create_replanner_iosystem",
     "create_saturation_iosystem",
     "create_source_iosystem",
+    "create_time_scaling_iosystem",
     "hurwitz_coefficients",
     "plants",
     "sample_hold",

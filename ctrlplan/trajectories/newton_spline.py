@@ -137,6 +137,13 @@ class NewtonSpline(Trajectory):
             out[:, list(axes)] = values
         return out
 
+    def _leg_series(self, leg: int, s: Any, order: int) -> list[list[Any]]:
+        found: list[list[Any]] = [[]] * self.naxes
+        for axes, system, coefficients in self._parts:
+            for axis, row in zip(axes, system.series(coefficients, s / self._duration, order), strict=True):
+                found[axis] = [value / self._duration**k for k, value in enumerate(row)]
+        return found
+
     def _per_axis(self) -> list[tuple[NewtonSystem, Array]]:
         """System and coefficients (size,) of each axis in order."""
         found = {a: (s, c[:, i]) for axes, s, c in self._parts for i, a in enumerate(axes)}

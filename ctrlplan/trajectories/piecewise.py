@@ -102,6 +102,9 @@ class PiecewiseSpline(Trajectory):
     def _leg_jet(self, leg: int, s: Array, order: int) -> Array:
         return self.legs[leg]._leg_jet(0, s, order)
 
+    def _leg_series(self, leg: int, s: Any, order: int) -> list[list[Any]]:
+        return self.legs[leg]._leg_series(0, s, order)
+
 
 def _filled(points: tuple[Waypoint, ...], alpha: float) -> list[Waypoint]:
     """Waypoints whose inner ones have no free entry below the axis's highest order."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
@@ -14,7 +15,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from ctrlplan.trajectories import extrema as _extrema
 from ctrlplan.trajectories import sampling as _sampling
-from ctrlplan.trajectories.common import Array, Frozen, checked_count, checked_time, checked_timepts, readonly
+from ctrlplan.trajectories.common import (
+    FACTORIALS,
+    Array,
+    Frozen,
+    checked_count,
+    checked_time,
+    checked_timepts,
+    readonly,
+)
 from ctrlplan.trajectories.continuity import Jump, find_jumps
 
 if TYPE_CHECKING:
@@ -71,6 +80,10 @@ class Trajectory(Frozen, ABC):
     @abstractmethod
     def _from_dict(cls, data: dict[str, Any]) -> Trajectory:
         """Trajectory from the plain data of `to_dict`."""
+
+    def _leg_series(self, leg: int, s: Any, order: int) -> list[list[Any]]:
+        """Taylor series axis by axis of a leg at a symbol of a tracer."""
+        raise TypeError(f"the time of a {type(self).__name__} must be a number, got {type(s).__name__}")
 
     @property
     def start(self) -> float:
@@ -153,6 +166,41 @@ class Trajectory(Frozen, ABC):
         highest = checked_count(order, "order")
         values = self._sample(times.ravel(), 0, highest, left)
         return values.reshape(highest + 1, self.naxes, *times.shape)
+
+    def series(self, t: Any, order: int) -> list[list[Any]]:
+        """Taylor series about one time, which may be a symbol of a tracer (CasADi's).
+
+        Symbols go through splines of one piece and of several.
+
+        Parameters
+        ----------
+        t : float or symbol
+            Time [s].
+        order : int
+            Highest coefficient.
+
+        Returns
+        -------
+        list of list, naxes by (order + 1)
+            Coefficient k is the k-th derivative / k!.
+
+        Raises
+        ------
+        TypeError
+            If `t` is a symbol and the trajectory of another kind.
+        """
+        if isinstance(t, Real):
+            return (self.jet(float(t), order).T / FACTORIALS[: order + 1]).tolist()
+        # Each leg counts where it holds; elsewhere it is taken at its ends, where it is finite.
+        found = [[value * (t < self.start), *[0.0] * order] for value in self.initial.tolist()]
+        edges = self.breakpoints.tolist()
+        for leg, (left, right) in enumerate(itertools.pairwise(edges)):
+            holds = (t >= left) * (t <= right if leg == len(edges) - 2 else t < right)
+            rows = self._leg_series(leg, np.fmin(np.fmax(t - left, 0.0), right - left), order)
+            found = [[a + holds * b for a, b in zip(*pair, strict=True)] for pair in zip(found, rows, strict=True)]
+        for row, value in zip(found, self.final.tolist(), strict=True):
+            row[0] = row[0] + value * (t > self.end)
+        return found
 
     def extrema(self, nu: int = 0) -> _extrema.Extrema:
         """Least and greatest value of the nu-th derivative, true over the whole interval.

@@ -91,11 +91,12 @@ class Crane:
 
     # The nonlinear plant
 
-    def iosystem(self, name: str = "crane") -> ct.NonlinearIOSystem:
+    def iosystem(self, name: str = "crane", *, wind: bool = False) -> ct.NonlinearIOSystem:
         """Nonlinear plant, equations (13) and (14).
 
-        States D, R, theta and their rates; inputs F [N] on the trolley and C
-        [N m] on the drum; outputs x, z, D, R, theta, the rates x_d1, z_d1,
+        States D, R, theta and their rates; inputs F [N] on the trolley, C [N m]
+        on the drum, and with `wind` the horizontal force wind [N] on the load,
+        along x; outputs x, z, D, R, theta, the rates x_d1, z_d1,
         D_d1, R_d1, theta_d1, and the tension T [N]. Parameters of a run named
         as this crane's own (``params={"load_mass": 1000.0}``) overrule them in
         the plant alone: a payload that the controller does not know of.
@@ -104,12 +105,12 @@ class Crane:
             self._update,
             self._output,
             states=list(STATES),
-            inputs=["F", "C"],
+            inputs=["F", "C", "wind"] if wind else ["F", "C"],
             outputs=list(OUTPUTS),
             name=name,
         )
-        # At once, force and torque act on the tension alone.
-        block.feedthrough = np.array([[output == "T"] * 2 for output in OUTPUTS])
+        # At once, forces and torque act on the tension alone.
+        block.feedthrough = np.array([[output == "T"] * (2 + wind) for output in OUTPUTS])
         return block
 
     def equilibrium(self, x: float, z: float) -> tuple[Array, Array]:
@@ -127,21 +128,22 @@ class Crane:
         state = np.array([x - self.drum_radius, z, 0.0, 0.0, 0.0, 0.0])
         return state, np.array([0.0, -self.drum_radius * self.load_mass * self.gravity])
 
-    def accelerations(self, state: Any, force: Any, torque: Any) -> tuple[Any, Any, Any, Any]:
+    def accelerations(self, state: Any, force: Any, torque: Any, wind: Any = 0.0) -> tuple[Any, Any, Any, Any]:
         """D'', R'', theta'' and the tension T, solved from (13) and (14)."""
-        return self._accelerations(self._numbers(), state, force, torque)
+        return self._accelerations(self._numbers(), state, force, torque, wind)
 
     def _accelerations(
-        self, numbers: tuple[Any, ...], state: Any, force: Any, torque: Any
+        self, numbers: tuple[Any, ...], state: Any, force: Any, torque: Any, wind: Any
     ) -> tuple[Any, Any, Any, Any]:
         m, trolley, inertia, b, f1, f2, g = numbers
         _, r, theta, d_rate, r_rate, rate = (state[i] for i in range(6))
         s, c = np.sin(theta), np.cos(theta)
         # Each acceleration is linear in T; the first equation of motion then gives T.
         d0, d1 = (force - f1 * d_rate) / trolley, s / trolley
-        swing = -g * s - 2.0 * r_rate * rate + b * rate * rate
+        push = wind / m
+        swing = push * c - g * s - 2.0 * r_rate * rate + b * rate * rate
         t0, t1 = (swing - c * d0) / r, -c * d1 / r
-        along = g * c + r * rate * rate
+        along = push * s + g * c + r * rate * rate
         if self.rope_wrap:
             r0, r1 = b / inertia * (torque - f2 * (r_rate / b - rate)), b * b / inertia
             tension = (along - s * d0 - r0) / (s * d1 + r1 + 1.0 / m)
@@ -358,14 +360,19 @@ class Crane:
         return overruled({name: getattr(self, name) for name in _NUMBERS}, params)
 
     def _update(self, t: float, state: Any, inputs: Any, params: dict[str, Any]) -> Array:
-        d2, r2, theta2, _ = self._accelerations(self._numbers(params), state, inputs[0], inputs[1])
+        d2, r2, theta2, _ = self._accelerations(self._numbers(params), state, *_forces(inputs))
         return np.array([state[3], state[4], state[5], d2, r2, theta2])
 
     def _output(self, t: float, state: Any, inputs: Any, params: dict[str, Any]) -> Array:
         numbers = self._numbers(params)
         x, z, x_rate, z_rate = _load(numbers[3], state)
-        tension = self._accelerations(numbers, state, inputs[0], inputs[1])[3]
+        tension = self._accelerations(numbers, state, *_forces(inputs))[3]
         return np.array([x, z, state[0], state[1], state[2], x_rate, z_rate, state[3], state[4], state[5], tension])
+
+
+def _forces(inputs: Any) -> tuple[Any, Any, Any]:
+    """F, C and the wind, 0 where none comes in."""
+    return inputs[0], inputs[1], inputs[2] if inputs.shape[0] > 2 else 0.0
 
 
 def _load(b: Any, state: Any) -> tuple[Any, Any, Any, Any]:

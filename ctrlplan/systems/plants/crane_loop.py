@@ -7,6 +7,7 @@ from typing import Any
 
 import control as ct
 import numpy as np
+from numpy.typing import NDArray
 
 from ctrlplan.systems.plants.crane import OUTPUTS, Crane
 from ctrlplan.systems.plants.crane_laws import (
@@ -36,6 +37,8 @@ def crane_loop(
     tf: float = 0.02,
     force_limits: Sequence[float] | None = None,
     torque_limits: Sequence[float] | None = None,
+    reference: Sequence[Any] | None = None,
+    wind: Trajectory | None = None,
     name: str = "crane_loop",
     **options: Any,
 ) -> ct.InterconnectedSystem:
@@ -58,6 +61,13 @@ def crane_loop(
         Their derivative filter [s].
     force_limits, torque_limits : (float, float), optional
         Limits of F [N] and C [N m], with anti-windup.
+    reference : sequence of control systems, optional
+        Blocks in the place of the plan's source: a replanner, a governor, a
+        slowed clock, with whatever they are fed by; among their outputs are the
+        jets that the law reads, x_ref, x_ref_d1, ..., z_ref, .... Where one
+        starts elsewhere than at 0, its attribute ``initial_state`` says so.
+    wind : Trajectory, optional
+        Horizontal force on the load [N], along x.
     name : str, optional
         Name of the loop.
     **options
@@ -97,8 +107,10 @@ def crane_loop(
     plan = _named(plan)
     _check_smooth(plan, smooth, law)
     crane.check(plan)
-    source = create_source_iosystem(plan, order, suffix="_ref")
-    plant = crane.iosystem()
+    sources = [create_source_iosystem(plan, order, suffix="_ref")] if reference is None else list(reference)
+    plant = crane.iosystem(wind=wind is not None)
+    if wind is not None:
+        sources.append(create_source_iosystem(stack([wind], labels=["wind"]), name="wind"))
     if law in ("dynamic", "feedforward"):
         if force_limits is not None or torque_limits is not None:
             raise ValueError(f"limits must go with a law that drives the PIDs, got law {law!r}")
@@ -107,7 +119,7 @@ def crane_loop(
             if law == "dynamic"
             else create_crane_feedforward_iosystem(crane)
         )
-        blocks = [source, block, plant]
+        blocks = [*sources, block, plant]
     else:
         if law == "still":
             block = create_still_iosystem(crane)
@@ -121,12 +133,18 @@ def crane_loop(
             crane.trolley_pid(bandwidth, tf, limits=force_limits),
             crane.hoist_pid(bandwidth, tf, limits=torque_limits),
         ]
-        blocks = [source, block, *pids, plant]
+        blocks = [*sources, block, *pids, plant]
     loop = ct.interconnect(blocks, inputs=0, outputs=[*OUTPUTS, "F", "C", "x_ref", "z_ref"], name=name)
     rest = crane.equilibrium(float(plan.initial[0]), float(plan.initial[1]))[0]
     # The crane comes last; the states of law and drives are 0 at rest.
-    loop.initial_state = np.concatenate([np.zeros(loop.nstates - rest.size), rest])
+    before = [_start(block) for block in blocks[:-1]]
+    loop.initial_state = np.concatenate([*before, rest])
     return loop
+
+
+def _start(block: Any) -> NDArray[np.float64]:
+    """Where a block starts: where it says so, or at 0."""
+    return np.zeros(block.nstates or 0) + np.asarray(getattr(block, "initial_state", 0.0), dtype=float)
 
 
 def _named(plan: Trajectory) -> Trajectory:

@@ -1,0 +1,212 @@
+"""A plan whose clock slows where the loop cannot keep up, as a block."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import control as ct
+import numpy as np
+from numpy.typing import NDArray
+
+from ctrlplan.trajectories import Trajectory
+from ctrlplan.trajectories.common import checked_count, checked_time
+from ctrlplan.trajectories.files import signal_names
+
+Array = NDArray[np.float64]
+
+
+def create_time_scaling_iosystem(
+    plan: Trajectory,
+    derivatives: int = 2,
+    *,
+    limits: Mapping[str, Sequence[float]] | None = None,
+    margin: float = 0.1,
+    errors: Mapping[str, Sequence[float]] | None = None,
+    bandwidth: float | None = None,
+    slowest: float = 0.1,
+    fastest: float = 1.1,
+    catch_up: float | None = None,
+    suffix: str = "",
+    name: str = "time_scaling",
+) -> ct.NonlinearIOSystem:
+    r"""Plan at a time of its own, which slows where actuators saturate or the error grows.
+
+    Puts out y_d(sigma(t)) and its derivatives, sigma' the rate: 1 as long as
+    nothing happens; towards `slowest` as an actuator comes near a limit or an
+    error grows; above 1 afterwards, until nothing is left to catch up. The rate
+    goes through as many lags as there are derivatives,
+
+    .. math:: \sigma' = \frac{\rho}{(s/w + 1)^n}, \qquad
+        \rho = \rho_{min} + (1 - \text{severity})\,
+        (\min(\rho_{max}, 1 + (t - \sigma)/T) - \rho_{min}),
+
+    so that sigma is n times continuously differentiable, and so is the
+    reference where the plan is. The path is the plan's own whatever the rate.
+
+    Outputs: the jet of each axis, as `create_source_iosystem` names them.
+    Inputs: the signals in `limits`, then those in `errors`. States: lag
+    t - sigma [s] and the lags of 1 - sigma'; the zero state follows the plan.
+
+    Parameters
+    ----------
+    plan : Trajectory
+        What is followed.
+    derivatives : int, optional
+        Highest derivative put out: the order that the flat law needs.
+    limits : mapping of str to (float, float), optional
+        Least and greatest value of actuators, one of them may be infinite.
+    margin : float, optional
+        Part of the range between limits, above 0 to 0.5, within which the rate
+        falls; of the limit itself where the other is infinite.
+    errors : mapping of str to (float, float), optional
+        For axes by their labels: distance of what is measured from the
+        reference at which the rate begins to fall, and at which it is least.
+    bandwidth : float, optional
+        w [rad/s] of each lag; 10 over the plan's duration unless given. A clock
+        that slows fast asks for the force y_d' sigma'' that it should save, and
+        most of all in braking: errors are the gentler cause to slow for.
+    slowest, fastest : float, optional
+        Least rate, from 0 below 1, and greatest, from 1.
+    catch_up : float, optional
+        Time constant T [s] with which the lag is made up for; four times the
+        delay n/w of the lags unless given.
+    suffix : str, optional
+        Put behind each label of an output.
+    name : str, optional
+        Name of the block.
+
+    Returns
+    -------
+    control.NonlinearIOSystem
+        Continuous; it has the plan's breakpoints.
+
+    Raises
+    ------
+    TypeError
+        If `plan` is not a trajectory.
+    ValueError
+        If an argument is out of range, neither limits nor errors are given, or
+        an output and an input would have the same name.
+
+    References
+    ----------
+    Dahl and Nielsen 1990 on path velocity; y'' = y_d'' sigma'^2 + y_d' sigma'',
+    and so on by composing Taylor series.
+
+    Examples
+    --------
+    >>> import ctrlplan as cp
+    >>> plan = cp.PolySpline([cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1, 0, 0)], labels=["x"])
+    >>> block = cp.create_time_scaling_iosystem(plan, limits={"u": (-1.0, 1.0)}, suffix="_ref")
+    >>> block.input_labels, block.output_labels, block.state_labels
+    (['u'], ['x_ref', 'x_ref_d1', 'x_ref_d2'], ['lag', 'slow[1]', 'slow[2]'])
+    """
+    if not isinstance(plan, Trajectory):
+        raise TypeError(f"plan must be a Trajectory, got {type(plan).__name__}")
+    highest = checked_count(derivatives, "derivatives")
+    n = max(highest, 1)
+    if bandwidth is None and not plan.duration:
+        raise ValueError("bandwidth must be given for a plan without duration, got None")
+    w = 10.0 / plan.duration if bandwidth is None else checked_time(bandwidth, "bandwidth", positive=True)
+    horizon = 4.0 * n / w if catch_up is None else checked_time(catch_up, "catch_up", positive=True)
+    least, most = float(slowest), float(fastest)
+    if not 0.0 <= least < 1.0:
+        raise ValueError(f"slowest must lie in [0, 1), got {slowest}")
+    if not 1.0 <= most < math.inf:
+        raise ValueError(f"fastest must be finite and at least 1, got {fastest}")
+    bounds = {label: _checked_limits(label, pair, margin) for label, pair in (limits or {}).items()}
+    bands = {label: _checked_band(label, pair, plan) for label, pair in (errors or {}).items()}
+    inputs = [*bounds, *bands]
+    outputs = signal_names([label + suffix for label in plan.labels], highest)
+    if not inputs:
+        raise ValueError("limits or errors must name a signal that slows the clock, got none")
+    both = [label for label in inputs if label in outputs or inputs.count(label) > 1]
+    if both:
+        raise ValueError(f"inputs and outputs must have names of their own, got {', '.join(both)} twice")
+    axes = [plan.labels.index(label) for label in bands]
+    weights = _rate_weights(n, w)
+
+    def severity(t: Any, x: Any, u: Any) -> Any:
+        found = [_nearness(u[k], *bound) for k, bound in enumerate(bounds.values())]
+        if bands:
+            reference = plan.series(t - x[0], 0)
+            for k, (axis, (soft, hard)) in enumerate(zip(axes, bands.values(), strict=True), len(bounds)):
+                found.append((np.fabs(u[k] - reference[axis][0]) - soft) / (hard - soft))
+        worst = found[0]
+        for value in found[1:]:
+            worst = np.fmax(worst, value)
+        return np.fmin(np.fmax(worst, 0.0), 1.0)
+
+    def update(t: Any, x: Any, u: Any, params: dict[str, Any]) -> Array:
+        wanted = least + (1.0 - severity(t, x, u)) * (np.fmin(most, 1.0 + x[0] / horizon) - least)
+        slow = [1.0 - wanted, *(x[k] for k in range(1, n + 1))]
+        return np.array([x[n], *(w * (slow[k] - slow[k + 1]) for k in range(n))])
+
+    def out(t: Any, x: Any, u: Any, params: dict[str, Any]) -> Array:
+        clock = [sum(weight * x[k + 1] for k, weight in enumerate(row)) for row in weights[:highest]]
+        if clock:
+            clock[0] = 1.0 + clock[0]
+        clock = [value / math.factorial(k) for k, value in enumerate(clock, 1)]
+        rows = [_composed(row, clock) for row in plan.series(t - x[0], highest)]
+        return np.array([value * math.factorial(k) for row in rows for k, value in enumerate(row)])
+
+    block = ct.nlsys(
+        update,
+        out,
+        states=["lag", *(f"slow[{k}]" for k in range(1, n + 1))],
+        inputs=inputs,
+        outputs=outputs,
+        dt=0,
+        name=name,
+    )
+    block.feedthrough = False
+    block.breakpoints = plan.breakpoints
+    return block
+
+
+def _rate_weights(n: int, w: float) -> list[list[float]]:
+    """Derivatives 0, 1, ... of -slow[n] from slow[1], ..., slow[n], each of which follows the one before it."""
+    row, rows = np.eye(n)[-1] * -1.0, []
+    for _ in range(n):
+        rows.append(row.tolist())
+        row = w * (np.append(row[1:], 0.0) - row)
+    return rows
+
+
+def _composed(outer: list[Any], inner: list[Any]) -> list[Any]:
+    """Series of the outer function of the inner one, whose constant term is left out."""
+    order = len(inner)
+    found: list[Any] = [outer[order], *[0.0] * order]
+    for value in reversed(outer[:order]):
+        found = [value, *(sum(inner[i] * found[k - i] for i in range(k + 1)) for k in range(order))]
+    return found
+
+
+def _nearness(value: Any, low: float, high: float, reach: float) -> Any:
+    """0 up to `reach` inside the limits, 1 at a limit."""
+    distance = np.fmin(value - low, high - value)
+    return 1.0 - distance / reach
+
+
+def _checked_limits(label: str, pair: Sequence[float], margin: float) -> tuple[float, float, float]:
+    """Limits, and the distance from them within which the rate falls."""
+    if np.shape(pair) != (2,) or not float(pair[0]) < float(pair[1]):
+        raise ValueError(f"limits of {label} must be two numbers that increase, got {pair!r}")
+    if not 0.0 < margin <= 0.5:
+        raise ValueError(f"margin must lie in (0, 0.5], got {margin}")
+    low, high = float(pair[0]), float(pair[1])
+    finite = [abs(value) for value in (low, high) if math.isfinite(value)]
+    span = high - low if len(finite) == 2 else max(finite, default=0.0)
+    if not span:
+        raise ValueError(f"limits of {label} must hold a finite one that is not 0, got {pair!r}")
+    return low, high, margin * span
+
+
+def _checked_band(label: str, pair: Sequence[float], plan: Trajectory) -> tuple[float, float]:
+    if label not in plan.labels:
+        raise ValueError(f"errors must name axes of the plan, {', '.join(plan.labels)}, got {label!r}")
+    if np.shape(pair) != (2,) or not 0.0 <= float(pair[0]) < float(pair[1]) < math.inf:
+        raise ValueError(f"errors of {label} must be two finite numbers that increase from 0, got {pair!r}")
+    return float(pair[0]), float(pair[1])
