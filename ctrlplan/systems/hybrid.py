@@ -122,8 +122,8 @@ def sample_hold(block: Any, dt: float, offset: float = 0.0, name: str | None = N
     """
     if not isinstance(block, ct.InputOutputSystem):
         raise TypeError(f"block must be a control system, got {type(block).__name__}")
-    period = _time("dt", dt, positive=True)
-    start = _time("offset", offset, positive=False)
+    period = checked_seconds("dt", dt, positive=True)
+    start = checked_seconds("offset", offset, positive=False)
     if block.dt == 0 and (block.nstates or isinstance(block, ct.TransferFunction)):
         raise ValueError(f"block must be discrete, got {block.name} with dt = 0: see control.sample_system")
     if isinstance(block.dt, float | int) and block.dt is not True and block.dt and abs(block.dt - period) > 1e-12 * dt:
@@ -175,7 +175,7 @@ def create_delay_iosystem(
     >>> cp.simulate(late, [0.0, 0.5, 1.0], cp.Step(1.0)).outputs.round(9).tolist()
     [0.0, 1.0, 1.0]
     """
-    seconds = _time("delay", delay, positive=True)
+    seconds = checked_seconds("delay", delay, positive=True)
     given, made = ([names] if isinstance(names, str) else list(names) for names in (inputs, outputs))
     if len(given) != len(made) or not given:
         raise ValueError(f"outputs must be as many as inputs, {len(given)}, got {len(made)}")
@@ -185,7 +185,8 @@ def create_delay_iosystem(
     return Delay(seconds, np.broadcast_to(before, (len(given),)).copy(), given, made, name)
 
 
-def _time(label: str, value: Any, positive: bool) -> float:
+def checked_seconds(label: str, value: Any, positive: bool) -> float:
+    """Finite number of seconds, above 0 or from 0."""
     if isinstance(value, bool) or not isinstance(value, Real):
         raise TypeError(f"{label} must be a number of seconds, got {value!r}")
     seconds = float(value)

@@ -12,7 +12,7 @@ import control as ct
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ctrlplan.systems.hybrid import refuse_alone
+from ctrlplan.systems.hybrid import checked_seconds, refuse_alone
 from ctrlplan.systems.source import create_source_iosystem
 from ctrlplan.trajectories import Trajectory
 from ctrlplan.trajectories.common import checked_count, checked_time
@@ -111,8 +111,8 @@ def create_replanner_iosystem(
     control.InterconnectedSystem
         Of the plan's source and the block that corrects it. States of that
         block: start and end of the correction [s], whether values were lost,
-        whether the goal is out of reach, the number of fits, the goal's change,
-        and coefficients. A run records as events when a value was not finite
+        whether the goal is out of reach, the number of fits, the goal at
+        the last, and coefficients. A run records as events when a value was not finite
         (nan from a sensor: the last good plan is held), and when the goal could
         not be reached within horizon and limits.
 
@@ -156,8 +156,10 @@ def create_replanner_iosystem(
     trigger_over = _checked_trigger(trigger, threshold, measured, goal_derivatives)
     limited = _checked_limits(plan, limits)
     signals = _Signals(plan.labels, max(put_out, order), put_out, goal_derivatives, measured, suffix)
-    core = _Correction(plan, horizons, checked_time(offset, "offset"), signals, trigger_over, limited, name)
-    source = create_source_iosystem(plan, signals.planned, name=f"{name}_plan", suffix="_planned")
+    core = _Correction(
+        plan, horizons, checked_seconds("offset", offset, positive=False), signals, trigger_over, limited, name
+    )
+    source = create_source_iosystem(plan, signals.planned, name=f"{name}_plan", suffix=signals.inside)
     return ct.interconnect(
         [source, core], inputs=signals.outer or 0, outputs=signals.outputs, name=name, warn_duplicate=False
     )
@@ -231,9 +233,12 @@ class _Signals:
         goals = [] if goal is None else signal_names([f"{label}_goal" for label in labels], goal)
         seen = [] if measured is None else signal_names(list(labels), measured)
         self.planned, self.put_out, self.goal, self.measured = planned, put_out, goal, measured
-        self.inner = signal_names([f"{label}_planned" for label in labels], planned)
         self.outer = [*goals, *seen]
         self.outputs = signal_names([label + suffix for label in labels], put_out)
+        self.inside = "_planned"
+        while {*self.outer, *self.outputs} & {*signal_names([label + self.inside for label in labels], planned)}:
+            self.inside += "_"
+        self.inner = signal_names([label + self.inside for label in labels], planned)
         both = [name for name in self.outputs if name in self.outer]
         if both:
             raise ValueError(f"suffix must tell outputs from inputs, got {suffix!r} and {', '.join(both)} among both")
@@ -267,9 +272,9 @@ class _Correction(ct.NonlinearIOSystem):  # type: ignore[misc]
         limits: tuple[tuple[int, Array], ...],
         name: str,
     ) -> None:
-        naxes, order, changes = plan.naxes, horizons.order, signals.goal_rows.stop - signals.goal_rows.start
+        naxes, order, kept = plan.naxes, horizons.order, signals.goal_rows.stop - signals.goal_rows.start
         states = ["start", "end", "lost", "missed", "fits"]
-        states += [f"change[{k}]" for k in range(changes)]
+        states += [f"goal[{k}]" for k in range(kept)]
         states += [f"coefficient[{k}]" for k in range(naxes * 2 * (order + 1))]
         super().__init__(
             self._no_rates,
@@ -293,8 +298,13 @@ class _Correction(ct.NonlinearIOSystem):  # type: ignore[misc]
             limits,
         )
         self._passed, self._naxes, self._order = signals.passed, naxes, order
-        self._change, self._fitted = slice(5, 5 + changes), slice(5 + changes, len(states))
-        self._final = np.array(plan.final)
+        self._final = plan.final.tolist()
+        self._goal, self._fitted = slice(5, 5 + kept), slice(5 + kept, len(states))
+        # The goal is reached where the plan ends, with the plan's own derivatives, or else rests there.
+        self._arrival = np.zeros((order + 1, naxes))
+        self._arrival[0] = plan.final
+        if horizons.shrinking:
+            self._arrival = plan.jet(plan.end, order)
 
     def sample(self, t: float, x: Array, u: Array, params: dict[str, Any]) -> Array:
         """States after a fit, or where none is due the same."""
@@ -302,8 +312,8 @@ class _Correction(ct.NonlinearIOSystem):  # type: ignore[misc]
         after[_LOST] = 0.0 if math.isfinite(sum(u.tolist())) else 1.0
         if after[_LOST]:
             return after
-        change = self._goal_change(u)
-        moved = change.size > 0 and change.ravel().tolist() != x[self._change].tolist()
+        goal = u[self._signals.goal_rows].reshape(self._naxes, -1).T
+        moved = goal.size > 0 and self._has_moved(t, x, goal)
         begins = self._deviation(t, x, u)
         after[_MISSED] = float(moved and self._horizons.late(t))
         found = self._horizons.at(t) if self._is_due(moved, t, x, begins) else None
@@ -311,15 +321,16 @@ class _Correction(ct.NonlinearIOSystem):  # type: ignore[misc]
             return after
         jets = np.zeros((2 * (self._order + 1), self._naxes))
         jets[: self._order + 1] = begins
-        if len(change):
-            jets[self._order + 1 : self._order + 1 + len(change)] = extrapolated(change, found.horizon)
+        if len(goal):
+            last = slice(self._order + 1, self._order + 1 + len(goal))
+            jets[last] = extrapolated(goal, found.horizon) - self._arrival[: len(goal)]
         coefficients = found.coefficients(jets)
-        if self._limits and not self._within_limits(t, found, coefficients):
+        if self._limits and not self._within_limits(t, found, coefficients, goal):
             after[_MISSED] = 1.0
             return after
         after[_START], after[_END], after[_MISSED] = t, t + found.horizon, 0.0
         after[_FITS] += 1.0
-        after[self._change] = change.ravel()
+        after[self._goal] = goal.ravel()
         after[self._fitted] = coefficients.ravel()
         return after
 
@@ -333,12 +344,13 @@ class _Correction(ct.NonlinearIOSystem):  # type: ignore[misc]
         # From the reference to the same goal, on what is left of the plan, a fit gives the same plan.
         return self._signals.measured is not None or not self._horizons.shrinking
 
-    def _goal_change(self, u: Array) -> Array:
-        """Jet (goal_derivatives + 1, naxes) of the goal less the plan's own; empty where none comes in."""
-        change = u[self._signals.goal_rows].reshape(self._naxes, -1).T.copy()
-        if len(change):
-            change[0] -= self._final
-        return change
+    def _has_moved(self, t: float, x: Array, goal: Array) -> bool:
+        """Whether the goal's jet is not what the last fit, or the plan itself, took it to be by now."""
+        if x[_FITS]:
+            expected = extrapolated(x[self._goal].reshape(goal.shape), t - x[_START])
+        else:
+            expected = extrapolated(self._arrival[: len(goal)], t - self._plan.end)
+        return bool((np.abs(goal - expected) > 1e-12 * (np.abs(goal) + np.abs(expected))).any())
 
     def _deviation(self, t: float, x: Array, u: Array) -> Array:
         """Jet (order + 1, naxes) from which a fit begins, less the plan's."""
@@ -349,15 +361,20 @@ class _Correction(ct.NonlinearIOSystem):  # type: ignore[misc]
         seen = (u[self._signals.seen_rows].reshape(self._naxes, -1) - planned).T
         return seen if highest == self._order else np.concatenate([seen, self._jets(t, x, self._order)[highest + 1 :]])
 
-    def _within_limits(self, t: float, found: Transition, coefficients: Array) -> bool:
-        """Whether the plan with a correction keeps its limits from now to the end of it."""
-        end, inner = t + found.horizon, self._plan.breakpoints
-        edges = [t, *inner[(inner > t) & (inner < end)].tolist(), end]
-        for left, right in itertools.pairwise(edges):
+    def _within_limits(self, t: float, found: Transition, coefficients: Array, goal: Array) -> bool:
+        """Whether the plan with a correction keeps its limits from now to the end of both."""
+        met, end = t + found.horizon, max(t + found.horizon, self._plan.end)
+        edges = np.unique([t, met, end, *self._plan.breakpoints.tolist()])
+        for left, right in itertools.pairwise(edges[edges >= t].tolist()):
 
             def jet(s: Array, order: int, left: float = left, right: float = right) -> Array:
                 planned = self._plan._jet_beside(0.5 * (left + right), left, s, order)
-                return planned + found.jet(coefficients, s + (left - t), order)
+                if right <= met:
+                    return planned + found.jet(coefficients, s + (left - t), order)
+                kept = extrapolated(goal, left - t)
+                kept = np.concatenate([kept, np.zeros((order + 1, self._naxes))])[: order + 1]
+                kept[0] -= self._plan.final if len(goal) else 0.0
+                return planned + np.stack([extrapolated(kept, value) for value in s.tolist()], axis=2)
 
             for nu, limit in self._limits:
                 times = stationary_times(jet, right - left, nu)
@@ -380,27 +397,30 @@ class _Correction(ct.NonlinearIOSystem):  # type: ignore[misc]
         """Jets of the correction axis by axis, of numbers or of symbols."""
         live = t <= x[_END]
         now = (t if live else x[_END]) if isinstance(live, bool) else np.fmin(t, x[_END])
-        columns = [
-            [x[k] for k in range(self._fitted.start + axis, self._fitted.stop, self._naxes)]
-            for axis in range(self._naxes)
-        ]
-        follows = self._signals.goal or 0
-        rows = series(self._horizons.rate, columns, now - x[_START], now - x[_END], max(order, follows))
-        return [_continued(row, t - now, live, follows)[: order + 1] for row in rows]
+        columns, goals = (
+            [[x[k] for k in range(rows.start + axis, rows.stop, self._naxes)] for axis in range(self._naxes)]
+            for rows in (self._fitted, self._goal)
+        )
+        rows = series(self._horizons.rate, columns, now - x[_START], now - x[_END], order)
+        changed = (x[_FITS] > 0.0) * (1.0 - live)
+        found = []
+        for row, goal, final in zip(rows, goals, self._final, strict=True):
+            kept = [row[0] * (1.0 - live) if not goal else changed * -final, *[0.0] * order]
+            for k in range(min(order + 1, len(goal))):
+                kept[k] = kept[k] + changed * _taylor(goal[k:], t - x[_START])
+            found.append([value * live * math.factorial(k) + kept[k] for k, value in enumerate(row)])
+        return found
 
     def _no_rates(self, t: float, x: Any, u: Any, params: dict[str, Any]) -> NoReturn:
         refuse_alone(self.name, "plans again every period")
 
 
-def _continued(row: list[Any], beyond: Any, live: Any, follows: int) -> list[Any]:
-    """Jet of a series, and after its end that of its Taylor polynomial up to the orders that the goal has."""
-    found = []
-    for k, value in enumerate(row):
-        total = value if k <= follows else value * live
-        for j in range(k + 1, follows + 1):
-            total = total + math.comb(j, k) * row[j] * beyond ** (j - k)
-        found.append(total * math.factorial(k))
-    return found
+def _taylor(jet: list[Any], s: Any) -> Any:
+    """Value of a Taylor polynomial s seconds on."""
+    total = jet[-1]
+    for k in range(len(jet) - 1, 0, -1):
+        total = jet[k - 1] + total * s / k
+    return total
 
 
 def _state(row: int, t: Any, x: Any, u: Any, params: dict[str, Any]) -> Any:
@@ -439,10 +459,15 @@ def _checked_trigger(
 
 def _checked_limits(plan: Trajectory, limits: Mapping[int, ArrayLike] | None) -> tuple[tuple[int, Array], ...]:
     """Limits by order, one for each axis, which the plan itself keeps."""
+    if not isinstance(limits, Mapping | None):
+        raise TypeError(f"limits must be a mapping of orders to magnitudes, got {type(limits).__name__}")
     found = []
     for key, value in (limits or {}).items():
         nu = checked_count(key, "orders of limits")
-        limit = np.asarray(value, dtype=float)
+        try:
+            limit = np.asarray(value, dtype=float)
+        except (TypeError, ValueError):
+            raise TypeError(f"limits[{nu}] must be numbers, got {value!r}") from None
         if limit.shape not in ((), (plan.naxes,)) or not (limit > 0.0).all():
             raise ValueError(f"limits[{nu}] must be above 0, one number or {plan.naxes}, got {value!r}")
         limit = np.broadcast_to(limit, (plan.naxes,))
