@@ -100,7 +100,21 @@ class Interpreted:
         return np.array(rows).T.reshape(-1, times.size)
 
     def sampled(self, blocks: tuple[int, ...], t: float, x: Array, driven: Array) -> Array:
-        """State after some discrete blocks have taken a sample, each seeing the others' new outputs."""
+        """State after some discrete blocks have taken a sample, each seeing the others' new outputs.
+
+        Blocks with an attribute ``samples_first`` go first and see signals as
+        they were: what they make of them may come back to them at once.
+        """
+        first = tuple(i for i in blocks if getattr(self.network.blocks[i].system, "samples_first", False))
+        if first:
+            w, before = self.signals(t, x, driven), x
+            x = x.copy()
+            for i in first:
+                place, sample = self.network.states[i], self.network.blocks[i].sampled(self.params)
+                x[place] = np.ravel(sample(t, before[place], self.network.fed[i](w)))
+            blocks = tuple(i for i in blocks if i not in first)
+            if not blocks:
+                return x
         if blocks not in self._for_samples:
             self._for_samples[blocks] = self._sampling(blocks)
         samples, steps = self._for_samples[blocks]

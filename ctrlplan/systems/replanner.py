@@ -23,6 +23,9 @@ from ctrlplan.trajectories.transition import Transition, extrapolated, series, t
 
 Array = NDArray[np.float64]
 
+_ROUNDING, _MATTERS = 1e-12, 1e-6
+"""Part of the move by which a goal has moved, and by which one that is not reached is worth an event."""
+
 TRIGGERS = ("period", "deviation", "goal")
 
 _START, _END, _LOST, _MISSED, _FITS = range(5)
@@ -50,11 +53,13 @@ def create_replanner_iosystem(
     r"""Plan that is made again every period, from where the reference or the plant is.
 
     Every `dt` seconds a spline is fitted from the present jet to the goal's.
-    It is kept as a correction to `plan`: the transition of the same family from
-    the present deviation to the change of the goal. Where `plan` is one spline
-    between two jets, their sum is that spline fitted again, with angular
-    frequency and gamma kept; and nothing being in the way, every plan is
-    followed as it was made, whatever its kind.
+    It is kept as a correction to `plan`: the transition of the same family and
+    angular frequency from the present deviation to the change of the goal.
+    Nothing being in the way the correction is 0, and every plan is followed as
+    it was made, whatever its kind. A polynomial between two jets plus its
+    correction is that polynomial fitted again. A trigonometric one is, but for
+    the phase of the correction's top harmonic, which is the middle of what is
+    left: with the plan's own gamma fits would be singular at some instants.
 
     Without `measured` the fit begins at the reference itself, so that no
     derivative up to `order` jumps. With it the fit begins at what is measured:
@@ -188,7 +193,7 @@ class _Horizons:
             raise ValueError(f"dt must be at most {what}, {whole:g} s, got {period:g} s")
         if alpha is None:
             alpha = plan.alpha if isinstance(plan, NewtonSpline) and plan.alpha < 2.0 * math.pi else 0.0
-        self._whole = Transition(order, whole, alpha)
+        self.whole, self._whole = whole, Transition(order, whole, alpha)
         self.period, self.order, self.rate = period, order, self._whole.rate
         self.step: Array | None = None  # from coefficients to jets a period later, where that is always the same map
         self._start, self._end = plan.start, plan.end
@@ -286,6 +291,7 @@ class _Correction(ct.NonlinearIOSystem):  # type: ignore[misc]
             name=f"{name}_correction",
         )
         self.period, self.offset, self.feedthrough = horizons.period, offset, signals.feedthrough
+        self.samples_first = True  # what is measured may follow the reference at once
         self.watched = {
             f"{name} lost a value": (partial(_state, _LOST), -math.inf, 0.5),
             f"{name} cannot reach the goal": (partial(_state, _MISSED), -math.inf, 0.5),
@@ -299,6 +305,9 @@ class _Correction(ct.NonlinearIOSystem):  # type: ignore[misc]
         )
         self._passed, self._naxes, self._order = signals.passed, naxes, order
         self._final = plan.final.tolist()
+        extrema = plan.extrema()
+        self._range = float((extrema.maximum - extrema.minimum).max())
+        self._scale = (horizons.whole ** np.arange(order + 1.0))[:, None]
         self._goal, self._fitted = slice(5, 5 + kept), slice(5 + kept, len(states))
         # The goal is reached where the plan ends, with the plan's own derivatives, or else rests there.
         self._arrival = np.zeros((order + 1, naxes))
@@ -313,9 +322,10 @@ class _Correction(ct.NonlinearIOSystem):  # type: ignore[misc]
         if after[_LOST]:
             return after
         goal = u[self._signals.goal_rows].reshape(self._naxes, -1).T
-        moved = goal.size > 0 and self._has_moved(t, x, goal)
+        miss = self._miss(t, x, goal)
+        moved = miss > _ROUNDING
         begins = self._deviation(t, x, u)
-        after[_MISSED] = float(moved and self._horizons.late(t))
+        after[_MISSED] = float(miss > _MATTERS and self._horizons.late(t))
         found = self._horizons.at(t) if self._is_due(moved, t, x, begins) else None
         if found is None:
             return after
@@ -341,16 +351,23 @@ class _Correction(ct.NonlinearIOSystem):  # type: ignore[misc]
         if kind == "deviation":
             off = begins[0] - self._jets(t, x, 0)[0]
             return math.hypot(*off.tolist()) > threshold
-        # From the reference to the same goal, on what is left of the plan, a fit gives the same plan.
+        # From the reference to the same goal, on what is left of the plan, the same plan will do.
         return self._signals.measured is not None or not self._horizons.shrinking
 
-    def _has_moved(self, t: float, x: Array, goal: Array) -> bool:
-        """Whether the goal's jet is not what the last fit, or the plan itself, took it to be by now."""
+    def _miss(self, t: float, x: Array, goal: Array) -> float:
+        """How far the goal is from where the last fit, or the plan, took it to be by now, relative to the move."""
+        if not len(goal):
+            return 0.0
         if x[_FITS]:
             expected = extrapolated(x[self._goal].reshape(goal.shape), t - x[_START])
+        elif self._arrival[1 : len(goal)].any():
+            return math.inf  # after its end the plan rests, which a fit sees to
         else:
-            expected = extrapolated(self._arrival[: len(goal)], t - self._plan.end)
-        return bool((np.abs(goal - expected) > 1e-12 * (np.abs(goal) + np.abs(expected))).any())
+            expected = self._arrival[: len(goal)]
+        size = max(self._range, *map(abs, goal[0].tolist()), *map(abs, expected[0].tolist()))
+        if not size:
+            return 0.0 if not goal.any() else math.inf
+        return max(map(abs, ((goal - expected) * self._scale[: len(goal)]).ravel().tolist())) / size
 
     def _deviation(self, t: float, x: Array, u: Array) -> Array:
         """Jet (order + 1, naxes) from which a fit begins, less the plan's."""

@@ -39,6 +39,7 @@ def crane_loop(
     torque_limits: Sequence[float] | None = None,
     reference: Sequence[Any] | None = None,
     wind: Trajectory | None = None,
+    inputs: Sequence[str] = (),
     name: str = "crane_loop",
     **options: Any,
 ) -> ct.InterconnectedSystem:
@@ -68,6 +69,9 @@ def crane_loop(
         starts elsewhere than at 0, its attribute ``initial_state`` says so.
     wind : Trajectory, optional
         Horizontal force on the load [N], along x.
+    inputs : sequence of str, optional
+        Signals that come from outside: what blocks of `reference` read, and
+        wind, where it is no trajectory.
     name : str, optional
         Name of the loop.
     **options
@@ -77,7 +81,7 @@ def crane_loop(
     Returns
     -------
     control.InterconnectedSystem
-        Without inputs; outputs those of the crane, F and C, x_ref and z_ref.
+        Without inputs unless given; outputs those of the crane, F and C, x_ref and z_ref.
         Its attribute ``initial_state`` is rest at the plan's first position.
 
     Raises
@@ -108,7 +112,7 @@ def crane_loop(
     _check_smooth(plan, smooth, law)
     crane.check(plan)
     sources = [create_source_iosystem(plan, order, suffix="_ref")] if reference is None else list(reference)
-    plant = crane.iosystem(wind=wind is not None)
+    plant = crane.iosystem(wind=wind is not None or "wind" in inputs)
     if wind is not None:
         sources.append(create_source_iosystem(stack([wind], labels=["wind"]), name="wind"))
     if law in ("dynamic", "feedforward"):
@@ -134,7 +138,7 @@ def crane_loop(
             crane.hoist_pid(bandwidth, tf, limits=torque_limits),
         ]
         blocks = [*sources, block, *pids, plant]
-    loop = ct.interconnect(blocks, inputs=0, outputs=[*OUTPUTS, "F", "C", "x_ref", "z_ref"], name=name)
+    loop = ct.interconnect(blocks, inputs=list(inputs) or 0, outputs=[*OUTPUTS, "F", "C", "x_ref", "z_ref"], name=name)
     rest = crane.equilibrium(float(plan.initial[0]), float(plan.initial[1]))[0]
     # The crane comes last; the states of law and drives are 0 at rest.
     before = [_start(block) for block in blocks[:-1]]
