@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Iterable, Sequence
 from itertools import pairwise
+from numbers import Real
 from typing import Any, Self
 
 import numpy as np
@@ -55,6 +56,13 @@ class _Combined(Trajectory):
 
     def _map_time(self, origin: float, target: float, rate: float) -> Self:
         return self._of(tuple(part._map_time(origin, target, rate) for part in self.parts), self.labels)
+
+    def series(self, t: Any, order: int) -> list[list[Any]]:
+        """Taylor series about one time, which may be a symbol of a tracer: see `Trajectory.series`."""
+        if isinstance(t, Real):
+            return super().series(t, order)
+        found: list[list[Any]] = self._combine([_objects(part.series(t, order)) for part in self.parts]).T.tolist()
+        return found
 
     def _sample(self, t: Array, low: int, high: int, left: bool) -> Array:
         out = super()._sample(t, low, high, left)
@@ -237,6 +245,10 @@ class Joined(Trajectory):
         part, own = self._legs[leg]
         return part._leg_jet(own, s, order)
 
+    def _leg_series(self, leg: int, s: Any, order: int) -> list[list[Any]]:
+        part, own = self._legs[leg]
+        return part._leg_series(own, s, order)
+
     _legs: list[tuple[Trajectory, int]]
 
 
@@ -260,6 +272,14 @@ def stack(plans: Iterable[Trajectory], labels: Sequence[str] | None = None) -> T
         If there is no plan, or labels are not unique.
     """
     return Stacked(plans, labels)
+
+
+def _objects(rows: list[list[Any]]) -> Any:
+    """Table (order + 1, naxes) of numbers or symbols."""
+    table = np.empty((len(rows[0]), len(rows)), dtype=object)
+    for axis, row in enumerate(rows):
+        table[:, axis] = row
+    return table
 
 
 def _checked_parts(parts: Iterable[Trajectory]) -> tuple[Trajectory, ...]:

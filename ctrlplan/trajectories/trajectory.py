@@ -170,7 +170,8 @@ class Trajectory(Frozen, ABC):
     def series(self, t: Any, order: int) -> list[list[Any]]:
         """Taylor series about one time, which may be a symbol of a tracer (CasADi's).
 
-        Symbols go through splines of one piece and of several.
+        Symbols go through steps, splines of one piece and of several, and what
+        is made of them.
 
         Parameters
         ----------
@@ -198,8 +199,9 @@ class Trajectory(Frozen, ABC):
             holds = (t >= left) * (t <= right if leg == len(edges) - 2 else t < right)
             rows = self._leg_series(leg, np.fmin(np.fmax(t - left, 0.0), right - left), order)
             found = [[a + holds * b for a, b in zip(*pair, strict=True)] for pair in zip(found, rows, strict=True)]
+        after = t > self.end if self.duration else t >= self.end
         for row, value in zip(found, self.final.tolist(), strict=True):
-            row[0] = row[0] + value * (t > self.end)
+            row[0] = row[0] + value * after
         return found
 
     def extrema(self, nu: int = 0) -> _extrema.Extrema:
