@@ -66,7 +66,7 @@ class Interpreted:
         self._calls = [self._call(i, output) for i, output in enumerate(self._outputs) if not network.blocks[i].driven]
         self._for_rates = self._steps(self._outputs, network.signals_of_inputs(), self.feeds)
         self._for_all = self._steps(self._outputs, np.ones(network.nsignals, dtype=bool), self.feeds)
-        self._for_samples: dict[tuple[int, ...], tuple[dict[int, Map], list[Call]]] = {}
+        self._for_samples: dict[tuple[int, ...], list[Call]] = {}
         self._a, self._b, self._driving, self._moving = _merged_linear(network)
 
     def rates(self, t: float, x: Array, driven: Array) -> Array:
@@ -102,31 +102,32 @@ class Interpreted:
     def sampled(self, blocks: tuple[int, ...], t: float, x: Array, driven: Array) -> Array:
         """State after some discrete blocks have taken a sample, each seeing the others' new outputs.
 
-        Blocks with an attribute ``samples_first`` go first and see signals as
-        they were: what they make of them may come back to them at once.
+        Blocks with an attribute ``samples_first`` go before the rest and see
+        their own outputs as they were, which may come back to them at once.
         """
         first = tuple(i for i in blocks if getattr(self.network.blocks[i].system, "samples_first", False))
+        rest = tuple(i for i in blocks if i not in first)
         if first:
-            w, before = self.signals(t, x, driven), x
-            x = x.copy()
-            for i in first:
-                place, sample = self.network.states[i], self.network.blocks[i].sampled(self.params)
-                x[place] = np.ravel(sample(t, before[place], self.network.fed[i](w)))
-            blocks = tuple(i for i in blocks if i not in first)
-            if not blocks:
-                return x
-        if blocks not in self._for_samples:
-            self._for_samples[blocks] = self._sampling(blocks)
-        samples, steps = self._for_samples[blocks]
-        w = self._signals(steps, t, x, driven)
-        after = x.copy()
-        for i, sample in samples.items():
-            place = self.network.states[i]
-            after[place] = np.ravel(sample(t, x[place], self.network.fed[i](w)))
+            w = self._seen(rest, t, x, driven) if rest else self.signals(t, x, driven)
+            x = self._after(first, t, x, w)
+        return self._after(rest, t, x, self._seen(rest, t, x, driven)) if rest else x
+
+    def _after(self, blocks: tuple[int, ...], t: float, x: Array, w: Array) -> Array:
+        """State after some blocks have taken a sample of some signals."""
+        network, after = self.network, x.copy()
+        for i in blocks:
+            place, sample = network.states[i], network.blocks[i].sampled(self.params)
+            after[place] = np.ravel(sample(t, x[place], network.fed[i](w)))
         return after
 
-    def _sampling(self, blocks: tuple[int, ...]) -> tuple[dict[int, Map], list[Call]]:
-        """What maps states on, and the steps to all signals at the instant of a sample."""
+    def _seen(self, blocks: tuple[int, ...], t: float, x: Array, driven: Array) -> Array:
+        """Signals at an instant, the outputs of some blocks being those after a sample."""
+        if blocks not in self._for_samples:
+            self._for_samples[blocks] = self._sampling(blocks)
+        return self._signals(self._for_samples[blocks], t, x, driven)
+
+    def _sampling(self, blocks: tuple[int, ...]) -> list[Call]:
+        """Steps to all signals at the instant of a sample."""
         network = self.network
         samples = {i: network.blocks[i].sampled(self.params) for i in blocks}
         outputs = list(self._outputs)
@@ -136,8 +137,7 @@ class Interpreted:
 
         for i in blocks:
             outputs[i] = renewed(i)
-        feeds = self._feeds(outputs, blocks)
-        return samples, self._steps(outputs, network.signals_of_inputs(), feeds)
+        return self._steps(outputs, network.signals_of_inputs(), self._feeds(outputs, blocks))
 
     def _feeds(self, outputs: Sequence[Map], unsure: Sequence[int] = ()) -> list[NDArray[np.bool_]]:
         """Feedthrough of every block: assumed where nothing is known; tried only where a loop seems to be."""

@@ -305,15 +305,15 @@ class _Correction(ct.NonlinearIOSystem):  # type: ignore[misc]
         )
         self._passed, self._naxes, self._order = signals.passed, naxes, order
         self._final = plan.final.tolist()
+        self._goal, self._fitted = slice(5, 5 + kept), slice(5 + kept, len(states))
         extrema = plan.extrema()
         self._range = float((extrema.maximum - extrema.minimum).max())
         self._scale = (horizons.whole ** np.arange(order + 1.0))[:, None]
-        self._goal, self._fitted = slice(5, 5 + kept), slice(5 + kept, len(states))
         # The goal is reached where the plan ends, with the plan's own derivatives, or else rests there.
         self._arrival = np.zeros((order + 1, naxes))
         self._arrival[0] = plan.final
         if horizons.shrinking:
-            self._arrival = plan.jet(plan.end, order)
+            self._arrival = _without_rounding(plan.jet(plan.end, order), self._scale, self._range)
 
     def sample(self, t: float, x: Array, u: Array, params: dict[str, Any]) -> Array:
         """States after a fit, or where none is due the same."""
@@ -358,7 +358,7 @@ class _Correction(ct.NonlinearIOSystem):  # type: ignore[misc]
         """How far the goal is from where the last fit, or the plan, took it to be by now, relative to the move."""
         if not len(goal):
             return 0.0
-        if x[_FITS]:
+        if x[_FITS] > 0.5:
             expected = extrapolated(x[self._goal].reshape(goal.shape), t - x[_START])
         elif self._arrival[1 : len(goal)].any():
             return math.inf  # after its end the plan rests, which a fit sees to
@@ -419,7 +419,7 @@ class _Correction(ct.NonlinearIOSystem):  # type: ignore[misc]
             for rows in (self._fitted, self._goal)
         )
         rows = series(self._horizons.rate, columns, now - x[_START], now - x[_END], order)
-        changed = (x[_FITS] > 0.0) * (1.0 - live)
+        changed = (x[_FITS] > 0.5) * (1.0 - live)
         found = []
         for row, goal, final in zip(rows, goals, self._final, strict=True):
             kept = [row[0] * (1.0 - live) if not goal else changed * -final, *[0.0] * order]
@@ -438,6 +438,13 @@ def _taylor(jet: list[Any], s: Any) -> Any:
     for k in range(len(jet) - 1, 0, -1):
         total = jet[k - 1] + total * s / k
     return total
+
+
+def _without_rounding(jet: Array, scale: Array, size: float) -> Array:
+    """Jet with 0 where derivatives are the rounding of a plan of some size."""
+    small = np.abs(jet * scale) <= 1e-9 * max(size, float(np.abs(jet[0]).max()))
+    small[0] = False
+    return np.where(small, 0.0, jet)
 
 
 def _state(row: int, t: Any, x: Any, u: Any, params: dict[str, Any]) -> Any:
