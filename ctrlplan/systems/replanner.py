@@ -293,8 +293,8 @@ class _Correction(ct.NonlinearIOSystem):  # type: ignore[misc]
         self.period, self.offset, self.feedthrough = horizons.period, offset, signals.feedthrough
         self.samples_first = True  # what is measured may follow the reference at once
         self.watched = {
-            f"{name} lost a value": (partial(_state, _LOST), -math.inf, 0.5),
-            f"{name} cannot reach the goal": (partial(_state, _MISSED), -math.inf, 0.5),
+            f"{name} input": (partial(_state, _LOST), -math.inf, 0.5),
+            f"{name} goal": (partial(_state, _MISSED), -math.inf, 0.5),
         }
         self._plan, self._horizons, self._signals, self._trigger, self._limits = (
             plan,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from numbers import Real
 from typing import Any
 
 import control as ct
@@ -40,7 +41,7 @@ def create_time_scaling_iosystem(
 
     .. math:: \sigma' = \frac{\rho}{(s/w + 1)^n}, \qquad
         \rho = \rho_{min} + (1 - \text{severity})\,
-        (\min(\rho_{max}, 1 + (t - \sigma)/T) - \rho_{min}),
+        (\min(\rho_{max}, \max(\rho_{min}, 1 + (t - \sigma)/T)) - \rho_{min}),
 
     so that sigma is n times continuously differentiable, and so is the
     reference where the plan is. The path is the plan's own whatever the rate.
@@ -87,8 +88,8 @@ def create_time_scaling_iosystem(
     TypeError
         If `plan` is not a trajectory.
     ValueError
-        If an argument is out of range, neither limits nor errors are given, or
-        an output and an input would have the same name.
+        If an argument is out of range, neither limits nor errors are given, the
+        lag would not settle, or an output and an input would have the same name.
 
     References
     ----------
@@ -106,17 +107,30 @@ def create_time_scaling_iosystem(
     if not isinstance(plan, Trajectory):
         raise TypeError(f"plan must be a Trajectory, got {type(plan).__name__}")
     highest = checked_count(derivatives, "derivatives")
+    for label, value in (("limits", limits), ("errors", errors)):
+        if not isinstance(value, Mapping | None):
+            raise TypeError(f"{label} must be a mapping of signals to pairs of numbers, got {type(value).__name__}")
     n = max(highest, 1)
     if bandwidth is None and not plan.duration:
         raise ValueError("bandwidth must be given for a plan without duration, got None")
     w = 10.0 / plan.duration if bandwidth is None else checked_time(bandwidth, "bandwidth", positive=True)
     horizon = 4.0 * n / w if catch_up is None else checked_time(catch_up, "catch_up", positive=True)
-    least, most = float(slowest), float(fastest)
+    least, most, inner = (
+        _number(label, value) for label, value in (("slowest", slowest), ("fastest", fastest), ("margin", margin))
+    )
+    poles = np.roots([*_lags(n, w), 1.0 / horizon])
+    if poles.real.max() >= 0.0:
+        raise ValueError(
+            f"catch_up must be long beside the lags, {n}/bandwidth = {n / w:g} s, got {horizon:g} s: the clock would "
+            f"swing with {abs(poles[poles.real.argmax()].imag):.3g} rad/s"
+        )
+    if not 0.0 < inner <= 0.5:
+        raise ValueError(f"margin must lie in (0, 0.5], got {margin}")
     if not 0.0 <= least < 1.0:
         raise ValueError(f"slowest must lie in [0, 1), got {slowest}")
     if not 1.0 <= most < math.inf:
         raise ValueError(f"fastest must be finite and at least 1, got {fastest}")
-    bounds = {label: _checked_limits(label, pair, margin) for label, pair in (limits or {}).items()}
+    bounds = {label: _checked_limits(label, pair, inner) for label, pair in (limits or {}).items()}
     bands = {label: _checked_band(label, pair, plan) for label, pair in (errors or {}).items()}
     inputs = [*bounds, *bands]
     outputs = signal_names([label + suffix for label in plan.labels], highest)
@@ -140,7 +154,8 @@ def create_time_scaling_iosystem(
         return np.fmin(np.fmax(worst, 0.0), 1.0)
 
     def update(t: Any, x: Any, u: Any, params: dict[str, Any]) -> Array:
-        wanted = least + (1.0 - severity(t, x, u)) * (np.fmin(most, 1.0 + x[0] / horizon) - least)
+        free = np.fmin(np.fmax(1.0 + x[0] / horizon, least), most)
+        wanted = least + (1.0 - severity(t, x, u)) * (free - least)
         slow = [1.0 - wanted, *(x[k] for k in range(1, n + 1))]
         return np.array([x[n], *(w * (slow[k] - slow[k + 1]) for k in range(n))])
 
@@ -192,11 +207,9 @@ def _nearness(value: Any, low: float, high: float, reach: float) -> Any:
 
 def _checked_limits(label: str, pair: Sequence[float], margin: float) -> tuple[float, float, float]:
     """Limits, and the distance from them within which the rate falls."""
-    if np.shape(pair) != (2,) or not float(pair[0]) < float(pair[1]):
-        raise ValueError(f"limits of {label} must be two numbers that increase, got {pair!r}")
-    if not 0.0 < margin <= 0.5:
-        raise ValueError(f"margin must lie in (0, 0.5], got {margin}")
-    low, high = float(pair[0]), float(pair[1])
+    low, high = _pair(f"limits of {label}", pair)
+    if not low < high:
+        raise ValueError(f"limits of {label} must increase, got {pair!r}")
     finite = [abs(value) for value in (low, high) if math.isfinite(value)]
     span = high - low if len(finite) == 2 else max(finite, default=0.0)
     if not span:
@@ -207,6 +220,24 @@ def _checked_limits(label: str, pair: Sequence[float], margin: float) -> tuple[f
 def _checked_band(label: str, pair: Sequence[float], plan: Trajectory) -> tuple[float, float]:
     if label not in plan.labels:
         raise ValueError(f"errors must name axes of the plan, {', '.join(plan.labels)}, got {label!r}")
-    if np.shape(pair) != (2,) or not 0.0 <= float(pair[0]) < float(pair[1]) < math.inf:
-        raise ValueError(f"errors of {label} must be two finite numbers that increase from 0, got {pair!r}")
-    return float(pair[0]), float(pair[1])
+    soft, hard = _pair(f"errors of {label}", pair)
+    if not 0.0 <= soft < hard < math.inf:
+        raise ValueError(f"errors of {label} must be finite and increase from 0, got {pair!r}")
+    return soft, hard
+
+
+def _pair(label: str, pair: Any) -> tuple[float, float]:
+    if not isinstance(pair, Sequence | np.ndarray) or isinstance(pair, str) or len(pair) != 2:
+        raise TypeError(f"{label} must be two numbers, got {pair!r}")
+    return _number(label, pair[0]), _number(label, pair[1])
+
+
+def _number(label: str, value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, Real):
+        raise TypeError(f"{label} must be a number, got {value!r}")
+    return float(value)
+
+
+def _lags(n: int, w: float) -> list[float]:
+    """Coefficients of (s/w + 1)^n, highest first."""
+    return [math.comb(n, k) / w**k for k in range(n, -1, -1)]

@@ -5,7 +5,6 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Iterable, Sequence
 from itertools import pairwise
-from numbers import Real
 from typing import Any, Self
 
 import numpy as np
@@ -57,13 +56,6 @@ class _Combined(Trajectory):
     def _map_time(self, origin: float, target: float, rate: float) -> Self:
         return self._of(tuple(part._map_time(origin, target, rate) for part in self.parts), self.labels)
 
-    def series(self, t: Any, order: int) -> list[list[Any]]:
-        """Taylor series about one time, which may be a symbol of a tracer: see `Trajectory.series`."""
-        if isinstance(t, Real):
-            return super().series(t, order)
-        found: list[list[Any]] = self._combine([_objects(part.series(t, order)) for part in self.parts]).T.tolist()
-        return found
-
     def _sample(self, t: Array, low: int, high: int, left: bool) -> Array:
         out = super()._sample(t, low, high, left)
         at_end = t == self.end
@@ -76,6 +68,12 @@ class _Combined(Trajectory):
         origin = float(self.breakpoints[leg])
         moment = 0.5 * (origin + float(self.breakpoints[leg + 1]))
         return self._combine([part._jet_beside(moment, origin, s, order) for part in self.parts])
+
+    def _leg_series(self, leg: int, s: Any, order: int) -> list[list[Any]]:
+        origin, end = (float(edge) for edge in self.breakpoints[leg : leg + 2])
+        rows = [part._series_beside(0.5 * (origin + end), origin, s, order) for part in self.parts]
+        found: list[list[Any]] = self._combine([_objects(row) for row in rows]).T.tolist()
+        return found
 
 
 class Sum(_Combined):

@@ -170,9 +170,6 @@ class Trajectory(Frozen, ABC):
     def series(self, t: Any, order: int) -> list[list[Any]]:
         """Taylor series about one time, which may be a symbol of a tracer (CasADi's).
 
-        Symbols go through steps, splines of one piece and of several, and what
-        is made of them.
-
         Parameters
         ----------
         t : float or symbol
@@ -188,10 +185,13 @@ class Trajectory(Frozen, ABC):
         Raises
         ------
         TypeError
-            If `t` is a symbol and the trajectory of another kind.
+            If `t` is neither.
         """
+        order = checked_count(order, "order")
         if isinstance(t, Real):
             return (self.jet(float(t), order).T / FACTORIALS[: order + 1]).tolist()
+        if t is None or isinstance(t, str | complex | list | tuple | np.ndarray):
+            raise TypeError(f"t must be one number or a symbol, got {t!r:.80}")
         # Each leg counts where it holds; elsewhere it is taken at its ends, where it is finite.
         found = [[value * (t < self.start), *[0.0] * order] for value in self.initial.tolist()]
         edges = self.breakpoints.tolist()
@@ -429,3 +429,10 @@ class Trajectory(Frozen, ABC):
         held = np.zeros((order + 1, self.naxes, s.size))
         held[0] = (self.initial if leg < 0 else self.final)[:, None]
         return held
+
+    def _series_beside(self, moment: float, origin: float, s: Any, order: int) -> list[list[Any]]:
+        """The same as Taylor series, of numbers or of symbols."""
+        leg = int(np.searchsorted(self.breakpoints, moment)) - 1
+        if 0 <= leg < self.breakpoints.size - 1:
+            return self._leg_series(leg, s + (origin - float(self.breakpoints[leg])), order)
+        return [[value, *[0.0] * order] for value in (self.initial if leg < 0 else self.final).tolist()]
