@@ -80,11 +80,12 @@ def create_replanner_iosystem(
     order : int, optional
         Highest derivative that is joined.
     horizon : float or "shrinking", optional
-        Time to the goal from every fit [s]; or what is left of the plan.
+        Time from every fit [s] after which deviations are gone and a change of
+        the goal is made; or what is left of the plan.
     alpha : float, optional
         Shape parameter [rad] of a transition over the horizon, or for
-        "shrinking" over the whole plan, whose angular frequency is kept: that
-        of `plan` unless given, 0 (polynomials) where it has none.
+        "shrinking" over the whole plan, whose angular frequency is kept. Unless
+        given, that of a `TrigSpline` for "shrinking", and 0 (polynomials) else.
     measured : int, optional
         Highest derivative that is measured; those above are the reference's.
     goal_derivatives : int, optional
@@ -101,7 +102,8 @@ def create_replanner_iosystem(
         of the loop that follows; five periods unless given, half the plan at most.
     limits : mapping of int to array_like, optional
         Greatest magnitude of a derivative by its order, for all axes or one
-        each. A fit beyond them is not taken: the last one is held.
+        each, until both plan and correction end. A fit beyond them is not
+        taken: the last one is held. Costs milliseconds a fit.
     derivatives : int, optional
         Highest derivative put out; `order` unless given.
     suffix : str, optional
@@ -192,7 +194,8 @@ class _Horizons:
             what = "the plan's duration" if self.shrinking else "the horizon"
             raise ValueError(f"dt must be at most {what}, {whole:g} s, got {period:g} s")
         if alpha is None:
-            alpha = plan.alpha if isinstance(plan, NewtonSpline) and plan.alpha < 2.0 * math.pi else 0.0
+            own = plan.alpha if isinstance(plan, NewtonSpline) and self.shrinking else 0.0
+            alpha = own if own < 2.0 * math.pi else 0.0
         self.whole, self._whole = whole, Transition(order, whole, alpha)
         self.period, self.order, self.rate = period, order, self._whole.rate
         self.step: Array | None = None  # from coefficients to jets a period later, where that is always the same map
@@ -213,6 +216,10 @@ class _Horizons:
     def late(self, t: float) -> bool:
         """Whether what is left of the plan is too short for a fit."""
         return self.shrinking and self._end - t < self._least * (1.0 - 1e-9)
+
+    def end(self, t: float) -> float:
+        """Where a fit at a time ends."""
+        return self._end if self.shrinking else t + self.whole
 
     def at(self, t: float) -> Transition | None:
         """Transition to fit at a time, None where it is too early or too late for one."""
@@ -338,7 +345,7 @@ class _Correction(ct.NonlinearIOSystem):  # type: ignore[misc]
         if self._limits and not self._within_limits(t, found, coefficients, goal):
             after[_MISSED] = 1.0
             return after
-        after[_START], after[_END], after[_MISSED] = t, t + found.horizon, 0.0
+        after[_START], after[_END], after[_MISSED] = t, self._horizons.end(t), 0.0
         after[_FITS] += 1.0
         after[self._goal] = goal.ravel()
         after[self._fitted] = coefficients.ravel()
@@ -380,7 +387,8 @@ class _Correction(ct.NonlinearIOSystem):  # type: ignore[misc]
 
     def _within_limits(self, t: float, found: Transition, coefficients: Array, goal: Array) -> bool:
         """Whether the plan with a correction keeps its limits from now to the end of both."""
-        met, end = t + found.horizon, max(t + found.horizon, self._plan.end)
+        met = self._horizons.end(t)
+        end = max(met, self._plan.end)
         edges = np.unique([t, met, end, *self._plan.breakpoints.tolist()])
         for left, right in itertools.pairwise(edges[edges >= t].tolist()):
 

@@ -8,6 +8,7 @@ from ctrlplan.trajectories.piecewise import PiecewiseSpline
 from ctrlplan.trajectories.polynomial import PolySpline
 from ctrlplan.trajectories.step import Step
 from ctrlplan.trajectories.trajectory import Trajectory
+from ctrlplan.trajectories.transition import Transition
 from ctrlplan.trajectories.trigonometric import FourierCoefficients, TrigSpline
 from ctrlplan.trajectories.waypoint import Waypoint
 
@@ -25,6 +26,7 @@ __all__ = [
     "Step",
     "Sum",
     "Trajectory",
+    "Transition",
     "TrigSpline",
     "Waypoint",
     "derivative_name",
