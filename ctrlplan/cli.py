@@ -5,8 +5,9 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import ctrlplan
 
@@ -38,6 +39,10 @@ def _parser() -> argparse.ArgumentParser:
     reproduce.add_argument("--out", type=Path, default=Path("report"), help="folder to write into (default: report)")
     reproduce.set_defaults(run=_reproduce)
 
+    online = commands.add_parser("online", help="run what is done while the loop runs, and write its report")
+    online.add_argument("--out", type=Path, default=Path("online"), help="folder to write into (default: online)")
+    online.set_defaults(run=_online)
+
     report = commands.add_parser("report", help="run a study of your own and write its report")
     report.add_argument("study", type=Path, help="study file (TOML)")
     report.add_argument("--out", type=Path, default=Path("report"), help="folder to write into (default: report)")
@@ -52,15 +57,27 @@ def _parser() -> argparse.ArgumentParser:
 
 def _reproduce(options: argparse.Namespace) -> list[Path]:
     _checked_folder(options.out)
-    from ctrlplan.reports import write_report
     from ctrlplan.studies import PAPER
 
-    studies = []
-    for name, study in PAPER.items():
+    return _all_of(PAPER, options.out, "Path planning with trigonometric splines: the paper's studies")
+
+
+def _online(options: argparse.Namespace) -> list[Path]:
+    _checked_folder(options.out)
+    from ctrlplan.studies import ONLINE
+
+    return _all_of(ONLINE, options.out, "On line: planning again, governing, and slowing the clock")
+
+
+def _all_of(studies: Mapping[str, Callable[..., Any]], folder: Path, title: str) -> list[Path]:
+    from ctrlplan.reports import write_report
+
+    found = []
+    for name, study in studies.items():
         _say(f"study {name}")
-        studies.append(study(progress=sys.stderr.isatty()))
+        found.append(study(progress=sys.stderr.isatty()))
     _say("report")
-    return write_report(studies, options.out, "Path planning with trigonometric splines: the paper's studies")
+    return write_report(found, folder, title)
 
 
 def _report(options: argparse.Namespace) -> list[Path]:

@@ -243,6 +243,27 @@ def plot_curves(study: Study) -> Figure:
     return figure
 
 
+@house_style
+def plot_online(comparison: Comparison) -> Figure:
+    """Load, reference in force, distance from the goal, sway and force of each way to run one plan."""
+    styles = line_styles(comparison.plans)
+    figure = new_figure(7.4, 8.2)
+    rows = [row[0] for row in stacked_axes(figure, 4)]
+    for name, plan in comparison.plans.items():
+        signals = _signals(comparison, name)
+        distance = np.hypot(signals["x"] - plan.final[0], signals["z"] - plan.final[1])
+        rows[0].plot(signals["t"], signals["x_ref"], color=styles[name]["color"], linewidth=0.7, alpha=0.6)
+        for axes, values in zip(rows, (signals["x"], distance, signals["theta"], signals["F"] / 1e3), strict=True):
+            axes.plot(signals["t"], values, **styles[name])
+    for axes, label in zip(rows, ("x [m]", "distance from goal [m]", "sway [rad]", "F [kN]"), strict=True):
+        axes.set_ylabel(label)
+    rows[1].set_yscale("log")
+    rows[1].set_ylim(bottom=1e-3)
+    rows[-1].set_xlabel("time [s]")
+    legend_above(figure, rows[0])
+    return figure
+
+
 def animation_data(comparison: Comparison, wall: Wall = None, rate: float = 12.0) -> str:
     """JSON for the animation: trolley, rope and angle of each plan at equal time steps."""
     frames: dict[str, Any] = {"b": CRANE.drum_radius, "rate": rate, "plans": {}}
@@ -299,6 +320,11 @@ CRANE_FIGURES = {
     "crane-motion": (
         lambda study: plot_motion(study.comparison, study.wall),
         "Trolley, rope and load at equal time steps.",
+    ),
+    "online": (
+        lambda study: plot_online(study.comparison),
+        "The load's x with the reference in force (thin), its distance from the goal (millimetres and less cut off), "
+        "sway and force.",
     ),
     "crane-sway": (plot_curves, "Sway after a push, with figure 3's generator and with feedback from the load."),
     "crane-curves": (plot_curves, "Where the claim holds: the study's quantity over alpha."),

@@ -2,6 +2,7 @@
 
 from ctrlplan.simulation.events import Event, Occurrence
 from ctrlplan.simulation.interpreted import SolverError
+from ctrlplan.simulation.predictor import Predictor
 from ctrlplan.simulation.prepared import Prepared, prepare, state_space
 from ctrlplan.simulation.rest import rest_state, unstable_poles
 from ctrlplan.simulation.simulate import simulate
@@ -9,6 +10,7 @@ from ctrlplan.simulation.simulate import simulate
 __all__ = [
     "Event",
     "Occurrence",
+    "Predictor",
     "Prepared",
     "SolverError",
     "prepare",

@@ -5,6 +5,12 @@ from ctrlplan.studies.crane import crane_first_order_study, crane_nominal_study,
 from ctrlplan.studies.ensemble import Ensemble, draws
 from ctrlplan.studies.linear import linear_study
 from ctrlplan.studies.measures import MEASURES, Measure
+from ctrlplan.studies.online import (
+    online_goal_study,
+    online_gust_study,
+    online_payload_study,
+    online_saturated_study,
+)
 from ctrlplan.studies.study import Study
 from ctrlplan.studies.sweep import Sweep, sweep
 
@@ -16,8 +22,17 @@ PAPER = {
 }
 """Studies of the paper by name: functions of ``progress`` that return a `Study`."""
 
+ONLINE = {
+    "online-gust": online_gust_study,
+    "online-payload": online_payload_study,
+    "online-goal": online_goal_study,
+    "online-saturated": online_saturated_study,
+}
+"""Studies of what is done while the loop runs, likewise."""
+
 __all__ = [
     "MEASURES",
+    "ONLINE",
     "PAPER",
     "Comparison",
     "Ensemble",
@@ -30,6 +45,10 @@ __all__ = [
     "crane_obstacle_study",
     "draws",
     "linear_study",
+    "online_goal_study",
+    "online_gust_study",
+    "online_payload_study",
+    "online_saturated_study",
     "standard_plans",
     "sweep",
 ]

@@ -1,0 +1,306 @@
+"""How far the reference of a nonlinear loop may go, by predictions."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from importlib.util import find_spec
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ctrlplan.simulation.interpreted import LoopError, SolverError
+from ctrlplan.simulation.prepared import Prepared, prepare
+from ctrlplan.simulation.simulate import simulate
+from ctrlplan.trajectories.common import Frozen, checked_time
+
+Array = NDArray[np.float64]
+
+_TOLERANCES = 1e-6, 1e-8
+"""Of the solver: a prediction is not worth more than its margin."""
+
+_SHORTEST = 2.0**-20
+"""Fractions below are taken for 0."""
+
+_REST = 0.8
+"""Part of the horizon after which the loop must be at rest."""
+
+_COUNTS = 20, 100_000
+"""Least and greatest number of times at which a prediction is looked at."""
+
+
+class Predictor(Frozen):
+    """Says by simulation how far the reference of a loop may go.
+
+    For loops that are not linear; `create_governor_iosystem` takes it in the
+    loop's place. A reference is admissible at a state if the loop, run from
+    there over the horizon with the reference held,
+
+    - keeps every limited output inside its limits by the margin, and
+    - is at rest over the last fifth of the horizon: limited outputs are inside
+      by twice the margin, and none moves by more than the margin.
+
+    A run that fails or leaves the range of numbers is not. Outputs are looked
+    at at `count` times, closer together after the start, and their peaks
+    between these by parabolas. What the horizon does not show is not seen: it
+    must be long beside the slowest motion of the loop.
+
+    Parameters
+    ----------
+    system : control system or Prepared
+        Continuous and not depending on time: without plans and delays. Blocks
+        that take samples are predicted as at the start of a run: the
+        governor's samples must fall on theirs.
+    limits : mapping of str to (float, float)
+        Least and greatest value of each limited output; one may be infinite.
+    horizon : float
+        How far ahead is looked [s], above 0.
+    references : sequence of str, optional
+        Inputs that are governed: all unless given. The others are 0.
+    margin : float, optional
+        Distance from the limits, relative to half the distance between two,
+        to the size of one alone (to 1 where that is 0); in (0, 1/2).
+    count : int, optional
+        Times at which a prediction is looked at, from 20.
+    resolution : float, optional
+        Accuracy of the fraction, in (0, 1).
+    params : mapping, optional
+        Parameters of the blocks.
+
+    Attributes
+    ----------
+    references, states : tuple of str
+        Labels of the governed inputs, and of the states.
+    horizon : float
+        How far ahead is looked [s].
+
+    Raises
+    ------
+    TypeError
+        If `system` is no system.
+    ValueError
+        If it is discrete or depends on time, a label is unknown, limits do not
+        increase, or a number is out of range.
+
+    References
+    ----------
+    A. Bemporad, "Reference governor for constrained nonlinear systems", IEEE
+    Trans. Automatic Control 43 (1998) 415-419.
+
+    Examples
+    --------
+    A pendulum, held by a spring of the law at the angle asked for, with little torque:
+
+    >>> import control as ct
+    >>> import numpy as np
+    >>> import ctrlplan as cp
+    >>> loop = ct.nlsys(
+    ...     lambda t, x, u, params: np.array([x[1], 4 * (u[0] - x[0]) - 3 * x[1]]),
+    ...     lambda t, x, u, params: np.array([x[0], 4 * (u[0] - x[0]) - 3 * x[1] + np.sin(x[0])]),
+    ...     inputs="r", outputs=["angle", "torque"], states=["angle", "speed"], name="loop",
+    ... )
+    >>> predictor = Predictor(loop, {"torque": (-1.0, 1.0)}, 10.0)
+    >>> predictor.fraction([0.0, 0.0], [0.0], [1.0]), predictor.fraction([0.0, 0.0], [0.0], [0.2])
+    (0.234375, 1.0)
+    """
+
+    references: tuple[str, ...]
+    states: tuple[str, ...]
+    horizon: float
+    _prepared: Prepared
+    _times: Array
+    _resting: int
+    _rows: list[int]
+    _low: Array
+    _high: Array
+    _inset: Array
+    _resolution: float
+    _params: dict[str, Any]
+
+    def __init__(
+        self,
+        system: Any,
+        limits: Mapping[str, Sequence[float]],
+        horizon: float,
+        *,
+        references: Sequence[str] | None = None,
+        margin: float = 0.02,
+        count: int = 200,
+        resolution: float = 1.0 / 64.0,
+        params: Mapping[str, Any] | None = None,
+    ) -> None:
+        prepared = prepare(system)
+        _check_autonomous(prepared)
+        if not prepared.input_labels:
+            raise ValueError(f"{prepared.name} must have an input to govern, got none")
+        governed = tuple(prepared.input_labels if references is None else references)
+        _check_known(governed, prepared.input_labels, "references", "inputs")
+        _check_known(tuple(limits), prepared.output_labels, "limits", "outputs")
+        for label, value, most in (("margin", margin, 0.5), ("resolution", resolution, 1.0)):
+            if not 0.0 < float(value) < most:
+                raise ValueError(f"{label} must lie in (0, {most:g}), got {value}")
+        seconds = checked_time(horizon, "horizon", positive=True)
+        if isinstance(count, bool) or int(count) != count or not _COUNTS[0] <= count <= _COUNTS[1]:
+            raise ValueError(f"count must be a whole number from {_COUNTS[0]} to {_COUNTS[1]}, got {count}")
+        bounds = np.array([_checked_limits(label, pair) for label, pair in limits.items()])
+        inset = float(margin) * np.array([_scale(*pair) for pair in bounds.tolist()])
+        # Even steps of the root of time: a new reference sets off the fastest motion at the start.
+        times = seconds * np.linspace(0.0, 1.0, int(count)) ** 2
+        self.__dict__.update(
+            references=governed,
+            states=tuple(prepared.state_labels),
+            horizon=seconds,
+            _prepared=prepared,
+            _times=times,
+            _resting=int(np.searchsorted(times, _REST * seconds)),
+            _rows=[prepared.output_labels.index(label) for label in limits],
+            _low=bounds[:, 0] + inset,
+            _high=bounds[:, 1] - inset,
+            _inset=inset,
+            _resolution=float(resolution),
+            _params=dict(params or {}),
+        )
+
+    def __repr__(self) -> str:
+        return f"<Predictor of {self._prepared.name} over {self.horizon:g} s>"
+
+    def contains(self, x: ArrayLike, v: ArrayLike) -> bool:
+        """Whether a reference, held from a state on, is admissible.
+
+        Parameters
+        ----------
+        x : array_like, shape (nstates,)
+            State.
+        v : array_like, shape (nreferences,)
+            Reference.
+        """
+        state, held = self._checked(x, v)
+        return self._admissible(state, held)
+
+    def fraction(self, x: ArrayLike, v: ArrayLike, r: ArrayLike) -> float:
+        """Part of the way from v to r that is admissible from a state on.
+
+        Parameters
+        ----------
+        x : array_like, shape (nstates,)
+            State.
+        v, r : array_like, shape (nreferences,)
+            Reference that is held, and the one asked for.
+
+        Returns
+        -------
+        float
+            Greatest kappa in [0, 1] found by halving, itself predicted to be
+            admissible: within `resolution`, or within a factor of 2 where it is
+            smaller; 1 where r is admissible; nan where neither r nor v is.
+        """
+        state, held, asked = self._checked(x, v, r)
+        if self._admissible(state, asked):
+            return 1.0
+        if np.array_equal(held, asked) or not self._admissible(state, held):
+            return math.nan
+        low, high = 0.0, 1.0
+        # A first step must be found however short, or a far reference would be waited for for ever.
+        while high - low > (self._resolution if low else _SHORTEST):
+            middle = 0.5 * (low + high)
+            if self._admissible(state, held + middle * (asked - held)):
+                low = middle
+            else:
+                high = middle
+        return low
+
+    def _admissible(self, state: Array, reference: Array) -> bool:
+        outputs = self._predicted(state, reference)
+        if outputs is None:
+            return False
+        low, high, inset = self._low, self._high, self._inset
+        last = outputs[:, self._resting :]
+        least, greatest = last.min(axis=1), last.max(axis=1)
+        return bool(
+            (-_peaks(-outputs) >= low).all()
+            and (_peaks(outputs) <= high).all()
+            and (least >= low + inset).all()
+            and (greatest <= high - inset).all()
+            and (greatest - least <= inset).all()
+        )
+
+    def _predicted(self, state: Array, reference: Array) -> Array | None:
+        """Limited outputs (nlimits, count) of a run, or None where it fails."""
+        inputs = dict(zip(self.references, reference.tolist(), strict=True))
+        with np.errstate(all="ignore"):
+            for method in self._methods():
+                try:
+                    found = simulate(
+                        self._prepared, self._times, inputs, state, method, *_TOLERANCES, self._params, events=()
+                    )
+                except (SolverError, LoopError):
+                    return None
+                except ValueError:
+                    if method != "compiled":  # what cannot be compiled is run by Python
+                        raise
+                    continue
+                outputs: Array = np.atleast_2d(found.y[self._rows, ...].reshape(len(self._rows), -1))
+                return outputs if np.isfinite(outputs).all() else None
+        raise AssertionError("the last method is tried in any case")
+
+    def _methods(self) -> tuple[str, ...]:
+        if self._prepared.linear is not None:
+            return ("exact",)
+        return ("python",) if find_spec("casadi") is None else ("compiled", "python")
+
+    def _checked(self, x: ArrayLike, *references: ArrayLike) -> list[Array]:
+        found = [np.asarray(x, dtype=float), *(np.atleast_1d(np.asarray(v, dtype=float)) for v in references)]
+        sizes = [("x", len(self.states)), *((name, len(self.references)) for name in ("v", "r"))]
+        for (name, size), values in zip(sizes, found, strict=False):
+            if values.shape != (size,) or not np.isfinite(values).all():
+                raise ValueError(f"{name} must have {size} finite entries, got {values.tolist()}")
+        return found
+
+
+def _peaks(values: Array) -> Array:
+    """Greatest values (nsignals,) of signals (nsignals, ntime), between samples by parabolas through three of them."""
+    before, middle, after = values[:, :-2], values[:, 1:-1], values[:, 2:]
+    bend = 2.0 * middle - before - after
+    inner = (middle >= before) & (middle >= after) & (bend > 0.0)
+    rise = np.where(inner, (after - before) ** 2 / (8.0 * np.where(inner, bend, 1.0)), 0.0)
+    return np.asarray(np.maximum((middle + rise).max(axis=1), np.maximum(values[:, 0], values[:, -1])))
+
+
+def _check_autonomous(prepared: Prepared) -> None:
+    """Refuse what a run from a state and constant inputs does not predict."""
+    if prepared.dt not in (None, 0):
+        raise ValueError(f"system must be continuous, got {prepared.name} with dt = {prepared.dt}")
+    if prepared.network is None:
+        raise ValueError(f"system must be one that ctrlplan runs itself, but {prepared.unsupported}")
+    for block in prepared.network.blocks:
+        if block.plan is not None or getattr(block.system, "breakpoints", None):
+            raise ValueError(f"system must not depend on time, got the plan or breakpoints of the block {block.name}")
+        if block.delay is not None:
+            raise ValueError(f"system must say all by its state, got the delay of the block {block.name}")
+
+
+def _check_known(given: tuple[str, ...], known: list[str], name: str, what: str) -> None:
+    if not given:
+        raise ValueError(f"{name} must not be empty")
+    for label in given:
+        if label not in known:
+            raise ValueError(f"{name} must be among the {what} {', '.join(known) or '(none)'}, got {label!r}")
+    if len(set(given)) < len(given):
+        raise ValueError(f"{name} must not name one of the {what} twice, got {', '.join(given)}")
+
+
+def _checked_limits(label: str, pair: Sequence[float]) -> tuple[float, float]:
+    if np.shape(pair) != (2,):
+        raise ValueError(f"limits of {label} must be two numbers, got {pair!r}")
+    low, high = float(pair[0]), float(pair[1])
+    if not low < high or (math.isinf(low) and math.isinf(high)):
+        raise ValueError(f"limits of {label} must increase and one of them be finite, got {low:g} and {high:g}")
+    return low, high
+
+
+def _scale(low: float, high: float) -> float:
+    """Half the distance of two limits, or the size of the only one."""
+    if math.isfinite(low) and math.isfinite(high):
+        return 0.5 * (high - low)
+    return abs(low if math.isfinite(low) else high) or 1.0

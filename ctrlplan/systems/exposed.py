@@ -1,0 +1,194 @@
+"""Systems that put out their states as well."""
+
+from __future__ import annotations
+
+import copy
+import re
+from collections.abc import Collection, Sequence
+from functools import partial
+from typing import Any
+
+import control as ct
+import numpy as np
+from control.statesp import LinearICSystem
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+def expose_states(system: Any, name: str | None = None) -> Any:
+    """Same system with its states among its outputs.
+
+    Interconnections are made anew around blocks that put out their states, so
+    that `ctrlplan.simulate` sees every block as before, sampled ones included.
+
+    States and inputs: those of `system`. Outputs: its own, then its states,
+    named by `state_signals`.
+
+    Parameters
+    ----------
+    system : control system
+        A `control.StateSpace`, `control.TransferFunction`,
+        `control.NonlinearIOSystem` or `control.InterconnectedSystem`.
+    name : str, optional
+        Name of the system that is returned: that of `system` unless given.
+
+    Returns
+    -------
+    control system
+        Of the kind of `system`, of a transfer function a `control.StateSpace`.
+
+    Raises
+    ------
+    TypeError
+        If `system` is of another kind, or a block has equations of a kind of its own.
+    ValueError
+        If an output is named as a state would be: the states are put out already.
+
+    Examples
+    --------
+    >>> import ctrlplan as cp
+    >>> cp.expose_states(cp.plants.integrator_lag_loop(5.0)).output_labels
+    ['y', 'plant_x_0_state', 'plant_x_1_state']
+    """
+    if isinstance(system, ct.TransferFunction):
+        system = ct.ss(system, name=system.name, inputs=system.input_labels, outputs=system.output_labels)
+    names = state_signals(getattr(system, "state_labels", None) or ())
+    twice = set(names) & set(getattr(system, "output_labels", None) or ())
+    if twice:
+        raise ValueError(f"outputs of {system.name} must not be named as its states are put out, got {min(twice)!r}")
+    found = _exposed(system, names)
+    if found is system:
+        found = copy.copy(system)
+    found.name = name or system.name
+    return found
+
+
+def state_signals(labels: Sequence[str]) -> list[str]:
+    """Names of the outputs by which `expose_states` puts out states.
+
+    Letters, digits and underlines of the state's label, and ``_state``, so that
+    nothing joins by name what was not meant to be joined.
+
+    Parameters
+    ----------
+    labels : sequence of str
+        State labels of a system, in order.
+
+    Returns
+    -------
+    list of str
+        As many names, no two the same.
+
+    Examples
+    --------
+    >>> state_signals(["speed", "plant_x[0]"])
+    ['speed_state', 'plant_x_0_state']
+    """
+    found: list[str] = []
+    for label in labels:
+        name = re.sub(r"\W+", "_", label, flags=re.ASCII).strip("_")
+        found.append(_free(f"{name}_state", found))
+    return found
+
+
+def _exposed(system: Any, names: Sequence[str]) -> Any:
+    """System with its states put out under some names; the same object where it has none."""
+    if not isinstance(system, ct.StateSpace | ct.NonlinearIOSystem):
+        raise TypeError(f"system must be a control system with states, got {type(system).__name__}")
+    if not names:
+        return system
+    if isinstance(system, ct.InterconnectedSystem):
+        return _interconnection(system, names)
+    if isinstance(system, ct.StateSpace):
+        return _state_space(system, names)
+    return _block(system, names)
+
+
+def _state_space(system: ct.StateSpace, names: Sequence[str]) -> ct.StateSpace:
+    return ct.StateSpace(
+        system.A,
+        system.B,
+        np.vstack([system.C, np.eye(len(names))]),
+        np.vstack([system.D, np.zeros((len(names), system.ninputs))]),
+        system.dt,
+        inputs=system.input_labels,
+        outputs=[*system.output_labels, *names],
+        states=system.state_labels,
+        name=system.name,
+    )
+
+
+def _block(system: ct.NonlinearIOSystem, names: Sequence[str]) -> ct.NonlinearIOSystem:
+    """Copy of a block, all that it says of itself included, with longer outputs."""
+    if any(getattr(type(system), name) is not getattr(ct.NonlinearIOSystem, name) for name in ("_rhs", "_out")):
+        raise TypeError(
+            f"block {system.name} must have updfcn and outfcn, got a {type(system).__name__} of its own kind"
+        )
+    block = copy.copy(system)
+    block.outfcn = partial(_with_states, system.outfcn)
+    block.set_outputs([*system.output_labels, *names])
+    declared = getattr(system, "feedthrough", False if system.outfcn is None else None)
+    if declared is not None:
+        own = np.broadcast_to(np.asarray(declared, dtype=bool), (system.noutputs, system.ninputs))
+        block.feedthrough = [*own.tolist(), *([False] * system.ninputs for _ in names)]
+    return block
+
+
+def _interconnection(system: ct.InterconnectedSystem, names: Sequence[str]) -> ct.InterconnectedSystem:
+    blocks: list[Any] = []
+    kept: list[int] = []
+    states: list[int] = []
+    first = 0
+    for block in system.syslist:
+        own = state_signals(block.state_labels)
+        blocks.append(_exposed(block, [_free(name, block.output_labels) for name in own]))
+        kept += range(first, first + block.noutputs)
+        states += range(first + block.noutputs, first + block.noutputs + block.nstates)
+        first += block.noutputs + block.nstates
+    connect = np.zeros((system.connect_map.shape[0], first))
+    connect[:, kept] = system.connect_map
+    own_outputs = np.hstack([np.zeros((system.noutputs, first)), system.output_map[:, len(kept) :]])
+    own_outputs[:, kept] = system.output_map[:, : len(kept)]
+    state_outputs = np.eye(own_outputs.shape[1])[states]
+    found = ct.InterconnectedSystem(
+        blocks,
+        inputs=system.input_labels,
+        outputs=[*system.output_labels, *names],
+        states=system.state_labels,
+        params=system.params,
+        dt=system.dt,
+        name=system.name,
+        warn_duplicate=False,
+        connection_type=system.connection_type,
+    )
+    found.set_connect_map(connect)
+    found.set_input_map(np.array(system.input_map))
+    found.set_output_map(np.vstack([own_outputs, state_outputs]))
+    if isinstance(system, ct.StateSpace):  # of linear blocks python-control keeps the matrices as well
+        found = LinearICSystem(found, _state_space(system, names), system.connection_type)
+    start = getattr(system, "initial_state", None)
+    if start is not None:
+        found.initial_state = start
+    return found
+
+
+def _with_states(outputs: Any, t: Any, x: Any, u: Any, params: dict[str, Any]) -> Any:
+    """Outputs of a block, then its states: of numbers or of symbols."""
+    own = x if outputs is None else outputs(t, x, u, params)
+    if isinstance(own, np.ndarray) and isinstance(x, np.ndarray):
+        return np.concatenate([own.ravel(), x])
+    return [*_entries(own), *_entries(x)]
+
+
+def _entries(values: Any) -> list[Any]:
+    """Entries of a column: a list, an array, or a symbol of CasADi, which counts them by a method."""
+    count = getattr(values, "numel", None)
+    return [values[k] for k in range(count())] if count is not None else list(np.ravel(values))
+
+
+def _free(name: str, taken: Collection[str]) -> str:
+    """Name, lengthened until it is not taken."""
+    while name in taken:
+        name += "_"
+    return name
