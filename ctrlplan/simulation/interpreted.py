@@ -146,11 +146,14 @@ class Interpreted:
         known = [None if i in unsure else known_feedthrough(block) for i, block in enumerate(network.blocks)]
         feeds = [np.ones(size, dtype=bool) if k is None else k for size, k in zip(sizes, known, strict=True)]
         every = np.ones(network.nsignals, dtype=bool)
-        if self._trials and any(step.unknown is not None for step in network.schedule(feeds, every)):
-            for i, (size, k) in enumerate(zip(sizes, known, strict=True)):
-                if k is None:
-                    self._doubtful = True
-                    feeds[i] = tried_feedthrough(outputs[i], *size, t, x[network.states[i]])
+        unknown = [i for i, k in enumerate(known) if k is None]
+        # What a sample makes of its inputs is tried last: it may take long.
+        for group in ([i for i in unknown if i not in unsure], [i for i in unknown if i in unsure]):
+            if not (self._trials and any(step.unknown is not None for step in network.schedule(feeds, every))):
+                break
+            for i in group:
+                self._doubtful = True
+                feeds[i] = tried_feedthrough(outputs[i], *sizes[i], t, x[network.states[i]])
         return feeds
 
     def _check(self, t: float, x: Array, w: Array) -> None:

@@ -346,7 +346,7 @@ def _flattened(system: Any, above: dict[str, Any]) -> _Part:
         block_diag(*(getattr(p, name) for p in parts)) for name in ("inner", "outer", "read", "through")
     )
     connect = np.asarray(system.connect_map, dtype=float)
-    external = np.asarray(system.input_map, dtype=float).reshape(len(connect), -1)
+    external = np.asarray(system.input_map, dtype=float).reshape(len(connect), system.ninputs or 0)
     outputs = np.asarray(system.output_map, dtype=float)
     from_out, from_in = outputs[:, : len(read)], outputs[:, len(read) :]
     # Parts take v = connect @ (read @ y + through @ v) + external @ r.

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from ctrlplan.simulation.interpreted import LoopError, SolverError
 from ctrlplan.simulation.prepared import Prepared, prepare
 from ctrlplan.simulation.simulate import simulate
-from ctrlplan.trajectories.common import Frozen, checked_time
+from ctrlplan.trajectories.common import Frozen, checked_limits, checked_time
 
 Array = NDArray[np.float64]
 
@@ -143,8 +143,8 @@ class Predictor(Frozen):
         seconds = checked_time(horizon, "horizon", positive=True)
         if isinstance(count, bool) or int(count) != count or not _COUNTS[0] <= count <= _COUNTS[1]:
             raise ValueError(f"count must be a whole number from {_COUNTS[0]} to {_COUNTS[1]}, got {count}")
-        bounds = np.array([_checked_limits(label, pair) for label, pair in limits.items()])
-        inset = float(margin) * np.array([_scale(*pair) for pair in bounds.tolist()])
+        bounds = np.array([checked_limits(pair, f"limits of {label}") for label, pair in limits.items()])
+        inset = float(margin) * bounds[:, 2]
         # Even steps of the root of time: a new reference sets off the fastest motion at the start.
         times = seconds * np.linspace(0.0, 1.0, int(count)) ** 2
         self.__dict__.update(
@@ -288,19 +288,3 @@ def _check_known(given: tuple[str, ...], known: list[str], name: str, what: str)
             raise ValueError(f"{name} must be among the {what} {', '.join(known) or '(none)'}, got {label!r}")
     if len(set(given)) < len(given):
         raise ValueError(f"{name} must not name one of the {what} twice, got {', '.join(given)}")
-
-
-def _checked_limits(label: str, pair: Sequence[float]) -> tuple[float, float]:
-    if np.shape(pair) != (2,):
-        raise ValueError(f"limits of {label} must be two numbers, got {pair!r}")
-    low, high = float(pair[0]), float(pair[1])
-    if not low < high or (math.isinf(low) and math.isinf(high)):
-        raise ValueError(f"limits of {label} must increase and one of them be finite, got {low:g} and {high:g}")
-    return low, high
-
-
-def _scale(low: float, high: float) -> float:
-    """Half the distance of two limits, or the size of the only one."""
-    if math.isfinite(low) and math.isfinite(high):
-        return 0.5 * (high - low)
-    return abs(low if math.isfinite(low) else high) or 1.0

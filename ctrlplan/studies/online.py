@@ -46,6 +46,7 @@ ONLINE_MEASURES = {
     "limited_time": Measure("Time with that force at its limit", "s"),
 }
 
+START = nominal_waypoints(1)[0].position
 _UNITS = {"x": "m", "z": "m", "F": "N", "C": "N m", "theta": "rad", "T": "N"}
 _LAW: dict[str, Any] = {"law": "load_feedback", "load_bandwidth": 0.5}
 _FILTER, _LAGS = 0.8, 5
@@ -224,7 +225,14 @@ def _replanned(trouble: Trouble, **drives: Any) -> Any:
         reference = [replanner, create_source_iosystem(trouble.goal, name="goal", suffix="_goal")]
     else:
         replanner = create_replanner_iosystem(
-            trouble.plan, period, horizon=6.0, measured=1, trigger="deviation", threshold=0.2, suffix="_ref"
+            trouble.plan,
+            period,
+            horizon=6.0,
+            alpha=1.0,
+            measured=1,
+            trigger="deviation",
+            threshold=0.2,
+            suffix="_ref",
         )
         reference = [replanner]
     return crane_loop(CRANE, trouble.plan, "generator", reference=reference, wind=trouble.wind, **drives)
@@ -233,19 +241,16 @@ def _replanned(trouble: Trouble, **drives: Any) -> Any:
 def _governed(trouble: Trouble, **drives: Any) -> Any:
     """Goal itself through a governor and a filter: no plan."""
     core = _filtered_loop(wind=trouble.wind, **drives)
-    governor = create_governor_iosystem(_admissible(trouble.force), _PERIODS["governed"], initial=CRANE_START[:1])
+    governor = create_governor_iosystem(_admissible(trouble.force), initial=START[:1])
     goal = stack([trouble.goal], labels=["x_command_asked", "z_command"])
     exposed = expose_states(core)
+    unread = set(exposed.output_labels) - {*governor.input_labels, *core.output_labels}
     loop = ct.interconnect(
         [create_source_iosystem(goal, name="goal"), governor, exposed],
         inputs=0,
         outputs=list(core.output_labels),
         name="governed",
-        ignore_outputs=[
-            f"{exposed.name}.{label}"
-            for label in exposed.output_labels
-            if label not in [*governor.input_labels, *core.output_labels]
-        ],
+        ignore_outputs=[f"{exposed.name}.{label}" for label in unread],
     )
     loop.initial_state = np.concatenate([np.zeros(governor.nstates), exposed.initial_state])
     return loop
@@ -264,8 +269,6 @@ WAYS: dict[str, Callable[..., Any]] = {
     "slowed": _slowed,
 }
 
-CRANE_START = np.array([0.0, 10.0])
-
 
 def _filtered_loop(wind: Trajectory | None = None, **drives: Any) -> Any:
     """Crane with load feedback behind filters of commands x_command and z_command."""
@@ -273,7 +276,7 @@ def _filtered_loop(wind: Trajectory | None = None, **drives: Any) -> Any:
         create_command_filter_iosystem(_FILTER, 2, _LAGS, input=f"{axis}_command", output=f"{axis}_ref")
         for axis in ("x", "z")
     ]
-    for block, start in zip(filters, CRANE_START, strict=True):
+    for block, start in zip(filters, START, strict=True):
         block.initial_state = np.array([start, *[0.0] * (_LAGS - 1)])
     inputs = ["x_command", "z_command"]
     return crane_loop(CRANE, _still_at_start(), reference=filters, inputs=inputs, wind=wind, **_LAW, **drives)
@@ -284,7 +287,7 @@ def _admissible(force: float) -> AdmissibleSet:
     """What keeps nine tenths of a force, on the way across linearised half way down; the hoist does not act on it."""
     loop = _filtered_loop()
     rest = np.array(loop.initial_state)
-    middle = 0.5 * (CRANE_START[1] + 11.0)
+    middle = 0.5 * (START[1] + 11.0)
     rest[loop.nstates - 6 :] = CRANE.equilibrium(0.0, middle)[0]
     rest[_LAGS] = middle
     linear = ct.linearize(loop, rest, [0.0, middle])
@@ -302,17 +305,13 @@ def _admissible(force: float) -> AdmissibleSet:
         states=[loop.state_labels[k] for k in rows],
     )
     limit = 0.9 * force
-    found = AdmissibleSet(model, {"F": (-limit, limit), "theta": (-0.2, 0.2)}, _PERIODS["governed"], margin=0.05)
-    return _About(found, rest[rows])
-
-
-class _About:
-    def __init__(self, inner: AdmissibleSet, origin: Array) -> None:
-        self._inner, self._origin = inner, origin
-        self.references, self.states, self.dt = inner.references, inner.states, inner.dt
-
-    def fraction(self, x: Array, v: Array, r: Array) -> float:
-        return self._inner.fraction(x - self._origin, v, r)
+    return AdmissibleSet(
+        model,
+        {"F": (-limit, limit), "theta": (-0.2, 0.2)},
+        _PERIODS["governed"],
+        margin=0.05,
+        origin=(rest[rows], 0.0),
+    )
 
 
 def _compared(trouble: Trouble, title: str, what: str) -> Comparison:
@@ -381,7 +380,7 @@ def _still() -> Step:
 
 
 def _still_at_start() -> Step:
-    return Step(CRANE_START, CRANE_START, labels=["x", "z"])
+    return Step(START, START, labels=["x", "z"])
 
 
 @cache

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import control as ct
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.linalg import expm, matrix_balance, solve_continuous_lyapunov
-from scipy.optimize import linprog, nnls
-from scipy.special import comb, factorial
+from scipy.optimize import linprog
 
-from ctrlplan.trajectories.common import Frozen, checked_time, readonly
+from ctrlplan.systems.output_cells import Problem, elevated, erosion, output_cells, seen_directions
+from ctrlplan.systems.polytope import Polytope, Rows
+from ctrlplan.trajectories.common import Frozen, checked_limits, checked_time, readonly
 
 Array = NDArray[np.float64]
 Limits: TypeAlias = Mapping[str, Sequence[float]]
@@ -27,36 +26,6 @@ _INSIDE = 1e-8
 
 _FAR = 1e6
 """Where an output has one limit, the other is so many times its size away: of unbounded sets rows have no end."""
-
-_DEGREE = 8
-"""Of the polynomials that outputs are over a cell of time."""
-
-_REMAINDER = 1e-10
-"""What such a polynomial leaves, relative to the motion at the start."""
-
-_CELLS = 3000
-"""Cells after which a loop must have come to rest."""
-
-_SEEN = 1e-7
-"""Relative size of what limited outputs show of a direction of the state, from which on it counts."""
-
-_PROVEN = 1e-11
-"""Relative error of a proof that a row follows from others."""
-
-_NEAR = 24
-"""Rows that are added to a proof at a time."""
-
-_ATTEMPTS = 50
-"""Times that this is done."""
-
-_PROOFS = 24
-"""Proofs that are kept to be tried on other rows."""
-
-_NEIGHBOURS = 64
-"""Rows on which a new proof is tried."""
-
-_Proof: TypeAlias = tuple[NDArray[np.float64], NDArray[np.float64]]
-"""Rows of which others are sums, and the inverse that finds the factors."""
 
 
 class AdmissibleSet(Frozen):
@@ -92,6 +61,9 @@ class AdmissibleSet(Frozen):
     disturbances : mapping of str to float, optional
         Greatest magnitude of inputs that may do as they like: the set holds
         whatever they do.
+    origin : (array_like, array_like), optional
+        State and reference at which a loop that was linearised has its zeros;
+        limits are of what its outputs differ by from those there.
 
     Attributes
     ----------
@@ -150,6 +122,7 @@ class AdmissibleSet(Frozen):
         references: Sequence[str] | None = None,
         margin: float = 0.01,
         disturbances: Mapping[str, float] | None = None,
+        origin: tuple[ArrayLike, ArrayLike] | None = None,
     ) -> None:
         period = checked_time(dt, "dt", positive=True)
         share = float(margin)
@@ -158,13 +131,14 @@ class AdmissibleSet(Frozen):
         problem = _problem(loop, limits, references, dict(disturbances or {}))
         rows, last = _determined(problem, share)
         of_reference = rows.reference - rows.state @ problem.rest
+        bounds = rows.bound + _shift(rows.state, of_reference, origin)
         self.__dict__.update(
             references=problem.references,
             states=problem.states,
             dt=period,
             state_matrix=readonly(rows.state),
             reference_matrix=readonly(of_reference),
-            bounds=readonly(rows.bound),
+            bounds=readonly(bounds),
             _rows=np.hstack([rows.state, of_reference]),
             periods=math.ceil(last / period),
             _margin=share,
@@ -220,60 +194,7 @@ class AdmissibleSet(Frozen):
         return _inside(room, rise, 0.0 if least >= -self._margin else math.nan)
 
 
-@dataclass(frozen=True, eq=False)
-class _Problem:
-    """Loop x' = a x + b v + e w, y = c x + d v + f w: y in units of `scale`, w within 1."""
-
-    a: Array
-    c: Array
-    e: Array
-    f: Array
-    rest: Array  # state at rest, by the reference
-    gain: Array  # outputs at rest
-    low: Array
-    high: Array
-    middle: Array  # between limits, or near the only one
-    labels: tuple[str, ...]
-    references: tuple[str, ...]
-    states: tuple[str, ...]
-
-    @property
-    def slowest(self) -> float:
-        """Rate [1/s] at which the slowest motion dies out."""
-        return float(-np.linalg.eigvals(self.a).real.max()) if self.a.size else 1.0
-
-
-@dataclass(frozen=True, eq=False)
-class _Cells:
-    """Cells of time, and over each the outputs as polynomials.
-
-    Attributes
-    ----------
-    ends : ndarray, shape (ncells,)
-        Where they end [s].
-    rows : ndarray, shape (ncells, noutputs, degree + 1, nstates)
-        Bernstein coefficients of c exp(a t).
-    needed : int
-        Those after which outputs that have kept their limits keep them for ever.
-    """
-
-    ends: Array
-    rows: Array
-    needed: int
-
-
-@dataclass(frozen=True, eq=False)
-class _Rows:
-    """Inequalities state @ z + reference @ v <= bound in the distance z of the state from rest."""
-
-    state: Array
-    reference: Array
-    bound: Array
-
-
-def _problem(
-    loop: Any, limits: Limits, references: Sequence[str] | None, disturbances: Mapping[str, float]
-) -> _Problem:
+def _problem(loop: Any, limits: Limits, references: Sequence[str] | None, disturbances: Mapping[str, float]) -> Problem:
     if isinstance(loop, ct.TransferFunction):
         loop = ct.ss(loop, name=loop.name, inputs=loop.input_labels, outputs=loop.output_labels)
     if not isinstance(loop, ct.StateSpace):
@@ -309,15 +230,15 @@ def _problem(
     if poles.size and not poles.real.max() < -1e-9 * np.abs(poles).max():
         worst = poles[poles.real.argmax()]
         raise ValueError(f"loop must be stable, got a pole of {loop.name} at {worst:.3g} 1/s")
-    pairs = np.array([_checked_limits(label, pair) for label, pair in limits.items()])
-    scale = np.array([_scale(*pair) for pair in pairs.tolist()])
+    found = np.array([checked_limits(pair, f"limits of {label}") for label, pair in limits.items()])
+    pairs, scale = found[:, :2], found[:, 2]
     rows, columns = [outputs.index(label) for label in limits], [inputs.index(label) for label in governed]
     shaken = [inputs.index(label) for label in disturbances]
     sizes = np.array([float(most) for most in disturbances.values()])
     c, d = c[rows] / scale[:, None], d[rows] / scale[:, None]
     rest = np.asarray(-np.linalg.solve(a, b[:, columns]), dtype=float)
     low, high = pairs.T / scale
-    return _Problem(
+    return Problem(
         a,
         c,
         b[:, shaken] * sizes,
@@ -346,22 +267,6 @@ def _matrices(loop: ct.StateSpace) -> tuple[Array, Array, Array, Array]:
     return rates[:, :n].reshape(n, n), rates[:, n:].reshape(n, -1), outputs[:, :n], outputs[:, n:]
 
 
-def _checked_limits(label: str, pair: Sequence[float]) -> tuple[float, float]:
-    if np.shape(pair) != (2,):
-        raise ValueError(f"limits of {label} must be two numbers, got {pair!r}")
-    low, high = float(pair[0]), float(pair[1])
-    if not low < high or (math.isinf(low) and math.isinf(high)):
-        raise ValueError(f"limits of {label} must increase and one of them be finite, got {low:g} and {high:g}")
-    return low, high
-
-
-def _scale(low: float, high: float) -> float:
-    """Half the distance of two limits, or the size of the only one."""
-    if math.isfinite(low) and math.isfinite(high):
-        return 0.5 * (high - low)
-    return abs(low if math.isfinite(low) else high) or 1.0
-
-
 def _inside(room: Array, rise: Array, otherwise: float) -> float:
     """Largest kappa in [0, 1] with room - kappa rise >= 0, where some room is below 0."""
     short = room < 0.0
@@ -373,17 +278,28 @@ def _inside(room: Array, rise: Array, otherwise: float) -> float:
     return float(most) if least <= most else otherwise
 
 
-def _determined(problem: _Problem, margin: float) -> tuple[_Rows, float]:
+def _shift(state: Array, reference: Array, origin: tuple[ArrayLike, ArrayLike] | None) -> Array | float:
+    """What an origin adds to the bounds of rows."""
+    if origin is None:
+        return 0.0
+    given = [np.atleast_1d(np.asarray(values, dtype=float)) for values in origin]
+    sizes = [(state.shape[1],), (reference.shape[1],)]
+    if [values.shape for values in given] != sizes or not all(np.isfinite(values).all() for values in given):
+        raise ValueError(f"origin must be {sizes[0][0]} states and {sizes[1][0]} references, finite, got {origin!r}")
+    return state @ given[0] + reference @ given[1]
+
+
+def _determined(problem: Problem, margin: float) -> tuple[Rows, float]:
     """Rows that determine the set, and the time [s] up to which they look."""
-    seen = _seen(problem)
-    cells = _cells(problem, seen, margin)
-    lost, in_all = _erosion(problem, cells)
+    seen = seen_directions(problem)
+    cells = output_cells(problem, seen, margin)
+    lost, in_all = erosion(problem, cells)
     high, low = problem.high - _INSIDE, problem.low + _INSIDE
     at_rest = (low + margin + in_all)[:, None], (high - margin - in_all)[:, None]
     _check_rest(problem, *at_rest)
-    polytope = _Polytope(problem, seen, _SPARED * margin)
+    polytope = Polytope(problem, seen, _SPARED * margin)
     polytope.take(np.zeros((len(high), 1, len(problem.a))), *at_rest, np.zeros(1))
-    rows = _elevated(cells.rows[: cells.needed])
+    rows = elevated(cells.rows[: cells.needed])
     count, p, each, n = rows.shape
     rows, lost = rows.swapaxes(0, 1).reshape(p, count * each, n), lost[:count].swapaxes(0, 1).reshape(p, -1)
     ends = np.repeat(cells.ends[:count], each)
@@ -402,92 +318,7 @@ def _by_halving(count: int) -> Iterator[NDArray[np.intp]]:
         yield np.arange(stride, count, 2 * stride)
 
 
-def _seen(problem: _Problem) -> Array:
-    """Directions (nstates, nseen) of the state that the limited outputs show, as long as they show as much.
-
-    They are coordinates in which the norm of a state is what the outputs' free
-    motion from there amounts to, the integral of its square: it never grows.
-    """
-    if not problem.a.size:
-        return np.zeros((0, 0))
-    balanced, scaling = matrix_balance(problem.a, permute=False)
-    c = problem.c @ scaling
-    size, directions = np.linalg.eigh(solve_continuous_lyapunov(balanced.T, -c.T @ c))
-    length = np.sqrt(np.maximum(size, 0.0))
-    shown = length > _SEEN * length.max(initial=0.0)
-    return np.asarray(scaling @ (directions[:, shown] / length[shown]))
-
-
-def _cells(problem: _Problem, seen: Array, margin: float) -> _Cells:
-    """Cells up to where the loop is at rest, or nearly.
-
-    In the coordinates `seen` no free motion grows: a derivative of an output is
-    nowhere later larger than it may be at the beginning of a cell, which bounds
-    what its Taylor polynomial leaves. The square of a state's size is what it
-    loses until t, no more than limits are wide, and what is left then: that
-    bounds the size.
-    """
-    a, n, widths = problem.a, len(problem.a), problem.high - problem.low
-    powers = [np.eye(n)]
-    for _ in range(_DEGREE + 1):
-        powers.append(powers[-1] @ a)
-    orders = np.arange(_DEGREE + 1)
-    # From powers of s in [0, 1] to Bernstein's polynomials, divided by factorials.
-    basis = np.tril(comb(orders[:, None], orders) / comb(_DEGREE, orders)) / factorial(orders)
-    moved, back, t, needed = np.eye(n), np.linalg.pinv(seen), 0.0, 0
-    first = _norm(problem.c @ seen)
-    ends: list[float] = []
-    found: list[Array] = []
-    while True:
-        if len(ends) == _CELLS:
-            raise ValueError(
-                f"loop must come to rest sooner beside its fastest motion, got motion after {t:.3g} s that takes more "
-                f"than {_CELLS} cells of time"
-            )
-        bend = _norm(problem.c @ powers[-1] @ moved @ seen)
-        h = (_REMAINDER * first * factorial(_DEGREE + 1) / bend) ** (1.0 / (_DEGREE + 1)) if bend else math.inf
-        h = min(h, 1.0 / problem.slowest)
-        series = np.stack([power * h**k for k, power in enumerate(powers[:-1])])
-        found.append(np.einsum("ij,jpn->pin", basis, (problem.c @ series) @ moved))
-        moved, t = expm(a * h) @ moved, t + h
-        ends.append(t)
-        left = _norm(problem.c @ moved @ seen)
-        if not needed:
-            kept = 1.0 - np.linalg.norm(back @ moved @ seen, 2) ** 2 if seen.size else 1.0
-            if kept > 0.0 and left * math.sqrt(t * float(widths @ widths) / kept) <= margin:
-                needed = len(ends)
-        # Disturbances add up until nothing moves.
-        if needed and (left <= _REMAINDER * first or not problem.e.any()):
-            return _Cells(np.array(ends), np.array(found), needed)
-
-
-def _norm(rows: Array) -> float:
-    return float(np.linalg.norm(rows, axis=1).max(initial=0.0))
-
-
-def _elevated(rows: Array) -> Array:
-    """Bernstein coefficients, along the last axis but one, of the same polynomials at a degree one higher."""
-    part = (np.arange(1, rows.shape[2]) / rows.shape[2])[:, None]
-    inner = part * rows[:, :, :-1] + (1.0 - part) * rows[:, :, 1:]
-    return np.concatenate([rows[:, :, :1], inner, rows[:, :, -1:]], axis=2)
-
-
-def _erosion(problem: _Problem, cells: _Cells) -> tuple[Array, Array]:
-    """What disturbances can make of each output: over each cell, (ncells, noutputs, degree + 2), and in all.
-
-    It is the integral of the size of c exp(a t) e. A polynomial is nowhere
-    larger than the one whose Bernstein coefficients are the sizes of its own,
-    and these add up to the coefficients of the integral.
-    """
-    size = np.abs(cells.rows @ problem.e).sum(axis=3)
-    lengths = np.diff(cells.ends, prepend=0.0)[:, None, None] / size.shape[2]
-    sums = np.cumsum(np.concatenate([np.zeros_like(size[:, :, :1]), lengths * size], axis=2), axis=2)
-    before = np.cumsum(sums[:, :, -1], axis=0) - sums[:, :, -1] + np.abs(problem.f).sum(axis=1)
-    found = sums + before[:, :, None]
-    return found, found[-1, :, -1]
-
-
-def _check_rest(problem: _Problem, low: Array, high: Array) -> None:
+def _check_rest(problem: Problem, low: Array, high: Array) -> None:
     """Refuse limits between which the loop cannot rest."""
     p, m = problem.gain.shape
     both = np.vstack([problem.gain, -problem.gain])
@@ -504,98 +335,3 @@ def _check_rest(problem: _Problem, low: Array, high: Array) -> None:
             f"limits of {', '.join(problem.labels)} must leave a reference at which the loop rests inside them by the "
             f"margin, whatever the disturbances, got {abs(room):.3g} of half their distance too little"
         )
-
-
-class _Polytope:
-    """Rows that are kept, each with a bound on z and v; and proofs that others follow from them.
-
-    A row follows if it is a sum of kept ones with factors of at least 0, which
-    are found by nonnegative least squares: some twenty times faster than a
-    linear program of this size.
-    """
-
-    def __init__(self, problem: _Problem, seen: Array, spare: float) -> None:
-        self._gain, self._seen, self._spare = problem.gain, seen, spare
-        u, s, _ = np.linalg.svd(problem.gain, full_matrices=False)
-        self._rest = u[:, s > 1e-12 * s.max(initial=0.0)]  # outputs at rest, by as many coordinates as they have
-        # Bounds are taken from the middle between limits, as near to it as outputs at rest come.
-        self._centre = self._rest @ (self._rest.T @ problem.middle)
-        self._columns = np.zeros((seen.shape[1] + self._rest.shape[1] + 1, 0))
-        self._columns = self._column(np.zeros((1, len(seen))), np.zeros((1, len(self._gain))), np.ones(1))
-        self._kept: list[tuple[Array, Array, float, float]] = []
-        self._proofs: list[_Proof] = []
-
-    def take(self, rows: Array, low: Array, high: Array, ends: Array) -> None:
-        """Keep what does not follow of low <= rows @ z + gain @ v <= high.
-
-        Rows (noutputs, ntime, nstates), limits (noutputs, ntime), and the times
-        of the ends of their cells; of time 0 nothing is given away.
-        """
-        p, count, n = rows.shape
-        outputs = np.repeat(np.eye(p), count, axis=0)
-        state = np.concatenate([rows, -rows]).reshape(2 * p * count, n)
-        output, bound = np.concatenate([outputs, -outputs]), np.concatenate([high, -low]).ravel()
-        spared = bound - np.tile(np.where(ends > 0.0, self._spare, 0.0), 2 * p)
-        columns, kept = self._column(state, output, bound), self._column(state, output, spared)
-        left = np.arange(bound.size)
-        for known in self._proofs:
-            left = left[_unproven(known, columns[:, left])]
-        self._proofs = []
-        while left.size:
-            k, left = int(left[0]), left[1:]
-            proof = self._proof(columns[:, k])
-            if proof is not None:
-                self._proofs = [proof, *self._proofs[: _PROOFS - 1]]
-                # What stands next is of the same output and of nearly the same time.
-                near, far = left[:_NEIGHBOURS], left[_NEIGHBOURS:]
-                left = np.concatenate([near[_unproven(proof, columns[:, near])], far])
-                continue
-            self._kept.append((state[k], output[k], float(spared[k]), float(ends[k % count])))
-            self._columns = np.hstack([self._columns, kept[:, [k]]])
-
-    def reduced(self) -> tuple[_Rows, float]:
-        """Rows that do not follow from the rest of them, and the time [s] up to which they look."""
-        needed = []
-        for k, row in enumerate(self._kept):
-            column = self._columns[:, k + 1].copy()
-            self._columns[:, k + 1] = 0.0
-            if self._proof(column) is None:
-                self._columns[:, k + 1] = column
-                needed.append(row)
-        state = np.array([row[0] for row in needed]).reshape(len(needed), len(self._seen))
-        output = np.array([row[1] for row in needed]).reshape(len(needed), len(self._gain))
-        bound = np.array([row[2] for row in needed])
-        return _Rows(state, output @ self._gain, bound), max([row[3] for row in needed], default=0.0)
-
-    def _column(self, state: Array, output: Array, bound: Array) -> Array:
-        """Rows as columns (coordinates and bound) of length 1."""
-        found = np.vstack([(state @ self._seen).T, (output @ self._rest).T, bound - output @ self._centre])
-        return np.asarray(found / np.linalg.norm(found, axis=0))
-
-    def _proof(self, column: Array) -> _Proof | None:
-        """Kept columns of which a column is a sum: of a few near it, and more as they are missed."""
-        every, missed = self._columns, column
-        near = np.empty(0, dtype=np.intp)
-        for _ in range(_ATTEMPTS):
-            gain = missed @ every
-            if gain.max() <= _PROVEN * np.linalg.norm(missed):
-                return None
-            new = np.argpartition(gain, -_NEAR)[-_NEAR:] if gain.size > _NEAR else np.arange(gain.size)
-            near = np.union1d(near, new)
-            try:
-                factors, rest = nnls(every[:, near], column)
-            except RuntimeError:
-                return None
-            used = factors > 0.0
-            near, generators = near[used], every[:, near[used]]
-            missed = column - generators @ factors[used]
-            if rest <= _PROVEN:
-                return generators, np.linalg.pinv(generators)
-        return None  # nothing is proven: the row is kept
-
-
-def _unproven(proof: _Proof, columns: Array) -> NDArray[np.bool_]:
-    """Which columns are no sum of those of a proof."""
-    generators, inverse = proof
-    missed = columns - generators @ np.maximum(inverse @ columns, 0.0)
-    return np.einsum("ij,ij->j", missed, missed) > _PROVEN**2

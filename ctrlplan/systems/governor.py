@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ctrlplan.systems.admissible import AdmissibleSet, Limits
 from ctrlplan.systems.exposed import state_signals
-from ctrlplan.systems.hybrid import refuse_alone
+from ctrlplan.systems.hybrid import checked_seconds, refuse_alone
 from ctrlplan.trajectories.common import checked_time
 
 Array = NDArray[np.float64]
@@ -68,7 +68,7 @@ class Governor(ct.NonlinearIOSystem):  # type: ignore[misc]
         )
         self.admission, self.period, self.offset, self.initial = admission, period, offset, initial
         self.feedthrough = False  # between samples
-        self.watched = {f"{name}_refused": (_refused, -math.inf, 0.5), f"{name}_unread": (_unread, -math.inf, 0.5)}
+        self.watched = {f"{name} state": (_refused, -math.inf, 0.5), f"{name} input": (_unread, -math.inf, 0.5)}
         self._count = len(references)
         self._last: tuple[bytes, Array] = (b"", np.empty(0))
 
@@ -114,8 +114,8 @@ def create_governor_iosystem(
     v+ = v + kappa (r - v), by the largest kappa in [0, 1] for which the loop,
     with v+ held from now on, keeps its limits for ever. What is admissible
     passes unchanged, kappa = 1. Where nothing is, not even holding, or an input
-    is not finite, v is held, and a run by `ctrlplan.simulate` records the
-    events ``<name>_refused`` and ``<name>_unread``.
+    is not finite, v is held, and a run by `ctrlplan.simulate` records events:
+    the governor's state, or its input, has left its limits.
 
     Inputs: what is asked for, ``<reference>_asked``, then the states of the
     loop as `expose_states` puts them out. Outputs: the references, by the
@@ -139,7 +139,8 @@ def create_governor_iosystem(
     name : str, optional
         Name of the block.
     **options
-        For the `AdmissibleSet` of a linear loop: references, margin, disturbances.
+        For the `AdmissibleSet` of a linear loop: references, margin,
+        disturbances, origin.
 
     Returns
     -------
@@ -185,9 +186,7 @@ def create_governor_iosystem(
     period = checked_time(given, "dt", positive=True)
     if own is not None and abs(period - own) > 1e-12 * own:
         raise ValueError(f"dt must be the period of the admissible set, {own:g} s, got {period:g} s")
-    start = checked_time(offset, "offset")
-    if start < 0.0:
-        raise ValueError(f"offset must be at least 0 s, got {start:g}")
+    start = checked_seconds("offset", offset, positive=False)
     count = len(admission.references)
     before = np.asarray(initial, dtype=float)
     if before.shape not in ((), (count,)) or not np.isfinite(before).all():

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from numbers import Real
 from typing import Any
 
 import control as ct
@@ -12,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctrlplan.trajectories import Trajectory
-from ctrlplan.trajectories.common import checked_count, checked_time
+from ctrlplan.trajectories.common import checked_count, checked_limits, checked_number, checked_pair, checked_time
 from ctrlplan.trajectories.files import signal_names
 
 Array = NDArray[np.float64]
@@ -116,7 +115,8 @@ def create_time_scaling_iosystem(
     w = 10.0 / plan.duration if bandwidth is None else checked_time(bandwidth, "bandwidth", positive=True)
     horizon = 4.0 * n / w if catch_up is None else checked_time(catch_up, "catch_up", positive=True)
     least, most, inner = (
-        _number(label, value) for label, value in (("slowest", slowest), ("fastest", fastest), ("margin", margin))
+        checked_number(value, label)
+        for label, value in (("slowest", slowest), ("fastest", fastest), ("margin", margin))
     )
     poles = np.roots([*_lags(n, w), 1.0 / horizon])
     if poles.real.max() >= 0.0:
@@ -205,37 +205,20 @@ def _nearness(value: Any, low: float, high: float, reach: float) -> Any:
     return 1.0 - distance / reach
 
 
-def _checked_limits(label: str, pair: Sequence[float], margin: float) -> tuple[float, float, float]:
+def _checked_limits(label: str, pair: Any, margin: float) -> tuple[float, float, float]:
     """Limits, and the distance from them within which the rate falls."""
-    low, high = _pair(f"limits of {label}", pair)
-    if not low < high:
-        raise ValueError(f"limits of {label} must increase, got {pair!r}")
-    finite = [abs(value) for value in (low, high) if math.isfinite(value)]
-    span = high - low if len(finite) == 2 else max(finite, default=0.0)
-    if not span:
-        raise ValueError(f"limits of {label} must hold a finite one that is not 0, got {pair!r}")
-    return low, high, margin * span
+    low, high, size = checked_limits(pair, f"limits of {label}")
+    both = math.isfinite(low) and math.isfinite(high)
+    return low, high, margin * (2.0 * size if both else size)
 
 
-def _checked_band(label: str, pair: Sequence[float], plan: Trajectory) -> tuple[float, float]:
+def _checked_band(label: str, pair: Any, plan: Trajectory) -> tuple[float, float]:
     if label not in plan.labels:
         raise ValueError(f"errors must name axes of the plan, {', '.join(plan.labels)}, got {label!r}")
-    soft, hard = _pair(f"errors of {label}", pair)
+    soft, hard = checked_pair(pair, f"errors of {label}")
     if not 0.0 <= soft < hard < math.inf:
-        raise ValueError(f"errors of {label} must be finite and increase from 0, got {pair!r}")
+        raise ValueError(f"errors of {label} must be finite and at least 0, got {soft:g} and {hard:g}")
     return soft, hard
-
-
-def _pair(label: str, pair: Any) -> tuple[float, float]:
-    if not isinstance(pair, Sequence | np.ndarray) or isinstance(pair, str) or len(pair) != 2:
-        raise TypeError(f"{label} must be two numbers, got {pair!r}")
-    return _number(label, pair[0]), _number(label, pair[1])
-
-
-def _number(label: str, value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, Real):
-        raise TypeError(f"{label} must be a number, got {value!r}")
-    return float(value)
 
 
 def _lags(n: int, w: float) -> list[float]:

@@ -89,6 +89,36 @@ def checked_timepts(t: ArrayLike) -> Array:
     return times
 
 
+def checked_number(value: object, name: str) -> float:
+    """Number that is not nan."""
+    if isinstance(value, bool) or not isinstance(value, Real):
+        raise TypeError(f"{name} must be a number, got {value!r}")
+    number = float(value)
+    if math.isnan(number):
+        raise ValueError(f"{name} must be a number, got nan")
+    return number
+
+
+def checked_pair(pair: object, name: str) -> tuple[float, float]:
+    """Two numbers that increase."""
+    if not isinstance(pair, Sequence | np.ndarray) or isinstance(pair, str) or len(pair) != 2:
+        raise ValueError(f"{name} must be two numbers, got {pair!r}")
+    low, high = checked_number(pair[0], name), checked_number(pair[1], name)
+    if not low < high:
+        raise ValueError(f"{name} must increase, got {low:g} and {high:g}")
+    return low, high
+
+
+def checked_limits(pair: object, name: str) -> tuple[float, float, float]:
+    """Least and greatest value, of which one may be infinite; and half their distance, or the size of the only one."""
+    low, high = checked_pair(pair, name)
+    if math.isinf(low) and math.isinf(high):
+        raise ValueError(f"{name} must hold a finite one, got {low:g} and {high:g}")
+    if math.isfinite(low) and math.isfinite(high):
+        return low, high, 0.5 * (high - low)
+    return low, high, abs(low if math.isfinite(low) else high) or 1.0
+
+
 def mapped_time(time: float, origin: float, target: float, rate: float) -> float:
     """Time moved to target + (time - origin)/rate: exact at the origin."""
     return target + (time - origin) / rate

@@ -171,14 +171,14 @@ def test_a_sensor_that_fails_and_comes_back():
     expected = np.where((times > 0.49) & (times < 0.99), 0.4, sampled)
     assert np.abs(found.outputs[1] - expected).max() <= 1e-12
     seen = [(event.name, event.kind, round(event.time, 6)) for event in found.events]
-    assert seen == [("governor_unread", "above", 0.5), ("governor_unread", "inside", 1.0)]
+    assert seen == [("governor input", "above", 0.5), ("governor input", "inside", 1.0)]
 
 
 def test_a_state_from_which_nothing_is_admissible():
     """The reference is 0 throughout, so that what would come is what comes: u beyond its limits, or not."""
     start = [0.0, 0.0, 0.0, 0.0, -0.4, 0.5]  # u = -2.5 there
     found = cp.simulate(lag_loop(), np.linspace(0.0, 6.0, 1201), 0.0, start)
-    assert [(e.name, e.kind) for e in found.events] == [("governor_refused", "above"), ("governor_refused", "inside")]
+    assert [(e.name, e.kind) for e in found.events] == [("governor state", "above"), ("governor state", "inside")]
     assert found.events[0].time == 0.0
     refused = found.states[2, ::10] == 1.0
     to_come = np.maximum.accumulate(np.abs(found.outputs[1])[::-1])[::-1][::10]
@@ -276,7 +276,7 @@ LIMITS = {"u": (-1.0, 1.0)}
         ({"dt": -1.0}, ValueError, "dt must be finite and above 0, got -1.0"),
         ({"initial": math.nan}, ValueError, "initial must be a finite number or 1 of them, got nan"),
         ({"initial": [0.0, 1.0]}, ValueError, "initial must be a finite number or 1 of them"),
-        ({"offset": -0.1}, ValueError, "offset must be at least 0 s, got -0.1"),
+        ({"offset": -0.1}, ValueError, "offset must be finite and at least 0 s, got -0.1"),
         ({"margin": 2.0}, ValueError, r"margin must lie in \(0, 1\)"),
         ({"loop": 3.0}, TypeError, "loop must be a linear control system or have references, .* got float"),
         ({"loop": Slowly()}, TypeError, "limits must go with a loop, got a Slowly, which has its own"),

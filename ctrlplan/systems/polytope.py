@@ -1,0 +1,136 @@
+"""Inequalities that matter, of many of which most follow from others."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import nnls
+
+from ctrlplan.systems.output_cells import Problem
+
+Array = NDArray[np.float64]
+
+_PROVEN = 1e-11
+"""Relative error of a proof that a row follows from others."""
+
+_NEAR = 24
+"""Rows that are added to a proof at a time."""
+
+_ATTEMPTS = 50
+"""Times that this is done."""
+
+_PROOFS = 24
+"""Proofs that are kept to be tried on other rows."""
+
+_NEIGHBOURS = 64
+"""Rows on which a new proof is tried."""
+
+_Proof: TypeAlias = tuple[NDArray[np.float64], NDArray[np.float64]]
+"""Rows of which others are sums, and the inverse that finds the factors."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """Inequalities state @ z + reference @ v <= bound in the distance z of the state from rest."""
+
+    state: Array
+    reference: Array
+    bound: Array
+
+
+class Polytope:
+    """Rows that are kept, each with a bound on z and v; and proofs that others follow from them.
+
+    A row follows if it is a sum of kept ones with factors of at least 0, which
+    are found by nonnegative least squares: some twenty times faster than a
+    linear program of this size.
+    """
+
+    def __init__(self, problem: Problem, seen: Array, spare: float) -> None:
+        self._gain, self._seen, self._spare = problem.gain, seen, spare
+        u, s, _ = np.linalg.svd(problem.gain, full_matrices=False)
+        self._rest = u[:, s > 1e-12 * s.max(initial=0.0)]  # outputs at rest, by as many coordinates as they have
+        # Bounds are taken from the middle between limits, as near to it as outputs at rest come.
+        self._centre = self._rest @ (self._rest.T @ problem.middle)
+        self._columns = np.zeros((seen.shape[1] + self._rest.shape[1] + 1, 0))
+        self._columns = self._column(np.zeros((1, len(seen))), np.zeros((1, len(self._gain))), np.ones(1))
+        self._kept: list[tuple[Array, Array, float, float]] = []
+        self._proofs: list[_Proof] = []
+
+    def take(self, rows: Array, low: Array, high: Array, ends: Array) -> None:
+        """Keep what does not follow of low <= rows @ z + gain @ v <= high.
+
+        Rows (noutputs, ntime, nstates), limits (noutputs, ntime), and the times
+        of the ends of their cells; of time 0 nothing is given away.
+        """
+        p, count, n = rows.shape
+        outputs = np.repeat(np.eye(p), count, axis=0)
+        state = np.concatenate([rows, -rows]).reshape(2 * p * count, n)
+        output, bound = np.concatenate([outputs, -outputs]), np.concatenate([high, -low]).ravel()
+        spared = bound - np.tile(np.where(ends > 0.0, self._spare, 0.0), 2 * p)
+        columns, kept = self._column(state, output, bound), self._column(state, output, spared)
+        left = np.arange(bound.size)
+        for known in self._proofs:
+            left = left[_unproven(known, columns[:, left])]
+        self._proofs = []
+        while left.size:
+            k, left = int(left[0]), left[1:]
+            proof = self._proof(columns[:, k])
+            if proof is not None:
+                self._proofs = [proof, *self._proofs[: _PROOFS - 1]]
+                # What stands next is of the same output and of nearly the same time.
+                near, far = left[:_NEIGHBOURS], left[_NEIGHBOURS:]
+                left = np.concatenate([near[_unproven(proof, columns[:, near])], far])
+                continue
+            self._kept.append((state[k], output[k], float(spared[k]), float(ends[k % count])))
+            self._columns = np.hstack([self._columns, kept[:, [k]]])
+
+    def reduced(self) -> tuple[Rows, float]:
+        """Rows that do not follow from the rest of them, and the time [s] up to which they look."""
+        needed = []
+        for k, row in enumerate(self._kept):
+            column = self._columns[:, k + 1].copy()
+            self._columns[:, k + 1] = 0.0
+            if self._proof(column) is None:
+                self._columns[:, k + 1] = column
+                needed.append(row)
+        state = np.array([row[0] for row in needed]).reshape(len(needed), len(self._seen))
+        output = np.array([row[1] for row in needed]).reshape(len(needed), len(self._gain))
+        bound = np.array([row[2] for row in needed])
+        return Rows(state, output @ self._gain, bound), max([row[3] for row in needed], default=0.0)
+
+    def _column(self, state: Array, output: Array, bound: Array) -> Array:
+        """Rows as columns (coordinates and bound) of length 1."""
+        found = np.vstack([(state @ self._seen).T, (output @ self._rest).T, bound - output @ self._centre])
+        return np.asarray(found / np.linalg.norm(found, axis=0))
+
+    def _proof(self, column: Array) -> _Proof | None:
+        """Kept columns of which a column is a sum: of a few near it, and more as they are missed."""
+        every, missed = self._columns, column
+        near = np.empty(0, dtype=np.intp)
+        for _ in range(_ATTEMPTS):
+            gain = missed @ every
+            if gain.max() <= _PROVEN * np.linalg.norm(missed):
+                return None
+            new = np.argpartition(gain, -_NEAR)[-_NEAR:] if gain.size > _NEAR else np.arange(gain.size)
+            near = np.union1d(near, new)
+            try:
+                factors, rest = nnls(every[:, near], column)
+            except RuntimeError:
+                return None
+            used = factors > 0.0
+            near, generators = near[used], every[:, near[used]]
+            missed = column - generators @ factors[used]
+            if rest <= _PROVEN:
+                return generators, np.linalg.pinv(generators)
+        return None  # nothing is proven: the row is kept
+
+
+def _unproven(proof: _Proof, columns: Array) -> NDArray[np.bool_]:
+    """Which columns are no sum of those of a proof."""
+    generators, inverse = proof
+    missed = columns - generators @ np.maximum(inverse @ columns, 0.0)
+    return np.einsum("ij,ij->j", missed, missed) > _PROVEN**2
