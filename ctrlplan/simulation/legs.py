@@ -153,6 +153,8 @@ def integrate(
         raise ValueError(
             f"a delay must be at least {_SHORTEST_DELAY:g} of the run of {last - first:g} s, got {longest:g} s"
         )
+    declared = [float(getattr(block.system, "longest", np.inf)) for block in network.blocks]
+    longest = max(min([longest, *declared]), _SHORTEST_DELAY * (last - first))
     if pause is not None:
         longest = min(longest, (last - first) / 64.0)
     shortest = 1e-9 * (last - first) if pause is not None else np.inf

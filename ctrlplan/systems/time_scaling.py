@@ -147,7 +147,9 @@ def create_time_scaling_iosystem(
         if bands:
             reference = plan.series(t - x[0], 0)
             for k, (axis, (soft, hard)) in enumerate(zip(axes, bands.values(), strict=True), len(bounds)):
-                found.append((np.fabs(u[k] - reference[axis][0]) - soft) / (hard - soft))
+                off = u[k] - reference[axis][0]
+                # Not fabs: of a signal that is lost (nan) its derivative would be lost as well.
+                found.append((np.fmax(off, -off) - soft) / (hard - soft))
         worst = found[0]
         for value in found[1:]:
             worst = np.fmax(worst, value)
@@ -178,6 +180,8 @@ def create_time_scaling_iosystem(
     )
     block.feedthrough = False
     block.breakpoints = plan.breakpoints
+    if plan.duration:  # once behind, the plan moves at times that no breakpoint names
+        block.longest = 0.5 * float(np.diff(plan.breakpoints).min())
     return block
 
 
@@ -209,6 +213,8 @@ def _checked_limits(label: str, pair: Any, margin: float) -> tuple[float, float,
     """Limits, and the distance from them within which the rate falls."""
     low, high, size = checked_limits(pair, f"limits of {label}")
     both = math.isfinite(low) and math.isfinite(high)
+    if not both and 0.0 in (low, high):
+        raise ValueError(f"limits of {label} must hold a finite one that is not 0, got {low:g} and {high:g}")
     return low, high, margin * (2.0 * size if both else size)
 
 

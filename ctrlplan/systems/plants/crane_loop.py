@@ -64,9 +64,10 @@ def crane_loop(
         Limits of F [N] and C [N m], with anti-windup.
     reference : sequence of control systems, optional
         Blocks in the place of the plan's source: a replanner, a governor, a
-        slowed clock, with whatever they are fed by; among their outputs are the
-        jets that the law reads, x_ref, x_ref_d1, ..., z_ref, .... Where one
-        starts elsewhere than at 0, its attribute ``initial_state`` says so.
+        slowed clock, with whatever they are fed by. What nothing else reads of
+        their outputs must be the jets that the law reads, x_ref, x_ref_d1, ...,
+        z_ref, .... Where one starts elsewhere than at 0, its attribute
+        ``initial_state`` says so.
     wind : Trajectory, optional
         Horizontal force on the load [N], along x.
     inputs : sequence of str, optional
@@ -111,10 +112,19 @@ def crane_loop(
     plan = _named(plan)
     _check_smooth(plan, smooth, law)
     crane.check(plan)
+    for label, values in (("inputs", inputs), ("reference", reference)):
+        if isinstance(values, str | ct.InputOutputSystem):
+            raise TypeError(f"{label} must be a sequence, got {values!r:.60}")
+    for block in reference or ():
+        if not isinstance(block, ct.InputOutputSystem):
+            raise TypeError(f"reference must hold control systems, got {type(block).__name__}")
+    if wind is not None and not (isinstance(wind, Trajectory) and wind.naxes == 1 and "wind" not in inputs):
+        got = "wind among inputs as well" if "wind" in inputs else repr(wind)
+        raise ValueError(f"wind must be a trajectory of one axis, or one of inputs, got {got:.60}")
     sources = [create_source_iosystem(plan, order, suffix="_ref")] if reference is None else list(reference)
     plant = crane.iosystem(wind=wind is not None or "wind" in inputs)
     if wind is not None:
-        sources.append(create_source_iosystem(stack([wind], labels=["wind"]), name="wind"))
+        sources.append(create_source_iosystem(stack([wind], labels=["wind"]), name="gust"))
     if law in ("dynamic", "feedforward"):
         if force_limits is not None or torque_limits is not None:
             raise ValueError(f"limits must go with a law that drives the PIDs, got law {law!r}")
@@ -148,7 +158,10 @@ def crane_loop(
 
 def _start(block: Any) -> NDArray[np.float64]:
     """Where a block starts: where it says so, or at 0."""
-    return np.zeros(block.nstates or 0) + np.asarray(getattr(block, "initial_state", 0.0), dtype=float)
+    start = np.asarray(getattr(block, "initial_state", 0.0), dtype=float)
+    if start.shape not in ((), (block.nstates,)):
+        raise ValueError(f"initial_state of {block.name} must be {block.nstates} numbers, got shape {start.shape}")
+    return np.broadcast_to(start, (block.nstates or 0,))
 
 
 def _named(plan: Trajectory) -> Trajectory:
