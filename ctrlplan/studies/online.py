@@ -189,11 +189,11 @@ def online_metrics(goal: Array, force: float, response: Any) -> dict[str, float]
     distance = np.hypot(signals["x"] - goal[0], signals["z"] - goal[1])
     behind = np.hypot(signals["x"] - signals["x_ref"], signals["z"] - signals["z_ref"])
     end = t >= t[-1] - 5.0
-    limit = force * (1.0 - 1e-9)
+    limit, far = force * (1.0 - 1e-9), max(float(distance.max()), NEAR)
     # Below what a run is accurate to, nothing is left.
     left, sway = float(distance[end].max()), float(metrics.peak(t[end], signals["theta"][end]))
     return {
-        "arrival": float(metrics.settling_time(t, distance, 0.0, distance[0], NEAR / distance[0])),
+        "arrival": float(metrics.settling_time(t, distance, 0.0, far, NEAR / far)),
         "error_end": left if left > 1e-5 else 0.0,
         "overshoot_goal": max(0.0, float(metrics.peak(t, signals["x"])) - float(goal[0])),
         "error_reference": float(metrics.peak(t, behind)),
@@ -354,7 +354,8 @@ def _compared(trouble: Trouble, title: str, what: str) -> Comparison:
 
 def _in_time_note(limit: float) -> str:
     """What it is worth to know a limit before one starts."""
-    seconds = float(brentq(lambda duration: _asked_force(duration) - limit, 15.0, 60.0, xtol=1e-3)) + 1e-3
+    shortest = brentq(lambda duration: _asked_force(duration) - limit, 15.0, 60.0, xtol=1e-3)
+    seconds = float(np.ceil(10.0 * shortest)) / 10.0
     loop = crane_loop(CRANE, _move().retime(seconds), force_limits=(-limit, limit), torque_limits=TORQUE_LIMITS, **_LAW)
     found = online_metrics(_still().final, limit, simulate(loop, np.linspace(0.0, 50.0, 2501)))
     return (
