@@ -23,6 +23,7 @@ _EXPORTS = {
     ),
     "systems": (
         "AdmissibleSet",
+        "command_lead",
         "create_command_filter_iosystem",
         "create_delay_iosystem",
         "create_feedforward_iosystem",

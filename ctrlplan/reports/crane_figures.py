@@ -321,7 +321,7 @@ CRANE_FIGURES = {
         lambda study: plot_motion(study.comparison, study.wall),
         "Trolley, rope and load at equal time steps.",
     ),
-    "online": (
+    "crane-online": (
         lambda study: plot_online(study.comparison),
         "The load's x with the reference in force (thin), its distance from the goal (millimetres and less cut off), "
         "sway and force.",

@@ -366,7 +366,7 @@ def _in_time_note(limit: float) -> str:
 
 
 def _study(name: str, found: Comparison, summary: str, *notes: str) -> Study:
-    return Study(name, found.title, found, summary, (*notes, *found.notes), figures=("online",))
+    return Study(name, found.title, found, summary, (*notes, *found.notes), figures=("crane-online",))
 
 
 def _move() -> TrigSpline:

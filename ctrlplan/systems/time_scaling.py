@@ -147,9 +147,7 @@ def create_time_scaling_iosystem(
         if bands:
             reference = plan.series(t - x[0], 0)
             for k, (axis, (soft, hard)) in enumerate(zip(axes, bands.values(), strict=True), len(bounds)):
-                off = u[k] - reference[axis][0]
-                # Not fabs: of a signal that is lost (nan) its derivative would be lost as well.
-                found.append((np.fmax(off, -off) - soft) / (hard - soft))
+                found.append((np.fabs(u[k] - reference[axis][0]) - soft) / (hard - soft))
         worst = found[0]
         for value in found[1:]:
             worst = np.fmax(worst, value)

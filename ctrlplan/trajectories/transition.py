@@ -15,7 +15,7 @@ from ctrlplan.trajectories.trigonometric import checked_alpha
 
 
 class Transition(Frozen):
-    r"""Splines from any jet to any other in one horizon, factorised once.
+    r"""Splines from jet to jet in one horizon, factorised once.
 
     Replanning every instant towards 0 with the horizon kept is the constant law
 

@@ -320,7 +320,7 @@ GOOD = {"limits": {"u": (-1.0, 1.0)}, "dt": 0.1}
         ({"limits": {"z": (-1, 1)}}, "limits must be of u, y, got 'z'"),
         ({"limits": {}}, "limits must name an output"),
         ({"limits": {"u": (1, 1)}}, "limits of u must increase, got 1 and 1"),
-        ({"limits": {"u": (math.nan, 1)}}, "limits of u must increase"),
+        ({"limits": {"u": (math.nan, 1)}}, "limits of u must be a number, got nan"),
         ({"limits": {"u": (-math.inf, math.inf)}}, "must hold a finite one"),
         ({"limits": {"u": (1, 2, 3)}}, "limits of u must be two numbers"),
         ({"limits": {"u": (1, 2)}}, "must leave a reference .* got 2.01 of half"),  # u rests at 0
