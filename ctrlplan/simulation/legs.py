@@ -39,6 +39,9 @@ _HOPS = 6
 
 _SHORTEST_DELAY = 1e-5
 
+_LEGS = 2_000
+"""Legs that blocks may ask for in a run."""
+
 _MARKS = 20_000
 """Instants of jumps that a run stops at, at most."""
 
@@ -154,7 +157,7 @@ def integrate(
             f"a delay must be at least {_SHORTEST_DELAY:g} of the run of {last - first:g} s, got {longest:g} s"
         )
     declared = [float(getattr(block.system, "longest", np.inf)) for block in network.blocks]
-    longest = max(min([longest, *declared]), _SHORTEST_DELAY * (last - first))
+    longest = min(longest, max(min(declared, default=np.inf), (last - first) / _LEGS))
     if pause is not None:
         longest = min(longest, (last - first) / 64.0)
     shortest = 1e-9 * (last - first) if pause is not None else np.inf

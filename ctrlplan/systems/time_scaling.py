@@ -178,9 +178,19 @@ def create_time_scaling_iosystem(
     )
     block.feedthrough = False
     block.breakpoints = plan.breakpoints
-    if plan.duration:  # once behind, the plan moves at times that no breakpoint names
-        block.longest = 0.5 * float(np.diff(plan.breakpoints).min())
+    # Once behind, the plan moves out of rest at times that no breakpoint names.
+    block.longest = 0.5 * _shortest_move(plan)
     return block
+
+
+def _shortest_move(plan: Trajectory) -> float:
+    """Shortest time [s] from rest to rest in which the plan moves."""
+    slopes = np.stack([plan.jet(plan.breakpoints, 2, left=left)[1:] for left in (False, True)])
+    still = np.flatnonzero(np.all(np.abs(slopes) <= 1e-9 * np.abs(slopes).max(initial=1e-300), axis=(0, 1, 2)))
+    rests = plan.breakpoints[np.union1d(still, [0, plan.breakpoints.size - 1])]
+    middles = 0.5 * (rests[1:] + rests[:-1])
+    moves = np.any(plan.jet(middles, 2)[1:] != 0.0, axis=(0, 1))
+    return float(np.diff(rests)[moves].min(initial=np.inf))
 
 
 def _rate_weights(n: int, w: float) -> list[list[float]]:

@@ -194,15 +194,14 @@ class Trajectory(Frozen, ABC):
             raise TypeError(f"t must be one number or a symbol, got {t!r:.80}")
         # Each leg counts where it holds; elsewhere it is taken at its ends, where it is finite.
         found = [[value * (t < self.start), *[0.0] * order] for value in self.initial.tolist()]
-        edges = self.breakpoints.tolist()
-        for leg, (left, right) in enumerate(itertools.pairwise(edges)):
-            holds = (t >= left) * (t <= right if leg == len(edges) - 2 else t < right)
+        for leg, (left, right) in enumerate(itertools.pairwise(self.breakpoints.tolist())):
+            holds = (t >= left) * (t < right)
             rows = self._leg_series(leg, np.fmin(np.fmax(t - left, 0.0), right - left), order)
             found = [[a + holds * b for a, b in zip(*pair, strict=True)] for pair in zip(found, rows, strict=True)]
-        after = t > self.end if self.duration else t >= self.end
         for row, value in zip(found, self.final.tolist(), strict=True):
-            row[0] = row[0] + value * after
-        return found
+            row[0] = row[0] + value * (t > self.end)
+        last = (self.jet(self.end, order).T / FACTORIALS[: order + 1]).tolist()
+        return [[a + (t == self.end) * b for a, b in zip(*pair, strict=True)] for pair in zip(found, last, strict=True)]
 
     def extrema(self, nu: int = 0) -> _extrema.Extrema:
         """Least and greatest value of the nu-th derivative, true over the whole interval.

@@ -115,6 +115,8 @@ def crane_loop(
     for label, values in (("inputs", inputs), ("reference", reference)):
         if isinstance(values, str | ct.InputOutputSystem):
             raise TypeError(f"{label} must be a sequence, got {values!r:.60}")
+    if len(set(inputs)) < len(inputs):
+        raise ValueError(f"inputs must not name a signal twice, got {', '.join(inputs)}")
     for block in reference or ():
         if not isinstance(block, ct.InputOutputSystem):
             raise TypeError(f"reference must hold control systems, got {type(block).__name__}")
