@@ -417,6 +417,7 @@ def test_values_at_which_a_loop_never_settles_are_drawn_too():
         assert set(k[np.isfinite(ts)]) == {1.0, 2.0}
 
 
+@pytest.mark.slow
 def test_every_measure_can_be_swept_and_drawn(swept):
     names = [name for name in MEASURES if name in swept.metrics["step"]]
     figure = plot_sweep(swept, names)

@@ -6,6 +6,8 @@ import math
 
 import pytest
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module", params=["own", pytest.param("reproduced", marks=pytest.mark.slow)])
 def shown(request):

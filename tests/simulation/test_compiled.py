@@ -207,6 +207,7 @@ def crane_reference(case):
 OFFSET = np.array([0.3, -0.2, 0.02, 0.0, 0.05, 0.0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("case", CASES)
 def test_a_crane_behind_its_drives(case, method):

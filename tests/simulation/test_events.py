@@ -231,6 +231,7 @@ def test_coming_back_does_not_stop_a_run(method):
     assert stopped.outputs.tolist() == [2.0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["compiled", "python", "auto"])
 @pytest.mark.parametrize("level", [2.0, 100.0, 1e6])
 def test_a_stop_before_the_solution_ends(level, method):

@@ -155,6 +155,7 @@ def test_calls_that_cannot_be_meant(call, kind, match):
         call()
 
 
+@pytest.mark.slow
 def test_all_runs_without_the_extra_fast():
     """In a process of its own, where CasADi cannot be imported at all."""
     program = """

@@ -280,6 +280,7 @@ def test_labels_that_are_changed(through):
     assert list(through(system, None, 1.0).output_labels) == ["renamed"]
 
 
+@pytest.mark.slow
 def test_the_forms_that_are_kept_do_not_grow_without_bound():
     systems = [decay(k) for k in np.linspace(1.0, 2.0, 40)]
     for system in systems:
@@ -423,6 +424,7 @@ def ends(ready, level):
     return simulate(ready, T, level).outputs[-1]
 
 
+@pytest.mark.slow
 def test_a_pool_of_processes():
     forms = [prepare(driven()), prepare(ct.ss(-1.0, 1.0, 1.0, 0.0))]
     expected = [[ends(ready, level) for level in (1.0, 2.0)] for ready in forms]

@@ -59,6 +59,7 @@ def test_random_plans_on_random_systems(alpha, seed):
     check(system, plan, signals, sampled, rng.normal(size=nstates))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("alpha", [0.0, 1e-2, 1.0, 4.0])
 @pytest.mark.parametrize(("npoints", "nentries"), [(4, 3), (6, 2), (8, 3), (12, 2)])
 def test_many_constraints(npoints, nentries, alpha):

@@ -460,6 +460,7 @@ def test_draws_of_the_crane_are_the_hand_written_right_hand_side():
 # The same bits wherever they run
 
 
+@pytest.mark.slow
 def test_other_processes_find_the_same_bits(found):
     with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
         same_bits(found, run(lag(), LAGS, pool))
@@ -864,6 +865,7 @@ def test_a_loop_is_not_taken_for_a_function_that_builds_it():
         run(loop, {"tau": [0.5, 1.0]}, Elsewhere())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("build", [lag_by_python_anew, lag_after_delay, discrete_lag])
 def test_a_function_that_builds_the_loop_is_sent_in_its_place(build):
     drawn = {"gain" if build is discrete_lag else "tau": np.linspace(0.5, 1.0, 9)}

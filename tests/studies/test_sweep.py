@@ -235,6 +235,7 @@ def test_an_unstable_loop_among_others_spoils_none_of_them():
     np.testing.assert_allclose(found.metrics["step"]["overshoot_error"][2:], expected, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_memory_does_not_grow_with_the_number_of_values():
     times = np.linspace(0.0, 20.0, 20_001)
     tracemalloc.start()
@@ -279,6 +280,7 @@ def test_threads_find_the_same(swept):
         same(swept, cp.sweep(BUILD, GAINS, PLANS, TIMES, pool, progress=False))
 
 
+@pytest.mark.slow
 def test_processes_find_the_same(swept):
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
         same(swept, cp.sweep(BUILD, GAINS, PLANS, TIMES, executor=pool, progress=False))

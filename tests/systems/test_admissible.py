@@ -145,6 +145,7 @@ def test_inside_nothing_is_violated_and_just_outside_something_is(seed):
         assert violates(loop, limits, 1.02 * inside * x, 1.02 * inside * v)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_limits_on_one_side(seed):
     rng = np.random.default_rng(200 + seed)
@@ -166,6 +167,7 @@ def test_limits_on_one_side(seed):
             assert y[0].max() > 1.5 or y[1].min() < -0.5 or rest[0] > 1.485 or rest[1] < -0.495
 
 
+@pytest.mark.slow
 def test_every_later_time_follows():
     """Finite determination, by linear programs: over the set no output leaves its limits at any time."""
     loop = random_loop(np.random.default_rng(3), 3, 2, 1)

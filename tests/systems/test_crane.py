@@ -159,6 +159,7 @@ def test_the_reverse_map_is_the_geometry_and_newtons_law_symbolically(reverse_ma
     assert sp.simplify(sine**2 + cosine**2) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "jet",
     [

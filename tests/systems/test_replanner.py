@@ -267,6 +267,7 @@ def test_at_its_samples_the_loop_is_the_power_of_a_matrix(order, horizon, alpha,
         state = map_from_fit_to_fit(order, horizon, alpha, period) @ state
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("order", "horizon", "alpha"), LINEAR)
 def test_the_loop_tends_to_the_constant_law_in_proportion_to_the_period(order, horizon, alpha):
     """Gains by the direct solution (alpha = 0: 6, 4; 60, 36, 9; 840, 480, 120, 16; 15120, ..., 25); slope measured."""
@@ -615,6 +616,7 @@ def test_no_derivative_jumps_and_each_is_that_of_the_one_before(order, alpha, ho
     assert (np.ptp(values[0, 1:12], axis=1) > travel).mean() > 0.8
 
 
+@pytest.mark.slow
 @settings(max_examples=40, deadline=None)
 @given(
     st.integers(0, 4),

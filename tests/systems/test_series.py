@@ -31,6 +31,7 @@ def test_entries_are_derivatives_over_factorials():
     np.testing.assert_allclose(series.to_jet(found), jet(A), rtol=1e-15)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("function", "expression"),
     [

@@ -182,6 +182,7 @@ KINKED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("harmonic", [1, 3, 8])
 @pytest.mark.parametrize("name", KINKED)
 def test_kinked_functions(name, harmonic):

@@ -190,6 +190,7 @@ def test_waypoints_close_together(gap, alpha):
     assert miss(plan) <= 1e-12
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("alpha", [0.0, 1e-4, 1.0, 4.2, 5.5, 6.2])
 @pytest.mark.parametrize(
     ("times", "lengths"),
