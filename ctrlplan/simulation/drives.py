@@ -30,6 +30,9 @@ RESOLVED = 4e-15
 """Size of the last terms, relative to the greatest, at which a signal counts as resolved."""
 
 
+_FLAT = 1e-7
+"""Relative size of terms that no longer fall, up to which they are taken for rounding errors."""
+
 _NOISE = 1e-11
 """Size of the later half of the longest series up to which it is taken for noise."""
 
@@ -111,13 +114,12 @@ class SampledDrive:
     def __init__(self, times: Array, values: Array) -> None:
         self.times, self.values = times, values
         slope = np.diff(values) / np.diff(times)
-        self.breakpoints = times[1:-1][slope[1:] != slope[:-1]]
+        rounding = 4.0 * np.finfo(float).eps * (np.abs(values[1:]) + np.abs(values[:-1])) / np.diff(times)
+        self.breakpoints = times[1:-1][np.abs(np.diff(slope)) > rounding[1:] + rounding[:-1]]
 
     def beside(self, moment: float, origin: float, s: Array) -> Array:
-        """Values of the straight line that holds at `moment`."""
-        left = min(max(int(np.searchsorted(self.times, moment)) - 1, 0), self.times.size - 2)
-        (t0, t1), (v0, v1) = self.times[left : left + 2], self.values[left : left + 2]
-        return (v0 + (v1 - v0) * ((origin - t0 + s) / (t1 - t0)))[None]
+        """Values between the samples, which are continuous: none is of one leg alone."""
+        return self.at(origin + s)
 
     def at(self, times: Array) -> Array:
         """Values between the samples."""
@@ -184,8 +186,12 @@ def resolved(signals: Callable[[Array], Array], left: float, right: float, toler
         allowed = size.max(axis=1, keepdims=True)
         if np.all(size[:, -3:] <= tolerance * allowed):
             return [Series(left, right, coefficients)]
-    # Terms that no longer fall are rounding errors of the signal itself.
-    if np.all(size[:, width // 2 :] <= max(_NOISE, 10.0 * tolerance) * allowed):
+    # Terms that no longer fall are rounding errors of the signal itself, which shorter legs make no smaller: where a
+    # plan comes to rest, its derivatives are next to nothing beside it.
+    half, end = size[:, width // 2 : -width // 4], size[:, -width // 4 :]
+    noise = np.maximum(half.max(axis=1), end.max(axis=1))
+    flat = half.max(axis=1) <= 10.0 * end.max(axis=1)
+    if np.all(noise <= np.where(flat, _FLAT, max(_NOISE, 10.0 * tolerance)) * allowed[:, 0]):
         return [Series(left, right, coefficients)]
     middle = 0.5 * (left + right)
     if not left < middle < right or duration < 1e-12 * max(abs(left), abs(right)):

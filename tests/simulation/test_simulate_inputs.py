@@ -147,3 +147,30 @@ def test_a_number_holds_from_the_first_sample_on():
 def test_a_scalar_initial_state_is_for_all_states():
     found = cp.simulate(SYSTEM, T, None, 0.5)
     assert gap(found.states, response(A, B, C, D, [constant(0.0)] * 2, T, [0.5, 0.5])[1]) <= 1e-11
+
+
+@pytest.mark.parametrize("method", ["compiled", "python"])
+@pytest.mark.parametrize("count", [301, 1501])
+def test_many_samples_beside_a_plan_that_comes_to_rest(count, method):
+    """Close to rest a plan's derivatives are rounding beside the plan: no leg is halved for them without end."""
+    t = np.linspace(0.0, 6.0, count)
+    move = [cp.Waypoint(0, 0, 0, 0), cp.Waypoint(4, 1, 0, 0)]
+    source = cp.create_source_iosystem(cp.PolySpline(move, labels=["x"]), 2)
+    limit = cp.create_saturation_iosystem(-1.0, 1.0, input="a", output="u")
+    plant = ct.ss(
+        [[-1.0]], [[1.0, 0.1, 0.1, 0.1]], [[1.0]], 0, inputs=["u", "x", "x_d1", "x_d2"], outputs="y", name="p"
+    )
+    whole = ct.interconnect([source, limit, plant], inputs=["a"], outputs=["y"])
+    linear = ct.interconnect([source, plant], inputs=["u"], outputs=["y"])
+    wave = 0.9 * np.sin(2.0 * t)
+    found = cp.simulate(whole, t, wave, method=method)
+    assert np.abs(found.outputs - cp.simulate(linear, t, wave, method="exact").outputs).max() < 1e-6
+
+
+def test_samples_on_a_line_do_not_bend_by_rounding():
+    from ctrlplan.simulation.drives import SampledDrive
+
+    t = np.linspace(0.3, 7.0, 5001)
+    assert SampledDrive(t, 1.0 + t / 3.0).breakpoints.size == 0
+    bent = np.where(t < t[2000], 1.0 + t / 3.0, 1.0 + t[2000] / 3.0 + (1 / 3 + 1e-9) * (t - t[2000]))
+    assert SampledDrive(t, bent).breakpoints.tolist() == [t[2000]]
