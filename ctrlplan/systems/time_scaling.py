@@ -56,17 +56,20 @@ def create_time_scaling_iosystem(
     derivatives : int, optional
         Highest derivative put out: the order that the flat law needs.
     limits : mapping of str to (float, float), optional
-        Least and greatest value of actuators, one of them may be infinite.
+        Least and greatest value of actuators, one of them may be infinite. A
+        clock that slows asks for force itself, and most of all where it has to
+        brake: without damping this can make things worse. An actuator that
+        rests near a limit keeps the clock slow.
     margin : float, optional
         Part of the range between limits, above 0 to 0.5, within which the rate
         falls; of the limit itself where the other is infinite.
     errors : mapping of str to (float, float), optional
         For axes by their labels: distance of what is measured from the
         reference at which the rate begins to fall, and at which it is least.
+        The gentler cause to slow for, and the one to try first.
     bandwidth : float, optional
-        w [rad/s] of each lag; 10 over the plan's duration unless given. A clock
-        that slows fast asks for the force y_d' sigma'' that it should save, and
-        most of all in braking: errors are the gentler cause to slow for.
+        w [rad/s] of each lag; 10 over the plan's duration unless given. The
+        faster, the greater the force y_d' sigma'' that slowing itself asks for.
     slowest, fastest : float, optional
         Least rate, from 0 below 1, and greatest, from 1.
     catch_up : float, optional
