@@ -3,7 +3,7 @@
 from ctrlplan.simulation.events import Event, Occurrence
 from ctrlplan.simulation.interpreted import SolverError
 from ctrlplan.simulation.predictor import Predictor
-from ctrlplan.simulation.prepared import Prepared, prepare, state_space
+from ctrlplan.simulation.prepared import Prepared, prepare, state_space, stated_start
 from ctrlplan.simulation.rest import rest_state, unstable_poles
 from ctrlplan.simulation.simulate import simulate
 
@@ -17,5 +17,6 @@ __all__ = [
     "rest_state",
     "simulate",
     "state_space",
+    "stated_start",
     "unstable_poles",
 ]

@@ -85,8 +85,11 @@ class Occurrence:
 
     def __str__(self) -> str:
         """In words."""
+        end = ", where the run ends" if self.stop else ""
+        if ":" in self.name:  # a condition of a block, in words of its own
+            return f"{self.time:.6g} s: {self.name}{', over' if self.kind == 'inside' else ''}{end}"
         where = "within its limits" if self.kind == "inside" else f"{self.kind} its limit"
-        return f"{self.time:.6g} s: {self.name} {where}{', where the run ends' if self.stop else ''}"
+        return f"{self.time:.6g} s: {self.name} {where}{end}"
 
 
 @dataclass(frozen=True, eq=False)

@@ -91,7 +91,7 @@ class Prepared:
     @property
     def initial_state(self) -> Any:
         """Where the system says that it starts, or None."""
-        return self._initial_state if self.system is None else getattr(self.system, "initial_state", None)
+        return self._initial_state if self.system is None else stated_start(self.system)
 
     @property
     def ninputs(self) -> int:
@@ -321,6 +321,19 @@ def prepared_form(system: Any) -> Prepared:
     _checked_system(system)
     key = fingerprint(system)
     return recent(_recent, key, _KEPT, lambda: Prepared(system))
+
+
+def stated_start(system: Any) -> Array | None:
+    """State at which a system says that it starts, or its blocks do, the rest of them at 0; None where none does."""
+    own = getattr(system, "initial_state", None)
+    if own is not None:
+        return np.broadcast_to(np.asarray(own, dtype=float), (system.nstates or 0,))
+    if not isinstance(system, ct.InterconnectedSystem):
+        return None
+    parts = [(stated_start(block), block.nstates or 0) for block in system.syslist]
+    if all(start is None for start, _ in parts):
+        return None
+    return np.concatenate([np.zeros(count) if start is None else start for start, count in parts])
 
 
 def state_space(system: Any) -> Any:

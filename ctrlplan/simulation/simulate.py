@@ -57,7 +57,8 @@ def simulate(
         name, ``{"r": plan, "d": 0.1}``, each for one input, 0 where unnamed.
     initial_state : array_like, optional
         State at the first sample time, a scalar for all; where it is 0 and the
-        system has an attribute ``initial_state`` (as `crane_loop` sets), that.
+        system or a block of it has an attribute ``initial_state`` (as
+        `crane_loop` sets), that.
     method : {"auto", "exact", "compiled", "python"}, optional
         "auto" takes the first of the others that can be taken; they insist.
     rtol, atol : float, optional

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ctrlplan.simulation import Event, Occurrence, rest_state, simulate, state_space, unstable_poles
+from ctrlplan.simulation import Event, Occurrence, rest_state, simulate, state_space, stated_start, unstable_poles
 from ctrlplan.studies.measures import MEASURES, Measure, control_metrics, path_metrics, response_metrics
 from ctrlplan.trajectories import PiecewiseSpline, PolySpline, Step, Trajectory, TrigSpline, Waypoint
 
@@ -151,7 +151,7 @@ def compare(
         As many inputs (the reference) as the plans have axes; or a function
         that maps a plan's name and the plan to a loop, which may have the plan
         as a block inside and no inputs. An
-        attribute ``initial_state`` of a loop is where it starts.
+        attribute ``initial_state`` of a loop or a block is where it starts.
     plans : mapping of str to Trajectory, or iterable of Waypoint
         The references by name; waypoints stand for the standard set of
         `standard_plans`: step, polynomial, trigonometric, piecewise.
@@ -255,7 +255,7 @@ def compare(
         waypoints=points,
         units=dict(units or {}),
         title=title,
-        parameters=dict(parameters or {}) | {"settling band": f"{100 * band:g} %"},
+        parameters=dict(parameters or {}) | ({} if only == () else {"settling band": f"{100 * band:g} %"}),
         notes=(*_notes(unstable, found), *_notes_of_events(responses, stopped)),
         marks={name: f"the run was ended: {event}" for name, event in stopped.items()},
         measures=dict(measures or {}) | MEASURES,
@@ -354,7 +354,8 @@ def _notes_of_events(responses: Mapping[str, Any], stopped: Mapping[str, Occurre
         left = []
         for name in names:
             at = [event.time for event in response.events if event.name == name and event.kind != "inside"]
-            left.append(f"{name} left its limits {len(at)} times, first at {at[0]:.4g} s")
+            what = name if ":" in name else f"{name} left its limits"
+            left.append(f"{what} {len(at)} times, first at {at[0]:.4g} s")
         ended = f"; the run was ended at {stopped[plan].time:.4g} s, and is not measured" if plan in stopped else ""
         if left:
             notes.append(f"With {plan}, {', '.join(left)}{ended}.")
@@ -410,8 +411,9 @@ def _initial_state(loop: Any, plan: Trajectory, times: Array, given: ArrayLike |
     """State given, or the loop's own, or rest at the plan's first position."""
     if given is not None:
         return given
-    if getattr(loop, "initial_state", None) is not None:
-        return np.asarray(loop.initial_state)
+    stated = stated_start(loop)
+    if stated is not None:
+        return stated
     return rest_state(loop, plan.jet(times[:1], 0, left=True)[0, :, 0])
 
 

@@ -90,7 +90,7 @@ def online_gust_study(progress: bool = True) -> Study:
         [Waypoint(5.0, 0.0, 0.0), Waypoint(6.0, 300.0, 0.0), Waypoint(8.0, 300.0, 0.0), Waypoint(9.0, 0.0, 0.0)]
     )
     found = _compared(Trouble(_still(), _move(), wind=gust), "On line: a gust on the load", "0 to 300 N, 5 to 9 s")
-    blind, law, again = (found.metrics[name] for name in ("off-line", "load feedback", "replanned"))
+    blind, law, again, governed, slowed = (found.metrics[name] for name in WAYS)
     return _study(
         "online-gust",
         found,
@@ -101,7 +101,9 @@ def online_gust_study(progress: bool = True) -> Study:
         "It has its price: every fit begins where the load is, the reference jumps there, and the force is at its "
         f"limit for {again['limited_time']:.2g} s. Feedback of the load by the law itself needs "
         f"{law['force_peak'] / 1e3:.2g} kN and arrives after {law['arrival']:.3g} s.",
-        "A governor and a slowed clock answer to limits and to errors; against a gust they only wait for the law.",
+        f"The governed way, which has no plan but a filter, arrives after {governed['arrival']:.3g} s. The slowed "
+        f"clock waits while the law gets the load back: {slowed['arrival']:.3g} s.",
+        "Who is first hangs on how fast each is made: fits over 6 s here, feedback with 0.5 rad/s.",
     )
 
 
@@ -140,7 +142,7 @@ def online_goal_study(progress: bool = True) -> Study:
         found,
         "At 7.5 s, half way, the goal is moved by 4 m. Off line the crane finishes its move and makes another.",
         "Replanned from the reference, which goes on without a jump up to its fourth derivative, the load is there "
-        f"after {arrivals['replanned']}, as if the goal had been known; the second move takes until "
+        f"after {arrivals['replanned']}, before the first move was to end; the second move takes until "
         f"{arrivals['off-line']}.",
         f"The governor needs no plan at all and takes {arrivals['governed']}. Slowing the clock is no answer to a "
         "goal: that plan makes the second move as well.",
@@ -158,8 +160,8 @@ def online_saturated_study(progress: bool = True) -> Study:
         "online-saturated",
         found,
         f"The trolley has {asked}.",
-        f"Off line the trolley falls behind, winds up and runs {past['off-line']}. With feedback of the load it is "
-        f"{past['load feedback']}, but the sway goes on growing: feedback asks for more force, which is not there.",
+        f"Off line the trolley falls behind and runs {past['off-line']}, anti-windup or not. With feedback of the load "
+        f"it is {past['load feedback']}, but the sway goes on growing: feedback asks for more, which is not there.",
         f"A clock that slows as the error grows arrives after {arrivals['slowed']}, {past['slowed']}; the governor, "
         f"which never asks for more than there is, after {arrivals['governed']}, {past['governed']}; replanned from "
         f"the measured load it is {arrivals['replanned']}, {past['replanned']}.",
@@ -190,15 +192,15 @@ def online_metrics(goal: Array, force: float, response: Any) -> dict[str, float]
     behind = np.hypot(signals["x"] - signals["x_ref"], signals["z"] - signals["z_ref"])
     end = t >= t[-1] - 5.0
     limit, far = force * (1.0 - 1e-9), max(float(distance.max()), NEAR)
-    # Below what a run is accurate to, nothing is left.
+    # Below a tenth of a millimetre, and what that is of the rope, nothing is left.
     left, sway = float(distance[end].max()), float(metrics.peak(t[end], signals["theta"][end]))
     return {
         "arrival": float(metrics.settling_time(t, distance, 0.0, far, NEAR / far)),
-        "error_end": left if left > 1e-5 else 0.0,
+        "error_end": left if left > 1e-4 else 0.0,
         "overshoot_goal": max(0.0, float(metrics.peak(t, signals["x"])) - float(goal[0])),
         "error_reference": float(metrics.peak(t, behind)),
         "sway_peak": float(metrics.peak(t, signals["theta"])),
-        "sway_end": sway if sway > 1e-6 else 0.0,
+        "sway_end": sway if sway > 1e-5 else 0.0,
         "force_peak": float(np.abs(signals["F"]).max()),
         "limited_time": float(metrics.saturation_time(t, signals["F"], -limit, limit)),
     }
@@ -245,15 +247,13 @@ def _governed(trouble: Trouble, **drives: Any) -> Any:
     goal = stack([trouble.goal], labels=["x_command_asked", "z_command"])
     exposed = expose_states(core)
     unread = set(exposed.output_labels) - {*governor.input_labels, *core.output_labels}
-    loop = ct.interconnect(
+    return ct.interconnect(
         [create_source_iosystem(goal, name="goal"), governor, exposed],
         inputs=0,
         outputs=list(core.output_labels),
         name="governed",
         ignore_outputs=[f"{exposed.name}.{label}" for label in unread],
     )
-    loop.initial_state = np.concatenate([np.zeros(governor.nstates), exposed.initial_state])
-    return loop
 
 
 def _slowed(trouble: Trouble, **drives: Any) -> Any:
@@ -273,11 +273,9 @@ WAYS: dict[str, Callable[..., Any]] = {
 def _filtered_loop(wind: Trajectory | None = None, **drives: Any) -> Any:
     """Crane with load feedback behind filters of commands x_command and z_command."""
     filters = [
-        create_command_filter_iosystem(_FILTER, 2, _LAGS, input=f"{axis}_command", output=f"{axis}_ref")
-        for axis in ("x", "z")
+        create_command_filter_iosystem(_FILTER, 2, _LAGS, initial=start, input=f"{axis}_command", output=f"{axis}_ref")
+        for axis, start in zip(("x", "z"), START.tolist(), strict=True)
     ]
-    for block, start in zip(filters, START, strict=True):
-        block.initial_state = np.array([start, *[0.0] * (_LAGS - 1)])
     inputs = ["x_command", "z_command"]
     return crane_loop(CRANE, _still_at_start(), reference=filters, inputs=inputs, wind=wind, **_LAW, **drives)
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from tqdm import tqdm
 
-from ctrlplan.simulation import rest_state, state_space
+from ctrlplan.simulation import rest_state, state_space, stated_start
 from ctrlplan.simulation.exact import exact_states
 from ctrlplan.simulation.linear import LinearForm, in_right_half, linear_forms
 from ctrlplan.studies.comparison import (
@@ -272,7 +272,7 @@ def _form(systems: list[Any]) -> LinearForm | None:
     labels = getattr(systems[0], "output_labels", None)
     if len(systems) < 2 or any(getattr(s, "output_labels", None) != labels for s in systems):
         return None
-    if any(getattr(s, "initial_state", None) is not None for s in systems):
+    if any(stated_start(s) is not None for s in systems):
         return None
     try:
         form = linear_forms(systems)

@@ -8,7 +8,7 @@ import control as ct
 import numpy as np
 
 from ctrlplan.trajectories import derivative_name
-from ctrlplan.trajectories.common import checked_count, checked_time
+from ctrlplan.trajectories.common import checked_count, checked_number, checked_time
 
 
 def create_command_filter_iosystem(
@@ -16,6 +16,7 @@ def create_command_filter_iosystem(
     derivatives: int = 2,
     order: int | None = None,
     *,
+    initial: float = 0.0,
     input: str = "r_asked",
     output: str = "r",
     name: str | None = None,
@@ -38,6 +39,9 @@ def create_command_filter_iosystem(
     order : int, optional
         n, at least one above `derivatives`, which is taken unless given: the
         derivative n jumps with the command.
+    initial : float, optional
+        Reference at which it rests in the beginning, by its attribute
+        ``initial_state``.
     input, output : str, optional
         Names of the signals.
     name : str, optional
@@ -65,16 +69,19 @@ def create_command_filter_iosystem(
     b = np.zeros((n, 1))
     b[-1] = w**n
     labels = [derivative_name(output, k) for k in range(n)]
-    return ct.ss(
+    block = ct.ss(
         a,
         b,
         np.eye(count, n),
         np.zeros((count, 1)),
         inputs=[input],
         outputs=labels[:count],
-        states=[f"{label}_state" for label in labels],
+        states=labels,
         name=name or f"{output}_filter",
     )
+    if checked_number(initial, "initial"):
+        block.initial_state = np.array([initial, *[0.0] * (n - 1)])
+    return block
 
 
 def command_lead(bandwidth: float, order: int) -> tuple[float, ...]:

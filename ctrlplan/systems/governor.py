@@ -68,7 +68,10 @@ class Governor(ct.NonlinearIOSystem):  # type: ignore[misc]
         )
         self.admission, self.period, self.offset, self.initial = admission, period, offset, initial
         self.feedthrough = False  # between samples
-        self.watched = {f"{name} state": (_refused, -math.inf, 0.5), f"{name} input": (_unread, -math.inf, 0.5)}
+        self.watched = {
+            f"{name}: nothing admissible, reference held": (_refused, -math.inf, 0.5),
+            f"{name}: input lost, reference held": (_unread, -math.inf, 0.5),
+        }
         self._count = len(references)
         self._last: tuple[bytes, Array] = (b"", np.empty(0))
 
@@ -114,8 +117,10 @@ def create_governor_iosystem(
     v+ = v + kappa (r - v), by the largest kappa in [0, 1] for which the loop,
     with v+ held from now on, keeps its limits for ever. What is admissible
     passes unchanged, kappa = 1. Where nothing is, not even holding, or an input
-    is not finite, v is held, and a run by `ctrlplan.simulate` records events:
-    the governor's state, or its input, has left its limits.
+    is not finite, v is held, and a run by `ctrlplan.simulate` records it as an
+    event. What a step of the reference sets off at once, as the derivative of
+    the error in a PID, makes every step small: take the derivative of the
+    output, or put `create_command_filter_iosystem` behind the governor.
 
     Inputs: what is asked for, ``<reference>_asked``, then the states of the
     loop as `expose_states` puts them out. Outputs: the references, by the

@@ -63,8 +63,12 @@ def create_replanner_iosystem(
 
     Without `measured` the fit begins at the reference itself, so that no
     derivative up to `order` jumps. With it the fit begins at what is measured:
-    feedback, and the reference jumps to the plant. Between fits the output is
-    the plan in continuous time. Runs in `ctrlplan.simulate` only.
+    feedback, and the reference jumps to the plant, so that a controller of the
+    error sees none. It is stable where the loop follows the plan between fits:
+    the period not below the time that the loop takes to follow, or a law that
+    reads the derivatives; a PID refitted faster than it acts lets the load
+    drift. Between fits the output is the plan in continuous time. Runs in
+    `ctrlplan.simulate` only.
 
     Outputs: the jet of each axis, named as `create_source_iosystem` names them.
     Inputs: with `goal_derivatives`, x_goal, x_goal_d1, ... of each axis; with
@@ -131,6 +135,7 @@ def create_replanner_iosystem(
         If an argument is out of range; the period is above the horizon; the
         sampled map from fit to fit has a spectral radius of 1 or more; the plan
         itself breaks a limit; or outputs and inputs would have the same name.
+        The spectral radius is that of a loop that follows at once.
 
     References
     ----------
@@ -300,8 +305,8 @@ class _Correction(ct.NonlinearIOSystem):  # type: ignore[misc]
         self.period, self.offset, self.feedthrough = horizons.period, offset, signals.feedthrough
         self.samples_first = True  # what is measured may follow the reference at once
         self.watched = {
-            f"{name} input": (partial(_state, _LOST), -math.inf, 0.5),
-            f"{name} goal": (partial(_state, _MISSED), -math.inf, 0.5),
+            f"{name}: input lost": (partial(_state, _LOST), -math.inf, 0.5),
+            f"{name}: goal out of reach": (partial(_state, _MISSED), -math.inf, 0.5),
         }
         self._plan, self._horizons, self._signals, self._trigger, self._limits = (
             plan,

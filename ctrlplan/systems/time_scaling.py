@@ -66,7 +66,8 @@ def create_time_scaling_iosystem(
     errors : mapping of str to (float, float), optional
         For axes by their labels: distance of what is measured from the
         reference at which the rate begins to fall, and at which it is least.
-        The gentler cause to slow for, and the one to try first.
+        Later than limits, and gentler: which of the two is better hangs on the
+        loop. Where a limit is known before the start, `retime` the plan.
     bandwidth : float, optional
         w [rad/s] of each lag; 10 over the plan's duration unless given. The
         faster, the greater the force y_d' sigma'' that slowing itself asks for.
@@ -148,7 +149,7 @@ def create_time_scaling_iosystem(
     def severity(t: Any, x: Any, u: Any) -> Any:
         found = [_nearness(u[k], *bound) for k, bound in enumerate(bounds.values())]
         if bands:
-            reference = plan.series(t - x[0], 0)
+            reference = _series(plan, t - x[0], 0)
             for k, (axis, (soft, hard)) in enumerate(zip(axes, bands.values(), strict=True), len(bounds)):
                 found.append((np.fabs(u[k] - reference[axis][0]) - soft) / (hard - soft))
         worst = found[0]
@@ -167,7 +168,7 @@ def create_time_scaling_iosystem(
         if clock:
             clock[0] = 1.0 + clock[0]
         clock = [value / math.factorial(k) for k, value in enumerate(clock, 1)]
-        rows = [_composed(row, clock) for row in plan.series(t - x[0], highest)]
+        rows = [_composed(row, clock) for row in _series(plan, t - x[0], highest)]
         return np.array([value * math.factorial(k) for row in rows for k, value in enumerate(row)])
 
     block = ct.nlsys(
@@ -186,12 +187,19 @@ def create_time_scaling_iosystem(
     return block
 
 
+def _series(plan: Trajectory, t: Any, order: int) -> list[list[Any]]:
+    """Series of a plan; nan of a loop that is lost, which the run then says."""
+    if isinstance(t, float) and not math.isfinite(t):
+        return [[math.nan] * (order + 1)] * plan.naxes
+    return plan.series(t, order)
+
+
 def _shortest_move(plan: Trajectory) -> float:
     """Shortest time [s] for which the plan moves between two in which it dwells."""
     durations, least, lasted = np.diff(plan.breakpoints), math.inf, 0.0
     inside = plan.breakpoints[:-1, None] + durations[:, None] * np.array([0.13, 0.37, 0.61, 0.89])
-    moving = plan.jet(inside, 2)[1:].any(axis=(0, 1, 3))
-    for moves, duration in zip([*moving.tolist(), False], [*durations.tolist(), 0.0], strict=True):
+    moving = np.append(plan.jet(inside, 2)[1:].any(axis=(0, 1, 3)), False)
+    for moves, duration in zip(moving.tolist(), np.append(durations, 0.0).tolist(), strict=True):
         lasted += duration if moves else 0.0
         if not moves and lasted:
             least, lasted = min(least, lasted), 0.0

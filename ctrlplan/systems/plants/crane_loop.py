@@ -63,8 +63,9 @@ def crane_loop(
     force_limits, torque_limits : (float, float), optional
         Limits of F [N] and C [N m], with anti-windup.
     reference : sequence of control systems, optional
-        Blocks in the place of the plan's source: a replanner, a governor, a
-        slowed clock, with whatever they are fed by. What nothing else reads of
+        Blocks in the place of the plan's source: a replanner, a slowed clock,
+        a command filter, with whatever they are fed by. (A governor, which reads
+        the states of the whole loop, stands outside.) What nothing else reads of
         their outputs must be the jets that the law reads, x_ref, x_ref_d1, ...,
         z_ref, .... Where one starts elsewhere than at 0, its attribute
         ``initial_state`` says so.
@@ -150,12 +151,25 @@ def crane_loop(
             crane.hoist_pid(bandwidth, tf, limits=torque_limits),
         ]
         blocks = [*sources, block, *pids, plant]
+    _check_fed(reference or (), blocks, inputs)
     loop = ct.interconnect(blocks, inputs=list(inputs) or 0, outputs=[*OUTPUTS, "F", "C", "x_ref", "z_ref"], name=name)
     rest = crane.equilibrium(float(plan.initial[0]), float(plan.initial[1]))[0]
     # The crane comes last; the states of law and drives are 0 at rest.
     before = [_start(block) for block in blocks[:-1]]
     loop.initial_state = np.concatenate([*before, rest])
     return loop
+
+
+def _check_fed(reference: Sequence[Any], blocks: Sequence[Any], inputs: Sequence[str]) -> None:
+    """Refuse blocks of the reference that read what nobody puts out: it would be 0."""
+    known = {*inputs, *(label for block in blocks for label in block.output_labels)}
+    for block in reference:
+        missing = [label for label in block.input_labels or () if label not in known]
+        if missing:
+            raise ValueError(
+                f"inputs of {block.name} must be outputs of other blocks or among inputs, got none for "
+                f"{', '.join(missing)}"
+            )
 
 
 def _start(block: Any) -> NDArray[np.float64]:
