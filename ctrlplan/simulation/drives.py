@@ -112,14 +112,18 @@ class SampledDrive:
     width = 1
 
     def __init__(self, times: Array, values: Array) -> None:
+        line = np.interp(times, times[[0, -1]], values[[0, -1]])
+        if np.abs(values - line).max() <= 4.0 * np.finfo(float).eps * np.abs(values).max():
+            times, values = times[[0, -1]], values[[0, -1]]  # one line but for rounding
         self.times, self.values = times, values
         slope = np.diff(values) / np.diff(times)
-        rounding = 4.0 * np.finfo(float).eps * (np.abs(values[1:]) + np.abs(values[:-1])) / np.diff(times)
-        self.breakpoints = times[1:-1][np.abs(np.diff(slope)) > rounding[1:] + rounding[:-1]]
+        self.breakpoints = times[1:-1][slope[1:] != slope[:-1]]
 
     def beside(self, moment: float, origin: float, s: Array) -> Array:
-        """Values between the samples, which are continuous: none is of one leg alone."""
-        return self.at(origin + s)
+        """Values of the straight line that holds at `moment`."""
+        left = min(max(int(np.searchsorted(self.times, moment)) - 1, 0), self.times.size - 2)
+        (t0, t1), (v0, v1) = self.times[left : left + 2], self.values[left : left + 2]
+        return (v0 + (v1 - v0) * ((origin - t0 + s) / (t1 - t0)))[None]
 
     def at(self, times: Array) -> Array:
         """Values between the samples."""

@@ -470,6 +470,7 @@ def test_circles_stand_at_the_gains_written_beside_them(swept):
 # Manners
 
 
+@pytest.mark.slow
 def test_figures_do_not_pile_up_in_pyplot(compared, swept):
     before = plt.get_fignums()
     for _ in range(3):

@@ -359,6 +359,7 @@ def test_a_decay_by_what_was(first, method):
     assert np.abs(found.outputs.ravel()[4:9] - (1 - middle + 0.5 * (middle - 1) ** 2)).max() <= 1e-8
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("count", [32, 301])
 def test_a_delay_much_shorter_than_the_run(count, method):

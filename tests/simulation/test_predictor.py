@@ -65,6 +65,7 @@ def test_the_fraction_is_within_the_resolution_and_below_it_within_a_factor_of_t
     assert 0.49 * exact < 300.0 * kappa < exact + 1e-2
 
 
+@pytest.mark.slow
 def test_a_linear_loop_is_as_the_admissible_set_says():
     loop = cp.plants.integrator_lag_loop(5.0, outputs=("y", "u"))
     limits = {"u": (-1.0, 1.0), "y": (-0.5, 0.5)}

@@ -126,6 +126,7 @@ def test_the_set_does_not_depend_on_the_period():
 # Brute force
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [*range(3), *(pytest.param(k, marks=pytest.mark.slow) for k in range(3, 24))])
 def test_inside_nothing_is_violated_and_just_outside_something_is(seed):
     rng = np.random.default_rng(seed)

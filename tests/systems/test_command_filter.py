@@ -93,7 +93,7 @@ def test_names():
     block = cp.create_command_filter_iosystem(1.0, 1, 3, input="x_ref", output="x")
     assert block.input_labels == ["x_ref"]
     assert block.output_labels == ["x", "x_d1"]
-    assert block.state_labels == ["x_state", "x_d1_state", "x_d2_state"]
+    assert block.state_labels == ["x", "x_d1", "x_d2"]
     assert block.name == "x_filter"
     assert cp.create_command_filter_iosystem(1.0, name="f").name == "f"
     assert block.dt == 0
@@ -189,8 +189,8 @@ def test_a_loop_starts_its_filters_where_they_say(commanded):
     """States in the order of the blocks: x, its derivatives, z, its derivatives, law and drives, then the crane's."""
     loop, _, _ = commanded
     start = dict(zip(loop.state_labels, loop.initial_state, strict=True))
-    assert start["x_ref_filter_x_ref_state"] == 1.0
-    assert start["z_ref_filter_z_ref_state"] == 10.0
+    assert start["x_ref_filter_x_ref"] == 1.0
+    assert start["z_ref_filter_z_ref"] == 10.0
     assert start["crane_D"] == 1.0 - 0.25
     assert start["crane_R"] == 10.0
     assert sum(value != 0.0 for value in start.values()) == 4

@@ -574,6 +574,7 @@ def saturated():
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("name", CLOCKS)
 def test_a_saturating_loop_against_its_equations_by_hand(saturated, name, method):
