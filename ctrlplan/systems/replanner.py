@@ -320,12 +320,12 @@ class _Correction(ct.NonlinearIOSystem):  # type: ignore[misc]
         self._goal, self._fitted = slice(5, 5 + kept), slice(5 + kept, len(states))
         extrema = plan.extrema()
         self._range = float((extrema.maximum - extrema.minimum).max())
-        self._scale = (horizons.whole ** np.arange(order + 1.0))[:, None]
+        self._scales = [horizons.whole**k for k in range(order + 1)]
         # The goal is reached where the plan ends, with the plan's own derivatives, or else rests there.
         self._arrival = np.zeros((order + 1, naxes))
         self._arrival[0] = plan.final
         if horizons.shrinking:
-            self._arrival = _without_rounding(plan.jet(plan.end, order), self._scale, self._range)
+            self._arrival = _without_rounding(plan.jet(plan.end, order), np.array(self._scales)[:, None], self._range)
 
     def sample(self, t: float, x: Array, u: Array, params: dict[str, Any]) -> Array:
         """States after a fit, or where none is due the same."""
@@ -376,10 +376,14 @@ class _Correction(ct.NonlinearIOSystem):  # type: ignore[misc]
             return math.inf  # after its end the plan rests, which a fit sees to
         else:
             expected = self._arrival[: len(goal)]
-        size = max(self._range, *map(abs, goal[0].tolist()), *map(abs, expected[0].tolist()))
-        if not size:
-            return 0.0 if not goal.any() else math.inf
-        return max(map(abs, ((goal - expected) * self._scale[: len(goal)]).ravel().tolist())) / size
+        rows = list(zip(goal.tolist(), expected.tolist(), strict=True))
+        size = max(self._range, *map(abs, rows[0][0]), *map(abs, rows[0][1]))
+        far = [
+            abs(a - b) * scale
+            for row, scale in zip(rows, self._scales, strict=False)
+            for a, b in zip(*row, strict=True)
+        ]
+        return max(far) / size if size else math.inf if any(far) else 0.0
 
     def _deviation(self, t: float, x: Array, u: Array) -> Array:
         """Jet (order + 1, naxes) from which a fit begins, less the plan's."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -62,17 +62,16 @@ class Transition(Frozen):
         order = checked_count(order, "order")
         horizon = checked_time(horizon, "horizon", positive=True)
         alpha = checked_alpha(alpha)
-        given = tuple(range(order + 1))
-        system = NewtonSystem(alpha, np.array([0.0, 1.0]), (given, given))
-        powers = horizon ** np.arange(2.0 * order + 2.0)
+        family = _family(order, alpha)
+        powers = horizon**family.exponents
         self.__dict__.update(
             order=order,
             horizon=horizon,
             alpha=alpha,
             rate=alpha / horizon,
-            _system=system,
-            _rows=system.waypoint_index * (order + 1) + system.order_index,
-            _data_scale=system.taylor_scale(horizon),
+            _system=family.system,
+            _rows=family.rows,
+            _data_scale=(powers[family.system.order_index] * family.inverse)[:, None],
             _time_scale=(1.0 / powers)[:, None],
         )
 
@@ -119,6 +118,24 @@ class Transition(Frozen):
     _rows: Any
     _data_scale: Array
     _time_scale: Array
+
+
+class _Family(NamedTuple):
+    """What transitions of one order and alpha share, whatever the horizon."""
+
+    system: NewtonSystem
+    rows: Any  # of the jets at both ends, in the system's order
+    exponents: Array
+    inverse: Array  # of the factorials
+
+
+@lru_cache(maxsize=4096)
+def _family(order: int, alpha: float) -> _Family:
+    """Factorised collocation in normalised time: of polynomials one for every horizon."""
+    given = tuple(range(order + 1))
+    system = NewtonSystem(alpha, np.array([0.0, 1.0]), (given, given))
+    rows = system.waypoint_index * (order + 1) + system.order_index
+    return _Family(system, rows, np.arange(2.0 * order + 2.0), 1.0 / FACTORIALS[system.order_index])
 
 
 @lru_cache(maxsize=4096)
