@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from ctrlplan.reports.style import house_style, legend_above, line_styles, new_figure, stacked_axes
 from ctrlplan.studies.comparison import Comparison
 from ctrlplan.studies.crane import CRANE, FORCE_LIMITS, TORQUE_LIMITS, nominal_waypoints
+from ctrlplan.studies.measures import signals_of
 from ctrlplan.studies.study import Study
 from ctrlplan.systems.plants import crane_loop
 from ctrlplan.trajectories import PolySpline
@@ -284,9 +285,7 @@ def is_crane(comparison: Comparison) -> bool:
 
 def _signals(comparison: Comparison, name: str) -> dict[str, Array]:
     response = comparison.responses[name]
-    return dict(zip(response.output_labels, np.asarray(response.outputs), strict=True)) | {
-        "t": np.asarray(response.time)
-    }
+    return signals_of(response) | {"t": np.asarray(response.time)}
 
 
 def _draw_crane(axes: Axes, d: float, r: float, theta: float, colour: str) -> None:

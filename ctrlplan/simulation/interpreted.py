@@ -61,6 +61,7 @@ class Interpreted:
         self._probe = probe
         self._outputs = [block.output(params) for block in network.blocks]
         self._updates = [block.update(params) for block in network.blocks]
+        self._samples = {i: _once(network.blocks[i].sampled(params)) for i in network.blocks_with("period")}
         self._doubtful, self._trials = False, trials
         self.feeds = self._feeds(self._outputs)
         self._calls = [self._call(i, output) for i, output in enumerate(self._outputs) if not network.blocks[i].driven]
@@ -116,8 +117,8 @@ class Interpreted:
         """State after some blocks have taken a sample of some signals."""
         network, after = self.network, x.copy()
         for i in blocks:
-            place, sample = network.states[i], network.blocks[i].sampled(self.params)
-            after[place] = np.ravel(sample(t, x[place], network.fed[i](w)))
+            place = network.states[i]
+            after[place] = self._samples[i](t, x[place], network.fed[i](w))
         return after
 
     def _seen(self, blocks: tuple[int, ...], t: float, x: Array, driven: Array) -> Array:
@@ -128,16 +129,14 @@ class Interpreted:
 
     def _sampling(self, blocks: tuple[int, ...]) -> list[Call]:
         """Steps to all signals at the instant of a sample."""
-        network = self.network
-        samples = {i: network.blocks[i].sampled(self.params) for i in blocks}
         outputs = list(self._outputs)
 
         def renewed(i: int) -> Map:
-            return lambda t, x, u: self._outputs[i](t, np.ravel(samples[i](t, x, u)), u)
+            return lambda t, x, u: self._outputs[i](t, self._samples[i](t, x, u), u)
 
         for i in blocks:
             outputs[i] = renewed(i)
-        return self._steps(outputs, network.signals_of_inputs(), self._feeds(outputs, blocks))
+        return self._steps(outputs, self.network.signals_of_inputs(), self._feeds(outputs, blocks))
 
     def _feeds(self, outputs: Sequence[Map], unsure: Sequence[int] = ()) -> list[NDArray[np.bool_]]:
         """Feedthrough of every block: assumed where nothing is known; tried only where a loop seems to be."""
@@ -272,6 +271,20 @@ class _named:  # noqa: N801 (a context, of which a run opens thousands)
     def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
         if error is not None:
             error.add_note(f"in block {self._name} at {self._t:g} s")
+
+
+def _once(sample: Map) -> Map:
+    """States after a sample, taken once though a run asks for them and for the outputs that they put out."""
+    last: tuple[Any, Array] = (None, np.empty(0))
+
+    def taken(t: Any, x: Array, u: Array) -> Array:
+        nonlocal last
+        asked = t, x.tobytes(), u.tobytes()
+        if asked != last[0]:
+            last = asked, np.ravel(sample(t, x, u))
+        return last[1].copy()
+
+    return taken
 
 
 def _merged_linear(network: Network) -> tuple[Array, Array, NDArray[np.intp], list[int]]:

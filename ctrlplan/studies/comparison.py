@@ -255,7 +255,8 @@ def compare(
         waypoints=points,
         units=dict(units or {}),
         title=title,
-        parameters=dict(parameters or {}) | ({} if only == () else {"settling band": f"{100 * band:g} %"}),
+        parameters=dict(parameters or {})
+        | ({} if only is not None and not only else {"settling band": f"{100 * band:g} %"}),
         notes=(*_notes(unstable, found), *_notes_of_events(responses, stopped)),
         marks={name: f"the run was ended: {event}" for name, event in stopped.items()},
         measures=dict(measures or {}) | MEASURES,

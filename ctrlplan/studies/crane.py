@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ctrlplan import metrics
 from ctrlplan.simulation import simulate
 from ctrlplan.studies.comparison import Comparison, compare
-from ctrlplan.studies.measures import Measure
+from ctrlplan.studies.measures import Measure, signals_of
 from ctrlplan.studies.study import Curves, Study
 from ctrlplan.systems.plants import Crane, crane_loop
 from ctrlplan.trajectories import PiecewiseSpline, PolySpline, Step, Trajectory, TrigSpline, Waypoint
@@ -244,7 +244,7 @@ def _limited_error(plan: Trajectory, options: dict[str, Any], timepts: Array) ->
     """Greatest error of the load with force and torque limited as the step's are."""
     loop = crane_loop(CRANE, plan, **options | {"force_limits": FORCE_LIMITS, "torque_limits": TORQUE_LIMITS})
     response = simulate(loop, timepts)
-    signals = dict(zip(response.output_labels, np.asarray(response.outputs), strict=True))
+    signals = signals_of(response)
     return float(np.hypot(*(np.stack([signals["x"], signals["z"]]) - plan.jet(timepts, 0)[0])).max())
 
 
@@ -278,7 +278,7 @@ def load_metrics(plan: Trajectory, response: Any, last: float) -> dict[str, floa
         The keys of `CRANE_MEASURES`.
     """
     t = np.asarray(response.time)
-    signals = dict(zip(response.output_labels, np.asarray(response.outputs), strict=True))
+    signals = signals_of(response)
     load = np.stack([signals["x"], signals["z"]])
     error = np.hypot(*(load - plan.jet(t, 0)[0]))
     way, after = t <= last, t >= last

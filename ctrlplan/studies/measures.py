@@ -57,6 +57,11 @@ MEASURES = {
 }
 
 
+def signals_of(response: Any) -> dict[str, Array]:
+    """Outputs (ntime,) of a response by their labels."""
+    return dict(zip(response.output_labels, np.asarray(response.outputs), strict=True))
+
+
 def response_metrics(
     timepts: Array, y: Array, plan: Trajectory, start: float, band: float, labels: tuple[str, ...], only: Wanted = None
 ) -> dict[str, float]:

@@ -16,7 +16,7 @@ from ctrlplan import metrics
 from ctrlplan.simulation import simulate
 from ctrlplan.studies.comparison import Comparison, compare
 from ctrlplan.studies.crane import CRANE, TORQUE_LIMITS, nominal_waypoints
-from ctrlplan.studies.measures import Measure
+from ctrlplan.studies.measures import Measure, signals_of
 from ctrlplan.studies.study import Study
 from ctrlplan.systems import (
     AdmissibleSet,
@@ -187,7 +187,7 @@ def online_metrics(goal: Array, force: float, response: Any) -> dict[str, float]
         The keys of `ONLINE_MEASURES`.
     """
     t = np.asarray(response.time)
-    signals = dict(zip(response.output_labels, np.asarray(response.outputs), strict=True))
+    signals = signals_of(response)
     distance = np.hypot(signals["x"] - goal[0], signals["z"] - goal[1])
     behind = np.hypot(signals["x"] - signals["x_ref"], signals["z"] - signals["z_ref"])
     end = t >= t[-1] - 5.0

@@ -19,7 +19,7 @@ from ctrlplan.trajectories.common import checked_count, checked_time
 from ctrlplan.trajectories.extrema import stationary_times
 from ctrlplan.trajectories.files import signal_names
 from ctrlplan.trajectories.newton_spline import NewtonSpline
-from ctrlplan.trajectories.transition import Transition, extrapolated, series, transition
+from ctrlplan.trajectories.transition import Transition, extrapolated, series, taylor_value, transition
 
 Array = NDArray[np.float64]
 
@@ -201,8 +201,8 @@ class _Horizons:
         if alpha is None:
             own = plan.alpha if isinstance(plan, NewtonSpline) and self.shrinking else 0.0
             alpha = own if own < 2.0 * math.pi else 0.0
-        self.whole, self._whole = whole, Transition(order, whole, alpha)
-        self.period, self.order, self.rate = period, order, self._whole.rate
+        self.whole = Transition(order, whole, alpha)
+        self.period, self.order, self.rate = period, order, self.whole.rate
         self.step: Array | None = None  # from coefficients to jets a period later, where that is always the same map
         self._start, self._end = plan.start, plan.end
         if self.shrinking:
@@ -210,8 +210,8 @@ class _Horizons:
             return
         if min_horizon is not None:
             raise ValueError(f'min_horizon must go with horizon = "shrinking", got {min_horizon} with {whole:g} s')
-        self.step = self._whole.evaluation(period, order)
-        radius = self._whole.radius(period)
+        self.step = self.whole.evaluation(period, order)
+        radius = self.whole.radius(period)
         if not radius < 1.0:
             raise ValueError(
                 "the map from fit to fit must have a spectral radius below 1, "
@@ -224,12 +224,12 @@ class _Horizons:
 
     def end(self, t: float) -> float:
         """Where a fit at a time ends."""
-        return self._end if self.shrinking else t + self.whole
+        return self._end if self.shrinking else t + self.whole.horizon
 
     def at(self, t: float) -> Transition | None:
         """Transition to fit at a time, None where it is too early or too late for one."""
         if not self.shrinking:
-            return self._whole
+            return self.whole
         if t < self._start or self.late(t):
             return None
         return transition(self.order, self._end - t, self.rate * (self._end - t))
@@ -320,7 +320,7 @@ class _Correction(ct.NonlinearIOSystem):  # type: ignore[misc]
         self._goal, self._fitted = slice(5, 5 + kept), slice(5 + kept, len(states))
         extrema = plan.extrema()
         self._range = float((extrema.maximum - extrema.minimum).max())
-        self._scales = [horizons.whole**k for k in range(order + 1)]
+        self._scales = [horizons.whole.horizon**k for k in range(order + 1)]
         # The goal is reached where the plan ends, with the plan's own derivatives, or else rests there.
         self._arrival = np.zeros((order + 1, naxes))
         self._arrival[0] = plan.final
@@ -441,20 +441,12 @@ class _Correction(ct.NonlinearIOSystem):  # type: ignore[misc]
         for row, goal, final in zip(rows, goals, self._final, strict=True):
             kept = [row[0] * (1.0 - live) if not goal else changed * -final, *[0.0] * order]
             for k in range(min(order + 1, len(goal))):
-                kept[k] = kept[k] + changed * _taylor(goal[k:], t - x[_START])
+                kept[k] = kept[k] + changed * taylor_value(goal[k:], t - x[_START])
             found.append([value * live * math.factorial(k) + kept[k] for k, value in enumerate(row)])
         return found
 
     def _no_rates(self, t: float, x: Any, u: Any, params: dict[str, Any]) -> NoReturn:
         refuse_alone(self.name, "plans again every period")
-
-
-def _taylor(jet: list[Any], s: Any) -> Any:
-    """Value of a Taylor polynomial s seconds on."""
-    total = jet[-1]
-    for k in range(len(jet) - 1, 0, -1):
-        total = jet[k - 1] + total * s / k
-    return total
 
 
 def _without_rounding(jet: Array, scale: Array, size: float) -> Array:

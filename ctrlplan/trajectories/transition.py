@@ -165,9 +165,12 @@ def series(rate: float, columns: Sequence[Sequence[Any]], past: Any, ahead: Any,
 def extrapolated(jet: ArrayLike, time: float) -> Array:
     """Jet (order + 1, naxes) `time` seconds later, along its Taylor polynomial."""
     values = np.asarray(jet, dtype=float)
-    n = len(values)
-    if n == 1:
-        return values
-    lag = np.subtract.outer(np.arange(n), np.arange(n)).T
-    weights = np.where(lag >= 0, time ** np.maximum(lag, 0) / FACTORIALS[np.maximum(lag, 0)], 0.0)
-    return weights @ values
+    return np.array([taylor_value(values[k:], time) for k in range(len(values))]) if len(values) > 1 else values
+
+
+def taylor_value(jet: Any, s: Any) -> Any:
+    """Value of a Taylor polynomial s seconds on; derivatives and time may be symbols."""
+    total = jet[-1]
+    for k in range(len(jet) - 1, 0, -1):
+        total = jet[k - 1] + total * s / k
+    return total
