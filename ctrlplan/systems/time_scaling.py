@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from ctrlplan.trajectories import Trajectory
 from ctrlplan.trajectories.common import checked_count, checked_limits, checked_number, checked_pair, checked_time
 from ctrlplan.trajectories.files import signal_names
+from ctrlplan.trajectories.retimed import composed
 
 Array = NDArray[np.float64]
 
@@ -168,7 +169,7 @@ def create_time_scaling_iosystem(
         if clock:
             clock[0] = 1.0 + clock[0]
         clock = [value / math.factorial(k) for k, value in enumerate(clock, 1)]
-        rows = [_composed(row, clock) for row in _series(plan, t - x[0], highest)]
+        rows = [composed(row, clock) for row in _series(plan, t - x[0], highest)]
         return np.array([value * math.factorial(k) for row in rows for k, value in enumerate(row)])
 
     block = ct.nlsys(
@@ -213,15 +214,6 @@ def _rate_weights(n: int, w: float) -> list[list[float]]:
         rows.append(row.tolist())
         row = w * (np.append(row[1:], 0.0) - row)
     return rows
-
-
-def _composed(outer: list[Any], inner: list[Any]) -> list[Any]:
-    """Series of the outer function of the inner one, whose constant term is left out."""
-    order = len(inner)
-    found: list[Any] = [outer[order], *[0.0] * order]
-    for value in reversed(outer[:order]):
-        found = [value, *(sum(inner[i] * found[k - i] for i in range(k + 1)) for k in range(order))]
-    return found
 
 
 def _nearness(value: Any, low: float, high: float, reach: float) -> Any:

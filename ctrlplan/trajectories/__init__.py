@@ -6,6 +6,9 @@ from ctrlplan.trajectories.extrema import Bounds, Extrema
 from ctrlplan.trajectories.files import derivative_name, load_trajectory, trajectory_from_dict
 from ctrlplan.trajectories.piecewise import PiecewiseSpline
 from ctrlplan.trajectories.polynomial import PolySpline
+from ctrlplan.trajectories.profiles import SCurve, Trapezoid
+from ctrlplan.trajectories.retimed import Retimed
+from ctrlplan.trajectories.shaping import Shaper
 from ctrlplan.trajectories.step import Step
 from ctrlplan.trajectories.trajectory import Trajectory
 from ctrlplan.trajectories.transition import Transition
@@ -20,13 +23,17 @@ __all__ = [
     "Jump",
     "PiecewiseSpline",
     "PolySpline",
+    "Retimed",
+    "SCurve",
     "Scaled",
     "Selected",
+    "Shaper",
     "Stacked",
     "Step",
     "Sum",
     "Trajectory",
     "Transition",
+    "Trapezoid",
     "TrigSpline",
     "Waypoint",
     "derivative_name",

@@ -33,6 +33,11 @@ ARGUMENTS = {
     "factor": lambda: -1 / 3,
     "labels": lambda: ["z", "x"],
     "final": lambda: [1 / 3, 2.0],
+    "velocity": lambda: [0.7, 0.9],
+    "acceleration": lambda: 0.8,
+    "jerk": lambda: 1.1,
+    "plan": lambda: trajectories.PiecewiseSpline(POINTS),
+    "law": lambda: trajectories.PolySpline([Waypoint(3.0, -1.0, 0.7), Waypoint(4.0, 0.1), Waypoint(7.5, 2.0, 0.3)]),
 }
 
 
@@ -149,7 +154,7 @@ def test_ends_are_held(plan):
     np.testing.assert_array_equal(plan.jet(plan.end, 0)[0], plan.final)
     np.testing.assert_array_equal(plan.jet(plan.start, 0, left=True)[0], plan.initial)
     if plan.duration:
-        assert np.abs(plan.jet(plan.end, 1)[1]).max() > 0 or np.abs(plan.jet(plan.end, 3)[3]).max() > 0
+        assert np.abs(plan.jet(plan.end, 3)[1:]).max() > 0
 
 
 @every

@@ -1,0 +1,289 @@
+"""Moves from rest to rest that are as fast as limits allow."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, ClassVar, Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ctrlplan.trajectories.common import FACTORIALS, Array, mapped_time, readonly
+from ctrlplan.trajectories.step import Step
+from ctrlplan.trajectories.trajectory import Trajectory
+
+
+class _Profile(Trajectory):
+    """Line initial + (final - initial) s(t) from rest to rest, s a rise of velocity, a cruise and the rise mirrored.
+
+    The rise is counted from the start and the fall backwards from the end, so
+    that both positions are exact. Legs last as long as the clock says after
+    rounding, and s is made of those: however late the start, what should be
+    continuous is, and no limit is exceeded, both to the last digits.
+    """
+
+    velocity: Array
+    acceleration: Array
+
+    _names: ClassVar[tuple[str, ...]]
+    _ramp: ClassVar[Array]  # the highest continuous derivative at both ends of each leg of the rise, to scale
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data that `trajectory_from_dict` reads."""
+        return {
+            "type": type(self).__name__,
+            "final": self.final.tolist(),
+            "initial": self.initial.tolist(),
+            **{name: getattr(self, name).tolist() for name in self._names},
+            "time": self.start,
+            "labels": list(self.labels),
+        }
+
+    @classmethod
+    def _from_dict(cls, data: dict[str, Any]) -> Self:
+        ends = Step(data["final"], data["initial"], data["time"], data["labels"])
+        return cls._of(ends, [data[name] for name in cls._names])
+
+    @classmethod
+    def _of(cls, ends: Step, limits: list[ArrayLike]) -> Self:
+        self = cls.__new__(cls)
+        self._set(ends, *limits)
+        return self
+
+    def _map_time(self, origin: float, target: float, rate: float) -> Self:
+        ends = Step(self.final, self.initial, mapped_time(self.start, origin, target, rate), self.labels)
+        return self._of(ends, [getattr(self, name) * rate**nu for nu, name in enumerate(self._names, 1)])
+
+    def _set(self, ends: Step, *limits: ArrayLike) -> None:
+        with np.errstate(over="ignore"):
+            change = ends.final - ends.initial
+        if not (np.isfinite(change).all() and change.any()):
+            raise ValueError(
+                "final must differ from initial, by a finite length, "
+                f"got {ends.final.tolist()} after {ends.initial.tolist()}"
+            )
+        given = [_checked_limit(*pair, ends.labels) for pair in zip(limits, self._names, strict=True)]
+        moves = change != 0.0
+        with np.errstate(all="ignore"):
+            durations = _fastest(*((limit[moves] / np.abs(change[moves])).min() for limit in given))
+        if not np.isfinite(durations).all():
+            raise ValueError(f"limits must give legs of finite durations, got {durations.tolist()} s")
+        least = 8.0 * np.finfo(float).eps * (abs(ends.start) + durations.sum())
+        kept = durations > least  # what is shorter is the rounding of a leg without duration
+        nrise = len(self._ramp)
+        if not kept[:nrise].any():
+            raise ValueError(
+                f"limits must leave the rise of velocity more than {least:.3g} s at time = {ends.start:g} s, "
+                f"got {durations[:nrise].sum():.3g} s"
+            )
+        times = [ends.start]
+        # Rounded down, or without the time of legs left out, the others would exceed their limits.
+        for duration in (durations[kept] + durations[~kept].clip(min=0.0).sum()).tolist():
+            time = times[-1] + duration
+            times.append(time if time - times[-1] >= duration else math.nextafter(time, math.inf))
+        lasts, ramp = np.diff(times), self._ramp[kept[:nrise]]
+        rise, before = _rise(lasts[: len(ramp)], ramp, len(given))
+        fall, after = _rise(lasts[::-1][: len(ramp)], ramp, len(given))
+        cruise = np.zeros((int(kept[nrise]), rise.shape[1]))
+        cruise[:, :2] = before, 1.0
+        whole = before + float(lasts[len(ramp) : -len(ramp)].sum()) + after
+        self.__dict__.update(
+            zip(self._names, given, strict=True),
+            initial=ends.initial,
+            final=ends.final,
+            labels=ends.labels,
+            breakpoints=readonly(np.array(times)),
+            _change=change,
+            _lasts=lasts.tolist(),
+            _taylor=(np.concatenate([rise, cruise, fall[::-1]]) / whole).tolist(),
+            _nfall=len(ramp),
+        )
+
+    def _leg_jet(self, leg: int, s: Array, order: int) -> Array:
+        anchor, series = self._law(leg, s, order)
+        law = np.array([np.broadcast_to(row, s.shape) for row in series]) * FACTORIALS[: order + 1, None]
+        out: Array = self._change[:, None] * law[:, None]
+        out[0] += anchor[:, None]
+        return out
+
+    def _leg_series(self, leg: int, s: Any, order: int) -> list[list[Any]]:
+        anchor, (first, *rest) = self._law(leg, s, order)
+        axes = zip(anchor.tolist(), self._change.tolist(), strict=True)
+        return [[position + change * first, *(change * value for value in rest)] for position, change in axes]
+
+    def _law(self, leg: int, s: Any, order: int) -> tuple[Array, list[Any]]:
+        """Position that a leg counts from, and the Taylor series of the part of the line beyond it."""
+        leg %= len(self._lasts)
+        if leg < len(self._lasts) - self._nfall:
+            return self.initial, _shifted(self._taylor[leg], s, order)
+        mirrored = _shifted(self._taylor[leg], self._lasts[leg] - s, order)
+        return self.final, [value if k % 2 else -value for k, value in enumerate(mirrored)]
+
+    _change: Array
+    _lasts: list[float]
+    _taylor: list[list[float]]
+    _nfall: int
+
+
+class Trapezoid(_Profile):
+    """Fastest rest-to-rest move with limits of its acceleration.
+
+    Under limits of velocity and acceleration: the velocity is a trapezoid, or a
+    triangle where the way is too short for its limit. Several axes move
+    together, on the straight line from `initial` to `final`, as fast as all
+    limits allow. The acceleration jumps at every breakpoint.
+
+    Parameters
+    ----------
+    final : array_like, scalar or shape (naxes,)
+        Position at the end.
+    initial : array_like, optional
+        Position at the start.
+    velocity, acceleration : array_like, scalar or shape (naxes,)
+        Greatest magnitudes, above 0 [unit of the axis per s, per s^2].
+    time : float, optional
+        Start [s].
+    labels : sequence of str, optional
+        Names of the axes.
+
+    Attributes
+    ----------
+    velocity, acceleration : ndarray, shape (naxes,)
+        The limits.
+
+    Raises
+    ------
+    ValueError
+        If a limit is not above 0 and finite, no axis moves, a position is not
+        finite, shapes differ, or the clock does not resolve the rise.
+
+    Examples
+    --------
+    The duration is d/v + v/a where v^2/a < d, and else 2 sqrt(d/a):
+
+    >>> Trapezoid(3.0, velocity=1.0, acceleration=0.5).duration
+    5.0
+    >>> Trapezoid(1.0, velocity=9.0, acceleration=1.0).breakpoints
+    array([0., 1., 2.])
+    """
+
+    _names = ("velocity", "acceleration")
+    _ramp = readonly(np.array([[0.0, 1.0]]))
+
+    def __init__(
+        self,
+        final: ArrayLike,
+        initial: ArrayLike = 0.0,
+        *,
+        velocity: ArrayLike,
+        acceleration: ArrayLike,
+        time: float = 0.0,
+        labels: Sequence[str] | None = None,
+    ) -> None:
+        self._set(Step(final, initial, time, labels), velocity, acceleration)
+
+
+class SCurve(_Profile):
+    """Fastest rest-to-rest move with limits of its jerk.
+
+    Under limits of velocity, acceleration and jerk: seven legs of constant
+    jerk, or fewer where the velocity or the acceleration limit is not reached.
+    Several axes move together, on the straight line from `initial` to `final`,
+    as fast as all limits allow. The jerk jumps at every breakpoint.
+
+    Parameters
+    ----------
+    final : array_like, scalar or shape (naxes,)
+        Position at the end.
+    initial : array_like, optional
+        Position at the start.
+    velocity, acceleration, jerk : array_like, scalar or shape (naxes,)
+        Greatest magnitudes, above 0 [unit of the axis per s, per s^2, per s^3].
+    time : float, optional
+        Start [s].
+    labels : sequence of str, optional
+        Names of the axes.
+
+    Attributes
+    ----------
+    velocity, acceleration, jerk : ndarray, shape (naxes,)
+        The limits.
+
+    Raises
+    ------
+    ValueError
+        If a limit is not above 0 and finite, no axis moves, a position is not
+        finite, shapes differ, or the clock does not resolve the rise.
+
+    Examples
+    --------
+    With every limit reached the duration is d/v + v/a + a/j:
+
+    >>> SCurve(4.0, velocity=1.0, acceleration=0.5, jerk=0.5).duration
+    7.0
+    """
+
+    jerk: Array
+
+    _names = ("velocity", "acceleration", "jerk")
+    _ramp = readonly(np.array([[0.0, 1.0], [1.0, 1.0], [1.0, 0.0]]))
+
+    def __init__(
+        self,
+        final: ArrayLike,
+        initial: ArrayLike = 0.0,
+        *,
+        velocity: ArrayLike,
+        acceleration: ArrayLike,
+        jerk: ArrayLike,
+        time: float = 0.0,
+        labels: Sequence[str] | None = None,
+    ) -> None:
+        self._set(Step(final, initial, time, labels), velocity, acceleration, jerk)
+
+
+def _fastest(velocity: float, acceleration: float, jerk: float = math.inf) -> Array:
+    """Durations of rise, cruise and fall of the fastest unit move; without a limit of jerk the rise is one leg."""
+    ramp = min(acceleration / jerk, np.sqrt(velocity / jerk), np.cbrt(0.5 / jerk))
+    peak = acceleration if ramp == acceleration / jerk else jerk * ramp
+    to_limit = velocity / peak + ramp
+    halfway = 0.5 * (ramp + np.hypot(ramp, 2.0 / np.sqrt(peak)))  # a rise that covers half of the way
+    rises = min(to_limit, halfway)
+    cruise = 1.0 / velocity - to_limit if to_limit < halfway else 0.0
+    rise = [rises] if jerk == math.inf else [ramp, rises - 2.0 * ramp, ramp]
+    return np.array([*rise, cruise, *rise])
+
+
+def _rise(lasts: Array, ramp: Array, order: int) -> tuple[Array, float]:
+    """Rise to unit velocity: Taylor coefficients (nlegs, order + 1) about the beginning of each leg, and its length."""
+    rows, end = [(ramp[:, 1] - ramp[:, 0]) / lasts, ramp[:, 0]], [float(ramp[-1, 1])]
+    for _ in range(order - 1):
+        grown = np.cumsum(sum(row * lasts**k / FACTORIALS[k] for k, row in enumerate(reversed(rows), 1)))
+        rows.append(np.append(0.0, grown[:-1]))
+        end.append(float(grown[-1]))
+    velocity, length = end[-2:]
+    return np.array(rows[::-1]).T / (velocity * FACTORIALS[: order + 1]), length / velocity
+
+
+def _shifted(taylor: list[float], s: Any, order: int) -> list[Any]:
+    """Coefficients of a polynomial about s, from those about 0."""
+    found: list[Any] = list(taylor)
+    for k in range(len(found) - 1):
+        for m in range(len(found) - 2, k - 1, -1):
+            found[m] = found[m] + s * found[m + 1]
+    return [*found, *[0.0] * order][: order + 1]
+
+
+def _checked_limit(limit: ArrayLike, name: str, labels: tuple[str, ...]) -> Array:
+    """Limit of each axis."""
+    try:
+        values = np.array(limit, dtype=float)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name} must be numbers, got {limit!r}") from None
+    if values.shape not in ((), (len(labels),)):
+        raise ValueError(f"{name} must be a scalar or of shape ({len(labels)},), got shape {values.shape}")
+    for label, value in zip(labels, np.broadcast_to(values, len(labels)).tolist(), strict=True):
+        if not 0.0 < value < math.inf:
+            raise ValueError(f"{name} must be above 0 and finite, got {value}{f' of {label}' if values.ndim else ''}")
+    return readonly(np.broadcast_to(values, len(labels)).copy())

@@ -1,0 +1,186 @@
+"""A plan on another clock."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Self
+
+import numpy as np
+from scipy.optimize import brentq
+
+from ctrlplan.trajectories.common import FACTORIALS, Array, checked_labels, readonly
+from ctrlplan.trajectories.files import trajectory_from_dict
+from ctrlplan.trajectories.trajectory import Trajectory
+
+_ROUNDING = 1e-12
+"""Part of a clock, or of a rate, that rounding may cost."""
+
+
+class Retimed(Trajectory):
+    """Path of a plan on another clock: plan(law(t)).
+
+    Parameters
+    ----------
+    plan : Trajectory
+        The path, with a duration.
+    law : Trajectory
+        Time of the plan [s] over time [s]: one axis, continuous and strictly
+        increasing, from the plan's start to its end.
+    labels : sequence of str, optional
+        Names of the axes; the plan's unless given.
+
+    Attributes
+    ----------
+    plan, law
+        As given.
+
+    Raises
+    ------
+    TypeError
+        If one is not a trajectory.
+    ValueError
+        If the plan has no duration, or the law has several axes, other ends, a
+        jump, or does not increase.
+
+    Examples
+    --------
+    A straight line, sped up and slowed down as a trapezoid:
+
+    >>> from ctrlplan.trajectories import PolySpline, Trapezoid, Waypoint
+    >>> line = PolySpline([Waypoint(0, 0), Waypoint(4, 8)])
+    >>> move = Retimed(line, Trapezoid(4.0, velocity=1.0, acceleration=1.0))
+    >>> move.duration, move([0.0, 1.0, 2.5, 5.0], 1)
+    (5.0, array([0., 2., 2., 0.]))
+    """
+
+    plan: Trajectory
+    law: Trajectory
+
+    def __init__(self, plan: Trajectory, law: Trajectory, labels: Sequence[str] | None = None) -> None:
+        for name, value in (("plan", plan), ("law", law)):
+            if not isinstance(value, Trajectory):
+                raise TypeError(f"{name} must be a Trajectory, got {type(value).__name__}")
+        names = checked_labels(plan.labels if labels is None else labels, plan.naxes)
+        slack = _ROUNDING * max(abs(plan.start), abs(plan.end))
+        values = _checked_law(plan, law, slack)
+        passed = np.array([_passing(law, values, float(b), slack) for b in plan.breakpoints[1:-1]])
+        breakpoints = np.union1d(law.breakpoints, passed)
+        legs = [
+            np.searchsorted(times, breakpoints[:-1], side="right").tolist() for times in (law.breakpoints[1:], passed)
+        ]
+        self.__dict__.update(
+            plan=plan,
+            law=law,
+            labels=names,
+            breakpoints=readonly(breakpoints),
+            initial=plan.initial,
+            final=plan.final,
+            _legs=list(zip(*legs, strict=True)),
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data that `trajectory_from_dict` reads."""
+        return {
+            "type": "Retimed",
+            "plan": self.plan.to_dict(),
+            "law": self.law.to_dict(),
+            "labels": list(self.labels),
+        }
+
+    @classmethod
+    def _from_dict(cls, data: dict[str, Any]) -> Self:
+        return cls(trajectory_from_dict(data["plan"]), trajectory_from_dict(data["law"]), data["labels"])
+
+    def _map_time(self, origin: float, target: float, rate: float) -> Self:
+        return type(self)(self.plan, self.law._map_time(origin, target, rate), self.labels)
+
+    def _sample(self, t: Array, low: int, high: int, left: bool) -> Array:
+        out = super()._sample(t, low, high, left)
+        at_end = t == self.end
+        if not left and at_end.any():  # the end belongs to the plan, by its own rule
+            jets = self.plan.jet([self.plan.end], high), self.law.jet([self.end], high)
+            out[:, :, at_end] = _composed_jets(*jets)[low:]
+        return out
+
+    def _leg_jet(self, leg: int, s: Array, order: int) -> Array:
+        clock, leg_of_plan = self._legs[leg]
+        inner = self.law._leg_jet(clock, s + self._since(leg), order)
+        elapsed = inner[0, 0] - self.plan.breakpoints[leg_of_plan]
+        return _composed_jets(self.plan._leg_jet(leg_of_plan, elapsed, order), inner)
+
+    def _leg_series(self, leg: int, s: Any, order: int) -> list[list[Any]]:
+        clock, leg_of_plan = self._legs[leg]
+        ((time, *rates),) = self.law._leg_series(clock, s + self._since(leg), order)
+        elapsed = time - float(self.plan.breakpoints[leg_of_plan])
+        return [composed(row, rates) for row in self.plan._leg_series(leg_of_plan, elapsed, order)]
+
+    def _since(self, leg: int) -> float:
+        """Time [s] from the beginning of the law's leg to that of one of the whole."""
+        return float(self.breakpoints[:-1][leg] - self.law.breakpoints[self._legs[leg][0]])
+
+    _legs: list[tuple[int, int]]
+
+
+def composed(outer: Sequence[Any], inner: Sequence[Any]) -> list[Any]:
+    """Taylor series of a function of a function.
+
+    Coefficients may be numbers, arrays that broadcast, or symbols.
+
+    Parameters
+    ----------
+    outer : sequence of length order + 1
+        Coefficients of the outer function about the value of the inner one.
+    inner : sequence of length order
+        Coefficients 1, 2, ... of the inner function: its value is left out.
+
+    Returns
+    -------
+    list of length order + 1
+    """
+    found = [outer[len(inner)]]
+    for value in reversed(outer[: len(inner)]):
+        found = [value, *(sum(inner[i] * found[k - i] for i in range(k + 1)) for k in range(len(found)))]
+    return found
+
+
+def _composed_jets(outer: Array, inner: Array) -> Array:
+    """Jet of a function (order + 1, naxes, ntime) of a law (order + 1, 1, ntime)."""
+    factorials = FACTORIALS[: len(outer), None, None]
+    rows = composed(list(outer / factorials), list(inner / factorials)[1:])
+    return np.array(rows) * factorials
+
+
+def _checked_law(plan: Trajectory, law: Trajectory, slack: float) -> Array:
+    """Values of the law at its breakpoints, once it is found to lead through the plan."""
+    if not plan.duration:
+        raise ValueError("plan must have a duration, got a step")
+    if law.naxes != 1:
+        raise ValueError(f"law must have one axis, got {law.naxes}: {', '.join(law.labels)}")
+    values = law(law.breakpoints)
+    first, last = float(law.initial[0]), float(law.final[0])
+    if max(abs(first - plan.start), abs(last - plan.end)) > slack:
+        raise ValueError(f"law must lead from {plan.start} s to {plan.end} s, where the plan is, got {first} to {last}")
+    for jump in law.jumps(0):
+        raise ValueError(f"law must be continuous, got a jump by {jump.size:g} at {jump.time:g} s")
+    rate = law.extrema(1)
+    if rate.minimum[0] < -_ROUNDING * rate.maximum[0]:
+        raise ValueError(f"law must increase, got the rate {rate.minimum[0]:g} at {rate.time_min[0]:g} s")
+    for leg in np.flatnonzero(np.diff(values) <= 0.0).tolist():
+        raise ValueError(f"law must increase strictly, got {values[leg]:g} from {law.breakpoints[leg]:g} s on")
+    return values
+
+
+def _passing(law: Trajectory, values: Array, target: float, slack: float) -> float:
+    """Instant at which an increasing law, of some values at its breakpoints, reaches a target."""
+    nearest = int(np.abs(values - target).argmin())
+    # Where the rate is 0 there, a root would be off by a root of the rounding.
+    if abs(values[nearest] - target) <= slack:
+        return float(law.breakpoints[nearest])
+    leg = int(np.searchsorted(values, target)) - 1
+    origin, end = law.breakpoints[leg : leg + 2].tolist()
+
+    def excess(s: float) -> float:
+        return float(law._leg_jet(leg, np.array([s]), 0)[0, 0, 0]) - target
+
+    eps = np.finfo(float).eps
+    return origin + float(brentq(excess, 0.0, end - origin, xtol=eps * (end - origin), rtol=4.0 * eps))

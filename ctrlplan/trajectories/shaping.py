@@ -1,0 +1,222 @@
+"""Input shaping: a reference split into delayed parts whose vibrations cancel."""
+
+from __future__ import annotations
+
+import math
+from typing import Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.special import comb
+
+from ctrlplan.trajectories.combined import Sum
+from ctrlplan.trajectories.common import Array, Frozen, checked_count, checked_time, readonly
+from ctrlplan.trajectories.trajectory import Trajectory
+
+
+class Shaper(Frozen):
+    r"""Impulses that any reference is convolved with.
+
+    The shaped reference is :math:`\sum_i w_i\,r(t - t_i)`. A mode whose response
+    to the impulses dies with the last of them is left without vibration by
+    every reference, and the end is where it was.
+
+    Parameters
+    ----------
+    delays : array_like, shape (nimpulses,)
+        Times t_i of the impulses [s], from 0, increasing.
+    weights : array_like, shape (nimpulses,)
+        Their weights w_i, of sum 1.
+
+    Attributes
+    ----------
+    delays, weights : ndarray, shape (nimpulses,)
+        As given; the sum of the weights is 1 to rounding.
+
+    Raises
+    ------
+    ValueError
+        If the delays do not increase from 0 or later, the weights do not sum to
+        1 within 1e-12, one is not finite, or the numbers of them differ.
+
+    References
+    ----------
+    Singer and Seering, Preshaping command inputs to reduce system vibration,
+    ASME J. Dynamic Systems, Measurement, and Control 112, 1990.
+
+    Examples
+    --------
+    A load that swings with 2 rad/s, moved in two halves:
+
+    >>> import numpy as np
+    >>> from ctrlplan.trajectories import Step
+    >>> shaper = Shaper.zv(2.0)
+    >>> shaper(Step(1.0))(np.array([-1.0, 0.0, 1.0, 2.0]))
+    array([0. , 0.5, 0.5, 1. ])
+    >>> shaper.residual([2.0, 2.2]).round(3)
+    array([0.   , 0.156])
+    """
+
+    delays: Array
+    weights: Array
+
+    def __init__(self, delays: ArrayLike, weights: ArrayLike) -> None:
+        times, parts = _numbers(delays, "delays"), _numbers(weights, "weights")
+        if times.size != parts.size:
+            raise ValueError(f"weights must be as many as delays, {times.size}, got {parts.size}")
+        if times[0] < 0.0:
+            raise ValueError(f"delays must be at least 0, got {times[0]}")
+        for i in np.flatnonzero(np.diff(times) <= 0.0).tolist():
+            raise ValueError(f"delays must increase strictly, got delays[{i + 1}] = {times[i + 1]} after {times[i]}")
+        total = math.fsum(parts)
+        if abs(total - 1.0) > 1e-12:
+            raise ValueError(f"weights must sum to 1, got {total}")
+        self.__dict__.update(delays=readonly(times), weights=readonly(parts / total))
+
+    @classmethod
+    def zv(cls, frequency: float, damping: float = 0.0) -> Self:
+        r"""Two impulses that leave no vibration of one mode.
+
+        Half a period :math:`\pi/(\omega\sqrt{1 - \zeta^2})` apart, of weights in
+        the ratio :math:`K = e^{-\zeta\pi/\sqrt{1 - \zeta^2}}` to the first.
+
+        Parameters
+        ----------
+        frequency : float
+            Undamped natural frequency [rad/s], above 0.
+        damping : float, optional
+            Damping ratio in [0, 1).
+
+        Raises
+        ------
+        ValueError
+            If one is out of range.
+        """
+        return cls.zvd(frequency, damping, 0)
+
+    @classmethod
+    def zvd(cls, frequency: float, damping: float = 0.0, derivatives: int = 1) -> Self:
+        """Impulses that leave little vibration where the frequency is not quite known.
+
+        The residual vibration and its derivatives with respect to frequency and
+        damping up to an order are 0: `zv` convolved with itself, weights by the
+        binomial theorem. Each order takes another half period.
+
+        Parameters
+        ----------
+        frequency : float
+            Undamped natural frequency [rad/s], above 0.
+        damping : float, optional
+            Damping ratio in [0, 1).
+        derivatives : int, optional
+            Order of the highest derivative that is 0: 1 is ZVD, 2 is ZVDD.
+
+        Raises
+        ------
+        ValueError
+            If one is out of range.
+        """
+        omega = checked_time(frequency, "frequency", positive=True)
+        zeta, count = float(_checked_damping(damping)), checked_count(derivatives, "derivatives") + 1
+        root = math.sqrt(1.0 - zeta**2)
+        decay = math.exp(-zeta * math.pi / root)
+        orders = np.arange(count + 1)
+        weights = comb(count, orders) * decay**orders / (1.0 + decay) ** count
+        return cls(orders * (math.pi / (omega * root)), weights)
+
+    @property
+    def duration(self) -> float:
+        """Time [s] by which a shaped reference ends later."""
+        return float(self.delays[-1])
+
+    def __call__(self, plan: Trajectory) -> Trajectory:
+        """Shaped reference.
+
+        Parameters
+        ----------
+        plan : Trajectory
+            Any reference, a `Step` too.
+
+        Returns
+        -------
+        Trajectory
+            From the plan's start and initial position to its final one,
+            `duration` after its end.
+
+        Raises
+        ------
+        TypeError
+            If `plan` is not a trajectory.
+        """
+        if not isinstance(plan, Trajectory):
+            raise TypeError(f"plan must be a Trajectory, got {type(plan).__name__}")
+        pairs = zip(self.delays.tolist(), self.weights.tolist(), strict=True)
+        return Sum(weight * plan.shift(delay) for delay, weight in pairs)
+
+    def then(self, other: Shaper) -> Shaper:
+        """Both shapers one after the other, for two modes: every impulse split again."""
+        if not isinstance(other, Shaper):
+            raise TypeError(f"other must be a Shaper, got {type(other).__name__}")
+        delays = np.add.outer(self.delays, other.delays).ravel()
+        order = np.argsort(delays, kind="stable")
+        delays, weights = delays[order], np.outer(self.weights, other.weights).ravel()[order]
+        # What differs by the rounding of the sums is one impulse.
+        first = np.flatnonzero(np.diff(delays, prepend=-1.0) > 8.0 * np.finfo(float).eps * delays[-1])
+        return Shaper(delays[first], np.add.reduceat(weights, first))
+
+    def residual(self, frequency: ArrayLike, damping: ArrayLike = 0.0) -> Array:
+        r"""Part of the vibration of a mode that is left.
+
+        .. math:: V = e^{-\zeta\omega t_n}
+            \left|\sum_i w_i\,e^{(\zeta + i\sqrt{1 - \zeta^2})\,\omega t_i}\right|
+
+        The amplitude at the last impulse t_n, relative to that of one impulse of
+        weight 1 when it comes: over frequencies this is the sensitivity curve.
+
+        Parameters
+        ----------
+        frequency : array_like
+            Undamped natural frequencies [rad/s], at least 0.
+        damping : array_like, optional
+            Damping ratios in [0, 1); broadcasts with `frequency`.
+
+        Returns
+        -------
+        ndarray, of the shape that both broadcast to
+            1 is the vibration without a shaper, 0 none.
+
+        Raises
+        ------
+        ValueError
+            If one is out of range.
+        """
+        omega, zeta = np.asarray(frequency, dtype=float), _checked_damping(damping)
+        if not np.all((omega >= 0.0) & (omega < math.inf)):
+            raise ValueError(f"frequency must be at least 0 and finite, got {frequency!r}")
+        mode = omega * (zeta + 1j * np.sqrt(1.0 - zeta**2))
+        left: Array = np.abs(np.exp(mode[..., None] * (self.delays - self.delays[-1])) @ self.weights)
+        return left
+
+    def __repr__(self) -> str:
+        return f"<Shaper of {self.delays.size} impulses over {self.duration:g} s>"
+
+
+def _numbers(values: ArrayLike, name: str) -> Array:
+    """One or more finite numbers as a new array."""
+    try:
+        found = np.array(values, dtype=float)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name} must be numbers, got {values!r}") from None
+    if found.ndim != 1 or not found.size:
+        raise ValueError(f"{name} must be of shape (nimpulses,), got shape {found.shape}")
+    if not np.isfinite(found).all():
+        raise ValueError(f"{name} must be finite, got {found.tolist()}")
+    return found
+
+
+def _checked_damping(damping: ArrayLike) -> Array:
+    """Damping ratios below the critical one."""
+    zeta = np.asarray(damping, dtype=float)
+    if not np.all((zeta >= 0.0) & (zeta < 1.0)):
+        raise ValueError(f"damping must lie in [0, 1), got {damping!r}")
+    return zeta
