@@ -35,6 +35,10 @@ FIXED = (
     "simulate",
     "compare",
     "sweep",
+    "choose_alpha",
+    "optimize_waypoints",
+    "fastest",
+    "avoid",
     "metrics.settling_time",
     "metrics.overshoot",
     "metrics.lag",
@@ -60,6 +64,7 @@ def fresh(code):
     [
         ("ctrlplan", {"control", "matplotlib", "scipy", "numpy", "jinja2", "tqdm", "pandas"}),
         ("ctrlplan.trajectories", {"control", "matplotlib", "jinja2", "tqdm", "pandas"}),
+        ("ctrlplan.planning", {"control", "matplotlib", "jinja2", "tqdm", "pandas"}),
         ("ctrlplan.metrics", {"control", "matplotlib", "scipy", "jinja2", "tqdm", "pandas"}),
         ("ctrlplan.cli", {"control", "matplotlib", "scipy", "pandas"}),
         ("ctrlplan.studies", {"matplotlib.backends.backend_svg", "jinja2", "pandas"}),
@@ -145,6 +150,10 @@ def test_names_of_the_design_are_there(name):
         ("compare", ["loop", "plans", "timepts"]),
         ("sweep", ["build", "values", "plans", "timepts", "executor", "progress"]),
         ("create_governor_iosystem", ["loop", "dt", "limits"]),
+        ("choose_alpha", ["waypoints", "objective"]),
+        ("optimize_waypoints", ["waypoints"]),
+        ("fastest", ["plan", "limits"]),
+        ("avoid", ["plan", "obstacles"]),
         ("Step", ["final", "initial", "time", "labels"]),
         ("metrics.settling_time", ["timepts", "y", "final", "initial", "band"]),
         ("metrics.overshoot", ["timepts", "y", "final", "initial", "reference"]),
@@ -182,6 +191,7 @@ def test_every_public_function_and_class_is_described(name):
 
 
 def test_subpackages_are_those_of_the_map():
+    assert "ctrlplan.planning" in SUBPACKAGES
     assert {"ctrlplan.trajectories", "ctrlplan.systems", "ctrlplan.simulation", "ctrlplan.metrics"} <= set(SUBPACKAGES)
     assert {"ctrlplan.studies", "ctrlplan.reports", "ctrlplan.systems.plants"} <= set(SUBPACKAGES)
 

@@ -24,6 +24,10 @@ class Options(NamedTuple):
     smooth: int = 3
     period: float | None = None
 
+    def given(self) -> dict[str, Any]:
+        """Those that differ from what is taken unless given."""
+        return {k: v for k, v in self._asdict().items() if v != self._field_defaults[k]}
+
 
 class NewtonSpline(Trajectory):
     """What the trigonometric and the polynomial spline share.
@@ -56,6 +60,17 @@ class NewtonSpline(Trajectory):
         """
         return self._again(same_times(waypoints, self.waypoints), self._options)
 
+    def through(self, waypoints: Iterable[Waypoint]) -> Self:
+        """Plan of the same kind and shape through any waypoints of as many axes.
+
+        Raises
+        ------
+        ValueError
+            As the constructor of this kind.
+        """
+        points = same_axes(checked_waypoints(waypoints, 2 if self._options.period is None else 1), self.naxes)
+        return self._again(points, self._options)
+
     @property
     def degree(self) -> tuple[int, ...]:
         """Degree axis by axis: m, or that of the polynomial where alpha is 0."""
@@ -72,6 +87,11 @@ class NewtonSpline(Trajectory):
         times = [w.time for w in waypoints]
         start, period = times[0], options.period
         duration = times[-1] - start if period is None else period
+        if period is not None and times[-1] >= start + period:
+            raise ValueError(
+                f"waypoints of a cyclic plan must lie within one period of {period:g} s from the first, "
+                f"got waypoints[{len(times) - 1}].time = {times[-1]}"
+            )
         if not 0.0 < duration < np.inf:
             raise ValueError(f"duration must be finite and above 0, got {times[-1]} s after {start} s")
         same_clock = donor is not None and donor._times == times and donor._duration == duration
@@ -156,9 +176,7 @@ class NewtonSpline(Trajectory):
             "waypoints": [w.to_dict() for w in self.waypoints],
             "labels": list(self.labels),
         }
-        chosen = self._options._asdict()
-        defaults = Options()._asdict()
-        return data | {k: v for k, v in chosen.items() if k != "labels" and v != defaults[k]}
+        return data | {k: v for k, v in self._options.given().items() if k != "labels"}
 
     _options: Options
     _times: list[float]
@@ -220,8 +238,13 @@ def same_times(waypoints: Iterable[Waypoint], before: tuple[Waypoint, ...]) -> t
     times = [w.time for w in before]
     if [w.time for w in points] != times:
         raise ValueError(f"waypoints must keep the times {times}, got {[w.time for w in points]}")
-    if points[0].naxes != before[0].naxes:
-        raise ValueError(f"waypoints must keep the number of axes, {before[0].naxes}, got {points[0].naxes}")
+    return same_axes(points, before[0].naxes)
+
+
+def same_axes(points: tuple[Waypoint, ...], naxes: int) -> tuple[Waypoint, ...]:
+    """Waypoints of a number of axes."""
+    if points[0].naxes != naxes:
+        raise ValueError(f"waypoints must keep the number of axes, {naxes}, got {points[0].naxes}")
     return points
 
 

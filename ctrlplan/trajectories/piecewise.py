@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable, Sequence
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 
 from ctrlplan.trajectories.common import FACTORIALS, Array, checked_labels, mapped_time, readonly
 from ctrlplan.trajectories.newton import NewtonSystem
-from ctrlplan.trajectories.newton_spline import NewtonSpline, checked_waypoints, given_entries, same_times
+from ctrlplan.trajectories.newton_spline import NewtonSpline, checked_waypoints, given_entries, same_axes, same_times
 from ctrlplan.trajectories.polynomial import PolySpline
 from ctrlplan.trajectories.trajectory import Trajectory
-from ctrlplan.trajectories.trigonometric import TrigSpline, checked_alpha
+from ctrlplan.trajectories.trigonometric import TrigSpline, chosen_alpha
 from ctrlplan.trajectories.waypoint import Waypoint
 
 
@@ -32,8 +32,9 @@ class PiecewiseSpline(Trajectory):
     ----------
     waypoints : iterable of Waypoint
         Two or more, times increasing.
-    alpha : float, optional
-        Shape parameter of every leg in [0, 2 pi) [rad]; 0 gives polynomials.
+    alpha : float or "auto", optional
+        Shape parameter of every leg in [0, 2 pi) [rad]; 0 gives polynomials,
+        "auto" the shortest path.
     labels : sequence of str, optional
         Names of the axes.
 
@@ -53,10 +54,14 @@ class PiecewiseSpline(Trajectory):
     legs: tuple[NewtonSpline, ...]
 
     def __init__(
-        self, waypoints: Iterable[Waypoint], *, alpha: float = 0.0, labels: Sequence[str] | None = None
+        self,
+        waypoints: Iterable[Waypoint],
+        *,
+        alpha: float | Literal["auto"] = 0.0,
+        labels: Sequence[str] | None = None,
     ) -> None:
         points = checked_waypoints(waypoints)
-        shape = checked_alpha(alpha)
+        shape = chosen_alpha(alpha, points, type(self), labels=labels)
         names = checked_labels(labels or points[0].labels, points[0].naxes)
         filled = _filled(points, shape)
         legs = tuple(
@@ -79,7 +84,18 @@ class PiecewiseSpline(Trajectory):
         ValueError
             If a time differs.
         """
-        return type(self)(same_times(waypoints, self.waypoints), alpha=self.alpha, labels=self.labels)
+        return self.through(same_times(waypoints, self.waypoints))
+
+    def through(self, waypoints: Iterable[Waypoint]) -> Self:
+        """Plan of the same shape through any waypoints of as many axes.
+
+        Raises
+        ------
+        ValueError
+            As the constructor.
+        """
+        points = same_axes(checked_waypoints(waypoints), self.naxes)
+        return type(self)(points, alpha=self.alpha, labels=self.labels)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data that `trajectory_from_dict` reads."""

@@ -8,7 +8,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from functools import cached_property
 from numbers import Real
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -69,7 +69,7 @@ class Trajectory(Frozen, ABC):
         """
 
     @abstractmethod
-    def _map_time(self, origin: float, target: float, rate: float) -> Trajectory:
+    def _map_time(self, origin: float, target: float, rate: float) -> Self:
         """Same path with time t moved to target + (t - origin)/rate."""
 
     @abstractmethod
@@ -300,7 +300,7 @@ class Trajectory(Frozen, ABC):
         """
         return find_jumps(self, checked_count(order, "order"))
 
-    def retime(self, duration: float) -> Trajectory:
+    def retime(self, duration: float) -> Self:
         """Same path from the same start, in another duration [s].
 
         The nu-th derivative is multiplied by (old duration/new)^nu.
@@ -309,7 +309,7 @@ class Trajectory(Frozen, ABC):
             raise ValueError("a trajectory without duration cannot be retimed, got a step")
         return self._map_time(self.start, self.start, self.duration / checked_time(duration, "duration", positive=True))
 
-    def shift(self, dt: float) -> Trajectory:
+    def shift(self, dt: float) -> Self:
         """Same path, dt seconds later."""
         return self._map_time(self.start, self.start + checked_time(dt, "dt"), 1.0)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, Self
 
@@ -32,7 +32,8 @@ class TrigSpline(NewtonSpline):
     waypoints : iterable of Waypoint
         Two or more, times increasing; each axis may leave its own entries free.
     alpha : float or "auto"
-        Shape parameter in [0, 2 pi) [rad]; 0 is the polynomial spline.
+        Shape parameter in [0, 2 pi) [rad]; 0 is the polynomial spline, "auto"
+        that of the shortest path (`ctrlplan.choose_alpha` has other objectives).
     gamma : float or sequence of float or None, optional
         Phase of the top harmonic [rad of tau], one for all axes or one an axis
         (None for the mean). Needs an even number of coefficients.
@@ -70,7 +71,7 @@ class TrigSpline(NewtonSpline):
     ) -> None:
         points = checked_waypoints(waypoints)
         chosen = Options(labels, _checked_gamma(gamma, points[0].naxes), *checked_degree(degree, smooth))
-        self._fit(points, checked_alpha(alpha), chosen)
+        self._fit(points, chosen_alpha(alpha, points, type(self), **chosen.given()), chosen)
 
     @classmethod
     def cyclic(
@@ -105,11 +106,6 @@ class TrigSpline(NewtonSpline):
         """
         points = checked_waypoints(waypoints, least=1)
         duration = checked_time(period, "period", positive=True)
-        if points[-1].time >= points[0].time + duration:
-            raise ValueError(
-                f"waypoints of a cyclic plan must lie within one period of {duration:g} s from the first, "
-                f"got waypoints[{len(points) - 1}].time = {points[-1].time}"
-            )
         chosen = Options(labels, _checked_gamma(gamma, points[0].naxes), *checked_degree(degree, smooth), duration)
         plan = cls.__new__(cls)
         plan._fit(points, 2.0 * math.pi, chosen)
@@ -205,12 +201,21 @@ class FourierCoefficients:
         return (self[axis] for axis in range(len(self)))
 
 
+def chosen_alpha(alpha: float | str, points: tuple[Waypoint, ...], family: Callable[..., Any], **options: Any) -> float:
+    """Shape parameter in [0, 2 pi): the one given, or for "auto" that of the shortest path."""
+    if not isinstance(alpha, str):
+        return checked_alpha(alpha)
+    if alpha != "auto":
+        raise ValueError(f'alpha must lie in [0, 2 pi) or be "auto", got {alpha!r}')
+    from ctrlplan.planning.alpha import choose_alpha
+
+    return choose_alpha(points, family=family, **options).alpha
+
+
 def checked_alpha(alpha: float | str) -> float:
     """Shape parameter in [0, 2 pi)."""
     if isinstance(alpha, str):
-        if alpha == "auto":
-            raise ValueError('alpha = "auto" must wait until choosing is built; give a number in [0, 2 pi)')
-        raise ValueError(f'alpha must lie in [0, 2 pi) or be "auto", got {alpha!r}')
+        raise ValueError(f"alpha must be a number in [0, 2 pi) here, got {alpha!r}")
     try:
         value = float(alpha)
     except (TypeError, ValueError):

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, ClassVar
 
 import control as ct
 import numpy as np
@@ -257,6 +257,10 @@ class Crane:
         if not least > 0.0:
             raise ValueError(f"the rope length R must be above 0, got {least:.4g} m at {time:.4g} s")
 
+    def rope(self) -> CraneRope:
+        """Rope of this crane, from the load up to the drum, as `planning.clearance` asks for one."""
+        return CraneRope(self.drum_radius, self.gravity)
+
     def _shortest_rope(self, plan: Trajectory, acceleration: Extrema) -> tuple[float, float]:
         """Certified lower bound of R over a plan, or its least value where that decides or no bound does."""
         g, b = self.gravity, self.drum_radius
@@ -368,6 +372,88 @@ class Crane:
         x, z, x_rate, z_rate = _load(numbers[3], state)
         tension = self._accelerations(numbers, state, *_forces(inputs))[3]
         return np.array([x, z, state[0], state[1], state[2], x_rate, z_rate, state[3], state[4], state[5], tension])
+
+
+@dataclass(frozen=True)
+class CraneRope:
+    """Straight rope from the load to the point where it leaves the drum.
+
+    Attributes
+    ----------
+    drum_radius : float
+        b [m].
+    gravity : float
+        g [m/s^2].
+    order : int
+        Highest derivative of the load that is read: 2.
+    """
+
+    drum_radius: float
+    gravity: float
+    order: ClassVar[int] = 2
+
+    def top(self, jet: Array) -> Array:
+        """Point (D + b cos theta, -b sin theta) at which the rope leaves the drum.
+
+        Parameters
+        ----------
+        jet : ndarray, shape (order + 1, 2, ...)
+            Derivatives of x and z, to order 2 at least.
+
+        Returns
+        -------
+        ndarray, shape (2, ...)
+
+        Raises
+        ------
+        ValueError
+            If g - z'' is not above 0 somewhere: the rope cannot push.
+        """
+        across, hanging = jet[2, 0], self.gravity - jet[2, 1]
+        if not np.min(hanging, initial=np.inf) > 0.0:
+            raise ValueError(f"g - z'' must be above 0 for a taut rope, got {np.min(hanging):.4g} m/s^2")
+        lean = across / np.hypot(across, hanging)
+        over = jet[0, 0] + across / hanging * (jet[0, 1] - self.drum_radius * lean)
+        return np.stack([over, self.drum_radius * lean])
+
+    def slopes(self, plan: Trajectory) -> Array:
+        """Bounds of |d top/d entry| over the jets of a plan.
+
+        Parameters
+        ----------
+        plan : Trajectory
+            Plan of x and z.
+
+        Returns
+        -------
+        ndarray, shape (3, 2)
+            Row nu, column axis: of the nu-th derivative of that axis.
+
+        Raises
+        ------
+        ValueError
+            If g - z'' is not above 0 over the whole plan.
+        """
+        b, fall = self.drum_radius, plan.extrema(2)
+        least = self.gravity - float(fall.maximum[1])
+        if not least > 0.0:
+            raise ValueError(
+                f"the rope can only pull: g - z'' must be above 0, got {least:.4g} m/s^2 "
+                f"at {fall.time_max[1]:.4g} s (tension T <= 0)"
+            )
+        depth, across = float(plan.peak()[1]), float(max(-fall.minimum[0], fall.maximum[0]))
+        lean = across / math.hypot(across, least)
+        # With h = g - z'': top = (x + z x''/h - b x''^2/(h S), b x''/S), term by term.
+        return np.array(
+            [
+                [1.0, across / least],
+                [0.0, 0.0],
+                [
+                    math.hypot((depth + 2.0 * b * lean) / least, b / least),
+                    math.hypot(across * (depth + 2.0 * b * lean) / least**2, b * lean / least),
+                ],
+            ]
+        )
 
 
 def _forces(inputs: Any) -> tuple[Any, Any, Any]:

@@ -1,0 +1,36 @@
+"""Choosing what the designer left free: shape, derivatives, times, durations, ways around obstacles."""
+
+from ctrlplan.planning.alpha import AlphaChoice, choose_alpha
+from ctrlplan.planning.avoid import avoid
+from ctrlplan.planning.clearance import Clearance, Rope, clearance
+from ctrlplan.planning.fastest import Fastest, fastest
+from ctrlplan.planning.limits import Bound, Margin, Margins, margins
+from ctrlplan.planning.objectives import OBJECTIVES, PeakDerivative, SquaredDerivative, path_length, wandering
+from ctrlplan.planning.obstacles import Disc, HalfPlane, Obstacle, Rectangle
+from ctrlplan.planning.optimize import Optimum, optimize_waypoints
+
+__all__ = [
+    "OBJECTIVES",
+    "AlphaChoice",
+    "Bound",
+    "Clearance",
+    "Disc",
+    "Fastest",
+    "HalfPlane",
+    "Margin",
+    "Margins",
+    "Obstacle",
+    "Optimum",
+    "PeakDerivative",
+    "Rectangle",
+    "Rope",
+    "SquaredDerivative",
+    "avoid",
+    "choose_alpha",
+    "clearance",
+    "fastest",
+    "margins",
+    "optimize_waypoints",
+    "path_length",
+    "wandering",
+]

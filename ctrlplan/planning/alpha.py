@@ -1,0 +1,219 @@
+"""The shape parameter alpha, chosen by an objective over its whole range."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from numbers import Real
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+
+from ctrlplan.planning.curve import curve
+from ctrlplan.planning.objectives import Objective, SquaredDerivative, checked_objective, wandering
+from ctrlplan.trajectories import Trajectory, TrigSpline, Waypoint
+from ctrlplan.trajectories.common import Array, readonly
+from ctrlplan.trajectories.newton_spline import checked_waypoints, given_entries
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_TIE = 1e-9
+_BLOWN = 1e3
+
+
+@dataclass(frozen=True, repr=False)
+class AlphaChoice:
+    """Shape parameter that was chosen, and the objective over alpha.
+
+    ``float(choice)`` is the alpha, so that a choice can stand where a plan
+    takes one.
+
+    Attributes
+    ----------
+    alpha : float
+        Shape parameter [rad] of the least objective.
+    value : float
+        That objective.
+    plan : Trajectory
+        The plan with it.
+    alphas, values : ndarray, shape (npoints,)
+        The objective over alpha, increasing; inf where the waypoints do not
+        determine a plan.
+    blow_up : float
+        Alpha [rad] from which on the objective is above a thousand times the
+        least for good; 2 pi where it never is.
+    tied : bool
+        Whether the objective does not depend on alpha near its least value, so
+        that the integral of the squared jerk decided.
+    objective : str
+        Its name.
+    """
+
+    alpha: float
+    value: float
+    plan: Trajectory
+    alphas: Array = field(compare=False)
+    values: Array = field(compare=False)
+    blow_up: float
+    tied: bool
+    objective: str
+
+    def __float__(self) -> float:
+        return self.alpha
+
+    def __repr__(self) -> str:
+        return f"<AlphaChoice alpha = {self.alpha:.6g} rad: {self.objective} {self.value:.6g}>"
+
+    def plot(self) -> Figure:
+        """Objective over alpha up to where it blows up, the choice marked."""
+        from ctrlplan.reports.planning_figures import plot_alpha_choice
+
+        return plot_alpha_choice(self)
+
+
+def choose_alpha(
+    waypoints: Iterable[Waypoint],
+    objective: str | Objective = "path",
+    *,
+    family: Callable[..., Trajectory] = TrigSpline,
+    **options: Any,
+) -> AlphaChoice:
+    """Shape parameter of the least objective, over all of [0, 2 pi).
+
+    The objective is taken on a grid that is the finer the more constraints
+    there are, and every valley in which the least value can lie is solved for.
+    Where the objective does not depend on alpha (the path of a straight move
+    has one length) the least integral of the squared jerk decides.
+
+    Parameters
+    ----------
+    waypoints : iterable of Waypoint
+        What the plan meets.
+    objective : str or callable, optional
+        What should be least: "path" (length), "wandering", "peak_velocity",
+        "peak_acceleration", "peak_jerk", "peak_snap", "squared_velocity", ...,
+        "squared_snap", an objective such as ``PeakDerivative(5)``, or any
+        function of a plan that returns a number. Axes must share a unit.
+    family : callable, optional
+        Kind of plan with an argument alpha: `TrigSpline` or `PiecewiseSpline`.
+    **options
+        Further arguments of the family: gamma, degree, labels, ...
+
+    Returns
+    -------
+    AlphaChoice
+
+    Raises
+    ------
+    ValueError
+        If no alpha gives a plan, or the objective returns nan.
+
+    Examples
+    --------
+    The least peak jerk of a unit move is less than the polynomial's 60:
+
+    >>> import ctrlplan as cp
+    >>> found = cp.choose_alpha([cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1, 0, 0)], "peak_jerk")
+    >>> round(found.alpha, 2), round(found.value, 2)
+    (1.98, 39.39)
+    """
+    points = checked_waypoints(waypoints)
+    goal = checked_objective(objective)
+
+    def plan_of(alpha: float) -> Trajectory:
+        return family(points, alpha=alpha, **options)
+
+    search = _Search(plan_of, goal)
+    alphas, values = curve(search, _grid(points))
+    best = float(values.min())
+    if math.isinf(best):
+        raise search.refusal or ValueError("objective must be finite for some alpha, got inf for all of [0, 2 pi)")
+    scale = 1.0 if goal is wandering else abs(best)
+    level = best + _TIE * scale
+    tied = np.flatnonzero(values <= level)
+    # Of one valley only its bottom is tied; of a plateau, or of several valleys, whole steps of the grid.
+    flat = bool(np.ptp(alphas[tied]) > 0.5 * np.diff(alphas).max())
+    if flat:
+        alpha, value = _smoothest(search, plan_of, alphas, tied, level)
+    else:
+        alpha, value = float(alphas[tied[0]]), best
+    return AlphaChoice(
+        alpha=alpha,
+        value=value,
+        plan=plan_of(alpha),
+        alphas=readonly(alphas),
+        values=readonly(values),
+        blow_up=_blow_up(alphas, values, best + _BLOWN * scale),
+        tied=flat,
+        objective=objective if isinstance(objective, str) else str(getattr(objective, "__name__", objective)),
+    )
+
+
+class _Search:
+    """Objective as a function of alpha: inf where there is no plan."""
+
+    def __init__(self, plan_of: Callable[[float], Trajectory], goal: Objective) -> None:
+        self._plan_of, self._goal = plan_of, goal
+        self.refusal: ValueError | None = None
+
+    def __call__(self, alpha: float) -> float:
+        try:
+            plan = self._plan_of(float(alpha))
+        except ValueError as refusal:  # free entries can make single alphas singular
+            self.refusal = self.refusal or refusal
+            return math.inf
+        value: Any = self._goal(plan)
+        if np.ndim(value) or not isinstance(value, Real | np.ndarray):
+            raise TypeError(f"objective must return a number, got {value!r:.60} at alpha = {alpha:.6g}")
+        if not float(value) > -math.inf:
+            raise ValueError(f"objective must return a number above -inf, got {value} at alpha = {alpha:.6g}")
+        return float(value)
+
+
+def _grid(points: tuple[Waypoint, ...]) -> Array:
+    """Alphas from 0 to just below 2 pi, so many that the highest harmonic is followed."""
+    _, patterns = given_entries(points)
+    most = max(sum(map(len, pattern)) for pattern in patterns)
+    return np.linspace(0.0, 2.0 * math.pi * 0.995, 33 + 3 * most)
+
+
+def _smoothest(
+    search: Callable[[float], float],
+    plan_of: Callable[[float], Trajectory],
+    alphas: Array,
+    tied: Any,
+    level: float,
+) -> tuple[float, float]:
+    """Of the alphas whose objective is at its least, that of the least integral of the squared jerk."""
+    jerk = _Search(plan_of, SquaredDerivative(3))
+    costs = np.array([jerk(alpha) for alpha in alphas[tied].tolist()])
+    # The first of equals: the polynomial, if it is one of them.
+    k = int(tied[int(np.argmax(costs <= costs.min() * (1.0 + 1e-12)))])
+    here = float(alphas[k])
+    low, high = (
+        _edge(search, here, float(alphas[k + step]), level) if 0 <= k + step < alphas.size else here for step in (-1, 1)
+    )
+    if low < high:
+        found = minimize_scalar(jerk, bounds=(low, high), method="bounded", options={"xatol": 1e-8})
+        if found.fun < costs.min() * (1.0 - 1e-12):
+            here = float(found.x)
+    return here, search(here)
+
+
+def _edge(search: Callable[[float], float], inside: float, outside: float, level: float) -> float:
+    """How far towards a neighbour the objective stays at its least."""
+    if search(outside) <= level:
+        return outside
+    while abs(outside - inside) > 1e-9:
+        middle = 0.5 * (inside + outside)
+        inside, outside = (middle, outside) if search(middle) <= level else (inside, middle)
+    return inside
+
+
+def _blow_up(alphas: Array, values: Array, bound: float) -> float:
+    """Alpha from which on the objective stays above a bound."""
+    last = int(np.flatnonzero(values <= bound)[-1])
+    return float(alphas[last + 1]) if last + 1 < alphas.size else 2.0 * math.pi

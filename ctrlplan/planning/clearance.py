@@ -1,0 +1,229 @@
+"""How far a plan stays from obstacles: a fact about its whole interval."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Literal, Protocol
+
+import numpy as np
+
+from ctrlplan.planning.obstacles import Obstacle
+from ctrlplan.trajectories import Trajectory
+from ctrlplan.trajectories.common import Array, checked_number
+
+_TIGHT = 1e-6  # gap between the bound and what is attained, where the size itself is asked for
+_ROUNDING = 1e-9  # of the coordinates: a plan that rests just as far from an obstacle as it must keeps clear of it
+
+
+class Rope(Protocol):
+    """Straight rope from the load up to a point that the load's jet gives."""
+
+    @property
+    def order(self) -> int:
+        """Highest derivative of the load that `top` reads."""
+
+    def top(self, jet: Array) -> Array:
+        """Upper end (2, ntime) from the load's jet (order + 1, 2, ntime)."""
+
+    def slopes(self, plan: Trajectory) -> Array:
+        """Bounds (order + 1, 2) of the length of d top/d entry, for each entry of the jets of a plan."""
+
+
+@dataclass(frozen=True)
+class Clearance:
+    """Certified clearance of a plan.
+
+    Attributes
+    ----------
+    lower : float
+        Everywhere on the whole interval the clearance is at least this.
+    least : float
+        Least clearance found: it is attained.
+    time : float
+        When [s].
+    position : tuple of float
+        Where the load is then.
+    obstacle : int
+        Index of the obstacle that is nearest then.
+    part : "load" or "rope"
+        What it is nearest to.
+    required : float or None
+        What was asked for.
+    certified : bool
+        Whether `lower` reaches `required`, to rounding (1e-9 of the size of
+        the coordinates); False where nothing was asked for.
+    """
+
+    lower: float
+    least: float
+    time: float
+    position: tuple[float, float]
+    obstacle: int
+    part: Literal["load", "rope"]
+    required: float | None
+    certified: bool
+
+
+def clearance(
+    plan: Trajectory,
+    obstacles: Iterable[Obstacle],
+    *,
+    load: float = 0.0,
+    rope: Rope | None = None,
+    required: float | None = None,
+    max_cells: int = 200_000,
+) -> Clearance:
+    """Clearance of a plan in the plane, certified over its whole interval.
+
+    Cells of each leg are refined until a bound decides, not a sample. In a cell
+    of duration h the load leaves its chord by no more than h^2/8 times the
+    bound of its acceleration; the rope's ends move by no more than h/2 times
+    the bounds of their speeds. Both bounds come from the jet at the centre and
+    the plan's own peaks. What is asked for is `required`; without it, or where
+    it is missed, `lower` comes as near to `least` as 1e-6, relative where that is
+    above 1, or as `max_cells` allow.
+
+    Parameters
+    ----------
+    plan : Trajectory
+        Plan of the load, two axes.
+    obstacles : iterable of Obstacle
+        One or more.
+    load : float, optional
+        Radius of the load.
+    rope : Rope, optional
+        Straight rope that must stay clear as well, such as `Crane.rope()`.
+    required : float, optional
+        Clearance asked for.
+    max_cells : int, optional
+        Cells at most.
+
+    Returns
+    -------
+    Clearance
+
+    Raises
+    ------
+    ValueError
+        If the plan has no duration or not two axes, there is no obstacle, the
+        load's radius is negative, or `max_cells` cells do not decide.
+    TypeError
+        If an obstacle is none.
+
+    Examples
+    --------
+    >>> from ctrlplan.planning.obstacles import Disc
+    >>> from ctrlplan.trajectories import PolySpline, Waypoint
+    >>> plan = PolySpline([Waypoint(0, [0, 0], 0, 0), Waypoint(1, [4, 0], 0, 0)])
+    >>> found = clearance(plan, [Disc((2.0, 3.0), 1.0)], load=0.5, required=1.4)
+    >>> found.certified, round(found.least, 6), found.part
+    (True, 1.5, 'load')
+    """
+    things = checked_obstacles(obstacles)
+    radius = checked_size(load, "load")
+    goal = None if required is None else checked_number(required, "required")
+    if plan.naxes != 2:
+        raise ValueError(f"a plan among obstacles must have two axes, got {plan.naxes}")
+    if not plan.duration:
+        raise ValueError("a trajectory without duration keeps clear of nothing on its way, got a step")
+    cells = _Cells(plan, things, radius, rope)
+    slack = _ROUNDING * float(plan.peak().max(initial=abs(goal or 0.0)))
+    times = np.concatenate([np.linspace(a, b, 65)[:-1] for a, b in itertools.pairwise(plan.breakpoints.tolist())])
+    left, right = times, np.append(times[1:], plan.end)
+    lower, spent = np.inf, 0
+    while left.size:
+        spent += left.size
+        bound = cells.bound(left, right)
+        least = cells.least
+        target = least - _TIGHT * max(1.0, abs(least)) if goal is None or least < goal - slack else goal - slack
+        open_ = bound < target
+        if spent + 2 * np.count_nonzero(open_) > max_cells:
+            if goal is not None and least >= goal - slack:
+                raise ValueError(
+                    f"the clearance must be decided within {max_cells} cells, got a bound of {bound.min():.6g} and a "
+                    f"least value of {least:.6g} where {goal:g} is required; raise max_cells or lower what is required"
+                )
+            open_[:] = False
+        lower = min(lower, float(bound[~open_].min(initial=np.inf)))
+        middle = 0.5 * (left + right)[open_]
+        left = np.stack([left[open_], middle], axis=1).ravel()
+        right = np.stack([middle, right[open_]], axis=1).ravel()
+    return cells.result(lower, goal, goal is not None and lower >= goal - slack)
+
+
+def checked_obstacles(obstacles: Iterable[Obstacle]) -> tuple[Obstacle, ...]:
+    """Obstacles as a tuple: one or more."""
+    if isinstance(obstacles, Obstacle) or not isinstance(obstacles, Iterable):
+        raise TypeError(f"obstacles must be a sequence of obstacles, got {obstacles!r}")
+    things = tuple(obstacles)
+    if not things:
+        raise ValueError("there must be at least one obstacle, got none")
+    for i, thing in enumerate(things):
+        if not isinstance(thing, Obstacle):
+            raise TypeError(f"obstacles[{i}] must be an obstacle, got {thing!r}")
+    return things
+
+
+def checked_size(value: object, name: str) -> float:
+    """Finite length of at least 0."""
+    size = checked_number(value, name)
+    if not 0.0 <= size < math.inf:
+        raise ValueError(f"{name} must be finite and at least 0, got {size:g}")
+    return size
+
+
+class _Cells:
+    """Bounds on cells of a plan's interval, and the least clearance met so far."""
+
+    def __init__(self, plan: Trajectory, obstacles: tuple[Obstacle, ...], load: float, rope: Rope | None) -> None:
+        self.plan, self.obstacles, self.load, self.rope = plan, obstacles, load, rope
+        self.order = 2 if rope is None else max(2, rope.order + 1)
+        self.peaks = np.stack([plan.peak(nu) for nu in range(self.order + 2)])[:, :, None]
+        self.least, self.where = np.inf, (0.0, 0, False)
+        if rope is not None:
+            slopes = np.asarray(rope.slopes(plan), dtype=float)
+            if slopes.shape != (rope.order + 1, 2) or not (np.isfinite(slopes).all() and np.all(slopes >= 0.0)):
+                raise ValueError(
+                    f"slopes of the rope must be finite, at least 0 and of shape ({rope.order + 1}, 2), got {slopes}"
+                )
+            self.slopes = slopes[:, :, None]
+
+    def bound(self, left: Array, right: Array) -> Array:
+        """Lower bound (ncells,) of the clearance in each cell."""
+        centre, half = 0.5 * (left + right), 0.5 * (right - left)
+        jet = self.plan.jet(centre, self.order)
+        # In its cell a derivative moves by no more than the next one's value at the centre and slope allow.
+        most = np.minimum(self.peaks[:-1], np.abs(jet) + half * self.peaks[1:])
+        speed, acceleration = np.hypot(*most[1]), np.hypot(*most[2])
+        ends = self.plan.jet(left, 0)[0], self.plan.jet(right, 0, left=True)[0]
+        away = self.load + 0.5 * half**2 * acceleration
+        chords = np.stack([thing.segment_distance(*ends) for thing in self.obstacles])
+        bound: Array = chords.min(axis=0) - away
+        for t, points in zip((left, right, centre), (*ends, jet[0]), strict=True):
+            self._meet(t, np.stack([thing.distance(points) for thing in self.obstacles]) - self.load, False)
+        if self.rope is not None:
+            order = self.rope.order
+            top = self.rope.top(jet[: order + 1])
+            moves = half * np.maximum(speed, np.sum(self.slopes * most[1 : order + 2], axis=(0, 1)))
+            values = np.stack([thing.segment_distance(top, jet[0]) for thing in self.obstacles])
+            self._meet(centre, values, True)
+            bound = np.minimum(bound, values.min(axis=0) - moves)
+        return bound
+
+    def _meet(self, t: Array, values: Array, rope: bool) -> None:
+        """Take the least of values (nobstacles, ntime) into account."""
+        if not np.isfinite(values).all():
+            raise ValueError("distances must be finite over the plan, got nan or inf")
+        obstacle, at = np.unravel_index(np.argmin(values), values.shape)
+        if values[obstacle, at] < self.least:
+            self.least, self.where = float(values[obstacle, at]), (float(t[at]), int(obstacle), rope)
+
+    def result(self, lower: float, required: float | None, certified: bool) -> Clearance:
+        time, obstacle, rope = self.where
+        x, z = self.plan(time).tolist()
+        return Clearance(
+            min(lower, self.least), self.least, time, (x, z), obstacle, "rope" if rope else "load", required, certified
+        )

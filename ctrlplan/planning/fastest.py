@@ -1,0 +1,347 @@
+"""The shortest duration for which limits hold over the whole of a plan."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import TYPE_CHECKING, Any, NoReturn
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import brentq
+
+from ctrlplan.planning.curve import curve
+from ctrlplan.planning.limits import Limited, Margin, Margins
+from ctrlplan.planning.time_law import with_fastest_law
+from ctrlplan.trajectories import PiecewiseSpline, Trajectory
+from ctrlplan.trajectories.common import Array, checked_pair
+from ctrlplan.trajectories.newton_spline import NewtonSpline
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_HOLDS = ("shape", "waypoints", "path")
+_PER_OCTAVE = 24
+"""Durations looked at while one doubles."""
+
+
+@dataclass(frozen=True, repr=False)
+class Fastest:
+    """Shortest plan under limits; made by `fastest`.
+
+    Attributes
+    ----------
+    plan : Trajectory
+        It.
+    duration : float
+        Its duration [s].
+    margins : Margins
+        Of every limit over the whole plan, the active one first.
+    feasible : tuple of (float, float)
+        Intervals of durations [s] for which the limits hold, increasing; the
+        last end is inf where every longer duration will do, else where the
+        search ended.
+    hold : str
+        What was kept.
+    limited : Limited
+        The limits, to look at other plans with.
+    refusal : str
+        What the plant says of shorter plans, where that holds the plan back and
+        no limit does; else empty.
+    """
+
+    plan: Trajectory
+    duration: float
+    margins: Margins
+    feasible: tuple[tuple[float, float], ...]
+    hold: str
+    limited: Limited
+    refusal: str = ""
+
+    @property
+    def active(self) -> Margin:
+        """The limit that comes nearest; it does not let the plan be shorter unless there is a refusal."""
+        return self.margins.active
+
+    def __repr__(self) -> str:
+        note = f"\nshorter plans are refused: {self.refusal}" if self.refusal else ""
+        return f"fastest with the {self.hold} held: {self.duration:.6g} s ({self._sets}){note}\n{self.margins!r}"
+
+    def _repr_html_(self) -> str:
+        note = f" Shorter plans are refused: {self.refusal}." if self.refusal else ""
+        return (
+            f"<p>Shortest duration with the {self.hold} held: <b>{self.duration:.6g} s</b> ({self._sets}).{note}</p>"
+            f"{self.margins._repr_html_()}"
+        )
+
+    @property
+    def _sets(self) -> str:
+        return "feasible: " + ", ".join(f"{low:.6g} to {high:.6g} s" for low, high in self.feasible)
+
+    def plot(self) -> Figure:
+        """Every limited signal over time with its limits."""
+        from ctrlplan.reports.planning_figures import plot_limits
+
+        return plot_limits(self.plan, self.limited)
+
+
+def fastest(
+    plan: Trajectory,
+    limits: Mapping[str, Any],
+    quantities: Any = None,
+    *,
+    hold: str = "shape",
+    durations: tuple[float, float] | None = None,
+) -> Fastest:
+    """Shortest duration for which limits hold over the whole interval.
+
+    Longer or shorter than the plan's own: what is given is retimed to limits
+    either way.
+
+    Parameters
+    ----------
+    plan : Trajectory
+        What is retimed; one without duration has nothing to retime.
+    limits, quantities
+        As for `margins`: of derivatives, and of quantities of a flat plant
+        such as ``crane.quantities``.
+    hold : {"shape", "waypoints", "path"}, optional
+        What is kept. The shape: all times move in proportion, derivatives
+        scale with them. The waypoints: their times move in proportion, but the
+        derivatives given there hold, and the spline is made anew. The path: only
+        the geometry, and a new time law slows down where a limit needs it
+        alone (`Retimed`).
+    durations : (float, float), optional
+        Durations [s] between which is searched: unless given, from a 64th of
+        the shortest that was found (of the plan's duration where waypoints are
+        held) to 64 times the plan's.
+
+    Returns
+    -------
+    Fastest
+
+    Raises
+    ------
+    ValueError
+        If no duration will do: the message says which limit cannot hold, its
+        value, and where; if limits are wrong, or a derivative of the plan jumps
+        that a limited signal is the derivative of.
+
+    Notes
+    -----
+    With the shape held, limits on derivatives alone have the closed form
+    T = T_0 max_k (peak_k/limit_k)^(1/k). All else is a search: feasibility need
+    not be monotone in the duration (MATH: a quintic from 0 to 1 with end speeds
+    1 needs no acceleration at T = 1, and some at 0.8 and at 2). Durations are
+    looked at 24 times an octave on samples, valleys between them are searched,
+    and the ends of every feasible interval are solved for with the extrema of
+    the whole plan. What is returned holds every limit to the last bit.
+
+    Examples
+    --------
+    >>> import ctrlplan as cp
+    >>> move = cp.PolySpline([cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1, 0, 0)])
+    >>> found = cp.fastest(move, {"y_d1": 0.5, "y_d2": 2.0})
+    >>> round(found.duration, 9), found.active.bound.name
+    (3.75, 'y_d1')
+    """
+    if hold not in _HOLDS:
+        raise ValueError(f"hold must be one of {', '.join(_HOLDS)}, got {hold!r}")
+    limited = Limited(plan, limits, quantities)
+    limited.check_smooth(plan)
+    span = None if durations is None else checked_pair(durations, "durations")
+    if span is not None and not (span[0] > 0.0 and math.isfinite(span[1])):
+        raise ValueError(f"durations must be above 0 and finite, got {span[0]:g} to {span[1]:g}")
+    if hold == "waypoints":
+        return _searched(_Replanned(plan, limited), span or _around(plan.duration), hold)
+    uniform = _uniform(plan, limited, span)
+    if hold == "shape":
+        return uniform
+    retimed = _uniform(with_fastest_law(uniform.plan, limited), limited, span)
+    return replace(min(retimed, uniform, key=lambda found: found.duration), hold=hold)
+
+
+class _Scaled:
+    """A plan of any duration, its shape held: jets scale by powers."""
+
+    def __init__(self, plan: Trajectory, limited: Limited) -> None:
+        self._plan, self.limited = plan, limited
+        self._jet = limited.sampled(plan)
+        self._powers = np.arange(limited.order + 1)[:, None, None]
+
+    def plan(self, duration: float) -> Trajectory:
+        return self._plan.retime(duration)
+
+    def excess(self, duration: float) -> float:
+        return self.limited.excess(self._jet * (self._plan.duration / duration) ** self._powers)
+
+
+class _Replanned:
+    """A plan of any duration, the derivatives at its waypoints held."""
+
+    def __init__(self, plan: Trajectory, limited: Limited) -> None:
+        if not isinstance(plan, NewtonSpline | PiecewiseSpline):
+            raise TypeError(
+                f"waypoints are held of a spline made through them, got a {type(plan).__name__}; hold the shape"
+            )
+        self._plan, self.limited = plan, limited
+
+    def plan(self, duration: float) -> Trajectory:
+        retimed = self._plan.retime(duration)
+        pairs = zip(self._plan.waypoints, retimed.waypoints, strict=True)
+        return retimed.through(given.scaled(moved.time, 1.0) for given, moved in pairs)
+
+    def excess(self, duration: float) -> float:
+        return self.limited.excess(self.limited.sampled(self.plan(duration)))
+
+
+def _uniform(plan: Trajectory, limited: Limited, span: tuple[float, float] | None) -> Fastest:
+    """Shortest duration with the shape held."""
+    scaled = _Scaled(plan, limited)
+    if not _allow_rest(plan, limited):
+        return _searched(scaled, span or _around(plan.duration), "waypoints")
+    least = _closed_form(plan, limited)
+    if limited.derivatives_only and span is None:
+        if not least:
+            raise ValueError("limits must name a derivative that the plan has, got none that a shorter one would break")
+        found = _holding(limited, plan.retime, least)
+        return Fastest(found, found.duration, limited.margins(found), ((found.duration, math.inf),), "shape", limited)
+    return _searched(scaled, span or _span(scaled.excess, plan.duration, least), "shape")
+
+
+def _allow_rest(plan: Trajectory, limited: Limited) -> bool:
+    """Whether limits hold however slow the plan is; refuse those that a plan breaks even then.
+
+    A speed that must not fall below something is kept by durations that are short enough.
+    """
+    still = limited.at_rest(plan)
+    slow = True
+    for bound, values in zip(limited.bounds, limited.values(still), strict=True):
+        worst = int(bound.excess(values).argmax())
+        if bound.excess(values)[worst] > 0.0:
+            if bound.axis is None or not bound.order:
+                place = zip(plan.labels, still[0, :, worst].tolist(), strict=True)
+                where = ", ".join(f"{label} = {value:.4g}" for label, value in place)
+                raise ValueError(
+                    f"limits must hold at rest, however slow the plan, got {bound.name} = {values[worst]:.6g} at rest "
+                    f"at {where}, where it must stay {bound.range}"
+                )
+            slow = False
+    return slow
+
+
+def _closed_form(plan: Trajectory, limited: Limited) -> float:
+    """Duration below which some derivative breaks its limits, T_0 max_k (peak_k/limit_k)^(1/k)."""
+    least = 0.0
+    for bound in limited.bounds:
+        if bound.axis is not None and bound.order:
+            extrema = plan.extrema(bound.order)
+            sides = (
+                (float(extrema.maximum[bound.axis]), bound.high, float(extrema.time_max[bound.axis])),
+                (-float(extrema.minimum[bound.axis]), -bound.low, float(extrema.time_min[bound.axis])),
+            )
+            rounding = 1e-12 * max(abs(value) for value, _, _ in sides)
+            for value, side, time in sides:
+                if side > 0.0:
+                    least = max(least, plan.duration * (max(value, 0.0) / side) ** (1.0 / bound.order))
+                elif value > rounding:  # a sign that must not be, whatever the duration
+                    raise ValueError(
+                        f"limits must hold for some duration, got {bound.name} of both signs where it must stay "
+                        f"{bound.range}: its sign at {time:.6g} s is the same at every duration"
+                    )
+    return least
+
+
+def _around(duration: float) -> tuple[float, float]:
+    return duration / 64.0, 64.0 * duration
+
+
+def _span(excess: Callable[[float], float], duration: float, least: float) -> tuple[float, float]:
+    """Durations between which is searched, from where limits are broken to where they hold."""
+    high = max(duration, least)
+    for _ in range(60):
+        if excess(high) <= 0.0:
+            break
+        high *= 2.0
+    else:
+        raise ValueError(f"limits must hold for some duration, got none up to {high:.3g} s")
+    low = high / 64.0
+    while low > least and excess(low) <= 0.0:
+        low /= 64.0
+        if low < 1e-12 * high:
+            raise ValueError("limits must include one that a shorter plan would break, got none")
+    return max(low, 0.999 * least), 1.01 * high
+
+
+def _searched(family: _Scaled | _Replanned, span: tuple[float, float], hold: str) -> Fastest:
+    """Feasible durations within a span, and the plan of the shortest."""
+    limited = family.limited
+    exact = cache(lambda duration: limited.exact_excess(family.plan(duration)))
+    count = max(9, math.ceil(_PER_OCTAVE * math.log2(span[1] / span[0])))
+    durations, excess = curve(family.excess, np.geomspace(*span, count), 0.0)
+    feasible = []
+    for low, high in _runs(excess <= 0.0):
+        middle = float(durations[low + int(excess[low : high + 1].argmin())])
+        if exact(middle) > 0.0:  # samples saw less than there is: no island after all
+            continue
+        ends = [
+            float(durations[inner])
+            if not 0 <= outer < durations.size
+            else _edge(exact, family.excess, middle, float(durations[outer]))
+            for inner, outer in ((low, low - 1), (high, high + 1))
+        ]
+        feasible.append((ends[0], ends[1]))
+    if not feasible:
+        _refuse(family, durations, excess)
+    if hold == "shape" and feasible[-1][1] == durations[-1]:
+        feasible[-1] = (feasible[-1][0], math.inf)
+    plan = _holding(limited, family.plan, feasible[0][0])
+    shorter = family.plan(plan.duration * (1.0 - 1e-6))
+    return Fastest(plan, plan.duration, limited.margins(plan), tuple(feasible), hold, limited, limited.refusal(shorter))
+
+
+def _runs(inside: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """First and last index of every run of true."""
+    change = np.flatnonzero(np.diff(np.concatenate([[False], inside, [False]])))
+    return [(int(a), int(b) - 1) for a, b in change.reshape(-1, 2)]
+
+
+def _edge(exact: Callable[[float], float], sampled: Callable[[float], float], inside: float, outside: float) -> float:
+    """Duration between a feasible and an infeasible one at which limits begin to hold."""
+    good, bad = inside, outside
+    while abs(bad - good) > 1e-6 * good:  # samples come cheap, and tell where to look
+        middle = 0.5 * (good + bad)
+        good, bad = (middle, bad) if sampled(middle) <= 0.0 else (good, middle)
+    step = good - bad
+    while exact(good) > 0.0:  # the whole interval says more than its samples: go inwards
+        good, bad, step = good + step, good, 8.0 * step
+        if (good - inside) * step > 0.0:
+            good = inside
+    while math.isinf(exact(bad)) and abs(bad - good) > 1e-13 * good:  # the plant refuses: there is no root
+        middle = 0.5 * (good + bad)
+        good, bad = (middle, bad) if exact(middle) <= 0.0 else (good, middle)
+    if math.isinf(exact(bad)):
+        return good
+    return float(brentq(exact, good, bad, xtol=1e-14 * good, rtol=1e-14)) if exact(bad) > 0.0 else bad
+
+
+def _holding(limited: Limited, plan_of: Callable[[float], Trajectory], duration: float) -> Trajectory:
+    """Plan of a duration, lengthened by as many roundings as its limits need to hold."""
+    step = float(np.spacing(duration))
+    while step < 1e-6 * duration:
+        plan = plan_of(duration)
+        if limited.exact_excess(plan) <= 0.0:
+            return plan
+        duration, step = duration + step, 2.0 * step
+    raise ValueError(f"limits must hold near {duration:.6g} s, got {limited.margins(plan).active}")
+
+
+def _refuse(family: _Scaled | _Replanned, durations: Array, excess: Array) -> NoReturn:
+    span = f"from {durations[0]:.4g} to {durations[-1]:.4g} s"
+    if math.isinf(excess.min()):
+        raise ValueError(f"the plant must be able to follow for some duration {span}, got none")
+    nearest = float(durations[int(excess.argmin())])
+    worst = family.limited.margins(family.plan(nearest)).active
+    raise ValueError(f"limits must hold for some duration {span}, got none; nearest at {nearest:.4g} s: {worst}")

@@ -1,0 +1,372 @@
+"""What must hold along a plan: limits on derivatives, and on whatever a flat plant makes of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from numbers import Real
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ctrlplan.trajectories import Trajectory, derivative_name
+from ctrlplan.trajectories.common import Array, checked_limits
+from ctrlplan.trajectories.waypoint import ENTRIES
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+Quantities = Callable[[Array], Mapping[str, Array]]
+"""Maps a jet (order + 1, naxes, ntime) to signals (ntime,) by name."""
+
+_SAMPLES = 193
+_HIGHEST = 8
+"""Derivatives up to which limits are looked for."""
+
+
+@dataclass(frozen=True)
+class Bound:
+    """Limits of one signal of a plan.
+
+    Attributes
+    ----------
+    name : str
+        Derivative of an axis (x_d1), or a quantity of the plant.
+    low, high : float
+        Between which it must stay; one may be infinite.
+    scale : float
+        What margins are fractions of: half their distance, or the size of the
+        only one.
+    order : int
+        Highest derivative that the signal is made of.
+    axis : int or None
+        Axis of a derivative; None for a quantity.
+    slack : float
+        What rounding may add to the excess: above 0 where the limit is touched at
+        rest, so that no duration can keep away from it.
+    """
+
+    name: str
+    low: float
+    high: float
+    scale: float
+    order: int
+    axis: int | None = None
+    slack: float = 0.0
+
+    def excess(self, values: Array) -> Array:
+        """By how much values are beyond the limits, as a fraction of the scale; negative inside."""
+        return np.maximum(values - self.high, self.low - values) / self.scale - self.slack
+
+    @property
+    def range(self) -> str:
+        """The limits in words."""
+        if math.isinf(self.low):
+            return f"at most {self.high:g}"
+        if math.isinf(self.high):
+            return f"at least {self.low:g}"
+        return f"within ±{self.high:g}" if self.low == -self.high else f"from {self.low:g} to {self.high:g}"
+
+
+@dataclass(frozen=True)
+class Margin:
+    """How near a signal comes to its limits over a whole plan.
+
+    Attributes
+    ----------
+    bound : Bound
+        The limits.
+    value, time : float
+        Where it comes nearest, or is farthest beyond, and when [s].
+    fraction : float
+        Distance left there as a fraction of the bound's scale; negative where
+        the limit does not hold.
+    """
+
+    bound: Bound
+    value: float
+    time: float
+    fraction: float
+
+    def __str__(self) -> str:
+        side = "left" if self.fraction >= 0.0 else "beyond"
+        return f"{self.bound.name} {self.bound.range}: {self.value:.6g} at {self.time:.6g} s, {self.share} {side}"
+
+    @property
+    def share(self) -> str:
+        """Margin in words: in percent, or as it is where the limit is a lone 0."""
+        size = abs(self.fraction)
+        lone_zero = math.isinf(self.bound.high - self.bound.low) and self.bound.scale == 1.0
+        return f"{size:.4g}" if lone_zero else f"{100.0 * size:.3g} %"
+
+
+@dataclass(frozen=True, repr=False)
+class Margins:
+    """Margins of all limits over a whole plan, the smallest first.
+
+    Attributes
+    ----------
+    rows : tuple of Margin
+        One a limit.
+    """
+
+    rows: tuple[Margin, ...]
+
+    @property
+    def active(self) -> Margin:
+        """The smallest margin: the limit that holds the plan back, or is broken."""
+        return self.rows[0]
+
+    @property
+    def hold(self) -> bool:
+        """Whether every limit holds over the whole plan."""
+        return self.active.fraction >= 0.0
+
+    def __iter__(self) -> Iterator[Margin]:
+        return iter(self.rows)
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def __repr__(self) -> str:
+        return "\n".join(map(str, self.rows))
+
+    def to_pandas(self) -> pd.DataFrame:
+        """Table with a row a limit: low, high, value, time, margin."""
+        import pandas as pd
+
+        table = {
+            row.bound.name: {
+                "low": row.bound.low,
+                "high": row.bound.high,
+                "value": row.value,
+                "time": row.time,
+                "margin": row.fraction,
+            }
+            for row in self.rows
+        }
+        return pd.DataFrame(table).T.rename_axis(index="limit")
+
+    def _repr_html_(self) -> str:
+        cells = "".join(
+            f"<tr><th>{row.bound.name}</th><td>{row.bound.range}</td><td>{row.value:.6g}</td>"
+            f"<td>{row.time:.6g}</td><td>{'' if row.fraction >= 0.0 else '−'}{row.share}</td></tr>"
+            for row in self.rows
+        )
+        heads = "".join(f"<th>{head}</th>" for head in ("limit", "must stay", "comes to", "at [s]", "margin"))
+        return f"<table><thead><tr>{heads}</tr></thead><tbody>{cells}</tbody></table>"
+
+
+def margins(plan: Trajectory, limits: Mapping[str, Any], quantities: Any = None) -> Margins:
+    """How near a plan comes to limits, over its whole interval.
+
+    Parameters
+    ----------
+    plan : Trajectory
+        Of any duration above 0.
+    limits : mapping of str to float or (float, float)
+        By the name of a derivative (x, x_d1, x_d2, ...; velocity,
+        acceleration, jerk or snap for those of every axis) or of a quantity: a
+        number above 0 for a magnitude, or least and greatest value, None where
+        there is none.
+    quantities : callable or object, optional
+        Maps a jet (order + 1, naxes, ntime) to a mapping of names to signals
+        (ntime,), such as ``crane.quantities``; or a plant that has such a
+        method.
+
+    Returns
+    -------
+    Margins
+        From the exact extrema of derivatives, and from those of quantities
+        resolved by Chebyshev polynomials.
+
+    Raises
+    ------
+    ValueError
+        If a limit is not positive or does not increase, a name is unknown, or
+        a derivative jumps that a limited signal is the derivative of.
+
+    Examples
+    --------
+    >>> import ctrlplan as cp
+    >>> move = cp.PolySpline([cp.Waypoint(0, 0, 0, 0), cp.Waypoint(2, 1, 0, 0)])
+    >>> print(cp.margins(move, {"y_d1": 1.0}))
+    y_d1 within ±1: 0.9375 at 1 s, 6.25 % left
+    """
+    limited = Limited(plan, limits, quantities)
+    limited.check_smooth(plan)
+    return limited.margins(plan)
+
+
+class Limited:
+    """Limits of a kind of plan, ready to be looked at for many plans of that kind.
+
+    Parameters are those of `margins`; the plan stands for others of its axes.
+    """
+
+    def __init__(self, plan: Trajectory, limits: Mapping[str, Any], quantities: Any = None) -> None:
+        if not isinstance(plan, Trajectory):
+            raise TypeError(f"plan must be a Trajectory, got {type(plan).__name__}")
+        if not plan.duration:
+            raise ValueError("a plan that is limited must have a duration, got a step")
+        if not isinstance(limits, Mapping):
+            raise TypeError(f"limits must be a mapping of names to limits, got {type(limits).__name__}")
+        self._quantities = _checked_quantities(quantities)
+        self._labels = plan.labels
+        self.bounds = tuple(self._bounds(plan, limits))
+        if not self.bounds:
+            raise ValueError("limits must name at least one signal, got none")
+        self.order = max(bound.order for bound in self.bounds)
+        self.derivatives_only = all(bound.axis is not None for bound in self.bounds)
+        self.bounds = tuple(self._slackened(plan))
+
+    def sampled(self, plan: Trajectory) -> Array:
+        """Jet (order + 1, naxes, ntime) at samples of every leg, its ends included."""
+        edges, inside = plan.breakpoints, np.linspace(0.0, 1.0, _SAMPLES)[1:-1]
+        times = (edges[:-1, None] + np.diff(edges)[:, None] * inside).ravel()
+        return np.concatenate(
+            [plan.jet(edges[1:], self.order, left=True), plan.jet(edges[:-1], self.order), plan.jet(times, self.order)],
+            axis=2,
+        )
+
+    def values(self, jet: Array) -> Array:
+        """Limited signals (nbounds, ntime) of a jet (order + 1, naxes, ntime)."""
+        found = {} if self.derivatives_only or self._quantities is None else self._quantities(jet)
+        rows = [jet[b.order, b.axis] if b.axis is not None else found[b.name] for b in self.bounds]
+        return np.stack(np.broadcast_arrays(*rows, jet[0, 0]))[:-1]
+
+    def excess(self, jet: Array) -> float:
+        """Greatest excess over a sampled jet, inf where the plant cannot follow at all."""
+        try:
+            values = self.values(jet)
+        except ValueError:  # the plant refuses: a rope that would have to push
+            return math.inf
+        worst = max(float(b.excess(row).max()) for b, row in zip(self.bounds, values, strict=True))
+        return worst if worst == worst else math.inf
+
+    def refusal(self, plan: Trajectory) -> str:
+        """Why the plant cannot follow a plan, empty where it can."""
+        try:
+            self.values(self.sampled(plan))
+        except ValueError as refusal:
+            return str(refusal)
+        return ""
+
+    def exact_excess(self, plan: Trajectory) -> float:
+        """Greatest excess over a whole plan."""
+        try:
+            return -self.margins(plan).active.fraction
+        except ValueError:
+            return math.inf
+
+    def margins(self, plan: Trajectory) -> Margins:
+        """Margins over a whole plan."""
+        derived = [b for b in self.bounds if b.axis is not None]
+        extrema = {order: plan.extrema(order) for order in {b.order for b in derived}}
+        rows = [
+            _margin(b, e.minimum[b.axis], e.maximum[b.axis], e.time_min[b.axis], e.time_max[b.axis])
+            for b in derived
+            for e in [extrema[b.order]]
+        ]
+        others = [k for k, b in enumerate(self.bounds) if b.axis is None]
+        if others:
+            found = plan.extrema_of(lambda jet: self.values(jet)[others], self.order)
+            columns = zip(found.minimum, found.maximum, found.time_min, found.time_max, strict=True)
+            rows += [_margin(self.bounds[k], *column) for k, column in zip(others, columns, strict=True)]
+        return Margins(tuple(sorted(rows, key=lambda row: row.fraction)))
+
+    def check_smooth(self, plan: Trajectory) -> None:
+        """Refuse a plan of which a derivative jumps where a limited signal would be infinite.
+
+        Rest before the start and after the end counts, except where the plan
+        has speed there: it is the continuation of a motion.
+        """
+        moving = {t for t in (plan.start, plan.end) if plan.jet(t, 1, left=t > plan.start)[1].any()}
+        for bound in self.bounds:
+            for jump in plan.jumps(bound.order - 1) if bound.order else ():
+                if jump.time not in moving and (bound.axis is None or plan.labels[bound.axis] == jump.label):
+                    what = "position" if jump.order == 0 else derivative_name(jump.label, jump.order)
+                    raise ValueError(
+                        f"{bound.name} is limited, which needs a plan continuous up to derivative {bound.order - 1} "
+                        f"(rest before and after counts), got {what} that jumps by {jump.size:.4g} at {jump.time:g} s"
+                    )
+
+    def at_rest(self, plan: Trajectory) -> Array:
+        """Jet at samples of a plan that is infinitely slow."""
+        return self.sampled(plan) * (np.arange(self.order + 1) == 0)[:, None, None]
+
+    def _slackened(self, plan: Trajectory) -> Iterator[Bound]:
+        """The bounds, with slack where they are touched at rest."""
+        for bound, values in zip(self.bounds, self.values(self.at_rest(plan)), strict=True):
+            rounding = 1e-12 * (1.0 + float(np.abs(values).max()) / bound.scale)
+            touched = abs(float(bound.excess(values).max())) <= rounding
+            yield replace(bound, slack=rounding if touched else 0.0)
+
+    def _bounds(self, plan: Trajectory, limits: Mapping[str, Any]) -> Iterator[Bound]:
+        derivatives = {
+            derivative_name(label, k): (k, axis) for k in range(_HIGHEST + 1) for axis, label in enumerate(plan.labels)
+        }
+        orders: dict[str, int] | None = None
+        for name, limit in limits.items():
+            if name in derivatives:
+                yield _bound(name, limit, *derivatives[name])
+                continue
+            if orders is None:
+                orders = {} if self._quantities is None else _orders(self._quantities, plan)
+            if name in orders:
+                yield _bound(name, limit, orders[name], None)
+            elif name in ENTRIES:
+                order = ENTRIES.index(name)
+                for axis, label in enumerate(plan.labels):
+                    yield replace(_bound(name, limit, order, axis), name=derivative_name(label, order))
+            else:
+                plain = [quantity for quantity in orders if "_d" not in quantity]
+                known = f" or quantities ({', '.join(plain)}, ...)" if orders else " (quantities were not given)"
+                axes = ", ".join(derivative_name(label, 1) for label in plan.labels)
+                raise ValueError(f"limits must name derivatives of the axes ({axes}, ...){known}, got {name!r}")
+
+
+def _checked_quantities(quantities: Any) -> Quantities | None:
+    found = getattr(quantities, "quantities", quantities)
+    if found is not None and not callable(found):
+        raise TypeError(f"quantities must be a function of a jet, got {type(quantities).__name__}")
+    return found
+
+
+def _bound(name: str, limit: Any, order: int, axis: int | None) -> Bound:
+    if np.ndim(limit):
+        pair = [side if side is not None else math.inf * (2 * i - 1) for i, side in enumerate(limit)]
+        low, high, scale = checked_limits(pair, f"limits of {name}")
+        return Bound(name, low, high, scale, order, axis)
+    if isinstance(limit, bool) or not isinstance(limit, Real | np.ndarray):
+        raise TypeError(f"limits of {name} must be a number or a pair, got {limit!r}")
+    high = float(limit)
+    if not 0.0 < high < math.inf:
+        raise ValueError(f"limits must be above 0 and finite, got {name} = {high:g}")
+    return Bound(name, -high, high, high, order, axis)
+
+
+def _orders(quantities: Quantities, plan: Trajectory) -> dict[str, int]:
+    """Lowest order of the jet from which each quantity is made, seen at rest at the start."""
+    still = np.zeros((_HIGHEST + 1, plan.naxes, 1))
+    still[0] = plan.initial[:, None]
+    orders: dict[str, int] = {}
+    for order in range(_HIGHEST + 1):
+        try:
+            with np.errstate(all="ignore"):
+                found = quantities(still[: order + 1])
+        except (ValueError, IndexError, KeyError):  # it reads more than this
+            continue
+        if not isinstance(found, Mapping):
+            raise TypeError(f"quantities must return a mapping of names to signals, got {type(found).__name__}")
+        for name in found:
+            orders.setdefault(name, order)
+    return orders
+
+
+def _margin(bound: Bound, minimum: Any, maximum: Any, time_min: Any, time_max: Any) -> Margin:
+    """The nearer of both sides."""
+    low, high = ((side / bound.scale + bound.slack) for side in (minimum - bound.low, bound.high - maximum))
+    value, time, fraction = (minimum, time_min, low) if low < high else (maximum, time_max, high)
+    return Margin(bound, float(value), float(time), float(fraction))

@@ -1,0 +1,230 @@
+"""What a designer wants little of: numbers that a plan is judged by.
+
+Every objective is a function of a plan. Those of this module take a fraction
+of a millisecond, so that a search can afford some hundred plans.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import pairwise
+
+import numpy as np
+
+from ctrlplan.trajectories import Trajectory
+from ctrlplan.trajectories.common import Array, checked_count
+
+Objective = Callable[[Trajectory], float]
+
+
+def path_length(plan: Trajectory) -> float:
+    r"""Length of the path that a plan takes.
+
+    .. math:: \int \Bigl(\sum_i \dot y_i(t)^2\Bigr)^{1/2} dt
+
+    Parameters
+    ----------
+    plan : Trajectory
+        Axes in the same unit. A step takes no path: 0.
+
+    Returns
+    -------
+    float
+        In the unit of the axes: to 1e-9 of it, or 1e-7 where the path nearly stops.
+    """
+    return sum(_arc(plan, left, right) for left, right in _legs(plan))
+
+
+def wandering(plan: Trajectory) -> float:
+    """Length of a plan's path beyond the polyline of its waypoints, as a fraction of it.
+
+    Parameters
+    ----------
+    plan : Trajectory
+        With waypoints whose positions are all given.
+
+    Returns
+    -------
+    float
+        Path length over polyline length, minus 1; nan where the polyline has none.
+    """
+    points = np.array([point.position for point in plan.waypoints]).reshape(-1, plan.naxes)
+    shortest = float(np.sqrt(np.square(np.diff(points, axis=0)).sum(axis=1)).sum())
+    return path_length(plan) / shortest - 1.0 if shortest > 0.0 else math.nan
+
+
+_GRADED = np.array([0.0, *0.1 ** np.arange(4.0)[::-1]])[:, None]
+
+
+@dataclass(frozen=True)
+class PeakDerivative:
+    """Greatest magnitude of a derivative, over all axes.
+
+    Made for searches: extrema are bracketed by samples and polished, where
+    `Trajectory.peak` proves that none is missed.
+
+    Parameters
+    ----------
+    nu : int
+        Order of the derivative.
+
+    Examples
+    --------
+    >>> import ctrlplan as cp
+    >>> move = cp.PolySpline([cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1, 0, 0)])
+    >>> round(PeakDerivative(1)(move), 12)
+    1.875
+    """
+
+    nu: int
+
+    def __post_init__(self) -> None:
+        checked_count(self.nu, "nu")
+
+    def __call__(self, plan: Trajectory) -> float:
+        """Greatest magnitude over the whole plan, in units of the axes per s^nu."""
+        count = 64 + 16 * max((point.jet.shape[0] for point in plan.waypoints), default=0)
+        return max((_peak(plan, left, right, self.nu, count) for left, right in _legs(plan)), default=0.0)
+
+
+@dataclass(frozen=True)
+class SquaredDerivative:
+    r"""Integral of a squared derivative, summed over the axes.
+
+    .. math:: \int \sum_i y_i^{(\nu)}(t)^2\,dt
+
+    between breakpoints; what jumps at them counts nothing.
+
+    Parameters
+    ----------
+    nu : int
+        Order of the derivative: 3 is the jerk.
+
+    Examples
+    --------
+    >>> import ctrlplan as cp
+    >>> move = cp.PolySpline([cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1, 0, 0)])
+    >>> round(SquaredDerivative(3)(move), 9)
+    720.0
+    """
+
+    nu: int
+
+    def __post_init__(self) -> None:
+        checked_count(self.nu, "nu")
+
+    def __call__(self, plan: Trajectory) -> float:
+        """Integral over the whole plan."""
+        nodes, weights = _gauss(64)
+        total = 0.0
+        for left, right in _legs(plan):
+            values = plan.jet(left + (right - left) * nodes, self.nu)[self.nu]
+            total += (right - left) * float(weights @ np.sum(values**2, axis=0))
+        return total
+
+
+OBJECTIVES: dict[str, Objective] = {
+    "path": path_length,
+    "wandering": wandering,
+    "peak_velocity": PeakDerivative(1),
+    "peak_acceleration": PeakDerivative(2),
+    "peak_jerk": PeakDerivative(3),
+    "peak_snap": PeakDerivative(4),
+    "squared_velocity": SquaredDerivative(1),
+    "squared_acceleration": SquaredDerivative(2),
+    "squared_jerk": SquaredDerivative(3),
+    "squared_snap": SquaredDerivative(4),
+}
+"""Objectives by name."""
+
+
+def checked_objective(objective: str | Objective) -> Objective:
+    """Objective by its name, or the function itself."""
+    if isinstance(objective, str):
+        if objective not in OBJECTIVES:
+            raise ValueError(f"objective must be one of {', '.join(OBJECTIVES)} or a function, got {objective!r}")
+        return OBJECTIVES[objective]
+    if not callable(objective):
+        raise TypeError(f"objective must be a name or a function of a plan, got {type(objective).__name__}")
+    return objective
+
+
+def _legs(plan: Trajectory) -> list[tuple[float, float]]:
+    return list(pairwise(plan.breakpoints.tolist()))
+
+
+def _arc(plan: Trajectory, left: float, right: float) -> float:
+    """Length of one leg in panels; where the speed nearly vanishes, in ever smaller ones about its least value."""
+    nodes, weights = _gauss(16)
+    edges = np.linspace(left, right, 13)
+    squares = _squares(plan, edges[:-1], edges[1:])
+    speed = np.sqrt(squares)
+    lengths = np.diff(edges) * (speed @ weights)
+    rough = (right - left) / 12 * np.abs(speed @ _last_legendre(16)).max(axis=1) > 1e-8 * lengths.sum()
+    if not rough.any():
+        return float(lengths.sum())
+    slowest = np.clip(np.argmin(squares[rough], axis=1), 1, 14)[:, None] + np.array([-1, 0, 1])
+    low, high = edges[:-1][rough], edges[1:][rough]
+    least = low + (high - low) * _vertex(nodes[slowest], np.take_along_axis(squares[rough], slowest, axis=1))
+    velocity, acceleration, jerk = plan.jet(np.clip(least, left, right), 3)[1:]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        moved = least - np.sum(velocity * acceleration, axis=0) / np.sum(acceleration**2 + velocity * jerk, axis=0)
+    least = np.clip(np.where(np.abs(moved - least) < 0.1 * (high - low), moved, least), low, high)
+    parts = np.concatenate([least + (end - least) * share for end in (low, high) for share in _GRADED])
+    begin, end = parts.reshape(2, len(_GRADED), -1)[:, :-1], parts.reshape(2, len(_GRADED), -1)[:, 1:]
+    finer = np.sqrt(_squares(plan, begin.ravel(), end.ravel())) @ weights
+    return float(lengths[~rough].sum() + np.abs(end - begin).ravel() @ finer)
+
+
+def _squares(plan: Trajectory, begin: Array, end: Array) -> Array:
+    """Squared speed (npanels, 16) at the Gauss points of panels."""
+    rates = plan.jet(begin[:, None] + (end - begin)[:, None] * _gauss(16)[0], 1)[1]
+    return np.einsum("apt,apt->pt", rates, rates)
+
+
+def _vertex(x: Array, y: Array) -> Array:
+    """Where parabolas through three points (nparabolas, 3) are least; the middle point where they are straight."""
+    rise, fall = (y[:, 2] - y[:, 1]) / (x[:, 2] - x[:, 1]), (y[:, 1] - y[:, 0]) / (x[:, 1] - x[:, 0])
+    curve = (rise - fall) / (x[:, 2] - x[:, 0])
+    bent = curve > 0.0
+    return np.where(bent, 0.5 * (x[:, 0] + x[:, 1] - fall / np.where(bent, curve, 1.0)), x[:, 1])
+
+
+@lru_cache(maxsize=8)
+def _gauss(count: int) -> tuple[Array, Array]:
+    """Nodes and weights of the Gauss rule on [0, 1]."""
+    nodes, weights = np.polynomial.legendre.leggauss(count)
+    return 0.5 * (nodes + 1.0), 0.5 * weights
+
+
+@lru_cache(maxsize=8)
+def _last_legendre(count: int) -> Array:
+    """From values at the nodes to the last two Legendre coefficients, shape (count, 2)."""
+    nodes, weights = np.polynomial.legendre.leggauss(count)
+    degrees = np.arange(count - 2, count)
+    return np.polynomial.legendre.legvander(nodes, count - 1)[:, -2:] * weights[:, None] * (degrees + 0.5)
+
+
+def _peak(plan: Trajectory, left: float, right: float, nu: int, count: int) -> float:
+    """Greatest magnitude on one leg: samples, and the vertex of a parabola wherever the slope changes its sign."""
+    inside = np.linspace(left, right, count)
+    # The ends belong to this leg, not to what follows.
+    inside[0], inside[-1] = np.nextafter(left, right), np.nextafter(right, left)
+    value, slope, curve = plan.jet(inside, nu + 2)[nu:]
+    best = float(np.abs(value).max())
+    axis, cell = np.nonzero(slope[:, 1:] * slope[:, :-1] < 0.0)
+    if not cell.size:
+        return best
+    # Where the chord of the slope crosses zero is near; only the cells that can hold the greatest are polished.
+    width = inside[cell + 1] - inside[cell]
+    start = inside[cell] + width * slope[axis, cell] / (slope[axis, cell] - slope[axis, cell + 1])
+    bound = np.abs(value[axis, cell]) + 0.5 * width**2 * np.maximum(*np.abs(curve[axis, [cell, cell + 1]]))
+    near = bound >= best
+    axis, t = axis[near], start[near]
+    value, slope, curve = plan.jet(t, nu + 2)[nu:, axis, np.arange(axis.size)]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        top = value - 0.5 * slope**2 / curve
+    return max(best, float(np.abs(top[np.isfinite(top)]).max(initial=0.0)))

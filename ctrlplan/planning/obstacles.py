@@ -1,0 +1,266 @@
+"""What a plan in the plane must keep clear of: rectangles, discs and half-planes."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ctrlplan.trajectories.common import Array, checked_number, checked_pair
+
+
+@runtime_checkable
+class Obstacle(Protocol):
+    """Closed set of the plane, seen through its distances.
+
+    Whatever has these three methods is an obstacle: `Rectangle`, `Disc` and
+    `HalfPlane` are.
+    """
+
+    def distance(self, points: ArrayLike) -> Array:
+        """Signed distance to points.
+
+        Parameters
+        ----------
+        points : array_like, shape (2, ...)
+            Positions.
+
+        Returns
+        -------
+        ndarray, shape (...)
+            Euclidean distance to the set; in the set at most 0, minus a depth.
+            Two points' values differ by no more than the points' distance.
+        """
+
+    def segment_distance(self, p: ArrayLike, q: ArrayLike) -> Array:
+        """Signed distance to the segments from p to q.
+
+        Parameters
+        ----------
+        p, q : array_like, shape (2, ...)
+            Ends of the segments.
+
+        Returns
+        -------
+        ndarray, shape (...)
+            Least distance of a point of the segment; not above 0 where the
+            segment meets the set. No greater move of either end moves it more.
+        """
+
+    def corners(self, margin: float) -> Array:
+        """Corners of a polygon about the set, which short ways round it pass.
+
+        Parameters
+        ----------
+        margin : float
+            Least distance of the polygon from the set.
+
+        Returns
+        -------
+        ndarray, shape (2, ncorners)
+            None for a set that no way leads round.
+        """
+
+
+@dataclass(frozen=True)
+class Rectangle:
+    """Rectangle with its sides along the axes.
+
+    Parameters
+    ----------
+    x, z : tuple of float
+        Least and greatest value on the first and on the second axis; either
+        may be infinite, so that walls and corridors are rectangles as well.
+
+    Raises
+    ------
+    ValueError
+        If a pair does not increase, or no side is finite.
+
+    Examples
+    --------
+    >>> Rectangle((7.0, 13.0), (6.5, 12.0)).distance([4.0, 2.5])
+    array(5.)
+    """
+
+    x: tuple[float, float]
+    z: tuple[float, float]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "x", checked_pair(self.x, "x"))
+        object.__setattr__(self, "z", checked_pair(self.z, "z"))
+        if math.inf in (self.x[0], self.z[0]) or -math.inf in (self.x[1], self.z[1]):
+            raise ValueError(f"the lower side must be below inf and the upper above -inf, got x {self.x}, z {self.z}")
+        if not any(map(math.isfinite, (*self.x, *self.z))):
+            raise ValueError("a rectangle must have a finite side, got none")
+
+    def distance(self, points: ArrayLike) -> Array:
+        """Signed Euclidean distance (...) to points (2, ...), negative inside."""
+        x, z = _plane(points, "points")
+        beside = np.maximum(self.x[0] - x, x - self.x[1])
+        above = np.maximum(self.z[0] - z, z - self.z[1])
+        outside = np.hypot(np.maximum(beside, 0.0), np.maximum(above, 0.0))
+        return np.where(outside > 0.0, outside, np.maximum(beside, above))
+
+    def segment_distance(self, p: ArrayLike, q: ArrayLike) -> Array:
+        """Least signed distance (...) on the segments from p (2, ...) to q."""
+        a, b = np.broadcast_arrays(_plane(p, "p"), _plane(q, "q"))
+        outside = np.minimum(self.distance(a), self.distance(b))
+        for corner in itertools.product(*(filter(math.isfinite, sides) for sides in (self.x, self.z))):
+            outside = np.minimum(outside, _to_segment(np.array(corner), a, b))
+        # Beyond each side the distance is affine along the segment: the least of their maximum is where two are equal.
+        ends = [
+            (sign * (a[axis] - side), sign * (b[axis] - side))
+            for axis, sides in enumerate((self.x, self.z))
+            for sign, side in zip((-1.0, 1.0), sides, strict=True)
+            if math.isfinite(side)
+        ]
+        first, last = (np.stack(values) for values in zip(*ends, strict=True))
+        depth = np.minimum(first.max(axis=0), last.max(axis=0))
+        for i, j in itertools.combinations(range(len(ends)), 2):
+            gap, other = first[i] - first[j], last[j] - last[i]
+            total = gap + other
+            share = np.clip(np.divide(gap, total, out=np.zeros_like(gap), where=total != 0.0), 0.0, 1.0)
+            depth = np.minimum(depth, (first + share * (last - first)).max(axis=0))
+        return np.where(depth > 0.0, outside, depth)
+
+    def corners(self, margin: float) -> Array:
+        """Corners of the rectangle grown by a margin, two for each of its own."""
+        turns = np.pi / 8 * np.array([1.0, 3.0])
+        step = margin / math.cos(np.pi / 8) * np.stack([np.cos(turns), np.sin(turns)])
+        found = [
+            np.array([[x], [z]]) + np.array([[left], [up]]) * step
+            for x, left in zip(self.x, (-1.0, 1.0), strict=True)
+            for z, up in zip(self.z, (-1.0, 1.0), strict=True)
+            if math.isfinite(x) and math.isfinite(z)
+        ]
+        return np.concatenate([np.empty((2, 0)), *found], axis=1)
+
+
+@dataclass(frozen=True)
+class Disc:
+    """Disc about a point.
+
+    Parameters
+    ----------
+    centre : tuple of float
+        Its position.
+    radius : float
+        Above 0.
+
+    Raises
+    ------
+    ValueError
+        If the centre is not two finite numbers or the radius not above 0.
+
+    Examples
+    --------
+    >>> Disc((0.0, 0.0), 2.0).segment_distance([-1.0, 3.0], [1.0, 3.0])
+    array(1.)
+    """
+
+    centre: tuple[float, float]
+    radius: float
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "centre", _finite_pair(self.centre, "centre"))
+        object.__setattr__(self, "radius", checked_number(self.radius, "radius"))
+        if not 0.0 < self.radius < math.inf:
+            raise ValueError(f"radius must be finite and above 0, got {self.radius:g}")
+
+    def distance(self, points: ArrayLike) -> Array:
+        """Signed Euclidean distance (...) to points (2, ...), negative inside."""
+        x, z = _plane(points, "points")
+        return np.asarray(np.hypot(x - self.centre[0], z - self.centre[1]) - self.radius)
+
+    def segment_distance(self, p: ArrayLike, q: ArrayLike) -> Array:
+        """Least signed distance (...) on the segments from p (2, ...) to q."""
+        a, b = np.broadcast_arrays(_plane(p, "p"), _plane(q, "q"))
+        return np.asarray(_to_segment(np.array(self.centre), a, b) - self.radius)
+
+    def corners(self, margin: float) -> Array:
+        """Corners of the polygon of 16 sides about the disc grown by a margin."""
+        turns = 2.0 * np.pi / 16 * np.arange(16)
+        reach = (self.radius + margin) / math.cos(np.pi / 16)
+        return np.array(self.centre)[:, None] + reach * np.stack([np.cos(turns), np.sin(turns)])
+
+
+@dataclass(frozen=True)
+class HalfPlane:
+    """Half-plane: where normal . p is at least an offset.
+
+    Parameters
+    ----------
+    normal : tuple of float
+        Direction into the set, of any length above 0; it is stored with length 1.
+    offset : float
+        As for the normal given: both are divided by its length.
+
+    Raises
+    ------
+    ValueError
+        If a number is not finite or the normal 0.
+
+    Examples
+    --------
+    The ground 12 m below a crane's trolley, z down:
+
+    >>> HalfPlane((0.0, 1.0), 12.0).distance([3.0, 10.0])
+    array(2.)
+    """
+
+    normal: tuple[float, float]
+    offset: float
+
+    def __post_init__(self) -> None:
+        normal, offset = _finite_pair(self.normal, "normal"), checked_number(self.offset, "offset")
+        length = math.hypot(*normal)
+        if not 0.0 < length < math.inf:
+            raise ValueError(f"normal must have a length above 0, got {normal}")
+        if not math.isfinite(offset):
+            raise ValueError(f"offset must be finite, got {offset:g}")
+        object.__setattr__(self, "normal", (normal[0] / length, normal[1] / length))
+        object.__setattr__(self, "offset", offset / length)
+
+    def distance(self, points: ArrayLike) -> Array:
+        """Signed Euclidean distance (...) to points (2, ...), negative inside."""
+        x, z = _plane(points, "points")
+        return np.asarray(self.offset - self.normal[0] * x - self.normal[1] * z)
+
+    def segment_distance(self, p: ArrayLike, q: ArrayLike) -> Array:
+        """Least signed distance (...) on the segments from p (2, ...) to q."""
+        return np.asarray(np.minimum(self.distance(p), self.distance(q)))
+
+    def corners(self, margin: float) -> Array:
+        """No way leads round a half-plane: shape (2, 0)."""
+        return np.empty((2, 0))
+
+
+def _plane(points: ArrayLike, name: str) -> Array:
+    values = np.asarray(points, dtype=float)
+    if values.ndim == 0 or len(values) != 2:
+        raise ValueError(f"{name} must have shape (2, ...), got {values.shape}")
+    return values
+
+
+def _finite_pair(pair: object, name: str) -> tuple[float, float]:
+    values = tuple(pair) if isinstance(pair, tuple | list | np.ndarray) else ()
+    if len(values) != 2:
+        raise ValueError(f"{name} must be two numbers, got {pair!r}")
+    first, second = (checked_number(value, name) for value in values)
+    if not (math.isfinite(first) and math.isfinite(second)):
+        raise ValueError(f"{name} must be finite, got {first:g} and {second:g}")
+    return first, second
+
+
+def _to_segment(point: Array, p: Array, q: Array) -> Array:
+    """Distance (...) of one point from the segments p-q."""
+    to = point.reshape(2, *[1] * (p.ndim - 1)) - p
+    along = q - p
+    square = np.sum(along * along, axis=0)
+    share = np.divide(np.sum(to * along, axis=0), square, out=np.zeros_like(square), where=square > 0.0)
+    return np.hypot(*(to - np.clip(share, 0.0, 1.0) * along))

@@ -1,0 +1,446 @@
+r"""Free entries of waypoints by least squares.
+
+A plan is linear in its data, so its cost is a sum of squares of samples,
+
+.. math:: J = \int (y^{(k)})^2\,dt = |A d|^2, \qquad
+    d_{free} = -A_{free}^{+} A_{fixed}\,d_{fixed}
+
+with samples at the nodes of a Gauss-Legendre rule that is exact to rounding.
+Times are relative to the duration and derivatives scaled alike, so that no
+duration costs a digit. The cost of one leg of duration h in that unit is
+:math:`h^{1-2k} |R H d|^2` with the matrix R of the unit leg and H the powers of h
+that scale derivatives: legs share one factorised system.
+
+Times are chosen over the optimum at each of them. There the free entries are
+stationary, so that only the prescribed ones count in the slope of the cost.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import blas, qr
+from scipy.optimize import minimize
+
+from ctrlplan.trajectories import Joined, PiecewiseSpline, PolySpline, Trajectory, TrigSpline, Waypoint
+from ctrlplan.trajectories.common import FACTORIALS, Array, checked_count, checked_labels, checked_time, readonly
+from ctrlplan.trajectories.newton import NewtonSystem
+from ctrlplan.trajectories.newton_spline import checked_waypoints, given_entries
+from ctrlplan.trajectories.trigonometric import checked_alpha
+
+
+@dataclass(frozen=True, repr=False)
+class Optimum:
+    """Waypoints without free entries, and the plan through them.
+
+    Iterating gives the waypoints.
+
+    Attributes
+    ----------
+    waypoints : tuple of Waypoint
+        Complete up to the order of the plan; nan where an entry was free on
+        each side separately.
+    plan : Trajectory
+        A spline where `single`; a `PiecewiseSpline` where legs share every
+        entry up to the order; otherwise legs joined.
+    cost : float
+        Weighted sum over the axes of int (y^(derivative))^2 dt within the legs.
+    unique : bool
+        Whether the prescribed entries leave no function of zero cost free.
+    derivative : int
+        Order of the derivative in the cost.
+    """
+
+    waypoints: tuple[Waypoint, ...]
+    plan: Trajectory
+    cost: float
+    unique: bool
+    derivative: int
+
+    def __iter__(self) -> Iterator[Waypoint]:
+        return iter(self.waypoints)
+
+    def __len__(self) -> int:
+        return len(self.waypoints)
+
+    def __repr__(self) -> str:
+        note = "" if self.unique else ", not unique"
+        return f"<Optimum of {len(self)} waypoints, int (y^({self.derivative}))^2 = {self.cost:.6g}{note}>"
+
+
+def optimize_waypoints(
+    waypoints: Iterable[Waypoint],
+    derivative: int = 3,
+    *,
+    order: int | None = None,
+    single: bool = False,
+    alpha: float = 0.0,
+    continuity: int | None = None,
+    free_times: bool = False,
+    weights: ArrayLike | None = None,
+    labels: Sequence[str] | None = None,
+) -> Optimum:
+    """Free entries, and times, of least squared derivative.
+
+    Entries up to `order` that waypoints leave free are chosen in closed form
+    so that the integral of the squared derivative is least: minimum jerk,
+    minimum snap. Where the prescribed entries leave a function of zero cost
+    free (two positions alone leave a quadratic under minimum jerk), the choice
+    of least norm is taken, of entries in units of the plan's duration, and
+    `Optimum.unique` is False.
+
+    Parameters
+    ----------
+    waypoints : iterable of Waypoint
+        Two or more, times increasing; entries that are missing or nan are free,
+        positions too.
+    derivative : int, optional
+        Order of the derivative in the cost, from 1: 3 is minimum jerk, 4
+        minimum snap.
+    order : int, optional
+        Highest order of the entries; derivative - 1 unless given, or the
+        continuity where that is higher. Prescribed entries above it raise it.
+    single : bool, optional
+        One spline through all waypoints instead of one a leg.
+    alpha : float, optional
+        Shape parameter in [0, 2 pi) [rad] of the spline or of every leg; 0 gives
+        polynomials.
+    continuity : int, optional
+        Highest derivative that legs share at inner waypoints, `order` unless
+        given. Above it free entries are free on each side separately and may
+        jump, which the cost does not count; prescribed ones hold on both sides.
+    free_times : bool, optional
+        Choose the times of inner waypoints too. Prescribed derivatives stay as
+        they are, and no leg becomes shorter than 1e-4 of the mean one or half
+        the shortest given. The result is the best of several local minima,
+        never worse than the given times.
+    weights : array_like, shape (naxes,), optional
+        Factors of the axes in the cost, above 0.
+    labels : sequence of str, optional
+        Names of the axes.
+
+    Returns
+    -------
+    Optimum
+        waypoints, plan, cost, unique.
+
+    Raises
+    ------
+    ValueError
+        If an argument is out of range, times do not increase, axes differ, the
+        order is below the continuity, or an axis prescribes nothing.
+
+    Examples
+    --------
+    From rest to rest through a point, velocity and acceleration there chosen:
+
+    >>> best = optimize_waypoints([Waypoint(0, 0, 0, 0), Waypoint(1, 1), Waypoint(2, 0, 0, 0)])
+    >>> best.waypoints[1].acceleration.round(6).tolist(), round(best.cost, 6)
+    ([-6.666667], 640.0)
+
+    The waypoint in the middle of a move belongs in the middle of its time:
+
+    >>> points = [Waypoint(0, 0, 0, 0), Waypoint(0.5, 1), Waypoint(4, 2, 0, 0)]
+    >>> round(optimize_waypoints(points, free_times=True).waypoints[1].time, 6)
+    2.0
+    """
+    points = checked_waypoints(waypoints)
+    derivative = checked_count(derivative, "derivative", 1)
+    alpha = checked_alpha(alpha)
+    naxes = points[0].naxes
+    names = points[0].labels if labels is None else checked_labels(labels, naxes)
+    order, continuity = _checked_orders(points, derivative, order, continuity, single)
+    factors = _checked_weights(weights, naxes)
+
+    times = np.array([p.time for p in points])
+    start, duration = points[0].time, checked_time(points[-1].time - points[0].time, "duration", positive=True)
+    relative = (times - start) / duration
+    table = np.full((len(points), order + 1, naxes), np.nan)
+    given, _ = given_entries(points)
+    table[:, : given.shape[1]] = given[:, : order + 1]
+    if np.isnan(table).all(axis=(0, 1)).any():
+        raise ValueError("every axis must have a prescribed entry, got an axis with none")
+    unit = duration ** np.arange(order + 1)[:, None]
+    problem = _Problem(table * unit, continuity, alpha, derivative, single)
+    found = problem.solve(relative)
+    if free_times and len(points) > 2:
+        chosen = start + duration * _best_times(problem, relative, found, factors)
+        chosen[[0, -1]] = times[[0, -1]]
+        better = problem.solve((chosen - start) / duration)
+        if better.cost @ factors < found.cost @ factors:
+            found, times = better, chosen
+
+    sides = np.where(np.isnan(table), found.sides / unit, table)  # prescribed entries to the last bit
+    before, after = (
+        [Waypoint._of(t, jet.copy(), names) for t, jet in zip(times.tolist(), side, strict=True)] for side in sides
+    )
+    parts = [after] if single else [list(pair) for pair in zip(after[:-1], before[1:], strict=True)]
+    split = problem.split()
+    plan: Trajectory
+    if single or split.any():
+        splines = [TrigSpline(p, alpha=alpha) if alpha else PolySpline(p) for p in parts]
+        plan = splines[0] if single else _joined(splines)
+    else:
+        plan = PiecewiseSpline(after, alpha=alpha)
+    shared = zip(times.tolist(), np.where(split, np.nan, sides[1]), strict=True)
+    chosen_points = tuple(Waypoint._of(t, jet.copy(), names) for t, jet in shared)
+    cost = float(found.cost @ factors) * duration ** (1 - 2 * derivative)
+    return Optimum(chosen_points, plan, cost, found.unique, derivative)
+
+
+class _Solution(NamedTuple):
+    """Optimum at given times, in units of the duration."""
+
+    sides: Array  # entries (2, nwaypoints, order + 1, naxes): left and right of each waypoint
+    cost: Array  # (naxes,)
+    slope: Array  # of the cost along the durations, shape (nlegs, naxes)
+    unique: bool
+
+
+class _Problem:
+    """What stays the same while times vary."""
+
+    def __init__(self, table: Array, continuity: int, alpha: float, derivative: int, single: bool) -> None:
+        self.table = table
+        self.family = _Whole if single else _Legs
+        self.shape = (alpha, table.shape[1] - 1, derivative)
+        self.loose = np.zeros(table.shape[:2], dtype=bool)  # legs need not share it where it is free
+        self.loose[1:-1, continuity + 1 :] = not single
+        known = ~np.isnan(table)
+        patterns, which = np.unique(known.reshape(-1, table.shape[2]), axis=1, return_inverse=True)
+        self.groups = [(p.reshape(known.shape[:2]), np.flatnonzero(which == i)) for i, p in enumerate(patterns.T)]
+
+    def split(self) -> NDArray[np.bool_]:
+        """Entries that are free on each side separately, shape (nwaypoints, order + 1, naxes)."""
+        return np.isnan(self.table) & self.loose[:, :, None]
+
+    def solve(self, times: Array) -> _Solution:
+        """Least cost at relative times."""
+        family = self.family(times, *self.shape)
+        count, _, naxes = self.table.shape
+        sides, cost, slope = np.empty((2, *self.table.shape)), np.empty(naxes), np.empty((count - 1, naxes))
+        unique = True
+        for known, axes in self.groups:
+            part = family.solve(known, self.table[:, :, axes], self.loose)
+            sides[..., axes], cost[axes], slope[:, axes] = part.sides, part.cost, part.slope
+            unique &= part.unique
+        return _Solution(sides, cost, slope, unique)
+
+    def scale(self, times: Array) -> Array:
+        """Cost (naxes,) of entries of these sizes that cancel nowhere: free ones 0, signs alternating."""
+        known = np.ones(self.table.shape[:2], dtype=bool)
+        entries = np.abs(np.nan_to_num(self.table))
+        entries[1::2] *= -1.0
+        return self.family(times, *self.shape).solve(known, entries, self.loose).cost
+
+
+class _Legs:
+    """One spline a leg."""
+
+    def __init__(self, times: Array, alpha: float, order: int, derivative: int) -> None:
+        self.root = _leg_root(alpha, order, derivative)
+        self.derivative = derivative
+        self.durations = np.diff(times)[:, None]
+        self.orders = np.tile(np.arange(order + 1), 2)
+
+    def solve(self, known: NDArray[np.bool_], table: Array, loose: NDArray[np.bool_]) -> _Solution:
+        """Optimum of axes that share a pattern of prescribed entries."""
+        # Columns of the entries on the right of each waypoint; those on the left are the same, or further ones.
+        right = np.arange(known.size).reshape(known.shape)
+        left = right.copy()
+        apart = loose & ~known
+        left[apart] = known.size + np.arange(apart.sum())
+        fixed = np.append(known, np.zeros(apart.sum(), dtype=bool))
+        entries = np.zeros((fixed.size, table.shape[2]))
+        entries[fixed] = table[known]
+
+        powers = self.durations**self.orders
+        ends = np.concatenate([right[:-1], left[1:]], axis=1)
+        samples = np.zeros((len(ends), len(self.root), fixed.size))
+        np.put_along_axis(samples, ends[:, None, :], self.root * powers[:, None, :], axis=2)
+        matrix = samples.reshape(-1, fixed.size)
+        weight = np.repeat(self.durations.ravel() ** (0.5 - self.derivative), len(self.root))
+        entries[~fixed], unique = _least_squares(matrix[:, ~fixed], -matrix @ entries, weight)
+
+        data = entries[ends] * powers[:, :, None]
+        value, change = self.root @ data, self.root @ (data * self.orders[:, None])
+        power = 1 - 2 * self.derivative
+        square = (value**2).sum(axis=1)
+        slope = self.durations ** (power - 1) * (power * square + 2.0 * (value * change).sum(axis=1))
+        return _Solution(entries[[left, right]], (self.durations**power * square).sum(axis=0), slope, unique)
+
+
+class _Whole:
+    """One spline through all waypoints."""
+
+    def __init__(self, times: Array, alpha: float, order: int, derivative: int) -> None:
+        given = (tuple(range(order + 1)),) * times.size
+        self.system = NewtonSystem(alpha, times, given)
+        self.samples = _samples(self.system, derivative)
+        self.jets = (self.system.taylor(times, order + 1) * FACTORIALS[: order + 2, None]).transpose(2, 1, 0)
+        # The part of the top harmonic that turns its phase is what a system of another gamma has more than this one.
+        self.turn = None
+        if self.system.gamma is not None:
+            m = self.system.size // 2
+            turned = NewtonSystem(alpha, times, given, self.system.gamma + 0.25 * np.pi / m)
+            self.turn = 2.0 * alpha * m / times.size * (_samples(turned, derivative) - self.samples)[:, -1]
+
+    def solve(self, known: NDArray[np.bool_], table: Array, loose: NDArray[np.bool_]) -> _Solution:
+        """Optimum of axes that share a pattern of prescribed entries."""
+        fixed = known.ravel()
+        entries = np.nan_to_num(table).reshape(fixed.size, -1)
+        matrix = self.samples @ _fitted(self.system, np.eye(fixed.size))
+        right = -self.samples @ _fitted(self.system, entries)
+        entries[~fixed], unique = _least_squares(matrix[:, ~fixed], right, np.ones(len(matrix)))
+
+        coefficients = _fitted(self.system, entries)
+        value = self.samples @ coefficients
+        # The price of a prescribed entry; a waypoint that moves takes its entries along, and they are then worth
+        # what they lose by Taylor's theorem.
+        scale = _norms(self.samples)
+        basis, upper = np.linalg.qr((self.jets[:, :-1][known] / scale).T)
+        price = np.zeros_like(table)
+        price[known] = blas.dtrsm(1.0, upper, basis.T @ (self.samples.T @ value / scale[:, None]))
+        slope = -2.0 * (price * (self.jets[:, 1:] @ coefficients)).sum(axis=1)
+        if self.turn is not None:  # the mean moves, too, and with it gamma
+            slope += (self.turn @ value) * coefficients[-1]
+        slope[-1] = 0.0  # the last time stays
+        side = entries.reshape(table.shape)
+        along = np.cumsum(slope[:0:-1], axis=0)[::-1]
+        return _Solution(np.stack([side, side]), (value**2).sum(axis=0), along, unique)
+
+
+@lru_cache(maxsize=256)
+def _leg_root(alpha: float, order: int, derivative: int) -> Array:
+    """Matrix R with int_0^1 (y^(derivative))^2 = |R d|^2, d the jet at 0, then that at 1."""
+    given = tuple(range(order + 1))
+    system = NewtonSystem(alpha, np.array([0.0, 1.0]), (given, given))
+    return readonly(np.linalg.qr(_samples(system, derivative) @ _fitted(system, np.eye(system.size))).R)
+
+
+def _fitted(system: NewtonSystem, entries: Array) -> Array:
+    """Coefficients (size, naxes) from entries (size, naxes), complete and waypoint by waypoint."""
+    orders = system.order_index
+    rows = system.waypoint_index * (orders.max() + 1) + orders
+    return system.coefficients(entries[rows] / FACTORIALS[orders, None])
+
+
+def _samples(system: NewtonSystem, derivative: int) -> Array:
+    """Weighted samples G with int_0^1 (y^(derivative))^2 = |G coefficients|^2."""
+    exact = max(system.size - derivative, 1)
+    nodes, weights = _gauss(2 * system.size + int(4.0 * system.alpha) + 8 if system.alpha else exact)
+    return (FACTORIALS[derivative] * weights * system.taylor(nodes, derivative)[:, derivative]).T
+
+
+@lru_cache(maxsize=256)
+def _gauss(count: int) -> tuple[Array, Array]:
+    """Nodes on [0, 1], and square roots of the weights."""
+    nodes, weights = np.polynomial.legendre.leggauss(count)
+    return readonly(0.5 * (nodes + 1.0)), readonly(np.sqrt(0.5 * weights))
+
+
+def _least_squares(matrix: Array, right: Array, weight: Array) -> tuple[Array, bool]:
+    """Solution of least norm of weighted equations, and whether it is the only one.
+
+    Weights of rows do not change what is determined, and would hide it where
+    they differ by powers of ten. Rows in falling order of weight and pivoted
+    columns keep each row's digits.
+    """
+    count = matrix.shape[1]
+    scale = _norms(matrix)
+    singular = np.linalg.svd(matrix / scale, compute_uv=False)
+    rank = int(np.sum(singular > 1e-14 * singular.max(initial=0.0)))
+    falling = np.argsort(-weight, kind="stable")
+    rows, right = (matrix * weight[:, None])[falling], (right * weight[:, None])[falling]
+    size = _norms(rows)
+    basis, upper, pivots = qr(rows / size, mode="economic", pivoting=True)
+    found = np.zeros((count, right.shape[1]))
+    if rank:  # not by LAPACK's dtrtrs, which waits for its threads however small the system
+        found[pivots[:rank]] = blas.dtrsm(1.0, upper[:rank, :rank], basis.T[:rank] @ right)
+    found /= size[:, None]
+    if rank < count:
+        null, _ = np.linalg.qr(np.linalg.svd(matrix / scale)[2][rank:].T / scale[:, None])
+        found -= null @ (null.T @ found)
+    return found, rank == count
+
+
+def _norms(matrix: Array) -> Array:
+    """Norms of the columns, 1 where a column is 0."""
+    norms = np.linalg.norm(matrix, axis=0)
+    return np.where(norms > 0.0, norms, 1.0)
+
+
+def _best_times(problem: _Problem, given: Array, first: _Solution, weights: Array) -> Array:
+    """Relative times of least cost found from several starts."""
+    # Costs below are rounding, and their logarithm would lead nowhere.
+    floor = 1e-26 * float(problem.scale(given) @ weights)
+    if first.cost @ weights <= floor:
+        return given
+    legs = np.diff(given)
+    least = min(1e-4 / legs.size, 0.5 * float(legs.min()))
+    room = 1.0 - legs.size * least
+    chord = np.sqrt(np.diff(first.sides[1, :, 0], axis=0) ** 2 @ weights)
+    chord = chord / chord.max() if chord.any() else np.ones(legs.size)
+
+    def durations(x: Array) -> tuple[Array, Array]:
+        share = np.exp(x - x.max())
+        share /= share.sum()
+        return least + room * share, share
+
+    def objective(x: Array) -> tuple[float, Array]:
+        h, share = durations(x)
+        found = problem.solve(_times(h))
+        cost, slope = float(found.cost @ weights) + floor, room * share * (found.slope @ weights)
+        return math.log(cost), (slope - share * slope.sum()) / cost
+
+    def best_from(start: Array) -> tuple[float, Array]:
+        h = np.maximum(start / start.sum(), 2.0 * least)
+        x = np.log(h / h.sum() - least)
+        result = minimize(objective, x, jac=True, method="BFGS", options={"gtol": 1e-7})
+        return float(result.fun), _times(durations(result.x)[0])
+
+    starts = [legs, *(chord**power for power in (1.0, 0.5, 1.0 / 3.0, 0.0))]
+    return min(map(best_from, starts), key=lambda pair: pair[0])[1]
+
+
+def _times(durations: Array) -> Array:
+    """Relative times from durations that sum to 1."""
+    return np.concatenate([[0.0], np.cumsum(durations[:-1]), [1.0]])
+
+
+def _checked_orders(
+    points: tuple[Waypoint, ...], derivative: int, order: int | None, continuity: int | None, single: bool
+) -> tuple[int, int]:
+    """Highest order of the entries, and that which legs share."""
+    if single and continuity is not None:
+        raise ValueError(f"continuity must be left out for a single plan, which is smooth, got {continuity}")
+    shared = 0 if continuity is None else checked_count(continuity, "continuity")
+    asked = max(derivative - 1, shared) if order is None else checked_count(order, "order")
+    prescribed = [int(np.flatnonzero(~np.isnan(p.jet).all(axis=1)).max(initial=0)) for p in points]
+    highest = max(asked, *prescribed)
+    if shared > highest:
+        raise ValueError(f"order must be at least the continuity {shared}, got {highest}")
+    return highest, highest if continuity is None else shared
+
+
+def _checked_weights(weights: ArrayLike | None, naxes: int) -> Array:
+    """Factors of the axes, above 0."""
+    if weights is None:
+        return np.ones(naxes)
+    factors = np.array([checked_time(w, f"weights[{i}]", positive=True) for i, w in enumerate(np.ravel(weights))])
+    if factors.size != naxes:
+        raise ValueError(f"weights must be one number an axis, {naxes}, got {factors.size}")
+    return factors
+
+
+def _joined(legs: Sequence[Trajectory]) -> Joined:
+    """Legs one after the other, which need no shift that would round their times."""
+    plan = Joined.__new__(Joined)
+    plan._set(tuple(legs), legs[0].labels)
+    return plan

@@ -1,0 +1,470 @@
+"""The shortest duration against closed forms, scans in plain words, and the crane written out in the test."""
+
+from math import inf, sqrt
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.interpolate import BPoly
+from scipy.optimize import brentq
+
+import ctrlplan as cp
+from ctrlplan import Waypoint
+from ctrlplan.planning import Fastest, fastest, margins
+from ctrlplan.studies.crane import CRANE, nominal_waypoints, obstacle_waypoints
+
+MOVE = cp.PolySpline([Waypoint(0, 0, 0, 0), Waypoint(1, 1, 0, 0)])
+THROUGH = cp.PolySpline([Waypoint(0, 0, 1, 0), Waypoint(1, 1, 1, 0)])
+OBSTACLE = cp.TrigSpline(obstacle_waypoints(), alpha=4.0)
+HOIST = cp.PolySpline(nominal_waypoints(5))
+HOIST_TRIG = cp.TrigSpline(nominal_waypoints(5), alpha=2.0)
+COUNT = 100_001
+
+
+def derivative(plan, nu, count=COUNT):
+    return plan.jet(np.linspace(plan.start, plan.end, count), nu)[nu]
+
+
+def crane_signals(plan, count=COUNT):
+    """Equations (15a-d) and the inputs along a plan, with w = x''/(g - z''), differentiated by hand."""
+    m, trolley, inertia, b, f1, f2, g = 500.0, 5000.0, 50.0, 0.25, 20.0, 20.0, 9.81
+    (_, z), (x1, z1), (x2, z2), (x3, z3), (x4, z4) = plan.jet(np.linspace(plan.start, plan.end, count), 4)
+    p, p1, p2 = g - z2, -z3, -z4
+    w = x2 / p
+    w1 = (x3 - w * p1) / p
+    w2 = (x4 - 2 * w1 * p1 - w * p2) / p
+    h = np.sqrt(1 + w * w)
+    h1 = w * w1 / h
+    h2 = (w1 * w1 + w * w2 - h1 * h1) / h
+    d1 = x1 - b * h1 + z1 * w + z * w1
+    d2 = x2 - b * h2 + z2 * w + 2 * z1 * w1 + z * w2
+    r1 = z1 * h + z * h1 - b * w1
+    r2 = z2 * h + 2 * z1 * h1 + z * h2 - b * w2
+    tension = m * p * h
+    return {
+        "F": trolley * d2 + f1 * d1 + m * x2,
+        "C": inertia * r2 / b + f2 * r1 / b - b * tension,
+        "T": tension,
+        "theta": np.arctan2(-x2, p),
+        "R": z * h - b * w,
+        "x_d1": x1,
+        "z_d1": z1,
+    }
+
+
+def excess(signals, limits):
+    """Greatest excess beyond limits (low, high), as a fraction of half their distance."""
+    found = []
+    for name, (low, high) in limits.items():
+        scale = 0.5 * (high - low)
+        found.append(max((signals[name].max() - high) / scale, (low - signals[name].min()) / scale))
+    return max(found)
+
+
+def runs(durations, inside):
+    """Intervals of a scan in which limits hold, by their first and last duration."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], inside, [False]]).astype(int)))
+    return [(durations[a], durations[b - 1]) for a, b in edges.reshape(-1, 2)]
+
+
+# The shape held: closed forms
+
+
+@pytest.mark.parametrize(
+    ("limits", "duration", "active"),
+    [
+        ({"y_d1": 0.5}, 15 / 8 / 0.5, "y_d1"),
+        ({"y_d2": 2.0}, sqrt(10 / sqrt(3) / 2.0), "y_d2"),
+        ({"y_d1": 0.5, "y_d2": 2.0}, 3.75, "y_d1"),
+        ({"y_d1": 5.0, "y_d2": 0.1}, sqrt(100 / sqrt(3)), "y_d2"),
+        ({"velocity": 0.5, "acceleration": 2.0}, 3.75, "y_d1"),
+        ({"y_d1": (-0.1, 0.5)}, 3.75, "y_d1"),
+        ({"y_d1": (0, 2)}, 0.9375, "y_d1"),
+        ({"y_d1": (None, 0.5)}, 3.75, "y_d1"),
+        ({"y_d2": (-1.0, 4.0)}, sqrt(10 / sqrt(3)), "y_d2"),
+        ({"y_d2": (-4.0, 1.0)}, sqrt(10 / sqrt(3)), "y_d2"),
+        ({"y": (-0.5, 1.5), "y_d1": 1.0}, 1.875, "y_d1"),
+    ],
+)
+def test_minimum_jerk_move(limits, duration, active):
+    found = fastest(MOVE, limits)
+    assert isinstance(found, Fastest)
+    assert found.duration == pytest.approx(duration, rel=1e-11)
+    assert found.plan.duration == found.duration
+    assert found.feasible == ((found.duration, inf),)
+    assert found.margins.hold
+    if limits != {"y_d1": (0, 2)}:  # there the lower side is touched as well
+        assert found.active.bound.name == active
+    assert found.active.fraction == pytest.approx(0.0, abs=1e-11)
+    assert found.hold == "shape"
+
+
+def test_jerk_and_snap_in_closed_form():
+    septic = cp.PolySpline([Waypoint(0, 0, 0, 0, 0), Waypoint(3, 2, 0, 0, 0)])
+    assert fastest(septic, {"jerk": 7.0}).duration == pytest.approx((2 * 52.5 / 7.0) ** (1 / 3), rel=1e-11)
+    nonic = cp.PolySpline([Waypoint.from_jets(t, y=[float(t), 0, 0, 0, 0]) for t in (0, 1)])
+    unit = BPoly.from_derivatives([0, 1], [[0, 0, 0, 0, 0], [1, 0, 0, 0, 0]])
+    snap = np.abs(unit.derivative(4)(np.linspace(0, 1, COUNT))).max()
+    assert fastest(nonic, {"snap": 30.0}).duration == pytest.approx((snap / 30.0) ** 0.25, rel=1e-9)
+
+
+@pytest.mark.parametrize("plan", [OBSTACLE, cp.PiecewiseSpline(obstacle_waypoints()), HOIST, MOVE + 2 * MOVE])
+def test_limits_on_derivatives_follow_from_the_peaks(plan):
+    limits = {"velocity": 1.5, "acceleration": 0.7}
+    found = fastest(plan, limits)
+    peaks = [np.abs(derivative(plan, nu)).max() for nu in (1, 2)]
+    expected = plan.duration * max(peaks[0] / 1.5, sqrt(peaks[1] / 0.7))
+    assert found.duration == pytest.approx(expected, rel=1e-8)
+    t = np.linspace(0, 1, 1001)
+    np.testing.assert_allclose(
+        found.plan(found.plan.start + found.duration * t), plan(plan.start + plan.duration * t), rtol=1e-12, atol=1e-12
+    )
+    for nu, limit in ((1, 1.5), (2, 0.7)):
+        assert np.abs(derivative(found.plan, nu)).max() <= limit * (1 + 1e-12)
+    shorter = plan.retime(found.duration * (1 - 1e-4))
+    assert any(np.abs(derivative(shorter, nu)).max() > limit for nu, limit in ((1, 1.5), (2, 0.7)))
+
+
+def test_a_slow_plan_is_made_shorter_and_a_fast_one_longer():
+    for duration in (1e-3, 1e3):
+        found = fastest(MOVE.retime(duration), {"y_d1": 2.0})
+        assert found.duration == pytest.approx(0.9375, rel=1e-12)
+
+
+def test_start_and_kind_stay():
+    found = fastest(OBSTACLE.shift(100.0), {"velocity": 2.0})
+    assert found.plan.start == 100.0
+    assert isinstance(found.plan, cp.TrigSpline)
+    assert found.plan.alpha == 4.0
+    times = np.array([w.time for w in found.plan.waypoints]) - 100.0
+    np.testing.assert_allclose(times / found.duration, np.array([0, 6, 11, 16]) / 16, rtol=1e-13)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_position_limits_that_the_move_just_touches(seed):
+    rng = np.random.default_rng(seed)
+    low, high = sorted(10 * rng.normal(size=2))
+    plan = cp.TrigSpline([Waypoint(0, low, 0, 0), Waypoint(1.7, high, 0, 0)], alpha=float(rng.uniform(0, 3)))
+    found = fastest(plan, {"y": (low, high), "y_d1": 2.0})
+    peak = np.abs(derivative(plan, 1)).max()
+    assert found.duration == pytest.approx(1.7 * peak / 2.0, rel=1e-7)
+    assert found.margins.hold
+
+
+@pytest.mark.parametrize("alpha", [0.5, 1.0, 2.0, 3.0])
+def test_never_backwards(alpha):
+    plan = cp.TrigSpline([Waypoint(0, 0, 0, 0), Waypoint(1, 1, 0, 0)], alpha=alpha)
+    found = fastest(plan, {"y_d1": (0.0, 2.0)})
+    assert found.duration == pytest.approx(derivative(plan, 1).max() / 2.0, rel=1e-8)
+
+
+sizes = st.floats(1e-3, 1e3)
+
+
+@settings(deadline=None, max_examples=12)
+@given(size=sizes, duration=sizes, shift=st.floats(-1e3, 1e3), limits=st.tuples(sizes, sizes))
+def test_closed_form_scales(size, duration, shift, limits):
+    plan = (size * MOVE).retime(duration).shift(shift)
+    found = fastest(plan, {"y_d1": limits[0], "y_d2": limits[1]})
+    expected = max(15 / 8 * size / limits[0], sqrt(10 / sqrt(3) * size / limits[1]))
+    # The clock of a plan far from 0 is known to a rounding of where it starts.
+    assert found.duration == pytest.approx(expected, rel=1e-11 + 1e-14 * abs(shift) / min(expected, duration))
+
+
+@settings(deadline=None, max_examples=10)
+@given(nu=st.integers(1, 2), factor=st.floats(0.01, 100.0))
+def test_wider_limits_by_a_power(nu, factor):
+    plan = cp.TrigSpline(obstacle_waypoints(), alpha=4.0)
+    word = ("velocity", "acceleration")[nu - 1]
+    ours, theirs = fastest(plan, {word: 1.0}).duration, fastest(plan, {word: factor}).duration
+    assert theirs == pytest.approx(ours * factor ** (-1 / nu), rel=1e-11)
+
+
+# The shape held: quantities of a plant
+
+
+CRANE_LIMITS = {
+    "drives": {"F": (-30e3, 30e3), "C": (-3e3, 1e3)},
+    "weak trolley": {"F": (-2e3, 2e3), "C": (-3e3, 1e3)},
+    "sway": {"theta": (-0.02, 0.02), "F": (-30e3, 30e3)},
+    "tension": {"T": (0.0, 4950.0), "theta": (-0.5, 0.5)},
+    "rope": {"R": (5.0, 11.05), "F": (-30e3, 30e3)},
+    "speed": {"x_d1": (-2.0, 2.0), "F": (-30e3, 30e3)},
+    "torque": {"C": (-1300.0, -1150.0)},
+}
+
+
+@pytest.mark.parametrize("name", CRANE_LIMITS)
+@pytest.mark.parametrize("plan", [HOIST, HOIST_TRIG], ids=["polynomial", "trigonometric"])
+def test_crane(plan, name):
+    limits = CRANE_LIMITS[name]
+    found = fastest(plan, limits, CRANE)
+    assert excess(crane_signals(found.plan), limits) <= 1e-11
+    assert excess(crane_signals(plan.retime(found.duration * (1 - 1e-4))), limits) > 0.0
+    assert found.active.fraction == pytest.approx(0.0, abs=1e-9)
+    signal = crane_signals(found.plan)[found.active.bound.name]
+    t = np.linspace(found.plan.start, found.plan.end, COUNT)
+    assert np.interp(found.active.time, t, signal) == pytest.approx(found.active.value, rel=1e-7)
+    assert len(found.margins) == len(limits)
+    for row in found.margins:
+        assert row.fraction == pytest.approx(
+            -excess(crane_signals(found.plan), {row.bound.name: limits[row.bound.name]}), abs=1e-7
+        )
+    assert found.feasible[-1][1] == inf
+
+
+def test_crane_feasible_set_is_that_of_a_scan():
+    limits = CRANE_LIMITS["weak trolley"]
+    found = fastest(HOIST, limits, CRANE)
+    for duration in np.geomspace(2.0, 200.0, 81):
+        try:
+            holds = excess(crane_signals(HOIST.retime(float(duration)), 2001), limits) <= 0.0
+        except ValueError:
+            holds = False
+        assert holds == any(low <= duration <= high for low, high in found.feasible)
+
+
+def test_crane_does_not_depend_on_the_duration_given():
+    expected = fastest(HOIST, CRANE_LIMITS["drives"], CRANE).duration
+    for duration in (0.5, 300.0):
+        assert fastest(HOIST.retime(duration), CRANE_LIMITS["drives"], CRANE).duration == pytest.approx(
+            expected, rel=1e-9
+        )
+
+
+def test_what_the_plant_refuses_is_told():
+    found = fastest(HOIST, {"T": (0, None)}, CRANE)
+    # The crane can follow only below g - z'' = 0, which no limit says.
+    fall = derivative(HOIST, 2)[1].max()
+    least = 15.0 * sqrt(fall / 9.81)
+    assert found.duration == pytest.approx(least, rel=1e-5)
+    assert found.duration >= least
+
+
+def test_a_static_torque_beyond_the_limit():
+    for hold in ("shape", "path"):
+        with pytest.raises(ValueError, match=r"limits must hold at rest.* got C = -1226.25 at rest at .*within ±1000"):
+            fastest(HOIST, {"C": 1000.0, "F": 3e4}, CRANE, hold=hold)
+    with pytest.raises(ValueError, match=r"limits must hold for some duration .*C within ±1000: -1226"):
+        fastest(HOIST, {"C": 1000.0}, CRANE, hold="waypoints")
+
+
+def test_a_position_beyond_the_limit():
+    with pytest.raises(ValueError, match=r"limits must hold at rest, .* got x = 20 at rest at x = 20, z = 11"):
+        fastest(HOIST, {"x": (0, 19.0), "x_d1": 2.0})
+
+
+def test_limits_that_no_shorter_plan_breaks():
+    with pytest.raises(ValueError, match="got none"):
+        fastest(MOVE, {"y": 2.0})
+    with pytest.raises(ValueError, match="got none"):
+        fastest(cp.PolySpline([Waypoint(0, 1, 0, 0), Waypoint(1, 1, 0, 0)]), {"y_d1": 1.0})
+
+
+# Waypoints held
+
+
+def quintic_peak(duration):
+    """Peak acceleration of the quintic from 0 to 1 with end speeds 1: its jerk is 0 where u (1 - u) = 1/6."""
+    # y = t + (1 - T) h(t/T) with h the minimum-jerk move.
+    return 10 / sqrt(3) * abs(1 - duration) / duration**2
+
+
+@pytest.mark.parametrize(("duration", "peak"), [(0.8, 1.80), (1.0, 0.0), (2.0, 1.44), (10.0, 0.52)])
+def test_the_peaks_of_the_quintic_are_those_of_the_mathematics(duration, peak):
+    assert quintic_peak(duration) == pytest.approx(peak, abs=0.005)
+
+
+@pytest.mark.parametrize("limit", [0.01, 0.5, 1.0, 1.4, 1.5, 3.0])
+def test_feasibility_is_not_monotone_where_derivatives_are_held(limit):
+    found = fastest(THROUGH, {"y_d2": limit}, hold="waypoints")
+    c = 10 / sqrt(3) / limit
+    # c |1 - T| <= T^2: below 1 from T^2 + c T - c, above 1 from T^2 - c T + c.
+    first = (-c + sqrt(c * c + 4 * c)) / 2
+    assert found.duration == pytest.approx(first, rel=1e-9)
+    if c > 4:
+        between = [(c - sqrt(c * c - 4 * c)) / 2, (c + sqrt(c * c - 4 * c)) / 2]
+        assert found.feasible[0] == pytest.approx((first, between[0]), rel=1e-9)
+        assert len(found.feasible) == (2 if between[1] < 64.0 else 1)
+        if between[1] < 64.0:
+            assert found.feasible[1] == pytest.approx((between[1], 64.0), rel=1e-9)
+    else:
+        assert len(found.feasible) == 1
+        assert found.feasible[0] == pytest.approx((first, 64.0), rel=1e-9)
+    assert found.active.fraction == pytest.approx(0.0, abs=1e-8)
+    np.testing.assert_allclose(found.plan.jet([0, found.duration], 2)[:, 0], [[0, 1], [1, 1], [0, 0]], atol=1e-12)
+    assert quintic_peak(found.duration * (1 - 1e-4)) > limit
+
+
+@pytest.mark.parametrize("family", ["trigonometric", "piecewise", "polynomial"])
+def test_feasible_set_is_that_of_a_scan(family):
+    points = obstacle_waypoints()
+    make = {
+        "trigonometric": lambda p: cp.TrigSpline(p, alpha=4.0),
+        "piecewise": cp.PiecewiseSpline,
+        "polynomial": cp.PolySpline,
+    }[family]
+    fast, hard = (6.0, 4.0) if family == "polynomial" else (5.0, 2.5)
+    limits = {"velocity": fast, "acceleration": hard}
+    found = fastest(make(points), limits, hold="waypoints", durations=(6.0, 300.0))
+
+    def peaks(duration):
+        plan = make([Waypoint(w.time * duration / 16.0, *w.jet) for w in points])
+        jet = plan.jet(np.linspace(0, plan.end, 4001), 2)
+        return max(np.abs(jet[1]).max() / fast, np.abs(jet[2]).max() / hard) - 1.0
+
+    durations = np.geomspace(6.0, 300.0, 201)
+    scanned = runs(durations, np.array([peaks(float(d)) for d in durations]) <= 0.0)
+    assert len(found.feasible) == len(scanned)
+    step = durations[1] / durations[0]
+    for (low, high), (first, last) in zip(found.feasible, scanned, strict=True):
+        assert first / step <= low <= first
+        assert last <= high * (1 + 1e-12) <= last * step * (1 + 1e-12)
+        if first > durations[0]:
+            assert low == pytest.approx(brentq(peaks, first / step, first, xtol=1e-9), rel=1e-5)
+        if last < durations[-1]:
+            assert high == pytest.approx(brentq(peaks, last, last * step, xtol=1e-9), rel=1e-5)
+    assert found.duration == pytest.approx(found.feasible[0][0], rel=1e-12)
+    given_derivatives = np.array([w.jet for w in points])
+    times = [w.time for w in found.plan.waypoints]
+    np.testing.assert_allclose(found.plan.jet(times, 2).transpose(2, 0, 1), given_derivatives, atol=1e-9)
+    np.testing.assert_allclose(np.array(times) / found.duration, np.array([0, 6, 11, 16]) / 16, rtol=1e-12)
+
+
+def test_waypoints_held_without_derivatives_is_the_shape_held():
+    points = [Waypoint(0, [0, 1]), Waypoint(2, [1, 3]), Waypoint(3, [4, 0]), Waypoint(5, [5, 5])]
+    for plan in (cp.TrigSpline(points, alpha=2.0), cp.PolySpline(points)):
+        shape, held = (fastest(plan, {"velocity": 2.0, "acceleration": 3.0}, hold=h) for h in ("shape", "waypoints"))
+        assert held.duration == pytest.approx(shape.duration, rel=1e-9)
+
+
+def test_waypoints_held_of_a_closed_plan():
+    plan = cp.TrigSpline.cyclic([Waypoint(0, 0), Waypoint(1, 1), Waypoint(2, -1)], 3.0)
+    shape, held = (fastest(plan, {"y_d1": 1.0}, hold=h) for h in ("shape", "waypoints"))
+    assert held.duration == pytest.approx(shape.duration, rel=1e-9)
+    assert [w.time for w in held.plan.waypoints] == pytest.approx([0, held.duration / 3, 2 * held.duration / 3])
+
+
+def test_waypoints_held_with_quantities():
+    limits = CRANE_LIMITS["weak trolley"]
+    points = [
+        Waypoint.from_jets(0, x=[0] * 4, z=[10, 0, 0, 0]),
+        Waypoint.from_jets(15, x=[20, 1, 0, 0], z=[11, 0, 0, 0]),
+    ]
+    found = fastest(cp.PolySpline(points), limits, CRANE, hold="waypoints")
+    assert excess(crane_signals(found.plan), limits) <= 1e-11
+    assert found.plan(found.duration, 1)[0] == pytest.approx(1.0, abs=1e-10)
+    assert found.active.fraction == pytest.approx(0.0, abs=1e-9)
+    for low, high in found.feasible:
+        middle = cp.PolySpline([points[0], points[1].scaled(sqrt(low * high), 1.0)])
+        assert excess(crane_signals(middle, 4001), limits) <= 1e-9
+
+
+def test_waypoints_are_held_of_splines_alone():
+    there_and_back = MOVE.then(cp.PolySpline([Waypoint(1, 1, 0, 0), Waypoint(2, 0, 0, 0)]))
+    with pytest.raises(TypeError, match="waypoints are held of a spline made through them, got a Joined"):
+        fastest(there_and_back, {"y_d1": 1.0}, hold="waypoints")
+
+
+# Durations given
+
+
+def test_durations_bound_the_search():
+    assert fastest(MOVE, {"y_d1": 1.0}, durations=(0.5, 5.0)).duration == pytest.approx(1.875, rel=1e-9)
+    assert fastest(MOVE, {"y_d1": 1.0}, durations=(3.0, 5.0)).duration == 3.0
+    with pytest.raises(
+        ValueError, match=r"for some duration from 0.5 to 1 s, got none; nearest at 1 s: y_d1 within ±1"
+    ):
+        fastest(MOVE, {"y_d1": 1.0}, durations=(0.5, 1.0))
+    held = fastest(THROUGH, {"y_d2": 1.0}, hold="waypoints", durations=(1.5, 30.0))
+    assert held.duration == pytest.approx(quintic_edge(1.0), rel=1e-9)
+
+
+def quintic_edge(limit):
+    c = 10 / sqrt(3) / limit
+    return (c + sqrt(c * c - 4 * c)) / 2
+
+
+@pytest.mark.parametrize(
+    ("durations", "message"),
+    [
+        ((0.0, 1.0), "durations must be above 0 and finite, got 0 to 1"),
+        ((-1.0, 1.0), "durations must be above 0 and finite, got -1 to 1"),
+        ((2.0, 1.0), "durations must increase, got 2 and 1"),
+        ((1.0, 1.0), "durations must increase"),
+        ((1.0, inf), "durations must be above 0 and finite, got 1 to inf"),
+        ((np.nan, 1.0), "durations must be a number, got nan"),
+        ((1.0,), "durations must be two numbers"),
+        (3.0, "durations must be two numbers"),
+    ],
+)
+@pytest.mark.parametrize("hold", ["shape", "waypoints"])
+def test_durations_that_are_none(durations, message, hold):
+    with pytest.raises(ValueError, match=message):
+        fastest(MOVE, {"y_d1": 1.0}, durations=durations, hold=hold)
+
+
+# What is refused
+
+
+@pytest.mark.parametrize("hold", ["time", "", None])
+def test_unknown_holds(hold):
+    with pytest.raises(ValueError, match=f"hold must be one of shape, waypoints, path, got {hold!r}"):
+        fastest(MOVE, {"y_d1": 1.0}, hold=hold)
+
+
+@pytest.mark.parametrize("hold", ["shape", "waypoints", "path"])
+@pytest.mark.parametrize(
+    ("limits", "error", "message"),
+    [
+        ({"y_d1": -1.0}, ValueError, "limits must be above 0 and finite, got y_d1 = -1"),
+        ({"y_d1": np.nan}, ValueError, "limits must be above 0 and finite, got y_d1 = nan"),
+        ({"y_d1": (1.0, -1.0)}, ValueError, "limits of y_d1 must increase, got 1 and -1"),
+        ({"F": 1.0}, ValueError, "quantities were not given"),
+        ({"y_d4": 1.0}, ValueError, "y_d4 is limited, which needs a plan continuous up to derivative 3"),
+        ({}, ValueError, "limits must name at least one signal, got none"),
+        (None, TypeError, "limits must be a mapping"),
+        ({"y_d1": "1"}, TypeError, "limits of y_d1 must be a number"),
+    ],
+)
+def test_wrong_limits(limits, error, message, hold):
+    with pytest.raises(error, match=message):
+        fastest(MOVE, limits, hold=hold)
+
+
+def test_nothing_to_retime():
+    with pytest.raises(ValueError, match="must have a duration, got a step"):
+        fastest(cp.Step(1.0), {"y_d1": 1.0})
+    with pytest.raises(TypeError, match="plan must be a Trajectory, got float"):
+        fastest(1.0, {"y_d1": 1.0})
+
+
+# The report
+
+
+def test_report():
+    found = fastest(MOVE, {"y_d1": 0.5, "y_d2": 2.0})
+    first, second, third = repr(found).splitlines()
+    assert first == "fastest with the shape held: 3.75 s (feasible: 3.75 to inf s)"
+    assert second.startswith("y_d1 within ±0.5: 0.5 at 1.875 s, ")
+    assert third.startswith("y_d2 within ±2: ")
+    assert third.endswith("% left")
+    html = found._repr_html_()
+    assert "<b>3.75 s</b>" in html
+    assert html.count("<tr>") == 3
+    peak = 10 / sqrt(3) / 3.75**2
+    assert found.margins.rows[1].fraction == pytest.approx(1 - peak / 2.0, rel=1e-10)
+
+
+def test_report_is_that_of_margins():
+    found = fastest(HOIST, CRANE_LIMITS["drives"], CRANE)
+    assert repr(found.margins) == repr(margins(found.plan, CRANE_LIMITS["drives"], CRANE))
+
+
+def test_figure():
+    import matplotlib.pyplot as plt
+
+    figure = fastest(HOIST, {"F": 3e4, "x_d1": 5.0}, CRANE).plot()
+    assert len(figure.axes) == 2
+    plt.close(figure)

@@ -1,0 +1,219 @@
+"""Objectives of a plan against closed forms, quadrature and exact roots of polynomials."""
+
+from itertools import pairwise
+from math import asinh, cos, pi, sin, sqrt
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.integrate import quad
+from scipy.interpolate import BPoly, PPoly
+
+import ctrlplan as cp
+from ctrlplan import Waypoint
+from ctrlplan.planning import OBJECTIVES, PeakDerivative, SquaredDerivative, path_length, wandering
+
+REST = [Waypoint(0, 0, 0, 0), Waypoint(1, 1, 0, 0)]
+MOVE = cp.PolySpline(REST)
+TIMES = [0.0, 1.5, 2.0, 4.0]
+JETS = np.random.default_rng(2).normal(size=(4, 3, 2)) * np.array([3.0, 2.0, 1.0])[:, None]
+POINTS = [Waypoint(t, *jet) for t, jet in zip(TIMES, JETS, strict=True)]
+PLANS = {
+    "polynomial": cp.PolySpline(POINTS),
+    "trigonometric": cp.TrigSpline(POINTS, alpha=4.0),
+    "piecewise": cp.PiecewiseSpline(POINTS),
+    "piecewise trigonometric": cp.PiecewiseSpline(POINTS, alpha=3.0),
+    "one axis": cp.TrigSpline(POINTS, alpha=2.0).select("y1"),
+    "three axes": cp.stack([cp.TrigSpline(POINTS, alpha=1.0), cp.PolySpline(REST, labels=["up"]).retime(4.0)]),
+}
+NAMES = {
+    "path": path_length,
+    "wandering": wandering,
+    **{f"peak_{name}": PeakDerivative(k) for k, name in enumerate(["velocity", "acceleration", "jerk", "snap"], 1)},
+    **{
+        f"squared_{name}": SquaredDerivative(k)
+        for k, name in enumerate(["velocity", "acceleration", "jerk", "snap"], 1)
+    },
+}
+
+
+def integral(plan, integrand):
+    """Integral over time of a function of one time, leg by leg, by adaptive quadrature."""
+    edges = plan.breakpoints.tolist()
+    return sum(quad(integrand, a, b, epsabs=0, epsrel=1e-12, limit=400)[0] for a, b in pairwise(edges))
+
+
+def quintics():
+    """Quintic legs of the same data, by scipy."""
+    return PPoly.from_bernstein_basis(BPoly.from_derivatives(TIMES, JETS))
+
+
+def test_names_lead_to_the_objectives():
+    assert dict(OBJECTIVES) == NAMES
+
+
+@pytest.mark.parametrize("name", PLANS)
+def test_path_length_is_the_integral_of_the_speed(name):
+    plan = PLANS[name]
+    expected = integral(plan, lambda t: float(np.linalg.norm(plan.jet(t, 1)[1])))
+    # These plans turn round, and nearly stop there.
+    assert path_length(plan) == pytest.approx(expected, rel=1e-7)
+
+
+def test_path_length_of_a_half_circle():
+    points = [Waypoint(t, [2 * cos(t), 2 * sin(t)]) for t in (0.0, pi / 2, pi)]
+    assert path_length(cp.TrigSpline(points, alpha=pi)) == pytest.approx(2 * pi, rel=1e-14)
+
+
+def test_path_length_of_a_parabola():
+    parabola = cp.PolySpline([Waypoint(t, [t, t * t]) for t in (0.0, 1.0, 3.0)])
+    assert path_length(parabola) == pytest.approx((6 * sqrt(37) + asinh(6)) / 4, rel=1e-14)
+
+
+def test_path_length_counts_the_way_there_and_back():
+    there_and_back = MOVE.then(cp.PolySpline([Waypoint(1, 1, 0, 0), Waypoint(3, -2, 0, 0)]))
+    assert path_length(there_and_back) == pytest.approx(4.0, rel=1e-14)
+
+
+@pytest.mark.parametrize("miss", [1e-2, 1e-4, 0.0])
+def test_path_length_where_the_path_nearly_stops(miss):
+    # x = t^2, z = miss t through t = 0: the speed hypot(2 t, miss) has its minimum inside a panel.
+    a, b = -0.7, 1.3
+    plan = cp.PolySpline([Waypoint(t, [t * t, miss * t]) for t in (a, 0.4, b)])
+
+    def primitive(t):
+        return t * sqrt(t * t + miss**2 / 4) + (miss**2 / 4 * asinh(2 * t / miss) if miss else 0.0)
+
+    expected = primitive(b) - primitive(a) if miss else a * a + b * b
+    assert path_length(plan) == pytest.approx(expected, rel=1e-7)
+
+
+def test_path_length_of_one_axis_is_the_way_between_its_turns():
+    cubic = cp.PolySpline([Waypoint(t, t**3 - t) for t in (-1.5, -0.6, 0.7, 2.0)])
+    turn = 2 / (3 * sqrt(3))  # height of the turns at -+1/sqrt 3
+    assert path_length(cubic) == pytest.approx((turn + 1.875) + 2 * turn + (turn + 6.0), rel=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("nu", "peak"), [(0, 1.0), (1, 15 / 8), (2, 10 / sqrt(3)), (3, 60.0), (4, 360.0), (5, 720.0), (6, 0.0)]
+)
+def test_peaks_of_the_minimum_jerk_move(nu, peak):
+    assert PeakDerivative(nu)(MOVE) == pytest.approx(peak, rel=1e-12, abs=1e-9)
+
+
+@pytest.mark.parametrize("nu", range(6))
+def test_peaks_of_quintic_legs_by_their_roots(nu):
+    peak = 0.0
+    for axis in range(2):
+        pieces = PPoly(quintics().c[:, :, axis], quintics().x)
+        pieces = pieces.derivative(nu) if nu else pieces
+        for leg, (a, b) in enumerate(pairwise(TIMES)):
+            values = np.poly1d(pieces.c[:, leg])
+            roots = [r.real for r in values.deriv().roots if abs(r.imag) < 1e-9 and 0 < r.real < b - a]
+            peak = max(peak, *(abs(values(s)) for s in [0.0, b - a, *roots]))
+    assert PeakDerivative(nu)(cp.PiecewiseSpline(POINTS)) == pytest.approx(peak, rel=1e-9)
+
+
+@pytest.mark.parametrize("nu", [1, 2, 3, 4])
+@pytest.mark.parametrize("name", ["polynomial", "trigonometric", "three axes"])
+def test_peaks_are_those_of_dense_samples(name, nu):
+    plan = PLANS[name]
+    dense = np.abs(plan.jet(np.linspace(plan.start, plan.end, 100_001), nu)[nu]).max()
+    peak = PeakDerivative(nu)(plan)
+    assert dense * (1 - 1e-12) <= peak <= dense * (1 + 1e-6)
+
+
+@pytest.mark.parametrize(("nu", "cost"), [(1, 10 / 7), (2, 120 / 7), (3, 720.0), (4, 43200.0), (5, 720.0**2)])
+def test_costs_of_the_minimum_jerk_move(nu, cost):
+    assert SquaredDerivative(nu)(MOVE) == pytest.approx(cost, rel=1e-12)
+
+
+@pytest.mark.parametrize("nu", [0, 1, 2, 3, 4])
+def test_costs_of_quintic_legs_are_exact(nu):
+    expected = 0.0
+    for axis in range(2):
+        pieces = PPoly(quintics().c[:, :, axis], quintics().x)
+        pieces = pieces.derivative(nu) if nu else pieces
+        for leg, length in enumerate(np.diff(TIMES)):
+            squared = np.poly1d(pieces.c[:, leg]) ** 2
+            expected += squared.integ()(length)
+    assert SquaredDerivative(nu)(cp.PiecewiseSpline(POINTS)) == pytest.approx(expected, rel=1e-12)
+
+
+@pytest.mark.parametrize("nu", [1, 3, 4])
+@pytest.mark.parametrize("name", ["trigonometric", "piecewise trigonometric", "three axes"])
+def test_costs_are_integrals(name, nu):
+    plan = PLANS[name]
+    expected = integral(plan, lambda t: float(np.square(plan.jet(t, nu)[nu]).sum()))
+    assert SquaredDerivative(nu)(plan) == pytest.approx(expected, rel=1e-10)
+
+
+def test_wandering_is_the_path_beyond_the_polyline():
+    plan = PLANS["trigonometric"]
+    polyline = sum(np.linalg.norm(b - a) for a, b in zip(JETS[:, 0], JETS[1:, 0], strict=False))
+    path = integral(plan, lambda t: float(np.linalg.norm(plan.jet(t, 1)[1])))
+    assert wandering(plan) == pytest.approx(path / polyline - 1, rel=1e-7)
+
+
+def test_a_straight_move_does_not_wander():
+    assert wandering(cp.PolySpline([Waypoint(0, [0, 3], 0, 0), Waypoint(2, [3, -1], 0, 0)])) == pytest.approx(
+        0.0, abs=1e-14
+    )
+
+
+def test_wandering_is_undefined_without_a_polyline():
+    still = cp.PolySpline([Waypoint(0, 1, 0), Waypoint(1, 1, 0)])
+    assert np.isnan(wandering(still))
+    assert np.isnan(wandering(cp.TrigSpline([Waypoint(0, 1, 0), Waypoint(0.7, None, 2), Waypoint(2, 3, 0)], alpha=1.0)))
+
+
+@pytest.mark.parametrize("objective", [path_length, PeakDerivative(1), SquaredDerivative(3)])
+def test_a_step_takes_no_path(objective):
+    assert objective(cp.Step(2.0)) == 0.0
+
+
+@pytest.mark.parametrize("kind", [PeakDerivative, SquaredDerivative])
+@pytest.mark.parametrize(
+    ("nu", "error", "message"),
+    [
+        (-1, ValueError, "nu must be a whole number from 0, got -1"),
+        (1.5, ValueError, "nu must be a whole number from 0, got 1.5"),
+        (101, ValueError, "nu must be at most 100, got 101"),
+        ("2", TypeError, "nu must be a whole number from 0, got '2'"),
+        (True, TypeError, "nu must be a whole number from 0, got True"),
+    ],
+)
+def test_orders_that_are_no_orders(kind, nu, error, message):
+    with pytest.raises(error, match=message):
+        kind(nu)
+
+
+factors = st.floats(1e-3, 1e3)
+
+
+@settings(deadline=None, max_examples=15)
+@given(
+    factor=factors, duration=factors, shift=st.floats(-1e3, 1e3), name=st.sampled_from(["trigonometric", "piecewise"])
+)
+def test_scales_of_amplitude_and_time(factor, duration, shift, name):
+    plan = PLANS[name]
+    other = (factor * plan).retime(duration).shift(shift)
+    rate = plan.duration / duration
+    assert path_length(other) == pytest.approx(factor * path_length(plan), rel=1e-9)
+    for nu in (1, 3):
+        # The clock of a plan that starts late is known to a rounding of that start.
+        slack = 1e-9 + 1e-13 * abs(shift) / duration
+        assert PeakDerivative(nu)(other) == pytest.approx(factor * rate**nu * PeakDerivative(nu)(plan), rel=slack)
+        expected = factor**2 * rate ** (2 * nu - 1) * SquaredDerivative(nu)(plan)
+        assert SquaredDerivative(nu)(other) == pytest.approx(expected, rel=slack)
+
+
+@settings(deadline=None, max_examples=15)
+@given(angle=st.floats(-pi, pi))
+def test_a_turned_path_is_as_long(angle):
+    turn = np.array([[cos(angle), -sin(angle)], [sin(angle), cos(angle)]])
+    turned = cp.TrigSpline([Waypoint(t, *(jet @ turn.T)) for t, jet in zip(TIMES, JETS, strict=True)], alpha=4.0)
+    assert path_length(turned) == pytest.approx(path_length(PLANS["trigonometric"]), rel=1e-10)
+    assert wandering(turned) == pytest.approx(wandering(PLANS["trigonometric"]), rel=1e-9)
+    assert SquaredDerivative(3)(turned) == pytest.approx(SquaredDerivative(3)(PLANS["trigonometric"]), rel=1e-10)
