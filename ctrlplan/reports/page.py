@@ -20,11 +20,13 @@ from markupsafe import Markup
 import ctrlplan
 from ctrlplan.reports.crane_figures import Wall, animation_data, is_crane, plot_curves
 from ctrlplan.reports.figures import FIGURES
+from ctrlplan.reports.planning_figures import plot_rivals
 from ctrlplan.reports.style import line_styles, to_svg
-from ctrlplan.reports.words import number, summary, unit_of, verdicts
+from ctrlplan.reports.words import number, summary, unit_in, unit_of, verdicts
 from ctrlplan.studies.comparison import Comparison
 from ctrlplan.studies.ensemble import Ensemble
 from ctrlplan.studies.study import Study
+from ctrlplan.studies.worth import SAME, Grid, Worth
 
 
 def write_page(studies: Sequence[Study], path: str | os.PathLike[str], title: str) -> Path:
@@ -172,7 +174,57 @@ def _section(study: Study) -> dict[str, Any]:
         "animation": Markup(animation_data(comparison, study.wall)) if is_crane(comparison) else "",  # noqa: S704
         "marks": comparison.marks,
         "parameters": {k: str(v) for k, v in comparison.parameters.items()},
+        "worth": None if comparison.worth is None else _worth(comparison.worth, study.name),
+        "claim": study.claim,
+        "grids": [_grid(grid, grid.unit) for grid in study.grids],
     }
+
+
+def _worth(worth: Worth, name: str) -> dict[str, Any]:
+    """The section on whether planning is worth it."""
+    least = min((need.duration for need in worth.needs if math.isfinite(need.duration)), default=math.nan)
+    return {
+        "verdicts": worth.verdicts,
+        "svg": Markup(to_svg(plot_rivals(worth.comparison), f"{name}-worth")),  # noqa: S704 (our own drawing)
+        "caption": "References through the same waypoints in the same time, what the loop makes of them, and what "
+        "that asks of its controls.",
+        "table": _table(worth.comparison),
+        "limits": "; ".join(f"{limit} {_limit_words(value)}" for limit, value in worth.limits.items()),
+        "needs": [
+            {
+                "name": need.name,
+                "text": number(need.duration),
+                "mark": "win" if need.duration <= least * (1.0 + SAME) else "",
+                "limit": need.limit,
+            }
+            for need in worth.needs
+        ],
+        "grids": [_grid(grid, unit_in(worth.comparison, grid.unit)) for grid in worth.grids],
+    }
+
+
+def _limit_words(value: Any) -> str:
+    """A limit as it was given, to four digits."""
+    if isinstance(value, (tuple, list)):
+        low, high = ("any" if side is None else f"{side:.4g}" for side in value)
+        return f"from {low} to {high}"
+    return f"within ±{value:.4g}"
+
+
+def _grid(grid: Grid, unit: str) -> dict[str, Any]:
+    """Rows of a number over duration and alpha, the rivals behind it."""
+    rows = []
+    for i, (duration, marks) in enumerate(zip(grid.durations.tolist(), grid.marks(), strict=True)):
+        best, _ = grid.best(i)
+        own = zip(grid.values[i].tolist(), marks, strict=True)
+        cells = [{"text": number(value, unit), "mark": mark} for value, mark in own]
+        cells += [
+            {"text": number(float(values[i]), unit), "mark": "best" if name == best else ""}
+            for name, values in grid.rivals.items()
+        ]
+        rows.append({"duration": f"{duration:.4g}", "cells": cells})
+    heads = [f"alpha {a:.3g}" if a else "alpha 0 (polynomial)" for a in grid.alphas.tolist()]
+    return {"title": grid.title, "unit": unit, "heads": [*heads, *grid.rivals], "rows": rows}
 
 
 def _table(comparison: Comparison) -> dict[str, Any]:

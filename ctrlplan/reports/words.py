@@ -77,10 +77,14 @@ def is_unstable(comparison: Comparison) -> bool:
 
 def unit_of(comparison: Comparison, key: str) -> str:
     """Unit of a metric in the units of a comparison; empty where it has none."""
+    return unit_in(comparison, comparison.measures[key].unit)
+
+
+def unit_in(comparison: Comparison, unit: str) -> str:
+    """A measure's unit in the units of a comparison."""
     first = next(iter(comparison.plans.values()))
     y = _shared([comparison.units.get(label, "") for label in first.labels])
     u = _shared([comparison.units.get(name, "") for name in comparison.controls])
-    unit = comparison.measures[key].unit
     if "{y}" in unit:
         unit = unit.replace("{y}", y) if y else ""
     if "{u}" in unit:

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
+    from ctrlplan.studies.worth import Worth
+
 Array = NDArray[np.float64]
 
 
@@ -53,6 +55,8 @@ class Comparison:
         Plans whose metrics come with a reservation, and that reservation.
     measures : dict of str to Measure
         How the metrics are called, in the order in which they are shown.
+    worth : Worth or None
+        The planned reference beside its rivals, where that was asked for.
     """
 
     plans: dict[str, Trajectory]
@@ -67,6 +71,7 @@ class Comparison:
     notes: tuple[str, ...] = ()
     marks: dict[str, str] = field(default_factory=dict)
     measures: dict[str, Measure] = field(default_factory=lambda: dict(MEASURES))
+    worth: Worth | None = None
 
     def __repr__(self) -> str:
         return f"<Comparison of {', '.join(self.plans)}: {self.title}>"
@@ -83,7 +88,7 @@ class Comparison:
             plan: {"metrics": {name: finite_or_none(value) for name, value in found.items()}}
             for plan, found in self.metrics.items()
         }
-        return {"plans": plans}
+        return {"plans": plans} | ({"worth": self.worth.results()} if self.worth is not None else {})
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write metrics, plans and parameters as JSON."""
@@ -142,6 +147,7 @@ def compare(
     units: Mapping[str, str] | None = None,
     title: str = "Step versus planned",
     parameters: Mapping[str, object] | None = None,
+    worth: bool | Mapping[str, Any] = False,
 ) -> Comparison:
     """Run several plans through a loop and measure each response.
 
@@ -187,6 +193,12 @@ def compare(
         Heading.
     parameters : mapping, optional
         What the report should say about how it was made.
+    worth : bool or mapping, optional
+        Whether the report should ask if planning is worth it: a trigonometric
+        plan through the waypoints beside step, trapezoid, S-curve, shaped step,
+        quintic and minimum jerk, in the same time and under the same limits. A
+        mapping gives limits, quantities, mode and whatever else
+        `ctrlplan.studies.worth` takes.
 
     Returns
     -------
@@ -246,6 +258,25 @@ def compare(
                 values |= control_metrics(times, signals[acting_rows], start, acting, only)
         responses[name] = response
         found[name] = values | (path_metrics(plan, points) if only is None else {})
+    beside = None
+    if worth is not False:
+        from ctrlplan.studies.worth import worth as judged
+
+        if not points:
+            raise ValueError("worth needs waypoints, in the place of plans or as waypoints, got none")
+        shared: dict[str, Any] = {
+            "alpha": alpha,
+            "outputs": outputs,
+            "controls": controls,
+            "initial_state": initial_state,
+            "band": band,
+            "params": params,
+            "measures": measures,
+            "units": units,
+        }
+        if measure is not None:
+            shared["measure"] = lambda plan, response, last: measure(plan, response)
+        beside = judged(loop, points, times, **shared | (dict(worth) if isinstance(worth, Mapping) else {}))
     return Comparison(
         plans=references,
         responses=responses,
@@ -260,6 +291,7 @@ def compare(
         notes=(*_notes(unstable, found), *_notes_of_events(responses, stopped)),
         marks={name: f"the run was ended: {event}" for name, event in stopped.items()},
         measures=dict(measures or {}) | MEASURES,
+        worth=beside,
     )
 
 

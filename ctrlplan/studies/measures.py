@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ctrlplan import metrics
+from ctrlplan.planning import SquaredDerivative
 from ctrlplan.trajectories import Trajectory, Waypoint
 
 Array = NDArray[np.float64]
@@ -120,7 +120,7 @@ def path_metrics(plan: Trajectory, waypoints: tuple[Waypoint, ...]) -> dict[str,
         return {}
     t = np.linspace(waypoints[0].time, waypoints[-1].time, 2001)
     path = plan.jet(t, 0)[0]
-    if not plan.duration:  # a step takes no path
+    if plan.jumps(0):  # steps take no path
         names = ("wandering", "excess_variation", "turning_points", "outside_box")
         return dict.fromkeys(names, np.nan) | {"reference_jerk": np.inf}
     return {
@@ -133,20 +133,8 @@ def path_metrics(plan: Trajectory, waypoints: tuple[Waypoint, ...]) -> dict[str,
 
 
 def jerk_cost(plan: Trajectory) -> float:
-    """Integral of the squared jerk, inf where position, velocity or acceleration jumps.
-
-    Sixty-four Gauss points a leg: exact to rounding for every spline of up to
-    some thirty harmonics.
-    """
-    if plan.jumps(2):
-        return np.inf
-    nodes, weights = np.polynomial.legendre.leggauss(64)
-    total = 0.0
-    for left, right in pairwise(plan.breakpoints.tolist()):
-        half = 0.5 * (right - left)
-        jerk = plan.jet(left + half * (nodes + 1.0), 3)[3]
-        total += half * float(weights @ np.sum(jerk**2, axis=0))
-    return total
+    """Integral of the squared jerk, inf where position, velocity or acceleration jumps."""
+    return np.inf if plan.jumps(2) else SquaredDerivative(3)(plan)
 
 
 def _measured(values: dict[str, Callable[[], Any]], labels: tuple[str, ...], only: Wanted) -> dict[str, float]:

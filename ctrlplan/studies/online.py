@@ -10,9 +10,9 @@ from typing import Any
 import control as ct
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import brentq
 
 from ctrlplan import metrics
+from ctrlplan.planning import fastest, margins
 from ctrlplan.simulation import simulate
 from ctrlplan.studies.comparison import Comparison, compare
 from ctrlplan.studies.crane import CRANE, TORQUE_LIMITS, nominal_waypoints
@@ -352,8 +352,7 @@ def _compared(trouble: Trouble, title: str, what: str) -> Comparison:
 
 def _in_time_note(limit: float) -> str:
     """What it is worth to know a limit before one starts."""
-    shortest = brentq(lambda duration: _asked_force(duration) - limit, 15.0, 60.0, xtol=1e-3)
-    seconds = float(np.ceil(10.0 * shortest)) / 10.0
+    seconds = float(np.ceil(10.0 * fastest(_move(), {"F": limit}, CRANE).duration)) / 10.0
     loop = crane_loop(CRANE, _move().retime(seconds), force_limits=(-limit, limit), torque_limits=TORQUE_LIMITS, **_LAW)
     found = online_metrics(_still().final, limit, simulate(loop, np.linspace(0.0, 50.0, 2501)))
     return (
@@ -382,8 +381,6 @@ def _still_at_start() -> Step:
     return Step(START, START, labels=["x", "z"])
 
 
-@cache
-def _asked_force(duration: float = 15.0) -> float:
+def _asked_force() -> float:
     """Greatest force that the move asks of the trolley [N]."""
-    found = _move().retime(duration).extrema_of(lambda jet: CRANE.quantities(jet)["F"], 4)
-    return float(max(-found.minimum[0], found.maximum[0]))
+    return abs(margins(_move(), {"F": 1.0}, CRANE).active.value)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from ctrlplan.studies.comparison import Comparison
 from ctrlplan.studies.ensemble import Ensemble
 from ctrlplan.studies.sweep import Sweep
+from ctrlplan.studies.worth import Grid
 
 
 @dataclass(frozen=True)
@@ -67,6 +68,10 @@ class Study:
         What its own figures need besides.
     wall : ((float, float), (float, float)) or None
         An obstacle to draw: its sides in x and in z [m].
+    claim : tuple of str
+        What became of the claim that the trigonometric path is optimal.
+    grids : tuple of Grid
+        The numbers over alpha and duration that say so.
     """
 
     name: str
@@ -80,6 +85,8 @@ class Study:
     figures: tuple[str, ...] = ("plans", "responses")
     curves: tuple[Curves, ...] = ()
     wall: tuple[tuple[float, float], tuple[float, float]] | None = None
+    claim: tuple[str, ...] = ()
+    grids: tuple[Grid, ...] = ()
 
     def results(self) -> dict[str, Any]:
         """Plain data for ``results.json``."""

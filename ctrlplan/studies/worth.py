@@ -1,0 +1,434 @@
+"""Whether a planned reference is worth it: its rivals, the limits that each keeps, where trigonometric plans win."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import reduce
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ctrlplan.planning import fastest, optimize_waypoints
+from ctrlplan.planning.limits import Limited
+from ctrlplan.simulation import state_space
+from ctrlplan.studies.comparison import Comparison, compare, finite_or_none, is_builder, waypoints_given
+from ctrlplan.studies.measures import MEASURES
+from ctrlplan.trajectories import (
+    PiecewiseSpline,
+    PolySpline,
+    SCurve,
+    Shaper,
+    Step,
+    Trajectory,
+    Trapezoid,
+    TrigSpline,
+    Waypoint,
+)
+
+Array = NDArray[np.float64]
+
+ALPHAS = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0)
+FACTORS = (0.75, 1.0, 1.5, 2.0)
+DECISIVE = ("settling_time", "control_peak")
+PLANNED = "trigonometric"
+_JUMPING = ("step", "shaped step")
+_DEGREES = {1: "straight line", 3: "cubic", 5: "quintic", 7: "septic", 9: "nonic"}
+SAME = 1e-3
+"""Relative difference up to which values count as equal."""
+
+
+@dataclass(frozen=True)
+class Grid:
+    """One number of trigonometric plans over alpha and duration, beside that of their rivals.
+
+    Attributes
+    ----------
+    title, unit : str
+        What it is; less is better.
+    durations : ndarray, shape (ndurations,)
+        Of the plans [s].
+    alphas : ndarray, shape (nalphas,)
+        Shape parameters [rad].
+    values : ndarray, shape (ndurations, nalphas)
+        Of the trigonometric plans.
+    rivals : dict of str to ndarray, shape (ndurations,)
+        Of the others by name.
+    beside : tuple of str
+        Rivals that are shown but do not count: steps, which keep no limit, or
+        a bound that no plan can reach.
+    """
+
+    title: str
+    unit: str
+    durations: Array
+    alphas: Array
+    values: Array
+    rivals: dict[str, Array]
+    beside: tuple[str, ...] = ()
+
+    def best(self, row: int) -> tuple[str, float]:
+        """Rival that does best at one of the durations, and its value."""
+        able = {name: values for name, values in self.rivals.items() if name not in self.beside}
+        found = {name: float(values[row]) for name, values in able.items() if not math.isnan(values[row])}
+        name = min(found, key=lambda rival: found[rival])
+        return name, found[name]
+
+    def marks(self) -> list[list[str]]:
+        """Whether each trigonometric plan wins against its best rival, loses, or neither: "win", "lose", ""."""
+        return [
+            [_mark(value, self.best(row)[1]) for value in values] for row, values in enumerate(self.values.tolist())
+        ]
+
+    @property
+    def verdict(self) -> str:
+        """How often trigonometric plans win and lose, in a sentence."""
+        marks = self.marks()
+        cells = [(i, j) for i in range(len(marks)) for j in range(self.alphas.size) if self.alphas[j] > 0.0]
+        wins = [(i, j) for i, j in cells if marks[i][j] == "win"]
+        losses = sum(marks[i][j] == "lose" for i, j in cells)
+        names = list(dict.fromkeys(self.best(i)[0] for i in range(self.durations.size)))
+        found = f"{self.title}: of {len(cells)} trigonometric plans {len(wins)} win and {losses} lose"
+        found += f" against the best rival ({', '.join(names)})"
+        if wins:
+            shapes = ", ".join(f"{self.alphas[j]:.3g}" for j in sorted({j for _, j in wins}))
+            times = ", ".join(f"{self.durations[i]:.3g} s" for i in sorted({i for i, _ in wins}))
+            found += f"; they win at alpha = {shapes} in {times}"
+        return found + "."
+
+
+@dataclass(frozen=True)
+class Need:
+    """How long a plan takes under the same limits.
+
+    Attributes
+    ----------
+    name : str
+        The plan.
+    duration : float
+        Shortest duration [s], nan where there is none.
+    limit : str
+        What does not let it be shorter, or why there is none.
+    """
+
+    name: str
+    duration: float
+    limit: str
+
+
+@dataclass(frozen=True)
+class Worth:
+    """A planned reference beside its rivals; made by `worth`.
+
+    Attributes
+    ----------
+    comparison : Comparison
+        All through the loop, through the same waypoints in the same time.
+    limits : dict of str to object
+        Limits that all are held to.
+    needs : tuple of Need
+        How long each takes under these limits.
+    grids : tuple of Grid
+        Where trigonometric plans win and lose.
+    """
+
+    comparison: Comparison
+    limits: dict[str, Any]
+    needs: tuple[Need, ...]
+    grids: tuple[Grid, ...]
+
+    @property
+    def verdicts(self) -> tuple[str, ...]:
+        """What was found, in sentences."""
+        return (*([_need_sentence(self.needs)] if self.needs else []), *(grid.verdict for grid in self.grids))
+
+    def results(self) -> dict[str, Any]:
+        """Plain data for ``results.json``."""
+        return {
+            "plans": self.comparison.results()["plans"],
+            "needs": {need.name: finite_or_none(need.duration) for need in self.needs},
+            "grids": [
+                {
+                    "title": grid.title,
+                    "durations": grid.durations.tolist(),
+                    "alphas": grid.alphas.tolist(),
+                    "values": [[finite_or_none(v) for v in row] for row in grid.values.tolist()],
+                    "rivals": {name: [finite_or_none(v) for v in row.tolist()] for name, row in grid.rivals.items()},
+                }
+                for grid in self.grids
+            ],
+        }
+
+
+def worth(
+    loop: Any,
+    waypoints: Iterable[Waypoint],
+    timepts: ArrayLike,
+    *,
+    alpha: float | str = "auto",
+    limits: Mapping[str, Any] | None = None,
+    quantities: Any = None,
+    mode: tuple[float, float] | None = None,
+    alphas: Sequence[float] = ALPHAS,
+    factors: Sequence[float] = FACTORS,
+    decisive: Sequence[str] = DECISIVE,
+    measure: Callable[[Trajectory, Any, float], Mapping[str, float]] | None = None,
+    **options: Any,
+) -> Worth:
+    """Compare a trigonometric plan with what else a designer could send.
+
+    Parameters
+    ----------
+    loop : control system or callable
+        As for `compare`.
+    waypoints : iterable of Waypoint
+        What every plan meets; profiles stop at each of them.
+    timepts : array_like, shape (ntime,)
+        Sample times [s]; longer plans are run longer.
+    alpha : float or "auto", optional
+        Shape parameter of the trigonometric plan.
+    limits, quantities : optional
+        As for `fastest`; unless given, the velocity, acceleration and jerk that
+        the polynomial needs, axis by axis.
+    mode : (float, float), optional
+        Frequency [rad/s] and damping ratio of the mode that shapers are made
+        for: unless given, that of the slowest complex poles where the loop is
+        linear.
+    alphas : sequence of float, optional
+        Shape parameters of the tables [rad].
+    factors : sequence of float, optional
+        Durations of the tables, as multiples of the waypoints' own.
+    decisive : sequence of str, optional
+        Metrics of the tables.
+    measure : callable, optional
+        Maps a plan, its response, and the time of the last waypoint to further metrics.
+    **options
+        As for `compare`.
+
+    Returns
+    -------
+    Worth
+
+    Raises
+    ------
+    ValueError
+        As `compare` and `fastest`.
+    """
+    points = waypoints_given(waypoints)
+    times = np.asarray(timepts, dtype=float)
+    reference = PolySpline(points)
+    held = dict(limits) if limits is not None else _needed_by(reference)
+    shaper = _shaper(loop, reference, mode)
+    shape = TrigSpline(points, alpha=alpha).alpha  # type: ignore[arg-type]
+
+    def compared(points: tuple[Waypoint, ...], plans: dict[str, Trajectory], only: Any = None) -> Comparison:
+        last, late = points[-1].time, points[-1].time - reference.end
+        more = np.arange(times[-1], times[-1] + max(late, 0.0), np.median(np.diff(times)))[1:]
+        return compare(
+            loop,
+            plans,
+            np.concatenate([times, more]),
+            waypoints=points,
+            only=only,
+            measure=None if measure is None else lambda plan, response: measure(plan, response, last),
+            **options,
+        )
+
+    found = compared(points, {PLANNED: TrigSpline(points, alpha=shape)} | rival_plans(points, held, shaper))
+    tables: list[dict[str, dict[str, float]]] = []
+    for factor in factors:
+        scaled = _scaled(points, factor)
+        shapes = {f"{a:g}": TrigSpline(scaled, alpha=a) for a in alphas}
+        rivals = rival_plans(scaled, held, shaper)
+        tables.append(compared(scaled, shapes | rivals, set(decisive)).metrics)
+    grids = tuple(
+        Grid(
+            title={**MEASURES, **found.measures}[key].title,
+            unit=found.measures[key].unit,
+            durations=reference.duration * np.array(factors),
+            alphas=np.array(alphas, dtype=float),
+            values=np.array([[rows[f"{a:g}"][key] for a in alphas] for rows in tables]),
+            rivals={name: np.array([rows[name][key] for rows in tables]) for name in rivals},
+            beside=_JUMPING,
+        )
+        for key in decisive
+    )
+    return Worth(found, held, _needs(points, shape, held, quantities), grids)
+
+
+def rival_plans(
+    waypoints: Sequence[Waypoint], limits: Mapping[str, Any] | None = None, shaper: Shaper | None = None
+) -> dict[str, Trajectory]:
+    """What a designer could send in the place of a trigonometric plan, in the same time.
+
+    Parameters
+    ----------
+    waypoints : sequence of Waypoint
+        Two or more, all positions given.
+    limits : mapping, optional
+        Of velocity, acceleration and jerk, as for `fastest`: profiles have the
+        proportions of the fastest ones under them.
+    shaper : Shaper, optional
+        What step and S-curve are shaped by, for a lightly damped mode.
+
+    Returns
+    -------
+    dict of str to Trajectory
+        step (to the goal at once), trapezoid and S-curve (at rest at every
+        waypoint), shaped step and shaped S-curve where there is a shaper,
+        quintic a leg (or what the entries given make of it), minimum jerk
+        (through the positions); one under both names where they are equal.
+    """
+    points = tuple(waypoints)
+    legs = PiecewiseSpline(points)
+    bounds = _derivative_limits(legs, limits if limits is not None else _needed_by(PolySpline(points)))
+    s_curve = _profile(points, legs.labels, SCurve, bounds)
+    plans: dict[str, Trajectory] = {
+        "step": Step(legs.final, legs.initial, legs.start, legs.labels),
+        "trapezoid": _profile(points, legs.labels, Trapezoid, bounds),
+        "S-curve": s_curve,
+    }
+    if shaper is not None:
+        plans["shaped step"] = shaper(plans["step"])
+        if shaper.duration < 0.9 * s_curve.duration:
+            plans["shaped S-curve"] = shaper(s_curve.retime(s_curve.duration - shaper.duration))
+    # Entries above the acceleration leave minimum jerk nothing to choose.
+    ends = [
+        Waypoint(p.time, *p.jet[:3]) if i in (0, len(points) - 1) else Waypoint(p.time, p.position)
+        for i, p in enumerate(points)
+    ]
+    jerk = optimize_waypoints(ends, 3, labels=legs.labels).plan
+    degree = max(max(leg.degree) for leg in legs.legs)
+    name = f"{_DEGREES.get(degree, f'degree {degree}')}{' a leg' if len(points) > 2 else ''}"
+    t = np.linspace(legs.start, legs.end, 101)
+    if np.abs(jerk.jet(t, 0) - legs.jet(t, 0)).max() <= 1e-9 * np.abs(legs.jet(t, 0)).max():
+        return plans | {f"{name} (minimum jerk)": legs}
+    return plans | {name: legs, "minimum jerk": jerk}
+
+
+def _needed_by(plan: Trajectory) -> dict[str, Any]:
+    """Velocity, acceleration and jerk that a plan needs, axis by axis."""
+    peaks = {order: plan.peak(order) for order in (1, 2, 3)}
+    names = [[label, f"{label}_d1", f"{label}_d2", f"{label}_d3"] for label in plan.labels]
+    return {
+        names[axis][order]: float(peak)
+        for order, values in peaks.items()
+        for axis, peak in enumerate(values)
+        if peak > 1e-9 * values.max()
+    }
+
+
+def _scaled(points: Sequence[Waypoint], factor: float) -> tuple[Waypoint, ...]:
+    """Same waypoints over another duration, passed at speeds in proportion."""
+    start = points[0].time
+    return tuple(point.scaled(start + factor * (point.time - start), 1.0 / factor) for point in points)
+
+
+def _shaper(loop: Any, plan: Trajectory, mode: tuple[float, float] | None) -> Shaper | None:
+    """Shaper with two zeros at a mode: the one given, or the loop's own where it is linear."""
+    if mode is None:
+        if is_builder(loop) or not hasattr(loop, "poles"):
+            return None
+        poles = np.asarray(state_space(loop).poles())
+        swinging = poles[(poles.imag > 0.0) & (poles.real < 0.0)]
+        if not swinging.size:
+            return None
+        slowest = swinging[swinging.real.argmax()]
+        mode = float(abs(slowest)), float(-slowest.real / abs(slowest))
+    return Shaper.zvd(*mode)
+
+
+Limits = tuple[Array, Array, Array]
+"""Velocity, acceleration and jerk, axis by axis; inf where there is none."""
+
+
+def _derivative_limits(plan: Trajectory, limits: Mapping[str, Any]) -> Limits:
+    found = np.full((3, plan.naxes), np.inf)
+    known = {name: limit for name, limit in limits.items() if name in _names(plan)}
+    for bound in Limited(plan, known).bounds if known else ():
+        if bound.axis is not None:
+            found[bound.order - 1, bound.axis] = min(bound.high, -bound.low)
+    return found[0], found[1], found[2]
+
+
+def _names(plan: Trajectory) -> set[str]:
+    return {"velocity", "acceleration", "jerk"} | {f"{label}_d{k}" for label in plan.labels for k in (1, 2, 3)}
+
+
+def _profile(
+    points: Sequence[Waypoint],
+    labels: tuple[str, ...],
+    kind: Callable[..., Trajectory],
+    limits: Limits,
+    timed: bool = True,
+) -> Trajectory:
+    """Profiles from rest to rest, one after the other: each in the time of its leg, or as fast as it can be."""
+    parts: list[Trajectory] = []
+    for first, last in pairwise(points):
+        duration, way = last.time - first.time, np.abs(last.position - first.position)
+        if not way.any():
+            parts.append(PolySpline([Waypoint(p.time, p.position, 0, 0) for p in (first, last)], labels=labels))
+            continue
+        way = np.maximum(way, 1e-9 * way.max())
+        # Where there is no limit, that of a move in equal thirds.
+        velocity, acceleration, jerk = (
+            np.where(np.isfinite(limit), limit, usual * way / duration**order)
+            for order, usual, limit in zip((1, 2, 3), (1.5, 4.5, 27.0), limits, strict=True)
+        )
+        more = {"jerk": jerk} if kind is SCurve else {}
+        part = kind(
+            last.position,
+            first.position,
+            velocity=velocity,
+            acceleration=acceleration,
+            time=first.time,
+            labels=labels,
+            **more,
+        )
+        parts.append(part.retime(duration) if timed else part)
+    return reduce(lambda one, other: one.then(other), parts)
+
+
+def _needs(points: tuple[Waypoint, ...], alpha: float, limits: Mapping[str, Any], quantities: Any) -> tuple[Need, ...]:
+    """Shortest duration of every plan under the same limits."""
+    planned = TrigSpline(points, alpha=alpha)
+    bounds = _derivative_limits(planned, limits)
+    fast = {
+        name: _profile(points, planned.labels, kind, bounds, timed=False)
+        for name, kind in (("trapezoid", Trapezoid), ("S-curve", SCurve))
+    }
+    plans = {PLANNED: planned} | rival_plans(points, limits) | fast
+    return tuple(_need(name, plan, limits, quantities) for name, plan in plans.items())
+
+
+def _need(name: str, plan: Trajectory, limits: Mapping[str, Any], quantities: Any) -> Need:
+    if not plan.duration:
+        return Need(name, math.nan, "jumps: no limit on a derivative holds")
+    try:
+        found = fastest(plan, limits, quantities)
+    except ValueError as refusal:
+        return Need(name, math.nan, str(refusal))
+    active = found.active
+    return Need(name, found.duration, f"{active.bound.name} {active.bound.range}, at {active.time:.3g} s")
+
+
+def _need_sentence(needs: Sequence[Need]) -> str:
+    possible = [need for need in needs if not math.isnan(need.duration)]
+    if not possible:
+        return "Under these limits no plan is possible."
+    first = min(possible, key=lambda need: need.duration)
+    others = ", ".join(f"{need.name} {need.duration:.4g} s" for need in possible if need is not first)
+    never = [need.name for need in needs if math.isnan(need.duration)]
+    without = f"; {', '.join(never)} cannot keep them at any" if never else ""
+    return f"Under the same limits {first.name} is the fastest with {first.duration:.4g} s ({others}{without})."
+
+
+def _mark(value: float, rival: float) -> str:
+    if math.isnan(value) or value == rival:
+        return ""
+    if math.isfinite(value) and abs(value - rival) <= SAME * max(abs(value), abs(rival)):
+        return ""
+    return "win" if value < rival else "lose"

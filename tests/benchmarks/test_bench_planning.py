@@ -1,0 +1,115 @@
+"""Cost of choosing alpha and of the shortest duration, beside scipy in one process; ratios are printed, none asserted.
+
+Wanted on one core: choose_alpha on 12 constraints and 2 axes under 50 ms, fastest on the crane under 0.5 s.
+"""
+
+from itertools import pairwise
+from statistics import median
+from time import perf_counter
+
+import numpy as np
+import pytest
+from scipy.optimize import brentq, minimize_scalar
+
+import ctrlplan as cp
+from ctrlplan.planning import OBJECTIVES
+from ctrlplan.studies.crane import CRANE, nominal_waypoints, obstacle_waypoints
+
+POINTS = obstacle_waypoints()
+PLANS = {
+    "polynomial": cp.PolySpline(nominal_waypoints(5)),
+    "trigonometric": cp.TrigSpline(nominal_waypoints(5), alpha=2.0),
+}
+LIMITS = {"F": (-30e3, 30e3), "C": (-3e3, 1e3)}
+
+
+@pytest.fixture
+def beside(benchmark, capsys, request):
+    """Benchmark ours, then time ours and the peer in turn; print the medians and the median of the ratios."""
+
+    def run(ours, peer, rounds=7):
+        benchmark.pedantic(ours, rounds=rounds, warmup_rounds=1)
+        times = []
+        for _ in range(rounds):
+            seconds = []
+            for function in (ours, peer):
+                begin = perf_counter()
+                function()
+                seconds.append(perf_counter() - begin)
+            times.append(seconds)
+        ratio = median(a / b for a, b in times)
+        benchmark.extra_info["ratio"] = ratio
+        own, other = (1e3 * median(column) for column in zip(*times, strict=True))
+        with capsys.disabled():
+            print(f"\n{request.node.name}: {own:.1f} ms, peer {other:.1f} ms, ratio {ratio:.3f}")
+
+    return run
+
+
+@pytest.mark.benchmark(group="alpha")
+@pytest.mark.parametrize("name", ["path", "wandering", "peak_velocity", "peak_jerk", "squared_jerk"])
+def test_choose_alpha(beside, name):
+    """Peer: bounded minimisation of the same objective from 32 parts of the range."""
+    goal = OBJECTIVES[name]
+
+    def objective(alpha):
+        return goal(cp.TrigSpline(POINTS, alpha=float(alpha)))
+
+    def peer():
+        edges = np.linspace(0.0, 6.25, 33)
+        found = [
+            minimize_scalar(objective, bounds=(a, b), method="bounded", options={"xatol": 1e-7})
+            for a, b in pairwise(edges)
+        ]
+        return min(found, key=lambda result: result.fun)
+
+    best = cp.choose_alpha(POINTS, name)
+    assert best.value <= peer().fun * (1 + 1e-9)
+    beside(lambda: cp.choose_alpha(POINTS, name), peer, rounds=3)
+
+
+@pytest.mark.benchmark(group="fastest")
+@pytest.mark.parametrize("name", PLANS)
+def test_fastest_on_the_crane(beside, name):
+    """Peer: brentq on 2001 samples, which sees no more than those and one crossing."""
+    plan = PLANS[name]
+    start = plan.jet(np.linspace(plan.start, plan.end, 2001), 4)
+
+    def excess(duration):
+        jet = start * (plan.duration / duration) ** np.arange(5)[:, None, None]
+        found = CRANE.quantities(jet)
+        return max(
+            max((found[k].max() - high) / (high - low), (low - found[k].min()) / (high - low))
+            for k, (low, high) in LIMITS.items()
+        )
+
+    def peer():
+        return brentq(excess, 4.0, 100.0, xtol=1e-12)
+
+    best = cp.fastest(plan, LIMITS, CRANE)
+    assert best.duration == pytest.approx(peer(), rel=1e-4)
+    assert best.margins.hold
+    beside(lambda: cp.fastest(plan, LIMITS, CRANE), peer)
+
+
+@pytest.mark.benchmark(group="fastest")
+@pytest.mark.parametrize("hold", ["shape", "waypoints", "path"])
+def test_fastest_within_limits_of_derivatives(beside, hold):
+    """Peer: brentq on 2001 samples of the retimed plan."""
+    plan = cp.TrigSpline(POINTS, alpha=4.0)
+    limits = {"velocity": 5.0, "acceleration": 3.0}
+
+    def excess(duration):
+        jet = np.abs(plan.retime(duration).jet(np.linspace(plan.start, plan.start + duration, 2001), 2))
+        return max(jet[1].max() / 5.0, jet[2].max() / 3.0) - 1.0
+
+    def peer():
+        return brentq(excess, 1.0, 100.0, xtol=1e-12)
+
+    best = cp.fastest(plan, limits, hold=hold)
+    assert best.margins.hold
+    if hold == "shape":
+        assert best.duration == pytest.approx(peer(), rel=1e-5)
+    if hold == "path":
+        assert best.duration <= peer() * (1 + 1e-6)
+    beside(lambda: cp.fastest(plan, limits, hold=hold), peer, rounds=3)
