@@ -80,11 +80,11 @@ class Fastest:
     def _sets(self) -> str:
         return "feasible: " + ", ".join(f"{low:.6g} to {high:.6g} s" for low, high in self.feasible)
 
-    def plot(self) -> Figure:
-        """Every limited signal over time with its limits."""
+    def plot(self, units: Mapping[str, str] | None = None) -> Figure:
+        """Every limited signal over time with its limits; units by the signals' names."""
         from ctrlplan.reports.planning_figures import plot_limits
 
-        return plot_limits(self.plan, self.limited)
+        return plot_limits(self.plan, self.limited, units)
 
 
 def fastest(
@@ -137,7 +137,8 @@ def fastest(
     1 needs no acceleration at T = 1, and some at 0.8 and at 2). Durations are
     looked at 24 times an octave on samples, valleys between them are searched,
     and the ends of every feasible interval are solved for with the extrema of
-    the whole plan. What is returned holds every limit to the last bit.
+    the whole plan. What is returned holds every limit to the last bit; where a
+    limit is touched at rest, to rounding.
 
     Examples
     --------

@@ -97,6 +97,8 @@ class Margin:
     def share(self) -> str:
         """Margin in words: in percent, or as it is where the limit is a lone 0."""
         size = abs(self.fraction)
+        if size < 1e-9:
+            return "nothing"
         lone_zero = math.isinf(self.bound.high - self.bound.low) and self.bound.scale == 1.0
         return f"{size:.4g}" if lone_zero else f"{100.0 * size:.3g} %"
 

@@ -63,13 +63,13 @@ class _Law:
     """Clocks of a plan, by the logarithms of their rates' coefficients."""
 
     def __init__(self, plan: Trajectory, limited: Limited) -> None:
-        self._knots = _graded(_PIECES, limited.order)
+        self._knots = _graded(_PIECES, limited)
         knots = np.concatenate([np.zeros(4), self._knots, np.ones(4)])
         self.size = _PIECES + 4
         passed = BSpline(knots, np.eye(self.size), 4).antiderivative()
         self._plan, self._limited = plan, limited
         self.weights = passed(1.0)
-        samples = _graded(_SAMPLES - 1, limited.order)
+        samples = _graded(_SAMPLES - 1, limited)
         orders = range(limited.order + 1)
         # Taylor coefficients of the clock at the samples, in parts of the duration.
         self._basis = np.stack([passed(samples, nu=k) / FACTORIALS[k] for k in orders])
@@ -134,10 +134,12 @@ class _Law:
         return room.reshape(len(rows) * _SAMPLES, logs.shape[1])
 
 
-def _graded(count: int, order: int) -> Array:
+def _graded(count: int, limited: Limited) -> Array:
     """Numbers from 0 to 1; closer at both ends, where a plan that starts slowly needs a clock that starts fast.
 
-    Higher derivatives than the second forbid that, and would be rounding on short pieces.
+    Limits on more than accelerations do not let it, and would be rounding on short pieces.
     """
     even = np.linspace(0.0, 1.0, count + 1)
-    return even**2 / (even**2 + (1.0 - even) ** 2) if order <= 2 else even
+    if limited.derivatives_only and limited.order <= 2:
+        return even**2 / (even**2 + (1.0 - even) ** 2)
+    return even

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ctrlplan.reports.style import house_style, legend_above, line_styles, new_figure, stacked_axes
 from ctrlplan.studies.comparison import Comparison
-from ctrlplan.studies.crane import CRANE, FORCE_LIMITS, TORQUE_LIMITS, nominal_waypoints
+from ctrlplan.studies.crane_setup import CRANE, FORCE_LIMITS, TORQUE_LIMITS, nominal_waypoints
 from ctrlplan.studies.measures import signals_of
 from ctrlplan.studies.study import Study
 from ctrlplan.systems.plants import crane_loop

@@ -18,6 +18,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescap
 from markupsafe import Markup
 
 import ctrlplan
+from ctrlplan.planning import Fastest
 from ctrlplan.reports.crane_figures import Wall, animation_data, is_crane, plot_curves
 from ctrlplan.reports.figures import FIGURES
 from ctrlplan.reports.planning_figures import plot_rivals
@@ -177,6 +178,30 @@ def _section(study: Study) -> dict[str, Any]:
         "worth": None if comparison.worth is None else _worth(comparison.worth, study.name),
         "claim": study.claim,
         "grids": [_grid(grid, grid.unit) for grid in study.grids],
+        "fastest": None if study.fastest is None else _fastest(study.fastest, study),
+    }
+
+
+def _fastest(found: Fastest, study: Study) -> dict[str, Any]:
+    """The section on a plan as fast as limits allow."""
+    units = study.comparison.units
+    return {
+        "duration": number(found.duration),
+        "limit": found.active.bound.name,
+        "time": number(found.active.time),
+        "rows": [
+            {
+                "name": row.bound.name,
+                "unit": units.get(row.bound.name, ""),
+                "range": row.bound.range,
+                "value": number(row.value),
+                "time": number(row.time),
+                "left": row.share,
+            }
+            for row in found.margins
+        ],
+        "svg": Markup(to_svg(found.plot(units), f"{study.name}-fastest")),  # noqa: S704 (our own drawing)
+        "caption": "Every limited signal of the fastest plan, and where it comes nearest to its limits (dashed).",
     }
 
 
@@ -185,6 +210,7 @@ def _worth(worth: Worth, name: str) -> dict[str, Any]:
     least = min((need.duration for need in worth.needs if math.isfinite(need.duration)), default=math.nan)
     return {
         "verdicts": worth.verdicts,
+        "note": worth.note,
         "svg": Markup(to_svg(plot_rivals(worth.comparison), f"{name}-worth")),  # noqa: S704 (our own drawing)
         "caption": "References through the same waypoints in the same time, what the loop makes of them, and what "
         "that asks of its controls.",

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
@@ -38,7 +40,7 @@ def plot_alpha_choice(choice: AlphaChoice) -> Figure:
 
 
 @house_style
-def plot_limits(plan: Trajectory, limited: Limited) -> Figure:
+def plot_limits(plan: Trajectory, limited: Limited, units: Mapping[str, str] | None = None) -> Figure:
     """Every limited signal of a plan over time, with its limits and where it comes nearest to them."""
     bounds = limited.bounds
     figure = new_figure(6.4, 0.9 + 1.5 * len(bounds))
@@ -55,7 +57,7 @@ def plot_limits(plan: Trajectory, limited: Limited) -> Figure:
             # A limit far away would flatten the curve: it is named in the title instead.
             if np.isfinite(side) and min(abs(side - row.min()), abs(side - row.max())) < 1.5 * span:
                 axes.axhline(side, color=_LIMIT, linestyle=(0, (4, 2)), linewidth=1.0)
-        axes.set_ylabel(bound.name)
+        axes.set_ylabel(with_unit(bound.name, (units or {}).get(bound.name)))
         axes.set_title(f"{bound.range}; {margin.share} left", loc="left", fontsize=8)
     rows[-1].set_xlabel("time [s]")
     return figure

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -11,57 +12,39 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctrlplan import metrics
+from ctrlplan.planning import avoid
 from ctrlplan.simulation import simulate
+from ctrlplan.studies.choosing import (
+    LOAD_RADIUS,
+    MARGIN,
+    WALLS,
+    clearance_note,
+    fastest_notes,
+    nominal_fastest,
+    nominal_worth,
+    optimality_claim,
+    optimality_grids,
+)
 from ctrlplan.studies.comparison import Comparison, compare
-from ctrlplan.studies.measures import Measure, signals_of
+from ctrlplan.studies.crane_setup import (
+    CRANE,
+    CRANE_MEASURES,
+    FORCE_LIMITS,
+    TORQUE_LIMITS,
+    UNITS,
+    WALL,
+    first_order_waypoints,
+    load_metrics,
+    marked_slack,
+    nominal_waypoints,
+    obstacle_waypoints,
+)
+from ctrlplan.studies.measures import signals_of
 from ctrlplan.studies.study import Curves, Study
-from ctrlplan.systems.plants import Crane, crane_loop
+from ctrlplan.systems.plants import crane_loop
 from ctrlplan.trajectories import PiecewiseSpline, PolySpline, Step, Trajectory, TrigSpline, Waypoint
 
 Array = NDArray[np.float64]
-
-CRANE = Crane()
-FORCE_LIMITS = (-30e3, 30e3)
-TORQUE_LIMITS = (-3e3, 1e3)
-WALL = ((7.0, 13.0), (6.5, 12.0))
-"""The obstacle of the third simulation: sides in x and in z (down) [m]."""
-
-CRANE_MEASURES = {
-    "error_travel": Measure("Greatest error of the load on the way", "m"),
-    "error_after": Measure("Greatest error of the load afterwards", "m"),
-    "sway_after": Measure("Greatest sway afterwards", "rad"),
-    "force_peak": Measure("Greatest force asked of the trolley", "N"),
-    "error_limited": Measure("Greatest error with the drives limited", "m"),
-    "slack_time": Measure("Time with a slack rope", "s"),
-    "path_length": Measure("Length of the planned path", "m"),
-    "load_path": Measure("Length of the load's path", "m"),
-}
-
-_UNITS = {"x": "m", "z": "m", "F": "N", "C": "N m", "theta": "rad", "T": "N"}
-
-
-def nominal_waypoints(rest: int = 3) -> tuple[Waypoint, Waypoint]:
-    """First simulation: 20 m across and 1 m down in 15 s, `rest` entries prescribed at both ends."""
-    still = [0.0] * (rest - 1)
-    return (
-        Waypoint.from_jets(0.0, x=[0.0, *still], z=[10.0, *still]),
-        Waypoint.from_jets(15.0, x=[20.0, *still], z=[11.0, *still]),
-    )
-
-
-def first_order_waypoints() -> tuple[Waypoint, Waypoint]:
-    """Second simulation: only the two positions, in 30 s."""
-    return Waypoint.from_jets(0.0, x=[0.0], z=[10.0]), Waypoint.from_jets(30.0, x=[20.0], z=[11.0])
-
-
-def obstacle_waypoints(duration: float = 16.0) -> tuple[Waypoint, ...]:
-    """Third simulation: over a wall, through A at 6 s and B at 11 s."""
-    return (
-        Waypoint.from_jets(0.0, x=[0.0, 0.0, 0.0], z=[10.0, 0.0, 0.0]),
-        Waypoint.from_jets(6.0, x=[5.0, 1.0, 0.1], z=[5.0, -1.0, -0.15]),
-        Waypoint.from_jets(11.0, x=[15.0, 2.0, 0.1], z=[5.0, 1.0, 1.0]),
-        Waypoint.from_jets(duration, x=[20.0, 0.0, 0.0], z=[11.0, 0.0, 0.0]),
-    )
 
 
 def crane_nominal_study(progress: bool = True) -> Study:
@@ -79,6 +62,8 @@ def crane_nominal_study(progress: bool = True) -> Study:
     }
     found = _compared(plans, points, 30.0, "Crane, nominal case (simulation 1)")
     poly, trig = found.metrics["polynomial"], found.metrics["trigonometric"]
+    found = replace(found, worth=nominal_worth())
+    limited = nominal_fastest()
     whole = found.metrics["C4 polynomial, dynamic law"]
     grows, damped = _slowest(_linear_loop("generator")), _slowest(_linear_loop("load_feedback"))
     return Study(
@@ -104,7 +89,9 @@ def crane_nominal_study(progress: bool = True) -> Study:
             f"The whole law (9)-(11), by dynamic extension, follows a plan of ten constraints to "
             f"{whole['error_travel']:.1g} m on the nominal model; so does its open-loop half, without any feedback to "
             "correct what is not nominal.",
+            *fastest_notes(limited),
         ),
+        fastest=limited,
         figures=("crane-sketch", "crane-blocks", "crane-time", "crane-step", "crane-motion", "crane-sway"),
         curves=(_sway_curves(),),
     )
@@ -157,11 +144,13 @@ def crane_obstacle_study(progress: bool = True) -> Study:
         "polynomial": (PolySpline(points), {}),
         "trigonometric": (TrigSpline(points, alpha=4.0), {}),
         "piecewise": (PiecewiseSpline(points), {}),
+        "via points chosen": (avoid(PolySpline([points[0], points[-1]]), WALLS, **_KEPT), {}),
     }
     found = _compared(plans, points, 30.0, "Crane, obstacle (simulation 3)")
     rows = found.metrics
     polyline = float(np.sum(np.hypot(*np.diff(np.array([w.position for w in points]).T, axis=1))))
     lengths = {name: rows[name]["path_length"] for name in ("polynomial", "trigonometric", "piecewise")}
+    grids = optimality_grids()
     return Study(
         "crane-obstacle",
         "Crane: over an obstacle (simulation 3, figure 6)",
@@ -181,15 +170,26 @@ def crane_obstacle_study(progress: bool = True) -> Study:
             f"The paper's other approach, one quintic a leg, takes {lengths['piecewise']:.2f} m and "
             f"{_verdict_on_legs()} What it costs is a jump of the jerk at A and B; the load follows it within "
             f"{1e3 * rows['piecewise']['error_travel']:.2g} mm.",
+            f"The paper gives A and B. Without them, a load of {LOAD_RADIUS:g} m radius, its rope, and {MARGIN:g} m of "
+            f"clearance, the via points are found: {_via_points(found.plans['via points chosen'])}; the path has "
+            f"{rows['via points chosen']['path_length']:.2f} m. {clearance_note(found.plans)}",
             _step_note(found),
             _limits_note(found),
         ),
         figures=("crane-plane", "crane-time", "crane-curves", "crane-motion"),
         curves=(_length_curves(),),
         wall=WALL,
+        claim=optimality_claim(grids),
+        grids=grids,
     )
 
 
+def _via_points(plan: Trajectory) -> str:
+    """Where and when a plan passes between its ends."""
+    return ", ".join(f"({w.position[0]:.3g}, {w.position[1]:.3g}) m at {w.time:.3g} s" for w in plan.waypoints[1:-1])
+
+
+_KEPT: dict[str, Any] = {"clearance": MARGIN, "load": LOAD_RADIUS, "rope": CRANE.rope()}
 _STEP: dict[str, Any] = {"law": "still", "force_limits": FORCE_LIMITS, "torque_limits": TORQUE_LIMITS}
 
 
@@ -222,22 +222,11 @@ def _compared(
         waypoints=points,
         measure=measure,
         measures=CRANE_MEASURES,
-        units=_UNITS,
+        units=UNITS,
         title=title,
         parameters=_parameters(t_end),
     )
     return marked_slack(found)
-
-
-def marked_slack(found: Comparison) -> Comparison:
-    """Comparison with a mark on every plan whose rope goes slack."""
-    slack = {name: values["slack_time"] for name, values in found.metrics.items() if values["slack_time"] > 0.0}
-    return found.marked(
-        {
-            name: f"the rope is slack for {time:.2g} s; from then on the model is no crane"
-            for name, time in slack.items()
-        }
-    )
 
 
 def _limited_error(plan: Trajectory, options: dict[str, Any], timepts: Array) -> float:
@@ -258,48 +247,6 @@ def _limits_note(found: Comparison) -> str:
         f"their acceleration or speed begins and ends with a jump. With the step's limits (30 kN) their greatest "
         f"errors are: {errors}."
     )
-
-
-def load_metrics(plan: Trajectory, response: Any, last: float) -> dict[str, float]:
-    """Metrics of the load against its plan, the way before `last` [s] and the time after.
-
-    Parameters
-    ----------
-    plan : Trajectory
-        Plan of x and z.
-    response : control.TimeResponseData
-        Of a `crane_loop`.
-    last : float
-        Time of the last waypoint [s].
-
-    Returns
-    -------
-    dict of str to float
-        The keys of `CRANE_MEASURES`.
-    """
-    t = np.asarray(response.time)
-    signals = signals_of(response)
-    load = np.stack([signals["x"], signals["z"]])
-    error = np.hypot(*(load - plan.jet(t, 0)[0]))
-    way, after = t <= last, t >= last
-    travelled = plan.jet(np.linspace(plan.start, plan.end, 4001), 0)[0] if plan.duration else None
-    slack = float(metrics.saturation_time(t, signals["T"], 0.0, np.inf))
-    return {
-        "error_travel": _peak(t[way], error[way]),
-        "error_after": _peak(t[after], error[after]),
-        "sway_after": _peak(t[after], signals["theta"][after]),
-        "force_peak": _peak(t, signals["F"]),
-        "slack_time": slack,
-        "path_length": np.nan
-        if travelled is None
-        else float(metrics.path_length(np.linspace(plan.start, plan.end, 4001), travelled)),
-        "load_path": float(metrics.path_length(t, load)),
-    }
-
-
-def _peak(t: Array, values: Array) -> float:
-    """Greatest magnitude, nan of a record too short to have one."""
-    return float(metrics.peak(t, values)) if t.size > 1 else np.nan
 
 
 def _parameters(t_end: float) -> dict[str, object]:

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctrlplan.studies.comparison import compare, standard_plans
-from ctrlplan.studies.crane import CRANE_MEASURES, load_metrics, marked_slack
+from ctrlplan.studies.crane_setup import CRANE_MEASURES, load_metrics, marked_slack
 from ctrlplan.studies.study import Study
 from ctrlplan.systems.plants import LAWS, Crane, crane_loop, unity_feedback_loop
 from ctrlplan.trajectories import PiecewiseSpline, PolySpline, Step, Trajectory, TrigSpline, Waypoint

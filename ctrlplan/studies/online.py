@@ -15,7 +15,7 @@ from ctrlplan import metrics
 from ctrlplan.planning import fastest, margins
 from ctrlplan.simulation import simulate
 from ctrlplan.studies.comparison import Comparison, compare
-from ctrlplan.studies.crane import CRANE, TORQUE_LIMITS, nominal_waypoints
+from ctrlplan.studies.crane_setup import CRANE, TORQUE_LIMITS, UNITS, nominal_waypoints
 from ctrlplan.studies.measures import Measure, signals_of
 from ctrlplan.studies.study import Study
 from ctrlplan.systems import (
@@ -47,7 +47,6 @@ ONLINE_MEASURES = {
 }
 
 START = nominal_waypoints(1)[0].position
-_UNITS = {"x": "m", "z": "m", "F": "N", "C": "N m", "theta": "rad", "T": "N"}
 _LAW: dict[str, Any] = {"law": "load_feedback", "load_bandwidth": 0.5}
 _FILTER, _LAGS = 0.8, 5
 """Bandwidth [rad/s] and order of the filter behind the governor: references of force that is continuous."""
@@ -332,7 +331,7 @@ def _compared(trouble: Trouble, title: str, what: str) -> Comparison:
         params=trouble.params,
         measure=measure,
         measures=ONLINE_MEASURES,
-        units=_UNITS,
+        units=UNITS,
         title=title,
         parameters={
             "trouble": what,

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ctrlplan.planning import Fastest
 from ctrlplan.studies.comparison import Comparison
 from ctrlplan.studies.ensemble import Ensemble
 from ctrlplan.studies.sweep import Sweep
@@ -72,6 +73,8 @@ class Study:
         What became of the claim that the trigonometric path is optimal.
     grids : tuple of Grid
         The numbers over alpha and duration that say so.
+    fastest : Fastest or None
+        A plan as fast as limits allow.
     """
 
     name: str
@@ -87,6 +90,7 @@ class Study:
     wall: tuple[tuple[float, float], tuple[float, float]] | None = None
     claim: tuple[str, ...] = ()
     grids: tuple[Grid, ...] = ()
+    fastest: Fastest | None = None
 
     def results(self) -> dict[str, Any]:
         """Plain data for ``results.json``."""

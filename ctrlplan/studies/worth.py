@@ -133,12 +133,15 @@ class Worth:
         How long each takes under these limits.
     grids : tuple of Grid
         Where trigonometric plans win and lose.
+    note : str
+        What a reader must know of how it was made.
     """
 
     comparison: Comparison
     limits: dict[str, Any]
     needs: tuple[Need, ...]
     grids: tuple[Grid, ...]
+    note: str = ""
 
     @property
     def verdicts(self) -> tuple[str, ...]:
@@ -176,6 +179,7 @@ def worth(
     factors: Sequence[float] = FACTORS,
     decisive: Sequence[str] = DECISIVE,
     measure: Callable[[Trajectory, Any, float], Mapping[str, float]] | None = None,
+    note: str = "",
     **options: Any,
 ) -> Worth:
     """Compare a trigonometric plan with what else a designer could send.
@@ -205,6 +209,8 @@ def worth(
         Metrics of the tables.
     measure : callable, optional
         Maps a plan, its response, and the time of the last waypoint to further metrics.
+    note : str, optional
+        What a reader must know of how it was made.
     **options
         As for `compare`.
 
@@ -256,7 +262,7 @@ def worth(
         )
         for key in decisive
     )
-    return Worth(found, held, _needs(points, shape, held, quantities), grids)
+    return Worth(found, held, _needs(points, shape, held, quantities), grids, note)
 
 
 def rival_plans(
@@ -296,11 +302,9 @@ def rival_plans(
         if shaper.duration < 0.9 * s_curve.duration:
             plans["shaped S-curve"] = shaper(s_curve.retime(s_curve.duration - shaper.duration))
     # Entries above the acceleration leave minimum jerk nothing to choose.
-    ends = [
-        Waypoint(p.time, *p.jet[:3]) if i in (0, len(points) - 1) else Waypoint(p.time, p.position)
-        for i, p in enumerate(points)
-    ]
-    jerk = optimize_waypoints(ends, 3, labels=legs.labels).plan
+    ends = (0, len(points) - 1)
+    freed = [point.truncated(2 if i in ends else 0) for i, point in enumerate(points)]
+    jerk = optimize_waypoints(freed, 3, labels=legs.labels).plan
     degree = max(max(leg.degree) for leg in legs.legs)
     name = f"{_DEGREES.get(degree, f'degree {degree}')}{' a leg' if len(points) > 2 else ''}"
     t = np.linspace(legs.start, legs.end, 101)

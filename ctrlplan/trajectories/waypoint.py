@@ -155,6 +155,10 @@ class Waypoint(Frozen):
         powers = rate ** np.arange(len(self.jet))
         return Waypoint._of(checked_time(time, "time"), self.jet * powers[:, None], self.labels)
 
+    def truncated(self, order: int) -> Waypoint:
+        """Same point with what it prescribes up to an order, and the rest left free."""
+        return Waypoint._of(self.time, self.jet[: order + 1], self.labels)
+
     def to_dict(self) -> dict[str, Any]:
         """Plain data: time, jet by order then axis (None where free)."""
         jet = [[None if v != v else v for v in row] for row in self.jet.tolist()]

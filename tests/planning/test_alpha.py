@@ -427,7 +427,8 @@ def test_a_choice_stands_for_its_alpha():
         found.alpha = 0.0
 
 
-@settings(deadline=None, max_examples=3)
+@pytest.mark.slow
+@settings(deadline=None, max_examples=8)
 @given(
     size=st.floats(1e-6, 1e6),
     duration=st.floats(1e-6, 1e6),

@@ -196,7 +196,9 @@ CRANE_LIMITS = {
 
 
 @pytest.mark.parametrize("name", CRANE_LIMITS)
-@pytest.mark.parametrize("plan", [HOIST, HOIST_TRIG], ids=["polynomial", "trigonometric"])
+@pytest.mark.parametrize(
+    "plan", [HOIST, pytest.param(HOIST_TRIG, marks=pytest.mark.slow)], ids=["polynomial", "trigonometric"]
+)
 def test_crane(plan, name):
     limits = CRANE_LIMITS[name]
     found = fastest(plan, limits, CRANE)

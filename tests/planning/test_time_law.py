@@ -138,6 +138,7 @@ def test_a_line_at_constant_speed_stays_one():
     np.testing.assert_allclose(np.hypot(*found.plan([0.1, 1.3, 2.4], 1)), 2.0, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_unequal_sides_turn_the_trapezoid():
     # Braking is twice as hard as speeding up: d/v + v/2 (1/a + 1/b).
     distance, velocity, up, down = 10.0, 1.0, 0.5, 1.0
@@ -196,6 +197,7 @@ def test_crane_forces_hold_on_the_new_clock(force):
     np.testing.assert_allclose(ends[1:], 0.0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_sway_is_limited_on_the_path():
     path = fastest(PLANS["obstacle"], {"theta": 0.08, "velocity": 3.0}, CRANE, hold="path")
     x, z = sampled(path.plan, 2).transpose(1, 0, 2)

@@ -1,0 +1,181 @@
+"""What is chosen for the crane: durations under limits, and whether the paper's path is the best there is."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from ctrlplan.planning import (
+    Fastest,
+    Rectangle,
+    SquaredDerivative,
+    choose_alpha,
+    clearance,
+    fastest,
+    optimize_waypoints,
+    path_length,
+)
+from ctrlplan.studies.crane_setup import (
+    CRANE,
+    CRANE_MEASURES,
+    FORCE_LIMITS,
+    TORQUE_LIMITS,
+    UNITS,
+    WALL,
+    load_metrics,
+    nominal_waypoints,
+    obstacle_waypoints,
+)
+from ctrlplan.studies.worth import Grid, Worth, worth
+from ctrlplan.systems.plants import crane_loop
+from ctrlplan.trajectories import PiecewiseSpline, Trajectory, TrigSpline, Waypoint
+
+LOAD_RADIUS, MARGIN = 0.5, 0.3
+"""Radius of the load, and the clearance that it and its rope keep [m]."""
+WALLS = (Rectangle(*WALL),)
+_LIMITS = {"F": 5e3, "C": TORQUE_LIMITS, "T": (0.0, None), "theta": 0.1, "R": (1.0, 12.0)}
+_COMFORT = {"velocity": 2.5, "acceleration": 0.6, "jerk": 0.4, "theta": 0.06, "R": (1.0, 12.0)}
+_POLYLINE = "polyline (no path is shorter)"
+
+
+def nominal_worth() -> Worth:
+    """The nominal move beside its rivals: plans through the flat map, profiles and steps straight to the drives."""
+
+    def build(name: str, plan: Trajectory) -> Any:
+        straight = name.startswith(("step", "trapezoid", "S-curve", "shaped"))
+        law = "still" if straight else "generator"
+        return crane_loop(CRANE, plan, law, force_limits=FORCE_LIMITS, torque_limits=TORQUE_LIMITS)
+
+    depth = float(np.mean([point.position[1] for point in nominal_waypoints()]))
+    return worth(
+        build,
+        nominal_waypoints(),
+        np.linspace(0.0, 40.0, 2001),
+        alpha=1.0,
+        limits=_COMFORT,
+        quantities=CRANE,
+        mode=(math.sqrt(CRANE.gravity / depth), 0.0),
+        alphas=(0.0, 1.0, 2.0, 3.0, 4.0),
+        factors=(0.75, 1.0, 1.5),
+        decisive=("settling_time", "sway_after", "force_peak"),
+        measure=load_metrics,
+        measures=CRANE_MEASURES,
+        controls=("F", "C"),
+        units=UNITS,
+        title="Crane, nominal case: planned beside its rivals",
+        note="Splines go to the drives through the flat map of the load (figure 3); profiles and steps, shaped for the "
+        "pendulum or not, go there as if the load hung at rest, as is usual. All drives are limited.",
+    )
+
+
+@cache
+def nominal_fastest() -> Fastest:
+    """The nominal move with ten constraints an axis, as fast as 5 kN and the other limits allow."""
+    return fastest(TrigSpline(nominal_waypoints(5), alpha=1.0), _LIMITS, CRANE)
+
+
+def fastest_notes(found: Fastest) -> tuple[str, ...]:
+    """What limits make of the nominal move, on its own time law and on another."""
+    law = fastest(found.plan, _LIMITS, CRANE, hold="path")
+    others = ", ".join(f"{row.bound.name} {row.share}" for row in found.margins.rows[1:])
+    active = found.active
+    return (
+        f"Within 5 kN, 0.1 rad of sway and 12 m of rope the ten-constraint move takes {found.duration:.4g} s at least: "
+        f"{active.bound.name} is at its limit at {active.time:.3g} s. What the other limits leave: {others}. The same "
+        f"path on another time law takes {law.duration:.4g} s, with {law.active.bound.name} at its limit at "
+        f"{law.active.time:.3g} s.",
+    )
+
+
+@cache
+def optimality_grids() -> tuple[Grid, Grid]:
+    """Length and squared jerk of one trigonometric spline through the paper's waypoints, over alpha and end time."""
+    ends, alphas = np.array([14.0, 15.0, 16.0, 17.0, 18.0, 20.0]), np.array([0.0, 1.0, 2.0, 3.0, 4.0, 4.5, 5.0])
+    shapes, rivals = [], []
+    for end in ends.tolist():
+        points = obstacle_waypoints(end)
+        shapes.append([TrigSpline(points, alpha=a) for a in alphas.tolist()])
+        rivals.append(
+            {
+                "quintic a leg (minimum jerk)": PiecewiseSpline(points),
+                "minimum jerk through the positions": _freed(points),
+                "shortest of one trigonometric spline a leg": choose_alpha(points, family=PiecewiseSpline).plan,
+            }
+        )
+    polyline = [_polyline(obstacle_waypoints(end)) for end in ends.tolist()]
+    jerk = SquaredDerivative(3)
+    return (
+        Grid(
+            "Length of the path",
+            "m",
+            ends,
+            alphas,
+            np.array([[path_length(plan) for plan in row] for row in shapes]),
+            {name: np.array([path_length(row[name]) for row in rivals]) for name in rivals[0]}
+            | {_POLYLINE: np.array(polyline)},
+            beside=(_POLYLINE,),
+        ),
+        Grid(
+            "Integral of the squared jerk",
+            "m²/s⁵",
+            ends,
+            alphas,
+            np.array([[jerk(plan) for plan in row] for row in shapes]),
+            {name: np.array([jerk(row[name]) for row in rivals]) for name in rivals[0]},
+        ),
+    )
+
+
+def optimality_claim(grids: tuple[Grid, Grid]) -> tuple[str, ...]:
+    """What becomes of the paper's claim that the trigonometric path is optimal."""
+    length, jerk = grids
+    row = int(np.flatnonzero(length.durations == 16.0)[0])
+    best = choose_alpha(obstacle_waypoints())
+    rival, shortest = length.best(row)
+    bound = float(length.rivals[_POLYLINE][row])
+    wins = sum(mark == "win" for grid in grids for marks in grid.marks() for mark in marks[1:])
+    cells = sum(grid.values[:, 1:].size for grid in grids)
+    polynomial = int((length.values[:, 1:] < length.values[:, :1] * (1.0 - 1e-3)).sum())
+    rest = choose_alpha(nominal_waypoints())
+    fails = "fails" if not wins else f"holds in {wins} of {cells} cases, and fails in the others"
+    return (
+        f"The paper calls its trigonometric path optimal. Over {cells // 2} pairs of alpha and end time, against "
+        f"minimum jerk and the shortest plan known through the same waypoints, the claim {fails}.",
+        f"Length: with 16 s the shortest trigonometric path through A and B has alpha = {best.alpha:.4g} and "
+        f"{best.value:.4g} m; {rival} has {shortest:.4g} m, and no path is shorter than the polyline's {bound:.4g} m. "
+        f"Against the one polynomial through all of them it is shorter in {polynomial} of {length.values[:, 1:].size} "
+        "cases: that is what the paper compared with.",
+        "Jerk: one quintic a leg has the least squared jerk of all plans through these entries, which is a theorem; "
+        f"at 16 s it has {jerk.rivals['quintic a leg (minimum jerk)'][row]:.3g} m²/s⁵, the best trigonometric plan of "
+        f"the table {jerk.values[row, 1:].min():.3g}.",
+        f"From rest to rest, as in simulation 1, the path is a straight line of {rest.value:.4g} m whatever the alpha "
+        f"below pi: it is the shortest, and so is every other; the least squared jerk is the polynomial's "
+        f"(alpha = {rest.alpha:g}).",
+        length.verdict,
+        jerk.verdict,
+    )
+
+
+def clearance_note(plans: Mapping[str, Trajectory]) -> str:
+    """How near each plan comes to the wall, with load and rope."""
+    found = {
+        name: clearance(plan, WALLS, load=LOAD_RADIUS, rope=CRANE.rope())
+        for name, plan in plans.items()
+        if plan.duration
+    }
+    parts = ", ".join(f"{name} {least.least:.2f} m ({least.part})" for name, least in found.items())
+    return f"Certified over the whole way, load and rope keep from the wall: {parts}."
+
+
+def _freed(points: tuple[Waypoint, ...]) -> Trajectory:
+    """Minimum jerk through the positions of inner waypoints."""
+    return optimize_waypoints([points[0], *(point.truncated(0) for point in points[1:-1]), points[-1]]).plan
+
+
+def _polyline(points: tuple[Waypoint, ...]) -> float:
+    corners = np.array([w.position for w in points])
+    return float(np.hypot(*np.diff(corners, axis=0).T).sum())
