@@ -245,11 +245,13 @@ def worth(
 
     found = compared(points, {PLANNED: TrigSpline(points, alpha=shape)} | rival_plans(points, held, shaper))
     tables: list[dict[str, dict[str, float]]] = []
+    names: dict[str, None] = {}  # a move can be too short to be shaped
     for factor in factors:
         scaled = _scaled(points, factor)
         shapes = {f"{a:g}": TrigSpline(scaled, alpha=a) for a in alphas}
         rivals = rival_plans(scaled, held, shaper)
         tables.append(compared(scaled, shapes | rivals, set(decisive)).metrics)
+        names |= dict.fromkeys(rivals)
     grids = tuple(
         Grid(
             title={**MEASURES, **found.measures}[key].title,
@@ -257,7 +259,7 @@ def worth(
             durations=reference.duration * np.array(factors),
             alphas=np.array(alphas, dtype=float),
             values=np.array([[rows[f"{a:g}"][key] for a in alphas] for rows in tables]),
-            rivals={name: np.array([rows[name][key] for rows in tables]) for name in rivals},
+            rivals={name: np.array([rows.get(name, {}).get(key, np.nan) for rows in tables]) for name in names},
             beside=_JUMPING,
         )
         for key in decisive
