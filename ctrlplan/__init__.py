@@ -52,6 +52,7 @@ _EXPORTS = {
         "create_source_iosystem",
         "create_time_scaling_iosystem",
         "expose_states",
+        "flat_quantities",
         "plants",
         "sample_hold",
         "source_samples",

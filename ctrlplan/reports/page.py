@@ -14,6 +14,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 from markupsafe import Markup
 
@@ -231,7 +232,7 @@ def _worth(worth: Worth, name: str) -> dict[str, Any]:
 
 def _limit_words(value: Any) -> str:
     """A limit as it was given, to four digits."""
-    if isinstance(value, (tuple, list)):
+    if np.ndim(value):
         low, high = ("any" if side is None else f"{side:.4g}" for side in value)
         return f"from {low} to {high}"
     return f"within ±{value:.4g}"

@@ -270,7 +270,9 @@ def compare(
             "controls": controls,
             "initial_state": initial_state,
             "band": band,
+            "start": start,
             "params": params,
+            "events": events,
             "measures": measures,
             "units": units,
         }

@@ -70,6 +70,8 @@ class StudyFile:
         The table [loop].
     units : dict of str to str
         Units by label.
+    worth : bool
+        Whether the report should ask if planning is worth it.
     """
 
     path: Path
@@ -81,6 +83,7 @@ class StudyFile:
     plans: dict[str, Trajectory]
     loop: dict[str, Any]
     units: dict[str, str] = field(default_factory=dict)
+    worth: bool = False
 
     def run(self) -> Study:
         """Simulate and measure.
@@ -100,7 +103,7 @@ class StudyFile:
                 units=self.units,
                 title=self.title,
                 parameters=self.parameters(),
-                **self._crane_options(),
+                **{"worth": self.worth} | self._crane_options(),
             )
         except StudyError:
             raise
@@ -119,10 +122,19 @@ class StudyFile:
             axes = ", ".join(self.waypoints[0].labels or ())
             raise StudyError(f"{self.path}: waypoints: a crane's axes must be x and z (down), got {axes}")
         last = self.waypoints[-1].time
+        crane = Crane(**{key: value for key, value in self.loop.items() if key in _CRANE_ENTRIES})
+        depth = float(np.mean([point.position[(point.labels or ()).index("z")] for point in self.waypoints]))
+        asked = {
+            "quantities": crane,
+            "mode": (math.sqrt(crane.gravity / depth), 0.0),
+            "decisive": ("settling_time", "sway_after", "force_peak"),
+            "measure": load_metrics,
+        }
         return {
             "controls": ("F", "C"),
             "measure": lambda plan, response: load_metrics(plan, response, last),
             "measures": CRANE_MEASURES,
+            "worth": asked if self.worth else False,
         }
 
     def timepts(self, loop: Any) -> NDArray[np.float64]:
@@ -174,7 +186,7 @@ def load_study(path: str | os.PathLike[str]) -> StudyFile:
     except tomllib.TOMLDecodeError as error:
         raise StudyError(f"{source}: must be valid TOML, got {error}") from None
     reader = _Reader(source)
-    reader.known(data, ("title", "t_end", "samples", "units", "loop", "plans", "waypoints"), "the file")
+    reader.known(data, ("title", "t_end", "samples", "worth", "units", "loop", "plans", "waypoints"), "the file")
     waypoints = reader.waypoints(data)
     t_end = reader.number(data, "t_end", "t_end", default=None)
     if not t_end > waypoints[-1].time:
@@ -187,6 +199,9 @@ def load_study(path: str | os.PathLike[str]) -> StudyFile:
     title = data.get("title", source.stem)
     if not isinstance(title, str):
         raise reader.error("title", f"must be a string, got {title!r}")
+    worth = data.get("worth", False)
+    if not isinstance(worth, bool):
+        raise reader.error("worth", f"must be true or false, got {worth!r}")
     units = reader.table(data, "units", needed=False)
     for label, unit in units.items():
         if not isinstance(unit, str):
@@ -195,7 +210,7 @@ def load_study(path: str | os.PathLike[str]) -> StudyFile:
         if label not in known and loop["kind"] == "linear":
             raise reader.error(f"units.{label}", f"must be of one of {', '.join(known)}, got {label!r}")
     plans = reader.plans(data, waypoints)
-    return StudyFile(source, source.stem, title, t_end, int(samples), waypoints, plans, loop, units)
+    return StudyFile(source, source.stem, title, t_end, int(samples), waypoints, plans, loop, units, worth)
 
 
 def build_loop(table: dict[str, Any], path: Path) -> Any:
@@ -227,7 +242,7 @@ def build_loop(table: dict[str, Any], path: Path) -> Any:
 
 
 def _crane(table: dict[str, Any], path: Path) -> Callable[[str, Trajectory], Any]:
-    """Loop of each plan: a step goes to the drives at rest, every other plan through the law."""
+    """Loop of each plan: steps, shaped or not, go to the drives as at rest, every other plan through the law."""
     try:
         crane = Crane(**{key: value for key, value in table.items() if key in _CRANE_ENTRIES})
     except (ValueError, TypeError) as error:
@@ -242,7 +257,7 @@ def _crane(table: dict[str, Any], path: Path) -> Callable[[str, Trajectory], Any
             raise StudyError(f"{path}: loop.{key}: must be two increasing numbers, got {pair!r}")
 
     def build(name: str, plan: Trajectory) -> Any:
-        return crane_loop(crane, plan, law if plan.duration else "still", **limits)
+        return crane_loop(crane, plan, "still" if plan.jumps(0) else law, **limits)
 
     return build
 

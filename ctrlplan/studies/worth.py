@@ -71,11 +71,11 @@ class Grid:
     beside: tuple[str, ...] = ()
 
     def best(self, row: int) -> tuple[str, float]:
-        """Rival that does best at one of the durations, and its value."""
+        """Rival that does best at one of the durations, and its value; nan where none has one."""
         able = {name: values for name, values in self.rivals.items() if name not in self.beside}
         found = {name: float(values[row]) for name, values in able.items() if not math.isnan(values[row])}
-        name = min(found, key=lambda rival: found[rival])
-        return name, found[name]
+        name = min(found, key=lambda rival: found[rival], default="none")
+        return name, found.get(name, math.nan)
 
     def marks(self) -> list[list[str]]:
         """Whether each trigonometric plan wins against its best rival, loses, or neither: "win", "lose", ""."""
@@ -86,6 +86,8 @@ class Grid:
     @property
     def verdict(self) -> str:
         """How often trigonometric plans win and lose, in a sentence."""
+        if not np.isfinite([self.best(i)[1] for i in range(self.durations.size)]).any():
+            return f"{self.title}: there is nothing to compare."
         marks = self.marks()
         cells = [(i, j) for i in range(len(marks)) for j in range(self.alphas.size) if self.alphas[j] > 0.0]
         wins = [(i, j) for i, j in cells if marks[i][j] == "win"]
@@ -235,7 +237,7 @@ def worth(
         more = np.arange(times[-1], times[-1] + max(late, 0.0), np.median(np.diff(times)))[1:]
         return compare(
             loop,
-            plans,
+            _followable(loop, plans),
             np.concatenate([times, more]),
             waypoints=points,
             only=only,
@@ -244,13 +246,16 @@ def worth(
         )
 
     found = compared(points, {PLANNED: TrigSpline(points, alpha=shape)} | rival_plans(points, held, shaper))
+    decisive = _measured(decisive, found)
     tables: list[dict[str, dict[str, float]]] = []
     names: dict[str, None] = {}  # a move can be too short to be shaped
     for factor in factors:
         scaled = _scaled(points, factor)
         shapes = {f"{a:g}": TrigSpline(scaled, alpha=a) for a in alphas}
         rivals = rival_plans(scaled, held, shaper)
-        tables.append(compared(scaled, shapes | rivals, set(decisive)).metrics)
+        # What the plant cannot follow loses.
+        refused = {name: dict.fromkeys(decisive, np.inf) for name in (*shapes, *rivals)}
+        tables.append(refused | compared(scaled, shapes | rivals, set(decisive)).metrics)
         names |= dict.fromkeys(rivals)
     grids = tuple(
         Grid(
@@ -315,6 +320,32 @@ def rival_plans(
     return plans | {name: legs, "minimum jerk": jerk}
 
 
+def _measured(decisive: Sequence[str], found: Comparison) -> list[str]:
+    """Those of the metrics asked for that the loop has: without controls, none of them."""
+    for key in decisive:
+        if key not in found.measures:
+            raise ValueError(f"decisive must be metrics ({', '.join(found.measures)}), got {key!r}")
+    return [key for key in decisive if any(key in rows for rows in found.metrics.values())]
+
+
+def _followable(loop: Any, plans: dict[str, Trajectory]) -> dict[str, Trajectory]:
+    """Plans that a builder of loops does not refuse."""
+    if not is_builder(loop):
+        return plans
+    found = {}
+    refusal = None
+    for name, plan in plans.items():
+        try:
+            loop(name, plan)
+        except ValueError as reason:
+            refusal = refusal or reason
+            continue
+        found[name] = plan
+    if refusal is not None and not found:
+        raise refusal
+    return found
+
+
 def _needed_by(plan: Trajectory) -> dict[str, Any]:
     """Velocity, acceleration and jerk that a plan needs, axis by axis."""
     peaks = {order: plan.peak(order) for order in (1, 2, 3)}
@@ -338,7 +369,10 @@ def _shaper(loop: Any, plan: Trajectory, mode: tuple[float, float] | None) -> Sh
     if mode is None:
         if is_builder(loop) or not hasattr(loop, "poles"):
             return None
-        poles = np.asarray(state_space(loop).poles())
+        system = state_space(loop)
+        poles = np.asarray(system.poles(), dtype=complex)
+        if system.dt:
+            poles = np.log(poles[poles != 0.0]) / float(system.dt)
         swinging = poles[(poles.imag > 0.0) & (poles.real < 0.0)]
         if not swinging.size:
             return None
@@ -356,7 +390,9 @@ def _derivative_limits(plan: Trajectory, limits: Mapping[str, Any]) -> Limits:
     known = {name: limit for name, limit in limits.items() if name in _names(plan)}
     for bound in Limited(plan, known).bounds if known else ():
         if bound.axis is not None:
-            found[bound.order - 1, bound.axis] = min(bound.high, -bound.low)
+            # Where only one sign is allowed, of that sign.
+            sides = [side for side in (bound.high, -bound.low) if side > 0.0]
+            found[bound.order - 1, bound.axis] = min(sides, default=np.inf)
     return found[0], found[1], found[2]
 
 
@@ -433,7 +469,7 @@ def _need_sentence(needs: Sequence[Need]) -> str:
 
 
 def _mark(value: float, rival: float) -> str:
-    if math.isnan(value) or value == rival:
+    if math.isnan(value) or math.isnan(rival) or value == rival:
         return ""
     if math.isfinite(value) and abs(value - rival) <= SAME * max(abs(value), abs(rival)):
         return ""

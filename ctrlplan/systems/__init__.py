@@ -9,6 +9,7 @@ from ctrlplan.systems.flat import create_flat_iosystem, hurwitz_coefficients
 from ctrlplan.systems.governor import Admission, Governor, create_governor_iosystem
 from ctrlplan.systems.hybrid import Delay, SampleHold, create_delay_iosystem, sample_hold
 from ctrlplan.systems.pid import create_pid_iosystem
+from ctrlplan.systems.quantities import flat_quantities
 from ctrlplan.systems.replanner import create_replanner_iosystem
 from ctrlplan.systems.saturation import create_saturation_iosystem
 from ctrlplan.systems.source import PlanSource, create_source_iosystem, source_samples
@@ -33,6 +34,7 @@ __all__ = [
     "create_source_iosystem",
     "create_time_scaling_iosystem",
     "expose_states",
+    "flat_quantities",
     "hurwitz_coefficients",
     "plants",
     "sample_hold",

@@ -1,0 +1,79 @@
+"""What a flat plant makes of a plan: its states and inputs, as planning asks for them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import control.flatsys as fs
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+def flat_quantities(flat_system: fs.FlatSystem) -> Callable[[Array], dict[str, Array]]:
+    """States and inputs of a flat system as functions of a plan of its flat outputs.
+
+    Handed to `ctrlplan.fastest` and `ctrlplan.margins`, so that limits can be
+    stated on them by name. (`Crane.quantities` is one already.)
+
+    Parameters
+    ----------
+    flat_system : control.flatsys.FlatSystem
+        In continuous time; the states must be functions of the flags without
+        their last entries.
+
+    Returns
+    -------
+    callable
+        Maps a jet (order + 1, nflat, ntime) to states and inputs (ntime,) by
+        name: the states from one order less than the inputs need.
+
+    Raises
+    ------
+    TypeError
+        If `flat_system` is no `control.flatsys.FlatSystem`.
+    ValueError
+        If it is in discrete time; by the function, if the jet is too short or
+        has another number of axes.
+
+    Examples
+    --------
+    A turn of a motor, as fast as 120 V allow:
+
+    >>> import ctrlplan as cp
+    >>> motor = cp.plants.dc_motor()
+    >>> turn = cp.PolySpline([cp.Waypoint(0, 0, 0, 0, 0), cp.Waypoint(2, 6.28, 0, 0, 0)])
+    >>> found = cp.fastest(turn, {"voltage": 120.0}, cp.flat_quantities(motor))
+    >>> round(found.duration, 3), found.active.bound.name
+    (1.863, 'voltage')
+    """
+    if not isinstance(flat_system, fs.FlatSystem):
+        raise TypeError(f"flat_system must be a control.flatsys.FlatSystem, got {type(flat_system).__name__}")
+    if flat_system.dt not in (None, 0):
+        raise ValueError(f"flat_system must be in continuous time, got dt = {flat_system.dt}")
+    states, inputs = list(flat_system.state_labels), list(flat_system.input_labels)
+    params = dict(flat_system.params)
+    # Off zero, where some flags are not finite.
+    flag = flat_system.forward(0.1 * np.ones(len(states)), 0.1 * np.ones(len(inputs)), params)
+    lengths = [len(row) for row in flag]
+    longest = max(lengths)
+
+    def quantities(jet: Array) -> dict[str, Array]:
+        if len(jet) < longest - 1 or jet.shape[1] != len(lengths):
+            raise ValueError(
+                f"jet must have the shape (order + 1, {len(lengths)}, ntime) with an order of {longest - 2} for states "
+                f"and {longest - 1} for inputs, got {jet.shape}"
+            )
+        known = len(jet) >= longest
+        values = jet if known else np.concatenate([jet, np.zeros((1, *jet.shape[1:]))])
+        columns: list[Any] = []
+        for k in range(jet.shape[2]):
+            x, u = flat_system.reverse([values[:length, j, k] for j, length in enumerate(lengths)], params)
+            columns.append(np.concatenate([np.ravel(x), np.ravel(u)]))
+        rows = np.array(columns).T
+        names = [*states, *inputs] if known else states
+        return dict(zip(names, rows, strict=False))
+
+    return quantities
