@@ -17,9 +17,10 @@ from scipy.sparse.csgraph import dijkstra
 from ctrlplan.planning.clearance import Clearance, Rope, checked_obstacles, checked_size
 from ctrlplan.planning.clearance import clearance as certified_clearance
 from ctrlplan.planning.obstacles import Obstacle
-from ctrlplan.trajectories import PiecewiseSpline, PolySpline, Trajectory, TrigSpline, Waypoint, trajectory_from_dict
+from ctrlplan.trajectories import PiecewiseSpline, PolySpline, Trajectory, TrigSpline, Waypoint
 from ctrlplan.trajectories.common import Array, checked_count
 
+Spline = TrigSpline | PolySpline | PiecewiseSpline
 Build = Callable[[Iterable[Waypoint]], Trajectory]
 Pairs = NDArray[np.intp]
 Mask = NDArray[np.bool_]
@@ -107,7 +108,7 @@ def avoid(
         return plan
     best = task.given
     ways = _ways(task)
-    for build in _kinds(plan):
+    for build in _kinds(task.plan):
         found = []
         for way in ways:
             reached, certificate = _search(task, build, way)
@@ -129,7 +130,7 @@ def avoid(
 class _Task:
     """What is asked for, and what every candidate is measured by."""
 
-    plan: Trajectory
+    plan: Spline
     obstacles: tuple[Obstacle, ...]
     wanted: float
     load: float
@@ -210,8 +211,8 @@ def _roughness(t: Array, jet: Array, size: float) -> Array:
     return np.asarray(duration**5 / (720.0 * size**2) * jerk + np.trapezoid(np.hypot(*jet[1]), t) / size)
 
 
-def _checked_plan(plan: Trajectory) -> Trajectory:
-    if not isinstance(plan, TrigSpline | PolySpline | PiecewiseSpline):
+def _checked_plan(plan: Trajectory) -> Spline:
+    if not isinstance(plan, Spline):
         raise TypeError(f"plan must be a TrigSpline, PolySpline or PiecewiseSpline, got {type(plan).__name__}")
     if plan.naxes != 2:
         raise ValueError(f"a plan among obstacles must have two axes, got {plan.naxes}")
@@ -223,10 +224,9 @@ def _checked_plan(plan: Trajectory) -> Trajectory:
     return plan
 
 
-def _kinds(plan: Trajectory) -> Iterator[Build]:
+def _kinds(plan: Spline) -> Iterator[Build]:
     """How plans through other waypoints are made: as the given one, then of minimum-jerk legs."""
-    data = plan.to_dict()
-    yield lambda points: trajectory_from_dict(data | {"waypoints": [w.to_dict() for w in points]})
+    yield plan.through
     if not (isinstance(plan, PiecewiseSpline) and plan.alpha == 0.0):
         yield lambda points: PiecewiseSpline(points, labels=plan.labels)
 
@@ -335,9 +335,11 @@ class _Vias:
 def _search(task: _Task, build: Build, way: list[Array]) -> tuple[Trajectory, Clearance]:
     """Certified plan along a way, or the one that keeps farthest from the obstacles."""
     vias = _first(task, way)
-    best, nearest = task.plan, task.given
+    best: Trajectory = task.plan
+    nearest = task.given
     while True:
-        plan, found, before = task.plan, task.given, nearest.least
+        plan: Trajectory = task.plan
+        found, before = task.given, nearest.least
         margin = fine = 3e-4 * task.size
         for _ in range(_TRIES):
             vias = _moved(task, build, vias, margin)

@@ -90,8 +90,12 @@ class Margin:
     fraction: float
 
     def __str__(self) -> str:
-        side = "left" if self.fraction >= 0.0 else "beyond"
-        return f"{self.bound.name} {self.bound.range}: {self.value:.6g} at {self.time:.6g} s, {self.share} {side}"
+        return f"{self.bound.name} {self.bound.range}: {self.value:.6g} at {self.time:.6g} s, {self.room}"
+
+    @property
+    def room(self) -> str:
+        """What is left of the room inside the limits, or by how much they are broken."""
+        return f"{self.share} {'left' if self.fraction >= 0.0 else 'beyond'}"
 
     @property
     def share(self) -> str:

@@ -58,7 +58,7 @@ def plot_limits(plan: Trajectory, limited: Limited, units: Mapping[str, str] | N
             if np.isfinite(side) and min(abs(side - row.min()), abs(side - row.max())) < 1.5 * span:
                 axes.axhline(side, color=_LIMIT, linestyle=(0, (4, 2)), linewidth=1.0)
         axes.set_ylabel(with_unit(bound.name, (units or {}).get(bound.name)))
-        axes.set_title(f"{bound.range}; {margin.share} left", loc="left", fontsize=8)
+        axes.set_title(f"{bound.range}; {margin.room}", loc="left", fontsize=8)
     rows[-1].set_xlabel("time [s]")
     return figure
 

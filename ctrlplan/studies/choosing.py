@@ -81,7 +81,7 @@ def nominal_fastest() -> Fastest:
 def fastest_notes(found: Fastest) -> tuple[str, ...]:
     """What limits make of the nominal move, on its own time law and on another."""
     law = fastest(found.plan, _LIMITS, CRANE, hold="path")
-    others = ", ".join(f"{row.bound.name} {row.share}" for row in found.margins.rows[1:])
+    others = ", ".join(f"{row.bound.name} {row.share}" for row in found.margins.rows[1:] if "%" in row.share)
     active = found.active
     return (
         f"Within 5 kN, 0.1 rad of sway and 12 m of rope the ten-constraint move takes {found.duration:.4g} s at least: "

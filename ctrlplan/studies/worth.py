@@ -298,16 +298,15 @@ def rival_plans(
     points = tuple(waypoints)
     legs = PiecewiseSpline(points)
     bounds = _derivative_limits(legs, limits if limits is not None else _needed_by(PolySpline(points)))
-    s_curve = _profile(points, legs.labels, SCurve, bounds)
     plans: dict[str, Trajectory] = {
         "step": Step(legs.final, legs.initial, legs.start, legs.labels),
         "trapezoid": _profile(points, legs.labels, Trapezoid, bounds),
-        "S-curve": s_curve,
+        "S-curve": _profile(points, legs.labels, SCurve, bounds),
     }
     if shaper is not None:
         plans["shaped step"] = shaper(plans["step"])
-        if shaper.duration < 0.9 * s_curve.duration:
-            plans["shaped S-curve"] = shaper(s_curve.retime(s_curve.duration - shaper.duration))
+        if shaper.duration < 0.9 * min(np.diff(legs.breakpoints)):
+            plans["shaped S-curve"] = _profile(points, legs.labels, SCurve, bounds, shaper=shaper)
     # Entries above the acceleration leave minimum jerk nothing to choose.
     ends = (0, len(points) - 1)
     freed = [point.truncated(2 if i in ends else 0) for i, point in enumerate(points)]
@@ -406,6 +405,7 @@ def _profile(
     kind: Callable[..., Trajectory],
     limits: Limits,
     timed: bool = True,
+    shaper: Shaper | None = None,
 ) -> Trajectory:
     """Profiles from rest to rest, one after the other: each in the time of its leg, or as fast as it can be."""
     parts: list[Trajectory] = []
@@ -421,7 +421,7 @@ def _profile(
             for order, usual, limit in zip((1, 2, 3), (1.5, 4.5, 27.0), limits, strict=True)
         )
         more = {"jerk": jerk} if kind is SCurve else {}
-        part = kind(
+        part: Trajectory = kind(
             last.position,
             first.position,
             velocity=velocity,
@@ -430,7 +430,11 @@ def _profile(
             labels=labels,
             **more,
         )
-        parts.append(part.retime(duration) if timed else part)
+        if shaper is not None:
+            part = shaper(part.retime(duration - shaper.duration))
+        elif timed:
+            part = part.retime(duration)
+        parts.append(part)
     return reduce(lambda one, other: one.then(other), parts)
 
 
@@ -471,6 +475,6 @@ def _need_sentence(needs: Sequence[Need]) -> str:
 def _mark(value: float, rival: float) -> str:
     if math.isnan(value) or math.isnan(rival) or value == rival:
         return ""
-    if math.isfinite(value) and abs(value - rival) <= SAME * max(abs(value), abs(rival)):
+    if math.isfinite(value - rival) and abs(value - rival) <= SAME * max(abs(value), abs(rival)):
         return ""
     return "win" if value < rival else "lose"

@@ -1,0 +1,575 @@
+"""Is it worth it: rivals that meet the same waypoints, in the same time; who wins and who loses is counted by hand."""
+
+import json
+import math
+
+import control as ct
+import numpy as np
+import pytest
+from scipy.interpolate import make_interp_spline
+from scipy.optimize import brentq
+
+import ctrlplan as cp
+from ctrlplan.studies.worth import Grid, Need, Worth, rival_plans, worth
+from ctrlplan.trajectories import SCurve, Shaper, Trapezoid
+
+MOVE = [cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1, 0, 0)]
+VIA = [
+    cp.Waypoint.from_jets(1, x=[0, 0, 0], z=[10, 0, 0]),
+    cp.Waypoint.from_jets(3, x=[5, 1, 0.1], z=[7, -1, 0]),
+    cp.Waypoint.from_jets(4, x=[6, 0, 0], z=[7, 0, 0]),
+    cp.Waypoint.from_jets(7, x=[2, 0, 0], z=[11, 0, 0]),
+]
+TIMES = np.linspace(0, 12, 1201)
+TABLES = {"alphas": (0.0, 1.0, 3.0), "factors": (1.0, 1.5)}
+NAMES = ["trigonometric", "step", "trapezoid", "S-curve", "shaped step", "shaped S-curve", "quintic (minimum jerk)"]
+# MATH.md, section 2: overshoot on the error [%] and settling time [s] at alpha = 1, T = 1.
+MATH = {
+    5.0: {
+        "step": (48.6397, 7.56125),
+        "trigonometric": (44.5425, 8.02597),
+        "quintic (minimum jerk)": (44.4532, 8.02505),
+    },
+    100.0: {
+        "step": (85.4468, 7.60094),
+        "trigonometric": (11.4917, 3.42085),
+        "quintic (minimum jerk)": (10.7596, 3.39506),
+    },
+}
+SHAPER = Shaper.zvd(20.0, 0.1)
+
+
+def loop(gain, outputs=("y", "u")):
+    return cp.plants.integrator_lag_loop(gain, outputs=outputs)
+
+
+@pytest.fixture(scope="module")
+def stiff():
+    return worth(loop(100.0), MOVE, TIMES, alpha=1.0, **TABLES)
+
+
+@pytest.fixture(scope="module")
+def soft():
+    return worth(loop(5.0), MOVE, TIMES, alpha=1.0, **TABLES)
+
+
+@pytest.fixture(scope="module")
+def rivals():
+    return rival_plans(VIA, None, SHAPER)
+
+
+# The rivals
+
+
+@pytest.mark.parametrize("name", ["trapezoid", "S-curve", "shaped S-curve", "quintic a leg", "minimum jerk"])
+def test_rivals_pass_every_waypoint_in_its_time(name, rivals):
+    plan = rivals[name]
+    times = np.array([w.time for w in VIA])
+    np.testing.assert_allclose(plan(times), np.transpose([w.position for w in VIA]), rtol=0, atol=1e-9)
+    assert (plan.start, plan.end) == pytest.approx((1.0, 7.0), abs=1e-12)
+    assert plan.labels == ("x", "z")
+
+
+def test_there_is_one_rival_of_each_kind(rivals):
+    steps = ["step", "shaped step"]
+    profiles = ["trapezoid", "S-curve", "shaped S-curve"]
+    assert sorted(rivals) == sorted([*steps, *profiles, "quintic a leg", "minimum jerk"])
+
+
+@pytest.mark.parametrize(("name", "order"), [("trapezoid", 1), ("S-curve", 2)])
+def test_profiles_rest_at_every_waypoint(name, order, rivals):
+    times = [w.time for w in VIA]
+    for left in (True, False):
+        jet = rivals[name].jet(times, order, left=left)
+        np.testing.assert_allclose(jet[1:], 0.0, rtol=0, atol=1e-9)
+    assert not rivals[name].jumps(order)
+
+
+def test_an_axis_that_stands_still_on_a_leg_stays_where_it_is(rivals):
+    t = np.linspace(3, 4, 101)
+    for name in ("trapezoid", "S-curve"):
+        np.testing.assert_allclose(rivals[name](t)[1], 7.0, rtol=0, atol=1e-8)
+
+
+def test_a_leg_on_which_nothing_moves_waits():
+    points = [cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1), cp.Waypoint(2, 1), cp.Waypoint(3, 4, 0, 0)]
+    for name in ("trapezoid", "S-curve"):
+        plan = rival_plans(points)[name]
+        np.testing.assert_allclose(plan(np.linspace(1, 2, 11)), 1.0, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(plan([0.0, 1.0, 2.0, 3.0]), [0, 1, 1, 4], rtol=0, atol=1e-9)
+
+
+def test_steps_go_to_the_goal_at_once(rivals):
+    np.testing.assert_array_equal(rivals["step"]([0.999, 1.0, 5.0]), [[0, 2, 2], [10, 11, 11]])
+    parts = rivals["shaped step"]
+    half = np.pi / (20.0 * np.sqrt(1 - 0.01))
+    decay = np.exp(-0.1 * np.pi / np.sqrt(1 - 0.01))
+    weights = np.array([1.0, 2 * decay, decay**2]) / (1 + decay) ** 2
+    np.testing.assert_allclose(parts.breakpoints, 1 + half * np.arange(3), rtol=1e-14)
+    reached = parts(1 + half * (np.arange(3) + 0.5))
+    np.testing.assert_allclose(reached, [2 * np.cumsum(weights), 10 + np.cumsum(weights)], rtol=1e-14)
+
+
+def test_profiles_have_the_proportions_of_the_fastest_ones():
+    """A move of 3 in 4 s: the trapezoid under v = 2, a = 4 takes 2 s and is slowed down to twice that."""
+    points = [cp.Waypoint(0, 0, 0, 0), cp.Waypoint(4, 3, 0, 0)]
+    found = rival_plans(points, {"velocity": 2.0, "acceleration": 4.0, "jerk": 32.0})
+    assert found["trapezoid"].peak(1) == pytest.approx([2.0 / 2], rel=1e-12)
+    assert found["trapezoid"].peak(2) == pytest.approx([4.0 / 4], rel=1e-12)
+    ratio = 4.0 / (3 / 2 + 2 / 4 + 4 / 32)
+    for order, limit in ((1, 2.0), (2, 4.0), (3, 32.0)):
+        assert found["S-curve"].peak(order) == pytest.approx([limit / ratio**order], rel=1e-12)
+
+
+@pytest.mark.parametrize("kind", [Trapezoid, SCurve])
+def test_without_limits_profiles_are_those_of_what_the_polynomial_needs(kind):
+    d, took = 3.0, 2.0
+    limits = {"velocity": 15 / 8 * d / took, "acceleration": 10 / 3**0.5 * d / took**2, "jerk": 60 * d / took**3}
+    if kind is Trapezoid:
+        del limits["jerk"]
+    expected = kind(5.0, 2.0, time=1.0, **limits).retime(took)
+    found = rival_plans([cp.Waypoint(1, 2, 0, 0), cp.Waypoint(3, 5, 0, 0)])
+    t = np.linspace(1, 3, 101)
+    name = "S-curve" if kind is SCurve else "trapezoid"
+    np.testing.assert_allclose(found[name](t), expected(t), rtol=0, atol=1e-9)
+
+
+def test_minimum_jerk_is_the_clamped_quintic_spline_of_scipy(rivals):
+    times = np.array([w.time for w in VIA])
+    rest = [(1, [0.0, 0.0]), (2, [0.0, 0.0])]
+    spline = make_interp_spline(times, [w.position for w in VIA], k=5, bc_type=(rest, rest))
+    t = np.linspace(1, 7, 301)
+    for nu in range(3):
+        np.testing.assert_allclose(rivals["minimum jerk"](t, nu), spline(t, nu).T, rtol=0, atol=1e-8)
+
+
+def test_a_quintic_a_leg_meets_every_entry(rivals):
+    for w in VIA:
+        np.testing.assert_allclose(rivals["quintic a leg"].jet(w.time, 2), w.jet, rtol=0, atol=1e-9)
+
+
+def test_where_velocities_alone_are_given_minimum_jerk_chooses_accelerations():
+    """Closed form: y''' = -60 t (1 - t), so that y'' = 5 - 30 t^2 + 20 t^3."""
+    found = rival_plans([cp.Waypoint(0, 0, 0), cp.Waypoint(1, 1, 0)])
+    t = np.linspace(0, 1, 51)
+    np.testing.assert_allclose(found["minimum jerk"](t, 2), 5 - 30 * t**2 + 20 * t**3, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(found["cubic"](t), 3 * t**2 - 2 * t**3, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("rest", "names"),
+    [
+        (1, ["straight line (minimum jerk)"]),
+        (2, ["cubic", "minimum jerk"]),
+        (3, ["quintic (minimum jerk)"]),
+        (4, ["septic", "minimum jerk"]),
+        (5, ["nonic", "minimum jerk"]),
+    ],
+)
+def test_rivals_are_called_what_they_are(rest, names):
+    still = [0.0] * (rest - 1)
+    found = rival_plans([cp.Waypoint(0, 0, *still), cp.Waypoint(2, 1, *still)])
+    assert [name for name in found if name not in ("step", "trapezoid", "S-curve")] == names
+
+
+def test_no_shaped_profile_where_the_shaper_takes_the_time_of_the_move():
+    slow, quick = Shaper.zvd(2.0), Shaper.zvd(10.0)
+    assert "shaped S-curve" not in rival_plans(MOVE, None, slow)
+    assert rival_plans(MOVE, None, slow)["shaped step"].end == pytest.approx(np.pi)
+    assert rival_plans(MOVE, None, quick)["shaped S-curve"].duration == pytest.approx(1.0, abs=1e-12)
+
+
+# The limits
+
+
+def test_unless_given_limits_are_what_the_polynomial_needs(stiff):
+    assert stiff.limits == pytest.approx({"y_d1": 15 / 8, "y_d2": 10 / 3**0.5, "y_d3": 60.0}, rel=1e-12)
+
+
+def test_an_axis_that_does_not_move_has_no_limit():
+    points = [cp.Waypoint.from_jets(0, x=[0, 0, 0], z=[1, 0, 0]), cp.Waypoint.from_jets(2, x=[4, 0, 0], z=[1, 0, 0])]
+    both = ct.append(ct.ss(loop(5.0)), ct.ss(loop(5.0)))
+    side = ct.ss(both.A, both.B, both.C[[0, 2, 1, 3]], both.D[[0, 2, 1, 3]], outputs=["x", "z", "ux", "uz"], inputs=2)
+    found = worth(side, points, TIMES[::10], alpha=1.0, alphas=(1.0,), factors=(1.0,), decisive=("control_peak",))
+    assert found.limits == pytest.approx({"x_d1": 15 / 4, "x_d2": 10 / 3**0.5, "x_d3": 30.0}, rel=1e-12)
+
+
+# How long each takes under the same limits
+
+
+def needs(found):
+    return {need.name: need for need in found.needs}
+
+
+def test_the_quintic_takes_exactly_its_own_time(stiff):
+    assert needs(stiff)["quintic (minimum jerk)"].duration == pytest.approx(1.0, abs=1e-12)
+
+
+def test_the_s_curve_takes_its_closed_form(stiff):
+    """Every limit is reached: d/v + v/a + a/j."""
+    v, a, j = 15 / 8, 10 / 3**0.5, 60.0
+    assert v * (v / a + a / j) < 1 > a**2 / j / v
+    assert needs(stiff)["S-curve"].duration == pytest.approx(1 / v + v / a + a / j, rel=1e-12)
+
+
+def test_the_trigonometric_plan_takes_what_its_peaks_need(stiff):
+    t = np.linspace(0, 1, 200_001)
+    jet = np.abs(cp.TrigSpline(MOVE, alpha=1.0).jet(t, 3)[1:, 0]).max(axis=1)
+    limits = np.array([15 / 8, 10 / 3**0.5, 60.0])
+    expected = ((jet / limits) ** (1.0 / np.arange(1, 4))).max()
+    need = needs(stiff)["trigonometric"]
+    assert need.duration == pytest.approx(expected, rel=1e-9)
+    assert need.limit.startswith("y_d1 within ±1.875, at 0.508 s")
+
+
+def test_what_jumps_keeps_no_limit_and_says_why(stiff):
+    found = needs(stiff)
+    assert math.isnan(found["step"].duration)
+    assert found["step"].limit == "jumps: no limit on a derivative holds"
+    assert math.isnan(found["trapezoid"].duration)
+    assert found["trapezoid"].limit.startswith("y_d3 is limited")
+
+
+def test_the_sentence_names_the_fastest_and_those_that_cannot(stiff):
+    sentence = stiff.verdicts[0]
+    assert sentence.startswith("Under the same limits S-curve is the fastest with 0.9543 s (trigonometric 1.017 s,")
+    assert "quintic (minimum jerk) 1 s" in sentence
+    assert "step, trapezoid cannot keep them at any" in sentence
+
+
+def test_limits_given_hold_all():
+    """v = 1, a = 4: the trapezoid takes d/v + v/a, every spline max(peak_k/limit_k)^(1/k)."""
+    limits = {"velocity": 1.0, "acceleration": 4.0}
+    few = {"alphas": (1.0,), "factors": (1.0,), "decisive": ("settling_time",)}
+    found = worth(loop(5.0), MOVE, TIMES, alpha=0.0, limits=limits, **few)
+    assert found.limits == limits
+    assert needs(found)["trapezoid"].duration == pytest.approx(1.25, rel=1e-12)
+    assert needs(found)["quintic (minimum jerk)"].duration == pytest.approx(15 / 8, rel=1e-12)
+    assert needs(found)["trigonometric"].duration == pytest.approx(15 / 8, rel=1e-12)
+    assert found.verdicts[0].startswith("Under the same limits trapezoid is the fastest with 1.25 s")
+    found = worth(loop(5.0), MOVE, TIMES, alpha=0.0, limits={"velocity": (None, 1.0)}, **few)
+    assert needs(found)["quintic (minimum jerk)"].duration == pytest.approx(15 / 8, rel=1e-12)
+
+
+def test_a_sign_may_be_a_limit():
+    """Never backwards, at most 2 m/s: what `fastest` takes as a limit."""
+    few = {"alphas": (1.0,), "factors": (1.0,), "decisive": ("settling_time",)}
+    found = worth(loop(5.0), MOVE, TIMES, alpha=0.0, limits={"y_d1": (0.0, 2.0)}, **few)
+    assert needs(found)["quintic (minimum jerk)"].duration == pytest.approx(15 / 16, rel=1e-6)
+
+
+def test_no_plan_is_possible_where_limits_are_none_that_time_can_keep():
+    lone = (Need("step", math.nan, "jumps"), Need("quintic", math.nan, "no"))
+    found = Worth(None, {}, lone, ())
+    assert found.verdicts == ("Under these limits no plan is possible.",)
+
+
+# What the loop makes of each
+
+
+@pytest.mark.parametrize("gain", MATH)
+def test_figures_of_the_linear_loop(gain, soft, stiff):
+    found = {5.0: soft, 100.0: stiff}[gain].comparison.metrics
+    for name, expected in MATH[gain].items():
+        measured = (found[name]["overshoot_error"], found[name]["settling_time"])
+        assert measured == pytest.approx(expected, rel=2e-5), name
+
+
+def shaped_settling(gain):
+    """Settling time of a step in three parts, by the closed form of the step response."""
+    w, xi = math.sqrt(gain), 0.5 / math.sqrt(gain)
+    damped = w * math.sqrt(1 - xi**2)
+    decay = math.exp(-math.pi * xi / math.sqrt(1 - xi**2))
+    delays = np.arange(3) * math.pi / damped
+    weights = np.array([1.0, 2 * decay, decay**2]) / (1 + decay) ** 2
+
+    def error(t):
+        s = np.subtract.outer(t, delays)
+        ring = (w / damped) * np.exp(-xi * w * np.maximum(s, 0)) * np.sin(damped * s + math.acos(xi))
+        return np.where(s >= 0, ring, 1.0) @ weights
+
+    t = np.linspace(0, 12, 120_001)
+    last = np.flatnonzero(np.abs(error(t)) > 0.02)[-1]
+    return brentq(lambda x: abs(error(np.array([x]))[0]) - 0.02, t[last], t[last + 1], xtol=1e-13)
+
+
+@pytest.mark.parametrize("gain", MATH)
+def test_the_shaped_step_is_made_for_the_loop_and_settles_before_the_plan(gain, soft, stiff):
+    """The comparison can be lost: shaping wins in a lightly damped linear loop."""
+    found = {5.0: soft, 100.0: stiff}[gain].comparison
+    damped = math.sqrt(gain - 0.25)
+    np.testing.assert_allclose(found.plans["shaped step"].breakpoints, np.arange(3) * np.pi / damped, rtol=1e-9)
+    settles = {name: values["settling_time"] for name, values in found.metrics.items()}
+    assert settles["shaped step"] == pytest.approx(shaped_settling(gain), rel=1e-4)
+    assert settles["shaped step"] < 0.5 * settles["trigonometric"]
+
+
+def test_all_go_through_the_loop_in_the_same_time(stiff):
+    assert list(stiff.comparison.plans) == NAMES
+    assert list(stiff.comparison.metrics) == list(stiff.comparison.responses) == NAMES
+    for name, plan in stiff.comparison.plans.items():
+        if "step" not in name:
+            assert plan.end == pytest.approx(1.0, abs=1e-12)
+    assert stiff.comparison.plans["trigonometric"].alpha == 1.0
+
+
+def test_a_mode_can_be_given_and_none_is_guessed_where_there_is_none():
+    few = {"alphas": (1.0,), "factors": (1.0,), "decisive": ("settling_time",)}
+    given = worth(loop(5.0), MOVE, TIMES, mode=(40.0, 0.0), alpha=1.0, **few).comparison.plans
+    np.testing.assert_allclose(given["shaped step"].breakpoints, [0, np.pi / 40, np.pi / 20], rtol=1e-14)
+    overdamped = worth(loop(0.2), MOVE, TIMES, alpha=1.0, **few).comparison.plans
+    built = worth(lambda name, plan: loop(5.0), MOVE, TIMES, alpha=1.0, **few).comparison.plans
+    for plans in (overdamped, built):
+        assert not [name for name in plans if "shaped" in name]
+
+
+def test_the_mode_of_a_sampled_loop_is_that_of_its_continuous_one():
+    few = {"alphas": (1.0,), "factors": (1.0,), "decisive": ("settling_time",)}
+    dt = 0.2  # poles at exp(-0.1 ± 2j): the left half of the disc
+    sampled = ct.c2d(ct.ss(loop(100.0)), dt)
+    system = ct.ss(sampled.A, sampled.B, sampled.C, sampled.D, dt, inputs=["r"], outputs=["y", "u"])
+    plans = worth(system, MOVE, dt * np.arange(61), alpha=1.0, **few).comparison.plans
+    np.testing.assert_allclose(plans["shaped step"].breakpoints[1], np.pi / math.sqrt(99.75), rtol=1e-9)
+
+
+def test_alpha_can_be_chosen():
+    points = [cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 3), cp.Waypoint(2, 1, 0, 0)]
+    few = {"alphas": (1.0,), "factors": (1.0,), "decisive": ("settling_time",)}
+    found = worth(loop(100.0), points, TIMES[::4], **few).comparison.plans["trigonometric"]
+    assert found.alpha == cp.choose_alpha(points).alpha
+
+
+# The tables over alpha and duration
+
+
+def test_there_is_a_table_for_settling_and_one_for_the_control(stiff):
+    settling, control = stiff.grids
+    assert (settling.title, settling.unit) == ("Settling time", "s")
+    assert (control.title, control.unit) == ("Peak of the control", "{u}")
+    for grid in stiff.grids:
+        np.testing.assert_array_equal(grid.durations, [1.0, 1.5])
+        np.testing.assert_array_equal(grid.alphas, [0.0, 1.0, 3.0])
+        assert grid.values.shape == (2, 3)
+        assert list(grid.rivals) == NAMES[1:]
+        assert grid.beside == ("step", "shaped step")
+
+
+def test_values_are_those_of_runs_of_their_own(stiff):
+    """The plan is made and simulated alone, and its control's peak is read off a fine record."""
+    t = np.linspace(0, 12, 120_001)
+    for i, duration in enumerate((1.0, 1.5)):
+        points = [cp.Waypoint(0, 0, 0, 0), cp.Waypoint(duration, 1, 0, 0)]
+        for j, alpha in enumerate((0.0, 1.0, 3.0)):
+            y, u = cp.simulate(loop(100.0), t, cp.TrigSpline(points, alpha=alpha)).outputs
+            last = np.flatnonzero(np.abs(y - 1) > 0.02)[-1]
+            assert t[last] <= stiff.grids[0].values[i, j] + 1e-4 <= t[last + 1] + 2e-4
+            assert stiff.grids[1].values[i, j] == pytest.approx(np.abs(u).max(), rel=1e-4)
+
+
+def test_alpha_zero_is_the_quintic_and_rows_of_the_move_itself_are_the_comparison(stiff):
+    for grid, key in zip(stiff.grids, ("settling_time", "control_peak"), strict=True):
+        np.testing.assert_allclose(grid.values[:, 0], grid.rivals["quintic (minimum jerk)"], rtol=1e-9)
+        assert grid.values[0, 1] == stiff.comparison.metrics["trigonometric"][key]
+        for name, values in grid.rivals.items():
+            assert values[0] == stiff.comparison.metrics[name][key]
+
+
+def test_steps_do_not_depend_on_the_duration(stiff):
+    for grid in stiff.grids:
+        for name in ("step", "shaped step"):
+            assert grid.rivals[name][1] == pytest.approx(grid.rivals[name][0], rel=1e-9)
+
+
+def test_longer_plans_are_run_longer():
+    """Waypoints passed at speeds in proportion, and a record that outlasts the plan."""
+    points = [cp.Waypoint(1, 0, 0, 0), cp.Waypoint(2, 2, 4, 0), cp.Waypoint(3, 3, 0, 0)]
+    times = np.linspace(0, 4, 401)
+    options = {"alpha": 1.0, "alphas": (2.0,), "decisive": ("iae",)}
+    (grid,) = worth(loop(400.0), points, times, factors=(3.0,), **options).grids
+    scaled = cp.TrigSpline([cp.Waypoint(1, 0, 0, 0), cp.Waypoint(4, 2, 4 / 3, 0), cp.Waypoint(7, 3, 0, 0)], alpha=2.0)
+    t = np.linspace(0, 8, 8001)
+    y = cp.simulate(loop(400.0), t, scaled).outputs[0]
+    error = np.abs(scaled(t) - y)
+    assert grid.values[0, 0] == pytest.approx(np.sum(0.5 * (error[1:] + error[:-1]) * 1e-3), rel=1e-3)
+    np.testing.assert_array_equal(grid.durations, [6.0])
+
+
+@pytest.mark.parametrize("factors", [(0.75, 2.0), (2.0, 0.75)])
+def test_a_shaper_too_slow_for_some_of_the_durations(factors):
+    """Period 1.41 s: a move of 2 s leaves room for it, one of 0.75 s does not."""
+    found = worth(loop(20.0), MOVE, TIMES, alpha=1.0, alphas=(1.0,), factors=factors, decisive=("settling_time",))
+    (grid,) = found.grids
+    shaped = dict(zip(factors, grid.rivals["shaped S-curve"].tolist(), strict=True))
+    assert math.isnan(shaped[0.75])
+    assert math.isfinite(shaped[2.0])
+    json.dumps(found.results(), allow_nan=False)
+
+
+def test_a_loop_without_controls_has_a_table_of_settling_alone():
+    found = worth(loop(100.0, ("y",)), MOVE, TIMES, alpha=1.0, alphas=(1.0,), factors=(1.0,))
+    assert [grid.title for grid in found.grids] == ["Settling time"]
+
+
+def test_a_move_there_and_back_has_no_winner():
+    """Nothing is settled where the end is the beginning: undefined is neither won nor lost."""
+    points = [cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1), cp.Waypoint(2, 0, 0, 0)]
+    found = worth(loop(100.0), points, TIMES, alpha=1.0, alphas=(0.0, 1.0), factors=(1.0,))
+    assert np.isnan(found.grids[0].values).all()
+    assert found.grids[0].marks() == [["", ""]]
+    assert "nan" not in " ".join(found.verdicts)
+
+
+# Wins and losses, counted by hand
+
+
+def grid(values, beside=(), **rivals):
+    values = np.array(values, dtype=float)
+    return Grid(
+        "Length",
+        "m",
+        np.arange(1.0, len(values) + 1),
+        np.arange(values.shape[1]) * 1.0,
+        values,
+        {name: np.array(row, dtype=float) for name, row in rivals.items()},
+        beside,
+    )
+
+
+def test_marks_are_against_the_best_rival_of_each_row():
+    found = grid([[5, 3, 1], [5, 3, 1]], one=[4, 2], two=[2, 6])
+    assert [found.best(0), found.best(1)] == [("two", 2.0), ("one", 2.0)]
+    assert found.marks() == [["lose", "lose", "win"], ["lose", "lose", "win"]]
+    assert found.verdict == (
+        "Length: of 4 trigonometric plans 2 win and 2 lose against the best rival (two, one); "
+        "they win at alpha = 2 in 1 s, 2 s."
+    )
+
+
+def test_rivals_that_stand_beside_do_not_count():
+    found = grid([[5, 3]], one=[4], step=[1], beside=("step",))
+    assert found.best(0) == ("one", 4.0)
+    assert found.marks() == [["lose", "win"]]
+
+
+@pytest.mark.parametrize(
+    ("value", "rival", "mark"),
+    [
+        (1.0, 1.0, ""),
+        (1.0009, 1.0, ""),
+        (0.9991, 1.0, ""),
+        (1.002, 1.0, "lose"),
+        (0.998, 1.0, "win"),
+        (0.0, 0.0, ""),
+        (0.0, 1e-30, "win"),
+        (math.inf, 1.0, "lose"),
+        (1.0, math.inf, "win"),
+        (math.inf, math.inf, ""),
+        (math.nan, 1.0, ""),
+        (math.nan, math.inf, ""),
+    ],
+)
+def test_marks_of_ties_and_of_what_is_infinite_or_undefined(value, rival, mark):
+    assert grid([[value]], one=[rival]).marks() == [[mark]]
+
+
+def test_an_undefined_rival_does_not_count_where_it_is_undefined():
+    found = grid([[2], [2]], one=[math.nan, 1], two=[3, math.nan])
+    assert found.marks() == [["win"], ["lose"]]
+    assert [found.best(i)[0] for i in (0, 1)] == ["two", "one"]
+
+
+def test_no_one_wins_where_every_rival_is_undefined():
+    found = grid([[2.0, 2.0], [2.0, 3.0]], one=[math.nan, 2.5])
+    assert found.marks() == [["", ""], ["win", "lose"]]
+    assert "nan" not in found.verdict
+
+
+def test_the_polynomial_is_no_trigonometric_plan():
+    """Alpha 0 is shown and marked, and not counted."""
+    found = grid([[1, 3], [1, 3]], one=[2, 2])
+    assert found.marks() == [["win", "lose"], ["win", "lose"]]
+    assert found.verdict == "Length: of 2 trigonometric plans 0 win and 2 lose against the best rival (one)."
+
+
+# As data
+
+
+def test_results_are_json_with_keys_that_stay(stiff, soft):
+    for found in (stiff, soft):
+        data = json.loads(json.dumps(found.results(), allow_nan=False))
+        assert list(data) == ["plans", "needs", "grids"]
+        assert list(data["plans"]) == list(found.comparison.plans)
+        assert data["needs"]["step"] is None
+        assert data["needs"]["quintic (minimum jerk)"] == pytest.approx(1.0, abs=1e-12)
+        assert [list(table) for table in data["grids"]] == 2 * [["title", "durations", "alphas", "values", "rivals"]]
+        for table, own in zip(data["grids"], found.grids, strict=True):
+            np.testing.assert_array_equal(np.array(table["values"], dtype=float), own.values)
+
+
+def test_what_is_infinite_or_undefined_is_null():
+    lone = Worth(
+        cp.compare(loop(5.0), {"step": cp.Step(1.0)}, TIMES),
+        {},
+        (Need("step", math.nan, "jumps"),),
+        (grid([[math.inf, 1.0]], one=[math.nan]),),
+    )
+    data = lone.results()
+    assert data["needs"] == {"step": None}
+    assert data["grids"][0]["values"] == [[None, 1.0]]
+    assert data["grids"][0]["rivals"] == {"one": [None]}
+
+
+# As an option of compare
+
+
+def test_compare_asks_when_it_is_asked_to(stiff):
+    few = {"alphas": (0.0, 1.0, 3.0), "factors": (1.0, 1.5)}
+    found = cp.compare(loop(100.0), MOVE, TIMES, worth=few, units={"y": "m"})
+    assert found.worth.comparison.metrics == stiff.comparison.metrics
+    assert found.worth.comparison.units == {"y": "m"}
+    assert found.results()["worth"] == stiff.results()
+    assert list(found.plans) == ["step", "polynomial", "trigonometric", "piecewise"]
+    assert "worth" not in cp.compare(loop(100.0), MOVE, TIMES).results()
+
+
+def test_compare_hands_on_what_it_was_given():
+    few = {"alphas": (1.0,), "factors": (1.0,), "limits": {"velocity": 3.0}}
+    plans = {"mine": cp.PolySpline(MOVE)}
+    measured = {"last": cp.studies.Measure("Last", "s")}
+    options = {"waypoints": MOVE, "alpha": 2.0, "band": 0.05, "start": 0.25, "controls": ("u",), "measures": measured}
+    found = cp.compare(loop(100.0), plans, TIMES, measure=lambda p, r: {"last": r.time[-1]}, worth=few, **options)
+    inner = found.worth.comparison
+    assert found.worth.limits == {"velocity": 3.0}
+    assert inner.plans["trigonometric"].alpha == 2.0
+    assert inner.metrics["trigonometric"]["last"] == TIMES[-1]
+    own = found.metrics["mine"]
+    assert inner.metrics["quintic (minimum jerk)"]["settling_time"] == pytest.approx(own["settling_time"], rel=1e-9)
+    assert inner.metrics["quintic (minimum jerk)"]["iae"] == pytest.approx(own["iae"], rel=1e-9)
+
+
+def test_further_metrics_can_be_decisive():
+    few = {"alphas": (0.0, 1.0), "factors": (1.0, 2.0), "decisive": ("half",)}
+    found = worth(
+        loop(100.0),
+        MOVE,
+        TIMES,
+        alpha=1.0,
+        measure=lambda plan, response, last: {"half": plan.peak(1)[0] * last},
+        measures={"half": cp.studies.Measure("Peak speed times time", "m")},
+        **few,
+    )
+    (table,) = found.grids
+    assert (table.title, table.unit) == ("Peak speed times time", "m")
+    np.testing.assert_allclose(table.values[:, 0], 15 / 8, rtol=1e-12)  # speed falls as the time grows
+    assert found.comparison.metrics["trapezoid"]["half"] < 15 / 8
+
+
+def test_what_cannot_be_asked():
+    with pytest.raises(ValueError, match=r"worth needs waypoints, .*got none"):
+        cp.compare(loop(5.0), {"step": cp.Step(1.0)}, TIMES, worth=True)
+    with pytest.raises(TypeError, match=r"plans must be .* waypoints, got Step"):
+        worth(loop(5.0), [cp.Step(1.0)], TIMES)
+    with pytest.raises(ValueError, match="limits must be above 0 and finite, got velocity = -1"):
+        worth(loop(5.0), MOVE, TIMES, alpha=1.0, limits={"velocity": -1.0})
+    with pytest.raises(ValueError, match=r"decisive"):
+        worth(loop(5.0), MOVE, TIMES, alpha=1.0, decisive=("beauty",), alphas=(1.0,), factors=(1.0,))
