@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import control as ct
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from ctrlplan.studies.comparison import Comparison, compare
 from ctrlplan.studies.study import Study
 from ctrlplan.studies.sweep import Sweep, sweep
+from ctrlplan.studies.worth import worth
 from ctrlplan.systems import create_feedforward_iosystem, create_source_iosystem
 from ctrlplan.systems.plants import integrator_lag_loop
 from ctrlplan.trajectories import PolySpline, Step, Trajectory, TrigSpline, Waypoint
@@ -72,6 +74,7 @@ def linear_study(progress: bool = True, count: int = 241, finest: float = 1e-3) 
             "run": f"{TIMEPTS[-1]:g} s",
         },
     )
+    comparison = replace(comparison, worth=worth(_loop(GAIN), WAYPOINTS, TIMEPTS, alpha=1.0))
     swept = _refined_sweep(count, finest, progress)
     return Study(
         "linear",

@@ -86,7 +86,7 @@ class Grid:
     @property
     def verdict(self) -> str:
         """How often trigonometric plans win and lose, in a sentence."""
-        if not np.isfinite([self.best(i)[1] for i in range(self.durations.size)]).any():
+        if np.isnan([self.best(i)[1] for i in range(self.durations.size)]).all():
             return f"{self.title}: there is nothing to compare."
         marks = self.marks()
         cells = [(i, j) for i in range(len(marks)) for j in range(self.alphas.size) if self.alphas[j] > 0.0]

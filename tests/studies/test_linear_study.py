@@ -157,7 +157,7 @@ def test_the_limit_point_of_the_step_is_that_of_the_paper():
 
 def test_results_have_the_stable_keys(study):
     results = study.results()
-    assert list(results) == ["plans", "sweep"]
+    assert set(results) == {"plans", "sweep", "worth"}
     assert list(results["plans"]) == ["step", "polynomial", "trigonometric", "trigonometric, feedforward"]
     assert list(results["sweep"]) == ["gain", "step", "polynomial", "trigonometric"]
     count = len(results["sweep"]["gain"])

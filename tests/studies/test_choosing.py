@@ -1,0 +1,345 @@
+"""What is chosen for the crane, against quadrature, scipy's splines and dense samples; and the claim of optimality."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+from scipy.interpolate import BPoly, make_interp_spline
+
+import ctrlplan as cp
+from ctrlplan.studies.choosing import (
+    clearance_note,
+    fastest_notes,
+    nominal_fastest,
+    nominal_worth,
+    optimality_claim,
+    optimality_grids,
+)
+from ctrlplan.studies.crane_setup import nominal_waypoints, obstacle_waypoints
+
+G, DRUM, TROLLEY, LOAD, INERTIA = 9.81, 0.25, 5000.0, 500.0, 50.0
+QUINTIC = "quintic a leg (minimum jerk)"
+FREED = "minimum jerk through the positions"
+LEGS = "shortest of one trigonometric spline a leg"
+POLYLINE = "polyline (no path is shorter)"
+L0 = 50**0.5 + 10 + 61**0.5
+
+
+@pytest.fixture(scope="module")
+def grids():
+    return optimality_grids()
+
+
+@pytest.fixture(scope="module")
+def fast():
+    return nominal_fastest()
+
+
+def quintics(end):
+    """One quintic a leg through the paper's waypoints, by scipy."""
+    points = obstacle_waypoints(end)
+    return BPoly.from_derivatives([w.time for w in points], [w.jet for w in points])
+
+
+def clamped(end):
+    """The quintic spline with four continuous derivatives at A and B, at rest at both ends."""
+    points = obstacle_waypoints(end)
+    rest = [(1, [0.0, 0.0]), (2, [0.0, 0.0])]
+    return make_interp_spline([w.time for w in points], [w.position for w in points], k=5, bc_type=(rest, rest))
+
+
+def length(velocity, end):
+    """Length of a path by adaptive quadrature."""
+    edges = [0.0, 6.0, 11.0, end]
+    parts = [quad(lambda t: np.hypot(*velocity(t)), a, b, epsabs=1e-9, limit=200)[0] for a, b in zip(edges, edges[1:])]
+    return sum(parts)
+
+
+def jerk(third, end):
+    edges = [0.0, 6.0, 11.0, end]
+    return sum(quad(lambda t: (third(t) ** 2).sum(), a, b, epsabs=1e-9)[0] for a, b in zip(edges, edges[1:]))
+
+
+def cell(grid, end, alpha):
+    (row,), (column,) = np.flatnonzero(grid.durations == end), np.flatnonzero(grid.alphas == alpha)
+    return grid.values[row, column]
+
+
+# Length and squared jerk over alpha and end time
+
+
+def test_grids_are_of_length_and_squared_jerk(grids):
+    assert [(grid.title, grid.unit) for grid in grids] == [
+        ("Length of the path", "m"),
+        ("Integral of the squared jerk", "m²/s⁵"),
+    ]
+    for grid in grids:
+        assert grid.values.shape == (grid.durations.size, grid.alphas.size)
+        assert {14.0, 16.0, 20.0} <= set(grid.durations)
+        assert {0.0, 4.0, 5.0} <= set(grid.alphas)
+    assert list(grids[0].rivals) == [QUINTIC, FREED, LEGS, POLYLINE]
+    assert list(grids[1].rivals) == [QUINTIC, FREED, LEGS]
+    assert (grids[0].beside, grids[1].beside) == ((POLYLINE,), ())
+
+
+@pytest.mark.parametrize(
+    ("end", "alpha", "metres"),
+    [(16.0, 0.0, "33.02"), (16.0, 4.0, "26.36"), (16.0, 5.0, "45.7"), (20.0, 0.0, "105"), (20.0, 4.0, "50")],
+)
+def test_lengths_are_those_of_math_md(grids, end, alpha, metres):
+    digits = len(metres.partition(".")[2])
+    assert f"{cell(grids[0], end, alpha):.{digits}f}" == metres
+
+
+@pytest.mark.parametrize(("end", "alpha"), [(14.0, 5.0), (16.0, 4.0), (20.0, 0.0), (18.0, 4.5)])
+def test_cells_against_quadrature(grids, end, alpha):
+    plan = cp.TrigSpline(obstacle_waypoints(end), alpha=alpha)
+    assert cell(grids[0], end, alpha) == pytest.approx(length(lambda t: plan(t, 1), end), rel=1e-9)
+    assert cell(grids[1], end, alpha) == pytest.approx(jerk(lambda t: plan(t, 3), end), rel=1e-9)
+
+
+@pytest.mark.parametrize("end", [14.0, 16.0, 20.0])
+def test_rivals_against_splines_of_scipy(grids, end):
+    (row,) = np.flatnonzero(grids[0].durations == end)
+    for name, spline in ((QUINTIC, quintics(end)), (FREED, clamped(end))):
+        assert grids[0].rivals[name][row] == pytest.approx(length(spline.derivative(), end), rel=1e-8)
+        assert grids[1].rivals[name][row] == pytest.approx(jerk(spline.derivative(3), end), rel=1e-8)
+
+
+def test_the_polyline_and_how_near_one_quintic_a_leg_comes_to_it(grids):
+    rivals = dict(grids[0].rivals)
+    np.testing.assert_allclose(rivals.pop(POLYLINE), L0, rtol=1e-12)
+    assert f"{L0:.1f}" == "24.9"
+    assert all((values > L0).all() for values in rivals.values())
+    assert (grids[0].values > L0).all()
+    of_end = dict(zip(grids[0].durations, rivals[QUINTIC] / L0, strict=True))
+    assert (f"{of_end[16.0]:.2f}", f"{of_end[20.0]:.2f}") == ("1.03", "1.06")
+
+
+def test_no_trigonometric_spline_a_leg_is_shorter_than_that_of_the_table(grids):
+    for end, found in zip(grids[0].durations, grids[0].rivals[LEGS], strict=True):
+        t = np.linspace(0, end, 4001)
+        alphas = np.linspace(0, 5.5, 45)
+        ways = [
+            np.hypot(*np.diff(cp.PiecewiseSpline(obstacle_waypoints(end), alpha=a)(t))).sum() for a in alphas.tolist()
+        ]
+        assert found <= min(ways) * (1 + 1e-6)
+        assert found == pytest.approx(min(ways), rel=1e-3)
+
+
+def test_one_quintic_a_leg_has_the_least_jerk_through_its_entries_and_freed_ones_less(grids):
+    least = grids[1].rivals
+    assert (grids[1].values > least[QUINTIC][:, None]).all()
+    assert (least[LEGS] >= least[QUINTIC] * (1 - 1e-9)).all()
+    assert (least[FREED] < least[QUINTIC]).all()
+
+
+# The claim
+
+
+def test_the_claim_fails_and_says_how(grids):
+    claim = optimality_claim(grids)
+    text = " ".join(claim)
+    assert all(mark == "lose" for grid in grids for row in grid.marks() for mark in row)
+    assert "Over 36 pairs of alpha and end time" in claim[0]
+    assert claim[0].endswith("the claim fails.")
+    assert claim[-2:] == (grids[0].verdict, grids[1].verdict)
+    shorter = sum(value < 0.999 * row[0] for row in grids[0].values for value in row[1:])
+    assert f"shorter in {shorter} of 36 cases" in text
+    at_16 = grids[1].values[list(grids[1].durations).index(16.0)]
+    assert f"it has {jerk(quintics(16.0).derivative(3), 16.0):.3g} m²/s⁵" in text
+    assert f"best trigonometric plan of the table {min(at_16[1:]):.3g}." in text
+    assert f"{length(quintics(16.0).derivative(), 16.0):.4g} m, and no path" in text
+    assert f"the polyline's {L0:.4g} m" in text
+    assert f"straight line of {401**0.5:.4g} m" in text
+    assert "nan" not in text
+
+
+def test_the_shortest_path_of_the_claim_is_the_shortest_of_a_scan(grids):
+    alpha, metres = map(float, re.search(r"has alpha = ([\d.]+) and ([\d.]+) m", optimality_claim(grids)[1]).groups())
+    t = np.linspace(0, 16, 8001)
+    alphas = np.linspace(3.9, 4.4, 101)
+    ways = [np.hypot(*np.diff(cp.TrigSpline(obstacle_waypoints(), alpha=a)(t))).sum() for a in alphas.tolist()]
+    assert alpha == pytest.approx(alphas[np.argmin(ways)], abs=0.006)
+    assert metres == pytest.approx(min(ways), abs=0.006)
+
+
+def test_the_claim_would_hold_where_it_held(grids):
+    """The words follow the numbers: a plan that is shorter than all rivals is counted."""
+    values = grids[0].values.copy()
+    values[2, 4] = values[0, 1] = 24.9
+    won = optimality_claim((replace(grids[0], values=values), grids[1]))
+    assert "the claim holds in 2 of 72 cases, and fails in the others." in won[0]
+
+
+@pytest.mark.parametrize("alpha", [0.0, 1.0, 2.0, 3.0, np.pi])
+def test_from_rest_to_rest_every_path_below_pi_has_one_length(alpha):
+    x, z = cp.TrigSpline(nominal_waypoints(), alpha=alpha)(np.linspace(0, 15, 2001))
+    np.testing.assert_allclose(z, 10 + x / 20, rtol=0, atol=1e-11)
+    assert np.abs(np.diff(x)).sum() == pytest.approx(20.0, rel=1e-12)
+
+
+def test_from_rest_to_rest_the_polynomial_has_the_least_jerk():
+    costs = [
+        quad(lambda t, p=cp.TrigSpline(nominal_waypoints(), alpha=a): (p(t, 3) ** 2).sum(), 0, 15)[0]
+        for a in (0.0, 0.5, 1.0, 2.0, 3.0)
+    ]
+    assert costs == sorted(costs)
+    assert costs[0] == pytest.approx(720 * 401 / 15**5, rel=1e-9)
+
+
+# As fast as limits allow
+
+
+def drives(plan):
+    """Signals of the crane along a plan, (15) from dense samples; differences in the place of derivatives."""
+    t = np.linspace(plan.start, plan.end, 200_001)
+    x, z = plan(t)
+    across, fall = plan(t, 2)
+    theta = np.arctan2(-across, G - fall)
+    tension = LOAD * np.hypot(across, G - fall)
+    rope = (z * tension / LOAD - DRUM * across) / (G - fall)
+    trolley = x - (DRUM * tension / LOAD - z * across) / (G - fall)
+    dt = t[1] - t[0]
+    rates = [np.gradient(np.gradient(s, dt, edge_order=2), dt, edge_order=2) for s in (trolley, rope)]
+    speeds = [np.gradient(s, dt, edge_order=2) for s in (trolley, rope)]
+    force = TROLLEY * rates[0] + 20.0 * speeds[0] + LOAD * across
+    torque = INERTIA * rates[1] / DRUM + 20.0 * speeds[1] / DRUM - DRUM * tension
+    return t, {"theta": theta, "T": tension, "R": rope, "F": force, "C": torque}
+
+
+def test_the_fastest_move_meets_its_waypoints_and_is_at_its_limit(fast):
+    assert fast.plan.duration == fast.duration < 15.0
+    np.testing.assert_allclose(fast.plan([0.0, fast.duration]), [[0, 20], [10, 11]], rtol=0, atol=1e-9)
+    for nu in range(1, 5):
+        np.testing.assert_allclose(fast.plan([0.0, fast.duration], nu), 0.0, rtol=0, atol=1e-9)
+    t, signals = drives(fast.plan)
+    worst = np.argmax(np.abs(signals["theta"]))
+    assert abs(signals["theta"][worst]) == pytest.approx(0.1, rel=1e-8)
+    assert fast.active.bound.name == "theta"
+    near = np.abs(signals["theta"]) > 0.1 * (1 - 1e-7)
+    assert np.abs(t[near] - fast.active.time).min() < 1e-2
+    assert np.abs(drives(fast.plan.retime(0.9999 * fast.duration))[1]["theta"]).max() > 0.1
+
+
+def test_margins_are_what_dense_samples_leave(fast):
+    _, signals = drives(fast.plan)
+    limits = {"F": (-5e3, 5e3), "C": (-3e3, 1e3), "theta": (-0.1, 0.1), "R": (1.0, 12.0), "T": (0.0, np.inf)}
+    assert {row.bound.name for row in fast.margins} == set(limits)
+    for row in fast.margins:
+        low, high = limits[row.bound.name]
+        values = signals[row.bound.name]
+        scale = 0.5 * (high - low) if np.isfinite(high) else 1.0
+        left = min(high - values.max(), values.min() - low) / scale
+        assert row.fraction == pytest.approx(left, rel=1e-3, abs=1e-6), row.bound.name
+        assert row.fraction >= 0.0
+    fractions = [row.fraction for row in fast.margins]
+    assert fractions == sorted(fractions)
+
+
+def test_the_notes_say_which_limit_where_and_what_the_others_leave(fast):
+    (note,) = fastest_notes(fast)
+    assert f"takes {fast.duration:.4g} s at least: theta is at its limit at {fast.active.time:.3g} s" in note
+    for name in "RFCT":
+        assert re.search(rf"\b{name} [\d.]+", note)
+    assert "theta" not in note.partition("What the other limits leave")[2].partition("The same path")[0]
+    other = float(re.search(r"another time law takes ([\d.]+) s", note)[1])
+    assert 0.5 * fast.duration < other < fast.duration
+
+
+# The wall
+
+
+def test_clearance_is_that_of_dense_samples():
+    """Disc of 0.5 m about the load, and its rope up to the drum, from the wall x in [7, 13], z in [6.5, 12]."""
+    points = obstacle_waypoints()
+    plans = {
+        "polynomial": cp.PolySpline(points),
+        "trigonometric": cp.TrigSpline(points, alpha=4.0),
+        "piecewise": cp.PiecewiseSpline(points),
+        "step": cp.Step([20.0, 11.0], [0.0, 10.0]),
+    }
+    note = clearance_note(plans)
+    found = dict(re.findall(r"(\w+) (-?[\d.]+ m \(\w+\))", note))
+    assert set(found) == {"polynomial", "trigonometric", "piecewise"}  # a step takes no way
+    for name, said in found.items():
+        t = np.linspace(0, 16, 20_001)
+        (x, z), (across, fall) = plans[name](t), plans[name](t, 2)
+        lean = across / np.hypot(across, G - fall)
+        top = np.array([x + across / (G - fall) * (z - DRUM * lean), DRUM * lean])
+
+        def beyond(p):
+            aside = np.maximum(np.maximum(7.0 - p[0], p[0] - 13.0), 0.0)
+            above = np.maximum(np.maximum(6.5 - p[1], p[1] - 12.0), 0.0)
+            inside = np.minimum.reduce([p[0] - 7.0, 13.0 - p[0], p[1] - 6.5, 12.0 - p[1]])
+            return np.where(inside > 0.0, -inside, np.hypot(aside, above))
+
+        load = beyond(np.array([x, z])).min() - 0.5
+        share = np.linspace(0, 1, 201)[:, None, None]
+        rope = min(beyond((share * top + (1 - share) * np.array([x, z]))[:, i]).min() for i in ()) if False else None
+        lines = share * top + (1 - share) * np.array([x, z])
+        rope = beyond(np.moveaxis(lines, 1, 0)).min()
+        least, part = (load, "load") if load < rope else (rope, "rope")
+        assert said == f"{least:.2f} m ({part})"
+
+
+# The nominal move beside its rivals
+
+
+@pytest.fixture(scope="module")
+def beside():
+    return nominal_worth()
+
+
+@pytest.mark.slow
+def test_the_nominal_move_beside_its_rivals(beside):
+    names = ["trigonometric", "step", "trapezoid", "S-curve", "shaped step", "shaped S-curve", "quintic (minimum jerk)"]
+    assert list(beside.comparison.plans) == names
+    half = np.pi * np.sqrt(10.5 / G)
+    np.testing.assert_allclose(beside.comparison.plans["shaped step"].breakpoints, [0, half, 2 * half], rtol=1e-12)
+    needs = {need.name: need for need in beside.needs}
+    # 15/8 of 20 m in 15 s is the limit of 2.5 m/s itself.
+    assert needs["quintic (minimum jerk)"].duration == pytest.approx(15.0, rel=1e-9)
+    t = np.linspace(0, 1, 100_001)
+    unit = cp.TrigSpline([cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1, 0, 0)], alpha=1.0)
+    assert needs["trigonometric"].duration == pytest.approx(20 / 2.5 * unit(t, 1).max(), rel=1e-8)
+    assert np.isnan(needs["step"].duration)
+
+
+@pytest.mark.slow
+def test_the_s_curve_of_the_needs_sways_as_far_as_is_allowed(beside):
+    """A jerk limit of 0.4 alone would take 20/2.5 + 2.5/0.6 + 0.6/0.4 s: it is retimed to 0.06 rad of sway."""
+    alone = 20 / 2.5 + 2.5 / 0.6 + 0.6 / 0.4
+    (need,) = (need for need in beside.needs if need.name == "S-curve")
+    stretch = need.duration / alone
+    across, fall = 0.6 / stretch**2, 0.03 / stretch**2
+    assert np.arctan2(across, G - fall) == pytest.approx(0.06, rel=1e-6)
+    assert "theta" in need.limit
+
+
+@pytest.mark.slow
+def test_values_of_the_crane_are_those_of_runs_of_their_own(beside):
+    from ctrlplan.systems.plants import Crane, crane_loop
+
+    settling, sway, force = beside.grids
+    assert [grid.unit for grid in beside.grids] == ["s", "rad", "N"]
+    plan = cp.TrigSpline(nominal_waypoints(), alpha=3.0)
+    profile = beside.comparison.plans["S-curve"]
+    t = np.linspace(0, 40, 4001)
+    limits = {"force_limits": (-30e3, 30e3), "torque_limits": (-3e3, 1e3)}
+    for given, law, column in ((plan, "generator", None), (profile, "still", "S-curve")):
+        made = crane_loop(Crane(), given, law, **limits)
+        out = cp.simulate(made, t, initial_state=made.initial_state)
+        rows = dict(zip(out.output_labels, np.asarray(out.outputs), strict=True))
+        swayed, pushed = np.abs(rows["theta"][t >= 15]).max(), np.abs(rows["F"]).max()
+        found = [g.values[1, 3] if column is None else g.rivals[column][1] for g in (sway, force)]
+        assert found == pytest.approx([swayed, pushed], rel=5e-3)
+    assert (np.diff(settling.values[:, :4], axis=1) < 0).all()  # it wins over the polynomial where alpha is below pi
+
+
+@pytest.mark.slow
+def test_limited_drives_are_never_asked_for_more_than_they_have(beside):
+    force = beside.grids[2]
+    assert max(force.values.max(), *(rows.max() for rows in force.rivals.values())) <= 30e3 * (1 + 1e-9)
