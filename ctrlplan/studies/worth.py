@@ -253,9 +253,10 @@ def worth(
         scaled = _scaled(points, factor)
         shapes = {f"{a:g}": TrigSpline(scaled, alpha=a) for a in alphas}
         rivals = rival_plans(scaled, held, shaper)
-        # What the plant cannot follow loses.
-        refused = {name: dict.fromkeys(decisive, np.inf) for name in (*shapes, *rivals)}
-        tables.append(refused | compared(scaled, shapes | rivals, set(decisive)).metrics)
+        rows = compared(scaled, shapes | rivals, set(decisive)).metrics
+        # What the plant cannot follow, and what an event has ended, loses.
+        lost = dict.fromkeys(decisive, np.inf)
+        tables.append({name: lost | rows.get(name, {}) for name in (*shapes, *rivals)})
         names |= dict.fromkeys(rivals)
     grids = tuple(
         Grid(

@@ -122,6 +122,37 @@ def test_choices_reach_the_plan(stated):
     np.testing.assert_array_equal(found["long"](np.arange(17.0)), expected(np.arange(17.0)))
 
 
+@pytest.mark.parametrize("family", ["trigonometric", "piecewise"])
+def test_alpha_can_be_left_to_be_chosen(family, stated):
+    """The shortest path, of all that a scan finds; from then on alpha is a number."""
+    stated_file = stated(valid(plans=[{"family": family, "alpha": "auto"}]))
+    (plan,) = stated_file.plans.values()
+    kind, t = FAMILIES[family][0], np.linspace(0, 16, 1001)
+
+    def way(alpha):
+        return np.abs(np.diff(kind(stated_file.waypoints, alpha=alpha)(t)[0])).sum()
+
+    assert way(plan.alpha) <= min(map(way, np.linspace(0.0, 6.0, 61))) + 1e-5
+    assert f"alpha = {plan.alpha:g} rad" in " ".join(map(str, stated_file.parameters().values()))
+    assert '"auto"' not in plans_as_json(stated_file)
+
+
+def test_a_gamma_cannot_be_chosen(stated):
+    with pytest.raises(StudyError, match=r"plans\[0\]: .*gamma"):
+        stated(valid(plans=[{"family": "trigonometric", "alpha": 1.0, "gamma": "auto"}]))
+
+
+def test_a_file_can_ask_whether_planning_is_worth_it(stated):
+    assert stated(valid()).run().comparison.worth is None
+    data = valid(worth=True, plans=[{"family": "polynomial"}], samples=601)
+    found = stated(data).run().comparison
+    assert found.worth.comparison.units == {"x": "m", "u": "N"}
+    assert {"trigonometric", "step", "trapezoid", "S-curve", "shaped step", "minimum jerk"} <= set(
+        found.worth.comparison.plans
+    )
+    assert list(found.results()) == ["plans", "worth"]
+
+
 def test_the_family_may_be_the_name(stated):
     assert list(stated(valid(plans=[{"name": "polynomial"}])).plans) == ["polynomial"]
     found = stated(valid(plans=[{"name": "mine", "family": "polynomial"}, {"family": "step"}])).plans

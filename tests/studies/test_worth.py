@@ -419,6 +419,16 @@ def test_a_move_there_and_back_has_no_winner():
     assert "nan" not in " ".join(found.verdicts)
 
 
+def test_a_run_that_is_ended_loses():
+    """At alpha = 3 the plan of 1 s asks for more than 15, at 1.5 s for less (MATH's loop, seen in the tables)."""
+    ends = [cp.Event("u", high=15.0, stop=True)]
+    few = {"alphas": (0.0, 1.0, 3.0), "factors": (1.0, 1.5), "decisive": ("settling_time",)}
+    (table,) = worth(loop(100.0), MOVE, TIMES, alpha=1.0, events=ends, **few).grids
+    assert table.values[0, 2] == math.inf
+    assert np.isfinite(table.values[1]).all()
+    assert table.marks()[0][2] == "lose"
+
+
 # Wins and losses, counted by hand
 
 
@@ -482,6 +492,12 @@ def test_no_one_wins_where_every_rival_is_undefined():
     found = grid([[2.0, 2.0], [2.0, 3.0]], one=[math.nan, 2.5])
     assert found.marks() == [["", ""], ["win", "lose"]]
     assert "nan" not in found.verdict
+
+
+def test_a_plan_wins_where_every_rival_never_arrives():
+    found = grid([[math.inf, 2.0]], one=[math.inf])
+    assert found.marks() == [["", "win"]]
+    assert "of 1 trigonometric plans 1 win and 0 lose" in found.verdict
 
 
 def test_the_polynomial_is_no_trigonometric_plan():
