@@ -211,6 +211,7 @@ def _worth(worth: Worth, name: str) -> dict[str, Any]:
     least = min((need.duration for need in worth.needs if math.isfinite(need.duration)), default=math.nan)
     return {
         "verdicts": worth.verdicts,
+        "alpha": f"{worth.alpha:.4g}",
         "note": worth.note,
         "svg": Markup(to_svg(plot_rivals(worth.comparison), f"{name}-worth")),  # noqa: S704 (our own drawing)
         "caption": "References through the same waypoints in the same time, what the loop makes of them, and what "

@@ -265,7 +265,7 @@ def compare(
         if not points:
             raise ValueError("worth needs waypoints, in the place of plans or as waypoints, got none")
         shared: dict[str, Any] = {
-            "alpha": alpha,
+            "alpha": next((plan.alpha for plan in references.values() if isinstance(plan, TrigSpline)), alpha),
             "outputs": outputs,
             "controls": controls,
             "initial_state": initial_state,

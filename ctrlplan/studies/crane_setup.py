@@ -81,7 +81,7 @@ def load_metrics(plan: Trajectory, response: Any, last: float) -> dict[str, floa
     load = np.stack([signals["x"], signals["z"]])
     error = np.hypot(*(load - plan.jet(t, 0)[0]))
     way, after = t <= last, t >= last
-    travelled = plan.jet(np.linspace(plan.start, plan.end, 4001), 0)[0] if plan.duration else None
+    travelled = None if plan.jumps(0) else plan.jet(np.linspace(plan.start, plan.end, 4001), 0)[0]
     slack = float(metrics.saturation_time(t, signals["T"], 0.0, np.inf))
     return {
         "error_travel": _peak(t[way], error[way]),

@@ -135,6 +135,8 @@ class Worth:
         How long each takes under these limits.
     grids : tuple of Grid
         Where trigonometric plans win and lose.
+    alpha : float
+        Shape parameter of the trigonometric plan [rad].
     note : str
         What a reader must know of how it was made.
     """
@@ -143,6 +145,7 @@ class Worth:
     limits: dict[str, Any]
     needs: tuple[Need, ...]
     grids: tuple[Grid, ...]
+    alpha: float = 0.0
     note: str = ""
 
     @property
@@ -270,7 +273,7 @@ def worth(
         )
         for key in decisive
     )
-    return Worth(found, held, _needs(points, shape, held, quantities), grids, note)
+    return Worth(found, held, _needs(points, shape, held, quantities), grids, shape, note)
 
 
 def rival_plans(

@@ -183,10 +183,8 @@ def test_from_rest_to_rest_every_path_below_pi_has_one_length(alpha):
 
 
 def test_from_rest_to_rest_the_polynomial_has_the_least_jerk():
-    costs = [
-        quad(lambda t, p=cp.TrigSpline(nominal_waypoints(), alpha=a): (p(t, 3) ** 2).sum(), 0, 15)[0]
-        for a in (0.0, 0.5, 1.0, 2.0, 3.0)
-    ]
+    plans = [cp.TrigSpline(nominal_waypoints(), alpha=a) for a in (0.0, 0.5, 1.0, 2.0, 3.0)]
+    costs = [quad(lambda t, plan=plan: (plan(t, 3) ** 2).sum(), 0, 15)[0] for plan in plans]
     assert costs == sorted(costs)
     assert costs[0] == pytest.approx(720 * 401 / 15**5, rel=1e-9)
 
@@ -240,6 +238,7 @@ def test_margins_are_what_dense_samples_leave(fast):
     assert fractions == sorted(fractions)
 
 
+@pytest.mark.slow
 def test_the_notes_say_which_limit_where_and_what_the_others_leave(fast):
     (note,) = fastest_notes(fast)
     assert f"takes {fast.duration:.4g} s at least: theta is at its limit at {fast.active.time:.3g} s" in note
@@ -337,6 +336,13 @@ def test_values_of_the_crane_are_those_of_runs_of_their_own(beside):
         found = [g.values[1, 3] if column is None else g.rivals[column][1] for g in (sway, force)]
         assert found == pytest.approx([swayed, pushed], rel=5e-3)
     assert (np.diff(settling.values[:, :4], axis=1) < 0).all()  # it wins over the polynomial where alpha is below pi
+
+
+@pytest.mark.slow
+def test_what_jumps_takes_no_path_and_the_others_the_straight_line(beside):
+    lengths = {name: values["path_length"] for name, values in beside.comparison.metrics.items()}
+    for name, found in lengths.items():
+        assert found == pytest.approx(np.nan if "step" in name else 401**0.5, rel=1e-6, nan_ok=True), name
 
 
 @pytest.mark.slow

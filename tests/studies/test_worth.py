@@ -121,6 +121,14 @@ def test_profiles_have_the_proportions_of_the_fastest_ones():
         assert found["S-curve"].peak(order) == pytest.approx([limit / ratio**order], rel=1e-12)
 
 
+def test_where_a_limit_is_not_given_it_is_that_of_a_move_in_equal_thirds():
+    """v = 1.5, a = 4.5: thirds. With the acceleration reached in half of a third, j = 27, it takes 2/3 + 1/3 + 1/6."""
+    found = rival_plans(MOVE, {"velocity": 1.5})
+    np.testing.assert_allclose(found["trapezoid"].breakpoints, np.arange(4) / 3, rtol=0, atol=1e-12)
+    for order, limit in ((1, 1.5), (2, 4.5), (3, 27.0)):
+        assert found["S-curve"].peak(order) == pytest.approx([limit * (7 / 6) ** order], rel=1e-12)
+
+
 @pytest.mark.parametrize("kind", [Trapezoid, SCurve])
 def test_without_limits_profiles_are_those_of_what_the_polynomial_needs(kind):
     d, took = 3.0, 2.0
@@ -420,7 +428,7 @@ def test_a_move_there_and_back_has_no_winner():
 
 
 def test_a_run_that_is_ended_loses():
-    """At alpha = 3 the plan of 1 s asks for more than 15, at 1.5 s for less (MATH's loop, seen in the tables)."""
+    """At alpha = 3 the plan of 1 s asks for more than 15, every other for less."""
     ends = [cp.Event("u", high=15.0, stop=True)]
     few = {"alphas": (0.0, 1.0, 3.0), "factors": (1.0, 1.5), "decisive": ("settling_time",)}
     (table,) = worth(loop(100.0), MOVE, TIMES, alpha=1.0, events=ends, **few).grids
