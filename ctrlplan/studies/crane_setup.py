@@ -87,13 +87,19 @@ def load_metrics(plan: Trajectory, response: Any, last: float) -> dict[str, floa
         "error_travel": _peak(t[way], error[way]),
         "error_after": _peak(t[after], error[after]),
         "sway_after": _peak(t[after], signals["theta"][after]),
-        "force_peak": _peak(t, signals["F"]),
+        "force_peak": _limited_peak(t, signals["F"]),
         "slack_time": slack,
         "path_length": np.nan
         if travelled is None
         else float(metrics.path_length(np.linspace(plan.start, plan.end, 4001), travelled)),
         "load_path": float(metrics.path_length(t, load)),
     }
+
+
+def _limited_peak(t: Array, values: Array) -> float:
+    """Greatest magnitude of what a limit may cut off: a curve through samples would go beyond it at the corner."""
+    size = np.abs(values)
+    return float(size.max()) if np.count_nonzero(size == size.max()) > 1 else _peak(t, values)
 
 
 def _peak(t: Array, values: Array) -> float:

@@ -159,7 +159,8 @@ def test_needs_are_shown_with_the_limit_that_is_active_and_where(study, page):
     assert winners == ["S-curve"]
 
 
-def test_limits_are_said_in_words(page):
+def test_alpha_and_limits_are_said_in_words(page):
+    assert "A trigonometric plan (alpha = 1 rad) beside" in page.words()
     assert "Under the same limits (y_d1 within ±1.875; y_d2 within ±5.774; y_d3 within ±60)" in page.words()
 
 
@@ -244,11 +245,15 @@ def test_marks_of_wins_losses_and_ties(page):
 # Odd cases
 
 
-def test_a_move_there_and_back_has_a_page(shown):
-    points = [cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1), cp.Waypoint(2, 0, 0, 0)]
-    words, page = shown(cp.compare(loop(100.0), points, TIMES, worth={"alphas": (0.0, 1.0), "factors": (1.0,)}))
-    assert WORTH in heads(page)
+def test_a_table_where_nothing_is_defined_has_a_page(study, shown):
+    """Such as of settling, for a move there and back."""
+    one, _ = study.comparison.worth.grids
+    rivals = dict.fromkeys(one.rivals, np.full(2, math.nan))
+    bare = replace(one, values=np.full((2, 3), math.nan), rivals=rivals)
+    words, page = shown(replace(study.comparison, worth=replace(study.comparison.worth, grids=(bare,))))
     assert not re.search(r"\bnan\b", words)
+    (table,) = tables(page, "grid")
+    assert {text for row in rows(table) for text in row[1:]} == {"–"}
 
 
 def test_limits_that_no_plan_can_keep_have_a_page(study, shown):
@@ -261,7 +266,7 @@ def test_limits_that_no_plan_can_keep_have_a_page(study, shown):
 
 
 def test_a_worth_without_needs_or_tables_has_a_page(study, shown):
-    bare = Worth(study.comparison.worth.comparison, {}, (), ())
+    bare = Worth(study.comparison.worth.comparison, {}, (), (), 1.0)
     assert WORTH in heads(shown(replace(study.comparison, worth=bare))[1])
 
 

@@ -19,6 +19,7 @@ from ctrlplan.studies.choosing import (
     optimality_grids,
 )
 from ctrlplan.studies.crane_setup import nominal_waypoints, obstacle_waypoints
+from ctrlplan.systems.plants import Crane, crane_loop
 
 G, DRUM, TROLLEY, LOAD, INERTIA = 9.81, 0.25, 5000.0, 500.0, 50.0
 QUINTIC = "quintic a leg (minimum jerk)"
@@ -121,8 +122,8 @@ def test_the_polyline_and_how_near_one_quintic_a_leg_comes_to_it(grids):
 
 def test_no_trigonometric_spline_a_leg_is_shorter_than_that_of_the_table(grids):
     for end, found in zip(grids[0].durations, grids[0].rivals[LEGS], strict=True):
-        t = np.linspace(0, end, 4001)
-        alphas = np.linspace(0, 5.5, 45)
+        t = np.linspace(0, end, 2001)
+        alphas = np.linspace(0, 5.5, 23)
         ways = [
             np.hypot(*np.diff(cp.PiecewiseSpline(obstacle_waypoints(end), alpha=a)(t))).sum() for a in alphas.tolist()
         ]
@@ -160,10 +161,10 @@ def test_the_claim_fails_and_says_how(grids):
 
 def test_the_shortest_path_of_the_claim_is_the_shortest_of_a_scan(grids):
     alpha, metres = map(float, re.search(r"has alpha = ([\d.]+) and ([\d.]+) m", optimality_claim(grids)[1]).groups())
-    t = np.linspace(0, 16, 8001)
-    alphas = np.linspace(3.9, 4.4, 101)
+    t = np.linspace(0, 16, 4001)
+    alphas = np.linspace(3.9, 4.4, 51)
     ways = [np.hypot(*np.diff(cp.TrigSpline(obstacle_waypoints(), alpha=a)(t))).sum() for a in alphas.tolist()]
-    assert alpha == pytest.approx(alphas[np.argmin(ways)], abs=0.006)
+    assert alpha == pytest.approx(alphas[np.argmin(ways)], abs=0.011)
     assert metres == pytest.approx(min(ways), abs=0.006)
 
 
@@ -320,8 +321,6 @@ def test_the_s_curve_of_the_needs_sways_as_far_as_is_allowed(beside):
 
 @pytest.mark.slow
 def test_values_of_the_crane_are_those_of_runs_of_their_own(beside):
-    from ctrlplan.systems.plants import Crane, crane_loop
-
     settling, sway, force = beside.grids
     assert [grid.unit for grid in beside.grids] == ["s", "rad", "N"]
     plan = cp.TrigSpline(nominal_waypoints(), alpha=3.0)

@@ -268,7 +268,7 @@ def test_a_sign_may_be_a_limit():
 
 def test_no_plan_is_possible_where_limits_are_none_that_time_can_keep():
     lone = (Need("step", math.nan, "jumps"), Need("quintic", math.nan, "no"))
-    found = Worth(None, {}, lone, ())
+    found = Worth(None, {}, lone, (), 1.0)
     assert found.verdicts == ("Under these limits no plan is possible.",)
 
 
@@ -343,8 +343,8 @@ def test_the_mode_of_a_sampled_loop_is_that_of_its_continuous_one():
 def test_alpha_can_be_chosen():
     points = [cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 3), cp.Waypoint(2, 1, 0, 0)]
     few = {"alphas": (1.0,), "factors": (1.0,), "decisive": ("settling_time",)}
-    found = worth(loop(100.0), points, TIMES[::4], **few).comparison.plans["trigonometric"]
-    assert found.alpha == cp.choose_alpha(points).alpha
+    found = worth(loop(100.0), points, TIMES[::4], **few)
+    assert found.comparison.plans["trigonometric"].alpha == found.alpha == cp.choose_alpha(points).alpha
 
 
 # The tables over alpha and duration
@@ -536,6 +536,7 @@ def test_what_is_infinite_or_undefined_is_null():
         {},
         (Need("step", math.nan, "jumps"),),
         (grid([[math.inf, 1.0]], one=[math.nan]),),
+        1.0,
     )
     data = lone.results()
     assert data["needs"] == {"step": None}
@@ -569,6 +570,14 @@ def test_compare_hands_on_what_it_was_given():
     own = found.metrics["mine"]
     assert inner.metrics["quintic (minimum jerk)"]["settling_time"] == pytest.approx(own["settling_time"], rel=1e-9)
     assert inner.metrics["quintic (minimum jerk)"]["iae"] == pytest.approx(own["iae"], rel=1e-9)
+
+
+def test_compare_judges_the_trigonometric_plan_that_it_was_given():
+    few = {"alphas": (1.0,), "factors": (1.0,), "decisive": ("settling_time",)}
+    plans = {"poly": cp.PolySpline(MOVE), "mine": cp.TrigSpline(MOVE, alpha=2.5)}
+    found = cp.compare(loop(100.0), plans, TIMES[::4], waypoints=MOVE, worth=few)
+    assert found.worth.alpha == 2.5
+    assert found.worth.comparison.metrics["trigonometric"] == found.metrics["mine"]
 
 
 def test_further_metrics_can_be_decisive():
