@@ -60,6 +60,7 @@ def brute(waypoints, name, alphas, family=cp.TrigSpline, count=1001, **options):
     return np.array([naive(family(waypoints, alpha=float(a), **options), name, count) for a in alphas])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", OBJECTIVES)
 def test_unit_move_has_no_better_alpha(name):
     found = cp.choose_alpha(REST, name)
@@ -119,6 +120,7 @@ def test_crane_wandering_is_the_same_choice():
     assert wander.blow_up > path.alpha
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["peak_jerk", "squared_acceleration", "peak_velocity"])
 def test_crane_other_objectives(name):
     found = cp.choose_alpha(OBSTACLE, name)

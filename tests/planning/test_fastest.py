@@ -227,6 +227,7 @@ def test_crane_feasible_set_is_that_of_a_scan():
         assert holds == any(low <= duration <= high for low, high in found.feasible)
 
 
+@pytest.mark.slow
 def test_crane_does_not_depend_on_the_duration_given():
     expected = fastest(HOIST, CRANE_LIMITS["drives"], CRANE).duration
     for duration in (0.5, 300.0):
@@ -235,6 +236,7 @@ def test_crane_does_not_depend_on_the_duration_given():
         )
 
 
+@pytest.mark.slow
 def test_what_the_plant_refuses_is_told():
     found = fastest(HOIST, {"T": (0, None)}, CRANE)
     # The crane can follow only below g - z'' = 0, which no limit says.
@@ -299,6 +301,7 @@ def test_feasibility_is_not_monotone_where_derivatives_are_held(limit):
     assert quintic_peak(found.duration * (1 - 1e-4)) > limit
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("family", ["trigonometric", "piecewise", "polynomial"])
 def test_feasible_set_is_that_of_a_scan(family):
     points = obstacle_waypoints()

@@ -57,6 +57,7 @@ def clock(plan):
     return plan.law
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PLANS)
 def test_limits_hold_and_no_time_is_lost_to_the_shape(name):
     plan = PLANS[name]
@@ -104,6 +105,7 @@ def test_the_clock_has_four_continuous_derivatives():
     assert (np.abs(right - left).max(axis=1) <= 1e-9 * size).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["cubic", "quintic"])
 @pytest.mark.parametrize(("distance", "velocity", "acceleration"), [(1.0, 10.0, 1.0), (10.0, 1.0, 1.0)])
 def test_straight_moves_come_near_the_trapezoid(kind, distance, velocity, acceleration):
@@ -206,6 +208,7 @@ def test_sway_is_limited_on_the_path():
     assert path.duration < fastest(PLANS["obstacle"], {"theta": 0.08, "velocity": 3.0}, CRANE).duration
 
 
+@pytest.mark.slow
 def test_position_limits_stay_what_they_are():
     plan = PLANS["nominal"]
     found = fastest(plan, {"x": (0, 20), "z": (10, 11), "x_d1": 2.0, "x_d2": 0.5}, hold="path")

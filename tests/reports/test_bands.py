@@ -229,6 +229,7 @@ def test_the_page_says_what_was_drawn(page):
     assert "failed" not in findings.words()
 
 
+@pytest.mark.slow
 def test_the_page_says_what_failed(failed, read):
     study = Study("draws", "Draws", failed.nominal, notes=tuple(failed.notes()), ensemble=failed, figures=("bands",))
     text = read(render_page([study], "Draws")).words()
@@ -246,6 +247,7 @@ def test_a_page_without_any_draw_that_was_run_is_whole(nothing, tmp_path, read):
     assert "2 draws failed" in text
 
 
+@pytest.mark.slow
 def test_values_that_are_never_reached_are_words_that_sort_last(tmp_path, read):
     slow = ensemble(lag(), PLANS, TIMES, {"tau": [0.5, 9.0, 9.5]}, None, False)
     rows, _ = spread(read(slow.report(tmp_path).read_text(encoding="utf-8")))

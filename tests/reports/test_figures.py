@@ -482,6 +482,7 @@ def test_figures_do_not_pile_up_in_pyplot(compared, swept):
     assert plt.get_fignums() == before
 
 
+@pytest.mark.slow
 def test_a_page_leaves_no_window_open(compared, swept, monkeypatch):
     monkeypatch.setattr(mpl, "get_backend", lambda: "QtAgg")  # where pyplot would manage them
     before = plt.get_fignums()

@@ -305,6 +305,7 @@ def several():
     return [Study(name, f"The {name} loop", cp.compare(loop, move, times)) for name, loop in loops.items()]
 
 
+@pytest.mark.slow
 def test_several_studies_stand_apart_and_are_found_from_the_top(several, read):
     tree = read(render_page(several, "Both"))
     assert [s.attributes["id"] for s in tree.all("section")] == ["slow", "fast"]
@@ -318,6 +319,7 @@ def test_several_studies_stand_apart_and_are_found_from_the_top(several, read):
     assert len(ids) == len(set(ids))
 
 
+@pytest.mark.slow
 def test_the_same_studies_give_the_same_page(several):
     assert render_page(several[:1], "One") == render_page(several[:1], "One")
 

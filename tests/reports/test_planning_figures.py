@@ -150,6 +150,7 @@ def compared():
     return cp.compare(loop, plans, t, waypoints=MOVE, units={"y": "m", "u": "N"})
 
 
+@pytest.mark.slow
 def test_rivals_are_drawn_with_what_the_loop_makes_of_them(compared):
     figure = plot_rivals(compared)
     reference, output, control = (axes for axes in figure.axes if axes.get_visible())

@@ -117,6 +117,7 @@ def test_words_of_others_are_escaped(html):
     assert "Length &amp; width" in html
 
 
+@pytest.mark.slow
 def test_without_units_there_are_no_brackets(shown, study):
     worth = replace(study.comparison.worth, comparison=replace(study.comparison.worth.comparison, units={}))
     words, _ = shown(replace(study.comparison, units={}, worth=worth))
@@ -169,6 +170,7 @@ def test_verdicts_are_there(study, page):
         assert sentence in page.words()
 
 
+@pytest.mark.slow
 def test_limits_of_every_form_and_the_note_are_said(study, shown):
     limits = {"velocity": 3, "y_d1": (-2.0, 3.0), "y_d2": [None, 3.0], "y_d3": np.array([-2.0, 3.0])}
     words, _ = shown(
@@ -245,6 +247,7 @@ def test_marks_of_wins_losses_and_ties(page):
 # Odd cases
 
 
+@pytest.mark.slow
 def test_a_table_where_nothing_is_defined_has_a_page(study, shown):
     """Such as of settling, for a move there and back."""
     one, _ = study.comparison.worth.grids
@@ -256,6 +259,7 @@ def test_a_table_where_nothing_is_defined_has_a_page(study, shown):
     assert {text for row in rows(table) for text in row[1:]} == {"–"}
 
 
+@pytest.mark.slow
 def test_limits_that_no_plan_can_keep_have_a_page(study, shown):
     needs = tuple(Need(need.name, math.nan, "never") for need in study.comparison.worth.needs)
     words, page = shown(replace(study.comparison, worth=replace(study.comparison.worth, needs=needs)))
@@ -265,6 +269,7 @@ def test_limits_that_no_plan_can_keep_have_a_page(study, shown):
     assert not list(table.all("td", class_="win"))
 
 
+@pytest.mark.slow
 def test_a_worth_without_needs_or_tables_has_a_page(study, shown):
     bare = Worth(study.comparison.worth.comparison, {}, (), (), 1.0)
     assert WORTH in heads(shown(replace(study.comparison, worth=bare))[1])

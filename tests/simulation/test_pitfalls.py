@@ -116,6 +116,7 @@ def explosive():
     return ct.interconnect([error, gain, plant], inputs="r", outputs=["y", "u"], name="explosive")
 
 
+@pytest.mark.slow
 def test_a_draw_counts_for_the_plans_that_get_through():
     plans = {"small": cp.Step(0.2), "large": cp.Step(3.0)}
     found = cp.sweep(explosive(), plans=plans, timepts=T, params={"g": [0.0, 0.1, 5.0]}, progress=False)

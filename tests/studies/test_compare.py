@@ -474,6 +474,7 @@ def test_names_are_escaped_wherever_they_are_shown(tmp_path):
         assert "&lt;b&gt;&amp;" in text
 
 
+@pytest.mark.slow
 def test_report_writes_a_page_into_a_folder_or_a_file(standard, tmp_path):
     assert standard.report(tmp_path / "new" / "folder") == tmp_path / "new" / "folder" / "index.html"
     assert standard.report(tmp_path / "it.html") == tmp_path / "it.html"

@@ -166,6 +166,7 @@ def test_results_have_the_stable_keys(study):
         assert all(len(row) == count for row in results["sweep"][plan].values())
 
 
+@pytest.mark.slow
 def test_progress_goes_to_stderr_or_nowhere(capsys):
     linear_study(progress=False, count=4, finest=0.5)
     said = capsys.readouterr()

@@ -63,6 +63,7 @@ def test_the_move_asks_for_the_force_of_the_flat_map():
     assert retimed[0].max() < 2e3 < retimed[1].max()
 
 
+@pytest.mark.slow
 def test_the_governors_model_is_the_crane_in_small_motion():
     """Rows of the set hold for the nonlinear loop: from rest, its own largest step keeps nine tenths of the limit."""
     found = studies._admissible(4e3)

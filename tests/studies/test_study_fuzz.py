@@ -86,12 +86,14 @@ def refused_or_run(text):
         assert study.results()
 
 
+@pytest.mark.slow
 @settings(max_examples=150, deadline=None)
 @given(mutated())
 def test_mutated_entries_are_run_or_refused(data):
     refused_or_run(to_toml(data))
 
 
+@pytest.mark.slow
 @settings(max_examples=100, deadline=None)
 @given(st.data())
 def test_mutated_text_is_run_or_refused(data):

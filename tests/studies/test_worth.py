@@ -321,6 +321,7 @@ def test_all_go_through_the_loop_in_the_same_time(stiff):
     assert stiff.comparison.plans["trigonometric"].alpha == 1.0
 
 
+@pytest.mark.slow
 def test_a_mode_can_be_given_and_none_is_guessed_where_there_is_none():
     few = {"alphas": (1.0,), "factors": (1.0,), "decisive": ("settling_time",)}
     given = worth(loop(5.0), MOVE, TIMES, mode=(40.0, 0.0), alpha=1.0, **few).comparison.plans
@@ -340,6 +341,7 @@ def test_the_mode_of_a_sampled_loop_is_that_of_its_continuous_one():
     np.testing.assert_allclose(plans["shaped step"].breakpoints[1], np.pi / math.sqrt(99.75), rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_alpha_can_be_chosen():
     points = [cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 3), cp.Waypoint(2, 1, 0, 0)]
     few = {"alphas": (1.0,), "factors": (1.0,), "decisive": ("settling_time",)}
@@ -388,6 +390,7 @@ def test_steps_do_not_depend_on_the_duration(stiff):
             assert grid.rivals[name][1] == pytest.approx(grid.rivals[name][0], rel=1e-9)
 
 
+@pytest.mark.slow
 def test_longer_plans_are_run_longer():
     """Waypoints passed at speeds in proportion, and a record that outlasts the plan."""
     points = [cp.Waypoint(1, 0, 0, 0), cp.Waypoint(2, 2, 4, 0), cp.Waypoint(3, 3, 0, 0)]
@@ -580,6 +583,7 @@ def test_compare_judges_the_trigonometric_plan_that_it_was_given():
     assert found.worth.comparison.metrics["trigonometric"] == found.metrics["mine"]
 
 
+@pytest.mark.slow
 def test_further_metrics_can_be_decisive():
     few = {"alphas": (0.0, 1.0), "factors": (1.0, 2.0), "decisive": ("half",)}
     found = worth(

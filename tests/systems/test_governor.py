@@ -64,6 +64,7 @@ def test_limits_hold_at_all_times(seed):
     assert response.events == []
 
 
+@pytest.mark.slow
 def test_limits_hold_whatever_a_bounded_disturbance_does():
     """One that switches from end to end at random, and one in step with the loop's own oscillation."""
     loop = ct.ss(

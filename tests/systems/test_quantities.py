@@ -54,7 +54,7 @@ def test_several_flat_outputs_and_linear_systems():
 
 @pytest.mark.parametrize("wrong", [None, "motor", cp.plants.integrator_lag_loop(1.0)])
 def test_what_is_no_flat_system_is_refused(wrong):
-    with pytest.raises(TypeError, match="flat_system must be a control.flatsys.FlatSystem, got"):
+    with pytest.raises(TypeError, match=r"flat_system must be a control\.flatsys\.FlatSystem, got"):
         cp.flat_quantities(wrong)
 
 
