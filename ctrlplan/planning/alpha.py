@@ -122,6 +122,8 @@ def choose_alpha(
     """
     points = checked_waypoints(waypoints)
     goal = checked_objective(objective)
+    if not callable(family):
+        raise TypeError(f"family must be TrigSpline, PiecewiseSpline or a function like them, got {family!r}")
 
     def plan_of(alpha: float) -> Trajectory:
         return family(points, alpha=alpha, **options)

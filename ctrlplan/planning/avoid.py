@@ -14,7 +14,7 @@ from scipy.optimize import minimize
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
-from ctrlplan.planning.clearance import Clearance, Rope, checked_obstacles, checked_size
+from ctrlplan.planning.clearance import Clearance, Rope, checked_obstacles, checked_rope, checked_size
 from ctrlplan.planning.clearance import clearance as certified_clearance
 from ctrlplan.planning.obstacles import Obstacle
 from ctrlplan.trajectories import PiecewiseSpline, PolySpline, Trajectory, TrigSpline, Waypoint
@@ -100,7 +100,7 @@ def avoid(
         checked_obstacles(obstacles),
         checked_size(clearance, "clearance"),
         checked_size(load, "load"),
-        rope,
+        checked_rope(rope),
         checked_count(max_points, "max_points", 1),
     )
     task.check_waypoints()

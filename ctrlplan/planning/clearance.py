@@ -6,7 +6,7 @@ import itertools
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -18,6 +18,7 @@ _TIGHT = 1e-6  # gap between the bound and what is attained, where the size itse
 _ROUNDING = 1e-9  # of the coordinates: a plan that rests just as far from an obstacle as it must keeps clear of it
 
 
+@runtime_checkable
 class Rope(Protocol):
     """Straight rope from the load up to a point that the load's jet gives."""
 
@@ -52,9 +53,9 @@ class Clearance:
         What it is nearest to.
     required : float or None
         What was asked for.
-    certified : bool
+    certified : bool or None
         Whether `lower` reaches `required`, to rounding (1e-9 of the size of
-        the coordinates); False where nothing was asked for.
+        the coordinates); None where nothing was asked for.
     """
 
     lower: float
@@ -64,7 +65,15 @@ class Clearance:
     obstacle: int
     part: Literal["load", "rope"]
     required: float | None
-    certified: bool
+    certified: bool | None
+
+    def __str__(self) -> str:
+        x, z = self.position
+        asked = {True: f"; {self.required} is kept", False: f"; {self.required} is not kept", None: ""}[self.certified]
+        return (
+            f"at least {self.lower:.6g} over the whole interval, {self.least:.6g} met by the {self.part} beside "
+            f"obstacles[{self.obstacle}] at {self.time:.6g} s with the load at ({x:.4g}, {z:.4g}){asked}"
+        )
 
 
 def clearance(
@@ -125,6 +134,7 @@ def clearance(
     things = checked_obstacles(obstacles)
     radius = checked_size(load, "load")
     goal = None if required is None else checked_number(required, "required")
+    checked_rope(rope)
     if plan.naxes != 2:
         raise ValueError(f"a plan among obstacles must have two axes, got {plan.naxes}")
     if not plan.duration:
@@ -151,7 +161,7 @@ def clearance(
         middle = 0.5 * (left + right)[open_]
         left = np.stack([left[open_], middle], axis=1).ravel()
         right = np.stack([middle, right[open_]], axis=1).ravel()
-    return cells.result(lower, goal, goal is not None and lower >= goal - slack)
+    return cells.result(lower, goal, None if goal is None else lower >= goal - slack)
 
 
 def checked_obstacles(obstacles: Iterable[Obstacle]) -> tuple[Obstacle, ...]:
@@ -165,6 +175,13 @@ def checked_obstacles(obstacles: Iterable[Obstacle]) -> tuple[Obstacle, ...]:
         if not isinstance(thing, Obstacle):
             raise TypeError(f"obstacles[{i}] must be an obstacle, got {thing!r}")
     return things
+
+
+def checked_rope(rope: Rope | None) -> Rope | None:
+    """Rope as clearances read it, or none."""
+    if rope is not None and not isinstance(rope, Rope):
+        raise TypeError(f"rope must be a rope such as crane.rope(), got {rope!r:.60}")
+    return rope
 
 
 def checked_size(value: object, name: str) -> float:
@@ -221,7 +238,7 @@ class _Cells:
         if values[obstacle, at] < self.least:
             self.least, self.where = float(values[obstacle, at]), (float(t[at]), int(obstacle), rope)
 
-    def result(self, lower: float, required: float | None, certified: bool) -> Clearance:
+    def result(self, lower: float, required: float | None, certified: bool | None) -> Clearance:
         time, obstacle, rope = self.where
         x, z = self.plan(time).tolist()
         return Clearance(

@@ -50,6 +50,8 @@ class Fastest:
     refusal : str
         What the plant says of shorter plans, where that holds the plan back and
         no limit does; else empty.
+    searched : (float, float)
+        Durations [s] between which was searched.
     """
 
     plan: Trajectory
@@ -59,6 +61,7 @@ class Fastest:
     hold: str
     limited: Limited
     refusal: str = ""
+    searched: tuple[float, float] = (0.0, math.inf)
 
     @property
     def active(self) -> Margin:
@@ -78,7 +81,9 @@ class Fastest:
 
     @property
     def _sets(self) -> str:
-        return "feasible: " + ", ".join(f"{low:.6g} to {high:.6g} s" for low, high in self.feasible)
+        found = "feasible: " + ", ".join(f"{low:.6g} to {high:.6g} s" for low, high in self.feasible)
+        cut = math.isfinite(self.searched[1]) and self.feasible[-1][1] >= self.searched[1] * (1.0 - 1e-9)
+        return f"{found}, where the search ended" if cut else found
 
     def plot(self, units: Mapping[str, str] | None = None) -> Figure:
         """Every limited signal over time with its limits; units by the signals' names."""
@@ -157,10 +162,10 @@ def fastest(
         raise ValueError(f"durations must be above 0 and finite, got {span[0]:g} to {span[1]:g}")
     if hold == "waypoints":
         return _searched(_Replanned(plan, limited), span or _around(plan.duration), hold)
-    uniform = _uniform(plan, limited, span)
+    uniform = fastest_within(plan, limited, span)
     if hold == "shape":
         return uniform
-    retimed = _uniform(with_fastest_law(uniform.plan, limited), limited, span)
+    retimed = fastest_within(with_fastest_law(uniform.plan, limited), limited, span)
     return replace(min(retimed, uniform, key=lambda found: found.duration), hold=hold)
 
 
@@ -198,8 +203,8 @@ class _Replanned:
         return self.limited.excess(self.limited.sampled(self.plan(duration)))
 
 
-def _uniform(plan: Trajectory, limited: Limited, span: tuple[float, float] | None) -> Fastest:
-    """Shortest duration with the shape held."""
+def fastest_within(plan: Trajectory, limited: Limited, span: tuple[float, float] | None = None) -> Fastest:
+    """Shortest duration with the shape held, for limits that were made ready before."""
     scaled = _Scaled(plan, limited)
     if not _allow_rest(plan, limited):
         return _searched(scaled, span or _around(plan.duration), "waypoints")
@@ -299,8 +304,11 @@ def _searched(family: _Scaled | _Replanned, span: tuple[float, float], hold: str
     if hold == "shape" and feasible[-1][1] == durations[-1]:
         feasible[-1] = (feasible[-1][0], math.inf)
     plan = _holding(limited, family.plan, feasible[0][0])
-    shorter = family.plan(plan.duration * (1.0 - 1e-6))
-    return Fastest(plan, plan.duration, limited.margins(plan), tuple(feasible), hold, limited, limited.refusal(shorter))
+    found = limited.margins(plan)
+    # Where no limit is met, something else holds it back: a plant that cannot follow.
+    refusal = limited.refusal(family.plan(0.99 * plan.duration)) if found.active.fraction > 1e-6 else ""
+    searched = (span[0], math.inf if math.isinf(feasible[-1][1]) else span[1])
+    return Fastest(plan, plan.duration, found, tuple(feasible), hold, limited, refusal, searched)
 
 
 def _runs(inside: NDArray[np.bool_]) -> list[tuple[int, int]]:

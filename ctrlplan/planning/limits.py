@@ -213,7 +213,7 @@ class Limited:
 
     def __init__(self, plan: Trajectory, limits: Mapping[str, Any], quantities: Any = None) -> None:
         if not isinstance(plan, Trajectory):
-            raise TypeError(f"plan must be a Trajectory, got {type(plan).__name__}")
+            raise TypeError(f"plan must be a Trajectory (the attribute plan of what was chosen), got {plan!r:.60}")
         if not plan.duration:
             raise ValueError("a plan that is limited must have a duration, got a step")
         if not isinstance(limits, Mapping):
@@ -239,8 +239,10 @@ class Limited:
     def values(self, jet: Array) -> Array:
         """Limited signals (nbounds, ntime) of a jet (order + 1, naxes, ntime)."""
         found = {} if self.derivatives_only or self._quantities is None else self._quantities(jet)
-        rows = [jet[b.order, b.axis] if b.axis is not None else found[b.name] for b in self.bounds]
-        return np.stack(np.broadcast_arrays(*rows, jet[0, 0]))[:-1]
+        rows = np.empty((len(self.bounds), jet.shape[2]))
+        for row, b in zip(rows, self.bounds, strict=True):
+            row[:] = jet[b.order, b.axis] if b.axis is not None else _signal(b.name, found[b.name], row.shape)
+        return rows
 
     def excess(self, jet: Array) -> float:
         """Greatest excess over a sampled jet, inf where the plant cannot follow at all."""
@@ -305,6 +307,8 @@ class Limited:
     def _slackened(self, plan: Trajectory) -> Iterator[Bound]:
         """The bounds, with slack where they are touched at rest."""
         for bound, values in zip(self.bounds, self.values(self.at_rest(plan)), strict=True):
+            if np.isnan(values).any():
+                raise ValueError(f"{bound.name} must be a number at rest, got nan")
             rounding = 1e-12 * (1.0 + float(np.abs(values).max()) / bound.scale)
             touched = abs(float(bound.excess(values).max())) <= rounding
             yield replace(bound, slack=rounding if touched else 0.0)
@@ -328,9 +332,12 @@ class Limited:
                     yield replace(_bound(name, limit, order, axis), name=derivative_name(label, order))
             else:
                 plain = [quantity for quantity in orders if "_d" not in quantity]
-                known = f" or quantities ({', '.join(plain)}, ...)" if orders else " (quantities were not given)"
+                known = f", or quantities ({', '.join(plain)}, ...)" if orders else "; quantities were not given"
                 axes = ", ".join(derivative_name(label, 1) for label in plan.labels)
-                raise ValueError(f"limits must name derivatives of the axes ({axes}, ...){known}, got {name!r}")
+                raise ValueError(
+                    f"limits must name derivatives of the axes ({axes}, ...), velocity, acceleration, jerk or snap of "
+                    f"them all{known}, got {name!r}"
+                )
 
 
 def _checked_quantities(quantities: Any) -> Quantities | None:
@@ -342,6 +349,8 @@ def _checked_quantities(quantities: Any) -> Quantities | None:
 
 def _bound(name: str, limit: Any, order: int, axis: int | None) -> Bound:
     if np.ndim(limit):
+        if np.size(limit) != 2:
+            raise ValueError(f"limits of {name} must be a number or a pair, got {limit!r}")
         pair = [side if side is not None else math.inf * (2 * i - 1) for i, side in enumerate(limit)]
         low, high, scale = checked_limits(pair, f"limits of {name}")
         return Bound(name, low, high, scale, order, axis)
@@ -358,17 +367,32 @@ def _orders(quantities: Quantities, plan: Trajectory) -> dict[str, int]:
     still = np.zeros((_HIGHEST + 1, plan.naxes, 1))
     still[0] = plan.initial[:, None]
     orders: dict[str, int] = {}
+    refusal: Exception | None = None
     for order in range(_HIGHEST + 1):
         try:
             with np.errstate(all="ignore"):
                 found = quantities(still[: order + 1])
-        except (ValueError, IndexError, KeyError):  # it reads more than this
+        except (ValueError, IndexError, KeyError) as reason:  # it reads more than this
+            refusal = reason
             continue
         if not isinstance(found, Mapping):
             raise TypeError(f"quantities must return a mapping of names to signals, got {type(found).__name__}")
         for name in found:
             orders.setdefault(name, order)
+    if not orders:
+        raise ValueError(
+            f"quantities must take jets (order + 1, {plan.naxes}, ntime) of up to {_HIGHEST} derivatives, got "
+            f"{type(refusal).__name__}: {refusal}"
+        )
     return orders
+
+
+def _signal(name: str, values: Any, shape: tuple[int, ...]) -> Array:
+    """Values of a quantity over time."""
+    found = np.asarray(values, dtype=float)
+    if found.shape != shape:
+        raise TypeError(f"quantities must be signals of shape (ntime,), got {name} of shape {found.shape}")
+    return found
 
 
 def _margin(bound: Bound, minimum: Any, maximum: Any, time_min: Any, time_max: Any) -> Margin:

@@ -183,17 +183,24 @@ def _arc(plan: Trajectory, left: float, right: float) -> float:
 
 def _variation(plan: Trajectory, left: float, right: float) -> float:
     """Length of one leg of one axis: from turning point to turning point."""
-    inside = left + (right - left) * _gauss(64)[0]
-    slope = plan.jet(inside, 1)[1, 0]
-    cell = np.flatnonzero(slope[1:] * slope[:-1] < 0.0)
-    turns = inside[cell] + np.diff(inside)[cell] * slope[cell] / (slope[cell] - slope[cell + 1])
-    for _ in range(2):
-        slope, curve = plan.jet(turns, 2)[1:, 0]
-        turns = np.clip(turns - slope / np.where(curve != 0.0, curve, np.inf), inside[cell], inside[cell + 1])
-    # What is left of the slope there counts by its square.
-    turned = plan.jet(turns, 0)[0, 0]
+    t = left + (right - left) * _gauss(128)[0]
+    # Between points of inflection the slope is monotone: no two turning points can hide between samples.
+    t = np.sort(np.concatenate([t, _crossings(plan, t, 2)]))
     ends = plan.jet([left], 0)[0, 0], plan.jet([right], 0, left=True)[0, 0]
+    turned = plan.jet(_crossings(plan, t, 1), 0)[0, 0]
     return float(np.abs(np.diff(np.concatenate([ends[0], turned, ends[1]]))).sum())
+
+
+def _crossings(plan: Trajectory, t: Array, nu: int) -> Array:
+    """Where the nu-th derivative of the only axis changes its sign between increasing times."""
+    values = plan.jet(t, nu)[nu, 0]
+    cell = np.flatnonzero(values[1:] * values[:-1] < 0.0)
+    low, high = t[cell], t[cell + 1]
+    found = low + (high - low) * values[cell] / (values[cell] - values[cell + 1])
+    for _ in range(2):
+        value, slope = plan.jet(found, nu + 1)[nu:, 0]
+        found = np.clip(found - value / np.where(slope != 0.0, slope, np.inf), low, high)
+    return found
 
 
 def _squares(plan: Trajectory, begin: Array, end: Array) -> Array:

@@ -224,6 +224,7 @@ def _worth(worth: Worth, name: str) -> dict[str, Any]:
                 "text": number(need.duration),
                 "mark": "win" if need.duration <= least * (1.0 + SAME) else "",
                 "limit": need.limit,
+                "kept": need.kept,
             }
             for need in worth.needs
         ],

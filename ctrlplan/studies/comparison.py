@@ -259,6 +259,8 @@ def compare(
         responses[name] = response
         found[name] = values | (path_metrics(plan, points) if only is None else {})
     beside = None
+    if not isinstance(worth, bool | Mapping):
+        raise TypeError(f"worth must be True, False or a mapping of choices, got {worth!r}")
     if worth is not False:
         from ctrlplan.studies.worth import worth as judged
 

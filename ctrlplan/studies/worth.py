@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ctrlplan.planning import fastest, optimize_waypoints
+from ctrlplan.planning import optimize_waypoints
+from ctrlplan.planning.fastest import fastest_within
 from ctrlplan.planning.limits import Limited
 from ctrlplan.simulation import state_space
 from ctrlplan.studies.comparison import Comparison, compare, finite_or_none, is_builder, waypoints_given
@@ -114,11 +115,14 @@ class Need:
         Shortest duration [s], nan where there is none.
     limit : str
         What does not let it be shorter, or why there is none.
+    kept : str
+        What the limits are to it in the time of the waypoints.
     """
 
     name: str
     duration: float
     limit: str
+    kept: str = ""
 
 
 @dataclass(frozen=True)
@@ -232,6 +236,7 @@ def worth(
     times = np.asarray(timepts, dtype=float)
     reference = PolySpline(points)
     held = dict(limits) if limits is not None else _needed_by(reference)
+    limited = Limited(reference, held, quantities)
     shaper = _shaper(loop, reference, mode)
     shape = TrigSpline(points, alpha=alpha).alpha  # type: ignore[arg-type]
 
@@ -273,7 +278,7 @@ def worth(
         )
         for key in decisive
     )
-    return Worth(found, held, _needs(points, shape, held, quantities), grids, shape, note)
+    return Worth(found, held, _needs(points, shape, limited, held, shaper), grids, shape, note)
 
 
 def rival_plans(
@@ -435,34 +440,46 @@ def _profile(
             **more,
         )
         if shaper is not None:
-            part = shaper(part.retime(duration - shaper.duration))
+            part = shaper(part.retime(duration - shaper.duration) if timed else part)
         elif timed:
             part = part.retime(duration)
         parts.append(part)
     return reduce(lambda one, other: one.then(other), parts)
 
 
-def _needs(points: tuple[Waypoint, ...], alpha: float, limits: Mapping[str, Any], quantities: Any) -> tuple[Need, ...]:
+def _needs(
+    points: tuple[Waypoint, ...], alpha: float, limited: Limited, limits: Mapping[str, Any], shaper: Shaper | None
+) -> tuple[Need, ...]:
     """Shortest duration of every plan under the same limits."""
     planned = TrigSpline(points, alpha=alpha)
     bounds = _derivative_limits(planned, limits)
-    fast = {
-        name: _profile(points, planned.labels, kind, bounds, timed=False)
-        for name, kind in (("trapezoid", Trapezoid), ("S-curve", SCurve))
+    timed = {PLANNED: planned} | rival_plans(points, limits, shaper)
+    # Profiles are as fast as they can be, each leg by itself; shaping adds its own time to each.
+    fast: dict[str, Trajectory] = {
+        "trapezoid": _profile(points, planned.labels, Trapezoid, bounds, timed=False),
+        "S-curve": _profile(points, planned.labels, SCurve, bounds, timed=False),
     }
-    plans = {PLANNED: planned} | rival_plans(points, limits) | fast
-    return tuple(_need(name, plan, limits, quantities) for name, plan in plans.items())
+    if "shaped S-curve" in timed:
+        fast["shaped S-curve"] = _profile(points, planned.labels, SCurve, bounds, timed=False, shaper=shaper)
+    return tuple(_need(name, plan, fast.get(name, plan), limited) for name, plan in timed.items())
 
 
-def _need(name: str, plan: Trajectory, limits: Mapping[str, Any], quantities: Any) -> Need:
-    if not plan.duration:
-        return Need(name, math.nan, "jumps: no limit on a derivative holds")
+def _need(name: str, plan: Trajectory, fast: Trajectory, limited: Limited) -> Need:
+    if plan.jumps(0):
+        return Need(name, math.nan, "jumps: no limit on a derivative holds", "broken")
     try:
-        found = fastest(plan, limits, quantities)
+        limited.check_smooth(plan)
+        worst = limited.margins(plan).active
+        kept = "all kept" if worst.fraction >= -SAME else f"{worst.bound.name} {worst.share} beyond"
+        shortest = limited.margins(fast)
+        duration = fast.duration
+        if fast is plan or not shortest.hold:
+            found = fastest_within(fast, limited)
+            duration, shortest = found.duration, found.margins
     except ValueError as refusal:
-        return Need(name, math.nan, str(refusal))
-    active = found.active
-    return Need(name, found.duration, f"{active.bound.name} {active.bound.range}, at {active.time:.3g} s")
+        return Need(name, math.nan, str(refusal), "broken")
+    active = shortest.active
+    return Need(name, duration, f"{active.bound.name} {active.bound.range}, at {active.time:.3g} s", kept)
 
 
 def _need_sentence(needs: Sequence[Need]) -> str:

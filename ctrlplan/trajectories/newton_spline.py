@@ -188,6 +188,8 @@ class NewtonSpline(Trajectory):
 
 def checked_waypoints(waypoints: Iterable[Waypoint], least: int = 2) -> tuple[Waypoint, ...]:
     """Waypoints as a tuple: enough of them, alike, at increasing times."""
+    if not isinstance(waypoints, Iterable):
+        raise TypeError(f"waypoints must be a sequence of Waypoint, got {type(waypoints).__name__}")
     points = tuple(waypoints)
     if len(points) < least:
         number = {1: "one waypoint", 2: "two waypoints"}[least]

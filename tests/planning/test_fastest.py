@@ -441,7 +441,7 @@ def test_wrong_limits(limits, error, message, hold):
 def test_nothing_to_retime():
     with pytest.raises(ValueError, match="must have a duration, got a step"):
         fastest(cp.Step(1.0), {"y_d1": 1.0})
-    with pytest.raises(TypeError, match="plan must be a Trajectory, got float"):
+    with pytest.raises(TypeError, match=r"plan must be a Trajectory .*, got 1\.0"):
         fastest(1.0, {"y_d1": 1.0})
 
 

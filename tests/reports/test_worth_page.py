@@ -108,7 +108,9 @@ def test_nothing_is_left_to_fill_in_and_nothing_is_undefined(html, page):
     words = page.words()
     assert not re.search(r"\{\w*\}|\{\{|\{%|\bnan\b|\bNone\b|\binf\b", words)
     assert "{u}" not in html
-    for cell in [cell for kind in ("needs", "grid", "metrics") for t in tables(page, kind) for cell in t.all("td")]:
+    for cell in [
+        cell for kind in ("needs", "grid", "metrics", "rivals") for t in tables(page, kind) for cell in t.all("td")
+    ]:
         assert cell.words() or "unit" in cell.attributes.get("class", "")
 
 
@@ -130,7 +132,7 @@ def test_without_units_there_are_no_brackets(shown, study):
 
 
 def test_all_rivals_are_in_the_table_of_the_section(study, page):
-    _, beside = tables(page, "metrics")
+    (beside,) = tables(page, "rivals")
     assert titles(beside) == ["metric", "unit", *study.comparison.worth.comparison.plans]
     expected = {"step", "trapezoid", "S-curve", "shaped step", "quintic (minimum jerk)"}
     assert expected <= set(titles(beside))
@@ -145,17 +147,28 @@ def test_all_rivals_are_in_the_table_of_the_section(study, page):
 
 def test_needs_are_shown_with_the_limit_that_is_active_and_where(study, page):
     _, table = tables(page, "needs")
-    assert titles(table) == ["plan", "takes [s]", "limit that does not let it be shorter"]
+    assert titles(table) == [
+        "plan",
+        "takes [s]",
+        "limit that does not let it be shorter",
+        "limits in the time above",
+    ]
     shown = rows(table)
-    for (name, text, why), need in zip(shown, study.comparison.worth.needs, strict=True):
-        assert (name, why) == (need.name, need.limit)
+    for (name, text, why, kept), need in zip(shown, study.comparison.worth.needs, strict=True):
+        assert (name, why, kept) == (need.name, need.limit, need.kept)
         if math.isnan(need.duration):
             assert text == "–"
         else:
             assert number(text) == pytest.approx(need.duration, rel=5e-4)
-    takes = {name: text for name, text, _ in shown}
+    takes = {name: text for name, text, *_ in shown}
+    kept = {name: words for name, _, _, words in shown}
+    assert kept["quintic (minimum jerk)"] == kept["S-curve"] == "all kept"
+    plan = study.comparison.worth.comparison.plans["trigonometric"]
+    beyond = np.abs(plan(np.linspace(0, 1, 20_001), 2)).max() / (10.0 / math.sqrt(3.0)) - 1.0
+    assert beyond > np.abs(plan(np.linspace(0, 1, 20_001), 1)).max() / 1.875 - 1.0 > 0.0
+    assert kept["trigonometric"] == f"y_d2 {100 * beyond:.3g} % beyond"
     assert takes["quintic (minimum jerk)"] == "1.000"
-    assert takes["S-curve"] == "0.9543"
+    assert takes["S-curve"] == "0.9543 ▲"
     winners = [row.children[0].words() for row in table.all("tr") if list(row.all("td", class_="win"))]
     assert winners == ["S-curve"]
 

@@ -242,7 +242,7 @@ def test_the_sentence_names_the_fastest_and_those_that_cannot(stiff):
     sentence = stiff.verdicts[0]
     assert sentence.startswith("Under the same limits S-curve is the fastest with 0.9543 s (trigonometric 1.017 s,")
     assert "quintic (minimum jerk) 1 s" in sentence
-    assert "step, trapezoid cannot keep them at any" in sentence
+    assert "step, trapezoid, shaped step cannot keep them at any" in sentence
 
 
 def test_limits_given_hold_all():
