@@ -202,6 +202,7 @@ def test_python_m_is_the_same_command(study, tmp_path):
     assert re.fullmatch(r"ctrlplan: --out must end in \.csv or \.json, got \S+plan\.txt\n", done.stderr)
 
 
+@pytest.mark.slow
 def test_a_wrong_file_ends_python_m_with_2_and_one_line(tmp_path):
     (tmp_path / "wrong.toml").write_text(STUDY.replace("alpha = 2.0", "alpha = 7.0"))
     done = python_m("report", "wrong.toml", "--out", "out", cwd=tmp_path)

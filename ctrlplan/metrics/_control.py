@@ -182,7 +182,9 @@ def _saturated(t: Array, u: Array, low: float, high: float) -> float:
     scale = high - low if len(sides) == 2 else max(map(abs, sides), default=0.0)
     most = 2 * max(np.abs(u[np.isfinite(u)]).max(initial=1.0), *map(abs, sides), 1.0)
     u = np.clip(u, -most, most)  # a diverged control is beyond the limit: where it went does not matter
-    return sum(_beyond(t, g, _AT_LIMIT * scale) for g in (low - u, u - high) if np.isfinite(g).all())
+    total = sum(_beyond(t, g, _AT_LIMIT * scale) for g in (low - u, u - high) if np.isfinite(g).all())
+    # What is taken to be at a limit on one side may reach into what is on the other.
+    return min(total, float(t[-1] - t[0]))
 
 
 def _beyond(t: Array, g: Array, tolerance: float) -> float:

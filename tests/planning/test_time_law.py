@@ -75,6 +75,7 @@ def test_limits_hold_and_no_time_is_lost_to_the_shape(name):
     assert path.plan.labels == plan.labels
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PLANS)
 def test_the_path_is_the_same(name):
     plan = PLANS[name]

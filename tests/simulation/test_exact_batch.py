@@ -74,6 +74,7 @@ def test_loops_of_every_gain_at_even_times(alpha, count):
     check([lag_loop(gain) for gain in GAINS], plan, signals, t, some=np.arange(0, count, count // 20))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("even", [True, False])
 def test_random_systems_with_random_states(even, seed):

@@ -318,6 +318,7 @@ def test_an_out_folder_that_is_a_file(where, capsys, tmp_path):
     assert "--out must be" in line
 
 
+@pytest.mark.slow
 def test_an_out_folder_whose_files_cannot_be_replaced_gets_neither(capsys, tmp_path):
     (tmp_path / "study.toml").write_text(to_toml(valid()))
     (tmp_path / "out" / "results.json").mkdir(parents=True)

@@ -684,6 +684,7 @@ def test_what_an_executor_found_before_an_interruption_is_kept(found):
     assert result.failures == ()
 
 
+@pytest.mark.slow
 def test_an_interruption_before_anything_was_found_leaves_the_nominal_run(tmp_path):
     result = run(lag(), LAGS, Interrupted(0))
     assert result.finished == 0
@@ -904,6 +905,7 @@ def test_a_loop_that_only_python_control_runs_takes_parameters_too():
 # The bar
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("executor", [None, Elsewhere])
 def test_progress_is_a_bar_on_stderr(executor, capsys):
     run(lag(), {"tau": np.linspace(0.5, 1.0, 24)}, executor and executor(), progress=True)

@@ -142,6 +142,7 @@ def test_a_gamma_cannot_be_chosen(stated):
         stated(valid(plans=[{"family": "trigonometric", "alpha": 1.0, "gamma": "auto"}]))
 
 
+@pytest.mark.slow
 def test_a_file_can_ask_whether_planning_is_worth_it(stated):
     assert stated(valid()).run().comparison.worth is None
     data = valid(worth=True, plans=[{"family": "polynomial"}], samples=601)

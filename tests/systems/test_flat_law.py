@@ -229,6 +229,7 @@ LOOPS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("error", [0.0, 0.2], ids=["on the plan", "beside the plan"])
 @pytest.mark.parametrize(("plant", "poles"), LOOPS.values(), ids=list(LOOPS))
 def test_closed_loops_are_chains_of_integrators(plant, poles, error):

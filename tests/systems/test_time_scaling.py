@@ -677,6 +677,7 @@ LATE = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize(
     ("case", "fastest"), [*((case, 1.0) for case in LATE), ("one move, late", 1.02), ("cubics", 1.02)]
