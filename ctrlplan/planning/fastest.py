@@ -138,8 +138,8 @@ def fastest(
     -----
     With the shape held, limits on derivatives alone have the closed form
     T = T_0 max_k (peak_k/limit_k)^(1/k). All else is a search: feasibility need
-    not be monotone in the duration (MATH: a quintic from 0 to 1 with end speeds
-    1 needs no acceleration at T = 1, and some at 0.8 and at 2). Durations are
+    not be monotone in the duration (a quintic from 0 to 1 with end speeds 1
+    needs no acceleration in 1 s, and some in 0.8 s and in 2 s). Durations are
     looked at 24 times an octave on samples, valleys between them are searched,
     and the ends of every feasible interval are solved for with the extrema of
     the whole plan. What is returned holds every limit to the last bit; where a
@@ -161,7 +161,7 @@ def fastest(
     if span is not None and not (span[0] > 0.0 and math.isfinite(span[1])):
         raise ValueError(f"durations must be above 0 and finite, got {span[0]:g} to {span[1]:g}")
     if hold == "waypoints":
-        return _searched(_Replanned(plan, limited), span or _around(plan.duration), hold)
+        return _searched(_Replanned(plan, limited), span or _around(plan.duration), hold, endless=False)
     uniform = fastest_within(plan, limited, span)
     if hold == "shape":
         return uniform
@@ -207,14 +207,14 @@ def fastest_within(plan: Trajectory, limited: Limited, span: tuple[float, float]
     """Shortest duration with the shape held, for limits that were made ready before."""
     scaled = _Scaled(plan, limited)
     if not _allow_rest(plan, limited):
-        return _searched(scaled, span or _around(plan.duration), "waypoints")
+        return _searched(scaled, span or _around(plan.duration), "shape", endless=False)
     least = _closed_form(plan, limited)
     if limited.derivatives_only and span is None:
         if not least:
             raise ValueError("limits must name a derivative that the plan has, got none that a shorter one would break")
         found = _holding(limited, plan.retime, least)
         return Fastest(found, found.duration, limited.margins(found), ((found.duration, math.inf),), "shape", limited)
-    return _searched(scaled, span or _span(scaled.excess, plan.duration, least), "shape")
+    return _searched(scaled, span or _span(scaled.excess, plan.duration, least), "shape", endless=True)
 
 
 def _allow_rest(plan: Trajectory, limited: Limited) -> bool:
@@ -281,8 +281,8 @@ def _span(excess: Callable[[float], float], duration: float, least: float) -> tu
     return max(low, 0.999 * least), 1.01 * high
 
 
-def _searched(family: _Scaled | _Replanned, span: tuple[float, float], hold: str) -> Fastest:
-    """Feasible durations within a span, and the plan of the shortest."""
+def _searched(family: _Scaled | _Replanned, span: tuple[float, float], hold: str, endless: bool) -> Fastest:
+    """Feasible durations within a span, and the plan of the shortest; endless where every slower plan is feasible."""
     limited = family.limited
     exact = cache(lambda duration: limited.exact_excess(family.plan(duration)))
     count = max(9, math.ceil(_PER_OCTAVE * math.log2(span[1] / span[0])))
@@ -301,7 +301,7 @@ def _searched(family: _Scaled | _Replanned, span: tuple[float, float], hold: str
         feasible.append((ends[0], ends[1]))
     if not feasible:
         _refuse(family, durations, excess)
-    if hold == "shape" and feasible[-1][1] == durations[-1]:
+    if endless and feasible[-1][1] == durations[-1]:
         feasible[-1] = (feasible[-1][0], math.inf)
     plan = _holding(limited, family.plan, feasible[0][0])
     found = limited.margins(plan)

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import reduce
 from itertools import pairwise
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -180,7 +180,7 @@ def worth(
     waypoints: Iterable[Waypoint],
     timepts: ArrayLike,
     *,
-    alpha: float | str = "auto",
+    alpha: float | Literal["auto"] = "auto",
     limits: Mapping[str, Any] | None = None,
     quantities: Any = None,
     mode: tuple[float, float] | None = None,
@@ -238,7 +238,7 @@ def worth(
     held = dict(limits) if limits is not None else _needed_by(reference)
     limited = Limited(reference, held, quantities)
     shaper = _shaper(loop, reference, mode)
-    shape = TrigSpline(points, alpha=alpha).alpha  # type: ignore[arg-type]
+    shape = TrigSpline(points, alpha=alpha).alpha
 
     def compared(points: tuple[Waypoint, ...], plans: dict[str, Trajectory], only: Any = None) -> Comparison:
         last, late = points[-1].time, points[-1].time - reference.end
