@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _TIE = 1e-9
-_BLOWN = 1e3
+_BLOWN = 10.0
 
 
 @dataclass(frozen=True, repr=False)
@@ -43,7 +43,7 @@ class AlphaChoice:
         The objective over alpha, increasing; inf where the waypoints do not
         determine a plan.
     blow_up : float
-        Alpha [rad] from which on the objective is above a thousand times the
+        Alpha [rad] from which on the objective is above ten times the
         least for good; 2 pi where it never is.
     tied : bool
         Whether the objective does not depend on alpha near its least value, so
@@ -148,7 +148,7 @@ def choose_alpha(
         plan=plan_of(alpha),
         alphas=readonly(alphas),
         values=readonly(values),
-        blow_up=_blow_up(alphas, values, best + _BLOWN * scale),
+        blow_up=_blow_up(alphas, values, best + (_BLOWN - 1.0) * scale),
         tied=flat,
         objective=objective if isinstance(objective, str) else str(getattr(objective, "__name__", objective)),
     )

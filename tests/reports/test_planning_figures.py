@@ -63,7 +63,7 @@ def test_the_legend_names_the_choice_and_where_plans_blow_up(choice):
 
 
 def test_without_a_blow_up_there_is_no_band():
-    flat = cp.choose_alpha(MOVE, lambda plan: 2.0 + (plan.alpha - 1.0) ** 2)
+    flat = cp.choose_alpha(MOVE, lambda plan: 5.0 + (plan.alpha - 1.0) ** 2)
     figure = plot_alpha_choice(flat)
     assert flat.alpha == pytest.approx(1.0, abs=1e-6)
     assert not figure.axes[0].patches
