@@ -57,5 +57,5 @@ def _valleys(values: Array, target: float) -> list[int]:
 def _bottom(function: Callable[[float], float], grid: Array, k: int) -> tuple[float, float]:
     """Least value between the neighbours of a grid point."""
     low, high = float(grid[max(k - 1, 0)]), float(grid[min(k + 1, grid.size - 1)])
-    found = minimize_scalar(function, bounds=(low, high), method="bounded", options={"xatol": 1e-8 * (high + low)})
+    found = minimize_scalar(function, bounds=(low, high), method="bounded", options={"xatol": 1e-7 * (high + low)})
     return float(found.x), float(found.fun)

@@ -171,10 +171,7 @@ def _arc(plan: Trajectory, left: float, right: float) -> float:
     slowest = np.clip(np.argmin(squares[rough], axis=1), 1, 14)[:, None] + np.array([-1, 0, 1])
     low, high = edges[:-1][rough], edges[1:][rough]
     least = low + (high - low) * _vertex(nodes[slowest], np.take_along_axis(squares[rough], slowest, axis=1))
-    velocity, acceleration, jerk = plan.jet(np.clip(least, left, right), 3)[1:]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        moved = least - np.sum(velocity * acceleration, axis=0) / np.sum(acceleration**2 + velocity * jerk, axis=0)
-    least = np.clip(np.where(np.abs(moved - least) < 0.1 * (high - low), moved, least), low, high)
+    least = np.clip(least, low, high)
     parts = np.concatenate([least + (end - least) * share for end in (low, high) for share in _GRADED])
     begin, end = parts.reshape(2, len(_GRADED), -1)[:, :-1], parts.reshape(2, len(_GRADED), -1)[:, 1:]
     finer = np.sqrt(_squares(plan, begin.ravel(), end.ravel())) @ weights
