@@ -35,8 +35,6 @@ class Fastest:
     ----------
     plan : Trajectory
         It.
-    duration : float
-        Its duration [s].
     margins : Margins
         Of every limit over the whole plan, the active one first.
     feasible : tuple of (float, float)
@@ -55,13 +53,17 @@ class Fastest:
     """
 
     plan: Trajectory
-    duration: float
     margins: Margins
     feasible: tuple[tuple[float, float], ...]
     hold: str
     limited: Limited
     refusal: str = ""
     searched: tuple[float, float] = (0.0, math.inf)
+
+    @property
+    def duration(self) -> float:
+        """Duration of the plan [s]."""
+        return self.plan.duration
 
     @property
     def active(self) -> Margin:
@@ -213,7 +215,7 @@ def fastest_within(plan: Trajectory, limited: Limited, span: tuple[float, float]
         if not least:
             raise ValueError("limits must name a derivative that the plan has, got none that a shorter one would break")
         found = _holding(limited, plan.retime, least)
-        return Fastest(found, found.duration, limited.margins(found), ((found.duration, math.inf),), "shape", limited)
+        return Fastest(found, limited.margins(found), ((found.duration, math.inf),), "shape", limited)
     return _searched(scaled, span or _span(scaled.excess, plan.duration, least), "shape", endless=True)
 
 
@@ -308,7 +310,7 @@ def _searched(family: _Scaled | _Replanned, span: tuple[float, float], hold: str
     # Where no limit is met, something else holds it back: a plant that cannot follow.
     refusal = limited.refusal(family.plan(0.99 * plan.duration)) if found.active.fraction > 1e-6 else ""
     searched = (span[0], math.inf if math.isinf(feasible[-1][1]) else span[1])
-    return Fastest(plan, plan.duration, found, tuple(feasible), hold, limited, refusal, searched)
+    return Fastest(plan, found, tuple(feasible), hold, limited, refusal, searched)
 
 
 def _runs(inside: NDArray[np.bool_]) -> list[tuple[int, int]]:

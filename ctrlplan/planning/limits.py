@@ -219,7 +219,6 @@ class Limited:
         if not isinstance(limits, Mapping):
             raise TypeError(f"limits must be a mapping of names to limits, got {type(limits).__name__}")
         self._quantities = _checked_quantities(quantities)
-        self._labels = plan.labels
         self.bounds = tuple(self._bounds(plan, limits))
         if not self.bounds:
             raise ValueError("limits must name at least one signal, got none")
@@ -251,7 +250,7 @@ class Limited:
         except ValueError:  # the plant refuses: a rope that would have to push
             return math.inf
         worst = max(float(b.excess(row).max()) for b, row in zip(self.bounds, values, strict=True))
-        return worst if worst == worst else math.inf
+        return math.inf if math.isnan(worst) else worst
 
     def refusal(self, plan: Trajectory) -> str:
         """Why the plant cannot follow a plan, empty where it can."""

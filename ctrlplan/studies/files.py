@@ -122,19 +122,22 @@ class StudyFile:
             axes = ", ".join(self.waypoints[0].labels or ())
             raise StudyError(f"{self.path}: waypoints: a crane's axes must be x and z (down), got {axes}")
         last = self.waypoints[-1].time
-        crane = Crane(**{key: value for key, value in self.loop.items() if key in _CRANE_ENTRIES})
-        depth = float(np.mean([point.position[(point.labels or ()).index("z")] for point in self.waypoints]))
-        asked = {
-            "quantities": crane,
-            "mode": (math.sqrt(crane.gravity / depth), 0.0),
-            "decisive": ("settling_time", "sway_after", "force_peak"),
-            "measure": load_metrics,
-        }
         return {
             "controls": ("F", "C"),
             "measure": lambda plan, response: load_metrics(plan, response, last),
             "measures": CRANE_MEASURES,
-            "worth": asked if self.worth else False,
+            "worth": self._asked_of_crane() if self.worth else False,
+        }
+
+    def _asked_of_crane(self) -> dict[str, Any]:
+        """How planning is judged on a crane: by its sway, and beside references shaped for its pendulum."""
+        crane = Crane(**{key: value for key, value in self.loop.items() if key in _CRANE_ENTRIES})
+        depth = float(np.mean([point.position[(point.labels or ()).index("z")] for point in self.waypoints]))
+        return {
+            "quantities": crane,
+            "mode": (math.sqrt(crane.gravity / depth), 0.0) if depth > 0.0 else None,
+            "decisive": ("settling_time", "sway_after", "force_peak"),
+            "measure": load_metrics,
         }
 
     def timepts(self, loop: Any) -> NDArray[np.float64]:

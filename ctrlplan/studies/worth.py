@@ -238,7 +238,7 @@ def worth(
     held = dict(limits) if limits is not None else _needed_by(reference)
     limited = Limited(reference, held, quantities)
     shaper = _shaper(loop, reference, mode)
-    shape = TrigSpline(points, alpha=alpha).alpha
+    planned = TrigSpline(points, alpha=alpha)
 
     def compared(points: tuple[Waypoint, ...], plans: dict[str, Trajectory], only: Any = None) -> Comparison:
         last, late = points[-1].time, points[-1].time - reference.end
@@ -253,7 +253,8 @@ def worth(
             **options,
         )
 
-    found = compared(points, {PLANNED: TrigSpline(points, alpha=shape)} | rival_plans(points, held, shaper))
+    beside: dict[str, Trajectory] = {PLANNED: planned} | rival_plans(points, held, shaper)
+    found = compared(points, beside)
     decisive = _measured(decisive, found)
     tables: list[dict[str, dict[str, float]]] = []
     names: dict[str, None] = {}  # a move can be too short to be shaped
@@ -278,7 +279,7 @@ def worth(
         )
         for key in decisive
     )
-    return Worth(found, held, _needs(points, shape, limited, held, shaper), grids, shape, note)
+    return Worth(found, held, _needs(points, beside, limited, held, shaper), grids, planned.alpha, note)
 
 
 def rival_plans(
@@ -448,19 +449,22 @@ def _profile(
 
 
 def _needs(
-    points: tuple[Waypoint, ...], alpha: float, limited: Limited, limits: Mapping[str, Any], shaper: Shaper | None
+    points: tuple[Waypoint, ...],
+    timed: dict[str, Trajectory],
+    limited: Limited,
+    limits: Mapping[str, Any],
+    shaper: Shaper | None,
 ) -> tuple[Need, ...]:
-    """Shortest duration of every plan under the same limits."""
-    planned = TrigSpline(points, alpha=alpha)
-    bounds = _derivative_limits(planned, limits)
-    timed = {PLANNED: planned} | rival_plans(points, limits, shaper)
+    """Shortest duration, under the same limits, of plans that take the time of the waypoints."""
+    labels = timed[PLANNED].labels
+    bounds = _derivative_limits(timed[PLANNED], limits)
     # Profiles are as fast as they can be, each leg by itself; shaping adds its own time to each.
     fast: dict[str, Trajectory] = {
-        "trapezoid": _profile(points, planned.labels, Trapezoid, bounds, timed=False),
-        "S-curve": _profile(points, planned.labels, SCurve, bounds, timed=False),
+        "trapezoid": _profile(points, labels, Trapezoid, bounds, timed=False),
+        "S-curve": _profile(points, labels, SCurve, bounds, timed=False),
     }
     if "shaped S-curve" in timed:
-        fast["shaped S-curve"] = _profile(points, planned.labels, SCurve, bounds, timed=False, shaper=shaper)
+        fast["shaped S-curve"] = _profile(points, labels, SCurve, bounds, timed=False, shaper=shaper)
     return tuple(_need(name, plan, fast.get(name, plan), limited) for name, plan in timed.items())
 
 
