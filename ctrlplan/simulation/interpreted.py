@@ -103,10 +103,10 @@ class Interpreted:
     def sampled(self, blocks: tuple[int, ...], t: float, x: Array, driven: Array) -> Array:
         """State after some discrete blocks have taken a sample, each seeing the others' new outputs.
 
-        Blocks with an attribute ``samples_first`` go before the rest and see
+        Blocks that declare `samples_first` go before the rest and see
         their own outputs as they were, which may come back to them at once.
         """
-        first = tuple(i for i in blocks if getattr(self.network.blocks[i].system, "samples_first", False))
+        first = tuple(i for i in blocks if self.network.blocks[i].traits.samples_first)
         rest = tuple(i for i in blocks if i not in first)
         if first:
             w = self._seen(rest, t, x, driven) if rest else self.signals(t, x, driven)

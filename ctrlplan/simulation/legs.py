@@ -156,7 +156,7 @@ def integrate(
         raise ValueError(
             f"a delay must be at least {_SHORTEST_DELAY:g} of the run of {last - first:g} s, got {longest:g} s"
         )
-    declared = [float(getattr(block.system, "longest", np.inf)) for block in network.blocks]
+    declared = [block.traits.longest for block in network.blocks]
     longest = min(longest, max(min(declared, default=np.inf), (last - first) / _LEGS))
     if pause is not None:
         longest = min(longest, (last - first) / 64.0)
@@ -239,8 +239,8 @@ class _Clock:
         self._first = first
         self._periods = {}
         for i in network.blocks_with("period"):
-            system = network.blocks[i].system
-            self._periods[i] = (float(system.period), float(getattr(system, "offset", 0.0)))
+            traits = network.blocks[i].traits
+            self._periods[i] = (float(traits.period or 0.0), traits.offset)
             self._push(i, 0)
 
     def following(self, t: float) -> float:

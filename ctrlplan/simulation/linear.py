@@ -10,6 +10,7 @@ import control as ct
 import numpy as np
 from numpy.typing import NDArray
 
+from ctrlplan.traits import traits_of
 from ctrlplan.trajectories import Trajectory
 
 Array = NDArray[np.float64]
@@ -80,8 +81,9 @@ def linear_forms(systems: Sequence[Any]) -> LinearForm:
             raise _unlike(systems)
         a, b, c, d = map(np.stack, matrices)
         return LinearForm(a, b, c, d, ())
-    plan, high = systems[0].plan, systems[0].derivatives
-    if any(system.plan is not plan or system.derivatives != high for system in systems):
+    sources = [traits_of(system) for system in systems]
+    plan, high = sources[0].plan, sources[0].derivatives
+    if any(source.plan is not plan or source.derivatives != high for source in sources):
         raise _unlike(systems)
     count, n = len(systems), systems[0].noutputs
     a, b, c = map(np.zeros, ((count, 0, 0), (count, 0, n), (count, n, 0)))
@@ -99,7 +101,7 @@ def _kind(system: Any) -> type:
     for kind in (ct.InterconnectedSystem, ct.StateSpace, ct.TransferFunction):
         if isinstance(system, kind):
             return kind
-    if isinstance(getattr(system, "plan", None), Trajectory):
+    if isinstance(traits_of(system).plan, Trajectory):
         return Trajectory
     raise NotLinearError(f"block {system.name} ({type(system).__name__}) is not linear")
 

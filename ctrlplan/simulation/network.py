@@ -23,6 +23,7 @@ from scipy.linalg import block_diag
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
+from ctrlplan.traits import BlockTraits, traits_of
 from ctrlplan.trajectories import Trajectory
 
 Array = NDArray[np.float64]
@@ -46,6 +47,11 @@ class Block:
         """What python-control calls it."""
         return str(self.system.name)
 
+    @cached_property
+    def traits(self) -> BlockTraits:
+        """What the block has declared."""
+        return traits_of(self.system)
+
     @property
     def linear(self) -> bool:
         """Whether four matrices say it all."""
@@ -54,18 +60,18 @@ class Block:
     @property
     def plan(self) -> Trajectory | None:
         """What the block puts out, where that is a plan."""
-        plan = getattr(self.system, "plan", None)
+        plan = self.traits.plan
         return plan if isinstance(plan, Trajectory) else None
 
     @property
     def delay(self) -> float | None:
         """How much later [s] the block puts out what goes in, where it does only that."""
-        return getattr(self.system, "delay", None)
+        return self.traits.delay
 
     @property
     def period(self) -> float | None:
         """Time between the samples of a discrete block in a continuous loop [s]."""
-        return getattr(self.system, "period", None)
+        return self.traits.period
 
     @property
     def driven(self) -> bool:
@@ -94,7 +100,9 @@ class Block:
 
     def sampled(self, params: Mapping[str, Any]) -> Map:
         """States after a sample of a discrete block in a continuous loop."""
-        sample, own = self.system.sample, {**self.params, **params}
+        sample, own = self.traits.sample, {**self.params, **params}
+        if sample is None:
+            raise TypeError(f"block {self.name} must declare a function that takes its samples")
         return lambda t, x, u: sample(t, x, u, own)
 
 
@@ -146,7 +154,7 @@ class Network:
     breakpoints : tuple of float
         Times [s] that blocks name at which their equations change.
     watched : tuple of Declared
-        Signals of blocks that declare limits, by an attribute ``watched``.
+        Signals of blocks that declare limits.
     """
 
     name: str
@@ -174,7 +182,7 @@ class Network:
             np.hstack([part.outer, part.inner]),
             np.hstack([part.through, part.read]),
             system.ninputs or 0,
-            tuple(float(t) for b in part.blocks for t in getattr(b.system, "breakpoints", ())),
+            tuple(t for b in part.blocks for t in b.traits.breakpoints),
         )
         return replace(network, watched=tuple(network._declared()))
 
@@ -230,7 +238,7 @@ class Network:
         return np.concatenate(rows)
 
     def blocks_with(self, kind: str) -> list[int]:
-        """Blocks of a kind: those with a ``period``, a ``delay``, ..."""
+        """Blocks of a kind: those with a period, a delay, ..."""
         return [i for i, block in enumerate(self.blocks) if getattr(block, kind) is not None]
 
     def schedule(self, feeds: Sequence[NDArray[np.bool_]], needed: NDArray[np.bool_]) -> list[Step]:
@@ -286,7 +294,7 @@ class Network:
 
     def _declared(self) -> Iterator[Declared]:
         for block, states, fed in zip(self.blocks, self.states, self.fed, strict=True):
-            for name, (function, low, high) in getattr(block.system, "watched", {}).items():
+            for name, (function, low, high) in (block.traits.watched or {}).items():
                 yield Declared(name, function, low, high, states, fed, block.params)
 
     def _owners(self, rows: NDArray[np.intp]) -> tuple[int, ...]:
@@ -296,15 +304,15 @@ class Network:
 def known_feedthrough(block: Block) -> NDArray[np.bool_] | None:
     """Which outputs of a block depend on which inputs at once, (noutputs, ninputs), where that is certain.
 
-    Of linear blocks by their matrix; of others where they say so themselves,
-    by an attribute ``feedthrough``, or put out their states.
+    Of linear blocks by their matrix; of others where they declare it or output
+    their states.
     """
     shape = (block.system.noutputs, block.system.ninputs or 0)
     if block.linear:
         return np.asarray(block.system.D) != 0.0
     if block.driven or block.system.outfcn is None:
         return np.zeros(shape, dtype=bool)
-    declared = getattr(block.system, "feedthrough", None)
+    declared = block.traits.feedthrough
     return None if declared is None else np.broadcast_to(np.asarray(declared, dtype=bool), shape)
 
 
