@@ -17,28 +17,36 @@ class TimeLimitError(RuntimeError):
 
 @contextmanager
 def time_limit(seconds: float | None) -> Iterator[None]:
-    """Context in which `check` raises once some time has passed.
+    """Context in which `check` raises once a run has taken some time.
+
+    The time counts from here, and again from each call of `begin_run`.
 
     Parameters
     ----------
     seconds : float or None
-        Time allowed [s], by the computer's clock; None for no limit. Inside
-        another limit the earlier end holds.
+        Time allowed for a run [s], by the computer's clock; None for what
+        holds outside.
 
     Notes
     -----
     The limit holds in the thread that entered the context; others have their
     own. Nothing is interrupted: code that never calls `check` is not stopped.
     """
-    given, outer = seconds, _LIMIT.get()
-    if given is None or (outer is not None and outer[0] <= time.monotonic() + given):
+    if seconds is None:
         yield
         return
-    token = _LIMIT.set((time.monotonic() + given, given))
+    token = _LIMIT.set((time.monotonic() + seconds, seconds))
     try:
         yield
     finally:
         _LIMIT.reset(token)
+
+
+def begin_run() -> None:
+    """Allow a run that begins the whole time, whatever the one before it took."""
+    limit = _LIMIT.get()
+    if limit is not None:
+        _LIMIT.set((time.monotonic() + limit[1], limit[1]))
 
 
 def check(t: float | None = None) -> None:
