@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
+from ctrlplan.simulation.budget import check
 from ctrlplan.simulation.drives import Series
 from ctrlplan.simulation.network import Map, Network, Step, known_feedthrough, tried_feedthrough
 
@@ -72,6 +73,7 @@ class Interpreted:
 
     def rates(self, t: float, x: Array, driven: Array) -> Array:
         """Derivatives of all states, given the signals that are functions of time."""
+        check(t)
         w = self._signals(self._for_all if self._doubtful else self._for_rates, t, x, driven)
         if self._doubtful:
             self._check(t, x, w)

@@ -12,6 +12,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from ctrlplan.simulation.budget import check
 from ctrlplan.simulation.drives import (
     RESOLVED,
     Drive,
@@ -167,6 +168,7 @@ def integrate(
     left, reach = first, longest
     x = clock.sample(equations, drives, first, state)
     while left < last:
+        check(left)  # CVODES is not stopped within a segment, whose steps are bounded
         right = clock.following(left)
         right = clock.on(times, right) if right - left <= reach * (1.0 + 1e-9) else left + reach
         if memory.delays or not (span and span[-1].right >= right):

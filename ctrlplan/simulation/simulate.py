@@ -12,6 +12,7 @@ import control as ct
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ctrlplan.simulation.budget import begin_run
 from ctrlplan.simulation.drives import Inputs, driven_signals, input_drives
 from ctrlplan.simulation.events import Event, Occurrence, crossings
 from ctrlplan.simulation.interpreted import FeedthroughError
@@ -97,6 +98,7 @@ def simulate(
         If a parameter is read by no block, or a block has equations of a kind that only python-control runs: its
         `control.input_output_response` is then used, with the same tolerances.
     """
+    begin_run()
     times = np.asarray(timepts, dtype=float)
     if times.ndim != 1 or times.size < 2 or not np.isfinite(times).all() or not np.all(np.diff(times) > 0):
         raise ValueError(f"timepts must be two or more finite times that increase strictly, got {timepts!r:.80}")
