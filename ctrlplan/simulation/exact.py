@@ -28,7 +28,8 @@ _TERMS = 18
 """Taylor terms of the input in a cell."""
 
 _FEWEST = 8
-"""Samples in a cell from which on a table for all cells is quicker than a series in each."""
+"""Samples in a cell from which on a table for all cells is quicker than a series in each; and states up to which
+products of their matrices are quicker than steps one by one."""
 
 _NUMBERS = 2**20
 """Numbers in an array of exponentials, where there is one for each spacing."""
@@ -78,7 +79,7 @@ def exact_states(
         return out
     first, last = float(timepts[0]), float(timepts[-1])
     inner = sorted({float(t) for t in breakpoints if first < t < last})
-    with np.errstate(over="ignore", under="ignore", invalid="ignore"):
+    with np.errstate(all="ignore"):
         for left, right in zip([first, *inner], [*inner, last], strict=True):
             begin, end = np.searchsorted(timepts, [left, right], side="left")
             end += right == last
@@ -113,7 +114,10 @@ def sampled_states(a: Array, b: Array, samples: Array, timepts: Array, initial: 
         steps[:] = even
     drive = np.concatenate([samples[:, :-1], np.diff(samples)]).T  # Taylor terms in the time of each interval
     part = max(1, _NUMBERS // max(1, scale.size * (scale.size + drive.shape[1])))
-    with np.errstate(over="ignore", under="ignore", invalid="ignore"):
+    with np.errstate(all="ignore"):
+        if even and scale.size > _FEWEST:
+            out[:] = _marched(state, _changes(even * a, even * b, 2), drive.T.reshape(2, len(samples), -1))[0].T
+            return matrix_product(np.diag(scale), out.T)
         for begin in range(0, steps.size if scale.size else 0, part):
             these = slice(begin, begin + part)
             spacings, which = np.unique(steps[these], return_inverse=True)
@@ -146,12 +150,18 @@ def matrix_product(left: Array, right: Array) -> Array:
     return product
 
 
+def state_scale(a: Array) -> Array:
+    """Scale (nstates,) in which rows and columns of a system's matrix are of one size, powers of two."""
+    scale: Array = matrix_balance(a, permute=False, separate=True)[1][0] if a.size else np.ones(0)
+    return scale
+
+
 def _balanced(a: Array, b: Array, initial: Array) -> tuple[Array, Array, Array, Array]:
     """Scale (nstates,) of the states, and systems and initial states in it.
 
     Powers of two, which change no digit, and let the cells be longer.
     """
-    scale: Array = matrix_balance(np.abs(a).max(axis=0), permute=False, separate=True)[1][0] if a.size else np.ones(0)
+    scale = state_scale(np.abs(a).max(axis=0)) if a.size else np.ones(0)
     return scale, a * (scale / scale[:, None]), b / scale[:, None], initial / scale
 
 
@@ -280,6 +290,11 @@ def _cells(jet: Callable[[Array, int], Array], duration: float) -> tuple[int, in
     """Number of cells in which the input's Taylor series dies, and of its terms."""
     order = _TERMS + 7
     size = np.abs(jet(np.linspace(0.0, duration, 9), order)).max(axis=2)  # (order + 1, ninputs)
+    if not np.isfinite(size[:_TERMS]).all():
+        raise ValueError(
+            f"inputs must have derivatives within the range of numbers up to order {_TERMS - 1}, got a segment of "
+            f"{duration:g} s on which they have not; state times, or values, in another unit"
+        )
     ncells = 1
     while ncells < 4096:
         terms = size * ((duration / ncells) ** np.arange(order + 1) / _LONG_FACTORIALS)[:, None]
@@ -404,10 +419,16 @@ def _carried(state: Array, series: Array, changes: list[Array]) -> Array:
 def _recurrence(change: Array, forced: Array, state: Array) -> Array:
     """States (nsteps, n) after each of the steps x + change x + forced, shapes (nsteps, n, n) and (nsteps, n, 1).
 
-    In blocks of as many steps as there are blocks: all blocks side by side
-    from a state still unknown, then that state from block to block.
+    Of few states in blocks of as many steps as there are blocks: all blocks
+    side by side from a state still unknown, then that state from block to block.
     """
     nsteps, n = change.shape[:2]
+    if n > _FEWEST:
+        found = np.empty((nsteps, n))
+        for k in range(nsteps):
+            state = state + (change[k] @ state + forced[k, :, 0])
+            found[k] = state
+        return found
     per = int(np.ceil(nsteps**0.5))
     steps = np.zeros((per * -(-nsteps // per), n, n + 1))
     steps[:nsteps, :, :n], steps[:nsteps, :, n:] = change, forced
@@ -435,7 +456,7 @@ def _taylor(a: Array, b: Array, states: Array, series: Array) -> list[Array]:
     """Taylor terms of the state over a unit of time, where norm(a) <= 1."""
     terms = [states]
     for j in range(_TERMS + 1):
-        following = a @ terms[-1]
+        following = matrix_product(a, terms[-1])
         if j < len(series):
             following = following + b @ series[j]
         terms.append(following / (j + 1))
@@ -449,6 +470,8 @@ def _evaluated(terms: list[Array], where: NDArray[np.intp], sigma: Array) -> Arr
     for term in reversed(terms[:-1]):
         out *= sigma
         out += np.take(term, where, axis=1, out=gathered, mode="clip")
+    if not np.isfinite(out).all():
+        out[np.isnan(out)] = np.inf
     return out
 
 

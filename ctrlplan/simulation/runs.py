@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 
 from ctrlplan.simulation.drives import Drive, PlanDrive, SampledDrive, breakpoints_of, driven_signals
 from ctrlplan.simulation.events import Event, Snapshot, Watched, watched_events
-from ctrlplan.simulation.exact import exact_states, matrix_product, sampled_states
+from ctrlplan.simulation.exact import exact_states, sampled_states
 from ctrlplan.simulation.interpreted import Interpreted, InterpretedSolver, SolverError
 from ctrlplan.simulation.legs import integrate
 from ctrlplan.simulation.linear import LinearForm
@@ -31,6 +32,9 @@ _LOOKS_A_TURN = 16
 _VISITED = 12
 """Visited states at which a compiled system is compared with Python."""
 
+
+_LOST = 1e-6
+"""Part of an output's size from which on a doubt about it is said."""
 
 _MOST_STEPS = 1e8
 """Steps of a discrete system in a run."""
@@ -159,22 +163,44 @@ def _exact(job: Job, form: LinearForm) -> Record:
 
     def see(t: Array, x: Array) -> Snapshot:
         driven = driven_signals(drives, t)
-        with np.errstate(over="ignore", invalid="ignore"):
-            return Snapshot(t, x, driven[: job.prepared.ninputs], _finite(matrix_product(form.c, x) + form.d @ driven))
+        return Snapshot(t, x, driven[: job.prepared.ninputs], form.outputs(x, driven))
 
-    def states_at(t: Array, state: Array) -> Array:
-        with np.errstate(over="ignore", invalid="ignore"):
-            found = exact_states(form.a, form.b[:, ~sampled], jet, breakpoints, t, state)
-            if sampled.any():  # what plans and samples make of a linear loop adds up
-                samples = driven_signals(drives, t)[sampled]
-                found = found + sampled_states(form.a, form.b[:, sampled], samples, t, np.zeros_like(state))
-            return _finite(found)
+    def states_at(t: Array, state: Array, a: Array = form.a) -> Array:
+        found = exact_states(a, form.b[:, ~sampled], jet, breakpoints, t, state)
+        if sampled.any():  # what plans and samples make of a linear loop adds up
+            samples = driven_signals(drives, t)[sampled]
+            found = found + sampled_states(a, form.b[:, sampled], samples, t, np.zeros_like(state))
+        return _finite(found)
 
     def carry(k: int, t: float) -> Array:
         return states_at(np.array([times[k], t]), states[:, k])[:, 1]
 
     states = states_at(times, job.state)
+    growing, fast = form.sensitivity(float(times[-1] - times[0]))
+    if growing or fast:
+        driven, nearly = driven_signals(drives, times), states_at(times, job.state, form.a * (1.0 + 2.0**-50))
+        floor = form.rounding(states[:, :1] if growing else states, driven)
+        _warn_of_lost_digits(job, form.outputs(states, driven), form.outputs(nearly, driven), floor)
     return Record(times, states, see, carry, watched, "exact", "linear and continuous")
+
+
+def _warn_of_lost_digits(job: Job, outputs: Array, others: Array, floor: Array) -> None:
+    """Say which outputs change by more than a floor when all rates change in their last digits."""
+    known = np.isfinite(outputs) & np.isfinite(others)
+    with np.errstate(all="ignore"):
+        apart = np.where(known, np.abs(outputs - others), 0.0).max(axis=1)
+    size = np.where(known, np.abs(outputs), 0.0).max(axis=1)
+    lost = apart > np.maximum(_LOST * size, floor)
+    if lost.any():
+        part = float((apart[lost] / np.maximum(size[lost], 0.5 * apart[lost])).max())
+        names = ", ".join(np.array(job.prepared.output_labels)[lost])
+        warnings.warn(
+            f"outputs {names} of {job.prepared.name} are uncertain by {100.0 * part:.3g} % of their size: "
+            f"over {job.times[-1] - job.times[0]:g} s rounding of the matrices is enough to change them so; make the "
+            "run shorter, or leave out modes that are so fast or so unstable",
+            UserWarning,
+            stacklevel=5,
+        )
 
 
 def _numerical(job: Job, method: str, reason: str) -> Record:

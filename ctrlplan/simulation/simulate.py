@@ -106,8 +106,11 @@ def simulate(
     Warns
     -----
     UserWarning
-        If a parameter is read by no block, a system with states has no timebase, or a block has equations of a kind that only python-control runs: its
-        `control.input_output_response` is then used, with the same tolerances.
+        If a parameter is read by no block; if a system with states has no
+        timebase; if a linear response depends on digits that rounding takes
+        from the system's matrices; or if a block has equations of a kind that
+        only python-control runs: its `control.input_output_response` is then
+        used, with the same tolerances.
     """
     times = real_array(timepts, "timepts")
     if times.ndim != 1 or times.size < 2 or not np.isfinite(times).all() or not np.all(np.diff(times) > 0):
