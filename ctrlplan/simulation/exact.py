@@ -17,6 +17,7 @@ stiffness limit.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -117,7 +118,7 @@ def sampled_states(a: Array, b: Array, samples: Array, timepts: Array, initial: 
     with np.errstate(all="ignore"):
         if even and scale.size > _FEWEST:
             out[:] = _marched(state, _changes(even * a, even * b, 2), drive.T.reshape(2, len(samples), -1))[0].T
-            return matrix_product(np.diag(scale), out.T)
+            return (out * scale).T
         for begin in range(0, steps.size if scale.size else 0, part):
             these = slice(begin, begin + part)
             spacings, which = np.unique(steps[these], return_inverse=True)
@@ -130,7 +131,7 @@ def sampled_states(a: Array, b: Array, samples: Array, timepts: Array, initial: 
             for k in range(_first_overflow(found.T), len(found)):
                 series = drive[begin + k].reshape(2, -1)
                 found[k] = _carried(out[begin + k], series, [level[which[k]] for level in changes])
-    return matrix_product(np.diag(scale), out.T)
+    return (out * scale).T
 
 
 def matrix_product(left: Array, right: Array) -> Array:
@@ -355,6 +356,7 @@ def _changes(a: Array, b: Array, nterms: int, halvings: int = 0) -> list[Array]:
     return found
 
 
+@lru_cache(maxsize=64)
 def _shift(nterms: int, m: int, time: float) -> Array:
     """Change of the input's Taylor terms over some time."""
     k = np.arange(nterms)
@@ -367,7 +369,7 @@ def _followed(early: Array, change: Array, terms: Array) -> Array:
     n = change.shape[-2]
     both = early + change[..., None, :] + early[..., :n] @ change[..., None, :, :]
     both[..., n:] += early[..., n:] @ terms
-    if not np.isfinite(both).all():
+    if not np.isfinite(both.sum()):
         both = early + change[..., None, :] + matrix_product(early[..., :n], change[..., None, :, :])
         both[..., n:] += matrix_product(early[..., n:], terms)
         both[np.isnan(both)] = np.inf
