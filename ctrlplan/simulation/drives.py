@@ -16,6 +16,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ctrlplan._checks import real_array
 from ctrlplan.trajectories import Step, Trajectory
 from ctrlplan.trajectories.files import signal_rows
 
@@ -196,8 +197,10 @@ def input_drives(labels: Sequence[str], inputs: Inputs, times: Array) -> list[Dr
         # By name where the names are the same, whatever their order.
         crossed = set(inputs.labels) == set(labels) and inputs.labels != tuple(labels)
         return [PlanDrive(inputs.select(labels) if crossed else inputs)]
-    elif inputs is None or (np.ndim(inputs) == 0 and not callable(inputs)):
+    elif inputs is None or (not isinstance(inputs, list | tuple) and np.ndim(inputs) == 0 and not callable(inputs)):
         given = [0.0 if inputs is None else inputs] * len(labels)
+    elif isinstance(inputs, list | tuple) and len(inputs) == len(labels) != times.size:
+        given = list(inputs)
     else:
         rows = _numbers(inputs, "inputs")
         rows = rows[None] if rows.ndim == 1 and len(labels) == 1 else rows
@@ -275,10 +278,9 @@ def _ordered(ends: Array) -> tuple[Array, Array]:
 
 
 def _numbers(value: Any, what: str) -> Array:
-    try:
-        return np.asarray(value, dtype=float)
-    except TypeError:
-        raise TypeError(f"{what} must be trajectories, numbers or samples, got {value!r:.80}") from None
+    if callable(value):
+        raise TypeError(f"{what} must be a trajectory, a number or samples, got {value!r:.80}")
+    return real_array(value, what)
 
 
 def _drive(value: Any, name: str, times: Array) -> Drive:
