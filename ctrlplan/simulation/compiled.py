@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import threading
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -125,7 +126,8 @@ class Compiled:
 
     def integrator(self, width: int, grid: Array, stiff: bool, rtol: float, atol: float, max_steps: int) -> Any:
         """CVODES over a leg of length 1, with outputs at some of its times."""
-        key = (width, grid.tobytes(), stiff, rtol, atol, max_steps)
+        # CasADi runs without Python's lock: no integrator is used by two threads at once.
+        key = (threading.get_ident(), width, grid.tobytes(), stiff, rtol, atol, max_steps)
 
         def made() -> Any:
             options = {
