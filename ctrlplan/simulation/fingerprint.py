@@ -17,7 +17,7 @@ import random
 import sys
 import types
 from array import array
-from collections import OrderedDict, defaultdict, deque
+from collections import defaultdict, deque, namedtuple
 from collections.abc import Callable, Hashable, Iterable, Iterator
 from dataclasses import dataclass, is_dataclass
 from typing import Any
@@ -34,25 +34,29 @@ _LONG = 256
 """Bytes above which an array is represented by a digest."""
 
 _IMPURE = frozenset(
-    "time datetime random secrets uuid os sys io socket threading subprocess multiprocessing asyncio pathlib tempfile "
-    "inspect gc weakref ctypes signal select shelve sqlite3 logging urllib http platform shutil glob fileinput".split()
+    str.split(
+        "time datetime random secrets uuid os sys io socket threading subprocess multiprocessing asyncio pathlib "
+        "tempfile inspect gc weakref ctypes signal select shelve sqlite3 logging urllib http platform shutil glob"
+    )
 )
 """Modules of the standard library whose functions depend on more than their arguments."""
 
 _PURE = (frozenset(sys.stdlib_module_names) - _IMPURE) | {"numpy", "scipy", "control", "casadi", "ctrlplan"}
 
-_HIDDEN = frozenset("open input eval exec globals locals __import__ compile id breakpoint".split())
+_HIDDEN = frozenset(str.split("open input eval exec globals locals __import__ compile id breakpoint"))
 """Built-in functions whose results are not functions of their arguments."""
 
-_ALL = frozenset("getattr vars __dict__ attrgetter astuple asdict copy deepcopy replace".split())
+_ALL = frozenset(str.split("getattr vars __dict__ attrgetter astuple asdict copy deepcopy replace"))
 """Names in a code that may stand for any attribute."""
 
 _DULL = frozenset(
-    "__dict__ __weakref__ __module__ __doc__ __annotations__ __qualname__ __slots__ __repr__ __str__ __format__ __hash__ "
-    "__reduce__ __reduce_ex__ __getstate__ __setstate__ __copy__ __deepcopy__ __del__ __init_subclass__ "
-    "__match_args__ __replace__ __dataclass_fields__ __dataclass_params__ __parameters__ __orig_bases__ "
-    "__abstractmethods__ _abc_impl __static_attributes__ __firstlineno__ __annotate__ __annotate_func__ "
-    "__annotations_cache__ __subclasshook__ __class_getitem__ __classcell__ __type_params__".split()
+    str.split(
+        "__dict__ __weakref__ __module__ __doc__ __annotations__ __qualname__ __slots__ __repr__ __str__ __format__ "
+        "__hash__ __reduce__ __reduce_ex__ __getstate__ __setstate__ __copy__ __deepcopy__ __del__ __init_subclass__ "
+        "__match_args__ __replace__ __dataclass_fields__ __dataclass_params__ __parameters__ __orig_bases__ "
+        "__abstractmethods__ _abc_impl __static_attributes__ __firstlineno__ __annotate__ __annotate_func__ "
+        "__annotations_cache__ __subclasshook__ __class_getitem__ __classcell__ __type_params__"
+    )
 )
 """Attributes of a class without influence on what its objects return."""
 
@@ -64,7 +68,7 @@ _MAKERS = frozenset(("__init__", "__post_init__", "__new__", "__set_name__"))
 
 @dataclass(frozen=True, eq=False)
 class Code:
-    """Names in a code and in those inside it: globals, attributes and other strings, imported modules, what is stored."""
+    """Names in a code and in those inside it: globals, attributes and strings, imported modules, what is stored."""
 
     globals: tuple[str, ...]
     names: frozenset[str]
@@ -101,6 +105,7 @@ class References:
         self._queue: deque[tuple[Any, str]] = deque()
         self._named: list[tuple[Any, str, set[str]]] = []  # of these the attributes that are named count
         self._bindings: list[tuple[Callable[[Any], None], Any]] = []
+        self._made: set[type] = set()  # classes that may be called
         self._bytes = 0
         self._roots = tuple(roots)
         for where, root in self._roots:
@@ -139,6 +144,11 @@ class References:
         if kind in _ATOMS:
             self._tokens += (kind, value.hex() if kind is float else value)
             return
+        if isinstance(value, type):
+            self._made.update(value.__mro__)
+        self._refer(value, where)
+
+    def _refer(self, value: Any, where: str) -> None:
         number = self._seen.get(id(value))
         if number is None:
             self._seen[id(value)] = number = len(self._objects)
@@ -160,11 +170,23 @@ class References:
         every = not self.names.isdisjoint(_ALL)
         for holder, where, done in list(self._named):
             found = vars(holder) if not isinstance(holder, _Slots) else holder.values()
-            fresh = [name for name in found if name not in done and _counts(holder, name, self.names, every)]
+            fresh = [name for name in found if name not in done and self._counts(holder, name, every)]
             for name in sorted(fresh):
                 done.add(name)
                 self._tokens.append(name)
                 self._attribute(holder, name, found[name], f"{where}.{name}")
+
+    def _counts(self, holder: Any, name: str, every: bool) -> bool:
+        """Whether an attribute may have an influence."""
+        if isinstance(getattr(type(holder), name, None), functools.cached_property):
+            return False  # kept by the object itself, and made of what is in the fingerprint
+        if isinstance(holder, types.ModuleType):
+            return name in self.names
+        if not isinstance(holder, type):
+            return name in self.names or every
+        if name in _MAKERS:
+            return holder in self._made or not self.names.isdisjoint(("type", "__class__"))
+        return name not in _DULL and (name in self.names or name.startswith("__"))
 
     def _attribute(self, holder: Any, name: str, value: Any, where: str) -> None:
         if isinstance(holder, types.ModuleType) and _pure(holder.__name__):
@@ -210,13 +232,13 @@ class References:
                 self._bindings.append((functools.partial(known.__setitem__, name), known[name]))
                 self._add(known[name], name)
             elif name in _HIDDEN:
-                self._hide("its results may change", f"{name}()")
+                self._hide("no function of its arguments", f"{name}()")
             else:
                 self._tokens.append(_Same(getattr(builtins, name, None)))
 
     def _method(self, value: types.MethodType, where: str) -> None:
         self._add(value.__func__, where)
-        self._add(value.__self__, where.rpartition(".")[0] or f"{where}'s object")
+        self._add(value.__self__, where.rpartition(".")[0] or f"the object of {where}")
 
     def _builtin(self, value: types.BuiltinFunctionType, where: str) -> None:
         owner = value.__self__
@@ -249,7 +271,7 @@ class References:
         elif not _pure(value.__module__):
             self._named.append((value, where, set()))
             for base in value.__mro__[1:-1]:
-                self._add(base, where)
+                self._refer(base, where)
 
     def _array(self, value: np.ndarray[Any, Any], where: str) -> None:
         self._tokens += (value.shape, value.dtype.str)
@@ -327,7 +349,7 @@ class References:
     def _attributes(self, value: Any, where: str) -> None:
         """Class and attributes of an object: those that are named where all its methods are known, or all."""
         kind = type(value)
-        self._add(kind, f"class {kind.__name__}")
+        self._refer(kind, f"class {kind.__name__}")
         known = not is_dataclass(kind) and not any(_pure(base.__module__) for base in kind.__mro__[:-1])
         for holder in (value, _Slots(value)):
             own = getattr(holder, "__dict__", None) if holder is value else holder.values()
@@ -404,6 +426,8 @@ _KINDS = {
     "_lru_cache_wrapper": "a cache, functools.lru_cache",
 }
 
+_Fields = type(vars(namedtuple("_", "field"))["field"])
+
 _READERS = (io.IOBase, random.Random, np.random.Generator, np.random.RandomState, np.random.BitGenerator)
 
 _VISITS: tuple[tuple[Any, Callable[[References, Any, str], None]], ...] = (
@@ -419,8 +443,9 @@ _VISITS: tuple[tuple[Any, Callable[[References, Any, str], None]], ...] = (
     (types.ModuleType, References._module),
     (enum.Enum, References._identity),
     (type, References._class),
-    ((np.ufunc, np.dtype, type(np.where), types.MethodDescriptorType, types.WrapperDescriptorType), References._identity),
-    ((types.GetSetDescriptorType, types.MemberDescriptorType, types.CodeType, range, slice), References._identity),
+    ((np.ufunc, np.dtype, type(np.where), types.CodeType, range, slice), References._identity),
+    ((types.MethodDescriptorType, types.WrapperDescriptorType), References._identity),
+    ((types.GetSetDescriptorType, types.MemberDescriptorType, _Fields), References._identity),
     ((types.MethodWrapperType, types.ClassMethodDescriptorType), References._identity),
     (property, References._property),
     ((int, float, complex, str, bytes, np.generic), References._fixed),
@@ -453,7 +478,7 @@ def _code(code: types.CodeType) -> Code:
             imports |= dict.fromkeys(inner.imports)
             stores |= dict.fromkeys(name for name in inner.stores if name not in code.co_cellvars)
             names |= inner.names
-    return Code(tuple(globals_), frozenset(names | set(code.co_varnames)), tuple(imports), tuple(stores))
+    return Code(tuple(globals_), frozenset(names.union(code.co_varnames, globals_)), tuple(imports), tuple(stores))
 
 
 def _strings(constant: Any) -> set[str]:
@@ -481,16 +506,6 @@ def _written_in_python(kind: type) -> bool:
 def _plain_child(kind: type) -> bool:
     """Class of Python without attributes of its own beyond those of its bases."""
     return "__module__" in vars(kind) and bool(kind.__flags__ & (1 << 9)) and kind.__base__ is not object
-
-
-def _counts(holder: Any, name: str, names: set[str], every: bool) -> bool:
-    """Whether an attribute may have an influence."""
-    if name in _DULL:
-        return False
-    if isinstance(getattr(type(holder), name, None), functools.cached_property):
-        return False  # kept by the object itself, and made of what is in the fingerprint
-    special = isinstance(holder, type) and name.startswith("__")
-    return special or name in names or (every and not isinstance(holder, types.ModuleType | type))
 
 
 def _unbound(value: Any) -> Any:

@@ -212,18 +212,23 @@ class Prepared:
         if find_spec("casadi") is None:
             return NotCompiledError("CasADi is not installed (pip install ctrlplan[fast])"), {}
         from ctrlplan.simulation.compiled import Compiled
-        from ctrlplan.simulation.traced import NotTraceableError, traced
+        from ctrlplan.simulation.traced import NotTraceableError, callable_references, traced
 
         network = self.network
         if network is None:
             return NotCompiledError(self.unsupported), {}
         if not network.blocks:
             return NotCompiledError(f"{self.name} is without its blocks, compiled for other parameters"), {}
-        equations = Interpreted(network, params, (first, state), self.trials)
-        w = equations.signals(first, state, driven_signals(drives, np.array([first]))[:, 0])
         traces: list[Trace | None] = []
         baked: dict[str, Any] = {}
         try:
+            others = [block for block in network.blocks if not (block.linear or block.driven)]
+            restored = callable_references(others, params).keeper()
+            try:
+                equations = Interpreted(network, params, (first, state), self.trials)
+                w = equations.signals(first, state, driven_signals(drives, np.array([first]))[:, 0])
+            finally:
+                restored()
             for block, states, fed in zip(network.blocks, network.states, network.fed, strict=True):
                 if block.linear or block.driven:
                     traces.append(None)

@@ -153,10 +153,10 @@ def _logaddexp(x: Any, y: Any) -> Any:
 _OPERATIONS: dict[str, Callable[..., Any]] = {
     **{
         name: _of(getattr(ca, name))
-        for name in "sqrt exp expm1 log log1p log10 sin cos tan sinh cosh tanh floor ceil sign".split()
+        for name in str.split("sqrt exp expm1 log log1p log10 sin cos tan sinh cosh tanh floor ceil sign")
     },
-    **{name: _of(getattr(ca, name)) for name in "fabs fmin fmax fmod hypot copysign power erf".split()},
-    **{f"arc{name}": _of(getattr(ca, f"a{name}")) for name in "sin cos tan sinh cosh tanh".split()},
+    **{name: _of(getattr(ca, name)) for name in str.split("fabs fmin fmax fmod hypot copysign power erf")},
+    **{f"arc{name}": _of(getattr(ca, f"a{name}")) for name in str.split("sin cos tan sinh cosh tanh")},
     "arctan2": _of(ca.atan2),
     "absolute": _of(ca.fabs),
     "minimum": _of(ca.fmin),

@@ -5,7 +5,7 @@ A trace counts only after it has agreed with Python.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -73,13 +73,7 @@ def traced(block: Block, params: Mapping[str, Any], t: float, x: Array, u: Array
         block is random or remembers.
     """
     values = {**block.params, **params}
-    roots = [*roots_of(block.system), *((f"params[{key!r}]", value) for key, value in values.items())]
-    before = References(roots)
-    if before.opaque:
-        raise NotTraceableError(f"block {block.name} refers to {before.opaque}, which may change unseen")
-    if before.remembers:
-        raise NotTraceableError(f"block {block.name} remembers: its code stores {before.remembers}")
-    restored, changed = before.keeper(), False
+    restored, changed = callable_references([block], params).keeper(), False
     try:
         with untouched():
             trace = _agreed(block, values, _known(block, list(_points(block, values, t, x, u))))
@@ -88,6 +82,27 @@ def traced(block: Block, params: Mapping[str, Any], t: float, x: Array, u: Array
     if changed:
         raise NotTraceableError(f"block {block.name} remembers: what it refers to changes when it is called")
     return trace
+
+
+def callable_references(blocks: Iterable[Block], params: Mapping[str, Any]) -> References:
+    """What blocks refer to that can be called and put back as they were.
+
+    Raises
+    ------
+    NotTraceableError
+        If one of them cannot.
+    """
+    roots = []
+    for block in blocks:
+        values = {**block.params, **params}
+        own = [*roots_of(block.system), *((f"params[{key!r}]", value) for key, value in values.items())]
+        found = References(own)
+        if found.opaque:
+            raise NotTraceableError(f"block {block.name} refers to {found.opaque}, which may change unseen")
+        if found.remembers:
+            raise NotTraceableError(f"block {block.name} remembers: its code stores {found.remembers}")
+        roots += own
+    return References(roots)
 
 
 def agrees(block: Block, trace: Trace, params: Mapping[str, Any], t: Array, x: Array, u: Array) -> str:

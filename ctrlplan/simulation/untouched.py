@@ -15,6 +15,7 @@ from ctrlplan.simulation.recent import BUILDING
 
 T = TypeVar("T")
 
+
 @contextmanager
 def untouched() -> Iterator[None]:
     """Context of trial calls, one thread at a time: the filters of warnings belong to all.
