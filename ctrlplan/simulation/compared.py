@@ -27,6 +27,11 @@ class Compared:
         self._runs, self._next = 0, 1
         self._chance = random.Random(0)
 
+    @property
+    def is_expected(self) -> bool:
+        """Whether the next run is to be compared, wherever it goes."""
+        return self._runs + 1 >= self._next
+
     def is_due(self, sides: Array) -> bool:
         """Whether to compare a run with these sides (nswitches, ntime) of its switches."""
         reached = np.array([(sides == side).any(axis=1) for side in (-1.0, 0.0, 1.0)])

@@ -187,7 +187,7 @@ class CompiledSolver:
     Attributes
     ----------
     evaluations : int
-        Evaluations of the right-hand side so far.
+        Evaluations of the right-hand side so far, counted where a comparison with Python is expected.
     """
 
     def __init__(
@@ -197,6 +197,7 @@ class CompiledSolver:
         self._options = rtol, atol, max_steps
         self._longest, self._stiff = 0.0, False
         self.evaluations = 0
+        self._report = self._count if equations.compared.is_expected else None
 
     def signals(self, times: Array, states: Array, driven: Array) -> Array:
         """All signals (nsignals, ntime) of the network."""
@@ -239,7 +240,7 @@ class CompiledSolver:
         for outputs, allowed in ((relative, min(_FEW_STEPS, max_steps)), (close, max_steps)):
             integrator = self._equations.integrator(width, outputs, self._stiff, rtol, atol, allowed)
             try:
-                found = _called(integrator, (state, np.empty(0), p), state.size, self._count)
+                found = _called(integrator, (state, np.empty(0), p), state.size, self._report)
                 return found[:, np.searchsorted(outputs, relative)]
             except RuntimeError as error:
                 code = re.search(r"CV_\w+", str(error))

@@ -35,7 +35,7 @@ _LOOKS_A_TURN = 16
 """Such times in a turn of the fastest oscillation about the state where a run begins."""
 
 _VISITED = 12
-"""Visited states at which equations must be defined."""
+"""Visited states at which equations must be defined; and of a comparison where evaluations were not counted."""
 
 _SHARE = 5
 """A compiled form is compared with Python at states a fifth as many as the run's evaluations of its equations."""
@@ -252,7 +252,7 @@ def _disagreement(job: Job, form: Compiled, solver: CompiledSolver, drives: Sequ
     driven = driven_signals(drives, run.times)
     if not form.compared.is_due(form.sides(run.times, run.states, driven, p)):
         return ""
-    most = max(1, solver.evaluations // _SHARE)
+    most = max(1, solver.evaluations // _SHARE) if solver.evaluations else _VISITED
     t, x = _closer(run, solver)
     driven = driven_signals(drives, t)
     w, sides = form.signals(t, x, driven, p), form.sides(t, x, driven, p)
