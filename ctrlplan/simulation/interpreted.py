@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -20,7 +22,8 @@ from ctrlplan.simulation.network import (
     sampled_feedthrough,
     tried_feedthrough,
 )
-from ctrlplan.simulation.trials import can_remember, trial, trial_copy, tried
+from ctrlplan.simulation.trials import can_remember, trial_copy, values_of
+from ctrlplan.simulation.untouched import untouched
 
 Array = NDArray[np.float64]
 
@@ -181,10 +184,9 @@ class Interpreted:
             block, outs = self.network.blocks[i], self.network.outputs[i]
             place, fed = self.network.states[i], self.network.fed[i](w)
             if remembers:  # a call of its own would be remembered
-                with trial():
-                    found = tried(trial_copy(block.system).outfcn, t, x[place], fed, {**block.params, **self.params})
-            else:
-                found = tried(block.output(self.params), t, x[place], fed)
+                block = replace(block, system=trial_copy(block.system))
+            with untouched() if remembers else nullcontext():
+                found = values_of(block.output(self.params), t, x[place], fed)
             size = np.abs(w).max(initial=0.0, where=np.isfinite(w))
             if found is not None and not np.allclose(found, w[outs], rtol=1e-9, atol=1e-9 * size, equal_nan=True):
                 raise FeedthroughError(f"outputs of {block.name} at {t:g} s depend on more inputs than at the start")

@@ -4,23 +4,29 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ctrlplan.simulation.budget import check
+from ctrlplan.simulation.compared import telling_states
 from ctrlplan.simulation.drives import Drive, PlanDrive, SampledDrive, breakpoints_of, driven_signals
 from ctrlplan.simulation.events import Event, Snapshot, Watched, watched_events
 from ctrlplan.simulation.exact import exact_states, sampled_states
 from ctrlplan.simulation.interpreted import Interpreted, InterpretedSolver, SolverError
-from ctrlplan.simulation.legs import integrate
+from ctrlplan.simulation.legs import Run, integrate
 from ctrlplan.simulation.linear import LinearForm
 from ctrlplan.simulation.network import Network
 from ctrlplan.simulation.prepared import DisagreementError, NotCompiledError, Prepared
 from ctrlplan.simulation.trials import can_remember
+
+if TYPE_CHECKING:
+    from ctrlplan.simulation.compiled import Compiled, CompiledSolver
 
 Array = NDArray[np.float64]
 
@@ -33,7 +39,13 @@ _LOOKS_A_TURN = 16
 """Such times in a turn of the fastest oscillation about the state where a run begins."""
 
 _VISITED = 12
-"""Visited states at which a compiled system is compared with Python."""
+"""Visited states at which equations must be defined; and of a comparison where evaluations were not counted."""
+
+_SHARE = 5
+"""A compiled form is compared with Python at states a fifth as many as the run's evaluations of its equations."""
+
+_CLOSE, _STRETCHES, _BETWEEN = 400, 8, 60
+"""A run with fewer times is followed once more, in some stretches with so many times each, to see where it switches."""
 
 
 _LOST = 1e-6
@@ -277,12 +289,46 @@ def _numerical(job: Job, method: str, reason: str) -> Record:
             raise SolverError(
                 f"the solver must reach {job.times[-1]:g} s, got to the edge of where equations are defined"
             )
-        if tests is not None:
-            wrong = form.disagreement(known, job.params, t, x, tests.all_signals(t, x, driven))
+        if network.blocks:
+            wrong = _disagreement(job, known, form, solver, drives, run)
             if wrong:
                 raise prepared.distrust(form, wrong)
-            prepared.trusted = True
     return Record(run.times, run.states, see, carry, watched, method, reason)
+
+
+def _disagreement(
+    job: Job, network: Network, form: Compiled, solver: CompiledSolver, drives: Sequence[Drive], run: Run
+) -> str:
+    """What is wrong with a compiled form at states of a run; empty where nothing, or where no comparison is due."""
+    p = form.parameters(job.params)
+    driven = driven_signals(drives, run.times)
+    if not form.compared.is_due(form.sides(run.times, run.states, driven, p)):
+        return ""
+    most = max(1, solver.evaluations // _SHARE) if solver.evaluations else _VISITED
+    t, x = _closer(run, solver)
+    driven = driven_signals(drives, t)
+    w, sides = form.signals(t, x, driven, p), form.sides(t, x, driven, p)
+    places = telling_states(sides, np.concatenate([w, x]), most)
+    # Blocks are compared at the inputs that the form computes: where each agrees, the whole does.
+    return form.disagreement(network, job.params, t[places], x[:, places], w[:, places])
+
+
+def _closer(run: Run, solver: CompiledSolver) -> tuple[Array, Array]:
+    """Times and states of a run, with more between them where they are few."""
+    times, states = [run.times], [run.states]
+    marks = np.unique(np.linspace(0, run.times.size - 1, _STRETCHES + 1).astype(int))
+    for k, following in pairwise(marks.tolist() if run.times.size < _CLOSE else []):
+        left, right = float(run.times[k]), float(run.times[following])
+        series = run.series(left)
+        right = min(right, series.right)
+        grid = np.linspace(left, right, _BETWEEN + 1)[1:]
+        with suppress(SolverError):
+            found = solver.advance(series, left, grid, run.states[:, k])
+            times.append(grid)
+            states.append(found)
+    t, x = np.concatenate(times), np.concatenate(states, axis=1)
+    order = np.argsort(t, kind="stable")
+    return t[order], x[:, order]
 
 
 def _discrete(job: Job, reason: str) -> Record:
