@@ -19,6 +19,7 @@ import types
 from array import array
 from collections import defaultdict, deque, namedtuple
 from collections.abc import Callable, Hashable, Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, is_dataclass
 from typing import Any
 
@@ -546,7 +547,8 @@ def _restore(value: Any, before: Any) -> None:
         value.extend(before)
     elif isinstance(value, _Slots):
         for name, entry in before.items():
-            value.places[name].__set__(value.value, entry)
+            with suppress(AttributeError):  # one that cannot be set has not changed
+                value.places[name].__set__(value.value, entry)
     else:
         vars(value).clear()
         vars(value).update(before)

@@ -232,7 +232,9 @@ def _by_elements(ufunc: Any, method: str, inputs: Sequence[Any], kwargs: dict[st
         operation = _OPERATIONS.get(ufunc.__name__)
         if operation is None or method not in ("__call__", "reduce", "accumulate", "outer"):
             raise TypeError(f"np.{ufunc.__name__} of a signal or parameter cannot be traced")
-        if kwargs.get("where", True) is not True or "initial" in kwargs:
+        kind = kwargs.get("dtype")
+        other = kind is not None and np.dtype(kind).kind not in "fO"
+        if kwargs.get("where", True) is not True or "initial" in kwargs or other:
             raise TypeError(f"options of np.{ufunc.__name__} cannot be traced")
         if method == "reduce" and "axis" not in options:
             options["axis"] = kwargs.get("axis", 0)
@@ -273,7 +275,16 @@ def _clipped(a: Any, a_min: Any = None, a_max: Any = None, **kwargs: Any) -> Any
     return _wrapped(np.frompyfunc(_clip, 3, 1)(*map(_plain, (a, low, high))))
 
 
-_FUNCTIONS: dict[Any, Callable[..., Any]] = {np.where: _where, np.select: _select, np.clip: _clipped}
+def _of_nan(*_: Any, **__: Any) -> NoReturn:
+    raise TypeError("functions of nan cannot be traced")
+
+
+_FUNCTIONS: dict[Any, Callable[..., Any]] = {
+    np.where: _where,
+    np.select: _select,
+    np.clip: _clipped,
+    np.nan_to_num: _of_nan,
+}
 """Functions of numpy that are not written by others of it."""
 
 

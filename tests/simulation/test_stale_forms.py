@@ -354,7 +354,7 @@ def with_random_numbers():
 
 
 def with_global_random_numbers():
-    return lambda t, x, u, p: [-x[0] + 0.0 * np.random.normal()]
+    return lambda t, x, u, p: [-x[0] + 0.0 * np.random.normal()]  # noqa: NPY002
 
 
 def with_python_random_numbers():
