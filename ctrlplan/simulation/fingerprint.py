@@ -143,7 +143,8 @@ class References:
         """Token of a value, or its number among the objects, which are visited later."""
         kind = type(value)
         if kind in _ATOMS:
-            self._tokens += (kind, value.hex() if kind is float else value)
+            self._tokens.append(kind)
+            self._tokens.append(value.hex() if kind is float else value)
             return
         if isinstance(value, type):
             self._made.update(value.__mro__)

@@ -8,7 +8,7 @@ a branch on one raises; nothing of CasADi is changed.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NoReturn
 
 import casadi as ca
@@ -44,7 +44,7 @@ class Symbol:
     def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **kwargs: Any) -> Any:
         return _by_elements(ufunc, method, inputs, kwargs)
 
-    def __array_function__(self, function: Any, types: Any, args: Sequence[Any], kwargs: dict[str, Any]) -> Any:
+    def __array_function__(self, function: Any, types: Any, args: Iterable[Any], kwargs: Mapping[str, Any]) -> Any:
         return _by_function(function, args, kwargs)
 
     def clip(self, low: Any = None, high: Any = None) -> Any:
@@ -60,7 +60,7 @@ class SymbolArray(np.ndarray[Any, Any]):
     def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **kwargs: Any) -> Any:
         return _by_elements(ufunc, method, inputs, kwargs)
 
-    def __array_function__(self, function: Any, types: Any, args: Sequence[Any], kwargs: dict[str, Any]) -> Any:
+    def __array_function__(self, function: Any, types: Any, args: Iterable[Any], kwargs: Mapping[str, Any]) -> Any:
         return _by_function(function, args, kwargs)
 
 
@@ -247,14 +247,14 @@ def _by_elements(ufunc: Any, method: str, inputs: Sequence[Any], kwargs: dict[st
     return out[0]
 
 
-def _by_function(function: Any, args: Sequence[Any], kwargs: dict[str, Any]) -> Any:
+def _by_function(function: Any, args: Iterable[Any], kwargs: Mapping[str, Any]) -> Any:
     """Function of numpy: from the table, or as numpy writes it by others."""
     known = _FUNCTIONS.get(function)
     if known is not None:
         return known(*args, **kwargs)
     proxy = np.empty((), dtype=object).view(SymbolArray)
-    args, kwargs = _arrays(args), {key: _arrays(value) for key, value in kwargs.items()}
-    return _wrapped(np.ndarray.__array_function__(proxy, function, (SymbolArray,), args, kwargs))
+    given = tuple(map(_arrays, args)), {key: _arrays(value) for key, value in kwargs.items()}
+    return _wrapped(np.ndarray.__array_function__(proxy, function, (SymbolArray,), *given))
 
 
 def _where(condition: Any, x: Any, y: Any) -> Any:
