@@ -19,6 +19,7 @@ import types
 from array import array
 from collections import defaultdict, deque, namedtuple
 from collections.abc import Callable, Hashable, Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, is_dataclass
 from typing import Any
 
@@ -144,7 +145,8 @@ class References:
         """Token of a value, or its number among the objects, which are visited later."""
         kind = type(value)
         if kind in _ATOMS:
-            self._tokens += (kind, value.hex() if kind is float else value)
+            self._tokens.append(kind)
+            self._tokens.append(value.hex() if kind is float else value)
             return
         if isinstance(value, type):
             self._made.update(value.__mro__)
@@ -543,7 +545,8 @@ def _restore(value: Any, before: Any) -> None:
         value.extend(before)
     elif isinstance(value, _Slots):
         for name, entry in before.items():
-            value.places[name].__set__(value.value, entry)
+            with suppress(AttributeError):  # one that cannot be set has not changed
+                value.places[name].__set__(value.value, entry)
     else:
         vars(value).clear()
         vars(value).update(before)

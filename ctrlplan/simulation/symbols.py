@@ -8,7 +8,7 @@ a branch on one raises; nothing of CasADi is changed.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NoReturn
 
 import casadi as ca
@@ -44,7 +44,7 @@ class Symbol:
     def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **kwargs: Any) -> Any:
         return _by_elements(ufunc, method, inputs, kwargs)
 
-    def __array_function__(self, function: Any, types: Any, args: Sequence[Any], kwargs: dict[str, Any]) -> Any:
+    def __array_function__(self, function: Any, types: Any, args: Iterable[Any], kwargs: Mapping[str, Any]) -> Any:
         return _by_function(function, args, kwargs)
 
     def clip(self, low: Any = None, high: Any = None) -> Any:
@@ -60,7 +60,7 @@ class SymbolArray(np.ndarray[Any, Any]):
     def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **kwargs: Any) -> Any:
         return _by_elements(ufunc, method, inputs, kwargs)
 
-    def __array_function__(self, function: Any, types: Any, args: Sequence[Any], kwargs: dict[str, Any]) -> Any:
+    def __array_function__(self, function: Any, types: Any, args: Iterable[Any], kwargs: Mapping[str, Any]) -> Any:
         return _by_function(function, args, kwargs)
 
 
@@ -232,7 +232,9 @@ def _by_elements(ufunc: Any, method: str, inputs: Sequence[Any], kwargs: dict[st
         operation = _OPERATIONS.get(ufunc.__name__)
         if operation is None or method not in ("__call__", "reduce", "accumulate", "outer"):
             raise TypeError(f"np.{ufunc.__name__} of a signal or parameter cannot be traced")
-        if kwargs.get("where", True) is not True or "initial" in kwargs:
+        kind = kwargs.get("dtype")
+        other = kind is not None and np.dtype(kind).kind not in "fO"
+        if kwargs.get("where", True) is not True or "initial" in kwargs or other:
             raise TypeError(f"options of np.{ufunc.__name__} cannot be traced")
         if method == "reduce" and "axis" not in options:
             options["axis"] = kwargs.get("axis", 0)
@@ -245,14 +247,14 @@ def _by_elements(ufunc: Any, method: str, inputs: Sequence[Any], kwargs: dict[st
     return out[0]
 
 
-def _by_function(function: Any, args: Sequence[Any], kwargs: dict[str, Any]) -> Any:
+def _by_function(function: Any, args: Iterable[Any], kwargs: Mapping[str, Any]) -> Any:
     """Function of numpy: from the table, or as numpy writes it by others."""
     known = _FUNCTIONS.get(function)
     if known is not None:
         return known(*args, **kwargs)
     proxy = np.empty((), dtype=object).view(SymbolArray)
-    args, kwargs = _arrays(args), {key: _arrays(value) for key, value in kwargs.items()}
-    return _wrapped(np.ndarray.__array_function__(proxy, function, (SymbolArray,), args, kwargs))
+    given = tuple(map(_arrays, args)), {key: _arrays(value) for key, value in kwargs.items()}
+    return _wrapped(np.ndarray.__array_function__(proxy, function, (SymbolArray,), *given))
 
 
 def _where(condition: Any, x: Any, y: Any) -> Any:
@@ -273,7 +275,16 @@ def _clipped(a: Any, a_min: Any = None, a_max: Any = None, **kwargs: Any) -> Any
     return _wrapped(np.frompyfunc(_clip, 3, 1)(*map(_plain, (a, low, high))))
 
 
-_FUNCTIONS: dict[Any, Callable[..., Any]] = {np.where: _where, np.select: _select, np.clip: _clipped}
+def _of_nan(*_: Any, **__: Any) -> NoReturn:
+    raise TypeError("functions of nan cannot be traced")
+
+
+_FUNCTIONS: dict[Any, Callable[..., Any]] = {
+    np.where: _where,
+    np.select: _select,
+    np.clip: _clipped,
+    np.nan_to_num: _of_nan,
+}
 """Functions of numpy that are not written by others of it."""
 
 
