@@ -184,7 +184,7 @@ class Prepared:
         blocks = [i for i, block in enumerate(network.blocks) if not (block.linear or block.driven)]
         functions = {i: [*_functions(network.blocks[i].system)] for i in blocks}
         found = References((f"block {network.blocks[i].name}", f) for i in blocks for f in functions[i])
-        if found.opaque or found.remembers:  # a call might leave something behind: what the code names counts
+        if found.opaque or found.stores:  # a call might leave something behind: what the code names counts
             return name in found.names or not found.names.isdisjoint(("keys", "values", "items"))
         restored = found.keeper()
 
