@@ -96,6 +96,8 @@ class References:
     ----------
     tokens : tuple
         Equal where nothing has changed; it holds on to all that it compares by identity.
+    cached : tuple
+        The same of cached properties, which a first call adds to an object.
     opaque : str
         First of what cannot be fingerprinted, in words; empty where there is none.
     stores : str
@@ -113,6 +115,7 @@ class References:
         self._queue: deque[tuple[Any, str]] = deque()
         self._named: list[tuple[Any, str, set[str]]] = []  # of these the attributes that are named count
         self._bindings: list[tuple[Callable[[Any], None], Any]] = []
+        self._cached: dict[str, Any] = {}
         self._made: set[type] = set()  # classes that may be called
         self._bytes = 0
         self._roots = tuple(roots)
@@ -121,6 +124,7 @@ class References:
         except Exception as error:  # whatever an object does when it is looked at
             self._hide(f"which cannot be looked into: {type(error).__name__}", "an object")
         self.tokens = tuple(self._tokens)
+        self.cached = References(self._cached.items()).tokens if self._cached else ()
 
     def _walk(self) -> None:
         for where, root in self._roots:
@@ -194,7 +198,8 @@ class References:
     def _counts(self, holder: Any, name: str, every: bool) -> bool:
         """Whether an attribute may have an influence."""
         if isinstance(getattr(type(holder), name, None), functools.cached_property):
-            return False  # kept by the object itself, and made of what is in the fingerprint
+            self._cached[f"{name} of {id(holder)}"] = vars(holder)[name]
+            return False
         if isinstance(holder, types.ModuleType):
             return name in self.names
         if not isinstance(holder, type):
@@ -286,7 +291,7 @@ class References:
             self._hide(f"class {value.__module__}.{value.__qualname__}", where)
         elif not _pure(value.__module__):
             self._named.append((value, where, set()))
-            for base in value.__mro__[1:-1]:
+            for base in (type(value), *value.__mro__[1:-1]):
                 self._refer(base, where)
 
     def _array(self, value: np.ndarray[Any, Any], where: str) -> None:
@@ -344,6 +349,11 @@ class References:
         if isinstance(value, np.ufunc) and "vectorized" in value.__name__:
             self._hide("made by numpy.frompyfunc", where)
         self._tokens.append(_Same(value))
+
+    def _member(self, value: enum.Enum, where: str) -> None:
+        """Member of an enumeration, whose value and attributes may be mutable."""
+        self._tokens.append(_Same(value))
+        self._add(value.__dict__, where)
 
     def _property(self, value: property, where: str) -> None:
         for part in (value.fget, value.fset):
@@ -457,7 +467,7 @@ _VISITS: tuple[tuple[Any, Callable[[References, Any, str], None]], ...] = (
     ((dict, types.MappingProxyType), References._dictionary),
     ((set, frozenset), References._set),
     (types.ModuleType, References._module),
-    (enum.Enum, References._identity),
+    (enum.Enum, References._member),
     (type, References._class),
     ((np.ufunc, np.dtype, type(np.where), types.CodeType, range, slice), References._identity),
     ((types.MethodDescriptorType, types.WrapperDescriptorType), References._identity),

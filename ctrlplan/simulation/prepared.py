@@ -410,7 +410,8 @@ def _referred(system: Any) -> tuple[Any, ...]:
     """What the functions of a block refer to, where they may be compiled."""
     if any(getattr(system, name, None) is not None for name in ("plan", "delay")):
         return ()
-    return References(roots_of(system)).tokens
+    found = References(roots_of(system))
+    return found.tokens, found.cached
 
 
 def _token(value: Any) -> tuple[Any, ...]:
