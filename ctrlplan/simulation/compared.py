@@ -18,13 +18,13 @@ _FEW = 4
 class Compared:
     """Which sides of its switches a form has been compared on, and in which run it is next.
 
-    A form is compared in its first run, in one random run of the next two, of
-    the next four, and so on, and wherever a run is on a new side of a switch.
+    A form is compared in its first two runs, in one random run of the next two,
+    of the next four, and so on, and wherever a run is on a new side of a switch.
     """
 
     def __init__(self, nswitches: int) -> None:
         self._seen = np.zeros((3, nswitches), dtype=bool)
-        self._runs, self._next = 0, 1
+        self._runs, self._next = 0, 1  # the runs so far, and the one to be compared next
         self._chance = random.Random(0)
 
     @property
@@ -41,11 +41,9 @@ class Compared:
             self._seen |= reached
             if self._runs < self._next:
                 return fresh
-            if self._runs == self._next:
-                octave = 2 ** int(np.log2(self._runs) + 1.0)
-                self._next = octave + self._chance.randrange(octave)
-                return True
-            return fresh
+            first = 1 << (self._runs - 1).bit_length()
+            self._next = first + 1 + self._chance.randrange(first)
+            return True
 
 
 def telling_states(sides: Array, signals: Array, most: int) -> NDArray[np.intp]:

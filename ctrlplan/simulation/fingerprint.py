@@ -18,7 +18,7 @@ import sys
 import types
 from array import array
 from collections import defaultdict, deque, namedtuple
-from collections.abc import Callable, Hashable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, is_dataclass
 from typing import Any
@@ -44,7 +44,14 @@ _IMPURE = frozenset(
 )
 """Modules of the standard library whose functions depend on more than their arguments."""
 
-_PURE = (frozenset(sys.stdlib_module_names) - _IMPURE) | {"numpy", "scipy", "control", "casadi", "ctrlplan"}
+_PURE = frozenset(
+    str.split(
+        "numpy scipy control casadi ctrlplan builtins math cmath operator functools itertools collections copy numbers "
+        "fractions decimal statistics typing types dataclasses enum abc contextlib warnings array bisect heapq string "
+        "re _abc _collections _collections_abc _functools _operator _bisect _heapq _decimal _statistics _weakrefset"
+    )
+)
+"""Modules whose functions depend on nothing but their arguments and closures."""
 
 _HIDDEN = frozenset(str.split("open input eval exec globals locals __import__ compile id breakpoint"))
 """Built-in functions whose results are not functions of their arguments."""
@@ -92,36 +99,46 @@ class References:
     ----------
     tokens : tuple
         Equal where nothing has changed; it holds on to all that it compares by identity.
+    cached : tuple
+        The same of cached properties, which a first call adds to an object.
     opaque : str
         First of what cannot be fingerprinted, in words; empty where there is none.
-    remembers : str
-        What the functions store in outside of their own variables, as far as their code shows it.
+    stores : str
+        Variable or attribute outside of their own that the functions assign by their code; empty where there is none.
     names : set of str
         Names and strings in the code of the functions.
     """
 
     def __init__(self, roots: Iterable[tuple[str, Any]]) -> None:
-        self.opaque = self.remembers = ""
+        self.opaque = self.stores = ""
         self.names: set[str] = set()
-        self._tokens: list[Hashable] = []
+        self._tokens: list[object] = []
         self._seen: dict[int, int] = {}
         self._objects: list[Any] = []  # alive, so that no address is given to another
         self._queue: deque[tuple[Any, str]] = deque()
         self._named: list[tuple[Any, str, set[str]]] = []  # of these the attributes that are named count
         self._bindings: list[tuple[Callable[[Any], None], Any]] = []
+        self._cached: dict[str, Any] = {}
         self._made: set[type] = set()  # classes that may be called
         self._bytes = 0
         self._roots = tuple(roots)
+        try:
+            self._walk()
+        except Exception as error:  # whatever an object does when it is looked at
+            self._hide(f"which cannot be looked into: {type(error).__name__}", "an object")
+        self.tokens = tuple(self._tokens)
+        self.cached = References(self._cached.items()).tokens if self._cached else ()
+
+    def _walk(self) -> None:
         for where, root in self._roots:
             self._add(root, where)
         while self._queue:
             self._visit(*self._queue.popleft())
             if len(self._objects) > _MOST or self._bytes > _BYTES:
-                self._hide("too many objects" if self._bytes <= _BYTES else "arrays too large", "what it refers to")
-                break
+                self._hide("too large to be compared in every run", "objects and arrays")
+                return
             if not self._queue:
                 self._add_named()
-        self.tokens = tuple(self._tokens)
 
     def keeper(self) -> Callable[[], bool]:
         """Function that puts all that was found back as it is now, and says whether it had changed."""
@@ -146,8 +163,7 @@ class References:
         """Token of a value, or its number among the objects, which are visited later."""
         kind = type(value)
         if kind in _ATOMS:
-            self._tokens.append(kind)
-            self._tokens.append(value.hex() if kind is float else value)
+            self._tokens += (kind, value.hex() if kind is float else value)
             return
         if isinstance(value, type):
             self._made.update(value.__mro__)
@@ -175,7 +191,8 @@ class References:
         every = not self.names.isdisjoint(_ALL)
         for holder, where, done in list(self._named):
             found = vars(holder) if not isinstance(holder, _Slots) else holder.values()
-            fresh = [name for name in found if name not in done and self._counts(holder, name, every)]
+            among: Iterable[str] = self.names.intersection(found) if isinstance(holder, types.ModuleType) else found
+            fresh = [name for name in among if name not in done and self._counts(holder, name, every)]
             for name in sorted(fresh):
                 done.add(name)
                 self._tokens.append(name)
@@ -184,7 +201,8 @@ class References:
     def _counts(self, holder: Any, name: str, every: bool) -> bool:
         """Whether an attribute may have an influence."""
         if isinstance(getattr(type(holder), name, None), functools.cached_property):
-            return False  # kept by the object itself, and made of what is in the fingerprint
+            self._cached[f"{name} of {id(holder)}"] = vars(holder)[name]
+            return False
         if isinstance(holder, types.ModuleType):
             return name in self.names
         if not isinstance(holder, type):
@@ -226,12 +244,13 @@ class References:
             return
         self.names |= code.names
         if code.stores and value.__name__ not in _MAKERS:
-            self.remembers = self.remembers or code.stores[0]
+            self.stores = self.stores or code.stores[0]
         self._globals(value.__globals__, code)
 
     def _globals(self, known: dict[str, Any], code: Code) -> None:
         for name in code.imports:
-            self._add(sys.modules.get(name), name)
+            for module in _imported(name, str(known.get("__package__") or "")):
+                self._add(module, name)
         for name in code.globals:
             if name in known:
                 self._bindings.append((functools.partial(known.__setitem__, name), known[name]))
@@ -275,7 +294,7 @@ class References:
             self._hide(f"class {value.__module__}.{value.__qualname__}", where)
         elif not _pure(value.__module__):
             self._named.append((value, where, set()))
-            for base in value.__mro__[1:-1]:
+            for base in (type(value), *value.__mro__[1:-1]):
                 self._refer(base, where)
 
     def _array(self, value: np.ndarray[Any, Any], where: str) -> None:
@@ -333,6 +352,11 @@ class References:
         if isinstance(value, np.ufunc) and "vectorized" in value.__name__:
             self._hide("made by numpy.frompyfunc", where)
         self._tokens.append(_Same(value))
+
+    def _member(self, value: enum.Enum, where: str) -> None:
+        """Member of an enumeration, whose value and attributes may be mutable."""
+        self._tokens.append(_Same(value))
+        self._add(value.__dict__, where)
 
     def _property(self, value: property, where: str) -> None:
         for part in (value.fget, value.fset):
@@ -441,7 +465,7 @@ _VISITS: tuple[tuple[Any, Callable[[References, Any, str], None]], ...] = (
     ((dict, types.MappingProxyType), References._dictionary),
     ((set, frozenset), References._set),
     (types.ModuleType, References._module),
-    (enum.Enum, References._identity),
+    (enum.Enum, References._member),
     (type, References._class),
     ((np.ufunc, np.dtype, type(np.where), types.CodeType, range, slice), References._identity),
     ((types.MethodDescriptorType, types.WrapperDescriptorType), References._identity),
@@ -481,6 +505,15 @@ def _code(code: types.CodeType) -> Code:
     return Code(tuple(globals_), frozenset(names.union(code.co_varnames, globals_)), tuple(imports), tuple(stores))
 
 
+def _imported(name: str, package: str) -> Iterator[types.ModuleType]:
+    """Modules that an import inside a function may mean, in its package or a level above."""
+    parts = package.split(".") if package else []
+    for n in range(len(parts) + 1):
+        module = sys.modules.get(".".join([*parts[:n], name]).strip("."))
+        if module is not None:
+            yield module
+
+
 def _strings(constant: Any) -> set[str]:
     if isinstance(constant, str):
         return {constant}
@@ -488,7 +521,6 @@ def _strings(constant: Any) -> set[str]:
 
 
 def _pure(module: Any) -> bool:
-    """Whether the functions of a module depend on nothing but their arguments and closures."""
     return isinstance(module, str) and module.partition(".")[0] in _PURE and not module.startswith("numpy.random")
 
 

@@ -185,7 +185,7 @@ class Prepared:
         blocks = [i for i, block in enumerate(network.blocks) if not (block.linear or block.driven)]
         functions = {i: [*_functions(network.blocks[i].system)] for i in blocks}
         found = References((f"block {network.blocks[i].name}", f) for i in blocks for f in functions[i])
-        if found.opaque or found.remembers:  # a call might leave something behind: what the code names counts
+        if found.opaque or found.stores:  # a call might leave something behind: what the code names counts
             return name in found.names or not found.names.isdisjoint(("keys", "values", "items"))
         restored = found.keeper()
 
@@ -419,7 +419,8 @@ def _referred(system: Any) -> tuple[Any, ...]:
     traits = traits_of(system)
     if traits.plan is not None or traits.delay is not None:
         return ()
-    return References(roots_of(system)).tokens
+    found = References(roots_of(system))
+    return found.tokens, found.cached
 
 
 def _token(value: Any) -> tuple[Any, ...]:

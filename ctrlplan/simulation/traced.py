@@ -70,7 +70,7 @@ def traced(block: Block, params: Mapping[str, Any], t: float, x: Array, u: Array
     ------
     NotTraceableError
         If no way of calling it with symbols gives what Python gives, or the
-        block is random or remembers.
+        block is random or has memory.
     """
     values = {**block.params, **params}
     restored, changed = callable_references([block], params).keeper(), False
@@ -80,7 +80,7 @@ def traced(block: Block, params: Mapping[str, Any], t: float, x: Array, u: Array
     finally:
         changed = restored()
     if changed:
-        raise NotTraceableError(f"block {block.name} remembers: what it refers to changes when it is called")
+        raise NotTraceableError(f"block {block.name} has memory: what it refers to changes when it is called")
     return trace
 
 
@@ -98,9 +98,9 @@ def callable_references(blocks: Iterable[Block], params: Mapping[str, Any]) -> R
         own = [*roots_of(block.system), *((f"params[{key!r}]", value) for key, value in values.items())]
         found = References(own)
         if found.opaque:
-            raise NotTraceableError(f"block {block.name} refers to {found.opaque}, which may change unseen")
-        if found.remembers:
-            raise NotTraceableError(f"block {block.name} remembers: its code stores {found.remembers}")
+            raise NotTraceableError(f"block {block.name} refers to {found.opaque}, which can change without notice")
+        if found.stores:
+            raise NotTraceableError(f"block {block.name} has memory: it assigns {found.stores} when it is called")
         roots += own
     return References(roots)
 
@@ -115,12 +115,12 @@ def agrees(block: Block, trace: Trace, params: Mapping[str, Any], t: Array, x: A
 
 
 def _known(block: Block, points: list[Point]) -> list[tuple[Point, Answer]]:
-    """Points inside the block's domain with Python's answers, which are the same a second time."""
+    """Points inside the block's domain with Python's values, which are the same in a second call."""
     first = [_finite(block, point) for point in points]
     again = [_finite(block, point) for point in points]
     if not all(same_answer(a, b) for a, b in zip(first, again, strict=True)):
         raise NotTraceableError(
-            f"block {block.name} answers differently to the same arguments: it is random, or remembers"
+            f"block {block.name} returns different values for equal arguments: it is random or has memory"
         )
     known = [(point, found) for point, found in zip(points, first, strict=True) if found is not None]
     if len(known) < _FEWEST:

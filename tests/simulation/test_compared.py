@@ -97,7 +97,7 @@ def test_a_comparison_costs_a_fifth_of_the_run_at_most(monkeypatch, times):
     assert 12 <= compared[0] <= sum(count for before, count in evaluated if before == 0) / 5
 
 
-def test_a_batch_is_compared_in_the_first_run_and_in_random_ones(monkeypatch):
+def test_a_batch_is_compared_in_the_first_runs_and_in_random_ones(monkeypatch):
     compared = []
     agrees = compiled_module.agrees
     monkeypatch.setattr(compiled_module, "agrees", lambda *given: compared.append(run) or agrees(*given))
@@ -114,10 +114,9 @@ def test_a_batch_is_compared_in_the_first_run_and_in_random_ones(monkeypatch):
     )
     for run in range(1, 17):
         cp.simulate(ready, np.linspace(0.0, 1.0, 5), None, 1.0, params={"k": float(run)})
-    assert compared[0] == 1
-    # One of 2 and 3, of 4 to 7, of 8 to 15.
-    assert [int(np.log2(run)) for run in compared[1:4]] == [1, 2, 3]
-    assert len(compared) <= 5
+    # One of 3 and 4, of 5 to 8, of 9 to 16.
+    assert compared[:2] == [1, 2]
+    assert [int(np.ceil(np.log2(run))) for run in compared[2:]] == [2, 3, 4]
 
 
 def test_both_sides_of_every_switch_come_first():
@@ -145,7 +144,7 @@ def test_a_form_without_switches_is_compared_once_and_at_random():
     sides = np.ones((0, 4))
     due = [compared.is_due(sides) for _ in range(64)]
     assert due[0]
-    assert [sum(due[2**k - 1 : 2 ** (k + 1) - 1]) for k in range(6)] == [1] * 6
+    assert [sum(due[2**k : 2 ** (k + 1)]) for k in range(6)] == [1] * 6
 
 
 x = ca.SX.sym("x")
@@ -174,3 +173,24 @@ def test_the_arguments_of_switches(name):
     expected = argument(*numbers)
     assert np.all((np.sign(found[0]) == np.sign(expected)) | (np.sign(found[0]) == -np.sign(expected)))
     assert abs(np.sum(np.sign(found[0]) * np.sign(expected))) == 50  # the same sign everywhere, or the other
+
+
+def test_of_many_draws_the_first_and_a_random_one_are_compared(monkeypatch):
+    compared = []
+    agrees = compiled_module.agrees
+    monkeypatch.setattr(compiled_module, "agrees", lambda *given: compared.append(given[2].get("k")) or agrees(*given))
+    block = ct.nlsys(
+        lambda t, x, u, p: [-p["k"] * (x[0] - u[0]) ** 3],
+        None,
+        inputs=["r"],
+        outputs=["y"],
+        states=1,
+        params={"k": 1.0},
+    )
+    gains = np.linspace(1.0, 2.0, 12)
+    plan = cp.PolySpline([cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1, 0, 0)], labels=["r"])
+    times = np.linspace(0.0, 2.0, 21)
+    cp.sweep(block, params={"k": gains}, plans={"plan": plan}, timepts=times, outputs={"y": "r"}, progress=False)
+    drawn = [k for k in compared if k is not None]
+    assert gains[0] in drawn
+    assert set(drawn) & set(gains[1:])

@@ -1,4 +1,4 @@
-"""Trial calls of a block leave nothing behind: what it raises, remembers, draws and warns of."""
+"""Trial calls of a block leave nothing behind: errors, memory, random numbers and warnings."""
 
 import random
 import sys
@@ -18,7 +18,7 @@ def block(update, output=None, **options):
     return ct.nlsys(update, output, **({"inputs": 0, "outputs": 1, "states": 1, "name": "tried"} | options))
 
 
-# What it raises
+# Errors
 
 TABLE = [40.0, 25.0, 16.0, 12.0, 10.0]
 """Ratio of each gear."""
@@ -74,7 +74,7 @@ def test_an_interruption_of_a_trial_reaches_the_caller():
         cp.simulate(block(update), T, None, 0.0)
 
 
-# What it remembers
+# Memory
 
 
 def relay_in_a_closure():
@@ -167,7 +167,7 @@ def test_a_switch_of_memory_that_no_trial_reaches():
 
     found = cp.simulate(block(update), np.linspace(0.0, 15.0, 16), None, 0.0, rtol=1e-6)
     assert found.method == "python"
-    assert "remembers" in found.reason
+    assert "has memory" in found.reason
 
 
 @pytest.mark.parametrize("call", ["simulate", "unread"])
@@ -189,14 +189,14 @@ def test_a_counter_counts_the_run_alone(call):
     assert counts[0] == counts[1] > 0
 
 
-def test_a_block_that_answers_differently_is_named():
+def test_a_block_with_two_values_for_equal_arguments_is_named():
     system = block(lambda t, x, u, p: [-x[0]], lambda t, x, u, p: [x[0] + 1e-9 * stats.norm.rvs()])
     found = cp.simulate(system, T, None, 1.0)
     assert found.method == "python"
-    assert found.reason == "block tried answers differently to the same arguments: it is random, or remembers"
+    assert found.reason == "block tried returns different values for equal arguments: it is random or has memory"
 
 
-# What it draws and says
+# Random numbers and warnings
 
 
 def test_global_random_generators_are_found_as_they_were():
@@ -213,7 +213,7 @@ def test_global_random_generators_are_found_as_they_were():
     expected = np.random.normal(size=3).tolist(), random.random()  # noqa: NPY002
     np.random.seed(5)  # noqa: NPY002
     random.seed(5)
-    with pytest.raises(NotTraceableError, match="answers differently"):
+    with pytest.raises(NotTraceableError, match="returns different values"):
         traced(Block(system, dict(system.params)), {}, 0.0, np.ones(1), np.zeros(0))
     assert (np.random.normal(size=3).tolist(), random.random()) == expected  # noqa: NPY002
 
