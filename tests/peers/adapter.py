@@ -8,6 +8,8 @@ python-control documents.
 
 from __future__ import annotations
 
+import inspect
+
 import control as ct
 import numpy as np
 
@@ -22,26 +24,18 @@ ALIASES = {
     "return_x": "return_states",
     "t_eval": "evaluation_times",
 }
-SHARED = ("timepts", "inputs", "initial_state", "transpose", "params", "return_states", "squeeze")
-OPTIONS = {
-    "input_output_response": (*SHARED, "ignore_errors", "solve_ivp_kwargs", "solve_ivp_method", "method")
-    + ("evaluation_times",),
-    "forced_response": (*SHARED, "interpolate"),
-}
-POSITIONS = {
-    "input_output_response": ("timepts", "inputs", "initial_state", "params", "ignore_errors", "transpose")
-    + ("return_states", "squeeze", "solve_ivp_kwargs", "evaluation_times"),
-    "forced_response": ("timepts", "inputs", "initial_state", "transpose", "params", "interpolate", "return_states")
-    + ("squeeze",),
-}
+SOLVER = ("solve_ivp_method", "method")
+"""Keywords of `input_output_response` that its signature does not show."""
 
 
 def options_of(function, args, kwargs):
     """Arguments after the system, by their own names; TypeError where one is unknown or given twice."""
-    given = list(zip(POSITIONS[function], args, strict=False)) + [(ALIASES.get(k, k), v) for k, v in kwargs.items()]
+    known = [*inspect.signature(getattr(ct, function)).parameters][1:-1]
+    hidden = SOLVER if function == "input_output_response" else ()
+    given = [*zip(known, args, strict=False), *((ALIASES.get(key, key), value) for key, value in kwargs.items())]
     options = {}
     for name, value in given:
-        if name not in OPTIONS[function]:
+        if name not in known and name not in hidden:
             raise TypeError(f"unrecognized keyword {name!r}")
         if name in options:
             raise TypeError(f"{name} was given twice")
@@ -156,7 +150,8 @@ def _initial_state(function, system, options):
 def _as_called(function, ours, rows, options):
     """The response at the wanted times, with the form that the call asked for."""
     # A system without states: python-control's nonlinear function shows none, its linear one an array of no rows.
-    states = None if ours.x is None or ours.x.size == 0 and function == "input_output_response" else ours.x[:, rows]
+    hidden = ours.x is not None and ours.x.size == 0 and function == "input_output_response"
+    states = None if ours.x is None or hidden else ours.x[:, rows]
     return ct.TimeResponseData(
         ours.t[rows],
         ours.y[:, rows],

@@ -98,7 +98,8 @@ def _of_signals(name, mine, theirs, largest):
     for row, size in enumerate(worst):
         if not size <= 1.0:
             k = int(np.nan_to_num(gap[row], nan=np.inf).argmax())
-            text = f"row {row}, sample {k}: {mine[row, k]:.12g} for {theirs[row, k]:.12g}, {size * AGREEMENT:.2g} of the range"
+            values = f"{mine[row, k]:.12g} for {theirs[row, k]:.12g}"
+            text = f"row {row}, sample {k}: {values}, {size * AGREEMENT:.2g} of the range"
             found.append((name, text, float(size)))
     return found
 

@@ -34,4 +34,4 @@ def test_example(name, monkeypatch):
     plt.close("all")
     names = {"__name__": "__main__", "display": print}
     for cell in code_of(Path(name)):
-        exec(compile(cell, name, "exec"), names)  # noqa: S102
+        exec(compile(cell, name, "exec"), names)

@@ -6,9 +6,12 @@ whatever ctrlplan answers. Loaded by ``-p`` in a process of its own; the
 folder of the record is the environment variable CTRLPLAN_PEERS.
 """
 
+# ruff: noqa: NPY002 (python-control's tests draw from numpy's global generator)
+
 from __future__ import annotations
 
 import functools
+import importlib
 import json
 import os
 import sys
@@ -16,6 +19,7 @@ import warnings
 import zlib
 from pathlib import Path
 
+import control
 import numpy as np
 from adapter import options_of, response
 from comparison import better_answers, differences
@@ -30,10 +34,8 @@ class Recorder:
     """Calls of one process: how many, and which differ."""
 
     def __init__(self, folder):
-        import control
-
         self.originals = {name: getattr(control, name) for name in FUNCTIONS}
-        self.file = Path(folder, f"calls-{os.getpid()}.jsonl").open("w", encoding="utf-8")
+        self.path = Path(folder, f"calls-{os.getpid()}.jsonl")
         self.test, self.count, self.total, self.inside = "import", 0, 0, False
 
     def begin(self, test):
@@ -49,8 +51,8 @@ class Recorder:
 
     def write(self, entry):
         """One line of the record."""
-        self.file.write(json.dumps(entry) + "\n")
-        self.file.flush()
+        with self.path.open("a", encoding="utf-8") as file:
+            file.write(json.dumps(entry) + "\n")
 
     def call(self, function, system, args, kwargs):
         """Answer of python-control, after ctrlplan's was compared with it."""
@@ -111,12 +113,8 @@ class Recorder:
 
 def patch(recorder):
     """Put the two functions of every module of control that has them in the recorder's hands."""
-    import control
-    import control.flatsys
-    import control.matlab
-    import control.optimal
-    import control.phaseplot
-
+    for module in ("flatsys", "matlab", "optimal", "phaseplot"):
+        importlib.import_module(f"control.{module}")
     for name in FUNCTIONS:
         original = recorder.originals[name]
 
@@ -160,4 +158,3 @@ def pytest_unconfigure(config):
     """Write the last test's calls."""
     if hasattr(config, "peers"):
         config.peers.end()
-        config.peers.file.close()
