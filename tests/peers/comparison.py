@@ -15,7 +15,7 @@ ROUNDING = 1e-13
 """Largest difference relative to the largest signal of the call: what rounding leaves of signals that do not move."""
 
 TIGHT = (
-    {"method": "LSODA", "rtol": 1e-11},
+    {"method": "LSODA", "rtol": 1e-10},
     {"method": "DOP853", "rtol": 1e-12},
     {"method": "Radau", "rtol": 1e-9},
 )
