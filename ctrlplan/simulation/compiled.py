@@ -149,17 +149,18 @@ class Compiled:
         """Equations in s from 0 to 1, the driven signals as Chebyshev series of some width."""
         if width not in self._equations:
             nx, nd, np_ = (self._rates.numel_in(k) for k in (1, 2, 3))
-            s, x, p, c, span = (
-                ca.SX.sym(name, *shape)
-                for name, shape in (("s", (1,)), ("x", (nx,)), ("p", (np_,)), ("c", (nd, width)), ("span", (4,)))
-            )
+            shapes = {"s": (1,), "x": (nx,), "p": (np_,), "c": (nd, width), "bounds": (nd, 2), "span": (4,)}
+            s, x, p, c, bounds, span = (ca.SX.sym(name, *shape) for name, shape in shapes.items())
             left, length, first, last = (span[k] for k in range(4))
             t = left + s * length
             driven = _series(c, (2.0 * t - first - last) / (last - first))
+            if width > 1:  # a signal that is nan stays nan
+                driven = ca.if_else(driven < bounds[:, 0], bounds[:, 0], driven)
+                driven = ca.if_else(driven > bounds[:, 1], bounds[:, 1], driven)
             self._equations[width] = {
                 "t": s,
                 "x": x,
-                "p": ca.vertcat(p, ca.vec(c), span),
+                "p": ca.vertcat(p, ca.vec(c), ca.vec(bounds), span),
                 "ode": length * self._rates(t, x, driven, p),
             }
         return self._equations[width]
@@ -215,7 +216,7 @@ class CompiledSolver:
             self._longest, self._stiff = right - left, decay * (right - left) > _STIFF
         width = series.coefficients.shape[1]
         span = [left, right - left, series.left, series.right]
-        p = np.concatenate([self._p, series.coefficients.ravel(order="F"), span])
+        p = np.concatenate([self._p, series.coefficients.ravel(order="F"), series.low, series.high, span])
         rtol, atol, max_steps = self._options
         # A solution that explodes takes all the steps it may: few at first, then more, between outputs close together.
         close = np.union1d(relative, np.linspace(0.0, 1.0, _CLOSE)[1:])

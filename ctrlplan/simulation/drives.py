@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ctrlplan._checks import real_array
 from ctrlplan.trajectories import Step, Trajectory
 from ctrlplan.trajectories.files import signal_rows
 
@@ -33,17 +34,32 @@ RESOLVED = 4e-15
 _FLAT = 1e-7
 """Relative size of terms that no longer fall, up to which they are taken for rounding errors."""
 
+_DENSE = np.cos(np.linspace(0.0, np.pi, 4 * WIDTHS[-1]))
+"""Where a series is compared with its bounds."""
+
+_ROUNDING = 1e-13
+"""Size, relative to the terms of a series, up to which it leaves its bounds by rounding."""
+
 _NOISE = 1e-11
 """Size of the later half of the longest series up to which it is taken for noise."""
 
 
 @dataclass(frozen=True, eq=False)
 class Series:
-    """Signals over one leg: Chebyshev coefficients (nsignals, width) from left to right."""
+    """Signals over one segment: Chebyshev coefficients (nsignals, width) from left to right.
+
+    Attributes
+    ----------
+    low, high : ndarray, shape (nsignals,)
+        Bounds that no value may leave, as it would by rounding; infinite where
+        none is known.
+    """
 
     left: float
     right: float
     coefficients: Array
+    low: Array
+    high: Array
 
     def __call__(self, t: float) -> Array:
         """All signals at one time, shape (nsignals,)."""
@@ -51,14 +67,26 @@ class Series:
         if width == 1:
             return self.coefficients[:, 0]
         u = (2.0 * t - self.left - self.right) / (self.right - self.left)
-        # A solver's trial step may look a little beyond the leg.
+        # A solver's trial step may look a little beyond the segment.
         angle = math.acos(min(1.0, max(-1.0, u)))
-        return np.asarray(self.coefficients @ np.cos(angle * _counts(width)))
+        values = self.coefficients @ np.cos(angle * _counts(width))
+        return np.asarray(np.minimum(np.maximum(values, self.low), self.high))
 
     def at(self, times: Array) -> Array:
         """All signals at many times, shape (nsignals, ntime)."""
         u = np.clip((2.0 * times - self.left - self.right) / (self.right - self.left), -1.0, 1.0)
-        return np.asarray(self.coefficients @ np.cos(_counts(self.coefficients.shape[1])[:, None] * np.arccos(u)))
+        values = self.coefficients @ np.cos(_counts(self.coefficients.shape[1])[:, None] * np.arccos(u))
+        return np.asarray(np.clip(values, self.low[:, None], self.high[:, None]))
+
+    def bounded(self, low: Array, high: Array) -> Series:
+        """Same signals with bounds, where they leave these by rounding alone."""
+        dense = np.polynomial.chebyshev.chebval(_DENSE, self.coefficients.T)
+        slack = _ROUNDING * np.abs(self.coefficients).sum(axis=1)
+        return replace(
+            self,
+            low=np.where(dense.min(axis=1) < low - slack, -np.inf, low),
+            high=np.where(dense.max(axis=1) > high + slack, np.inf, high),
+        )
 
 
 class Drive(Protocol):
@@ -74,6 +102,12 @@ class Drive(Protocol):
 
     def beside(self, moment: float, origin: float, s: Array) -> Array:
         """Values (nsignals, ntime) at origin + s of the analytic functions that hold at `moment`."""
+
+    def bounds(self, moment: float, left: float, right: float) -> tuple[Array, Array]:
+        """Minima and maxima (nsignals,) between two times that no breakpoint parts; infinite where not known.
+
+        Where a signal exceeds them between the ends, they are ignored.
+        """
 
     def at(self, times: Array) -> Array:
         """Values (nsignals, ntime), right-continuous."""
@@ -101,6 +135,10 @@ class PlanDrive:
         jet = self.plan._jet_beside(moment, origin, s, self.derivatives)
         return jet.transpose(1, 0, 2).reshape(-1, s.size)
 
+    def bounds(self, moment: float, left: float, right: float) -> tuple[Array, Array]:
+        """The plan's own values at both ends."""
+        return _ordered(self.beside(moment, left, np.array([0.0, right - left])))
+
     def at(self, times: Array) -> Array:
         """Values of the plan."""
         return signal_rows(self.plan, times, self.derivatives)
@@ -125,9 +163,17 @@ class SampledDrive:
         (t0, t1), (v0, v1) = self.times[left : left + 2], self.values[left : left + 2]
         return (v0 + (v1 - v0) * ((origin - t0 + s) / (t1 - t0)))[None]
 
+    def bounds(self, moment: float, left: float, right: float) -> tuple[Array, Array]:
+        """The samples between which a straight line runs."""
+        start = min(max(int(np.searchsorted(self.times, moment)) - 1, 0), self.times.size - 2)
+        return _ordered(self.values[None, start : start + 2])
+
     def at(self, times: Array) -> Array:
         """Values between the samples."""
-        return np.interp(times, self.times, self.values)[None]
+        after = np.clip(np.searchsorted(self.times, times, side="right"), 1, self.times.size - 1)
+        first, second = self.values[after - 1], self.values[after]
+        found = np.interp(times, self.times, self.values)
+        return np.clip(found, np.minimum(first, second), np.maximum(first, second))[None]
 
 
 def input_drives(labels: Sequence[str], inputs: Inputs, times: Array) -> list[Drive]:
@@ -151,8 +197,10 @@ def input_drives(labels: Sequence[str], inputs: Inputs, times: Array) -> list[Dr
         # By name where the names are the same, whatever their order.
         crossed = set(inputs.labels) == set(labels) and inputs.labels != tuple(labels)
         return [PlanDrive(inputs.select(labels) if crossed else inputs)]
-    elif inputs is None or (np.ndim(inputs) == 0 and not callable(inputs)):
+    elif inputs is None or (not isinstance(inputs, list | tuple) and np.ndim(inputs) == 0 and not callable(inputs)):
         given = [0.0 if inputs is None else inputs] * len(labels)
+    elif isinstance(inputs, list | tuple) and len(inputs) == len(labels) != times.size:
+        given = list(inputs)
     else:
         rows = _numbers(inputs, "inputs")
         rows = rows[None] if rows.ndim == 1 and len(labels) == 1 else rows
@@ -183,23 +231,23 @@ def resolved(signals: Callable[[Array], Array], left: float, right: float, toler
     duration = right - left
     values = signals(duration * _LOOKS)
     if np.all(values == values[:, :1]):
-        return [Series(left, right, values[:, :1])]
+        return [_unbounded(left, right, values[:, :1])]
     for width in WIDTHS[1:]:
         coefficients = chebyshev_coefficients(signals(chebyshev_times(0.0, duration, width)))
         size = np.abs(coefficients)
         allowed = size.max(axis=1, keepdims=True)
         if np.all(size[:, -3:] <= tolerance * allowed):
-            return [Series(left, right, coefficients)]
+            return [_unbounded(left, right, coefficients)]
     # Terms that no longer fall are rounding errors of the signal itself, which shorter legs make no smaller: where a
     # plan comes to rest, its derivatives are next to nothing beside it.
     half, end = size[:, width // 2 : -width // 4], size[:, -width // 4 :]
     noise = np.maximum(half.max(axis=1), end.max(axis=1))
     flat = half.max(axis=1) <= 10.0 * end.max(axis=1)
     if np.all(noise <= np.where(flat, _FLAT, max(_NOISE, 10.0 * tolerance)) * allowed[:, 0]):
-        return [Series(left, right, coefficients)]
+        return [_unbounded(left, right, coefficients)]
     middle = 0.5 * (left + right)
     if not left < middle < right or duration < 1e-12 * max(abs(left), abs(right)):
-        return [Series(left, right, coefficients)]
+        return [_unbounded(left, right, coefficients)]
     first = resolved(signals, left, middle, tolerance)
     return first + resolved(lambda s: signals(s + (middle - left)), middle, right, tolerance)
 
@@ -211,15 +259,28 @@ def chebyshev_times(left: float, right: float, width: int) -> Array:
 
 
 def chebyshev_coefficients(values: Array) -> Array:
-    """Coefficients (nsignals, width) from values (nsignals, width) at `chebyshev_times`."""
-    return values @ _chebyshev(values.shape[1])[1]
+    """Coefficients (nsignals, width) from values (nsignals, width) at `chebyshev_times`; of a constant, itself."""
+    coefficients = values @ _chebyshev(values.shape[1])[1]
+    constant = np.all(values == values[:, :1], axis=1)
+    coefficients[constant] = 0.0
+    coefficients[constant, 0] = values[constant, 0]
+    return np.asarray(coefficients)
+
+
+def _unbounded(left: float, right: float, coefficients: Array) -> Series:
+    free = np.full(len(coefficients), np.inf)
+    return Series(left, right, coefficients, -free, free)
+
+
+def _ordered(ends: Array) -> tuple[Array, Array]:
+    """Smaller and larger of two values (nsignals, 2)."""
+    return ends.min(axis=1), ends.max(axis=1)
 
 
 def _numbers(value: Any, what: str) -> Array:
-    try:
-        return np.asarray(value, dtype=float)
-    except TypeError:
-        raise TypeError(f"{what} must be trajectories, numbers or samples, got {value!r:.80}") from None
+    if callable(value):
+        raise TypeError(f"{what} must be a trajectory, a number or samples, got {value!r:.80}")
+    return real_array(value, what)
 
 
 def _drive(value: Any, name: str, times: Array) -> Drive:

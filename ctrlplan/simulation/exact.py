@@ -17,6 +17,7 @@ stiffness limit.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +27,10 @@ Array = NDArray[np.float64]
 
 _TERMS = 18
 """Taylor terms of the input in a cell."""
+
+_FEWEST = 8
+"""Samples in a cell from which on a table for all cells is quicker than a series in each; and states up to which
+products of their matrices are quicker than steps one by one."""
 
 _NUMBERS = 2**20
 """Numbers in an array of exponentials, where there is one for each spacing."""
@@ -75,10 +80,11 @@ def exact_states(
         return out
     first, last = float(timepts[0]), float(timepts[-1])
     inner = sorted({float(t) for t in breakpoints if first < t < last})
-    for left, right in zip([first, *inner], [*inner, last], strict=True):
-        begin, end = np.searchsorted(timepts, [left, right], side="left")
-        end += right == last
-        state = _leg(a, b, jet, left, right, timepts[begin:end] - left, state, read, out[:, :, begin:end])
+    with np.errstate(all="ignore"):
+        for left, right in zip([first, *inner], [*inner, last], strict=True):
+            begin, end = np.searchsorted(timepts, [left, right], side="left")
+            end += right == last
+            state = _leg(a, b, jet, left, right, timepts[begin:end] - left, state, read, out[:, :, begin:end])
     return out
 
 
@@ -108,15 +114,47 @@ def sampled_states(a: Array, b: Array, samples: Array, timepts: Array, initial: 
     if even:  # spacings that differ by rounding alone share an exponential
         steps[:] = even
     drive = np.concatenate([samples[:, :-1], np.diff(samples)]).T  # Taylor terms in the time of each interval
-    part = _NUMBERS // max(1, scale.size * (scale.size + drive.shape[1]))
-    for begin in range(0, steps.size if scale.size else 0, max(1, part)):
-        these = slice(begin, begin + max(1, part))
-        spacings, which = np.unique(steps[these], return_inverse=True)
-        h = spacings[:, None, None]
-        change = _changes(h * a, h * b, 2)[-1][0][which]
-        forced = change[:, :, scale.size :] @ drive[these, :, None]
-        out[begin + 1 : these.stop + 1] = _recurrence(change[:, :, : scale.size], forced, out[begin])
+    part = max(1, _NUMBERS // max(1, scale.size * (scale.size + drive.shape[1])))
+    with np.errstate(all="ignore"):
+        if even and scale.size > _FEWEST:
+            out[:] = _marched(state, _changes(even * a, even * b, 2), drive.T.reshape(2, len(samples), -1))[0].T
+            return (out * scale).T
+        for begin in range(0, steps.size if scale.size else 0, part):
+            these = slice(begin, begin + part)
+            spacings, which = np.unique(steps[these], return_inverse=True)
+            h = spacings[:, None, None]
+            changes = _changes(h * a, h * b, 2)
+            change = changes[-1][which]
+            forced = change[:, :, scale.size :] @ drive[these, :, None]
+            found = out[begin + 1 : these.stop + 1]
+            found[:] = _recurrence(change[:, :, : scale.size], forced, out[begin])
+            for k in range(_first_overflow(found.T), len(found)):
+                series = drive[begin + k].reshape(2, -1)
+                found[k] = _carried(out[begin + k], series, [level[which[k]] for level in changes])
     return (out * scale).T
+
+
+def matrix_product(left: Array, right: Array) -> Array:
+    """Matrix product in which 0 times inf is 0 and what is undefined is infinite.
+
+    A signal that has left the range of numbers spoils only what depends on it.
+    """
+    product: Array = left @ right
+    if np.isfinite(product).all():
+        return product
+    lost, gone = ~np.isfinite(left), ~np.isfinite(right)
+    product = np.where(lost, 0.0, left) @ np.where(gone, 0.0, right)
+    votes = np.where(lost, np.sign(left), 0.0) @ np.sign(right) + np.sign(left) @ np.where(gone, np.sign(right), 0.0)
+    touched = lost.astype(float) @ (right != 0.0) + (left != 0.0) @ gone.astype(float) > 0.0
+    product[touched] = np.copysign(np.inf, votes[touched])
+    product[np.isnan(product)] = np.inf
+    return product
+
+
+def state_scale(a: Array) -> Array:
+    """Scale (nstates,) in which rows and columns of a system's matrix are of one size, powers of two."""
+    scale: Array = matrix_balance(a, permute=False, separate=True)[1][0] if a.size else np.ones(0)
+    return scale
 
 
 def _balanced(a: Array, b: Array, initial: Array) -> tuple[Array, Array, Array, Array]:
@@ -124,7 +162,7 @@ def _balanced(a: Array, b: Array, initial: Array) -> tuple[Array, Array, Array, 
 
     Powers of two, which change no digit, and let the cells be longer.
     """
-    scale: Array = matrix_balance(np.abs(a).max(axis=0), permute=False, separate=True)[1][0] if a.size else np.ones(0)
+    scale = state_scale(np.abs(a).max(axis=0)) if a.size else np.ones(0)
     return scale, a * (scale / scale[:, None]), b / scale[:, None], initial / scale
 
 
@@ -150,13 +188,18 @@ def _leg(
     ncells, nterms = _cells(lambda s, order: jet(moment, left, s, order), duration)
     per = _samples_per_cell(samples, duration, duration / ncells)
     if per:
-        return _even_leg(a, b, series, duration, nterms, per, samples, state, read, out)
+        h = per * float(samples[-1] - samples[0]) / (samples.size - 1)
+        changes = _changes(h * a, h * b, nterms, halvings=per.bit_length() - 1)
+        while per >= _FEWEST and not np.isfinite(changes[-1]).all():  # an unstable system outgrows a cell
+            changes, per, h = changes[:-1], per // 2, 0.5 * h
+        if per >= _FEWEST:
+            return _even_leg(a, b, series, duration, nterms, per, h, changes, samples, state, read, out)
     h = duration / ncells
     terms = series(h * np.arange(ncells, dtype=float), h)
     ends = np.empty_like(state)
     for i in range(len(a)):
         values, ends[i] = _any_leg(h * a[i], h * b[i], terms, samples / h, state[i])
-        np.matmul(read[i], values, out=out[i])
+        out[i] = matrix_product(read[i], values)
     return ends
 
 
@@ -167,65 +210,80 @@ def _even_leg(
     duration: float,
     nterms: int,
     per: int,
+    h: float,
+    changes: list[Array],
     samples: Array,
     state: Array,
     read: Array,
     out: Array,
 ) -> Array:
-    """Same, for evenly spaced samples, a power of two of them, `per`, in each cell."""
-    count, n = state.shape
-    h = per * float(samples[-1] - samples[0]) / (samples.size - 1)
+    """Same, for evenly spaced samples, a power of two of them, `per`, in each cell of length h."""
+    (count, n), m = state.shape, b.shape[-1]
     whole, rest = divmod(samples.size, per)
     last = int(duration // h)  # the cell in which the leg ends
     cells = series(h * np.arange(max(last, whole) + 1, dtype=float), h)
     chain = cells.reshape(-1, cells.shape[2])
-    changes = _changes(h * a, h * b, nterms, halvings=per.bit_length() - 1)
-    whole_cell = changes[-1][0]
     known = np.empty((count, cells.shape[2], n + len(chain)))
-    known[:, :, :n] = _marched(state, whole_cell[..., :n], whole_cell[..., n:] @ chain[:, :-1]).swapaxes(1, 2)
+    known[:, :, :n] = _marched(state, changes, cells[:, :, :-1]).swapaxes(1, 2)
     known[:, :, n:] = chain.T
 
     table = np.zeros((count, n, per, known.shape[2]))  # from a cell's beginning to its samples
     if samples[0]:
-        table[:, :, 0] = _changes(h * a, h * b, nterms, samples[0] / h)[-1][0]
+        table[:, :, 0] = _part(a, b, nterms, h, samples[0] / h)
     have = 1
     for change in changes[-per.bit_length() : -1]:
-        table[:, :, have : 2 * have] = _followed(table[:, :, :have], *change)
+        time = have / per
+        powers = np.repeat(time ** np.arange(nterms), m)
+        step = np.concatenate([change[..., :n], change[..., n:] * powers], axis=-1)
+        table[:, :, have : 2 * have] = _followed(table[:, :, :have], step, _shift(nterms, m, time))
         have *= 2
     rows = (read @ table.reshape(count, n, -1)).reshape(count, -1, *table.shape[2:]).swapaxes(2, 3)
     rows[:, :, :n] += read[..., None]
     main = out[:, :, : whole * per].reshape(*out.shape[:2], whole, per)
     np.matmul(known[:, None, :whole], rows, out=main)
     out[:, :, whole * per :] = (known[:, None, whole : whole + 1] @ rows[..., :rest])[:, :, 0]
+    for i in np.flatnonzero(~np.isfinite(out).all(axis=(1, 2))):
+        main[i] = matrix_product(known[i, :whole], rows[i])
+        out[i, :, whole * per :] = matrix_product(known[i, whole : whole + 1], rows[i, ..., :rest])[:, 0]
     if samples[-1] == duration:
         ending, last = table[:, :, rest - 1], whole if rest else whole - 1
     else:
-        ending = _changes(h * a, h * b, nterms, duration / h - last)[-1][0]
-    return known[:, last, :n] + (ending @ known[:, last, :, None])[:, :, 0]
+        ending = _part(a, b, nterms, h, duration / h - last)
+    return known[:, last, :n] + matrix_product(ending, known[:, last, :, None])[:, :, 0]
+
+
+def _part(a: Array, b: Array, nterms: int, h: float, part: float) -> Array:
+    """Change of states over a part of a cell, from states and the input's terms in the time of the whole cell."""
+    n, powers = a.shape[-1], np.repeat(part ** np.arange(nterms), b.shape[-1])
+    change: Array = _changes(part * h * a, part * h * b, nterms)[-1]
+    change[..., n:] *= powers
+    return change
 
 
 def _any_leg(a: Array, b: Array, series: Array, samples: Array, state: Array) -> tuple[Array, Array]:
     """States of one system at any samples, and at the end of the leg; the unit of time is a cell."""
-    n, (nterms, _, ncells) = len(a), series.shape
-    *halvings, (change, _) = _changes(a, b, nterms)
-    states = _marched(state[None], change[None, :, :n], (change[:, n:] @ series.reshape(-1, ncells))[None])[0]
+    n, ncells = len(a), series.shape[2]
+    changes = _changes(a, b, len(series))
+    states = _marched(state[None], [change[None] for change in changes], series)[0]
     end, states = states[:, -1], states[:, :-1]
     if not samples.size:
         return np.empty((n, 0)), end
-    cells, h = np.arange(ncells), 1.0
-    for change, _ in reversed(halvings):
+    where = np.minimum(samples, ncells - 1.0).astype(np.intp)
+    sigma, h = samples - where, 1.0
+    for level in range(len(changes) - 2, -1, -1):
         h *= 0.5
         first, second = _halved(series)
-        own = change[:, n:] * np.repeat(h ** -np.arange(nterms, dtype=float), b.shape[1])  # terms in their own time
-        middle = states + (change[:, :n] @ states + own @ first.reshape(-1, first.shape[2]))
+        change = changes[level]
+        middle = states + (change[:, :n] @ states + change[:, n:] @ first.reshape(-1, first.shape[2]))
+        for k in np.flatnonzero(~np.isfinite(middle).all(axis=0)):
+            middle[:, k] = _carried(states[:, k], first[:, :, k], changes[: level + 1])
         states = np.stack([states, middle], axis=2).reshape(n, -1)
-        series = np.stack([first, second], axis=3).reshape(nterms, b.shape[1], 2 * first.shape[2])
-        cells = (2 * cells[:, None] + np.arange(2)).ravel()
-        if cells.size > 4 * samples.size + 64:  # stiff: only cells with samples in them matter
-            used = np.isin(cells, np.minimum(samples / h, cells[-1]).astype(np.intp))
-            cells, states, series = cells[used], states[:, used], series[:, :, used]
-    where = np.clip(np.searchsorted(cells, samples / h, side="right") - 1, 0, cells.size - 1)
-    sigma = samples / h - cells[where]
+        series = np.stack([first, second], axis=3).reshape(*first.shape[:2], 2 * first.shape[2])
+        later = sigma >= 0.5  # doubling and this difference are exact, however many halvings there are
+        where, sigma = 2 * where + later, 2.0 * sigma - later
+        if states.shape[1] > 4 * samples.size + 64:  # stiff: only cells with samples in them matter
+            used, where = np.unique(where, return_inverse=True)
+            states, series = states[:, used], series[:, :, used]
     return _evaluated(_taylor(h * a, h * b, states, series), where, sigma), end
 
 
@@ -233,6 +291,11 @@ def _cells(jet: Callable[[Array, int], Array], duration: float) -> tuple[int, in
     """Number of cells in which the input's Taylor series dies, and of its terms."""
     order = _TERMS + 7
     size = np.abs(jet(np.linspace(0.0, duration, 9), order)).max(axis=2)  # (order + 1, ninputs)
+    if not np.isfinite(size[:_TERMS]).all():
+        raise ValueError(
+            f"inputs must have derivatives within the range of numbers up to order {_TERMS - 1}, got a segment of "
+            f"{duration:g} s on which they have not; state times, or values, in another unit"
+        )
     ncells = 1
     while ncells < 4096:
         terms = size * ((duration / ncells) ** np.arange(order + 1) / _LONG_FACTORIALS)[:, None]
@@ -250,7 +313,7 @@ def _samples_per_cell(samples: Array, duration: float, longest: float) -> int:
         return 0
     # Longer cells than the square root and the table costs more than the march.
     most = min(longest / step - 1.0, 2.0 * samples.size**0.5)
-    return 2 ** int(np.log2(most)) if most >= 8.0 else 0
+    return 2 ** int(np.log2(most)) if most >= _FEWEST else 0
 
 
 def _spacing(samples: Array, duration: float) -> float:
@@ -262,60 +325,112 @@ def _spacing(samples: Array, duration: float) -> float:
     return step if beside.max() <= 4.0 * np.finfo(float).eps * duration else 0.0
 
 
-def _changes(a: Array, b: Array, nterms: int, time: float = 1.0, halvings: int = 0) -> list[tuple[Array, Array]]:
-    """Change of states and of the input's Taylor terms over ..., time/4, time/2, time; at least so many halvings.
+def _changes(a: Array, b: Array, nterms: int, halvings: int = 0) -> list[Array]:
+    """Change of states over ..., 1/4, 1/2, 1 units of time; at least so many halvings.
 
-    States (..., n, n + nterms * ninputs) from states and terms; terms, which
-    all systems share, from terms. The shortest by its Taylor series, each next
-    one from two of the one before. The change, not the state: beside a fast
-    mode, squaring would cost a slow one a digit every three levels.
+    States (..., n, n + nterms * ninputs) from states and the input's Taylor
+    terms, each in the time that it is for. The shortest by its Taylor series,
+    each next one from two of the one before. The change, not the state: beside
+    a fast mode, squaring would cost a slow one a digit every three levels.
     """
     n, m = b.shape[-2:]
-    k = np.arange(nterms)
-    norm = float(np.abs(time * a).sum(axis=-2).max(initial=1.0))
+    norm = float(np.abs(a).sum(axis=-2).max(initial=1.0))
+    if not np.isfinite(norm):
+        raise ValueError("rates of the system times the duration of the run must be below 1e308, got more")
     levels = max(halvings, int(np.ceil(np.log2(norm))))
-    short = time * 0.5**levels
     rate = np.zeros((*a.shape[:-2], n + nterms * m, n + nterms * m))
-    rate[..., :n, :n], rate[..., :n, n : n + m] = short * a, short * b
-    rate[..., n:, n:] = np.diag(np.repeat(short * k[1:], m), m)
+    rate[..., :n, :n], rate[..., :n, n : n + m] = a * 0.5**levels, b * 0.5**levels
+    rate[..., n:, n:] = np.diag(np.repeat(np.arange(1.0, nterms), m), m)
     term: Array = np.eye(n, n + nterms * m)
-    states = np.zeros((*a.shape[:-2], n, n + nterms * m))
+    change = np.zeros((*a.shape[:-2], n, n + nterms * m))
     for j in range(1, _TERMS + 2):
         term = term @ rate / j
-        states += term
-    shift = _PASCAL[:nterms, :nterms] * short ** np.maximum(k - k[:, None], 0.0) - np.eye(nterms)
-    found = [(states, np.kron(shift, np.eye(m)))]
+        change += term
+    shift = _shift(nterms, m, 1.0)
+    powers = np.repeat(0.5 ** np.arange(nterms), m)
+    found = [change]
     for _ in range(levels):
-        states, terms = found[-1]
-        found.append((_followed(states[..., None, :], states, terms)[..., 0, :], 2.0 * terms + terms @ terms))
+        change = _followed(change[..., None, :], change, shift)[..., 0, :]
+        change[..., n:] *= powers
+        found.append(change)
     return found
 
 
-def _followed(early: Array, states: Array, terms: Array) -> Array:
+@lru_cache(maxsize=64)
+def _shift(nterms: int, m: int, time: float) -> Array:
+    """Change of the input's Taylor terms over some time."""
+    k = np.arange(nterms)
+    powers = time ** np.maximum(k - k[:, None], 0.0)
+    return np.kron(_PASCAL[:nterms, :nterms] * powers - np.eye(nterms), np.eye(m))
+
+
+def _followed(early: Array, change: Array, terms: Array) -> Array:
     """Changes of states over some times (..., n, ntime, width), followed by one more change."""
-    n = states.shape[-2]
-    both = early + states[..., None, :] + early[..., :n] @ states[..., None, :, :]
+    n = change.shape[-2]
+    both = early + change[..., None, :] + early[..., :n] @ change[..., None, :, :]
     both[..., n:] += early[..., n:] @ terms
+    if not np.isfinite(both.sum()):
+        both = early + change[..., None, :] + matrix_product(early[..., :n], change[..., None, :, :])
+        both[..., n:] += matrix_product(early[..., n:], terms)
+        both[np.isnan(both)] = np.inf
     return both
 
 
-def _marched(state: Array, change: Array, forced: Array) -> Array:
-    """States (nsystems, n, ncells + 1) at the ends of cells, from what the input adds in each (nsystems, n, ncells)."""
-    states = np.empty((*forced.shape[:2], forced.shape[2] + 1))
+def _marched(state: Array, changes: list[Array], series: Array) -> Array:
+    """States (nsystems, n, ncells + 1) at the ends of cells, with the input's terms (nterms, ninputs, ncells)."""
+    (count, n), ncells = state.shape, series.shape[2]
+    states = np.empty((count, n, ncells + 1))
     states[:, :, 0] = state
-    for k in range(forced.shape[2]):
+    change = changes[-1][..., :n]
+    forced = changes[-1][..., n:] @ series.reshape(-1, ncells)
+    for k in range(ncells):
         state = state + ((change @ state[:, :, None])[:, :, 0] + forced[:, :, k])
         states[:, :, k + 1] = state
+    for i, found in enumerate(states):
+        for k in range(_first_overflow(found), ncells + 1):
+            if k:
+                found[:, k] = _carried(found[:, k - 1], series[:, :, k - 1], [change[i] for change in changes])
     return states
+
+
+def _first_overflow(states: Array) -> int:
+    """Index of the first time at which a state is not finite; their number where all are."""
+    lost = ~np.isfinite(states).all(axis=0)
+    return int(lost.argmax()) if lost.any() else lost.size
+
+
+def _carried(state: Array, series: Array, changes: list[Array]) -> Array:
+    """State (n,) after the last of some changes, by shorter ones where that one is beyond the range of numbers.
+
+    What is zero, or does not depend on what has overflowed, is not touched by it.
+    """
+    n, todo = state.size, [(len(changes) - 1, series[:, :, None])]
+    while todo:
+        level, terms = todo.pop()
+        known = np.concatenate([state, terms.ravel()])
+        used = np.isfinite(known) & (known != 0.0)
+        if level and not np.isfinite(changes[level][np.isfinite(state)][:, used]).all():
+            first, second = _halved(terms)
+            todo += [(level - 1, second), (level - 1, first)]
+            continue
+        state = state + matrix_product(changes[level], known[:, None])[:n, 0]
+        state[np.isnan(state)] = np.inf
+    return state
 
 
 def _recurrence(change: Array, forced: Array, state: Array) -> Array:
     """States (nsteps, n) after each of the steps x + change x + forced, shapes (nsteps, n, n) and (nsteps, n, 1).
 
-    In blocks of as many steps as there are blocks: all blocks side by side
-    from a state still unknown, then that state from block to block.
+    Of few states in blocks of as many steps as there are blocks: all blocks
+    side by side from a state still unknown, then that state from block to block.
     """
     nsteps, n = change.shape[:2]
+    if n > _FEWEST:
+        found = np.empty((nsteps, n))
+        for k in range(nsteps):
+            state = state + (change[k] @ state + forced[k, :, 0])
+            found[k] = state
+        return found
     per = int(np.ceil(nsteps**0.5))
     steps = np.zeros((per * -(-nsteps // per), n, n + 1))
     steps[:nsteps, :, :n], steps[:nsteps, :, n:] = change, forced
@@ -343,7 +458,7 @@ def _taylor(a: Array, b: Array, states: Array, series: Array) -> list[Array]:
     """Taylor terms of the state over a unit of time, where norm(a) <= 1."""
     terms = [states]
     for j in range(_TERMS + 1):
-        following = a @ terms[-1]
+        following = matrix_product(a, terms[-1])
         if j < len(series):
             following = following + b @ series[j]
         terms.append(following / (j + 1))
@@ -357,6 +472,8 @@ def _evaluated(terms: list[Array], where: NDArray[np.intp], sigma: Array) -> Arr
     for term in reversed(terms[:-1]):
         out *= sigma
         out += np.take(term, where, axis=1, out=gathered, mode="clip")
+    if not np.isfinite(out).all():
+        out[np.isnan(out)] = np.inf
     return out
 
 

@@ -4,14 +4,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
+from ctrlplan.simulation.budget import check
 from ctrlplan.simulation.drives import Series
-from ctrlplan.simulation.network import Map, Network, Step, known_feedthrough, tried_feedthrough
+from ctrlplan.simulation.network import (
+    Map,
+    Network,
+    Step,
+    known_feedthrough,
+    sampled_feedthrough,
+    tried_feedthrough,
+)
+from ctrlplan.simulation.trials import can_remember, trial_copy, tried
 
 Array = NDArray[np.float64]
 
@@ -61,10 +71,10 @@ class Interpreted:
         self._probe = probe
         self._outputs = [block.output(params) for block in network.blocks]
         self._updates = [block.update(params) for block in network.blocks]
-        self._samples = {i: _once(network.blocks[i].sampled(params)) for i in network.blocks_with("period")}
-        self._doubtful, self._trials = False, trials
-        self.feeds = self._feeds(self._outputs)
-        self._calls = [self._call(i, output) for i, output in enumerate(self._outputs) if not network.blocks[i].driven]
+        self._samples = {i: network.blocks[i].sampled(params) for i in network.blocks_with("period")}
+        self._trials = trials
+        self.feeds, doubtful = self._feeds(self._outputs)
+        self._doubtful = [(i, can_remember(network.blocks[i].system)) for i in doubtful]
         self._for_rates = self._steps(self._outputs, network.signals_of_inputs(), self.feeds)
         self._for_all = self._steps(self._outputs, np.ones(network.nsignals, dtype=bool), self.feeds)
         self._for_samples: dict[tuple[int, ...], list[Call]] = {}
@@ -72,9 +82,12 @@ class Interpreted:
 
     def rates(self, t: float, x: Array, driven: Array) -> Array:
         """Derivatives of all states, given the signals that are functions of time."""
+        check(t)
         w = self._signals(self._for_all if self._doubtful else self._for_rates, t, x, driven)
-        if self._doubtful:
-            self._check(t, x, w)
+        return self.rates_of(t, x, w)
+
+    def rates_of(self, t: float, x: Array, w: Array) -> Array:
+        """The same, given all signals; the next states of a discrete system."""
         dx = self._a @ x + self._b @ w[self._driving]
         for i in self._moving:
             place = self.network.states[i]
@@ -95,18 +108,15 @@ class Interpreted:
     def all_signals(self, times: Array, states: Array, driven: Array) -> Array:
         """All signals (nsignals, ntime) at many times."""
         rows = [self.signals(t, states[:, k], driven[:, k]) for k, t in enumerate(times.tolist())]
-        if self._doubtful:
-            for k, t in enumerate(times.tolist()):
-                self._check(t, states[:, k], rows[k])
         return np.array(rows).T.reshape(-1, times.size)
 
     def sampled(self, blocks: tuple[int, ...], t: float, x: Array, driven: Array) -> Array:
         """State after some discrete blocks have taken a sample, each seeing the others' new outputs.
 
-        Blocks with an attribute ``samples_first`` go before the rest and see
+        Blocks that declare `samples_first` go before the rest and see
         their own outputs as they were, which may come back to them at once.
         """
-        first = tuple(i for i in blocks if getattr(self.network.blocks[i].system, "samples_first", False))
+        first = tuple(i for i in blocks if self.network.blocks[i].traits.samples_first)
         rest = tuple(i for i in blocks if i not in first)
         if first:
             w = self._seen(rest, t, x, driven) if rest else self.signals(t, x, driven)
@@ -118,7 +128,11 @@ class Interpreted:
         network, after = self.network, x.copy()
         for i in blocks:
             place = network.states[i]
-            after[place] = self._samples[i](t, x[place], network.fed[i](w))
+            with _named(network.blocks[i].name, t):
+                following = self._samples[i][1](t, x[place], network.fed[i](w))
+            if network.blocks[i].held is not None:  # what is held has become known with the signals
+                following = np.concatenate([following, w[network.outputs[i]]])
+            after[place] = following
         return after
 
     def _seen(self, blocks: tuple[int, ...], t: float, x: Array, driven: Array) -> Array:
@@ -130,47 +144,56 @@ class Interpreted:
     def _sampling(self, blocks: tuple[int, ...]) -> list[Call]:
         """Steps to all signals at the instant of a sample."""
         outputs = list(self._outputs)
-
-        def renewed(i: int) -> Map:
-            return lambda t, x, u: self._outputs[i](t, self._samples[i](t, x, u), u)
-
         for i in blocks:
-            outputs[i] = renewed(i)
-        return self._steps(outputs, self.network.signals_of_inputs(), self._feeds(outputs, blocks))
+            outputs[i] = self._samples[i][0]
+        # Of the blocks that are sampled all outputs are held, whether another block reads them or not.
+        needed = self.network.signals_of_inputs()
+        for i in blocks:
+            needed[self.network.outputs[i]] = True
+        return self._steps(outputs, needed, self._feeds(outputs, blocks)[0])
 
-    def _feeds(self, outputs: Sequence[Map], unsure: Sequence[int] = ()) -> list[NDArray[np.bool_]]:
-        """Feedthrough of every block: assumed where nothing is known; tried only where a loop seems to be."""
+    def _feeds(self, outputs: Sequence[Map], sampled: Sequence[int] = ()) -> tuple[list[NDArray[np.bool_]], list[int]]:
+        """Feedthrough of every block, and the blocks of which it was tried.
+
+        It is assumed where nothing is known, and tried only where a loop seems to be.
+        """
         network, (t, x) = self.network, self._probe
         sizes = [(block.system.noutputs, block.system.ninputs or 0) for block in network.blocks]
-        known = [None if i in unsure else known_feedthrough(block) for i, block in enumerate(network.blocks)]
+        known = [(sampled_feedthrough if i in sampled else known_feedthrough)(b) for i, b in enumerate(network.blocks)]
         feeds = [np.ones(size, dtype=bool) if k is None else k for size, k in zip(sizes, known, strict=True)]
         every = np.ones(network.nsignals, dtype=bool)
         unknown = [i for i, k in enumerate(known) if k is None]
+        doubtful: list[int] = []
         # What a sample makes of its inputs is tried last: it may take long.
-        for group in ([i for i in unknown if i not in unsure], [i for i in unknown if i in unsure]):
+        for group in ([i for i in unknown if i not in sampled], [i for i in unknown if i in sampled]):
             if not (self._trials and any(step.unknown is not None for step in network.schedule(feeds, every))):
                 break
+            copies = network.for_trials().blocks if group else ()
             for i in group:
-                self._doubtful = True
-                feeds[i] = tried_feedthrough(outputs[i], *sizes[i], t, x[network.states[i]])
-        return feeds
+                block = copies[i]
+                function = block.sampled(self.params)[0] if i in sampled else block.output(self.params)
+                feeds[i] = tried_feedthrough(function, *sizes[i], t, x[network.states[i]])
+                doubtful.append(i)
+        return feeds, doubtful
 
     def _check(self, t: float, x: Array, w: Array) -> None:
-        """Refuse signals of which one is not what its block puts out: it depends on more than was found by trying."""
-        again = w.copy()
-        for call in self._calls:
-            fed = w.copy()
-            call(t, x, fed)
-            changed = fed != w
-            again[changed] = fed[changed]
-        if not np.allclose(again, w, rtol=1e-9, atol=1e-9 * np.abs(w).max(initial=0.0), equal_nan=True):
-            raise FeedthroughError(f"signals at {t:g} s depend on more than they did at the start")
+        """Raise where an output is not what its block makes of all signals: it depends on more than trials found."""
+        for i, remembers in self._doubtful:
+            block, outs = self.network.blocks[i], self.network.outputs[i]
+            if remembers:  # a call of its own would be remembered
+                block = replace(block, system=trial_copy(block.system))
+            found = tried(block.output(self.params), t, x[self.network.states[i]], self.network.fed[i](w))
+            size = np.abs(w).max(initial=0.0, where=np.isfinite(w))
+            if found is not None and not np.allclose(found, w[outs], rtol=1e-9, atol=1e-9 * size, equal_nan=True):
+                raise FeedthroughError(f"outputs of {block.name} at {t:g} s depend on more inputs than at the start")
 
     def _signals(self, steps: list[Call], t: float, x: Array, driven: Array) -> Array:
         w = np.zeros(self.network.nsignals)
         w[self.network.driven] = driven
         for step in steps:
             step(t, x, w)
+        if self._doubtful and steps is self._for_all:
+            self._check(t, x, w)
         return w
 
     def _steps(self, outputs: list[Map], needed: NDArray[np.bool_], feeds: Sequence[NDArray[np.bool_]]) -> list[Call]:
@@ -184,17 +207,29 @@ class Interpreted:
 
         owned = [np.intersect1d(unknown, np.arange(p.start, p.stop)) for p in map(outs.__getitem__, step.blocks)]
 
+        settles = True
+
         def solve(t: float, x: Array, w: Array) -> None:
-            def left_over(z: Array) -> Array:
+            nonlocal settles
+
+            def image(z: Array) -> Array:
                 w[unknown] = z
                 after = w.copy()
                 for call, rows in zip(calls, owned, strict=True):
                     fed = w.copy()  # every block sees the trial values, not its neighbours' new ones
                     call(t, x, fed)
                     after[rows] = fed[rows]
-                return np.asarray(after[unknown] - z)
+                return np.asarray(after[unknown])
 
-            w[unknown] = _root(left_over, w[unknown], names, t)
+            start = w[unknown]
+            if settles:
+                # Signals that only seem to be a loop are passed on from block to block, as python-control does.
+                found = _passed_on(image, start, len(calls) + 1)
+                if found is not None:
+                    w[unknown] = found
+                    return
+                settles = False
+            w[unknown] = _root(lambda z: image(z) - z, start, names, t)
 
         return solve
 
@@ -273,20 +308,6 @@ class _named:  # noqa: N801 (a context, of which a run opens thousands)
             error.add_note(f"in block {self._name} at {self._t:g} s")
 
 
-def _once(sample: Map) -> Map:
-    """States after a sample, taken once though a run asks for them and for the outputs that they put out."""
-    last: tuple[Any, Array] = (None, np.empty(0))
-
-    def taken(t: Any, x: Array, u: Array) -> Array:
-        nonlocal last
-        asked = t, x.tobytes(), u.tobytes()
-        if asked != last[0]:
-            last = asked, np.ravel(sample(t, x, u))
-        return last[1].copy()
-
-    return taken
-
-
 def _merged_linear(network: Network) -> tuple[Array, Array, NDArray[np.intp], list[int]]:
     """Linear blocks as one: rates a x + b w of some signals w, and which; and the other blocks with states."""
     a = np.zeros((network.nstates, network.nstates))
@@ -307,10 +328,31 @@ def _used(matrix: Array) -> tuple[Array, NDArray[np.intp]]:
     return matrix[:, columns], columns
 
 
+def _passed_on(image: Callable[[Array], Array], start: Array, times: int) -> Array | None:
+    """Signals that no longer change when they are passed on; None where they still do."""
+    z = image(start)
+    for _ in range(times):
+        try:
+            following = image(z)
+        except Exception:  # these are no signals of the loop yet, and may lie outside of a block's domain
+            return None
+        if np.array_equal(following, z, equal_nan=True):
+            return z
+        z = following
+    return None
+
+
 def _root(left_over: Callable[[Array], Array], guess: Array, names: str, t: float) -> Array:
     """Solution of an algebraic loop by Newton's iteration, in one step where it is linear."""
     z = guess.copy()
     rest = left_over(z)
+
+    def trial_rest(z: Array) -> Array:
+        try:
+            return left_over(z)
+        except Exception:  # outside of a block's domain
+            return np.full(z.size, np.nan)
+
     for _ in range(50):
         size = 1.0 + np.abs(z)
         if np.all(np.abs(rest) <= 1e-13 * size):
@@ -319,13 +361,15 @@ def _root(left_over: Callable[[Array], Array], guess: Array, names: str, t: floa
         for j in range(z.size):
             step = np.zeros(z.size)
             step[j] = 1e-7 * size[j]
-            slope[:, j] = (left_over(z + step) - rest) / step[j]
+            slope[:, j] = (trial_rest(z + step) - rest) / step[j]
+            if not np.isfinite(slope[:, j]).all():
+                slope[:, j] = (rest - trial_rest(z - step)) / step[j]
         if not np.isfinite(slope).all():
             break
         change = np.linalg.lstsq(slope, -rest, rcond=1e-14)[0]
         before = np.abs(rest).max()
         for _ in range(30):
-            following = left_over(z + change)
+            following = trial_rest(z + change)
             if np.abs(following).max() < before:
                 break
             change = 0.5 * change

@@ -12,6 +12,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from ctrlplan.simulation.budget import check
 from ctrlplan.simulation.drives import (
     RESOLVED,
     Drive,
@@ -77,6 +78,16 @@ class DelayedDrive:
     def beside(self, moment: float, origin: float, s: Array) -> Array:
         """Values as they were; legs end where they break."""
         return self.at(origin + s)
+
+    def bounds(self, moment: float, left: float, right: float) -> tuple[Array, Array]:
+        """Bounds of the signals as they were."""
+        low, high = np.full(self.width, np.inf), np.full(self.width, -np.inf)
+        if left - self.delay < self._first:
+            low, high = self._initial, self._initial
+        for piece in self._pieces:
+            if piece.left < right - self.delay and piece.right > left - self.delay:
+                low, high = np.minimum(low, piece.low), np.maximum(high, piece.high)
+        return low, high
 
     def at(self, times: Array) -> Array:
         """Values as they were."""
@@ -156,7 +167,7 @@ def integrate(
         raise ValueError(
             f"a delay must be at least {_SHORTEST_DELAY:g} of the run of {last - first:g} s, got {longest:g} s"
         )
-    declared = [float(getattr(block.system, "longest", np.inf)) for block in network.blocks]
+    declared = [block.traits.longest for block in network.blocks]
     longest = min(longest, max(min(declared, default=np.inf), (last - first) / _LEGS))
     if pause is not None:
         longest = min(longest, (last - first) / 64.0)
@@ -167,13 +178,17 @@ def integrate(
     left, reach = first, longest
     x = clock.sample(equations, drives, first, state)
     while left < last:
+        check(left)  # CVODES is not stopped within a segment, whose steps are bounded
         right = clock.following(left)
         right = clock.on(times, right) if right - left <= reach * (1.0 + 1e-9) else left + reach
         if memory.delays or not (span and span[-1].right >= right):
             until = right if memory.delays else clock.fixed_after(left)
             moment = 0.5 * (left + right)
             accuracy = resolution if memory.delays else RESOLVED
-            span = resolved(partial(_beside, drives, moment, left), left, until, accuracy)
+            span = [
+                series.bounded(*_bounds(drives, moment, series.left, series.right))
+                for series in resolved(partial(_beside, drives, moment, left), left, until, accuracy)
+            ]
         series = next(s for s in span if left < s.right)
         right = min(right, series.right)
         inside = times[slice(*np.searchsorted(times, [left, right]))]
@@ -208,6 +223,7 @@ class _Memory:
         blocks = network.blocks_with("delay")
         self._drives: list[Any] = [drive for drive in drives if isinstance(drive, DelayedDrive)]
         self._fed = [network.fed[i] for i in blocks]
+        self._wires, self._driven = [network.wire[network.inputs[i]] for i in blocks], network.driven
         self._solver, self._resolution = solver, resolution
         self.delays = [drive.delay for drive in self._drives]
 
@@ -224,8 +240,8 @@ class _Memory:
         pieces = [chebyshev_coefficients(fed(w)) for fed in self._fed]
         if right - left > _SHORTEST * min(self.delays) and any(_unresolved(p, self._resolution) for p in pieces):
             return False
-        for drive, piece in zip(self._drives, pieces, strict=True):
-            drive.record(Series(left, right, piece))
+        for drive, piece, wire in zip(self._drives, pieces, self._wires, strict=True):
+            drive.record(Series(left, right, piece, *_combined_bounds(wire, self._driven, series)))
         return True
 
 
@@ -239,8 +255,8 @@ class _Clock:
         self._first = first
         self._periods = {}
         for i in network.blocks_with("period"):
-            system = network.blocks[i].system
-            self._periods[i] = (float(system.period), float(getattr(system, "offset", 0.0)))
+            traits = network.blocks[i].traits
+            self._periods[i] = (float(traits.period or 0.0), traits.offset)
             self._push(i, 0)
 
     def following(self, t: float) -> float:
@@ -278,6 +294,23 @@ class _Clock:
 
 def _beside(drives: Sequence[Drive], moment: float, origin: float, s: Array) -> Array:
     return np.concatenate([np.zeros((0, s.size)), *(drive.beside(moment, origin, s) for drive in drives)])
+
+
+def _bounds(drives: Sequence[Drive], moment: float, left: float, right: float) -> tuple[Array, Array]:
+    found = [drive.bounds(moment, left, right) for drive in drives]
+    return tuple(np.concatenate([np.zeros(0), *(pair[side] for pair in found)]) for side in (0, 1))  # type: ignore[return-value]
+
+
+def _combined_bounds(wire: Array, driven: NDArray[np.intp], series: Series) -> tuple[Array, Array]:
+    """Bounds of sums of signals, where only functions of time are summed."""
+    others = np.delete(wire, driven, axis=1)
+    known = ~np.any(others != 0.0, axis=1)
+    weights = wire[:, driven]
+    ends = [
+        np.where(weights != 0.0, weights, 0.0) * np.where(weights != 0.0, end, 0.0) for end in (series.low, series.high)
+    ]
+    low, high = np.minimum(*ends).sum(axis=1), np.maximum(*ends).sum(axis=1)
+    return np.where(known, low, -np.inf), np.where(known, high, np.inf)
 
 
 def _fixed(

@@ -10,9 +10,15 @@ import control as ct
 import numpy as np
 from numpy.typing import NDArray
 
+from ctrlplan._checks import real_array
+from ctrlplan.simulation.exact import matrix_product, state_scale
+from ctrlplan.traits import traits_of
 from ctrlplan.trajectories import Trajectory
 
 Array = NDArray[np.float64]
+
+_TURNS, _GROWTH = 1e9, 20.0
+"""Durations in units of the fastest pole, and of the fastest growth, up to which rounding stays below 1e-6."""
 
 
 class NotLinearError(ValueError):
@@ -38,6 +44,25 @@ class LinearForm:
     d: Array
     sources: tuple[tuple[Trajectory, int], ...]
 
+    def outputs(self, states: Array, inputs: Array) -> Array:
+        """Outputs (noutputs, ntime); a state that has overflowed spoils only those that see it."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            found: Array = matrix_product(self.c, states) + self.d @ inputs
+        found[np.isnan(found)] = np.inf
+        return found
+
+    def sensitivity(self, duration: float) -> tuple[bool, bool]:
+        """Whether growth, or poles so fast, make a run of some duration [s] depend on last digits to 1e-6."""
+        poles = np.linalg.eigvals(self.a) if self.a.size else np.zeros(1)
+        return bool(duration * poles.real.max() > _GROWTH), bool(duration * np.abs(poles).max() > _TURNS)
+
+    def rounding(self, states: Array, inputs: Array) -> Array:
+        """What rounding of states and inputs of a size leaves in the outputs, shape (noutputs,)."""
+        scale = state_scale(self.a)
+        largest = np.abs(states / scale[:, None]).max(initial=0.0)
+        fed = np.abs(self.c) @ scale * largest + np.abs(self.d) @ np.abs(inputs).max(axis=1, initial=0.0)
+        return np.asarray(64.0 * np.finfo(float).eps * fed)
+
 
 def linear_form(system: Any) -> LinearForm:
     """Flatten a linear system, nested interconnections and plan sources included.
@@ -49,7 +74,8 @@ def linear_form(system: Any) -> LinearForm:
     NotLinearError
         If a block is nonlinear or discrete; its name is in the message.
     ValueError
-        If blocks form an algebraic loop without a unique solution.
+        If blocks form an algebraic loop without a unique solution, or a matrix
+        is not finite.
     """
     form = linear_forms([system])
     return LinearForm(form.a[0], form.b[0], form.c[0], form.d[0], form.sources)
@@ -75,13 +101,14 @@ def linear_forms(systems: Sequence[Any]) -> LinearForm:
     if kind is ct.TransferFunction:
         return linear_forms([ct.ss(system) for system in systems])
     if kind is ct.StateSpace:
-        matrices = [[np.asarray(getattr(system, name), dtype=float) for system in systems] for name in "ABCD"]
+        matrices = [[_matrix(system, name) for system in systems] for name in "ABCD"]
         if any(matrix.shape != row[0].shape for row in matrices for matrix in row):
             raise _unlike(systems)
         a, b, c, d = map(np.stack, matrices)
         return LinearForm(a, b, c, d, ())
-    plan, high = systems[0].plan, systems[0].derivatives
-    if any(system.plan is not plan or system.derivatives != high for system in systems):
+    sources = [traits_of(system) for system in systems]
+    plan, high = sources[0].plan, sources[0].derivatives
+    if any(source.plan is not plan or source.derivatives != high for source in sources):
         raise _unlike(systems)
     count, n = len(systems), systems[0].noutputs
     a, b, c = map(np.zeros, ((count, 0, 0), (count, 0, n), (count, n, 0)))
@@ -93,13 +120,20 @@ def in_right_half(poles: NDArray[Any]) -> NDArray[np.bool_]:
     return np.asarray(poles.real > 1e-9 * np.maximum(1e-300, np.abs(poles)))
 
 
+def _matrix(system: Any, name: str) -> Array:
+    matrix = real_array(getattr(system, name), f"{name} of {system.name}")
+    if not np.isfinite(matrix).all():
+        raise ValueError(f"{name} of {system.name} must be finite, got nan or inf")
+    return matrix
+
+
 def _kind(system: Any) -> type:
     if system.dt not in (None, 0):
         raise NotLinearError(f"block {system.name} is discrete (dt = {system.dt})")
     for kind in (ct.InterconnectedSystem, ct.StateSpace, ct.TransferFunction):
         if isinstance(system, kind):
             return kind
-    if isinstance(getattr(system, "plan", None), Trajectory):
+    if isinstance(traits_of(system).plan, Trajectory):
         return Trajectory
     raise NotLinearError(f"block {system.name} ({type(system).__name__}) is not linear")
 

@@ -23,11 +23,17 @@ from scipy.linalg import block_diag
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
+from ctrlplan.simulation.trials import can_remember, reads, trial, trial_copy, tried
+from ctrlplan.traits import BlockTraits, traits_of
 from ctrlplan.trajectories import Trajectory
 
 Array = NDArray[np.float64]
 Map = Callable[[Any, Any, Any], Any]
 """(t, state of the block, input of the block) -> outputs or rates; of numbers, or of symbols."""
+
+
+_INPUT = 2
+"""Position of the input among the arguments (t, x, u, params) of a block's functions."""
 
 
 class UnsupportedError(ValueError):
@@ -46,6 +52,11 @@ class Block:
         """What python-control calls it."""
         return str(self.system.name)
 
+    @cached_property
+    def traits(self) -> BlockTraits:
+        """What the block has declared."""
+        return traits_of(self.system)
+
     @property
     def linear(self) -> bool:
         """Whether four matrices say it all."""
@@ -54,18 +65,24 @@ class Block:
     @property
     def plan(self) -> Trajectory | None:
         """What the block puts out, where that is a plan."""
-        plan = getattr(self.system, "plan", None)
+        plan = self.traits.plan
         return plan if isinstance(plan, Trajectory) else None
 
     @property
     def delay(self) -> float | None:
         """How much later [s] the block puts out what goes in, where it does only that."""
-        return getattr(self.system, "delay", None)
+        return self.traits.delay
 
     @property
     def period(self) -> float | None:
         """Time between the samples of a discrete block in a continuous loop [s]."""
-        return getattr(self.system, "period", None)
+        return self.traits.period
+
+    @property
+    def held(self) -> Any:
+        """Discrete system inside a sampled block whose held outputs are the block's; None of other blocks."""
+        inner = self.traits.block if self.period is not None else None
+        return inner if inner is not None and inner.noutputs == self.system.noutputs else None
 
     @property
     def driven(self) -> bool:
@@ -92,10 +109,25 @@ class Block:
             return lambda t, x, u: np.zeros(len(x))
         return lambda t, x, u: update(t, x, u, own)
 
-    def sampled(self, params: Mapping[str, Any]) -> Map:
-        """States after a sample of a discrete block in a continuous loop."""
-        sample, own = self.system.sample, {**self.params, **params}
-        return lambda t, x, u: sample(t, x, u, own)
+    def sampled(self, params: Mapping[str, Any]) -> tuple[Map, Map]:
+        """Outputs of a discrete block in a continuous loop when it takes a sample, and its states after it.
+
+        Of a system that is held, output and update apart; the update returns
+        its states alone, behind which the held outputs follow.
+        """
+        sample, own = self.traits.sample, {**self.params, **params}
+        inner = self.held
+        if inner is not None:
+            count, given = inner.nstates or 0, None if isinstance(inner, ct.StateSpace) else own
+            return (
+                lambda t, x, u: np.ravel(inner.output(t, x[:count], u, given)),
+                lambda t, x, u: np.ravel(inner.dynamics(t, x[:count], u, given)) if count else np.empty(0),
+            )
+        if sample is None:
+            raise TypeError(f"block {self.name} must declare a function that takes its samples")
+        taken = _once(lambda t, x, u: sample(t, x, u, own))
+        output = self.output(params)
+        return (lambda t, x, u: output(t, taken(t, x, u), u)), taken
 
 
 @dataclass(frozen=True)
@@ -146,7 +178,7 @@ class Network:
     breakpoints : tuple of float
         Times [s] that blocks name at which their equations change.
     watched : tuple of Declared
-        Signals of blocks that declare limits, by an attribute ``watched``.
+        Signals of blocks that declare limits.
     """
 
     name: str
@@ -174,9 +206,15 @@ class Network:
             np.hstack([part.outer, part.inner]),
             np.hstack([part.through, part.read]),
             system.ninputs or 0,
-            tuple(float(t) for b in part.blocks for t in getattr(b.system, "breakpoints", ())),
+            tuple(t for b in part.blocks for t in b.traits.breakpoints),
         )
         return replace(network, watched=tuple(network._declared()))
+
+    def for_trials(self) -> Network:
+        """Same network with blocks whose memory, if they have one, is not that of the run."""
+        remember = [not block.linear and can_remember(block.system) for block in self.blocks]
+        pairs = zip(self.blocks, remember, strict=True)
+        return replace(self, blocks=tuple(replace(b, system=trial_copy(b.system)) if r else b for b, r in pairs))
 
     def without_blocks(self) -> Network:
         """What a run of a compiled form needs, without functions that cannot be sent to another process."""
@@ -230,7 +268,7 @@ class Network:
         return np.concatenate(rows)
 
     def blocks_with(self, kind: str) -> list[int]:
-        """Blocks of a kind: those with a ``period``, a ``delay``, ..."""
+        """Blocks of a kind: those with a period, a delay, ..."""
         return [i for i, block in enumerate(self.blocks) if getattr(block, kind) is not None]
 
     def schedule(self, feeds: Sequence[NDArray[np.bool_]], needed: NDArray[np.bool_]) -> list[Step]:
@@ -286,7 +324,7 @@ class Network:
 
     def _declared(self) -> Iterator[Declared]:
         for block, states, fed in zip(self.blocks, self.states, self.fed, strict=True):
-            for name, (function, low, high) in getattr(block.system, "watched", {}).items():
+            for name, (function, low, high) in (block.traits.watched or {}).items():
                 yield Declared(name, function, low, high, states, fed, block.params)
 
     def _owners(self, rows: NDArray[np.intp]) -> tuple[int, ...]:
@@ -296,33 +334,63 @@ class Network:
 def known_feedthrough(block: Block) -> NDArray[np.bool_] | None:
     """Which outputs of a block depend on which inputs at once, (noutputs, ninputs), where that is certain.
 
-    Of linear blocks by their matrix; of others where they say so themselves,
-    by an attribute ``feedthrough``, or put out their states.
+    Of linear blocks by their matrix; of others where they declare it, output
+    their states, or have a function that never reads its input.
     """
     shape = (block.system.noutputs, block.system.ninputs or 0)
     if block.linear:
         return np.asarray(block.system.D) != 0.0
     if block.driven or block.system.outfcn is None:
         return np.zeros(shape, dtype=bool)
-    declared = getattr(block.system, "feedthrough", None)
-    return None if declared is None else np.broadcast_to(np.asarray(declared, dtype=bool), shape)
+    declared = block.traits.feedthrough
+    if declared is None:
+        return None if reads(block.system.outfcn, _INPUT) else np.zeros(shape, dtype=bool)
+    return np.broadcast_to(np.asarray(declared, dtype=bool), shape)
+
+
+def sampled_feedthrough(block: Block) -> NDArray[np.bool_] | None:
+    """The same for a block at the instant of a sample, of which outputs follow from states after it."""
+    inner = block.held
+    if inner is None or isinstance(inner, ct.InterconnectedSystem):
+        return None
+    return known_feedthrough(Block(inner, block.params))
 
 
 def tried_feedthrough(output: Map, noutputs: int, nin: int, t: float, x: Array) -> NDArray[np.bool_]:
-    """Which outputs change when an input does, about a time and a state."""
+    """Which outputs change when an input does, about a time and a state; all, where no trial tells."""
     found = np.zeros((noutputs, nin), dtype=bool)
+    known = np.zeros(nin, dtype=bool)
     rng = np.random.default_rng(1)
-    with np.errstate(all="ignore"):
+    with trial():
         for scale in (0.0, 1.0, 1e3):
             u = scale * rng.standard_normal(nin)
-            state = x + 0.1 * rng.standard_normal(x.size)
-            before = np.ravel(output(t, state, u))
+            state = x + (0.1 * rng.standard_normal(x.size) if scale else 0.0)
+            before = tried(output, t, state, u)
+            if before is None:
+                continue
             for j in range(nin):
                 for step in (1e-3, 1.0, 1e3):
                     moved = u.copy()
                     moved[j] += step
-                    found[:, j] |= np.ravel(output(t, state, moved)) != before
-    return found
+                    after = tried(output, t, state.copy(), moved)
+                    if after is not None and after.shape == before.shape == (noutputs,):
+                        known[j] = True
+                        found[:, j] |= (after != before) & ~(np.isnan(after) & np.isnan(before))
+    return found | ~known
+
+
+def _once(sample: Map) -> Map:
+    """States after a sample, taken once though a run asks for them and for the outputs that follow from them."""
+    last: tuple[Any, Array] = (None, np.empty(0))
+
+    def taken(t: Any, x: Array, u: Array) -> Array:
+        nonlocal last
+        asked = t, x.tobytes(), u.tobytes()
+        if asked != last[0]:
+            last = asked, np.ravel(sample(t, x, u))
+        return last[1].copy()
+
+    return taken
 
 
 @dataclass(frozen=True)

@@ -274,7 +274,7 @@ def _check_autonomous(prepared: Prepared) -> None:
     if prepared.network is None:
         raise ValueError(f"system must be one that ctrlplan runs itself, but {prepared.unsupported}")
     for block in prepared.network.blocks:
-        if block.plan is not None or getattr(block.system, "breakpoints", None):
+        if block.plan is not None or block.traits.breakpoints:
             raise ValueError(f"system must not depend on time, got the plan or breakpoints of the block {block.name}")
         if block.delay is not None:
             raise ValueError(f"system must say all by its state, got the delay of the block {block.name}")

@@ -19,6 +19,7 @@ from ctrlplan.simulation.legs import DelayedDrive
 from ctrlplan.simulation.linear import LinearForm, NotLinearError, linear_form
 from ctrlplan.simulation.network import Network, UnsupportedError
 from ctrlplan.simulation.recent import recent
+from ctrlplan.traits import traits_of
 
 if TYPE_CHECKING:
     from ctrlplan.simulation.compiled import Compiled
@@ -79,7 +80,7 @@ class Prepared:
             if block.delay is not None or block.period is not None:
                 what = "puts out the past" if block.delay is not None else "takes samples"
                 self.not_linear = f"block {block.name} {what}"
-        self._sources = [PlanDrive(b.plan, b.system.derivatives) for b in self._blocks() if b.plan is not None]
+        self._sources = [PlanDrive(b.plan, b.traits.derivatives) for b in self._blocks() if b.plan is not None]
         self.trusted = True
         self.trials = True
         self._read: dict[str, bool] = {}
@@ -105,7 +106,7 @@ class Prepared:
             if block.plan is not None:
                 found.append(next(sources))
             elif block.delay is not None:
-                initial = np.broadcast_to(np.asarray(block.system.initial, dtype=float), (block.system.ninputs,))
+                initial = np.broadcast_to(np.asarray(block.traits.initial, dtype=float), (block.system.ninputs,))
                 found.append(DelayedDrive(block.delay, initial, first))
         return [*found, *sources]
 
@@ -181,7 +182,7 @@ class Prepared:
         for i, block in enumerate(network.blocks):
             if block.linear or block.driven:
                 continue
-            functions = (block.system.outfcn, block.system.updfcn, getattr(block.system, "sample", None))
+            functions = (block.system.outfcn, block.system.updfcn, block.traits.sample)
             for scale in (0.0, 0.1, 1.0):
                 x, u = start[network.states[i]], network.fed[i](w)
                 x, u = (v + scale * rng.standard_normal(v.size) * (1.0 + np.abs(v)) for v in (x, u))
@@ -325,9 +326,9 @@ def prepared_form(system: Any) -> Prepared:
 
 def stated_start(system: Any) -> Array | None:
     """State at which a system says that it starts, or its blocks do, the rest of them at 0; None where none does."""
-    own = getattr(system, "initial_state", None)
+    own = traits_of(system).initial_state
     if own is not None:
-        return np.broadcast_to(np.asarray(own, dtype=float), (system.nstates or 0,))
+        return own
     if not isinstance(system, ct.InterconnectedSystem):
         return None
     parts = [(stated_start(block), block.nstates or 0) for block in system.syslist]
@@ -355,10 +356,10 @@ def fingerprint(system: Any) -> tuple[Any, ...]:
     if isinstance(system, ct.TransferFunction):
         return (own, labels, _frozen([system.num, system.den]))
     # The functions themselves, not their addresses: those of the dead are given to others.
-    functions = tuple(_frozen(getattr(system, name, None)) for name in ("updfcn", "outfcn", "plan"))
-    numbers = tuple(getattr(system, name, None) for name in ("derivatives", "delay", "period", "offset"))
-    inner = getattr(system, "block", None)
-    return (own, labels, functions, numbers, () if inner is None else fingerprint(inner))
+    functions = tuple(_frozen(getattr(system, name, None)) for name in ("updfcn", "outfcn"))
+    # Traits are immutable and compared by identity.
+    traits = traits_of(system)
+    return (own, labels, functions, traits, () if traits.block is None else fingerprint(traits.block))
 
 
 def _checked_system(system: Any) -> Any:

@@ -8,6 +8,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import null_space
 
+from ctrlplan._checks import real_array
+from ctrlplan.simulation.exact import state_scale
 from ctrlplan.simulation.linear import LinearForm, NotLinearError, in_right_half, linear_form
 from ctrlplan.simulation.prepared import Prepared
 
@@ -30,7 +32,7 @@ def rest_state(system: Any, position: ArrayLike) -> Array:
         A solution of A x + B w = 0, with outputs as near w as it allows; zero
         where there is none.
     """
-    held = np.atleast_1d(np.asarray(position, dtype=float))
+    held = np.atleast_1d(real_array(position, "position"))
     if not held.any():
         return np.zeros(system.nstates or 0)
     try:
@@ -39,16 +41,22 @@ def rest_state(system: Any, position: ArrayLike) -> Array:
         return np.zeros(system.nstates or 0)
     if form.b.shape[1] != held.size:
         return np.zeros(len(form.a))
-    supplied = form.b @ held
-    state: Array = np.linalg.lstsq(form.a, -supplied, rcond=None)[0]
-    if np.abs(form.a @ state + supplied).max(initial=0.0) > 1e-9 * np.abs(supplied).max(initial=0.0):
+    # Rows and columns of one size: beside a fast pole a slow one is not taken for an integrator.
+    scale, supplied = state_scale(form.a), form.b @ held
+    rates = form.a * scale
+    size = np.abs(np.column_stack([rates, supplied])).max(axis=1, initial=0.0)
+    size[size == 0.0] = 1.0
+    rates, supplied = rates / size[:, None], supplied / size
+    state: Array = np.linalg.lstsq(rates, -supplied, rcond=None)[0]
+    left = np.abs(rates @ state + supplied).max(initial=0.0)
+    if left > 1e-9 * max(np.abs(state).max(initial=0.0), np.abs(supplied).max(initial=0.0)):
         return np.zeros(len(form.a))
     # Where integrators leave a choice, the outputs should be what is asked for.
-    idle, tracked = null_space(form.a), form.c[: held.size]
+    idle, tracked = null_space(rates), form.c[: held.size] * scale
     if idle.size and len(tracked) == held.size:
         missing = held - tracked @ state - form.d[: held.size] @ held
         state = state + idle @ np.linalg.lstsq(tracked @ idle, missing, rcond=None)[0]
-    return state
+    return state * scale
 
 
 def unstable_poles(system: Any) -> NDArray[np.complex128]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -10,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ctrlplan.simulation.drives import Drive, PlanDrive, SampledDrive, driven_signals
+from ctrlplan.simulation.drives import Drive, PlanDrive, SampledDrive, breakpoints_of, driven_signals
 from ctrlplan.simulation.events import Event, Snapshot, Watched, watched_events
 from ctrlplan.simulation.exact import exact_states, sampled_states
 from ctrlplan.simulation.interpreted import Interpreted, InterpretedSolver, SolverError
@@ -30,6 +31,16 @@ _LOOKS_A_TURN = 16
 
 _VISITED = 12
 """Visited states at which a compiled system is compared with Python."""
+
+
+_LOST = 1e-6
+"""Part of an output's size from which on a doubt about it is said."""
+
+_MOST_STEPS = 1e8
+"""Steps of a discrete system in a run."""
+
+_OFF_CLOCK = 1e-4
+"""Part of a sampling time by which a time may miss an instant, besides rounding of the times."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,22 +163,44 @@ def _exact(job: Job, form: LinearForm) -> Record:
 
     def see(t: Array, x: Array) -> Snapshot:
         driven = driven_signals(drives, t)
-        with np.errstate(over="ignore", invalid="ignore"):
-            return Snapshot(t, x, driven[: job.prepared.ninputs], _finite(form.c @ x + form.d @ driven))
+        return Snapshot(t, x, driven[: job.prepared.ninputs], form.outputs(x, driven))
 
-    def states_at(t: Array, state: Array) -> Array:
-        with np.errstate(over="ignore", invalid="ignore"):
-            found = exact_states(form.a, form.b[:, ~sampled], jet, breakpoints, t, state)
-            if sampled.any():  # what plans and samples make of a linear loop adds up
-                samples = driven_signals(drives, t)[sampled]
-                found = found + sampled_states(form.a, form.b[:, sampled], samples, t, np.zeros_like(state))
-            return _finite(found)
+    def states_at(t: Array, state: Array, a: Array = form.a) -> Array:
+        found = exact_states(a, form.b[:, ~sampled], jet, breakpoints, t, state)
+        if sampled.any():  # what plans and samples make of a linear loop adds up
+            samples = driven_signals(drives, t)[sampled]
+            found = found + sampled_states(a, form.b[:, sampled], samples, t, np.zeros_like(state))
+        return _finite(found)
 
     def carry(k: int, t: float) -> Array:
         return states_at(np.array([times[k], t]), states[:, k])[:, 1]
 
     states = states_at(times, job.state)
+    growing, fast = form.sensitivity(float(times[-1] - times[0]))
+    if growing or fast:
+        driven, nearly = driven_signals(drives, times), states_at(times, job.state, form.a * (1.0 + 2.0**-50))
+        floor = form.rounding(states[:, :1] if growing else states, driven)
+        _warn_of_lost_digits(job, form.outputs(states, driven), form.outputs(nearly, driven), floor)
     return Record(times, states, see, carry, watched, "exact", "linear and continuous")
+
+
+def _warn_of_lost_digits(job: Job, outputs: Array, others: Array, floor: Array) -> None:
+    """Say which outputs change by more than a floor when all rates change in their last digits."""
+    known = np.isfinite(outputs) & np.isfinite(others)
+    with np.errstate(all="ignore"):
+        apart = np.where(known, np.abs(outputs - others), 0.0).max(axis=1)
+    size = np.where(known, np.abs(outputs), 0.0).max(axis=1)
+    lost = apart > np.maximum(_LOST * size, floor)
+    if lost.any():
+        part = float((apart[lost] / np.maximum(size[lost], 0.5 * apart[lost])).max())
+        names = ", ".join(np.array(job.prepared.output_labels)[lost])
+        warnings.warn(
+            f"outputs {names} of {job.prepared.name} are uncertain by {100.0 * part:.3g} % of their size: "
+            f"over {job.times[-1] - job.times[0]:g} s rounding of the matrices is enough to change them so; make the "
+            "run shorter, or leave out modes that are so fast or so unstable",
+            UserWarning,
+            stacklevel=5,
+        )
 
 
 def _numerical(job: Job, method: str, reason: str) -> Record:
@@ -238,29 +271,65 @@ def _numerical(job: Job, method: str, reason: str) -> Record:
 def _discrete(job: Job, reason: str) -> Record:
     """Discrete system, from sample to sample."""
     prepared, network = job.prepared, _network(job.prepared)
-    period = 1.0 if prepared.dt is True else float(prepared.dt)
-    steps = (job.times - job.first) / period
-    wanted = np.round(steps).astype(int)
-    if np.abs(steps - wanted).max() > 1e-6:
-        at = float(job.times[np.abs(steps - wanted).argmax()])
-        raise ValueError(f"timepts must be whole periods of {period:g} s apart in a discrete system, got {at:g} s")
-    clock = job.first + period * np.arange(wanted[-1] + 1)
-    clock[wanted] = job.times
+    clock = _clock(job.times, prepared.dt)
     drives = prepared.drives(job.inputs, job.first)
     equations = Interpreted(network, job.params, (job.first, job.state), prepared.trials)
-    driven = driven_signals(drives, clock)
+    breakpoints = np.array(sorted(breakpoints_of(drives)))
+    driven = driven_signals(drives, _on_breakpoints(clock, breakpoints))
     states = np.empty((job.state.size, clock.size))
     states[:, 0] = job.state
     for k in range(clock.size - 1):
         states[:, k + 1] = equations.rates(float(clock[k]), states[:, k], driven[:, k])
 
     def see(t: Array, x: Array) -> Snapshot:
-        now = driven_signals(drives, t)
+        now = driven_signals(drives, _on_breakpoints(t, breakpoints))
         w = equations.all_signals(t, x, now)
         return Snapshot(t, x, now[: prepared.ninputs], network.put_out(w), lambda: w)
 
     # Between samples nothing happens: what crosses a limit does so at the later one.
     return Record(clock, states, see, lambda k, t: states[:, k], job.watched(), "python", reason)
+
+
+def _clock(times: Array, dt: float | bool) -> Array:
+    """Sampling instants of a discrete system from the first time to the last, the times themselves among them."""
+    rounding = 4.0 * np.finfo(float).eps * np.abs(times).max()
+    if isinstance(dt, bool):
+        spacing = np.diff(times)
+        if np.ptp(spacing) > _OFF_CLOCK * spacing.mean() + rounding:
+            raise ValueError(
+                "timepts must be evenly spaced for a system with unspecified sampling time (dt = True), "
+                f"got spacings from {spacing.min():g} to {spacing.max():g} s"
+            )
+        return times
+    period = float(dt)
+    if not rounding < 0.1 * period < np.inf:
+        raise ValueError(f"timepts must tell instants {period:g} s apart, got times up to {np.abs(times).max():g} s")
+    steps = (times - times[0]) / period
+    if steps[-1] > _MOST_STEPS:
+        raise ValueError(f"timepts must span {_MOST_STEPS:g} periods of a discrete system at most, got {steps[-1]:.3g}")
+    wanted = np.round(steps)
+    off = np.abs(steps - wanted)
+    if off.max() > _OFF_CLOCK + rounding / period:
+        at = float(times[off.argmax()])
+        raise ValueError(
+            f"timepts must be whole periods of {period:g} s apart in a discrete system, got {at:.12g} s, "
+            f"{off.max():.2g} periods off"
+        )
+    if np.any(np.diff(wanted) < 1.0):
+        raise ValueError(f"timepts must be at least a period of {period:g} s apart in a discrete system, got less")
+    clock: Array = times[0] + period * np.arange(wanted[-1] + 1.0)
+    clock[wanted.astype(int)] = times
+    return clock
+
+
+def _on_breakpoints(times: Array, breakpoints: Array) -> Array:
+    """Times, but the breakpoint itself where a time is one but for rounding: 29 times 0.01 s is 0.29 s."""
+    if not breakpoints.size:
+        return times
+    after = np.clip(np.searchsorted(breakpoints, times), 1, max(1, breakpoints.size - 1))
+    before, following = breakpoints[after - 1], breakpoints[np.minimum(after, breakpoints.size - 1)]
+    nearest = np.where(times - before < following - times, before, following)
+    return np.where(np.abs(times - nearest) <= 4.0 * np.finfo(float).eps * np.abs(times).max(), nearest, times)
 
 
 def _network(prepared: Prepared) -> Any:

@@ -12,6 +12,8 @@ import control as ct
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ctrlplan._checks import real_array
+from ctrlplan.simulation.budget import begin_run
 from ctrlplan.simulation.drives import Inputs, driven_signals, input_drives
 from ctrlplan.simulation.events import Event, Occurrence, crossings
 from ctrlplan.simulation.interpreted import FeedthroughError
@@ -23,12 +25,17 @@ Array = NDArray[np.float64]
 _LONGEST = 1e15
 """Seconds after which a double cannot tell one microsecond from the next, by far."""
 
+_NO_TIMEBASE = (
+    "{} has states and no timebase (dt = None): it is taken for continuous, as control.input_output_response does, "
+    "where control.forced_response takes one step a sample; give dt = 0, or dt = True"
+)
+
 
 def simulate(
     system: Any,
     timepts: ArrayLike,
     inputs: Inputs = None,
-    initial_state: ArrayLike = 0.0,
+    initial_state: ArrayLike | None = None,
     method: str = "auto",
     rtol: float = 1e-8,
     atol: float = 1e-10,
@@ -48,17 +55,21 @@ def simulate(
     system : control system or Prepared
         With whatever inputs; unmodified python-control objects, or what
         `prepare` made of one. The built form is kept, and made anew where maps,
-        parameters or blocks have changed.
+        parameters or blocks have changed. A system with states and without a
+        timebase (dt = None) is taken for continuous, with a warning.
     timepts : array_like, shape (ntime,)
-        Sample times [s], strictly increasing, two or more.
+        Sample times [s], strictly increasing, two or more. Of a discrete system
+        multiples of its sampling time from the first on; where that is
+        unspecified (dt = True), evenly spaced, one step of the system each.
     inputs : Trajectory, array_like, mapping or None, optional
         For all inputs in order: a trajectory with as many axes, a number, an
-        array (ninputs, ntime) of samples taken for linear in between; or by
-        name, ``{"r": plan, "d": 0.1}``, each for one input, 0 where unnamed.
-    initial_state : array_like, optional
-        State at the first sample time, a scalar for all; where it is 0 and the
-        system or a block of it has an attribute ``initial_state`` (as
-        `crane_loop` sets), that.
+        array (ninputs, ntime) of samples taken for linear in between, or a list
+        of one of these for each input; or by name, ``{"r": plan, "d": 0.1}``,
+        each for one input, 0 where unnamed.
+    initial_state : array_like, shape (nstates,), float or None, optional
+        State at the first sample time, a number for all states. None: the
+        attribute ``initial_state`` of the system or of its blocks (as
+        `crane_loop` sets), and 0 where there is none.
     method : {"auto", "exact", "compiled", "python"}, optional
         "auto" takes the first of the others that can be taken; they insist.
     rtol, atol : float, optional
@@ -83,9 +94,11 @@ def simulate(
     Raises
     ------
     TypeError
-        If `system` is no system.
+        If `system` is no system, or times, inputs or states are no real
+        numbers: strings, complex numbers, dates, values with units.
     ValueError
-        If times do not increase, inputs do not fit, or a method is asked for
+        If times do not increase or are no sampling instants of a discrete
+        system, inputs do not fit, values are masked, or a method is asked for
         that the system does not allow; the reason is in the message.
     RuntimeError
         If a solver fails, or an algebraic loop has no solution that is found;
@@ -94,10 +107,14 @@ def simulate(
     Warns
     -----
     UserWarning
-        If a parameter is read by no block, or a block has equations of a kind that only python-control runs: its
-        `control.input_output_response` is then used, with the same tolerances.
+        If a parameter is read by no block; if a system with states has no
+        timebase; if a linear response depends on digits that rounding takes
+        from the system's matrices; or if a block has equations of a kind that
+        only python-control runs: its `control.input_output_response` is then
+        used, with the same tolerances.
     """
-    times = np.asarray(timepts, dtype=float)
+    begin_run()
+    times = real_array(timepts, "timepts")
     if times.ndim != 1 or times.size < 2 or not np.isfinite(times).all() or not np.all(np.diff(times) > 0):
         raise ValueError(f"timepts must be two or more finite times that increase strictly, got {timepts!r:.80}")
     if times[-1] - times[0] > _LONGEST:
@@ -112,6 +129,8 @@ def simulate(
     drives = input_drives(prepared.input_labels, inputs, times)
     state = _checked_state(prepared, initial_state)
     _warn_of_idle(prepared, params or {})
+    if prepared.dt is None and prepared.nstates:
+        warnings.warn(_NO_TIMEBASE.format(prepared.name), UserWarning, stacklevel=2)
     job = Job(prepared, times, drives, state, dict(params or {}), (rtol, atol), events)
     if prepared.network is None and prepared.linear is None and method in ("auto", "python"):
         return _delegated(job)
@@ -143,9 +162,10 @@ def _response(job: Job, record: Record) -> ct.TimeResponseData:
     seen = record.see(times, states)
     response = ct.TimeResponseData(
         times,
-        seen.y,
+        seen.y.reshape(len(prepared.output_labels), times.size),
         states,
         seen.u if len(seen.u) else None,
+        params=job.params or None,
         issiso=prepared.issiso,
         output_labels=prepared.output_labels,
         state_labels=prepared.state_labels,
@@ -192,10 +212,10 @@ def _delegated(job: Job) -> ct.TimeResponseData:
     return response
 
 
-def _checked_state(prepared: Prepared, initial_state: ArrayLike) -> Array:
-    if np.ndim(initial_state) == 0 and initial_state == 0 and prepared.initial_state is not None:
-        initial_state = prepared.initial_state
-    state = np.asarray(initial_state, dtype=float)
+def _checked_state(prepared: Prepared, initial_state: ArrayLike | None) -> Array:
+    if initial_state is None:
+        initial_state = 0.0 if prepared.initial_state is None else prepared.initial_state
+    state = real_array(initial_state, "initial_state")
     count = prepared.nstates
     if state.ndim and state.shape != (count,):
         raise ValueError(f"initial_state must be a scalar or have {count} entries, got shape {state.shape}")

@@ -7,6 +7,7 @@ import math
 import control as ct
 import numpy as np
 
+from ctrlplan.traits import declare
 from ctrlplan.trajectories import derivative_name
 from ctrlplan.trajectories.common import checked_count, checked_number, checked_time
 
@@ -80,7 +81,7 @@ def create_command_filter_iosystem(
         name=name or f"{output}_filter",
     )
     if checked_number(initial, "initial"):
-        block.initial_state = np.array([initial, *[0.0] * (n - 1)])
+        declare(block, initial_state=np.array([initial, *[0.0] * (n - 1)]))
     return block
 
 

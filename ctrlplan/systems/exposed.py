@@ -13,6 +13,8 @@ import numpy as np
 from control.statesp import LinearICSystem
 from numpy.typing import NDArray
 
+from ctrlplan.traits import declare, traits_of
+
 Array = NDArray[np.float64]
 
 
@@ -128,10 +130,10 @@ def _block(system: ct.NonlinearIOSystem, names: Sequence[str]) -> ct.NonlinearIO
     block = copy.copy(system)
     block.outfcn = partial(_with_states, system.outfcn)
     block.set_outputs([*system.output_labels, *names])
-    declared = getattr(system, "feedthrough", False if system.outfcn is None else None)
+    declared = False if system.outfcn is None else traits_of(system).feedthrough
     if declared is not None:
         own = np.broadcast_to(np.asarray(declared, dtype=bool), (system.noutputs, system.ninputs))
-        block.feedthrough = [*own.tolist(), *([False] * system.ninputs for _ in names)]
+        declare(block, feedthrough=np.vstack([own, np.zeros((len(names), system.ninputs), dtype=bool)]))
     return block
 
 
@@ -167,10 +169,7 @@ def _interconnection(system: ct.InterconnectedSystem, names: Sequence[str]) -> c
     found.set_output_map(np.vstack([own_outputs, state_outputs]))
     if isinstance(system, ct.StateSpace):  # of linear blocks python-control keeps the matrices as well
         found = LinearICSystem(found, _state_space(system, names), system.connection_type)
-    start = getattr(system, "initial_state", None)
-    if start is not None:
-        found.initial_state = start
-    return found
+    return declare(found, initial_state=traits_of(system).initial_state)
 
 
 def _with_states(outputs: Any, t: Any, x: Any, u: Any, params: dict[str, Any]) -> Any:

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from ctrlplan.systems.admissible import AdmissibleSet, Limits
 from ctrlplan.systems.exposed import state_signals
 from ctrlplan.systems.hybrid import checked_seconds, refuse_alone
+from ctrlplan.traits import Declared, declare
 from ctrlplan.trajectories.common import checked_time
 
 Array = NDArray[np.float64]
@@ -55,6 +56,9 @@ class Governor(ct.NonlinearIOSystem):  # type: ignore[misc]
         Reference before the first sample.
     """
 
+    period = Declared()
+    offset = Declared()
+
     def __init__(self, admission: Admission, period: float, offset: float, initial: Array, name: str) -> None:
         references = list(admission.references)
         super().__init__(
@@ -66,12 +70,18 @@ class Governor(ct.NonlinearIOSystem):  # type: ignore[misc]
             dt=0,
             name=name,
         )
-        self.admission, self.period, self.offset, self.initial = admission, period, offset, initial
-        self.feedthrough = False  # between samples
-        self.watched = {
-            f"{name}: nothing admissible, reference held": (_refused, -math.inf, 0.5),
-            f"{name}: input lost, reference held": (_unread, -math.inf, 0.5),
-        }
+        self.admission, self.initial = admission, initial
+        declare(
+            self,
+            period=period,
+            offset=offset,
+            sample=self.sample,
+            feedthrough=False,  # between samples
+            watched={
+                f"{name}: nothing admissible, reference held": (_refused, -math.inf, 0.5),
+                f"{name}: input lost, reference held": (_unread, -math.inf, 0.5),
+            },
+        )
         self._count = len(references)
 
     def sample(self, t: float, x: Array, u: Array, params: dict[str, Any]) -> Array:

@@ -11,6 +11,8 @@ import control as ct
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ctrlplan.traits import Declared, declare
+
 Array = NDArray[np.float64]
 
 
@@ -25,6 +27,10 @@ class SampleHold(ct.NonlinearIOSystem):  # type: ignore[misc]
         It takes them at offset, offset + period, ... [s] after the run begins.
     """
 
+    block = Declared()
+    period = Declared()
+    offset = Declared()
+
     def __init__(self, block: Any, period: float, offset: float, name: str) -> None:
         held = [f"{label}_held" for label in block.output_labels]
         super().__init__(
@@ -37,8 +43,8 @@ class SampleHold(ct.NonlinearIOSystem):  # type: ignore[misc]
             name=name,
             params=dict(getattr(block, "params", {})),
         )
-        self.block, self.period, self.offset = block, period, offset
-        self.feedthrough = False  # between samples
+        # No direct feedthrough between samples.
+        declare(self, block=block, period=period, offset=offset, sample=self.sample, feedthrough=False)
         self._inner = block.nstates or 0
 
     def sample(self, t: float, x: Array, u: Array, params: dict[str, Any]) -> Array:
@@ -67,9 +73,12 @@ class Delay(ct.NonlinearIOSystem):  # type: ignore[misc]
         What it puts out before anything has come through.
     """
 
+    delay = Declared()
+    initial = Declared()
+
     def __init__(self, delay: float, initial: Array, inputs: list[str], outputs: list[str], name: str) -> None:
         super().__init__(None, self._past, inputs=inputs, outputs=outputs, dt=0, name=name)
-        self.delay, self.initial = delay, initial
+        declare(self, delay=delay, initial=initial)
 
     def _past(self, t: float, x: Any, u: Any, params: dict[str, Any]) -> NoReturn:
         refuse_alone(self.name, "has a memory of its input")

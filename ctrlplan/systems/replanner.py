@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ctrlplan.systems.hybrid import checked_seconds, refuse_alone
 from ctrlplan.systems.source import create_source_iosystem
+from ctrlplan.traits import Declared, declare
 from ctrlplan.trajectories import Trajectory
 from ctrlplan.trajectories.common import checked_count, checked_time
 from ctrlplan.trajectories.extrema import stationary_times
@@ -279,6 +280,9 @@ class _Signals:
 class _Correction(ct.NonlinearIOSystem):  # type: ignore[misc]
     """Jets of a plan plus those of the transition last fitted."""
 
+    period = Declared()
+    offset = Declared()
+
     def __init__(
         self,
         plan: Trajectory,
@@ -302,12 +306,18 @@ class _Correction(ct.NonlinearIOSystem):  # type: ignore[misc]
             dt=0,
             name=f"{name}_correction",
         )
-        self.period, self.offset, self.feedthrough = horizons.period, offset, signals.feedthrough
-        self.samples_first = True  # what is measured may follow the reference at once
-        self.watched = {
-            f"{name}: input lost": (partial(_state, _LOST), -math.inf, 0.5),
-            f"{name}: goal out of reach": (partial(_state, _MISSED), -math.inf, 0.5),
-        }
+        declare(
+            self,
+            period=horizons.period,
+            offset=offset,
+            sample=self.sample,
+            samples_first=True,  # what is measured may follow the reference directly
+            feedthrough=signals.feedthrough,
+            watched={
+                f"{name}: input lost": (partial(_state, _LOST), -math.inf, 0.5),
+                f"{name}: goal out of reach": (partial(_state, _MISSED), -math.inf, 0.5),
+            },
+        )
         self._plan, self._horizons, self._signals, self._trigger, self._limits = (
             plan,
             horizons,

@@ -8,6 +8,7 @@ import control as ct
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ctrlplan.traits import Declared, declare
 from ctrlplan.trajectories import Trajectory
 from ctrlplan.trajectories.common import checked_count
 from ctrlplan.trajectories.files import signal_names, signal_rows
@@ -29,12 +30,18 @@ class PlanSource(ct.NonlinearIOSystem):  # type: ignore[misc]
         integrator should stop there.
     """
 
+    plan = Declared()
+    derivatives = Declared()
+
     def __init__(self, plan: Trajectory, derivatives: int, name: str, suffix: str) -> None:
         labels = signal_names([label + suffix for label in plan.labels], derivatives)
         super().__init__(None, self._output, inputs=0, outputs=labels, dt=None, name=name)
-        self.plan = plan
-        self.derivatives = derivatives
-        self.breakpoints = plan.breakpoints
+        declare(self, plan=plan, derivatives=derivatives)
+
+    @property
+    def breakpoints(self) -> Array:
+        """Breakpoints of the plan."""
+        return np.asarray(self.plan.breakpoints)
 
     def _output(self, t: float, x: Array, u: Array, params: dict[str, Any]) -> Array:
         return self.plan.jet(t, self.derivatives).T.ravel()

@@ -10,6 +10,7 @@ import control as ct
 import numpy as np
 from numpy.typing import NDArray
 
+from ctrlplan.traits import declare
 from ctrlplan.trajectories import Trajectory
 from ctrlplan.trajectories.common import checked_count, checked_limits, checked_number, checked_pair, checked_time
 from ctrlplan.trajectories.files import signal_names
@@ -181,11 +182,8 @@ def create_time_scaling_iosystem(
         dt=0,
         name=name,
     )
-    block.feedthrough = False
-    block.breakpoints = plan.breakpoints
     # Once behind, the plan moves out of rest at times that no breakpoint names.
-    block.longest = 0.5 * _shortest_move(plan)
-    return block
+    return declare(block, feedthrough=False, breakpoints=plan.breakpoints, longest=0.5 * _shortest_move(plan))
 
 
 def _series(plan: Trajectory, t: Any, order: int) -> list[list[Any]]:

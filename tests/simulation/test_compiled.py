@@ -738,7 +738,7 @@ def test_a_branch_of_time_between_the_visited_states():
         return np.array([-x[0] + (5.0 if 25.1 < float(t) < 25.9 else 0.0)])
 
     block = ct.nlsys(rate, None, inputs=0, outputs=1, states=1, name="bump")
-    block.breakpoints = (25.1, 25.9)
+    cp.declare(block, breakpoints=(25.1, 25.9))
     times = np.arange(51.0)
     bump = np.where(times > 25.5, 5.0 * (np.exp(25.9 - times) - np.exp(25.1 - times)), 0.0)
     right_or_python(block, times, 1.0, (np.exp(-times) + bump)[None])

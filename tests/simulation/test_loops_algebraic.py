@@ -214,7 +214,7 @@ def test_a_loop_that_closes_between_the_samples(method):
         states=1,
         name="plant",
     )
-    plant.breakpoints = (5.2, 5.8)
+    cp.declare(plant, breakpoints=(5.2, 5.8))
     loop = ct.interconnect([plant, gain([1.0, -1.0], ["r", "y"], "u", "adder"), source()], inputs=0, outputs=["y"])
     # x' = 1 - 2 x outside and (1 - 3 x)/2 in between.
     times = np.arange(0.0, 9.0)

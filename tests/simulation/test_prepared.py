@@ -91,7 +91,7 @@ def test_a_transfer_function_is_prepared_too():
 
 def test_the_state_in_which_a_prepared_loop_rests():
     system = decay()
-    system.initial_state = np.array([2.0])
+    cp.declare(system, initial_state=np.array([2.0]))
     for one in (system, prepare(system)):
         assert np.abs(simulate(one, T).outputs.ravel() - decayed(1.0, 2.0)).max() <= 1e-7
         assert np.abs(simulate(one, T, None, 1.0).outputs.ravel() - decayed(1.0)).max() <= 1e-7
@@ -101,7 +101,7 @@ def test_a_resting_state_given_later_is_noticed():
     system = decay()
     ready = prepare(system)
     assert np.abs(simulate(system, T).outputs).max() == 0.0
-    system.initial_state = np.array([1.0])
+    cp.declare(system, initial_state=np.array([1.0]))
     for one in (system, ready):
         assert np.abs(simulate(one, T).outputs.ravel() - decayed(1.0)).max() <= 1e-7
 
@@ -254,10 +254,9 @@ def test_a_replaced_plan_and_a_replaced_delay(through):
     late = cp.create_delay_iosystem(0.25, "r", "y")
     loop = ct.interconnect([source, late], inputs=0, outputs="y")
     assert np.abs(through(loop).outputs.ravel() - PLAN.shift(0.25)(T)).max() <= 1e-9
-    late.delay = 0.5
+    cp.declare(late, delay=0.5)
     assert np.abs(through(loop).outputs.ravel() - PLAN.shift(0.5)(T)).max() <= 1e-9
     source.plan = -2.0 * PLAN
-    source.breakpoints = source.plan.breakpoints
     assert np.abs(through(loop).outputs.ravel() + 2 * PLAN.shift(0.5)(T)).max() <= 1e-9
     late.initial = np.array([7.0])
     assert np.abs(through(loop).outputs.ravel()[0] - 7.0) <= 1e-12
@@ -406,7 +405,7 @@ def test_breakpoints_that_blocks_declare_in_another_process():
         return np.array([-x[0] + 50.0 * (t > 90.0) * (t < 90.1)])
 
     system = ct.nlsys(rate, None, inputs=0, outputs="y", states=1, name="bump")
-    system.breakpoints = (90.0, 90.1)
+    cp.declare(system, breakpoints=(90.0, 90.1))
     times = np.array([0.0, 89.0, 91.0])
     exact = 50.0 * (np.exp(90.1 - 91.0) - np.exp(90.0 - 91.0))
     ready = prepare(system)

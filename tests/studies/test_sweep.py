@@ -178,7 +178,7 @@ def test_fractions_are_swept_together():
 def test_loops_with_a_state_of_their_own_start_there():
     def build(rate):
         loop = ct.ss([[-rate]], [[rate]], [[1.0]], [[0.0]], inputs="r", outputs="y")
-        loop.initial_state = [3.0]
+        cp.declare(loop, initial_state=[3.0])
         return loop
 
     found = cp.sweep(build, [1.0, 2.0], {"step": cp.Step(1.0)}, TIMES, progress=False, only=["iae"])

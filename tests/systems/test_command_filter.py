@@ -177,8 +177,8 @@ def commanded():
         cp.create_command_filter_iosystem(w, 2, 3, input=f"{axis}_asked", output=f"{axis}_ref")
         for axis, w in (("x", 1.5), ("z", 2.0))
     ]
-    filters[0].initial_state = [1.0, 0.0, 0.0]
-    filters[1].initial_state = [10.0, 0.0, 0.0]
+    cp.declare(filters[0], initial_state=[1.0, 0.0, 0.0])
+    cp.declare(filters[1], initial_state=[10.0, 0.0, 0.0])
     loop = crane_loop(Crane(), plan, reference=filters, inputs=["x_asked", "z_asked"])
     t = np.linspace(0, 12, 121)
     asked = {"x_asked": cp.Step(4.0, 1.0, 1.0), "z_asked": cp.Step(9.0, 10.0, 1.0)}

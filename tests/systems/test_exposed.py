@@ -101,23 +101,24 @@ def test_linear_interconnections_stay_linear():
 def test_what_a_block_says_of_itself_is_kept():
     law = cp.create_pid_iosystem(6.0, 2.0, 3.0, 0.1, limits=(-0.5, 5.0))
     exposed = cp.expose_states(law)
-    assert exposed.watched == law.watched
+    assert cp.traits_of(exposed).watched == cp.traits_of(law).watched
     found = cp.simulate(cp.expose_states(loop(law)), TIMES, cp.Step(-1.0))
     assert [event.name for event in found.events][:1] == ["u"]
     block = pendulum()
-    block.feedthrough = False
-    assert cp.expose_states(block).feedthrough == [[False]] * 3
+    cp.declare(block, feedthrough=False)
+    assert not cp.traits_of(cp.expose_states(block)).feedthrough.any()
     block = ct.nlsys(lambda t, x, u, p: -x, lambda t, x, u, p: u, inputs=2, outputs=2, states=1)
-    block.feedthrough = [[True, False], [False, True]]
-    assert cp.expose_states(block).feedthrough == [[True, False], [False, True], [False, False]]
+    cp.declare(block, feedthrough=[[True, False], [False, True]])
+    assert cp.traits_of(cp.expose_states(block)).feedthrough.tolist() == [[True, False], [False, True], [False, False]]
     assert block.noutputs == 2
 
 
 def test_parameters_and_the_initial_state_are_kept():
     plain = SYSTEMS["loop"]()
-    plain.initial_state = [0.0, 0.0, 0.4, 0.0]
+    cp.declare(plain, initial_state=[0.0, 0.0, 0.4, 0.0])
     exposed = cp.expose_states(plain, name="open")
-    assert (exposed.name, exposed.params["g"], exposed.initial_state) == ("open", 2.0, plain.initial_state)
+    assert (exposed.name, exposed.params["g"]) == ("open", 2.0)
+    assert cp.traits_of(exposed).initial_state.tolist() == [0.0, 0.0, 0.4, 0.0]
     runs = [cp.simulate(s, TIMES, PLAN, params={"g": 3.0}, **TIGHT).y[0] for s in (plain, exposed)]
     assert runs[0][0] == 0.4
     assert np.abs(runs[0] - runs[1]).max() <= 1e-8

@@ -236,7 +236,7 @@ def test_a_nonlinear_loop_behind_a_predictor():
         states=["angle", "rate"],
         name="pendulum",
     )
-    pendulum.feedthrough = False
+    cp.declare(pendulum, feedthrough=False)
     law = cp.create_pid_iosystem(20.0, 15.0, 8.0, 0.05, limits=(-30.0, 30.0))
     loop = ct.interconnect([law, pendulum], inputs="r", outputs=["y", "u"], name="loop")
     limits = {"y": (-1.2, 1.05), "u": (-12.0, 12.0)}

@@ -30,8 +30,8 @@ def test_names():
     block = create_pid_iosystem(*GAINS, name="drive", inputs=("D_ref", "D"), output="F", limits=(-1, 1))
     assert (block.name, block.input_labels, block.output_labels) == ("drive", ["D_ref", "D"], ["F"])
     assert block.state_labels == ["integral", "filter"]
-    _, low, high = block.watched["F"]
-    assert (list(block.watched), low, high) == (["F"], -1.0, 1.0)
+    _, low, high = cp.traits_of(block).watched["F"]
+    assert (list(cp.traits_of(block).watched), low, high) == (["F"], -1.0, 1.0)
 
 
 @pytest.mark.parametrize("options", [{"bias": 7.0}, {"limits": (-1e9, 1e9)}, {"bias": -2.0, "limits": (-1e9, 1e9)}])

@@ -21,7 +21,7 @@ METHODS = ("compiled", "python")
 TIGHT = {"rtol": 1e-11, "atol": 1e-13}
 REST = [Waypoint(0, 0, 0, 0), Waypoint(10, 1, 0, 0)]
 PLAN = cp.PolySpline(REST, labels=["x"])
-LOST, MISSED = cp.create_replanner_iosystem(PLAN, 0.5).syslist[1].watched
+LOST, MISSED = cp.traits_of(cp.create_replanner_iosystem(PLAN, 0.5).syslist[1]).watched
 """What the block calls its events: a value was not finite; the goal is out of reach."""
 
 

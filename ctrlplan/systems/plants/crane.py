@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from ctrlplan.systems import series
 from ctrlplan.systems.pid import create_pid_iosystem
 from ctrlplan.systems.plants.parameters import check_parameters, overruled
+from ctrlplan.traits import declare
 from ctrlplan.trajectories import Extrema, Trajectory
 
 Array = NDArray[np.float64]
@@ -110,7 +111,7 @@ class Crane:
             name=name,
         )
         # At once, forces and torque act on the tension alone.
-        block.feedthrough = np.array([[output == "T"] * (2 + wind) for output in OUTPUTS])
+        declare(block, feedthrough=np.array([[output == "T"] * (2 + wind) for output in OUTPUTS]))
         return block
 
     def equilibrium(self, x: float, z: float) -> tuple[Array, Array]:

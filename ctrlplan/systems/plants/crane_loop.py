@@ -18,6 +18,7 @@ from ctrlplan.systems.plants.crane_laws import (
     create_still_iosystem,
 )
 from ctrlplan.systems.source import create_source_iosystem
+from ctrlplan.traits import declare, traits_of
 from ctrlplan.trajectories import Trajectory, stack
 
 # What each law asks of the plan: the highest derivative it reads, and the highest that must not jump.
@@ -157,7 +158,7 @@ def crane_loop(
     # The crane comes last; the states of law and drives are 0 at rest.
     before = [_start(block) for block in blocks[:-1]]
     loop.initial_state = np.concatenate([*before, rest])
-    return loop
+    return declare(loop, initial_state=loop.initial_state)
 
 
 def _check_fed(reference: Sequence[Any], blocks: Sequence[Any], inputs: Sequence[str]) -> None:
@@ -174,10 +175,8 @@ def _check_fed(reference: Sequence[Any], blocks: Sequence[Any], inputs: Sequence
 
 def _start(block: Any) -> NDArray[np.float64]:
     """Where a block starts: where it says so, or at 0."""
-    start = np.asarray(getattr(block, "initial_state", 0.0), dtype=float)
-    if start.shape not in ((), (block.nstates,)):
-        raise ValueError(f"initial_state of {block.name} must be {block.nstates} numbers, got shape {start.shape}")
-    return np.broadcast_to(start, (block.nstates or 0,))
+    start = traits_of(block).initial_state
+    return np.zeros(block.nstates or 0) if start is None else start
 
 
 def _named(plan: Trajectory) -> Trajectory:

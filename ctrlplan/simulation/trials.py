@@ -1,0 +1,260 @@
+"""Calls of a block that only try it: on copies of what it remembers, whatever it raises.
+
+A run needs to know of a block what only its functions tell: which outputs
+depend directly on which inputs, whether two calls with equal arguments give
+equal values. Such trial calls are made on copies of the functions, with copies
+of the objects that they refer to, so that a block with a memory does not
+remember them; the global random generators are left as they were.
+"""
+
+from __future__ import annotations
+
+import copy
+import dis
+import functools
+import inspect
+import random
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from types import BuiltinFunctionType, CellType, CodeType, FunctionType, MethodType, ModuleType
+from typing import Any
+
+import control as ct
+import numpy as np
+from numpy.typing import NDArray
+
+from ctrlplan.traits import declare, traits_of
+
+Array = NDArray[np.float64]
+
+_DEPTH = 6
+"""Functions that call functions are copied so many levels deep."""
+
+_LIBRARIES = frozenset({"casadi", "control", "ctrlplan", "math", "matplotlib", "numpy", "pandas", "scipy", "sympy"})
+"""Packages whose functions have no memory of a block."""
+
+_STORES = frozenset({"STORE_DEREF", "STORE_GLOBAL", "DELETE_DEREF", "DELETE_GLOBAL", "STORE_ATTR", "IMPORT_NAME"})
+"""Instructions by which a function may leave something behind."""
+
+_PLAIN = (
+    type(None),
+    bool,
+    int,
+    float,
+    complex,
+    str,
+    bytes,
+    type,
+    ModuleType,
+    BuiltinFunctionType,
+    np.ufunc,
+    np.generic,
+)
+
+
+def isolated(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Copy of a function that shares no memory with it.
+
+    Closures, defaults, global variables that the function names, and the
+    object of a method are copied; functions of libraries are shared, and so is
+    what cannot be copied, such as an open file.
+    """
+    return _function(function, {}, _DEPTH)
+
+
+def trial_copy(system: Any) -> Any:
+    """Copy of a block whose functions share no memory with those of the block.
+
+    Parameters
+    ----------
+    system : control.NonlinearIOSystem
+        Block; of a sampled one the system inside is copied as well.
+    """
+    made, memo = copy.copy(system), {id(system): system}
+    for name in ("updfcn", "outfcn"):
+        function = getattr(system, name, None)
+        if function is not None:
+            setattr(made, name, _function(function, memo, _DEPTH))
+    traits = traits_of(system)
+    if traits.block is not None and not isinstance(traits.block, ct.StateSpace):
+        declare(made, block=copy.deepcopy(traits.block) if _levels(traits.block) else trial_copy(traits.block))
+    elif traits.sample is not None:
+        declare(made, sample=_function(traits.sample, memo, _DEPTH))
+    return made
+
+
+def can_remember(system: Any) -> bool:
+    """Whether a block may have a memory besides its state: False is certain, True is not."""
+    traits = traits_of(system)
+    inner = traits.block
+    if inner is not None:
+        return _levels(inner) or (not isinstance(inner, ct.StateSpace) and can_remember(inner))
+    functions = (getattr(system, "updfcn", None), getattr(system, "outfcn", None), traits.sample)
+    return any(function is not None and _has_memory(function, set(), _DEPTH) for function in functions)
+
+
+def tried(function: Callable[..., Any], *arguments: Any) -> Array | None:
+    """Values of a trial call as an array (n,); None where the arguments are outside of the function's domain.
+
+    Any exception means outside, but for KeyboardInterrupt; a call that ends the
+    program is taken for one as well.
+    """
+    try:
+        return np.array(np.ravel(function(*arguments)), dtype=float)
+    except (Exception, SystemExit):
+        return None
+
+
+@contextmanager
+def trial() -> Iterator[None]:
+    """Context of trial calls: no floating-point warnings, and random generators that are found as they were."""
+    before = random.getstate(), np.random.get_state()  # noqa: NPY002 (a user's blocks may draw from it)
+    try:
+        with np.errstate(all="ignore"):
+            yield
+    finally:
+        if random.getstate() != before[0]:
+            random.setstate(before[0])
+        if not _equal(np.random.get_state(), before[1]):  # noqa: NPY002
+            np.random.set_state(before[1])  # noqa: NPY002
+
+
+def reads(function: Callable[..., Any], position: int) -> bool:
+    """Whether a function can read one of its arguments, by its code: False is certain, True is not.
+
+    Parameters
+    ----------
+    function : callable
+        Function of (t, x, u, params).
+    position : int
+        Position of the argument.
+    """
+    if isinstance(function, functools.partial):
+        return bool(function.keywords) or reads(function.func, position + len(function.args))
+    if isinstance(function, MethodType):
+        return reads(function.__func__, position + 1)
+    if not isinstance(function, FunctionType):
+        call = next((vars(kind)["__call__"] for kind in type(function).__mro__ if "__call__" in vars(kind)), None)
+        return not isinstance(call, FunctionType) or reads(call, position + 1)
+    code = inspect.unwrap(function).__code__
+    if function.__code__ is not code or position >= code.co_argcount:
+        return True
+    name = code.co_varnames[position]
+    if name in code.co_cellvars or any(i.opname in ("IMPORT_NAME", "IMPORT_STAR") for i in dis.get_instructions(code)):
+        return True
+    called = {*code.co_names} & {"locals", "vars", "eval", "exec"}
+    loaded = any(i.argval == name or (isinstance(i.argval, tuple) and name in i.argval) for i in _loads(code))
+    return bool(called) or loaded
+
+
+def _loads(code: CodeType) -> Iterator[dis.Instruction]:
+    return (i for i in dis.get_instructions(code) if i.opname.startswith("LOAD_") or "FAST" in i.opname)
+
+
+def _function(function: Any, memo: dict[int, Any], depth: int) -> Any:
+    """Copy of something that is called."""
+    if isinstance(function, functools.partial):
+        arguments = [_value(entry, memo, depth) for entry in function.args]
+        keywords = {key: _value(entry, memo, depth) for key, entry in function.keywords.items()}
+        return functools.partial(_function(function.func, memo, depth), *arguments, **keywords)
+    if isinstance(function, MethodType) and not _of_library(function.__func__):
+        return MethodType(_function(function.__func__, memo, depth), _value(function.__self__, memo, depth))
+    if not isinstance(function, FunctionType):
+        return function if isinstance(function, MethodType) else _value(function, memo, depth)
+    if id(function) in memo:
+        return memo[id(function)]
+    if depth == 0 or _of_library(function):
+        return function
+    space = dict(function.__globals__)
+    cells = tuple(CellType() for _ in function.__closure__ or ())
+    made = FunctionType(function.__code__, space, function.__name__, None, cells or None)
+    memo[id(function)] = made
+    made.__dict__.update(function.__dict__)
+    made.__defaults__ = _value(function.__defaults__, memo, depth)
+    made.__kwdefaults__ = _value(function.__kwdefaults__, memo, depth)
+    for cell, own in zip(cells, function.__closure__ or (), strict=True):
+        try:
+            cell.cell_contents = _value(own.cell_contents, memo, depth - 1)
+        except ValueError:  # an empty cell
+            continue
+    for name in _names(function.__code__):
+        if name in space:
+            space[name] = _value(space[name], memo, depth - 1)
+    return made
+
+
+def _value(value: Any, memo: dict[int, Any], depth: int) -> Any:
+    """Copy of something that a function refers to."""
+    if isinstance(value, _PLAIN) or value is None:
+        return value
+    if isinstance(value, FunctionType | MethodType | functools.partial):
+        return _function(value, memo, depth)
+    if isinstance(value, ct.NonlinearIOSystem) and not isinstance(value, ct.InterconnectedSystem | ct.StateSpace):
+        return trial_copy(value)
+    try:
+        return copy.deepcopy(value, memo)
+    except Exception:  # what cannot be copied is shared
+        return value
+
+
+def _has_memory(value: Any, seen: set[int], depth: int) -> bool:
+    """Whether a function, or what it refers to, may keep something from call to call."""
+    if isinstance(value, _PLAIN) or id(value) in seen:
+        return False
+    seen.add(id(value))
+    if isinstance(value, functools.partial):
+        parts: tuple[Any, ...] = (value.func, *value.args, *value.keywords.values())
+    elif isinstance(value, tuple | frozenset):
+        parts = tuple(value)
+    elif isinstance(value, np.ndarray):
+        return value.flags.writeable
+    elif isinstance(value, MethodType):
+        return not _of_library(value.__func__)
+    elif isinstance(value, ct.InterconnectedSystem):
+        parts = tuple(value.syslist)
+    elif isinstance(value, ct.NonlinearIOSystem):
+        return not isinstance(value, ct.StateSpace) and can_remember(value)
+    elif isinstance(value, np.random.Generator | np.random.RandomState):
+        return True
+    elif isinstance(value, FunctionType):
+        if _of_library(value):
+            return False
+        code = value.__code__
+        if "random" in _names(code):  # the generators of numpy, or of Python
+            return True
+        if depth == 0 or any(i.opname in _STORES for i in dis.get_instructions(code)):
+            return True
+        named = [value.__globals__[name] for name in _names(code) if name in value.__globals__]
+        parts = (*_contents(value), *(value.__defaults__ or ()), *(value.__kwdefaults__ or {}).values(), *named)
+    else:
+        return not _of_library(type(value))
+    return any(_has_memory(part, seen, depth - 1) for part in parts)
+
+
+def _contents(function: FunctionType) -> Iterator[Any]:
+    for cell in function.__closure__ or ():
+        try:
+            yield cell.cell_contents
+        except ValueError:  # an empty cell
+            continue
+
+
+def _of_library(thing: Any) -> bool:
+    """Whether a function or class is of a library whose objects, but for arrays, are not changed by being called."""
+    return str(getattr(thing, "__module__", "")).partition(".")[0] in _LIBRARIES
+
+
+def _levels(system: Any) -> bool:
+    return isinstance(system, ct.InterconnectedSystem) and not isinstance(system, ct.StateSpace)
+
+
+def _names(code: CodeType) -> set[str]:
+    """Global names in a function's code, and in that of functions inside it."""
+    inner = (constant for constant in code.co_consts if isinstance(constant, CodeType))
+    return set(code.co_names).union(*map(_names, inner))
+
+
+def _equal(first: Any, second: Any) -> bool:
+    if isinstance(first, Mapping):
+        return all(_equal(first[key], second[key]) for key in first)
+    return all(np.array_equal(a, b) for a, b in zip(first, second, strict=True))
