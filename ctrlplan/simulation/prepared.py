@@ -393,6 +393,12 @@ def fingerprint(system: Any) -> tuple[Any, ...]:
 def _checked_system(system: Any) -> Any:
     if not isinstance(system, ct.InputOutputSystem):
         raise TypeError(f"system must be a control system, got {type(system).__name__}")
+    states = 0 if isinstance(system, ct.TransferFunction) else system.nstates
+    sizes = {"states": states, "inputs": system.ninputs, "outputs": system.noutputs}
+    unknown = [name for name, size in sizes.items() if size is None]
+    if unknown:
+        numbers = ", ".join(f"{name}=..." for name in unknown)
+        raise ValueError(f"system must have a number of {unknown[0]}, got {system.name} without; give it {numbers}")
     return system
 
 

@@ -101,3 +101,12 @@ def test_initial_states_that_are_not_numbers(initial, method):
 def test_the_exact_method_says_why_it_cannot(system, inputs, match):
     with pytest.raises(ValueError, match=f'method "exact" .*{match}'):
         cp.simulate(system, T, inputs, method="exact")
+
+
+@pytest.mark.parametrize("missing", ["states", "inputs"])
+def test_a_system_without_stated_sizes_is_named_with_what_to_give(missing):
+    sizes = {"states": 1, "inputs": 1, "outputs": 1}
+    del sizes[missing]
+    system = ct.nlsys(lambda t, x, u, p: -x + u, lambda t, x, u, p: x, name="lag", **sizes)
+    with pytest.raises(ValueError, match=rf"system must have a number of {missing}, got lag .* give it {missing}="):
+        cp.simulate(system, [0.0, 1.0], 1.0, 0.0)

@@ -213,7 +213,7 @@ def test_a_loop_without_inputs_has_plain_outputs_and_plots():
     peer = ct.input_output_response(loop, times, 0, 0.0)
     found = cp.simulate(loop, times)
     assert peer.outputs.shape == found.outputs.shape == (1, times.size)
-    assert found.inputs is None
+    assert peer.inputs.shape == found.inputs.shape == (0, times.size)
     with pytest.raises(ValueError, match="no inputs"):
         peer.plot()
     with pytest.raises(ct.ControlDimension):

@@ -1,0 +1,37 @@
+"""python-control's examples as tests, for a run by pytest in a process of its own: one a script or notebook."""
+
+from __future__ import annotations
+
+import json
+import os
+import runpy
+from pathlib import Path
+
+import pytest
+
+FOLDER = Path(os.environ.get("CTRLPLAN_PEERS_EXAMPLES", "."))
+EXAMPLES = sorted(path.name for path in FOLDER.iterdir() if path.suffix in (".py", ".ipynb"))
+
+
+def code_of(notebook):
+    """Code cells without the lines that only IPython runs."""
+    cells = [c["source"] for c in json.loads(notebook.read_text(encoding="utf-8"))["cells"] if c["cell_type"] == "code"]
+    for source in cells:
+        text = source if isinstance(source, str) else "".join(source)
+        yield "\n".join(line for line in text.split("\n") if line.lstrip()[:1] not in ("%", "!", "?"))
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_example(name, monkeypatch):
+    """One script or notebook, from its own folder."""
+    monkeypatch.chdir(FOLDER)
+    monkeypatch.syspath_prepend(str(FOLDER))
+    if name.endswith(".py"):
+        runpy.run_path(name, run_name="__main__")
+        return
+    from matplotlib import pyplot as plt
+
+    plt.close("all")
+    names = {"__name__": "__main__", "display": print}
+    for cell in code_of(Path(name)):
+        exec(compile(cell, name, "exec"), names)
