@@ -38,8 +38,7 @@ def states_of(a, b, plan, times, initial=None):
 # Poles times duration far beyond 1e16
 
 
-@pytest.mark.parametrize("rate", [1e9, 1e12, 1e17, 1e60, 1e200])
-@pytest.mark.parametrize("duration", [1e-3, 1e4, 1e10])
+@pytest.mark.parametrize(("rate", "duration"), [(1e9, 1e4), (1e12, 1e4), (1e17, 1e-3), (1e17, 1e10), (1e150, 1.0)])
 @pytest.mark.parametrize("count", [2, 11, 33, 1001])
 def test_a_fast_lag_follows_whatever_the_duration(rate, duration, count):
     # x' = rate (u - x): within |u'|/rate of u once exp(-rate t) has died.
@@ -133,8 +132,10 @@ def test_a_stiff_loop_rests_where_its_slow_states_do():
 # Growth beyond the range of numbers
 
 
-@pytest.mark.parametrize("count", [2, 6, 51, 501, 5001])
-@pytest.mark.parametrize("rate", [100.0, 1e4, 1e9, 1e200])
+@pytest.mark.parametrize(
+    ("rate", "count"),
+    [(100.0, 2), (100.0, 51), (100.0, 5001), (1e4, 501), (1e9, 6), (1e9, 51), (1e200, 2), (1e200, 51)],
+)
 def test_an_unstable_plant_at_rest_stays_there(rate, count):
     t = np.linspace(0.0, 50.0, count)
     system = ct.ss(rate, 1.0, 1.0, 0.0)
@@ -252,9 +253,9 @@ def test_a_phase_that_doubles_do_not_hold_is_said(turns, warned):
         warnings.simplefilter("always")
         found = cp.simulate(system, t, 1.0).outputs
     exact = response(*(np.asarray(m) for m in (system.A, system.B, system.C, system.D)), [constant(1.0)], t)[0]
-    assert [str(warning.message).startswith("outputs y[0], y[1] of ringing are uncertain by") for warning in caught] == [
-        True
-    ] * warned
+    assert [
+        str(warning.message).startswith("outputs y[0], y[1] of ringing are uncertain by") for warning in caught
+    ] == [True] * warned
     if not warned:
         assert gap(found, exact) <= 1e-6
 
