@@ -214,8 +214,9 @@ def _warn_of_undefined(job: Job, form: LinearForm, times: Array, states: Array) 
     undefined = added & taken
     if undefined.any():
         names = ", ".join(np.array(job.prepared.output_labels)[undefined.any(axis=1)])
+        begin = times[undefined.any(axis=0).argmax()]
         warnings.warn(
-            f"outputs {names} of {job.prepared.name} are not known from {times[undefined.any(axis=0).argmax()]:g} s on, "
+            f"outputs {names} of {job.prepared.name} are not known from {begin:g} s on, "
             "where states whose difference they are leave the range of numbers: given as infinite",
             UserWarning,
             stacklevel=5,
