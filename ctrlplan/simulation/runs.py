@@ -110,6 +110,7 @@ def _exact(job: Job, form: LinearForm) -> Record:
         driven, nearly = driven_signals(drives, times), states_at(times, job.state, form.a * (1.0 + 2.0**-50))
         floor = form.rounding(states[:, :1] if growing else states, driven)
         _warn_of_lost_digits(job, form.outputs(states, driven), form.outputs(nearly, driven), floor)
+    _warn_of_undefined(job, form, times, states)
     return Record(times, states, see, carry, watched, "exact", "linear and continuous")
 
 
@@ -127,6 +128,25 @@ def _warn_of_lost_digits(job: Job, outputs: Array, others: Array, floor: Array) 
             f"outputs {names} of {job.prepared.name} are uncertain by {100.0 * part:.3g} % of their size: "
             f"over {job.times[-1] - job.times[0]:g} s rounding of the matrices is enough to change them so; make the "
             "run shorter, or leave out modes that are so fast or so unstable",
+            UserWarning,
+            stacklevel=5,
+        )
+
+
+def _warn_of_undefined(job: Job, form: LinearForm, times: Array, states: Array) -> None:
+    """Say which outputs are differences of states that have overflowed: they are reported as infinite."""
+    if np.isfinite(states).all():
+        return
+    up, down = (states == np.inf).astype(float), (states == -np.inf).astype(float)
+    added = (form.c > 0.0) @ up + (form.c < 0.0) @ down > 0.0
+    taken = (form.c > 0.0) @ down + (form.c < 0.0) @ up > 0.0
+    undefined = added & taken
+    if undefined.any():
+        names = ", ".join(np.array(job.prepared.output_labels)[undefined.any(axis=1)])
+        begin = times[undefined.any(axis=0).argmax()]
+        warnings.warn(
+            f"outputs {names} of {job.prepared.name} are not known from {begin:g} s on, "
+            "where states whose difference they are leave the range of numbers: given as infinite",
             UserWarning,
             stacklevel=5,
         )
