@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import re
+import signal
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import casadi as ca
@@ -250,7 +252,8 @@ class CompiledSolver:
         for outputs, allowed in ((relative, min(_FEW_STEPS, max_steps)), (close, max_steps)):
             integrator = self._equations.integrator(width, outputs, self._stiff, self.rtol, scales.atol, allowed)
             try:
-                found = _called(integrator, (start, np.empty(0), p), state.size, self._report)
+                with _passing_interruptions():
+                    found = _called(integrator, (start, np.empty(0), p), state.size, self._report)
                 wanted = found[:, np.searchsorted(outputs, relative)]
                 return scales.shift[:, None] + scales.scale[:, None] * wanted
             except RuntimeError as error:
@@ -262,6 +265,44 @@ class CompiledSolver:
 
     def _count(self, stats: dict[str, Any]) -> None:
         self.evaluations += int(stats.get("nfevals", 0))
+
+
+@contextmanager
+def _passing_interruptions() -> Iterator[None]:
+    """Let what signal handlers raise reach the caller, Ctrl-C among it.
+
+    CVODES takes an exception that a handler raises while it runs for a failure
+    of the equations. Handlers run in the main thread alone, so there they are
+    accompanied; they are found as they were.
+    """
+    raised: list[BaseException] = []
+    handlers: dict[int, Any] = {}
+
+    def accompanied(number: int, frame: Any) -> None:
+        try:
+            handlers[number](number, frame)
+        except BaseException as error:
+            raised.append(error)
+            raise
+
+    if threading.current_thread() is threading.main_thread():
+        for number in signal.valid_signals():
+            handler = signal.getsignal(number)
+            if callable(handler):
+                handlers[number] = handler
+                signal.signal(number, accompanied)
+    try:
+        yield
+    except RuntimeError:
+        if raised:
+            raise raised[0] from None
+        raise
+    finally:
+        for number, handler in handlers.items():
+            if signal.getsignal(number) is accompanied:
+                signal.signal(number, handler)
+    if raised:
+        raise raised[0]
 
 
 def _called(
