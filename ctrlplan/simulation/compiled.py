@@ -286,7 +286,7 @@ def _passing_interruptions() -> Iterator[None]:
             raise
 
     if threading.current_thread() is threading.main_thread():
-        for number in signal.valid_signals():
+        for number in map(int, signal.valid_signals()):
             handler = signal.getsignal(number)
             if callable(handler):
                 handlers[number] = handler
@@ -298,9 +298,9 @@ def _passing_interruptions() -> Iterator[None]:
             raise raised[0] from None
         raise
     finally:
-        for number, handler in handlers.items():
-            if signal.getsignal(number) is accompanied:
-                signal.signal(number, handler)
+        for key, handler in handlers.items():
+            if signal.getsignal(key) is accompanied:
+                signal.signal(key, handler)
     if raised:
         raise raised[0]
 
