@@ -299,6 +299,16 @@ def _drive(value: Any, name: str, times: Array) -> Drive:
     return SampledDrive(times, signal)
 
 
+def within(left: float, right: float) -> tuple[float, float]:
+    """First and last time of a segment at which its equations are evaluated: inside, by rounding of the times.
+
+    At the ends themselves a block that switches there may already be on the
+    other side.
+    """
+    inset = min(4.0 * float(np.spacing(max(abs(left), abs(right)))), 0.25 * (right - left))
+    return left + inset, right - inset
+
+
 def breakpoints_of(drives: Iterable[Drive]) -> list[float]:
     """Times at which one of the drives is not analytic."""
     return [float(t) for drive in drives for t in drive.breakpoints]

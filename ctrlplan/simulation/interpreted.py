@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.integrate import LSODA, RK45, OdeSolver
 
 from ctrlplan.simulation.budget import check
-from ctrlplan.simulation.drives import Series
+from ctrlplan.simulation.drives import Series, within
 from ctrlplan.simulation.network import (
     Map,
     Network,
@@ -280,7 +280,7 @@ class InterpretedSolver:
     def __init__(self, equations: Interpreted, rtol: float, scales: Scales) -> None:
         self._equations, self._scales = equations, scales
         self.rtol, self._atol = max(_SAFETY * rtol, 2.3e-14), _SAFETY * scales.atol
-        self.longest = math.inf
+        self._bounded = any(b.changes_unseen and b.depends_on_time for b in equations.network.blocks)
         self._segments, self._next = 0, 0
 
     def scaled_rates(self, t: float, z: Array, driven: Array) -> Array:
@@ -323,6 +323,10 @@ class InterpretedSolver:
                 t = passed
         raise self._ended(rates, t, z, why)
 
+    def instants(self, first: float, last: float, driven: Callable[[Array], Array]) -> list[float]:
+        """Times at which equations switch: of functions in Python none are known but those declared."""
+        return []
+
     def review(self, rates: _Watched, t: float, z: Array) -> None:
         """Raise where so many evaluations have a cause in a block.
 
@@ -349,7 +353,9 @@ class InterpretedSolver:
         """
         right = float(grid[-1])
         rates.begin(_CALLS if kind is LSODA else _PASSING)
-        solver = kind(rates, t, z, right, rtol=self.rtol, atol=self._atol, max_step=self.longest)
+        # What depends on time is seen at least once a sample: a pulse as long cannot be passed over unseen.
+        longest = float(np.diff(grid, prepend=rates.left).max()) if self._bounded else math.inf
+        solver = kind(rates, t, z, right, rtol=self.rtol, atol=self._atol, max_step=longest)
         if isinstance(solver, LSODA):
             _raise_failures(solver)
         while solver.status == "running":
@@ -500,7 +506,7 @@ class _Watched:
 
     def __init__(self, solver: InterpretedSolver, series: Series, left: float, right: float) -> None:
         self._solver, self.series, self.left, self.right = solver, series, left, right
-        self.defined = left
+        self.defined, self._within = left, within(left, right)
         self.begin(_CALLS)
 
     def begin(self, calls: int) -> None:
@@ -514,7 +520,8 @@ class _Watched:
         elif self._asked > self._calls:
             raise _StalledError("the solution ends there")
         self._solver.review(self, t, z)
-        rates = self._solver.scaled_rates(t, z, self.series(t))
+        inside = min(max(t, self._within[0]), self._within[1])
+        rates = self._solver.scaled_rates(inside, z, self.series(inside))
         if t > self.defined and math.isfinite(rates.sum()):
             self.defined = t
         return rates

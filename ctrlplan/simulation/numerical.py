@@ -101,6 +101,7 @@ class _Attempt:
             with_looks(job.times, self.watched, self._slope),
             job.state,
             resolution=10.0 * job.rtol,
+            marks=self.solver.instants(job.first, float(job.times[-1]), lambda t: driven_signals(self.drives, t)),
             pause=self._pause if self.stops else None,
         )
         self._compare()

@@ -51,6 +51,10 @@ class Trace:
     update: Any
     symbols: tuple[str, ...]
 
+    def depends_on_time(self) -> bool:
+        """Whether outputs or rates depend on t itself."""
+        return any(function.jac_sparsity(0, 0).nnz() > 0 for function in (self.output, self.update))
+
     def feedthrough(self) -> NDArray[np.bool_]:
         """Which outputs have direct feedthrough of which inputs, (noutputs, ninputs): by structure, at every state."""
         found = np.zeros((self.output.numel_out(0), self.output.numel_in(2)), dtype=bool)
