@@ -183,8 +183,7 @@ def test_signs_of_what_has_overflowed():
     assert (down[t > 8.0] == -np.inf).all()
 
 
-@pytest.mark.parametrize("count", [3, 26, 51, 401])
-@pytest.mark.parametrize("rate", [100.0, 1e5, 1e60])
+@pytest.mark.parametrize(("rate", "count"), [(100.0, 3), (100.0, 51), (100.0, 401), (1e5, 26), (1e60, 51)])
 @pytest.mark.parametrize("method", ["plan", "number", "samples"])
 def test_outputs_that_do_not_see_an_overflowing_state_stay_finite(method, rate, count):
     # The unstable state is decoupled, or driven by the stable one; neither acts on it.
