@@ -11,7 +11,8 @@ the cells' beginnings: a matrix product. Several systems with one input go
 through it together. Elsewhere the cells are halved, all at once and through the
 same squarings, until the state's own Taylor series converges in them, and the
 samples are read off that series. Neither interpolates, and neither has a
-stiffness limit.
+stiffness limit. What leaves the range of numbers is infinite, and so is what
+depends on it; the rest stays finite.
 """
 
 from __future__ import annotations

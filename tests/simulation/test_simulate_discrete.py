@@ -131,7 +131,9 @@ def test_no_timebase():
     assert (cp.simulate(ct.ss([], [], [], 2.0, None), t, 1.0).outputs == 2.0).all()
     bent = ct.nlsys(None, lambda t, x, u, p: u**2, inputs=1, outputs=1, dt=None)
     assert (cp.simulate(bent, t, 3.0).outputs == 9.0).all()
-    with pytest.warns(UserWarning, match=r"lag has states and no timebase \(dt = None\): it is taken for continuous"):
+    with pytest.warns(
+        UserWarning, match=r"lag has states and no timebase \(dt = None\): it is simulated as continuous-time"
+    ):
         found = cp.simulate(ct.ss(-1.0, 1.0, 1.0, 0.0, None, name="lag"), t, 1.0)
     assert np.abs(found.outputs + np.expm1(-t)).max() <= 1e-15
     # Joined with others it has theirs.
