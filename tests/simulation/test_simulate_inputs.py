@@ -184,6 +184,14 @@ def test_a_list_holds_what_each_input_takes():
     peer = ct.input_output_response(SYSTEM, T, [samples, 0.5], START)
     assert np.array_equal(cp.simulate(SYSTEM, T, [samples, 0.5], START).inputs, peer.inputs)
     assert np.array_equal(cp.simulate(ct.ss(-1.0, 1.0, 1.0, 0.0), T, [2.0]).inputs, np.full(T.size, 2.0))
+    # As many inputs as times: numbers are for one input each, rows are samples, a plan is a plan.
+    two = [0.0, 6.0]
+    for inputs, rows in (
+        ([1.0, 2.0], [[1, 1], [2, 2]]),
+        ([[1, 2], [3, 4]], [[1, 2], [3, 4]]),
+        ([PLAN, 2.0], [[0, 0.5], [2, 2]]),
+    ):
+        assert np.abs(cp.simulate(SYSTEM, two, inputs).inputs - rows).max() <= 1e-15
 
 
 # Where a run starts
