@@ -199,7 +199,11 @@ def input_drives(labels: Sequence[str], inputs: Inputs, times: Array) -> list[Dr
         return [PlanDrive(inputs.select(labels) if crossed else inputs)]
     elif inputs is None or (not isinstance(inputs, list | tuple) and np.ndim(inputs) == 0 and not callable(inputs)):
         given = [0.0 if inputs is None else inputs] * len(labels)
-    elif isinstance(inputs, list | tuple) and len(inputs) == len(labels) != times.size:
+    elif (
+        isinstance(inputs, list | tuple)
+        and len(inputs) == len(labels)
+        and (len(inputs) != times.size or any(isinstance(value, Trajectory) for value in inputs))
+    ):
         given = list(inputs)
     else:
         rows = _numbers(inputs, "inputs")

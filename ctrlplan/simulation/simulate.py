@@ -28,8 +28,8 @@ _LONGEST = 1e15
 """Seconds after which a double cannot tell one microsecond from the next, by far."""
 
 _NO_TIMEBASE = (
-    "{} has states and no timebase (dt = None): it is taken for continuous, as control.input_output_response does, "
-    "where control.forced_response takes one step a sample; give dt = 0, or dt = True"
+    "{} has states and no timebase (dt = None): it is simulated as continuous-time, as by "
+    "control.input_output_response (control.forced_response takes one step per sample); set dt = 0 or dt = True"
 )
 
 
@@ -58,7 +58,7 @@ def simulate(
         With whatever inputs; unmodified python-control objects, or what
         `prepare` made of one. The built form is kept, and made anew where maps,
         parameters or blocks have changed. A system with states and without a
-        timebase (dt = None) is taken for continuous, with a warning.
+        timebase (dt = None) is simulated as continuous-time, with a warning.
     timepts : array_like, shape (ntime,)
         Sample times [s], strictly increasing, two or more. Of a discrete system
         multiples of its sampling time from the first on; where that is
