@@ -25,6 +25,8 @@ from typing import Any
 
 import numpy as np
 
+from ctrlplan.trajectories.common import Frozen
+
 _MOST = 20_000
 """Objects that a fingerprint covers."""
 
@@ -197,13 +199,11 @@ class References:
 
     def _counts(self, holder: Any, name: str, every: bool) -> bool:
         """Whether an attribute may have an influence."""
-        if isinstance(getattr(type(holder), name, None), functools.cached_property):
-            self._cached[f"{name} of {id(holder)}"] = vars(holder)[name]
-            return False
         if isinstance(holder, types.ModuleType):
             return name in self.names
         if not isinstance(holder, type):
-            return name in self.names or every
+            cached = not isinstance(holder, _Slots) and self._is_cached(holder, name, vars(holder)[name])
+            return not cached and (name in self.names or every)
         if name in _MAKERS:
             return holder in self._made or not self.names.isdisjoint(("type", "__class__"))
         return name not in _DULL and (name in self.names or name.startswith("__"))
@@ -355,6 +355,17 @@ class References:
         self._tokens.append(_Same(value))
         self._add(value.__dict__, where)
 
+    def _frozen(self, value: Frozen, where: str) -> None:
+        """Immutable objects of this package: by identity, but for parts that may be a user's."""
+        if not _pure(type(value).__module__):
+            self._attributes(value, where)
+            return
+        self._tokens.append(_Same(value))
+        for entry in vars(value).values():
+            for part in entry if isinstance(entry, tuple | list) else (entry,):
+                if isinstance(part, Frozen):
+                    self._refer(part, where)
+
     def _property(self, value: property, where: str) -> None:
         for part in (value.fget, value.fset):
             self._add(part, where)
@@ -387,8 +398,16 @@ class References:
                 self._named.append((holder, where, set()))
             else:
                 for name, entry in list(own.items()):
-                    self._tokens.append(name)
-                    self._add(entry, f"{where}.{name}")
+                    if not self._is_cached(value, name, entry):
+                        self._tokens.append(name)
+                        self._add(entry, f"{where}.{name}")
+
+    def _is_cached(self, value: Any, name: str, entry: Any) -> bool:
+        """Whether an attribute is that of a cached property, which is kept apart."""
+        if not isinstance(getattr(type(value), name, None), functools.cached_property):
+            return False
+        self._cached[f"{name} of {id(value)}"] = entry
+        return True
 
 
 def roots_of(system: Any) -> Iterator[tuple[str, Any]]:
@@ -474,6 +493,7 @@ _VISITS: tuple[tuple[Any, Callable[[References, Any, str], None]], ...] = (
     ((types.GetSetDescriptorType, types.MemberDescriptorType, _Fields), References._identity),
     ((types.MethodWrapperType, types.ClassMethodDescriptorType), References._identity),
     (property, References._property),
+    (Frozen, References._frozen),
     ((int, float, complex, str, bytes, np.generic), References._fixed),
     ((Iterator, types.CoroutineType, functools._lru_cache_wrapper), References._nothing),
 )
@@ -561,7 +581,7 @@ def _contents(value: Any) -> Any:
         return value.copy()
     if isinstance(value, _Slots):
         return value.values()
-    own = getattr(value, "__dict__", None)
+    own = getattr(value, "__dict__", None) if not isinstance(value, Frozen) else None
     return dict(own) if isinstance(own, dict) and not isinstance(value, types.ModuleType | type) else None
 
 

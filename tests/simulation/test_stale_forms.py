@@ -365,6 +365,17 @@ def by_new_code():
     return update, lambda k: setattr(update, "__code__", codes[k])
 
 
+def by_a_plan_of_a_user_inside_another():
+    class _Level(cp.PolySpline):
+        levels = [1.0]  # noqa: RUF012
+
+        def _leg_jet(self, leg, s, order):
+            return super()._leg_jet(leg, s, order) * self.levels[0]
+
+    stacked = cp.stack([_Level([cp.Waypoint(0, 0, 0), cp.Waypoint(1, 1, 0)])])
+    return (lambda t, x, u, p: decay(2.0 * float(stacked(0.5)), x)), lambda k: _Level.levels.__setitem__(0, k)
+
+
 def by_ten_levels_of_functions():
     gains = [1.0]
 
