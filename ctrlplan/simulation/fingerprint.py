@@ -206,7 +206,7 @@ class References:
             return not cached and (name in self.names or every)
         if name in _MAKERS:
             return holder in self._made or not self.names.isdisjoint(("type", "__class__"))
-        return name not in _DULL and (name in self.names or name.startswith("__"))
+        return name not in _DULL and (name in self.names or name.startswith("__") or _of_library(holder))
 
     def _attribute(self, holder: Any, name: str, value: Any, where: str) -> None:
         if isinstance(holder, types.ModuleType) and _pure(holder.__name__):
@@ -387,7 +387,7 @@ class References:
         """Class and attributes of an object: those that are named where all its methods are known, or all."""
         kind = type(value)
         self._refer(kind, f"class {kind.__name__}")
-        known = not is_dataclass(kind) and not any(_pure(base.__module__) for base in kind.__mro__[:-1])
+        known = not is_dataclass(kind) and not _of_library(kind)
         for holder in (value, _Slots(value)):
             own = getattr(holder, "__dict__", None) if holder is value else holder.values()
             if not own:
@@ -544,6 +544,11 @@ def _strings(constant: Any) -> set[str]:
 
 def _pure(module: Any) -> bool:
     return isinstance(module, str) and module.partition(".")[0] in _PURE and not module.startswith("numpy.random")
+
+
+def _of_library(kind: type) -> bool:
+    """Whether functions of a library may use attributes of an object that no other code names."""
+    return any(_pure(base.__module__) and base.__module__ not in ("builtins", "abc", "typing") for base in kind.__mro__)
 
 
 def _impure(kind: type) -> bool:
