@@ -17,7 +17,7 @@ import random
 import sys
 import types
 from array import array
-from collections import defaultdict, deque, namedtuple
+from collections import OrderedDict, defaultdict, deque, namedtuple
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, is_dataclass
@@ -116,11 +116,12 @@ class References:
         self._objects: list[Any] = []  # alive, so that no address is given to another
         self._queue: deque[tuple[Any, str]] = deque()
         self._named: list[tuple[Any, str, set[str]]] = []  # of these the attributes that are named count
-        self._bindings: list[tuple[Callable[[Any], None], Any]] = []
+        self._bindings: list[tuple[Any, str, Any]] = []
         self._cached: dict[str, Any] = {}
         self._made: set[type] = set()  # classes that may be called
         self._bytes = 0
         self._roots = tuple(roots)
+        self._codes = _codes(root for _, root in self._roots)
         try:
             self._walk()
         except Exception as error:  # whatever an object does when it is looked at
@@ -139,21 +140,14 @@ class References:
             if not self._queue:
                 self._add_named()
 
-    def keeper(self) -> Callable[[], bool]:
-        """Function that puts all that was found back as it is now, and says whether it had changed."""
-        contents = [(value, _contents(value)) for value in self._objects]
-        bindings = list(self._bindings)
+    def keeper(self) -> Keeper:
+        """Contents of all that was found, to be put back."""
+        return Keeper(self._roots, self.tokens, self._objects, self._bindings)
 
-        def restored() -> bool:
-            if References(self._roots).tokens == self.tokens:
-                return False
-            for value, before in contents:
-                _restore(value, before)
-            for bind, value in bindings:
-                bind(value)
-            return True
-
-        return restored
+    def _is_log(self, holder: Any, key: Any) -> bool:
+        """Whether a place is known to be written by the functions, and to have no influence on them."""
+        known = _LOGS.get((id(holder), key))
+        return known is not None and known[0] is holder and self._codes <= known[1]
 
     def _hide(self, what: str, where: str) -> None:
         self.opaque = self.opaque or f"{where} ({what})"
@@ -194,8 +188,9 @@ class References:
             fresh = [name for name in among if name not in done and self._counts(holder, name, every)]
             for name in sorted(fresh):
                 done.add(name)
-                self._tokens.append(name)
-                self._attribute(holder, name, found[name], f"{where}.{name}")
+                if not self._is_log(holder, name):
+                    self._tokens.append(name)
+                    self._attribute(holder, name, found[name], f"{where}.{name}")
 
     def _counts(self, holder: Any, name: str, every: bool) -> bool:
         """Whether an attribute may have an influence."""
@@ -215,9 +210,9 @@ class References:
                 return
         elif isinstance(holder, type):
             value = _unbound(value)
-            self._bindings.append((functools.partial(setattr, holder, name), vars(holder)[name]))
+            self._bindings.append((holder, name, vars(holder)[name]))
         elif isinstance(holder, types.ModuleType):
-            self._bindings.append((functools.partial(setattr, holder, name), value))
+            self._bindings.append((holder, name, value))
         self._add(value, where)
 
     # Kinds of objects
@@ -235,8 +230,9 @@ class References:
             except ValueError:
                 self._tokens.append("empty")
                 continue
-            self._bindings.append((functools.partial(setattr, cell, "cell_contents"), content))
-            self._add(content, name)
+            self._bindings.append((cell, "cell_contents", content))
+            if not self._is_log(cell, "cell_contents"):
+                self._add(content, name)
         if _pure(value.__globals__.get("__name__")):
             return
         self.names |= code.names
@@ -249,8 +245,10 @@ class References:
             for module in _imported(name, str(known.get("__package__") or "")):
                 self._add(module, name)
         for name in code.globals:
+            self._bindings.append((known, name, known.get(name, _MISSING)))
+            if self._is_log(known, name):
+                continue
             if name in known:
-                self._bindings.append((functools.partial(known.__setitem__, name), known[name]))
                 self._add(known[name], name)
             elif name in _HIDDEN:
                 self._hide("no function of its arguments", f"{name}()")
@@ -296,31 +294,40 @@ class References:
 
     def _array(self, value: np.ndarray[Any, Any], where: str) -> None:
         self._tokens += (value.shape, value.dtype.str)
+        self._bytes += value.nbytes
         if value.dtype.hasobject:
-            self._sequence(value.ravel().tolist(), where)
-        else:
-            self._bytes += value.nbytes
-            self._tokens.append(_digest(value.tobytes()) if self._bytes <= _BYTES else None)
+            self._sequence(value, value.ravel().tolist(), where)
+        elif self._bytes <= _BYTES:
+            logs = [k for k in range(value.size) if self._is_log(value, k)] if _LOGS and value.size <= _FEW else []
+            content = value
+            if logs:
+                content = value.copy()
+                content.flat[logs] = 0
+            self._tokens.append(_digest(content.tobytes()))
         if type(value) is not np.ndarray:
             self._attributes(value, where)
             if isinstance(value, np.ma.MaskedArray):
                 self._add(np.ma.getmaskarray(value), where)
 
-    def _sequence(self, value: Iterable[Any], where: str) -> None:
-        values = list(value)
-        if set(map(type, values)) == {float}:
+    def _sequence(self, holder: Any, values: list[Any], where: str) -> None:
+        if self._is_log(holder, None):
+            return
+        if set(map(type, values)) == {float} and not _LOGS:
             self._tokens += (len(values), _digest(array("d", values).tobytes()))
             return
         self._tokens.append(len(values))
         for k, entry in enumerate(values):
-            self._add(entry, f"{where}[{k}]")
+            if not self._is_log(holder, k):
+                self._add(entry, f"{where}[{k}]")
 
     def _container(self, value: Any, where: str) -> None:
-        self._sequence(value, where)
+        self._sequence(value, list(value), where)
         self._attributes(value, where)
 
     def _dictionary(self, value: Any, where: str) -> None:
         for key, entry in list(value.items()):
+            if self._is_log(value, key):
+                continue
             self._add(key, f"a key of {where}")
             self._add(entry, f"{where}[{key!r:.20}]")
         self._tokens.append("end")
@@ -333,7 +340,7 @@ class References:
         if all(type(entry) in _ATOMS for entry in value):
             self._tokens.append(frozenset((type(entry), entry) for entry in value))
         else:
-            self._sequence(value, where)
+            self._sequence(value, list(value), where)
         self._attributes(value, where)
 
     def _fixed(self, value: Any, where: str) -> None:
@@ -398,7 +405,7 @@ class References:
                 self._named.append((holder, where, set()))
             else:
                 for name, entry in list(own.items()):
-                    if not self._is_cached(value, name, entry):
+                    if not self._is_cached(value, name, entry) and not self._is_log(value, name):
                         self._tokens.append(name)
                         self._add(entry, f"{where}.{name}")
 
@@ -514,6 +521,8 @@ def _code(code: types.CodeType) -> Code:
             imports[name] = None
         elif step.opname in _STORES or (step.opname == "STORE_DEREF" and name in code.co_freevars):
             stores[name] = None
+            if "GLOBAL" in step.opname:
+                globals_[name] = None
         if "ATTR" in step.opname or "METHOD" in step.opname or step.opname == "IMPORT_FROM":
             names.add(name)
     for constant in code.co_consts:
@@ -576,6 +585,95 @@ def _unbound(value: Any) -> Any:
 
 def _digest(content: bytes) -> bytes:
     return content if len(content) <= _LONG else hashlib.blake2b(content, digest_size=16).digest()
+
+
+class Keeper:
+    """Contents of objects at one time, what has changed of them since, and how to put them back."""
+
+    def __init__(
+        self,
+        roots: tuple[tuple[str, Any], ...],
+        tokens: tuple[object, ...],
+        objects: list[Any],
+        bindings: list[tuple[Any, str, Any]],
+    ) -> None:
+        self._roots, self._tokens, self._bindings = roots, tokens, list(bindings)
+        self._contents = [(value, found) for value in objects if (found := _contents(value)) is not None]
+
+    def changes(self) -> list[tuple[Any, Any]]:
+        """Places (object, key or attribute, None for all) whose contents differ; none where it has no effect."""
+        if References(self._roots).tokens == self._tokens:
+            return []
+        found = [(value, key) for value, before in self._contents for key in _changed(value, before)]
+        return found + [(holder, key) for holder, key, value in self._bindings if _bound(holder, key) is not value]
+
+    def restore(self) -> None:
+        """Put everything back."""
+        for value, before in self._contents:
+            if _changed(value, before):
+                _restore(value, before)
+        for holder, key, value in self._bindings:
+            if _bound(holder, key) is not value:
+                _bind(holder, key, value)
+
+    def ignore(self, changes: list[tuple[Any, Any]]) -> None:
+        """Take some places for logs, which the functions write and do not depend on."""
+        codes = _codes(root for _, root in self._roots)
+        for holder, key in changes:
+            _, known = _LOGS.pop((id(holder), key), (holder, frozenset()))
+            _LOGS[id(holder), key] = holder, known | codes
+        while len(_LOGS) > _FEW:
+            _LOGS.popitem(last=False)
+
+
+_LOGS: OrderedDict[tuple[int, Any], tuple[Any, frozenset[types.CodeType]]] = OrderedDict()
+"""Places that are logs or counters, and the functions that they have no influence on."""
+
+_FEW = 256
+"""Logs kept in mind; entries of an array of which some may be counters."""
+
+_MISSING = object()
+
+
+def _codes(roots: Iterable[Any]) -> frozenset[types.CodeType]:
+    """Code of the functions among some objects."""
+    functions = (getattr(root, "__func__", root) for root in roots)
+    return frozenset(function.__code__ for function in functions if isinstance(function, types.FunctionType))
+
+
+def _bound(holder: Any, key: str) -> Any:
+    if isinstance(holder, types.CellType):
+        try:
+            return holder.cell_contents
+        except ValueError:
+            return _MISSING
+    return (holder if isinstance(holder, dict) else vars(holder)).get(key, _MISSING)
+
+
+def _bind(holder: Any, key: str, value: Any) -> None:
+    if not isinstance(holder, dict):
+        setattr(holder, key, value)
+    elif value is _MISSING:
+        holder.pop(key, None)
+    else:
+        holder[key] = value
+
+
+def _changed(value: Any, before: Any) -> list[Any]:
+    """Keys of an object under which it holds something else than before; None stands for all."""
+    now = _contents(value)
+    if isinstance(value, np.ndarray):
+        if not value.dtype.hasobject and now.tobytes() == before.tobytes():
+            return []
+        pairs = zip(now.flat, before.flat, strict=True)
+        if value.dtype.hasobject:
+            return [k for k, (a, b) in enumerate(pairs) if a is not b]
+        return [k for k, (a, b) in enumerate(pairs) if a != b] if value.size <= _FEW else [None]
+    if isinstance(before, list | deque | bytearray) and len(now) == len(before):
+        return [k for k, (a, b) in enumerate(zip(now, before, strict=True)) if a is not b]
+    if isinstance(before, dict):
+        return [key for key in {**before, **now} if now.get(key, _MISSING) is not before.get(key, _MISSING)]
+    return [] if now == before else [None]
 
 
 def _contents(value: Any) -> Any:
