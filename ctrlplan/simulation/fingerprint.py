@@ -70,20 +70,17 @@ _DULL = frozenset(
 )
 """Attributes of a class without influence on what its objects return."""
 
-_STORES = frozenset(("STORE_GLOBAL", "DELETE_GLOBAL", "STORE_ATTR", "DELETE_ATTR"))
-
 _MAKERS = frozenset(("__init__", "__post_init__", "__new__", "__set_name__"))
 """Methods that set attributes of objects that are new."""
 
 
 @dataclass(frozen=True, eq=False)
 class Code:
-    """Names in a code and in those inside it: globals, attributes and strings, imported modules, what is stored."""
+    """Names in a code and in those inside it: globals, attributes and strings, imported modules."""
 
     globals: tuple[str, ...]
     names: frozenset[str]
     imports: tuple[str, ...]
-    stores: tuple[str, ...]
 
 
 class References:
@@ -102,14 +99,12 @@ class References:
         The same of cached properties, which a first call adds to an object.
     opaque : str
         First of what cannot be fingerprinted, in words; empty where there is none.
-    stores : str
-        Variable or attribute outside of their own that the functions assign by their code; empty where there is none.
     names : set of str
         Names and strings in the code of the functions.
     """
 
     def __init__(self, roots: Iterable[tuple[str, Any]]) -> None:
-        self.opaque = self.stores = ""
+        self.opaque = ""
         self.names: set[str] = set()
         self._tokens: list[object] = []
         self._seen: dict[int, int] = {}
@@ -148,6 +143,10 @@ class References:
         """Whether a place is known to be written by the functions, and to have no influence on them."""
         known = _LOGS.get((id(holder), key))
         return known is not None and known[0] is holder and self._codes <= known[1]
+
+    def _logs_of(self, holder: Any) -> set[Any]:
+        """Such places in an object."""
+        return {key for number, key in list(_LOGS) if number == id(holder) and self._is_log(holder, key)}
 
     def _hide(self, what: str, where: str) -> None:
         self.opaque = self.opaque or f"{where} ({what})"
@@ -236,8 +235,6 @@ class References:
         if _pure(value.__globals__.get("__name__")):
             return
         self.names |= code.names
-        if code.stores and value.__name__ not in _MAKERS:
-            self.stores = self.stores or code.stores[0]
         self._globals(value.__globals__, code)
 
     def _globals(self, known: dict[str, Any], code: Code) -> None:
@@ -298,11 +295,10 @@ class References:
         if value.dtype.hasobject:
             self._sequence(value, value.ravel().tolist(), where)
         elif self._bytes <= _BYTES:
-            logs = [k for k in range(value.size) if self._is_log(value, k)] if _LOGS and value.size <= _FEW else []
-            content = value
+            logs, content = self._logs_of(value), value
             if logs:
                 content = value.copy()
-                content.flat[logs] = 0
+                content.flat[slice(None) if None in logs else sorted(logs)] = 0
             self._tokens.append(_digest(content.tobytes()))
         if type(value) is not np.ndarray:
             self._attributes(value, where)
@@ -310,15 +306,16 @@ class References:
                 self._add(np.ma.getmaskarray(value), where)
 
     def _sequence(self, holder: Any, values: list[Any], where: str) -> None:
-        if self._is_log(holder, None):
+        logs = self._logs_of(holder)
+        if None in logs:
             return
-        if set(map(type, values)) == {float} and not _LOGS:
+        values = [None if k in logs else entry for k, entry in enumerate(values)] if logs else values
+        if set(map(type, values)) == {float}:
             self._tokens += (len(values), _digest(array("d", values).tobytes()))
             return
         self._tokens.append(len(values))
         for k, entry in enumerate(values):
-            if not self._is_log(holder, k):
-                self._add(entry, f"{where}[{k}]")
+            self._add(entry, f"{where}[{k}]")
 
     def _container(self, value: Any, where: str) -> None:
         self._sequence(value, list(value), where)
@@ -511,18 +508,13 @@ _VISITS: tuple[tuple[Any, Callable[[References, Any, str], None]], ...] = (
 def _code(code: types.CodeType) -> Code:
     globals_: dict[str, None] = {}
     imports: dict[str, None] = {}
-    stores: dict[str, None] = {}
     names: set[str] = set()
     for step in dis.get_instructions(code):
         name = step.argval if isinstance(step.argval, str) else ""
-        if step.opname in ("LOAD_GLOBAL", "LOAD_NAME"):
+        if step.opname in ("LOAD_GLOBAL", "LOAD_NAME", "STORE_GLOBAL"):
             globals_[name] = None
         elif step.opname == "IMPORT_NAME":
             imports[name] = None
-        elif step.opname in _STORES or (step.opname == "STORE_DEREF" and name in code.co_freevars):
-            stores[name] = None
-            if "GLOBAL" in step.opname:
-                globals_[name] = None
         if "ATTR" in step.opname or "METHOD" in step.opname or step.opname == "IMPORT_FROM":
             names.add(name)
     for constant in code.co_consts:
@@ -531,9 +523,8 @@ def _code(code: types.CodeType) -> Code:
             inner = _code(constant)
             globals_ |= dict.fromkeys(inner.globals)
             imports |= dict.fromkeys(inner.imports)
-            stores |= dict.fromkeys(name for name in inner.stores if name not in code.co_cellvars)
             names |= inner.names
-    return Code(tuple(globals_), frozenset(names.union(code.co_varnames, globals_)), tuple(imports), tuple(stores))
+    return Code(tuple(globals_), frozenset(names.union(code.co_varnames, globals_)), tuple(imports))
 
 
 def _imported(name: str, package: str) -> Iterator[types.ModuleType]:
