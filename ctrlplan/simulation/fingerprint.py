@@ -61,7 +61,8 @@ _ALL = frozenset(str.split("getattr vars __dict__ attrgetter astuple asdict copy
 
 _DULL = frozenset(
     str.split(
-        "__dict__ __weakref__ __module__ __doc__ __annotations__ __qualname__ __slots__ __repr__ __str__ __format__ "
+        "__slotnames__ __dict__ __weakref__ __module__ __doc__ __annotations__ __qualname__ __slots__ "
+        "__repr__ __str__ __format__ "
         "__hash__ __reduce__ __reduce_ex__ __getstate__ __setstate__ __copy__ __deepcopy__ __del__ __init_subclass__ "
         "__match_args__ __replace__ __dataclass_fields__ __dataclass_params__ __parameters__ __orig_bases__ "
         "__abstractmethods__ _abc_impl __static_attributes__ __firstlineno__ __annotate__ __annotate_func__ "

@@ -258,10 +258,7 @@ def _disagreement(job: Job, form: Compiled, solver: CompiledSolver, drives: Sequ
     w, sides = form.signals(t, x, driven, p), form.sides(t, x, driven, p)
     places = telling_states(sides, np.concatenate([w, x]), most)
     # Blocks are compared at the inputs that the form computes: where each agrees, the whole does.
-    wrong = form.disagreement(_network(job.prepared), job.params, t[places], x[:, places], w[:, places])
-    if not wrong:
-        job.prepared.trusted = True
-    return wrong
+    return form.disagreement(_network(job.prepared), job.params, t[places], x[:, places], w[:, places])
 
 
 def _closer(run: Run, solver: CompiledSolver) -> tuple[Array, Array]:
