@@ -36,7 +36,7 @@ class Recorder:
 
     def __init__(self, folder):
         self.originals = {name: getattr(ct, name) for name in FUNCTIONS}
-        self.path = Path(folder, f"calls-{os.getpid()}.jsonl")
+        self.path = Path(folder, f"calls-{os.getpid()}.jsonl").resolve()  # examples change the folder
         self.test, self.count, self.total, self.inside = "import", 0, 0, False
         self.compared = {}
 
@@ -92,6 +92,7 @@ class Recorder:
         if key in self.compared:
             self.record(function, system, self.compared[key][1])
             return
+        options = {}
         try:
             np.random.set_state(random)
             options = options_of(function, args, kwargs)
