@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import re
+import threading
 from collections import OrderedDict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from ctrlplan.simulation.compared import Compared
 from ctrlplan.simulation.drives import Series
 from ctrlplan.simulation.interpreted import SolverError
 from ctrlplan.simulation.network import Block, Network, Step, known_feedthrough
 from ctrlplan.simulation.recent import recent
+from ctrlplan.simulation.switches import switch_arguments
 from ctrlplan.simulation.traced import NotTraceableError, Trace, agrees
 
 Array = NDArray[np.float64]
@@ -80,6 +83,8 @@ class Compiled:
         w = _signals(network, traces, own, network.schedule(feeds, every), t, x, d)
         self._functions["signals"] = ca.Function("signals", [t, x, d, p], [ca.densify(w)])
         self._functions["outputs"] = ca.Function("outputs", [t, x, d, p], [ca.densify(_sparse(network.read) @ w)])
+        self._functions["switches"] = switch_arguments(ca.Function("all", [t, x, d, p], [ca.vertcat(w, rates)]))
+        self.compared = Compared(self._functions["switches"].numel_out(0))
         self._integrators: OrderedDict[Any, Any] = OrderedDict()
         self._maps: OrderedDict[Any, Any] = OrderedDict()
         self._equations: dict[int, dict[str, Any]] = {}
@@ -109,6 +114,10 @@ class Compiled:
         """All signals at many times, (nsignals, ntime)."""
         return self._at_many("signals", t, x, driven, p)
 
+    def sides(self, t: Array, x: Array, driven: Array, p: Array) -> Array:
+        """On which side of its switches the form is at many times, (nswitches, ntime): -1, 0 or 1."""
+        return np.sign(self._at_many("switches", t, x, driven, p))
+
     def disagreement(self, network: Network, params: Mapping[str, Any], t: Array, x: Array, w: Array) -> str:
         """What is wrong with a trace at visited times, states and signals; empty where nothing."""
         for block, trace, states, fed in zip(network.blocks, self._traces, network.states, network.fed, strict=True):
@@ -125,7 +134,8 @@ class Compiled:
 
     def integrator(self, width: int, grid: Array, stiff: bool, rtol: float, atol: float, max_steps: int) -> Any:
         """CVODES over a leg of length 1, with outputs at some of its times."""
-        key = (width, grid.tobytes(), stiff, rtol, atol, max_steps)
+        # CasADi runs without Python's lock: no integrator is used by two threads at once.
+        key = (threading.get_ident(), width, grid.tobytes(), stiff, rtol, atol, max_steps)
 
         def made() -> Any:
             options = {
@@ -173,7 +183,13 @@ class Compiled:
 
 
 class CompiledSolver:
-    """CVODES on a compiled network, leg by leg."""
+    """CVODES on a compiled network, leg by leg.
+
+    Attributes
+    ----------
+    evaluations : int
+        Evaluations of the right-hand side so far, counted where a comparison with Python is expected.
+    """
 
     def __init__(
         self, equations: Compiled, params: Mapping[str, Any], rtol: float, atol: float, max_steps: int = 20_000
@@ -181,6 +197,8 @@ class CompiledSolver:
         self._equations, self._p = equations, equations.parameters(params)
         self._options = rtol, atol, max_steps
         self._longest, self._stiff = 0.0, False
+        self.evaluations = 0
+        self._report = self._count if equations.compared.is_expected else None
 
     def signals(self, times: Array, states: Array, driven: Array) -> Array:
         """All signals (nsignals, ntime) of the network."""
@@ -223,7 +241,7 @@ class CompiledSolver:
         for outputs, allowed in ((relative, min(_FEW_STEPS, max_steps)), (close, max_steps)):
             integrator = self._equations.integrator(width, outputs, self._stiff, rtol, atol, allowed)
             try:
-                found = _called(integrator, (state, np.empty(0), p), state.size)
+                found = _called(integrator, (state, np.empty(0), p), state.size, self._report)
                 return found[:, np.searchsorted(outputs, relative)]
             except RuntimeError as error:
                 code = re.search(r"CV_\w+", str(error))
@@ -232,8 +250,13 @@ class CompiledSolver:
                     break
         raise SolverError(f"the solver must reach {right:g} s from {left:g} s, got to where {why}")
 
+    def _count(self, stats: dict[str, Any]) -> None:
+        self.evaluations += int(stats.get("nfevals", 0))
 
-def _called(function: Any, arguments: Sequence[Array], nrows: int) -> Array:
+
+def _called(
+    function: Any, arguments: Sequence[Array], nrows: int, report: Callable[[dict[str, Any]], None] | None = None
+) -> Array:
     """First result (nrows, n) of a function, without a detour through CasADi's own matrices."""
     out = np.zeros((function.numel_out(0) // nrows if nrows else 0, nrows))
     buffer, evaluate = function.buffer()
@@ -243,6 +266,8 @@ def _called(function: Any, arguments: Sequence[Array], nrows: int) -> Array:
             buffer.set_arg(k, values.data)
     buffer.set_res(0, out.data)
     evaluate()
+    if report is not None:
+        report(buffer.stats())
     return out.T
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from typing import Any
 
@@ -21,7 +22,8 @@ from ctrlplan.simulation.network import (
     sampled_feedthrough,
     tried_feedthrough,
 )
-from ctrlplan.simulation.trials import can_remember, trial_copy, tried
+from ctrlplan.simulation.trials import can_remember, trial_copy, values_of
+from ctrlplan.simulation.untouched import untouched
 
 Array = NDArray[np.float64]
 
@@ -180,9 +182,11 @@ class Interpreted:
         """Raise where an output is not what its block makes of all signals: it depends on more than trials found."""
         for i, remembers in self._doubtful:
             block, outs = self.network.blocks[i], self.network.outputs[i]
+            place, fed = self.network.states[i], self.network.fed[i](w)
             if remembers:  # a call of its own would be remembered
                 block = replace(block, system=trial_copy(block.system))
-            found = tried(block.output(self.params), t, x[self.network.states[i]], self.network.fed[i](w))
+            with untouched() if remembers else nullcontext():
+                found = values_of(block.output(self.params), t, x[place], fed)
             size = np.abs(w).max(initial=0.0, where=np.isfinite(w))
             if found is not None and not np.allclose(found, w[outs], rtol=1e-9, atol=1e-9 * size, equal_nan=True):
                 raise FeedthroughError(f"outputs of {block.name} at {t:g} s depend on more inputs than at the start")

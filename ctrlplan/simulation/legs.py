@@ -6,6 +6,7 @@ import heapq
 from bisect import bisect_right
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from fractions import Fraction
 from functools import partial
 from typing import Any, Protocol
 
@@ -20,7 +21,6 @@ from ctrlplan.simulation.drives import (
     breakpoints_of,
     chebyshev_coefficients,
     chebyshev_times,
-    driven_signals,
     resolved,
 )
 from ctrlplan.simulation.interpreted import Interpreted, SolverError
@@ -39,6 +39,12 @@ _HOPS = 6
 
 
 _SHORTEST_DELAY = 1e-5
+
+_TOLERANCE = 1e-12
+"""Part of a run by which two instants that are meant to be one may differ."""
+
+_DENOMINATOR = 10**7
+"""Largest denominator of times that are taken for fractions."""
 
 _LEGS = 2_000
 """Legs that blocks may ask for in a run."""
@@ -66,6 +72,7 @@ class DelayedDrive:
     def __init__(self, delay: float, initial: Array, first: float) -> None:
         self.delay, self.width = delay, initial.size
         self.breakpoints = np.empty(0)
+        self.tolerance = 0.0
         self._initial, self._first = initial, first
         self._pieces: list[Series] = []
         self._ends: list[float] = []
@@ -91,13 +98,14 @@ class DelayedDrive:
 
     def at(self, times: Array) -> Array:
         """Values as they were."""
-        past = times - self.delay
+        # A jump that arrives at a time is seen there, however the times were rounded.
+        past = times - self.delay + self.tolerance
         out = np.repeat(self._initial[:, None], times.size, axis=1)
         which = np.array([bisect_right(self._ends, t) for t in past.tolist()])
         for k in np.unique(which[past >= self._first]).tolist():
             piece = self._pieces[min(k, len(self._pieces) - 1)]
             rows = (which == k) & (past >= self._first)
-            out[:, rows] = piece.at(past[rows])
+            out[:, rows] = piece.at(np.maximum(past[rows] - self.tolerance, piece.left))
         return out
 
 
@@ -161,7 +169,7 @@ def integrate(
     memory = _Memory(network, solver, drives, resolution)
     for_ever = equations is not None and network.delays_feed_delays(equations.feeds)
     hops = _MARKS if for_ever else _HOPS
-    clock = _Clock(network, _fixed(network, drives, first, last, memory.delays, hops), first, last)
+    clock = _Clock(network, drives, _fixed(network, drives, first, last, memory.delays, hops), first, last)
     longest = min([last - first, *memory.delays])
     if longest < _SHORTEST_DELAY * (last - first):
         raise ValueError(
@@ -176,7 +184,7 @@ def integrate(
     legs: list[tuple[float, Series]] = []
     span: list[Series] = []
     left, reach = first, longest
-    x = clock.sample(equations, drives, first, state)
+    x = clock.sample(equations, first, state)
     while left < last:
         check(left)  # CVODES is not stopped within a segment, whose steps are bounded
         right = clock.following(left)
@@ -208,7 +216,7 @@ def integrate(
         legs.append((left, series))
         asked = np.isin(grid, inside)
         known.append((np.append(left, grid[asked]), np.column_stack([x, found[:, asked]])))
-        before, x = x, clock.sample(equations, drives, right, found[:, -1])
+        before, x = x, clock.sample(equations, right, found[:, -1])
         left, reach = right, min(longest, 2.0 * reach)
         if pause is not None and pause(np.append(legs[-1][0], grid), np.column_stack([before, found])):
             break
@@ -246,25 +254,40 @@ class _Memory:
 
 
 class _Clock:
-    """Instants at which a leg must end: breakpoints, and samples of discrete blocks."""
+    """Instants at which a segment must end: breakpoints, and samples of discrete blocks.
 
-    def __init__(self, network: Network, fixed: list[float], first: float, last: float) -> None:
+    Sample instants are multiples of a common tick, offset + k period as whole
+    numbers: 3 times 0.1 s is 0.3 s. A breakpoint that differs from an instant
+    by rounding is at that instant, and its sample sees what holds after it.
+    """
+
+    def __init__(
+        self, network: Network, drives: Sequence[Drive], fixed: list[float], first: float, last: float
+    ) -> None:
         self._fixed = [*fixed, last]
-        self._tolerance = 1e-12 * max(abs(first), abs(last), last - first)
-        self._samples: list[tuple[float, int, int]] = []
-        self._first = first
-        self._periods = {}
+        latest = max(abs(first), abs(last))
+        self._tolerance = max(4.0 * np.finfo(float).eps * latest, _TOLERANCE * (last - first))
+        self._drives = drives
+        for drive in drives:
+            if isinstance(drive, DelayedDrive):
+                drive.tolerance = self._tolerance
+        self._samples: list[tuple[Fraction, int]] = []
+        self._periods: dict[int, Fraction] = {}
         for i in network.blocks_with("period"):
             traits = network.blocks[i].traits
-            self._periods[i] = (float(traits.period or 0.0), traits.offset)
-            self._push(i, 0)
+            if float(traits.period or 0.0) < 4.0 * self._tolerance:
+                raise ValueError(
+                    f"the period of {network.blocks[i].name} must be told from 0 in times up to {latest:g} s, "
+                    f"got {traits.period:g} s"
+                )
+            self._periods[i] = _fraction(traits.period or 0.0)
+            heapq.heappush(self._samples, (_fraction(first) + _fraction(traits.offset), i))
 
     def following(self, t: float) -> float:
         """The next instant after t."""
         due = self.fixed_after(t)
-        if self._samples and self._samples[0][0] < due - self._tolerance:
-            return self._samples[0][0]
-        return due
+        sample = float(self._samples[0][0]) if self._samples else np.inf
+        return sample if sample <= min(due + self._tolerance, self._fixed[-1]) else due
 
     def fixed_after(self, t: float) -> float:
         """The next breakpoint after t, or the end."""
@@ -276,20 +299,29 @@ class _Clock:
         close = near[np.abs(near - t) <= self._tolerance]
         return float(close[0]) if close.size else t
 
-    def sample(self, equations: Interpreted | None, drives: Sequence[Drive], t: float, x: Array) -> Array:
+    def sample(self, equations: Interpreted | None, t: float, x: Array) -> Array:
         """State after the blocks due at t have taken their samples."""
         due = []
-        while self._samples and self._samples[0][0] <= t + self._tolerance:
-            _, i, k = heapq.heappop(self._samples)
+        while self._samples and float(self._samples[0][0]) <= t + self._tolerance:
+            instant, i = self._samples[0]
+            heapq.heapreplace(self._samples, (instant + self._periods[i], i))
             due.append(i)
-            self._push(i, k + 1)
         if not due or equations is None:
             return x
-        return equations.sampled(tuple(sorted(due)), t, x, driven_signals(drives, np.array([t]))[:, 0])
+        seen = [drive.at(np.array([self._after(drive, t)])) for drive in self._drives]
+        return equations.sampled(tuple(sorted(due)), t, x, np.concatenate([np.zeros((0, 1)), *seen])[:, 0])
 
-    def _push(self, i: int, k: int) -> None:
-        period, offset = self._periods[i]
-        heapq.heappush(self._samples, (self._first + offset + k * period, i, k))
+    def _after(self, drive: Drive, t: float) -> float:
+        """Time at which a signal is read at an instant: at its breakpoint, where the two differ by rounding."""
+        marks = drive.breakpoints
+        k = int(np.searchsorted(marks, t))
+        return float(marks[k]) if k < len(marks) and marks[k] - t <= self._tolerance else t
+
+
+def _fraction(seconds: float) -> Fraction:
+    """The fraction that a decimal or a quotient of small numbers was meant to be; otherwise the number itself."""
+    simple = Fraction(seconds).limit_denominator(_DENOMINATOR)
+    return simple if abs(float(simple) - seconds) <= 1e-15 * abs(seconds) else Fraction(seconds)
 
 
 def _beside(drives: Sequence[Drive], moment: float, origin: float, s: Array) -> Array:

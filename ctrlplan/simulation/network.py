@@ -23,7 +23,8 @@ from scipy.linalg import block_diag
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
-from ctrlplan.simulation.trials import can_remember, reads, trial, trial_copy, tried
+from ctrlplan.simulation.trials import can_remember, reads, trial_copy, values_of
+from ctrlplan.simulation.untouched import untouched
 from ctrlplan.traits import BlockTraits, traits_of
 from ctrlplan.trajectories import Trajectory
 
@@ -361,18 +362,18 @@ def tried_feedthrough(output: Map, noutputs: int, nin: int, t: float, x: Array) 
     found = np.zeros((noutputs, nin), dtype=bool)
     known = np.zeros(nin, dtype=bool)
     rng = np.random.default_rng(1)
-    with trial():
+    with untouched():
         for scale in (0.0, 1.0, 1e3):
             u = scale * rng.standard_normal(nin)
             state = x + (0.1 * rng.standard_normal(x.size) if scale else 0.0)
-            before = tried(output, t, state, u)
+            before = values_of(output, t, state, u)
             if before is None:
                 continue
             for j in range(nin):
                 for step in (1e-3, 1.0, 1e3):
                     moved = u.copy()
                     moved[j] += step
-                    after = tried(output, t, state.copy(), moved)
+                    after = values_of(output, t, state.copy(), moved)
                     if after is not None and after.shape == before.shape == (noutputs,):
                         known[j] = True
                         found[:, j] |= (after != before) & ~(np.isnan(after) & np.isnan(before))

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import suppress
-from copy import deepcopy
+from functools import partial
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
@@ -14,11 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctrlplan.simulation.drives import Drive, PlanDrive, driven_signals
+from ctrlplan.simulation.fingerprint import References, roots_of
 from ctrlplan.simulation.interpreted import Interpreted
 from ctrlplan.simulation.legs import DelayedDrive
 from ctrlplan.simulation.linear import LinearForm, NotLinearError, linear_form
 from ctrlplan.simulation.network import Network, UnsupportedError
-from ctrlplan.simulation.recent import recent
+from ctrlplan.simulation.recent import BUILDING, recent
+from ctrlplan.simulation.untouched import tried, untouched
 from ctrlplan.traits import traits_of
 
 if TYPE_CHECKING:
@@ -118,27 +119,34 @@ class Prepared:
         NotCompiledError
             If CasADi is missing, or a block cannot be traced; it is named.
         """
-        names = frozenset(params)
-        for known, baked, form in self._compiled:
-            numbers = isinstance(form, NotCompiledError) or all(np.ndim(params.get(k, 0.0)) == 0 for k in form.symbols)
-            if known == names and numbers and all(_same(params.get(key), value) for key, value in baked.items()):
-                if isinstance(form, NotCompiledError):
-                    raise form
-                return form
-        form, baked = self._build(params, drives, first, state)
-        self._compiled = [*self._compiled[-7:], (names, baked, form)]
+        form = self._known(params)
+        if form is None:
+            with BUILDING:
+                form = self._known(params)
+                if form is None:
+                    form, baked = self._build(params, drives, first, state)
+                    self._compiled = [*self._compiled[-7:], (frozenset(params), baked, form)]
         if isinstance(form, NotCompiledError):
-            raise form
+            raise NotCompiledError(str(form))
         return form
+
+    def _known(self, params: Mapping[str, Any]) -> Compiled | NotCompiledError | None:
+        """Form built before, in which the parameters that are no symbols have the same values."""
+        for names, baked, form in self._compiled:
+            numbers = isinstance(form, NotCompiledError) or all(np.ndim(params.get(k, 0.0)) == 0 for k in form.symbols)
+            if names == frozenset(params) and numbers and all(_token(params[k]) == v for k, v in baked.items()):
+                return form
+        return None
 
     def distrust(self, form: Compiled, why: str) -> DisagreementError:
         """Drop a compiled form that was found wrong: once, for what it was made of may have changed; then for good."""
-        again, self.trusted = not self.trusted, False
-        self._compiled = [
-            (names, baked, NotCompiledError(why) if known is form else known)
-            for names, baked, known in self._compiled
-            if again or known is not form
-        ]
+        with BUILDING:
+            again, self.trusted = not self.trusted, False
+            self._compiled = [
+                (names, baked, NotCompiledError(why) if known is form else known)
+                for names, baked, known in self._compiled
+                if again or known is not form
+            ]
         return DisagreementError(why)
 
     def detached(self, names: Iterable[str] = ()) -> Prepared:
@@ -174,21 +182,29 @@ class Prepared:
         given = self.initial_state if initial_state is None else initial_state
         start = np.zeros(self.nstates) + (0.0 if given is None else np.asarray(given, dtype=float))
         w = np.zeros(network.nsignals)
-        with np.errstate(all="ignore"), suppress(Exception):
+        blocks = [i for i, block in enumerate(network.blocks) if not (block.linear or block.driven)]
+        functions = {i: [*_functions(network.blocks[i].system)] for i in blocks}
+        found = References((f"block {network.blocks[i].name}", f) for i in blocks for f in functions[i])
+        if found.opaque or found.stores:  # a call might leave something behind: what the code names counts
+            return name in found.names or not found.names.isdisjoint(("keys", "values", "items"))
+        restored = found.keeper()
+
+        def starting() -> Array:
             equations = Interpreted(network, {name: value}, (0.0, start))
-            w = equations.signals(0.0, start, driven_signals(self.drives([], 0.0), np.zeros(1))[:, 0])
+            return equations.signals(0.0, start, driven_signals(self.drives([], 0.0), np.zeros(1))[:, 0])
+
         read: set[str] = set()
         rng = np.random.default_rng(0)
-        for i, block in enumerate(network.blocks):
-            if block.linear or block.driven:
-                continue
-            functions = (block.system.outfcn, block.system.updfcn, block.traits.sample)
-            for scale in (0.0, 0.1, 1.0):
-                x, u = start[network.states[i]], network.fed[i](w)
-                x, u = (v + scale * rng.standard_normal(v.size) * (1.0 + np.abs(v)) for v in (x, u))
-                for function in filter(None, functions):
-                    with np.errstate(all="ignore"), suppress(Exception):
-                        function(10.0 * scale, x, u, _Noticing({**block.params, name: value}, read))
+        with untouched():
+            w = tried(starting, np.zeros(network.nsignals))
+            for i in blocks:
+                noticing = _Noticing({**network.blocks[i].params, name: value}, read)
+                for scale in (0.0, 0.1, 1.0):
+                    x, u = start[network.states[i]], network.fed[i](w)
+                    x, u = (v + scale * rng.standard_normal(v.size) * (1.0 + np.abs(v)) for v in (x, u))
+                    for function in functions[i]:
+                        tried(partial(function, 10.0 * scale, x.copy(), u.copy(), noticing), None)
+        restored()
         return name in read or _Noticing.ALL in read
 
     def _build(
@@ -197,18 +213,23 @@ class Prepared:
         if find_spec("casadi") is None:
             return NotCompiledError("CasADi is not installed (pip install ctrlplan[fast])"), {}
         from ctrlplan.simulation.compiled import Compiled
-        from ctrlplan.simulation.traced import NotTraceableError, traced
+        from ctrlplan.simulation.traced import NotTraceableError, callable_references, traced
 
         network = self.network
         if network is None:
             return NotCompiledError(self.unsupported), {}
         if not network.blocks:
             return NotCompiledError(f"{self.name} is without its blocks, compiled for other parameters"), {}
-        equations = Interpreted(network, params, (first, state), self.trials)
-        w = equations.signals(first, state, driven_signals(drives, np.array([first]))[:, 0])
         traces: list[Trace | None] = []
         baked: dict[str, Any] = {}
         try:
+            others = [block for block in network.blocks if not (block.linear or block.driven)]
+            restored = callable_references(others, params).keeper()
+            try:
+                equations = Interpreted(network.for_trials(), params, (first, state), self.trials)
+                w = equations.signals(first, state, driven_signals(drives, np.array([first]))[:, 0])
+            finally:
+                restored()
             for block, states, fed in zip(network.blocks, network.states, network.fed, strict=True):
                 if block.linear or block.driven:
                     traces.append(None)
@@ -216,10 +237,10 @@ class Prepared:
                 trace = traced(block, params, first, state[states], fed(w))
                 traces.append(trace)
                 # What is a constant in the trace must be so in every run of it.
-                baked |= {key: deepcopy(params[key]) for key in params if key not in trace.symbols}
+                baked |= {key: _token(params[key]) for key in params if key not in trace.symbols}
             return Compiled(network, traces), baked
         except NotTraceableError as error:
-            return NotCompiledError(str(error)), deepcopy(dict(params))
+            return NotCompiledError(str(error)), {key: _token(value) for key, value in params.items()}
 
     def _blocks(self) -> tuple[Any, ...]:
         return self.network.blocks if self.network is not None else ()
@@ -346,7 +367,7 @@ def state_space(system: Any) -> Any:
 
 def fingerprint(system: Any) -> tuple[Any, ...]:
     """What a run depends on: equal only where nothing has changed."""
-    own = (id(system), str(system.name), system.dt, _frozen(system.params) if hasattr(system, "params") else ())
+    own = (id(system), str(system.name), system.dt, _token(getattr(system, "params", None)))
     labels = (tuple(system.input_labels or ()), tuple(system.output_labels or ()), tuple(system.state_labels or ()))
     if isinstance(system, ct.InterconnectedSystem):
         maps = tuple(np.asarray(m).tobytes() for m in (system.connect_map, system.input_map, system.output_map))
@@ -359,7 +380,14 @@ def fingerprint(system: Any) -> tuple[Any, ...]:
     functions = tuple(_frozen(getattr(system, name, None)) for name in ("updfcn", "outfcn"))
     # Traits are immutable and compared by identity.
     traits = traits_of(system)
-    return (own, labels, functions, traits, () if traits.block is None else fingerprint(traits.block))
+    return (
+        own,
+        labels,
+        functions,
+        traits,
+        () if traits.block is None else fingerprint(traits.block),
+        _referred(system),
+    )
 
 
 def _checked_system(system: Any) -> Any:
@@ -392,5 +420,20 @@ def _frozen(value: Any) -> Any:
     return value
 
 
-def _same(a: Any, b: Any) -> bool:
-    return bool(a is b or np.array_equal(a, b))
+def _referred(system: Any) -> tuple[Any, ...]:
+    """What the functions of a block refer to, where they may be compiled."""
+    traits = traits_of(system)
+    if traits.plan is not None or traits.delay is not None:
+        return ()
+    found = References(roots_of(system))
+    return found.tokens, found.cached
+
+
+def _token(value: Any) -> tuple[Any, ...]:
+    """Fingerprint of a parameter."""
+    return References([("params", value)]).tokens
+
+
+def _functions(system: Any) -> Iterator[Any]:
+    """Functions of a block that are called with its parameters."""
+    return filter(None, (system.outfcn, system.updfcn, traits_of(system).sample))

@@ -4,20 +4,29 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ctrlplan.simulation.budget import check
+from ctrlplan.simulation.compared import telling_states
 from ctrlplan.simulation.drives import Drive, PlanDrive, SampledDrive, breakpoints_of, driven_signals
 from ctrlplan.simulation.events import Event, Snapshot, Watched, watched_events
 from ctrlplan.simulation.exact import exact_states, sampled_states
 from ctrlplan.simulation.interpreted import Interpreted, InterpretedSolver, SolverError
-from ctrlplan.simulation.legs import integrate
+from ctrlplan.simulation.legs import Run, integrate
 from ctrlplan.simulation.linear import LinearForm
+from ctrlplan.simulation.network import Network
 from ctrlplan.simulation.prepared import DisagreementError, NotCompiledError, Prepared
+from ctrlplan.simulation.trials import can_remember
+
+if TYPE_CHECKING:
+    from ctrlplan.simulation.compiled import Compiled, CompiledSolver
 
 Array = NDArray[np.float64]
 
@@ -30,7 +39,13 @@ _LOOKS_A_TURN = 16
 """Such times in a turn of the fastest oscillation about the state where a run begins."""
 
 _VISITED = 12
-"""Visited states at which a compiled system is compared with Python."""
+"""Visited states at which equations must be defined; and of a comparison where evaluations were not counted."""
+
+_SHARE = 5
+"""A compiled form is compared with Python at states a fifth as many as the run's evaluations of its equations."""
+
+_CLOSE, _STRETCHES, _BETWEEN = 400, 8, 60
+"""A run with fewer times is followed once more, in some stretches with so many times each, to see where it switches."""
 
 
 _LOST = 1e-6
@@ -54,6 +69,7 @@ class Job:
     params: dict[str, Any]
     tolerances: tuple[float, float]
     events: Sequence[Event] | None
+    network: Network | None
 
     @property
     def first(self) -> float:
@@ -130,19 +146,29 @@ def recorded(job: Job, method: str) -> Record:
     if method == "python":
         return _numerical(job, "python", 'method "python" was asked for')
     reason = reason or 'method "compiled" was asked for'
+    again = _unused(job)
     try:
         try:
             return _numerical(job, "compiled", reason)
         except DisagreementError:  # what a function refers to may have changed since it was traced
+            job, again = again, _unused(again)
             return _numerical(job, "compiled", reason)
     except NotCompiledError as error:
         if method == "compiled":
             raise ValueError(f'method "compiled" must be given blocks that can be traced, but {error}') from None
-        return _numerical(job, "python", str(error))
+        return _numerical(again, "python", str(error))
     except SolverError as error:
         if method == "compiled":
             raise
-        return _numerical(job, "python", f"CVODES failed: {error}")
+        return _numerical(again, "python", f"CVODES failed: {error}")
+
+
+def _unused(job: Job) -> Job:
+    """Same job for another attempt, its sampled blocks with the memory that they have now."""
+    network = job.network
+    if network is None or not any(can_remember(network.blocks[i].system) for i in network.blocks_with("period")):
+        return job
+    return replace(job, network=network.for_trials())
 
 
 def _exact(job: Job, form: LinearForm) -> Record:
@@ -205,15 +231,18 @@ def _warn_of_lost_digits(job: Job, outputs: Array, others: Array, floor: Array) 
 
 def _numerical(job: Job, method: str, reason: str) -> Record:
     """Leg by leg, compiled or by Python."""
-    prepared, network = job.prepared, _network(job.prepared)
+    prepared, network = job.prepared, _network(job)
     drives = prepared.drives(job.inputs, job.first)
     equations = Interpreted(network, job.params, (job.first, job.state), prepared.trials) if network.blocks else None
     watched = job.watched()
     stops = any(entry.stop for entry in watched)
     solver: Any
     if method == "compiled":
-        if equations is not None:  # an algebraic loop without a solution is better named here
-            equations.signals(job.first, job.state, driven_signals(drives, job.times[:1])[:, 0])
+        # Compiled forms are compared with Python on copies of what blocks remember.
+        known = network.for_trials()
+        tests = Interpreted(known, job.params, (job.first, job.state), prepared.trials) if network.blocks else None
+        if tests is not None:  # an algebraic loop without a solution is better named here
+            tests.signals(job.first, job.state, driven_signals(drives, job.times[:1])[:, 0])
         form = prepared.compiled(job.params, drives, job.first, job.state)
         from ctrlplan.simulation.compiled import CompiledSolver  # there is a form: so there is CasADi
 
@@ -260,30 +289,72 @@ def _numerical(job: Job, method: str, reason: str) -> Record:
             raise SolverError(
                 f"the solver must reach {job.times[-1]:g} s, got to the edge of where equations are defined"
             )
-        if equations is not None:
-            wrong = form.disagreement(network, job.params, t, x, equations.all_signals(t, x, driven))
+        if network.blocks:
+            wrong = _disagreement(job, known, form, solver, drives, run)
             if wrong:
                 raise prepared.distrust(form, wrong)
-            prepared.trusted = True
     return Record(run.times, run.states, see, carry, watched, method, reason)
 
 
+def _disagreement(
+    job: Job, network: Network, form: Compiled, solver: CompiledSolver, drives: Sequence[Drive], run: Run
+) -> str:
+    """What is wrong with a compiled form at states of a run; empty where nothing, or where no comparison is due."""
+    p = form.parameters(job.params)
+    driven = driven_signals(drives, run.times)
+    if not form.compared.is_due(form.sides(run.times, run.states, driven, p)):
+        return ""
+    most = max(1, solver.evaluations // _SHARE) if solver.evaluations else _VISITED
+    t, x = _closer(run, solver)
+    driven = driven_signals(drives, t)
+    w, sides = form.signals(t, x, driven, p), form.sides(t, x, driven, p)
+    places = telling_states(sides, np.concatenate([w, x]), most)
+    # Blocks are compared at the inputs that the form computes: where each agrees, the whole does.
+    return form.disagreement(network, job.params, t[places], x[:, places], w[:, places])
+
+
+def _closer(run: Run, solver: CompiledSolver) -> tuple[Array, Array]:
+    """Times and states of a run, with more between them where they are few."""
+    times, states = [run.times], [run.states]
+    marks = np.unique(np.linspace(0, run.times.size - 1, _STRETCHES + 1).astype(int))
+    for k, following in pairwise(marks.tolist() if run.times.size < _CLOSE else []):
+        left, right = float(run.times[k]), float(run.times[following])
+        series = run.series(left)
+        right = min(right, series.right)
+        grid = np.linspace(left, right, _BETWEEN + 1)[1:]
+        with suppress(SolverError):
+            found = solver.advance(series, left, grid, run.states[:, k])
+            times.append(grid)
+            states.append(found)
+    t, x = np.concatenate(times), np.concatenate(states, axis=1)
+    order = np.argsort(t, kind="stable")
+    return t[order], x[:, order]
+
+
 def _discrete(job: Job, reason: str) -> Record:
-    """Discrete system, from sample to sample."""
-    prepared, network = job.prepared, _network(job.prepared)
+    """Discrete system, from sample to sample: first the outputs, in the order of the signal flow, then the updates.
+
+    Each function of a block is called once a sample, so that a block may remember.
+    """
+    prepared, network = job.prepared, _network(job)
     clock = _clock(job.times, prepared.dt)
     drives = prepared.drives(job.inputs, job.first)
     equations = Interpreted(network, job.params, (job.first, job.state), prepared.trials)
     breakpoints = np.array(sorted(breakpoints_of(drives)))
     driven = driven_signals(drives, _on_breakpoints(clock, breakpoints))
     states = np.empty((job.state.size, clock.size))
+    signals = np.empty((network.nsignals, clock.size))
     states[:, 0] = job.state
-    for k in range(clock.size - 1):
-        states[:, k + 1] = equations.rates(float(clock[k]), states[:, k], driven[:, k])
+    for k, t in enumerate(clock.tolist()):
+        check(t)
+        signals[:, k] = equations.signals(t, states[:, k], driven[:, k])
+        following = equations.rates_of(t, states[:, k], signals[:, k])
+        if k + 1 < clock.size:
+            states[:, k + 1] = following
 
     def see(t: Array, x: Array) -> Snapshot:
         now = driven_signals(drives, _on_breakpoints(t, breakpoints))
-        w = equations.all_signals(t, x, now)
+        w = signals[:, np.searchsorted(clock, t, side="right") - 1]
         return Snapshot(t, x, now[: prepared.ninputs], network.put_out(w), lambda: w)
 
     # Between samples nothing happens: what crosses a limit does so at the later one.
@@ -332,10 +403,10 @@ def _on_breakpoints(times: Array, breakpoints: Array) -> Array:
     return np.where(np.abs(times - nearest) <= 4.0 * np.finfo(float).eps * np.abs(times).max(), nearest, times)
 
 
-def _network(prepared: Prepared) -> Any:
-    if prepared.network is None:
-        raise NotCompiledError(prepared.unsupported)
-    return prepared.network
+def _network(job: Job) -> Network:
+    if job.network is None:
+        raise NotCompiledError(job.prepared.unsupported)
+    return job.network
 
 
 def _of_block(function: Any, states: slice, fed: Any, params: dict[str, Any], seen: Snapshot) -> Array:

@@ -131,7 +131,7 @@ def simulate(
     _warn_of_idle(prepared, params or {})
     if prepared.dt is None and prepared.nstates:
         warnings.warn(_NO_TIMEBASE.format(prepared.name), UserWarning, stacklevel=2)
-    job = Job(prepared, times, drives, state, dict(params or {}), (rtol, atol), events)
+    job = Job(prepared, times, drives, state, dict(params or {}), (rtol, atol), events, prepared.network)
     if prepared.network is None and prepared.linear is None and method in ("auto", "python"):
         return _delegated(job)
     try:

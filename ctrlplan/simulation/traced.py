@@ -1,14 +1,11 @@
 """A block's equations as CasADi functions, found by calling them with symbols.
 
-A trace counts only after it has agreed with Python: some ways of writing numpy
-end without an error in nan or in a constant.
+A trace counts only after it has agreed with Python.
 """
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,12 +13,22 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from ctrlplan.simulation.fingerprint import References, roots_of
 from ctrlplan.simulation.network import Block
+from ctrlplan.simulation.symbols import Symbol, column_of, symbol_array
+from ctrlplan.simulation.untouched import same_answer, tried, untouched
 
 Array = NDArray[np.float64]
+Point = tuple[Any, Array, Array, dict[str, Any]]
+"""Time, state and input of a block, and parameters."""
+Answer = tuple[Array, Array]
+"""Outputs and rates of a block."""
 
 _SAME = 1e-8
 """Relative difference up to which a trace and Python agree."""
+
+_FEWEST = 8
+"""Points at which a block must be finite to be checked."""
 
 
 class NotTraceableError(ValueError):
@@ -45,7 +52,7 @@ class Trace:
     symbols: tuple[str, ...]
 
     def feedthrough(self) -> NDArray[np.bool_]:
-        """Which outputs depend on which inputs at once, (noutputs, ninputs): by structure, at every time and state."""
+        """Which outputs have direct feedthrough of which inputs, (noutputs, ninputs): by structure, at every state."""
         found = np.zeros((self.output.numel_out(0), self.output.numel_in(2)), dtype=bool)
         if found.size:
             rows, columns = self.output.jac_sparsity(0, 2).get_triplet()
@@ -56,66 +63,95 @@ class Trace:
 def traced(block: Block, params: Mapping[str, Any], t: float, x: Array, u: Array) -> Trace:
     """Trace a block and compare with Python about a time, a state and an input.
 
+    What the block's functions refer to is left as it was; a block that cannot
+    be put back is not called.
+
     Raises
     ------
     NotTraceableError
-        If no way of calling it with symbols gives what Python gives.
+        If no way of calling it with symbols gives what Python gives, or the
+        block is random or has memory.
     """
     values = {**block.params, **params}
-    points = list(_points(block, values, t, x, u))
-    if sum(_finite(block, point) is not None for point in points) < 8:
+    restored, changed = callable_references([block], params).keeper(), False
+    try:
+        with untouched():
+            trace = _agreed(block, values, _known(block, list(_points(block, values, t, x, u))))
+    finally:
+        changed = restored()
+    if changed:
+        raise NotTraceableError(f"block {block.name} has memory: what it refers to changes when it is called")
+    return trace
+
+
+def callable_references(blocks: Iterable[Block], params: Mapping[str, Any]) -> References:
+    """What blocks refer to that can be called and put back as they were.
+
+    Raises
+    ------
+    NotTraceableError
+        If one of them cannot.
+    """
+    roots = []
+    for block in blocks:
+        values = {**block.params, **params}
+        own = [*roots_of(block.system), *((f"params[{key!r}]", value) for key, value in values.items())]
+        found = References(own)
+        if found.opaque:
+            raise NotTraceableError(f"block {block.name} refers to {found.opaque}, which can change without notice")
+        if found.stores:
+            raise NotTraceableError(f"block {block.name} has memory: it assigns {found.stores} when it is called")
+        roots += own
+    return References(roots)
+
+
+def agrees(block: Block, trace: Trace, params: Mapping[str, Any], t: Array, x: Array, u: Array) -> str:
+    """What is wrong with a trace at times (n,), states (nstates, n) and inputs (ninputs, n); empty where nothing."""
+    values = {**block.params, **params}
+    points = [(t[k], x[:, k], u[:, k], values) for k in range(t.size)]
+    with untouched():
+        known = [(point, found) for point in points if (found := _finite(block, point)) is not None]
+    return _disagreement(trace, known)
+
+
+def _known(block: Block, points: list[Point]) -> list[tuple[Point, Answer]]:
+    """Points inside the block's domain with Python's values, which are the same in a second call."""
+    first = [_finite(block, point) for point in points]
+    again = [_finite(block, point) for point in points]
+    if not all(same_answer(a, b) for a, b in zip(first, again, strict=True)):
+        raise NotTraceableError(
+            f"block {block.name} returns different values for equal arguments: it is random or has memory"
+        )
+    known = [(point, found) for point, found in zip(points, first, strict=True) if found is not None]
+    if len(known) < _FEWEST:
         raise NotTraceableError(f"block {block.name} cannot be checked: it is finite at too few states")
+    return known
+
+
+def _agreed(block: Block, values: dict[str, Any], known: list[tuple[Point, Answer]]) -> Trace:
+    """Trace that agrees with Python, numbers among the parameters as symbols if that can be."""
     numbers = tuple(
         key for key, value in values.items() if np.ndim(value) == 0 and np.asarray(value).dtype.kind in "iuf"
     )
     why = ""
     for symbols in dict.fromkeys((numbers, ())):
-        for as_objects in (True, False):
-            try:
-                with warnings.catch_warnings(), _no_number_is_a_symbol():
-                    warnings.simplefilter("ignore")
-                    trace = _trace(block, values, symbols, as_objects)
-            except Exception as error:  # whatever a block does when it meets a symbol
-                why = why or f"{type(error).__name__}: {str(error).strip().splitlines()[-1]:.120}"
-                continue
-            wrong = _disagreement(block, trace, points)
-            if not wrong:
-                return trace
-            why = wrong
+        try:
+            trace = _trace(block, values, symbols)
+        except (Exception, SystemExit) as error:  # whatever a block does when it meets a symbol
+            lines = str(error).strip().splitlines() or [""]
+            why = why or f"{type(error).__name__}: {lines[-1]:.120}"
+            continue
+        wrong = _disagreement(trace, known)
+        if not wrong:
+            return trace
+        why = wrong
     raise NotTraceableError(
         f"block {block.name} cannot be traced ({why}); functions of numpy can be, as np.sin, np.maximum and np.where, "
         "and lists of values, but not functions of math, branches on a state, or arrays that are filled"
     )
 
 
-@contextmanager
-def _no_number_is_a_symbol() -> Iterator[None]:
-    """Let a symbol that is asked for its number, or looked up, raise: CasADi answers nan, and a branch is lost."""
-
-    def refuse(symbol: Any) -> Any:
-        raise TypeError("a symbol has no number")
-
-    names = ("__float__", "__int__", "__hash__")
-    before = {name: getattr(ca.SX, name) for name in names if hasattr(ca.SX, name)}
-    for name in names:
-        setattr(ca.SX, name, refuse)
-    try:
-        yield
-    finally:
-        for name in names:
-            if name in before:
-                setattr(ca.SX, name, before[name])
-            else:
-                delattr(ca.SX, name)
-
-
-def agrees(block: Block, trace: Trace, params: Mapping[str, Any], t: Array, x: Array, u: Array) -> str:
-    """What is wrong with a trace at times (n,), states (nstates, n) and inputs (ninputs, n); empty where nothing."""
-    values = {**block.params, **params}
-    return _disagreement(block, trace, [(t[k], x[:, k], u[:, k], values) for k in range(t.size)])
-
-
-def _points(block: Block, values: dict[str, Any], t: float, x: Array, u: Array) -> Iterator[tuple[Any, ...]]:
+def _points(block: Block, values: dict[str, Any], t: float, x: Array, u: Array) -> Iterator[Point]:
     """Times, states, inputs and parameters near the given ones and far from them."""
     rng = np.random.default_rng(0)
     for scale in (0.0, 1e-3, 0.1, 1.0):
@@ -127,60 +163,50 @@ def _points(block: Block, values: dict[str, Any], t: float, x: Array, u: Array) 
                 else value
                 for key, value in values.items()
             }
-            yield (t + 10.0 * scale * rng.random(), *near, other)
+            x_near, u_near = near
+            yield t + 10.0 * scale * rng.random(), x_near, u_near, other
     for _ in range(6):
         yield t, rng.standard_normal(x.size), rng.standard_normal(u.size), values
 
 
-def _finite(block: Block, point: tuple[Any, ...]) -> tuple[Array, Array] | None:
-    """Outputs and rates by Python, or None outside the block's domain."""
+def _finite(block: Block, point: Point) -> Answer | None:
+    """Outputs and rates by Python, or None outside of the block's domain."""
     t, x, u, values = point
-    with np.errstate(all="ignore"), warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        try:
-            found = tuple(
-                np.array(np.ravel(f(t, x.copy(), u.copy())), dtype=float)
-                for f in (block.output(values), block.update(values))
-            )
-        except (ArithmeticError, ValueError, np.linalg.LinAlgError):
-            return None
-    return (found[0], found[1]) if all(np.isfinite(values).all() for values in found) else None
+
+    def answer() -> Answer | None:
+        output, update = (
+            _real(function(t, x.copy(), u.copy())) for function in (block.output(values), block.update(values))
+        )
+        return (output, update) if np.isfinite(output).all() and np.isfinite(update).all() else None
+
+    return tried(answer, None)
 
 
-def _trace(block: Block, values: dict[str, Any], symbols: tuple[str, ...], as_objects: bool) -> Trace:
+def _real(values: Any) -> Array:
+    found = np.ravel(values)
+    if found.dtype.kind == "c":
+        raise TypeError("values must be real")
+    return np.array(found, dtype=float)
+
+
+def _trace(block: Block, values: dict[str, Any], symbols: tuple[str, ...]) -> Trace:
     nx, nu = block.system.nstates or 0, block.system.ninputs or 0
     t, x, u, p = (ca.SX.sym(name, n) for name, n in (("t", 1), ("x", nx), ("u", nu), ("p", len(symbols))))
-    given = {**values, **{key: p[k] for k, key in enumerate(symbols)}}
-    state, fed = (_objects(x), _objects(u)) if as_objects else (x, u)
+    given = {**values, **{key: Symbol(p[k]) for k, key in enumerate(symbols)}}
     functions = []
-    for name, function, count in (
+    parts: tuple[tuple[str, Callable[..., Any], int], ...] = (
         ("output", block.output(given), block.system.noutputs),
         ("update", block.update(given), nx),
-    ):
-        column = _column(function(t, state, fed)) if count else ca.SX(0, 1)
+    )
+    for name, function, count in parts:
+        column = column_of(function(Symbol(t), symbol_array(x), symbol_array(u))) if count else ca.SX(0, 1)
         if column.numel() != count:
             raise ValueError(f"{column.numel()} values for {count}")
         functions.append(ca.Function(name, [t, x, u, p], [ca.densify(column)]))
     return Trace(functions[0], functions[1], symbols)
 
 
-def _objects(column: Any) -> Any:
-    """Symbols as a numpy array of objects, which takes whatever numpy takes."""
-    out = np.empty(column.numel(), dtype=object)
-    for k in range(out.size):
-        out[k] = column[k]
-    return out
-
-
-def _column(values: Any) -> Any:
-    if isinstance(values, ca.SX):
-        return ca.vec(values)
-    flat = [values] if not isinstance(values, list | tuple | np.ndarray) else list(np.ravel(np.asarray(values, object)))
-    return ca.vertcat(*[value if isinstance(value, ca.SX) else ca.SX(float(value)) for value in flat])
-
-
-def _disagreement(block: Block, trace: Trace, points: list[tuple[Any, ...]]) -> str:
-    known = [(point, expected) for point in points if (expected := _finite(block, point)) is not None]
+def _disagreement(trace: Trace, known: list[tuple[Point, Answer]]) -> str:
     if not known:
         return ""
     t, x, u = (np.array([point[k] for point, _ in known]).T.reshape(-1, len(known)) for k in range(3))

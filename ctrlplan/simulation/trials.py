@@ -4,7 +4,7 @@ A run needs to know of a block what only its functions tell: which outputs
 depend directly on which inputs, whether two calls with equal arguments give
 equal values. Such trial calls are made on copies of the functions, with copies
 of the objects that they refer to, so that a block with a memory does not
-remember them; the global random generators are left as they were.
+remember them.
 """
 
 from __future__ import annotations
@@ -13,9 +13,7 @@ import copy
 import dis
 import functools
 import inspect
-import random
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
 from types import BuiltinFunctionType, CellType, CodeType, FunctionType, MethodType, ModuleType
 from typing import Any
 
@@ -23,6 +21,7 @@ import control as ct
 import numpy as np
 from numpy.typing import NDArray
 
+from ctrlplan.simulation.untouched import tried
 from ctrlplan.traits import declare, traits_of
 
 Array = NDArray[np.float64]
@@ -93,30 +92,9 @@ def can_remember(system: Any) -> bool:
     return any(function is not None and _has_memory(function, set(), _DEPTH) for function in functions)
 
 
-def tried(function: Callable[..., Any], *arguments: Any) -> Array | None:
-    """Values of a trial call as an array (n,); None where the arguments are outside of the function's domain.
-
-    Any exception means outside, but for KeyboardInterrupt; a call that ends the
-    program is taken for one as well.
-    """
-    try:
-        return np.array(np.ravel(function(*arguments)), dtype=float)
-    except (Exception, SystemExit):
-        return None
-
-
-@contextmanager
-def trial() -> Iterator[None]:
-    """Context of trial calls: no floating-point warnings, and random generators that are found as they were."""
-    before = random.getstate(), np.random.get_state()  # noqa: NPY002 (a user's blocks may draw from it)
-    try:
-        with np.errstate(all="ignore"):
-            yield
-    finally:
-        if random.getstate() != before[0]:
-            random.setstate(before[0])
-        if not _equal(np.random.get_state(), before[1]):  # noqa: NPY002
-            np.random.set_state(before[1])  # noqa: NPY002
+def values_of(function: Callable[..., Any], *arguments: Any) -> Array | None:
+    """Values of a trial call as an array (n,); None where the arguments are outside of the function's domain."""
+    return tried(lambda: np.array(np.ravel(function(*arguments)), dtype=float), None)
 
 
 def reads(function: Callable[..., Any], position: int) -> bool:
@@ -252,9 +230,3 @@ def _names(code: CodeType) -> set[str]:
     """Global names in a function's code, and in that of functions inside it."""
     inner = (constant for constant in code.co_consts if isinstance(constant, CodeType))
     return set(code.co_names).union(*map(_names, inner))
-
-
-def _equal(first: Any, second: Any) -> bool:
-    if isinstance(first, Mapping):
-        return all(_equal(first[key], second[key]) for key in first)
-    return all(np.array_equal(a, b) for a, b in zip(first, second, strict=True))

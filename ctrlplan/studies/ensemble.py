@@ -286,8 +286,9 @@ def ensemble(
         if not any(form.reads(name, float(values[0]), start) for form in forms.values()):
             raise ValueError(f"params must be parameters of a block, got {name!r}, which none reads")
     nominal, nominal_draw = _nominal(forms, references, times, table, {"waypoints": points, **settings})
-    # Compiled for these parameters, and compared with Python, here and once.
-    _one(forms, references, times, settings, _draw(table, 0))
+    # Compiled for these parameters, and compared with Python, here: the first draw, and a random one.
+    for k in sorted({0, int(np.random.default_rng(0).integers(count))}):
+        _one(forms, references, times, settings, _draw(table, k))
     try:
         light: Any = {name: form.detached(table) for name, form in forms.items()}
     except TypeError as error:

@@ -430,7 +430,7 @@ def test_a_choice_stands_for_its_alpha():
 
 
 @pytest.mark.slow
-@settings(deadline=None, max_examples=8)
+@settings(max_examples=8)
 @given(
     size=st.floats(1e-6, 1e6),
     duration=st.floats(1e-6, 1e6),

@@ -160,7 +160,7 @@ things = st.one_of(
 )
 
 
-@settings(deadline=None, max_examples=10)
+@settings(max_examples=10)
 @given(
     st.sampled_from(["polynomial", "trigonometric", "piecewise"]),
     st.lists(st.tuples(st.floats(0.0, 20.0), st.floats(5.0, 12.0)), min_size=2, max_size=4),

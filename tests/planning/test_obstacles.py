@@ -112,7 +112,7 @@ obstacles = st.one_of(
 )
 
 
-@settings(deadline=None, max_examples=300)
+@settings(max_examples=300)
 @given(obstacles, pairs, pairs, pairs, pairs)
 def test_no_greater_move_of_an_end_moves_the_distance_more(thing, p, q, a, b):
     moved = abs(thing.segment_distance(p, q) - thing.segment_distance(a, b))
@@ -120,13 +120,13 @@ def test_no_greater_move_of_an_end_moves_the_distance_more(thing, p, q, a, b):
     assert abs(thing.distance(p) - thing.distance(a)) <= math.dist(p, a) + 1e-12
 
 
-@settings(deadline=None, max_examples=200)
+@settings(max_examples=200)
 @given(obstacles, pairs, pairs, st.floats(0.0, 1.0))
 def test_no_point_of_a_segment_is_nearer(thing, p, q, share):
     assert thing.segment_distance(p, q) <= thing.distance(p + share * (q - p)) + 1e-12
 
 
-@settings(deadline=None, max_examples=100)
+@settings(max_examples=100)
 @given(obstacles, st.floats(0.0, 5.0))
 def test_corners_keep_the_margin_and_not_much_more(thing, margin):
     corners = thing.corners(margin)

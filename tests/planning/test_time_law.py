@@ -227,7 +227,7 @@ def test_the_plan_is_saved_with_its_clock(tmp_path):
 
 
 @pytest.mark.slow
-@settings(deadline=None, max_examples=5)
+@settings(max_examples=5)
 @given(size=st.floats(1e-3, 1e3), duration=st.floats(1e-3, 1e3), start=st.sampled_from([0.0, -50.0, 100.0]))
 def test_neither_units_nor_clock_change_what_is_fastest(size, duration, start):
     plan = (size * move("quintic")).retime(duration).shift(start)

@@ -285,7 +285,7 @@ def close(found, other):
     assert np.abs(found.states - other.states).max() <= SMALL * scale
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(runs(), st.floats(-3, 3))
 def test_responses_superpose(run, factor):
     system, plan, t, initial = run
@@ -298,7 +298,7 @@ def test_responses_superpose(run, factor):
     )
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(runs(), st.data())
 def test_a_run_can_be_taken_up_at_any_sample(run, data):
     system, plan, t, initial = run
@@ -310,7 +310,7 @@ def test_a_run_can_be_taken_up_at_any_sample(run, data):
     assert np.abs(rest.states[:, 0] - whole.states[:, k]).max() == 0.0
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(runs(), st.integers(0, 3))
 def test_a_sample_does_not_depend_on_the_others(run, seed):
     system, plan, t, initial = run
@@ -322,7 +322,7 @@ def test_a_sample_does_not_depend_on_the_others(run, seed):
     assert np.abs(sparse.states - dense.states[:, where]).max() <= SMALL * scale
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(runs(), st.integers(-512, 512))
 def test_the_clock_may_start_anywhere(run, eighths):
     # Times that stay exact under the shift, so that only the simulation's own rounding is left.

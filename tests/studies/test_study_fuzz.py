@@ -87,14 +87,14 @@ def refused_or_run(text):
 
 
 @pytest.mark.slow
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(mutated())
 def test_mutated_entries_are_run_or_refused(data):
     refused_or_run(to_toml(data))
 
 
 @pytest.mark.slow
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(st.data())
 def test_mutated_text_is_run_or_refused(data):
     text = to_toml(valid() | {"samples": 41})
@@ -107,7 +107,7 @@ def test_mutated_text_is_run_or_refused(data):
     refused_or_run(text)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(mutated(), st.sampled_from(["csv", "json"]))
 def test_the_command_ends_with_a_file_or_with_status_2(data, suffix):
     with TemporaryDirectory() as folder:

@@ -117,7 +117,7 @@ INPUTS = st.tuples(st.floats(-3e4, 3e4), st.floats(-3e3, 1e3))
 
 
 @given(STATES, INPUTS)
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 def test_with_the_rope_winding_motion_is_lagranges(lagrange, state, inputs):
     crane = Crane(**ODD, rope_wrap=True)
     *second, tension = crane.accelerations(state, *inputs)
@@ -128,7 +128,7 @@ def test_with_the_rope_winding_motion_is_lagranges(lagrange, state, inputs):
 
 @BOTH
 @given(STATES, INPUTS)
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 def test_accelerations_solve_the_equations_of_motion(wrap, state, inputs):
     crane = Crane(**ODD, rope_wrap=wrap)
     expected = solved(crane, state, *inputs)
@@ -207,7 +207,7 @@ JETS = st.tuples(
 
 @BOTH
 @given(JETS)
-@settings(deadline=None, max_examples=100)
+@settings(max_examples=100)
 def test_forward_after_reverse_is_the_identity(wrap, jets):
     crane = Crane(**ODD, rope_wrap=wrap)
     jet = np.array(jets).T

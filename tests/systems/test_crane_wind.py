@@ -90,7 +90,7 @@ def solved(mechanics, crane, state, inputs):
 
 @WRAPS
 @given(STATES, INPUTS)
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 def test_accelerations_and_tension_are_newtons(mechanics, wrap, state, inputs):
     """Load, trolley and drum each by itself, the constraint differentiated by sympy."""
     crane = Crane(**ODD, rope_wrap=wrap)
@@ -100,7 +100,7 @@ def test_accelerations_and_tension_are_newtons(mechanics, wrap, state, inputs):
 
 
 @given(STATES, INPUTS)
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 def test_with_the_rope_on_the_drum_they_are_lagranges(mechanics, state, inputs):
     """The wind's generalised forces are W dx/dq."""
     crane = Crane(**ODD, rope_wrap=True)

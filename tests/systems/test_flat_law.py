@@ -335,7 +335,7 @@ def test_along_a_plan_of_python_controls_own_it_puts_out_the_inputs():
         assert np.abs(law.output(0.0, np.zeros(0), np.concatenate([flag, x])) - u).max() < 1e-9
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(st.lists(st.floats(-3, 3), min_size=4, max_size=4), st.lists(st.floats(-3, 3), min_size=5, max_size=5))
 def test_the_last_derivative_is_what_the_law_asks_for(x, reference):
     # The definition, at any state and reference: y'''' = y_d'''' - sum sigma_k (y^(k) - y_d^(k)).
@@ -469,7 +469,7 @@ def test_it_can_be_traced(name):
 # The gains
 
 
-@settings(deadline=None)
+@settings()
 @given(
     st.lists(st.floats(0.01, 10), max_size=4),
     st.lists(st.tuples(st.floats(0.01, 10), st.floats(0.01, 10)), max_size=3),

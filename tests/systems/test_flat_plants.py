@@ -149,7 +149,7 @@ def test_the_motor_as_a_polynomial_in_the_derivative():
 
 
 @each_plant
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(data=st.data())
 def test_forward_after_reverse_is_the_identity(plant, data):
     entries = st.floats(-10, 10)
@@ -162,7 +162,7 @@ def test_forward_after_reverse_is_the_identity(plant, data):
 
 
 @each_plant
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(data=st.data())
 def test_reverse_after_forward_is_the_identity(plant, data):
     x, u = (

@@ -53,7 +53,7 @@ def test_the_papers_loop_tracks_its_plan_exactly(gain, alpha):
     assert np.abs(found.outputs - plan(T)).max() < 1e-12
 
 
-@settings(deadline=None)
+@settings()
 @given(st.floats(0.01, 1e4))
 def test_its_command_is_the_one_of_the_closed_form(gain):
     block = create_feedforward_iosystem(cp.plants.integrator_lag_loop(gain))
@@ -66,7 +66,7 @@ def test_without_it_the_loop_lags():
     assert np.abs(bare.outputs - plan(T)).max() > 0.3
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     st.lists(st.floats(-8.0, 2.0), max_size=3),
     st.lists(st.tuples(st.floats(-5.0, 1.0), st.floats(0.1, 5.0)), max_size=2),

@@ -317,7 +317,7 @@ def radius(order, horizon, alpha, period):
     return float(np.abs(np.linalg.eigvals(map_from_fit_to_fit(order, horizon, alpha, period))).max())
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     st.integers(0, 4),
     st.one_of(st.just(0.0), st.floats(0.1, 6.0)),
@@ -617,7 +617,7 @@ def test_no_derivative_jumps_and_each_is_that_of_the_one_before(order, alpha, ho
 
 
 @pytest.mark.slow
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     st.integers(0, 4),
     st.sampled_from([0.0, 1.0, 3.0, 5.0]),

@@ -35,7 +35,7 @@ def assert_same_bits(plan, again):
     assert again.to_dict() == plan.to_dict()
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     st.lists(st.tuples(st.floats(1e-3, 10), st.lists(number, min_size=1, max_size=3)), min_size=2, max_size=5),
     st.floats(0, 6.28),

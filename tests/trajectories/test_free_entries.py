@@ -112,7 +112,7 @@ def test_one_axis_that_is_singular_is_enough():
         PolySpline(points)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.data())
 def test_free_entries_are_met_wherever_they_are_determined(data):
     """Any mask over 3 waypoints by 3 orders that keeps the ends' positions."""

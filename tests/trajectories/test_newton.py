@@ -31,7 +31,7 @@ def plans(draw, ndigits=4):
     return points, draw(st.one_of(st.sampled_from([0.0, 1e-12, 1e-4, 1.0, np.pi]), st.floats(1e-3, 6.2)))
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(plans())
 def test_waypoints_are_met_whatever_the_plan(case):
     points, alpha = case

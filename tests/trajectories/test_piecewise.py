@@ -138,7 +138,7 @@ def test_ends_that_prescribe_less_lower_the_degree_of_their_legs():
     assert [leg.degree for leg in PiecewiseSpline(waypoints(TIMES, JETS)).legs] == [(5,)] * 3
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     st.lists(
         st.tuples(st.integers(20, 200), st.integers(-100, 100), st.booleans(), st.booleans()), min_size=3, max_size=8

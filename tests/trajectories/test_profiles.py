@@ -81,7 +81,7 @@ def test_legs_of_the_s_curve(d, v, a, j, legs):
         np.testing.assert_allclose(np.diff(plan.breakpoints), np.array(legs) / speed, rtol=4e-15)
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(SIZES, SIZES, SIZES, SIZES)
 def test_the_duration_is_that_of_the_cases(d, v, a, j):
     assume(min(v / a, a / j) > 1e-12 * (d / v + v / a + a / j))
@@ -132,7 +132,7 @@ def test_jets_are_those_of_the_integrated_acceleration(d, v, a):
     assert not plan.jet(t, 5)[3:].any()
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(ENDS, SIZES, SIZES, SIZES, CLOCKS)
 @example((0.0, 30.0), 1.0, 1.0, 1.0 + 7e-14, -7.3)  # a leg that the clock does not resolve
 @example((0.0, 2.0), 1.0 - 4e-15, 1.0, 1.0, -7.3)

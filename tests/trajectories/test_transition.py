@@ -211,7 +211,7 @@ def test_the_printed_radius():
     assert round(sampled_radius(2, 1.0, 3.3, 0.1), 3) == 0.961
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     st.integers(0, 4),
     st.one_of(st.just(0.0), st.floats(0.05, 6.0)),

@@ -1,0 +1,77 @@
+"""When, and at which states of its runs, a compiled form is compared with Python."""
+
+from __future__ import annotations
+
+import random
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctrlplan.simulation.recent import BUILDING
+
+Array = NDArray[np.float64]
+
+_FEW = 4
+"""Changes of each switch that come before the peaks of the signals."""
+
+
+class Compared:
+    """Which sides of its switches a form has been compared on, and in which run it is next.
+
+    A form is compared in its first two runs, in one random run of the next two,
+    of the next four, and so on, and wherever a run is on a new side of a switch.
+    """
+
+    def __init__(self, nswitches: int) -> None:
+        self._seen = np.zeros((3, nswitches), dtype=bool)
+        self._runs, self._next = 0, 1  # the runs so far, and the one to be compared next
+        self._chance = random.Random(0)
+
+    @property
+    def is_expected(self) -> bool:
+        """Whether the next run is to be compared, wherever it goes."""
+        return self._runs + 1 >= self._next
+
+    def is_due(self, sides: Array) -> bool:
+        """Whether to compare a run with these sides (nswitches, ntime) of its switches."""
+        reached = np.array([(sides == side).any(axis=1) for side in (-1.0, 0.0, 1.0)])
+        with BUILDING:
+            self._runs += 1
+            fresh = bool((reached & ~self._seen).any())
+            self._seen |= reached
+            if self._runs < self._next:
+                return fresh
+            first = 1 << (self._runs - 1).bit_length()
+            self._next = first + 1 + self._chance.randrange(first)
+            return True
+
+
+def telling_states(sides: Array, signals: Array, most: int) -> NDArray[np.intp]:
+    """Places of a run at which a wrong form would show, in order of time.
+
+    Parameters
+    ----------
+    sides : ndarray, shape (nswitches, ntime)
+        Signs of the switches' arguments.
+    signals : ndarray, shape (nsignals, ntime)
+        Signals and states.
+    most : int
+        Places at most.
+
+    Returns
+    -------
+    ndarray of int
+        Both sides of changes of a switch, the first of every switch before the
+        second of one; maxima and minima of signals; the rest evenly spread.
+    """
+    ntime = signals.shape[1]
+    switch, before = np.nonzero(sides[:, 1:] != sides[:, :-1])
+    rank = np.arange(switch.size) - np.searchsorted(switch, switch)
+    order = np.argsort(rank, kind="stable")
+    changes = np.column_stack([before, before + 1])[order].ravel()
+    early = 2 * int((rank < _FEW).sum())
+    peaks = np.concatenate([signals.argmax(axis=1), signals.argmin(axis=1)])
+    spread = np.linspace(0, ntime - 1, min(ntime, most)).astype(int)
+    places = np.concatenate([[0, ntime - 1], changes[:early], peaks, changes[early:], spread])
+    _, first = np.unique(places, return_index=True)
+    return np.sort(places[np.sort(first)[:most]].astype(np.intp))

@@ -1,0 +1,247 @@
+"""Trial calls of a block leave nothing behind: errors, memory, random numbers and warnings."""
+
+import random
+import sys
+import warnings
+
+import control as ct
+import numpy as np
+import pytest
+from scipy import stats
+
+import ctrlplan as cp
+
+T = np.linspace(0.0, 3.0, 31)
+
+
+def block(update, output=None, **options):
+    return ct.nlsys(update, output, **({"inputs": 0, "outputs": 1, "states": 1, "name": "tried"} | options))
+
+
+# Errors
+
+TABLE = [40.0, 25.0, 16.0, 12.0, 10.0]
+"""Ratio of each gear."""
+
+
+class OfItsOwnError(Exception):
+    pass
+
+
+def looked_up(u):
+    return TABLE[int(u) - 1] if u >= 1 else {}["no gear"]
+
+
+def exited(u):
+    return TABLE[0] if u == 1.0 else sys.exit("no such gear")
+
+
+def recursive(u):
+    return TABLE[0] if u == 1.0 else recursive(u)
+
+
+def of_its_own(u):
+    if u != 1.0:
+        raise OfItsOwnError
+    return TABLE[0]
+
+
+def imaginary(u):
+    return TABLE[0] if u == 1.0 else 1j
+
+
+@pytest.mark.parametrize("ratio", [looked_up, exited, recursive, of_its_own, imaginary], ids=lambda f: f.__name__)
+def test_arguments_outside_of_a_domain(ratio):
+    """x' = -x ratio(gear)/40 with the gear 1 at all times of the run."""
+    system = block(lambda t, x, u, p: [-x[0] * ratio(u[0]) / 40.0], inputs="gear", params={"unused": 1.0})
+    found = cp.simulate(system, T, 1.0, 1.0)
+    assert found.method == "python"
+    assert "block tried" in found.reason
+    assert np.abs(found.states[0] - np.exp(-T)).max() <= 1e-6
+
+
+def test_an_exit_in_a_run_reaches_the_caller():
+    system = block(lambda t, x, u, p: [1.0 if t < 1.0 else sys.exit("the end")])
+    with pytest.raises(SystemExit, match="the end"):
+        cp.simulate(system, T, None, 0.0)
+
+
+def test_an_interruption_of_a_trial_reaches_the_caller():
+    def update(t, x, u, p):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        cp.simulate(block(update), T, None, 0.0)
+
+
+# Memory
+
+
+def relay_in_a_closure():
+    on = 1.0
+
+    def force(x):
+        nonlocal on
+        on = 1.0 if x < 0.2 else (0.0 if x > 0.8 else on)
+        return on
+
+    return force
+
+
+def relay_in_a_dictionary():
+    memory = {"on": 1.0}
+
+    def force(x):
+        memory["on"] = 1.0 if x < 0.2 else (0.0 if x > 0.8 else memory["on"])
+        return memory["on"]
+
+    return force
+
+
+def relay_that_traces():
+    """Written so that a symbol passes through, too."""
+    memory = np.ones(1, dtype=object)
+
+    def force(x):
+        memory[0] = np.where(x < 0.2, 1.0, np.where(x > 0.8, 0.0, memory[0]))
+        return memory[0]
+
+    return force
+
+
+class Relay:
+    def __init__(self):
+        self.on = 1.0
+
+    def force(self, x):
+        self.on = 1.0 if x < 0.2 else (0.0 if x > 0.8 else self.on)
+        return self.on
+
+
+def relay_in_an_object():
+    return Relay().force
+
+
+def relay_in_a_list():
+    states = [1.0]
+
+    def force(x):
+        states.append(1.0 if x < 0.2 else (0.0 if x > 0.8 else states[-1]))
+        return states[-1]
+
+    return force
+
+
+def relay_in_a_default():
+    def force(x, memory={"on": 1.0}):  # noqa: B006
+        memory["on"] = 1.0 if x < 0.2 else (0.0 if x > 0.8 else memory["on"])
+        return memory["on"]
+
+    return force
+
+
+RELAYS = [relay for name, relay in sorted(globals().items()) if name.startswith("relay_")]
+
+
+@pytest.mark.parametrize("relay", RELAYS, ids=lambda relay: relay.__name__)
+def test_a_form_is_not_made_of_a_block_with_memory(relay):
+    """A relay between its thresholds is on at the start of the run, whatever trial states lie beyond them."""
+    force = relay()
+    system = block(lambda t, x, u, p: [2.0 * force(x[0]) - x[0]])
+    with pytest.raises(ValueError, match="block tried"):
+        cp.simulate(system, T, None, 0.5, method="compiled")
+    assert force(0.5) == 1.0
+    found = cp.simulate(system, np.linspace(0.0, 0.2, 5), None, 0.5)
+    assert found.method == "python"
+    # It heats from 0.5 towards 2 and is switched off after ln(1.5/1.2) = 0.22 s.
+    assert np.abs(found.states[0] - (2.0 - 1.5 * np.exp(-found.time))).max() <= 1e-6
+
+
+def test_a_switch_of_memory_that_no_trial_reaches():
+    """An object array keeps what was once beyond 1000: found by what is stored, not by what it gives."""
+    memory = np.zeros(1, dtype=object)
+
+    def update(t, x, u, p):
+        memory[0] = np.where(x[0] > 1000.0, 1.0, memory[0])
+        return [100.0 - 200.0 * memory[0]]
+
+    found = cp.simulate(block(update), np.linspace(0.0, 15.0, 16), None, 0.0, rtol=1e-6)
+    assert found.method == "python"
+    assert "has memory" in found.reason
+
+
+@pytest.mark.parametrize("call", ["simulate", "unread"])
+def test_a_counter_counts_the_run_alone(call):
+    """With and without a parameter to be looked for, a block is called as often."""
+    counts = []
+    for params in (None, {"unread": 1.0} if call == "unread" else {"k": 1.0}):
+        calls = []
+
+        def update(t, x, u, p, calls=calls):
+            calls.append(t)
+            return [-x[0]]
+
+        system = block(update, params={"k": 1.0} if call == "simulate" else {})
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            assert cp.simulate(system, T, None, 1.0, params=params).method == "python"
+        counts.append(len(calls))
+    assert counts[0] == counts[1] > 0
+
+
+def test_a_block_with_two_values_for_equal_arguments_is_named():
+    system = block(lambda t, x, u, p: [-x[0]], lambda t, x, u, p: [x[0] + 1e-9 * stats.norm.rvs()])
+    found = cp.simulate(system, T, None, 1.0)
+    assert found.method == "python"
+    assert found.reason == "block tried returns different values for equal arguments: it is random or has memory"
+
+
+# Random numbers and warnings
+
+
+def test_global_random_generators_are_found_as_they_were():
+    """Trials of a block whose function draws through a library: the next numbers are those without it."""
+    from ctrlplan.simulation.network import Block
+    from ctrlplan.simulation.traced import NotTraceableError, traced
+
+    def update(t, x, u, p):
+        return [-x[0] + 1e-9 * stats.norm.rvs()]
+
+    system = block(update)
+    np.random.seed(5)  # noqa: NPY002
+    random.seed(5)
+    expected = np.random.normal(size=3).tolist(), random.random()  # noqa: NPY002
+    np.random.seed(5)  # noqa: NPY002
+    random.seed(5)
+    with pytest.raises(NotTraceableError, match="returns different values"):
+        traced(Block(system, dict(system.params)), {}, 0.0, np.ones(1), np.zeros(0))
+    assert (np.random.normal(size=3).tolist(), random.random()) == expected  # noqa: NPY002
+
+
+def test_warnings_of_trials_do_not_show_and_filters_stay():
+    def output(t, x, u, p):
+        if float(np.abs(x[0])) > 1.5:
+            warnings.warn("far out", stacklevel=1)
+        return [np.sqrt(x[0])]
+
+    before = list(warnings.filters)
+    with np.errstate(all="raise"):
+        found = cp.simulate(block(lambda t, x, u, p: [-x[0]], output), T, None, 1.0)
+    assert found.method == "python"
+    assert np.abs(found.outputs[0] - np.exp(-T / 2)).max() <= 1e-6
+    assert warnings.filters == before
+
+
+def test_a_parameter_of_a_block_that_must_not_be_called():
+    """Its code shows what it reads."""
+    generator = np.random.default_rng(0)
+
+    def update(t, x, u, p):
+        return [-p.get("k", 1.0) * x[0] + 0.0 * generator.normal()]
+
+    with pytest.warns(UserWarning, match="'gain' is read by no block"):
+        cp.simulate(block(update), T, None, 1.0, params={"gain": 2.0})
+    state = generator.bit_generator.state
+    assert cp.prepare(block(update)).reads("k", 2.0)
+    assert not cp.prepare(block(update)).reads("gain", 2.0)
+    assert generator.bit_generator.state == state
