@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import re
+import signal
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import casadi as ca
@@ -17,6 +19,7 @@ from ctrlplan.simulation.drives import Series
 from ctrlplan.simulation.interpreted import SolverError
 from ctrlplan.simulation.network import Block, Network, Step, known_feedthrough
 from ctrlplan.simulation.recent import recent
+from ctrlplan.simulation.scales import Scales
 from ctrlplan.simulation.switches import switch_arguments
 from ctrlplan.simulation.traced import NotTraceableError, Trace, agrees
 
@@ -45,7 +48,7 @@ _FAILURES = {
 _STIFF = 3000.0
 """Times that the fastest motion could die out within a leg, above which BDF takes fewer steps than Adams."""
 
-_SAFETY = 0.1
+_SAFETY = 0.01
 """CVODES controls the error of a step by tolerances this much below those asked for: errors add up over a run."""
 
 
@@ -140,7 +143,7 @@ class Compiled:
         def made() -> Any:
             options = {
                 "linear_multistep_method": "bdf" if stiff else "adams",
-                "reltol": max(_SAFETY * rtol, 1e-14),
+                "reltol": rtol,
                 "abstol": atol * _SAFETY,
                 "max_num_steps": max_steps,
                 "show_eval_warnings": False,
@@ -156,11 +159,12 @@ class Compiled:
         return _called(at_all, (t, x, driven, np.repeat(p[:, None], t.size, axis=1)), function.numel_out(0))
 
     def _leg_equations(self, width: int) -> dict[str, Any]:
-        """Equations in s from 0 to 1, the driven signals as Chebyshev series of some width."""
+        """Equations of scaled states in s from 0 to 1, the functions of time as Chebyshev series of some width."""
         if width not in self._equations:
             nx, nd, np_ = (self._rates.numel_in(k) for k in (1, 2, 3))
-            shapes = {"s": (1,), "x": (nx,), "p": (np_,), "c": (nd, width), "bounds": (nd, 2), "span": (4,)}
-            s, x, p, c, bounds, span = (ca.SX.sym(name, *shape) for name, shape in shapes.items())
+            shapes = {"s": (1,), "z": (nx,), "p": (np_,), "c": (nd, width), "bounds": (nd, 2)}
+            shapes |= {"span": (4,), "shift": (nx,), "scale": (nx,)}
+            s, z, p, c, bounds, span, shift, scale = (ca.SX.sym(name, *shape) for name, shape in shapes.items())
             left, length, first, last = (span[k] for k in range(4))
             t = left + s * length
             driven = _series(c, (2.0 * t - first - last) / (last - first))
@@ -169,9 +173,9 @@ class Compiled:
                 driven = ca.if_else(driven > bounds[:, 1], bounds[:, 1], driven)
             self._equations[width] = {
                 "t": s,
-                "x": x,
-                "p": ca.vertcat(p, ca.vec(c), ca.vec(bounds), span),
-                "ode": length * self._rates(t, x, driven, p),
+                "x": z,
+                "p": ca.vertcat(p, ca.vec(c), ca.vec(bounds), span, shift, scale),
+                "ode": length * self._rates(t, shift + scale * z, driven, p) / scale,
             }
         return self._equations[width]
 
@@ -192,10 +196,11 @@ class CompiledSolver:
     """
 
     def __init__(
-        self, equations: Compiled, params: Mapping[str, Any], rtol: float, atol: float, max_steps: int = 20_000
+        self, equations: Compiled, params: Mapping[str, Any], rtol: float, scales: Scales, max_steps: int = 20_000
     ) -> None:
         self._equations, self._p = equations, equations.parameters(params)
-        self._options = rtol, atol, max_steps
+        self._scales, self._max_steps = scales, max_steps
+        self.rtol = max(_SAFETY * rtol, 1e-14)
         self._longest, self._stiff = 0.0, False
         self.evaluations = 0
         self._report = self._count if equations.compared.is_expected else None
@@ -208,14 +213,18 @@ class CompiledSolver:
         """Outputs (noutputs, ntime) of the whole."""
         return self._equations.outputs(times, states, driven, self._p)
 
+    def rates(self, times: Array, states: Array, driven: Array) -> Array:
+        """Rates (nstates, ntime) of the states."""
+        return self._equations.rates(times, states, driven, self._p)
+
     def at_edge(self, times: Array, states: Array, driven: Array) -> bool:
         """Whether equations are undefined within the tolerances of states found.
 
         There CVODES may stay for ever on a solution that has ended: a Newton
         step beside an infinite slope is as small as it likes.
         """
-        rtol, atol, _ = self._options
-        reach = rtol * np.abs(states) + atol
+        scales = self._scales
+        reach = (self.rtol * np.abs(states) + (scales.atol * scales.scale)[:, None]) / _SAFETY
         return not all(
             np.isfinite(self._equations.rates(times, near, driven, self._p)).all()
             for near in (states - reach, states, states + reach)
@@ -234,15 +243,19 @@ class CompiledSolver:
             self._longest, self._stiff = right - left, decay * (right - left) > _STIFF
         width = series.coefficients.shape[1]
         span = [left, right - left, series.left, series.right]
-        p = np.concatenate([self._p, series.coefficients.ravel(order="F"), series.low, series.high, span])
-        rtol, atol, max_steps = self._options
+        scales, max_steps = self._scales, self._max_steps
+        known = [series.coefficients.ravel(order="F"), series.low, series.high, span, scales.shift, scales.scale]
+        p = np.concatenate([self._p, *known])
+        start = (state - scales.shift) / scales.scale
         # A solution that explodes takes all the steps it may: few at first, then more, between outputs close together.
         close = np.union1d(relative, np.linspace(0.0, 1.0, _CLOSE)[1:])
         for outputs, allowed in ((relative, min(_FEW_STEPS, max_steps)), (close, max_steps)):
-            integrator = self._equations.integrator(width, outputs, self._stiff, rtol, atol, allowed)
+            integrator = self._equations.integrator(width, outputs, self._stiff, self.rtol, scales.atol, allowed)
             try:
-                found = _called(integrator, (state, np.empty(0), p), state.size, self._report)
-                return found[:, np.searchsorted(outputs, relative)]
+                with _passing_interruptions():
+                    found = _called(integrator, (start, np.empty(0), p), state.size, self._report)
+                wanted = found[:, np.searchsorted(outputs, relative)]
+                return scales.shift[:, None] + scales.scale[:, None] * wanted
             except RuntimeError as error:
                 code = re.search(r"CV_\w+", str(error))
                 why = _FAILURES.get(code.group() if code else "", "its equations could not be evaluated")
@@ -252,6 +265,44 @@ class CompiledSolver:
 
     def _count(self, stats: dict[str, Any]) -> None:
         self.evaluations += int(stats.get("nfevals", 0))
+
+
+@contextmanager
+def _passing_interruptions() -> Iterator[None]:
+    """Let what signal handlers raise reach the caller, Ctrl-C among it.
+
+    CVODES takes an exception that a handler raises while it runs for a failure
+    of the equations. Handlers run in the main thread alone, so there they are
+    accompanied; they are found as they were.
+    """
+    raised: list[BaseException] = []
+    handlers: dict[int, Any] = {}
+
+    def accompanied(number: int, frame: Any) -> None:
+        try:
+            handlers[number](number, frame)
+        except BaseException as error:
+            raised.append(error)
+            raise
+
+    if threading.current_thread() is threading.main_thread():
+        for number in signal.valid_signals():
+            handler = signal.getsignal(number)
+            if callable(handler):
+                handlers[number] = handler
+                signal.signal(number, accompanied)
+    try:
+        yield
+    except RuntimeError:
+        if raised:
+            raise raised[0] from None
+        raise
+    finally:
+        for number, handler in handlers.items():
+            if signal.getsignal(number) is accompanied:
+                signal.signal(number, handler)
+    if raised:
+        raise raised[0]
 
 
 def _called(

@@ -16,6 +16,7 @@ stiffness limit.
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Callable, Sequence
 from functools import lru_cache
 
@@ -129,8 +130,8 @@ def sampled_states(a: Array, b: Array, samples: Array, timepts: Array, initial: 
             found = out[begin + 1 : these.stop + 1]
             found[:] = _recurrence(change[:, :, : scale.size], forced, out[begin])
             for k in range(_first_overflow(found.T), len(found)):
-                series = drive[begin + k].reshape(2, -1)
-                found[k] = _carried(out[begin + k], series, [level[which[k]] for level in changes])
+                series, own = drive[begin + k].reshape(2, -1, 1), [level[which[k]] for level in changes]
+                found[k] = _carried(out[begin + k][:, None], series, own)[:, 0]
     return (out * scale).T
 
 
@@ -139,11 +140,12 @@ def matrix_product(left: Array, right: Array) -> Array:
 
     A signal that has left the range of numbers spoils only what depends on it.
     """
-    product: Array = left @ right
-    if np.isfinite(product).all():
-        return product
-    lost, gone = ~np.isfinite(left), ~np.isfinite(right)
-    product = np.where(lost, 0.0, left) @ np.where(gone, 0.0, right)
+    with np.errstate(over="ignore", invalid="ignore"):
+        product: Array = left @ right
+        if np.isfinite(product).all():
+            return product
+        lost, gone = ~np.isfinite(left), ~np.isfinite(right)
+        product = np.where(lost, 0.0, left) @ np.where(gone, 0.0, right)
     votes = np.where(lost, np.sign(left), 0.0) @ np.sign(right) + np.sign(left) @ np.where(gone, np.sign(right), 0.0)
     touched = lost.astype(float) @ (right != 0.0) + (left != 0.0) @ gone.astype(float) > 0.0
     product[touched] = np.copysign(np.inf, votes[touched])
@@ -153,7 +155,10 @@ def matrix_product(left: Array, right: Array) -> Array:
 
 def state_scale(a: Array) -> Array:
     """Scale (nstates,) in which rows and columns of a system's matrix are of one size, powers of two."""
-    scale: Array = matrix_balance(a, permute=False, separate=True)[1][0] if a.size else np.ones(0)
+    if not a.size:
+        return np.ones(0)
+    with np.errstate(invalid="ignore"):  # scipy reads a scale as an index as well, which it does not use
+        scale: Array = matrix_balance(a, permute=False, separate=True)[1][0]
     return scale
 
 
@@ -268,23 +273,25 @@ def _any_leg(a: Array, b: Array, series: Array, samples: Array, state: Array) ->
     end, states = states[:, -1], states[:, :-1]
     if not samples.size:
         return np.empty((n, 0)), end
+    ending = samples >= ncells
     where = np.minimum(samples, ncells - 1.0).astype(np.intp)
-    sigma, h = samples - where, 1.0
+    sigma, h = np.where(ending, 0.0, samples - where), 1.0
     for level in range(len(changes) - 2, -1, -1):
+        if not sigma.any():
+            break
         h *= 0.5
         first, second = _halved(series)
-        change = changes[level]
-        middle = states + (change[:, :n] @ states + change[:, n:] @ first.reshape(-1, first.shape[2]))
-        for k in np.flatnonzero(~np.isfinite(middle).all(axis=0)):
-            middle[:, k] = _carried(states[:, k], first[:, :, k], changes[: level + 1])
+        middle = _carried(states, first, changes[: level + 1])
         states = np.stack([states, middle], axis=2).reshape(n, -1)
         series = np.stack([first, second], axis=3).reshape(*first.shape[:2], 2 * first.shape[2])
-        later = sigma >= 0.5  # doubling and this difference are exact, however many halvings there are
+        later = sigma >= 0.5  # doubling and this difference are exact, until nothing is left of any sample
         where, sigma = 2 * where + later, 2.0 * sigma - later
         if states.shape[1] > 4 * samples.size + 64:  # stiff: only cells with samples in them matter
             used, where = np.unique(where, return_inverse=True)
             states, series = states[:, used], series[:, :, used]
-    return _evaluated(_taylor(h * a, h * b, states, series), where, sigma), end
+    found = _evaluated(_taylor(h * a, h * b, states, series), where, sigma) if sigma.any() else states[:, where]
+    found[:, ending] = end[:, None]
+    return found, end
 
 
 def _cells(jet: Callable[[Array, int], Array], duration: float) -> tuple[int, int]:
@@ -389,7 +396,8 @@ def _marched(state: Array, changes: list[Array], series: Array) -> Array:
     for i, found in enumerate(states):
         for k in range(_first_overflow(found), ncells + 1):
             if k:
-                found[:, k] = _carried(found[:, k - 1], series[:, :, k - 1], [change[i] for change in changes])
+                before, terms = found[:, k - 1, None], series[:, :, k - 1, None]
+                found[:, k] = _carried(before, terms, [change[i] for change in changes])[:, 0]
     return states
 
 
@@ -399,23 +407,33 @@ def _first_overflow(states: Array) -> int:
     return int(lost.argmax()) if lost.any() else lost.size
 
 
-def _carried(state: Array, series: Array, changes: list[Array]) -> Array:
-    """State (n,) after the last of some changes, by shorter ones where that one is beyond the range of numbers.
+def _carried(states: Array, series: Array, changes: list[Array]) -> Array:
+    """States (n, ncells) after the last of some changes, of one system with the input's terms in each cell.
 
-    What is zero, or does not depend on what has overflowed, is not touched by it.
+    Where that change is beyond the range of numbers, by shorter ones: what is
+    zero, or does not depend on what has overflowed, is not touched by it.
     """
-    n, todo = state.size, [(len(changes) - 1, series[:, :, None])]
-    while todo:
-        level, terms = todo.pop()
-        known = np.concatenate([state, terms.ravel()])
-        used = np.isfinite(known) & (known != 0.0)
-        if level and not np.isfinite(changes[level][np.isfinite(state)][:, used]).all():
-            first, second = _halved(terms)
-            todo += [(level - 1, second), (level - 1, first)]
-            continue
-        state = state + matrix_product(changes[level], known[:, None])[:n, 0]
-        state[np.isnan(state)] = np.inf
-    return state
+    change = changes[-1]
+    known = np.concatenate([states, series.reshape(-1, series.shape[2])])
+    after: Array = states + matrix_product(change, known)
+    if np.isfinite(after).all():
+        return after
+    after = np.where(np.isinf(states), states, np.where(np.isnan(after), np.inf, after))
+    used = np.isfinite(known) & (known != 0.0)
+    grown = np.isfinite(states) & ((~np.isfinite(change)).astype(float) @ used > 0.0)
+    cells = grown.any(axis=0)
+    if not cells.any():
+        return after
+    last, grown, series = len(changes) - 1, grown[:, cells], series[:, :, cells]
+    level = bisect_left(range(last), True, key=lambda k: not np.isfinite(changes[k]).all()) - 1
+    halves = 0.5 ** np.arange(len(series))[:, None, None]
+    now = _carried(states[:, cells], series * halves ** (last - level), changes[: level + 1])
+    while level < last and np.isfinite(now[grown]).any():
+        _, second = _halved(series * halves ** (last - level - 1))
+        now = _carried(now, second, changes[: level + 1])
+        level += 1
+    after[:, cells] = now if level == last else np.where(grown, now, after[:, cells])
+    return after
 
 
 def _recurrence(change: Array, forced: Array, state: Array) -> Array:
@@ -473,7 +491,8 @@ def _evaluated(terms: list[Array], where: NDArray[np.intp], sigma: Array) -> Arr
         out *= sigma
         out += np.take(term, where, axis=1, out=gathered, mode="clip")
     if not np.isfinite(out).all():
-        out[np.isnan(out)] = np.inf
+        starts = np.take(terms[0], where, axis=1)
+        out = np.where(np.isinf(starts), starts, np.where(np.isnan(out), np.inf, out))
     return out
 
 

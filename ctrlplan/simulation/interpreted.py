@@ -22,6 +22,7 @@ from ctrlplan.simulation.network import (
     sampled_feedthrough,
     tried_feedthrough,
 )
+from ctrlplan.simulation.scales import Scales
 from ctrlplan.simulation.trials import can_remember, trial_copy, values_of
 from ctrlplan.simulation.untouched import untouched
 
@@ -30,7 +31,7 @@ Array = NDArray[np.float64]
 Call = Callable[[float, Array, Array], None]
 """(t, state of the network, its signals): puts a block's outputs among the signals."""
 
-_SAFETY = 0.25
+_SAFETY = 0.02
 """LSODA controls the error of a step by tolerances this much below those asked for: errors add up over a run."""
 
 _CALLS = 5000
@@ -264,13 +265,10 @@ class Interpreted:
 class InterpretedSolver:
     """LSODA on a network's equations, leg by leg."""
 
-    def __init__(self, equations: Interpreted, rtol: float, atol: float) -> None:
-        self._equations = equations
-        self._options: dict[str, Any] = {
-            "method": "LSODA",
-            "rtol": max(_SAFETY * rtol, 2.3e-14),
-            "atol": _SAFETY * atol,
-        }
+    def __init__(self, equations: Interpreted, rtol: float, scales: Scales) -> None:
+        self._equations, self._scales = equations, scales
+        self.rtol = max(_SAFETY * rtol, 2.3e-14)
+        self._options: dict[str, Any] = {"method": "LSODA", "rtol": self.rtol, "atol": _SAFETY * scales.atol}
 
     def signals(self, times: Array, states: Array, driven: Array) -> Array:
         """All signals (nsignals, ntime) of the network."""
@@ -280,20 +278,24 @@ class InterpretedSolver:
         """Outputs (noutputs, ntime) of the whole."""
         return self._equations.network.put_out(self.signals(times, states, driven))
 
+    def rates(self, times: Array, states: Array, driven: Array) -> Array:
+        """Rates (nstates, ntime) of the states."""
+        rows = [self._equations.rates(t, states[:, k], driven[:, k]) for k, t in enumerate(times.tolist())]
+        return np.array(rows).T.reshape(-1, times.size)
+
     def advance(self, series: Series, left: float, grid: Array, state: Array) -> Array:
-        """States (nstates, ngrid) at times of a leg, of which the last is its end."""
+        """States (nstates, ngrid) at times of a segment, of which the last is its end."""
         right = float(grid[-1])
         if not state.size:
             return np.zeros((0, grid.size))
-        equations = self._equations
-
-        rates = _Advancing(lambda t, x: equations.rates(t, x, series(t)), left, right)
-        found = solve_ivp(rates, (left, right), state, t_eval=grid, **self._options)
+        equations, shift, scale = self._equations, self._scales.shift, self._scales.scale
+        rates = _Advancing(lambda t, z: equations.rates(t, shift + scale * z, series(t)) / scale, left, right)
+        found = solve_ivp(rates, (left, right), (state - shift) / scale, t_eval=grid, **self._options)
         if not found.success:
             raise rates.ended(f"{found.message} Equations that jump, as by floor or sign, may chatter there")
         if not np.isfinite(found.y).all():
             raise rates.ended("a state is infinite beyond")
-        return np.asarray(found.y)
+        return np.asarray(shift[:, None] + scale[:, None] * found.y)
 
 
 class _named:  # noqa: N801 (a context, of which a run opens thousands)

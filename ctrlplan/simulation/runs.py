@@ -3,50 +3,27 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
-from contextlib import suppress
-from dataclasses import dataclass, replace
-from functools import partial
-from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ctrlplan.simulation.budget import check
-from ctrlplan.simulation.compared import telling_states
-from ctrlplan.simulation.drives import Drive, PlanDrive, SampledDrive, breakpoints_of, driven_signals
-from ctrlplan.simulation.events import Event, Snapshot, Watched, watched_events
+from ctrlplan.simulation.drives import PlanDrive, SampledDrive, breakpoints_of, driven_signals
+from ctrlplan.simulation.events import Snapshot
 from ctrlplan.simulation.exact import exact_states, sampled_states
-from ctrlplan.simulation.interpreted import Interpreted, InterpretedSolver, SolverError
-from ctrlplan.simulation.legs import Run, integrate
+from ctrlplan.simulation.interpreted import Interpreted, SolverError
+from ctrlplan.simulation.job import Job, Record, unused, with_looks
 from ctrlplan.simulation.linear import LinearForm
-from ctrlplan.simulation.network import Network
-from ctrlplan.simulation.prepared import DisagreementError, NotCompiledError, Prepared
-from ctrlplan.simulation.trials import can_remember
+from ctrlplan.simulation.numerical import numerical
+from ctrlplan.simulation.prepared import DisagreementError, NotCompiledError
 
 if TYPE_CHECKING:
-    from ctrlplan.simulation.compiled import Compiled, CompiledSolver
+    pass
 
 Array = NDArray[np.float64]
 
 METHODS = ("auto", "exact", "compiled", "python")
-
-_LOOKS = 400, 20_000
-"""Times at least and at most, beside those asked for, at which the signals of events are looked at."""
-
-_LOOKS_A_TURN = 16
-"""Such times in a turn of the fastest oscillation about the state where a run begins."""
-
-_VISITED = 12
-"""Visited states at which equations must be defined; and of a comparison where evaluations were not counted."""
-
-_SHARE = 5
-"""A compiled form is compared with Python at states a fifth as many as the run's evaluations of its equations."""
-
-_CLOSE, _STRETCHES, _BETWEEN = 400, 8, 60
-"""A run with fewer times is followed once more, in some stretches with so many times each, to see where it switches."""
-
 
 _LOST = 1e-6
 """Part of an output's size from which on a doubt about it is said."""
@@ -56,72 +33,6 @@ _MOST_STEPS = 1e8
 
 _OFF_CLOCK = 1e-4
 """Part of a sampling time by which a time may miss an instant, besides rounding of the times."""
-
-
-@dataclass(frozen=True, eq=False)
-class Job:
-    """What one call of `simulate` asks for."""
-
-    prepared: Prepared
-    times: Array
-    inputs: list[Drive]
-    state: Array
-    params: dict[str, Any]
-    tolerances: tuple[float, float]
-    events: Sequence[Event] | None
-    network: Network | None
-
-    @property
-    def first(self) -> float:
-        """Where the run begins [s]."""
-        return float(self.times[0])
-
-    def watched(self) -> tuple[Watched, ...]:
-        """Events asked for, and unless none are wanted those that blocks declare."""
-        prepared = self.prepared
-        # An output hides an input or a state of the same name.
-        kinds = (("u", prepared.input_labels), ("x", prepared.state_labels), ("y", prepared.output_labels))
-        labels = {label: (kind, row) for kind, names in kinds for row, label in enumerate(names)}
-        asked = watched_events(self.events or (), labels)
-        if self.events is not None and not self.events:
-            return ()
-        known = prepared.network.watched if prepared.network is not None else ()
-        declared = [
-            Watched(w.name, partial(_of_block, w.function, w.states, w.fed, {**w.params, **self.params}), w.low, w.high)
-            for w in known
-        ]
-        return (*declared, *asked)
-
-
-@dataclass(frozen=True, eq=False)
-class Record:
-    """States at the times of a run, and how to see more of it.
-
-    Attributes
-    ----------
-    times, states : ndarray, shapes (ntime,) and (nstates, ntime)
-        As far as the run went.
-    see : callable
-        Maps times and states to all signals.
-    carry : callable
-        Maps k and a time between times[k] and the next to the state there.
-    watched : tuple of Watched
-        Signals whose limits count as events.
-    method, reason : str
-        What ran, and why.
-    """
-
-    times: Array
-    states: Array
-    see: Callable[[Array, Array], Snapshot]
-    carry: Callable[[int, float], Array]
-    watched: tuple[Watched, ...]
-    method: str
-    reason: str
-
-    def state_at(self, k: int, t: float) -> Array:
-        """State at a time from times[k] to the next."""
-        return self.carry(k, t) if t > self.times[k] else self.states[:, k]
 
 
 def recorded(job: Job, method: str) -> Record:
@@ -144,31 +55,23 @@ def recorded(job: Job, method: str) -> Record:
             raise ValueError(f'method "compiled" must be given a continuous system, got dt = {prepared.dt}')
         return _discrete(job, reason)
     if method == "python":
-        return _numerical(job, "python", 'method "python" was asked for')
+        return numerical(job, "python", 'method "python" was asked for')
     reason = reason or 'method "compiled" was asked for'
-    again = _unused(job)
+    again = unused(job)
     try:
         try:
-            return _numerical(job, "compiled", reason)
+            return numerical(job, "compiled", reason)
         except DisagreementError:  # what a function refers to may have changed since it was traced
-            job, again = again, _unused(again)
-            return _numerical(job, "compiled", reason)
+            job, again = again, unused(again)
+            return numerical(job, "compiled", reason)
     except NotCompiledError as error:
         if method == "compiled":
             raise ValueError(f'method "compiled" must be given blocks that can be traced, but {error}') from None
-        return _numerical(again, "python", str(error))
+        return numerical(again, "python", str(error))
     except SolverError as error:
         if method == "compiled":
             raise
-        return _numerical(again, "python", f"CVODES failed: {error}")
-
-
-def _unused(job: Job) -> Job:
-    """Same job for another attempt, its sampled blocks with the memory that they have now."""
-    network = job.network
-    if network is None or not any(can_remember(network.blocks[i].system) for i in network.blocks_with("period")):
-        return job
-    return replace(job, network=network.for_trials())
+        return numerical(again, "python", f"CVODES failed: {error}")
 
 
 def _exact(job: Job, form: LinearForm) -> Record:
@@ -180,7 +83,7 @@ def _exact(job: Job, form: LinearForm) -> Record:
     )
     breakpoints = [t for plan, _ in plans for t in plan.breakpoints]
     watched = job.watched()
-    times = _with_looks(job.times, watched, lambda: form.a)
+    times = with_looks(job.times, watched, lambda: form.a)
 
     def jet(moment: float, origin: float, s: Array, order: int) -> Array:
         rows = [plan._jet_beside(moment, origin, s, order + high) for plan, high in plans]
@@ -207,6 +110,7 @@ def _exact(job: Job, form: LinearForm) -> Record:
         driven, nearly = driven_signals(drives, times), states_at(times, job.state, form.a * (1.0 + 2.0**-50))
         floor = form.rounding(states[:, :1] if growing else states, driven)
         _warn_of_lost_digits(job, form.outputs(states, driven), form.outputs(nearly, driven), floor)
+    _warn_of_undefined(job, form, times, states)
     return Record(times, states, see, carry, watched, "exact", "linear and continuous")
 
 
@@ -229,106 +133,23 @@ def _warn_of_lost_digits(job: Job, outputs: Array, others: Array, floor: Array) 
         )
 
 
-def _numerical(job: Job, method: str, reason: str) -> Record:
-    """Leg by leg, compiled or by Python."""
-    prepared, network = job.prepared, _network(job)
-    drives = prepared.drives(job.inputs, job.first)
-    equations = Interpreted(network, job.params, (job.first, job.state), prepared.trials) if network.blocks else None
-    watched = job.watched()
-    stops = any(entry.stop for entry in watched)
-    solver: Any
-    if method == "compiled":
-        # Compiled forms are compared with Python on copies of what blocks remember.
-        known = network.for_trials()
-        tests = Interpreted(known, job.params, (job.first, job.state), prepared.trials) if network.blocks else None
-        if tests is not None:  # an algebraic loop without a solution is better named here
-            tests.signals(job.first, job.state, driven_signals(drives, job.times[:1])[:, 0])
-        form = prepared.compiled(job.params, drives, job.first, job.state)
-        from ctrlplan.simulation.compiled import CompiledSolver  # there is a form: so there is CasADi
-
-        # Beyond a stop there may be no solution: legs are short then, and must fail soon.
-        solver = CompiledSolver(form, job.params, *job.tolerances, max_steps=2_000 if stops else 20_000)
-    elif equations is not None:
-        solver = InterpretedSolver(equations, *job.tolerances)
-    else:
-        raise NotCompiledError(f"{prepared.name} came from another process without its blocks")
-
-    def see(t: Array, x: Array) -> Snapshot:
-        driven = driven_signals(drives, t)
-        y = solver.outputs(t, x, driven)
-        return Snapshot(t, x, driven[: prepared.ninputs], y, lambda: solver.signals(t, x, driven))
-
-    def carry(k: int, t: float) -> Array:
-        start = float(run.times[k])
-        return solver.advance(run.series(start), start, np.array([t]), run.states[:, k])[:, -1]
-
-    def pause(t: Array, x: Array) -> bool:
-        seen = see(t, x)
-        return any(entry.side(entry.value(seen)).any() for entry in watched if entry.stop)
-
-    def slope() -> Array:
-        if equations is None:
-            return np.zeros((0, 0))
-        driven = driven_signals(drives, job.times[:1])[:, 0]
-        return _slope(lambda x: equations.rates(job.first, x, driven), job.state)
-
-    run = integrate(
-        network,
-        equations,
-        solver,
-        drives,
-        _with_looks(job.times, watched, slope),
-        job.state,
-        resolution=10.0 * job.tolerances[0],
-        pause=pause if stops else None,
-    )
-    if method == "compiled":
-        some = np.unique(np.linspace(0, run.times.size - 1, _VISITED).astype(int))
-        t, x, driven = run.times[some], run.states[:, some], driven_signals(drives, run.times[some])
-        if solver.at_edge(t, x, driven):
-            raise SolverError(
-                f"the solver must reach {job.times[-1]:g} s, got to the edge of where equations are defined"
-            )
-        if network.blocks:
-            wrong = _disagreement(job, known, form, solver, drives, run)
-            if wrong:
-                raise prepared.distrust(form, wrong)
-    return Record(run.times, run.states, see, carry, watched, method, reason)
-
-
-def _disagreement(
-    job: Job, network: Network, form: Compiled, solver: CompiledSolver, drives: Sequence[Drive], run: Run
-) -> str:
-    """What is wrong with a compiled form at states of a run; empty where nothing, or where no comparison is due."""
-    p = form.parameters(job.params)
-    driven = driven_signals(drives, run.times)
-    if not form.compared.is_due(form.sides(run.times, run.states, driven, p)):
-        return ""
-    most = max(1, solver.evaluations // _SHARE) if solver.evaluations else _VISITED
-    t, x = _closer(run, solver)
-    driven = driven_signals(drives, t)
-    w, sides = form.signals(t, x, driven, p), form.sides(t, x, driven, p)
-    places = telling_states(sides, np.concatenate([w, x]), most)
-    # Blocks are compared at the inputs that the form computes: where each agrees, the whole does.
-    return form.disagreement(network, job.params, t[places], x[:, places], w[:, places])
-
-
-def _closer(run: Run, solver: CompiledSolver) -> tuple[Array, Array]:
-    """Times and states of a run, with more between them where they are few."""
-    times, states = [run.times], [run.states]
-    marks = np.unique(np.linspace(0, run.times.size - 1, _STRETCHES + 1).astype(int))
-    for k, following in pairwise(marks.tolist() if run.times.size < _CLOSE else []):
-        left, right = float(run.times[k]), float(run.times[following])
-        series = run.series(left)
-        right = min(right, series.right)
-        grid = np.linspace(left, right, _BETWEEN + 1)[1:]
-        with suppress(SolverError):
-            found = solver.advance(series, left, grid, run.states[:, k])
-            times.append(grid)
-            states.append(found)
-    t, x = np.concatenate(times), np.concatenate(states, axis=1)
-    order = np.argsort(t, kind="stable")
-    return t[order], x[:, order]
+def _warn_of_undefined(job: Job, form: LinearForm, times: Array, states: Array) -> None:
+    """Say which outputs are differences of states that have overflowed: they are reported as infinite."""
+    if np.isfinite(states).all():
+        return
+    up, down = (states == np.inf).astype(float), (states == -np.inf).astype(float)
+    added = (form.c > 0.0) @ up + (form.c < 0.0) @ down > 0.0
+    taken = (form.c > 0.0) @ down + (form.c < 0.0) @ up > 0.0
+    undefined = added & taken
+    if undefined.any():
+        names = ", ".join(np.array(job.prepared.output_labels)[undefined.any(axis=1)])
+        begin = times[undefined.any(axis=0).argmax()]
+        warnings.warn(
+            f"outputs {names} of {job.prepared.name} are not known from {begin:g} s on, "
+            "where states whose difference they are leave the range of numbers: given as infinite",
+            UserWarning,
+            stacklevel=5,
+        )
 
 
 def _discrete(job: Job, reason: str) -> Record:
@@ -336,7 +157,7 @@ def _discrete(job: Job, reason: str) -> Record:
 
     Each function of a block is called once a sample, so that a block may remember.
     """
-    prepared, network = job.prepared, _network(job)
+    prepared, network = job.prepared, job.blocks
     clock = _clock(job.times, prepared.dt)
     drives = prepared.drives(job.inputs, job.first)
     equations = Interpreted(network, job.params, (job.first, job.state), prepared.trials)
@@ -401,39 +222,6 @@ def _on_breakpoints(times: Array, breakpoints: Array) -> Array:
     before, following = breakpoints[after - 1], breakpoints[np.minimum(after, breakpoints.size - 1)]
     nearest = np.where(times - before < following - times, before, following)
     return np.where(np.abs(times - nearest) <= 4.0 * np.finfo(float).eps * np.abs(times).max(), nearest, times)
-
-
-def _network(job: Job) -> Network:
-    if job.network is None:
-        raise NotCompiledError(job.prepared.unsupported)
-    return job.network
-
-
-def _of_block(function: Any, states: slice, fed: Any, params: dict[str, Any], seen: Snapshot) -> Array:
-    """Signal that a block declares, from its states and inputs."""
-    return np.asarray(function(seen.t, seen.x[states], fed(seen.w), params))
-
-
-def _with_looks(times: Array, watched: Sequence[Watched], slope: Callable[[], Array]) -> Array:
-    """Times asked for, and more where events are watched, so that no crossing hides between two."""
-    if not watched:
-        return times
-    matrix = slope()
-    fastest = float(np.abs(np.linalg.eigvals(matrix).imag).max(initial=0.0)) if np.isfinite(matrix).all() else 0.0
-    turns = fastest * float(times[-1] - times[0]) / (2.0 * np.pi)
-    count = int(min(max(_LOOKS[0], _LOOKS_A_TURN * turns), _LOOKS[1]))
-    return np.union1d(times, np.linspace(times[0], times[-1], count))
-
-
-def _slope(rates: Callable[[Array], Array], state: Array) -> Array:
-    """Derivatives of rates by the states, by differences."""
-    steps = 1e-6 * (1.0 + np.abs(state))
-    with np.errstate(all="ignore"):
-        before = rates(state)
-        columns = [
-            (rates(state + step * unit) - before) / step for step, unit in zip(steps, np.eye(state.size), strict=True)
-        ]
-    return np.array(columns).T.reshape(state.size, state.size)
 
 
 def _derivatives(jet: Array, high: int, order: int) -> Array:

@@ -17,8 +17,10 @@ from ctrlplan.simulation.budget import begin_run
 from ctrlplan.simulation.drives import Inputs, driven_signals, input_drives
 from ctrlplan.simulation.events import Event, Occurrence, crossings
 from ctrlplan.simulation.interpreted import FeedthroughError
+from ctrlplan.simulation.job import Job, Record
 from ctrlplan.simulation.prepared import Prepared, prepared_form
-from ctrlplan.simulation.runs import METHODS, Job, Record, recorded
+from ctrlplan.simulation.runs import METHODS, recorded
+from ctrlplan.simulation.scales import RELATIVE
 
 Array = NDArray[np.float64]
 
@@ -38,7 +40,7 @@ def simulate(
     initial_state: ArrayLike | None = None,
     method: str = "auto",
     rtol: float = 1e-8,
-    atol: float = 1e-10,
+    atol: float | None = None,
     params: Mapping[str, Any] | None = None,
     events: Sequence[Event] | None = None,
 ) -> ct.TimeResponseData:
@@ -72,8 +74,13 @@ def simulate(
         `crane_loop` sets), and 0 where there is none.
     method : {"auto", "exact", "compiled", "python"}, optional
         "auto" takes the first of the others that can be taken; they insist.
-    rtol, atol : float, optional
-        Tolerances of a numerical solver; "exact" needs none.
+    rtol : float, optional
+        Relative tolerance of a numerical solver; "exact" needs none.
+    atol : float, optional
+        Absolute tolerance for all states. None, the default, is 1e-10 of each
+        state's own scale, its largest displacement from its start: a run in
+        which a state moves less than 1e-3, or less than a hundredth of its
+        size, is repeated in the scales that it found (four runs at most).
     params : mapping, optional
         Parameters of the blocks.
     events : sequence of Event, optional
@@ -121,6 +128,8 @@ def simulate(
         raise ValueError(f"timepts must span {_LONGEST:g} s at most, got {times[-1] - times[0]:g} s")
     for label, value in (("rtol", rtol), ("atol", atol)):
         number: Any = value
+        if value is None and label == "atol":
+            continue
         if isinstance(number, bool) or not isinstance(number, Real) or not 0.0 < float(number) < math.inf:
             raise ValueError(f"{label} must be a finite number above 0, got {value!r}")
     if method not in METHODS:
@@ -131,7 +140,7 @@ def simulate(
     _warn_of_idle(prepared, params or {})
     if prepared.dt is None and prepared.nstates:
         warnings.warn(_NO_TIMEBASE.format(prepared.name), UserWarning, stacklevel=2)
-    job = Job(prepared, times, drives, state, dict(params or {}), (rtol, atol), events, prepared.network)
+    job = Job(prepared, times, drives, state, dict(params or {}), rtol, atol, events, prepared.network)
     if prepared.network is None and prepared.linear is None and method in ("auto", "python"):
         return _delegated(job)
     try:
@@ -195,7 +204,7 @@ def _occurrences(record: Record) -> list[Occurrence]:
 
 def _delegated(job: Job) -> ct.TimeResponseData:
     """Response by python-control, of what only it runs."""
-    prepared, (rtol, atol) = job.prepared, job.tolerances
+    prepared = job.prepared
     warnings.warn(
         f"{prepared.unsupported}: run by control.input_output_response, without events", UserWarning, stacklevel=3
     )
@@ -206,7 +215,7 @@ def _delegated(job: Job) -> ct.TimeResponseData:
         job.state,
         params=job.params or None,
         solve_ivp_method="LSODA",
-        solve_ivp_kwargs={"rtol": rtol, "atol": atol},
+        solve_ivp_kwargs={"rtol": job.rtol, "atol": RELATIVE if job.atol is None else job.atol},
     )
     response.method, response.reason, response.events = "python", prepared.unsupported, []
     return response

@@ -55,6 +55,8 @@ def test_crossings_between_samples_far_apart(method):
 @pytest.mark.parametrize("name", ["rtol", "atol"])
 @pytest.mark.parametrize("value", [0.0, -1.0, np.nan, np.inf, None, "a", True])
 def test_tolerances(name, value):
+    if (name, value) == ("atol", None):
+        return  # the default: each state's own scale
     with pytest.raises(ValueError, match=rf"{name} must be a finite number above 0, got"):
         cp.simulate(cp.plants.integrator_lag_loop(5.0), T, PLAN, **{name: value})
 

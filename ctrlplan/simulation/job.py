@@ -1,0 +1,123 @@
+"""What a run is asked for, and what it leaves."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctrlplan.simulation.drives import Drive
+from ctrlplan.simulation.events import Event, Snapshot, Watched, watched_events
+from ctrlplan.simulation.network import Network
+from ctrlplan.simulation.prepared import NotCompiledError, Prepared
+from ctrlplan.simulation.trials import can_remember
+
+Array = NDArray[np.float64]
+
+_LOOKS = 400, 20_000
+"""Times at least and at most, beside those asked for, at which the signals of events are looked at."""
+
+_LOOKS_A_TURN = 16
+"""Such times in a turn of the fastest oscillation about the state where a run begins."""
+
+
+@dataclass(frozen=True, eq=False)
+class Job:
+    """What one call of `simulate` asks for."""
+
+    prepared: Prepared
+    times: Array
+    inputs: list[Drive]
+    state: Array
+    params: dict[str, Any]
+    rtol: float
+    atol: float | None
+    events: Sequence[Event] | None
+    network: Network | None
+
+    @property
+    def blocks(self) -> Network:
+        """Network that is run."""
+        if self.network is None:
+            raise NotCompiledError(self.prepared.unsupported)
+        return self.network
+
+    @property
+    def first(self) -> float:
+        """Where the run begins [s]."""
+        return float(self.times[0])
+
+    def watched(self) -> tuple[Watched, ...]:
+        """Events asked for, and unless none are wanted those that blocks declare."""
+        prepared = self.prepared
+        # An output hides an input or a state of the same name.
+        kinds = (("u", prepared.input_labels), ("x", prepared.state_labels), ("y", prepared.output_labels))
+        labels = {label: (kind, row) for kind, names in kinds for row, label in enumerate(names)}
+        asked = watched_events(self.events or (), labels)
+        if self.events is not None and not self.events:
+            return ()
+        known = prepared.network.watched if prepared.network is not None else ()
+        declared = [
+            Watched(w.name, partial(_of_block, w.function, w.states, w.fed, {**w.params, **self.params}), w.low, w.high)
+            for w in known
+        ]
+        return (*declared, *asked)
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    """States at the times of a run, and how to see more of it.
+
+    Attributes
+    ----------
+    times, states : ndarray, shapes (ntime,) and (nstates, ntime)
+        As far as the run went.
+    see : callable
+        Maps times and states to all signals.
+    carry : callable
+        Maps k and a time between times[k] and the next to the state there.
+    watched : tuple of Watched
+        Signals whose limits count as events.
+    method, reason : str
+        What ran, and why.
+    """
+
+    times: Array
+    states: Array
+    see: Callable[[Array, Array], Snapshot]
+    carry: Callable[[int, float], Array]
+    watched: tuple[Watched, ...]
+    method: str
+    reason: str
+
+    def state_at(self, k: int, t: float) -> Array:
+        """State at a time from times[k] to the next."""
+        return self.carry(k, t) if t > self.times[k] else self.states[:, k]
+
+
+def with_looks(times: Array, watched: Sequence[Watched], slope: Callable[[], Array]) -> Array:
+    """Times asked for, and more where events are watched, so that no crossing hides between two."""
+    if not watched:
+        return times
+    matrix = slope()
+    fastest = float(np.abs(np.linalg.eigvals(matrix).imag).max(initial=0.0)) if np.isfinite(matrix).all() else 0.0
+    turns = fastest * float(times[-1] - times[0]) / (2.0 * np.pi)
+    count = int(min(max(_LOOKS[0], _LOOKS_A_TURN * turns), _LOOKS[1]))
+    return np.union1d(times, np.linspace(times[0], times[-1], count))
+
+
+def _of_block(function: Any, states: slice, fed: Any, params: dict[str, Any], seen: Snapshot) -> Array:
+    """Signal that a block declares, from its states and inputs."""
+    return np.asarray(function(seen.t, seen.x[states], fed(seen.w), params))
+
+
+def unused(job: Job) -> Job:
+    """Same job for another attempt, its sampled blocks with the memory that they have now."""
+    network = job.network
+    if network is None or not any(can_remember(network.blocks[i].system) for i in network.blocks_with("period")):
+        return job
+    return replace(job, network=network.for_trials())

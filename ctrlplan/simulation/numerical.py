@@ -1,0 +1,245 @@
+"""Numerical runs of a network, compiled or by Python."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctrlplan.simulation.compared import telling_states
+from ctrlplan.simulation.drives import Drive, driven_signals
+from ctrlplan.simulation.events import Snapshot, Watched
+from ctrlplan.simulation.interpreted import Interpreted, InterpretedSolver, SolverError
+from ctrlplan.simulation.job import Job, Record, unused, with_looks
+from ctrlplan.simulation.legs import Run, integrate
+from ctrlplan.simulation.network import Network
+from ctrlplan.simulation.prepared import NotCompiledError
+from ctrlplan.simulation.scales import PASSES, Scales, doubt
+
+if TYPE_CHECKING:
+    from ctrlplan.simulation.compiled import Compiled, CompiledSolver
+
+Array = NDArray[np.float64]
+
+_VISITED = 12
+"""Visited states at which equations must be defined; and of a comparison where evaluations were not counted."""
+
+_SHARE = 5
+"""A compiled form is compared with Python at states a fifth as many as the run's evaluations of its equations."""
+
+_CLOSE, _STRETCHES, _BETWEEN = 400, 8, 60
+"""A run with fewer times is followed once more, in some stretches with so many times each, to see where it switches."""
+
+_DOUBTED = 1e-6
+"""Uncertainty of an output, relative to its range, above which the response says so."""
+
+
+def numerical(job: Job, method: str, reason: str) -> Record:
+    """Run from segment to segment, repeated where the scales of the states were not known."""
+    scales, spare = Scales.plain(job.state.size, job.atol), unused(job)
+    attempt = _Attempt(job, method, scales)
+    attempt.go()
+    for _ in range(PASSES - 1 if job.atol is None else 0):
+        found = scales.renewed(attempt.run.states, attempt.noise)
+        if found is None:
+            break
+        following = _Attempt(spare, method, found)
+        try:
+            following.go()
+        except SolverError:  # the run before stands, with what is said of its accuracy
+            break
+        scales, attempt = found, following
+    return attempt.record(reason)
+
+
+@dataclass(eq=False)
+class _Attempt:
+    """One run with some scales of the states."""
+
+    job: Job
+    method: str
+    scales: Scales
+    drives: list[Drive] = field(init=False)
+    watched: tuple[Watched, ...] = field(init=False)
+    equations: Interpreted | None = field(init=False)
+    solver: Any = field(init=False)
+    run: Run = field(init=False)
+    _compare: Callable[[], None] = field(init=False)
+
+    def __post_init__(self) -> None:
+        job, network = self.job, self.job.blocks
+        self.drives, self.watched = job.prepared.drives(job.inputs, job.first), job.watched()
+        self.equations = _equations(job, network)
+        if self.method == "compiled":
+            self._compile()
+        elif self.equations is not None:
+            self.solver, self._compare = InterpretedSolver(self.equations, job.rtol, self.scales), lambda: None
+        else:
+            raise NotCompiledError(f"{job.prepared.name} came from another process without its blocks")
+
+    @property
+    def stops(self) -> bool:
+        """Whether an event may end the run."""
+        return any(entry.stop for entry in self.watched)
+
+    def go(self) -> None:
+        """Run, and compare a compiled form with Python."""
+        job = self.job
+        self.run = integrate(
+            job.blocks,
+            self.equations,
+            self.solver,
+            self.drives,
+            with_looks(job.times, self.watched, self._slope),
+            job.state,
+            resolution=10.0 * job.rtol,
+            pause=self._pause if self.stops else None,
+        )
+        self._compare()
+
+    def record(self, reason: str) -> Record:
+        """What the run left, and how accurate it is where that is worse than usual."""
+        said = _in_doubt(self)
+        reason = f"{reason}; {said}" if said else reason
+        return Record(self.run.times, self.run.states, self._see, self._carry, self.watched, self.method, reason)
+
+    def noise(self) -> Array:
+        """Rounding noise of the rates along the run, times its duration."""
+        t, x, driven = self._visited()
+        rng = np.random.default_rng(0)
+        plain, found = self.solver.rates(t, x, driven), np.zeros(len(x))
+        for _ in range(3):
+            near = x * (1.0 + np.finfo(float).eps * rng.choice([-1.0, 1.0], x.shape))
+            apart = np.abs(self.solver.rates(t, near, driven) - plain)
+            found = np.maximum(found, np.where(np.isfinite(apart), apart, 0.0).max(axis=1, initial=0.0))
+        return found * float(self.run.times[-1] - self.run.times[0])
+
+    def _compile(self) -> None:
+        from ctrlplan.simulation.compiled import CompiledSolver
+
+        job = self.job
+        # Compiled forms are compared with Python on copies of what blocks remember.
+        known = job.blocks.for_trials()
+        form = job.prepared.compiled(job.params, self.drives, job.first, job.state)
+        tests = _equations(job, known)
+        if tests is not None:  # an algebraic loop without a solution is better named here
+            tests.signals(job.first, job.state, driven_signals(self.drives, job.times[:1])[:, 0])
+        # Beyond a stop there may be no solution: segments are short then, and must fail soon.
+        solver = CompiledSolver(form, job.params, job.rtol, self.scales, max_steps=2_000 if self.stops else 20_000)
+
+        def compare() -> None:
+            if solver.at_edge(*self._visited()):
+                raise SolverError(
+                    f"the solver must reach {job.times[-1]:g} s, got to the edge of where equations are defined"
+                )
+            wrong = _disagreement(job, known, form, solver, self.drives, self.run) if known.blocks else ""
+            if wrong:
+                raise job.prepared.distrust(form, wrong)
+
+        self.solver, self._compare = solver, compare
+
+    def _visited(self) -> tuple[Array, Array, Array]:
+        """Some times and states of the run, and the functions of time there."""
+        some = np.unique(np.linspace(0, self.run.times.size - 1, _VISITED).astype(int))
+        t = self.run.times[some]
+        return t, self.run.states[:, some], driven_signals(self.drives, t)
+
+    def _see(self, t: Array, x: Array) -> Snapshot:
+        driven = driven_signals(self.drives, t)
+        y = self.solver.outputs(t, x, driven)
+        return Snapshot(t, x, driven[: self.job.prepared.ninputs], y, lambda: self.solver.signals(t, x, driven))
+
+    def _carry(self, k: int, t: float) -> Array:
+        start = float(self.run.times[k])
+        found: Array = self.solver.advance(self.run.series(start), start, np.array([t]), self.run.states[:, k])
+        return found[:, -1]
+
+    def _pause(self, t: Array, x: Array) -> bool:
+        seen = self._see(t, x)
+        return any(entry.side(entry.value(seen)).any() for entry in self.watched if entry.stop)
+
+    def _slope(self) -> Array:
+        equations, job = self.equations, self.job
+        if equations is None:
+            return np.zeros((0, 0))
+        driven = driven_signals(self.drives, job.times[:1])[:, 0]
+        return _slope(lambda x: equations.rates(job.first, x, driven), job.state)
+
+
+def _equations(job: Job, network: Network) -> Interpreted | None:
+    """Equations by Python, where there are blocks."""
+    return Interpreted(network, job.params, (job.first, job.state), job.prepared.trials) if network.blocks else None
+
+
+def _in_doubt(attempt: _Attempt) -> str:
+    """What is uncertain in the outputs, and the tolerance that would do, in words; empty where nothing is."""
+    job, run, solver = attempt.job, attempt.run, attempt.solver
+    some = np.unique(np.linspace(0, run.times.size - 1, _VISITED).astype(int))
+    t, x = run.times[some], run.states[:, some]
+    if not x.size or not np.isfinite(x).all():
+        return ""
+    driven = driven_signals(attempt.drives, t)
+    uncertainty = attempt.scales.uncertainty(run.states, solver.rtol)
+    worst, ranges = doubt(lambda near: solver.outputs(t, near, driven), x, uncertainty)
+    allowed = max(_DOUBTED, 100.0 * job.rtol) * ranges
+    lost = (ranges > 0.0) & (worst > allowed)
+    if not lost.any():
+        return ""
+    part = np.where(lost, worst / np.where(lost, ranges, 1.0), 0.0)
+    names = ", ".join(np.array(job.prepared.output_labels)[lost])
+    needed = job.rtol * _DOUBTED / float(part.max())
+    return (
+        f"outputs {names} are differences of larger terms and uncertain by about {float(part.max()):.1g} "
+        f"of their range: rtol = {needed:.0e} would do"
+    )
+
+
+def _disagreement(
+    job: Job, network: Network, form: Compiled, solver: CompiledSolver, drives: Sequence[Drive], run: Run
+) -> str:
+    """What is wrong with a compiled form at states of a run; empty where nothing, or where no comparison is due."""
+    p = form.parameters(job.params)
+    driven = driven_signals(drives, run.times)
+    if not form.compared.is_due(form.sides(run.times, run.states, driven, p)):
+        return ""
+    most = max(1, solver.evaluations // _SHARE) if solver.evaluations else _VISITED
+    t, x = _closer(run, solver)
+    driven = driven_signals(drives, t)
+    w, sides = form.signals(t, x, driven, p), form.sides(t, x, driven, p)
+    places = telling_states(sides, np.concatenate([w, x]), most)
+    # Blocks are compared at the inputs that the form computes: where each agrees, the whole does.
+    return form.disagreement(network, job.params, t[places], x[:, places], w[:, places])
+
+
+def _closer(run: Run, solver: CompiledSolver) -> tuple[Array, Array]:
+    """Times and states of a run, with more between them where they are few."""
+    times, states = [run.times], [run.states]
+    marks = np.unique(np.linspace(0, run.times.size - 1, _STRETCHES + 1).astype(int))
+    for k, following in pairwise(marks.tolist() if run.times.size < _CLOSE else []):
+        left, right = float(run.times[k]), float(run.times[following])
+        series = run.series(left)
+        right = min(right, series.right)
+        grid = np.linspace(left, right, _BETWEEN + 1)[1:]
+        with suppress(SolverError):
+            found = solver.advance(series, left, grid, run.states[:, k])
+            times.append(grid)
+            states.append(found)
+    t, x = np.concatenate(times), np.concatenate(states, axis=1)
+    order = np.argsort(t, kind="stable")
+    return t[order], x[:, order]
+
+
+def _slope(rates: Callable[[Array], Array], state: Array) -> Array:
+    """Derivatives of rates by the states, by differences."""
+    steps = 1e-6 * (1.0 + np.abs(state))
+    with np.errstate(all="ignore"):
+        before = rates(state)
+        columns = [
+            (rates(state + step * unit) - before) / step for step, unit in zip(steps, np.eye(state.size), strict=True)
+        ]
+    return np.array(columns).T.reshape(state.size, state.size)

@@ -1,0 +1,163 @@
+"""Accuracy in the signals' own scale: a millionth of each range, from nanometres to meganewtons, whatever the units."""
+
+import control as ct
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import ctrlplan as cp
+
+METHODS = ["compiled", "python"]
+ALLOWED = 1e-6
+
+
+def stage(size, kind):
+    """Saturation in front of 1e6/(s^2 + 200 s + 1e6), for signals of some size."""
+    plant = ct.tf([1e6], [1, 200, 1e6], inputs="u", outputs="y", name="plant")
+    if kind == "ss":
+        plant = ct.ss([[0, 1], [-1e6, -200]], [[0], [1e6]], [[1, 0]], [[0]], inputs="u", outputs="y", name="plant")
+
+    def out(t, x, u, params):
+        return [np.clip(u[0], -0.7 * size, 0.7 * size)]
+
+    limiter = ct.nlsys(None, out, inputs="r", outputs="u", dt=0, name="limiter")
+    return ct.interconnect([limiter, plant], inputs="r", outputs=["y", "u"])
+
+
+def stage_by_hand(plan, t):
+    """The same for signals of size 1, with integration stopped where the limit is met."""
+    met = float(np.real_if_close(np.roots([6, -15, 10, 0, 0, -0.7]))[0].real)
+    roots = [r.real for r in np.roots([6, -15, 10, 0, 0, -0.7]) if abs(r.imag) < 1e-12 and 0 < r.real < 1]
+    met = 0.02 * roots[0]
+    y = np.empty_like(t)
+    x = np.zeros(2)
+    for left, right in ((0.0, met), (met, t[-1])):
+        inside = (t >= left) & (t <= right)
+        found = solve_ivp(
+            lambda s, z: [z[1], 1e6 * (min(float(plan(s)), 0.7) - z[0]) - 200 * z[1]],
+            (left, right),
+            x,
+            t_eval=np.union1d(t[inside], [right]),
+            method="DOP853",
+            rtol=1e-12,
+            atol=[1e-13, 1e-10],
+        )
+        x = found.y[:, -1]
+        y[inside] = found.y[0, : inside.sum()]
+    return y
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("kind", ["tf", "ss"])
+@pytest.mark.parametrize("size", [1e-9, 1e-6, 1e-3, 1.0, 1e6])
+def test_a_stage_of_any_size_in_any_realisation(size, kind, method):
+    t = np.linspace(0, 0.04, 201)
+    unit = cp.PolySpline([cp.Waypoint(0, 0, 0, 0), cp.Waypoint(0.02, 1, 0, 0)])
+    found = cp.simulate(stage(size, kind), t, size * unit, method=method)
+    assert np.abs(found.outputs[0] / size - stage_by_hand(unit, t)).max() < ALLOWED
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_signals_fifteen_powers_of_ten_apart_in_one_loop(method):
+    """A force of meganewtons, a displacement of nanometres: x'' = F/m with a spring that stiffens."""
+    size_x, size_f, mass = 2.0**-30, 1e6, 1e6 * 2.0**30
+
+    def rates(t, x, u, params):
+        return [x[1], (u[0] - size_f * ((x[0] / size_x) + (x[0] / size_x) ** 3) - 2 * size_f * x[1] / size_x) / mass]
+
+    block = ct.nlsys(rates, inputs="F", outputs=2, states=["x", "v"], name="stage")
+    # In units of its own, as mass size_x = size_f: z'' = F - z - z^3 - 2 z'.
+    plan = cp.PolySpline([cp.Waypoint(0, 0, 0, 0), cp.Waypoint(3, 1, 0, 0)])
+    t = np.linspace(0, 8, 161)
+    expected = solve_ivp(
+        lambda s, z: [z[1], float(plan(s)) - z[0] - z[0] ** 3 - 2 * z[1]],
+        (0, 8),
+        [0, 0],
+        t_eval=t,
+        method="DOP853",
+        rtol=1e-12,
+        atol=1e-14,
+    ).y
+    found = cp.simulate(block, t, size_f * plan, method=method)
+    errors = np.abs(found.outputs / size_x - expected).max(axis=1) / np.ptp(expected, axis=1)
+    assert errors.max() < ALLOWED
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("moved", [1e-3, 1e-6, 1e-8])
+def test_a_signal_that_moves_little_about_an_offset(moved, method):
+    """A tank about 10 m whose inflow differs by very little, against its displacement alone."""
+
+    def rates(t, x, u, params):
+        return [u[0] - np.sqrt(x[0] / 10.0)]
+
+    block = ct.nlsys(rates, inputs="q", outputs="h", states="h", name="tank")
+    t = np.linspace(0, 60, 61)
+    found = cp.simulate(block, t, 1.0 + moved, 10.0, method=method)
+    # With s = sqrt(h/10): 20 s s' = 1 + m - s; in its displacement z = s - 1: 20 (1 + z) z' = m - z.
+    small = solve_ivp(
+        lambda _, z: (moved - z) / (20.0 * (1.0 + z)), (0, 60), [0.0], t_eval=t, method="DOP853", rtol=1e-13, atol=1e-30
+    ).y[0]
+    expected = 10.0 * (2.0 * small + small**2)
+    rounding = 4.0 * np.finfo(float).eps * 10.0
+    assert np.abs(found.outputs - 10.0 - expected).max() < ALLOWED * expected[-1] + rounding
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_car_at_speed_against_its_closed_form(method):
+    """Unbounded growth of an angle's error: a circle, in closed form."""
+    speed, steer = 10.0, 0.1
+
+    def rates(t, x, u, params):
+        return [speed * np.cos(x[2]), speed * np.sin(x[2]), speed / 3.0 * np.tan(u[0])]
+
+    block = ct.nlsys(rates, inputs="delta", outputs=3, states=["x", "y", "theta"], name="car")
+    t = np.linspace(0, 10, 101)
+    found = cp.simulate(block, t, steer, method=method)
+    rate = speed / 3.0 * np.tan(steer)
+    expected = np.array([np.sin(rate * t), 1.0 - np.cos(rate * t), rate * t]) * [[speed / rate]] * 1.0
+    expected[2] = rate * t
+    assert (np.abs(found.outputs - expected).max(axis=1) / np.ptp(expected, axis=1)).max() < ALLOWED
+
+
+def test_a_state_that_is_still_but_for_rounding_is_not_chased():
+    """A difference of two equal motions stays at rounding level, and the run ends as soon as without it."""
+    count = [0]
+
+    def rates(t, x, u, params):
+        count[0] += 1
+        return [u[0] - x[0], u[0] - x[1], (x[0] * 0.1 - x[1] * 0.1) * 3.0 - x[2]]
+
+    block = ct.nlsys(rates, inputs="r", outputs=3, states=3, name="twins")
+    plan = cp.PolySpline([cp.Waypoint(0, 0, 0, 0), cp.Waypoint(3, 1, 0, 0)])
+    found = cp.simulate(block, np.linspace(0, 5, 51), plan, [0.3, 0.3, 0.0], method="python")
+    assert np.abs(found.outputs[2]).max() < 1e-12
+    assert count[0] < 20_000
+
+
+def test_outputs_that_cancel_say_how_uncertain_they_are():
+    """The difference of two states of size 1e9 that differ by a billionth: said, with a tolerance that does better."""
+
+    def rates(t, x, u, params):
+        return [u[0] - 1e-3 * x[0] ** 1.0, u[0] - 1e-3 * x[1] + 1e-9 * np.sin(x[1])]
+
+    def out(t, x, u, params):
+        return [x[1] - x[0]]
+
+    block = ct.nlsys(rates, out, inputs="r", outputs="y", states=2, name="bridge")
+    found = cp.simulate(block, np.linspace(0, 10, 11), 1.0)
+    assert "outputs y are differences of larger terms and uncertain by about" in found.reason
+    assert "rtol = " in found.reason
+    plain = cp.simulate(block, np.linspace(0, 10, 11), 1.0)
+    assert plain.reason == found.reason
+
+
+def test_an_absolute_tolerance_given_is_absolute():
+    """A number is taken as it is, for every state: what moves by less than it is not resolved, as asked for."""
+    t = np.linspace(0, 0.04, 201)
+    plan = 1e-6 * cp.PolySpline([cp.Waypoint(0, 0, 0, 0), cp.Waypoint(0.02, 1, 0, 0)])
+    rough, fine = (cp.simulate(stage(1e-6, "tf"), t, plan, atol=atol, method="python") for atol in (1e-3, None))
+    assert np.abs(rough.outputs[0] - fine.outputs[0]).max() > 1e-8
+    for atol in (0.0, -1.0, np.nan, True, "small"):
+        with pytest.raises(ValueError, match="atol must be a finite number above 0"):
+            cp.simulate(stage(1.0, "tf"), t, plan, atol=atol)
