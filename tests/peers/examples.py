@@ -8,6 +8,7 @@ import runpy
 from pathlib import Path
 
 import pytest
+from matplotlib import pyplot as plt
 
 FOLDER = Path(os.environ.get("CTRLPLAN_PEERS_EXAMPLES", "."))
 EXAMPLES = sorted(path.name for path in FOLDER.iterdir() if path.suffix in (".py", ".ipynb"))
@@ -24,14 +25,16 @@ def code_of(notebook):
 @pytest.mark.parametrize("name", EXAMPLES)
 def test_example(name, monkeypatch):
     """One script or notebook, from its own folder."""
+    plt.close("all")
     monkeypatch.chdir(FOLDER)
     monkeypatch.syspath_prepend(str(FOLDER))
     if name.endswith(".py"):
         runpy.run_path(name, run_name="__main__")
         return
-    from matplotlib import pyplot as plt
-
-    plt.close("all")
-    names = {"__name__": "__main__", "display": print}
+    names, failures = {"__name__": "__main__", "display": print}, []
     for cell in code_of(Path(name)):
-        exec(compile(cell, name, "exec"), names)
+        try:
+            exec(compile(cell, name, "exec"), names)
+        except Exception as error:  # written for older versions of numpy: the cells after it may run
+            failures.append(f"{type(error).__name__}: {error}")
+    assert not failures

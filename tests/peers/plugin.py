@@ -36,9 +36,9 @@ class Recorder:
 
     def __init__(self, folder):
         self.originals = {name: getattr(ct, name) for name in FUNCTIONS}
-        self.path = Path(folder, f"calls-{os.getpid()}.jsonl")
-        self.test, self.count, self.total, self.inside = "import", 0, 0, False
-        self.compared = {}
+        self.path = Path(folder, f"calls-{os.getpid()}.jsonl").resolve()  # examples change the folder
+        self.test, self.count, self.total = "import", 0, 0
+        self.compared, self.running, self.comparing = {}, [], False
 
     def begin(self, test):
         """Calls are named after the test and counted in it."""
@@ -57,32 +57,40 @@ class Recorder:
             file.write(json.dumps(entry) + "\n")
 
     def call(self, function, system, args, kwargs):
-        """Answer of python-control, after ctrlplan's was compared with it."""
+        """Answer of python-control, after ctrlplan's was compared with it.
+
+        Calls that blocks make while python-control runs them are calls too, as those of a predictive controller; those
+        that blocks make while ctrlplan does are not, nor those by which one of the functions hands a system to the
+        other, or a list of systems one by one.
+        """
         original = self.originals[function]
-        if self.inside:
+        if self.comparing or any(system is one for one in self.running):
             return original(system, *args, **kwargs)
-        self.inside, self.count, self.total = True, self.count + 1, self.total + 1
+        self.count, self.total = self.count + 1, self.total + 1
         if self.total > MAXIMUM_CALLS:
             raise SystemExit(f"calls must number {MAXIMUM_CALLS} at most in a process")
+        number, begun, outer = self.count, np.random.get_state(), self.running
+        self.running = system if isinstance(system, (list, tuple)) else [system]
+        error, answer = None, None
         try:
-            begun = np.random.get_state()
-            error, answer = None, None
-            try:
-                answer = original(system, *args, **kwargs)
-            except Exception as raised:
-                error = raised
-            ended = np.random.get_state()
+            answer = original(system, *args, **kwargs)
+        except Exception as raised:
+            error = raised
+        finally:
+            self.running = outer
+        ended, self.comparing = np.random.get_state(), True
+        try:
             with warnings.catch_warnings(), np.errstate(all="warn"):
                 warnings.simplefilter("ignore")
-                self.compare(function, system, args, kwargs, error or answer, begun)
-            np.random.set_state(ended)
+                self.compare(number, function, system, args, kwargs, error or answer, begun)
         finally:
-            self.inside = False
+            self.comparing = False
+            np.random.set_state(ended)
         if error is not None:
             raise error
         return answer
 
-    def compare(self, function, system, args, kwargs, answer, random):
+    def compare(self, number, function, system, args, kwargs, answer, random):
         """Record what differs from python-control's answer.
 
         A call that repeats one of the test to the last bit, answer included, as an optimiser's finite differences do,
@@ -90,8 +98,9 @@ class Recorder:
         """
         key = id(system), _digest(function, args, kwargs, answer)
         if key in self.compared:
-            self.record(function, system, self.compared[key][1])
+            self.record(number, function, system, self.compared[key][1])
             return
+        options = {}
         try:
             np.random.set_state(random)
             options = options_of(function, args, kwargs)
@@ -102,12 +111,12 @@ class Recorder:
         pairs = [(system, ours, answer)] if one else zip(system, ours, answer, strict=True)
         found = [entry for each in pairs for entry in self.differences(function, options, *each)]
         self.compared[key] = system, found  # the system too: while it lives, no other has its id
-        self.record(function, system, found)
+        self.record(number, function, system, found)
 
-    def record(self, function, system, found):
+    def record(self, number, function, system, found):
         """Write what differs in a call."""
         if found:
-            entry = {"test": self.test, "call": self.count, "function": function, "system": type(system).__name__}
+            entry = {"test": self.test, "call": number, "function": function, "system": type(system).__name__}
             entry["differs"] = [[field, text] for field, text, _ in found]
             self.write(entry)
 
