@@ -30,7 +30,7 @@ _FIRST = 4
 """Loops that are taken together at first; then twice as many each time, so that an interruption loses little."""
 
 _MEASURED = ("plans", "timepts", "outputs", "controls", "waypoints", "initial_state", "band", "start", "only")
-_WITHOUT_EFFECT = ("alpha", "measures", "units", "title", "parameters")
+_WITHOUT_EFFECT = ("alpha", "title", "parameters")
 _SHARED = {"loop", *_MEASURED, *_WITHOUT_EFFECT}
 """Arguments of `compare` that are heeded here; with any other each loop must be compared by itself."""
 
@@ -79,7 +79,9 @@ class Alike:
             bound.arguments[name] is signature.parameters[name].default for name in own
         )
         self._size, self._most = _FIRST, max(2, _SAMPLES // max(1, self._asked.timepts.size))
-        self._first = next(iter(self._asked.plans.values()))
+        plans, begin = self._asked.plans, self._asked.timepts[:1]
+        self._held = {k: plan.jet(begin, 0, left=True)[0, :, 0] for k, plan in plans.items()} if self._possible else {}
+        self._first = next(iter(plans.values()))
         self.waiting: dict[int, Linear] = {}
 
     @property
@@ -103,11 +105,11 @@ class Alike:
 
     def _starts(self, system: Any) -> dict[str, Array]:
         """States at the first sample by plan: as given, or at rest where the plan is."""
-        plans, times, given = self._asked.plans, self._asked.timepts, self._asked.initial_state
+        given = self._asked.initial_state
         if given is not None:
-            return dict.fromkeys(plans, np.broadcast_to(real_array(given, "initial_state"), (system.nstates,)))
-        held = {name: plan.jet(times[:1], 0, left=True)[0, :, 0] for name, plan in plans.items()}
-        return {name: rest_state(system, position) for name, position in held.items()}
+            state = np.broadcast_to(real_array(given, "initial_state"), (system.nstates,))
+            return dict.fromkeys(self._held, state)
+        return {name: rest_state(system, position) for name, position in self._held.items()}
 
     def fits(self, linear: Linear) -> bool:
         """Whether a loop differs from those that wait in numbers alone."""
@@ -165,7 +167,9 @@ def _ordered(times: Array) -> bool:
 def _of_loops(measured: list[dict[str, float]], labels: Sequence[str], each: Sequence[str]) -> dict[str, Array]:
     """Metrics (nloops,) as `compare` names them, from those of each label: the worst, and each where there are more."""
     names = [name for name in measured[0] if name in MEASURES] if measured else []
-    rows = {name: np.array([[found[f"{name}_{i}"] for i in each] for found in measured]) for name in names}
+    # Of one loop alone there is the worst, which it is.
+    keys = {name: [f"{name}_{i}" for i in each] if len(each) > 1 else [name] for name in names}
+    rows = {name: np.array([[found[key] for key in keys[name]] for found in measured]) for name in names}
     worst = {name: np.fmax.reduce(row) for name, row in rows.items()}
     if len(labels) > 1:
         for name, row in rows.items():

@@ -23,6 +23,7 @@ from ctrlplan.studies.comparison import (
     finite_or_none,
     is_builder,
     references_of,
+    tracked_outputs,
     waypoints_given,
 )
 from ctrlplan.studies.executing import Account, Failed, Shared, checked_executor, executed, tried
@@ -286,7 +287,9 @@ def ensemble(
     forms = _forms(loop, references, table)
     _check_read(forms, table, settings.get("initial_state"))
     nominal, nominal_draw = _nominal(forms, references, times, table, {"waypoints": points, **settings}, timeout)
-    settings = {"events": (), **settings, "worth": False}
+    first = next(iter(references.values()))
+    outputs = {name: tracked_outputs(form, settings.get("outputs"), first) for name, form in forms.items()}
+    settings = {"events": (), **settings, "worth": False, "outputs": outputs}
     # Compiled for these parameters, and compared with Python, here and once.
     tried(partial(_one, forms, references, times, settings), _draw(table, 0), timeout)
     light: Any = _light(forms, table)
@@ -298,7 +301,7 @@ def ensemble(
     drawn = [_draw(table, k) for k in range(next(iter(table.values())).size)]
     account = executed(run, drawn, executor, timeout, "draws", progress)
     account.raise_if_all_lost("the loop")
-    if light is not forms and light is not loop and not account.interrupted:
+    if light is not forms and light is not loop:
 
         def by_python(some: dict[str, Trajectory], params: dict[str, float]) -> Outcome:
             return _one(forms, some, times, settings, params)
@@ -417,12 +420,14 @@ def _by_python(
     }
     if not failed:
         return account
+    found = {k: outcome for k, outcome in account.found.items() if k not in failed}
+    if account.interrupted:
+        return Account(found, True)
     again = executed(lambda k: run(failed[k], drawn[k]), list(failed), None, timeout, "draws by Python", progress)
-    found = dict(account.found)
-    for k, outcome in zip(failed, again.in_order().values(), strict=False):
-        known = found[k]
-        if not isinstance(known, Failed) and not isinstance(outcome, Failed):
-            found[k] = known | outcome
+    for i, outcome in again.found.items():
+        k = list(failed)[i]
+        known = account.found[k]
+        found[k] = known | outcome if isinstance(known, dict) and isinstance(outcome, dict) else outcome
     return Account(found, again.interrupted)
 
 
@@ -510,11 +515,15 @@ def _one(
     settings: dict[str, Any],
     params: dict[str, float],
 ) -> Outcome:
-    """One draw, plan by plan: one may get through where another does not."""
+    """One draw, plan by plan: one may get through where another does not.
+
+    Among the settings are the outputs that follow the plans, by plan.
+    """
     wanted = times[_some(times)]
 
     def measured(plan: str) -> tuple[dict[str, float], dict[str, Array]]:
-        result = compare(_given(forms), {plan: references[plan]}, times, params=params, **settings)
+        own = {**settings, "outputs": settings["outputs"][plan]}
+        result = compare(_given(forms), {plan: references[plan]}, times, params=params, **own)
         response = result.responses[plan]
         rows = np.asarray(response.outputs).reshape(len(response.output_labels), -1)
         kept = np.isin(np.asarray(response.time), wanted)

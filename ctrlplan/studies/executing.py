@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 import pickle
+import signal
 import threading
 from asyncio import CancelledError
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from contextvars import ContextVar
 from dataclasses import dataclass, field
 from functools import partial
 from numbers import Real
@@ -152,11 +154,15 @@ def checked_timeout(timeout: float | None) -> float | None:
 
 def tried(run: Callable[[T], R], task: T, timeout: float | None = None) -> R | Failed:
     """Result of a task, or what went wrong; Ctrl-C alone is raised."""
+    _raise_if_pressed()
+    outcome: R | Failed
     try:
         with time_limit(timeout):
-            return run(task)
+            outcome = run(task)
     except (Exception, SystemExit) as error:  # whatever a user's function does
-        return Failed.of(error)
+        outcome = Failed.of(error)
+    _raise_if_pressed()  # a solver or a block may have taken Ctrl-C for an error of its own, and gone on without
+    return outcome
 
 
 def gathered(outcomes: Iterable[tuple[int, R | Failed]], count: int, label: str, progress: bool) -> Account[R]:
@@ -174,7 +180,7 @@ def gathered(outcomes: Iterable[tuple[int, R | Failed]], count: int, label: str,
         Whether a bar is shown on stderr.
     """
     account: Account[R] = Account()
-    with _bar(count, label, progress) as advance:
+    with _noticing_interruptions(), _bar(count, label, progress) as advance:
         try:
             for k, outcome in outcomes:
                 account.found[k] = outcome
@@ -209,26 +215,30 @@ def executed(
     Futures are taken as they complete where they have ``add_done_callback`` or
     ``done``, and in the order of submission where they have ``result`` alone.
     What an executor loses is not run again. On Ctrl-C, and whenever this
-    function raises, tasks that have not begun are cancelled.
+    function raises, tasks that have not begun are cancelled; others run on.
     """
     if executor is None:
         here = ((k, tried(run, task, timeout)) for k, task in enumerate(tasks))
         return gathered(here, len(tasks), label, progress)
     account: Account[R] = Account()
     futures: dict[int, Any] = {}
-    with _bar(len(tasks), label, progress) as advance:
-        try:
-            refused = _submit(partial(tried, run, timeout=timeout), tasks, executor, futures)
-            for k, outcome in _completed(futures):
-                account.found[k] = outcome
-                advance()
-            account.found |= refused
-        except KeyboardInterrupt:
-            account.interrupted = True
-            _cancel(futures)
-            account.found |= _finished(futures, account.found)
-        finally:
-            _cancel(futures)
+    try:
+        with _noticing_interruptions(), _bar(len(tasks), label, progress) as advance:
+            try:
+                refused = _submit(partial(tried, run, timeout=timeout), tasks, executor, futures)
+                for k, outcome in _completed(futures):
+                    account.found[k] = outcome
+                    advance()
+                account.found |= refused
+            except KeyboardInterrupt:
+                account.interrupted = True
+        if account.interrupted:
+            done = {k: future for k, future in futures.items() if _is_done(future)}
+            _cancel({k: future for k, future in futures.items() if k not in done})
+            account.found |= _results({k: future for k, future in done.items() if k not in account.found})
+    finally:
+        _cancel(futures)
+        futures.clear()  # an executor keeps what somebody may still ask for
     return account
 
 
@@ -278,6 +288,41 @@ def _kept() -> OrderedDict[Any, Any]:
     return kept
 
 
+_PRESSED: ContextVar[threading.Event | None] = ContextVar("pressed", default=None)
+"""Set by Ctrl-C while runs are made."""
+
+
+@contextmanager
+def _noticing_interruptions() -> Iterator[None]:
+    """Context in which Ctrl-C is remembered: KeyboardInterrupt is lost where it is raised in a callback.
+
+    As `asyncio.run` does, in the main thread and where nobody else handles it.
+    """
+    here = threading.current_thread() is threading.main_thread()
+    if not here or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+        yield
+        return
+    pressed = threading.Event()
+
+    def remember(number: int, frame: Any) -> None:
+        pressed.set()
+        signal.default_int_handler(number, frame)
+
+    token = _PRESSED.set(pressed)
+    signal.signal(signal.SIGINT, remember)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        _PRESSED.reset(token)
+
+
+def _raise_if_pressed() -> None:
+    pressed = _PRESSED.get()
+    if pressed is not None and pressed.is_set():
+        raise KeyboardInterrupt
+
+
 @contextmanager
 def _bar(count: int, label: str, progress: bool) -> Iterator[Callable[[], Any]]:
     bar = tqdm(total=count, desc=label, disable=not progress, leave=False)
@@ -313,6 +358,7 @@ def _completed(futures: dict[int, Any]) -> Iterator[tuple[int, Any]]:
             ready = [done.get(timeout=_POLL_BESIDE_CALLBACKS if tells else _POLL)]
         except Empty:
             ready = [k for k, future in futures.items() if _is_done(future)]
+        _raise_if_pressed()
         for k in ready:
             if k in futures:
                 yield k, _outcome(futures[k])
@@ -324,17 +370,17 @@ def _outcome(future: Any) -> Any:
     try:
         return future.result()
     except (Exception, SystemExit, CancelledError) as error:  # a worker died, or the result cannot be read
-        return Failed.of(error, lost=True)
+        _raise_if_pressed()  # which workers may have heard as well
+        return Failed.of(error.with_traceback(None), lost=True)  # which would keep the future
 
 
-def _finished(futures: dict[int, Any], known: dict[int, Any]) -> dict[int, Any]:
+def _results(futures: dict[int, Any]) -> dict[int, Any]:
     """Results of futures that are done; what went wrong while all was interrupted is no failure of a task."""
     found = {}
     for k, future in futures.items():
-        if k not in known and _is_done(future):
-            with suppress(Exception, CancelledError):
-                if future.exception() is None:
-                    found[k] = future.result()
+        with suppress(Exception, CancelledError):
+            if future.exception() is None:
+                found[k] = future.result()
     return found
 
 

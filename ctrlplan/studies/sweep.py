@@ -236,8 +236,9 @@ def _swept(parameter: str, points: Array, account: Account[Metrics]) -> Sweep:
     rows: dict[str, dict[str, Array]] = {}
     for i, metrics in enumerate(found.values()):
         for plan, values in metrics.items() if not isinstance(metrics, Failed) else ():
+            row = rows.setdefault(plan, {})
             for name, value in values.items():
-                rows.setdefault(plan, {}).setdefault(name, np.full(reached.size, np.nan))[i] = value
+                row.setdefault(name, np.full(reached.size, np.nan))[i] = value
     failures = tuple(Failure(i, {parameter: float(reached[i])}, failed.message) for i, failed in errors)
     return Sweep(parameter, reached, rows, failures, account.interrupted)
 
