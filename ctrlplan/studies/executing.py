@@ -180,12 +180,14 @@ def gathered(outcomes: Iterable[tuple[int, R | Failed]], count: int, label: str,
         Whether a bar is shown on stderr.
     """
     account: Account[R] = Account()
-    with _noticing_interruptions(), _bar(count, label, progress) as advance:
+    with _counting_interruptions() as pressed, _bar(count, label, progress) as advance:
         try:
             for k, outcome in outcomes:
                 account.found[k] = outcome
                 advance()
         except KeyboardInterrupt:
+            if len(pressed) > 1:
+                raise
             account.interrupted = True
     return account
 
@@ -223,7 +225,7 @@ def executed(
     account: Account[R] = Account()
     futures: dict[int, Any] = {}
     try:
-        with _noticing_interruptions(), _bar(len(tasks), label, progress) as advance:
+        with _counting_interruptions() as pressed, _bar(len(tasks), label, progress) as advance:
             try:
                 refused = _submit(partial(tried, run, timeout=timeout), tasks, executor, futures)
                 for k, outcome in _completed(futures):
@@ -231,6 +233,8 @@ def executed(
                     advance()
                 account.found |= refused
             except KeyboardInterrupt:
+                if len(pressed) > 1:
+                    raise
                 account.interrupted = True
         if account.interrupted:
             done = {k: future for k, future in futures.items() if _is_done(future)}
@@ -288,38 +292,37 @@ def _kept() -> OrderedDict[Any, Any]:
     return kept
 
 
-_PRESSED: ContextVar[threading.Event | None] = ContextVar("pressed", default=None)
-"""Set by Ctrl-C while runs are made."""
+_PRESSED: ContextVar[Sequence[int]] = ContextVar("pressed", default=())
+"""Signals of Ctrl-C since runs are made."""
 
 
 @contextmanager
-def _noticing_interruptions() -> Iterator[None]:
+def _counting_interruptions() -> Iterator[Sequence[int]]:
     """Context in which Ctrl-C is remembered: KeyboardInterrupt is lost where it is raised in a callback.
 
     As `asyncio.run` does, in the main thread and where nobody else handles it.
     """
+    pressed: list[int] = []
     here = threading.current_thread() is threading.main_thread()
     if not here or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
-        yield
+        yield pressed
         return
-    pressed = threading.Event()
 
     def remember(number: int, frame: Any) -> None:
-        pressed.set()
+        pressed.append(number)
         signal.default_int_handler(number, frame)
 
     token = _PRESSED.set(pressed)
     signal.signal(signal.SIGINT, remember)
     try:
-        yield
+        yield pressed
     finally:
         signal.signal(signal.SIGINT, signal.default_int_handler)
         _PRESSED.reset(token)
 
 
 def _raise_if_pressed() -> None:
-    pressed = _PRESSED.get()
-    if pressed is not None and pressed.is_set():
+    if _PRESSED.get():
         raise KeyboardInterrupt
 
 

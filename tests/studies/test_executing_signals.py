@@ -153,12 +153,16 @@ def build(rate):
     def update(t, x, u, p):
         if rate == 3.0 and t > 0.0:
             try:
-                interrupt()
+                if not mistaken:
+                    mistaken.append(1)
+                    interrupt()
             except BaseException:
-                raise ValueError("taken for an error")
+                pass
+            raise ValueError("taken for an error")
         return rate_of(rate) * (float(u[0]) - x)
     return ct.nlsys(update, None, states=1, inputs="r", outputs="y", name="lag")
 
+mistaken = []
 found["mistaken"] = said_of(*swept(build, values))
 found["handler"] = signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
@@ -171,6 +175,20 @@ try:
     found["again"] = "returned"
 except KeyboardInterrupt:
     found["again"] = "raised"
+
+def build(rate):
+    if rate == 3.0:
+        try:
+            interrupt()
+        finally:
+            interrupt()
+    return lag(rate)
+
+try:
+    swept(build, values)
+    found["twice at once"] = "returned"
+except KeyboardInterrupt:
+    found["twice at once"] = "raised"
 
 class Twice:
     def submit(self, function, *arguments):
@@ -212,7 +230,7 @@ def test_signals_keep_what_is_finished_in_this_process_and_in_threads(tmp_path):
     assert draws["said"] == ["the sweep was interrupted: 7 of 20 draws are kept"]
     assert found["handler"]
     assert found["again"] == "returned"  # one signal alone, while tasks are handed out
-    assert found["twice"] == "raised"
+    assert found["twice"] == found["twice at once"] == "raised"
 
 
 KILLED = """
