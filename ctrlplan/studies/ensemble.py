@@ -290,15 +290,16 @@ def ensemble(
     first = next(iter(references.values()))
     outputs = {name: tracked_outputs(form, settings.get("outputs"), first) for name, form in forms.items()}
     settings = {"events": (), **settings, "worth": False, "outputs": outputs}
-    # Compiled for these parameters, and compared with Python, here and once.
-    tried(partial(_one, forms, references, times, settings), _draw(table, 0), timeout)
+    drawn = [_draw(table, k) for k in range(next(iter(table.values())).size)]
+    # Compiled for these parameters, and compared with Python, here: the first draw, and a random one.
+    for k in sorted({0, int(np.random.default_rng(0).integers(len(drawn)))}):
+        tried(partial(_one, forms, references, times, settings), drawn[k], timeout)
     light: Any = _light(forms, table)
     if light is None:
         light = loop if is_builder(loop) and executor is not None else forms
     run = partial(_one, light, references, times, settings)
     if executor is not None:
         run = partial(_elsewhere, Shared(light), references, times, settings)
-    drawn = [_draw(table, k) for k in range(next(iter(table.values())).size)]
     account = executed(run, drawn, executor, timeout, "draws", progress)
     account.raise_if_all_lost("the loop")
     if light is not forms and light is not loop:

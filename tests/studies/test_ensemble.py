@@ -713,7 +713,7 @@ def interrupt_in_draw(monkeypatch, k):
 
     def one(*arguments):
         done.append(arguments)
-        if len(done) == k + 2:  # one before all draws
+        if len(done) == k + 3:  # two before all draws
             raise KeyboardInterrupt
         return known(*arguments)
 

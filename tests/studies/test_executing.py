@@ -242,7 +242,7 @@ def test_draws_that_a_worker_takes_with_it_are_named_and_run_nowhere_else():
     found = ensemble(
         loop, PLANS, TIMES, {"tau": tau}, Losing({3, 11}, RuntimeError("gone")), False, {"measure": measure}
     )
-    assert len(run) == 2 + 10  # nominal, compiled, and the draws
+    assert len(run) == 3 + 10  # the nominal loop, two draws that are compared with Python, and all but the lost
     assert [(f.draw, f.params, f.message) for f in found.failures] == [
         (k, {"tau": tau[k]}, "RuntimeError: gone") for k in (3, 11)
     ]
