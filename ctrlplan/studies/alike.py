@@ -41,8 +41,8 @@ class Linear:
 
     Attributes
     ----------
-    labels : tuple of str
-        Its outputs.
+    labels, tracked, acting : tuple of str
+        Its outputs; those that follow the plan; those that are controls.
     form : LinearForm
         Its matrices.
     starts : dict of str to ndarray, shape (nstates,)
@@ -50,6 +50,8 @@ class Linear:
     """
 
     labels: tuple[str, ...]
+    tracked: tuple[str, ...]
+    acting: tuple[str, ...]
     form: LinearForm
     starts: dict[str, Array]
 
@@ -98,10 +100,12 @@ class Alike:
             form, stated = linear_form(system), stated_start(system)
             if form.sources or stated is not None or form.b.shape[1] != self._first.naxes:
                 return None
+            tracked = tracked_outputs(system, self._asked.outputs, self._first)
+            acting = acting_outputs(system, self._asked.controls)
             starts = self._starts(system)
         except (AttributeError, TypeError, ValueError):  # what is wrong is for `compare` to say
             return None
-        return Linear(tuple(system.output_labels), form, starts)
+        return Linear(tuple(system.output_labels), tracked, acting, form, starts)
 
     def _starts(self, system: Any) -> dict[str, Array]:
         """States at the first sample by plan: as given, or at rest where the plan is."""
@@ -130,8 +134,7 @@ class Alike:
 def _metrics(asked: Any, loops: list[Linear]) -> list[Metrics]:
     """What `compare` finds of each loop."""
     plans, times, labels = asked.plans, asked.timepts, list(loops[0].labels)
-    first, labelled = next(iter(plans.values())), SimpleNamespace(output_labels=labels)
-    tracked, acting = tracked_outputs(labelled, asked.outputs, first), acting_outputs(labelled, asked.controls)
+    first, tracked, acting = next(iter(plans.values())), loops[0].tracked, loops[0].acting
     if asked.only is not None and not any(name.startswith("control") for name in asked.only):
         acting = ()
     rows = [labels.index(name) for name in (*tracked, *acting)]
