@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 import warnings
 from collections.abc import Mapping, Sequence
 from numbers import Real
@@ -23,6 +24,9 @@ from ctrlplan.simulation.runs import METHODS, recorded
 from ctrlplan.simulation.scales import RELATIVE
 
 Array = NDArray[np.float64]
+
+_DELEGATED = threading.RLock()
+"""One run by python-control at a time: it keeps the parameters of a run in the system."""
 
 _LONGEST = 1e15
 """Seconds after which a double cannot tell one microsecond from the next, by far."""
@@ -208,15 +212,16 @@ def _delegated(job: Job) -> ct.TimeResponseData:
     warnings.warn(
         f"{prepared.unsupported}: run by control.input_output_response, without events", UserWarning, stacklevel=3
     )
-    response = ct.input_output_response(
-        prepared.system,
-        job.times,
-        driven_signals(job.inputs, job.times) if job.inputs else 0,
-        job.state,
-        params=job.params or None,
-        solve_ivp_method="LSODA",
-        solve_ivp_kwargs={"rtol": job.rtol, "atol": RELATIVE if job.atol is None else job.atol},
-    )
+    with _DELEGATED:
+        response = ct.input_output_response(
+            prepared.system,
+            job.times,
+            driven_signals(job.inputs, job.times) if job.inputs else 0,
+            job.state,
+            params=job.params or None,
+            solve_ivp_method="LSODA",
+            solve_ivp_kwargs={"rtol": job.rtol, "atol": RELATIVE if job.atol is None else job.atol},
+        )
     response.method, response.reason, response.events = "python", prepared.unsupported, []
     return response
 
