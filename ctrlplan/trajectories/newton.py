@@ -35,15 +35,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from operator import mul
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import blas
+from scipy.linalg import blas, solve_triangular
 
 from ctrlplan.trajectories.common import FACTORIALS, Array, Frozen, readonly
+
+
+_MEET = 0.25
+"""Ends meet where they are nearer to each other, on the circle, than this part of all neighbours."""
+
+_SUSPECT = 1e5
+"""Amplification of rounding errors above which the digits lost are estimated."""
 
 
 class NewtonSystem(Frozen):
@@ -67,6 +74,12 @@ class NewtonSystem(Frozen):
         spare coefficients minimise int (y^(smooth))^2 over [0, 1].
     smooth : int
         That derivative order.
+    meet : bool
+        Whether the data of both ends agree, so that they may be one node near
+        alpha = 2 pi.
+    apart : ndarray, shape (nwaypoints, nwaypoints), or None
+        Differences of the relative times, where they are known to more digits
+        than the times themselves have: waypoints close together need them.
 
     Raises
     ------
@@ -89,12 +102,14 @@ class NewtonSystem(Frozen):
         gamma: float | None = None,
         size: int | None = None,
         smooth: int = 3,
+        meet: bool = False,
+        apart: Array | None = None,
     ) -> None:
         count = sum(map(len, given))
         if count == 0:
             raise ValueError("an axis needs at least one prescribed entry, got none")
         size = count if size is None else size
-        waypoints, orders = _sequence(_leja(_effective(alpha), times, given), given)
+        waypoints, orders, lead = _constraints(_effective(alpha), times, given, meet)
         nodes = times[waypoints]
         mean = math.fsum(nodes) / count
         nodes = np.concatenate([nodes, _spare_nodes(mean, size - count)]) if size > count else nodes
@@ -118,14 +133,19 @@ class NewtonSystem(Frozen):
             _first=nodes[0 : size - size % 2 : 2],
             _second=nodes[1::2],
             _scales={},
+            _positions=(orders == 0).astype(float)[:, None],
+            _anchor=int((orders == 0).argmax()),
         )
-        jets = self.taylor(times, max(orders))
+        beyond = times[:, None] - nodes
+        if apart is not None:
+            beyond[:, :count] = apart[:, waypoints]
+        jets = self._taylor(beyond.T[: size - size % 2 : 2], beyond.T[1:size:2], max(orders))
         collocation = jets[:, orders, waypoints].T
         hermite = all(g == tuple(range(len(g))) for g in given)
         self.__dict__["_triangle"], self.__dict__["_spread"] = (
             (np.asfortranarray(collocation), None)
             if hermite and size == count
-            else _factor(collocation, hermite, self._roughness(smooth) if size > count else None)
+            else _factor(collocation, hermite, self._roughness(smooth) if size > count else None, lead)
         )
 
         if not self._triangle.diagonal().all():
@@ -142,9 +162,13 @@ class NewtonSystem(Frozen):
 
     def coefficients(self, taylor_data: Array) -> Array:
         """Coefficients (size, naxes) from Taylor data (nconstraints, naxes)."""
+        # Positions from the first one: what they have in common costs no digit of their differences.
+        first = taylor_data[self._anchor]
         # Not LAPACK's dtrtrs, which waits for its threads however small the system.
-        solved = blas.dtrsm(1.0, self._triangle, taylor_data, lower=1)
-        return solved if self._spread is None else self._spread @ solved
+        solved = blas.dtrsm(1.0, self._triangle, taylor_data - self._positions * first, lower=1)
+        found = solved if self._spread is None else self._spread @ solved
+        found[0] += first * self._positions[self._anchor]
+        return found
 
     def taylor(self, u: Array, order: int) -> Array:
         """Taylor coefficients of every basis function.
@@ -160,19 +184,22 @@ class NewtonSystem(Frozen):
         -------
         ndarray, shape (size, order + 1, ntime)
         """
+        return self._taylor(u - self._first[:, None], u - self._second[:, None], order)
+
+    def _taylor(self, first: Array, second: Array, order: int) -> Array:
+        """The same from the distances (npairs, ntime) beyond the nodes of each pair."""
         alpha = _effective(self.alpha)
         half = 0.5 * alpha
-        npairs = len(self._second)
-        out = np.empty((2 * npairs + 1, order + 1, u.size))
+        npairs, ntime = len(second), second.shape[1]
+        out = np.empty((2 * npairs + 1, order + 1, ntime))
         out[0] = 0.0
         out[0, 0] = 1.0
         if npairs:
-            first, second = u - self._first[:, None], u - self._second[:, None]
-            middle = u - 0.5 * (self._first + self._second)[:, None]
-            factor = np.empty((npairs, 2, 3, 1, u.size))  # [q c, q q] by [1, S, V]
+            middle = 0.5 * (first + second)
+            factor = np.empty((npairs, 2, 3, 1, ntime))  # [q c, q q] by [1, S, V]
             if alpha:
                 q = np.sin(half * first) / half
-                second *= half
+                second = half * second
                 sigma, kappa = np.sin(alpha * middle), np.cos(alpha * middle)
                 factor[:, 0, 0, 0] = q * np.cos(second)
                 factor[:, 1, 0, 0] = q * np.sin(second) / half
@@ -187,7 +214,7 @@ class NewtonSystem(Frozen):
                 factor[:, 1, 1, 0] = 2.0 * middle
             kernel = _kernel(alpha, order)
             for j in range(npairs):
-                shifted = (kernel @ out[2 * j]).reshape(3, order + 1, u.size)
+                shifted = (kernel @ out[2 * j]).reshape(3, order + 1, ntime)
                 np.add.reduce(factor[j] * shifted, axis=1, out=out[2 * j + 1 : 2 * j + 3])
         if self._fold:
             out[self.size - 1] += self._fold * out[self.size]
@@ -204,6 +231,39 @@ class NewtonSystem(Frozen):
             columns = [[*column, self._fold * column[-1]] for column in columns]
         return [newton_series(factors, column, order) for column in columns]
 
+    def loss(self, taylor_data: Array) -> float:
+        """Bound of what rounding costs the plan through the data, relative to its range.
+
+        The rounding of each product in the triangular solution, through the
+        inverse to the plan: Skeel's componentwise bound, to first order.
+        """
+        if self._amplification < _SUSPECT:
+            return 0.0
+        data = taylor_data - self._positions * taylor_data[self._anchor]
+        solved = blas.dtrsm(1.0, self._triangle, data, lower=1)
+        rounding = np.finfo(float).eps * (np.abs(self._triangle) @ np.abs(solved))
+        functions, cardinal = self._samples
+        plan, lost = (np.abs(values).max(axis=1) for values in (functions @ solved, np.abs(cardinal) @ rounding))
+        # Derivatives are of Taylor's scale: some are 0 but for rounding.
+        size = np.maximum(plan, plan[0])
+        return float((lost / np.where(size > 0.0, size, 1.0)).max())
+
+    @cached_property
+    def _amplification(self) -> float:
+        """By how much rounding errors can grow in the solution, at most."""
+        scaled = self._triangle / np.abs(self._triangle).max(axis=0)
+        inverse: Array = solve_triangular(scaled, np.eye(len(scaled)), lower=True, check_finite=False)
+        return float((np.abs(inverse) @ np.abs(scaled)).max())
+
+    @cached_property
+    def _samples(self) -> tuple[Array, Array]:
+        """Taylor coefficients (order + 1, ntime, nconstraints) by solution, and by data."""
+        u = np.linspace(0.0, 1.0, 2 * self.size + 1)
+        functions = self.taylor(u, int(self.order_index.max())).transpose(1, 2, 0)
+        functions = functions if self._spread is None else functions @ self._spread
+        inverse = solve_triangular(self._triangle, np.eye(len(self._triangle)), lower=True, check_finite=False)
+        return functions, functions @ inverse
+
     def _roughness(self, smooth: int) -> Array:
         """Weighted samples G with int (y^(smooth))^2 = |G coefficients|^2."""
         nodes, weights = np.polynomial.legendre.leggauss(2 * self.size + int(4 * self.alpha) + 8)
@@ -211,6 +271,8 @@ class NewtonSystem(Frozen):
         return np.sqrt(weights)[:, None] * top.T
 
     _scales: dict[float, Array]  # the last duration's, as a memory
+    _positions: Array  # 1 where a position is prescribed, else 0
+    _anchor: int
     _triangle: Array
     _spread: Array | None
     _fold: float
@@ -266,19 +328,34 @@ def _effective(alpha: float) -> float:
     return alpha if alpha > 1e-100 else 0.0
 
 
-def _leja(alpha: float, times: Array, given: tuple[tuple[int, ...], ...]) -> list[int]:
-    """Waypoints in Leja order: each next one farthest, in product, from those before."""
+def _constraints(
+    alpha: float, times: Array, given: tuple[tuple[int, ...], ...], meet: bool
+) -> tuple[NDArray[np.intp], NDArray[np.intp], int]:
+    """Waypoint and order of each constraint, in the order in which the Newton form takes them.
+
+    Waypoints in Leja order: each next one farthest, in product, from those
+    before. Ends that meet on the circle come first with all their entries, whose
+    number is returned: their data agree, so the divided differences between them
+    are exactly 0 or small, and no others are divided by their distance.
+    """
     used = [i for i, g in enumerate(given) if g]
     u = times[used]
-    distance = np.abs(np.sin(0.5 * alpha * (u[:, None] - u))) if alpha else np.abs(u[:, None] - u)
-    chosen = [0]
-    product = distance[0]
+    distance = np.abs(u[:, None] - u)
+    if alpha:
+        distance = np.abs(np.sin(0.5 * alpha * distance)) * (2.0 / alpha)
+    meet = meet and len(used) > 2 and distance[0, -1] < _MEET * np.diag(distance, 1).min()
+    chosen = [0, len(used) - 1] if meet else [0]
+    product = distance[chosen].prod(axis=0)
     while len(chosen) < len(used):
         # Rescaled, so that many waypoints do not underflow to a tie.
         farthest = int(product.argmax())
         product = product * (distance[farthest] / product[farthest])
         chosen.append(farthest)
-    return [used[i] for i in chosen]
+    ordered = [used[i] for i in chosen]
+    if not meet:
+        return *_sequence(ordered, given), 0
+    (first, rank), (others, ranks) = _sequence(ordered[:2], given), _sequence(ordered[2:], given)
+    return np.concatenate([first, others]), np.concatenate([rank, ranks]), len(first)
 
 
 def _sequence(waypoints: list[int], given: tuple[tuple[int, ...], ...]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -323,25 +400,32 @@ def _fold(alpha: float, size: int, offset: float) -> float:
     return -0.5 * alpha * math.tan(angle)
 
 
-def _factor(collocation: Array, hermite: bool, roughness: Array | None) -> tuple[Array, Array | None]:
-    """Lower triangle T and matrix B such that coefficients = B T^-1 data."""
+def _factor(collocation: Array, hermite: bool, roughness: Array | None, lead: int) -> tuple[Array, Array | None]:
+    """Lower triangle T and matrix B such that coefficients = B T^-1 data.
+
+    The first `lead` constraints are left as they are where they are triangular.
+    """
     count, size = collocation.shape
     if hermite:  # spare functions vanish at every constraint
         triangle, basis = collocation[:, :count], np.eye(size)
     else:
+        lead = lead if not np.triu(collocation[:lead], 1).any() else 0
+        rest = collocation[lead:, lead:]
         # Columns and rows scaled: neither the size of the basis functions nor the units of the entries must count.
-        size_of = np.abs(collocation).max(axis=0)
+        size_of = np.abs(rest).max(axis=0)
         weight = 1.0 / np.where(size_of > 0.0, size_of, 1.0)
-        scaled = collocation * weight
+        scaled = rest * weight
         singular = np.linalg.svd(scaled / np.linalg.norm(scaled, axis=1, keepdims=True), compute_uv=False)
         if singular[-1] < 1e-13 * singular[0]:
             raise ValueError(
                 "the entries left free must not make the system singular: the prescribed entries conflict or leave "
                 f"the plan undetermined, got a relative singular value of {singular[-1] / singular[0]:.1g}"
             )
-        basis, upper = np.linalg.qr(scaled.T, mode="complete")
-        basis *= weight[:, None]
-        triangle = upper[:count].T
+        mixed, upper = np.linalg.qr(scaled.T, mode="complete")
+        basis = np.eye(size)
+        basis[lead:, lead:] = mixed * weight[:, None]
+        triangle = collocation[:, :count].copy()
+        triangle[lead:, lead:] = upper[: count - lead].T
     spread = basis[:, :count]
     if roughness is not None:
         cost = roughness @ basis

@@ -13,6 +13,14 @@ from ctrlplan.trajectories.trajectory import Trajectory
 from ctrlplan.trajectories.waypoint import Waypoint
 
 Given = tuple[tuple[int, ...], ...]
+Kind = tuple[Given, float | None, bool]
+"""Entries given at each waypoint, gamma, and whether the ends meet."""
+
+MOST_LOSS = 1e-6
+"""Estimated error, relative to the plan's range, up to which a plan is made."""
+
+_NEARLY_CLOSED = 5.0
+"""Alpha [rad] from which on both ends may count as one point."""
 
 
 class Options(NamedTuple):
@@ -97,19 +105,24 @@ class NewtonSpline(Trajectory):
         same_clock = donor is not None and donor._times == times and donor._duration == duration
         relative = donor._relative if donor and same_clock else (np.array(times) - start) / duration
         lent = donor._systems if donor and (same_clock or np.array_equal(donor._relative, relative)) else {}
+        # Differences of the times themselves: rounded as parts of the duration, close ones would lose digits.
+        apart = np.subtract.outer(times, times) / duration
         table, patterns = given_entries(waypoints)
-        systems: dict[tuple[Given, float | None], NewtonSystem] = {}
+        systems: dict[Kind, NewtonSystem] = {}
         parts = []
-        for (given, gamma), axes in _groups(patterns, options.gamma).items():
-            system = lent.get((given, gamma))
+        for kind, axes in _groups(patterns, options.gamma, _meeting(table, alpha)).items():
+            given, gamma, meet = kind
+            system = lent.get(kind)
             if system is None:
                 size = _size(alpha, sum(map(len, given)), options.degree)
-                system = NewtonSystem(alpha, relative, given, gamma, size, options.smooth)
-            systems[given, gamma] = system
+                system = NewtonSystem(alpha, relative, given, gamma, size, options.smooth, meet, apart)
+            systems[kind] = system
             data = table[system.waypoint_index, system.order_index]
             if len(axes) < table.shape[2]:
                 data = data[:, axes]
-            parts.append((axes, system, system.coefficients(data * system.taylor_scale(duration))))
+            data = data * system.taylor_scale(duration)
+            _check_loss(system.loss(data), alpha)
+            parts.append((axes, system, system.coefficients(data)))
         if donor is not None and len(donor.labels) == table.shape[2]:
             labels = donor.labels
         else:
@@ -182,7 +195,7 @@ class NewtonSpline(Trajectory):
     _times: list[float]
     _relative: Array
     _duration: float
-    _systems: dict[tuple[Given, float | None], NewtonSystem]
+    _systems: dict[Kind, NewtonSystem]
     _parts: list[tuple[tuple[int, ...], NewtonSystem, Array]]
 
 
@@ -264,17 +277,39 @@ def given_entries(waypoints: Sequence[Waypoint]) -> tuple[Array, list[Given]]:
     return table, patterns
 
 
+def _meeting(table: Array, alpha: float) -> list[bool]:
+    """Whether the first and last positions agree, axis by axis; only near alpha = 2 pi, where ends can meet."""
+    if alpha < _NEARLY_CLOSED:
+        return [False] * table.shape[2]
+    found = []
+    for positions in table[:, 0].T:
+        known = positions[~np.isnan(positions)]
+        found.append(known.size > 1 and bool(abs(known[-1] - known[0]) <= 0.1 * np.ptp(known)))
+    return found
+
+
 def _groups(
-    patterns: list[Given], gamma: float | list[float | None] | None
-) -> dict[tuple[Given, float | None], tuple[int, ...]]:
-    """Axes that share a pattern of given entries and a gamma."""
-    if gamma is None and patterns.count(patterns[0]) == len(patterns):
-        return {(patterns[0], None): tuple(range(len(patterns)))}
+    patterns: list[Given], gamma: float | list[float | None] | None, meeting: list[bool]
+) -> dict[Kind, tuple[int, ...]]:
+    """Axes that share a pattern of given entries, a gamma, and whether their ends meet."""
+    if gamma is None and patterns.count(patterns[0]) == len(patterns) and len(set(meeting)) == 1:
+        return {(patterns[0], None, meeting[0]): tuple(range(len(patterns)))}
     gammas = gamma if isinstance(gamma, list) else [gamma] * len(patterns)
-    groups: dict[tuple[Given, float | None], tuple[int, ...]] = {}
-    for axis, key in enumerate(zip(patterns, gammas, strict=True)):
-        groups[key] = (*groups.get(key, ()), axis)
+    groups: dict[Kind, tuple[int, ...]] = {}
+    for axis, kind in enumerate(zip(patterns, gammas, meeting, strict=True)):
+        groups[kind] = (*groups.get(kind, ()), axis)
     return groups
+
+
+def _check_loss(loss: float, alpha: float) -> None:
+    """Raise where rounding has cost digits that matter."""
+    if loss > MOST_LOSS:
+        near = " Near alpha = 2 pi both ends are nearly one point: lower alpha, or use TrigSpline.cyclic."
+        raise ValueError(
+            f"waypoints must determine the plan to {MOST_LOSS:g} of its range in double precision, got an estimated "
+            f"loss of {loss:.1g}: waypoints so close together, or so many entries, amplify rounding; move them apart "
+            f"or prescribe less.{near if alpha > _NEARLY_CLOSED else ''}"
+        )
 
 
 def checked_degree(degree: int | None, smooth: int) -> tuple[int | None, int]:
