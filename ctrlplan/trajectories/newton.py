@@ -41,7 +41,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import blas, solve_triangular
+from scipy.linalg import blas
 
 from ctrlplan.trajectories.common import FACTORIALS, Array, Frozen, readonly
 
@@ -51,6 +51,13 @@ _MEET = 0.25
 
 _SUSPECT = 1e5
 """Amplification of rounding errors above which the digits lost are estimated."""
+
+
+MOST_LOSS = 1e-6
+"""Part of a plan's range up to which rounding may cost it."""
+
+NEARLY_CLOSED = 5.0
+"""Alpha [rad] from which on both ends may count as one point."""
 
 
 class NewtonSystem(Frozen):
@@ -163,11 +170,11 @@ class NewtonSystem(Frozen):
     def coefficients(self, taylor_data: Array) -> Array:
         """Coefficients (size, naxes) from Taylor data (nconstraints, naxes)."""
         # Positions from the first one: what they have in common costs no digit of their differences.
-        first = taylor_data[self._anchor]
+        offset = taylor_data[self._anchor] * self._positions[self._anchor]
         # Not LAPACK's dtrtrs, which waits for its threads however small the system.
-        solved = blas.dtrsm(1.0, self._triangle, taylor_data - self._positions * first, lower=1)
+        solved = blas.dtrsm(1.0, self._triangle, taylor_data - self._positions * offset, lower=1)
         found = solved if self._spread is None else self._spread @ solved
-        found[0] += first * self._positions[self._anchor]
+        found[0] += offset
         return found
 
     def taylor(self, u: Array, order: int) -> Array:
@@ -252,7 +259,7 @@ class NewtonSystem(Frozen):
     def _amplification(self) -> float:
         """By how much rounding errors can grow in the solution, at most."""
         scaled = self._triangle / np.abs(self._triangle).max(axis=0)
-        inverse: Array = solve_triangular(scaled, np.eye(len(scaled)), lower=True, check_finite=False)
+        inverse: Array = blas.dtrsm(1.0, scaled, np.eye(len(scaled)), lower=1)
         return float((np.abs(inverse) @ np.abs(scaled)).max())
 
     @cached_property
@@ -261,8 +268,7 @@ class NewtonSystem(Frozen):
         u = np.linspace(0.0, 1.0, 2 * self.size + 1)
         functions = self.taylor(u, int(self.order_index.max())).transpose(1, 2, 0)
         functions = functions if self._spread is None else functions @ self._spread
-        inverse = solve_triangular(self._triangle, np.eye(len(self._triangle)), lower=True, check_finite=False)
-        return functions, functions @ inverse
+        return functions, functions @ blas.dtrsm(1.0, self._triangle, np.eye(len(self._triangle)), lower=1)
 
     def _roughness(self, smooth: int) -> Array:
         """Weighted samples G with int (y^(smooth))^2 = |G coefficients|^2."""
@@ -278,6 +284,21 @@ class NewtonSystem(Frozen):
     _fold: float
     _first: Array
     _second: Array
+
+
+def check_loss(system: NewtonSystem, taylor_data: Array) -> None:
+    """Raise where rounding could cost a plan digits that matter."""
+    loss = system.loss(taylor_data)
+    if loss <= MOST_LOSS:
+        return
+    if system.alpha < NEARLY_CLOSED:
+        why = "waypoints so close together amplify rounding: move them apart, or use PiecewiseSpline"
+    else:
+        why = "near alpha = 2 pi both ends are nearly one point: lower alpha, or use TrigSpline.cyclic"
+    raise ValueError(
+        f"waypoints must determine the plan to {MOST_LOSS:g} of its range in floating point, got an estimated loss "
+        f"of {loss:.1g}; {why}"
+    )
 
 
 Pair = tuple[list[Any], list[Any]]

@@ -8,19 +8,13 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 
 from ctrlplan.trajectories.common import FACTORIALS, Array, checked_count, checked_labels, mapped_time, readonly
-from ctrlplan.trajectories.newton import NewtonSystem
+from ctrlplan.trajectories.newton import NEARLY_CLOSED, NewtonSystem, check_loss
 from ctrlplan.trajectories.trajectory import Trajectory
 from ctrlplan.trajectories.waypoint import Waypoint
 
 Given = tuple[tuple[int, ...], ...]
 Kind = tuple[Given, float | None, bool]
 """Entries given at each waypoint, gamma, and whether the ends meet."""
-
-MOST_LOSS = 1e-6
-"""Estimated error, relative to the plan's range, up to which a plan is made."""
-
-_NEARLY_CLOSED = 5.0
-"""Alpha [rad] from which on both ends may count as one point."""
 
 
 class Options(NamedTuple):
@@ -105,8 +99,6 @@ class NewtonSpline(Trajectory):
         same_clock = donor is not None and donor._times == times and donor._duration == duration
         relative = donor._relative if donor and same_clock else (np.array(times) - start) / duration
         lent = donor._systems if donor and (same_clock or np.array_equal(donor._relative, relative)) else {}
-        # Differences of the times themselves: rounded as parts of the duration, close ones would lose digits.
-        apart = np.subtract.outer(times, times) / duration
         table, patterns = given_entries(waypoints)
         systems: dict[Kind, NewtonSystem] = {}
         parts = []
@@ -114,6 +106,8 @@ class NewtonSpline(Trajectory):
             given, gamma, meet = kind
             system = lent.get(kind)
             if system is None:
+                # Differences of the times themselves: rounded as parts of the duration, close ones would lose digits.
+                apart = np.subtract.outer(times, times) / duration
                 size = _size(alpha, sum(map(len, given)), options.degree)
                 system = NewtonSystem(alpha, relative, given, gamma, size, options.smooth, meet, apart)
             systems[kind] = system
@@ -121,7 +115,7 @@ class NewtonSpline(Trajectory):
             if len(axes) < table.shape[2]:
                 data = data[:, axes]
             data = data * system.taylor_scale(duration)
-            _check_loss(system.loss(data), alpha)
+            check_loss(system, data)
             parts.append((axes, system, system.coefficients(data)))
         if donor is not None and len(donor.labels) == table.shape[2]:
             labels = donor.labels
@@ -279,7 +273,7 @@ def given_entries(waypoints: Sequence[Waypoint]) -> tuple[Array, list[Given]]:
 
 def _meeting(table: Array, alpha: float) -> list[bool]:
     """Whether the first and last positions agree, axis by axis; only near alpha = 2 pi, where ends can meet."""
-    if alpha < _NEARLY_CLOSED:
+    if alpha < NEARLY_CLOSED:
         return [False] * table.shape[2]
     found = []
     for positions in table[:, 0].T:
@@ -299,17 +293,6 @@ def _groups(
     for axis, kind in enumerate(zip(patterns, gammas, meeting, strict=True)):
         groups[kind] = (*groups.get(kind, ()), axis)
     return groups
-
-
-def _check_loss(loss: float, alpha: float) -> None:
-    """Raise where rounding has cost digits that matter."""
-    if loss > MOST_LOSS:
-        near = " Near alpha = 2 pi both ends are nearly one point: lower alpha, or use TrigSpline.cyclic."
-        raise ValueError(
-            f"waypoints must determine the plan to {MOST_LOSS:g} of its range in double precision, got an estimated "
-            f"loss of {loss:.1g}: waypoints so close together, or so many entries, amplify rounding; move them apart "
-            f"or prescribe less.{near if alpha > _NEARLY_CLOSED else ''}"
-        )
 
 
 def checked_degree(degree: int | None, smooth: int) -> tuple[int | None, int]:
