@@ -45,7 +45,6 @@ from scipy.linalg import blas
 
 from ctrlplan.trajectories.common import FACTORIALS, Array, Frozen, readonly
 
-
 _MEET = 0.25
 """Ends meet where they are nearer to each other, on the circle, than this part of all neighbours."""
 
@@ -254,6 +253,11 @@ class NewtonSystem(Frozen):
         # Derivatives are of Taylor's scale: some are 0 but for rounding.
         size = np.maximum(plan, plan[0])
         return float((lost / np.where(size > 0.0, size, 1.0)).max())
+
+    @cached_property
+    def functions(self) -> Array:
+        """Values (size, ntime) of the basis functions at times between which a plan cannot hide much."""
+        return self.taylor(np.linspace(0.0, 1.0, 2 * self.size + 1), 0)[:, 0]
 
     @cached_property
     def _amplification(self) -> float:

@@ -9,6 +9,7 @@ import numpy as np
 
 from ctrlplan.trajectories.common import FACTORIALS, Array, checked_count, checked_labels, mapped_time, readonly
 from ctrlplan.trajectories.newton import NEARLY_CLOSED, NewtonSystem, check_loss
+from ctrlplan.trajectories.swing import warn_of_swing
 from ctrlplan.trajectories.trajectory import Trajectory
 from ctrlplan.trajectories.waypoint import Waypoint
 
@@ -25,10 +26,11 @@ class Options(NamedTuple):
     degree: int | None = None
     smooth: int = 3
     period: float | None = None
+    warn: bool = True
 
     def given(self) -> dict[str, Any]:
-        """Those that differ from what is taken unless given."""
-        return {k: v for k, v in self._asdict().items() if v != self._field_defaults[k]}
+        """Those that make the plan what it is, where they differ from what is taken unless given."""
+        return {k: v for k, v in self._asdict().items() if k != "warn" and v != self._field_defaults[k]}
 
 
 class NewtonSpline(Trajectory):
@@ -60,7 +62,9 @@ class NewtonSpline(Trajectory):
         ValueError
             If a time differs.
         """
-        return self._again(same_times(waypoints, self.waypoints), self._options)
+        plan = self._again(same_times(waypoints, self.waypoints), self._options)
+        plan._check_swing()
+        return plan
 
     def through(self, waypoints: Iterable[Waypoint]) -> Self:
         """Plan of the same kind and shape through any waypoints of as many axes.
@@ -71,7 +75,9 @@ class NewtonSpline(Trajectory):
             As the constructor of this kind.
         """
         points = same_axes(checked_waypoints(waypoints, 2 if self._options.period is None else 1), self.naxes)
-        return self._again(points, self._options)
+        plan = self._again(points, self._options)
+        plan._check_swing()
+        return plan
 
     @property
     def degree(self) -> tuple[int, ...]:
@@ -143,6 +149,28 @@ class NewtonSpline(Trajectory):
         plan = type(self).__new__(type(self))
         plan._fit(_checked_waypoints(waypoints), self.alpha, options, self)
         return plan
+
+    def _check_swing(self) -> None:
+        """Warn, where it was not declined, of a plan that swings far beyond its waypoints."""
+        if self._options.warn:
+            values = np.empty((self.naxes, 2 * max(s.size for _, s, _ in self._parts) + 1))
+            for axes, system, coefficients in self._parts:
+                found = coefficients.T @ system.functions
+                values[list(axes), : found.shape[1]] = found
+                values[list(axes), found.shape[1] :] = found[:, :1]
+            way_on = "use PiecewiseSpline, one polynomial a segment"
+            if self.alpha:
+                way_on = f"lower alpha from {self.alpha:.6g} (choose_alpha finds the best one) or {way_on}"
+            warn_of_swing(values, self.waypoints, self.end, self.labels, way_on)
+
+    def quiet(self) -> Self:
+        """The same plan, which no longer warns where `through` or `with_values` swings."""
+        return self._again(self.waypoints, self._options._replace(warn=False))
+
+    def _loaded(self) -> Self:
+        """The plan as it was saved: it was warned of when it was made, and its `through` warns."""
+        self.__dict__["_options"] = self._options._replace(warn=True)
+        return self
 
     def _map_time(self, origin: float, target: float, rate: float) -> Self:
         moved = tuple(w.scaled(mapped_time(w.time, origin, target, rate), rate) for w in self.waypoints)

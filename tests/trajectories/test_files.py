@@ -21,6 +21,9 @@ from ctrlplan.trajectories import (
     trajectory_from_dict,
 )
 
+# Data drawn at random and every alpha: most of these plans swing, on purpose.
+pytestmark = pytest.mark.filterwarnings("ignore:the plan swings")
+
 number = st.floats(-1e6, 1e6, allow_nan=False)
 MOVE = PolySpline(waypoints([0.0, 1.0], [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]))
 
