@@ -44,6 +44,7 @@ from numpy.typing import NDArray
 from scipy.linalg import blas
 
 from ctrlplan.trajectories.common import FACTORIALS, Array, Frozen, readonly
+from ctrlplan.trajectories.digits import many_digits
 
 _MEET = 0.25
 """Ends meet where they are nearer to each other, on the circle, than this part of all neighbours."""
@@ -52,8 +53,14 @@ _SUSPECT = 1e5
 """Amplification of rounding errors above which the digits lost are estimated."""
 
 
+_KEPT = 1e-10
+"""Part of a plan's range up to which rounding may cost it before more digits are taken."""
+
 MOST_LOSS = 1e-6
-"""Part of a plan's range up to which rounding may cost it."""
+"""The same where there are no more to take."""
+
+_MOST_DIGITS = 100
+"""Constraints up to which many digits take a fraction of a second."""
 
 NEARLY_CLOSED = 5.0
 """Alpha [rad] from which on both ends may count as one point."""
@@ -139,6 +146,7 @@ class NewtonSystem(Frozen):
             _first=nodes[0 : size - size % 2 : 2],
             _second=nodes[1::2],
             _scales={},
+            _hermite=all(g == tuple(range(len(g))) for g in given),
             _positions=(orders == 0).astype(float)[:, None],
             _anchor=int((orders == 0).argmax()),
         )
@@ -147,11 +155,10 @@ class NewtonSystem(Frozen):
             beyond[:, :count] = apart[:, waypoints]
         jets = self._taylor(beyond.T[: size - size % 2 : 2], beyond.T[1:size:2], max(orders))
         collocation = jets[:, orders, waypoints].T
-        hermite = all(g == tuple(range(len(g))) for g in given)
         self.__dict__["_triangle"], self.__dict__["_spread"] = (
             (np.asfortranarray(collocation), None)
-            if hermite and size == count
-            else _factor(collocation, hermite, self._roughness(smooth) if size > count else None, lead)
+            if self._hermite and size == count
+            else _factor(collocation, self._hermite, self._roughness(smooth) if size > count else None, lead)
         )
 
         if not self._triangle.diagonal().all():
@@ -175,6 +182,32 @@ class NewtonSystem(Frozen):
         found = solved if self._spread is None else self._spread @ solved
         found[0] += offset
         return found
+
+    def fitted(self, values: Array, times: Sequence[float], duration: float, taylor_data: Array) -> Array:
+        """Coefficients from prescribed derivatives at the times [s], which no rounding has spoilt.
+
+        Raises
+        ------
+        ValueError
+            If rounding could cost more than 1e-6 of the plan's range.
+        """
+        loss = self.loss(taylor_data)
+        if loss <= _KEPT:
+            return self.coefficients(taylor_data)
+        if self._hermite and len(values) <= _MOST_DIGITS:
+            digits = math.ceil(math.log10(min(self._amplification, 1e300)))
+            constraints = self.waypoint_index, self.order_index
+            solved = many_digits(self.alpha, times, duration, constraints, values, self._fold, digits)
+            return solved if self._spread is None else self._spread @ solved
+        if loss <= MOST_LOSS:
+            return self.coefficients(taylor_data)
+        why = "waypoints so close together amplify rounding: move them apart, or use PiecewiseSpline"
+        if self.alpha > NEARLY_CLOSED:
+            why = "near alpha = 2 pi both ends are nearly one point: lower alpha, or use TrigSpline.cyclic"
+        raise ValueError(
+            f"waypoints must determine the plan to {MOST_LOSS:g} of its range in floating point, got an estimated "
+            f"loss of {loss:.1g}; {why}"
+        )
 
     def taylor(self, u: Array, order: int) -> Array:
         """Taylor coefficients of every basis function.
@@ -281,6 +314,7 @@ class NewtonSystem(Frozen):
         return np.sqrt(weights)[:, None] * top.T
 
     _scales: dict[float, Array]  # the last duration's, as a memory
+    _hermite: bool  # no gaps between the orders at any waypoint
     _positions: Array  # 1 where a position is prescribed, else 0
     _anchor: int
     _triangle: Array
@@ -288,21 +322,6 @@ class NewtonSystem(Frozen):
     _fold: float
     _first: Array
     _second: Array
-
-
-def check_loss(system: NewtonSystem, taylor_data: Array) -> None:
-    """Raise where rounding could cost a plan digits that matter."""
-    loss = system.loss(taylor_data)
-    if loss <= MOST_LOSS:
-        return
-    if system.alpha < NEARLY_CLOSED:
-        why = "waypoints so close together amplify rounding: move them apart, or use PiecewiseSpline"
-    else:
-        why = "near alpha = 2 pi both ends are nearly one point: lower alpha, or use TrigSpline.cyclic"
-    raise ValueError(
-        f"waypoints must determine the plan to {MOST_LOSS:g} of its range in floating point, got an estimated loss "
-        f"of {loss:.1g}; {why}"
-    )
 
 
 Pair = tuple[list[Any], list[Any]]

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 
 from ctrlplan.trajectories.common import FACTORIALS, Array, checked_count, checked_labels, mapped_time, readonly
-from ctrlplan.trajectories.newton import NEARLY_CLOSED, NewtonSystem, check_loss
+from ctrlplan.trajectories.newton import NEARLY_CLOSED, NewtonSystem
 from ctrlplan.trajectories.swing import warn_of_swing
 from ctrlplan.trajectories.trajectory import Trajectory
 from ctrlplan.trajectories.waypoint import Waypoint
@@ -104,7 +104,8 @@ class NewtonSpline(Trajectory):
             raise ValueError(f"duration must be finite and above 0, got {times[-1]} s after {start} s")
         same_clock = donor is not None and donor._times == times and donor._duration == duration
         relative = donor._relative if donor and same_clock else (np.array(times) - start) / duration
-        lent = donor._systems if donor and (same_clock or np.array_equal(donor._relative, relative)) else {}
+        apart = donor._apart if donor and same_clock else _apart(times, relative, duration)
+        lent = donor._systems if donor and (same_clock or _same_pattern(donor, relative, apart)) else {}
         table, patterns = given_entries(waypoints)
         systems: dict[Kind, NewtonSystem] = {}
         parts = []
@@ -112,17 +113,13 @@ class NewtonSpline(Trajectory):
             given, gamma, meet = kind
             system = lent.get(kind)
             if system is None:
-                # Differences of the times themselves: rounded as parts of the duration, close ones would lose digits.
-                apart = np.subtract.outer(times, times) / duration
                 size = _size(alpha, sum(map(len, given)), options.degree)
                 system = NewtonSystem(alpha, relative, given, gamma, size, options.smooth, meet, apart)
             systems[kind] = system
             data = table[system.waypoint_index, system.order_index]
             if len(axes) < table.shape[2]:
                 data = data[:, axes]
-            data = data * system.taylor_scale(duration)
-            check_loss(system, data)
-            parts.append((axes, system, system.coefficients(data)))
+            parts.append((axes, system, system.fitted(data, times, duration, data * system.taylor_scale(duration))))
         if donor is not None and len(donor.labels) == table.shape[2]:
             labels = donor.labels
         else:
@@ -139,6 +136,7 @@ class NewtonSpline(Trajectory):
             _options=options,
             _times=times,
             _relative=relative,
+            _apart=apart,
             _duration=duration,
             _systems=systems,
             _parts=parts,
@@ -216,6 +214,7 @@ class NewtonSpline(Trajectory):
     _options: Options
     _times: list[float]
     _relative: Array
+    _apart: Array | None
     _duration: float
     _systems: dict[Kind, NewtonSystem]
     _parts: list[tuple[tuple[int, ...], NewtonSystem, Array]]
@@ -250,6 +249,20 @@ def _checked_waypoints(points: tuple[Waypoint, ...]) -> tuple[Waypoint, ...]:
                 )
         before = point
     return points
+
+
+def _apart(times: list[float], relative: Array, duration: float) -> Array | None:
+    """Differences of the times in parts of the duration, where those of the rounded parts would lose digits."""
+    if np.diff(relative).min(initial=1.0) > 1e-4:
+        return None
+    return np.subtract.outer(times, times) / duration
+
+
+def _same_pattern(donor: NewtonSpline, relative: Array, apart: Array | None) -> bool:
+    """Whether the systems of another plan fit these times."""
+    if not np.array_equal(donor._relative, relative):
+        return False
+    return apart is None or (donor._apart is not None and np.array_equal(donor._apart, apart))
 
 
 def _size(alpha: float, count: int, degree: int | None) -> int | None:

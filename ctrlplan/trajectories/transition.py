@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ctrlplan.trajectories.common import FACTORIALS, Array, Frozen, checked_count, checked_time
-from ctrlplan.trajectories.newton import NewtonSystem, check_loss, newton_series, pair_series
+from ctrlplan.trajectories.newton import NewtonSystem, newton_series, pair_series
 from ctrlplan.trajectories.trigonometric import checked_alpha
 
 
@@ -86,15 +86,10 @@ class Transition(Frozen):
         Returns
         -------
         ndarray, shape (2 (order + 1), naxes)
-
-        Raises
-        ------
-        ValueError
-            If rounding could cost more than 1e-6 of the range, near alpha = 2 pi.
         """
-        data = jets[self._rows] * self._data_scale
-        check_loss(self._system, data)
-        return self._system.coefficients(data) * self._time_scale
+        data = jets[self._rows]
+        found = self._system.fitted(data, (0.0, self.horizon), self.horizon, data * self._data_scale)
+        return found * self._time_scale
 
     def jet(self, coefficients: Array, s: Array, order: int) -> Array:
         """Jet (order + 1, naxes, ntime) at times s [s] after the beginning."""
