@@ -94,8 +94,23 @@ def write_csv(plan: Trajectory, path: str | os.PathLike[str], timepts: ArrayLike
         Times [s]; 1001 from start to end unless given.
     order : int, optional
         Highest derivative; columns are x, x_d1, x_d2, ...
+
+    Raises
+    ------
+    ValueError
+        If `timepts` is no sequence of times (a sampling period is none), one is
+        nan, or the order is negative.
+    OSError
+        If the file cannot be written: one of this name is as it was.
     """
-    times = np.linspace(plan.start, plan.end, 1001) if timepts is None else np.atleast_1d(checked_timepts(timepts))
+    times = np.linspace(plan.start, plan.end, 1001) if timepts is None else checked_timepts(timepts)
+    if times.ndim != 1:
+        got = f"the scalar {times:g}" if times.ndim == 0 else f"shape {times.shape}"
+        step = f"{times:g}" if times.ndim == 0 else "dt"
+        raise ValueError(
+            f"timepts must be sample times of shape (ntime,), got {got}; for a row every {step} s give "
+            f"np.arange(plan.start, plan.end, {step})"
+        )
     columns = np.concatenate([times[None], signal_rows(plan, times, order)])
     table = io.StringIO()
     np.savetxt(table, columns.T, fmt="%.17g", delimiter=",", header=csv_header(column_names(plan, order)), comments="")

@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ctrlplan.trajectories.common import FACTORIALS, Array, mapped_time, readonly
+from ctrlplan.trajectories.common import FACTORIALS, Array, mapped_time, new_numbers, readonly
 from ctrlplan.trajectories.step import Step
 from ctrlplan.trajectories.trajectory import Trajectory
 
@@ -277,10 +277,7 @@ def _shifted(taylor: list[float], s: Any, order: int) -> list[Any]:
 
 def _checked_limit(limit: ArrayLike, name: str, labels: tuple[str, ...]) -> Array:
     """Limit of each axis."""
-    try:
-        values = np.array(limit, dtype=float)
-    except (TypeError, ValueError):
-        raise ValueError(f"{name} must be numbers, got {limit!r}") from None
+    values = new_numbers(limit, name)
     if values.shape not in ((), (len(labels),)):
         raise ValueError(f"{name} must be a scalar or of shape ({len(labels)},), got shape {values.shape}")
     for label, value in zip(labels, np.broadcast_to(values, len(labels)).tolist(), strict=True):

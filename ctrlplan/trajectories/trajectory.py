@@ -373,12 +373,12 @@ class Trajectory(Frozen, ABC):
     def __mul__(self, factor: float | Real) -> Trajectory:
         from ctrlplan.trajectories.combined import Scaled
 
-        return Scaled(self, float(factor)) if isinstance(factor, Real) else NotImplemented
+        return Scaled(self, float(factor)) if _is_factor(factor) else NotImplemented
 
     __rmul__ = __mul__
 
     def __truediv__(self, factor: float | Real) -> Trajectory:
-        return self * (1.0 / float(factor)) if isinstance(factor, Real) else NotImplemented
+        return self * (1.0 / float(factor)) if _is_factor(factor) else NotImplemented
 
     def __neg__(self) -> Trajectory:
         return self * -1.0
@@ -435,3 +435,8 @@ class Trajectory(Frozen, ABC):
         if 0 <= leg < self.breakpoints.size - 1:
             return self._leg_series(leg, s + (origin - float(self.breakpoints[leg])), order)
         return [[value, *[0.0] * order] for value in (self.initial if leg < 0 else self.final).tolist()]
+
+
+def _is_factor(value: object) -> bool:
+    """Whether a plan may be multiplied by a value: numpy counts a time difference among the real numbers."""
+    return isinstance(value, Real) and not isinstance(value, bool | np.timedelta64)

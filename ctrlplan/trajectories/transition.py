@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ctrlplan._checks import real_array
 from ctrlplan.trajectories.common import FACTORIALS, Array, Frozen, checked_count, checked_time
 from ctrlplan.trajectories.newton import NewtonSystem, newton_series, pair_series
 from ctrlplan.trajectories.trigonometric import checked_alpha
@@ -166,7 +167,7 @@ def series(rate: float, columns: Sequence[Sequence[Any]], past: Any, ahead: Any,
 
 def extrapolated(jet: ArrayLike, time: float) -> Array:
     """Jet (order + 1, naxes) `time` seconds later, along its Taylor polynomial."""
-    values = np.asarray(jet, dtype=float)
+    values = real_array(jet, "jet")
     return np.array([taylor_value(values[k:], time) for k in range(len(values))]) if len(values) > 1 else values
 
 

@@ -9,7 +9,7 @@ from typing import Any, Literal, Self
 
 import numpy as np
 
-from ctrlplan.trajectories.common import Array, checked_time
+from ctrlplan.trajectories.common import Array, checked_time, one_number
 from ctrlplan.trajectories.newton import NewtonSystem
 from ctrlplan.trajectories.newton_spline import NewtonSpline, Options, checked_degree, checked_waypoints
 from ctrlplan.trajectories.waypoint import Waypoint
@@ -233,10 +233,7 @@ def checked_alpha(alpha: float | str) -> float:
     """Shape parameter in [0, 2 pi)."""
     if isinstance(alpha, str):
         raise ValueError(f"alpha must be a number in [0, 2 pi) here, got {alpha!r}")
-    try:
-        value = float(alpha)
-    except (TypeError, ValueError):
-        raise TypeError(f"alpha must be a number in [0, 2 pi), got {alpha!r}") from None
+    value = one_number(alpha, "alpha", "a number in [0, 2 pi)")
     if not 0.0 <= value < 2.0 * math.pi:
         raise ValueError(f"alpha must lie in [0, 2 pi), got {value}")
     return value
@@ -247,10 +244,7 @@ def _checked_gamma(gamma: float | Sequence[float | None] | None, naxes: int) -> 
     if gamma is None:
         return None
     given: Any = np.asarray(gamma, dtype=object)
-    try:
-        values = [None if v is None else float(v) for v in given.ravel()]
-    except (TypeError, ValueError):
-        raise TypeError(f"gamma must be a number, or one an axis, got {gamma!r}") from None
+    values = [None if v is None else one_number(v, "gamma", "a number, or one an axis") for v in given.ravel()]
     for value in values:
         if value is not None and not math.isfinite(value):
             raise ValueError(f"gamma must be finite, got {value}")
