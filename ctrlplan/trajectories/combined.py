@@ -39,14 +39,19 @@ class _Combined(Trajectory):
         return self
 
     def _set(self, parts: tuple[Trajectory, ...], labels: tuple[str, ...]) -> None:
-        initial = readonly(self._combine([part.initial for part in parts]))
+        with np.errstate(over="ignore", invalid="ignore"):
+            initial, final = (self._combine([getattr(p, end) for p in parts]) for end in ("initial", "final"))
+        if not (np.isfinite(initial).all() and np.isfinite(final).all()):
+            raise ValueError(
+                f"positions must stay within floating point, got {initial.tolist()} and {final.tolist()} at the ends"
+            )
         joined = np.unique(np.concatenate([part.breakpoints for part in parts]))
         self.__dict__.update(
             parts=parts,
             labels=checked_labels(labels, initial.size),
             breakpoints=readonly(joined),
-            initial=initial,
-            final=readonly(self._combine([part.final for part in parts])),
+            initial=readonly(initial),
+            final=readonly(final),
         )
 
     @abstractmethod
@@ -191,7 +196,7 @@ class Joined(Trajectory):
     def __init__(self, parts: Iterable[Trajectory]) -> None:
         members = list(_checked_parts(parts))
         for i in range(1, len(members)):
-            members[i] = members[i]._map_time(members[i].start, members[i - 1].end, 1.0)
+            members[i] = members[i]._moved(members[i].start, members[i - 1].end, 1.0)
         for before, after in pairwise(_same_axes(tuple(members))):
             _check_join(before, after)
         self._set(tuple(members), members[0].labels)

@@ -85,7 +85,7 @@ def one_number(value: object, name: str, rule: str = "a number") -> float:
         return value
     given: Any = value
     wrong = TypeError(f"{name} must be {rule}, got {value!r:.80}")
-    if isinstance(value, _NO_NUMBERS) or getattr(given, "ndim", 0) or np.ma.is_masked(given):
+    if isinstance(value, _NO_NUMBERS) or bool(getattr(given, "ndim", False)) or np.ma.is_masked(given):
         raise wrong
     if getattr(getattr(given, "dtype", None), "kind", "f") not in "iufO" or _has_unit(given):
         raise wrong
@@ -168,6 +168,33 @@ def checked_limits(pair: object, name: str) -> tuple[float, float, float]:
     if math.isfinite(low) and math.isfinite(high):
         return low, high, 0.5 * (high - low)
     return low, high, abs(low if math.isfinite(low) else high) or 1.0
+
+
+def times_powers(values: Array, base: float, orders: NDArray[np.integer[Any]]) -> Array:
+    """Derivatives (order, ...) times powers of a time or rate: exact 0 stays 0, and nothing leaves floating point."""
+    with np.errstate(all="ignore"):
+        found = np.where(values == 0.0, 0.0, values * base**orders)
+        size = np.abs(found)
+        lost = (values != 0.0) & np.isfinite(values) & ~((size >= _TINY) & (size < np.inf))
+    if lost.any():
+        place = tuple(np.argwhere(lost)[0])
+        raise ValueError(
+            f"derivatives must stay within floating point, got {values[place]:g} times {base:g} to the power "
+            f"{np.broadcast_to(orders, values.shape)[place]:g}; choose a time unit nearer to the plan's"
+        )
+    return found
+
+
+def derivative_scale(duration: float, order: int) -> Array:
+    """Factors (order + 1,) that make derivatives of Taylor coefficients in parts of a duration."""
+    with np.errstate(over="ignore", divide="ignore", under="ignore"):
+        scale: Array = FACTORIALS[: order + 1] / duration ** np.arange(order + 1)
+    if not scale[-1] < np.inf:
+        raise ValueError(f"derivative {order} must stay within floating point, got a duration of {duration:g} s")
+    return scale
+
+
+_TINY = float(np.finfo(float).tiny)
 
 
 def mapped_time(time: float, origin: float, target: float, rate: float) -> float:

@@ -168,7 +168,13 @@ class NewtonSystem(Frozen):
         """Column that turns prescribed derivatives into normalised Taylor data."""
         scale: Array | None = self._scales.get(duration)
         if scale is None:
-            scale = (duration**self.order_index / FACTORIALS[self.order_index])[:, None]
+            with np.errstate(over="ignore", under="ignore"):
+                scale = (duration**self.order_index / FACTORIALS[self.order_index])[:, None]
+            if not (scale.min() > 1e-290 and scale.max() < np.inf):
+                raise ValueError(
+                    f"powers of the duration must stay within floating point, got {duration:g} s to the power "
+                    f"{self.order_index.max()}; choose another unit of time"
+                )
             self._scales.clear()
             self._scales[duration] = scale
         return scale

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from ctrlplan.trajectories.common import FACTORIALS, Array, checked_count, checked_labels, mapped_time, readonly
+from ctrlplan.trajectories.common import Array, checked_count, checked_labels, derivative_scale, mapped_time, readonly
 from ctrlplan.trajectories.newton import NEARLY_CLOSED, NewtonSystem
 from ctrlplan.trajectories.swing import warn_of_swing
 from ctrlplan.trajectories.trajectory import Trajectory
@@ -108,7 +108,7 @@ class NewtonSpline(Trajectory):
         lent = donor._systems if donor and (same_clock or _same_pattern(donor, relative, apart)) else {}
         table, patterns = given_entries(waypoints)
         systems: dict[Kind, NewtonSystem] = {}
-        parts = []
+        parts, largest = [], 0.0
         for kind, axes in _groups(patterns, options.gamma, _meeting(table, alpha)).items():
             given, gamma, meet = kind
             system = lent.get(kind)
@@ -119,7 +119,16 @@ class NewtonSpline(Trajectory):
             data = table[system.waypoint_index, system.order_index]
             if len(axes) < table.shape[2]:
                 data = data[:, axes]
-            parts.append((axes, system, system.fitted(data, times, duration, data * system.taylor_scale(duration))))
+            with np.errstate(over="ignore", invalid="ignore"):
+                found = system.fitted(data, times, duration, data * system.taylor_scale(duration))
+            size = np.abs(found).max()
+            if not size < np.inf:
+                raise ValueError(
+                    "what waypoints prescribe must leave a plan within floating point, got coefficients of up to "
+                    f"{size} from entries of up to {np.abs(data).max():g} over {duration:g} s"
+                )
+            largest = max(largest, float(size))
+            parts.append((axes, system, found))
         if donor is not None and len(donor.labels) == table.shape[2]:
             labels = donor.labels
         else:
@@ -140,6 +149,7 @@ class NewtonSpline(Trajectory):
             _duration=duration,
             _systems=systems,
             _parts=parts,
+            _largest=largest,
         )
 
     def _again(self, waypoints: tuple[Waypoint, ...], options: Options) -> Self:
@@ -151,11 +161,14 @@ class NewtonSpline(Trajectory):
     def _check_swing(self) -> None:
         """Warn, where it was not declined, of a plan that swings far beyond its waypoints."""
         if self._options.warn:
-            values = np.empty((self.naxes, 2 * max(s.size for _, s, _ in self._parts) + 1))
+            values = np.empty((self.naxes, 2 * max([s.size for _, s, _ in self._parts]) + 1))
             for axes, system, coefficients in self._parts:
                 found = coefficients.T @ system.functions
-                values[list(axes), : found.shape[1]] = found
-                values[list(axes), found.shape[1] :] = found[:, :1]
+                if len(self._parts) == 1:
+                    values = found
+                else:
+                    values[list(axes), : found.shape[1]] = found
+                    values[list(axes), found.shape[1] :] = found[:, :1]
             way_on = "use PiecewiseSpline, one polynomial a segment"
             if self.alpha:
                 way_on = f"lower alpha from {self.alpha:.6g} (choose_alpha finds the best one) or {way_on}"
@@ -179,12 +192,30 @@ class NewtonSpline(Trajectory):
 
     def _leg_jet(self, leg: int, s: Array, order: int) -> Array:
         u = s / self._duration
-        scale = FACTORIALS[: order + 1] / self._duration ** np.arange(order + 1)
-        out = np.empty((order + 1, self.naxes, s.size))
+        scale = derivative_scale(self._duration, order)
+        if self._largest > 1e250 / max(1.0, scale.max()):
+            return self._huge_jet(u, scale)
+        return self._jet(u, scale)
+
+    def _huge_jet(self, u: Array, scale: Array) -> Array:
+        """The same where it could overflow."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            found = self._jet(u, scale)
+        if not np.isfinite(found).all():
+            raise ValueError(
+                f"derivatives up to {len(scale) - 1} must stay within floating point, got coefficients of up to "
+                f"{self._largest:g} over {self._duration:g} s"
+            )
+        return found
+
+    def _jet(self, u: Array, scale: Array) -> Array:
+        """Derivatives from order 0 at parts u of the duration."""
+        order = len(scale) - 1
+        out = np.empty((order + 1, self.naxes, u.size))
         for axes, system, coefficients in self._parts:
             taylor = system.taylor(u, order)
             values = coefficients.T @ taylor.reshape(system.size, -1)
-            values = values.reshape(len(axes), order + 1, s.size).transpose(1, 0, 2) * scale[:, None, None]
+            values = values.reshape(len(axes), order + 1, u.size).transpose(1, 0, 2) * scale[:, None, None]
             if len(axes) == self.naxes:
                 return values
             out[:, list(axes)] = values
@@ -217,6 +248,7 @@ class NewtonSpline(Trajectory):
     _apart: Array | None
     _duration: float
     _systems: dict[Kind, NewtonSystem]
+    _largest: float  # of the coefficients
     _parts: list[tuple[tuple[int, ...], NewtonSystem, Array]]
 
 

@@ -8,7 +8,7 @@ from typing import Any, Literal, Self
 
 import numpy as np
 
-from ctrlplan.trajectories.common import FACTORIALS, Array, checked_labels, mapped_time, readonly
+from ctrlplan.trajectories.common import FACTORIALS, Array, checked_labels, mapped_time, readonly, times_powers
 from ctrlplan.trajectories.newton import NewtonSystem
 from ctrlplan.trajectories.newton_spline import NewtonSpline, checked_waypoints, given_entries, same_axes, same_times
 from ctrlplan.trajectories.polynomial import PolySpline
@@ -196,7 +196,7 @@ def _conjugate(
     unit = (points[-1].time - points[0].time) / last
     naxes = table.shape[2]
     columns = np.concatenate([np.nan_to_num(table), np.zeros((last + 1, size, len(free)))], axis=2)
-    columns *= (unit ** np.arange(size))[:, None]
+    columns = times_powers(columns, unit, np.arange(size)[:, None])
     for n, (i, k) in enumerate(free):
         columns[i, k, naxes + n] = 1.0
     jump = np.zeros((last + 1, 2 * size, columns.shape[2]))  # right limit minus left, at each waypoint
@@ -220,4 +220,4 @@ def _conjugate(
     if scale.min() == 0.0 or np.linalg.cond(matrix / scale) > 1e13:
         raise ValueError("the entries left free at inner waypoints must be determined by the others; prescribe more")
     solution: Array = np.linalg.solve(matrix, -known)
-    return solution / unit ** np.array([k for _, k in free])[:, None]
+    return times_powers(solution, 1.0 / unit, np.array([k for _, k in free])[:, None])

@@ -36,12 +36,15 @@ def warn_of_swing(values: Array, points: Sequence[Waypoint], end: float, labels:
     way_on : str
         What to do instead.
     """
-    low, high = _data_range(points, end)
-    plan, data = np.ptp(values, axis=1), high - low
-    # Relative to a range that is only rounding of the positions, rounding is large.
-    counts = plan > 1e-9 * np.abs(values).max(axis=1)
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        swing = np.where(counts, plan / data, 0.0)
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        plan = values.max(axis=1) - values.min(axis=1)
+        positions = np.array([p.jet[0] for p in points])
+        if (plan <= MOST_SWING * (positions.max(axis=0) - positions.min(axis=0))).all():
+            return  # the common case, without regard to derivatives
+        low, high = _data_range(points, end)
+        # Relative to a range that is only rounding of the positions, rounding is large.
+        counts = plan > 1e-9 * np.abs(values).max(axis=1)
+        swing = np.where(counts, plan / (high - low), 0.0)
     axis = int(swing.argmax())
     if swing[axis] > MOST_SWING:
         warnings.warn(

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ctrlplan._checks import real_array
-from ctrlplan.trajectories.common import FACTORIALS, Array, Frozen, checked_count, checked_time
+from ctrlplan.trajectories.common import FACTORIALS, Array, Frozen, checked_count, checked_time, derivative_scale
 from ctrlplan.trajectories.newton import NewtonSystem, newton_series, pair_series
 from ctrlplan.trajectories.trigonometric import checked_alpha
 
@@ -64,7 +64,12 @@ class Transition(Frozen):
         horizon = checked_time(horizon, "horizon", positive=True)
         alpha = checked_alpha(alpha)
         family = _family(order, alpha)
-        powers = horizon**family.exponents
+        with np.errstate(over="ignore", under="ignore"):
+            powers = horizon**family.exponents
+        if not 1e-290 < powers[-1] < 1e290:
+            raise ValueError(
+                f"powers of the horizon must stay within floating point, got {horizon:g} s to the power {2 * order + 1}"
+            )
         self.__dict__.update(
             order=order,
             horizon=horizon,
@@ -96,7 +101,7 @@ class Transition(Frozen):
         """Jet (order + 1, naxes, ntime) at times s [s] after the beginning."""
         taylor = self._system.taylor(np.asarray(s, dtype=float) / self.horizon, order)
         values = np.einsum("mkt,ma->kat", taylor, coefficients / self._time_scale)
-        return values * (FACTORIALS[: order + 1] / self.horizon ** np.arange(order + 1))[:, None, None]
+        return values * derivative_scale(self.horizon, order)[:, None, None]
 
     def evaluation(self, s: float, order: int) -> Array:
         """Matrix (order + 1, 2 (self.order + 1)) from coefficients to derivatives s seconds after the beginning."""

@@ -243,6 +243,8 @@ def _checked_gamma(gamma: float | Sequence[float | None] | None, naxes: int) -> 
     """One phase for all axes, or one an axis, as plain numbers."""
     if gamma is None:
         return None
+    if np.ma.is_masked(gamma):
+        raise TypeError(f"gamma must be a number, or one an axis, got {gamma!r:.80}")
     given: Any = np.asarray(gamma, dtype=object)
     values = [None if v is None else one_number(v, "gamma", "a number, or one an axis") for v in given.ravel()]
     for value in values:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ctrlplan.trajectories.common import Array, Frozen, checked_time, new_numbers, readonly
+from ctrlplan.trajectories.common import Array, Frozen, checked_time, new_numbers, readonly, times_powers
 
 ENTRIES = ("position", "velocity", "acceleration", "jerk", "snap")
 
@@ -152,8 +152,8 @@ class Waypoint(Frozen):
 
     def scaled(self, time: float, rate: float) -> Waypoint:
         """Same point at another time, passed `rate` times as fast."""
-        powers = rate ** np.arange(len(self.jet))
-        return Waypoint._of(checked_time(time, "time"), self.jet * powers[:, None], self.labels)
+        moved = times_powers(self.jet, rate, np.arange(len(self.jet))[:, None])
+        return Waypoint._of(checked_time(time, "time"), moved, self.labels)
 
     def truncated(self, order: int) -> Waypoint:
         """Same point with what it prescribes up to an order, and the rest left free."""
