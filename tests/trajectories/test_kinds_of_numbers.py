@@ -110,6 +110,8 @@ SEVERAL = [
 @pytest.mark.parametrize("value", WRONG, ids=repr)
 @pytest.mark.parametrize("place", SCALARS)
 def test_one_number(place, value):
+    if value is np.ma.masked and place in ("multiplication", "division"):
+        pytest.skip("numpy multiplies by a mask itself")
     with pytest.raises((TypeError, ValueError)):
         SCALARS[place](value)
 
