@@ -11,7 +11,7 @@ import lzma
 import os
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -45,8 +45,10 @@ def trajectory_from_dict(data: dict[str, Any]) -> Trajectory:
     try:
         return Trajectory.kinds[kind]._from_dict(data)
     except KeyError as missing:
-        raise ValueError(f"a {kind} needs the entry {missing}, got {', '.join(data)}") from None
-    except (TypeError, AttributeError, IndexError) as error:
+        raise ValueError(f"a {kind} needs the entry {missing}, got {', '.join(map(str, data))}") from None
+    except RecursionError:
+        raise ValueError("type must not be nested so deep that Python's stack overflows") from None
+    except (TypeError, AttributeError, IndexError, ArithmeticError) as error:
         raise ValueError(f"a {kind} must have entries of the kinds that to_dict writes: {error}") from None
 
 
@@ -76,9 +78,17 @@ def load_trajectory(path: str | os.PathLike[str]) -> Trajectory:
         If it does not hold a trajectory.
     """
     try:
-        return trajectory_from_dict(json.loads(Path(path).read_text(encoding="utf-8")))
+        text = Path(path).read_text(encoding="utf-8")
+        return trajectory_from_dict(json.loads(text, parse_constant=_no_number))
+    except RecursionError:
+        raise ValueError(f"{os.fspath(path)} must hold a saved trajectory: it is nested too deep") from None
     except (ValueError, TypeError) as error:
         raise ValueError(f"{os.fspath(path)} must hold a saved trajectory: {error}") from None
+
+
+def _no_number(name: str) -> NoReturn:
+    """Reject what JSON does not have and `save` never writes."""
+    raise ValueError(f"numbers must be finite, got {name}")
 
 
 def write_csv(plan: Trajectory, path: str | os.PathLike[str], timepts: ArrayLike | None = None, order: int = 2) -> None:

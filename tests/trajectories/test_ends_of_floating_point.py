@@ -99,7 +99,7 @@ def test_what_a_late_clock_costs_is_stated():
     with pytest.raises(ValueError, match=r"times must keep the intervals of the plan, got a loss of 0\.0?\d+ of"):
         plan.shift(1e4 * at)
     with pytest.raises(ValueError, match="times must keep the intervals"):
-        moved.then(PolySpline([Waypoint(0, 0, 0), Waypoint(1e-6, 1, 0), Waypoint(1e-5, 2)]))
+        moved.then(PolySpline([Waypoint(0, 0, 0), Waypoint(1e-6, 1, 0), Waypoint(1e-5, 2)], warn=False))
     late = PolySpline([Waypoint(1e9, 0, 0), Waypoint(1e9 + 1, 1, 0)])
     with pytest.raises(ValueError, match="times must keep the intervals"):
         late.retime(1e-6)
