@@ -188,7 +188,8 @@ class Joined(Trajectory):
     ------
     ValueError
         If the axes differ in number, or a first position differs from the last
-        one before it by more than 1e-9 of the size of either trajectory.
+        one before it by more than 1e-9 of the range of either trajectory and the
+        rounding of positions.
     """
 
     parts: tuple[Trajectory, ...]
@@ -309,8 +310,17 @@ def _check_join(before: Trajectory, after: Trajectory) -> None:
     if abs(after.start - before.end) > 1e-9 * (before.duration + after.duration):
         raise ValueError(f"parts must follow one another in time, got {after.start} s after {before.end} s")
     last, first = before.final, after.initial
-    if np.any(first != last) and np.any(np.abs(first - last) > 1e-9 * np.maximum(before.peak(), after.peak())):
+    if np.any(first != last) and np.any(np.abs(first - last) > _slack(before, after)):
         raise ValueError(
             f"positions must agree where trajectories join, got {first.tolist()} after {last.tolist()} "
             f"at {before.end:g} s"
         )
+
+
+def _slack(*parts: Trajectory) -> Array:
+    """Difference of positions (naxes,) that counts as none: part of a range, so that a far origin hides no jump."""
+    extrema = [part.extrema() for part in parts]
+    ranges = np.max([e.maximum - e.minimum for e in extrema], axis=0)
+    size = np.max([np.maximum(np.abs(e.minimum), np.abs(e.maximum)) for e in extrema], axis=0)
+    slack: Array = 1e-9 * ranges + 8.0 * np.finfo(float).eps * size
+    return slack

@@ -339,7 +339,7 @@ class Trajectory(Frozen, ABC):
         ------
         ValueError
             If the other's first position differs from this one's last by more
-            than 1e-9 of their size, or the axes differ in number.
+            than 1e-9 of their range, or the axes differ in number.
         """
         from ctrlplan.trajectories.combined import Joined
 
