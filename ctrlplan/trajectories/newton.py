@@ -52,7 +52,6 @@ _MEET = 0.25
 _SUSPECT = 1e5
 """Amplification of rounding errors above which the digits lost are estimated."""
 
-
 _KEPT = 1e-10
 """Part of a plan's range up to which rounding may cost it before more digits are taken."""
 
@@ -126,16 +125,7 @@ class NewtonSystem(Frozen):
         nodes = times[waypoints]
         mean = math.fsum(nodes) / count
         nodes = np.concatenate([nodes, _spare_nodes(mean, size - count)]) if size > count else nodes
-        fold = 0.0
-        if size % 2 or not alpha:
-            if gamma is not None:
-                why = f"{size} coefficients" if size % 2 else "alpha = 0"
-                raise ValueError(f"gamma needs an even number of coefficients and alpha > 0, got {why}")
-            phase = None
-        else:
-            phase = alpha * mean if gamma is None else gamma
-            if gamma is not None:
-                fold = _fold(alpha, size, alpha * mean - gamma)
+        phase, fold = _top_harmonic(alpha, size, mean, gamma)
         self.__dict__.update(
             alpha=alpha,
             size=size,
@@ -203,7 +193,7 @@ class NewtonSystem(Frozen):
         if self._hermite and len(values) <= _MOST_DIGITS:
             digits = math.ceil(math.log10(min(self._amplification, 1e300)))
             constraints = self.waypoint_index, self.order_index
-            solved = many_digits(self.alpha, times, duration, constraints, values, self._fold, digits)
+            solved = many_digits(_effective(self.alpha), times, duration, constraints, values, self._fold, digits)
             return solved if self._spread is None else self._spread @ solved
         if loss <= MOST_LOSS:
             return self.coefficients(taylor_data)
@@ -433,6 +423,18 @@ def _spare_nodes(mean: float, count: int) -> Array:
     """Nodes for spare functions, symmetric about the mean so that gamma stays."""
     reach = min(mean, 1.0 - mean)
     return mean + reach * np.cos(np.pi * (np.arange(count) + 0.5) / count)
+
+
+def _top_harmonic(alpha: float, size: int, mean: float, gamma: float | None) -> tuple[float | None, float]:
+    """Phase of the top harmonic, if there is one, and what turns it to a given gamma."""
+    if size % 2 or not alpha:
+        if gamma is not None:
+            why = f"{size} coefficients" if size % 2 else "alpha = 0"
+            raise ValueError(f"gamma needs an even number of coefficients and alpha > 0, got {why}")
+        return None, 0.0
+    if gamma is None:
+        return alpha * mean, 0.0
+    return gamma, _fold(alpha, size, alpha * mean - gamma)
 
 
 def _fold(alpha: float, size: int, offset: float) -> float:

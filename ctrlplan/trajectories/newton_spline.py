@@ -108,7 +108,7 @@ class NewtonSpline(Trajectory):
         lent = donor._systems if donor and (same_clock or _same_pattern(donor, relative, apart)) else {}
         table, patterns = given_entries(waypoints)
         systems: dict[Kind, NewtonSystem] = {}
-        parts, largest = [], 0.0
+        parts = []
         for kind, axes in _groups(patterns, options.gamma, _meeting(table, alpha)).items():
             given, gamma, meet = kind
             system = lent.get(kind)
@@ -119,16 +119,7 @@ class NewtonSpline(Trajectory):
             data = table[system.waypoint_index, system.order_index]
             if len(axes) < table.shape[2]:
                 data = data[:, axes]
-            with np.errstate(over="ignore", invalid="ignore"):
-                found = system.fitted(data, times, duration, data * system.taylor_scale(duration))
-            size = np.abs(found).max()
-            if not size < np.inf:
-                raise ValueError(
-                    "what waypoints prescribe must leave a plan within floating point, got coefficients of up to "
-                    f"{size} from entries of up to {np.abs(data).max():g} over {duration:g} s"
-                )
-            largest = max(largest, float(size))
-            parts.append((axes, system, found))
+            parts.append((axes, system, _solved(system, data, times, duration)))
         if donor is not None and len(donor.labels) == table.shape[2]:
             labels = donor.labels
         else:
@@ -149,7 +140,7 @@ class NewtonSpline(Trajectory):
             _duration=duration,
             _systems=systems,
             _parts=parts,
-            _largest=largest,
+            _largest=max([float(np.abs(found).max()) for _, _, found in parts]),
         )
 
     def _again(self, waypoints: tuple[Waypoint, ...], options: Options) -> Self:
@@ -281,6 +272,18 @@ def _checked_waypoints(points: tuple[Waypoint, ...]) -> tuple[Waypoint, ...]:
                 )
         before = point
     return points
+
+
+def _solved(system: NewtonSystem, data: Array, times: list[float], duration: float) -> Array:
+    """Coefficients from prescribed derivatives (nconstraints, naxes)."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        found = system.fitted(data, times, duration, data * system.taylor_scale(duration))
+    if not np.isfinite(found).all():
+        raise ValueError(
+            "what waypoints prescribe must leave a plan within floating point, got coefficients beyond it from "
+            f"entries of up to {np.abs(data).max():g} over {duration:g} s"
+        )
+    return found
 
 
 def _apart(times: list[float], relative: Array, duration: float) -> Array | None:
