@@ -31,7 +31,7 @@ def real_array(values: ArrayLike, name: str) -> Array:
         If the values are strings, complex, dates or time differences, or carry
         a physical unit: which unit is meant would be a guess.
     ValueError
-        If a value is masked, or rows differ in length.
+        If a value is masked or beyond floating point, or rows differ in length.
     """
     if type(values) is np.ndarray and values.dtype == np.float64:
         return values
@@ -49,6 +49,8 @@ def real_array(values: ArrayLike, name: str) -> Array:
     if array.dtype.kind == "O":
         try:
             return array.astype(float)
+        except OverflowError:
+            raise ValueError(f"{name} must be within floating point, got {given!r:.80}") from None
         except (TypeError, ValueError):
             raise TypeError(f"{name} must be real numbers, got {given!r:.80}") from None
     if array.dtype.kind not in "buif":

@@ -6,6 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ctrlplan._checks import real_array
+
 Array = NDArray[np.float64]
 Value = float | Array
 
@@ -16,12 +18,12 @@ HUGE = np.finfo(np.float64).max / 1e3
 def real(name: str, value: ArrayLike) -> Array:
     """Return an array of floats without nan, or say what is wrong with `name`."""
     try:
-        array = np.asarray(value)
-    except ValueError as error:
-        raise TypeError(f"{name} must be an array of real numbers, got a ragged sequence") from error
-    if array.dtype.kind not in "buif":
-        raise TypeError(f"{name} must be an array of real numbers, got dtype {array.dtype}")
-    array = array.astype(np.float64, copy=False)
+        kind = np.asarray(value).dtype
+    except ValueError:
+        raise TypeError(f"{name} must be an array of real numbers, got a ragged sequence") from None
+    if kind.kind not in "buifmM":
+        raise TypeError(f"{name} must be an array of real numbers, got dtype {kind}")
+    array = real_array(value, name)  # without units, dates and masks
     _forbid(name, array, np.isnan(array), "hold no nan")
     return array
 

@@ -13,7 +13,7 @@ from scipy.optimize import minimize_scalar
 
 from ctrlplan.planning.curve import curve
 from ctrlplan.planning.objectives import Objective, SquaredDerivative, checked_objective, wandering
-from ctrlplan.trajectories import Trajectory, TrigSpline, Waypoint
+from ctrlplan.trajectories import PiecewiseSpline, Trajectory, TrigSpline, Waypoint
 from ctrlplan.trajectories.common import Array, readonly
 from ctrlplan.trajectories.newton_spline import checked_waypoints, given_entries
 
@@ -125,8 +125,12 @@ def choose_alpha(
     if not callable(family):
         raise TypeError(f"family must be TrigSpline, PiecewiseSpline or a function like them, got {family!r}")
 
+    # Candidates swing wherever alpha is too large: only the choice may warn.
+    warns = isinstance(family, type) and issubclass(family, TrigSpline | PiecewiseSpline)
+    quiet = options | {"warn": False} if warns else options
+
     def plan_of(alpha: float) -> Trajectory:
-        return family(points, alpha=alpha, **options)
+        return family(points, alpha=alpha, **quiet)
 
     search = _Search(plan_of, goal)
     alphas, values = curve(search, _grid(points))
@@ -145,7 +149,7 @@ def choose_alpha(
     return AlphaChoice(
         alpha=alpha,
         value=value,
-        plan=plan_of(alpha),
+        plan=family(points, alpha=alpha, **options),
         alphas=readonly(alphas),
         values=readonly(values),
         blow_up=_blow_up(alphas, values, best + (_BLOWN - 1.0) * scale),

@@ -226,9 +226,9 @@ def _checked_plan(plan: Trajectory) -> Spline:
 
 def _kinds(plan: Spline) -> Iterator[Build]:
     """How plans through other waypoints are made: as the given one, then of minimum-jerk legs."""
-    yield plan.through
+    yield plan.quiet().through
     if not (isinstance(plan, PiecewiseSpline) and plan.alpha == 0.0):
-        yield lambda points: PiecewiseSpline(points, labels=plan.labels)
+        yield lambda points: PiecewiseSpline(points, labels=plan.labels, warn=False)
 
 
 # Ways: polylines round the obstacles

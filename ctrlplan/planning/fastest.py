@@ -194,7 +194,7 @@ class _Replanned:
             raise TypeError(
                 f"waypoints are held of a spline made through them, got a {type(plan).__name__}; hold the shape"
             )
-        self._plan, self.limited = plan, limited
+        self._plan, self.limited = plan.quiet(), limited
 
     def plan(self, duration: float) -> Trajectory:
         retimed = self._plan.retime(duration)

@@ -205,6 +205,10 @@ def margins(plan: Trajectory, limits: Mapping[str, Any], quantities: Any = None)
     return limited.margins(plan)
 
 
+class UndeterminedError(ValueError):
+    """A signal that the plan does not determine: the plant's maps are singular on it."""
+
+
 class Limited:
     """Limits of a kind of plan, ready to be looked at for many plans of that kind.
 
@@ -237,6 +241,21 @@ class Limited:
 
     def values(self, jet: Array) -> Array:
         """Limited signals (nbounds, ntime) of a jet (order + 1, naxes, ntime)."""
+        rows = self._rows(jet)
+        if not jet[1:].any():  # infinitely slow, so that nothing is said of plans that move
+            return rows
+        for row, b in zip(rows, self.bounds, strict=True):
+            if np.isnan(row).any():
+                still = not jet[1:, :, int(np.isnan(row).argmax())].any()
+                raise UndeterminedError(
+                    f"{b.name} must be determined by the plan, got nan{' where the plan is at rest' if still else ''}: "
+                    "the maps of the plant are singular there, as those of a car are at rest; limit it along plans "
+                    "that keep moving, by margins, or limit what is determined"
+                )
+        return rows
+
+    def _rows(self, jet: Array) -> Array:
+        """The same with nan where the plan does not determine a signal."""
         found = {} if self.derivatives_only or self._quantities is None else self._quantities(jet)
         rows = np.empty((len(self.bounds), jet.shape[2]))
         for row, b in zip(rows, self.bounds, strict=True):
@@ -305,9 +324,16 @@ class Limited:
 
     def _slackened(self, plan: Trajectory) -> Iterator[Bound]:
         """The bounds, with slack where they are touched at rest."""
+        try:
+            self.values(self.sampled(plan))
+        except UndeterminedError:  # as it is at any other duration
+            raise
+        except ValueError:  # what the plant cannot follow, it may follow more slowly
+            pass
         for bound, values in zip(self.bounds, self.values(self.at_rest(plan)), strict=True):
-            if np.isnan(values).any():
-                raise ValueError(f"{bound.name} must be a number at rest, got nan")
+            if np.isnan(values).any():  # what is singular at rest touches nothing there
+                yield replace(bound, slack=0.0)
+                continue
             rounding = 1e-12 * (1.0 + float(np.abs(values).max()) / bound.scale)
             touched = abs(float(bound.excess(values).max())) <= rounding
             yield replace(bound, slack=rounding if touched else 0.0)

@@ -109,6 +109,7 @@ class _Law:
                 for t, jet in zip(times.tolist(), (jets / length ** np.arange(3)[:, None]).T, strict=True)
             ],
             labels=["clock"],
+            warn=False,
         )
 
     def _room(self, logs: Array) -> Array:

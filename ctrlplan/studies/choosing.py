@@ -98,7 +98,7 @@ def optimality_grids() -> tuple[Grid, Grid]:
     shapes, rivals = [], []
     for end in ends.tolist():
         points = obstacle_waypoints(end)
-        shapes.append([TrigSpline(points, alpha=a) for a in alphas.tolist()])
+        shapes.append([TrigSpline(points, alpha=a, warn=False) for a in alphas.tolist()])
         rivals.append(
             {
                 "quintic a leg (minimum jerk)": PiecewiseSpline(points),

@@ -360,7 +360,7 @@ def standard_plans(waypoints: Iterable[Waypoint], alpha: float = 1.0) -> dict[st
         trigonometric, piecewise.
     """
     points = tuple(waypoints)
-    polynomial = PolySpline(points)
+    polynomial = PolySpline(points, warn=False)  # one of the baselines, however it swings
     return {
         "step": Step(polynomial.final, polynomial.initial, polynomial.start, polynomial.labels),
         "polynomial": polynomial,

@@ -310,12 +310,15 @@ def _speed_curves(points: tuple[Waypoint, Waypoint]) -> Curves:
     rows: dict[str, list[float]] = {"start, gamma pi/2": [], "end, gamma pi/2": [], "both ends, gamma mean": []}
     for alpha in alphas.tolist():
         fixed = (
-            TrigSpline(points, alpha=alpha, gamma=np.pi / 2) if abs(np.cos(0.5 * alpha - np.pi / 2)) > 1e-3 else None
+            TrigSpline(points, alpha=alpha, gamma=np.pi / 2, warn=False)
+            if abs(np.cos(0.5 * alpha - np.pi / 2)) > 1e-3
+            else None
         )
         ends = np.full(2, np.nan) if fixed is None else np.hypot(*fixed.jet([0.0, 30.0], 1)[1])
         rows["start, gamma pi/2"].append(float(ends[0]))
         rows["end, gamma pi/2"].append(float(ends[1]))
-        rows["both ends, gamma mean"].append(float(np.hypot(*TrigSpline(points, alpha=alpha).jet(30.0, 1)[1])))
+        mean = TrigSpline(points, alpha=alpha, warn=False)
+        rows["both ends, gamma mean"].append(float(np.hypot(*mean.jet(30.0, 1)[1])))
     return Curves(
         "alpha [rad]",
         "speed of the plan [m/s]",
@@ -343,7 +346,7 @@ def _length_curves() -> Curves:
     for duration in (14.0, 16.0, 20.0):
         points = obstacle_waypoints(duration)
         t = np.linspace(0.0, duration, 2001)
-        lengths = [float(metrics.path_length(t, TrigSpline(points, alpha=a)(t))) for a in alphas.tolist()]
+        lengths = [float(metrics.path_length(t, TrigSpline(points, alpha=a, warn=False)(t))) for a in alphas.tolist()]
         rows[f"one plan, {duration:g} s"] = np.array(lengths)
         legs = float(metrics.path_length(t, PiecewiseSpline(points)(t)))
         rows[f"one quintic a leg, {duration:g} s"] = np.full(alphas.size, legs)

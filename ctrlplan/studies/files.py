@@ -361,7 +361,7 @@ class _Reader:
             except ValueError as error:
                 raise self.error(place, error) from None
         try:
-            return PolySpline(points).waypoints
+            return PolySpline(points, warn=False).waypoints
         except ValueError as error:
             raise self.error("waypoints", error) from None
 

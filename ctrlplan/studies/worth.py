@@ -234,7 +234,7 @@ def worth(
     """
     points = waypoints_given(waypoints)
     times = np.asarray(timepts, dtype=float)
-    reference = PolySpline(points)
+    reference = PolySpline(points, warn=False)
     held = dict(limits) if limits is not None else _needed_by(reference)
     limited = Limited(reference, held, quantities)
     shaper = _shaper(loop, reference, mode)
@@ -260,7 +260,7 @@ def worth(
     names: dict[str, None] = {}  # a move can be too short to be shaped
     for factor in factors:
         scaled = _scaled(points, factor)
-        shapes = {f"{a:g}": TrigSpline(scaled, alpha=a) for a in alphas}
+        shapes = {f"{a:g}": TrigSpline(scaled, alpha=a, warn=False) for a in alphas}
         rivals = rival_plans(scaled, held, shaper)
         rows = compared(scaled, shapes | rivals, set(decisive)).metrics
         # What the plant cannot follow, and what an event has ended, loses.
@@ -307,7 +307,7 @@ def rival_plans(
     """
     points = tuple(waypoints)
     legs = PiecewiseSpline(points)
-    bounds = _derivative_limits(legs, limits if limits is not None else _needed_by(PolySpline(points)))
+    bounds = _derivative_limits(legs, limits if limits is not None else _needed_by(PolySpline(points, warn=False)))
     plans: dict[str, Trajectory] = {
         "step": Step(legs.final, legs.initial, legs.start, legs.labels),
         "trapezoid": _profile(points, legs.labels, Trapezoid, bounds),

@@ -5,6 +5,8 @@ Equations (9)-(11) of the paper, (11) corrected: the sum starts at 0 and is subt
 
 from __future__ import annotations
 
+import math
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -15,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctrlplan.trajectories import derivative_name
-from ctrlplan.trajectories.common import checked_labels
+from ctrlplan.trajectories.common import checked_labels, default_labels
 
 Array = NDArray[np.float64]
 
@@ -83,6 +85,12 @@ def create_flat_iosystem(
         and the plant's equations do not belong together; or if poles or labels
         are wrong.
 
+    Warns
+    -----
+    UserWarning
+        If `flat_system` is a `LinearFlatSystem` whose output is a multiple of its
+        flat output, which python-control chose, and `labels` does not name it.
+
     Notes
     -----
     The plant's maps are looked at in a few states, drawn at random from a fixed
@@ -114,10 +122,13 @@ def create_flat_iosystem(
     True
     """
     plant = _checked_plant(flat_system)
+    if labels is None:
+        warn_of_gain(flat_system)
     probes = _random_probes(plant)
     names = _flat_labels(plant, probes, labels)
     _check_linearises(plant, probes, names)
-    _check_linearises(plant, _planned_probes(plant, probes[0].orders), names)
+    planned = _planned_probes(plant, probes[0].orders)
+    _check_linearises(plant, planned, names)
     orders = probes[0].orders
     gains = _gains(poles, orders)
     references = [
@@ -140,9 +151,16 @@ def create_flat_iosystem(
             first += r + 1
         return plant.reverse(flag)[1]
 
+    regular = np.concatenate([*planned[0].flag, planned[0].x])
+
     def law_off_zero(t: float, x: Any, u: Any, params: dict[str, Any]) -> Any:
-        # Blocks are first evaluated with all inputs zero, where this plant is singular.
-        return law(t, x, u, params) if np.any(u) else idle
+        # Blocks are first evaluated with all inputs zero, where this plant is singular: there the law is taken
+        # elsewhere, and is 0. Without a condition, so that it can be traced.
+        idles = math.prod(value == 0.0 for value in u)
+        moved = np.empty(regular.size, dtype=u.dtype)
+        for i, at in enumerate(regular.tolist()):
+            moved[i] = u[i] + idles * at
+        return [value * (1.0 - idles) for value in law(t, x, moved, params)]
 
     zero = np.zeros(len(references) + plant.nstates)
     return ct.nlsys(
@@ -153,6 +171,44 @@ def create_flat_iosystem(
         dt=None,
         name=name,
     )
+
+
+def warn_of_gain(flat_system: fs.FlatSystem) -> None:
+    """Warn where a linear system's flat output, which python-control chose, is its output in another unit."""
+    if not isinstance(flat_system, fs.LinearFlatSystem):
+        return
+    output, chosen = np.ravel(flat_system.C), np.ravel(flat_system.Cf)
+    gain = float(output @ chosen / (chosen @ chosen))
+    rest = float(np.abs(output - gain * chosen).max() / np.abs(output).max(initial=np.finfo(float).tiny))
+    name = flat_system.output_labels[0]
+    if rest < _SAME and abs(gain - 1.0) > _SAME:
+        warnings.warn(
+            f"the flat output of {flat_system.name} is not its output, but {name} is {gain:.6g} times it: a plan of "
+            f"{name} must be multiplied by {1.0 / gain:.6g}, or flat_system be a control.flatsys.FlatSystem whose "
+            "flat output it is",
+            stacklevel=3,
+        )
+
+
+def check_maps(flat_system: fs.FlatSystem) -> None:
+    """Raise where the maps of a flat system do not belong together, or to its motion.
+
+    Raises
+    ------
+    ValueError
+        With what was found: a state and an input whose flag `reverse` does not
+        return to, or whose flag changes at other rates than it states.
+    """
+    plant = _checked_plant(flat_system)
+    try:
+        probes = _random_probes(plant)
+    except ValueError:  # it is regular elsewhere: nothing is known of it
+        return
+    names = default_labels(plant.ninputs)
+    sizes = _sizes(probes)
+    for probe in probes:
+        _check_derivatives(plant, probe, names)
+        _check_reverse(plant, probe, names, sizes)
 
 
 def hurwitz_coefficients(poles: Sequence[complex], count: int, where: str = "") -> tuple[float, ...]:
@@ -331,7 +387,7 @@ def _flat_labels(plant: _Plant, probes: list[_Probe], labels: Sequence[str] | st
 
 def _check_linearises(plant: _Plant, probes: list[_Probe], names: Sequence[str]) -> None:
     """Refuse maps of which the law would not make chains of integrators."""
-    sizes = [np.max(rows, axis=0) for rows in zip(*([np.abs(row) for row in p.flag] for p in probes), strict=True)]
+    sizes = _sizes(probes)
     for probe in probes:
         _check_below(plant, probe, names, sizes)
     for probe in probes:
@@ -345,6 +401,11 @@ def _check_linearises(plant: _Plant, probes: list[_Probe], names: Sequence[str])
     for probe in probes:
         _check_derivatives(plant, probe, names)
         _check_reverse(plant, probe, names, sizes)
+
+
+def _sizes(probes: list[_Probe]) -> list[Array]:
+    """Size of each entry of the flags, over all probes."""
+    return [np.max(rows, axis=0) for rows in zip(*([np.abs(row) for row in p.flag] for p in probes), strict=True)]
 
 
 def _varied(plant: _Plant, probe: _Probe, step: float) -> Iterator[tuple[int, float, list[Array], list[Array]]]:

@@ -9,6 +9,8 @@ import control.flatsys as fs
 import numpy as np
 from numpy.typing import NDArray
 
+from ctrlplan.systems.flat import check_maps, warn_of_gain
+
 Array = NDArray[np.float64]
 
 
@@ -35,8 +37,19 @@ def flat_quantities(flat_system: fs.FlatSystem) -> Callable[[Array], dict[str, A
     TypeError
         If `flat_system` is no `control.flatsys.FlatSystem`.
     ValueError
-        If it is in discrete time; by the function, if the jet is too short or
+        If it is in discrete time, or `forward`, `reverse` and the equations of
+        motion do not belong together; by the function, if the jet is too short or
         has another number of axes.
+
+    Warns
+    -----
+    UserWarning
+        If it is a `LinearFlatSystem` whose output is a multiple of its flat output.
+
+    Notes
+    -----
+    What the flat output does not determine at rest (heading and steering angle of
+    a car, quotients of derivatives that are 0 there) is nan at rest.
 
     Examples
     --------
@@ -53,12 +66,15 @@ def flat_quantities(flat_system: fs.FlatSystem) -> Callable[[Array], dict[str, A
         raise TypeError(f"flat_system must be a control.flatsys.FlatSystem, got {type(flat_system).__name__}")
     if flat_system.dt not in (None, 0):
         raise ValueError(f"flat_system must be in continuous time, got dt = {flat_system.dt}")
+    warn_of_gain(flat_system)
+    check_maps(flat_system)
     states, inputs = list(flat_system.state_labels), list(flat_system.input_labels)
     params = dict(flat_system.params)
     # Off zero, where some flags are not finite.
     flag = flat_system.forward(0.1 * np.ones(len(states)), 0.1 * np.ones(len(inputs)), params)
     lengths = [len(row) for row in flag]
     longest = max(lengths)
+    undetermined = _undetermined_at_rest(flat_system, lengths, params)
 
     def quantities(jet: Array) -> dict[str, Array]:
         if len(jet) < longest - 1 or jet.shape[1] != len(lengths):
@@ -69,11 +85,44 @@ def flat_quantities(flat_system: fs.FlatSystem) -> Callable[[Array], dict[str, A
         known = len(jet) >= longest
         values = jet if known else np.concatenate([jet, np.zeros((1, *jet.shape[1:]))])
         columns: list[Any] = []
-        for k in range(jet.shape[2]):
-            x, u = flat_system.reverse([values[:length, j, k] for j, length in enumerate(lengths)], params)
-            columns.append(np.concatenate([np.ravel(x), np.ravel(u)]))
-        rows = np.array(columns).T
+        with np.errstate(divide="ignore", invalid="ignore"):  # nan says the same
+            for k in range(jet.shape[2]):
+                x, u = flat_system.reverse([values[:length, j, k] for j, length in enumerate(lengths)], params)
+                columns.append(np.concatenate([np.ravel(x), np.ravel(u)]))
+        rows = np.array(columns, dtype=float).T
+        if undetermined.any():
+            speed = np.abs(values[1]).max(axis=0)
+            # Nearer to rest than this a quotient of derivatives is one of their rounding.
+            rows[np.ix_(undetermined, speed <= 1e-6 * speed.max())] = np.nan
         names = [*states, *inputs] if known else states
         return dict(zip(names, rows, strict=False))
 
     return quantities
+
+
+def _undetermined_at_rest(flat_system: fs.FlatSystem, lengths: list[int], params: dict[str, Any]) -> NDArray[np.bool_]:
+    """Whether each state and input keeps depending on derivatives however slow the plan is."""
+
+    def found(flag: list[Array], pace: float) -> Array | None:
+        """States and inputs along a plan that is slowed down, None outside of their domain."""
+        slowed = [row * pace ** np.arange(row.size) for row in flag]
+        with np.errstate(all="ignore"):
+            try:
+                both = np.concatenate([np.ravel(part) for part in flat_system.reverse(slowed, params)]).astype(float)
+            except Exception:  # of a trial call, whatever it is
+                return None
+        return both if np.isfinite(both).all() else None
+
+    rng = np.random.default_rng(0)
+    undetermined: NDArray[np.bool_] = np.zeros(
+        len(flat_system.state_labels) + len(flat_system.input_labels), dtype=bool
+    )
+    for _ in range(4):
+        flags = [[rng.normal(size=length) for length in lengths] for _ in range(2)]
+        for first, second in zip(*flags, strict=True):
+            second[0] = first[0]  # two motions through one position
+        rows = [row for pace in (1e-3, 1e-6) for flag in flags if (row := found(flag, pace)) is not None]
+        if len(rows) == 4:
+            apart, nearer = np.abs(rows[1] - rows[0]), np.abs(rows[3] - rows[2])
+            undetermined |= (nearer > 0.01 * apart) & (nearer > 1e-9 * (1.0 + np.abs(rows[2])))
+    return undetermined

@@ -39,14 +39,19 @@ class _Combined(Trajectory):
         return self
 
     def _set(self, parts: tuple[Trajectory, ...], labels: tuple[str, ...]) -> None:
-        initial = readonly(self._combine([part.initial for part in parts]))
+        with np.errstate(over="ignore", invalid="ignore"):
+            initial, final = (self._combine([getattr(p, end) for p in parts]) for end in ("initial", "final"))
+        if not (np.isfinite(initial).all() and np.isfinite(final).all()):
+            raise ValueError(
+                f"positions must stay within floating point, got {initial.tolist()} and {final.tolist()} at the ends"
+            )
         joined = np.unique(np.concatenate([part.breakpoints for part in parts]))
         self.__dict__.update(
             parts=parts,
             labels=checked_labels(labels, initial.size),
             breakpoints=readonly(joined),
-            initial=initial,
-            final=readonly(self._combine([part.final for part in parts])),
+            initial=readonly(initial),
+            final=readonly(final),
         )
 
     @abstractmethod
@@ -183,7 +188,8 @@ class Joined(Trajectory):
     ------
     ValueError
         If the axes differ in number, or a first position differs from the last
-        one before it by more than 1e-9 of the size of either trajectory.
+        one before it by more than 1e-9 of the range of either trajectory and the
+        rounding of positions.
     """
 
     parts: tuple[Trajectory, ...]
@@ -191,7 +197,7 @@ class Joined(Trajectory):
     def __init__(self, parts: Iterable[Trajectory]) -> None:
         members = list(_checked_parts(parts))
         for i in range(1, len(members)):
-            members[i] = members[i]._map_time(members[i].start, members[i - 1].end, 1.0)
+            members[i] = members[i]._moved(members[i].start, members[i - 1].end, 1.0)
         for before, after in pairwise(_same_axes(tuple(members))):
             _check_join(before, after)
         self._set(tuple(members), members[0].labels)
@@ -304,8 +310,17 @@ def _check_join(before: Trajectory, after: Trajectory) -> None:
     if abs(after.start - before.end) > 1e-9 * (before.duration + after.duration):
         raise ValueError(f"parts must follow one another in time, got {after.start} s after {before.end} s")
     last, first = before.final, after.initial
-    if np.any(first != last) and np.any(np.abs(first - last) > 1e-9 * np.maximum(before.peak(), after.peak())):
+    if np.any(first != last) and np.any(np.abs(first - last) > _slack(before, after)):
         raise ValueError(
             f"positions must agree where trajectories join, got {first.tolist()} after {last.tolist()} "
             f"at {before.end:g} s"
         )
+
+
+def _slack(*parts: Trajectory) -> Array:
+    """Difference of positions (naxes,) that counts as none: part of a range, so that a far origin hides no jump."""
+    extrema = [part.extrema() for part in parts]
+    ranges = np.max([e.maximum - e.minimum for e in extrema], axis=0)
+    size = np.max([np.maximum(np.abs(e.minimum), np.abs(e.maximum)) for e in extrema], axis=0)
+    slack: Array = 1e-9 * ranges + 8.0 * np.finfo(float).eps * size
+    return slack

@@ -10,6 +10,8 @@ from typing import Any, NoReturn, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ctrlplan._checks import real_array
+
 Array = NDArray[np.float64]
 
 FACTORIALS: Array = np.array([float(math.factorial(k)) for k in range(171)])
@@ -71,19 +73,68 @@ def checked_labels(labels: Sequence[str] | str | None, naxes: int) -> tuple[str,
 
 def checked_time(time: float, name: str, positive: bool = False) -> float:
     """Finite number of seconds, above 0 where it is a duration."""
-    try:
-        value = float(time)
-    except (TypeError, ValueError):
-        raise TypeError(f"{name} must be a number, got {time!r}") from None
+    value = one_number(time, name)
     if not math.isfinite(value) or (positive and value <= 0.0):
         raise ValueError(f"{name} must be finite{' and above 0' if positive else ''}, got {value}")
     return value
 
 
+def one_number(value: object, name: str, rule: str = "a number") -> float:
+    """One number: no truth value, text, complex number, date, nor anything with a unit."""
+    if type(value) is float:
+        return value
+    given: Any = value
+    wrong = TypeError(f"{name} must be {rule}, got {value!r:.80}")
+    if isinstance(value, _NO_NUMBERS) or bool(getattr(given, "ndim", False)) or np.ma.is_masked(given):
+        raise wrong
+    if getattr(getattr(given, "dtype", None), "kind", "f") not in "iufO" or _has_unit(given):
+        raise wrong
+    try:
+        return float(given)
+    except OverflowError:
+        raise ValueError(f"{name} must be within floating point, got {value!r:.80}") from None
+    except (TypeError, ValueError):
+        raise wrong from None
+
+
+_NO_NUMBERS = (bool, np.bool_, str, bytes, complex, np.complexfloating, np.datetime64, np.timedelta64)
+
+
+def _has_unit(value: Any) -> bool:
+    unit = getattr(value, "units", None) or getattr(value, "unit", None)
+    return unit is not None and str(unit) not in ("", "dimensionless")
+
+
+def new_numbers(values: object, name: str) -> Array:
+    """Numbers as a new array of floats; None is nan. The kinds that `one_number` rejects are rejected here."""
+    _check_kinds(values, name)
+    try:
+        return np.array(values, dtype=float)
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError(f"{name} must be numbers, got {values!r:.200}") from None
+
+
+def _check_kinds(values: Any, name: str) -> None:
+    """Reject what numpy would convert to numbers without being some."""
+    if type(values) in (float, int) or values is None:
+        return
+    if isinstance(values, list | tuple):
+        for value in values:
+            _check_kinds(value, name)
+        return
+    kind = getattr(getattr(values, "dtype", None), "kind", None)
+    if isinstance(values, bool | str | bytes | complex) or (kind is not None and kind in "bcSU"):
+        raise ValueError(f"{name} must be numbers, got {values!r:.80}")
+    if kind == "O" and isinstance(values, np.ndarray):
+        _check_kinds(values.tolist(), name)
+    elif type(values) is not np.ndarray or kind not in ("i", "u", "f"):
+        real_array(values, name)  # what has a unit, is a date, or is masked
+
+
 def checked_timepts(t: ArrayLike) -> Array:
     """Times as an array of any shape, without nan."""
-    times = np.asarray(t, dtype=float)
-    # One number tells: the least of times with a nan among them is nan.
+    times = real_array(t, "times")
+    # One number tells: the minimum of times with a nan among them is nan.
     if times.size and np.isnan(times.min()):
         raise ValueError(f"times must not be nan, got nan at index {int(np.isnan(times).argmax())}")
     return times
@@ -91,9 +142,9 @@ def checked_timepts(t: ArrayLike) -> Array:
 
 def checked_number(value: object, name: str) -> float:
     """Number that is not nan."""
-    if isinstance(value, bool) or not isinstance(value, Real):
+    if not isinstance(value, Real):
         raise TypeError(f"{name} must be a number, got {value!r}")
-    number = float(value)
+    number = one_number(value, name)
     if math.isnan(number):
         raise ValueError(f"{name} must be a number, got nan")
     return number
@@ -119,6 +170,33 @@ def checked_limits(pair: object, name: str) -> tuple[float, float, float]:
     return low, high, abs(low if math.isfinite(low) else high) or 1.0
 
 
+def times_powers(values: Array, base: float, orders: NDArray[np.integer[Any]]) -> Array:
+    """Derivatives (order, ...) times powers of a time or rate: exact 0 stays 0, and nothing leaves floating point."""
+    with np.errstate(all="ignore"):
+        found = np.where(values == 0.0, 0.0, values * base**orders)
+        size = np.abs(found)
+        lost = (values != 0.0) & np.isfinite(values) & ~((size >= _TINY) & (size < np.inf))
+    if lost.any():
+        place = tuple(np.argwhere(lost)[0])
+        raise ValueError(
+            f"derivatives must stay within floating point, got {values[place]:g} times {base:g} to the power "
+            f"{np.broadcast_to(orders, values.shape)[place]:g}; choose a time unit nearer to the plan's"
+        )
+    return found
+
+
+def derivative_scale(duration: float, order: int) -> Array:
+    """Factors (order + 1,) that make derivatives of Taylor coefficients in parts of a duration."""
+    with np.errstate(over="ignore", divide="ignore", under="ignore"):
+        scale: Array = FACTORIALS[: order + 1] / duration ** np.arange(order + 1)
+    if not scale[-1] < np.inf:
+        raise ValueError(f"derivative {order} must stay within floating point, got a duration of {duration:g} s")
+    return scale
+
+
+_TINY = float(np.finfo(float).tiny)
+
+
 def mapped_time(time: float, origin: float, target: float, rate: float) -> float:
     """Time moved to target + (time - origin)/rate: exact at the origin."""
     return target + (time - origin) / rate
@@ -126,9 +204,9 @@ def mapped_time(time: float, origin: float, target: float, rate: float) -> float
 
 def checked_count(value: float | Real, name: str, least: int = 0) -> int:
     """Whole number of some least value."""
-    if isinstance(value, bool) or not isinstance(value, Real):
+    if not isinstance(value, Real):
         raise TypeError(f"{name} must be a whole number from {least}, got {value!r}")
-    number = float(value)
+    number = one_number(value, name, f"a whole number from {least}")
     if not math.isfinite(number) or number != int(number) or number < least:
         raise ValueError(f"{name} must be a whole number from {least}, got {value}")
     if number > MOST:

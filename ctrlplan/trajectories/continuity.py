@@ -37,15 +37,20 @@ def find_jumps(plan: Trajectory, order: int) -> tuple[Jump, ...]:
     """Jumps of the derivatives up to an order, lowest order first, then in time.
 
     Rest before the start and after the end counts: a plan that starts at
-    speed jumps there. Differences below 1e-9 of a derivative's peak are rounding.
+    speed jumps there. Differences below 1e-9 of a derivative's peak, or of the
+    range of the position, are rounding.
     """
     before = plan.jet(plan.breakpoints, order, left=True)
     after = plan.jet(plan.breakpoints, order)
     after[:, :, -1] = 0.0
     after[0, :, -1] = plan.final
     size = after - before
-    peaks = np.stack([plan.peak(k) for k in range(order + 1)])[:, :, None]
-    found = np.argwhere(np.abs(size) > 1e-9 * np.maximum(peaks, np.finfo(float).tiny))
+    position, eps = plan.extrema(), float(np.finfo(float).eps)
+    # A far origin of the positions hides no jump.
+    farthest = np.maximum(np.abs(position.minimum), np.abs(position.maximum))
+    slack = [1e-9 * (position.maximum - position.minimum) + 8.0 * eps * farthest]
+    slack += [1e-9 * plan.peak(k) for k in range(1, order + 1)]
+    found = np.argwhere(np.abs(size) > np.maximum(slack, np.finfo(float).tiny)[:, :, None])
     return tuple(
         Jump(int(k), float(plan.breakpoints[i]), plan.labels[a], float(size[k, a, i]))
         for k, a, i in sorted(found.tolist(), key=lambda entry: (entry[0], entry[2], entry[1]))

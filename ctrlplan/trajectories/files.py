@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import bz2
 import csv
+import gzip
 import io
 import json
+import lzma
 import os
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ctrlplan._files import write_bytes, write_text
 from ctrlplan.trajectories.common import Array, checked_timepts
 from ctrlplan.trajectories.trajectory import Trajectory
 
@@ -41,15 +45,17 @@ def trajectory_from_dict(data: dict[str, Any]) -> Trajectory:
     try:
         return Trajectory.kinds[kind]._from_dict(data)
     except KeyError as missing:
-        raise ValueError(f"a {kind} needs the entry {missing}, got {', '.join(data)}") from None
-    except (TypeError, AttributeError, IndexError) as error:
+        raise ValueError(f"a {kind} needs the entry {missing}, got {', '.join(map(str, data))}") from None
+    except RecursionError:
+        raise ValueError("type must not be nested so deep that Python's stack overflows") from None
+    except (TypeError, AttributeError, IndexError, ArithmeticError) as error:
         raise ValueError(f"a {kind} must have entries of the kinds that to_dict writes: {error}") from None
 
 
 def save_trajectory(plan: Trajectory, path: str | os.PathLike[str]) -> None:
     """Write a trajectory as JSON; numbers are written so that every bit returns."""
     text = json.dumps(plan.to_dict(), indent=1, allow_nan=False)
-    Path(path).write_text(text + "\n", encoding="utf-8")
+    write_text(path, text + "\n")
 
 
 def load_trajectory(path: str | os.PathLike[str]) -> Trajectory:
@@ -72,9 +78,17 @@ def load_trajectory(path: str | os.PathLike[str]) -> Trajectory:
         If it does not hold a trajectory.
     """
     try:
-        return trajectory_from_dict(json.loads(Path(path).read_text(encoding="utf-8")))
+        text = Path(path).read_text(encoding="utf-8")
+        return trajectory_from_dict(json.loads(text, parse_constant=_no_number))
+    except RecursionError:
+        raise ValueError(f"{os.fspath(path)} must hold a saved trajectory: it is nested too deep") from None
     except (ValueError, TypeError) as error:
         raise ValueError(f"{os.fspath(path)} must hold a saved trajectory: {error}") from None
+
+
+def _no_number(name: str) -> NoReturn:
+    """Reject what JSON does not have and `save` never writes."""
+    raise ValueError(f"numbers must be finite, got {name}")
 
 
 def write_csv(plan: Trajectory, path: str | os.PathLike[str], timepts: ArrayLike | None = None, order: int = 2) -> None:
@@ -90,10 +104,29 @@ def write_csv(plan: Trajectory, path: str | os.PathLike[str], timepts: ArrayLike
         Times [s]; 1001 from start to end unless given.
     order : int, optional
         Highest derivative; columns are x, x_d1, x_d2, ...
+
+    Raises
+    ------
+    ValueError
+        If `timepts` is no sequence of times (a sampling period is none), one is
+        nan, or the order is negative.
+    OSError
+        If the file cannot be written: one of this name is as it was.
     """
-    times = np.linspace(plan.start, plan.end, 1001) if timepts is None else np.atleast_1d(checked_timepts(timepts))
+    times = np.linspace(plan.start, plan.end, 1001) if timepts is None else checked_timepts(timepts)
+    if times.ndim != 1:
+        got = f"the scalar {times:g}" if times.ndim == 0 else f"shape {times.shape}"
+        step = f"{times:g}" if times.ndim == 0 else "dt"
+        raise ValueError(
+            f"timepts must be sample times of shape (ntime,), got {got}; for a row every {step} s give "
+            f"np.arange(plan.start, plan.end, {step})"
+        )
     columns = np.concatenate([times[None], signal_rows(plan, times, order)])
-    np.savetxt(path, columns.T, fmt="%.17g", delimiter=",", header=csv_header(column_names(plan, order)), comments="")
+    table = io.StringIO()
+    np.savetxt(table, columns.T, fmt="%.17g", delimiter=",", header=csv_header(column_names(plan, order)), comments="")
+    # As numpy's own writing to a path of these endings.
+    packers: dict[str, Callable[[bytes], bytes]] = {".gz": gzip.compress, ".bz2": bz2.compress, ".xz": lzma.compress}
+    write_bytes(path, packers.get(Path(path).suffix, bytes)(table.getvalue().encode("utf-8")))
 
 
 def csv_header(names: list[str]) -> str:

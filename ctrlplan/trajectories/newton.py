@@ -35,7 +35,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from operator import mul
 from typing import Any
 
@@ -44,6 +44,25 @@ from numpy.typing import NDArray
 from scipy.linalg import blas
 
 from ctrlplan.trajectories.common import FACTORIALS, Array, Frozen, readonly
+from ctrlplan.trajectories.digits import many_digits
+
+_MEET = 0.25
+"""Ends meet where they are nearer to each other, on the circle, than this part of all neighbours."""
+
+_SUSPECT = 1e5
+"""Amplification of rounding errors above which the digits lost are estimated."""
+
+_KEPT = 1e-10
+"""Part of a plan's range up to which rounding may cost it before more digits are taken."""
+
+MOST_LOSS = 1e-6
+"""The same where there are no more to take."""
+
+_MOST_DIGITS = 100
+"""Constraints up to which many digits take a fraction of a second."""
+
+NEARLY_CLOSED = 5.0
+"""Alpha [rad] from which on both ends may count as one point."""
 
 
 class NewtonSystem(Frozen):
@@ -67,6 +86,12 @@ class NewtonSystem(Frozen):
         spare coefficients minimise int (y^(smooth))^2 over [0, 1].
     smooth : int
         That derivative order.
+    meet : bool
+        Whether the data of both ends agree, so that they may be one node near
+        alpha = 2 pi.
+    apart : ndarray, shape (nwaypoints, nwaypoints), or None
+        Differences of the relative times, where they are known to more digits
+        than the times themselves have: waypoints close together need them.
 
     Raises
     ------
@@ -89,25 +114,18 @@ class NewtonSystem(Frozen):
         gamma: float | None = None,
         size: int | None = None,
         smooth: int = 3,
+        meet: bool = False,
+        apart: Array | None = None,
     ) -> None:
         count = sum(map(len, given))
         if count == 0:
             raise ValueError("an axis needs at least one prescribed entry, got none")
         size = count if size is None else size
-        waypoints, orders = _sequence(_leja(_effective(alpha), times, given), given)
+        waypoints, orders, lead = _constraints(_effective(alpha), times, given, meet)
         nodes = times[waypoints]
         mean = math.fsum(nodes) / count
         nodes = np.concatenate([nodes, _spare_nodes(mean, size - count)]) if size > count else nodes
-        fold = 0.0
-        if size % 2 or not alpha:
-            if gamma is not None:
-                why = f"{size} coefficients" if size % 2 else "alpha = 0"
-                raise ValueError(f"gamma needs an even number of coefficients and alpha > 0, got {why}")
-            phase = None
-        else:
-            phase = alpha * mean if gamma is None else gamma
-            if gamma is not None:
-                fold = _fold(alpha, size, alpha * mean - gamma)
+        phase, fold = _top_harmonic(alpha, size, mean, gamma)
         self.__dict__.update(
             alpha=alpha,
             size=size,
@@ -118,14 +136,19 @@ class NewtonSystem(Frozen):
             _first=nodes[0 : size - size % 2 : 2],
             _second=nodes[1::2],
             _scales={},
+            _hermite=all(g == tuple(range(len(g))) for g in given),
+            _positions=(orders == 0).astype(float)[:, None],
+            _anchor=int((orders == 0).argmax()),
         )
-        jets = self.taylor(times, max(orders))
+        beyond = times[:, None] - nodes
+        if apart is not None:
+            beyond[:, :count] = apart[:, waypoints]
+        jets = self._taylor(beyond.T[: size - size % 2 : 2], beyond.T[1:size:2], max(orders))
         collocation = jets[:, orders, waypoints].T
-        hermite = all(g == tuple(range(len(g))) for g in given)
         self.__dict__["_triangle"], self.__dict__["_spread"] = (
             (np.asfortranarray(collocation), None)
-            if hermite and size == count
-            else _factor(collocation, hermite, self._roughness(smooth) if size > count else None)
+            if self._hermite and size == count
+            else _factor(collocation, self._hermite, self._roughness(smooth) if size > count else None, lead)
         )
 
         if not self._triangle.diagonal().all():
@@ -135,16 +158,52 @@ class NewtonSystem(Frozen):
         """Column that turns prescribed derivatives into normalised Taylor data."""
         scale: Array | None = self._scales.get(duration)
         if scale is None:
-            scale = (duration**self.order_index / FACTORIALS[self.order_index])[:, None]
+            with np.errstate(over="ignore", under="ignore"):
+                scale = (duration**self.order_index / FACTORIALS[self.order_index])[:, None]
+            if not (scale.min() > 1e-290 and scale.max() < np.inf):
+                raise ValueError(
+                    f"powers of the duration must stay within floating point, got {duration:g} s to the power "
+                    f"{self.order_index.max()}; choose another unit of time"
+                )
             self._scales.clear()
             self._scales[duration] = scale
         return scale
 
     def coefficients(self, taylor_data: Array) -> Array:
         """Coefficients (size, naxes) from Taylor data (nconstraints, naxes)."""
+        # Positions from the first one: what they have in common costs no digit of their differences.
+        offset = taylor_data[self._anchor] * self._positions[self._anchor]
         # Not LAPACK's dtrtrs, which waits for its threads however small the system.
-        solved = blas.dtrsm(1.0, self._triangle, taylor_data, lower=1)
-        return solved if self._spread is None else self._spread @ solved
+        solved = blas.dtrsm(1.0, self._triangle, taylor_data - self._positions * offset, lower=1)
+        found = solved if self._spread is None else self._spread @ solved
+        found[0] += offset
+        return found
+
+    def fitted(self, values: Array, times: Sequence[float], duration: float, taylor_data: Array) -> Array:
+        """Coefficients from prescribed derivatives at the times [s], which no rounding has spoilt.
+
+        Raises
+        ------
+        ValueError
+            If rounding could cost more than 1e-6 of the plan's range.
+        """
+        loss = self.loss(taylor_data)
+        if loss <= _KEPT:
+            return self.coefficients(taylor_data)
+        if self._hermite and len(values) <= _MOST_DIGITS:
+            digits = math.ceil(math.log10(min(self._amplification, 1e300)))
+            constraints = self.waypoint_index, self.order_index
+            solved = many_digits(_effective(self.alpha), times, duration, constraints, values, self._fold, digits)
+            return solved if self._spread is None else self._spread @ solved
+        if loss <= MOST_LOSS:
+            return self.coefficients(taylor_data)
+        why = "waypoints so close together amplify rounding: move them apart, or use PiecewiseSpline"
+        if self.alpha > NEARLY_CLOSED:
+            why = "near alpha = 2 pi both ends are nearly one point: lower alpha, or use TrigSpline.cyclic"
+        raise ValueError(
+            f"waypoints must determine the plan to {MOST_LOSS:g} of its range in floating point, got an estimated "
+            f"loss of {loss:.1g}; {why}"
+        )
 
     def taylor(self, u: Array, order: int) -> Array:
         """Taylor coefficients of every basis function.
@@ -160,19 +219,22 @@ class NewtonSystem(Frozen):
         -------
         ndarray, shape (size, order + 1, ntime)
         """
+        return self._taylor(u - self._first[:, None], u - self._second[:, None], order)
+
+    def _taylor(self, first: Array, second: Array, order: int) -> Array:
+        """The same from the distances (npairs, ntime) beyond the nodes of each pair."""
         alpha = _effective(self.alpha)
         half = 0.5 * alpha
-        npairs = len(self._second)
-        out = np.empty((2 * npairs + 1, order + 1, u.size))
+        npairs, ntime = len(second), second.shape[1]
+        out = np.empty((2 * npairs + 1, order + 1, ntime))
         out[0] = 0.0
         out[0, 0] = 1.0
         if npairs:
-            first, second = u - self._first[:, None], u - self._second[:, None]
-            middle = u - 0.5 * (self._first + self._second)[:, None]
-            factor = np.empty((npairs, 2, 3, 1, u.size))  # [q c, q q] by [1, S, V]
+            middle = 0.5 * (first + second)
+            factor = np.empty((npairs, 2, 3, 1, ntime))  # [q c, q q] by [1, S, V]
             if alpha:
                 q = np.sin(half * first) / half
-                second *= half
+                second = half * second
                 sigma, kappa = np.sin(alpha * middle), np.cos(alpha * middle)
                 factor[:, 0, 0, 0] = q * np.cos(second)
                 factor[:, 1, 0, 0] = q * np.sin(second) / half
@@ -187,7 +249,7 @@ class NewtonSystem(Frozen):
                 factor[:, 1, 1, 0] = 2.0 * middle
             kernel = _kernel(alpha, order)
             for j in range(npairs):
-                shifted = (kernel @ out[2 * j]).reshape(3, order + 1, u.size)
+                shifted = (kernel @ out[2 * j]).reshape(3, order + 1, ntime)
                 np.add.reduce(factor[j] * shifted, axis=1, out=out[2 * j + 1 : 2 * j + 3])
         if self._fold:
             out[self.size - 1] += self._fold * out[self.size]
@@ -204,6 +266,43 @@ class NewtonSystem(Frozen):
             columns = [[*column, self._fold * column[-1]] for column in columns]
         return [newton_series(factors, column, order) for column in columns]
 
+    def loss(self, taylor_data: Array) -> float:
+        """Bound of what rounding costs the plan through the data, relative to its range.
+
+        The rounding of each product in the triangular solution, through the
+        inverse to the plan: Skeel's componentwise bound, to first order.
+        """
+        if self._amplification < _SUSPECT:
+            return 0.0
+        data = taylor_data - self._positions * taylor_data[self._anchor]
+        solved = blas.dtrsm(1.0, self._triangle, data, lower=1)
+        rounding = np.finfo(float).eps * (np.abs(self._triangle) @ np.abs(solved))
+        functions, cardinal = self._samples
+        plan, lost = (np.abs(values).max(axis=1) for values in (functions @ solved, np.abs(cardinal) @ rounding))
+        # Derivatives are of Taylor's scale: some are 0 but for rounding.
+        size = np.maximum(plan, plan[0])
+        return float((lost / np.where(size > 0.0, size, 1.0)).max())
+
+    @cached_property
+    def functions(self) -> Array:
+        """Values (size, ntime) of the basis functions at times between which a plan cannot hide much."""
+        return self.taylor(np.linspace(0.0, 1.0, 2 * self.size + 1), 0)[:, 0]
+
+    @cached_property
+    def _amplification(self) -> float:
+        """By how much rounding errors can grow in the solution, at most."""
+        scaled = self._triangle / np.abs(self._triangle).max(axis=0)
+        inverse: Array = blas.dtrsm(1.0, scaled, np.eye(len(scaled)), lower=1)
+        return float((np.abs(inverse) @ np.abs(scaled)).max())
+
+    @cached_property
+    def _samples(self) -> tuple[Array, Array]:
+        """Taylor coefficients (order + 1, ntime, nconstraints) by solution, and by data."""
+        u = np.linspace(0.0, 1.0, 2 * self.size + 1)
+        functions = self.taylor(u, int(self.order_index.max())).transpose(1, 2, 0)
+        functions = functions if self._spread is None else functions @ self._spread
+        return functions, functions @ blas.dtrsm(1.0, self._triangle, np.eye(len(self._triangle)), lower=1)
+
     def _roughness(self, smooth: int) -> Array:
         """Weighted samples G with int (y^(smooth))^2 = |G coefficients|^2."""
         nodes, weights = np.polynomial.legendre.leggauss(2 * self.size + int(4 * self.alpha) + 8)
@@ -211,6 +310,9 @@ class NewtonSystem(Frozen):
         return np.sqrt(weights)[:, None] * top.T
 
     _scales: dict[float, Array]  # the last duration's, as a memory
+    _hermite: bool  # no gaps between the orders at any waypoint
+    _positions: Array  # 1 where a position is prescribed, else 0
+    _anchor: int
     _triangle: Array
     _spread: Array | None
     _fold: float
@@ -266,19 +368,34 @@ def _effective(alpha: float) -> float:
     return alpha if alpha > 1e-100 else 0.0
 
 
-def _leja(alpha: float, times: Array, given: tuple[tuple[int, ...], ...]) -> list[int]:
-    """Waypoints in Leja order: each next one farthest, in product, from those before."""
+def _constraints(
+    alpha: float, times: Array, given: tuple[tuple[int, ...], ...], meet: bool
+) -> tuple[NDArray[np.intp], NDArray[np.intp], int]:
+    """Waypoint and order of each constraint, in the order in which the Newton form takes them.
+
+    Waypoints in Leja order: each next one farthest, in product, from those
+    before. Ends that meet on the circle come first with all their entries, whose
+    number is returned: their data agree, so the divided differences between them
+    are exactly 0 or small, and no others are divided by their distance.
+    """
     used = [i for i, g in enumerate(given) if g]
     u = times[used]
-    distance = np.abs(np.sin(0.5 * alpha * (u[:, None] - u))) if alpha else np.abs(u[:, None] - u)
-    chosen = [0]
-    product = distance[0]
+    distance = np.abs(u[:, None] - u)
+    if alpha:
+        distance = np.abs(np.sin(0.5 * alpha * distance)) * (2.0 / alpha)
+    meet = meet and len(used) > 2 and distance[0, -1] < _MEET * np.diag(distance, 1).min()
+    chosen = [0, len(used) - 1] if meet else [0]
+    product = distance[chosen].prod(axis=0)
     while len(chosen) < len(used):
         # Rescaled, so that many waypoints do not underflow to a tie.
         farthest = int(product.argmax())
         product = product * (distance[farthest] / product[farthest])
         chosen.append(farthest)
-    return [used[i] for i in chosen]
+    ordered = [used[i] for i in chosen]
+    if not meet:
+        return *_sequence(ordered, given), 0
+    (first, rank), (others, ranks) = _sequence(ordered[:2], given), _sequence(ordered[2:], given)
+    return np.concatenate([first, others]), np.concatenate([rank, ranks]), len(first)
 
 
 def _sequence(waypoints: list[int], given: tuple[tuple[int, ...], ...]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -308,6 +425,18 @@ def _spare_nodes(mean: float, count: int) -> Array:
     return mean + reach * np.cos(np.pi * (np.arange(count) + 0.5) / count)
 
 
+def _top_harmonic(alpha: float, size: int, mean: float, gamma: float | None) -> tuple[float | None, float]:
+    """Phase of the top harmonic, if there is one, and what turns it to a given gamma."""
+    if size % 2 or not alpha:
+        if gamma is not None:
+            why = f"{size} coefficients" if size % 2 else "alpha = 0"
+            raise ValueError(f"gamma needs an even number of coefficients and alpha > 0, got {why}")
+        return None, 0.0
+    if gamma is None:
+        return alpha * mean, 0.0
+    return gamma, _fold(alpha, size, alpha * mean - gamma)
+
+
 def _fold(alpha: float, size: int, offset: float) -> float:
     """Weight of phi_M in the last function that turns the top harmonic to a given gamma.
 
@@ -323,25 +452,32 @@ def _fold(alpha: float, size: int, offset: float) -> float:
     return -0.5 * alpha * math.tan(angle)
 
 
-def _factor(collocation: Array, hermite: bool, roughness: Array | None) -> tuple[Array, Array | None]:
-    """Lower triangle T and matrix B such that coefficients = B T^-1 data."""
+def _factor(collocation: Array, hermite: bool, roughness: Array | None, lead: int) -> tuple[Array, Array | None]:
+    """Lower triangle T and matrix B such that coefficients = B T^-1 data.
+
+    The first `lead` constraints are left as they are where they are triangular.
+    """
     count, size = collocation.shape
     if hermite:  # spare functions vanish at every constraint
         triangle, basis = collocation[:, :count], np.eye(size)
     else:
+        lead = lead if not np.triu(collocation[:lead], 1).any() else 0
+        rest = collocation[lead:, lead:]
         # Columns and rows scaled: neither the size of the basis functions nor the units of the entries must count.
-        size_of = np.abs(collocation).max(axis=0)
+        size_of = np.abs(rest).max(axis=0)
         weight = 1.0 / np.where(size_of > 0.0, size_of, 1.0)
-        scaled = collocation * weight
+        scaled = rest * weight
         singular = np.linalg.svd(scaled / np.linalg.norm(scaled, axis=1, keepdims=True), compute_uv=False)
         if singular[-1] < 1e-13 * singular[0]:
             raise ValueError(
                 "the entries left free must not make the system singular: the prescribed entries conflict or leave "
                 f"the plan undetermined, got a relative singular value of {singular[-1] / singular[0]:.1g}"
             )
-        basis, upper = np.linalg.qr(scaled.T, mode="complete")
-        basis *= weight[:, None]
-        triangle = upper[:count].T
+        mixed, upper = np.linalg.qr(scaled.T, mode="complete")
+        basis = np.eye(size)
+        basis[lead:, lead:] = mixed * weight[:, None]
+        triangle = collocation[:, :count].copy()
+        triangle[lead:, lead:] = upper[: count - lead].T
     spread = basis[:, :count]
     if roughness is not None:
         cost = roughness @ basis

@@ -7,12 +7,15 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from ctrlplan.trajectories.common import FACTORIALS, Array, checked_count, checked_labels, mapped_time, readonly
-from ctrlplan.trajectories.newton import NewtonSystem
+from ctrlplan.trajectories.common import Array, checked_count, checked_labels, derivative_scale, mapped_time, readonly
+from ctrlplan.trajectories.newton import NEARLY_CLOSED, NewtonSystem
+from ctrlplan.trajectories.swing import warn_of_swing
 from ctrlplan.trajectories.trajectory import Trajectory
 from ctrlplan.trajectories.waypoint import Waypoint
 
 Given = tuple[tuple[int, ...], ...]
+Kind = tuple[Given, float | None, bool]
+"""Entries given at each waypoint, gamma, and whether the ends meet."""
 
 
 class Options(NamedTuple):
@@ -23,10 +26,11 @@ class Options(NamedTuple):
     degree: int | None = None
     smooth: int = 3
     period: float | None = None
+    warn: bool = True
 
     def given(self) -> dict[str, Any]:
-        """Those that differ from what is taken unless given."""
-        return {k: v for k, v in self._asdict().items() if v != self._field_defaults[k]}
+        """Those that make the plan what it is, where they differ from what is taken unless given."""
+        return {k: v for k, v in self._asdict().items() if k != "warn" and v != self._field_defaults[k]}
 
 
 class NewtonSpline(Trajectory):
@@ -58,7 +62,9 @@ class NewtonSpline(Trajectory):
         ValueError
             If a time differs.
         """
-        return self._again(same_times(waypoints, self.waypoints), self._options)
+        plan = self._again(same_times(waypoints, self.waypoints), self._options)
+        plan._check_swing()
+        return plan
 
     def through(self, waypoints: Iterable[Waypoint]) -> Self:
         """Plan of the same kind and shape through any waypoints of as many axes.
@@ -69,7 +75,9 @@ class NewtonSpline(Trajectory):
             As the constructor of this kind.
         """
         points = same_axes(checked_waypoints(waypoints, 2 if self._options.period is None else 1), self.naxes)
-        return self._again(points, self._options)
+        plan = self._again(points, self._options)
+        plan._check_swing()
+        return plan
 
     @property
     def degree(self) -> tuple[int, ...]:
@@ -96,20 +104,22 @@ class NewtonSpline(Trajectory):
             raise ValueError(f"duration must be finite and above 0, got {times[-1]} s after {start} s")
         same_clock = donor is not None and donor._times == times and donor._duration == duration
         relative = donor._relative if donor and same_clock else (np.array(times) - start) / duration
-        lent = donor._systems if donor and (same_clock or np.array_equal(donor._relative, relative)) else {}
+        apart = donor._apart if donor and same_clock else _apart(times, relative, duration)
+        lent = donor._systems if donor and (same_clock or _same_pattern(donor, relative, apart)) else {}
         table, patterns = given_entries(waypoints)
-        systems: dict[tuple[Given, float | None], NewtonSystem] = {}
+        systems: dict[Kind, NewtonSystem] = {}
         parts = []
-        for (given, gamma), axes in _groups(patterns, options.gamma).items():
-            system = lent.get((given, gamma))
+        for kind, axes in _groups(patterns, options.gamma, _meeting(table, alpha)).items():
+            given, gamma, meet = kind
+            system = lent.get(kind)
             if system is None:
                 size = _size(alpha, sum(map(len, given)), options.degree)
-                system = NewtonSystem(alpha, relative, given, gamma, size, options.smooth)
-            systems[given, gamma] = system
+                system = NewtonSystem(alpha, relative, given, gamma, size, options.smooth, meet, apart)
+            systems[kind] = system
             data = table[system.waypoint_index, system.order_index]
             if len(axes) < table.shape[2]:
                 data = data[:, axes]
-            parts.append((axes, system, system.coefficients(data * system.taylor_scale(duration))))
+            parts.append((axes, system, _solved(system, data, times, duration)))
         if donor is not None and len(donor.labels) == table.shape[2]:
             labels = donor.labels
         else:
@@ -126,9 +136,11 @@ class NewtonSpline(Trajectory):
             _options=options,
             _times=times,
             _relative=relative,
+            _apart=apart,
             _duration=duration,
             _systems=systems,
             _parts=parts,
+            _largest=max([float(np.abs(found).max()) for _, _, found in parts]),
         )
 
     def _again(self, waypoints: tuple[Waypoint, ...], options: Options) -> Self:
@@ -136,6 +148,31 @@ class NewtonSpline(Trajectory):
         plan = type(self).__new__(type(self))
         plan._fit(_checked_waypoints(waypoints), self.alpha, options, self)
         return plan
+
+    def _check_swing(self) -> None:
+        """Warn, where it was not declined, of a plan that swings far beyond its waypoints."""
+        if self._options.warn:
+            values = np.empty((self.naxes, 2 * max([s.size for _, s, _ in self._parts]) + 1))
+            for axes, system, coefficients in self._parts:
+                found = coefficients.T @ system.functions
+                if len(self._parts) == 1:
+                    values = found
+                else:
+                    values[list(axes), : found.shape[1]] = found
+                    values[list(axes), found.shape[1] :] = found[:, :1]
+            way_on = "use PiecewiseSpline, one polynomial a segment"
+            if self.alpha:
+                way_on = f"lower alpha from {self.alpha:.6g} (choose_alpha finds the best one) or {way_on}"
+            warn_of_swing(values, self.waypoints, self.end, self.labels, way_on)
+
+    def quiet(self) -> Self:
+        """The same plan, which no longer warns where `through` or `with_values` swings."""
+        return self._again(self.waypoints, self._options._replace(warn=False))
+
+    def _loaded(self) -> Self:
+        """The plan as it was saved: it was warned of when it was made, and its `through` warns."""
+        self.__dict__["_options"] = self._options._replace(warn=True)
+        return self
 
     def _map_time(self, origin: float, target: float, rate: float) -> Self:
         moved = tuple(w.scaled(mapped_time(w.time, origin, target, rate), rate) for w in self.waypoints)
@@ -146,12 +183,30 @@ class NewtonSpline(Trajectory):
 
     def _leg_jet(self, leg: int, s: Array, order: int) -> Array:
         u = s / self._duration
-        scale = FACTORIALS[: order + 1] / self._duration ** np.arange(order + 1)
-        out = np.empty((order + 1, self.naxes, s.size))
+        scale = derivative_scale(self._duration, order)
+        if self._largest > 1e250 / max(1.0, scale.max()):
+            return self._huge_jet(u, scale)
+        return self._jet(u, scale)
+
+    def _huge_jet(self, u: Array, scale: Array) -> Array:
+        """The same where it could overflow."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            found = self._jet(u, scale)
+        if not np.isfinite(found).all():
+            raise ValueError(
+                f"derivatives up to {len(scale) - 1} must stay within floating point, got coefficients of up to "
+                f"{self._largest:g} over {self._duration:g} s"
+            )
+        return found
+
+    def _jet(self, u: Array, scale: Array) -> Array:
+        """Derivatives from order 0 at parts u of the duration."""
+        order = len(scale) - 1
+        out = np.empty((order + 1, self.naxes, u.size))
         for axes, system, coefficients in self._parts:
             taylor = system.taylor(u, order)
             values = coefficients.T @ taylor.reshape(system.size, -1)
-            values = values.reshape(len(axes), order + 1, s.size).transpose(1, 0, 2) * scale[:, None, None]
+            values = values.reshape(len(axes), order + 1, u.size).transpose(1, 0, 2) * scale[:, None, None]
             if len(axes) == self.naxes:
                 return values
             out[:, list(axes)] = values
@@ -181,8 +236,10 @@ class NewtonSpline(Trajectory):
     _options: Options
     _times: list[float]
     _relative: Array
+    _apart: Array | None
     _duration: float
-    _systems: dict[tuple[Given, float | None], NewtonSystem]
+    _systems: dict[Kind, NewtonSystem]
+    _largest: float  # of the coefficients
     _parts: list[tuple[tuple[int, ...], NewtonSystem, Array]]
 
 
@@ -215,6 +272,32 @@ def _checked_waypoints(points: tuple[Waypoint, ...]) -> tuple[Waypoint, ...]:
                 )
         before = point
     return points
+
+
+def _solved(system: NewtonSystem, data: Array, times: list[float], duration: float) -> Array:
+    """Coefficients from prescribed derivatives (nconstraints, naxes)."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        found = system.fitted(data, times, duration, data * system.taylor_scale(duration))
+    if not np.isfinite(found).all():
+        raise ValueError(
+            "what waypoints prescribe must leave a plan within floating point, got coefficients beyond it from "
+            f"entries of up to {np.abs(data).max():g} over {duration:g} s"
+        )
+    return found
+
+
+def _apart(times: list[float], relative: Array, duration: float) -> Array | None:
+    """Differences of the times in parts of the duration, where those of the rounded parts would lose digits."""
+    if np.diff(relative).min(initial=1.0) > 1e-4:
+        return None
+    return np.subtract.outer(times, times) / duration
+
+
+def _same_pattern(donor: NewtonSpline, relative: Array, apart: Array | None) -> bool:
+    """Whether the systems of another plan fit these times."""
+    if not np.array_equal(donor._relative, relative):
+        return False
+    return apart is None or (donor._apart is not None and np.array_equal(donor._apart, apart))
 
 
 def _size(alpha: float, count: int, degree: int | None) -> int | None:
@@ -264,16 +347,27 @@ def given_entries(waypoints: Sequence[Waypoint]) -> tuple[Array, list[Given]]:
     return table, patterns
 
 
+def _meeting(table: Array, alpha: float) -> list[bool]:
+    """Whether the first and last positions agree, axis by axis; only near alpha = 2 pi, where ends can meet."""
+    if alpha < NEARLY_CLOSED:
+        return [False] * table.shape[2]
+    found = []
+    for positions in table[:, 0].T:
+        known = positions[~np.isnan(positions)]
+        found.append(known.size > 1 and bool(abs(known[-1] - known[0]) <= 0.1 * np.ptp(known)))
+    return found
+
+
 def _groups(
-    patterns: list[Given], gamma: float | list[float | None] | None
-) -> dict[tuple[Given, float | None], tuple[int, ...]]:
-    """Axes that share a pattern of given entries and a gamma."""
-    if gamma is None and patterns.count(patterns[0]) == len(patterns):
-        return {(patterns[0], None): tuple(range(len(patterns)))}
+    patterns: list[Given], gamma: float | list[float | None] | None, meeting: list[bool]
+) -> dict[Kind, tuple[int, ...]]:
+    """Axes that share a pattern of given entries, a gamma, and whether their ends meet."""
+    if gamma is None and patterns.count(patterns[0]) == len(patterns) and len(set(meeting)) == 1:
+        return {(patterns[0], None, meeting[0]): tuple(range(len(patterns)))}
     gammas = gamma if isinstance(gamma, list) else [gamma] * len(patterns)
-    groups: dict[tuple[Given, float | None], tuple[int, ...]] = {}
-    for axis, key in enumerate(zip(patterns, gammas, strict=True)):
-        groups[key] = (*groups.get(key, ()), axis)
+    groups: dict[Kind, tuple[int, ...]] = {}
+    for axis, kind in enumerate(zip(patterns, gammas, meeting, strict=True)):
+        groups[kind] = (*groups.get(kind, ()), axis)
     return groups
 
 

@@ -8,13 +8,17 @@ from typing import Any, Literal, Self
 
 import numpy as np
 
-from ctrlplan.trajectories.common import FACTORIALS, Array, checked_labels, mapped_time, readonly
+from ctrlplan.trajectories.common import FACTORIALS, Array, checked_labels, mapped_time, readonly, times_powers
 from ctrlplan.trajectories.newton import NewtonSystem
 from ctrlplan.trajectories.newton_spline import NewtonSpline, checked_waypoints, given_entries, same_axes, same_times
 from ctrlplan.trajectories.polynomial import PolySpline
+from ctrlplan.trajectories.swing import warn_of_swing
 from ctrlplan.trajectories.trajectory import Trajectory
 from ctrlplan.trajectories.trigonometric import TrigSpline, chosen_alpha
 from ctrlplan.trajectories.waypoint import Waypoint
+
+_WITHIN = np.linspace(0.0, 1.0, 13)
+"""Parts of a segment at which its swing is measured."""
 
 
 class PiecewiseSpline(Trajectory):
@@ -37,6 +41,10 @@ class PiecewiseSpline(Trajectory):
         "auto" the shortest path.
     labels : sequence of str, optional
         Names of the axes.
+    warn : bool, optional
+        Whether to warn where the plan swings over more than 3 times the range
+        of its waypoints (their positions, and where their derivatives lead
+        within half a segment), on any axis.
 
     Attributes
     ----------
@@ -48,10 +56,16 @@ class PiecewiseSpline(Trajectory):
     ValueError
         If alpha is outside [0, 2 pi), times do not increase, axes differ, or
         the entries left free are not determined.
+
+    Warns
+    -----
+    UserWarning
+        If the plan swings far beyond its waypoints (`warn`).
     """
 
     alpha: float
     legs: tuple[NewtonSpline, ...]
+    _warn: bool
 
     def __init__(
         self,
@@ -59,13 +73,16 @@ class PiecewiseSpline(Trajectory):
         *,
         alpha: float | Literal["auto"] = 0.0,
         labels: Sequence[str] | None = None,
+        warn: bool = True,
     ) -> None:
         points = checked_waypoints(waypoints)
         shape = chosen_alpha(alpha, points, type(self), labels=labels)
         names = checked_labels(labels or points[0].labels, points[0].naxes)
         filled = _filled(points, shape)
         legs = tuple(
-            TrigSpline(pair, alpha=shape, labels=names) if shape else PolySpline(pair, labels=names)
+            TrigSpline(pair, alpha=shape, labels=names, warn=False)
+            if shape
+            else PolySpline(pair, labels=names, warn=False)
             for pair in itertools.pairwise(filled)
         )
         self.__dict__.update(
@@ -74,7 +91,9 @@ class PiecewiseSpline(Trajectory):
             labels=names,
             legs=legs,
             breakpoints=readonly(np.array([p.time for p in points])),
+            _warn=warn,
         )
+        self._check_swing()
 
     def with_values(self, waypoints: Iterable[Waypoint]) -> Self:
         """Plan with the same times and shape through new values.
@@ -84,7 +103,9 @@ class PiecewiseSpline(Trajectory):
         ValueError
             If a time differs.
         """
-        return self.through(same_times(waypoints, self.waypoints))
+        plan = self._again(same_times(waypoints, self.waypoints), self._warn)
+        plan._check_swing()
+        return plan
 
     def through(self, waypoints: Iterable[Waypoint]) -> Self:
         """Plan of the same shape through any waypoints of as many axes.
@@ -94,8 +115,9 @@ class PiecewiseSpline(Trajectory):
         ValueError
             As the constructor.
         """
-        points = same_axes(checked_waypoints(waypoints), self.naxes)
-        return type(self)(points, alpha=self.alpha, labels=self.labels)
+        plan = self._again(same_axes(checked_waypoints(waypoints), self.naxes), self._warn)
+        plan._check_swing()
+        return plan
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data that `trajectory_from_dict` reads."""
@@ -109,11 +131,30 @@ class PiecewiseSpline(Trajectory):
     @classmethod
     def _from_dict(cls, data: dict[str, Any]) -> Self:
         points = [Waypoint.from_dict(w) for w in data["waypoints"]]
-        return cls(points, alpha=data["alpha"], labels=data["labels"])
+        plan = cls(points, alpha=data["alpha"], labels=data["labels"], warn=False)
+        plan.__dict__["_warn"] = True  # of what is made from it
+        return plan
 
     def _map_time(self, origin: float, target: float, rate: float) -> Self:
         moved = [w.scaled(mapped_time(w.time, origin, target, rate), rate) for w in self.waypoints]
-        return type(self)(moved, alpha=self.alpha, labels=self.labels)
+        return self._again(moved, self._warn)
+
+    def _again(self, points: Iterable[Waypoint], warn: bool) -> Self:
+        """Plan of the same shape through other waypoints, without a warning now."""
+        plan = type(self)(points, alpha=self.alpha, labels=self.labels, warn=False)
+        plan.__dict__["_warn"] = warn
+        return plan
+
+    def quiet(self) -> Self:
+        """The same plan, which no longer warns where `through` or `with_values` swings."""
+        return self._again(self.waypoints, False)
+
+    def _check_swing(self) -> None:
+        """Warn, where it was not declined, of a plan that swings far beyond its waypoints."""
+        if self._warn:
+            values = [leg._leg_jet(0, leg.duration * _WITHIN, 0)[0] for leg in self.legs]
+            way_on = f"lower alpha from {self.alpha:.6g}" if self.alpha else "prescribe velocities at inner waypoints"
+            warn_of_swing(np.concatenate(values, axis=1), self.waypoints, self.end, self.labels, way_on)
 
     def _leg_jet(self, leg: int, s: Array, order: int) -> Array:
         return self.legs[leg]._leg_jet(0, s, order)
@@ -155,7 +196,7 @@ def _conjugate(
     unit = (points[-1].time - points[0].time) / last
     naxes = table.shape[2]
     columns = np.concatenate([np.nan_to_num(table), np.zeros((last + 1, size, len(free)))], axis=2)
-    columns *= (unit ** np.arange(size))[:, None]
+    columns = times_powers(columns, unit, np.arange(size)[:, None])
     for n, (i, k) in enumerate(free):
         columns[i, k, naxes + n] = 1.0
     jump = np.zeros((last + 1, 2 * size, columns.shape[2]))  # right limit minus left, at each waypoint
@@ -179,4 +220,4 @@ def _conjugate(
     if scale.min() == 0.0 or np.linalg.cond(matrix / scale) > 1e13:
         raise ValueError("the entries left free at inner waypoints must be determined by the others; prescribe more")
     solution: Array = np.linalg.solve(matrix, -known)
-    return solution / unit ** np.array([k for _, k in free])[:, None]
+    return times_powers(solution, 1.0 / unit, np.array([k for _, k in free])[:, None])

@@ -27,12 +27,22 @@ class PolySpline(NewtonSpline):
         `smooth`.
     smooth : int, optional
         That order, 3 (jerk) unless given.
+    warn : bool, optional
+        Whether to warn where the plan swings over more than 3 times the range
+        of its waypoints (their positions, and where their derivatives lead
+        within half a segment), on any axis.
 
     Raises
     ------
     ValueError
         If times do not increase, axes differ, the free entries make the system
-        singular, or the degree is too low.
+        singular, or the degree is too low; if rounding could cost more than 1e-6
+        of the plan's range.
+
+    Warns
+    -----
+    UserWarning
+        If the plan swings far beyond its waypoints (`warn`).
 
     Examples
     --------
@@ -50,10 +60,13 @@ class PolySpline(NewtonSpline):
         labels: Sequence[str] | None = None,
         degree: int | None = None,
         smooth: int = 3,
+        warn: bool = True,
     ) -> None:
-        self._fit(checked_waypoints(waypoints), 0.0, Options(labels, None, *checked_degree(degree, smooth)))
+        chosen = Options(labels, None, *checked_degree(degree, smooth), warn=warn)
+        self._fit(checked_waypoints(waypoints), 0.0, chosen)
+        self._check_swing()
 
     @classmethod
     def _from_dict(cls, data: dict[str, Any]) -> Self:
         points = [Waypoint.from_dict(w) for w in data["waypoints"]]
-        return cls(points, **{k: data[k] for k in ("labels", "degree", "smooth") if k in data})
+        return cls(points, warn=False, **{k: data[k] for k in ("labels", "degree", "smooth") if k in data})._loaded()

@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ctrlplan.trajectories.common import FACTORIALS, Array, mapped_time, readonly
+from ctrlplan.trajectories.common import FACTORIALS, Array, mapped_time, new_numbers, readonly, times_powers
 from ctrlplan.trajectories.step import Step
 from ctrlplan.trajectories.trajectory import Trajectory
 
@@ -53,7 +53,8 @@ class _Profile(Trajectory):
 
     def _map_time(self, origin: float, target: float, rate: float) -> Self:
         ends = Step(self.final, self.initial, mapped_time(self.start, origin, target, rate), self.labels)
-        return self._of(ends, [getattr(self, name) * rate**nu for nu, name in enumerate(self._names, 1)])
+        limits = np.array([getattr(self, name) for name in self._names])
+        return self._of(ends, list(times_powers(limits, rate, np.arange(1, len(limits) + 1)[:, None])))
 
     def _set(self, ends: Step, *limits: ArrayLike) -> None:
         with np.errstate(over="ignore"):
@@ -87,6 +88,8 @@ class _Profile(Trajectory):
         fall, after = _rise(lasts[::-1][: len(ramp)], ramp, len(given))
         cruise = np.zeros((int(kept[nrise]), rise.shape[1]))
         cruise[:, :2] = before, 1.0
+        if not np.isfinite(cruise).all():
+            raise ValueError(f"limits must give segments within floating point, got durations {durations.tolist()} s")
         whole = before + float(lasts[len(ramp) : -len(ramp)].sum()) + after
         self.__dict__.update(
             zip(self._names, given, strict=True),
@@ -277,10 +280,7 @@ def _shifted(taylor: list[float], s: Any, order: int) -> list[Any]:
 
 def _checked_limit(limit: ArrayLike, name: str, labels: tuple[str, ...]) -> Array:
     """Limit of each axis."""
-    try:
-        values = np.array(limit, dtype=float)
-    except (TypeError, ValueError):
-        raise ValueError(f"{name} must be numbers, got {limit!r}") from None
+    values = new_numbers(limit, name)
     if values.shape not in ((), (len(labels),)):
         raise ValueError(f"{name} must be a scalar or of shape ({len(labels)},), got shape {values.shape}")
     for label, value in zip(labels, np.broadcast_to(values, len(labels)).tolist(), strict=True):

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from scipy.special import comb
 
 from ctrlplan.trajectories.combined import Sum
-from ctrlplan.trajectories.common import Array, Frozen, checked_count, checked_time, readonly
+from ctrlplan.trajectories.common import Array, Frozen, checked_count, checked_time, new_numbers, readonly
 from ctrlplan.trajectories.trajectory import Trajectory
 
 
@@ -190,7 +190,7 @@ class Shaper(Frozen):
         ValueError
             If one is out of range.
         """
-        omega, zeta = np.asarray(frequency, dtype=float), _checked_damping(damping)
+        omega, zeta = new_numbers(frequency, "frequency"), _checked_damping(damping)
         if not np.all((omega >= 0.0) & (omega < math.inf)):
             raise ValueError(f"frequency must be at least 0 and finite, got {frequency!r}")
         mode = omega * (zeta + 1j * np.sqrt(1.0 - zeta**2))
@@ -203,10 +203,7 @@ class Shaper(Frozen):
 
 def _numbers(values: ArrayLike, name: str) -> Array:
     """One or more finite numbers as a new array."""
-    try:
-        found = np.array(values, dtype=float)
-    except (TypeError, ValueError):
-        raise ValueError(f"{name} must be numbers, got {values!r}") from None
+    found = new_numbers(values, name)
     if found.ndim != 1 or not found.size:
         raise ValueError(f"{name} must be of shape (nimpulses,), got shape {found.shape}")
     if not np.isfinite(found).all():
@@ -216,7 +213,7 @@ def _numbers(values: ArrayLike, name: str) -> Array:
 
 def _checked_damping(damping: ArrayLike) -> Array:
     """Damping ratios below the critical one."""
-    zeta = np.asarray(damping, dtype=float)
+    zeta = new_numbers(damping, "damping")
     if not np.all((zeta >= 0.0) & (zeta < 1.0)):
         raise ValueError(f"damping must lie in [0, 1), got {damping!r}")
     return zeta

@@ -8,7 +8,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ctrlplan.trajectories.common import Array, checked_labels, checked_time, mapped_time, readonly
+from ctrlplan.trajectories.common import Array, checked_labels, checked_time, mapped_time, new_numbers, readonly
 from ctrlplan.trajectories.trajectory import Trajectory
 
 
@@ -81,10 +81,7 @@ class Step(Trajectory):
 
 def _positions(values: ArrayLike, name: str) -> Array:
     """Positions as a new array (naxes,)."""
-    try:
-        found = np.array(values, dtype=float)
-    except (TypeError, ValueError):
-        raise ValueError(f"{name} must be numbers, got {values!r}") from None
+    found = new_numbers(values, name)
     if found.ndim > 1 or not found.size:
         raise ValueError(f"{name} must be a scalar or of shape (naxes,), got shape {found.shape}")
     if not np.isfinite(found).all():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import os
+import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from functools import cached_property
@@ -22,6 +23,7 @@ from ctrlplan.trajectories.common import (
     checked_count,
     checked_time,
     checked_timepts,
+    one_number,
     readonly,
 )
 from ctrlplan.trajectories.continuity import Jump, find_jumps
@@ -54,6 +56,8 @@ class Trajectory(Frozen, ABC):
     waypoints: tuple[Waypoint, ...] = ()
 
     kinds: ClassVar[dict[str, type[Trajectory]]] = {}
+
+    __array_ufunc__ = None  # numpy's numbers leave products to this class, and its arrays are no factors
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
@@ -189,8 +193,8 @@ class Trajectory(Frozen, ABC):
         """
         order = checked_count(order, "order")
         if isinstance(t, Real):
-            return (self.jet(float(t), order).T / FACTORIALS[: order + 1]).tolist()
-        if t is None or isinstance(t, str | complex | list | tuple | np.ndarray):
+            return (self.jet(one_number(t, "t"), order).T / FACTORIALS[: order + 1]).tolist()
+        if t is None or isinstance(t, str | complex | list | tuple | np.ndarray | np.datetime64 | np.bool_):
             raise TypeError(f"t must be one number or a symbol, got {t!r:.80}")
         # Each leg counts where it holds; elsewhere it is taken at its ends, where it is finite.
         found = [[value * (t < self.start), *[0.0] * order] for value in self.initial.tolist()]
@@ -304,14 +308,29 @@ class Trajectory(Frozen, ABC):
         """Same path from the same start, in another duration [s].
 
         The nu-th derivative is multiplied by (old duration/new)^nu.
+
+        Raises
+        ------
+        ValueError
+            If the duration is not above 0, a derivative leaves floating point,
+            or rounding changes an interval of the plan by more than 1e-3 of its
+            length; above 1e-6 it warns.
         """
         if not self.duration:
             raise ValueError("a trajectory without duration cannot be retimed, got a step")
-        return self._map_time(self.start, self.start, self.duration / checked_time(duration, "duration", positive=True))
+        wanted = checked_time(duration, "duration", positive=True)
+        return self._moved(self.start, self.start, self.duration / wanted)
 
     def shift(self, dt: float) -> Self:
-        """Same path, dt seconds later."""
-        return self._map_time(self.start, self.start + checked_time(dt, "dt"), 1.0)
+        """Same path, dt seconds later.
+
+        Raises
+        ------
+        ValueError
+            If the rounding of so late a time changes an interval of the plan by
+            more than 1e-3 of its length; above 1e-6 it warns.
+        """
+        return self._moved(self.start, self.start + checked_time(dt, "dt"), 1.0)
 
     def then(self, other: Trajectory) -> Trajectory:
         """This trajectory, then the other from this one's end on.
@@ -320,7 +339,7 @@ class Trajectory(Frozen, ABC):
         ------
         ValueError
             If the other's first position differs from this one's last by more
-            than 1e-9 of their size, or the axes differ in number.
+            than 1e-9 of their range, or the axes differ in number.
         """
         from ctrlplan.trajectories.combined import Joined
 
@@ -370,15 +389,15 @@ class Trajectory(Frozen, ABC):
     def __sub__(self, other: Trajectory) -> Trajectory:
         return self + (-1.0) * other if isinstance(other, Trajectory) else NotImplemented
 
-    def __mul__(self, factor: float | Real) -> Trajectory:
+    def __mul__(self, factor: float) -> Trajectory:
         from ctrlplan.trajectories.combined import Scaled
 
-        return Scaled(self, float(factor)) if isinstance(factor, Real) else NotImplemented
+        return Scaled(self, factor) if _is_factor(factor) else NotImplemented
 
     __rmul__ = __mul__
 
-    def __truediv__(self, factor: float | Real) -> Trajectory:
-        return self * (1.0 / float(factor)) if isinstance(factor, Real) else NotImplemented
+    def __truediv__(self, factor: float) -> Trajectory:
+        return self * (1.0 / one_number(factor, "factor")) if _is_factor(factor) else NotImplemented
 
     def __neg__(self) -> Trajectory:
         return self * -1.0
@@ -387,6 +406,25 @@ class Trajectory(Frozen, ABC):
         axes = ", ".join(self.labels)
         when = f"from {self.start:g} s to {self.end:g} s" if self.duration else f"at {self.start:g} s"
         return f"<{type(self).__name__} of {axes} {when}>"
+
+    def _moved(self, origin: float, target: float, rate: float) -> Self:
+        """As `_map_time`, with what the rounding of times costs the intervals between them stated."""
+        moved = self._map_time(origin, target, rate)
+        before, after = (np.union1d(p.breakpoints, [w.time for w in p.waypoints]) for p in (self, moved))
+        if before.size < 2:
+            return moved
+        if before.size != after.size:  # a profile leaves out segments shorter than its clock resolves
+            before, after = before[[0, -1]], after[[0, -1]]
+        loss = float(np.abs(np.diff(after) * rate / np.diff(before) - 1.0).max())
+        if loss > 1e-6:
+            said = (
+                f"times must keep the intervals of the plan, got a loss of {loss:.1g} of an interval by rounding "
+                f"between {after[0]:.17g} s and {after[-1]:.17g} s; count time from an origin nearer to the plan"
+            )
+            if loss > 1e-3:
+                raise ValueError(said)
+            warnings.warn(said, stacklevel=3)
+        return moved
 
     def _sample(self, t: Array, low: int, high: int, left: bool) -> Array:
         """Derivatives low to high, shape (high - low + 1, naxes, ntime)."""
@@ -435,3 +473,8 @@ class Trajectory(Frozen, ABC):
         if 0 <= leg < self.breakpoints.size - 1:
             return self._leg_series(leg, s + (origin - float(self.breakpoints[leg])), order)
         return [[value, *[0.0] * order] for value in (self.initial if leg < 0 else self.final).tolist()]
+
+
+def _is_factor(value: object) -> bool:
+    """Whether a plan may be multiplied by a value: numpy counts a time difference among the real numbers."""
+    return isinstance(value, Real) and not isinstance(value, bool | np.timedelta64)

@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ctrlplan.trajectories.common import FACTORIALS, Array, Frozen, checked_count, checked_time
+from ctrlplan._checks import real_array
+from ctrlplan.trajectories.common import FACTORIALS, Array, Frozen, checked_count, checked_time, derivative_scale
 from ctrlplan.trajectories.newton import NewtonSystem, newton_series, pair_series
 from ctrlplan.trajectories.trigonometric import checked_alpha
 
@@ -63,7 +64,12 @@ class Transition(Frozen):
         horizon = checked_time(horizon, "horizon", positive=True)
         alpha = checked_alpha(alpha)
         family = _family(order, alpha)
-        powers = horizon**family.exponents
+        with np.errstate(over="ignore", under="ignore"):
+            powers = horizon**family.exponents
+        if not 1e-290 < powers[-1] < 1e290:
+            raise ValueError(
+                f"powers of the horizon must stay within floating point, got {horizon:g} s to the power {2 * order + 1}"
+            )
         self.__dict__.update(
             order=order,
             horizon=horizon,
@@ -87,13 +93,15 @@ class Transition(Frozen):
         -------
         ndarray, shape (2 (order + 1), naxes)
         """
-        return self._system.coefficients(jets[self._rows] * self._data_scale) * self._time_scale
+        data = jets[self._rows]
+        found = self._system.fitted(data, (0.0, self.horizon), self.horizon, data * self._data_scale)
+        return found * self._time_scale
 
     def jet(self, coefficients: Array, s: Array, order: int) -> Array:
         """Jet (order + 1, naxes, ntime) at times s [s] after the beginning."""
         taylor = self._system.taylor(np.asarray(s, dtype=float) / self.horizon, order)
         values = np.einsum("mkt,ma->kat", taylor, coefficients / self._time_scale)
-        return values * (FACTORIALS[: order + 1] / self.horizon ** np.arange(order + 1))[:, None, None]
+        return values * derivative_scale(self.horizon, order)[:, None, None]
 
     def evaluation(self, s: float, order: int) -> Array:
         """Matrix (order + 1, 2 (self.order + 1)) from coefficients to derivatives s seconds after the beginning."""
@@ -164,7 +172,7 @@ def series(rate: float, columns: Sequence[Sequence[Any]], past: Any, ahead: Any,
 
 def extrapolated(jet: ArrayLike, time: float) -> Array:
     """Jet (order + 1, naxes) `time` seconds later, along its Taylor polynomial."""
-    values = np.asarray(jet, dtype=float)
+    values = real_array(jet, "jet")
     return np.array([taylor_value(values[k:], time) for k in range(len(values))]) if len(values) > 1 else values
 
 

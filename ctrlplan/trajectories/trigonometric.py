@@ -9,7 +9,7 @@ from typing import Any, Literal, Self
 
 import numpy as np
 
-from ctrlplan.trajectories.common import Array, checked_time
+from ctrlplan.trajectories.common import Array, checked_time, one_number
 from ctrlplan.trajectories.newton import NewtonSystem
 from ctrlplan.trajectories.newton_spline import NewtonSpline, Options, checked_degree, checked_waypoints
 from ctrlplan.trajectories.waypoint import Waypoint
@@ -45,12 +45,23 @@ class TrigSpline(NewtonSpline):
         `smooth`.
     smooth : int, optional
         That order, 3 (jerk) unless given.
+    warn : bool, optional
+        Whether to warn where the plan swings over more than 3 times the range
+        of its waypoints (their positions, and where their derivatives lead
+        within half a segment), on any axis.
 
     Raises
     ------
     ValueError
         If alpha is outside [0, 2 pi), times do not increase, axes differ, the
-        free entries or gamma make the system singular, or the degree is too low.
+        free entries or gamma make the system singular, or the degree is too low;
+        if rounding could cost more than 1e-6 of the plan's range: near alpha =
+        2 pi both ends are nearly one point.
+
+    Warns
+    -----
+    UserWarning
+        If the plan swings far beyond its waypoints (`warn`).
 
     Examples
     --------
@@ -68,10 +79,12 @@ class TrigSpline(NewtonSpline):
         labels: Sequence[str] | None = None,
         degree: int | None = None,
         smooth: int = 3,
+        warn: bool = True,
     ) -> None:
         points = checked_waypoints(waypoints)
-        chosen = Options(labels, _checked_gamma(gamma, points[0].naxes), *checked_degree(degree, smooth))
+        chosen = Options(labels, _checked_gamma(gamma, points[0].naxes), *checked_degree(degree, smooth), warn=warn)
         self._fit(points, chosen_alpha(alpha, points, type(self), **chosen.given()), chosen)
+        self._check_swing()
 
     @classmethod
     def cyclic(
@@ -83,6 +96,7 @@ class TrigSpline(NewtonSpline):
         labels: Sequence[str] | None = None,
         degree: int | None = None,
         smooth: int = 3,
+        warn: bool = True,
     ) -> Self:
         """Closed plan that repeats, alpha = 2 pi (remark 2 of the paper).
 
@@ -96,7 +110,7 @@ class TrigSpline(NewtonSpline):
             stated.
         period : float
             Duration of a round [s].
-        gamma, labels, degree, smooth
+        gamma, labels, degree, smooth, warn
             As for `TrigSpline`.
 
         Raises
@@ -106,9 +120,12 @@ class TrigSpline(NewtonSpline):
         """
         points = checked_waypoints(waypoints, least=1)
         duration = checked_time(period, "period", positive=True)
-        chosen = Options(labels, _checked_gamma(gamma, points[0].naxes), *checked_degree(degree, smooth), duration)
+        chosen = Options(
+            labels, _checked_gamma(gamma, points[0].naxes), *checked_degree(degree, smooth), duration, warn
+        )
         plan = cls.__new__(cls)
         plan._fit(points, 2.0 * math.pi, chosen)
+        plan._check_swing()
         return plan
 
     @property
@@ -144,8 +161,8 @@ class TrigSpline(NewtonSpline):
         points = [Waypoint.from_dict(w) for w in data["waypoints"]]
         chosen = {k: data[k] for k in ("gamma", "labels", "degree", "smooth") if k in data}
         if "period" in data:
-            return cls.cyclic(points, data["period"], **chosen)
-        return cls(points, alpha=data["alpha"], **chosen)
+            return cls.cyclic(points, data["period"], warn=False, **chosen)._loaded()
+        return cls(points, alpha=data["alpha"], warn=False, **chosen)._loaded()
 
 
 AxisCoefficients = tuple[float, Array, Array, float, int, float]
@@ -209,17 +226,14 @@ def chosen_alpha(alpha: float | str, points: tuple[Waypoint, ...], family: Calla
         raise ValueError(f'alpha must lie in [0, 2 pi) or be "auto", got {alpha!r}')
     from ctrlplan.planning.alpha import choose_alpha
 
-    return choose_alpha(points, family=family, **options).alpha
+    return choose_alpha(points, family=family, warn=False, **options).alpha
 
 
 def checked_alpha(alpha: float | str) -> float:
     """Shape parameter in [0, 2 pi)."""
     if isinstance(alpha, str):
         raise ValueError(f"alpha must be a number in [0, 2 pi) here, got {alpha!r}")
-    try:
-        value = float(alpha)
-    except (TypeError, ValueError):
-        raise TypeError(f"alpha must be a number in [0, 2 pi), got {alpha!r}") from None
+    value = one_number(alpha, "alpha", "a number in [0, 2 pi)")
     if not 0.0 <= value < 2.0 * math.pi:
         raise ValueError(f"alpha must lie in [0, 2 pi), got {value}")
     return value
@@ -229,11 +243,10 @@ def _checked_gamma(gamma: float | Sequence[float | None] | None, naxes: int) -> 
     """One phase for all axes, or one an axis, as plain numbers."""
     if gamma is None:
         return None
+    if np.ma.is_masked(gamma):
+        raise TypeError(f"gamma must be a number, or one an axis, got {gamma!r:.80}")
     given: Any = np.asarray(gamma, dtype=object)
-    try:
-        values = [None if v is None else float(v) for v in given.ravel()]
-    except (TypeError, ValueError):
-        raise TypeError(f"gamma must be a number, or one an axis, got {gamma!r}") from None
+    values = [None if v is None else one_number(v, "gamma", "a number, or one an axis") for v in given.ravel()]
     for value in values:
         if value is not None and not math.isfinite(value):
             raise ValueError(f"gamma must be finite, got {value}")

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ctrlplan.trajectories.common import Array, Frozen, checked_time, readonly
+from ctrlplan.trajectories.common import Array, Frozen, checked_time, new_numbers, readonly, times_powers
 
 ENTRIES = ("position", "velocity", "acceleration", "jerk", "snap")
 
@@ -99,7 +99,7 @@ class Waypoint(Frozen):
             raise ValueError("from_jets needs at least one axis, such as x=[0.0, 0.0], got none")
         columns = {}
         for label, jet in jets.items():
-            column = _numbers(jet, f"jet of axis {label}")
+            column = new_numbers(jet, f"jet of axis {label}")
             if column.ndim != 1:
                 raise ValueError(f"jet of axis {label} must be a sequence of numbers, got {jet!r}")
             columns[label] = column
@@ -152,8 +152,8 @@ class Waypoint(Frozen):
 
     def scaled(self, time: float, rate: float) -> Waypoint:
         """Same point at another time, passed `rate` times as fast."""
-        powers = rate ** np.arange(len(self.jet))
-        return Waypoint._of(checked_time(time, "time"), self.jet * powers[:, None], self.labels)
+        moved = times_powers(self.jet, rate, np.arange(len(self.jet))[:, None])
+        return Waypoint._of(checked_time(time, "time"), moved, self.labels)
 
     def truncated(self, order: int) -> Waypoint:
         """Same point with what it prescribes up to an order, and the rest left free."""
@@ -174,7 +174,7 @@ class Waypoint(Frozen):
         rows = [[np.nan if v is None else v for v in row] for row in data["jet"]]
         if len({len(row) for row in rows}) > 1:
             raise ValueError(f"jet must have rows of one length, got {data['jet']!r}")
-        jet = _numbers(rows, "jet")
+        jet = new_numbers(rows, "jet")
         if jet.ndim != 2 or jet.size == 0 or (labels is not None and len(labels) != jet.shape[1]):
             raise ValueError(f"jet must be a table of entries by axes, got {data['jet']!r}")
         return cls._of(checked_time(data["time"], "time"), jet, labels)
@@ -197,24 +197,17 @@ class Waypoint(Frozen):
         return f"Waypoint({self.time!r}, {named})"
 
 
-def _numbers(values: object, name: str) -> Array:
-    try:
-        return np.array(values, dtype=float)
-    except (TypeError, ValueError):
-        raise ValueError(f"{name} must be numbers, got {values!r}") from None
-
-
 def _jet(entries: list[ArrayLike | None]) -> Array:
     """Table (order, axis) of the entries, scalars that mean every axis spread."""
     try:
-        table = np.array(entries, dtype=float)  # the common case: alike shapes and no gaps
+        table = new_numbers(entries, "position")  # the common case: alike shapes and no gaps
     except (TypeError, ValueError):
-        table = np.empty(())
+        table = np.empty(())  # says below which entry is wrong
     if table.ndim == 2 and table.shape[1]:
         return table
     if table.ndim == 1:
         return table[:, None]
-    rows = [_numbers(np.nan if e is None else e, ENTRIES[k]) for k, e in enumerate(entries)]
+    rows = [new_numbers(np.nan if e is None else e, ENTRIES[k]) for k, e in enumerate(entries)]
     naxes = max((r.size for r in rows), default=1)
     out = np.empty((len(rows), naxes))
     for k, row in enumerate(rows):

@@ -3,6 +3,7 @@
 import inspect
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from ctrlplan import metrics
@@ -172,3 +173,34 @@ def test_the_arguments_are_left_alone(name):
         array.setflags(write=False)
     call(name, timepts=frozen[0], signal=frozen[1])
     np.testing.assert_array_equal(frozen, before)
+
+
+class Quantity(np.ndarray):
+    """Numbers with a unit, as pint's and astropy's."""
+
+    units = "millisecond"
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(
+    "times",
+    [
+        np.arange(TIMES.size).astype("m8[s]"),
+        pd.to_timedelta(np.arange(TIMES.size), unit="s"),
+        pd.date_range("2024-01-01", periods=TIMES.size),
+        TIMES.view(Quantity),
+    ],
+    ids=lambda times: type(times).__name__ + str(times.dtype),
+)
+def test_times_and_signals_carry_no_unit(name, times):
+    with pytest.raises(TypeError, match="timepts must be plain numbers"):
+        call(name, timepts=times)
+    with pytest.raises(TypeError, match="must be plain numbers"):
+        call(name, signal=times)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_masked_samples_are_no_samples(name):
+    masked = np.ma.masked_array(RECORD, mask=np.arange(RECORD.size) == 2)
+    with pytest.raises(ValueError, match="must have no masked values"):
+        call(name, signal=masked)

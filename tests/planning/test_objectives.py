@@ -20,8 +20,8 @@ TIMES = [0.0, 1.5, 2.0, 4.0]
 JETS = np.random.default_rng(2).normal(size=(4, 3, 2)) * np.array([3.0, 2.0, 1.0])[:, None]
 POINTS = [Waypoint(t, *jet) for t, jet in zip(TIMES, JETS, strict=True)]
 PLANS = {
-    "polynomial": cp.PolySpline(POINTS),
-    "trigonometric": cp.TrigSpline(POINTS, alpha=4.0),
+    "polynomial": cp.PolySpline(POINTS, warn=False),
+    "trigonometric": cp.TrigSpline(POINTS, alpha=4.0, warn=False),
     "piecewise": cp.PiecewiseSpline(POINTS),
     "piecewise trigonometric": cp.PiecewiseSpline(POINTS, alpha=3.0),
     "one axis": cp.TrigSpline(POINTS, alpha=2.0).select("y1"),

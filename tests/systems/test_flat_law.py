@@ -685,3 +685,31 @@ def test_labels_are_refused():
     taken = double_integrator(states=["x", "x_ref_d1"])
     with pytest.raises(ValueError, match=r"^labels must not make references of the names of states, got x_ref_d1"):
         create_flat_iosystem(taken, [-1, -2])
+
+
+@pytest.mark.filterwarnings("ignore::FutureWarning")  # casadi will change the types that numpy's functions return
+def test_a_law_that_is_singular_at_zero_inputs_can_be_traced():
+    casadi = pytest.importorskip("casadi")
+    law = create_flat_iosystem(levitation(), [-8.0, -9.0], labels="gap")
+    signals = casadi.SX.sym("w", law.ninputs)
+    boxed = np.array([signals[i] for i in range(law.ninputs)], dtype=object)
+    traced = casadi.Function("law", [signals], [casadi.vertcat(*law.outfcn(0.0, np.zeros(0), boxed, {}))])
+    for values in (
+        [0.02, 0.0, 0.0, 0.021, 0.01],
+        [0.02, 0.0, 0.3, 0.019, -0.2],
+        [0.03, 0.1, 0.0, 0.03, 0.0],
+        [0.0] * 5,
+    ):
+        np.testing.assert_allclose(np.array(traced(values)).ravel(), law.output(0.0, np.zeros(0), np.array(values)))
+    assert float(traced([0.0] * 5)) == 0.0
+
+
+def test_the_loop_of_such_a_law_is_compiled():
+    pytest.importorskip("casadi")
+    plant = levitation()
+    law = create_flat_iosystem(plant, [-8.0, -9.0], labels="gap")
+    plan = 0.01 * smooth(2, labels=["gap"]) + cp.Step(0.02, initial=0.02, labels=["gap"])
+    t = np.linspace(0.0, 3.0, 31)
+    loop = closed(plan, law, plant, 2)
+    found = cp.simulate(loop, t, initial_state=[0.02, 0.0], method="compiled", rtol=1e-11, atol=1e-13)
+    assert np.abs(found.states - plan.jet(t, 1)[:, 0]).max() < 1e-9

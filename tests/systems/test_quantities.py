@@ -1,10 +1,12 @@
 """States and inputs of flat systems as functions of a plan: against the plants' own equations, and as limits."""
 
+import control as ct
 import control.flatsys as fs
 import numpy as np
 import pytest
 
 import ctrlplan as cp
+from ctrlplan.systems.flat import create_flat_iosystem
 from ctrlplan.systems.plants.integrator_chain import integrator_chain
 
 TURN = cp.PolySpline([cp.Waypoint(0, 0, 0, 0, 0), cp.Waypoint(2, 6.28, 0, 0, 0)])
@@ -63,3 +65,144 @@ def test_discrete_systems_are_refused():
     discrete = fs.FlatSystem(chain.forward, chain.reverse, inputs=1, outputs=1, states=1, dt=0.1)
     with pytest.raises(ValueError, match=r"continuous time, got dt = 0\.1"):
         cp.flat_quantities(discrete)
+
+
+# Maps that do not mean what their user thinks
+
+
+def lagged(*lags):
+    """1/(s (T_1 s + 1) ...), whose flat output to python-control is its output in another unit."""
+    chain = np.poly1d([1.0, 0.0])
+    for lag in lags:
+        chain *= np.poly1d([lag, 1.0])
+    return ct.ss(ct.tf([1.0], chain.coeffs)), chain.coeffs[::-1]
+
+
+@pytest.mark.parametrize("lags", [(0.02, 0.001), (0.5,), (0.1, 0.03)])
+def test_a_flat_output_in_another_unit_is_said(lags):
+    """With its factor: the plan of the output times that is the plan of the flat output."""
+    system, coefficients = lagged(*lags)
+    order = len(coefficients) - 1
+    flat = fs.LinearFlatSystem(system)
+    gain = 1.0 / np.prod(lags)
+    told = rf"y\[0\] is {gain:.6g} times it: a plan of y\[0\] must be multiplied by {1 / gain:.6g}".replace("+", r"\+")
+    with pytest.warns(UserWarning, match=told) as caught:
+        quantities = cp.flat_quantities(flat)
+    assert caught[0].filename == __file__
+    with pytest.warns(UserWarning, match=told) as caught:
+        create_flat_iosystem(flat, [-1.0 - k for k in range(order)])
+    assert caught[0].filename == __file__
+    create_flat_iosystem(flat, [-1.0 - k for k in range(order)], labels="z")  # whoever names it knows it
+    # What the message says, done: u = (the plant's denominator) y.
+    plan = cp.PolySpline([cp.Waypoint.from_jets(0, y=[0] * 5), cp.Waypoint.from_jets(1, y=[90, 0, 0, 0, 0])])
+    jet = plan.jet(np.linspace(0, 1, 21), order)
+    u = sum(c * row for c, row in zip(coefficients, jet[:, 0], strict=True))
+    np.testing.assert_allclose(quantities(jet / gain)["u[0]"], u, rtol=1e-9, atol=1e-9 * np.abs(u).max())
+
+
+def test_the_fastest_move_of_such_a_plant():
+    """90 with |u| <= 400: u is nearly y', whose peak is 2.1875 times the mean of the septic move."""
+    flat = fs.LinearFlatSystem(lagged(0.02, 0.001)[0])
+    with pytest.warns(UserWarning, match="50000 times"):
+        quantities = cp.flat_quantities(flat)
+    move = cp.PolySpline([cp.Waypoint(0, 0, 0, 0, 0), cp.Waypoint(1, 90 / 50000, 0, 0, 0)])
+    found = cp.fastest(move, {"u[0]": 400.0}, quantities)
+    assert found.duration == pytest.approx(2.1875 * 90 / 400, rel=0.02)
+
+
+def test_a_flat_output_that_is_the_output_is_no_news():
+    chain = ct.ss([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]], [[1.0, 0.0]], [[0.0]])
+    cp.flat_quantities(fs.LinearFlatSystem(chain))
+    create_flat_iosystem(fs.LinearFlatSystem(chain), [-1.0, -2.0])
+
+
+def wrong_maps(forward=lambda v: v, reverse=lambda v: v, rate=lambda v: v):
+    """x'' = u with something changed."""
+    return fs.FlatSystem(
+        lambda x, u, params: [np.array([x[0], forward(x[1]), u[0]])],
+        lambda flag, params: (np.array([flag[0][0], reverse(flag[0][1])]), np.array([flag[0][2]])),
+        lambda t, x, u, params: np.array([rate(x[1]), u[0]]),
+        lambda t, x, u, params: x[:1],
+        states=["a", "b"],
+        inputs=["u"],
+        outputs=["a"],
+    )
+
+
+def test_maps_that_do_not_belong_together_give_no_limits():
+    with pytest.raises(ValueError, match="reverse must undo forward, got"):
+        cp.flat_quantities(wrong_maps(reverse=lambda v: 1.1 * v))
+    with pytest.raises(ValueError, match="forward must return derivatives along the motion"):
+        cp.flat_quantities(wrong_maps(rate=lambda v: 2.0 * v))
+    cp.flat_quantities(wrong_maps())
+
+
+# Maps that are singular at rest
+
+
+def car(steering):
+    """Rear axle as flat output; the steering angle by its arctangent of two arguments, or by the quotient."""
+    length = 3.0
+
+    def forward(x, u, params):
+        c, s, turn = np.cos(x[2]), np.sin(x[2]), u[0] * np.tan(u[1]) / length
+        return [np.array([x[0], u[0] * c, -u[0] * turn * s]), np.array([x[1], u[0] * s, u[0] * turn * c])]
+
+    def reverse(flag, params):
+        (px, vx, ax), (py, vy, ay) = flag
+        heading = np.arctan2(vy, vx)
+        speed = vx * np.cos(heading) + vy * np.sin(heading)
+        sideways = ay * np.cos(heading) - ax * np.sin(heading)
+        if steering == "two arguments":
+            delta = np.arctan2(length * sideways, speed**2)
+        else:
+            delta = np.arctan(length * (vx * ay - vy * ax) / np.hypot(vx, vy) ** 3)
+        return np.array([px, py, heading]), np.array([speed, delta])
+
+    def motion(t, x, u, params):
+        return np.array([u[0] * np.cos(x[2]), u[0] * np.sin(x[2]), u[0] * np.tan(u[1]) / length])
+
+    names = ["x", "y", "theta"]
+    return fs.FlatSystem(forward, reverse, motion, None, states=names, inputs=["v", "delta"], outputs=names)
+
+
+FROM_REST = cp.PolySpline([cp.Waypoint(0, [0, 0], 0, 0), cp.Waypoint(10, [20, 10], 0, 0)])
+MOVING = cp.PolySpline([cp.Waypoint(0, [0, 0], [1, 0], 0), cp.Waypoint(10, [20, 10], [1, 0.5], 0)])
+
+
+@pytest.mark.parametrize("steering", ["two arguments", "quotient"])
+@pytest.mark.parametrize(
+    "limits", [{"delta": 0.5}, {"theta": (0.0, 1.0)}, {"v": 3.0, "delta": 0.5}, {"delta": (0, None)}]
+)
+def test_what_is_singular_at_rest_is_refused_with_the_reason(steering, limits):
+    """Not 214 % beyond, which is a quotient of rounding errors."""
+    quantities = cp.flat_quantities(car(steering))
+    for call in (cp.margins, cp.fastest):
+        with pytest.raises(ValueError, match=r"(delta|theta) must be determined by the plan, got nan where"):
+            call(FROM_REST, limits, quantities)
+
+
+@pytest.mark.parametrize("steering", ["two arguments", "quotient"])
+def test_what_is_regular_at_rest_stays_limited(steering):
+    quantities = cp.flat_quantities(car(steering))
+    found = cp.fastest(FROM_REST, {"v": 3.0}, quantities)
+    assert found.duration == pytest.approx(1.875 * np.hypot(20, 10) / 3.0, rel=1e-6)
+
+
+@pytest.mark.parametrize("steering", ["two arguments", "quotient"])
+def test_a_car_that_keeps_moving(steering):
+    """Against the curvature, on a fine grid."""
+    quantities = cp.flat_quantities(car(steering))
+    found = cp.margins(MOVING, {"delta": 0.5}, quantities)
+    j = MOVING.jet(np.linspace(0, 10, 200001), 2)
+    delta = np.arctan(3.0 * (j[1, 0] * j[2, 1] - j[1, 1] * j[2, 0]) / np.hypot(*j[1]) ** 3)
+    assert abs(found.active.value) == pytest.approx(np.abs(delta).max(), rel=1e-8)
+
+
+def test_regular_plants_are_determined_at_rest():
+    for plant in (cp.plants.dc_motor(), cp.plants.flexible_joint(), integrator_chain(3)):
+        quantities = cp.flat_quantities(plant)
+        order = plant.nstates
+        still = np.zeros((order + 1, 1, 3))
+        still[0] = 0.3
+        assert all(np.isfinite(row).all() for row in quantities(still).values())

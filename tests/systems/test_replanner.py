@@ -352,13 +352,13 @@ PLANS = {
     "polynomial, inner waypoints": cp.PolySpline(INNER),
     "polynomial, two axes": cp.PolySpline(TWO),
     "trigonometric, alpha 1": cp.TrigSpline(REST, alpha=1.0),
-    "trigonometric, alpha 5": cp.TrigSpline(REST, alpha=5.0),
+    "trigonometric, alpha 5": cp.TrigSpline(REST, alpha=5.0, warn=False),
     "trigonometric, inner waypoints, alpha 4": cp.TrigSpline(INNER, alpha=4.0),
     "trigonometric, entries free, in motion at the end": cp.TrigSpline(FREE, alpha=2.0),
     "trigonometric, gamma given": cp.TrigSpline(REST, alpha=3.0, gamma=1.2),
     "piecewise": cp.PiecewiseSpline(INNER),
     "piecewise, trigonometric": cp.PiecewiseSpline(TWO, alpha=1.5),
-    "joined": cp.TrigSpline([*REST[:1], Waypoint(6, 2, 0, 0)], alpha=5.0).then(
+    "joined": cp.TrigSpline([*REST[:1], Waypoint(6, 2, 0, 0)], alpha=5.0, warn=False).then(
         cp.PolySpline([Waypoint(6, 2, 0, 0), Waypoint(10, 1, 0, 0)])
     ),
     "sum": 2.0 * cp.TrigSpline(REST, alpha=2.0) + cp.PolySpline(INNER),

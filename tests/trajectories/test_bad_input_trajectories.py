@@ -17,6 +17,9 @@ from ctrlplan.trajectories import (
     stack,
 )
 
+# Data drawn at random and every alpha: most of these plans swing, on purpose.
+pytestmark = pytest.mark.filterwarnings("ignore:the plan swings")
+
 nan, inf = np.nan, np.inf
 POINTS = waypoints([0.0, 1.0], [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
 MOVE = PolySpline(POINTS)

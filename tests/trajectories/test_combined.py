@@ -287,3 +287,16 @@ def test_what_is_not_a_trajectory():
         Sum([MOVE, 3])
     with pytest.raises(TypeError, match=r"parts\[1\] must be a Trajectory, got Waypoint"):
         stack([MOVE, Waypoint(0, 0)])
+
+
+def test_a_far_origin_hides_no_jump():
+    """1e-9 of 2^40 is 1100: what counts is the range of the positions, 1."""
+    at = 2.0**40
+    move = PolySpline([Waypoint(0, at, 0, 0), Waypoint(1, at + 1, 0, 0)])
+    with pytest.raises(ValueError, match="positions must agree where trajectories join"):
+        move.then(move)
+    with pytest.raises(ValueError, match="positions must agree where trajectories join"):
+        move.then(move + Step(1.01, 1.01))
+    move.then(move + Step(1.0, 1.0))
+    (jump,) = (move + Step(at + 0.0625, at, time=0.5)).jumps(0)
+    assert (jump.order, jump.time, jump.size) == (0, 0.5, 0.0625)

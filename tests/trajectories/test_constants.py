@@ -8,6 +8,9 @@ from trajectory_oracle import waypoints
 
 from ctrlplan.trajectories import PolySpline, TrigSpline, Waypoint
 
+# Data drawn at random and every alpha: most of these plans swing, on purpose.
+pytestmark = pytest.mark.filterwarnings("ignore:the plan swings")
+
 REST = [Waypoint(0, 0, 0, 0), Waypoint(1, 1, 0, 0)]
 
 

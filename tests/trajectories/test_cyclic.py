@@ -7,6 +7,9 @@ from trajectory_oracle import Direct, miss, scales, waypoints
 
 from ctrlplan.trajectories import TrigSpline, Waypoint
 
+# Data drawn at random and every alpha: most of these plans swing, on purpose.
+pytestmark = pytest.mark.filterwarnings("ignore:the plan swings")
+
 # Times, jets and period: N 1, 2, 3, 7, 8, 12.
 ROUNDS = {
     "one position": ([0.5], [[2.0]], 3.0),

@@ -8,6 +8,9 @@ from trajectory_oracle import Direct, waypoints
 
 from ctrlplan.trajectories import PiecewiseSpline, PolySpline, Step, TrigSpline, Waypoint, stack
 
+# Data drawn at random and every alpha: most of these plans swing, on purpose.
+pytestmark = pytest.mark.filterwarnings("ignore:the plan swings")
+
 MOVE = PolySpline(waypoints([0.0, 2.0], [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]))
 
 

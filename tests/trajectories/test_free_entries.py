@@ -8,6 +8,9 @@ from trajectory_oracle import Direct, error, miss, waypoints
 
 from ctrlplan.trajectories import PolySpline, TrigSpline, Waypoint
 
+# Data drawn at random and every alpha: most of these plans swing, on purpose.
+pytestmark = pytest.mark.filterwarnings("ignore:the plan swings")
+
 ALPHAS = [0.0, 1.0, 4.0, 5.5]
 
 # Position and acceleration with the velocity free, velocities without positions, no entry at all, a late entry alone.

@@ -8,6 +8,9 @@ import pytest
 
 from ctrlplan.trajectories import PolySpline, TrigSpline, Waypoint
 
+# Data drawn at random and every alpha: most of these plans swing, on purpose.
+pytestmark = pytest.mark.filterwarnings("ignore:the plan swings")
+
 CASES = json.loads(Path(__file__).with_name("golden_hermite.json").read_text())
 
 

@@ -8,6 +8,9 @@ from trajectory_oracle import Direct, error, miss, waypoints
 
 from ctrlplan.trajectories import PolySpline, TrigSpline, Waypoint
 
+# Data drawn at random and every alpha: most of these plans swing, on purpose.
+pytestmark = pytest.mark.filterwarnings("ignore:the plan swings")
+
 
 @st.composite
 def plans(draw, ndigits=4):

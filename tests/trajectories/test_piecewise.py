@@ -11,6 +11,9 @@ from trajectory_oracle import Direct, miss, waypoints
 
 from ctrlplan.trajectories import PiecewiseSpline, PolySpline, TrigSpline, Waypoint
 
+# Data drawn at random and every alpha: most of these plans swing, on purpose.
+pytestmark = pytest.mark.filterwarnings("ignore:the plan swings")
+
 TIMES = [0.0, 6.0, 11.0, 16.0]
 JETS = [[0.0, 0.0, 0.0], [5.0, 1.0, 0.1], [15.0, 2.0, 0.1], [20.0, 0.0, 0.0]]
 

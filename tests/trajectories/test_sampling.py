@@ -8,6 +8,9 @@ from trajectory_oracle import Direct, waypoints
 
 from ctrlplan.trajectories import PiecewiseSpline, PolySpline, TrigSpline, Waypoint, stack
 
+# Data drawn at random and every alpha: most of these plans swing, on purpose.
+pytestmark = pytest.mark.filterwarnings("ignore:the plan swings")
+
 EPS = np.finfo(float).eps
 ALPHAS = [0.0, 0.3, 1.0, 3.0, 5.5]
 COUNTS = [4097, 4500, 5000, 6500, 20_000, 100_000]

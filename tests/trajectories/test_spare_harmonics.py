@@ -8,6 +8,9 @@ from trajectory_oracle import miss, waypoints
 
 from ctrlplan.trajectories import PolySpline, TrigSpline
 
+# Data drawn at random and every alpha: most of these plans swing, on purpose.
+pytestmark = pytest.mark.filterwarnings("ignore:the plan swings")
+
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(60)
 
 DATA = {

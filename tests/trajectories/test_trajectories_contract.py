@@ -11,6 +11,9 @@ import pytest
 from ctrlplan import trajectories
 from ctrlplan.trajectories import Trajectory, Waypoint
 
+# Data drawn at random and every alpha: most of these plans swing, on purpose.
+pytestmark = pytest.mark.filterwarnings("ignore:the plan swings")
+
 EXPORTED = {name: getattr(trajectories, name) for name in trajectories.__all__}
 KINDS = {
     name: kind

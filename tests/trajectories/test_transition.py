@@ -13,6 +13,9 @@ from trajectory_oracle import Direct
 from ctrlplan.trajectories import PolySpline, TrigSpline, Waypoint
 from ctrlplan.trajectories.transition import Transition, extrapolated, series, transition
 
+# Data drawn at random and every alpha: most of these plans swing, on purpose.
+pytestmark = pytest.mark.filterwarnings("ignore:the plan swings")
+
 ALPHAS = [0.0, 0.05, 1.0, 2.5, 4.0, 5.5]
 
 

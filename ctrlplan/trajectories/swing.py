@@ -1,0 +1,77 @@
+"""Plans that swing far beyond what they must meet."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Sequence
+
+import numpy as np
+
+from ctrlplan.trajectories.common import FACTORIALS, Array
+from ctrlplan.trajectories.waypoint import Waypoint
+
+MOST_SWING = 3.0
+"""Range of a plan, relative to that of its data, above which it warns.
+
+Rest-to-rest moves and those of the paper stay below 1.4 up to alpha = 4; from
+alpha = 4.5 on, and between many waypoints, one polynomial or trigonometric
+spline swings by powers of ten.
+"""
+
+
+def warn_of_swing(values: Array, points: Sequence[Waypoint], end: float, labels: Sequence[str], way_on: str) -> None:
+    """Warn of the axis that swings most, where the method that calls was called.
+
+    Parameters
+    ----------
+    values : ndarray, shape (naxes, ntime)
+        Positions of the plan at times between which it cannot hide much.
+    points : sequence of Waypoint
+        What it meets.
+    end : float
+        End of the plan [s], which may lie beyond the last waypoint.
+    labels : sequence of str
+        Names of the axes.
+    way_on : str
+        What to do instead.
+    """
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        plan = values.max(axis=1) - values.min(axis=1)
+        positions = np.array([p.jet[0] for p in points])
+        if (plan <= MOST_SWING * (positions.max(axis=0) - positions.min(axis=0))).all():
+            return  # the common case, without regard to derivatives
+        low, high = _data_range(points, end)
+        # Relative to a range that is only rounding of the positions, rounding is large.
+        counts = plan > 1e-9 * np.abs(values).max(axis=1)
+        swing = np.where(counts, plan / (high - low), 0.0)
+    axis = int(swing.argmax())
+    if swing[axis] > MOST_SWING:
+        warnings.warn(
+            f"the plan swings over {swing[axis]:.3g} times the range of its waypoints: {labels[axis]} from "
+            f"{values[axis].min():.6g} to {values[axis].max():.6g}, where positions and derivatives of the waypoints "
+            f"stay from {low[axis]:.6g} to {high[axis]:.6g}; {way_on}, or pass warn=False if this is intended",
+            stacklevel=4,
+        )
+
+
+def _data_range(points: Sequence[Waypoint], end: float) -> tuple[Array, Array]:
+    """Minimum and maximum (naxes,) of positions, and of where derivatives lead within half a segment."""
+    gaps = np.diff([p.time for p in points], append=max(end, points[-1].time))
+    if not gaps[-1]:
+        gaps = gaps[:-1]
+        reach = 0.5 * np.maximum(np.append(gaps, 0.0), np.append(0.0, gaps))
+    else:  # a cyclic plan returns to the first waypoint
+        reach = 0.5 * np.maximum(gaps, np.roll(gaps, 1))
+    table = np.full((len(points), max(len(p.jet) for p in points), points[0].naxes), np.nan)
+    for row, point in zip(table, points, strict=True):
+        row[: len(point.jet)] = point.jet
+    orders = np.arange(table.shape[1])
+    with np.errstate(over="ignore", invalid="ignore"):
+        size = np.abs(np.nan_to_num(table)) * (reach[:, None] ** orders / FACTORIALS[orders])[:, :, None]
+    away = size[:, 1:].sum(axis=1)
+    known = ~np.isnan(table[:, 0])
+    low = np.where(known, table[:, 0] - away, math.inf).min(axis=0)
+    high = np.where(known, table[:, 0] + away, -math.inf).max(axis=0)
+    free = np.where(known, 0.0, away).sum(axis=0)  # derivatives at no stated position
+    return low - free, high + free
