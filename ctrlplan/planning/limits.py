@@ -12,6 +12,7 @@ import numpy as np
 
 from ctrlplan.trajectories import Trajectory, derivative_name
 from ctrlplan.trajectories.common import Array, checked_limits
+from ctrlplan.trajectories.extrema import function_extrema
 from ctrlplan.trajectories.waypoint import ENTRIES
 
 if TYPE_CHECKING:
@@ -278,7 +279,8 @@ class Limited:
         ]
         others = [k for k, b in enumerate(self.bounds) if b.axis is None]
         if others:
-            found = plan.extrema_of(lambda jet: self.values(jet)[others], self.order)
+            scales = [self.bounds[k].scale for k in others]  # a quantity of 0 is not resolved to its rounding
+            found = function_extrema(plan, lambda jet: self.values(jet)[others], self.order, scales)
             columns = zip(found.minimum, found.maximum, found.time_min, found.time_max, strict=True)
             rows += [_margin(self.bounds[k], *column) for k, column in zip(others, columns, strict=True)]
         return Margins(tuple(sorted(rows, key=lambda row: row.fraction)))
