@@ -208,8 +208,7 @@ class _Replanned:
 def fastest_within(plan: Trajectory, limited: Limited, span: tuple[float, float] | None = None) -> Fastest:
     """Shortest duration with the shape held, for limits that were made ready before."""
     scaled = _Scaled(plan, limited)
-    if not _allow_rest(plan, limited):
-        return _searched(scaled, span or _around(plan.duration), "shape", endless=False)
+    _check_rest(plan, limited)
     least = _closed_form(plan, limited)
     if limited.derivatives_only and span is None:
         if not least:
@@ -219,25 +218,18 @@ def fastest_within(plan: Trajectory, limited: Limited, span: tuple[float, float]
     return _searched(scaled, span or _span(scaled.excess, plan.duration, least), "shape", endless=True)
 
 
-def _allow_rest(plan: Trajectory, limited: Limited) -> bool:
-    """Whether limits hold however slow the plan is; refuse those that a plan breaks even then.
-
-    A speed that must not fall below something is kept by durations that are short enough.
-    """
+def _check_rest(plan: Trajectory, limited: Limited) -> None:
+    """Reject limits of positions and quantities that a plan breaks however slow it is."""
     still = limited.at_rest(plan)
-    slow = True
     for bound, values in zip(limited.bounds, limited.values(still), strict=True):
         worst = int(bound.excess(values).argmax())
         if bound.excess(values)[worst] > 0.0:
-            if bound.axis is None or not bound.order:
-                place = zip(plan.labels, still[0, :, worst].tolist(), strict=True)
-                where = ", ".join(f"{label} = {value:.4g}" for label, value in place)
-                raise ValueError(
-                    f"limits must hold at rest, however slow the plan, got {bound.name} = {values[worst]:.6g} at rest "
-                    f"at {where}, where it must stay {bound.range}"
-                )
-            slow = False
-    return slow
+            place = zip(plan.labels, still[0, :, worst].tolist(), strict=True)
+            where = ", ".join(f"{label} = {value:.4g}" for label, value in place)
+            raise ValueError(
+                f"limits must hold at rest, however slow the plan, got {bound.name} = {values[worst]:.6g} at rest "
+                f"at {where}, where it must stay {bound.range}"
+            )
 
 
 def _closed_form(plan: Trajectory, limited: Limited) -> float:
