@@ -166,7 +166,7 @@ def test_magnitudes_by_axis_are_above_0(limit):
 
 @pytest.mark.parametrize("limit", [[True, 2.0], [None, 2.0], np.array([1, 2], dtype="timedelta64[s]")])
 def test_magnitudes_by_axis_are_numbers(limit):
-    with pytest.raises(TypeError, match="limits of velocity must be (a number or a pair|plain numbers)"):
+    with pytest.raises(TypeError, match=r"limits of velocity must be (a number or a pair|plain numbers)"):
         margins(SLOW_FAST, {"velocity": limit})
 
 
