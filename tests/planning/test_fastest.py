@@ -400,6 +400,7 @@ def test_a_time_law_would_open_a_closed_plan(name):
     np.testing.assert_allclose(first, last, rtol=0, atol=1e-8 * found.peak()[:, None].max())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "plan",
     [
@@ -413,12 +414,10 @@ def test_an_open_plan_has_a_time_law(plan):
     found = fastest(plan, limits, hold="path")
     assert found.duration <= fastest(plan, limits).duration
     jet = np.abs(found.plan.jet(np.linspace(found.plan.start, found.plan.end, COUNT), 2))
-    assert (jet[1].max(), jet[2].max()) <= (3.0 * (1 + 1e-11), 9.0 * (1 + 1e-11))
+    assert jet[1].max() <= 3.0 * (1 + 1e-11)
+    assert jet[2].max() <= 9.0 * (1 + 1e-11)
     # At rest stays at rest; of an end in motion the direction is kept.
-    before, after = (
-        plan.jet([plan.start, plan.end], 1)[1, 0],
-        found.plan.jet([found.plan.start, found.plan.end], 1)[1, 0],
-    )
+    before, after = (p.jet([p.start, p.end], 1)[1, 0] for p in (plan, found.plan))
     np.testing.assert_array_equal(np.sign(np.round(after, 9)), np.sign(before))
 
 
@@ -534,9 +533,7 @@ def test_nothing_to_retime():
 @pytest.mark.parametrize("position", [0.0, 1.0, -1e5])
 def test_a_plan_that_does_not_move(position, hold):
     still = cp.PolySpline([Waypoint(0, position, 0, 0), Waypoint(1, position, 0, 0)])
-    with pytest.raises(
-        ValueError, match="plan must move to be limited by its duration, got none of its axes that does"
-    ):
+    with pytest.raises(ValueError, match="plan must move to be limited by its duration, got none of its axes"):
         fastest(still, {"velocity": 1.0, "acceleration": 1.0}, hold=hold)
 
 
