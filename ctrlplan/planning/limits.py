@@ -10,8 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ctrlplan._checks import real_array
 from ctrlplan.trajectories import Trajectory, derivative_name
 from ctrlplan.trajectories.common import Array, checked_limits
+from ctrlplan.trajectories.extrema import function_extrema
 from ctrlplan.trajectories.waypoint import ENTRIES
 
 if TYPE_CHECKING:
@@ -171,11 +173,13 @@ def margins(plan: Trajectory, limits: Mapping[str, Any], quantities: Any = None)
     ----------
     plan : Trajectory
         Of any duration above 0.
-    limits : mapping of str to float or (float, float)
-        By the name of a derivative (x, x_d1, x_d2, ...; velocity,
-        acceleration, jerk or snap for those of every axis) or of a quantity: a
-        number above 0 for a magnitude, or least and greatest value, None where
-        there is none.
+    limits : mapping of str to float, (float, float) or array_like
+        By the name of a derivative (x, x_d1, x_d2, ...) or of a quantity: a
+        number above 0 for a magnitude, or minimum and maximum, None where there
+        is none. By velocity, acceleration, jerk or snap for those of every
+        axis: a number, or a tuple (minimum, maximum), for all axes; a list or
+        array of naxes numbers, or of shape (naxes, 2), by axis. A derivative
+        must be allowed to be 0.
     quantities : callable or object, optional
         Maps a jet (order + 1, naxes, ntime) to a mapping of names to signals
         (ntime,), such as ``crane.quantities``; or a plant that has such a
@@ -184,14 +188,17 @@ def margins(plan: Trajectory, limits: Mapping[str, Any], quantities: Any = None)
     Returns
     -------
     Margins
-        From the exact extrema of derivatives, and from those of quantities
-        resolved by Chebyshev polynomials.
+        From the extrema of derivatives, which are exact to rounding, and from
+        those of quantities by `Trajectory.extrema_of`, to 1e-9 of the larger of
+        magnitude and limit.
 
     Raises
     ------
     ValueError
         If a limit is not positive or does not increase, a name is unknown, or
         a derivative jumps that a limited signal is the derivative of.
+    RuntimeError
+        If a quantity is not resolved, since it is noisy or oscillates.
 
     Examples
     --------
@@ -297,7 +304,8 @@ class Limited:
         ]
         others = [k for k, b in enumerate(self.bounds) if b.axis is None]
         if others:
-            found = plan.extrema_of(lambda jet: self.values(jet)[others], self.order)
+            scales = [self.bounds[k].scale for k in others]  # a quantity of 0 is not resolved to its rounding
+            found = function_extrema(plan, lambda jet: self.values(jet)[others], self.order, scales)
             columns = zip(found.minimum, found.maximum, found.time_min, found.time_max, strict=True)
             rows += [_margin(self.bounds[k], *column) for k, column in zip(others, columns, strict=True)]
         return Margins(tuple(sorted(rows, key=lambda row: row.fraction)))
@@ -353,8 +361,9 @@ class Limited:
                 yield _bound(name, limit, orders[name], None)
             elif name in ENTRIES:
                 order = ENTRIES.index(name)
-                for axis, label in enumerate(plan.labels):
-                    yield replace(_bound(name, limit, order, axis), name=derivative_name(label, order))
+                for axis, own in enumerate(_by_axis(name, limit, plan.naxes)):
+                    named = derivative_name(plan.labels[axis], order)
+                    yield replace(_bound(name, own, order, axis), name=named)
             else:
                 plain = [quantity for quantity in orders if "_d" not in quantity]
                 known = f", or quantities ({', '.join(plain)}, ...)" if orders else "; quantities were not given"
@@ -372,18 +381,40 @@ def _checked_quantities(quantities: Any) -> Quantities | None:
     return found
 
 
+_FORMS = "a tuple (minimum, maximum) holds for every axis, a list of one number an axis gives magnitudes"
+
+
+def _by_axis(name: str, limit: Any, naxes: int) -> list[Any]:
+    """Limits of each axis, from those of all of them."""
+    if isinstance(limit, str | Mapping) or not np.iterable(limit):
+        return [limit] * naxes
+    rows, given = list(limit), isinstance(limit, tuple)
+    flat = not any(map(np.iterable, rows))
+    if flat and len(rows) == 2 and (given or naxes == 1):
+        return [tuple(rows)] * naxes
+    if len(rows) == naxes and (not given if flat else all(np.iterable(row) and len(row) == 2 for row in rows)):
+        return rows
+    raise ValueError(
+        f"limits of {name} must be a number, a pair, or {naxes} numbers or pairs by axis, got {limit!r}; {_FORMS}"
+    )
+
+
 def _bound(name: str, limit: Any, order: int, axis: int | None) -> Bound:
     if np.ndim(limit):
         if np.size(limit) != 2:
             raise ValueError(f"limits of {name} must be a number or a pair, got {limit!r}")
         pair = [side if side is not None else math.inf * (2 * i - 1) for i, side in enumerate(limit)]
         low, high, scale = checked_limits(pair, f"limits of {name}")
+        if axis is not None and order and not low <= 0.0 <= high:
+            raise ValueError(
+                f"limits of {name} must allow 0, which every plan has at rest, got from {low:g} to {high:g}; {_FORMS}"
+            )
         return Bound(name, low, high, scale, order, axis)
     if isinstance(limit, bool) or not isinstance(limit, Real | np.ndarray):
         raise TypeError(f"limits of {name} must be a number or a pair, got {limit!r}")
-    high = float(limit)
+    high = float(real_array(limit, f"limits of {name}"))
     if not 0.0 < high < math.inf:
-        raise ValueError(f"limits must be above 0 and finite, got {name} = {high:g}")
+        raise ValueError(f"limits must be above 0 and finite, got {name} = {high:g}; {_FORMS}")
     return Bound(name, -high, high, high, order, axis)
 
 

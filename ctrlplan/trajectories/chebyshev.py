@@ -25,8 +25,8 @@ def chebyshev_proxy(
         None where 128 degrees do not resolve the function.
     """
     for degree in _DEGREES:
-        values = jet(_points(degree, *interval), high)[low:]
-        coefficients = _transform(values)
+        values = jet(points(degree, *interval), high)[low:]
+        coefficients = transform(values)
         used = resolved_size(coefficients)
         if used is not None:
             return coefficients[..., :used]
@@ -51,7 +51,7 @@ def resolved_size(coefficients: Array, rtol: float = 3e-14) -> int | None:
 
 def fit(function: Callable[[Array], Array], interval: tuple[float, float], degree: int) -> Array:
     """Coefficients (..., degree + 1) of the interpolant at Chebyshev points."""
-    return _transform(function(_points(degree, *interval)))
+    return transform(function(points(degree, *interval)))
 
 
 def real_roots(coefficients: Array) -> Array:
@@ -65,6 +65,16 @@ def real_roots(coefficients: Array) -> Array:
     return np.clip(np.sort(roots.real[near]), -1.0, 1.0)
 
 
+def points(degree: int, a: float, b: float) -> Array:
+    """Chebyshev points of an interval, one more than the degree."""
+    return 0.5 * (a + b) + 0.5 * (b - a) * _nodes(degree)
+
+
+def transform(values: Array) -> Array:
+    """Coefficients (..., size) of the interpolant of values (..., size) at `points`."""
+    return values @ _matrix(values.shape[-1] - 1)
+
+
 @lru_cache(maxsize=16)
 def _nodes(degree: int) -> Array:
     return np.cos(np.pi * (np.arange(degree + 1) + 0.5) / (degree + 1))
@@ -76,11 +86,3 @@ def _matrix(degree: int) -> Array:
     matrix = (2.0 / n) * np.cos(np.pi * np.outer(np.arange(n) + 0.5, np.arange(n)) / n)
     matrix[:, 0] *= 0.5
     return matrix
-
-
-def _points(degree: int, a: float, b: float) -> Array:
-    return 0.5 * (a + b) + 0.5 * (b - a) * _nodes(degree)
-
-
-def _transform(values: Array) -> Array:
-    return values @ _matrix(values.shape[-1] - 1)

@@ -2,21 +2,32 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from functools import lru_cache
+from typing import TYPE_CHECKING, NoReturn
 
 import numpy as np
 from numpy.polynomial import chebyshev
 from numpy.typing import ArrayLike, NDArray
 
-from ctrlplan.trajectories.chebyshev import chebyshev_proxy, fit, real_roots
-from ctrlplan.trajectories.common import Array
+from ctrlplan.trajectories.chebyshev import chebyshev_proxy, fit, points, real_roots, transform
+from ctrlplan.trajectories.common import Array, readonly
 
 if TYPE_CHECKING:
     from ctrlplan.trajectories.trajectory import Trajectory
 
-_MAX_PIECES = 4000
+TOLERANCE = 1e-9
+"""Error of an extremum of a function of the jet, relative to the function's largest magnitude."""
+
+_SAMPLES = 8192  # times of a plan at which such a function is evaluated, however smooth it seems; 64 a segment at least
+
+_MAX_PIECES = 20_000
+_CHUNK = 256  # pieces that are evaluated together
+_FIT = 32  # degree of an interpolant
+_CHECKS = 8  # times in a piece, at least, that its interpolant was not made from
+_ROUNDING = 8.0 * float(np.finfo(float).eps)
 _TINY = float(np.finfo(float).tiny)
 
 
@@ -66,13 +77,14 @@ def derivative_extrema(plan: Trajectory, nu: int) -> Extrema:
     if nu == 0 or plan.breakpoints.size == 1:
         held = np.zeros((2, plan.naxes)) if nu else np.stack([plan.initial, plan.final])
         found.add(np.array([plan.start, plan.end]), held.T, (plan.start, plan.end))
-    for leg, (origin, duration) in enumerate(_legs(plan)):
+    for leg, (_, duration) in enumerate(_legs(plan)):
 
         def jet(t: Array, order: int, leg: int = leg) -> Array:
             return plan._leg_jet(leg, t, order)
 
         t = stationary_times(jet, duration, nu)
-        found.add(origin + t, jet(t, nu)[nu], (origin, origin + duration))
+        times, ends = _placed(plan, leg, t)
+        found.add(times, jet(t, nu)[nu], ends)
     return found.extrema()
 
 
@@ -104,40 +116,142 @@ def stationary_times(jet: Callable[[Array, int], Array], duration: float, nu: in
     return np.unique(t)
 
 
-def function_extrema(plan: Trajectory, function: Callable[[Array], Array], order: int) -> Extrema:
-    """Extrema of a function of the jet, resolved by Chebyshev proxies."""
-    found = _Candidates()
-    for leg, (origin, duration) in enumerate(_searchable_legs(plan)):
+def function_extrema(
+    plan: Trajectory, function: Callable[[Array], Array], order: int, scale: ArrayLike = 0.0
+) -> Extrema:
+    """Extrema of a function of the jet, to `TOLERANCE` of its largest magnitude or of a scale.
 
-        def value(t: Array, leg: int = leg) -> Array:
-            return np.atleast_2d(np.asarray(function(plan._leg_jet(leg, t, order)), dtype=float))
+    The function is evaluated at 8192 times of the plan (64 of a segment at
+    least); what shows at none of them, such as a shorter pulse, is missed.
 
-        scale = np.abs(value(np.linspace(0.0, duration, 65))).max(axis=1)
-        todo, pieces = [(0.0, duration, np.inf)], 0
-        while todo:
-            left, right, before = todo.pop()
-            pieces += 1
-            series = fit(value, (left, right), 32)
-            ends = value(np.array([left, right]))
-            if not np.isfinite(series).all() or not np.isfinite(ends).all():
-                where = f"between {origin + left:g} and {origin + right:g} s"
-                raise ValueError(f"function must be finite over the plan, got nan or inf {where}")
-            # The points are inside: a kink beside an end shows only in the value there.
-            missed = np.abs(chebyshev.chebval(np.array([-1.0, 1.0]), series.T) - ends).max(axis=1)
-            scale = np.maximum(scale, np.abs(ends).max(axis=1))
-            unresolved = float(
-                (np.maximum(missed, np.abs(series[:, -8:]).max(axis=1)) / np.maximum(scale, _TINY)).max()
+    Parameters
+    ----------
+    plan : Trajectory
+        With a duration.
+    function : callable
+        Maps a jet (order + 1, naxes, ntime) to (ntime,) or (m, ntime).
+    order : int
+        Highest derivative that it needs.
+    scale : array_like, broadcasts to (m,), optional
+        What counts as a magnitude where the function itself is smaller.
+
+    Returns
+    -------
+    Extrema
+        Each entry of shape (m,).
+
+    Raises
+    ------
+    ValueError
+        If the function is not finite over the plan, or does not return one
+        value for each time.
+    RuntimeError
+        If the function is not resolved with `_MAX_PIECES` pieces.
+    """
+    search = _Search(plan, function, order, np.asarray(scale, dtype=float))
+    for leg in range(len(search.legs)):
+        search.bisect(leg)
+    return search.found.extrema()
+
+
+class _Search:
+    """Bisection of segments until a function of the jet is resolved wherever an extremum can be.
+
+    A piece is resolved where the Chebyshev interpolant agrees with the function
+    at points that it was not made from; where the function varies by less than
+    the tolerance (about a kink); or where the clock resolves nothing shorter
+    (at a jump). A piece whose values stay farther from the extrema seen so far
+    than they are apart is left alone.
+    """
+
+    def __init__(self, plan: Trajectory, function: Callable[[Array], Array], order: int, scale: Array) -> None:
+        self.legs = _searchable_legs(plan)
+        self.found = _Candidates()
+        self._plan, self._function, self._order, self._scale = plan, function, order, scale
+        self._spent = 0
+        self._samples = []
+        for leg, (_, duration) in enumerate(self.legs):
+            count = 2 ** math.ceil(math.log2(max(_SAMPLES * duration / plan.duration, 64)))
+            parts = np.array_split(duration * _between(count), -(-count // 1024))  # small enough for a cache
+            rows = [self._values(leg, t) for t in (*parts, np.array([0.0, duration]))]
+            self._samples.append(np.concatenate(rows, axis=1))
+        self._low = np.min([rows.min(axis=1) for rows in self._samples], axis=0)
+        self._high = np.max([rows.max(axis=1) for rows in self._samples], axis=0)
+
+    def bisect(self, leg: int) -> None:
+        """Add to what was found the times at which a segment can hold an extremum."""
+        index = np.zeros(1, dtype=np.int64)
+        level = 0
+        while index.size:
+            self._spent += index.size
+            parts = [self._pieces(leg, level, index[k : k + _CHUNK]) for k in range(0, index.size, _CHUNK)]
+            again = np.concatenate([split for split, _ in parts])
+            if again.size and self._spent + 2 * again.size > _MAX_PIECES:
+                self._give_up(leg, level, again, max(rest for _, rest in parts))
+            index = (2 * again[:, None] + np.arange(2)).ravel()
+            level += 1
+
+    def _pieces(self, leg: int, level: int, index: NDArray[np.int64]) -> tuple[NDArray[np.int64], float]:
+        """Those of the pieces of a level that must be bisected, and what is not resolved there at most."""
+        duration, samples = self.legs[leg][1], self._samples[leg][:, :-2]
+        width, count = math.ldexp(duration, -level), samples.shape[1] >> level
+        own = _SHARES if count >= _CHECKS else np.append(_SHARES, _between(_CHECKS))
+        times = np.minimum(width * (index[:, None] + own), duration)
+        values = self._values(leg, times.ravel()).reshape(len(samples), *times.shape)
+        checks = values[..., _SHARES.size :]
+        if count >= _CHECKS:
+            checks = samples.reshape(len(samples), -1, count)[:, index]
+        series = transform(values[..., : _FIT + 1])
+        missed = np.abs(series @ _basis(checks.shape[2]) - checks).max(axis=2)
+        missed = np.maximum(missed, np.abs(series @ _ENDS - values[..., _FIT + 1 : _FIT + 3]).max(axis=2))
+        missed = np.maximum(missed, np.abs(series[..., -8:]).max(axis=2))
+
+        low = np.minimum(values.min(axis=2), checks.min(axis=2))
+        high = np.maximum(values.max(axis=2), checks.max(axis=2))
+        self._low, self._high = np.minimum(self._low, low.min(axis=1)), np.maximum(self._high, high.max(axis=1))
+        magnitude = np.maximum(np.maximum(np.abs(self._low), np.abs(self._high)), self._scale)
+        scale = np.maximum(magnitude, _TINY)[:, None]
+        reach = high - low + 4.0 * missed + _ROUNDING * scale
+        matters = (high + reach >= self._high[:, None]) | (low - reach <= self._low[:, None])
+
+        # Where the function is smooth, its value at a root of the interpolant's slope is off by the square of this.
+        rest = missed / scale
+        smooth = rest <= 0.1 * TOLERANCE
+        flat = high - low <= 0.1 * TOLERANCE * scale
+        short = width <= 4.0 * np.finfo(float).eps * duration
+        split = (matters & ~(smooth | flat | short)).any(axis=0)
+        for piece in np.flatnonzero(matters.any(axis=0) & ~split).tolist():
+            t = [times[piece, _FIT + 1 : _FIT + 3]]
+            for row in np.flatnonzero(matters[:, piece]).tolist():
+                roots = real_roots(chebyshev.chebder(series[row, piece])) if smooth[row, piece] else 2.0 * own - 1.0
+                t.append(np.minimum(width * (index[piece] + 0.5 * (1.0 + roots)), duration))
+            self._add(leg, np.concatenate(t))
+        return index[split], float(rest[:, split].max(initial=0.0))
+
+    def _add(self, leg: int, t: Array) -> None:
+        times, ends = _placed(self._plan, leg, t)
+        self.found.add(times, self._values(leg, t), ends)
+
+    def _values(self, leg: int, t: Array) -> Array:
+        """Values (nrows, ntime) of the function at times from the beginning of a segment."""
+        values = np.atleast_2d(np.asarray(self._function(self._plan._leg_jet(leg, t, self._order)), dtype=float))
+        if values.ndim != 2 or values.shape[1] != t.size:
+            raise ValueError(f"function must return values of shape (ntime,) or (m, ntime), got shape {values.shape}")
+        if not np.isfinite(values).all():
+            row, place = np.argwhere(~np.isfinite(values))[0].tolist()
+            raise ValueError(
+                f"function must be finite over the plan, got {values[row, place]} at {self.legs[leg][0] + t[place]:g} s"
             )
-            # What bisection no longer makes smaller is the rounding of the function; a kink would be halved.
-            resolved = unresolved <= 1e-13 or 0.7 * before < unresolved <= 1e-9
-            if not resolved and pieces < _MAX_PIECES and right - left > 1e-9 * duration:
-                middle = 0.5 * (left + right)
-                todo += [(left, middle, unresolved), (middle, right, unresolved)]
-                continue
-            roots = [real_roots(chebyshev.chebder(row)) for row in series]
-            t = np.concatenate([[left, right], *(0.5 * (left + right) + 0.5 * (right - left) * r for r in roots)])
-            found.add(origin + t, value(t), (origin, origin + duration))
-    return found.extrema()
+        return values
+
+    def _give_up(self, leg: int, level: int, index: NDArray[np.int64], rest: float) -> NoReturn:
+        origin, duration = self.legs[leg]
+        left, right = (origin + math.ldexp(duration, -level) * (k + i) for i, k in enumerate((index[0], index[-1])))
+        raise RuntimeError(
+            f"function must be resolved to {TOLERANCE:g} of its largest magnitude, got {rest:.2g} "
+            f"between {left:g} and {right:g} s after {_MAX_PIECES} pieces: it is noisy or oscillates there; "
+            f"smooth it, or take `bounds`, which needs a Lipschitz constant"
+        )
 
 
 def certified_bounds(
@@ -171,12 +285,12 @@ def certified_bounds(
     first, second = (np.stack([plan.peak(k + nu) for k in range(order + 1)])[:, :, None] for nu in (1, 2))
     found, lower, upper = _Candidates(), np.inf, -np.inf
     least, greatest = np.inf, -np.inf
-    for leg, (origin, duration) in enumerate(legs):
+    for leg, (_, duration) in enumerate(legs):
         s = np.linspace(0.0, duration, 129)
         values = evaluated(plan._leg_jet(leg, s, order))
-        found.add(origin + s, values[None])
+        found.add(_placed(plan, leg, s)[0], values[None])
         least, greatest = min(least, float(values.min())), max(greatest, float(values.max()))
-    for leg, (origin, duration) in enumerate(legs):
+    for leg, (_, duration) in enumerate(legs):
         radius, spent = duration / 256, 0
         centres = duration * (np.arange(128) + 0.5) / 128
         while centres.size:
@@ -188,7 +302,7 @@ def certified_bounds(
             # In its cell a derivative moves by no more than the next one's value at the centre and slope allow.
             slope = np.minimum(first, np.abs(jet[1:]) + radius * second)
             reach = radius * np.sum(weights * slope, axis=(0, 1))
-            found.add(origin + centres, values[None])
+            found.add(_placed(plan, leg, centres)[0], values[None])
             least, greatest = min(least, float(values.min())), max(greatest, float(values.max()))
             gap = rtol * (greatest - least)
             undecided = (values - reach < least - gap) | (values + reach > greatest + gap)
@@ -204,6 +318,22 @@ def certified_bounds(
         upper,
         *(float(v[0]) for v in (best.minimum, best.maximum, best.time_min, best.time_max)),
     )
+
+
+_SHARES = readonly(np.append(points(_FIT, 0.0, 1.0), [0.0, 1.0]))
+_ENDS = chebyshev.chebvander(np.array([-1.0, 1.0]), _FIT).T
+
+
+@lru_cache(maxsize=16)
+def _between(count: int) -> Array:
+    """Parts of an interval, evenly spaced but in step with no other grid."""
+    return readonly((np.arange(count) + 0.5 * (math.sqrt(5.0) - 1.0)) / count)
+
+
+@lru_cache(maxsize=16)
+def _basis(count: int) -> Array:
+    """Chebyshev polynomials (degree + 1, ntime) there."""
+    return readonly(chebyshev.chebvander(2.0 * _between(count) - 1.0, _FIT).T)
 
 
 class _Candidates:
@@ -231,7 +361,7 @@ class _Candidates:
     @staticmethod
     def _first(values: Array, ends: Array) -> NDArray[np.intp]:
         """Where each row is least: to rounding, at an end if it can be, and as early as it can be."""
-        slack = 8.0 * np.finfo(float).eps * np.abs(values).max(axis=1, keepdims=True)
+        slack = _ROUNDING * np.abs(values).max(axis=1, keepdims=True)
         tied = values <= values.min(axis=1, keepdims=True) + slack
         return np.argmax(tied * (1.0 + ends), axis=1)
 
@@ -239,6 +369,13 @@ class _Candidates:
 def _legs(plan: Trajectory) -> list[tuple[float, float]]:
     """Beginning and duration [s] of each leg."""
     return list(zip(plan.breakpoints[:-1].tolist(), np.diff(plan.breakpoints).tolist(), strict=True))
+
+
+def _placed(plan: Trajectory, leg: int, t: Array) -> tuple[Array, tuple[float, float]]:
+    """Times of a plan from those of a segment, and the ends of the segment, which rounding does not leave."""
+    left, right = plan.breakpoints[leg : leg + 2].tolist()
+    times = np.where(t < right - left, np.minimum(left + t, math.nextafter(right, left)), right)
+    return times, (left, right)
 
 
 def _searchable_legs(plan: Trajectory) -> list[tuple[float, float]]:

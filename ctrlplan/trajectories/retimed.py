@@ -10,6 +10,7 @@ from scipy.optimize import brentq
 
 from ctrlplan.trajectories.common import FACTORIALS, Array, checked_labels, readonly
 from ctrlplan.trajectories.files import trajectory_from_dict
+from ctrlplan.trajectories.shaping import is_shaped, is_unit_rate
 from ctrlplan.trajectories.trajectory import Trajectory
 
 _ROUNDING = 1e-12
@@ -40,7 +41,8 @@ class Retimed(Trajectory):
         If one is not a trajectory.
     ValueError
         If the plan has no duration, or the law has several axes, other ends, a
-        jump, or does not increase.
+        jump, or does not increase; if the plan is shaped (`Shaper`) and the
+        rate of the law is not 1, which would change the delays of the shaper.
 
     Examples
     --------
@@ -165,6 +167,11 @@ def _checked_law(plan: Trajectory, law: Trajectory, slack: float) -> Array:
     rate = law.extrema(1)
     if rate.minimum[0] < -_ROUNDING * rate.maximum[0]:
         raise ValueError(f"law must increase, got the rate {rate.minimum[0]:g} at {rate.time_min[0]:g} s")
+    if is_shaped(plan) and not (is_unit_rate(float(rate.minimum[0])) and is_unit_rate(float(rate.maximum[0]))):
+        raise ValueError(
+            f"law must have the rate 1 where the plan is shaped, got {rate.minimum[0]:g} to {rate.maximum[0]:g}: the "
+            f"delays of the shaper would change with it; take the plan before it is shaped, then shape the result"
+        )
     for leg in np.flatnonzero(np.diff(values) <= 0.0).tolist():
         raise ValueError(f"law must increase strictly, got {values[leg]:g} from {law.breakpoints[leg]:g} s on")
     return values

@@ -372,6 +372,90 @@ def test_waypoints_are_held_of_splines_alone():
         fastest(there_and_back, {"y_d1": 1.0}, hold="waypoints")
 
 
+# A closed plan stays closed
+
+CYCLE = cp.TrigSpline.cyclic([Waypoint(0, [0, 0]), Waypoint(1, [3, 0]), Waypoint(2, [1, 2])], 3.0)
+TURNING = cp.TrigSpline.cyclic([Waypoint(0, 1.0, 0.0), Waypoint(1, 0.0), Waypoint(2, -2.0)], 3.0)
+LOOP = [Waypoint(0, [0, 0], [1, 0], 0), Waypoint(1, [2, 1], 0, 0), Waypoint(3, [0, 0], [1, 0], 0)]
+CLOSED = {
+    "cycle": CYCLE,
+    "late": CYCLE.shift(1e4),
+    "far away": CYCLE + cp.Step([1e6, -1e6], [1e6, -1e6]),
+    "two rounds": CYCLE.then(CYCLE),
+    "multiple": -3.0 * CYCLE,
+    "stacked": cp.stack([CYCLE, TURNING], labels=["a", "b", "c"]),
+    "from a turning point": TURNING,
+    "through waypoints": cp.PiecewiseSpline(LOOP),
+    "on another clock": cp.Retimed(CYCLE, cp.PolySpline([Waypoint(0, 0, 2.0), Waypoint(2, 3, 2.0)])),
+}
+
+
+@pytest.mark.parametrize("name", CLOSED)
+def test_a_time_law_would_open_a_closed_plan(name):
+    plan = CLOSED[name]
+    with pytest.raises(ValueError, match="hold must be 'shape' or 'waypoints' for a closed plan, got 'path'"):
+        fastest(plan, {"velocity": 2.0, "acceleration": 3.0}, hold="path")
+    found = fastest(plan, {"velocity": 2.0, "acceleration": 3.0}).plan
+    first, last = found.jet(found.start, 1), found.jet(found.end, 1)
+    np.testing.assert_allclose(first, last, rtol=0, atol=1e-8 * found.peak()[:, None].max())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "plan",
+    [
+        cp.PolySpline([Waypoint(0, 0, 0, 0), Waypoint(1, 1, 0, 0), Waypoint(2, 0, 0, 0)]),  # there and back, at rest
+        cp.PolySpline([Waypoint(0, 0, 1, 0), Waypoint(1, 2, 1, 0)]),  # on with the speed it came with
+        cp.PolySpline([Waypoint(0, 0, 1, 0), Waypoint(1, 0, -1, 0)]),  # back the way it came
+    ],
+)
+def test_an_open_plan_has_a_time_law(plan):
+    limits = {"velocity": 3.0, "acceleration": 9.0}
+    found = fastest(plan, limits, hold="path")
+    assert found.duration <= fastest(plan, limits).duration
+    jet = np.abs(found.plan.jet(np.linspace(found.plan.start, found.plan.end, COUNT), 2))
+    assert jet[1].max() <= 3.0 * (1 + 1e-11)
+    assert jet[2].max() <= 9.0 * (1 + 1e-11)
+    # At rest stays at rest; of an end in motion the direction is kept.
+    before, after = (p.jet([p.start, p.end], 1)[1, 0] for p in (plan, found.plan))
+    np.testing.assert_array_equal(np.sign(np.round(after, 9)), np.sign(before))
+
+
+@pytest.mark.parametrize("start", [100.0, 1e5, -3e6])
+def test_a_late_start_does_not_change_the_time_law(start):
+    """Times of the law are counted from the start; what is left is the search's own last step of 1e-5."""
+    limits = {"velocity": 1.0, "acceleration": 1.0}
+    wanted = fastest(MOVE, limits, hold="path").duration
+    found = fastest(MOVE.shift(start), limits, hold="path")
+    assert found.plan.start == start
+    assert found.duration == pytest.approx(wanted, rel=1e-4)
+    assert found.margins.hold
+
+
+# Quantities that samples do not see
+
+
+@pytest.mark.parametrize("width", [1e-2, 1e-3, 1e-4])
+def test_a_narrow_peak_of_a_quantity_sets_the_duration(width):
+    """A load that grows about one place, in proportion to the speed there: its peak is that of u over the duration."""
+
+    def load(jet):
+        return {"load": jet[1, 0] * (1.0 + 5.0 / (1.0 + ((jet[0, 0] - 0.37) / width) ** 2))}
+
+    place = brentq(lambda t: MOVE(t) - 0.37, 0.0, 1.0, xtol=1e-15)
+    t = place + np.linspace(-1.0, 1.0, 2_000_001) * min(50 * width, 0.3)
+    peak = load(MOVE.jet(t, 1))["load"].max()
+    found = fastest(MOVE, {"load": 2.0}, load)
+    assert found.duration == pytest.approx(peak / 2.0, rel=1e-8)
+    assert load(found.plan.jet(t * found.duration, 1))["load"].max() <= 2.0 * (1 + 1e-9)
+
+
+def test_a_noisy_quantity_is_not_limited():
+    noise = np.random.default_rng(5)
+    with pytest.raises(RuntimeError, match="function must be resolved"):
+        fastest(MOVE, {"load": 2.0}, lambda jet: {"load": jet[1, 0] + 1e-3 * noise.normal(size=jet.shape[2])})
+
+
 # Durations given
 
 
@@ -443,6 +527,26 @@ def test_nothing_to_retime():
         fastest(cp.Step(1.0), {"y_d1": 1.0})
     with pytest.raises(TypeError, match=r"plan must be a Trajectory .*, got 1\.0"):
         fastest(1.0, {"y_d1": 1.0})
+
+
+@pytest.mark.parametrize("hold", ["shape", "waypoints", "path"])
+@pytest.mark.parametrize("position", [0.0, 1.0, -1e5])
+def test_a_plan_that_does_not_move(position, hold):
+    still = cp.PolySpline([Waypoint(0, position, 0, 0), Waypoint(1, position, 0, 0)])
+    with pytest.raises(ValueError, match="plan must move to be limited by its duration, got none of its axes"):
+        fastest(still, {"velocity": 1.0, "acceleration": 1.0}, hold=hold)
+
+
+def test_a_search_that_ends_where_limits_come_nearer_says_so():
+    far = cp.PolySpline([Waypoint(0, 0, 0.1), Waypoint(1, 20, 0.1)])
+    with pytest.raises(ValueError, match=r"from 0.01562 to 64 s, got none.* they may hold beyond, give durations="):
+        fastest(far, {"velocity": 0.2}, hold="waypoints")
+    found = fastest(far, {"velocity": 0.2}, hold="waypoints", durations=(10.0, 1000.0))
+    # y' is 0.1 at the ends and 1.5 d/T - 0.05 in the middle.
+    assert found.duration == pytest.approx(1.5 * 20 / 0.25, rel=1e-9)
+    inside = cp.PolySpline([Waypoint(0, 0, 1, 0), Waypoint(1, 1, 1, 0)])
+    with pytest.raises(ValueError, match=r"got none; nearest at [0-9.]+ s: y_d1 within ±0.9: [^;]*$"):
+        fastest(inside, {"velocity": 0.9, "y_d2": 1.0}, hold="waypoints", durations=(0.5, 50.0))
 
 
 # The report

@@ -96,6 +96,86 @@ def test_sides_and_their_scale(limit, fraction, value):
     assert row.value == pytest.approx(value, abs=1e-13)
 
 
+SLOW_FAST = cp.PolySpline([Waypoint(0, [0, 0], 0, 0), Waypoint(1, [1, -2], 0, 0)])
+"""Peak speeds 15/8 and 15/4, the second one downwards; both axes lie in one range only one way."""
+
+
+def fractions(plan, limits):
+    return {row.bound.name: (row.bound.low, row.bound.high, row.fraction) for row in margins(plan, limits)}
+
+
+@pytest.mark.parametrize("kind", [list, np.array, lambda values: np.array(values, dtype=np.float32)])
+def test_a_list_of_as_many_numbers_as_axes_is_by_axis(kind):
+    found = fractions(SLOW_FAST, {"velocity": kind([2.0, 5.0])})
+    assert found["y1_d1"] == (-2.0, 2.0, pytest.approx(1 / 16, rel=1e-11))
+    assert found["y2_d1"] == (-5.0, 5.0, pytest.approx(1 / 4, rel=1e-11))
+
+
+@pytest.mark.parametrize("kind", [list, tuple, np.array])
+def test_pairs_by_axis(kind):
+    found = fractions(SLOW_FAST, {"velocity": kind([(-1.0, 3.0), (-4.0, 2.0)])})
+    assert found["y1_d1"] == (-1.0, 3.0, pytest.approx(0.5, rel=1e-11))
+    assert found["y2_d1"] == (-4.0, 2.0, pytest.approx(0.25 / 3.0, rel=1e-11))
+    open_ended = fractions(SLOW_FAST, {"velocity": [[None, 3.0], [-5.0, None]]})
+    assert (open_ended["y1_d1"][:2], open_ended["y2_d1"][:2]) == ((-inf, 3.0), (-5.0, inf))
+
+
+def test_a_tuple_of_two_numbers_is_a_pair_for_every_axis():
+    found = fractions(SLOW_FAST, {"velocity": (-5.0, 4.0), "acceleration": (None, 30.0)})
+    assert found["y1_d1"][:2] == found["y2_d1"][:2] == (-5.0, 4.0)
+    assert found["y1_d2"][:2] == (-inf, 30.0)
+    assert found["y2_d1"][2] == pytest.approx((5 - 15 / 4) / 4.5, rel=1e-11)
+
+
+def test_limits_by_axis_are_those_of_each_axis():
+    plan = cp.PolySpline([Waypoint(0, [0, 0, 0], 0, 0), Waypoint(2, [1, -2, 3], 0, 0)])
+    given = {"velocity": [1.0, 3.0, 4.0], "acceleration": np.array([[-9.0, 8.0], [-7.0, 6.0], [-9.5, 5.0]])}
+    named = {"y1_d1": 1.0, "y2_d1": 3.0, "y3_d1": 4.0, "y1_d2": (-9.0, 8.0), "y2_d2": (-7.0, 6.0), "y3_d2": (-9.5, 5.0)}
+    assert fractions(plan, given) == fractions(plan, named)
+
+
+def test_on_one_axis_a_list_of_two_is_a_pair():
+    assert fractions(MOVE, {"velocity": [-1.0, 3.0]}) == fractions(MOVE, {"velocity": (-1.0, 3.0)})
+    assert fractions(MOVE, {"velocity": [3.0]}) == fractions(MOVE, {"velocity": 3.0})
+
+
+@pytest.mark.parametrize(
+    "limit",
+    [[1.0, 2.0, 3.0], (1.0, 2.0, 3.0), [1.0], [[-1.0, 1.0]], np.ones((2, 3)), [[-1, 1], 2.0], [[-1, 1, 2], [1, 2]], []],
+)
+def test_limits_by_axis_of_another_number_of_axes(limit):
+    with pytest.raises(ValueError, match="limits of velocity must be a number, a pair, or 2 numbers or pairs by axis"):
+        margins(SLOW_FAST, {"velocity": limit})
+
+
+@pytest.mark.parametrize("name", ["velocity", "y2_d1", "acceleration"])
+@pytest.mark.parametrize("limit", [(1.0, 2.0), (-2.0, -1.0), (0.5, None), (None, -0.5)])
+def test_a_derivative_must_be_allowed_to_be_0(name, limit):
+    """Which tells a pair from magnitudes by axis that were given as a tuple."""
+    with pytest.raises(ValueError, match=r"must allow 0.*a tuple \(minimum, maximum\).*a list of one number an axis"):
+        margins(SLOW_FAST, {name: limit})
+
+
+@pytest.mark.parametrize("limit", [[-1.0, 2.0], [0.0, 2.0], np.array([1.0, np.nan])])
+def test_magnitudes_by_axis_are_above_0(limit):
+    with pytest.raises(
+        ValueError, match=r"limits must be above 0 and finite, got velocity = .*a tuple \(minimum, maxi"
+    ):
+        margins(SLOW_FAST, {"velocity": limit})
+
+
+@pytest.mark.parametrize("limit", [[True, 2.0], [None, 2.0], np.array([1, 2], dtype="timedelta64[s]")])
+def test_magnitudes_by_axis_are_numbers(limit):
+    with pytest.raises(TypeError, match=r"limits of velocity must be (a number or a pair|plain numbers)"):
+        margins(SLOW_FAST, {"velocity": limit})
+
+
+def test_a_position_may_have_to_stay_away_from_0():
+    plan = cp.PolySpline([Waypoint(0, [3, 4], 0, 0), Waypoint(1, [5, 6], 0, 0)])
+    assert fractions(plan, {"position": (2.0, 7.0)})["y1"][:2] == (2.0, 7.0)
+    assert fractions(plan, {"position": [[2.0, 6.0], [3.0, 8.0]]})["y2"][:2] == (3.0, 8.0)
+
+
 def test_hold_says_whether_all_do():
     assert margins(MOVE, {"y_d1": 1.876, "y_d2": 5.78}).hold
     assert not margins(MOVE, {"y_d1": 1.876, "y_d2": 5.77}).hold
@@ -116,6 +196,28 @@ def test_both_limits_of_a_jump_count():
 
 
 # Quantities
+
+
+@pytest.mark.parametrize("width", [1e-2, 1e-3, 1e-4])
+def test_a_quantity_with_a_narrow_peak(width):
+    """A resonance of the place y = 0.37: its height is 5 however fast it is passed."""
+    plan = cp.TrigSpline([Waypoint(0, 0, 0, 0), Waypoint(3, 1, 0, 0)], alpha=2.0)
+    (row,) = margins(plan, {"load": 4.0}, lambda jet: {"load": 5.0 / (1.0 + ((jet[0, 0] - 0.37) / width) ** 2)})
+    assert row.value == pytest.approx(5.0, rel=1e-9)
+    assert plan(row.time) == pytest.approx(0.37, abs=1e-3 * width)
+    assert row.fraction == pytest.approx(-0.25, rel=1e-8)
+
+
+def test_a_quantity_that_is_0_but_for_rounding():
+    """It is resolved to the size of its limit, not to its own."""
+    (row,) = margins(MOVE, {"drift": 1.0}, lambda jet: {"drift": (jet[0, 0] + 1e3) - 1e3 - jet[0, 0]})
+    assert row.fraction == pytest.approx(1.0, abs=1e-12)
+
+
+def test_a_noisy_quantity_has_no_margin():
+    noise = np.random.default_rng(0)
+    with pytest.raises(RuntimeError, match="function must be resolved"):
+        margins(MOVE, {"load": 2.0}, lambda jet: {"load": jet[0, 0] + 1e-4 * noise.normal(size=jet.shape[2])})
 
 
 def test_a_quantity_is_limited_over_the_whole_interval():

@@ -4,9 +4,20 @@ import mpmath as mp
 import numpy as np
 import pytest
 import sympy
+from scipy.optimize import brentq
 from trajectory_oracle import Direct, waypoints
 
-from ctrlplan.trajectories import PiecewiseSpline, PolySpline, Step, TrigSpline, Waypoint, stack
+from ctrlplan.trajectories import (
+    PiecewiseSpline,
+    PolySpline,
+    Retimed,
+    SCurve,
+    Step,
+    Trapezoid,
+    TrigSpline,
+    Waypoint,
+    stack,
+)
 
 # Data drawn at random and every alpha: most of these plans swing, on purpose.
 pytestmark = pytest.mark.filterwarnings("ignore:the plan swings")
@@ -206,6 +217,163 @@ def test_a_kink_of_minimum_jerk():
     assert found.minimum[0] == pytest.approx(0.5, abs=1e-8)
     assert found.time_min[0] == pytest.approx(1.0, abs=1e-8)
     assert found.maximum[0] == 1.0
+
+
+RISES = {
+    "polynomial": MOVE,
+    "late": MOVE.shift(1e5),
+    "trigonometric": TrigSpline(waypoints([1.0, 4.0], [[0.0, 0.0], [1.0, 0.0]]), alpha=2.5),
+    "segments": PiecewiseSpline(waypoints([0.0, 0.1, 3.0], [[0.0, 0.0], [0.04, 1.0], [1.0, 0.0]])),
+    "profile": SCurve(1.0, velocity=1.0, acceleration=2.0, jerk=9.0),
+    "long": MOVE.retime(1e6),
+}
+
+
+@pytest.mark.parametrize("width", [1e-2, 1e-3, 1e-4])
+@pytest.mark.parametrize("name", RISES)
+def test_narrow_peaks_of_smooth_functions(name, width):
+    """exp(-((y - c)/w)^2) is 1 where y = c, and the jet is smooth there."""
+    plan = RISES[name]
+    for level in np.random.default_rng(7).uniform(0.02, 0.98, 5):
+        found = plan.extrema_of(lambda jet, level=level: 3.0 - np.exp(-(((jet[0, 0] - level) / width) ** 2)), 0)
+        assert found.minimum[0] == pytest.approx(2.0, rel=1e-9)
+        assert found.maximum[0] == pytest.approx(3.0, rel=1e-9)
+        assert plan(found.time_min[0]) == pytest.approx(level, abs=1e-3 * width)
+
+
+@pytest.mark.parametrize("name", ["polynomial", "trigonometric", "segments", "profile"])
+def test_pulses_longer_than_the_distance_of_the_samples(name):
+    """A function that is 0 but for a part 1/2000 of the duration, and jumps at both ends of it."""
+    plan = RISES[name]
+    for begin in np.random.default_rng(8).uniform(0.05, 0.9, 10):
+        low, high = plan(plan.start + plan.duration * (begin + np.array([0.0, 5e-4])))
+        found = plan.extrema_of(lambda jet, low=low, high=high: ((jet[0, 0] > low) & (jet[0, 0] < high)) * jet[0, 0], 0)
+        # The largest value is the limit from below at the second jump.
+        assert found.maximum[0] == pytest.approx(high, rel=1e-9)
+        assert found.minimum[0] == 0.0
+
+
+def test_both_limits_of_a_jump_of_the_function():
+    """The speed changes its sign and its scale where y crosses a level: 15/8 times 4/3 u^2 (1 - u)^2 ... there."""
+    level = 0.3
+    u = brentq(lambda u: 10 * u**3 - 15 * u**4 + 6 * u**5 - level, 0.0, 1.0, xtol=1e-15)
+    there = 15 * (u * (1 - u)) ** 2
+    found = MOVE.extrema_of(lambda jet: np.where(jet[0, 0] < level, -3.0, 0.1) * jet[1, 0], 1)
+    assert found.minimum[0] == pytest.approx(-3.0 * there, rel=1e-9)
+    assert found.time_min[0] == pytest.approx(2.0 * u, rel=1e-9)
+    assert found.maximum[0] == pytest.approx(0.1 * 15 / 16, rel=1e-12)
+
+
+def rough(rng):
+    """A function of the jet, of size about 1, with kinks, jumps, cusps or narrow peaks."""
+    a, b, c = rng.uniform(-0.7, 0.7, 3)
+    width = 10.0 ** rng.uniform(-3, -1)
+    return rng.choice(
+        [
+            lambda y, v: np.exp(-(((y - a) / width) ** 2)) + 0.3 * v,
+            lambda y, v: np.abs(y - a) - 0.7 * np.abs(v - b) + c * y * v,
+            lambda y, v: np.where(y > a, v, c * y) - 0.2 * y,
+            lambda y, v: np.maximum(np.minimum(y, v), np.sin(9.0 * y)),
+            lambda y, v: np.interp(y, np.linspace(-1.0, 1.0, 41), np.cos(1.7 * np.arange(41.0))) + c * v,
+            lambda y, v: np.tanh((v - b) / width) * np.cos(3.0 * y),
+            lambda y, v: np.cbrt(y - a) * (v - b),
+        ]
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(12))
+def test_rough_functions_against_dense_samples(seed):
+    """No sample of 4e5 lies beyond what is found, and what is found is attained."""
+    rng = np.random.default_rng(seed)
+    times = np.cumsum(rng.uniform(0.3, 2.0, 4))
+    points = waypoints(times, [[*rng.normal(size=2), 0.0] for _ in times])
+    plan = (PolySpline(points), TrigSpline(points, alpha=3.0), PiecewiseSpline(points))[seed % 3]
+    size = [plan.peak(nu)[0] for nu in (0, 1)]
+    for _ in range(6):
+        function = rough(rng)
+
+        def of_jet(jet, function=function):
+            return function(jet[0, 0] / size[0], jet[1, 0] / size[1])
+
+        found = plan.extrema_of(of_jet, 1)
+        samples = of_jet(plan.jet(np.linspace(plan.start, plan.end, 400_001), 1))
+        scale = max(-found.minimum[0], found.maximum[0])
+        assert samples.min() >= found.minimum[0] - 1e-9 * scale
+        assert samples.max() <= found.maximum[0] + 1e-9 * scale
+        # At a jump one of the sides is met, to the resolution of the clock; a cusp is as steep as its cube root.
+        near = found.time_max[0] + 1e-13 * plan.duration * np.arange(-40, 41)
+        assert of_jet(plan.jet(np.clip(near, plan.start, plan.end), 1)).max() >= found.maximum[0] - 1e-4 * scale
+
+
+def test_a_lookup_table_of_many_kinks():
+    """Piecewise linear through 400 points: its extrema along a monotone move are those of the table."""
+    table = np.random.default_rng(2).normal(size=400)
+    levels = np.linspace(0.0, 1.0, 400)
+    found = MOVE.extrema_of(lambda jet: np.interp(jet[0, 0], levels, table), 0)
+    size = np.abs(table).max()
+    assert found.maximum[0] == pytest.approx(table.max(), abs=1e-9 * size)
+    assert found.minimum[0] == pytest.approx(table.min(), abs=1e-9 * size)
+    assert MOVE(found.time_max[0]) == pytest.approx(levels[table.argmax()], abs=1e-8)
+
+
+@pytest.mark.parametrize("noise", [1e-7, 1e-3])
+def test_a_noisy_function_is_said_to_be_unresolved(noise):
+    rng = np.random.default_rng(1)
+    with pytest.raises(RuntimeError, match=r"function must be resolved to 1e-09 of its largest magnitude, .* noisy"):
+        MOVE.extrema_of(lambda jet: 1.0 + jet[0, 0] + noise * rng.normal(size=jet.shape[2]), 0)
+
+
+def test_oscillation_without_end_is_said_to_be_unresolved():
+    line = PolySpline(waypoints([0.0, 1.0], [[0.0], [1.0]]))
+    with pytest.raises(RuntimeError, match="after 20000 pieces"):
+        line.extrema_of(lambda jet: np.sin(1e6 * jet[0, 0] ** 2), 0)
+
+
+@pytest.mark.parametrize("function", [lambda jet: 3.0, lambda jet: jet[0].T, lambda jet: jet])
+def test_a_function_returns_a_value_for_each_time(function):
+    with pytest.raises(ValueError, match=r"function must return values of shape \(ntime,\) or \(m, ntime\), got shape"):
+        MOVE.extrema_of(function, 0)
+
+
+def test_a_function_is_finite_over_the_plan():
+    with pytest.raises(ValueError, match=r"function must be finite over the plan, got nan at 1\."):
+        MOVE.extrema_of(lambda jet: np.where(jet[0, 0] > 0.5, np.nan, 0.0), 0)
+
+
+FAMILIES = {
+    "polynomial": PolySpline(waypoints([0.1, 0.4], [[0.0, 0.0], [1.0, 3.0]])),
+    "trigonometric": TrigSpline(waypoints([0.1, 0.4], [[0.0, 0.0], [1.0, 3.0]]), alpha=2.0),
+    "segments": PiecewiseSpline(waypoints([0.1, 0.2, 0.7], [[0.0, 0.0], [1.0, 3.0], [5.0, 9.0]])),
+    "trapezoid": Trapezoid(2.0, velocity=3.0, acceleration=7.0, time=0.1),
+    "S-curve": SCurve(2.0, velocity=3.0, acceleration=7.0, jerk=70.0, time=0.1),
+    "sum": MOVE.retime(0.3).shift(0.1) + PolySpline(waypoints([0.0, 0.7], [[0.0], [1.0]])),
+    "joined": PolySpline(waypoints([0.1, 0.3], [[0.0], [1.0]])).then(PolySpline(waypoints([0.0, 0.7], [[1.0], [9.0]]))),
+    "retimed": Retimed(MOVE, PolySpline(waypoints([0.1, 0.8], [[0.0, 1.0], [2.0, 9.0]]))),
+    "cyclic": TrigSpline.cyclic(waypoints([0.1, 0.2], [[0.0], [1.0]]), 0.7),
+}
+
+
+def rounded_beyond(plan, rng, count):
+    """Plans like it, of other starts and durations, first those whose last segment is rounded to end beyond the end."""
+    moved = [plan.retime(rng.uniform(0.1, 9.0)).shift(rng.uniform(-4.0, 1.0)) for _ in range(50 * count)]
+    ends = [p.breakpoints[-2] + (p.end - p.breakpoints[-2]) - p.end for p in moved]
+    return [moved[i] for i in np.argsort(ends)[: -count - 1 : -1]]
+
+
+@pytest.mark.parametrize("name", FAMILIES)
+def test_times_of_extrema_lie_in_the_plan(name):
+    """A time beyond the end by a rounding would have the position held, and rest."""
+    for plan in rounded_beyond(FAMILIES[name], np.random.default_rng(3), 4):
+        for nu in range(3):
+            for found in (plan.extrema(nu), plan.extrema_of(lambda jet, nu=nu: jet[nu, 0], nu)):
+                for value, time in ((found.minimum[0], found.time_min[0]), (found.maximum[0], found.time_max[0])):
+                    assert plan.start <= time <= plan.end
+                    sides = [plan.jet(time, nu, left=left)[nu, 0] for left in (False, time > plan.start)]
+                    rounding = plan.peak(nu + 1)[0] * np.spacing(max(-plan.start, plan.end))
+                    assert min(abs(side - value) for side in sides) <= 1e-9 * plan.peak(nu)[0] + rounding
+        bounds = plan.bounds(lambda jet: jet[0, 0], 0, 1.0)
+        assert plan.start <= min(bounds.time_min, bounds.time_max) <= max(bounds.time_min, bounds.time_max) <= plan.end
 
 
 @pytest.mark.parametrize("alpha", [0.0, 3.0])

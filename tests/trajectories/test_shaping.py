@@ -10,7 +10,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from ctrlplan.trajectories import PolySpline, SCurve, Shaper, Step, Trajectory, Trapezoid, TrigSpline, Waypoint, stack
+from ctrlplan.planning import fastest, margins
+from ctrlplan.trajectories import (
+    PolySpline,
+    Retimed,
+    SCurve,
+    Shaper,
+    Step,
+    Trajectory,
+    Trapezoid,
+    TrigSpline,
+    Waypoint,
+    stack,
+    trajectory_from_dict,
+)
 
 MODES = [(1.0, 0.0), (2.5, 0.05), (7.0, 0.3), (0.2, 0.7)]
 modes = pytest.mark.parametrize(("omega", "zeta"), MODES)
@@ -285,3 +298,87 @@ def test_other_arguments_that_are_refused():
         shaper(1.0)
     with pytest.raises(TypeError, match="other must be a Shaper, got float"):
         shaper.then(1.0)
+
+
+# The time scale is that of the mode
+
+
+SHAPED = Shaper.zv(6.0)(SPLINE)
+UNIT_RATE = PolySpline([Waypoint(1.0, SHAPED.start), Waypoint(1.0 + SHAPED.duration, SHAPED.end)])
+MADE_OF_SHAPED = {
+    "itself": SHAPED,
+    "shaped step": Shaper.zvd(3.0)(Step(1.0)),
+    "shaped twice": Shaper.zv(2.0)(SHAPED),
+    "multiple": -2.0 * SHAPED,
+    "sum": SPLINE + SHAPED,
+    "stacked": stack([SPLINE, SHAPED], labels=["a", "b"]),
+    "selected": stack([SPLINE, SHAPED], labels=["a", "b"]).select("b"),
+    "joined": PolySpline([Waypoint(0.0, 0.0), Waypoint(1.0, 1.0)]).then(SHAPED),
+    "on a shifted clock": Retimed(
+        SHAPED, PolySpline([Waypoint(1.0, 0.5), Waypoint(SHAPED.duration + 1.0, SHAPED.end)])
+    ),
+    "read from a file": trajectory_from_dict(SHAPED.to_dict()),
+    "shifted": SHAPED.shift(7.0),
+}
+
+
+@pytest.mark.parametrize("factor", [0.5, 1.01, 3.0])
+@pytest.mark.parametrize("name", MADE_OF_SHAPED)
+def test_a_shaped_plan_is_not_retimed(name, factor):
+    """Delays that scale with the duration would leave the vibration that the shaper is there for."""
+    plan = MADE_OF_SHAPED[name]
+    with pytest.raises(ValueError, match="the delays of the shaper would change with it"):
+        plan.retime(factor * plan.duration)
+    with pytest.raises(ValueError, match="the delays of the shaper would change with it"):
+        Retimed(plan, PolySpline([Waypoint(0.0, plan.start), Waypoint(factor * plan.duration, plan.end)]))
+
+
+@pytest.mark.parametrize("name", MADE_OF_SHAPED)
+def test_a_shaped_plan_is_shifted_and_kept_in_its_duration(name):
+    plan = MADE_OF_SHAPED[name]
+    t = np.linspace(plan.start - 0.1, plan.end + 0.1, 58)
+    for moved in (
+        plan.shift(3.0),
+        plan.retime(plan.duration).shift(3.0),
+        plan.retime(plan.duration * (1 + 1e-15)).shift(3.0),
+    ):
+        np.testing.assert_allclose(moved(t + 3.0), plan(t), rtol=0, atol=1e-12)
+
+
+def test_a_law_of_rate_1_on_average_is_not_enough():
+    law = PolySpline([Waypoint(SHAPED.start, SHAPED.start, 1.2), Waypoint(SHAPED.end, SHAPED.end, 1.2)])
+    with pytest.raises(ValueError, match=r"law must have the rate 1 where the plan is shaped, got 0\.\d+ to 1\.2"):
+        Retimed(SHAPED, law)
+
+
+@pytest.mark.parametrize("hold", ["shape", "path"])
+@pytest.mark.parametrize("limits", [{"velocity": 0.7}, {"speed": 0.7}, {"velocity": 3.0, "acceleration": 1.0}])
+def test_fastest_does_not_undo_shaping(limits, hold):
+    quantities = (lambda jet: {"speed": np.abs(jet[1, 0])}) if "speed" in limits else None
+    with pytest.raises(
+        ValueError, match=r"a shaped plan must keep its duration of .* retime the plan first, then shape"
+    ):
+        fastest(SHAPED, limits, quantities, hold=hold)
+
+
+@modes
+def test_a_plan_made_fastest_before_it_is_shaped(omega, zeta):
+    """What the message says to do leaves no vibration and keeps limits of derivatives."""
+    limits = {"velocity": 0.7, "acceleration": 2.0}
+    found = Shaper.zv(omega, zeta)(fastest(PolySpline([Waypoint(0, 0, 0, 0), Waypoint(1, 1, 0, 0)]), limits).plan)
+    assert margins(found, limits).active.fraction >= -1e-12
+    t = np.linspace(found.start, found.end, 200_001)
+    # Exact for every reference: the convolution with the response to an impulse, by the trapezoidal rule.
+    mode = (-zeta + 1j * math.sqrt(1.0 - zeta**2)) * omega
+    left = np.trapezoid(found(t, 1) * np.exp(mode * (found.end - t)), t)
+    alone = np.trapezoid(found(t, 1), t)
+    assert abs(left) <= 1e-8 * alone
+
+
+@pytest.mark.parametrize("wrong", [0.95, 1.05])
+def test_what_retiming_would_do_to_a_shaper(wrong):
+    """The delays of a ZV shaper scaled by 5 %: a residual of |cos(pi/2 1.05)|, where it was 0."""
+    shaper = Shaper.zv(6.0)
+    scaled = Shaper(wrong * shaper.delays, shaper.weights)
+    assert shaper.residual(6.0) <= 1e-15
+    assert scaled.residual(6.0) == pytest.approx(abs(math.cos(0.5 * math.pi * wrong)), rel=1e-12)
