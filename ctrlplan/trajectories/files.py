@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import bz2
 import csv
+import gzip
 import io
 import json
+import lzma
 import os
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ctrlplan._files import write_bytes, write_text
 from ctrlplan.trajectories.common import Array, checked_timepts
 from ctrlplan.trajectories.trajectory import Trajectory
 
@@ -49,7 +53,7 @@ def trajectory_from_dict(data: dict[str, Any]) -> Trajectory:
 def save_trajectory(plan: Trajectory, path: str | os.PathLike[str]) -> None:
     """Write a trajectory as JSON; numbers are written so that every bit returns."""
     text = json.dumps(plan.to_dict(), indent=1, allow_nan=False)
-    Path(path).write_text(text + "\n", encoding="utf-8")
+    write_text(path, text + "\n")
 
 
 def load_trajectory(path: str | os.PathLike[str]) -> Trajectory:
@@ -93,7 +97,11 @@ def write_csv(plan: Trajectory, path: str | os.PathLike[str], timepts: ArrayLike
     """
     times = np.linspace(plan.start, plan.end, 1001) if timepts is None else np.atleast_1d(checked_timepts(timepts))
     columns = np.concatenate([times[None], signal_rows(plan, times, order)])
-    np.savetxt(path, columns.T, fmt="%.17g", delimiter=",", header=csv_header(column_names(plan, order)), comments="")
+    table = io.StringIO()
+    np.savetxt(table, columns.T, fmt="%.17g", delimiter=",", header=csv_header(column_names(plan, order)), comments="")
+    # As numpy's own writing to a path of these endings.
+    packers: dict[str, Callable[[bytes], bytes]] = {".gz": gzip.compress, ".bz2": bz2.compress, ".xz": lzma.compress}
+    write_bytes(path, packers.get(Path(path).suffix, bytes)(table.getvalue().encode("utf-8")))
 
 
 def csv_header(names: list[str]) -> str:

@@ -1,5 +1,6 @@
 """Trajectories as JSON and CSV: numbers to the last bit, and what is not a trajectory is refused in one line."""
 
+import errno
 import json
 
 import numpy as np
@@ -188,3 +189,25 @@ def test_nothing_is_written_of_a_wrong_request(tmp_path):
         with pytest.raises(ValueError, match="must"):
             MOVE.to_csv(tmp_path / "plan.csv", **arguments)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("ending", [".gz", ".bz2", ".xz"])
+def test_a_table_is_compressed_as_its_ending_says(ending, tmp_path):
+    path = tmp_path / f"plan.csv{ending}"
+    MOVE.to_csv(path, [0.25, 0.5], order=0)
+    np.testing.assert_array_equal(np.loadtxt(path, delimiter=",", skiprows=1)[:, 1], MOVE([0.25, 0.5]))
+
+
+@pytest.mark.parametrize("write", ["save", "to_csv"])
+def test_a_write_that_fails_leaves_the_plan_before(write, tmp_path, monkeypatch):
+    path = tmp_path / "plan"
+    path.write_text("before")
+
+    def full(handle):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("os.fsync", full)
+    with pytest.raises(OSError, match="No space left"):
+        getattr(MOVE, write)(path)
+    assert path.read_text() == "before"
+    assert list(tmp_path.iterdir()) == [path]
