@@ -18,6 +18,7 @@ from tqdm import tqdm
 from ctrlplan.simulation import Prepared, prepare
 from ctrlplan.studies.comparison import (
     Comparison,
+    all_run,
     check_has_inputs,
     compare,
     finite_or_none,
@@ -352,12 +353,12 @@ def _nominal(
 ) -> tuple[Comparison, int | None]:
     """The loop with its own parameters; or, where that does not run, with those of the first draw that does."""
     try:
-        return compare(_given(forms), references, times, **settings), None
+        return all_run(compare(_given(forms), references, times, **settings)), None
     except (ArithmeticError, RuntimeError, TypeError, KeyError) as error:
         for k in range(min(20, next(iter(table.values())).size)):
             with suppress(Exception):
                 params = _draw(table, k)
-                found = compare(_given(forms), references, times, params=params, **settings)
+                found = all_run(compare(_given(forms), references, times, params=params, **settings))
                 values = ", ".join(f"{name} = {value:.4g}" for name, value in params.items())
                 note = f"Nominal is draw {k} ({values}): the loop's own parameters do not run."
                 return replace(found, notes=(*found.notes, note)), k

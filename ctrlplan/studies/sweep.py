@@ -17,6 +17,7 @@ from ctrlplan.simulation.exact import exact_states
 from ctrlplan.simulation.linear import LinearForm, in_right_half, linear_forms
 from ctrlplan.studies.comparison import (
     acting_outputs,
+    all_run,
     compare,
     finite_or_none,
     is_builder,
@@ -207,7 +208,7 @@ def _swept(parameter: str, points: Array, found: list[Metrics | Exception]) -> S
 def _tried(build: Callable[[float], Any], value: float, given: dict[str, Any]) -> Metrics | Exception:
     """Metrics for one value, or what went wrong."""
     try:
-        return compare(build(value), **given).metrics
+        return all_run(compare(build(value), **given)).metrics
     except Exception as error:  # whatever a loop does at this value
         return error
 
