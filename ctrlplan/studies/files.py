@@ -350,11 +350,15 @@ class _Reader:
         return (self.numbers if isinstance(table[key], list) else partial(self.number, default=None))(table, key, place)
 
     def waypoints(self, data: dict[str, Any]) -> tuple[Waypoint, ...]:
+        loop = data.get("loop")
+        # A crane is measured in x and z, in whatever order a file has them.
+        first = ("x", "z") if isinstance(loop, dict) and loop.get("kind") == "crane" else ()
         points = []
         for i, table in enumerate(self.tables(data, "waypoints")):
             place = f"waypoints[{i}]"
             time = self.number(table, "time", f"{place}.time", default=None)
-            labels = [label for label in table if label != "time"]
+            labels = [label for label in first if label in table]
+            labels += [label for label in table if label not in ("time", *first)]
             jets = {label: self.numbers(table, label, f"{place}.{label}", finite=False) for label in labels}
             try:
                 points.append(Waypoint.from_jets(time, **jets))
