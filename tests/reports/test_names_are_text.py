@@ -213,7 +213,7 @@ def test_a_plan_named_with_an_underscore_keeps_its_colour_in_all_figures():
 
 STATE = """
 return {
-  hit: typeof window.hit, text: document.body.innerText, title: document.title,
+  hit: typeof window.hit, text: document.body.innerText.toWellFormed(), title: document.title,
   elements: Array.from(document.querySelectorAll("*")).map(e => e.tagName.toLowerCase())
     .filter(t => ["img", "iframe", "object", "embed", "base", "audio", "video", "form", "input", "b", "i"].includes(t)),
   scripts: document.querySelectorAll("script:not([type])").length,
