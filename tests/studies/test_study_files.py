@@ -240,7 +240,7 @@ def test_a_plant_that_passes_its_input_on_has_a_loop(stated):
 LOOP = """
 import control as ct
 
-def build():
+def build() -> ct.StateSpace:
     return ct.ss([[-{rate}]], [[{rate}]], [[1.0]], [[0.0]], inputs=["r"], outputs=["y"])
 """
 
@@ -284,7 +284,7 @@ def test_the_search_path_is_left_as_it_was(tmp_path):
 def test_a_nonlinear_loop_is_compared_too(tmp_path):
     (tmp_path / "curved_loop.py").write_text(
         "import control as ct\nimport numpy as np\n\n"
-        "def build():\n"
+        "def build() -> ct.NonlinearIOSystem:\n"
         "    return ct.nlsys(lambda t, x, u, p: np.tanh(20 * (u - x)), None, inputs=1, outputs=['y'], states=1)\n"
     )
     path = tmp_path / "study.toml"
