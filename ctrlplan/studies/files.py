@@ -107,16 +107,17 @@ class StudyFile:
         """
         loop = build_loop(self.loop, self.path)
         try:
-            comparison = compare(
-                loop,
-                self.plans,
-                self.timepts(loop),
-                waypoints=self.waypoints,
-                units=self.units,
-                title=self.title,
-                parameters=self.parameters(),
-                **{"worth": self.worth} | self._crane_options(),
-            )
+            with np.errstate(over="ignore", invalid="ignore"):  # a run that leaves all bounds says so itself
+                comparison = compare(
+                    loop,
+                    self.plans,
+                    self.timepts(loop),
+                    waypoints=self.waypoints,
+                    units=self.units,
+                    title=self.title,
+                    parameters=self.parameters(),
+                    **{"worth": self.worth} | self._crane_options(),
+                )
         except StudyError:
             raise
         except (ValueError, TypeError, RuntimeError) as error:
@@ -369,18 +370,22 @@ def plans_as_json(study: StudyFile) -> str:
 
 
 def plans_as_csv(study: StudyFile, order: int = 2) -> str:
-    """Samples of all plans as one table: time, then plan.axis with its derivatives."""
+    """Samples of all plans as one table: time, then plan.axis with its derivatives.
+
+    An apostrophe stands before names that a spreadsheet would take for a formula.
+    """
     times = np.linspace(study.waypoints[0].time, study.waypoints[-1].time, 1001)
     times = np.union1d(times, [w.time for w in study.waypoints])
     names, rows = ["time"], [times]
     for name, plan in study.plans.items():
-        names += [f"{name}.{signal}" for signal in signal_names(plan.labels, order)]
+        head = f"'{name}" if name.startswith(("=", "+", "-", "@", "\t", "\r")) else name
+        names += [f"{head}.{signal}" for signal in signal_names(plan.labels, order)]
         rows += list(signal_rows(plan, times, order))
     try:
         header = csv_header(names)
     except ValueError as error:
         raise StudyError(f"{study.path}: waypoints: {error}") from None
-    table = io.StringIO()
+    table = io.StringIO(newline="")
     np.savetxt(table, np.array(rows).T, fmt="%.17g", delimiter=",", header=header, comments="")
     return table.getvalue()
 
