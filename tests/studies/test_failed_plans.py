@@ -1,12 +1,16 @@
 """A plan whose run fails is recorded with its reason, and the others are kept."""
 
+import html
 import json
+import os
+import re
 
 import control as ct
 import numpy as np
 import pytest
 
 import ctrlplan as cp
+from ctrlplan.cli import main
 
 TIMES = np.linspace(0.0, 3.0, 301)
 PLANS = {"far": cp.Step(2.0), "near": cp.Step(0.5), "planned": cp.PolySpline([cp.Waypoint(0, 0), cp.Waypoint(1, 0.5)])}
@@ -125,3 +129,37 @@ def test_a_value_of_a_sweep_at_which_a_plan_fails_is_a_failure_of_the_sweep():
     (failure,) = found.failures
     assert failure.params == {"rate": 1.0}
     assert "far" in failure.message
+
+
+@pytest.mark.slow
+def test_a_crane_that_cannot_follow_some_plans_is_reported_with_the_others(tmp_path, capsys):
+    """Ten metres in 3.5 s with 2 kN: with feedback of the load no smooth plan stays within numbers; the step does."""
+    places = "".join(
+        f"[[waypoints]]\ntime = {t}\nx = [{x}, 0.0, 0.0]\nz = [9.0, 0.0, 0.0]\n" for t, x in ((0.0, 0.0), (3.5, 10.0))
+    )
+    loop = '[loop]\nkind = "crane"\nlaw = "load_feedback"\nforce_limits = [-2000.0, 2000.0]\n'
+    (tmp_path / "hasty.toml").write_text(f"t_end = 40.0\nsamples = 401\n{loop}{places}")
+    assert main(["report", str(tmp_path / "hasty.toml"), "--out", str(tmp_path / "out")]) == 0
+    (found,) = json.loads((tmp_path / "out" / "results.json").read_text())["studies"].values()
+    assert list(found["plans"]) == ["step"]
+    assert set(found["failures"]) == {"polynomial", "trigonometric", "piecewise"}
+    page = (tmp_path / "out" / "index.html").read_text(encoding="utf-8")
+    for plan, reason in found["failures"].items():
+        assert re.search(r"solver must reach 40 s, got to \d", reason)
+        assert f'<th scope="row">{plan}</th><td class="words">{html.escape(reason)}</td>' in page
+    assert capsys.readouterr().err.splitlines() == ["ctrlplan: study hasty", "ctrlplan: report"]
+
+
+def test_what_ends_a_save_leaves_the_file_of_before(compared, tmp_path, monkeypatch):
+    path = tmp_path / "found.json"
+    compared.save(path)
+    before = path.read_text()
+
+    def full(handle):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="No space left"):
+        compared.save(path)
+    assert [p.name for p in tmp_path.iterdir()] == ["found.json"]
+    assert path.read_text() == before

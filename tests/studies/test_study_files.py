@@ -324,7 +324,18 @@ def test_plans_as_csv_are_their_samples(stated):
         np.testing.assert_array_equal(rows, plan.jet(table[0], 2)[:, 0])
 
 
-NAMES = ["fast, then slow", 'the "best"', "fast;slow", "two\nlines", "two\r\nlines", "a\rreturn", '"', '",\n"', " ", "é🚀"]
+NAMES = [
+    "fast, then slow",
+    'the "best"',
+    "fast;slow",
+    "two\nlines",
+    "two\r\nlines",
+    "a\rreturn",
+    '"',
+    '",\n"',
+    " ",
+    "é🚀",
+]
 
 
 @pytest.mark.parametrize("name", NAMES)
