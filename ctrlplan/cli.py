@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -18,13 +19,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         paths = options.run(options)
     except OSError as error:
-        print(f"ctrlplan: --out must be writable, got {options.out}: {error.strerror or error}", file=sys.stderr)
+        _say(f"--out must be writable, got {options.out}: {error.strerror or error}")
         return 2
     except ValueError as error:
-        print(f"ctrlplan: {error}", file=sys.stderr)
+        _say(str(error))
         return 2
     for path in paths:
-        print(path)
+        _tell(str(path))
     return 0
 
 
@@ -114,4 +115,20 @@ def _checked_folder(folder: Path) -> None:
 
 
 def _say(text: str) -> None:
-    print(f"ctrlplan: {text}", file=sys.stderr, flush=True)
+    """One line on stderr, whatever names are in it."""
+    line = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in " ".join(text.splitlines()))
+    print(f"ctrlplan: {line}", file=sys.stderr, flush=True)
+
+
+def _tell(line: str) -> None:
+    """One line on stdout, as far as its encoding goes: what was to be written is written by then."""
+    encoding = getattr(sys.stdout, "encoding", None) or "utf-8"
+    try:
+        line.encode(encoding, getattr(sys.stdout, "errors", None) or "strict")
+    except UnicodeEncodeError:
+        line = line.encode(encoding, "backslashreplace").decode(encoding)
+    try:
+        print(line, flush=True)
+    except OSError:  # nobody reads it, or there is no room for it; what is left of it goes nowhere
+        with contextlib.suppress(OSError, ValueError):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

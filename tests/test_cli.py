@@ -1,15 +1,20 @@
 """The command: what it writes, what it says where, and how it ends."""
 
+import html
+import io
 import json
+import os
 import re
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import ctrlplan as cp
 from ctrlplan.cli import main
+from ctrlplan.reports import write_all
 from ctrlplan.studies import MEASURES
 
 STUDY = """
@@ -211,6 +216,172 @@ def test_a_wrong_file_ends_python_m_with_2_and_one_line(tmp_path):
     said = re.escape("ctrlplan: wrong.toml: plans[1]: alpha must lie in [0, 2 pi), got 7")
     assert re.fullmatch(rf"{said}(\.0)?\n", done.stderr)
     assert [p.name for p in tmp_path.iterdir()] == ["wrong.toml"]
+
+
+# Names of any kind, and terminals that cannot show them
+
+
+ASCII = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("more", [{"PYTHONIOENCODING": "ascii"}, {"PYTHONIOENCODING": "ascii:strict"}, {}])
+def test_a_terminal_without_the_letters_of_a_path_gets_it_all_the_same(more, tmp_path):
+    (tmp_path / "üb🚀er.toml").write_text(STUDY, encoding="utf-8")
+    environment = {**os.environ, **ASCII, **more}
+    done = python_m("plan", "üb🚀er.toml", "--out", "plän.csv", cwd=tmp_path, env=environment, errors="surrogateescape")
+    assert done.returncode == 0, done.stderr
+    assert "Traceback" not in done.stderr
+    assert done.stdout.startswith("pl")
+    assert done.stdout.endswith("n.csv\n")
+    assert (tmp_path / "plän.csv").read_text(encoding="utf-8").startswith("time,")
+
+
+@pytest.mark.parametrize("errors", ["strict", "surrogateescape"])
+def test_an_ascii_terminal_is_told_the_path_in_escapes(errors, study, tmp_path, monkeypatch):
+    terminal = io.TextIOWrapper(io.BytesIO(), encoding="ascii", errors=errors)
+    monkeypatch.setattr(sys, "stdout", terminal)
+    assert main(["plan", str(study), "--out", str(tmp_path / "plän.csv")]) == 0
+    assert terminal.buffer.getvalue().endswith(rb"/pl\xe4n.csv" + os.linesep.encode())
+
+
+@pytest.mark.slow
+def test_a_reader_who_has_left_is_no_error(study, tmp_path):
+    reading, writing = os.pipe()
+    os.close(reading)
+    command = [sys.executable, "-m", "ctrlplan", "plan", str(study), "--out", str(tmp_path / "plan.csv")]
+    done = subprocess.run(command, stdout=writing, stderr=subprocess.PIPE, text=True, check=False)
+    os.close(writing)
+    assert (done.returncode, done.stderr) == (0, "ctrlplan: plans of wall\n")
+    assert (tmp_path / "plan.csv").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full here")
+def test_a_terminal_without_room_is_no_error(study, tmp_path):
+    with open("/dev/full", "w") as full:
+        command = [sys.executable, "-m", "ctrlplan", "plan", str(study), "--out", str(tmp_path / "plan.csv")]
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "ctrlplan: plans of wall\n")
+
+
+@pytest.mark.skipif(os.name == "nt", reason="names of files are texts there")
+def test_a_file_name_that_is_no_text_is_a_name(tmp_path, capsys):
+    path = Path(os.fsdecode(bytes(tmp_path) + b"/caf\xe9\n\x1b[31m.toml"))
+    try:
+        path.write_text(STUDY)
+    except OSError:
+        pytest.skip("the file system does not take this name")
+    assert main(["plan", str(path), "--out", str(tmp_path / "plan.json")]) == 0
+    said = capsys.readouterr().err
+    assert said.splitlines() == [r"ctrlplan: plans of caf\udce9 \x1b[31m"]
+    assert main(["plan", f"{path}x", "--out", str(tmp_path / "plan.json")]) == 2
+    assert len(capsys.readouterr().err.splitlines()) == 1
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(os.name == "nt", reason="names of files are texts there")
+def test_a_page_of_a_file_whose_name_is_no_text_is_written(tmp_path, capsys):
+    path = Path(os.fsdecode(bytes(tmp_path) + b'/"><img src=x onerror=hit()>\xe9.toml'))
+    path.write_text(STUDY.replace('title = "Over the wall"', "worth = true").replace("samples = 201", "samples = 101"))
+    assert main(["report", str(path), "--out", str(tmp_path / "out")]) == 0
+    page = (tmp_path / "out" / "index.html").read_text(encoding="utf-8")
+    assert "<img" not in page
+    assert "&#34;&gt;&lt;img src=x onerror=hit()&gt;\N{REPLACEMENT CHARACTER}" in page
+    capsys.readouterr()
+
+
+# A plan that fails
+
+
+FAILING = """
+t_end = 4.0
+samples = 41
+[loop]
+kind = "python:tangent_loop:build"
+[[plans]]
+family = "polynomial"
+[[plans]]
+name = "far <b>"
+family = "step"
+[[waypoints]]
+time = 0.0
+y = [0.0, 0.0, 0.0]
+[[waypoints]]
+time = 3.0
+y = [{goal}, 0.0, 0.0]
+"""
+
+# x = r tan(r t) for a constant r: with r = 0.6 it leaves all bounds at 2.6 s; the plan is below 0.6 until 3 s.
+TANGENT = """
+import control as ct
+
+def build() -> ct.NonlinearIOSystem:
+    return ct.nlsys(lambda t, x, u, p: [u[0] ** 2 + x[0] ** 2], None, inputs=["r"], outputs=["y"], states=["y"])
+"""
+
+
+@pytest.fixture
+def failing(tmp_path, monkeypatch):
+    def at(goal):
+        monkeypatch.chdir(tmp_path)
+        (tmp_path / "tangent_loop.py").write_text(TANGENT)
+        (tmp_path / "tangent.toml").write_text(FAILING.format(goal=goal))
+        return main(["report", "tangent.toml", "--out", "out"])
+
+    return at
+
+
+def test_a_plan_that_fails_is_a_row_with_its_reason_beside_the_others(failing, tmp_path, capsys):
+    assert failing(0.6) == 0
+    assert len(capsys.readouterr().out.splitlines()) == 2
+    (found,) = json.loads((tmp_path / "out" / "results.json").read_text())["studies"].values()
+    assert list(found["plans"]) == ["polynomial"]
+    assert list(found["failures"]) == ["far <b>"]
+    page = (tmp_path / "out" / "index.html").read_text(encoding="utf-8")
+    (row,) = re.findall(r'<th scope="row">far &lt;b&gt;</th><td class="words">(.*?)</td>', page)
+    assert html.unescape(row) == found["failures"]["far <b>"] != ""
+
+
+def test_where_every_plan_fails_nothing_is_written(failing, tmp_path, capsys):
+    assert failing(30.0) == 2
+    *_, line = capsys.readouterr().err.splitlines()
+    assert line.startswith("ctrlplan: tangent.toml: loop: ")
+    assert not (tmp_path / "out").exists()
+
+
+# Written whole or not at all
+
+
+@pytest.mark.slow
+def test_without_room_for_the_page_nothing_is_left(study, tmp_path):
+    resource = pytest.importorskip("resource", reason="there are no limits of the size of files here")
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "results.json").write_text("before")
+    for out in ("out", "new/folder"):
+        done = python_m(
+            *("report", study, "--out", tmp_path / out),
+            preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000)),
+        )
+        assert done.returncode == 2
+        assert done.stderr.splitlines()[-1].startswith("ctrlplan: --out must be writable, got")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["out", "wall.toml"]
+    assert [(p.name, p.read_text()) for p in (tmp_path / "out").iterdir()] == [("results.json", "before")]
+
+
+@pytest.mark.parametrize("ended", [OSError(28, "No space left on device"), KeyboardInterrupt(), MemoryError()])
+def test_what_ends_while_files_are_written_leaves_what_was_there(ended, tmp_path, monkeypatch):
+    def interrupted(handle):
+        raise ended
+
+    (tmp_path / "old").mkdir()
+    (tmp_path / "old" / "a.txt").write_text("before")
+    monkeypatch.setattr(os, "fsync", interrupted)
+    for folder in ("old", "new/deep"):
+        with pytest.raises(type(ended)):
+            write_all({tmp_path / folder / "a.txt": "after", tmp_path / folder / "b.txt": "after"})
+    assert [p.name for p in tmp_path.rglob("*")] == ["old", "a.txt"]
+    assert (tmp_path / "old" / "a.txt").read_text() == "before"
 
 
 @pytest.mark.parametrize(

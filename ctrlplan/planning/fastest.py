@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
+from html import escape
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
@@ -75,7 +76,7 @@ class Fastest:
         return f"fastest with the {self.hold} held: {self.duration:.6g} s ({self._sets}){note}\n{self.margins!r}"
 
     def _repr_html_(self) -> str:
-        note = f" Shorter plans are refused: {self.refusal}." if self.refusal else ""
+        note = f" Shorter plans are refused: {escape(self.refusal)}." if self.refusal else ""
         return (
             f"<p>Shortest duration with the {self.hold} held: <b>{self.duration:.6g} s</b> ({self._sets}).{note}</p>"
             f"{self.margins._repr_html_()}"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from html import escape
 from numbers import Real
 from typing import TYPE_CHECKING, Any
 
@@ -158,7 +159,7 @@ class Margins:
 
     def _repr_html_(self) -> str:
         cells = "".join(
-            f"<tr><th>{row.bound.name}</th><td>{row.bound.range}</td><td>{row.value:.6g}</td>"
+            f"<tr><th>{escape(row.bound.name)}</th><td>{row.bound.range}</td><td>{row.value:.6g}</td>"
             f"<td>{row.time:.6g}</td><td>{'' if row.fraction >= 0.0 else '−'}{row.share}</td></tr>"
             for row in self.rows
         )

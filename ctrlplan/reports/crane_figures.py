@@ -2,18 +2,26 @@
 
 from __future__ import annotations
 
-import json
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
-from matplotlib.axes import Axes
+from jinja2.utils import htmlsafe_json_dumps
+from markupsafe import Markup
 from matplotlib.figure import Figure
 from matplotlib.patches import Arc, Circle, FancyArrowPatch, FancyBboxPatch, Rectangle
 from numpy.typing import NDArray
 
-from ctrlplan.reports.style import house_style, legend_above, line_styles, new_figure, stacked_axes
+from ctrlplan.reports.style import (
+    as_text,
+    house_style,
+    legend_above,
+    legend_label,
+    line_styles,
+    new_figure,
+    stacked_axes,
+)
 from ctrlplan.studies.comparison import Comparison
-from ctrlplan.studies.crane_setup import CRANE, FORCE_LIMITS, TORQUE_LIMITS, nominal_waypoints
+from ctrlplan.studies.crane_setup import CRANE, nominal_waypoints
 from ctrlplan.studies.measures import signals_of
 from ctrlplan.studies.study import Study
 from ctrlplan.systems.plants import crane_loop
@@ -22,8 +30,6 @@ from ctrlplan.trajectories import PolySpline
 Array = NDArray[np.float64]
 
 Wall = tuple[tuple[float, float], tuple[float, float]] | None
-MAIN = ("step", "polynomial", "trigonometric", "piecewise")
-"""Plans that figures over time show; more would hide one another."""
 
 
 @house_style
@@ -123,15 +129,14 @@ def plot_blocks() -> Figure:
 @house_style
 def plot_time(comparison: Comparison) -> Figure:
     """Load, error, sway and controls over time, as the paper's figures 4 and 5 lay them out."""
-    names = [n for n in comparison.plans if n != "step"]
+    names = _moving(comparison) or list(comparison.plans)
     styles = line_styles(comparison.plans)
     figure = new_figure(7.4, 9.4)
     rows = [row[0] for row in stacked_axes(figure, 6)]
     for name in names:
         signals = _signals(comparison, name)
-        t, plan = signals["t"], comparison.plans[name]
-        reference = plan.jet(t, 0)[0]
-        error = np.hypot(signals["x"] - reference[0], signals["z"] - reference[1])
+        t = signals["t"]
+        error = np.hypot(*(np.stack([signals["x"], signals["z"]]) - _planned(comparison, name, t)))
         for axes, values in zip(
             rows,
             (signals["x"], signals["z"], 1e3 * error, signals["theta"], signals["F"] / 1e3, signals["C"] / 1e3),
@@ -150,16 +155,23 @@ def plot_time(comparison: Comparison) -> Figure:
 
 @house_style
 def plot_step(comparison: Comparison) -> Figure:
-    """What a step asks of the drives, and the rope it leaves slack."""
-    signals = _signals(comparison, "step")
-    t, colour = signals["t"], line_styles(comparison.plans)["step"]["color"]
+    """What a step asks of the drives, with the limits of its own loop, and the rope it leaves slack."""
+    moving = _moving(comparison)
+    name = next((name for name in comparison.plans if name not in moving), None)
+    if name is None:
+        raise ValueError("a comparison must have a step for this figure, got plans without jumps alone")
+    signals = _signals(comparison, name)
+    t, colour = signals["t"], line_styles(comparison.plans)[name]["color"]
     figure = new_figure(7.0, 6.4)
     rows = [row[0] for row in stacked_axes(figure, 4)]
-    scales = (("F", 1e3, "F [kN]", FORCE_LIMITS), ("C", 1e3, "C [kN m]", TORQUE_LIMITS), ("T", 1e3, "T [kN]", (0.0,)))
-    for axes, (name, scale, label, limits) in zip(rows, scales, strict=False):
-        axes.plot(t, signals[name] / scale, color=colour, linewidth=1.0, label="step")
-        for k, limit in enumerate(limits):
-            axes.axhline(limit / scale, color="#D55E00", linewidth=1.0, linestyle="--", label="" if k else "limit")
+    limits = comparison.limits.get(name, {}) | {"T": (0.0, np.inf)}
+    drawn = "limit"
+    for axes, (signal, label) in zip(rows, (("F", "F [kN]"), ("C", "C [kN m]"), ("T", "T [kN]")), strict=False):
+        axes.plot(t, signals[signal] / 1e3, color=colour, linewidth=1.0, label=legend_label(name))
+        for limit in limits.get(signal, ()):
+            if np.isfinite(limit):
+                axes.axhline(limit / 1e3, color="#D55E00", linewidth=1.0, linestyle="--", label=drawn)
+                drawn = ""
         axes.set_ylabel(label)
     rows[2].fill_between(t, signals["T"] / 1e3, 0.0, where=signals["T"] < 0.0, color="#D55E00", alpha=0.4)
     rows[3].plot(t, signals["theta"], color=colour, linewidth=1.0)
@@ -179,19 +191,15 @@ def plot_plane(comparison: Comparison, wall: Wall) -> Figure:
         (left, right), (top, ground) = wall
         axes.add_patch(Rectangle((left, top), right - left, ground - top, color="#bbbbbb", zorder=0))
         axes.text(0.5 * (left + right), 0.5 * (top + ground), "wall", ha="center", fontsize=9)
-    last = comparison.waypoints[-1].time
-    for name, plan in comparison.plans.items():
-        if plan.jumps(0):  # steps take no path
-            continue
+    last = _ends(comparison)[1]
+    for name in _moving(comparison):  # steps take no path
         signals = _signals(comparison, name)
         way = signals["t"] <= last
-        planned = plan.jet(signals["t"][way], 0)[0]
-        axes.plot(planned[0], planned[1], color=styles[name]["color"], linewidth=0.7, alpha=0.6)
+        axes.plot(*_planned(comparison, name, signals["t"][way]), color=styles[name]["color"], linewidth=0.7, alpha=0.6)
         axes.plot(signals["x"][way], signals["z"][way], **styles[name])
-    for i, point in enumerate(comparison.waypoints):
-        axes.plot(*point.position, "o", color="#444444", mfc="white", zorder=5)
-        text = "start" if i == 0 else "goal" if point.time == last else "AB"[i - 1]
-        axes.annotate(text, tuple(point.position.tolist()), xytext=(6, -10), textcoords="offset points", fontsize=9)
+    for text, place in _named_places(comparison).items():
+        axes.plot(*place, "o", color="#444444", mfc="white", zorder=5)
+        axes.annotate(text, place, xytext=(6, -10), textcoords="offset points", fontsize=9)
     axes.set_xlabel("x [m]")
     axes.set_ylabel("z [m], down")
     axes.invert_yaxis()
@@ -202,10 +210,11 @@ def plot_plane(comparison: Comparison, wall: Wall) -> Figure:
 @house_style
 def plot_motion(comparison: Comparison, wall: Wall, steps: int = 13) -> Figure:
     """Trolley, rope and load at equal time steps along each plan."""
-    names = [n for n in ("polynomial", "trigonometric") if n in comparison.plans]
-    figure = new_figure(7.4, 6.8)
+    known = [n for n in ("polynomial", "trigonometric") if n in comparison.plans]
+    names = known or (_moving(comparison) or list(comparison.plans))[:2]
+    figure = new_figure(7.4, 3.4 * len(names))
     rows = [row[0] for row in stacked_axes(figure, len(names))]
-    last = comparison.waypoints[-1].time
+    first, last = _ends(comparison)
     colours = line_styles(comparison.plans)
     for name, axes in zip(names, rows, strict=True):
         signals = _signals(comparison, name)
@@ -215,10 +224,16 @@ def plot_motion(comparison: Comparison, wall: Wall, steps: int = 13) -> Figure:
         axes.axhline(0.0, color="#999999", linewidth=2)
         colour = colours[name]["color"]
         axes.plot(signals["x"], signals["z"], color=colour, linewidth=0.8)
-        for t in np.linspace(0.0, last, steps):
-            d, r, theta = (float(np.interp(t, signals["t"], signals[k])) for k in ("D", "R", "theta"))
-            _draw_crane(axes, d, r, theta, colour)
-        axes.set_title(f"{name}: every {last / (steps - 1):.3g} s", loc="left", fontsize=9)
+        size, drum = max(np.ptp(signals["x"]), np.ptp(signals["z"])) / 25.0, abs(_drum_radius(signals))
+        ends = [signals["D"], signals["x"], signals["z"], *_rope_top(signals)]
+        times = np.linspace(first, last, steps)
+        for t in times[times <= signals["t"][-1]]:  # an event can have ended the run
+            trolley, x, z, top_x, top_z = (float(np.interp(t, signals["t"], row)) for row in ends)
+            axes.add_patch(Rectangle((trolley - 0.5 * size, -0.3 * size), size, 0.3 * size, color="#333333", zorder=3))
+            axes.add_patch(Circle((trolley, 0.0), drum, fill=False, color="#333333", linewidth=0.6, zorder=3))
+            axes.plot([top_x, x], [top_z, z], color="#888888", linewidth=0.7)
+            axes.plot(x, z, "o", color=colour, markersize=4.5, zorder=4)
+        axes.set_title(f"{as_text(name)}: every {(last - first) / (steps - 1):.3g} s", loc="left", fontsize=9)
         axes.set_ylabel("z [m], down")
         axes.invert_yaxis()
         axes.set_aspect("equal")
@@ -235,11 +250,13 @@ def plot_curves(study: Study) -> Figure:
     palette = ("#0072B2", "#D55E00", "#009E73", "#000000", "#CC79A7", "#E69F00")
     for i, (name, row) in enumerate(curves.rows.items()):
         style = "-" if i % 2 == 0 else (0, (5, 1.5))
-        axes.plot(curves.x, row, color=palette[(i // 2 if curves.log else i) % 6], linestyle=style, label=name)
+        axes.plot(
+            curves.x, row, color=palette[(i // 2 if curves.log else i) % 6], linestyle=style, label=legend_label(name)
+        )
     if curves.log:
         axes.set_yscale("log")
-    axes.set_xlabel(curves.x_label)
-    axes.set_ylabel(curves.y_label)
+    axes.set_xlabel(as_text(curves.x_label))
+    axes.set_ylabel(as_text(curves.y_label))
     legend_above(figure, axes)
     return figure
 
@@ -252,7 +269,8 @@ def plot_online(comparison: Comparison) -> Figure:
     rows = [row[0] for row in stacked_axes(figure, 4)]
     for name, plan in comparison.plans.items():
         signals = _signals(comparison, name)
-        distance = np.hypot(signals["x"] - plan.final[0], signals["z"] - plan.final[1])
+        x, z = _across_and_down(comparison, plan.labels, plan.final)
+        distance = np.hypot(signals["x"] - x, signals["z"] - z)
         rows[0].plot(signals["t"], signals["x_ref"], color=styles[name]["color"], linewidth=0.7, alpha=0.6)
         for axes, values in zip(rows, (signals["x"], distance, signals["theta"], signals["F"] / 1e3), strict=True):
             axes.plot(signals["t"], values, **styles[name])
@@ -265,16 +283,55 @@ def plot_online(comparison: Comparison) -> Figure:
     return figure
 
 
-def animation_data(comparison: Comparison, wall: Wall = None, rate: float = 12.0) -> str:
-    """JSON for the animation: trolley, rope and angle of each plan at equal time steps."""
-    frames: dict[str, Any] = {"b": CRANE.drum_radius, "rate": rate, "plans": {}}
+_FRAMES = 20_000
+"""Frames of an animation at most; longer runs have fewer a second."""
+
+
+def animation_data(comparison: Comparison, wall: Wall = None, rate: float = 12.0) -> Markup:
+    """JSON for the animation, safe inside HTML: each plan at equal time steps, up to where it is finite.
+
+    Entries: plans {name: [D, R, theta]}, the radius b of the drum (by plan where
+    cranes differ), frames per second, wall, and the view: left, top, width, height.
+    """
+    plans: dict[str, list[list[float]]] = {}
+    drums: dict[str, float] = {}
+    corners = [] if not wall else [np.array(wall)]
+    longest = max(float(np.ptp(response.time)) for response in comparison.responses.values())
+    rate = min(rate, _FRAMES / max(longest, 1.0))
     for name in comparison.plans:
         signals = _signals(comparison, name)
-        t = np.arange(0.0, signals["t"][-1], 1.0 / rate)
-        columns = [np.interp(t, signals["t"], signals[k]) for k in ("D", "R", "theta")]
-        frames["plans"][name] = [np.round(column, 3).tolist() for column in columns]
-    frames["wall"] = wall
-    return json.dumps(frames)
+        sound = np.isfinite([signals[k] for k in ("x", "z", "D", "R", "theta")]).all(axis=0)
+        end = sound.size if sound.all() else int(np.argmin(sound))
+        if not end:
+            continue
+        t = signals["t"][:end]
+        at = np.arange(t[0], t[-1], 1.0 / rate) if end > 1 else t
+        plans[name] = [np.round(np.interp(at, t, signals[k][:end]), 3).tolist() for k in ("D", "R", "theta")]
+        drums[name] = _drum_radius({k: row[:end] for k, row in signals.items()})
+        corners.append(np.stack([signals["x"][:end], signals["z"][:end]]))
+    one = len(set(drums.values())) == 1
+    drum = next(iter(drums.values())) if one else drums
+    view = _view(comparison, corners)
+    return htmlsafe_json_dumps({"b": drum, "rate": rate, "plans": plans, "wall": wall, "view": view}, allow_nan=False)
+
+
+def _view(comparison: Comparison, corners: list[Array]) -> list[float]:
+    """Left, top, width and height of what an animation shows: every waypoint, and loads that do not fly away."""
+    first, last = _ends(comparison)
+    paths = [_planned(comparison, name, np.linspace(first, last, 201)) for name in comparison.plans]
+    low, high = (
+        np.min([np.nanmin(path, axis=1, initial=np.inf) for path in paths], axis=0),
+        np.max([np.nanmax(path, axis=1, initial=-np.inf) for path in paths], axis=0),
+    )
+    low[1], high[1] = min(low[1], 0.0), max(high[1], 0.0)  # the trolley runs at z = 0
+    span = max(float(np.max(high - low)), 1e-3)
+    for box in corners:
+        low = np.maximum(np.minimum(low, box.min(axis=1)), low - 0.5 * span)
+        high = np.minimum(np.maximum(high, box.max(axis=1)), high + 0.5 * span)
+    room = 0.1 * float(np.max(high - low))
+    left, top = (low - room).tolist()
+    width, height = (high - low + 2.0 * room).tolist()
+    return [round(value, 4) for value in (left, top, width, height)]
 
 
 def is_crane(comparison: Comparison) -> bool:
@@ -288,13 +345,60 @@ def _signals(comparison: Comparison, name: str) -> dict[str, Array]:
     return signals_of(response) | {"t": np.asarray(response.time)}
 
 
-def _draw_crane(axes: Axes, d: float, r: float, theta: float, colour: str) -> None:
-    b = CRANE.drum_radius
-    tangent = (d + b * np.cos(theta), -b * np.sin(theta))
-    load = (tangent[0] + r * np.sin(theta), tangent[1] + r * np.cos(theta))
-    axes.add_patch(Rectangle((d - 0.4, -0.25), 0.8, 0.25, color="#333333", zorder=3))
-    axes.plot([tangent[0], load[0]], [tangent[1], load[1]], color="#888888", linewidth=0.7)
-    axes.plot(*load, "o", color=colour, markersize=4.5, zorder=4)
+def _rope_top(signals: dict[str, Array]) -> Array:
+    """Point (2, ntime) at which the rope leaves the drum: of the crane that was simulated, whatever its drum."""
+    across, down = np.sin(signals["theta"]), np.cos(signals["theta"])
+    return np.stack([signals["x"] - signals["R"] * across, signals["z"] - signals["R"] * down])
+
+
+def _drum_radius(signals: dict[str, Array]) -> float:
+    """Radius b of the drum: the rope leaves it at (D + b cos theta, -b sin theta)."""
+    x, z = _rope_top(signals)
+    theta = signals["theta"]
+    return float(np.round(np.median((x - signals["D"]) * np.cos(theta) - z * np.sin(theta)), 6))
+
+
+def _moving(comparison: Comparison) -> list[str]:
+    """Plans whose position does not jump."""
+    return [name for name, plan in comparison.plans.items() if not plan.jumps(0)]
+
+
+def _ends(comparison: Comparison) -> tuple[float, float]:
+    """Times of the first and the last waypoint, or of the plans where none are known."""
+    if comparison.waypoints:
+        return comparison.waypoints[0].time, comparison.waypoints[-1].time
+    plans = comparison.plans.values()
+    return min(plan.start for plan in plans), max(plan.end for plan in plans)
+
+
+def _planned(comparison: Comparison, name: str, t: Array) -> Array:
+    """Planned x and z of the load, (2, ntime)."""
+    plan = comparison.plans[name]
+    return _across_and_down(comparison, plan.labels, plan.jet(t, 0)[0])
+
+
+def _across_and_down(comparison: Comparison, labels: Sequence[str], rows: Array) -> Array:
+    """Rows called x and z, or followed by the outputs x and z, in this order; nan where there are none."""
+    named = dict(zip(comparison.outputs, rows, strict=False)) | dict(zip(labels, rows, strict=True))
+    return np.stack([named.get(label, np.full(rows.shape[1:], np.nan)) for label in ("x", "z")])
+
+
+def _named_places(comparison: Comparison) -> dict[str, tuple[float, float]]:
+    """Positions of the waypoints: start, A, B, ..., goal; those given in part are left out."""
+    points = comparison.waypoints
+    names = ["start", *map(_letters_of, range(len(points) - 2)), "goal"][: len(points)]
+    found = {}
+    for name, point in zip(names, points, strict=True):
+        x, z = _across_and_down(comparison, point.labels or comparison.outputs, point.position).tolist()
+        if np.isfinite(x + z):
+            found[name] = (x, z)
+    return found
+
+
+def _letters_of(count: int) -> str:
+    """A, B, ..., Z, AA, AB, ..."""
+    head, last = divmod(count, 26)
+    return (_letters_of(head - 1) if head else "") + chr(ord("A") + last)
 
 
 CRANE_FIGURES = {

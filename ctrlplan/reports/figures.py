@@ -10,7 +10,16 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from ctrlplan.reports.crane_figures import CRANE_FIGURES
-from ctrlplan.reports.style import house_style, legend_above, line_styles, new_figure, stacked_axes, with_unit
+from ctrlplan.reports.style import (
+    as_text,
+    house_style,
+    legend_above,
+    legend_label,
+    line_styles,
+    new_figure,
+    stacked_axes,
+    with_unit,
+)
 from ctrlplan.studies.comparison import Comparison
 from ctrlplan.studies.ensemble import Ensemble
 from ctrlplan.studies.linear import STEP_LIMIT, jumps
@@ -45,7 +54,7 @@ def plot_trajectory(plan: Trajectory, order: int = 2, units: Sequence[str] | Non
     markers = "osD^v"
     for k, (axes,) in enumerate(rows):
         for a, label in enumerate(plan.labels):
-            axes.plot(t, _broken(t, jet[k, a], plan), color=f"C{a}", label=label)
+            axes.plot(t, _broken(t, jet[k, a], plan), color=f"C{a}", label=legend_label(label))
             points = [(w.time, w.jet[k, a]) for w in plan.waypoints if k < len(w.jet) and not np.isnan(w.jet[k, a])]
             if points:
                 axes.plot(*zip(*points, strict=True), markers[a % 5], color=f"C{a}", markersize=5, mfc="white")
@@ -132,14 +141,16 @@ def plot_sweep(sweep: Sweep, names: Sequence[str] = ("settling_time", "overshoot
                 x, y = _with_gaps(x, y)
             axes.plot(x, y, **styles[plan])
         measure = MEASURES.get(name)
-        axes.set_ylabel(with_unit(measure.title, "" if "{" in measure.unit else measure.unit) if measure else name)
+        axes.set_ylabel(
+            with_unit(measure.title, "" if "{" in measure.unit else measure.unit) if measure else as_text(name)
+        )
         finite = np.concatenate([r[name][np.isfinite(r[name])] for r in sweep.metrics.values()])
         if finite.size and finite.min() > 0.0 and finite.max() > 100.0 * finite.min():
             axes.set_yscale("log")
         if sweep.values[0] > 0.0 and sweep.values[-1] > 20.0 * sweep.values[0]:
             axes.set_xscale("log")
     for axes in grid[-columns:]:
-        axes.set_xlabel(sweep.parameter)
+        axes.set_xlabel(as_text(sweep.parameter))
     for axes in grid[len(names) :]:
         axes.set_visible(False)
     legend_above(figure, grid[0])
@@ -185,7 +196,7 @@ def plot_bands(ensemble: Ensemble) -> Figure:
         for axes in row:
             axes.set_ylabel(with_unit(f"error of {signal}" if error else signal, unit))
     for axes, plan in zip(rows[0], nominal.plans, strict=True):
-        axes.set_title(plan, fontsize=9)
+        axes.set_title(as_text(plan), fontsize=9)
     for axes in rows[-1]:
         axes.set_xlabel("time [s]")
     legend_above(figure, rows[0][0])
@@ -198,19 +209,19 @@ def plot_plane(sweep: Sweep) -> Figure:
     styles = line_styles(sweep.metrics)
     figure = new_figure(6.8, 5.2)
     ((axes,),) = stacked_axes(figure, 1)
+    numbered = _NUMBERED if _of_the_paper(sweep) else {}
     for plan, rows in sweep.metrics.items():
         ts, overshoot = rows["settling_time"], rows["overshoot_error"]
         x, gap = _with_gaps(sweep.values, ts)
         colour = styles[plan]["color"]
         axes.plot(gap, np.interp(x, sweep.values, overshoot), linewidth=1.0, **{**styles[plan], "linestyle": "-"})
         axes.plot(ts, overshoot, ".", color=colour, markersize=2.5)
-        if plan not in _NUMBERED:
-            continue  # beside the trigonometric one: the numbers would overprint
-        for gain, offset in _NUMBERED[plan].items():
+        # Only a few plans are numbered, or the numbers would overprint.
+        for gain, offset in numbered.get(plan, {}).items():
             at = int(np.argmin(np.abs(sweep.values - gain)))
             axes.plot(ts[at], overshoot[at], "o", color=colour, mfc="white", markersize=5, zorder=4)
             axes.annotate(
-                f"{gain:g}",
+                f"{sweep.values[at]:.4g}",
                 (ts[at], overshoot[at]),
                 xytext=offset,
                 textcoords="offset points",
@@ -220,14 +231,25 @@ def plot_plane(sweep: Sweep) -> Figure:
                 va="center",
                 arrowprops={"arrowstyle": "-", "color": colour, "linewidth": 0.5, "shrinkA": 1, "shrinkB": 3},
             )
-    axes.plot(*STEP_LIMIT, "*", color="#E69F00", markersize=13, label="limit of the step, k → ∞", zorder=5)
+    if numbered:
+        axes.plot(*STEP_LIMIT, "*", color="#E69F00", markersize=13, label="limit of the step, k → ∞", zorder=5)
+        axes.set_title("numbers at the circles: gain k", loc="left", fontsize=8)
     axes.set_xlabel("settling time ±2 % [s]")
     axes.set_ylabel("overshoot on the error [%]")
     axes.set_xlim(left=0.0)
     axes.set_ylim(-4.0, 108.0)
-    axes.set_title("numbers at the circles: gain k", loc="left", fontsize=8)
     legend_above(figure, axes)
     return figure
+
+
+def _of_the_paper(sweep: Sweep) -> bool:
+    """Whether a sweep is of the paper's loop, k/(s (s + 1)) in unity feedback, of which gains and limit are known."""
+    found = sweep.metrics.get("step", {}).get("overshoot_error")
+    swings = sweep.values > 0.25
+    if found is None or not swings.any():
+        return False
+    known = 100.0 * np.exp(-np.pi / np.sqrt(4.0 * sweep.values[swings] - 1.0))
+    return bool(np.all(np.abs(found[swings] - known) < 0.1))
 
 
 # Where the gains of the table stand beside their circles, in points.
@@ -310,7 +332,7 @@ def _derivative_label(unit: str, order: int, name: str = "") -> str:
     word = DERIVATIVES[order] if order < len(DERIVATIVES) else f"derivative {order}"
     suffix = ("" if order == 0 else "/s" if order == 1 else f"/s$^{order}$") if unit or order else ""
     label = f"{name} {word}".strip() if name not in ("", "y") else word
-    return with_unit(label, f"{unit or '1'}{suffix}" if suffix or unit else "")
+    return with_unit(label, (unit or "1") if suffix or unit else "", suffix)
 
 
 def _common(units: Any) -> str:

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-import errno
+import base64
+import contextlib
+import hashlib
 import json
 import math
 import os
 import platform
 import re
-import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from functools import cache
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -19,11 +21,12 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescap
 from markupsafe import Markup
 
 import ctrlplan
+from ctrlplan import _files
 from ctrlplan.planning import Fastest
 from ctrlplan.reports.crane_figures import Wall, animation_data, is_crane, plot_curves
 from ctrlplan.reports.figures import FIGURES
 from ctrlplan.reports.planning_figures import plot_rivals
-from ctrlplan.reports.style import line_styles, to_svg
+from ctrlplan.reports.style import line_styles, slug, to_svg
 from ctrlplan.reports.words import number, summary, unit_in, unit_of, verdicts
 from ctrlplan.studies.comparison import Comparison
 from ctrlplan.studies.ensemble import Ensemble
@@ -77,35 +80,40 @@ def write_report(studies: Sequence[Study], folder: str | os.PathLike[str], title
     )
 
 
-def write_all(texts: dict[Path, str]) -> list[Path]:
-    """Write files all or none: each beside its place first, then moved there."""
-    staged: list[tuple[str, Path]] = []
+def write_all(texts: Mapping[Path, str]) -> list[Path]:
+    """Write files, of which none is replaced before all are on the disk; their folders are made if need be.
+
+    Raises
+    ------
+    OSError
+        If one cannot be written; nothing is left behind.
+    """
+    contents: dict[_files.PathLike, str | bytes] = dict(texts.items())
+    made: list[Path] = []
     try:
         for path in texts:
-            if path.is_dir():
-                raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
-        for path, text in texts.items():
-            path.parent.mkdir(parents=True, exist_ok=True)
-            handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-            staged.append((name, path))
-            with os.fdopen(handle, "w", encoding="utf-8") as file:
-                file.write(text)
-            os.chmod(name, 0o644)
-        for name, path in staged:
-            os.replace(name, path)
-    except OSError:
-        for name, _ in staged:
-            Path(name).unlink(missing_ok=True)
+            missing = [folder for folder in path.parents if not folder.exists()]
+            for folder in reversed(missing):
+                folder.mkdir(exist_ok=True)
+                made.append(folder)
+        _files.write_all(contents)
+    except BaseException:  # an interruption as well
+        for folder in reversed(made):
+            with contextlib.suppress(OSError):  # somebody else has written there
+                folder.rmdir()
         raise
-    return [path for _, path in staged]
+    return list(texts)
 
 
 def render_page(studies: Sequence[Study], title: str) -> str:
     """The page as text."""
+    script = _script("sort.js.html") + _script("animation.js.html")
     return _template("page.html").render(
         title=title,
-        sections=[_section(study) for study in studies],
+        sections=[_section(study, key) for study, key in zip(studies, _keys(studies), strict=True)],
         versions=_versions(),
+        script=script,
+        policy=_policy(script),
     )
 
 
@@ -128,11 +136,12 @@ class CraneAnimation:
     def __init__(self, comparison: Comparison, wall: Wall = None) -> None:
         if not is_crane(comparison):
             raise ValueError("an animation must be of a comparison of cranes, got one without D, R and theta")
-        self._data = Markup(animation_data(comparison, wall))  # noqa: S704
+        self._data = animation_data(comparison, wall)
         self._name = f"crane{abs(hash(self._data)):x}"
 
     def _repr_html_(self) -> str:
-        return str(_template("animation.html").module.crane_animation(self._name, self._data))
+        drawing = _template("animation.html").module.crane_animation(self._name, self._data)
+        return f"{drawing}<script>{_script('animation.js.html')}</script>"
 
 
 def comparison_fragment(comparison: Comparison) -> str:
@@ -144,27 +153,77 @@ def comparison_fragment(comparison: Comparison) -> str:
 
 
 def _template(name: str) -> Any:
-    environment = Environment(
+    return _environment().get_template(name)
+
+
+@cache
+def _environment() -> Environment:
+    return Environment(
         loader=PackageLoader("ctrlplan.reports", "templates"),
         autoescape=select_autoescape(),
+        finalize=_readable,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    return environment.get_template(name)
 
 
-def _section(study: Study) -> dict[str, Any]:
+# Control characters, overrides of the direction of writing, halves of surrogate pairs (of file names), no characters.
+_UNREADABLE = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udfff\ufffe\uffff]")
+
+
+def _readable(value: Any) -> Any:
+    """What is put into the page: of a text every character that can be seen and written."""
+    return _UNREADABLE.sub("\N{REPLACEMENT CHARACTER}", value) if type(value) is str else value
+
+
+def _script(name: str) -> Markup:
+    """A script of the page, which has no names in it: what it works on stands in the elements as text."""
+    loader = _environment().loader
+    assert loader is not None  # noqa: S101 (for the type)
+    return Markup(loader.get_source(_environment(), name)[0])  # noqa: S704 (our own script)
+
+
+def _policy(script: str) -> str:
+    """Content security policy of the page: its own script and styles, and nothing from outside."""
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    return (
+        f"default-src 'none'; script-src 'sha256-{digest}'; style-src 'unsafe-inline'; img-src data:; "
+        "base-uri 'none'; form-action 'none'"
+    )
+
+
+def _keys(studies: Sequence[Study]) -> list[str]:
+    """Ids of the sections: the studies' names as far as an id can hold them; no id of the page stands twice."""
+    keys: list[str] = []
+    taken: set[str] = set()
+    for study in studies:
+        stem = key = slug(study.name)
+        count = 1
+        while not taken.isdisjoint(_ids(key, study)):
+            count += 1
+            key = f"{stem}-{count}"
+        keys.append(key)
+        taken.update(_ids(key, study))
+    return keys
+
+
+def _ids(name: str, study: Study) -> list[str]:
+    """Ids of a section, its own the first, and of the figures in it."""
+    return [name, *(f"{name}-{key}" for key in study.figures)]
+
+
+def _section(study: Study, name: str) -> dict[str, Any]:
     comparison = study.comparison
     figures = []
     for key in study.figures:
         draw, caption = FIGURES[key]
-        svg = to_svg(draw(study), re.sub(r"[^\w-]+", "-", f"{study.name}-{key}"))
+        svg = to_svg(draw(study), f"{name}.{key}")
         if draw is plot_curves:
             caption = study.curves[0].caption
         figures.append({"key": key, "svg": Markup(svg), "caption": caption})  # noqa: S704 (our own drawing)
     return {
-        "name": re.sub(r"[^\w-]+", "-", study.name) or "study",
+        "name": name,
         "title": study.title,
         "summary": study.summary,
         "notes": study.notes,
@@ -173,17 +232,18 @@ def _section(study: Study) -> dict[str, Any]:
         "table": _table(comparison),
         "spread": _spread(study.ensemble),
         "figures": figures,
-        "animation": Markup(animation_data(comparison, study.wall)) if is_crane(comparison) else "",  # noqa: S704
+        "animation": animation_data(comparison, study.wall) if is_crane(comparison) else "",
         "marks": comparison.marks,
+        "failures": comparison.failures,
         "parameters": {k: str(v) for k, v in comparison.parameters.items()},
-        "worth": None if comparison.worth is None else _worth(comparison.worth, study.name),
+        "worth": None if comparison.worth is None else _worth(comparison.worth, name),
         "claim": study.claim,
         "grids": [_grid(grid, grid.unit) for grid in study.grids],
-        "fastest": None if study.fastest is None else _fastest(study.fastest, study),
+        "fastest": None if study.fastest is None else _fastest(study.fastest, study, name),
     }
 
 
-def _fastest(found: Fastest, study: Study) -> dict[str, Any]:
+def _fastest(found: Fastest, study: Study, name: str) -> dict[str, Any]:
     """The section on a plan as fast as limits allow."""
     units = study.comparison.units
     return {
@@ -201,7 +261,7 @@ def _fastest(found: Fastest, study: Study) -> dict[str, Any]:
             }
             for row in found.margins
         ],
-        "svg": Markup(to_svg(found.plot(units), f"{study.name}-fastest")),  # noqa: S704 (our own drawing)
+        "svg": Markup(to_svg(found.plot(units), f"{name}.fastest")),  # noqa: S704 (our own drawing)
         "caption": "Every limited signal of the fastest plan, and where it comes nearest to its limits (dashed).",
     }
 
@@ -213,7 +273,7 @@ def _worth(worth: Worth, name: str) -> dict[str, Any]:
         "verdicts": worth.verdicts,
         "alpha": f"{worth.alpha:.4g}",
         "note": worth.note,
-        "svg": Markup(to_svg(plot_rivals(worth.comparison), f"{name}-worth")),  # noqa: S704 (our own drawing)
+        "svg": Markup(to_svg(plot_rivals(worth.comparison), f"{name}.worth")),  # noqa: S704 (our own drawing)
         "caption": "References through the same waypoints in the same time, what the loop makes of them, and what "
         "that asks of its controls.",
         "table": _table(worth.comparison),

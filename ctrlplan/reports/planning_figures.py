@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ctrlplan.planning import AlphaChoice
 from ctrlplan.planning.limits import Limited
-from ctrlplan.reports.style import house_style, legend_above, line_styles, new_figure, stacked_axes, with_unit
+from ctrlplan.reports.style import as_text, house_style, legend_above, line_styles, new_figure, stacked_axes, with_unit
 from ctrlplan.studies.comparison import Comparison
 from ctrlplan.trajectories import Trajectory
 
@@ -34,7 +34,7 @@ def plot_alpha_choice(choice: AlphaChoice) -> Figure:
     if choice.blow_up < 2.0 * np.pi:
         axes.axvspan(choice.blow_up, 2.0 * np.pi, color="#dddddd", label="blows up")
     axes.set_xlabel("alpha [rad] (0: polynomial)")
-    axes.set_ylabel(choice.objective.replace("_", " "))
+    axes.set_ylabel(as_text(choice.objective.replace("_", " ")))
     legend_above(figure, axes)
     return figure
 
@@ -58,7 +58,7 @@ def plot_limits(plan: Trajectory, limited: Limited, units: Mapping[str, str] | N
             if np.isfinite(side) and min(abs(side - row.min()), abs(side - row.max())) < 1.5 * span:
                 axes.axhline(side, color=_LIMIT, linestyle=(0, (4, 2)), linewidth=1.0)
         axes.set_ylabel(with_unit(bound.name, (units or {}).get(bound.name)))
-        axes.set_title(f"{bound.range}; {margin.room}", loc="left", fontsize=8)
+        axes.set_title(as_text(f"{bound.range}; {margin.room}"), loc="left", fontsize=8)
     rows[-1].set_xlabel("time [s]")
     return figure
 

@@ -6,7 +6,7 @@ import io
 import re
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from functools import wraps
+from functools import cache, wraps
 from itertools import cycle
 from typing import Any, ParamSpec
 
@@ -14,6 +14,7 @@ import matplotlib as mpl
 import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.font_manager import FontProperties, findfont, get_font
 
 P = ParamSpec("P")
 
@@ -62,7 +63,7 @@ def line_styles(names: Iterable[str]) -> dict[str, dict[str, Any]]:
         styles[name] = {
             "color": COLOURS.get(name) or next(spare),
             "linestyle": dashes,
-            "label": name,
+            "label": legend_label(name),
             "zorder": 2.0 if dashes == "-" else 2.5,
         }
     return styles
@@ -101,22 +102,61 @@ def stacked_axes(figure: Figure, rows: int, columns: int = 1, sharex: bool = Tru
 
 
 def legend_above(figure: Figure, axes: Axes) -> None:
-    """One legend above all axes, where it hides no curve."""
+    """One legend above all axes, where it hides no curve; labels are those of `legend_label`."""
     handles, labels = axes.get_legend_handles_labels()
     if handles:
-        fit = int(11 * figure.get_figwidth() / (max(map(len, labels)) + 6))  # of about eleven letters an inch
-        figure.legend(
-            handles, labels, loc="outside upper center", ncols=max(1, min(len(labels), 5, fit)), frameon=False
+        names = [letters(label.removeprefix(_HIDDEN)) for label in labels]
+        fit = int(11 * figure.get_figwidth() / (max(map(len, names)) + 6))  # of about eleven letters an inch
+        legend = figure.legend(
+            handles, labels, loc="outside upper center", ncols=max(1, min(len(names), 5, fit)), frameon=False
         )
+        for text, name in zip(legend.get_texts(), names, strict=True):
+            text.set_parse_math(False)
+            text.set_text(name)
 
 
-def with_unit(name: str, unit: str | None) -> str:
-    """Label of an axis: name [unit]."""
-    return f"{name} [{unit}]" if unit else name
+_HIDDEN = "\N{WORD JOINER}"
 
 
-def to_svg(figure: Figure, salt: str) -> str:
-    """Figure as an SVG element to stand in a page; `salt` keeps its ids apart from others'."""
+def legend_label(name: str) -> str:
+    """Label of a curve for the legend: matplotlib leaves out empty ones, and those that begin with an underscore."""
+    return _HIDDEN + name if not name or name.startswith("_") else name
+
+
+_LONGEST = 60
+
+
+def letters(text: str) -> str:
+    """Text of a user as the font of the figures can write it.
+
+    Line breaks become blanks; control characters, and letters that the font
+    lacks, become their code points; the middle of a very long text is left out.
+    """
+    if len(text) > _LONGEST:
+        text = f"{text[: _LONGEST // 2]} … {text[-_LONGEST // 3 :]}"
+    return "".join(c if ord(c) in _glyphs() else " " if c.isspace() else f"<U+{ord(c):04X}>" for c in text)
+
+
+def as_text(text: str) -> str:
+    """Text of a user for a label or a title, in which matplotlib finds no formula."""
+    return letters(text).replace("$", r"\$")
+
+
+@cache
+def _glyphs() -> frozenset[int]:
+    """Code points that the font of the figures has."""
+    with _house_settings():
+        return frozenset(get_font(findfont(FontProperties())).get_charmap())
+
+
+def with_unit(name: str, unit: str | None, power: str = "") -> str:
+    """Label of an axis: name [unit], both a user's text; `power` is ours and may be a formula."""
+    return f"{as_text(name)} [{as_text(unit or '')}{power}]" if unit or power else as_text(name)
+
+
+def to_svg(figure: Figure, key: str) -> str:
+    """Figure as an SVG element to stand in a page; `key` keeps its ids apart from others'."""
+    salt = re.sub(r"[^\w.-]+", "-", key)
     buffer = io.StringIO()
     with _house_settings(**{"svg.hashsalt": salt}):
         figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
@@ -124,3 +164,8 @@ def to_svg(figure: Figure, salt: str) -> str:
     text = buffer.getvalue()
     # Several drawings stand in one page: what they define must be their own.
     return re.sub(r'(\bid="|url\(#|href="#)', rf"\g<1>{salt}-", text[text.index("<svg") :])
+
+
+def slug(name: str) -> str:
+    """Name as a part of an id: letters, digits, hyphens and underscores alone."""
+    return re.sub(r"[^\w-]+", "-", name) or "study"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass
 
 from ctrlplan.studies.comparison import Comparison
@@ -85,11 +86,11 @@ def unit_in(comparison: Comparison, unit: str) -> str:
     first = next(iter(comparison.plans.values()))
     y = _shared([comparison.units.get(label, "") for label in first.labels])
     u = _shared([comparison.units.get(name, "") for name in comparison.controls])
-    if "{y}" in unit:
-        unit = unit.replace("{y}", y) if y else ""
-    if "{u}" in unit:
-        unit = unit.replace("{u}", u) if u else ""
-    return unit.replace("^2", "²").replace("^5", "⁵")
+    known = {"{y}": y, "{u}": u}
+    if any(name in unit and not stands_for for name, stands_for in known.items()):
+        return ""
+    # At once, since what stands for one of them is a user's text.
+    return re.sub(r"\{[yu]\}", lambda name: known[name[0]], unit.replace("^2", "²").replace("^5", "⁵"))
 
 
 def number(value: float, unit: str = "") -> str:

@@ -13,7 +13,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ctrlplan._files import write_text
 from ctrlplan.simulation import Event, Occurrence, rest_state, simulate, state_space, stated_start, unstable_poles
+from ctrlplan.studies.limits import limits_of
 from ctrlplan.studies.measures import MEASURES, Measure, control_metrics, path_metrics, response_metrics
 from ctrlplan.trajectories import PiecewiseSpline, PolySpline, Step, Trajectory, TrigSpline, Waypoint
 
@@ -57,6 +59,10 @@ class Comparison:
         How the metrics are called, in the order in which they are shown.
     worth : Worth or None
         The planned reference beside its rivals, where that was asked for.
+    failures : dict of str to str
+        Plans that could not be run, and why: they are in no other entry.
+    limits : dict of str to dict of str to (float, float)
+        Plan, output, (minimum, maximum): what actuators of its loop declare.
     """
 
     plans: dict[str, Trajectory]
@@ -72,9 +78,12 @@ class Comparison:
     marks: dict[str, str] = field(default_factory=dict)
     measures: dict[str, Measure] = field(default_factory=lambda: dict(MEASURES))
     worth: Worth | None = None
+    failures: dict[str, str] = field(default_factory=dict)
+    limits: dict[str, dict[str, tuple[float, float]]] = field(default_factory=dict)
 
     def __repr__(self) -> str:
-        return f"<Comparison of {', '.join(self.plans)}: {self.title}>"
+        failed = f" ({', '.join(self.failures)} failed)" if self.failures else ""
+        return f"<Comparison of {', '.join(self.plans)}{failed}: {self.title}>"
 
     def to_pandas(self) -> pd.DataFrame:
         """Metrics as a table, one row a metric, one column a plan."""
@@ -88,15 +97,16 @@ class Comparison:
             plan: {"metrics": {name: finite_or_none(value) for name, value in found.items()}}
             for plan, found in self.metrics.items()
         }
-        return {"plans": plans} | ({"worth": self.worth.results()} if self.worth is not None else {})
+        failed = {"failures": dict(self.failures)} if self.failures else {}
+        return {"plans": plans} | failed | ({"worth": self.worth.results()} if self.worth is not None else {})
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write metrics, plans and parameters as JSON."""
+        """Write metrics, plans and parameters as JSON, whole or not at all."""
         data = self.results()
         for name, plan in self.plans.items():
             data["plans"][name]["trajectory"] = plan.to_dict()
         data |= {"title": self.title, "parameters": {k: str(v) for k, v in self.parameters.items()}}
-        Path(path).write_text(json.dumps(data, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        write_text(path, json.dumps(data, indent=1, allow_nan=False) + "\n")
 
     def marked(self, marks: Mapping[str, str]) -> Comparison:
         """Same comparison with reservations about some plans."""
@@ -210,6 +220,9 @@ def compare(
         If there is no plan, plans differ in axes, or an output is unknown.
     TypeError
         If a plan is not a trajectory.
+    Exception
+        What the first plan's run raised, where no plan can be run. Where others
+        can be, it is recorded in `Comparison.failures`, and they are kept.
 
     Examples
     --------
@@ -228,12 +241,19 @@ def compare(
     first = next(iter(references.values()))
     times = np.asarray(timepts, dtype=float)
     start = min(plan.start for plan in references.values()) if start is None else start
-    responses, found, unstable = {}, {}, np.empty(0, dtype=complex)
+    responses: dict[str, Any] = {}
+    found: dict[str, dict[str, float]] = {}
+    tracked: tuple[str, ...] = ()
+    acting: tuple[str, ...] = ()
+    unstable = np.empty(0, dtype=complex)
     stopped: dict[str, Occurrence] = {}
+    limits: dict[str, dict[str, tuple[float, float]]] = {}
     builds = is_builder(loop)
     if not builds:
         check_has_inputs(loop)
-    for name, plan in references.items():
+
+    def run(name: str, plan: Trajectory) -> None:
+        nonlocal tracked, acting, unstable
         system = state_space(loop(name, plan) if builds else loop)
         tracked, acting = tracked_outputs(system, outputs, first), acting_outputs(system, controls)
         response = simulate(
@@ -256,8 +276,12 @@ def compare(
                 values |= {key: np.inf for key in values if "settling_time" in key}
             if acting:
                 values |= control_metrics(times, signals[acting_rows], start, acting, only)
-        responses[name] = response
         found[name] = values | (path_metrics(plan, points) if only is None else {})
+        responses[name], limits[name] = response, limits_of(system)
+
+    failures = _each(run, references)
+    references = {name: plan for name, plan in references.items() if name not in failures}
+    stopped = {name: event for name, event in stopped.items() if name not in failures}
     beside = None
     if not isinstance(worth, bool | Mapping):
         raise TypeError(f"worth must be True, False or a mapping of choices, got {worth!r}")
@@ -292,11 +316,26 @@ def compare(
         title=title,
         parameters=dict(parameters or {})
         | ({} if only is not None and not only else {"settling band": f"{100 * band:g} %"}),
-        notes=(*_notes(unstable, found), *_notes_of_events(responses, stopped)),
+        notes=(*_notes(unstable, found), *_notes_of_events(responses, stopped), *_notes_of_failures(failures)),
         marks={name: f"the run was ended: {event}" for name, event in stopped.items()},
         measures=dict(measures or {}) | MEASURES,
         worth=beside,
+        failures=failures,
+        limits=limits,
     )
+
+
+def all_run(found: Comparison) -> Comparison:
+    """The same comparison, where every plan could be run.
+
+    Raises
+    ------
+    RuntimeError
+        If one could not, with its reason.
+    """
+    if found.failures:
+        raise RuntimeError("; ".join(f"{plan} could not be run: {reason}" for plan, reason in found.failures.items()))
+    return found
 
 
 def references_of(plans: Mapping[str, Trajectory] | Iterable[Waypoint], alpha: float = 1.0) -> dict[str, Trajectory]:
@@ -397,6 +436,30 @@ def _notes_of_events(responses: Mapping[str, Any], stopped: Mapping[str, Occurre
         if left:
             notes.append(f"With {plan}, {', '.join(left)}{ended}.")
     return tuple(notes)
+
+
+def _notes_of_failures(failures: Mapping[str, str]) -> tuple[str, ...]:
+    return tuple(f"{plan} could not be run and is left out: {reason}" for plan, reason in failures.items())
+
+
+def _each(run: Callable[[str, Trajectory], None], references: Mapping[str, Trajectory]) -> dict[str, str]:
+    """Run every plan; those that fail, and why. An error that meets all of them is raised."""
+    errors: dict[str, Exception] = {}
+    for name, plan in references.items():
+        try:
+            run(name, plan)
+        except Exception as error:  # whatever a loop does with this plan
+            errors[name] = error
+    if len(errors) == len(references):
+        raise next(iter(errors.values()))
+    return {name: _reason(error) for name, error in errors.items()}
+
+
+def _reason(error: Exception) -> str:
+    """Message of an error in one line; with its type where the message alone says little."""
+    told = " ".join(str(error).split())
+    speaks = told and isinstance(error, ValueError | TypeError | RuntimeError)
+    return told if speaks else f"{type(error).__name__}: {told}".rstrip(": ")
 
 
 def finite_or_none(value: float) -> float | None:

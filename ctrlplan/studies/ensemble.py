@@ -18,6 +18,7 @@ from ctrlplan.simulation import Prepared, SolverError, prepare
 from ctrlplan.simulation.prepared import NotCompiledError
 from ctrlplan.studies.comparison import (
     Comparison,
+    all_run,
     check_has_inputs,
     compare,
     finite_or_none,
@@ -387,7 +388,7 @@ def _nominal(
     """The loop with its own parameters; or, where that does not run, with those of the first draw that does."""
 
     def compared(params: dict[str, float] | None) -> Comparison:
-        return compare(_given(forms), references, times, params=params, **settings)
+        return all_run(compare(_given(forms), references, times, params=params, **settings))
 
     own = tried(compared, None, timeout)
     if not isinstance(own, Failed):

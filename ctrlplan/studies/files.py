@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import inspect
 import io
 import json
 import math
@@ -14,8 +15,10 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass, field, fields
 from functools import partial
 from pathlib import Path
-from typing import Any
+from types import UnionType
+from typing import Any, Union, get_args, get_origin
 
+import control as ct
 import numpy as np
 from numpy.typing import NDArray
 
@@ -38,7 +41,13 @@ LOOPS = {
     "linear": ("num", "den", "gain"),
     "crane": ("law", "force_limits", "torque_limits", *(entry.name for entry in fields(Crane))),
 }
-"""Kinds of loops by name, and the entries that each takes; and "python:module:function"."""
+"""Kinds of loops by name, and the entries that each takes.
+
+Besides, "python:module:function": a function beside the study file or of an
+installed package, which takes nothing and is declared to return a loop by its
+return annotation, ``def build() -> control.InputOutputSystem``. A study file
+that names one is code: whoever runs the study runs the module.
+"""
 
 
 _CRANE_ENTRIES = tuple(entry.name for entry in fields(Crane))
@@ -46,6 +55,9 @@ _CRANE_ENTRIES = tuple(entry.name for entry in fields(Crane))
 
 class StudyError(ValueError):
     """A study file is wrong: one line says what must hold, what was given and where."""
+
+    def __init__(self, message: object) -> None:
+        super().__init__(_one_line(str(message)))
 
 
 @dataclass(frozen=True)
@@ -95,20 +107,23 @@ class StudyFile:
         """
         loop = build_loop(self.loop, self.path)
         try:
-            comparison = compare(
-                loop,
-                self.plans,
-                self.timepts(loop),
-                waypoints=self.waypoints,
-                units=self.units,
-                title=self.title,
-                parameters=self.parameters(),
-                **{"worth": self.worth} | self._crane_options(),
-            )
+            with np.errstate(over="ignore", invalid="ignore"):  # a run that leaves all bounds says so itself
+                comparison = compare(
+                    loop,
+                    self.plans,
+                    self.timepts(loop),
+                    waypoints=self.waypoints,
+                    units=self.units,
+                    title=self.title,
+                    parameters=self.parameters(),
+                    **{"worth": self.worth} | self._crane_options(),
+                )
         except StudyError:
             raise
-        except (ValueError, TypeError) as error:
+        except (ValueError, TypeError, RuntimeError) as error:
             raise StudyError(f"{self.path}: loop: {error}") from error
+        except Exception as error:  # whatever a loop of the user's own raises with every plan
+            raise StudyError(f"{self.path}: loop: must run, got {type(error).__name__}: {error}") from error
         if self.loop["kind"] != "crane":
             return Study(self.name, self.title, comparison, notes=comparison.notes)
         figures = ("crane-plane", "plans", "crane-time", "crane-motion")
@@ -145,6 +160,8 @@ class StudyFile:
         start = self.waypoints[0].time
         if getattr(loop, "dt", None):
             period = 1.0 if loop.dt is True else float(loop.dt)
+            count = (self.t_end - start) / period
+            _check_memory(count, len(self.plans), self.worth, f"{self.path}: t_end: periods of {period:g} s")
             return start + period * np.arange(int((self.t_end - start) / period * (1 + 1e-12)) + 1, dtype=float)
         return np.union1d(np.linspace(start, self.t_end, self.samples), [w.time for w in self.waypoints])
 
@@ -180,14 +197,7 @@ def load_study(path: str | os.PathLike[str]) -> StudyFile:
         With one line: what must hold, what was given, where.
     """
     source = Path(path)
-    try:
-        data = tomllib.loads(source.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise StudyError(f"{source}: a study file must exist, got no such file") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise StudyError(f"{source}: a study file must be readable, got {error}") from None
-    except tomllib.TOMLDecodeError as error:
-        raise StudyError(f"{source}: must be valid TOML, got {error}") from None
+    data = _parsed(source)
     reader = _Reader(source)
     reader.known(data, ("title", "t_end", "samples", "worth", "units", "loop", "plans", "waypoints"), "the file")
     waypoints = reader.waypoints(data)
@@ -197,23 +207,65 @@ def load_study(path: str | os.PathLike[str]) -> StudyFile:
     loop = reader.table(data, "loop")
     _checked_loop(loop, reader)
     samples = reader.number(data, "samples", "samples", default=4001.0)
-    if samples != int(samples) or not 2 <= samples <= 10_000_000:
-        raise reader.error("samples", f"must be a whole number from 2 to 10000000, got {samples:g}")
+    if samples != int(samples) or samples < 2:
+        raise reader.error("samples", f"must be a whole number, 2 or more, got {samples:g}")
     title = data.get("title", source.stem)
     if not isinstance(title, str):
-        raise reader.error("title", f"must be a string, got {title!r}")
+        raise reader.error("title", f"must be a string, got {_got(title)}")
     worth = data.get("worth", False)
     if not isinstance(worth, bool):
-        raise reader.error("worth", f"must be true or false, got {worth!r}")
+        raise reader.error("worth", f"must be true or false, got {_got(worth)}")
     units = reader.table(data, "units", needed=False)
     for label, unit in units.items():
         if not isinstance(unit, str):
-            raise reader.error(f"units.{label}", f"must be a string, got {unit!r}")
+            raise reader.error(f"units.{label}", f"must be a string, got {_got(unit)}")
         known = [*(waypoints[0].labels or ()), "y", "u", "e"]
         if label not in known and loop["kind"] == "linear":
             raise reader.error(f"units.{label}", f"must be of one of {', '.join(known)}, got {label!r}")
     plans = reader.plans(data, waypoints)
+    _check_memory(samples, len(plans), worth, f"{source}: samples")
     return StudyFile(source, source.stem, title, t_end, int(samples), waypoints, plans, loop, units, worth)
+
+
+_MEMORY = 2.0**30
+"""Bytes that a run and its page may take, as far as the number of samples decides."""
+
+_BESIDE, _EACH, _RIVALS = 750, 450, 8
+"""Bytes a sample, as measured with a crane: once, and for each plan; and how many plans a benefit report adds."""
+
+
+def _check_memory(samples: float, plans: int, worth: bool, place: str) -> None:
+    """Raise where the samples of all plans would take more memory than a study may."""
+    each = _BESIDE + _EACH * (plans + _RIVALS * worth)
+    if samples * each > _MEMORY:
+        raise StudyError(
+            f"{place} must be at most {int(_MEMORY / each)} with {plans} plans, for about {_MEMORY / 1e9:.2g} GB of "
+            f"memory, got {samples:.12g}, for about {samples * each / 1e9:.2g} GB"
+        )
+
+
+_LARGEST = 2**24
+"""Bytes of a study file at most: it is written by hand."""
+
+
+def _parsed(source: Path) -> dict[str, Any]:
+    """Data of a TOML file."""
+    try:
+        with source.open("rb") as file:
+            content = file.read(_LARGEST + 1)
+        if len(content) > _LARGEST:
+            raise StudyError(f"{source}: a study file must have at most {_LARGEST} bytes, got more")
+        return tomllib.loads(content.decode("utf-8"))
+    except FileNotFoundError:
+        raise StudyError(f"{source}: a study file must exist, got no such file") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise StudyError(f"{source}: a study file must be readable, got {error}") from None
+    except StudyError:
+        raise
+    except RecursionError:
+        raise StudyError(f"{source}: must be valid TOML, got lists or tables nested too deep") from None
+    except ValueError as error:  # invalid TOML, or a number too long to read
+        raise StudyError(f"{source}: must be valid TOML, got {error}") from None
 
 
 def build_loop(table: dict[str, Any], path: Path) -> Any:
@@ -232,16 +284,48 @@ def build_loop(table: dict[str, Any], path: Path) -> Any:
             raise StudyError(f"{path}: loop: {error}") from None
     if kind == "crane":
         return _crane(table, path)
-    _, module, function = kind.split(":")
+    return _loop_of_module(kind, path)
+
+
+_SIGNATURE = "def build() -> control.InputOutputSystem:"
+
+
+def _loop_of_module(kind: str, path: Path) -> Any:
+    """Loop that a function of a module returns, called only where it is declared to return one."""
+    _, module, name = kind.split(":")
     try:
-        loop = getattr(_module(module, path.resolve().parent), function)()
-    except Exception as error:  # whatever a user's own module does must end in one line
-        reason = " ".join(f"{type(error).__name__}: {error}".split())
-        must = "must name a module and a function in it that takes nothing and returns a loop"
-        raise StudyError(f"{path}: loop.kind: {must}, got {kind!r}: {reason}") from None
+        if not all(part.isidentifier() for part in (*module.split("."), name)):
+            raise ValueError("module and function must be names, with dots between packages")
+        function = getattr(_module(module, path.resolve().parent), name)
+        _check_declared(function)
+        loop = function()
+    except (Exception, SystemExit) as error:  # whatever a user's own module does must end in one line
+        must = f"must name a module and a function in it, such as {_SIGNATURE}"
+        raise StudyError(
+            f"{path}: loop.kind: {must}, got {kind!r}: {type(error).__name__}: {_one_line(str(error), 300)}"
+        ) from None
     if not (hasattr(loop, "output_labels") and hasattr(loop, "ninputs")):
         raise StudyError(f"{path}: loop.kind: {kind!r} must return a control system, got {type(loop).__name__}")
     return loop
+
+
+def _check_declared(function: Any) -> None:
+    """Raise where a callable is not a function that takes nothing and is declared to return a control system."""
+    if inspect.isclass(function) or not inspect.isfunction(inspect.unwrap(function)):
+        raise TypeError(f"what is called must be a function of Python, got {type(function).__name__}")
+    try:
+        signature = inspect.signature(function, eval_str=True)
+    except NameError as error:
+        raise TypeError(f"its annotations must have a meaning where the module runs, got {error}") from None
+    spare = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+    needed = [p.name for p in signature.parameters.values() if p.default is p.empty and p.kind not in spare]
+    if needed:
+        raise TypeError(f"the function must take nothing, got one that needs {', '.join(needed)}")
+    declared = signature.return_annotation
+    kinds = get_args(declared) if isinstance(declared, UnionType) or get_origin(declared) is Union else (declared,)
+    if not all(inspect.isclass(kind) and issubclass(kind, ct.InputOutputSystem) for kind in kinds):
+        got = "none" if declared is signature.empty else declared
+        raise TypeError(f"its return annotation must be a class of control systems, got {got}")
 
 
 def _crane(table: dict[str, Any], path: Path) -> Callable[[str, Trajectory], Any]:
@@ -252,12 +336,12 @@ def _crane(table: dict[str, Any], path: Path) -> Callable[[str, Trajectory], Any
         raise StudyError(f"{path}: loop: {error}") from None
     law = table.get("law", "generator")
     if law not in LAWS:
-        raise StudyError(f"{path}: loop.law: must be one of {', '.join(LAWS)}, got {law!r}")
+        raise StudyError(f"{path}: loop.law: must be one of {', '.join(LAWS)}, got {_got(law)}")
 
     limits = {key: table[key] for key in ("force_limits", "torque_limits") if key in table}
     for key, pair in limits.items():
         if not (isinstance(pair, list) and len(pair) == 2 and all(map(_is_number, pair)) and pair[0] < pair[1]):
-            raise StudyError(f"{path}: loop.{key}: must be two increasing numbers, got {pair!r}")
+            raise StudyError(f"{path}: loop.{key}: must be two increasing numbers, got {_got(pair)}")
 
     def build(name: str, plan: Trajectory) -> Any:
         return crane_loop(crane, plan, "still" if plan.jumps(0) else law, **limits)
@@ -286,18 +370,22 @@ def plans_as_json(study: StudyFile) -> str:
 
 
 def plans_as_csv(study: StudyFile, order: int = 2) -> str:
-    """Samples of all plans as one table: time, then plan.axis with its derivatives."""
+    """Samples of all plans as one table: time, then plan.axis with its derivatives.
+
+    An apostrophe stands before names that a spreadsheet would take for a formula.
+    """
     times = np.linspace(study.waypoints[0].time, study.waypoints[-1].time, 1001)
     times = np.union1d(times, [w.time for w in study.waypoints])
     names, rows = ["time"], [times]
     for name, plan in study.plans.items():
-        names += [f"{name}.{signal}" for signal in signal_names(plan.labels, order)]
+        head = f"'{name}" if name.startswith(("=", "+", "-", "@", "\t", "\r")) else name
+        names += [f"{head}.{signal}" for signal in signal_names(plan.labels, order)]
         rows += list(signal_rows(plan, times, order))
     try:
         header = csv_header(names)
     except ValueError as error:
         raise StudyError(f"{study.path}: waypoints: {error}") from None
-    table = io.StringIO()
+    table = io.StringIO(newline="")
     np.savetxt(table, np.array(rows).T, fmt="%.17g", delimiter=",", header=header, comments="")
     return table.getvalue()
 
@@ -321,26 +409,26 @@ class _Reader:
         if found is None and not needed:
             return {}
         if not isinstance(found, dict):
-            raise self.error(key, f"must be a table [{key}], got {'none' if found is None else repr(found)}")
+            raise self.error(key, f"must be a table [{key}], got {'none' if found is None else _got(found)}")
         return found
 
     def tables(self, data: dict[str, Any], key: str) -> list[dict[str, Any]]:
         found = data.get(key, [])
         if not isinstance(found, list) or not all(isinstance(t, dict) for t in found):
-            raise self.error(key, f"must be tables [[{key}]], got {found!r}")
+            raise self.error(key, f"must be tables [[{key}]], got {_got(found)}")
         return found
 
     def number(self, table: dict[str, Any], key: str, place: str, default: float | None) -> float:
         value = table.get(key, default)
         if value is None or not _is_number(value):
-            raise self.error(place, f"must be a finite number, got {'none' if value is None else repr(value)}")
+            raise self.error(place, f"must be a finite number, got {'none' if value is None else _got(value)}")
         return float(value)
 
     def numbers(self, table: dict[str, Any], key: str, place: str, finite: bool = True) -> list[float]:
         value = table.get(key)
         if not isinstance(value, list) or not all(_is_number(v, finite) for v in value):
             kind = "finite numbers" if finite else "numbers"
-            raise self.error(place, f"must be a list of {kind}, got {'none' if value is None else repr(value)}")
+            raise self.error(place, f"must be a list of {kind}, got {'none' if value is None else _got(value)}")
         return [float(v) for v in value]
 
     def choice(self, table: dict[str, Any], key: str, place: str) -> Any:
@@ -350,11 +438,15 @@ class _Reader:
         return (self.numbers if isinstance(table[key], list) else partial(self.number, default=None))(table, key, place)
 
     def waypoints(self, data: dict[str, Any]) -> tuple[Waypoint, ...]:
+        loop = data.get("loop")
+        # A crane is measured in x and z, in whatever order a file has them.
+        first = ("x", "z") if isinstance(loop, dict) and loop.get("kind") == "crane" else ()
         points = []
         for i, table in enumerate(self.tables(data, "waypoints")):
             place = f"waypoints[{i}]"
             time = self.number(table, "time", f"{place}.time", default=None)
-            labels = [label for label in table if label != "time"]
+            labels = [label for label in first if label in table]
+            labels += [label for label in table if label not in ("time", *first)]
             jets = {label: self.numbers(table, label, f"{place}.{label}", finite=False) for label in labels}
             try:
                 points.append(Waypoint.from_jets(time, **jets))
@@ -371,10 +463,10 @@ class _Reader:
             place = f"plans[{i}]"
             family = table.get("family", table.get("name"))
             if not isinstance(family, str) or family not in FAMILIES:
-                raise self.error(f"{place}.family", f"must be one of {', '.join(FAMILIES)}, got {family!r}")
+                raise self.error(f"{place}.family", f"must be one of {', '.join(FAMILIES)}, got {_got(family)}")
             name = table.get("name", family)
             if not isinstance(name, str) or not name or name in plans:
-                raise self.error(f"{place}.name", f"must be a name of its own, got {name!r}")
+                raise self.error(f"{place}.name", f"must be a name of its own, got {_got(name)}")
             kind, choices = FAMILIES[family]
             self.known(table, ("name", "family", *choices), place)
             chosen = {key: self.choice(table, key, f"{place}.{key}") for key in choices if key in table}
@@ -397,7 +489,7 @@ def _checked_loop(loop: dict[str, Any], reader: _Reader) -> None:
         return
     if not isinstance(kind, str) or kind not in LOOPS:
         kinds = ", ".join([*LOOPS, '"python:module:function"'])
-        raise reader.error("loop.kind", f"must be one of {kinds}, got {kind!r}")
+        raise reader.error("loop.kind", f"must be one of {kinds}, got {_got(kind)}")
     reader.known(loop, ("kind", *LOOPS[kind]), "loop")
     if kind == "crane":
         build_loop(loop, reader.path)
@@ -406,6 +498,20 @@ def _checked_loop(loop: dict[str, Any], reader: _Reader) -> None:
         loop[key] = reader.numbers(loop, key, f"loop.{key}")
     loop["gain"] = reader.number(loop, "gain", "loop.gain", default=1.0)
     build_loop(loop, reader.path)
+
+
+def _got(value: object) -> str:
+    """A value in a message."""
+    try:
+        return _one_line(repr(value), 300)
+    except ValueError:  # of a whole number beyond all that Python prints
+        return f"a {type(value).__name__} too long to print"
+
+
+def _one_line(text: str, longest: int = 1500) -> str:
+    """Text in one line without control characters, its middle left out where it is long."""
+    line = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in " ".join(text.split()))
+    return line if len(line) <= longest else f"{line[: longest - 100]} … {line[-100:]}"
 
 
 def _is_number(value: object, finite: bool = True) -> bool:

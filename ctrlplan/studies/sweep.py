@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ctrlplan._checks import real_array
 from ctrlplan.studies.alike import Alike, Metrics
-from ctrlplan.studies.comparison import compare, finite_or_none, is_builder, references_of, waypoints_given
+from ctrlplan.studies.comparison import all_run, compare, finite_or_none, is_builder, references_of, waypoints_given
 from ctrlplan.studies.ensemble import Ensemble, Failure, ensemble
 from ctrlplan.studies.executing import Account, Failed, checked_executor, checked_timeout, executed, gathered, tried
 from ctrlplan.trajectories import Trajectory, Waypoint
@@ -245,7 +245,7 @@ def _swept(parameter: str, points: Array, account: Account[Metrics]) -> Sweep:
 
 def _metrics(given: dict[str, Any], loop: Any) -> Metrics:
     """Metrics of one loop."""
-    return compare(loop, **given).metrics
+    return all_run(compare(loop, **given)).metrics
 
 
 def _compared(build: Callable[[float], Any], given: dict[str, Any], value: float) -> Metrics:

@@ -134,9 +134,9 @@ def csv_header(names: list[str]) -> str:
     for name in names:
         if names.count(name) > 1:
             raise ValueError(f"columns must have names of their own, got {name!r} twice; rename an axis")
-    line = io.StringIO()
-    csv.writer(line, lineterminator="").writerow(names)
-    return line.getvalue()
+    line = io.StringIO(newline="")
+    csv.writer(line, lineterminator="\r\n").writerow(names)  # names with any of both are quoted then
+    return line.getvalue()[:-2]
 
 
 def column_names(plan: Trajectory, order: int) -> list[str]:

@@ -53,7 +53,7 @@ def _tables(value):
 
 
 def _key(key):
-    return json.dumps(key, ensure_ascii=False)
+    return json.dumps(key, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
 def _value(value):
@@ -72,5 +72,5 @@ def _value(value):
     if isinstance(value, dict):
         return f"{{{', '.join(f'{_key(k)} = {_value(v)}' for k, v in value.items())}}}"
     if isinstance(value, str):
-        return json.dumps(value, ensure_ascii=False)
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
     return repr(value)

@@ -44,6 +44,7 @@ def module(text, function="build"):
     return valid(loop={"kind": f"python:NAME:{function}"}, units={}), text
 
 
+DECLARED = "import control as ct\n\ndef build() -> ct.InputOutputSystem:\n"
 REST = [0.0, 0.0, 0.0]
 END = [20.0, 0.0, 0.0]
 BIG = 10**400
@@ -54,6 +55,13 @@ WRONG = {
     "not TOML to the end": ("title = [", ["TOML"]),
     "not TOML: a key twice": ("t_end = 1\nt_end = 2\n", ["TOML", "line 2"]),
     "not UTF-8": (b"title = '\xff\xfe'\n", []),
+    "not TOML: nested too deep": ("a = " + 100_000 * "[", ["TOML", "nested"]),
+    "not TOML: a number too long": (f"a = {'9' * 5000}\n", ["TOML"]),
+    "not TOML: zeros alone": (b"\x00" * 1000, ["TOML"]),
+    "larger than any study": (b"# " + b"x" * 2**24, ["16777216 bytes"]),
+    "a name of a million letters": (valid(**{"k" * 1_000_000: 1.0}), ["kkk", "…"]),
+    "a list of a million numbers": (valid(title=[0] * 1_000_000), ["title", "…"]),
+    "a name that writes on the screen": (valid(**{"\x1b[2J\x07": 1.0}), ["x1b[2J"]),
     "empty": ("", ["waypoint"]),
     # Unknown keys, at every level
     "unknown key": (valid(tile="Over the wall"), ["tile"]),
@@ -162,6 +170,8 @@ WRONG = {
     "one sample": (valid(samples=1), ["samples", "1"]),
     "half a sample": (valid(samples=100.5), ["samples", "100.5"]),
     "samples in words": (valid(samples="many"), ["samples", "'many'"]),
+    "samples for gigabytes": (valid(samples=1e7), ["samples", "at most", "GB of memory", "got 10000000"]),
+    "number longer than Python prints": (f"samples = 0x{'F' * 5000}\n" + to_toml(without("samples")), ["samples"]),
     "samples without end": (valid(samples=10**9), ["samples", "1"]),
     "title is a number": (valid(title=3), ["title", "3"]),
     "worth in words": (valid(worth="yes"), ["worth", "'yes'"]),
@@ -203,15 +213,19 @@ WRONG = {
     "no such function": (module("def other(): pass\n"), ["loop.kind", "build"]),
     "module with a mistake": (module("def build(:\n"), ["loop", "NAME"]),
     "module that fails": (module("1 / 0\n"), ["loop", "NAME"]),
-    "function that fails": (module("def build():\n    raise RuntimeError('no\\nplant')\n"), ["loop", "NAME"]),
-    "function that wants more": (module("def build(gain): pass\n"), ["loop", "NAME"]),
+    "function that fails": (
+        module(f"{DECLARED}    raise RuntimeError('no\\nplant')\n"),
+        ["loop", "NAME", "no plant"],
+    ),
+    "function that ends Python": (module(f"{DECLARED}    raise SystemExit(0)\n"), ["loop", "NAME", "SystemExit"]),
+    "module that ends Python": (module("raise SystemExit(0)\n"), ["loop", "NAME", "SystemExit"]),
+    "function that says too much": (module(f"{DECLARED}    raise ValueError('x' * 100_000)\n"), ["loop", "NAME"]),
+    "function that wants more": (module(DECLARED.replace("()", "(gain)") + "    pass\n"), ["NAME", "needs gain"]),
     "no function": (module("build = 3\n"), ["loop", "NAME"]),
-    "function without a loop": (module("def build(): return None\n"), ["loop", "NAME"]),
-    "function without its data": (module("def build():\n    return open('nowhere.csv')\n"), ["loop", "nowhere.csv"]),
+    "function without a loop": (module(f"{DECLARED}    return None\n"), ["loop", "NAME", "NoneType"]),
+    "function without its data": (module(f"{DECLARED}    return open('nowhere.csv')\n"), ["loop", "nowhere.csv"]),
     "loop of other axes": (
-        module(
-            "import control as ct\n\ndef build():\n    return ct.ss([[-1.0]], [[1.0, 1.0]], [[1.0]], [[0.0, 0.0]])\n"
-        ),
+        module(f"{DECLARED}    return ct.ss([[-1.0]], [[1.0, 1.0]], [[1.0]], [[0.0, 0.0]])\n"),
         ["loop", "axes"],
     ),
 }
@@ -265,6 +279,8 @@ def test_report_refuses_it_in_one_line(name, wrong, capsys, tmp_path):
     assert line.startswith("ctrlplan: ")
     assert "study.toml" in line
     assert RULE.search(line), line
+    assert len(line) < 2000
+    assert line.isprintable()
     for part in mentions:
         assert part in line
     assert not (tmp_path / "out").exists()

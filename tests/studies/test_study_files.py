@@ -1,6 +1,7 @@
 """A study file is what it says: every family, loop and unit that it can state."""
 
 import csv
+import io
 import tomllib
 
 import control as ct
@@ -240,7 +241,7 @@ def test_a_plant_that_passes_its_input_on_has_a_loop(stated):
 LOOP = """
 import control as ct
 
-def build():
+def build() -> ct.StateSpace:
     return ct.ss([[-{rate}]], [[{rate}]], [[1.0]], [[0.0]], inputs=["r"], outputs=["y"])
 """
 
@@ -284,7 +285,7 @@ def test_the_search_path_is_left_as_it_was(tmp_path):
 def test_a_nonlinear_loop_is_compared_too(tmp_path):
     (tmp_path / "curved_loop.py").write_text(
         "import control as ct\nimport numpy as np\n\n"
-        "def build():\n"
+        "def build() -> ct.NonlinearIOSystem:\n"
         "    return ct.nlsys(lambda t, x, u, p: np.tanh(20 * (u - x)), None, inputs=1, outputs=['y'], states=1)\n"
     )
     path = tmp_path / "study.toml"
@@ -323,12 +324,33 @@ def test_plans_as_csv_are_their_samples(stated):
         np.testing.assert_array_equal(rows, plan.jet(table[0], 2)[:, 0])
 
 
-@pytest.mark.parametrize("name", ["fast, then slow", 'the "best"', "fast;slow"])
+NAMES = [
+    "fast, then slow",
+    'the "best"',
+    "fast;slow",
+    "two\nlines",
+    "two\r\nlines",
+    "a\rreturn",
+    '"',
+    '",\n"',
+    " ",
+    "é🚀",
+]
+
+
+@pytest.mark.parametrize("name", NAMES)
 def test_csv_has_as_many_names_as_columns_whatever_the_plan_is_called(stated, name):
     found = stated(valid(plans=[{"name": name, "family": "polynomial"}]))
-    head, *rows = csv.reader(plans_as_csv(found).splitlines())
+    head, *rows = csv.reader(io.StringIO(plans_as_csv(found), newline=""))
     assert head == ["time", *(f"{name}.{x}" for x in ("x", "x_d1", "x_d2"))]
     assert {len(row) for row in rows} == {4}
+
+
+@pytest.mark.parametrize("name", ['=HYPERLINK("http://evil.example")', "+1", "-2+3", "@SUM(A1)", "\t=1", "\r=1"])
+def test_a_spreadsheet_takes_no_name_of_a_plan_for_a_formula(stated, name):
+    found = stated(valid(plans=[{"name": name, "family": "polynomial"}]))
+    head, *_ = csv.reader(io.StringIO(plans_as_csv(found), newline=""))
+    assert head == ["time", *(f"'{name}.{x}" for x in ("x", "x_d1", "x_d2"))]
 
 
 def test_csv_names_no_two_columns_alike(stated):

@@ -1,8 +1,12 @@
 """Random mutations of a valid study file: it runs or it is refused in one line, and nothing else."""
 
 import copy
+import io
+import json
 import math
 import re
+from contextlib import redirect_stderr, redirect_stdout
+from html.parser import HTMLParser
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -116,6 +120,90 @@ def test_the_command_ends_with_a_file_or_with_status_2(data, suffix):
         status = main(["plan", str(path), "--out", str(out)])
         assert status in (0, 2)
         assert out.exists() == (status == 0)
+
+
+HOSTILE = st.one_of(
+    st.sampled_from(
+        [
+            '"><img src=x onerror=alert(1)>',
+            "</script><script>alert(1)</script>",
+            "--><b>",
+            "{{ 7 * 7 }}",
+            "$x$",
+            r"$\frac$",
+            "_a",
+            "\n",
+            "a\tb",
+            "\x7f",
+            "\u202eabc",
+            "\U0001f680",
+            "__proto__",
+            "=1+1",
+            "w" * 300,
+        ]
+    ),
+    st.text(st.characters(exclude_categories=["Cs"]), min_size=1, max_size=12),
+)
+
+
+@st.composite
+def named_by_others(draw):
+    """A file, mutated or not, whose title, plans, units and axis are called whatever."""
+    data = draw(st.one_of(st.just(valid()), mutated()))
+    data["samples"] = 41
+    data["title"] = draw(HOSTILE)
+    for plan in data["plans"] if isinstance(data.get("plans"), list) else ():
+        if isinstance(plan, dict) and isinstance(plan.get("family"), str):
+            plan["name"] = draw(HOSTILE)
+    if isinstance(data.get("units"), dict):
+        data["units"] = {key: draw(HOSTILE) for key in data["units"]}
+    axis = draw(st.one_of(st.just("x"), HOSTILE))
+    for point in data["waypoints"] if isinstance(data.get("waypoints"), list) else ():
+        if isinstance(point, dict) and "x" in point:
+            point[axis] = point.pop("x")
+    if axis != "x" and isinstance(data.get("units"), dict) and "x" in data["units"]:
+        data["units"][axis] = data["units"].pop("x")
+    return data
+
+
+TAGS = {*("html", "head", "meta", "link", "title", "style", "body", "header", "main", "section", "footer", "script")}
+TAGS |= {*("h1", "h2", "h3", "p", "ul", "li", "dl", "dt", "dd", "a", "nav", "figure", "figcaption", "div", "span")}
+TAGS |= {*("table", "thead", "tbody", "tr", "th", "td", "button", "svg", "metadata", "g", "path", "use", "defs")}
+TAGS |= {"clippath", "rect"}
+
+
+class Tags(HTMLParser):
+    """Tags of a page, and attributes that would run something."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.found, self.handlers = set(), []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        self.found.add(tag)
+        self.handlers += [key for key, _ in attrs if key.startswith("on")]
+
+
+# What is promised at the end of all numbers is an answer: that it overflows there is no fault.
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+@pytest.mark.slow
+@settings(max_examples=25, deadline=None)
+@given(named_by_others())
+def test_the_report_is_a_page_without_foreign_elements_or_status_2_and_nothing(data):
+    with TemporaryDirectory() as folder, redirect_stderr(io.StringIO()) as said, redirect_stdout(io.StringIO()):
+        path, out = Path(folder) / "study.toml", Path(folder) / "out"
+        path.write_text(to_toml(data), encoding="utf-8", newline="")
+        status = main(["report", str(path), "--out", str(out)])
+        assert status in (0, 2)
+        assert all(line.startswith("ctrlplan: ") and line.isprintable() for line in said.getvalue().splitlines())
+        if status == 2:
+            assert sorted(p.name for p in Path(folder).iterdir()) == ["study.toml"]
+            return
+        page = Tags((out / "index.html").read_text(encoding="utf-8"))
+        assert {tag for tag in page.found if ":" not in tag} <= TAGS
+        assert page.handlers == []
+        assert json.loads((out / "results.json").read_text(encoding="utf-8"))["studies"]["study"]["plans"]
 
 
 EXTREMES = {

@@ -1,0 +1,29 @@
+"""Limits that the actuators of a loop declare, for the figures."""
+
+from __future__ import annotations
+
+from typing import Any
+
+
+def limits_of(loop: Any) -> dict[str, tuple[float, float]]:
+    """Limits of a loop's outputs by their labels.
+
+    Parameters
+    ----------
+    loop : control system
+        Of which PIDs and saturations, in networks inside as well, declare what
+        they limit.
+
+    Returns
+    -------
+    dict of str to (float, float)
+        Minimum and maximum in the unit of the output; one may be infinite.
+        Outputs without limits are left out.
+    """
+    found: dict[str, tuple[float, float]] = {}
+    for block in getattr(loop, "syslist", None) or ():
+        found |= limits_of(block)
+    for name, (_, low, high) in (getattr(loop, "watched", None) or {}).items():
+        found[name] = (float(low), float(high))
+    known = loop.output_labels or ()
+    return {name: pair for name, pair in found.items() if name in known}
