@@ -1,0 +1,98 @@
+"""Ctrl-C and SystemExit reach the caller of a run, from Python's equations and from inside CVODES alike."""
+
+import signal
+import threading
+
+import control as ct
+import numpy as np
+import pytest
+
+import ctrlplan as cp
+
+pytestmark = pytest.mark.skipif(
+    not hasattr(signal, "setitimer") or threading.current_thread() is not threading.main_thread(),
+    reason="signals of a timer are handled in the main thread alone",
+)
+
+
+def fast():
+    """Pendulum of a thousand radians per second, of which a run of an hour takes far longer than any test."""
+    return ct.nlsys(lambda t, x, u, p: [x[1], -1e6 * np.sin(x[0])], inputs=0, outputs=2, states=2, name="fast")
+
+
+@pytest.fixture
+def alarm():
+    """Set a handler of a timer's signal that raises some exception, until the test is over."""
+    before = signal.getsignal(signal.SIGALRM)
+
+    def start(error):
+        def handler(number, frame):
+            raise error
+
+        signal.signal(signal.SIGALRM, handler)
+        signal.setitimer(signal.ITIMER_REAL, 0.3)
+        return handler
+
+    yield start
+    signal.setitimer(signal.ITIMER_REAL, 0.0)
+    signal.signal(signal.SIGALRM, before)
+
+
+@pytest.mark.parametrize("method", ["compiled", "auto", "python"])
+@pytest.mark.parametrize("error", [KeyboardInterrupt, SystemExit(3)])
+def test_what_a_handler_raises_reaches_the_caller(error, method, alarm, capfd):
+    system = fast()
+    cp.simulate(system, [0.0, 0.001], None, [1.0, 0.0], method=method)  # compiled before
+    handler = alarm(error)
+    kind = error if isinstance(error, type) else type(error)
+    with pytest.raises(kind) as caught:
+        cp.simulate(system, np.linspace(0, 3600, 360001), None, [1.0, 0.0], method=method)
+    if isinstance(error, SystemExit):
+        assert caught.value.code == 3
+    assert signal.getsignal(signal.SIGALRM) is handler
+    # The form runs on as before.
+    signal.setitimer(signal.ITIMER_REAL, 0.0)
+    found = cp.simulate(system, [0.0, 0.001], None, [1.0, 0.0], method=method)
+    assert np.isfinite(found.outputs).all()
+
+
+def test_an_interruption_of_a_comparison_reaches_the_caller(alarm):
+    system = ct.nlsys(
+        lambda t, x, u, p: [x[1], -1e6 * np.sin(x[0]) + 0.0 * u[0]],
+        inputs="r",
+        outputs=["y", "v"],
+        states=2,
+        name="fast",
+    )
+    alarm(KeyboardInterrupt)
+    with pytest.raises(KeyboardInterrupt):
+        cp.compare(system, {"step": cp.Step(1.0)}, np.linspace(0, 3600, 360001), initial_state=[1.0, 0.0])
+
+
+def test_a_handler_that_raises_nothing_is_called_and_the_run_goes_on(alarm):
+    """A timer of the user's own program: its handler runs during CVODES, and the result is as without it."""
+    system, calls = fast(), []
+    before = signal.getsignal(signal.SIGALRM)
+    signal.signal(signal.SIGALRM, lambda number, frame: calls.append(number))
+    t = np.linspace(0, 20, 2001)
+    try:
+        signal.setitimer(signal.ITIMER_REAL, 0.01, 0.01)
+        found = cp.simulate(system, t, None, [1.0, 0.0], method="compiled")
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
+    plain = cp.simulate(system, t, None, [1.0, 0.0], method="compiled")
+    assert calls
+    assert np.array_equal(found.outputs, plain.outputs)
+
+
+def test_runs_in_other_threads_leave_handlers_alone():
+    system, before = fast(), signal.getsignal(signal.SIGINT)
+    found = []
+    thread = threading.Thread(
+        target=lambda: found.append(cp.simulate(system, [0.0, 1.0], None, [1.0, 0.0], method="compiled"))
+    )
+    thread.start()
+    thread.join()
+    assert len(found) == 1
+    assert signal.getsignal(signal.SIGINT) is before
