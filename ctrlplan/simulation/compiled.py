@@ -19,7 +19,7 @@ from ctrlplan.simulation.drives import Series, within
 from ctrlplan.simulation.interpreted import SolverError
 from ctrlplan.simulation.network import Block, Network, Step, known_feedthrough
 from ctrlplan.simulation.recent import recent
-from ctrlplan.simulation.scales import Scales
+from ctrlplan.simulation.scales import Scales, Tolerances
 from ctrlplan.simulation.switches import changes_of_side, switch_arguments
 from ctrlplan.simulation.traced import NotTraceableError, Trace, agrees
 
@@ -48,8 +48,8 @@ _FAILURES = {
 _STIFF = 3000.0
 """Times that the fastest motion could die out within a leg, above which BDF takes fewer steps than Adams."""
 
-_SAFETY = 0.01
-"""CVODES controls the error of a step by tolerances this much below those asked for: errors add up over a run."""
+_EDGE = 100.0
+"""Tolerances of a step about a state within which equations must be defined."""
 
 
 class Compiled:
@@ -83,6 +83,7 @@ class Compiled:
         self._rates = ca.Function("rates", [t, x, d, p], [rates])
         self._functions = {"rates": self._rates}
         self._jacobian = ca.Function("jacobian", [t, x, d, p], [ca.densify(ca.jacobian(rates, x))])
+        self._functions["jacobian"] = self._jacobian
         w = _signals(network, traces, own, network.schedule(feeds, every), t, x, d)
         self._functions["signals"] = ca.Function("signals", [t, x, d, p], [ca.densify(w)])
         self._functions["outputs"] = ca.Function("outputs", [t, x, d, p], [ca.densify(_sparse(network.read) @ w)])
@@ -119,6 +120,10 @@ class Compiled:
     def rates(self, t: Array, x: Array, driven: Array, p: Array) -> Array:
         """Rates of all states at many times, (nstates, ntime)."""
         return self._at_many("rates", t, x, driven, p)
+
+    def slopes(self, t: Array, x: Array, driven: Array, p: Array) -> Array:
+        """Derivatives of the rates by the states at many times, column after column, (nstates**2, ntime)."""
+        return self._at_many("jacobian", t, x, driven, p)
 
     def signals(self, t: Array, x: Array, driven: Array, p: Array) -> Array:
         """All signals at many times, (nsignals, ntime)."""
@@ -190,7 +195,7 @@ class Compiled:
             options = {
                 "linear_multistep_method": "bdf" if stiff else "adams",
                 "reltol": rtol,
-                "abstol": atol * _SAFETY,
+                "abstol": atol,
                 "max_num_steps": max_steps,
                 "max_step_size": longest,
                 "show_eval_warnings": False,
@@ -243,11 +248,16 @@ class CompiledSolver:
     """
 
     def __init__(
-        self, equations: Compiled, params: Mapping[str, Any], rtol: float, scales: Scales, max_steps: int = 20_000
+        self,
+        equations: Compiled,
+        params: Mapping[str, Any],
+        tolerances: Tolerances,
+        scales: Scales,
+        max_steps: int = 20_000,
     ) -> None:
         self._equations, self._p = equations, equations.parameters(params)
         self._scales, self._max_steps = scales, max_steps
-        self.rtol = max(_SAFETY * rtol, 1e-14)
+        self._tolerances = tolerances
         self._longest, self._stiff = 0.0, False
         self.evaluations = 0
         self._report = self._count if equations.compared.is_expected else None
@@ -260,6 +270,11 @@ class CompiledSolver:
         """Outputs (noutputs, ntime) of the whole."""
         return self._equations.outputs(times, states, driven, self._p)
 
+    def slopes(self, times: Array, states: Array, driven: Array) -> Array:
+        """Derivatives of the rates by the states, (ntime, nstates, nstates)."""
+        n = len(states)
+        return self._equations.slopes(times, states, driven, self._p).reshape(n, n, times.size).transpose(2, 1, 0)
+
     def rates(self, times: Array, states: Array, driven: Array) -> Array:
         """Rates (nstates, ntime) of the states."""
         return self._equations.rates(times, states, driven, self._p)
@@ -270,8 +285,8 @@ class CompiledSolver:
         There CVODES may stay for ever on a solution that has ended: a Newton
         step beside an infinite slope is as small as it likes.
         """
-        scales = self._scales
-        reach = (self.rtol * np.abs(states) + (scales.atol * scales.scale)[:, None]) / _SAFETY
+        rtol, atol = self._tolerances
+        reach = (rtol * np.abs(states) + (atol * self._scales.scale)[:, None]) * _EDGE
         return not all(
             np.isfinite(self._equations.rates(times, near, driven, self._p)).all()
             for near in (states - reach, states, states + reach)
@@ -303,9 +318,7 @@ class CompiledSolver:
         # A solution that explodes takes all the steps it may: few at first, then more, between outputs close together.
         close = np.union1d(relative, np.linspace(0.0, 1.0, _CLOSE)[1:])
         for outputs, allowed in ((relative, min(_FEW_STEPS, max_steps)), (close, max_steps)):
-            integrator = self._equations.integrator(
-                width, outputs, self._stiff, self.rtol, scales.atol, allowed, longest
-            )
+            integrator = self._equations.integrator(width, outputs, self._stiff, *self._tolerances, allowed, longest)
             try:
                 with _passing_interruptions():
                     found = _called(integrator, (start, np.empty(0), p), state.size, self._report)

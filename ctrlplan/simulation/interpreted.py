@@ -22,7 +22,7 @@ from ctrlplan.simulation.network import (
     sampled_feedthrough,
     tried_feedthrough,
 )
-from ctrlplan.simulation.scales import Scales
+from ctrlplan.simulation.scales import Scales, Tolerances
 from ctrlplan.simulation.stalled import cause
 from ctrlplan.simulation.trials import can_remember, trial_copy, values_of
 from ctrlplan.simulation.untouched import untouched
@@ -32,8 +32,8 @@ Array = NDArray[np.float64]
 Call = Callable[[float, Array, Array], None]
 """(t, state of the network, its signals): puts a block's outputs among the signals."""
 
-_SAFETY = 0.02
-"""LSODA controls the error of a step by tolerances this much below those asked for: errors add up over a run."""
+_LEAST = 2.3e-14
+"""Smallest relative tolerance of scipy's solvers."""
 
 _CALLS, _INSTANT = 2000, 1e-9
 """Calls about one instant, a part of the segment, after which a solver is taken to stay there."""
@@ -277,9 +277,9 @@ class Interpreted:
 class InterpretedSolver:
     """LSODA on a network's equations, leg by leg."""
 
-    def __init__(self, equations: Interpreted, rtol: float, scales: Scales) -> None:
+    def __init__(self, equations: Interpreted, tolerances: Tolerances, scales: Scales) -> None:
         self._equations, self._scales = equations, scales
-        self.rtol, self._atol = max(_SAFETY * rtol, 2.3e-14), _SAFETY * scales.atol
+        self._rtol, self._atol = max(tolerances.rtol, _LEAST), tolerances.atol
         self._bounded = any(b.changes_unseen and b.depends_on_time for b in equations.network.blocks)
         self._segments, self._next = 0, 0
 
@@ -295,6 +295,18 @@ class InterpretedSolver:
     def outputs(self, times: Array, states: Array, driven: Array) -> Array:
         """Outputs (noutputs, ntime) of the whole."""
         return self._equations.network.put_out(self.signals(times, states, driven))
+
+    def slopes(self, times: Array, states: Array, driven: Array) -> Array:
+        """Derivatives of the rates by the states, by differences, (ntime, nstates, nstates)."""
+        n = len(states)
+        steps = 1e-7 * np.maximum(self._scales.scale, np.abs(states).max(axis=1, initial=0.0))
+        plain = self.rates(times, states, driven)
+        found = np.empty((times.size, n, n))
+        for j in range(n):
+            near = states.copy()
+            near[j] += steps[j]
+            found[:, :, j] = ((self.rates(times, near, driven) - plain) / steps[j]).T
+        return found
 
     def rates(self, times: Array, states: Array, driven: Array) -> Array:
         """Rates (nstates, ntime) of the states."""
@@ -355,7 +367,7 @@ class InterpretedSolver:
         rates.begin(_CALLS if kind is LSODA else _PASSING)
         # What depends on time is seen at least once a sample: a pulse as long cannot be passed over unseen.
         longest = float(np.diff(grid, prepend=rates.left).max()) if self._bounded else math.inf
-        solver = kind(rates, t, z, right, rtol=self.rtol, atol=self._atol, max_step=longest)
+        solver = kind(rates, t, z, right, rtol=self._rtol, atol=self._atol, max_step=longest)
         if isinstance(solver, LSODA):
             _raise_failures(solver)
         while solver.status == "running":

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
@@ -12,14 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctrlplan.simulation.compared import telling_states
-from ctrlplan.simulation.drives import Drive, driven_signals
+from ctrlplan.simulation.drives import Drive, breakpoints_of, driven_signals
 from ctrlplan.simulation.events import Snapshot, Watched
 from ctrlplan.simulation.interpreted import Interpreted, InterpretedSolver, SolverError
 from ctrlplan.simulation.job import Job, Record, unused, with_looks
 from ctrlplan.simulation.legs import Run, integrate
 from ctrlplan.simulation.network import Network
 from ctrlplan.simulation.prepared import NotCompiledError
-from ctrlplan.simulation.scales import PASSES, Scales, doubt
+from ctrlplan.simulation.scales import PASSES, Scales, Tolerances, doubt
 from ctrlplan.simulation.stalled import unrepeatable
 from ctrlplan.simulation.untouched import tried
 
@@ -36,6 +37,12 @@ _SHARE = 5
 
 _CLOSE, _STRETCHES, _BETWEEN = 400, 8, 60
 """A run with fewer times is followed once more, in some stretches with so many times each, to see where it switches."""
+
+_ASIDE = 1e-6
+"""Distance, in the scales of the states, at which a neighbouring run starts."""
+
+_GROWTH, _TIGHTEST = 30.0, 1e4
+"""Growth of a distance along a run above which steps are made with smaller tolerances, and how much smaller at most."""
 
 _DOUBTED = 1e-6
 """Uncertainty of an output, relative to its range, above which the response says so."""
@@ -56,7 +63,34 @@ def numerical(job: Job, method: str, reason: str) -> Record:
         except SolverError:  # the run before stands, with what is said of its accuracy
             break
         scales, attempt = found, following
+    if job.atol is None and attempt.expands():
+        attempt = _tightened(attempt, spare)
     return attempt.record(reason)
+
+
+def _tightened(attempt: _Attempt, spare: Job) -> _Attempt:
+    """Run whose errors of steps grow: measured by a run from beside, and made again with smaller ones."""
+    scales, aside = attempt.scales, _ASIDE * attempt.scales.scale
+    aside = aside * np.where(np.arange(aside.size) % 2, -1.0, 1.0)
+    try:
+        near = _Attempt(replace(spare, state=spare.state + aside), attempt.method, scales)
+        near.go()
+    except SolverError:
+        return attempt
+    common, mine, others = np.intersect1d(attempt.run.times, near.run.times, return_indices=True)
+    apart = np.abs(attempt.run.states[:, mine] - near.run.states[:, others]).max(axis=1, initial=0.0)
+    growth = float((apart / np.abs(aside)).max(initial=1.0)) if common.size else 1.0
+    attempt.growth = growth
+    if growth <= _GROWTH:
+        return attempt
+    tighter = min(growth / _GROWTH, _TIGHTEST)
+    try:
+        again = _Attempt(spare, attempt.method, scales, tighter)
+        again.go()
+    except SolverError:
+        return attempt
+    again.growth = growth
+    return again
 
 
 @dataclass(eq=False)
@@ -66,6 +100,8 @@ class _Attempt:
     job: Job
     method: str
     scales: Scales
+    tighter: float = 1.0
+    growth: float = 1.0
     drives: list[Drive] = field(init=False)
     watched: tuple[Watched, ...] = field(init=False)
     equations: Interpreted | None = field(init=False)
@@ -81,7 +117,7 @@ class _Attempt:
             self._compile()
         elif self.equations is not None:
             self._check_repeatable(self.equations)
-            self.solver, self._compare = InterpretedSolver(self.equations, job.rtol, self.scales), lambda: None
+            self.solver, self._compare = InterpretedSolver(self.equations, self._tolerances, self.scales), lambda: None
         else:
             raise NotCompiledError(f"{job.prepared.name} came from another process without its blocks")
 
@@ -112,6 +148,24 @@ class _Attempt:
         reason = f"{reason}; {said}" if said else reason
         return Record(self.run.times, self.run.states, self._see, self._carry, self.watched, self.method, reason)
 
+    def expands(self) -> bool:
+        """Whether neighbouring solutions may part, by the fastest growing motion along the run."""
+        t, x, driven = self._visited()
+        slopes = self.solver.slopes(t, x, driven)
+        if t.size < 2 or not slopes.size or not np.isfinite(slopes).all():
+            return False
+        rates = np.maximum(np.linalg.eigvals(slopes).real.max(axis=1), 0.0)
+        return float(np.trapezoid(rates, t)) > math.log(_GROWTH)
+
+    @property
+    def _tolerances(self) -> Tolerances:
+        """Tolerances of a step, so that the errors of all segments stay within those of the run."""
+        job, network = self.job, self.job.blocks
+        first, last = job.first, float(job.times[-1])
+        marks = {t for t in (*breakpoints_of(self.drives), *network.breakpoints) if first < t < last}
+        samples = sum((last - first) / float(network.blocks[i].period or 1.0) for i in network.blocks_with("period"))
+        return Tolerances.of_run(job.rtol, self.scales.atol, len(marks) + int(samples), self.tighter)
+
     def noise(self) -> Array:
         """Rounding noise of the rates along the run, times its duration."""
         t, x, driven = self._visited()
@@ -132,7 +186,8 @@ class _Attempt:
         form = job.prepared.compiled(job.params, self.drives, job.first, job.state)
         _at_start(_equations(job, known), job, self.drives)  # an algebraic loop without a solution is better named here
         # Beyond a stop there may be no solution: segments are short then, and must fail soon.
-        solver = CompiledSolver(form, job.params, job.rtol, self.scales, max_steps=2_000 if self.stops else 20_000)
+        most = 2_000 if self.stops else 20_000
+        solver = CompiledSolver(form, job.params, self._tolerances, self.scales, max_steps=most)
 
         def compare() -> None:
             if solver.at_edge(*self._visited()):
@@ -201,7 +256,7 @@ def _in_doubt(attempt: _Attempt) -> str:
     if not x.size or not np.isfinite(x).all():
         return ""
     driven = driven_signals(attempt.drives, t)
-    uncertainty = attempt.scales.uncertainty(run.states, solver.rtol)
+    uncertainty = attempt.scales.uncertainty(run.states, job.rtol) * attempt.growth / attempt.tighter
     worst, ranges = doubt(lambda near: solver.outputs(t, near, driven), x, uncertainty)
     allowed = max(_DOUBTED, 100.0 * job.rtol) * ranges
     lost = (ranges > 0.0) & (worst > allowed)
@@ -210,10 +265,9 @@ def _in_doubt(attempt: _Attempt) -> str:
     part = np.where(lost, worst / np.where(lost, ranges, 1.0), 0.0)
     names = ", ".join(np.array(job.prepared.output_labels)[lost])
     needed = job.rtol * _DOUBTED / float(part.max())
-    return (
-        f"outputs {names} are differences of larger terms and uncertain by about {float(part.max()):.1g} "
-        f"of their range: rtol = {needed:.0e} would do"
-    )
+    what = "are differences of larger terms" if attempt.growth <= _GROWTH else "grow apart from their neighbours"
+    advice = f"rtol = {needed:.0e} would do" if needed > 1e-12 else "no tolerance would do"
+    return f"outputs {names} {what} and are uncertain by about {float(part.max()):.1g} of their range: {advice}"
 
 
 def _disagreement(

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,11 +34,24 @@ _OFFSET = 1e-2
 _NOISE = 1e11
 """Scale of a state whose rate is noise of size 1 over a run of length 1: a tenth of it is the tolerance."""
 
-_INNER = 0.02
-"""Part of the absolute tolerance at which the error of a step is controlled."""
+_ADDED = 0.3
+"""Error of a state at the end of a run, relative to the tolerance of the run, as errors of steps add up."""
 
-_GROWTH = 30.0
-"""How much larger than its tolerance the error of a state is taken to be at the end of a run."""
+_A_STEP, _A_SEGMENT = 100.0, 4.0
+"""Tolerance of a run over that of a step; or, of many segments, so many times their number."""
+
+
+class Tolerances(NamedTuple):
+    """Tolerances of a step, relative and in the scales of the states."""
+
+    rtol: float
+    atol: float
+
+    @classmethod
+    def of_run(cls, rtol: float, atol: float, nsegments: int, tighter: float = 1.0) -> Tolerances:
+        """Of a run that restarts at every segment: the errors of all add up."""
+        divisor = tighter * max(_A_STEP, _A_SEGMENT * nsegments)
+        return cls(max(rtol / divisor, min(rtol, 1e-13)), atol / divisor)
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,9 +101,9 @@ class Scales:
         return Scales(shift, np.minimum(scale, np.where(small, self.scale, np.inf)), self.atol)
 
     def uncertainty(self, states: Array, rtol: float) -> Array:
-        """Error that the states of a run are taken to have (nstates,), from tolerances of each step."""
+        """Error that the states of a run are taken to have (nstates,), where errors of steps do not grow."""
         size = np.abs(states - self.shift[:, None]).max(axis=1, initial=0.0)
-        return _GROWTH * (rtol * size + _INNER * self.atol * self.scale)
+        return _ADDED * (rtol * size + self.atol * self.scale)
 
 
 def doubt(outputs: Callable[[Array], Array], states: Array, uncertainty: Array) -> tuple[Array, Array]:

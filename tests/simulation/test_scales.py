@@ -161,3 +161,45 @@ def test_an_absolute_tolerance_given_is_absolute():
     for atol in (0.0, -1.0, np.nan, True, "small"):
         with pytest.raises(ValueError, match="atol must be a finite number above 0"):
             cp.simulate(stage(1.0, "tf"), t, plan, atol=atol)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_many_samples_whose_segments_errors_add_up(method):
+    """A car steered by a hundred samples: against an integration from sample to sample at 1e-13."""
+    rng = np.random.default_rng(0)
+    t = np.linspace(0, 10, 100)
+    inputs = np.array([10 + 0.3 * np.sin(3 * t), 0.1 * np.cos(2 * t) + 0.05 * rng.standard_normal(100)])
+
+    def rates(x, v, delta):
+        return [np.cos(x[2]) * v, np.sin(x[2]) * v, v / 3.0 * np.tan(delta)]
+
+    expected = np.zeros((3, t.size))
+    for k in range(t.size - 1):
+        slope = (inputs[:, k + 1] - inputs[:, k]) / (t[k + 1] - t[k])
+        run = solve_ivp(
+            lambda s, x, k=k, slope=slope: rates(x, *(inputs[:, k] + slope * (s - t[k]))),
+            (t[k], t[k + 1]),
+            expected[:, k],
+            method="DOP853",
+            rtol=1e-13,
+            atol=1e-13,
+        )
+        expected[:, k + 1] = run.y[:, -1]
+    block = ct.nlsys(lambda t, x, u, p: rates(x, *u), inputs=2, outputs=3, states=3, name="car")
+    found = cp.simulate(block, t, inputs, method=method)
+    assert (np.abs(found.outputs - expected).max(axis=1) / np.ptp(expected, axis=1)).max() < ALLOWED
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_pendulum_that_falls_from_upright_is_accurate_or_says_that_it_is_not(method):
+    """Errors grow by a factor of 1e11 on the way: within a millionth, and its doubt is said with a tolerance."""
+
+    def rates(t, x):
+        return [x[1], 9.0 * np.sin(x[0]) - 0.2 * x[1]]
+
+    t = np.linspace(0, 9, 91)
+    expected = solve_ivp(rates, (0, 9), [1e-8, 0], t_eval=t, method="DOP853", rtol=1e-13, atol=1e-20).y
+    block = ct.nlsys(lambda t, x, u, p: rates(t, x), inputs=0, outputs=2, states=2, name="pendulum")
+    found = cp.simulate(block, t, None, [1e-8, 0.0], method=method)
+    assert (np.abs(found.outputs - expected).max(axis=1) / np.ptp(expected, axis=1)).max() < ALLOWED
+    assert "grow apart from their neighbours and are uncertain by about" in found.reason
