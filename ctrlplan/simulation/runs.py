@@ -39,7 +39,7 @@ _LOST = 1e-6
 _MOST_STEPS = 1e8
 """Steps of a discrete system in a run."""
 
-_OFF_CLOCK = 1e-4
+_OFF_CLOCK = 1e-5
 """Part of a sampling time by which a time may miss an instant, besides rounding of the times."""
 
 
