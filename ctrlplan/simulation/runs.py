@@ -333,7 +333,7 @@ def _clock(times: Array, dt: float | bool) -> Array:
     if off.max() > _OFF_CLOCK + rounding / period:
         at = float(times[off.argmax()])
         raise ValueError(
-            f"timepts must be whole periods of {period:g} s apart in a discrete system, got {at:.12g} s, "
+            f"timepts must be whole periods of {period:g} s apart in a discrete system, got {at:g} s, "
             f"{off.max():.2g} periods off"
         )
     if np.any(np.diff(wanted) < 1.0):
