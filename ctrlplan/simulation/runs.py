@@ -31,7 +31,7 @@ _LOST = 1e-6
 _MOST_STEPS = 1e8
 """Steps of a discrete system in a run."""
 
-_OFF_CLOCK = 1e-4
+_OFF_CLOCK = 1e-5
 """Part of a sampling time by which a time may miss an instant, besides rounding of the times."""
 
 
@@ -205,7 +205,7 @@ def _clock(times: Array, dt: float | bool) -> Array:
     if off.max() > _OFF_CLOCK + rounding / period:
         at = float(times[off.argmax()])
         raise ValueError(
-            f"timepts must be whole periods of {period:g} s apart in a discrete system, got {at:.12g} s, "
+            f"timepts must be whole periods of {period:g} s apart in a discrete system, got {at:g} s, "
             f"{off.max():.2g} periods off"
         )
     if np.any(np.diff(wanted) < 1.0):
