@@ -60,8 +60,8 @@ def simulate(
     ----------
     system : control system or Prepared
         With whatever inputs; unmodified python-control objects, or what
-        `prepare` made of one. The built form is kept, and made anew where maps,
-        parameters or blocks have changed. A system with states and without a
+        `prepare` made of one. The built form is kept, and rebuilt where maps,
+        parameters, blocks or what their functions refer to have changed. A system with states and without a
         timebase (dt = None) is simulated as continuous-time, with a warning.
     timepts : array_like, shape (ntime,)
         Sample times [s], strictly increasing, two or more. Of a discrete system
@@ -74,10 +74,11 @@ def simulate(
         each for one input, 0 where unnamed.
     initial_state : array_like, shape (nstates,), float or None, optional
         State at the first sample time, a number for all states. None: the
-        attribute ``initial_state`` of the system or of its blocks (as
-        `crane_loop` sets), and 0 where there is none.
+        initial state that the system or its blocks declare (see `declare`; as
+        `crane_loop` does), and 0 where none does.
     method : {"auto", "exact", "compiled", "python"}, optional
-        "auto" takes the first of the others that can be taken; they insist.
+        "auto" takes the first of the others that applies; these raise where
+        they do not apply.
     rtol : float, optional
         Relative tolerance of a numerical solver; "exact" needs none.
     atol : float, optional
@@ -89,8 +90,8 @@ def simulate(
         Parameters of the blocks.
     events : sequence of Event, optional
         Limits of signals whose crossings are recorded, and may end the run.
-        Signals are looked at at the sample times and at sixteen instants in a
-        turn of the loop's fastest oscillation: closer crossings need closer
+        Signals are evaluated at the sample times and at sixteen instants in a
+        period of the loop's fastest oscillation: closer crossings need closer
         sample times. Limits that blocks declare, as a PID does, are watched as
         well, unless an empty sequence is given.
 
@@ -100,7 +101,8 @@ def simulate(
         Labelled and ordered as python-control does, with the attributes
         ``method`` and ``reason`` saying what ran and why, and ``events``, a
         list of `Occurrence` in order of time. Where an event ended the run its
-        time is the last.
+        time is the last. Where an output is not accurate to 1e-6 of its range,
+        ``reason`` gives the estimate and the tolerance that would do.
 
     Raises
     ------
@@ -112,8 +114,8 @@ def simulate(
         system, inputs do not fit, values are masked, or a method is asked for
         that the system does not allow; the reason is in the message.
     RuntimeError
-        If a solver fails, or an algebraic loop has no solution that is found;
-        time or blocks are in the message.
+        If an integrator fails, or an algebraic loop has no solution that is
+        found; time and block are in the message.
 
     Warns
     -----
@@ -123,6 +125,26 @@ def simulate(
         from the system's matrices; or if a block has equations of a kind that
         only python-control runs: its `control.input_output_response` is then
         used, with the same tolerances.
+
+    Notes
+    -----
+    Inputs reach the blocks exactly: constants to the bit, samples and plans
+    within their own range.
+
+    Switches in t: breakpoints that a block declares are stopped at. In compiled
+    blocks undeclared ones are found in the equations. A block that is run by
+    Python and reads t is evaluated at least once between two sample times: a
+    pulse that is shorter than the sample spacing must be declared.
+
+    Discrete blocks are evaluated in the order of the signal flow, first the
+    outputs, then the updates, each once a sample, so that they may have a
+    memory besides their states. The functions of a continuous block must return
+    equal values for equal arguments.
+
+    A run by Python that makes no progress ends with an error: after 2,000
+    evaluations of the equations about one instant, and where 60,000 evaluations
+    (and 300 for each segment between breakpoints and samples) have been spent
+    and a block jumps, has an infinite slope or is random at that time.
     """
     begin_run()
     times = real_array(timepts, "timepts")
