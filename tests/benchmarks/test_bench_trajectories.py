@@ -13,6 +13,9 @@ from scipy.interpolate import BPoly, PPoly
 
 from ctrlplan.trajectories import TrigSpline, Waypoint
 
+# Data drawn at random: some of these plans swing.
+pytestmark = pytest.mark.filterwarnings("ignore:the plan swings")
+
 RNG = np.random.default_rng(0)
 JETS = RNG.normal(size=(4, 3, 2))
 TIMES = np.array([0.0, 3.0, 6.0, 10.0])
