@@ -184,7 +184,8 @@ def optimize_waypoints(
     split = problem.split()
     plan: Trajectory
     if single or split.any():
-        splines = [TrigSpline(p, alpha=alpha) if alpha else PolySpline(p) for p in parts]
+        # Of joined segments each is measured by its own ends alone, which says nothing of the whole.
+        splines = [TrigSpline(p, alpha=alpha, warn=single) if alpha else PolySpline(p, warn=single) for p in parts]
         plan = splines[0] if single else _joined(splines)
     else:
         plan = PiecewiseSpline(after, alpha=alpha)

@@ -53,7 +53,7 @@ def test_choose_alpha(beside, name):
     goal = OBJECTIVES[name]
 
     def objective(alpha):
-        return goal(cp.TrigSpline(POINTS, alpha=float(alpha)))
+        return goal(cp.TrigSpline(POINTS, alpha=float(alpha), warn=False))
 
     def peer():
         edges = np.linspace(0.0, 6.25, 33)

@@ -67,12 +67,12 @@ def test_construct_at_new_times(beside, waypoints, alpha):
     if waypoints == "with waypoints":
 
         def ours(data):
-            return TrigSpline(points(data[0]), alpha=alpha)
+            return TrigSpline(points(data[0]), alpha=alpha, warn=False)
 
     else:
 
         def ours(data):
-            return TrigSpline(data[1], alpha=alpha)
+            return TrigSpline(data[1], alpha=alpha, warn=False)
 
     def peer(data):
         return BPoly.from_derivatives(data[0], JETS)
@@ -87,7 +87,7 @@ def test_construct_at_new_times(beside, waypoints, alpha):
 @pytest.mark.parametrize("waypoints", ["with waypoints", "without waypoints"])
 def test_new_values_at_the_same_times(beside, waypoints):
     """Peer: BPoly.from_derivatives of the new data. Wanted: under 0.1."""
-    plan = TrigSpline(points(TIMES), alpha=ALPHA)
+    plan = TrigSpline(points(TIMES), alpha=ALPHA, warn=False)
     inputs = [(jets, points(TIMES, jets)) for jets in RNG.normal(size=(300, 4, 3, 2))]
     if waypoints == "with waypoints":
 
@@ -101,7 +101,9 @@ def test_new_values_at_the_same_times(beside, waypoints):
 
     jets = inputs[0][0]
     assert meets(ours(inputs[0]), TIMES, jets)
-    np.testing.assert_array_equal(ours(inputs[0])(TIMES), TrigSpline(points(TIMES, jets), alpha=ALPHA)(TIMES))
+    np.testing.assert_array_equal(
+        ours(inputs[0])(TIMES), TrigSpline(points(TIMES, jets), alpha=ALPHA, warn=False)(TIMES)
+    )
     beside(ours, lambda data: BPoly.from_derivatives(TIMES, data[0]), inputs, batch=10)
 
 
@@ -117,7 +119,7 @@ SAMPLES = {
 @pytest.mark.parametrize("name", SAMPLES)
 def test_position_and_two_derivatives_at_a_million_times(beside, name, alpha):
     """Peer: PPoly of the same data and its derivatives. Wanted: under 0.25 at uniform times, at most 1 at others."""
-    plan = TrigSpline(points(TIMES), alpha=alpha)
+    plan = TrigSpline(points(TIMES), alpha=alpha, warn=False)
     quintics = PPoly.from_bernstein_basis(BPoly.from_derivatives(TIMES, JETS))
     pieces = [quintics, quintics.derivative(), quintics.derivative(2)]
     t = SAMPLES[name]

@@ -13,6 +13,9 @@ from ctrlplan import Waypoint
 from ctrlplan.planning import OBJECTIVES, AlphaChoice, PeakDerivative, SquaredDerivative
 from ctrlplan.studies.crane import obstacle_waypoints
 
+# Scans over all of [0, 2 pi) swing; that the choice itself does not warn is tested with the warning.
+pytestmark = pytest.mark.filterwarnings("ignore:the plan swings")
+
 REST = [Waypoint(0, 0, 0, 0), Waypoint(1, 1, 0, 0)]
 OBSTACLE = obstacle_waypoints()
 POLYLINE = hypot(5, 5) + 10 + hypot(5, 6)

@@ -24,8 +24,10 @@ PLANS = {
     "trigonometric": cp.TrigSpline(POINTS, alpha=4.0, warn=False),
     "piecewise": cp.PiecewiseSpline(POINTS),
     "piecewise trigonometric": cp.PiecewiseSpline(POINTS, alpha=3.0),
-    "one axis": cp.TrigSpline(POINTS, alpha=2.0).select("y1"),
-    "three axes": cp.stack([cp.TrigSpline(POINTS, alpha=1.0), cp.PolySpline(REST, labels=["up"]).retime(4.0)]),
+    "one axis": cp.TrigSpline(POINTS, alpha=2.0, warn=False).select("y1"),
+    "three axes": cp.stack(
+        [cp.TrigSpline(POINTS, alpha=1.0, warn=False), cp.PolySpline(REST, labels=["up"]).retime(4.0)]
+    ),
 }
 NAMES = {
     "path": path_length,
@@ -213,7 +215,9 @@ def test_scales_of_amplitude_and_time(factor, duration, shift, name):
 @given(angle=st.floats(-pi, pi))
 def test_a_turned_path_is_as_long(angle):
     turn = np.array([[cos(angle), -sin(angle)], [sin(angle), cos(angle)]])
-    turned = cp.TrigSpline([Waypoint(t, *(jet @ turn.T)) for t, jet in zip(TIMES, JETS, strict=True)], alpha=4.0)
+    turned = cp.TrigSpline(
+        [Waypoint(t, *(jet @ turn.T)) for t, jet in zip(TIMES, JETS, strict=True)], alpha=4.0, warn=False
+    )
     assert path_length(turned) == pytest.approx(path_length(PLANS["trigonometric"]), rel=1e-8)
     assert wandering(turned) == pytest.approx(wandering(PLANS["trigonometric"]), rel=1e-8)
     assert SquaredDerivative(3)(turned) == pytest.approx(SquaredDerivative(3)(PLANS["trigonometric"]), rel=1e-10)

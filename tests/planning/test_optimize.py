@@ -2,6 +2,7 @@
 
 import itertools
 import math
+import warnings
 
 import mpmath as mp
 import numpy as np
@@ -602,8 +603,10 @@ def test_chosen_times_are_never_worse(seed, options):
     table[1:-1, 1] = np.where(rng.random((max(n - 2, 0), 2)) < 0.3, rng.normal(size=(max(n - 2, 0), 2)), FREE)
     if n > 3:
         table[2, 0] = table[1, 0]  # a leg without length
-    found = optimize_waypoints(points_of(times, table), free_times=True, **options)
-    assert found.cost <= optimize_waypoints(points_of(times, table), **options).cost
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "the plan swings")  # one polynomial through random data
+        found = optimize_waypoints(points_of(times, table), free_times=True, **options)
+        assert found.cost <= optimize_waypoints(points_of(times, table), **options).cost
     chosen = [w.time for w in found]
     assert np.diff(chosen).min() > 0
     assert (chosen[0], chosen[-1]) == (times[0], times[-1])

@@ -512,7 +512,9 @@ def test_a_goal_that_is_sampled_at_the_same_instants_is_seen_at_once():
 def test_after_a_goal_and_a_deviation_it_is_the_plan_and_a_spline_between_two_jets(order, alpha):
     """alpha = rate x remaining time; the deviation in every derivative that is measured."""
     ends = [[0.0] * (order + 1), [1.0] + [0.0] * order]
-    plan = cp.TrigSpline([Waypoint.from_jets(t, x=jet) for t, jet in zip((2.0, 7.0), ends, strict=True)], alpha=alpha)
+    plan = cp.TrigSpline(
+        [Waypoint.from_jets(t, x=jet) for t, jet in zip((2.0, 7.0), ends, strict=True)], alpha=alpha, warn=False
+    )
     replanner = cp.create_replanner_iosystem(
         plan, 0.1, order=order, measured=order, goal_derivatives=min(order, 1), suffix="_r", derivatives=order + 1
     )
@@ -586,7 +588,9 @@ def test_no_derivative_jumps_and_each_is_that_of_the_one_before(order, alpha, ho
     """From the outputs of a run alone: each leg as a Chebyshev series, taken to its ends and differentiated."""
     rng = np.random.default_rng(10 * order + int(alpha))
     ends = [[0.0] * (order + 1), [1.0] + [0.0] * order]
-    plan = cp.TrigSpline([Waypoint.from_jets(t, x=jet) for t, jet in zip((0.0, 4.0), ends, strict=True)], alpha=alpha)
+    plan = cp.TrigSpline(
+        [Waypoint.from_jets(t, x=jet) for t, jet in zip((0.0, 4.0), ends, strict=True)], alpha=alpha, warn=False
+    )
     replanner = cp.create_replanner_iosystem(plan, 0.25, order=order, horizon=horizon, goal_derivatives=0)
     goal = steps(
         *[(float(t), float(v)) for t, v in zip(np.sort(rng.uniform(0, 3, 4)), rng.normal(size=4), strict=True)]
@@ -629,7 +633,7 @@ def test_no_jump_at_any_fit_whatever_the_goals(order, alpha, moves, seed):
     rng = np.random.default_rng(seed)
     ends = np.zeros((2, order + 1, 2))
     ends[1, 0] = [1.0, -2.0]
-    plan = cp.TrigSpline([Waypoint(t, *jet) for t, jet in zip((0.0, 10.0), ends, strict=True)], alpha=alpha)
+    plan = cp.TrigSpline([Waypoint(t, *jet) for t, jet in zip((0.0, 10.0), ends, strict=True)], alpha=alpha, warn=False)
     options = {} if alpha > 2.0 or rng.random() < 0.5 else {"horizon": 4.0}
     replanner = cp.create_replanner_iosystem(plan, 0.5, order=order, goal_derivatives=0, **options)
     core = replanner.syslist[1]
