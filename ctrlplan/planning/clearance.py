@@ -40,7 +40,8 @@ class Clearance:
     Attributes
     ----------
     lower : float
-        Everywhere on the whole interval the clearance is at least this.
+        Everywhere on the whole interval the clearance is at least this, what
+        rounds the coordinates subtracted.
     least : float
         Least clearance found: it is attained.
     time : float
@@ -241,6 +242,6 @@ class _Cells:
     def result(self, lower: float, required: float | None, certified: bool | None) -> Clearance:
         time, obstacle, rope = self.where
         x, z = self.plan(time).tolist()
-        return Clearance(
-            min(lower, self.least), self.least, time, (x, z), obstacle, "rope" if rope else "load", required, certified
-        )
+        # Coordinates and distances are rounded; a bound is not allowed to be so upwards.
+        safe = min(lower, self.least) - 32.0 * float(np.finfo(float).eps) * max(self.peaks[0].max(), abs(self.least))
+        return Clearance(safe, self.least, time, (x, z), obstacle, "rope" if rope else "load", required, certified)

@@ -18,6 +18,7 @@ stationary, so that only the prescribed ones count in the slope of the cost.
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -33,6 +34,9 @@ from ctrlplan.trajectories.common import FACTORIALS, Array, checked_count, check
 from ctrlplan.trajectories.newton import NewtonSystem
 from ctrlplan.trajectories.newton_spline import checked_waypoints, given_entries
 from ctrlplan.trajectories.trigonometric import checked_alpha
+
+_EPS = float(np.finfo(float).eps)
+_FEW, _NONE = 1e-6, 1e-2  # estimated relative errors of the cost, above which there is a warning, an error
 
 
 @dataclass(frozen=True, repr=False)
@@ -134,7 +138,16 @@ def optimize_waypoints(
     ------
     ValueError
         If an argument is out of range, times do not increase, axes differ, the
-        order is below the continuity, or an axis prescribes nothing.
+        order is below the continuity, or an axis prescribes nothing; if
+        waypoints are so near in time, or so far from the origin, that rounding
+        of the data costs the digits of the cost.
+
+    Warns
+    -----
+    UserWarning
+        If the estimated relative error of the cost is above 1e-6; above 1e-2 it
+        is an error. The error grows with the power 2 `derivative` - 1 of the
+        ratio between the mean and the shortest segment.
 
     Examples
     --------
@@ -175,6 +188,7 @@ def optimize_waypoints(
         better = problem.solve((chosen - start) / duration)
         if better.cost @ factors < found.cost @ factors:
             found, times = better, chosen
+    _check_digits(problem, found, times)
 
     sides = np.where(np.isnan(table), found.sides / unit, table)  # prescribed entries to the last bit
     before, after = (
@@ -195,6 +209,29 @@ def optimize_waypoints(
     return Optimum(chosen_points, plan, cost, found.unique, derivative)
 
 
+def _check_digits(problem: _Problem, found: _Solution, times: Array) -> None:
+    """Say how many digits of the cost are left, where rounding of the data costs many."""
+    position, higher = problem.table[:, 0], np.nan_to_num(problem.table[:, 1:])
+    size = np.nanmax(np.abs(position), axis=0, initial=0.0)
+    ranges = np.nanmax(position, axis=0, initial=-np.inf) - np.nanmin(position, axis=0, initial=np.inf)
+    ranges[ranges <= 4.0 * _EPS * size] = 0.0  # equal but for rounding
+    data = ranges**2 + (higher**2).sum(axis=(0, 1))
+    # A cost of 0 is met to rounding: what counts is its size beside that of other plans through such data.
+    lost = float(np.divide(found.rounding, np.maximum(found.cost, 1e-6 * data), where=data > 0.0, out=0.0 * data).max())
+    if not lost > _FEW:
+        return
+    steps = np.diff(times)
+    k = int(steps.argmin())
+    why = (
+        f"an estimated relative error of {lost:.1g}: positions up to {size.max():.3g} are known to 16 digits, and "
+        f"{steps[k]:.3g} s from waypoints[{k}] to [{k + 1}] are {steps[k] / steps.mean():.2g} of the mean segment; "
+        f"merge waypoints that are so near, or measure positions from a nearer origin"
+    )
+    if lost > _NONE:
+        raise ValueError(f"the cost must be resolved in double precision, got {why}")
+    warnings.warn(f"the optimum is known to few digits only, with {why}", stacklevel=3)
+
+
 class _Solution(NamedTuple):
     """Optimum at given times, in units of the duration."""
 
@@ -202,6 +239,7 @@ class _Solution(NamedTuple):
     cost: Array  # (naxes,)
     slope: Array  # of the cost along the durations, shape (nlegs, naxes)
     unique: bool
+    rounding: Array  # estimate of the error of the cost, shape (naxes,)
 
 
 class _Problem:
@@ -226,12 +264,13 @@ class _Problem:
         family = self.family(times, *self.shape)
         count, _, naxes = self.table.shape
         sides, cost, slope = np.empty((2, *self.table.shape)), np.empty(naxes), np.empty((count - 1, naxes))
-        unique = True
+        unique, rounding = True, np.empty(naxes)
         for known, axes in self.groups:
             part = family.solve(known, self.table[:, :, axes], self.loose)
             sides[..., axes], cost[axes], slope[:, axes] = part.sides, part.cost, part.slope
+            rounding[axes] = part.rounding
             unique &= part.unique
-        return _Solution(sides, cost, slope, unique)
+        return _Solution(sides, cost, slope, unique, rounding)
 
     def scale(self, times: Array) -> Array:
         """Cost (naxes,) of entries of these sizes that cancel nowhere: free ones 0, signs alternating."""
@@ -274,7 +313,9 @@ class _Legs:
         power = 1 - 2 * self.derivative
         square = (value**2).sum(axis=1)
         slope = self.durations ** (power - 1) * (power * square + 2.0 * (value * change).sum(axis=1))
-        return _Solution(entries[[left, right]], (self.durations**power * square).sum(axis=0), slope, unique)
+        rounding = (self.durations**power * _rounding(value, np.abs(self.root) @ np.abs(data)).sum(axis=1)).sum(axis=0)
+        rounding += 16.0 * _EPS * np.abs(slope).sum(axis=0)  # of the times
+        return _Solution(entries[[left, right]], (self.durations**power * square).sum(axis=0), slope, unique, rounding)
 
 
 class _Whole:
@@ -314,7 +355,8 @@ class _Whole:
         slope[-1] = 0.0  # the last time stays
         side = entries.reshape(table.shape)
         along = np.cumsum(slope[:0:-1], axis=0)[::-1]
-        return _Solution(np.stack([side, side]), (value**2).sum(axis=0), along, unique)
+        rounding = _rounding(value, np.abs(matrix) @ np.abs(entries)).sum(axis=0)
+        return _Solution(np.stack([side, side]), (value**2).sum(axis=0), along, unique, rounding)
 
 
 @lru_cache(maxsize=256)
@@ -369,6 +411,12 @@ def _least_squares(matrix: Array, right: Array, weight: Array) -> tuple[Array, b
         null, _ = np.linalg.qr(np.linalg.svd(matrix / scale)[2][rank:].T / scale[:, None])
         found -= null @ (null.T @ found)
     return found, rank == count
+
+
+def _rounding(value: Array, size: Array) -> Array:
+    """Errors of squared samples that are sums of terms of some size: what rounding of the terms leaves in them."""
+    error = 16.0 * _EPS * size
+    return 2.0 * np.abs(value) * error + error**2
 
 
 def _norms(matrix: Array) -> Array:

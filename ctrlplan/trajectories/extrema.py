@@ -313,9 +313,12 @@ def certified_bounds(
             radius *= 0.5
             centres = (centres[undecided, None] + np.array([-radius, radius])).ravel()
     best = found.extrema()
+    # What the function is made of is rounded, and can cancel in its values.
+    terms = float(np.sum(weights[:, :, 0] * np.stack([plan.peak(k) for k in range(order + 1)])))
+    rounding = _ROUNDING * (max(abs(least), abs(greatest)) + terms)
     return Bounds(
-        lower,
-        upper,
+        lower - rounding,
+        upper + rounding,
         *(float(v[0]) for v in (best.minimum, best.maximum, best.time_min, best.time_max)),
     )
 

@@ -217,7 +217,18 @@ def _conjugate(
     rows = np.array([jump[i, 2 * size - 1 - k] for i, k in free])
     matrix, known = rows[:, naxes:], rows[:, :naxes]
     scale = np.abs(matrix).max(axis=1, keepdims=True)
-    if scale.min() == 0.0 or np.linalg.cond(matrix / scale) > 1e13:
+    condition = np.linalg.cond(matrix / scale) if scale.min() > 0.0 else np.inf
+    if condition > 1e13:
+        steps = np.diff([p.time for p in points])
+        if np.ptp(steps) > 1e-9 * unit:
+            # Whether the data determine the entries does not depend on the times: this raises if they do not.
+            _conjugate(tuple(p.scaled(float(i), 1.0) for i, p in enumerate(points)), pattern, size, free, table, alpha)
+            k = int(steps.argmin())
+            raise ValueError(
+                f"the entries left free at inner waypoints must be determined in double precision, got a condition "
+                f"number of {condition:.1g}: {steps[k]:.3g} s from waypoints[{k}] to [{k + 1}] are "
+                f"{steps[k] / unit:.2g} of the mean segment; merge waypoints that are so near, or prescribe more there"
+            )
         raise ValueError("the entries left free at inner waypoints must be determined by the others; prescribe more")
     solution: Array = np.linalg.solve(matrix, -known)
     return times_powers(solution, 1.0 / unit, np.array([k for _, k in free])[:, None])

@@ -250,3 +250,17 @@ def test_distances_that_are_no_numbers_are_refused():
 
     with pytest.raises(ValueError, match="distances must be finite over the plan"):
         clearance(ACROSS, [Hole((0.0, 0.0), 1.0)])
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_a_bound_is_not_rounded_upwards(seed):
+    """On a line run evenly beside a wall the bound is exact, and all samples are alike, but for rounding."""
+    rng = np.random.default_rng(seed)
+    angle, offset, far = rng.uniform(0.0, 2.0 * np.pi), rng.normal(), 10.0 ** rng.uniform(-2.0, 4.0)
+    normal, along = np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])
+    points = [(offset + 1.0) * normal + side * far * along for side in (-1.0, 1.0)]
+    plan = cp.PolySpline([cp.Waypoint(0, points[0]), cp.Waypoint(10, points[1])])
+    wall = HalfPlane(tuple(-normal), -offset)
+    found = clearance(plan, [wall])
+    assert found.lower <= wall.distance(plan(np.linspace(0.0, 10.0, 100_001))).min()
+    assert found.lower == pytest.approx(1.0, abs=1e-13 * max(far, 1.0))

@@ -669,3 +669,122 @@ def test_results_cannot_be_changed():
         found.cost = 0.0
     with pytest.raises(ValueError, match="read-only"):
         found.waypoints[1].jet[0, 0] = 2.0
+
+
+# Digits that rounding of the data costs
+
+
+def minimum_jerk(times, positions):
+    """Cost of minimum jerk through positions, at rest at both ends: normal equations of Hermite quintics, 50 digits."""
+    with mp.workdps(50):
+        hermite = mp.matrix(6, 6)
+        for i, j in itertools.product(range(3), range(6)):
+            hermite[i, j] = mp.factorial(i) if i == j else 0
+            hermite[3 + i, j] = mp.ff(j, i) if j >= i else 0
+        gram = mp.matrix(6, 6)
+        for i, j in itertools.product(range(3, 6), repeat=2):
+            gram[i, j] = mp.ff(i, 3) * mp.ff(j, 3) / mp.mpf(i + j - 5)
+        unit = (hermite**-1).T * gram * hermite**-1
+        size = 3 * len(times)
+        whole, data = mp.matrix(size, size), mp.matrix(size, 1)
+        for k, (left, right) in enumerate(itertools.pairwise(map(mp.mpf, times))):
+            powers = [(right - left) ** i for i in range(3)] * 2
+            for i, j in itertools.product(range(6), repeat=2):
+                whole[3 * k + i, 3 * k + j] += unit[i, j] * powers[i] * powers[j] / (right - left) ** 5
+        data[::3] = mp.matrix(list(map(mp.mpf, positions)))
+        free = [k for k in range(3, size - 3) if k % 3]
+        matrix = mp.matrix([[whole[i, j] for j in free] for i in free])
+        known = whole * data
+        for k, value in zip(free, mp.lu_solve(matrix, mp.matrix([-known[k] for k in free])), strict=True):
+            data[k] = value
+        return float((data.T * whole * data)[0])
+
+
+def optimum_or_word(times, positions, **options):
+    """Optimum of minimum jerk, and the warning or the error that was given instead of digits."""
+    ends = (0, len(times) - 1)
+    points = [
+        Waypoint(float(t), float(p), *((0.0, 0.0) if i in ends else ()))
+        for i, (t, p) in enumerate(zip(times, positions, strict=True))
+    ]
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        try:
+            found = optimize_waypoints(points, **options)
+        except ValueError as error:
+            return None, str(error)
+    return found, str(caught[0].message) if caught else ""
+
+
+@pytest.mark.parametrize("order", [2, 3, 4])
+@pytest.mark.parametrize("gap", [1e-2, 1e-4, 3e-5, 1e-5, 1e-6, 1e-7, 1e-9])
+def test_a_short_inner_segment_is_right_or_says_what_it_costs(gap, order):
+    times = [0.0, 1.0, 1.0 + gap, 2.0]
+    found, word = optimum_or_word(times, times, order=order)
+    if gap <= 1e-6:
+        assert "known to 16 digits" in word
+        assert "from waypoints[1] to [2]" in word
+    if gap >= 1e-4:
+        assert not word
+    if not word:
+        assert found.cost == pytest.approx(minimum_jerk(times, times), rel=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_no_digits_are_lost_without_a_word(seed):
+    """Random points, some very near, some far from the origin: without a word six digits of the cost are right."""
+    rng = np.random.default_rng(seed)
+    gaps = 10.0 ** rng.uniform(-(seed % 9), 0.0, rng.integers(2, 6))
+    times = np.concatenate([[0.0], np.cumsum(gaps)])
+    steps = rng.normal(size=times.size) * np.concatenate([[0.0], gaps])
+    positions = np.cumsum(steps) + 10.0 ** rng.uniform(-2.0, 4.0)
+    found, word = optimum_or_word(times, positions, order=int(rng.integers(2, 5)))
+    if not word:
+        assert found.cost == pytest.approx(minimum_jerk(times, positions), rel=1e-6)
+
+
+def test_the_estimate_of_what_is_lost():
+    """Where a warning is given the cost is as near to the true one as the warning says."""
+    told = []
+    for gap in np.geomspace(1e-4, 3e-7, 14):
+        times = [0.0, 1.0, 1.0 + gap, 2.0]
+        found, word = optimum_or_word(times, times, order=3)
+        if found and word:
+            estimate = float(word.split("relative error of ")[1].split(":")[0])
+            told.append(estimate)
+            assert abs(found.cost / minimum_jerk(times, times) - 1.0) <= 1.1 * estimate
+    assert len(told) >= 2
+
+
+@pytest.mark.parametrize(
+    ("times", "positions"),
+    [
+        (np.arange(30.0), np.arange(30.0)),  # a straight line but for its ends
+        (np.arange(5.0), np.zeros(5)),
+        (np.arange(5.0), np.full(5, 1e6)),
+        (1e-6 * np.arange(5.0), 1e-9 * np.arange(5.0) ** 2),
+        (1e6 * np.arange(5.0), [0.0, 1e7, -1e7, 1e7, 0.0]),
+        (1e5 + np.arange(4.0), [0.0, 1.0, 3.0, 2.0]),
+        (np.cumsum([0.0, 1.0, 1e-3, 1.0]), [0.0, 1.0, 1.001, 2.0]),
+    ],
+)
+def test_nothing_is_said_where_digits_are_kept(times, positions):
+    found, word = optimum_or_word(times, positions)
+    assert not word
+    size = np.ptp(positions) ** 2 / (times[-1] - times[0]) ** 5
+    # Beside a cost that is 0, what a rounding of the positions costs.
+    rounding = (1e-13 * np.abs(positions).max() / np.diff(times).min() ** 2.5) ** 2
+    assert found.cost == pytest.approx(minimum_jerk(times, positions), rel=1e-6, abs=1e-12 * size + rounding)
+
+
+def test_digits_lost_far_from_the_origin():
+    """A move of a millimetre at 1e12, where numbers are 0.1 mm apart."""
+    found, word = optimum_or_word([0.0, 1.0, 2.0], [1e12, 1e12 + 1e-3, 1e12])
+    assert found is None
+    assert "measure positions from a nearer origin" in word
+
+
+def test_a_single_spline_through_near_points_loses_digits_too():
+    points = [Waypoint(t, math.sin(9.0 * t), 9.0 * math.cos(9.0 * t), 0.0) for t in (0.0, 0.5, 0.5 + 1e-6, 1.0)]
+    with pytest.raises(ValueError, match="the cost must be resolved in double precision, got an estimated relative"):
+        optimize_waypoints(points, single=True)

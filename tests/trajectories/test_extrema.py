@@ -425,6 +425,15 @@ def test_bounds_of_a_jumping_derivative():
     assert found.maximum - 1e-12 <= exact.maximum[0] <= found.upper
 
 
+@pytest.mark.parametrize("seed", range(10))
+def test_bounds_are_not_rounded_inwards(seed):
+    """Of a line the Lipschitz bound is exact, so that only rounding lies between the bounds and the ends."""
+    start, end = np.random.default_rng(seed).normal(size=2)
+    line = PolySpline(waypoints([0.0, 1.0], [[start], [end]]))
+    found = line.bounds(lambda jet: jet[0, 0], 0, 1.0)
+    assert found.lower <= min(start, end) <= max(start, end) <= found.upper
+
+
 def test_bounds_that_cannot_be_reached_are_refused():
     with pytest.raises(ValueError, match="rtol = 1e-12 must be reached within 200 cells"):
         MOVE.bounds(lambda jet: jet[0, 0], 0, 1.0, rtol=1e-12, max_cells=200)
