@@ -22,7 +22,7 @@ from ctrlplan.simulation.runs import METHODS, Job, Record, recorded
 
 Array = NDArray[np.float64]
 
-_DELEGATED = threading.RLock()
+DELEGATED = threading.RLock()
 """One run by python-control at a time: it keeps the parameters of a run in the system."""
 
 _LONGEST = 1e15
@@ -185,7 +185,7 @@ def _delegated(job: Job) -> ct.TimeResponseData:
     warnings.warn(
         f"{prepared.unsupported}: run by control.input_output_response, without events", UserWarning, stacklevel=3
     )
-    with _DELEGATED:
+    with DELEGATED:
         response = ct.input_output_response(
             prepared.system,
             job.times,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -16,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from ctrlplan._checks import real_array
 from ctrlplan.simulation import Prepared, SolverError, prepare
 from ctrlplan.simulation.prepared import NotCompiledError
+from ctrlplan.simulation.simulate import DELEGATED
 from ctrlplan.studies.comparison import (
     Comparison,
     check_has_inputs,
@@ -524,7 +526,8 @@ def _one(
 
     def measured(plan: str) -> tuple[dict[str, float], dict[str, Array]]:
         own = {**settings, "outputs": settings["outputs"][plan]}
-        result = compare(_given(forms), {plan: references[plan]}, times, params=params, **own)
+        with DELEGATED if forms[plan].network is None else nullcontext():
+            result = compare(_given(forms), {plan: references[plan]}, times, params=params, **own)
         response = result.responses[plan]
         rows = np.asarray(response.outputs).reshape(len(response.output_labels), -1)
         kept = np.isin(np.asarray(response.time), wanted)
