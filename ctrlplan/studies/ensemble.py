@@ -334,20 +334,29 @@ def _forms(loop: Any, references: dict[str, Trajectory], table: dict[str, Array]
     """The loop's built form by plan: one for all, or one of each loop that a function builds."""
     if not is_builder(loop):
         return dict.fromkeys(references, prepare(check_has_inputs(loop)))
-    try:
-        names = list(inspect.signature(loop).parameters)[:2]
-        inspect.signature(loop).bind("", None)
-    except (TypeError, ValueError) as error:
-        names = list(table) if isinstance(error, TypeError) else []
-    if set(names) & set(table):
-        raise ValueError(
-            "build must be, with params, a loop whose blocks read the parameters, or a function of a plan's name and "
-            f"the plan that returns one, got {loop!r:.80}; give a function of the parameter with values="
-        )
+    _check_builder(loop, table)
     built = tried(lambda _: {name: prepare(loop(name, plan)) for name, plan in references.items()}, None)
     if isinstance(built, Failed):
         raise built.error
     return built
+
+
+def _check_builder(loop: Any, table: dict[str, Array]) -> None:
+    """Reject a function of the parameters, which would be called with a plan's name and the plan."""
+    try:
+        signature = inspect.signature(loop)
+        first = list(signature.parameters)[:2]
+    except (TypeError, ValueError):  # of some built-in functions nothing is known
+        return
+    try:
+        signature.bind("", None)
+    except TypeError:
+        first = list(table)
+    if set(first) & set(table):
+        raise ValueError(
+            "build must be, with params, a loop whose blocks read the parameters, or a function of a plan's name and "
+            f"the plan that returns one, got {loop!r:.80}; give a function of the parameter with values="
+        )
 
 
 def _check_read(forms: Mapping[str, Prepared], table: dict[str, Array], start: Any) -> None:
