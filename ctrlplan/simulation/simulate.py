@@ -25,7 +25,7 @@ from ctrlplan.simulation.scales import RELATIVE
 
 Array = NDArray[np.float64]
 
-_DELEGATED = threading.RLock()
+DELEGATED = threading.RLock()
 """One run by python-control at a time: it keeps the parameters of a run in the system."""
 
 _LONGEST = 1e15
@@ -234,7 +234,7 @@ def _delegated(job: Job) -> ct.TimeResponseData:
     warnings.warn(
         f"{prepared.unsupported}: run by control.input_output_response, without events", UserWarning, stacklevel=3
     )
-    with _DELEGATED:
+    with DELEGATED:
         response = ct.input_output_response(
             prepared.system,
             job.times,

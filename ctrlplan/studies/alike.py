@@ -32,7 +32,7 @@ _FIRST = 4
 _MEASURED = ("plans", "timepts", "outputs", "controls", "waypoints", "initial_state", "band", "start", "only")
 _WITHOUT_EFFECT = ("alpha", "title", "parameters")
 _SHARED = {"loop", *_MEASURED, *_WITHOUT_EFFECT}
-"""Arguments of `compare` that are heeded here; with any other each loop must be compared by itself."""
+"""Arguments of `compare` that are used here; with any other each loop must be compared by itself."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,13 +75,13 @@ class Alike:
         signature = inspect.signature(compare)
         bound = signature.bind(None, **given)
         bound.apply_defaults()
-        self._asked = SimpleNamespace(**bound.arguments)
+        self._given = SimpleNamespace(**bound.arguments)
         own = [name for name in signature.parameters if name not in _SHARED]
-        self._possible = _ordered(self._asked.timepts) and all(
+        self._possible = _ordered(self._given.timepts) and all(
             bound.arguments[name] is signature.parameters[name].default for name in own
         )
-        self._size, self._most = _FIRST, max(2, _SAMPLES // max(1, self._asked.timepts.size))
-        plans, begin = self._asked.plans, self._asked.timepts[:1]
+        self._size, self._most = _FIRST, max(2, _SAMPLES // max(1, self._given.timepts.size))
+        plans, begin = self._given.plans, self._given.timepts[:1]
         self._held = {k: plan.jet(begin, 0, left=True)[0, :, 0] for k, plan in plans.items()} if self._possible else {}
         self._first = next(iter(plans.values()))
         self.waiting: dict[int, Linear] = {}
@@ -100,8 +100,8 @@ class Alike:
             form, stated = linear_form(system), stated_start(system)
             if form.sources or stated is not None or form.b.shape[1] != self._first.naxes:
                 return None
-            tracked = tracked_outputs(system, self._asked.outputs, self._first)
-            acting = acting_outputs(system, self._asked.controls)
+            tracked = tracked_outputs(system, self._given.outputs, self._first)
+            acting = acting_outputs(system, self._given.controls)
             starts = self._starts(system)
         except (AttributeError, TypeError, ValueError):  # what is wrong is for `compare` to say
             return None
@@ -109,9 +109,9 @@ class Alike:
 
     def _starts(self, system: Any) -> dict[str, Array]:
         """States at the first sample by plan: as given, or at rest where the plan is."""
-        given = self._asked.initial_state
-        if given is not None:
-            state = np.broadcast_to(real_array(given, "initial_state"), (system.nstates,))
+        initial = self._given.initial_state
+        if initial is not None:
+            state = np.broadcast_to(real_array(initial, "initial_state"), (system.nstates,))
             return dict.fromkeys(self._held, state)
         return {name: rest_state(system, position) for name, position in self._held.items()}
 
@@ -128,17 +128,17 @@ class Alike:
     def metrics(self) -> dict[int, Metrics]:
         """Metrics of those that wait, by their numbers."""
         loops = list(self.waiting.values())
-        return dict(zip(self.waiting, _metrics(self._asked, loops), strict=True)) if loops else {}
+        return dict(zip(self.waiting, _metrics(self._given, loops), strict=True)) if loops else {}
 
 
-def _metrics(asked: Any, loops: list[Linear]) -> list[Metrics]:
+def _metrics(given: Any, loops: list[Linear]) -> list[Metrics]:
     """What `compare` finds of each loop."""
-    plans, times, labels = asked.plans, asked.timepts, list(loops[0].labels)
+    plans, times, labels = given.plans, given.timepts, list(loops[0].labels)
     first, tracked, acting = next(iter(plans.values())), loops[0].tracked, loops[0].acting
-    if asked.only is not None and not any(name.startswith("control") for name in asked.only):
+    if given.only is not None and not any(name.startswith("control") for name in given.only):
         acting = ()
     rows = [labels.index(name) for name in (*tracked, *acting)]
-    start = min(plan.start for plan in plans.values()) if asked.start is None else asked.start
+    start = min(plan.start for plan in plans.values()) if given.start is None else given.start
     a, b, c, d = (np.stack([getattr(loop.form, name) for loop in loops]) for name in "abcd")
     form = LinearForm(a, b, c, d, ())
     unstable = in_right_half(np.linalg.eigvals(form.a)).any(axis=1)
@@ -150,14 +150,14 @@ def _metrics(asked: Any, loops: list[Linear]) -> list[Metrics]:
         axes = [plan] if plan.naxes == 1 else [plan.select([label]) for label in plan.labels]
         # One axis of all loops is measured like the axes of one.
         responses = [
-            response_metrics(times, y, axis, start, asked.band, each, asked.only)
+            response_metrics(times, y, axis, start, given.band, each, given.only)
             for y, axis in zip(signals[: len(axes)], axes, strict=True)
         ]
-        controls = [control_metrics(times, u, start, each, asked.only) for u in signals[len(axes) :]]
+        controls = [control_metrics(times, u, start, each, given.only) for u in signals[len(axes) :]]
         values = _of_loops(responses, first.labels, each)
         values |= {key: np.where(unstable, np.inf, row) for key, row in values.items() if "settling_time" in key}
         values |= _of_loops(controls, acting, each)
-        of_plan = path_metrics(plan, asked.waypoints) if asked.only is None else {}
+        of_plan = path_metrics(plan, given.waypoints) if given.only is None else {}
         for i, metrics in enumerate(found):
             metrics[name] = {key: float(row[i]) for key, row in values.items()} | of_plan
     return found

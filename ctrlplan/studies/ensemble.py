@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -16,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from ctrlplan._checks import real_array
 from ctrlplan.simulation import Prepared, SolverError, prepare
 from ctrlplan.simulation.prepared import NotCompiledError
+from ctrlplan.simulation.simulate import DELEGATED
 from ctrlplan.studies.comparison import (
     Comparison,
     all_run,
@@ -333,20 +335,29 @@ def _forms(loop: Any, references: dict[str, Trajectory], table: dict[str, Array]
     """The loop's built form by plan: one for all, or one of each loop that a function builds."""
     if not is_builder(loop):
         return dict.fromkeys(references, prepare(check_has_inputs(loop)))
-    try:
-        names = list(inspect.signature(loop).parameters)[:2]
-        inspect.signature(loop).bind("", None)
-    except (TypeError, ValueError) as error:
-        names = list(table) if isinstance(error, TypeError) else []
-    if set(names) & set(table):
-        raise ValueError(
-            "build must be, with params, a loop whose blocks read the parameters, or a function of a plan's name and "
-            f"the plan that returns one, got {loop!r:.80}; give a function of the parameter with values="
-        )
+    _check_builder(loop, table)
     built = tried(lambda _: {name: prepare(loop(name, plan)) for name, plan in references.items()}, None)
     if isinstance(built, Failed):
         raise built.error
     return built
+
+
+def _check_builder(loop: Any, table: dict[str, Array]) -> None:
+    """Reject a function of the parameters, which would be called with a plan's name and the plan."""
+    try:
+        signature = inspect.signature(loop)
+        first = list(signature.parameters)[:2]
+    except (TypeError, ValueError):  # of some built-in functions nothing is known
+        return
+    try:
+        signature.bind("", None)
+    except TypeError:
+        first = list(table)
+    if set(first) & set(table):
+        raise ValueError(
+            "build must be, with params, a loop whose blocks read the parameters, or a function of a plan's name and "
+            f"the plan that returns one, got {loop!r:.80}; give a function of the parameter with values="
+        )
 
 
 def _check_read(forms: Mapping[str, Prepared], table: dict[str, Array], start: Any) -> None:
@@ -525,7 +536,8 @@ def _one(
 
     def measured(plan: str) -> tuple[dict[str, float], dict[str, Array]]:
         own = {**settings, "outputs": settings["outputs"][plan]}
-        result = compare(_given(forms), {plan: references[plan]}, times, params=params, **own)
+        with DELEGATED if forms[plan].network is None else nullcontext():
+            result = compare(_given(forms), {plan: references[plan]}, times, params=params, **own)
         response = result.responses[plan]
         rows = np.asarray(response.outputs).reshape(len(response.output_labels), -1)
         kept = np.isin(np.asarray(response.time), wanted)

@@ -8,7 +8,7 @@ import signal
 import threading
 from asyncio import CancelledError
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import dataclass, field
@@ -165,13 +165,16 @@ def tried(run: Callable[[T], R], task: T, timeout: float | None = None) -> R | F
     return outcome
 
 
-def gathered(outcomes: Iterable[tuple[int, R | Failed]], count: int, label: str, progress: bool) -> Account[R]:
+def gathered(
+    outcomes: Generator[tuple[int, R | Failed], None, None], count: int, label: str, progress: bool
+) -> Account[R]:
     """Outcomes of tasks in this process, until the last or until Ctrl-C.
 
     Parameters
     ----------
-    outcomes : iterable of (int, result or Failed)
-        Number and outcome of each task; it makes the runs.
+    outcomes : generator of (int, result or Failed)
+        Number and outcome of each task; it makes the runs. Interrupted, it may
+        yield what is ready.
     count : int
         How many there are.
     label : str
@@ -186,10 +189,20 @@ def gathered(outcomes: Iterable[tuple[int, R | Failed]], count: int, label: str,
                 account.found[k] = outcome
                 advance()
         except KeyboardInterrupt:
+            account.interrupted = True
+            account.found |= dict(_ready(outcomes))
             if len(pressed) > 1:
                 raise
-            account.interrupted = True
     return account
+
+
+def _ready(outcomes: Generator[tuple[int, Any], None, None]) -> Iterator[tuple[int, Any]]:
+    """What a generator yields when it is interrupted; nothing if that is what ended it."""
+    try:
+        yield outcomes.throw(KeyboardInterrupt)
+        yield from outcomes
+    except (KeyboardInterrupt, StopIteration):
+        return
 
 
 def executed(
@@ -217,7 +230,8 @@ def executed(
     Futures are taken as they complete where they have ``add_done_callback`` or
     ``done``, and in the order of submission where they have ``result`` alone.
     What an executor loses is not run again. On Ctrl-C, and whenever this
-    function raises, tasks that have not begun are cancelled; others run on.
+    function raises, tasks that have not begun are cancelled; the others are
+    finished by the executor.
     """
     if executor is None:
         here = ((k, tried(run, task, timeout)) for k, task in enumerate(tasks))
@@ -227,11 +241,11 @@ def executed(
     try:
         with _counting_interruptions() as pressed, _bar(len(tasks), label, progress) as advance:
             try:
-                refused = _submit(partial(tried, run, timeout=timeout), tasks, executor, futures)
+                rejected = _submit(partial(tried, run, timeout=timeout), tasks, executor, futures)
                 for k, outcome in _completed(futures):
                     account.found[k] = outcome
                     advance()
-                account.found |= refused
+                account.found |= rejected
             except KeyboardInterrupt:
                 if len(pressed) > 1:
                     raise
@@ -269,7 +283,7 @@ class Shared(Generic[T]):
 
     def made(self, make: Callable[[T], R]) -> R:
         """What is made of the value, in this thread: kept, so that no two threads share it."""
-        return recent(_kept(), (self._key, "made"), _KEPT, lambda: make(self._own()))
+        return recent(_kept(), self._key, _KEPT, lambda: make(self._own()))
 
     def _own(self) -> T:
         return pickle.loads(self._data) if self._data else self._value  # noqa: S301 (its own)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -116,8 +116,9 @@ def sweep(
     A value or draw that cannot be run, whose worker process dies, that takes
     too long, or that calls ``sys.exit`` is recorded in `failures` with the
     reason; the others are kept. Ctrl-C ends the sweep: what is finished is
-    returned with a warning, and tasks that have not begun are cancelled. A
-    second Ctrl-C, or one before the first draw, raises KeyboardInterrupt.
+    returned with a warning, and tasks that have not begun are cancelled; an
+    executor finishes those that have. A second Ctrl-C, or one before the first
+    draw, raises KeyboardInterrupt.
 
     Parameters
     ----------
@@ -255,7 +256,7 @@ def _compared(build: Callable[[float], Any], given: dict[str, Any], value: float
 
 def _outcomes(
     build: Callable[[float], Any], values: list[float], given: dict[str, Any], timeout: float | None
-) -> Iterator[tuple[int, Metrics | Failed]]:
+) -> Generator[tuple[int, Metrics | Failed], None, None]:
     """Outcome of each value, of many at once where their loops are linear and differ in numbers alone.
 
     The first of these is compared by itself, so that `compare` checks the options.

@@ -386,6 +386,31 @@ def test_an_interruption_returns_every_value_that_was_finished(build, k):
     assert found.results([]) == {"value": RATES[:k]} | {plan: {} for plan in found.metrics}
 
 
+@pytest.mark.parametrize("build", [lag, bent])
+@pytest.mark.parametrize("k", [1, 2, 5])
+def test_an_interruption_between_two_results_loses_none(build, k, monkeypatch):
+    """As in the progress bar: what is measured together with the last one is ready too."""
+    from ctrlplan.studies import executing
+
+    class Bar:
+        def __init__(self, **settings):
+            self.done = 0
+
+        def update(self):
+            self.done += 1
+            if self.done == k:
+                raise KeyboardInterrupt
+
+        def close(self):
+            pass
+
+    monkeypatch.setattr(executing, "tqdm", Bar)
+    with pytest.warns(UserWarning, match="interrupted"):
+        found = swept(build)
+    assert found.interrupted
+    check(found, RATES[: {1: 1, 2: 5, 5: 5}[k] if build is lag else k])  # one alone, then four together
+
+
 def test_a_sweep_that_is_not_interrupted_says_so():
     assert not swept(lag).interrupted
     assert not ensemble(drawn(), PLANS, TIMES, {"tau": [1.0]}, None, False).interrupted

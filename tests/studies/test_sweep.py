@@ -235,6 +235,26 @@ def test_metrics_count_from_the_start_that_is_given(start):
     np.testing.assert_allclose(found.metrics["step"]["itae"], itae, rtol=1e-5)
 
 
+@pytest.mark.parametrize(
+    "build",
+    [
+        lambda k: ct.ss([], [], [], [[k, 0.5], [0.25, k]], inputs=["x_ref", "z_ref"], outputs=["x", "z"]),
+        lambda k: ct.ss(
+            np.diag([-k, 90.0, -1.0]), [[k, 0], [1, 1], [0, 1]], [[1, 0, 0], [0, 0, 1]], 0, inputs=2, outputs=["x", "z"]
+        ),
+    ],
+    ids=["gains without states", "a state that grows and no output shows"],
+)
+def test_odd_loops_are_measured_as_by_themselves(build):
+    values, times = np.array([0.5, 1.0, 2.0, 4.0]), np.linspace(0.0, 12.0, 121)
+    plans, options = {"step": cp.Step([1.0, 1.0], labels=["x", "z"])}, {"outputs": list(build(1.0).output_labels)}
+    found = cp.sweep(build, values, plans, times, progress=False, **options)
+    for i, value in enumerate(values):
+        row = cp.compare(build(value), plans, times, **options).metrics["step"]
+        of_value = [found.metrics["step"][name][i] for name in row]
+        np.testing.assert_allclose(of_value, list(row.values()), rtol=1e-9, atol=1e-12)
+
+
 def test_a_builder_may_change_one_loop_from_value_to_value():
     """Measured is the loop as it was at each value, not as the builder left it."""
     lag = ct.ss([[-1.0]], [[1.0]], [[1.0]], [[0.0]], inputs="r", outputs="y", name="lag")
