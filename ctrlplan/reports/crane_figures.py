@@ -339,6 +339,9 @@ def _view(comparison: Comparison, corners: list[Array]) -> list[float]:
     room = 0.1 * float(np.max(high - low))
     left, top = (low - room).tolist()
     width, height = (high - low + 2.0 * room).tolist()
+    # Neither a strip nor a tower: the figure has the width of the page.
+    height = max(height, 0.6 * width)
+    left, width = left - max(0.0, 0.4 * height - 0.5 * width), max(width, 0.8 * height)
     return _rounded(np.array([left, top, width, height]))
 
 

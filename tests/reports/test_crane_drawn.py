@@ -224,6 +224,7 @@ def test_the_view_of_the_animation_holds_the_whole_way():
         assert left < -5.0 * scale < 40.0 * scale < left + width
         assert top < 0.0 < 22.0 * scale < top + height
         assert max(width, height) < 4 * 45.0 * scale
+        assert 0.6 * width - 1e-3 * scale < height < 1.25 * width + 1e-3 * scale
 
 
 def test_a_small_crane_is_animated_as_well_as_a_large_one():
@@ -234,6 +235,16 @@ def test_a_small_crane_is_animated_as_well_as_a_large_one():
     assert np.unique(trolley).size > 30
     assert trolley[[0, -1]] == pytest.approx([-1e-3, 1e-3], abs=1e-5)
     assert data["view"][2] < 1.0
+
+
+@pytest.mark.parametrize("places", [((0.0, 10.0), (200.0, 10.0)), ((3.0, 10.0), (3.0, 90.0))])
+def test_the_view_is_neither_a_strip_nor_a_tower(places):
+    data = json.loads(animation_data(compared(points(*places, step=60.0))))
+    left, top, width, height = data["view"]
+    assert 0.599 < height / width < 1.251
+    for x, z in places:
+        assert left < x < left + width
+        assert top < z < top + height
 
 
 def test_a_run_that_leaves_the_range_of_numbers_is_drawn_up_to_there():
