@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -306,13 +307,20 @@ def animation_data(comparison: Comparison, wall: Wall = None, rate: float = 12.0
             continue
         t = signals["t"][:end]
         at = np.arange(t[0], t[-1], 1.0 / rate) if end > 1 else t
-        plans[name] = [np.round(np.interp(at, t, signals[k][:end]), 3).tolist() for k in ("D", "R", "theta")]
+        plans[name] = [_rounded(np.interp(at, t, signals[k][:end])) for k in ("D", "R", "theta")]
         drums[name] = _drum_radius({k: row[:end] for k, row in signals.items()})
         corners.append(np.stack([signals["x"][:end], signals["z"][:end]]))
     one = len(set(drums.values())) == 1
     drum = next(iter(drums.values())) if one else drums
     view = _view(comparison, corners)
     return htmlsafe_json_dumps({"b": drum, "rate": rate, "plans": plans, "wall": wall, "view": view}, allow_nan=False)
+
+
+def _rounded(values: Array) -> list[float]:
+    """Values to five digits of the largest one."""
+    size = float(np.max(np.abs(values), initial=0.0))
+    found: list[float] = np.round(values, 4 - math.floor(math.log10(size)) if size > 0.0 else 0).tolist()
+    return found
 
 
 def _view(comparison: Comparison, corners: list[Array]) -> list[float]:
@@ -324,14 +332,17 @@ def _view(comparison: Comparison, corners: list[Array]) -> list[float]:
         np.max([np.nanmax(path, axis=1, initial=-np.inf) for path in paths], axis=0),
     )
     low[1], high[1] = min(low[1], 0.0), max(high[1], 0.0)  # the trolley runs at z = 0
-    span = max(float(np.max(high - low)), 1e-3)
+    span = float(np.max(high - low)) or 1.0
     for box in corners:
         low = np.maximum(np.minimum(low, box.min(axis=1)), low - 0.5 * span)
         high = np.minimum(np.maximum(high, box.max(axis=1)), high + 0.5 * span)
     room = 0.1 * float(np.max(high - low))
     left, top = (low - room).tolist()
     width, height = (high - low + 2.0 * room).tolist()
-    return [round(value, 4) for value in (left, top, width, height)]
+    # Neither a strip nor a tower: the figure has the width of the page.
+    height = max(height, 0.6 * width)
+    left, width = left - max(0.0, 0.4 * height - 0.5 * width), max(width, 0.8 * height)
+    return _rounded(np.array([left, top, width, height]))
 
 
 def is_crane(comparison: Comparison) -> bool:
@@ -355,7 +366,8 @@ def _drum_radius(signals: dict[str, Array]) -> float:
     """Radius b of the drum: the rope leaves it at (D + b cos theta, -b sin theta)."""
     x, z = _rope_top(signals)
     theta = signals["theta"]
-    return float(np.round(np.median((x - signals["D"]) * np.cos(theta) - z * np.sin(theta)), 6))
+    radius = float(np.median((x - signals["D"]) * np.cos(theta) - z * np.sin(theta)))
+    return float(f"{radius:.6g}")
 
 
 def _moving(comparison: Comparison) -> list[str]:

@@ -107,10 +107,13 @@ def write_all(texts: Mapping[Path, str]) -> list[Path]:
 
 def render_page(studies: Sequence[Study], title: str) -> str:
     """The page as text."""
-    script = _script("sort.js.html") + _script("animation.js.html")
+    sections = [_section(study, key) for study, key in zip(studies, _keys(studies), strict=True)]
+    script = _script("sort.js.html")
+    if any(section["animation"] for section in sections):
+        script += _script("animation.js.html")
     return _template("page.html").render(
         title=title,
-        sections=[_section(study, key) for study, key in zip(studies, _keys(studies), strict=True)],
+        sections=sections,
         versions=_versions(),
         script=script,
         policy=_policy(script),

@@ -439,7 +439,7 @@ def _notes_of_events(responses: Mapping[str, Any], stopped: Mapping[str, Occurre
 
 
 def _notes_of_failures(failures: Mapping[str, str]) -> tuple[str, ...]:
-    return tuple(f"{plan} could not be run and is left out: {reason}" for plan, reason in failures.items())
+    return tuple(f"With {plan} the run failed, and it is left out: {reason}" for plan, reason in failures.items())
 
 
 def _each(run: Callable[[str, Trajectory], None], references: Mapping[str, Trajectory]) -> dict[str, str]:

@@ -244,7 +244,7 @@ def _check_memory(samples: float, plans: int, worth: bool, place: str) -> None:
         )
 
 
-_LARGEST = 2**24
+_LARGEST = 2**20
 """Bytes of a study file at most: it is written by hand."""
 
 

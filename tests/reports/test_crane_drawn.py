@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import ctrlplan as cp
-from ctrlplan.reports import FIGURES, CraneAnimation
+from ctrlplan.reports import FIGURES, CraneAnimation, render_page
 from ctrlplan.reports.crane_figures import animation_data, plot_motion, plot_plane, plot_step, plot_time
 from ctrlplan.studies import Study
 from ctrlplan.studies.files import load_study
@@ -224,6 +224,27 @@ def test_the_view_of_the_animation_holds_the_whole_way():
         assert left < -5.0 * scale < 40.0 * scale < left + width
         assert top < 0.0 < 22.0 * scale < top + height
         assert max(width, height) < 4 * 45.0 * scale
+        assert 0.6 * width - 1e-3 * scale < height < 1.25 * width + 1e-3 * scale
+
+
+def test_a_small_crane_is_animated_as_well_as_a_large_one():
+    places = points((0.0, 0.1), (0.002, 0.1))
+    data = json.loads(animation_data(compared(places, crane=wide(1e-3))))
+    assert data["b"] == pytest.approx(1e-3, rel=1e-4)
+    trolley = np.array(data["plans"]["polynomial"][0])
+    assert np.unique(trolley).size > 30
+    assert trolley[[0, -1]] == pytest.approx([-1e-3, 1e-3], abs=1e-5)
+    assert data["view"][2] < 1.0
+
+
+@pytest.mark.parametrize("places", [((0.0, 10.0), (200.0, 10.0)), ((3.0, 10.0), (3.0, 90.0))])
+def test_the_view_is_neither_a_strip_nor_a_tower(places):
+    data = json.loads(animation_data(compared(points(*places, step=60.0))))
+    left, top, width, height = data["view"]
+    assert 0.599 < height / width < 1.251
+    for x, z in places:
+        assert left < x < left + width
+        assert top < z < top + height
 
 
 def test_a_run_that_leaves_the_range_of_numbers_is_drawn_up_to_there():
@@ -297,3 +318,47 @@ def test_the_order_of_axes_in_a_study_file_does_not_change_what_is_measured(tmp_
     for plan, rows in one.metrics.items():
         for name, value in rows.items():
             assert other.metrics[plan][name] == pytest.approx(value, rel=1e-6, abs=1e-9, nan_ok=True), (plan, name)
+
+
+# In the browser
+
+
+PARTS = """
+var root = document.querySelector("figure.animation"), of = k => root.querySelector("." + k);
+var number = (k, keys) => keys.map(a => Number(of(k).getAttribute(a)));
+return {view: root.querySelector("svg").getAttribute("viewBox").split(" ").map(Number),
+  rope: number("rope", ["x1", "y1", "x2", "y2"]), load: number("load", ["cx", "cy"]),
+  drum: number("drum", ["cx", "r"]), trace: of("trace").getAttribute("points").split(" ").length,
+  plan: root.querySelector("select").selectedOptions[0].textContent, clock: of("clock").textContent};
+"""
+
+
+@pytest.mark.slow
+def test_the_animation_plays_the_crane_that_was_simulated(browser, tmp_path):
+    found = compared(MOVE, crane=wide(1.5))
+    path = tmp_path / "index.html"
+    path.write_text(render_page([Study("it", "It", found, figures=())], "It"), encoding="utf-8")
+    browser.get("about:blank")
+    browser.get_log("browser")
+    browser.get(path.as_uri())
+    shown = browser.execute_script(PARTS)
+    assert shown["plan"] == "trigonometric"
+    assert shown["view"] == json.loads(animation_data(found))["view"]
+    # At rest at (0, 10): the rope hangs straight down from the drum, whose middle is b to the left of the load.
+    assert shown["rope"] == pytest.approx([0.0, 0.0, 0.0, 10.0], abs=2e-3)
+    assert shown["load"] == pytest.approx([0.0, 10.0], abs=2e-3)
+    assert shown["drum"] == pytest.approx([-1.5, 1.5], abs=2e-3)
+    assert shown["trace"] > 50
+    (choose,) = browser.find_elements("css selector", "figure.animation select")
+    browser.execute_script("arguments[0].selectedIndex = 0; arguments[0].dispatchEvent(new Event('change'))", choose)
+    assert browser.execute_script(PARTS)["plan"] == "polynomial"
+    browser.find_element("css selector", "figure.animation .play").click()
+    for _ in range(10_000):
+        moved = browser.execute_script(PARTS)
+        if moved["load"][0] > 1.0:
+            break
+    known = signals(found, "polynomial")
+    t = np.interp(moved["load"][0], known["x"], known["t"])
+    assert float(moved["clock"].split()[0]) == pytest.approx(t, abs=0.1)
+    assert moved["load"][1] == pytest.approx(np.interp(t, known["t"], known["z"]), abs=0.01)
+    assert browser.get_log("browser") == []
