@@ -29,9 +29,12 @@ class BlockTraits:
 
     Attributes
     ----------
-    breakpoints : tuple of float
+    breakpoints : tuple of float, or None
         Times [s] at which the equations of the block may jump or bend, as a
-        pulse or a switch in t does: the integrator stops there. Default: none.
+        pulse or a switch in t does: the integrator stops there. None (default)
+        where they are not known: switches are looked for where the block can be
+        compiled; otherwise, if its functions read t, no step is longer than the
+        distance of two sample times.
     feedthrough : None, bool or ndarray of bool, shape (noutputs, ninputs)
         Which outputs depend directly on which inputs; None (default) where it
         is not known.
@@ -67,7 +70,7 @@ class BlockTraits:
         System inside, whose changes are changes of this block.
     """
 
-    breakpoints: tuple[float, ...] = ()
+    breakpoints: tuple[float, ...] | None = None
     feedthrough: bool | NDArray[np.bool_] | None = None
     initial_state: NDArray[np.float64] | None = None
     longest: float = math.inf
@@ -228,7 +231,9 @@ def _seconds(value: Any, label: str) -> float:
         raise TypeError(f"{label} must be a number of seconds, got {value!r}") from None
 
 
-def _breakpoints(value: Any, label: str, system: Any) -> tuple[float, ...]:
+def _breakpoints(value: Any, label: str, system: Any) -> tuple[float, ...] | None:
+    if value is None:
+        return None
     entries = value if isinstance(value, Sequence | np.ndarray) and not isinstance(value, str) else [value]
     times = sorted({_seconds(entry, label) for entry in entries})
     if not all(map(math.isfinite, times)):

@@ -14,6 +14,9 @@ Array = NDArray[np.float64]
 _FEW = 4
 """Changes of each switch that come before the peaks of the signals."""
 
+_ENOUGH = 12
+"""States compared where nothing switches, and one for each signal."""
+
 
 class Compared:
     """Which sides of its switches a form has been compared on, and in which run it is next.
@@ -62,7 +65,7 @@ def telling_states(sides: Array, signals: Array, most: int) -> NDArray[np.intp]:
     -------
     ndarray of int
         Both sides of changes of a switch, the first of every switch before the
-        second of one; maxima and minima of signals; the rest evenly spread.
+        second of one; maxima and minima of signals; some evenly spread.
     """
     ntime = signals.shape[1]
     switch, before = np.nonzero(sides[:, 1:] != sides[:, :-1])
@@ -71,7 +74,9 @@ def telling_states(sides: Array, signals: Array, most: int) -> NDArray[np.intp]:
     changes = np.column_stack([before, before + 1])[order].ravel()
     early = 2 * int((rank < _FEW).sum())
     peaks = np.concatenate([signals.argmax(axis=1), signals.argmin(axis=1)])
-    spread = np.linspace(0, ntime - 1, min(ntime, most)).astype(int)
+    enough = _ENOUGH + len(signals)
+    most = min(most, changes.size + enough)
+    spread = np.concatenate([np.linspace(0, ntime - 1, enough).astype(int), np.arange(min(ntime, 2 * enough))])
     places = np.concatenate([[0, ntime - 1], changes[:early], peaks, changes[early:], spread])
     _, first = np.unique(places, return_index=True)
     return np.sort(places[np.sort(first)[:most]].astype(np.intp))

@@ -15,12 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctrlplan.simulation.compared import Compared
-from ctrlplan.simulation.drives import Series
+from ctrlplan.simulation.drives import Series, within
 from ctrlplan.simulation.interpreted import SolverError
 from ctrlplan.simulation.network import Block, Network, Step, known_feedthrough
 from ctrlplan.simulation.recent import recent
 from ctrlplan.simulation.scales import Scales
-from ctrlplan.simulation.switches import switch_arguments
+from ctrlplan.simulation.switches import changes_of_side, switch_arguments
 from ctrlplan.simulation.traced import NotTraceableError, Trace, agrees
 
 Array = NDArray[np.float64]
@@ -88,6 +88,13 @@ class Compiled:
         self._functions["outputs"] = ca.Function("outputs", [t, x, d, p], [ca.densify(_sparse(network.read) @ w)])
         self._functions["switches"] = switch_arguments(ca.Function("all", [t, x, d, p], [ca.vertcat(w, rates)]))
         self.compared = Compared(self._functions["switches"].numel_out(0))
+        jumps = switch_arguments(ca.Function("all", [t, x, d, p], [ca.vertcat(w, rates)]), bends=False)
+        self._timed = [self._of_time("switches", self._functions["switches"], network, 0)]
+        self._timed += [self._of_time("jumps", jumps, network, 2)]
+        self.depends_on_time = any(
+            trace is not None and block.changes_unseen and trace.depends_on_time()
+            for block, trace in zip(network.blocks, traces, strict=True)
+        )
         self._integrators: OrderedDict[Any, Any] = OrderedDict()
         self._maps: OrderedDict[Any, Any] = OrderedDict()
         self._equations: dict[int, dict[str, Any]] = {}
@@ -117,6 +124,43 @@ class Compiled:
         """All signals at many times, (nsignals, ntime)."""
         return self._at_many("signals", t, x, driven, p)
 
+    def instants(self, first: float, last: float, driven: Callable[[Array], Array], p: Array) -> list[float]:
+        """Times of a run at which the equations switch, where time and functions of time alone decide.
+
+        Parameters
+        ----------
+        first, last : float
+            Beginning and end of the run [s].
+        driven : callable
+            Maps times (n,) to the functions of time (ndriven, n).
+        p : ndarray
+            Parameters of the run.
+        """
+        found: list[float] = []
+        for name, function in self._timed:
+            if function is not None:
+
+                def sides(t: Array, name: str = name) -> Array:
+                    return np.sign(self._at_many(name, t, np.zeros((self._rates.numel_in(1), t.size)), driven(t), p))
+
+                found += changes_of_side(sides, first, last)
+        return sorted(set(found))
+
+    def _of_time(self, name: str, switches: Any, network: Network, argument: int) -> tuple[str, Any]:
+        """Those of some switches that depend on time (0) or functions of time (2), and on no state; None without."""
+        late = np.zeros(network.nsignals, dtype=bool)
+        for i in network.blocks_with("delay"):
+            late[network.outputs[i]] = True
+        depends = {k: np.asarray(ca.DM(switches.jac_sparsity(0, k)).full(), dtype=bool) for k in (0, 1, 2)}
+        undecided = depends[1].any(axis=1) | depends[2][:, late[network.driven]].any(axis=1)
+        rows = depends[argument].any(axis=1) & ~undecided
+        if not rows.any():
+            return name, None
+        inputs = [ca.SX.sym(switches.name_in(k), switches.sparsity_in(k)) for k in range(switches.n_in())]
+        chosen = switches(*inputs)[np.flatnonzero(rows).tolist()]
+        self._functions[f"timed {name}"] = ca.Function("timed", inputs, [ca.densify(chosen)])
+        return f"timed {name}", self._functions[f"timed {name}"]
+
     def sides(self, t: Array, x: Array, driven: Array, p: Array) -> Array:
         """On which side of its switches the form is at many times, (nswitches, ntime): -1, 0 or 1."""
         return np.sign(self._at_many("switches", t, x, driven, p))
@@ -135,10 +179,12 @@ class Compiled:
         jacobian = _called(self._jacobian, (np.array([t]), x, driven, p), x.size)
         return float(-np.linalg.eigvals(jacobian).real.min()) if np.isfinite(jacobian).all() else np.inf
 
-    def integrator(self, width: int, grid: Array, stiff: bool, rtol: float, atol: float, max_steps: int) -> Any:
+    def integrator(
+        self, width: int, grid: Array, stiff: bool, rtol: float, atol: float, max_steps: int, longest: float
+    ) -> Any:
         """CVODES over a leg of length 1, with outputs at some of its times."""
         # CasADi runs without Python's lock: no integrator is used by two threads at once.
-        key = (threading.get_ident(), width, grid.tobytes(), stiff, rtol, atol, max_steps)
+        key = (threading.get_ident(), width, grid.tobytes(), stiff, rtol, atol, max_steps, longest)
 
         def made() -> Any:
             options = {
@@ -146,6 +192,7 @@ class Compiled:
                 "reltol": rtol,
                 "abstol": atol * _SAFETY,
                 "max_num_steps": max_steps,
+                "max_step_size": longest,
                 "show_eval_warnings": False,
                 "disable_internal_warnings": True,
             }
@@ -163,10 +210,10 @@ class Compiled:
         if width not in self._equations:
             nx, nd, np_ = (self._rates.numel_in(k) for k in (1, 2, 3))
             shapes = {"s": (1,), "z": (nx,), "p": (np_,), "c": (nd, width), "bounds": (nd, 2)}
-            shapes |= {"span": (4,), "shift": (nx,), "scale": (nx,)}
+            shapes |= {"span": (6,), "shift": (nx,), "scale": (nx,)}
             s, z, p, c, bounds, span, shift, scale = (ca.SX.sym(name, *shape) for name, shape in shapes.items())
-            left, length, first, last = (span[k] for k in range(4))
-            t = left + s * length
+            left, length, first, last, earliest, latest = (span[k] for k in range(6))
+            t = ca.fmin(ca.fmax(left + s * length, earliest), latest)
             driven = _series(c, (2.0 * t - first - last) / (last - first))
             if width > 1:  # a signal that is nan stays nan
                 driven = ca.if_else(driven < bounds[:, 0], bounds[:, 0], driven)
@@ -230,6 +277,10 @@ class CompiledSolver:
             for near in (states - reach, states, states + reach)
         )
 
+    def instants(self, first: float, last: float, driven: Callable[[Array], Array]) -> list[float]:
+        """Times of a run at which the equations switch, where functions of time alone decide."""
+        return self._equations.instants(first, last, driven, self._p)
+
     def advance(self, series: Series, left: float, grid: Array, state: Array) -> Array:
         """States (nstates, ngrid) at times of a leg, of which the last is its end."""
         if not state.size:
@@ -242,15 +293,19 @@ class CompiledSolver:
             decay = self._equations.fastest_decay(left, state, series(left), self._p)
             self._longest, self._stiff = right - left, decay * (right - left) > _STIFF
         width = series.coefficients.shape[1]
-        span = [left, right - left, series.left, series.right]
+        span = [left, right - left, series.left, series.right, *within(left, right)]
         scales, max_steps = self._scales, self._max_steps
         known = [series.coefficients.ravel(order="F"), series.low, series.high, span, scales.shift, scales.scale]
         p = np.concatenate([self._p, *known])
         start = (state - scales.shift) / scales.scale
+        # What depends on time is seen at least once a sample: a pulse cannot be passed over unseen.
+        longest = round(float(np.diff(relative, prepend=0.0).max()), 6) if self._equations.depends_on_time else 0.0
         # A solution that explodes takes all the steps it may: few at first, then more, between outputs close together.
         close = np.union1d(relative, np.linspace(0.0, 1.0, _CLOSE)[1:])
         for outputs, allowed in ((relative, min(_FEW_STEPS, max_steps)), (close, max_steps)):
-            integrator = self._equations.integrator(width, outputs, self._stiff, self.rtol, scales.atol, allowed)
+            integrator = self._equations.integrator(
+                width, outputs, self._stiff, self.rtol, scales.atol, allowed, longest
+            )
             try:
                 with _passing_interruptions():
                     found = _called(integrator, (start, np.empty(0), p), state.size, self._report)
@@ -286,7 +341,7 @@ def _passing_interruptions() -> Iterator[None]:
             raise
 
     if threading.current_thread() is threading.main_thread():
-        for number in signal.valid_signals():
+        for number in map(int, signal.valid_signals()):
             handler = signal.getsignal(number)
             if callable(handler):
                 handlers[number] = handler
@@ -298,9 +353,9 @@ def _passing_interruptions() -> Iterator[None]:
             raise raised[0] from None
         raise
     finally:
-        for number, handler in handlers.items():
-            if signal.getsignal(number) is accompanied:
-                signal.signal(number, handler)
+        for key, handler in handlers.items():
+            if signal.getsignal(key) is accompanied:
+                signal.signal(key, handler)
     if raised:
         raise raised[0]
 
@@ -318,7 +373,7 @@ def _called(
     buffer.set_res(0, out.data)
     evaluate()
     if report is not None:
-        report(buffer.stats())
+        report(getattr(buffer, "stats", dict)())
     return out.T
 
 

@@ -199,7 +199,11 @@ def input_drives(labels: Sequence[str], inputs: Inputs, times: Array) -> list[Dr
         return [PlanDrive(inputs.select(labels) if crossed else inputs)]
     elif inputs is None or (not isinstance(inputs, list | tuple) and np.ndim(inputs) == 0 and not callable(inputs)):
         given = [0.0 if inputs is None else inputs] * len(labels)
-    elif isinstance(inputs, list | tuple) and len(inputs) == len(labels) != times.size:
+    elif (
+        isinstance(inputs, list | tuple)
+        and len(inputs) == len(labels)
+        and (len(inputs) != times.size or any(isinstance(value, Trajectory) for value in inputs))
+    ):
         given = list(inputs)
     else:
         rows = _numbers(inputs, "inputs")
@@ -297,6 +301,16 @@ def _drive(value: Any, name: str, times: Array) -> Drive:
         kinds = f"a trajectory, a number or {times.size} samples"
         raise ValueError(f"input {name} must be {kinds}, got shape {signal.shape}")
     return SampledDrive(times, signal)
+
+
+def within(left: float, right: float) -> tuple[float, float]:
+    """First and last time of a segment at which its equations are evaluated: inside, by rounding of the times.
+
+    At the ends themselves a block that switches there may already be on the
+    other side.
+    """
+    inset = min(4.0 * float(np.spacing(max(abs(left), abs(right)))), 0.25 * (right - left))
+    return left + inset, right - inset
 
 
 def breakpoints_of(drives: Iterable[Drive]) -> list[float]:

@@ -11,7 +11,8 @@ the cells' beginnings: a matrix product. Several systems with one input go
 through it together. Elsewhere the cells are halved, all at once and through the
 same squarings, until the state's own Taylor series converges in them, and the
 samples are read off that series. Neither interpolates, and neither has a
-stiffness limit.
+stiffness limit. What leaves the range of numbers is infinite, and so is what
+depends on it; the rest stays finite.
 """
 
 from __future__ import annotations
@@ -342,8 +343,8 @@ def _changes(a: Array, b: Array, nterms: int, halvings: int = 0) -> list[Array]:
     """
     n, m = b.shape[-2:]
     norm = float(np.abs(a).sum(axis=-2).max(initial=1.0))
-    if not np.isfinite(norm):
-        raise ValueError("rates of the system times the duration of the run must be below 1e308, got more")
+    if not (np.isfinite(norm) and np.isfinite(b).all()):
+        raise ValueError("rates and input gains of the system times the duration must be below 1e308, got more")
     levels = max(halvings, int(np.ceil(np.log2(norm))))
     rate = np.zeros((*a.shape[:-2], n + nterms * m, n + nterms * m))
     rate[..., :n, :n], rate[..., :n, n : n + m] = a * 0.5**levels, b * 0.5**levels
@@ -422,10 +423,10 @@ def _carried(states: Array, series: Array, changes: list[Array]) -> Array:
     used = np.isfinite(known) & (known != 0.0)
     grown = np.isfinite(states) & ((~np.isfinite(change)).astype(float) @ used > 0.0)
     cells = grown.any(axis=0)
-    if not cells.any():
+    if len(changes) == 1 or not cells.any():
         return after
     last, grown, series = len(changes) - 1, grown[:, cells], series[:, :, cells]
-    level = bisect_left(range(last), True, key=lambda k: not np.isfinite(changes[k]).all()) - 1
+    level = max(0, bisect_left(range(last), True, key=lambda k: not np.isfinite(changes[k]).all()) - 1)
     halves = 0.5 ** np.arange(len(series))[:, None, None]
     now = _carried(states[:, cells], series * halves ** (last - level), changes[: level + 1])
     while level < last and np.isfinite(now[grown]).any():

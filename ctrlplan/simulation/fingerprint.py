@@ -17,7 +17,7 @@ import random
 import sys
 import types
 from array import array
-from collections import defaultdict, deque, namedtuple
+from collections import OrderedDict, defaultdict, deque, namedtuple
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, is_dataclass
@@ -26,6 +26,7 @@ from typing import Any
 import numpy as np
 
 from ctrlplan.traits import traits_of
+from ctrlplan.trajectories.common import Frozen
 
 _MOST = 20_000
 """Objects that a fingerprint covers."""
@@ -71,20 +72,17 @@ _DULL = frozenset(
 )
 """Attributes of a class without influence on what its objects return."""
 
-_STORES = frozenset(("STORE_GLOBAL", "DELETE_GLOBAL", "STORE_ATTR", "DELETE_ATTR"))
-
 _MAKERS = frozenset(("__init__", "__post_init__", "__new__", "__set_name__"))
 """Methods that set attributes of objects that are new."""
 
 
 @dataclass(frozen=True, eq=False)
 class Code:
-    """Names in a code and in those inside it: globals, attributes and strings, imported modules, what is stored."""
+    """Names in a code and in those inside it: globals, attributes and strings, imported modules."""
 
     globals: tuple[str, ...]
     names: frozenset[str]
     imports: tuple[str, ...]
-    stores: tuple[str, ...]
 
 
 class References:
@@ -103,25 +101,24 @@ class References:
         The same of cached properties, which a first call adds to an object.
     opaque : str
         First of what cannot be fingerprinted, in words; empty where there is none.
-    stores : str
-        Variable or attribute outside of their own that the functions assign by their code; empty where there is none.
     names : set of str
         Names and strings in the code of the functions.
     """
 
     def __init__(self, roots: Iterable[tuple[str, Any]]) -> None:
-        self.opaque = self.stores = ""
+        self.opaque = ""
         self.names: set[str] = set()
         self._tokens: list[object] = []
         self._seen: dict[int, int] = {}
         self._objects: list[Any] = []  # alive, so that no address is given to another
         self._queue: deque[tuple[Any, str]] = deque()
         self._named: list[tuple[Any, str, set[str]]] = []  # of these the attributes that are named count
-        self._bindings: list[tuple[Callable[[Any], None], Any]] = []
+        self._bindings: list[tuple[Any, str, Any]] = []
         self._cached: dict[str, Any] = {}
         self._made: set[type] = set()  # classes that may be called
         self._bytes = 0
         self._roots = tuple(roots)
+        self._codes = _codes(root for _, root in self._roots)
         try:
             self._walk()
         except Exception as error:  # whatever an object does when it is looked at
@@ -140,21 +137,18 @@ class References:
             if not self._queue:
                 self._add_named()
 
-    def keeper(self) -> Callable[[], bool]:
-        """Function that puts all that was found back as it is now, and says whether it had changed."""
-        contents = [(value, _contents(value)) for value in self._objects]
-        bindings = list(self._bindings)
+    def keeper(self) -> Keeper:
+        """Contents of all that was found, to be put back."""
+        return Keeper(self._roots, self.tokens, self._objects, self._bindings)
 
-        def restored() -> bool:
-            if References(self._roots).tokens == self.tokens:
-                return False
-            for value, before in contents:
-                _restore(value, before)
-            for bind, value in bindings:
-                bind(value)
-            return True
+    def _is_log(self, holder: Any, key: Any) -> bool:
+        """Whether a place is known to be written by the functions, and to have no influence on them."""
+        known = _LOGS.get((id(holder), key))
+        return known is not None and known[0] is holder and self._codes <= known[1]
 
-        return restored
+    def _logs_of(self, holder: Any) -> set[Any]:
+        """Such places in an object."""
+        return {key for number, key in list(_LOGS) if number == id(holder) and self._is_log(holder, key)}
 
     def _hide(self, what: str, where: str) -> None:
         self.opaque = self.opaque or f"{where} ({what})"
@@ -195,21 +189,20 @@ class References:
             fresh = [name for name in among if name not in done and self._counts(holder, name, every)]
             for name in sorted(fresh):
                 done.add(name)
-                self._tokens.append(name)
-                self._attribute(holder, name, found[name], f"{where}.{name}")
+                if not self._is_log(holder, name):
+                    self._tokens.append(name)
+                    self._attribute(holder, name, found[name], f"{where}.{name}")
 
     def _counts(self, holder: Any, name: str, every: bool) -> bool:
         """Whether an attribute may have an influence."""
-        if isinstance(getattr(type(holder), name, None), functools.cached_property):
-            self._cached[f"{name} of {id(holder)}"] = vars(holder)[name]
-            return False
         if isinstance(holder, types.ModuleType):
             return name in self.names
         if not isinstance(holder, type):
-            return name in self.names or every
+            cached = not isinstance(holder, _Slots) and self._is_cached(holder, name, vars(holder)[name])
+            return not cached and (name in self.names or every)
         if name in _MAKERS:
             return holder in self._made or not self.names.isdisjoint(("type", "__class__"))
-        return name not in _DULL and (name in self.names or name.startswith("__"))
+        return name not in _DULL and (name in self.names or name.startswith("__") or _of_library(holder))
 
     def _attribute(self, holder: Any, name: str, value: Any, where: str) -> None:
         if isinstance(holder, types.ModuleType) and _pure(holder.__name__):
@@ -218,9 +211,9 @@ class References:
                 return
         elif isinstance(holder, type):
             value = _unbound(value)
-            self._bindings.append((functools.partial(setattr, holder, name), vars(holder)[name]))
+            self._bindings.append((holder, name, vars(holder)[name]))
         elif isinstance(holder, types.ModuleType):
-            self._bindings.append((functools.partial(setattr, holder, name), value))
+            self._bindings.append((holder, name, value))
         self._add(value, where)
 
     # Kinds of objects
@@ -238,13 +231,12 @@ class References:
             except ValueError:
                 self._tokens.append("empty")
                 continue
-            self._bindings.append((functools.partial(setattr, cell, "cell_contents"), content))
-            self._add(content, name)
+            self._bindings.append((cell, "cell_contents", content))
+            if not self._is_log(cell, "cell_contents"):
+                self._add(content, name)
         if _pure(value.__globals__.get("__name__")):
             return
         self.names |= code.names
-        if code.stores and value.__name__ not in _MAKERS:
-            self.stores = self.stores or code.stores[0]
         self._globals(value.__globals__, code)
 
     def _globals(self, known: dict[str, Any], code: Code) -> None:
@@ -252,8 +244,10 @@ class References:
             for module in _imported(name, str(known.get("__package__") or "")):
                 self._add(module, name)
         for name in code.globals:
+            self._bindings.append((known, name, known.get(name, _MISSING)))
+            if self._is_log(known, name):
+                continue
             if name in known:
-                self._bindings.append((functools.partial(known.__setitem__, name), known[name]))
                 self._add(known[name], name)
             elif name in _HIDDEN:
                 self._hide("no function of its arguments", f"{name}()")
@@ -299,18 +293,25 @@ class References:
 
     def _array(self, value: np.ndarray[Any, Any], where: str) -> None:
         self._tokens += (value.shape, value.dtype.str)
+        self._bytes += value.nbytes
         if value.dtype.hasobject:
-            self._sequence(value.ravel().tolist(), where)
-        else:
-            self._bytes += value.nbytes
-            self._tokens.append(_digest(value.tobytes()) if self._bytes <= _BYTES else None)
+            self._sequence(value, value.ravel().tolist(), where)
+        elif self._bytes <= _BYTES:
+            logs, content = self._logs_of(value), value
+            if logs:
+                content = value.copy()
+                content.flat[slice(None) if None in logs else sorted(logs)] = 0
+            self._tokens.append(_digest(content.tobytes()))
         if type(value) is not np.ndarray:
             self._attributes(value, where)
             if isinstance(value, np.ma.MaskedArray):
                 self._add(np.ma.getmaskarray(value), where)
 
-    def _sequence(self, value: Iterable[Any], where: str) -> None:
-        values = list(value)
+    def _sequence(self, holder: Any, values: list[Any], where: str) -> None:
+        logs = self._logs_of(holder)
+        if None in logs:
+            return
+        values = [None if k in logs else entry for k, entry in enumerate(values)] if logs else values
         if set(map(type, values)) == {float}:
             self._tokens += (len(values), _digest(array("d", values).tobytes()))
             return
@@ -319,11 +320,13 @@ class References:
             self._add(entry, f"{where}[{k}]")
 
     def _container(self, value: Any, where: str) -> None:
-        self._sequence(value, where)
+        self._sequence(value, list(value), where)
         self._attributes(value, where)
 
     def _dictionary(self, value: Any, where: str) -> None:
         for key, entry in list(value.items()):
+            if self._is_log(value, key):
+                continue
             self._add(key, f"a key of {where}")
             self._add(entry, f"{where}[{key!r:.20}]")
         self._tokens.append("end")
@@ -336,7 +339,7 @@ class References:
         if all(type(entry) in _ATOMS for entry in value):
             self._tokens.append(frozenset((type(entry), entry) for entry in value))
         else:
-            self._sequence(value, where)
+            self._sequence(value, list(value), where)
         self._attributes(value, where)
 
     def _fixed(self, value: Any, where: str) -> None:
@@ -357,6 +360,17 @@ class References:
         """Member of an enumeration, whose value and attributes may be mutable."""
         self._tokens.append(_Same(value))
         self._add(value.__dict__, where)
+
+    def _frozen(self, value: Frozen, where: str) -> None:
+        """Immutable objects of this package: by identity, but for parts that may be a user's."""
+        if not _pure(type(value).__module__):
+            self._attributes(value, where)
+            return
+        self._tokens.append(_Same(value))
+        for entry in vars(value).values():
+            for part in entry if isinstance(entry, tuple | list) else (entry,):
+                if isinstance(part, Frozen):
+                    self._refer(part, where)
 
     def _property(self, value: property, where: str) -> None:
         for part in (value.fget, value.fset):
@@ -379,7 +393,7 @@ class References:
         """Class and attributes of an object: those that are named where all its methods are known, or all."""
         kind = type(value)
         self._refer(kind, f"class {kind.__name__}")
-        known = not is_dataclass(kind) and not any(_pure(base.__module__) for base in kind.__mro__[:-1])
+        known = not is_dataclass(kind) and not _of_library(kind)
         for holder in (value, _Slots(value)):
             own = getattr(holder, "__dict__", None) if holder is value else holder.values()
             if not own:
@@ -390,8 +404,16 @@ class References:
                 self._named.append((holder, where, set()))
             else:
                 for name, entry in list(own.items()):
-                    self._tokens.append(name)
-                    self._add(entry, f"{where}.{name}")
+                    if not self._is_cached(value, name, entry) and not self._is_log(value, name):
+                        self._tokens.append(name)
+                        self._add(entry, f"{where}.{name}")
+
+    def _is_cached(self, value: Any, name: str, entry: Any) -> bool:
+        """Whether an attribute is that of a cached property, which is kept apart."""
+        if not isinstance(getattr(type(value), name, None), functools.cached_property):
+            return False
+        self._cached[f"{name} of {id(value)}"] = entry
+        return True
 
 
 def roots_of(system: Any) -> Iterator[tuple[str, Any]]:
@@ -472,6 +494,7 @@ _VISITS: tuple[tuple[Any, Callable[[References, Any, str], None]], ...] = (
     ((types.GetSetDescriptorType, types.MemberDescriptorType, _Fields), References._identity),
     ((types.MethodWrapperType, types.ClassMethodDescriptorType), References._identity),
     (property, References._property),
+    (Frozen, References._frozen),
     ((int, float, complex, str, bytes, np.generic), References._fixed),
     ((Iterator, types.CoroutineType, functools._lru_cache_wrapper), References._nothing),
 )
@@ -482,16 +505,13 @@ _VISITS: tuple[tuple[Any, Callable[[References, Any, str], None]], ...] = (
 def _code(code: types.CodeType) -> Code:
     globals_: dict[str, None] = {}
     imports: dict[str, None] = {}
-    stores: dict[str, None] = {}
     names: set[str] = set()
     for step in dis.get_instructions(code):
         name = step.argval if isinstance(step.argval, str) else ""
-        if step.opname in ("LOAD_GLOBAL", "LOAD_NAME"):
+        if step.opname in ("LOAD_GLOBAL", "LOAD_NAME", "STORE_GLOBAL"):
             globals_[name] = None
         elif step.opname == "IMPORT_NAME":
             imports[name] = None
-        elif step.opname in _STORES or (step.opname == "STORE_DEREF" and name in code.co_freevars):
-            stores[name] = None
         if "ATTR" in step.opname or "METHOD" in step.opname or step.opname == "IMPORT_FROM":
             names.add(name)
     for constant in code.co_consts:
@@ -500,9 +520,8 @@ def _code(code: types.CodeType) -> Code:
             inner = _code(constant)
             globals_ |= dict.fromkeys(inner.globals)
             imports |= dict.fromkeys(inner.imports)
-            stores |= dict.fromkeys(name for name in inner.stores if name not in code.co_cellvars)
             names |= inner.names
-    return Code(tuple(globals_), frozenset(names.union(code.co_varnames, globals_)), tuple(imports), tuple(stores))
+    return Code(tuple(globals_), frozenset(names.union(code.co_varnames, globals_)), tuple(imports))
 
 
 def _imported(name: str, package: str) -> Iterator[types.ModuleType]:
@@ -522,6 +541,11 @@ def _strings(constant: Any) -> set[str]:
 
 def _pure(module: Any) -> bool:
     return isinstance(module, str) and module.partition(".")[0] in _PURE and not module.startswith("numpy.random")
+
+
+def _of_library(kind: type) -> bool:
+    """Whether functions of a library may use attributes of an object that no other code names."""
+    return any(_pure(base.__module__) and base.__module__ not in ("builtins", "abc", "typing") for base in kind.__mro__)
 
 
 def _impure(kind: type) -> bool:
@@ -551,6 +575,95 @@ def _digest(content: bytes) -> bytes:
     return content if len(content) <= _LONG else hashlib.blake2b(content, digest_size=16).digest()
 
 
+class Keeper:
+    """Contents of objects at one time, what has changed of them since, and how to put them back."""
+
+    def __init__(
+        self,
+        roots: tuple[tuple[str, Any], ...],
+        tokens: tuple[object, ...],
+        objects: list[Any],
+        bindings: list[tuple[Any, str, Any]],
+    ) -> None:
+        self._roots, self._tokens, self._bindings = roots, tokens, list(bindings)
+        self._contents = [(value, found) for value in objects if (found := _contents(value)) is not None]
+
+    def changes(self) -> list[tuple[Any, Any]]:
+        """Places (object, key or attribute, None for all) whose contents differ; none where it has no effect."""
+        if References(self._roots).tokens == self._tokens:
+            return []
+        found = [(value, key) for value, before in self._contents for key in _changed(value, before)]
+        return found + [(holder, key) for holder, key, value in self._bindings if _bound(holder, key) is not value]
+
+    def restore(self) -> None:
+        """Put everything back."""
+        for value, before in self._contents:
+            if _changed(value, before):
+                _restore(value, before)
+        for holder, key, value in self._bindings:
+            if _bound(holder, key) is not value:
+                _bind(holder, key, value)
+
+    def ignore(self, changes: list[tuple[Any, Any]]) -> None:
+        """Take some places for logs, which the functions write and do not depend on."""
+        codes = _codes(root for _, root in self._roots)
+        for holder, key in changes:
+            _, known = _LOGS.pop((id(holder), key), (holder, frozenset()))
+            _LOGS[id(holder), key] = holder, known | codes
+        while len(_LOGS) > _FEW:
+            _LOGS.popitem(last=False)
+
+
+_LOGS: OrderedDict[tuple[int, Any], tuple[Any, frozenset[types.CodeType]]] = OrderedDict()
+"""Places that are logs or counters, and the functions that they have no influence on."""
+
+_FEW = 256
+"""Logs kept in mind; entries of an array of which some may be counters."""
+
+_MISSING = object()
+
+
+def _codes(roots: Iterable[Any]) -> frozenset[types.CodeType]:
+    """Code of the functions among some objects."""
+    functions = (getattr(root, "__func__", root) for root in roots)
+    return frozenset(function.__code__ for function in functions if isinstance(function, types.FunctionType))
+
+
+def _bound(holder: Any, key: str) -> Any:
+    if isinstance(holder, types.CellType):
+        try:
+            return holder.cell_contents
+        except ValueError:
+            return _MISSING
+    return (holder if isinstance(holder, dict) else vars(holder)).get(key, _MISSING)
+
+
+def _bind(holder: Any, key: str, value: Any) -> None:
+    if not isinstance(holder, dict):
+        setattr(holder, key, value)
+    elif value is _MISSING:
+        holder.pop(key, None)
+    else:
+        holder[key] = value
+
+
+def _changed(value: Any, before: Any) -> list[Any]:
+    """Keys of an object under which it holds something else than before; None stands for all."""
+    now = _contents(value)
+    if isinstance(value, np.ndarray):
+        if not value.dtype.hasobject and now.tobytes() == before.tobytes():
+            return []
+        pairs = zip(now.flat, before.flat, strict=True)
+        if value.dtype.hasobject:
+            return [k for k, (a, b) in enumerate(pairs) if a is not b]
+        return [k for k, (a, b) in enumerate(pairs) if a != b] if value.size <= _FEW else [None]
+    if isinstance(before, list | deque | bytearray) and len(now) == len(before):
+        return [k for k, (a, b) in enumerate(zip(now, before, strict=True)) if a is not b]
+    if isinstance(before, dict):
+        return [key for key in {**before, **now} if now.get(key, _MISSING) is not before.get(key, _MISSING)]
+    return [] if now == before else [None]
+
+
 def _contents(value: Any) -> Any:
     """Copy of what an object holds itself, or None where it cannot change."""
     if isinstance(value, np.ndarray):
@@ -559,7 +672,7 @@ def _contents(value: Any) -> Any:
         return value.copy()
     if isinstance(value, _Slots):
         return value.values()
-    own = getattr(value, "__dict__", None)
+    own = getattr(value, "__dict__", None) if not isinstance(value, Frozen) else None
     return dict(own) if isinstance(own, dict) and not isinstance(value, types.ModuleType | type) else None
 
 

@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.integrate import solve_ivp
+from scipy.integrate import LSODA, RK45, OdeSolver
 
 from ctrlplan.simulation.budget import check
-from ctrlplan.simulation.drives import Series
+from ctrlplan.simulation.drives import Series, within
 from ctrlplan.simulation.network import (
     Map,
     Network,
@@ -23,6 +23,7 @@ from ctrlplan.simulation.network import (
     tried_feedthrough,
 )
 from ctrlplan.simulation.scales import Scales
+from ctrlplan.simulation.stalled import cause
 from ctrlplan.simulation.trials import can_remember, trial_copy, values_of
 from ctrlplan.simulation.untouched import untouched
 
@@ -34,8 +35,17 @@ Call = Callable[[float, Array, Array], None]
 _SAFETY = 0.02
 """LSODA controls the error of a step by tolerances this much below those asked for: errors add up over a run."""
 
-_CALLS = 5000
-"""Calls about one instant after which the solution is taken to end there."""
+_CALLS, _INSTANT = 2000, 1e-9
+"""Calls about one instant, a part of the segment, after which a solver is taken to stay there."""
+
+_PASSING, _PASSED = 3000, 1e-7
+"""Calls of an explicit solver about such an instant, and the part of a segment after which it has passed it."""
+
+_PASSES = 100
+"""Such instants of a segment."""
+
+_EVALUATIONS, _A_SEGMENT, _REVIEWED = 60_000, 300, 20_000
+"""Evaluations of a run, and more a segment, after which every so many the cause is looked for."""
 
 
 class LoopError(RuntimeError):
@@ -75,7 +85,7 @@ class Interpreted:
         self._outputs = [block.output(params) for block in network.blocks]
         self._updates = [block.update(params) for block in network.blocks]
         self._samples = {i: network.blocks[i].sampled(params) for i in network.blocks_with("period")}
-        self._trials = trials
+        self._trials, self.evaluations = trials, 0
         self.feeds, doubtful = self._feeds(self._outputs)
         self._doubtful = [(i, can_remember(network.blocks[i].system)) for i in doubtful]
         self._for_rates = self._steps(self._outputs, network.signals_of_inputs(), self.feeds)
@@ -86,6 +96,7 @@ class Interpreted:
     def rates(self, t: float, x: Array, driven: Array) -> Array:
         """Derivatives of all states, given the signals that are functions of time."""
         check(t)
+        self.evaluations += 1
         w = self._signals(self._for_all if self._doubtful else self._for_rates, t, x, driven)
         return self.rates_of(t, x, w)
 
@@ -218,6 +229,7 @@ class Interpreted:
             nonlocal settles
 
             def image(z: Array) -> Array:
+                self.evaluations += 1
                 w[unknown] = z
                 after = w.copy()
                 for call, rows in zip(calls, owned, strict=True):
@@ -267,8 +279,14 @@ class InterpretedSolver:
 
     def __init__(self, equations: Interpreted, rtol: float, scales: Scales) -> None:
         self._equations, self._scales = equations, scales
-        self.rtol = max(_SAFETY * rtol, 2.3e-14)
-        self._options: dict[str, Any] = {"method": "LSODA", "rtol": self.rtol, "atol": _SAFETY * scales.atol}
+        self.rtol, self._atol = max(_SAFETY * rtol, 2.3e-14), _SAFETY * scales.atol
+        self._bounded = any(b.changes_unseen and b.depends_on_time for b in equations.network.blocks)
+        self._segments, self._next = 0, 0
+
+    def scaled_rates(self, t: float, z: Array, driven: Array) -> Array:
+        """Rates of the states in their scales."""
+        scales = self._scales
+        return np.asarray(self._equations.rates(t, scales.shift + scales.scale * z, driven) / scales.scale)
 
     def signals(self, times: Array, states: Array, driven: Array) -> Array:
         """All signals (nsignals, ntime) of the network."""
@@ -285,17 +303,93 @@ class InterpretedSolver:
 
     def advance(self, series: Series, left: float, grid: Array, state: Array) -> Array:
         """States (nstates, ngrid) at times of a segment, of which the last is its end."""
-        right = float(grid[-1])
         if not state.size:
             return np.zeros((0, grid.size))
-        equations, shift, scale = self._equations, self._scales.shift, self._scales.scale
-        rates = _Advancing(lambda t, z: equations.rates(t, shift + scale * z, series(t)) / scale, left, right)
-        found = solve_ivp(rates, (left, right), (state - shift) / scale, t_eval=grid, **self._options)
-        if not found.success:
-            raise rates.ended(f"{found.message} Equations that jump, as by floor or sign, may chatter there")
-        if not np.isfinite(found.y).all():
-            raise rates.ended("a state is infinite beyond")
-        return np.asarray(shift[:, None] + scale[:, None] * found.y)
+        shift, scale = self._scales.shift, self._scales.scale
+        right = float(grid[-1])
+        self._segments += 1
+        rates = _Watched(self, series, left, right)
+        out = np.empty((state.size, grid.size))
+        t, z = left, (state - shift) / scale
+        with np.errstate(over="ignore", invalid="ignore"):  # what is infinite ends the run, and is said then
+            for _ in range(_PASSES):
+                t, z, why = self._marched(LSODA, rates, t, z, grid, out)
+                if t >= right:
+                    return np.asarray(shift[:, None] + scale[:, None] * out)
+                # What no implicit step gets over an explicit one may pass: a state that comes to rest at a jump.
+                passed, z, _ = self._marched(RK45, rates, t, z, grid, out)
+                if passed - t < _PASSED * (right - left):
+                    break
+                t = passed
+        raise self._ended(rates, t, z, why)
+
+    def instants(self, first: float, last: float, driven: Callable[[Array], Array]) -> list[float]:
+        """Times at which equations switch: of functions in Python none are known but those declared."""
+        return []
+
+    def review(self, rates: _Watched, t: float, z: Array) -> None:
+        """Raise where so many evaluations have a cause in a block.
+
+        Raises
+        ------
+        SolverError
+            If more than 60,000 evaluations, and 300 a segment, have been spent
+            and a block jumps, has an infinite slope or is random there; looked
+            for every 20,000 evaluations.
+        """
+        if self._equations.evaluations < max(self._next, _EVALUATIONS + _A_SEGMENT * self._segments):
+            return
+        self._next = self._equations.evaluations + _REVIEWED
+        found = self._cause(rates, t, z)
+        if found:
+            raise self._message(rates, found)
+
+    def _marched(
+        self, kind: type[OdeSolver], rates: _Watched, t: float, z: Array, grid: Array, out: Array
+    ) -> tuple[float, Array, str]:
+        """As far as a solver gets to the end of the segment: time, scaled state, and why not further.
+
+        An explicit solver goes on only until its steps are long again.
+        """
+        right = float(grid[-1])
+        rates.begin(_CALLS if kind is LSODA else _PASSING)
+        # What depends on time is seen at least once a sample: a pulse as long cannot be passed over unseen.
+        longest = float(np.diff(grid, prepend=rates.left).max()) if self._bounded else math.inf
+        solver = kind(rates, t, z, right, rtol=self.rtol, atol=self._atol, max_step=longest)
+        if isinstance(solver, LSODA):
+            _raise_failures(solver)
+        while solver.status == "running":
+            before, z = float(solver.t), np.asarray(solver.y)
+            try:
+                why = solver.step() or ""
+            except _StalledError as stalled:
+                return before, z, str(stalled)
+            if solver.status == "failed":
+                return before, z, f"{why} Equations that jump, as by floor or sign, may chatter there"
+            if not np.isfinite(solver.y).all():
+                return before, z, "a state is infinite beyond"
+            now = float(solver.t)
+            inside = slice(*np.searchsorted(grid, [before, now], side="right"))
+            if inside.stop > inside.start:
+                out[:, inside] = np.reshape(solver.dense_output()(grid[inside]), (len(z), -1))
+            if kind is RK45 and now - before > _PASSED * (right - rates.left) and now < right:
+                break
+        return float(solver.t), np.asarray(solver.y), ""
+
+    def _cause(self, rates: _Watched, t: float, z: Array) -> str:
+        equations, x = self._equations, self._scales.shift + self._scales.scale * z
+        driven = rates.series(t)
+        try:
+            w = equations.signals(t, x, driven)
+        except Exception:  # outside of a block's domain, and no help
+            return ""
+        return cause(equations.network, equations.params, t, x, w, rates.right - rates.left)
+
+    def _ended(self, rates: _Watched, t: float, z: Array, why: str) -> SolverError:
+        return self._message(rates, self._cause(rates, t, z) or why)
+
+    def _message(self, rates: _Watched, why: str) -> SolverError:
+        return SolverError(f"the solver must reach {rates.right:g} s, got to {rates.defined:g} s: {why}")
 
 
 class _named:  # noqa: N801 (a context, of which a run opens thousands)
@@ -390,23 +484,44 @@ def _root(left_over: Callable[[Array], Array], guess: Array, names: str, t: floa
     )
 
 
-class _Advancing:
-    """Right-hand side that refuses to be asked for ever about one instant: the solution ends there."""
+class _StalledError(Exception):
+    """A solver that gets no further than one instant."""
 
-    def __init__(self, rate: Callable[[float, Array], Array], left: float, right: float) -> None:
-        self._rate, self._left, self._right = rate, left, right
-        self._about, self._asked, self._defined = left, 0, left
 
-    def __call__(self, t: float, x: Array) -> Array:
+class _Failures(dict[int, str]):
+    """Messages of LSODA that are raised in place of being shown as warnings."""
+
+    def get(self, key: int, default: Any = None) -> Any:
+        raise _StalledError(f"LSODA: {super().get(key, default)}")
+
+
+def _raise_failures(solver: LSODA) -> None:
+    integrator = getattr(getattr(solver, "_lsoda_solver", None), "_integrator", None)
+    if integrator is not None and isinstance(getattr(integrator, "messages", None), dict):
+        integrator.messages = _Failures(integrator.messages)
+
+
+class _Watched:
+    """Right-hand side of scaled states over a segment, which ends a solver that stays at one instant."""
+
+    def __init__(self, solver: InterpretedSolver, series: Series, left: float, right: float) -> None:
+        self._solver, self.series, self.left, self.right = solver, series, left, right
+        self.defined, self._within = left, within(left, right)
+        self.begin(_CALLS)
+
+    def begin(self, calls: int) -> None:
+        """Count anew, with so many calls about one instant."""
+        self._calls, self._about, self._asked = calls, -math.inf, 0
+
+    def __call__(self, t: float, z: Array) -> Array:
         self._asked += 1
-        if abs(t - self._about) > 1e-9 * (self._right - self._left):
+        if abs(t - self._about) > _INSTANT * (self.right - self.left):
             self._about, self._asked = t, 0
-        elif self._asked > _CALLS:
-            raise self.ended("the solution ends there")
-        rates = self._rate(t, x)
-        if t > self._defined and math.isfinite(rates.sum()):
-            self._defined = t
+        elif self._asked > self._calls:
+            raise _StalledError("the solution ends there")
+        self._solver.review(self, t, z)
+        inside = min(max(t, self._within[0]), self._within[1])
+        rates = self._solver.scaled_rates(inside, z, self.series(inside))
+        if t > self.defined and math.isfinite(rates.sum()):
+            self.defined = t
         return rates
-
-    def ended(self, why: str) -> SolverError:
-        return SolverError(f"the solver must reach {self._right:g} s, got to {self._defined:g} s: {why}")

@@ -140,6 +140,7 @@ def integrate(
     times: Array,
     state: Array,
     resolution: float,
+    marks: Sequence[float] = (),
     pause: Callable[[Array, Array], bool] | None = None,
 ) -> Run:
     """Run a network over increasing times.
@@ -156,6 +157,8 @@ def integrate(
         Where it starts.
     resolution : float
         Relative accuracy of signals kept for delays.
+    marks : sequence of float, optional
+        Further times [s] at which equations switch.
     pause : callable, optional
         Maps the times and states of a leg to whether the run may end behind
         it; legs are then short.
@@ -169,7 +172,8 @@ def integrate(
     memory = _Memory(network, solver, drives, resolution)
     for_ever = equations is not None and network.delays_feed_delays(equations.feeds)
     hops = _MARKS if for_ever else _HOPS
-    clock = _Clock(network, drives, _fixed(network, drives, first, last, memory.delays, hops), first, last)
+    marks = [*breakpoints_of(drives), *network.breakpoints, *marks]
+    clock = _Clock(network, drives, _fixed(marks, first, last, memory.delays, hops), first, last)
     longest = min([last - first, *memory.delays])
     if longest < _SHORTEST_DELAY * (last - first):
         raise ValueError(
@@ -345,11 +349,8 @@ def _combined_bounds(wire: Array, driven: NDArray[np.intp], series: Series) -> t
     return np.where(known, low, -np.inf), np.where(known, high, np.inf)
 
 
-def _fixed(
-    network: Network, drives: Sequence[Drive], first: float, last: float, delays: list[float], hops: int
-) -> list[float]:
+def _fixed(marks: Sequence[float], first: float, last: float, delays: list[float], hops: int) -> list[float]:
     """Breakpoints inside the run, and where delays carry them to."""
-    marks = [*breakpoints_of(drives), *network.breakpoints]
     found = {t for t in marks if first < t < last}
     fresh = {*found, first}
     for _ in range(hops if delays else 0):

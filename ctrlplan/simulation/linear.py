@@ -170,13 +170,17 @@ def _interconnections(systems: Sequence[Any]) -> LinearForm:
     )
     u_x, u_r, u_s = connect @ y_x, connect @ y_r + external, connect @ y_s
     from_y, from_u = outputs[:, : d.shape[1]], outputs[:, d.shape[1] :]
-    return LinearForm(
-        a + b @ u_x,
-        np.concatenate([b @ u_r, b @ u_s + e], axis=2),
-        from_y @ y_x + from_u @ u_x,
-        np.concatenate([from_y @ y_r + from_u @ u_r, from_y @ y_s + from_u @ u_s], axis=2),
-        tuple(source for form in forms for source in form.sources),
-    )
+    with np.errstate(over="ignore", invalid="ignore"):
+        form = LinearForm(
+            a + b @ u_x,
+            np.concatenate([b @ u_r, b @ u_s + e], axis=2),
+            from_y @ y_x + from_u @ u_x,
+            np.concatenate([from_y @ y_r + from_u @ u_r, from_y @ y_s + from_u @ u_s], axis=2),
+            tuple(source for form in forms for source in form.sources),
+        )
+    if not all(np.isfinite(matrix).all() for matrix in (form.a, form.b, form.c, form.d)):
+        raise ValueError(f"gains of the blocks in {first.name} must have finite products, got some beyond 1e308")
+    return form
 
 
 def _diagonal(blocks: list[Array]) -> Array:

@@ -23,7 +23,7 @@ from scipy.linalg import block_diag
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
-from ctrlplan.simulation.trials import can_remember, reads, trial_copy, values_of
+from ctrlplan.simulation.trials import can_remember, of_library, reads, trial_copy, values_of
 from ctrlplan.simulation.untouched import untouched
 from ctrlplan.traits import BlockTraits, traits_of
 from ctrlplan.trajectories import Trajectory
@@ -33,8 +33,8 @@ Map = Callable[[Any, Any, Any], Any]
 """(t, state of the block, input of the block) -> outputs or rates; of numbers, or of symbols."""
 
 
-_INPUT = 2
-"""Position of the input among the arguments (t, x, u, params) of a block's functions."""
+_TIME, _INPUT = 0, 2
+"""Positions of time and input among the arguments (t, x, u, params) of a block's functions."""
 
 
 class UnsupportedError(ValueError):
@@ -78,6 +78,18 @@ class Block:
     def period(self) -> float | None:
         """Time between the samples of a discrete block in a continuous loop [s]."""
         return self.traits.period
+
+    @property
+    def changes_unseen(self) -> bool:
+        """Whether the equations may switch at times that nobody has named, if they depend on time."""
+        named = self.traits.breakpoints is not None or self.period is not None
+        functions = (self.system.outfcn, self.system.updfcn) if not (self.linear or self.driven or named) else ()
+        return any(function is not None and not of_library(function) for function in functions)
+
+    @property
+    def depends_on_time(self) -> bool:
+        """Whether a function of the block can read the time, by its code."""
+        return any(f is not None and reads(f, _TIME) for f in (self.system.outfcn, self.system.updfcn))
 
     @property
     def held(self) -> Any:
@@ -207,7 +219,7 @@ class Network:
             np.hstack([part.outer, part.inner]),
             np.hstack([part.through, part.read]),
             system.ninputs or 0,
-            tuple(t for b in part.blocks for t in b.traits.breakpoints),
+            tuple(t for b in part.blocks for t in b.traits.breakpoints or ()),
         )
         return replace(network, watched=tuple(network._declared()))
 

@@ -20,6 +20,8 @@ from ctrlplan.simulation.legs import Run, integrate
 from ctrlplan.simulation.network import Network
 from ctrlplan.simulation.prepared import NotCompiledError
 from ctrlplan.simulation.scales import PASSES, Scales, doubt
+from ctrlplan.simulation.stalled import unrepeatable
+from ctrlplan.simulation.untouched import tried
 
 if TYPE_CHECKING:
     from ctrlplan.simulation.compiled import Compiled, CompiledSolver
@@ -78,6 +80,7 @@ class _Attempt:
         if self.method == "compiled":
             self._compile()
         elif self.equations is not None:
+            self._check_repeatable(self.equations)
             self.solver, self._compare = InterpretedSolver(self.equations, job.rtol, self.scales), lambda: None
         else:
             raise NotCompiledError(f"{job.prepared.name} came from another process without its blocks")
@@ -98,6 +101,7 @@ class _Attempt:
             with_looks(job.times, self.watched, self._slope),
             job.state,
             resolution=10.0 * job.rtol,
+            marks=self.solver.instants(job.first, float(job.times[-1]), lambda t: driven_signals(self.drives, t)),
             pause=self._pause if self.stops else None,
         )
         self._compare()
@@ -126,9 +130,7 @@ class _Attempt:
         # Compiled forms are compared with Python on copies of what blocks remember.
         known = job.blocks.for_trials()
         form = job.prepared.compiled(job.params, self.drives, job.first, job.state)
-        tests = _equations(job, known)
-        if tests is not None:  # an algebraic loop without a solution is better named here
-            tests.signals(job.first, job.state, driven_signals(self.drives, job.times[:1])[:, 0])
+        _at_start(_equations(job, known), job, self.drives)  # an algebraic loop without a solution is better named here
         # Beyond a stop there may be no solution: segments are short then, and must fail soon.
         solver = CompiledSolver(form, job.params, job.rtol, self.scales, max_steps=2_000 if self.stops else 20_000)
 
@@ -142,6 +144,14 @@ class _Attempt:
                 raise job.prepared.distrust(form, wrong)
 
         self.solver, self._compare = solver, compare
+
+    def _check_repeatable(self, equations: Interpreted) -> None:
+        """Raise where a continuous block is random: such a loop has no solution."""
+        job = self.job
+        w = tried(lambda: _at_start(_equations(job, job.blocks.for_trials()), job, self.drives), None)
+        found = unrepeatable(job.blocks, job.params, job.first, job.state, w) if w is not None else ""
+        if found:
+            raise SolverError(f"the solver must reach {job.times[-1]:g} s, got to {job.first:g} s: {found}")
 
     def _visited(self) -> tuple[Array, Array, Array]:
         """Some times and states of the run, and the functions of time there."""
@@ -174,6 +184,13 @@ class _Attempt:
 def _equations(job: Job, network: Network) -> Interpreted | None:
     """Equations by Python, where there are blocks."""
     return Interpreted(network, job.params, (job.first, job.state), job.prepared.trials) if network.blocks else None
+
+
+def _at_start(equations: Interpreted | None, job: Job, drives: Sequence[Drive]) -> Array | None:
+    """Signals at the start of a run."""
+    if equations is None:
+        return None
+    return equations.signals(job.first, job.state, driven_signals(drives, job.times[:1])[:, 0])
 
 
 def _in_doubt(attempt: _Attempt) -> str:

@@ -125,6 +125,8 @@ class Prepared:
                 form = self._known(params)
                 if form is None:
                     form, baked = self._build(params, drives, first, state)
+                    if self.original is not None:  # what blocks only write has turned out meanwhile
+                        self.fingerprint = fingerprint(self.original)
                     self._compiled = [*self._compiled[-7:], (frozenset(params), baked, form)]
         if isinstance(form, NotCompiledError):
             raise NotCompiledError(str(form))
@@ -185,9 +187,9 @@ class Prepared:
         blocks = [i for i, block in enumerate(network.blocks) if not (block.linear or block.driven)]
         functions = {i: [*_functions(network.blocks[i].system)] for i in blocks}
         found = References((f"block {network.blocks[i].name}", f) for i in blocks for f in functions[i])
-        if found.opaque or found.stores:  # a call might leave something behind: what the code names counts
+        if found.opaque:  # a call might leave something behind: what the code names counts
             return name in found.names or not found.names.isdisjoint(("keys", "values", "items"))
-        restored = found.keeper()
+        keeper = found.keeper()
 
         def starting() -> Array:
             equations = Interpreted(network, {name: value}, (0.0, start))
@@ -204,7 +206,7 @@ class Prepared:
                     x, u = (v + scale * rng.standard_normal(v.size) * (1.0 + np.abs(v)) for v in (x, u))
                     for function in functions[i]:
                         tried(partial(function, 10.0 * scale, x.copy(), u.copy(), noticing), None)
-        restored()
+        keeper.restore()
         return name in read or _Noticing.ALL in read
 
     def _build(
@@ -224,12 +226,12 @@ class Prepared:
         baked: dict[str, Any] = {}
         try:
             others = [block for block in network.blocks if not (block.linear or block.driven)]
-            restored = callable_references(others, params).keeper()
+            keeper = callable_references(others, params).keeper()
             try:
                 equations = Interpreted(network.for_trials(), params, (first, state), self.trials)
                 w = equations.signals(first, state, driven_signals(drives, np.array([first]))[:, 0])
             finally:
-                restored()
+                keeper.restore()
             for block, states, fed in zip(network.blocks, network.states, network.fed, strict=True):
                 if block.linear or block.driven:
                     traces.append(None)

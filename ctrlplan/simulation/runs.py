@@ -115,26 +115,27 @@ def _exact(job: Job, form: LinearForm) -> Record:
 
 
 def _warn_of_lost_digits(job: Job, outputs: Array, others: Array, floor: Array) -> None:
-    """Say which outputs change by more than a floor when all rates change in their last digits."""
+    """Warn of outputs that change by more than a floor when all rates change in their last digits."""
     known = np.isfinite(outputs) & np.isfinite(others)
     with np.errstate(all="ignore"):
         apart = np.where(known, np.abs(outputs - others), 0.0).max(axis=1)
     size = np.where(known, np.abs(outputs), 0.0).max(axis=1)
     lost = apart > np.maximum(_LOST * size, floor)
     if lost.any():
-        part = float((apart[lost] / np.maximum(size[lost], 0.5 * apart[lost])).max())
+        percent = 100.0 * float((apart[lost] / np.maximum(size[lost], 0.5 * apart[lost])).max())
+        span = float(job.times[-1] - job.times[0])
         names = ", ".join(np.array(job.prepared.output_labels)[lost])
         warnings.warn(
-            f"outputs {names} of {job.prepared.name} are uncertain by {100.0 * part:.3g} % of their size: "
-            f"over {job.times[-1] - job.times[0]:g} s rounding of the matrices is enough to change them so; make the "
-            "run shorter, or leave out modes that are so fast or so unstable",
+            f"outputs {names} of {job.prepared.name} are uncertain by {percent:.3g} % of their size: "
+            f"rounding errors in the system's matrices change them by that much over {span:g} s; "
+            "shorten the run, or remove modes that are so fast or so unstable",
             UserWarning,
             stacklevel=5,
         )
 
 
 def _warn_of_undefined(job: Job, form: LinearForm, times: Array, states: Array) -> None:
-    """Say which outputs are differences of states that have overflowed: they are reported as infinite."""
+    """Warn of outputs that are differences of states that have overflowed."""
     if np.isfinite(states).all():
         return
     up, down = (states == np.inf).astype(float), (states == -np.inf).astype(float)
@@ -145,8 +146,8 @@ def _warn_of_undefined(job: Job, form: LinearForm, times: Array, states: Array) 
         names = ", ".join(np.array(job.prepared.output_labels)[undefined.any(axis=1)])
         begin = times[undefined.any(axis=0).argmax()]
         warnings.warn(
-            f"outputs {names} of {job.prepared.name} are not known from {begin:g} s on, "
-            "where states whose difference they are leave the range of numbers: given as infinite",
+            f"outputs {names} of {job.prepared.name} are undefined from {begin:g} s on: they are differences of states "
+            "that have overflowed, and are given as infinite",
             UserWarning,
             stacklevel=5,
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 import warnings
 from collections.abc import Mapping, Sequence
 from numbers import Real
@@ -24,12 +25,15 @@ from ctrlplan.simulation.scales import RELATIVE
 
 Array = NDArray[np.float64]
 
+_DELEGATED = threading.RLock()
+"""One run by python-control at a time: it keeps the parameters of a run in the system."""
+
 _LONGEST = 1e15
 """Seconds after which a double cannot tell one microsecond from the next, by far."""
 
 _NO_TIMEBASE = (
-    "{} has states and no timebase (dt = None): it is taken for continuous, as control.input_output_response does, "
-    "where control.forced_response takes one step a sample; give dt = 0, or dt = True"
+    "{} has states and no timebase (dt = None): it is simulated as continuous-time, as by "
+    "control.input_output_response (control.forced_response takes one step per sample); set dt = 0 or dt = True"
 )
 
 
@@ -58,7 +62,7 @@ def simulate(
         With whatever inputs; unmodified python-control objects, or what
         `prepare` made of one. The built form is kept, and made anew where maps,
         parameters or blocks have changed. A system with states and without a
-        timebase (dt = None) is taken for continuous, with a warning.
+        timebase (dt = None) is simulated as continuous-time, with a warning.
     timepts : array_like, shape (ntime,)
         Sample times [s], strictly increasing, two or more. Of a discrete system
         multiples of its sampling time from the first on; where that is
@@ -208,15 +212,16 @@ def _delegated(job: Job) -> ct.TimeResponseData:
     warnings.warn(
         f"{prepared.unsupported}: run by control.input_output_response, without events", UserWarning, stacklevel=3
     )
-    response = ct.input_output_response(
-        prepared.system,
-        job.times,
-        driven_signals(job.inputs, job.times) if job.inputs else 0,
-        job.state,
-        params=job.params or None,
-        solve_ivp_method="LSODA",
-        solve_ivp_kwargs={"rtol": job.rtol, "atol": RELATIVE if job.atol is None else job.atol},
-    )
+    with _DELEGATED:
+        response = ct.input_output_response(
+            prepared.system,
+            job.times,
+            driven_signals(job.inputs, job.times) if job.inputs else 0,
+            job.state,
+            params=job.params or None,
+            solve_ivp_method="LSODA",
+            solve_ivp_kwargs={"rtol": job.rtol, "atol": RELATIVE if job.atol is None else job.atol},
+        )
     response.method, response.reason, response.events = "python", prepared.unsupported, []
     return response
 

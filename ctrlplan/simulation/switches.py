@@ -2,19 +2,32 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+_GRID, _FINEST, _MOST = 4096, 2**17, 20_000
+"""Intervals of the grid on which changes are looked for at first and at last, and changes at most."""
+
+_HALVINGS = 60
+"""Halvings from a grid's spacing to rounding of a time."""
 
 
-def switch_arguments(function: Any) -> Any:
+def switch_arguments(function: Any, bends: bool = True) -> Any:
     """Arguments whose changes of sign switch the equations of a function.
 
     Parameters
     ----------
     function : casadi.Function
         Of symbols of kind SX.
+    bends : bool, optional
+        Whether those of continuous functions are wanted, as abs and the larger
+        of two values; otherwise of jumps alone.
 
     Returns
     -------
@@ -37,11 +50,60 @@ def switch_arguments(function: Any) -> Any:
             work[places[0]] = ca.SX(function.instruction_constant(k))
         else:
             values = [work[place] for place in given]
-            if kind in _SWITCHES:
+            if kind in _SWITCHES and (bends or kind not in _BENDS):
                 found.append(_SWITCHES[kind](*values))
             work[places[0]] = ca.SX.unary(kind, *values) if len(values) == 1 else ca.SX.binary(kind, *values)
     moving = [value for value in found if not value.is_constant()]
     return ca.Function("switches", inputs, [ca.densify(ca.vertcat(ca.SX(0, 1), *moving))])
+
+
+def changes_of_side(sides: Callable[[Array], Array], first: float, last: float) -> list[float]:
+    """Times between two others at which a sign changes.
+
+    Parameters
+    ----------
+    sides : callable
+        Maps times (n,) to signs (nswitches, n).
+    first, last : float
+        The times.
+
+    Returns
+    -------
+    list of float
+        To rounding of the times; on a grid that is refined until twice as many
+        times show no more changes. None where there are more than 20,000.
+    """
+    count, known = _GRID, np.empty(0)
+    while True:
+        # What has been found is a time to look at as well: a narrow interval about a bend shows there.
+        t = np.union1d(np.linspace(first, last, count + 1), known)
+        found = _apart(np.union1d(known, _located(sides, t)), 1e-12 * max(abs(first), abs(last), last - first))
+        if found.size == known.size and count > _GRID:
+            break
+        if found.size > _MOST or count >= _FINEST:
+            break
+        known, count = found, 2 * count
+    inner = found[(found > first) & (found < last)]
+    return inner.tolist() if inner.size <= _MOST else []
+
+
+def _apart(times: Array, tolerance: float) -> Array:
+    """Increasing times without those that follow another closely."""
+    return times[np.diff(times, prepend=-np.inf) > tolerance]
+
+
+def _located(sides: Callable[[Array], Array], t: Array) -> Array:
+    """Times at which a sign changes between two of some times, by bisection of all at once."""
+    signs = sides(t)
+    switch, before = np.nonzero(signs[:, 1:] != signs[:, :-1])
+    if not switch.size or switch.size > _MOST:
+        return np.empty(0)
+    left, right, side = t[before], t[before + 1], signs[switch, before]
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (left + right)
+        same = sides(middle)[switch, np.arange(switch.size)] == side
+        left, right = np.where(same, middle, left), np.where(same, right, middle)
+    return np.unique(right)
 
 
 def _difference(x: Any, y: Any) -> Any:
@@ -55,6 +117,8 @@ def _first(x: Any, *_: Any) -> Any:
 def _whole(x: Any, *_: Any) -> Any:
     return ca.sin(np.pi * x)
 
+
+_BENDS = (ca.OP_FMIN, ca.OP_FMAX, ca.OP_FABS)
 
 _SWITCHES = {
     **dict.fromkeys((ca.OP_LT, ca.OP_LE, ca.OP_EQ, ca.OP_NE, ca.OP_FMIN, ca.OP_FMAX), _difference),

@@ -135,13 +135,13 @@ def _function(function: Any, memo: dict[int, Any], depth: int) -> Any:
         arguments = [_value(entry, memo, depth) for entry in function.args]
         keywords = {key: _value(entry, memo, depth) for key, entry in function.keywords.items()}
         return functools.partial(_function(function.func, memo, depth), *arguments, **keywords)
-    if isinstance(function, MethodType) and not _of_library(function.__func__):
+    if isinstance(function, MethodType) and not of_library(function.__func__):
         return MethodType(_function(function.__func__, memo, depth), _value(function.__self__, memo, depth))
     if not isinstance(function, FunctionType):
         return function if isinstance(function, MethodType) else _value(function, memo, depth)
     if id(function) in memo:
         return memo[id(function)]
-    if depth == 0 or _of_library(function):
+    if depth == 0 or of_library(function):
         return function
     space = dict(function.__globals__)
     cells = tuple(CellType() for _ in function.__closure__ or ())
@@ -187,7 +187,7 @@ def _has_memory(value: Any, seen: set[int], depth: int) -> bool:
     elif isinstance(value, np.ndarray):
         return value.flags.writeable
     elif isinstance(value, MethodType):
-        return not _of_library(value.__func__)
+        return not of_library(value.__func__)
     elif isinstance(value, ct.InterconnectedSystem):
         parts = tuple(value.syslist)
     elif isinstance(value, ct.NonlinearIOSystem):
@@ -195,7 +195,7 @@ def _has_memory(value: Any, seen: set[int], depth: int) -> bool:
     elif isinstance(value, np.random.Generator | np.random.RandomState):
         return True
     elif isinstance(value, FunctionType):
-        if _of_library(value):
+        if of_library(value):
             return False
         code = value.__code__
         if "random" in _names(code):  # the generators of numpy, or of Python
@@ -205,7 +205,7 @@ def _has_memory(value: Any, seen: set[int], depth: int) -> bool:
         named = [value.__globals__[name] for name in _names(code) if name in value.__globals__]
         parts = (*_contents(value), *(value.__defaults__ or ()), *(value.__kwdefaults__ or {}).values(), *named)
     else:
-        return not _of_library(type(value))
+        return not of_library(type(value))
     return any(_has_memory(part, seen, depth - 1) for part in parts)
 
 
@@ -217,8 +217,10 @@ def _contents(function: FunctionType) -> Iterator[Any]:
             continue
 
 
-def _of_library(thing: Any) -> bool:
+def of_library(thing: Any) -> bool:
     """Whether a function or class is of a library whose objects, but for arrays, are not changed by being called."""
+    if isinstance(thing, functools.partial):
+        return of_library(thing.func)
     return str(getattr(thing, "__module__", "")).partition(".")[0] in _LIBRARIES
 
 

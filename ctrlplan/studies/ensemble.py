@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
+import inspect
 import os
-import pickle
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -13,9 +12,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from tqdm import tqdm
 
-from ctrlplan.simulation import Prepared, prepare
+from ctrlplan._checks import real_array
+from ctrlplan.simulation import Prepared, SolverError, prepare
+from ctrlplan.simulation.prepared import NotCompiledError
 from ctrlplan.studies.comparison import (
     Comparison,
     check_has_inputs,
@@ -23,8 +23,10 @@ from ctrlplan.studies.comparison import (
     finite_or_none,
     is_builder,
     references_of,
+    tracked_outputs,
     waypoints_given,
 )
+from ctrlplan.studies.executing import Account, Failed, Shared, checked_executor, executed, tried
 from ctrlplan.trajectories import Trajectory, Waypoint
 
 if TYPE_CHECKING:
@@ -37,8 +39,8 @@ Distribution = Any
 
 LEVELS = (0.05, 0.25, 0.5, 0.75, 0.95)
 
-_CHUNK = 20
-"""Draws that an executor is handed at a time."""
+_STAND_INS = 20
+"""Draws of which the first that runs stands for a nominal loop that does not."""
 
 _SAMPLES = 1001
 """Times at which bands are kept, at most."""
@@ -46,16 +48,16 @@ _SAMPLES = 1001
 
 @dataclass(frozen=True)
 class Failure:
-    """A draw that could not be run.
+    """A draw that could not be run, or a value.
 
     Attributes
     ----------
     draw : int
-        Which.
+        Which; of a sweep over values, the index of the value.
     params : dict of str to float
         Its parameters.
     message : str
-        What went wrong.
+        What went wrong: what was raised, or how it was lost.
     plan : str
         With which plan; empty where with all.
     """
@@ -90,6 +92,8 @@ class Ensemble:
         Draws run or failed; fewer than asked for where the run was interrupted.
     nominal_draw : int or None
         The draw that stands for the nominal loop, where its own parameters do not run.
+    interrupted : bool
+        Whether Ctrl-C ended the run.
     """
 
     nominal: Comparison
@@ -101,6 +105,7 @@ class Ensemble:
     failures: tuple[Failure, ...] = ()
     finished: int = 0
     nominal_draw: int | None = None
+    interrupted: bool = False
 
     def __repr__(self) -> str:
         return (
@@ -267,67 +272,45 @@ def ensemble(
     executor: Any = None,
     progress: bool = True,
     options: Mapping[str, Any] | None = None,
+    timeout: float | None = None,
 ) -> Ensemble:
     """Compare plans in a loop for each draw of its parameters; see `sweep`."""
-    table = _checked_draws(params)
-    count = next(iter(table.values())).size
-    times = np.asarray(timepts, dtype=float)
-    settings: dict[str, Any] = {"events": (), **(options or {})}
+    checked_executor(executor)
+    table, times = _checked_draws(params), real_array(timepts, "timepts")
+    settings = dict(options or {})
     points = settings.pop("waypoints", ())
     if not isinstance(plans, Mapping):
         plans = points = waypoints_given(plans)
     references = references_of(plans, settings.pop("alpha", 1.0))
-    settings.setdefault("start", min(plan.start for plan in references.values()))
-    builds = is_builder(loop)
-    shared = None if builds else prepare(check_has_inputs(loop))
-    forms = {name: shared or prepare(loop(name, plan)) for name, plan in references.items()}
-    for name, values in table.items():
-        start = settings.get("initial_state")
-        if not any(form.reads(name, float(values[0]), start) for form in forms.values()):
-            raise ValueError(f"params must be parameters of a block, got {name!r}, which none reads")
-    nominal, nominal_draw = _nominal(forms, references, times, table, {"waypoints": points, **settings})
+    if settings.get("start") is None:
+        settings["start"] = min(plan.start for plan in references.values())
+    forms = _forms(loop, references, table)
+    _check_read(forms, table, settings.get("initial_state"))
+    nominal, nominal_draw = _nominal(forms, references, times, table, {"waypoints": points, **settings}, timeout)
+    first = next(iter(references.values()))
+    outputs = {name: tracked_outputs(form, settings.get("outputs"), first) for name, form in forms.items()}
+    settings = {"events": (), **settings, "worth": False, "outputs": outputs}
+    drawn = [_draw(table, k) for k in range(next(iter(table.values())).size)]
     # Compiled for these parameters, and compared with Python, here: the first draw, and a random one.
-    for k in sorted({0, int(np.random.default_rng(0).integers(count))}):
-        _one(forms, references, times, settings, _draw(table, k))
-    try:
-        light: Any = {name: form.detached(table) for name, form in forms.items()}
-    except TypeError as error:
-        light = forms if executor is None else _sendable(loop, builds, error)
+    for k in sorted({0, int(np.random.default_rng(0).integers(len(drawn)))}):
+        tried(partial(_one, forms, references, times, settings), drawn[k], timeout)
+    light: Any = _light(forms, table)
+    if light is None:
+        light = loop if is_builder(loop) and executor is not None else forms
+    run = partial(_one, light, references, times, settings)
+    if executor is not None:
+        run = partial(_elsewhere, Shared(light), references, times, settings)
+    account = executed(run, drawn, executor, timeout, "draws", progress)
+    account.raise_if_all_lost("the loop")
+    if light is not forms and light is not loop:
 
-    def again(k: int, found: Outcome) -> Outcome:
-        """Plans of a draw that failed, by the loop itself: what is compiled may fail where Python does not."""
-        failed = {plan: references[plan] for plan, one in found.items() if isinstance(one, str)}
-        return {**found, **_one(forms, failed, times, settings, _draw(table, k))} if failed else found
+        def by_python(some: dict[str, Trajectory], params: dict[str, float]) -> Outcome:
+            return _one(forms, some, times, settings, params)
 
-    kept = _Kept(count, times)
-    bar = tqdm(total=count, desc="draws", disable=not progress, leave=False)
-    futures: list[Any] = []
-    try:
-        if executor is None:
-            for k in range(count):
-                found = _one(light, references, times, settings, _draw(table, k))
-                kept.add(k, _draw(table, k), again(k, found) if light is not forms else found)
-                bar.update()
-        else:
-            size = max(1, min(_CHUNK, -(-count // 8)))
-            tasks = [range(k, min(k + size, count)) for k in range(0, count, size)]
-            run = partial(_several, light, references, times, settings)
-            futures = [executor.submit(run, [_draw(table, k) for k in task]) for task in tasks]
-            for task, future in zip(tasks, futures, strict=True):
-                try:
-                    outcomes = future.result()
-                except Exception as error:  # a worker that died; where none works at all, that is what to say
-                    if not kept.finished:
-                        raise
-                    outcomes = [dict.fromkeys(references, f"{type(error).__name__}: {error}")] * len(task)
-                for k, found in zip(task, outcomes, strict=True):
-                    kept.add(k, _draw(table, k), again(k, found))
-                bar.update(len(task))
-    except KeyboardInterrupt:
-        for future in futures:
-            getattr(future, "cancel", bool)()
-    finally:
-        bar.close()
+        account = _by_python(account, by_python, references, drawn, timeout, progress)
+    kept = _Kept(len(drawn), times)
+    for k, outcome in account.in_order().items():
+        kept.add(k, drawn[k], outcome)
     return Ensemble(
         nominal,
         table,
@@ -337,11 +320,60 @@ def ensemble(
         failures=tuple(kept.failures),
         finished=kept.finished,
         nominal_draw=nominal_draw,
+        interrupted=account.interrupted,
     )
 
 
-Outcome = dict[str, tuple[dict[str, float], dict[str, Array]] | str]
+Outcome = dict[str, tuple[dict[str, float], dict[str, Array]] | Failed]
 """By plan: metrics, and signals at the times of the bands; or what went wrong."""
+
+
+def _forms(loop: Any, references: dict[str, Trajectory], table: dict[str, Array]) -> dict[str, Prepared]:
+    """The loop's built form by plan: one for all, or one of each loop that a function builds."""
+    if not is_builder(loop):
+        return dict.fromkeys(references, prepare(check_has_inputs(loop)))
+    try:
+        names = list(inspect.signature(loop).parameters)[:2]
+        inspect.signature(loop).bind("", None)
+    except (TypeError, ValueError) as error:
+        names = list(table) if isinstance(error, TypeError) else []
+    if set(names) & set(table):
+        raise ValueError(
+            "build must be, with params, a loop whose blocks read the parameters, or a function of a plan's name and "
+            f"the plan that returns one, got {loop!r:.80}; give a function of the parameter with values="
+        )
+    built = tried(lambda _: {name: prepare(loop(name, plan)) for name, plan in references.items()}, None)
+    if isinstance(built, Failed):
+        raise built.error
+    return built
+
+
+def _check_read(forms: Mapping[str, Prepared], table: dict[str, Array], start: Any) -> None:
+    """Reject a parameter that no block has or reads."""
+    for name, values in table.items():
+
+        def reads(form: Prepared, name: str = name, value: float = float(values[0])) -> bool:
+            return form.reads(name, value, start)
+
+        found = [tried(reads, form) for form in forms.values()]
+        if any(isinstance(one, Failed) or one for one in found):  # what ends in an error of a block may be its own
+            continue
+        form = next(iter(forms.values()))
+        way = (
+            f"{form.name} is linear, and its matrices have no parameters: give sweep a function from a value of "
+            f"{name!r} to a loop, with values="
+            if form.linear is not None
+            else "a linear block has none, and others have those of python-control's params="
+        )
+        raise ValueError(f"params must be parameters of a block, got {name!r}, which none reads; {way}")
+
+
+def _light(forms: Mapping[str, Prepared], table: dict[str, Array]) -> dict[str, Prepared] | None:
+    """Forms without python-control's blocks, for many runs and for other processes; None where there are none."""
+    try:
+        return {name: form.detached(table) for name, form in forms.items()}
+    except TypeError:
+        return None
 
 
 def _nominal(
@@ -350,20 +382,58 @@ def _nominal(
     times: Array,
     table: dict[str, Array],
     settings: dict[str, Any],
+    timeout: float | None,
 ) -> tuple[Comparison, int | None]:
     """The loop with its own parameters; or, where that does not run, with those of the first draw that does."""
-    try:
-        return compare(_given(forms), references, times, **settings), None
-    except (ArithmeticError, RuntimeError, TypeError, KeyError) as error:
-        for k in range(min(20, next(iter(table.values())).size)):
-            with suppress(Exception):
-                params = _draw(table, k)
-                found = compare(_given(forms), references, times, params=params, **settings)
-                values = ", ".join(f"{name} = {value:.4g}" for name, value in params.items())
-                note = f"Nominal is draw {k} ({values}): the loop's own parameters do not run."
-                return replace(found, notes=(*found.notes, note)), k
-        error.add_note("with the loop's own parameters, and with the first draws")
-        raise
+
+    def compared(params: dict[str, float] | None) -> Comparison:
+        return compare(_given(forms), references, times, params=params, **settings)
+
+    own = tried(compared, None, timeout)
+    if not isinstance(own, Failed):
+        return own, None
+    if not isinstance(own.error, ArithmeticError | RuntimeError | TypeError | KeyError):
+        raise own.error
+    for k in range(min(_STAND_INS, next(iter(table.values())).size)):
+        params = _draw(table, k)
+        found = tried(compared, params, timeout)
+        if not isinstance(found, Failed):
+            values = ", ".join(f"{name} = {value:.4g}" for name, value in params.items())
+            note = f"Nominal is draw {k} ({values}): the loop's own parameters do not run."
+            return replace(found, notes=(*found.notes, note)), k
+    own.error.add_note("with the loop's own parameters, and with the first draws")
+    raise own.error
+
+
+def _by_python(
+    account: Account[Outcome],
+    run: Callable[[dict[str, Trajectory], dict[str, float]], Outcome],
+    references: dict[str, Trajectory],
+    drawn: list[dict[str, float]],
+    timeout: float | None,
+    progress: bool,
+) -> Account[Outcome]:
+    """Plans and draws with which CVODES failed, run by the loop itself in this process: Python may get through."""
+    failed = {
+        k: {plan: references[plan] for plan, one in outcome.items() if _of_solver(one)}
+        for k, outcome in account.in_order().items()
+        if not isinstance(outcome, Failed) and any(map(_of_solver, outcome.values()))
+    }
+    if not failed:
+        return account
+    found = {k: outcome for k, outcome in account.found.items() if k not in failed}
+    if account.interrupted:
+        return Account(found, True)
+    again = executed(lambda k: run(failed[k], drawn[k]), list(failed), None, timeout, "draws by Python", progress)
+    for i, outcome in again.found.items():
+        k = list(failed)[i]
+        known = account.found[k]
+        found[k] = known | outcome if isinstance(known, dict) and isinstance(outcome, dict) else outcome
+    return Account(found, again.interrupted)
+
+
+def _of_solver(outcome: Any) -> bool:
+    return isinstance(outcome, Failed) and isinstance(outcome.error, SolverError | NotCompiledError)
 
 
 class _Kept:
@@ -377,16 +447,19 @@ class _Kept:
         self._signals: dict[str, dict[str, Array]] = {}
         self._count = count
 
-    def add(self, k: int, params: dict[str, float], outcome: Outcome) -> None:
+    def add(self, k: int, params: dict[str, float], outcome: Outcome | Failed) -> None:
         """One draw, or what went wrong with it."""
         self.finished += 1
-        wrong = [found for found in outcome.values() if isinstance(found, str)]
+        if isinstance(outcome, Failed):
+            self.failures.append(Failure(k, params, outcome.message))
+            return
+        wrong = [found.message for found in outcome.values() if isinstance(found, Failed)]
         if len(wrong) == len(outcome) and len(set(wrong)) == 1:
             self.failures.append(Failure(k, params, wrong[0]))
             return
         for plan, found in outcome.items():
-            if isinstance(found, str):
-                self.failures.append(Failure(k, params, found, plan))
+            if isinstance(found, Failed):
+                self.failures.append(Failure(k, params, found.message, plan))
                 continue
             metrics, signals = found
             for name, value in metrics.items():
@@ -419,18 +492,21 @@ def _some(times: Array) -> NDArray[np.intp]:
     return np.unique(np.linspace(0, times.size - 1, min(times.size, _SAMPLES)).round().astype(np.intp))
 
 
-def _several(
-    forms: Any,
+def _elsewhere(
+    shared: Shared[Any],
     references: dict[str, Trajectory],
     times: Array,
     settings: dict[str, Any],
-    draws: list[dict[str, float]],
-) -> list[Outcome]:
-    """Some draws, in another process."""
-    if not isinstance(forms, Mapping):  # a function that builds the loops
-        build = forms
-        forms = {name: prepare(build(name, plan)) for name, plan in references.items()}
-    return [_one(forms, references, times, settings, params) for params in draws]
+    params: dict[str, float],
+) -> Outcome:
+    """One draw, in another process or thread."""
+
+    def forms(given: Any) -> Mapping[str, Prepared]:
+        if isinstance(given, Mapping):
+            return given
+        return {name: prepare(given(name, plan)) for name, plan in references.items()}
+
+    return _one(shared.made(forms), references, times, settings, params)
 
 
 def _one(
@@ -440,22 +516,23 @@ def _one(
     settings: dict[str, Any],
     params: dict[str, float],
 ) -> Outcome:
-    """One draw, plan by plan: one may get through where another does not."""
+    """One draw, plan by plan: one may get through where another does not.
+
+    Among the settings are the outputs that follow the plans, by plan.
+    """
     wanted = times[_some(times)]
-    outcome: Outcome = {}
-    for plan, reference in references.items():
-        try:
-            result = compare(_given(forms), {plan: reference}, times, params=params, **settings)
-        except Exception as error:  # whatever a block does at these parameters
-            outcome[plan] = f"{type(error).__name__}: {error}"
-            continue
+
+    def measured(plan: str) -> tuple[dict[str, float], dict[str, Array]]:
+        own = {**settings, "outputs": settings["outputs"][plan]}
+        result = compare(_given(forms), {plan: references[plan]}, times, params=params, **own)
         response = result.responses[plan]
         rows = np.asarray(response.outputs).reshape(len(response.output_labels), -1)
         kept = np.isin(np.asarray(response.time), wanted)
         names = dict.fromkeys((*result.outputs, *result.controls))
         signals = {name: rows[list(response.output_labels).index(name)][kept] for name in names}
-        outcome[plan] = (result.metrics[plan], signals)
-    return outcome
+        return result.metrics[plan], signals
+
+    return {plan: tried(measured, plan) for plan in references}
 
 
 def _given(forms: Mapping[str, Prepared]) -> Callable[[str, Trajectory], Prepared]:
@@ -467,7 +544,7 @@ def _draw(table: dict[str, Array], k: int) -> dict[str, float]:
 
 
 def _checked_draws(params: Mapping[str, ArrayLike]) -> dict[str, Array]:
-    table = {name: np.atleast_1d(np.asarray(values, dtype=float)) for name, values in params.items()}
+    table = {name: np.atleast_1d(real_array(values, f"params[{name!r}]")) for name, values in params.items()}
     sizes = {name: values.shape for name, values in table.items()}
     if not table or len(set(sizes.values())) != 1 or any(len(shape) != 1 or not shape[0] for shape in sizes.values()):
         raise ValueError(f"params must hold as many draws of each parameter, at least one, got shapes {sizes}")
@@ -475,13 +552,3 @@ def _checked_draws(params: Mapping[str, ArrayLike]) -> dict[str, Array]:
         if not np.isfinite(values).all():
             raise ValueError(f"params must be finite, got {values[~np.isfinite(values)][0]} of {name!r}")
     return table
-
-
-def _sendable(loop: Any, builds: bool, error: TypeError) -> Any:
-    """A function that builds the loops, where the loops themselves cannot be sent to another process."""
-    try:
-        if builds and pickle.dumps(loop):
-            return loop
-    except Exception as why:  # whatever pickle meets in a user's object
-        raise ValueError(f"the loop must go to other processes, but {error} ({why})") from None
-    raise ValueError(f"the loop must go to other processes, but {error}")

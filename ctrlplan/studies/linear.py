@@ -127,6 +127,8 @@ def _refined_sweep(count: int, finest: float, progress: bool) -> Sweep:
     def swept(gains: Array) -> Sweep:
         found = sweep(_loop, gains, linear_plans(), TIMEPTS, progress=progress, parameter="gain", only=SWEPT)
         assert isinstance(found, Sweep)  # noqa: S101 (of values, not of draws)
+        if found.interrupted:  # a study is made whole or not at all
+            raise KeyboardInterrupt
         return found
 
     even = np.linspace(GAINS[0] ** 0.5, GAINS[1] ** 0.5, count)[1:-1] ** 2

@@ -3,29 +3,20 @@
 from __future__ import annotations
 
 import inspect
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from types import SimpleNamespace
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from tqdm import tqdm
 
-from ctrlplan.simulation import rest_state, state_space, stated_start
-from ctrlplan.simulation.exact import exact_states
-from ctrlplan.simulation.linear import LinearForm, in_right_half, linear_forms
-from ctrlplan.studies.comparison import (
-    acting_outputs,
-    compare,
-    finite_or_none,
-    is_builder,
-    references_of,
-    tracked_outputs,
-    waypoints_given,
-)
+from ctrlplan._checks import real_array
+from ctrlplan.studies.alike import Alike, Metrics
+from ctrlplan.studies.comparison import compare, finite_or_none, is_builder, references_of, waypoints_given
 from ctrlplan.studies.ensemble import Ensemble, Failure, ensemble
-from ctrlplan.studies.measures import MEASURES, control_metrics, path_metrics, response_metrics
+from ctrlplan.studies.executing import Account, Failed, checked_executor, checked_timeout, executed, gathered, tried
 from ctrlplan.trajectories import Trajectory, Waypoint
 
 if TYPE_CHECKING:
@@ -33,11 +24,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Array = NDArray[np.float64]
-Metrics = dict[str, dict[str, float]]
-"""Plan, metric, value."""
-
-_SAMPLES = 2**19
-"""Samples of a signal of all the loops that are taken together."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -53,13 +39,16 @@ class Sweep:
     metrics : dict of str to dict of str to ndarray
         Plan, metric, (nvalues,); nan where a value failed.
     failures : tuple of Failure
-        Values that could not be run, and why.
+        Values that could not be run, and why; `Failure.draw` is the value's index.
+    interrupted : bool
+        Whether Ctrl-C ended the sweep: values that it did not reach are then missing.
     """
 
     parameter: str
     values: Array
     metrics: dict[str, dict[str, Array]]
     failures: tuple[Failure, ...] = ()
+    interrupted: bool = False
 
     def __repr__(self) -> str:
         return f"<Sweep of {', '.join(self.metrics)} over {self.values.size} values of {self.parameter}>"
@@ -82,14 +71,25 @@ class Sweep:
         return {self.parameter: self.values.tolist()} | rows
 
     def merged(self, other: Sweep) -> Sweep:
-        """Both sweeps in one, in order of the values."""
+        """Both sweeps in one, in order of the values; nan where one has not a metric of the other."""
         values = np.concatenate([self.values, other.values])
         order = np.argsort(values, kind="stable")
-        rows = {
-            plan: {name: np.concatenate([row, other.metrics[plan][name]])[order] for name, row in found.items()}
-            for plan, found in self.metrics.items()
+        place = np.argsort(order)
+        names = {
+            plan: dict.fromkeys((*self.metrics.get(plan, {}), *other.metrics.get(plan, {})))
+            for plan in dict.fromkeys((*self.metrics, *other.metrics))
         }
-        return Sweep(self.parameter, values[order], rows, (*self.failures, *other.failures))
+        rows = {
+            plan: {name: np.concatenate([one._column(plan, name) for one in (self, other)])[order] for name in found}
+            for plan, found in names.items()
+        }
+        moved = [replace(failure, draw=int(place[failure.draw])) for failure in self.failures]
+        moved += [replace(failure, draw=int(place[failure.draw + self.values.size])) for failure in other.failures]
+        failures = tuple(sorted(moved, key=lambda failure: failure.draw))
+        return Sweep(self.parameter, values[order], rows, failures, self.interrupted or other.interrupted)
+
+    def _column(self, plan: str, name: str) -> Array:
+        return self.metrics.get(plan, {}).get(name, np.full(self.values.size, np.nan))
 
     def plot(self, names: Sequence[str] = ("settling_time", "overshoot_error")) -> Figure:
         """Metrics over the parameter."""
@@ -108,12 +108,16 @@ def sweep(
     *,
     params: Mapping[str, ArrayLike] | None = None,
     parameter: str = "value",
+    timeout: float | None = None,
     **options: Any,
 ) -> Sweep | Ensemble:
     """Compare plans in a loop for each value of a parameter, or for each of many draws.
 
-    A value or draw that cannot be run is recorded, and ends nothing; what is
-    finished when the run is interrupted is kept.
+    A value or draw that cannot be run, whose worker process dies, that takes
+    too long, or that calls ``sys.exit`` is recorded in `failures` with the
+    reason; the others are kept. Ctrl-C ends the sweep: what is finished is
+    returned with a warning, and tasks that have not begun are cancelled. A
+    second Ctrl-C, or one before the first draw, raises KeyboardInterrupt.
 
     Parameters
     ----------
@@ -122,13 +126,14 @@ def sweep(
     values : array_like, shape (nvalues,), optional
         Values of the parameter, increasing.
     plans, timepts, **options
-        As for `compare`.
+        As for `compare`; ``worth`` with `params` only, for the nominal loop.
     executor : concurrent.futures.Executor or alike, optional
         Where the comparisons run: anything with ``submit`` whose result has
-        ``result``, as of `dask.distributed` or `mpi4py.futures`. A process pool
-        needs a `build` that can be pickled, or with `params` a loop that can be
-        compiled. Without one, linear loops that differ in numbers alone are
-        solved and measured together, which is faster by far.
+        ``result``, as of `dask.distributed`, `loky` or `mpi4py.futures`; not a
+        `multiprocessing.Pool`. Results are taken as they complete. Other
+        processes need a `build` that the executor can send, or with `params` a
+        loop that can be compiled. Without an executor, linear loops that differ
+        in numbers alone are solved and measured together, which is faster by far.
     progress : bool, optional
         Show a bar on stderr.
     params : mapping of str to array_like, shape (ndraws,), optional
@@ -136,6 +141,12 @@ def sweep(
         them. The loop is built once for all.
     parameter : str, optional
         Name of what is varied.
+    timeout : float, optional
+        Time limit of one run, one plan in one loop [s]. It is checked between
+        evaluations of the loop's equations, of a compiled loop between the
+        segments of a run (from breakpoint to breakpoint): a function of yours
+        that never returns is not stopped, and a compiled segment is finished.
+        Linear loops are solved in closed form, and have no limit.
 
     Returns
     -------
@@ -144,10 +155,17 @@ def sweep(
 
     Raises
     ------
+    TypeError
+        If `executor` has no ``submit``, or an option is none of `compare`.
     ValueError
         If the values are not finite or do not increase, draws are not as many
         of each parameter, or a parameter is none of a block. What a comparison
-        raises at every value is raised.
+        raises at every value is raised, SystemExit as a RuntimeError.
+
+    Warns
+    -----
+    UserWarning
+        If Ctrl-C ended it.
 
     Examples
     --------
@@ -158,159 +176,115 @@ def sweep(
     >>> found.metrics["step"]["overshoot_error"].round(1)
     array([16.3, 85.4])
     """
+    executor, timeout = checked_executor(executor), checked_timeout(timeout)
+    # An iterator would be used up by the first of the comparisons.
+    options = {name: tuple(value) if isinstance(value, Iterator) else value for name, value in options.items()}
+    inspect.signature(compare).bind(None, plans, timepts, **options)
+    found: Sweep | Ensemble
     if params is not None:
         if values is not None:
             raise ValueError("values must not be given beside params, got both")
-        return ensemble(build, plans, timepts, params, executor, progress, options)
-    if values is None:
-        raise ValueError("values, or draws as params, must be given, got neither")
-    points = np.atleast_1d(np.asarray(values, dtype=float))
-    if points.ndim != 1 or not points.size or not np.isfinite(points).all() or np.any(np.diff(points) <= 0.0):
-        raise ValueError(f"values must be finite and increase strictly, got {points.tolist()!s:.80}")
-    if not is_builder(build):
-        raise TypeError(f"build must be a function from a value to a loop, got {type(build).__name__}")
-    options["waypoints"] = tuple(options.get("waypoints", ())) if isinstance(plans, Mapping) else waypoints_given(plans)
-    references = references_of(plans if isinstance(plans, Mapping) else options["waypoints"], options.get("alpha", 1.0))
-    given: dict[str, Any] = {"plans": references, "timepts": np.asarray(timepts, dtype=float)} | options
-    bar = tqdm(total=points.size, desc=parameter, disable=not progress, leave=False)
-    found: list[Metrics | Exception] = []
-    futures: list[Any] = []
-    try:
-        if executor is not None:
-            futures = [executor.submit(_tried, build, value, given) for value in points.tolist()]
-        outcomes = (future.result() for future in futures) if futures else _outcomes(build, points.tolist(), given)
-        for outcome in outcomes:
-            found.append(outcome)
-            bar.update()
-    except KeyboardInterrupt:
-        for future in futures:
-            getattr(future, "cancel", bool)()
-    finally:
-        bar.close()
-    return _swept(parameter, points[: len(found)], found)
-
-
-def _swept(parameter: str, points: Array, found: list[Metrics | Exception]) -> Sweep:
-    errors = [(k, error) for k, error in enumerate(found) if isinstance(error, Exception)]
-    if errors and len(errors) == len(found):
-        raise errors[0][1]
-    known = [(k, metrics) for k, metrics in enumerate(found) if not isinstance(metrics, Exception)]
-    rows: dict[str, dict[str, Array]] = {}
-    for k, metrics in known:
-        for plan, values in metrics.items():
-            for name, value in values.items():
-                rows.setdefault(plan, {}).setdefault(name, np.full(points.size, np.nan))[k] = value
-    failures = [Failure(k, {parameter: float(points[k])}, f"{type(e).__name__}: {e}") for k, e in errors]
-    return Sweep(parameter, points, rows, tuple(failures))
-
-
-def _tried(build: Callable[[float], Any], value: float, given: dict[str, Any]) -> Metrics | Exception:
-    """Metrics for one value, or what went wrong."""
-    try:
-        return compare(build(value), **given).metrics
-    except Exception as error:  # whatever a loop does at this value
-        return error
-
-
-def _outcomes(
-    build: Callable[[float], Any], values: list[float], given: dict[str, Any]
-) -> Iterator[Metrics | Exception]:
-    """Metrics for each value, of many at once where their loops are linear and differ in numbers alone."""
-    count = max(2, _SAMPLES // max(1, given["timepts"].size))
-    for begin in range(0, len(values), count):
-        some = values[begin : begin + count]
-        try:
-            together = _together([build(value) for value in some], given)
-        except Exception:  # one of them, which is found below
-            together = None
-        yield from (_tried(build, value, given) for value in some) if together is None else together
-
-
-def _together(loops: list[Any], given: dict[str, Any]) -> list[Metrics] | None:
-    """What `compare` finds of each loop; None where they are not alike, or it has more to say."""
-    bound = inspect.signature(compare).bind(None, **given)
-    bound.apply_defaults()
-    asked = SimpleNamespace(**bound.arguments)
-    plans, times = asked.plans, asked.timepts
-    first = next(iter(plans.values()))
-    systems = [state_space(loop) for loop in loops]
-    form = _form(systems)
-    if form is None or form.b.shape[2] != first.naxes or not _ordered(times):
-        return None
-    if asked.measure is not None or asked.params or asked.events:
-        return None
-    if asked.initial_state is not None and np.shape(asked.initial_state) not in ((), form.a.shape[2:]):
-        return None
-    tracked, acting = tracked_outputs(systems[0], asked.outputs, first), acting_outputs(systems[0], asked.controls)
-    if asked.only is not None and not any(name.startswith("control") for name in asked.only):
-        acting = ()
-    rows = [systems[0].output_labels.index(name) for name in (*tracked, *acting)]
-    start = min(plan.start for plan in plans.values())
-    unstable = in_right_half(np.linalg.eigvals(form.a)).any(axis=1)
-    each = tuple(map(str, range(len(loops))))
-    found: list[Metrics] = [{} for _ in loops]
-    for name, plan in plans.items():
-        signals = _outputs(form, rows, plan, times, _starts(systems, plan, times, asked.initial_state)).swapaxes(0, 1)
-        axes = [plan] if plan.naxes == 1 else [plan.select([label]) for label in plan.labels]
-        # One axis of all loops is measured like the axes of one.
-        responses = [
-            response_metrics(times, y, axis, start, asked.band, each, asked.only)
-            for y, axis in zip(signals[: len(axes)], axes, strict=True)
-        ]
-        controls = [control_metrics(times, u, start, each, asked.only) for u in signals[len(axes) :]]
-        values = _of_loops(responses, first.labels, each)
-        values |= {key: np.where(unstable, np.inf, row) for key, row in values.items() if "settling_time" in key}
-        values |= _of_loops(controls, acting, each)
-        of_plan = path_metrics(plan, asked.waypoints) if asked.only is None else {}
-        for i, metrics in enumerate(found):
-            metrics[name] = {key: float(row[i]) for key, row in values.items()} | of_plan
+        found = ensemble(build, plans, timepts, params, executor, progress, options, timeout)
+        done, count, what = found.finished, found.ndraws, "draws"
+    else:
+        points = _checked_values(values)
+        if not is_builder(build):
+            raise TypeError(f"build must be a function from a value to a loop, got {type(build).__name__}")
+        given = _given(plans, timepts, options)
+        if executor is None:
+            account = gathered(_outcomes(build, points.tolist(), given, timeout), points.size, parameter, progress)
+        else:
+            run = partial(_compared, build, given)
+            account = executed(run, points.tolist(), executor, timeout, parameter, progress)
+            account.raise_if_all_lost("build")
+        found = _swept(parameter, points, account)
+        done, count, what = found.values.size, points.size, "values"
+    if found.interrupted:
+        warnings.warn(f"the sweep was interrupted: {done} of {count} {what} are kept", UserWarning, stacklevel=2)
     return found
 
 
-def _form(systems: list[Any]) -> LinearForm | None:
-    """Linear form of loops driven by their inputs alone; None unless they differ in numbers alone."""
-    labels = getattr(systems[0], "output_labels", None)
-    if len(systems) < 2 or any(getattr(s, "output_labels", None) != labels for s in systems):
-        return None
-    if any(stated_start(s) is not None for s in systems):
-        return None
+def _checked_values(values: ArrayLike | None) -> Array:
+    if values is None:
+        raise ValueError("values, or draws as params, must be given, got neither")
+    points = np.atleast_1d(real_array(values, "values"))
+    if points.ndim != 1 or not points.size or not np.isfinite(points).all() or np.any(np.diff(points) <= 0.0):
+        raise ValueError(f"values must be finite and increase strictly, got {points.tolist()!s:.80}")
+    return points
+
+
+def _given(plans: Any, timepts: ArrayLike, options: Mapping[str, Any]) -> dict[str, Any]:
+    """Arguments of `compare` for every value."""
+    given = dict(options)
+    worth: Any = given.get("worth", False)
+    if worth is not False:
+        raise (ValueError if isinstance(worth, bool | Mapping) else TypeError)(
+            "worth must be False in a sweep over values, which has no place for it, got "
+            f"{worth!r:.80}; give it to compare at the value of interest"
+        )
+    given["waypoints"] = tuple(given.get("waypoints", ())) if isinstance(plans, Mapping) else waypoints_given(plans)
+    given["plans"] = references_of(plans if isinstance(plans, Mapping) else given["waypoints"], given.get("alpha", 1.0))
+    return given | {"timepts": real_array(timepts, "timepts")}
+
+
+def _swept(parameter: str, points: Array, account: Account[Metrics]) -> Sweep:
+    found = account.in_order()
+    errors = [(i, outcome) for i, outcome in enumerate(found.values()) if isinstance(outcome, Failed)]
+    if errors and len(errors) == len(found) and not account.interrupted:
+        raise errors[0][1].error
+    reached = points[list(found)]
+    rows: dict[str, dict[str, Array]] = {}
+    for i, metrics in enumerate(found.values()):
+        for plan, values in metrics.items() if not isinstance(metrics, Failed) else ():
+            row = rows.setdefault(plan, {})
+            for name, value in values.items():
+                row.setdefault(name, np.full(reached.size, np.nan))[i] = value
+    failures = tuple(Failure(i, {parameter: float(reached[i])}, failed.message) for i, failed in errors)
+    return Sweep(parameter, reached, rows, failures, account.interrupted)
+
+
+def _metrics(given: dict[str, Any], loop: Any) -> Metrics:
+    """Metrics of one loop."""
+    return compare(loop, **given).metrics
+
+
+def _compared(build: Callable[[float], Any], given: dict[str, Any], value: float) -> Metrics:
+    """Metrics for one value."""
+    return _metrics(given, build(value))
+
+
+def _outcomes(
+    build: Callable[[float], Any], values: list[float], given: dict[str, Any], timeout: float | None
+) -> Iterator[tuple[int, Metrics | Failed]]:
+    """Outcome of each value, of many at once where their loops are linear and differ in numbers alone.
+
+    The first of these is compared by itself, so that `compare` checks the options.
+    """
+    alike, checked = Alike(given), False
+
+    def together() -> Iterator[tuple[int, Metrics | Failed]]:
+        try:
+            yield from alike.metrics().items()
+        except Exception:  # one of them, which is found so
+            for k in alike.waiting:
+                yield k, tried(partial(_compared, build, given), values[k], timeout)
+        alike.clear()
+
     try:
-        form = linear_forms(systems)
-    except (AttributeError, ValueError):
-        return None
-    return None if form.sources else form
-
-
-def _ordered(times: Array) -> bool:
-    return times.ndim == 1 and times.size > 1 and bool(np.isfinite(times).all() and np.all(np.diff(times) > 0.0))
-
-
-def _starts(systems: list[Any], plan: Trajectory, times: Array, given: ArrayLike | None) -> Array:
-    """States (nloops, nstates) at the first sample: as given, or at rest where the plan is."""
-    position = plan.jet(times[:1], 0, left=True)[0, :, 0]
-    if given is None and position.any():
-        return np.stack([rest_state(system, position) for system in systems])
-    return np.broadcast_to(0.0 if given is None else np.asarray(given, dtype=float), (len(systems), systems[0].nstates))
-
-
-def _of_loops(measured: list[dict[str, float]], labels: Sequence[str], each: Sequence[str]) -> dict[str, Array]:
-    """Metrics (nloops,) as `compare` names them, from those of each label: the worst, and each where there are more."""
-    names = [name for name in measured[0] if name in MEASURES] if measured else []
-    rows = {name: np.array([[found[f"{name}_{i}"] for i in each] for found in measured]) for name in names}
-    worst = {name: np.fmax.reduce(row) for name, row in rows.items()}
-    if len(labels) > 1:
-        for name, row in rows.items():
-            worst |= {f"{name}_{label}": values for label, values in zip(labels, row, strict=True)}
-    return worst
-
-
-def _outputs(form: LinearForm, rows: list[int], plan: Trajectory, times: Array, initial: Array) -> Array:
-    """Some of the outputs, shape (nloops, nrows, ntime), with a plan at the inputs."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        out = exact_states(form.a, form.b, plan._jet_beside, list(plan.breakpoints), times, initial, form.c[:, rows])
-        for k, row in enumerate(rows):
-            if form.d[:, row].any():
-                out[:, k] += form.d[:, row] @ plan.jet(times, 0)[0]
-    if not np.isfinite(out[..., -1]).all():  # what has left the range of numbers does not come back
-        out[np.isnan(out)] = np.inf
-    return out
+        for k, value in enumerate(values):
+            loop = tried(build, value, timeout)
+            linear = None if isinstance(loop, Failed) else alike.linear(loop)
+            if linear is None or not checked:
+                outcome = loop if isinstance(loop, Failed) else tried(partial(_metrics, given), loop, timeout)
+                checked = checked or (linear is not None and not isinstance(outcome, Failed))
+                yield k, outcome
+                continue
+            if not alike.fits(linear):
+                yield from together()
+            alike.waiting[k] = linear
+            if alike.full:
+                yield from together()
+        yield from together()
+    except KeyboardInterrupt:  # what has been built is soon measured
+        yield from together()
+        raise

@@ -112,8 +112,13 @@ def test_plans_of_any_duration(unit, alpha):
 
 def test_what_is_beyond_the_range_says_so():
     t = np.linspace(0.0, 1e10, 5)
-    with pytest.raises(ValueError, match="rates of the system times the duration of the run must be below 1e308"):
-        cp.simulate(ct.ss(-1e300, 1.0, 1.0, 0.0), t, 1.0)
+    for matrices in ((-1e300, 1.0, 1.0, 0.0), (-1e-5, 1e306, 1e-306, 0.0)):
+        with pytest.raises(
+            ValueError, match="rates and input gains of the system times the duration must be below 1e308"
+        ):
+            cp.simulate(ct.ss(*matrices), t, cp.Step(1.0))
+    far = ct.series(ct.ss(-1.0, 1e200, 1.0, 0.0), ct.ss(-1.0, 1.0, 1e200, 0.0))
+    assert np.isposinf(cp.simulate(far, [0.0, 1.0], 1.0).outputs[1])
     plan = cp.PolySpline([cp.Waypoint(0.0, 0, 0, 0), cp.Waypoint(1e-25, 1, 0, 0)])
     with pytest.raises(ValueError, match=r"derivatives within the range of numbers .*got a segment of 1e-25 s"):
         cp.simulate(ct.ss(-1e25, 1e25, 1.0, 0.0), [0.0, 1e-25, 2e-25], plan)
@@ -183,8 +188,7 @@ def test_signs_of_what_has_overflowed():
     assert (down[t > 8.0] == -np.inf).all()
 
 
-@pytest.mark.parametrize("count", [3, 26, 51, 401])
-@pytest.mark.parametrize("rate", [100.0, 1e5, 1e60])
+@pytest.mark.parametrize(("rate", "count"), [(100.0, 3), (100.0, 51), (100.0, 401), (1e5, 26), (1e60, 51)])
 @pytest.mark.parametrize("method", ["plan", "number", "samples"])
 def test_outputs_that_do_not_see_an_overflowing_state_stay_finite(method, rate, count):
     # The unstable state is decoupled, or driven by the stable one; neither acts on it.
@@ -266,14 +270,14 @@ def test_an_output_that_hides_an_unstable_mode_is_said():
     short, long = np.linspace(0.0, 5.0, 51), np.linspace(0.0, 40.0, 51)
     found = cp.simulate(system, short, 1.0).outputs
     assert np.abs(found + np.expm1(-1.3 * short) / 1.3).max() <= 1e-6
-    with pytest.warns(UserWarning, match=r"outputs y\[0\] of hiding are uncertain by .* leave out modes"):
+    with pytest.warns(UserWarning, match=r"outputs y\[0\] of hiding are uncertain by .*remove modes"):
         cp.simulate(system, long, 1.0)
 
 
 def test_a_difference_of_overflowed_states_is_said():
     system = ct.ss(np.diag([100.0, 100.0]), [[1.0], [1.0]], [[1.0, -1.0], [1.0, 0.0]], 0.0, name="apart")
     t = np.linspace(0.0, 50.0, 51)
-    with pytest.warns(UserWarning, match=r"outputs y\[0\] of apart are not known from 8 s on"):
+    with pytest.warns(UserWarning, match=r"outputs y\[0\] of apart are undefined from 8 s on"):
         found = cp.simulate(system, t, 1.0)
     assert not np.isnan(found.outputs).any()
 
@@ -314,7 +318,7 @@ def test_random_chains_up_to_and_beyond_the_range_of_numbers(kind, seed, monkeyp
         inside = np.logical_and.accumulate(np.isfinite(true))
         near = inside & (np.abs(true) < 1e300)
         biggest = np.maximum.accumulate(np.where(inside, np.abs(true), 0.0))
-        between = 1e-13 * np.abs(start).max()  # what falls fast may have been large between two times
-        assert np.all(np.abs(row - true)[near] <= 1e-10 * biggest[near] + between + 1e-240)
+        between = 1e-13 * np.abs(start).max()  # what decays fast may have been large between two times
+        assert np.all(np.abs(row[near] - true[near]) <= 1e-10 * biggest[near] + between + 1e-240)
         assert not row[true == 0.0].any()
         assert not np.isfinite(row[~inside]).any()

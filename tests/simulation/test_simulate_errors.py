@@ -1,5 +1,7 @@
 """Bad input: what must hold, what was given, where."""
 
+import datetime
+
 import control as ct
 import numpy as np
 import pytest
@@ -110,3 +112,82 @@ def test_a_system_without_stated_sizes_is_named_with_what_to_give(missing):
     system = ct.nlsys(lambda t, x, u, p: -x + u, lambda t, x, u, p: x, name="lag", **sizes)
     with pytest.raises(ValueError, match=rf"system must have a number of {missing}, got lag .* give it {missing}="):
         cp.simulate(system, [0.0, 1.0], 1.0, 0.0)
+
+
+# What is no plain number
+
+
+class Quantity:
+    """As a value of pint or astropy: it turns into an array without its unit."""
+
+    units = "millisecond"
+
+    def __init__(self, values):
+        self.values = np.asarray(values, dtype=float)
+
+    def __array__(self, dtype=None, copy=None):
+        return self.values
+
+    def __len__(self):
+        return len(self.values)
+
+
+KINDS = {
+    "time differences": lambda values: (1000 * np.asarray(values)).astype("m8[ms]"),
+    "dates": lambda values: np.datetime64("2026-01-01") + (1000 * np.asarray(values)).astype("m8[ms]"),
+    "standard time differences": lambda values: [datetime.timedelta(seconds=float(v)) for v in values],
+    "standard dates": lambda values: [datetime.datetime(2026, 1, 1 + k) for k in range(len(values))],
+    "units": Quantity,
+    "complex": lambda values: np.asarray(values) + 0j,
+    "complex in a list": lambda values: [*list(values)[:-1], 1j],
+    "strings": lambda values: [str(v) for v in values],
+    "masked": lambda values: np.ma.masked_greater(np.asarray(values), np.asarray(values)[-2]),
+    "functions": lambda values: np.sin,
+}  # fmt: skip
+DISCRETE = ct.ss(0.5 * np.eye(2), np.ones((2, 1)), np.ones((1, 2)), 0, 0.2, name="discrete")
+WIDE = ct.nlsys(lambda t, x, u, p: u - x**3, None, inputs=["r"], outputs=2, states=2, name="wide")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("system", [LOOP, WIDE, DISCRETE], ids=["linear", "nonlinear", "discrete"])
+def test_times_inputs_and_states_that_are_no_plain_numbers(system, kind):
+    made, error = KINDS[kind], ValueError if kind == "masked" else TypeError
+    with pytest.raises(error, match="timepts must"):
+        cp.simulate(system, made(T))
+    for inputs in (made(T), {system.input_labels[0]: made(T)}):
+        with pytest.raises(error, match=r"input.* must"):
+            cp.simulate(system, T, inputs)
+    if kind != "functions":
+        with pytest.raises(error, match=r"input.* must"):
+            cp.simulate(system, T, [made(T)])
+    with pytest.raises(error, match="initial_state must"):
+        cp.simulate(system, T, 0.0, made([1.0, 2.0]) if kind != "functions" else np.sin)
+
+
+@pytest.mark.parametrize("value", [np.timedelta64(1, "s"), datetime.timedelta(seconds=1), 1j, "1", np.ma.masked])
+def test_single_values_that_are_no_plain_numbers(value):
+    error = ValueError if value is np.ma.masked else TypeError
+    for inputs in (value, {"r": value}, [value]):
+        with pytest.raises(error, match=r"input.* must"):
+            cp.simulate(LOOP, T, inputs)
+    with pytest.raises(error, match="initial_state must"):
+        cp.simulate(LOOP, T, 0.0, value)
+
+
+def test_whole_numbers_booleans_and_masks_of_nothing_are_numbers():
+    expected = cp.simulate(LOOP, T, np.ones(11), [1.0, 0.0]).outputs
+    for ones in (
+        [1] * 11,
+        [True] * 11,
+        np.ones(11, dtype=np.float32),
+        np.ma.array(np.ones(11)),
+        np.ones(11, dtype=object),
+    ):
+        assert np.array_equal(cp.simulate(LOOP, T.tolist(), ones, (1, False)).outputs, expected)
+
+
+def test_a_matrix_that_was_set_to_complex_numbers():
+    system = ct.ss(-1.0, 1.0, 1.0, 0.0, name="turned")
+    system.A = np.array([[-1.0 + 2.0j]])
+    with pytest.raises(TypeError, match="A of turned must be real numbers, got complex numbers"):
+        cp.simulate(system, T, 1.0)

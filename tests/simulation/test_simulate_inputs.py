@@ -175,3 +175,53 @@ def test_samples_on_a_line_do_not_bend_by_rounding():
     bent = np.where(t < t[2000], 1.0 + t / 3.0, 1.0 + t[2000] / 3.0 + (1 / 3 + 1e-9) * (t - t[2000]))
     assert t[2000] in SampledDrive(t, bent).breakpoints
     assert np.array_equal(SampledDrive(t, bent).at(t)[0], bent)
+
+
+def test_a_list_holds_what_each_input_takes():
+    samples = saw(T)
+    found = cp.simulate(SYSTEM, T, [PLAN, samples], START)
+    assert np.array_equal(found.outputs, cp.simulate(SYSTEM, T, {"r": PLAN, "d": samples}, START).outputs)
+    peer = ct.input_output_response(SYSTEM, T, [samples, 0.5], START)
+    assert np.array_equal(cp.simulate(SYSTEM, T, [samples, 0.5], START).inputs, peer.inputs)
+    assert np.array_equal(cp.simulate(ct.ss(-1.0, 1.0, 1.0, 0.0), T, [2.0]).inputs, np.full(T.size, 2.0))
+    # As many inputs as times: numbers are for one input each, rows are samples, a plan is a plan.
+    two = [0.0, 6.0]
+    for inputs, rows in (
+        ([1.0, 2.0], [[1, 1], [2, 2]]),
+        ([[1, 2], [3, 4]], [[1, 2], [3, 4]]),
+        ([PLAN, 2.0], [[0, 0.5], [2, 2]]),
+    ):
+        assert np.abs(cp.simulate(SYSTEM, two, inputs).inputs - rows).max() <= 1e-15
+
+
+# Where a run starts
+
+
+def test_none_is_the_stated_start_and_a_number_is_that_number():
+    lag = ct.ss(-1.0, 1.0, 1.0, 0.0, inputs="u", outputs="y", name="lag")
+    follower = cp.create_command_filter_iosystem(2.0, 2, input="y", name="follower")
+    follower.initial_state = np.array([3.0, -1.0, 0.5])
+    loop = ct.interconnect([lag, follower], inputs="u", outputs=["y"], check_unused=False)
+    t = [0.0, 1.0]
+    for system in (loop, cp.prepare(loop)):
+        for method in ("auto", "python"):
+            begins = [cp.simulate(system, t, 0.0, *start, method=method).states[:, 0].tolist()
+                      for start in ((), (None,), (0.0,), (0,), ([0.0] * 4,), (2.0,))]  # fmt: skip
+            assert begins == [[0.0, 3.0, -1.0, 0.5]] * 2 + [[0.0] * 4] * 3 + [[2.0] * 4]
+    loop.initial_state = 5.0
+    assert cp.simulate(loop, t).states[:, 0].tolist() == [5.0] * 4
+    assert cp.simulate(loop, t, initial_state=0.0).states[:, 0].tolist() == [0.0] * 4
+    plain = ct.ss(-1.0, 1.0, 1.0, 0.0, 0.5)
+    assert cp.simulate(plain, t, 0.0).states[:, 0].tolist() == [0.0]
+
+
+def test_what_runs_many_loops_starts_where_it_is_told():
+    plan = cp.PolySpline([cp.Waypoint(0, 0, 0), cp.Waypoint(1, 1, 0)], labels=["r"])
+    loop = ct.ss(-1.0, 1.0, 1.0, 0.0, inputs="r", outputs="y")
+    loop.initial_state = np.array([7.0])
+    t = np.linspace(0.0, 2.0, 21)
+    first = [
+        cp.compare(loop, {"plan": plan}, t, initial_state=start).responses["plan"].states[0, 0]
+        for start in (None, 0.0, [0.0], 2.0)
+    ]
+    assert first == [7.0, 0.0, 0.0, 2.0]

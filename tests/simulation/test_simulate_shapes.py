@@ -150,3 +150,31 @@ def test_times_may_be_a_list_of_whole_numbers():
     found = cp.simulate(system, [0, 1, 3], plan)
     assert np.array_equal(found.time, [0.0, 1.0, 3.0])
     assert np.array_equal(found.outputs, cp.simulate(system, np.array([0.0, 1.0, 3.0]), plan).outputs)
+
+
+@pytest.mark.parametrize("dt", [0, 0.5])
+@pytest.mark.parametrize("linear", [True, False])
+def test_systems_without_outputs(linear, dt):
+    t = np.linspace(0.0, 2.0, 5)
+    if linear:
+        system = ct.ss(-0.5, 1.0, np.zeros((0, 1)), np.zeros((0, 1)), dt)
+    else:
+        system = ct.nlsys(lambda t, x, u, p: u - 0.5 * x, lambda t, x, u, p: [], inputs=1, outputs=0, states=1, dt=dt)
+    same = ct.ss(-0.5, 1.0, 1.0, 0.0, dt)
+    for method in ("auto", "python"):
+        found = cp.simulate(system, t, 1.0, method=method)
+        assert found.outputs.shape == (0, 5)
+        assert np.abs(found.states[0] - cp.simulate(same, t, 1.0).outputs).max() <= 1e-7
+
+
+def test_parameters_of_a_response_are_those_given():
+    system = ct.nlsys(lambda t, x, u, p: u - p["k"] * x, None, inputs=1, outputs=1, states=1, params={"k": 2.0})
+    t = np.linspace(0.0, 1.0, 5)
+    for params in (None, {"k": 3.0}):
+        peer = ct.input_output_response(system, t, np.ones(5), params=params)
+        found = cp.simulate(system, t, 1.0, params=params)
+        assert found.params == peer.params
+    given = {"k": 4.0}
+    found = cp.simulate(system, t, 1.0, params=given)
+    given["k"] = 5.0
+    assert found.params == {"k": 4.0}

@@ -1,6 +1,7 @@
 """A compiled form belongs to all that its functions refer to; what cannot be followed is run by Python."""
 
 import collections
+import collections.abc
 import dataclasses
 import datetime
 import enum
@@ -363,6 +364,40 @@ def by_new_code():
 
     codes = {1.0: update.__code__, 4.0: (lambda t, x, u, p: decay(4.0, x)).__code__}
     return update, lambda k: setattr(update, "__code__", codes[k])
+
+
+def by_a_plan_of_a_user_inside_another():
+    class _Level(cp.PolySpline):
+        levels = [1.0]  # noqa: RUF012
+
+        def _leg_jet(self, leg, s, order):
+            return super()._leg_jet(leg, s, order) * self.levels[0]
+
+    stacked = cp.stack([_Level([cp.Waypoint(0, 0, 0), cp.Waypoint(1, 1, 0)])])
+    return (lambda t, x, u, p: decay(2.0 * float(stacked(0.5)), x)), lambda k: _Level.levels.__setitem__(0, k)
+
+
+def by_a_chain_of_dictionaries():
+    chain = collections.ChainMap({"k": 1.0})
+    return (lambda t, x, u, p: decay(chain["k"], x)), lambda k: chain.update(k=k)
+
+
+def by_a_subclass_of_a_mapping():
+    class Gains(collections.abc.Mapping):
+        def __init__(self):
+            self.hidden = {"k": 1.0}
+
+        def __getitem__(self, key):
+            return self.hidden[key]
+
+        def __iter__(self):
+            return iter(self.hidden)
+
+        def __len__(self):
+            return len(self.hidden)
+
+    gains = Gains()
+    return (lambda t, x, u, p: decay(gains.get("k"), x)), lambda k: gains.hidden.update(k=k)
 
 
 def by_ten_levels_of_functions():

@@ -63,7 +63,7 @@ EXPRESSIONS = {
     # reductions and shapes
     "sums of all": lambda x: [x.sum(), np.sum(x), sum(x), np.mean(x), x.mean(), np.prod(x)],
     "extremes": lambda x: [x.max(), np.max(x), x.min(), np.amin(x), np.ptp(x) if hasattr(np, "ptp") else 0.0],
-    "running": lambda x: [*np.cumsum(x), *np.diff(x), np.trapezoid(x)],
+    "running": lambda x: [*np.cumsum(x), *np.diff(x), getattr(np, "trapezoid", np.sum)(x)],
     "norm": lambda x: [np.linalg.norm(x), np.linalg.norm([x[0], 1.0])],
     "polynomial": lambda x: [np.polyval([0.1, -0.2, 1.0], x[0]), np.polynomial.Polynomial([1.0, 2.0, 3.0])(x[1])],
     "joined": lambda x: np.hstack([x[1:], -np.sin(x[:1]), np.concatenate([x, [1.0]])]),

@@ -184,9 +184,111 @@ def test_a_counter_counts_the_run_alone(call):
         system = block(update, params={"k": 1.0} if call == "simulate" else {})
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            assert cp.simulate(system, T, None, 1.0, params=params).method == "python"
+            cp.simulate(system, T, None, 1.0, params=params, method="python")
         counts.append(len(calls))
     assert counts[0] == counts[1] > 0
+
+
+def log_in_a_list():
+    calls = []
+
+    def update(t, x, u, p):
+        calls.append((t, x[0]))
+        return [-p["k"] * x[0]]
+
+    return update, lambda: len(calls)
+
+
+def log_in_a_closure():
+    calls = 0
+
+    def update(t, x, u, p):
+        nonlocal calls
+        calls += 1
+        return [-p["k"] * x[0]]
+
+    return update, lambda: calls
+
+
+class Counting:
+    calls = 0
+
+    def update(self, t, x, u, p):
+        self.calls += 1
+        return [-p["k"] * x[0]]
+
+
+def log_in_an_object():
+    counting = Counting()
+    return counting.update, lambda: counting.calls
+
+
+def log_in_an_array():
+    calls = np.zeros(2, dtype=int)
+
+    def update(t, x, u, p):
+        calls[1] += 1
+        return [-p["k"] * x[0]]
+
+    return update, lambda: calls[1]
+
+
+def log_beside_a_gain():
+    known = {"calls": 0, "gain": 1.0}
+
+    def update(t, x, u, p):
+        known["calls"] += 1
+        return [-p["k"] * known["gain"] * x[0]]
+
+    update.known = known
+    return update, lambda: known["calls"]
+
+
+LOGS = [log for name, log in sorted(globals().items()) if name.startswith("log_")]
+
+
+@pytest.mark.parametrize("log", LOGS, ids=lambda log: log.__name__)
+def test_what_is_written_and_never_read_does_not_matter(monkeypatch, log):
+    """Trials do not count; the form is kept though the counter moves on."""
+    from ctrlplan.simulation import traced as traced_module
+
+    traces = []
+    plain = traced_module.traced
+    monkeypatch.setattr(traced_module, "traced", lambda *given: traces.append(given) or plain(*given))
+    update, calls = log()
+    ready = cp.prepare(block(update, params={"k": 1.0}))
+    ready.compiled({}, [], 0.0, np.ones(1))
+    assert calls() == 0
+    for k in range(1, 6):
+        found = cp.simulate(ready, T, None, 1.0, params={"k": float(k)})
+        assert found.method == "compiled"
+        assert np.abs(found.states[0] - np.exp(-k * T)).max() <= 1e-6
+    assert calls() > 0
+    assert len(traces) == 2  # without parameters of the run, and with
+
+
+def test_a_gain_beside_a_counter_still_counts():
+    update, _ = log_beside_a_gain()
+    system = block(update, params={"k": 1.0})
+    for gain in (1.0, 3.0, 1.0):
+        update.known["gain"] = gain
+        found = cp.simulate(system, T, None, 1.0)
+        assert found.method == "compiled"
+        assert np.abs(found.states[0] - np.exp(-gain * T)).max() <= 1e-6
+
+
+def test_the_first_call_that_is_remembered_is_no_log():
+    first = {}
+
+    def update(t, x, u, p):
+        start = first.setdefault("time", t)
+        return [-x[0] + 0.1 * (t - start)]
+
+    found = cp.simulate(block(update), T + 1.0, None, 1.0)
+    assert found.method == "python"
+    assert "has memory" in found.reason
+    assert first == {"time": 1.0}
+    assert np.abs(found.states[0] - (0.1 * T - 0.1 + 1.1 * np.exp(-T))).max() <= 1e-6
 
 
 def test_a_block_with_two_values_for_equal_arguments_is_named():

@@ -3,7 +3,7 @@
 import json
 import math
 import pickle
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from multiprocessing import get_context
 
 import control as ct
@@ -713,7 +713,7 @@ def interrupt_in_draw(monkeypatch, k):
 
     def one(*arguments):
         done.append(arguments)
-        if len(done) == k + 2:  # one before all draws
+        if len(done) == k + 3:  # two before all draws
             raise KeyboardInterrupt
         return known(*arguments)
 
@@ -759,9 +759,60 @@ def test_a_parameter_that_no_block_reads_is_refused(loop):
         run(loop(), {"tau": [1.0, 2.0], "tua": [1.0, 2.0]})
 
 
-def test_a_linear_loop_has_no_parameters():
-    with pytest.raises(ValueError, match="params must be parameters of a block, got 'gain', which none reads"):
-        run(cp.plants.integrator_lag_loop(5.0), {"gain": [1.0, 2.0]})
+@pytest.mark.parametrize(
+    "loop",
+    [
+        cp.plants.integrator_lag_loop(5.0),
+        ct.ss([[-2.0]], [[2.0]], [[1.0]], [[0.0]], inputs="r", outputs="y"),
+        ct.tf([3.0], [1.0, 3.0], inputs="r", outputs="y"),
+        lambda name, plan: cp.plants.unity_feedback_loop([1.0], [1.0, 1.0, 0.0], 4.0),
+    ],
+    ids=["interconnection", "state space", "transfer function", "builder"],
+)
+def test_a_linear_loop_has_no_parameters_and_the_error_says_what_has(loop):
+    said = (
+        "params must be parameters of a block, got 'gain', which none reads; .* is linear, and its matrices have no "
+        "parameters: give sweep a function from a value of 'gain' to a loop, with values="
+    )
+    with pytest.raises(ValueError, match=said):
+        run(loop, {"gain": [1.0, 2.0]})
+
+
+@pytest.mark.parametrize("build", [lambda gain: None, lambda mass, friction: None, cp.plants.integrator_lag_loop])
+def test_a_function_of_the_parameters_is_not_taken_for_one_of_a_plan(build):
+    table = {"gain": [1.0, 2.0], "mass": [1.0, 2.0], "friction": [1.0, 2.0]}
+    said = "build must be, with params, a loop whose blocks read the parameters, or a function of a plan's name and"
+    with pytest.raises(ValueError, match=said):
+        run(build, table)
+
+
+def test_a_builder_may_have_further_arguments_named_as_the_parameters():
+    result = run(lambda name, plan, tau=2.0: lag(tau=tau), {"tau": [0.5, 1.0]})
+    np.testing.assert_allclose(result.metrics["step"]["settling_time"], np.log(50) * np.array([0.5, 1.0]), rtol=1e-5)
+    assert result.nominal.metrics["step"]["settling_time"] == pytest.approx(2.0 * math.log(50), rel=1e-5)
+
+
+@pytest.mark.parametrize("start", [None, 0.5])
+def test_metrics_of_draws_count_from_the_start_that_a_comparison_takes(start):
+    """The earliest start of a plan unless given: of both plans for both, though each draw runs plan by plan."""
+    plans = {"step": cp.Step(1.0, time=2.0), "ramp": cp.PolySpline([cp.Waypoint(1, 0), cp.Waypoint(2, 1)])}
+    result = run(lag(), {"tau": [0.5, 1.0]}, plans=plans, start=start, only=["settling_time", "itae"])
+    for k, tau in enumerate((0.5, 1.0)):
+        alone = cp.compare(lag(), plans, TIMES, params={"tau": tau}, start=start, only=["settling_time", "itae"])
+        for plan, row in alone.metrics.items():
+            np.testing.assert_allclose([result.metrics[plan][n][k] for n in row], list(row.values()), rtol=1e-9)
+    since = 1.0 if start is None else start
+    np.testing.assert_allclose(
+        result.metrics["step"]["settling_time"], 2.0 - since + np.log(50) * np.array([0.5, 1.0]), rtol=1e-5
+    )
+
+
+@pytest.mark.parametrize("values", [["0.5", "1.0"], [0.5 + 0j], np.ma.masked_array([0.5, 1.0], [0, 1])])
+def test_draws_are_plain_numbers(values):
+    with pytest.raises(
+        (TypeError, ValueError), match=r"params\['tau'\] must (be real numbers|have no masked values), got"
+    ):
+        run(lag(), {"tau": values})
 
 
 @pytest.mark.parametrize(
@@ -900,6 +951,37 @@ def test_a_loop_that_only_python_control_runs_takes_parameters_too():
     loop = Own(_lag_rate, _lag_out, states=1, inputs="r", outputs="y", params={"tau": 1.0}, name="own")
     result = run(loop, {"tau": [0.5, 1.0]}, plans={"step": cp.Step(1.0)}, times=np.linspace(0, 10, 2001))
     np.testing.assert_allclose(result.metrics["step"]["iae_final"], [0.5, 1.0], rtol=1e-3)
+
+
+def test_all_plans_are_measured_on_the_outputs_that_a_comparison_takes():
+    """Those named like the axes of the first plan, though each draw runs plan by plan."""
+    loop = block(
+        lambda t, x, u, params: (u - x) / params["tau"],
+        {"tau": 1.0},
+        lambda t, x, u, params: np.array([u[0], x[0]]),
+        outputs=["r_seen", "y"],
+    )
+    plans = {"step": cp.Step(1.0), "ramp": cp.PolySpline([cp.Waypoint(0, 0), cp.Waypoint(1, 1)], labels=["height"])}
+    result = run(loop, {"tau": [0.5, 2.0]}, plans=plans, only=["iae_final"])
+    for k, tau in enumerate((0.5, 2.0)):
+        alone = cp.compare(loop, plans, TIMES, params={"tau": tau}, only=["iae_final"]).metrics
+        for plan, row in alone.items():
+            assert result.metrics[plan]["iae_final"][k] == pytest.approx(row["iae_final"], rel=1e-9)
+
+
+@pytest.mark.filterwarnings("ignore:block own .*run by control.input_output_response:UserWarning")
+def test_draws_of_a_loop_that_only_python_control_runs_do_not_mix_in_threads():
+    """It keeps the parameters of a run in the system, which all threads share."""
+
+    class Own(ct.NonlinearIOSystem):
+        def _rhs(self, t, x, u):
+            return super()._rhs(t, x, u)
+
+    loop = Own(_lag_rate, _lag_out, states=1, inputs="r", outputs="y", params={"tau": 1.0}, name="own")
+    tau, times = np.linspace(0.5, 2.0, 12), np.linspace(0, 10, 401)
+    alone = run(loop, {"tau": tau}, None, {"step": cp.Step(1.0)}, times, only=["iae_final"])
+    with ThreadPoolExecutor(4) as pool:
+        same_bits(alone, run(loop, {"tau": tau}, pool, {"step": cp.Step(1.0)}, times, only=["iae_final"]))
 
 
 # The bar

@@ -1,5 +1,7 @@
 """Comparisons over a parameter: the same numbers however they are computed."""
 
+import functools
+import inspect
 import json
 import tracemalloc
 from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
@@ -11,6 +13,7 @@ import pytest
 
 import ctrlplan as cp
 from ctrlplan.studies import MEASURES
+from ctrlplan.studies.measures import Measure
 
 MOVE = [cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1, 0, 0)]
 PLANS = {"step": cp.Step(1.0), "planned": cp.TrigSpline(MOVE, alpha=1.0)}
@@ -131,6 +134,147 @@ def test_many_loops_of_two_axes_at_once(options):
             assert list(found.metrics[plan]) == list(row)
             rows = [found.metrics[plan][name][i] for name in row]
             np.testing.assert_allclose(rows, list(row.values()), rtol=1e-9, atol=1e-12)
+
+
+class Here:
+    """Runs a task when it is submitted."""
+
+    def submit(self, function, /, *arguments):
+        task = Future()
+        task.set_result(function(*arguments))
+        return task
+
+
+# Right and wrong values of every parameter of compare; those that are used up are made for each call.
+CHOICES = {
+    "alpha": [3.0, np.nan, "a", None],
+    "outputs": [["z", "x"], ("x", "u"), "xz", ["x", "no"], [], 3, lambda: iter(["z", "x"])],
+    "controls": [["u", "x"], ("u", "u"), "u", ["no"], [], 3, lambda: iter(["u"])],
+    "waypoints": [OPTIONS["waypoints"]["waypoints"], lambda: iter(OPTIONS["waypoints"]["waypoints"]), [], [1.0], 3],
+    "initial_state": [0.1, [0.1, -0.2, 0.3, 0.0], np.nan, [np.inf] * 4, "a", [1.0], [[0.0] * 4], 1j, None],
+    "band": [0.1, 1, np.nan, 0.0, -0.1, np.inf, "a", None, [0.02, 0.05]],
+    "start": [0.7, 0.0, -3.0, 11.95, 12.0, 50.0, np.nan, np.inf, -np.inf, "a", "0.7", [0.7], 1j, None],
+    "only": [
+        ["iae", "control_effort"],
+        {"itae"},
+        "settling_time",
+        ["no"],
+        [],
+        3,
+        lambda: iter(["ise", "itae"]),
+        ["wandering"],
+    ],
+    "events": [(), [], [cp.Event("x", high=1.5, stop=True)], [cp.Event("x", high=1.5)], [cp.Event("no", high=1.0)], 3],
+    "measure": [lambda plan, response: {"last": response.outputs[0, -1]}, lambda plan, response: 1.0, 3],
+    "measures": [{"last": Measure("Last value")}, 3],
+    "units": [{"x": "m"}, {"no": "m"}, 3],
+    "title": ["Title", 3],
+    "parameters": [{"mass": 1.0}, 3],
+    "worth": [False],
+    "params": [],  # of a sweep these are draws
+}
+
+
+def outcome(function):
+    """What a function returns, or the kind and words of what it raises."""
+    try:
+        return function()
+    except Exception as error:
+        return type(error), str(error)
+
+
+def test_every_parameter_of_compare_is_among_the_choices():
+    assert set(CHOICES) == set(inspect.signature(cp.compare).parameters) - {"loop", "plans", "timepts"}
+
+
+@pytest.mark.parametrize(("name", "value"), [(name, value) for name, values in CHOICES.items() for value in values])
+def test_an_option_means_and_is_checked_the_same_however_loops_are_run(name, value):
+    """As in a comparison of each loop by itself."""
+    values, times = np.array([2.0, 11.0, 60.0]), np.linspace(0.0, 12.0, 31)
+    lasting = value if name == "measure" or not callable(value) else list(value())
+
+    def alone(stiffness):
+        return outcome(lambda: cp.compare(two_axes(stiffness), plans_of_two_axes(), times, **{name: lasting}).metrics)
+
+    def swept(executor):
+        given = value if lasting is value else value()
+        sweep = functools.partial(cp.sweep, two_axes, values, plans_of_two_axes(), times, executor, False)
+        return outcome(lambda: sweep(**{name: given}).metrics)
+
+    expected = [alone(stiffness) for stiffness in values]
+    for found in (swept(None), swept(Here())):
+        if isinstance(expected[0], tuple):
+            assert found == expected[0]
+            continue
+        for i, rows in enumerate(expected):
+            assert {plan: list(row) for plan, row in found.items()} == {plan: list(row) for plan, row in rows.items()}
+            for plan, row in rows.items():
+                of_value = [found[plan][key][i] for key in row]
+                np.testing.assert_allclose(of_value, list(row.values()), rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("executor", [None, Here()], ids=["together", "one by one"])
+@pytest.mark.parametrize(("worth", "kind"), [(3, TypeError), (None, TypeError), (True, ValueError), ({}, ValueError)])
+def test_a_sweep_has_no_place_for_the_benefit(worth, kind, executor):
+    with pytest.raises(kind, match="worth must be False in a sweep over values, which has no place for it, got"):
+        cp.sweep(BUILD, GAINS, MOVE, TIMES, executor, progress=False, worth=worth)
+
+
+@pytest.mark.parametrize("start", [0.0, 0.5, 1.75])
+def test_metrics_count_from_the_start_that_is_given(start):
+    """The error of a lag behind a step is exp(-rate t); its integrals from the start to 20 s."""
+
+    def build(rate):
+        return ct.ss([[-rate]], [[rate]], [[1.0]], [[0.0]], inputs="r", outputs="y")
+
+    rates, end = np.array([0.25, 0.5, 0.75, 1.0, 1.5, 2.0]), 20.0
+    found = cp.sweep(build, rates, {"step": cp.Step(1.0)}, np.linspace(0.0, end, 2001), progress=False, start=start)
+    ends = [np.exp(-rates * t) for t in (start, end)]
+    np.testing.assert_allclose(found.metrics["step"]["iae"], (ends[0] - ends[1]) / rates, rtol=1e-5)
+    itae = (ends[0] - ends[1] * (1.0 + rates * (end - start))) / rates**2
+    np.testing.assert_allclose(found.metrics["step"]["itae"], itae, rtol=1e-5)
+
+
+def test_a_builder_may_change_one_loop_from_value_to_value():
+    """Measured is the loop as it was at each value, not as the builder left it."""
+    lag = ct.ss([[-1.0]], [[1.0]], [[1.0]], [[0.0]], inputs="r", outputs="y", name="lag")
+
+    def build(rate):
+        lag.A[0, 0], lag.B[0, 0] = -rate, rate
+        return ct.interconnect([lag], inputs=["r"], outputs=["y"], name="loop")
+
+    rates = np.array([0.25, 0.5, 0.75, 1.0, 1.5, 2.0])
+    found = cp.sweep(build, rates, {"step": cp.Step(1.0)}, TIMES, progress=False, only=["settling_time"])
+    np.testing.assert_allclose(found.metrics["step"]["settling_time"], np.log(50.0) / rates, rtol=1e-5)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 5, 6, 7, 13, 14, 15])
+def test_a_loop_is_built_once_for_each_value(count):
+    built = []
+    gains = np.linspace(1.0, 20.0, count)
+    found = cp.sweep(
+        lambda gain: built.append(gain) or BUILD(gain), gains, PLANS, TIMES, progress=False, only=["overshoot_error"]
+    )
+    assert built == found.values.tolist() == gains.tolist()
+    expected = 100 * np.exp(-0.5 * np.pi / np.sqrt(gains - 0.25))
+    np.testing.assert_allclose(found.metrics["step"]["overshoot_error"], expected, rtol=1e-5)
+
+
+def test_a_loop_is_built_once_for_each_value_even_where_one_cannot_be():
+    built = []
+
+    def build(gain):
+        built.append(gain)
+        if gain == 5.0:
+            raise ValueError("none at 5")
+        return BUILD(gain)
+
+    found = cp.sweep(build, np.arange(1.0, 10.0), PLANS, TIMES, progress=False, only=["overshoot_error"])
+    assert built == found.values.tolist() == list(range(1, 10))
+    assert [(f.draw, f.params, f.message) for f in found.failures] == [(4, {"value": 5.0}, "ValueError: none at 5")]
+    expected = 100 * np.exp(-0.5 * np.pi / np.sqrt(found.values - 0.25))
+    expected[4] = np.nan
+    np.testing.assert_allclose(found.metrics["step"]["overshoot_error"], expected, rtol=1e-5)
 
 
 def test_an_axis_that_starts_elsewhere_starts_at_rest():

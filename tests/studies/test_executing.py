@@ -1,0 +1,467 @@
+"""Sweeps on executors: taken as they complete, kept when interrupted or bereft of a worker, never run twice."""
+
+import pickle
+import sys
+from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
+from itertools import count
+from multiprocessing.pool import ThreadPool
+from types import SimpleNamespace
+
+import control as ct
+import numpy as np
+import pytest
+
+import ctrlplan as cp
+from ctrlplan.simulation import budget
+from ctrlplan.studies.ensemble import ensemble
+from ctrlplan.studies.executing import Failed
+
+TIMES = np.linspace(0.0, 10.0, 201)
+PLANS = {"step": cp.Step(1.0)}
+RATES = [0.5, 1.0, 1.5, 2.0, 2.5, 3.0]
+
+
+def lag(rate):
+    return ct.ss([[-rate]], [[rate]], [[1.0]], [[0.0]], inputs="r", outputs="y")
+
+
+def bent(rate):
+    """The same lag, which only Python runs."""
+    return ct.nlsys(
+        lambda t, x, u, p: rate * (float(u[0]) - float(x[0])), None, states=1, inputs="r", outputs="y", name="bent"
+    )
+
+
+def drawn(tau=1.0, **names):
+    """Lag with a parameter."""
+    return ct.nlsys(
+        lambda t, x, u, p: (u - x) / p["tau"], None, states=1, inputs="r", outputs="y", params={"tau": tau}, **names
+    )
+
+
+def swept(build, values=RATES, executor=None, **options):
+    return cp.sweep(build, values, PLANS, TIMES, executor, False, only=["settling_time"], **options)
+
+
+def check(found, values):
+    """A lag settles when exp(-rate t) is a fiftieth."""
+    assert found.values.tolist() == list(values)
+    np.testing.assert_allclose(found.metrics["step"]["settling_time"], np.log(50.0) / found.values, rtol=1e-5)
+
+
+# Executors of every kind
+
+
+class InTurn:
+    """Nothing but submit and result."""
+
+    def __init__(self):
+        self.tasks = []
+
+    def submit(self, function, /, *arguments):
+        future = Future()
+        self.tasks.append((future, function, arguments))
+        return self.answer(future, len(self.tasks) - 1)
+
+    def answer(self, future, k):
+        return SimpleNamespace(result=lambda: self.run(k))
+
+    def run(self, k):
+        future, function, arguments = self.tasks[k]
+        if not future.done():
+            future.set_result(function(*arguments))
+        return future.result()
+
+
+class LastFirst(InTurn):
+    """Each task is done only once all that were submitted after it have been taken; it can be asked."""
+
+    def answer(self, future, k):
+        return SimpleNamespace(done=lambda: self.later_ones_taken(k), result=lambda: self.taken(k))
+
+    def later_ones_taken(self, k):
+        return all(future.done() for future, *_ in self.tasks[k + 1 :])
+
+    def taken(self, k):
+        assert self.later_ones_taken(k)
+        return self.run(k)
+
+
+class LastFirstByCallback(LastFirst):
+    """The same, and says so by itself."""
+
+    def __init__(self):
+        super().__init__()
+        self.callbacks = {}
+
+    def answer(self, future, k):
+        return SimpleNamespace(
+            add_done_callback=lambda call: self.tell(k, call), done=lambda: False, result=lambda: self.taken(k)
+        )
+
+    def tell(self, k, call):
+        self.callbacks[k] = call
+        if k == len(self.tasks) - 1:
+            call(None)
+
+    def taken(self, k):
+        found = super().taken(k)
+        if k:
+            self.callbacks[k - 1](None)
+        return found
+
+
+@pytest.mark.parametrize("executor", [InTurn, LastFirst, LastFirstByCallback])
+@pytest.mark.parametrize("build", [lag, bent])
+def test_results_are_taken_as_they_complete_from_whatever_has_submit_and_result(executor, build):
+    check(swept(build, executor=executor()), RATES)
+
+
+@pytest.mark.parametrize("executor", [InTurn, LastFirst, LastFirstByCallback])
+def test_draws_are_taken_as_they_complete_too(executor):
+    tau = np.array([0.5, 1.0, 2.0])
+    found = ensemble(drawn(), PLANS, TIMES, {"tau": tau}, executor(), False)
+    np.testing.assert_allclose(found.metrics["step"]["settling_time"], np.log(50.0) * tau, rtol=1e-5)
+    assert (found.finished, found.failures, found.interrupted) == (3, (), False)
+
+
+def not_to_be_built(*arguments):
+    raise AssertionError("built")
+
+
+@pytest.mark.parametrize("draws", [{}, {"params": {"tau": [1.0]}}], ids=["values", "draws"])
+@pytest.mark.parametrize(
+    ("executor", "said"),
+    [
+        (3, "executor must be an object with submit, as those of concurrent.futures, got 3"),
+        ("threads", "executor must be an object with submit, .* got 'threads'"),
+        (ThreadPoolExecutor, "executor must be an object with submit, .* got the class ThreadPoolExecutor itself"),
+        (SimpleNamespace(submit=None), "executor must be an object with submit"),
+    ],
+)
+def test_what_is_no_executor_is_rejected_before_a_loop_is_built(executor, said, draws):
+    with pytest.raises(TypeError, match=said):
+        cp.sweep(not_to_be_built, None if draws else [1.0], PLANS, TIMES, executor, False, **draws)
+
+
+def test_a_multiprocessing_pool_is_rejected_before_a_loop_is_built():
+    said = "got multiprocessing.pool.ThreadPool, which never tells of a worker that dies; use concurrent.futures"
+    with ThreadPool(1) as pool, pytest.raises(TypeError, match=said):
+        swept(not_to_be_built, executor=pool)
+
+
+class Pickling(InTurn):
+    """What goes in is pickled; what cannot be is said in the result, as by a process pool."""
+
+    def submit(self, function, /, *arguments):
+        def run():
+            pickled = pickle.dumps((function, arguments))
+            return pickle.loads(pickle.dumps(pickle.loads(pickled)[0](*arguments)))
+
+        return super().submit(run)
+
+
+def test_functions_that_only_pickle_rejects_run_where_nothing_is_pickled():
+    with ThreadPoolExecutor(2) as pool:
+        check(swept(lambda rate: bent(rate), executor=pool), RATES)
+        found = ensemble(lambda name, plan: drawn(), PLANS, TIMES, {"tau": [0.5, 2.0]}, pool, False)
+        float_only = drawn_by_python()
+        alone = ensemble(float_only, PLANS, TIMES, {"tau": [0.5, 2.0]}, pool, False)
+    for one in (found, alone):
+        np.testing.assert_allclose(one.metrics["step"]["settling_time"], np.log(50.0) * np.array([0.5, 2]), rtol=1e-5)
+
+
+def drawn_by_python():
+    def update(t, x, u, p):
+        return (float(u[0]) - float(x[0])) / p["tau"]
+
+    return ct.nlsys(update, None, states=1, inputs="r", outputs="y", params={"tau": 1.0}, name="lag")
+
+
+def test_what_cannot_be_sent_is_said_in_the_executors_words():
+    with pytest.raises(ValueError, match=r"build must go to other processes, but .*lambda.*; give a function that"):
+        swept(lambda rate: lag(rate), executor=Pickling())
+    with pytest.raises(ValueError, match=r"the loop must go to other processes, but lag must be linear or compiled"):
+        ensemble(drawn_by_python(), PLANS, TIMES, {"tau": [0.5]}, Pickling(), False)
+
+
+class OddError(Exception):
+    """Cannot be made of what pickle keeps of it."""
+
+    def __init__(self, one, other):
+        super().__init__(f"{one} and {other}")
+
+
+def test_an_error_that_cannot_be_pickled_is_still_told_of():
+    failed = pickle.loads(pickle.dumps(Failed.of(OddError(1, 2))))
+    assert failed.message == "OddError: 1 and 2"
+    assert type(failed.error) is RuntimeError
+    same = pickle.loads(pickle.dumps(Failed.of(ZeroDivisionError("by 0"), lost=True)))
+    assert (same.message, type(same.error), same.lost) == ("ZeroDivisionError: by 0", ZeroDivisionError, True)
+
+
+# What an executor loses
+
+
+class Losing(InTurn):
+    """Some tasks are lost with an error of the executor, before they run."""
+
+    def __init__(self, lost, error):
+        super().__init__()
+        self.lost, self.error = lost, error
+
+    def run(self, k):
+        if k in self.lost:
+            raise self.error
+        return super().run(k)
+
+
+@pytest.mark.parametrize("error", [RuntimeError("worker died"), CancelledError(), SystemExit(3)])
+def test_what_a_worker_takes_with_it_is_named_and_runs_nowhere_else(error):
+    built = []
+    found = swept(lambda rate: built.append(rate) or lag(rate), executor=Losing({1, 4}, error))
+    assert built == [0.5, 1.5, 2.0, 3.0]
+    name = f"{type(error).__name__}: {error}".removesuffix(": ")
+    assert [(f.draw, f.params, f.message) for f in found.failures] == [
+        (1, {"value": 1.0}, name),
+        (4, {"value": 2.5}, name),
+    ]
+    assert np.isnan(found.metrics["step"]["settling_time"]).tolist() == [k in (1, 4) for k in range(6)]
+    assert not found.interrupted
+
+
+def test_draws_that_a_worker_takes_with_it_are_named_and_run_nowhere_else():
+    tau = np.linspace(0.5, 2.0, 12)
+    run = []
+    loop = drawn()
+
+    def measure(plan, response):
+        run.append(float(response.outputs[1]))
+        return {}
+
+    found = ensemble(
+        loop, PLANS, TIMES, {"tau": tau}, Losing({3, 11}, RuntimeError("gone")), False, {"measure": measure}
+    )
+    assert len(run) == 3 + 10  # the nominal loop, two draws that are compared with Python, and all but the lost
+    assert [(f.draw, f.params, f.message) for f in found.failures] == [
+        (k, {"tau": tau[k]}, "RuntimeError: gone") for k in (3, 11)
+    ]
+    assert np.flatnonzero(np.isnan(found.metrics["step"]["settling_time"])).tolist() == [3, 11]
+
+
+def test_an_executor_that_loses_everything_is_heard_of():
+    lost = Losing(range(6), RuntimeError("all gone"))
+    with pytest.raises(RuntimeError, match="all gone"):
+        swept(lag, executor=lost)
+    with pytest.raises(RuntimeError, match="all gone"):
+        ensemble(drawn(), PLANS, TIMES, {"tau": [0.5, 1.0]}, Losing(range(2), RuntimeError("all gone")), False)
+
+
+def test_an_executor_that_takes_no_more_keeps_what_it_has():
+    class Breaks(InTurn):
+        def submit(self, function, /, *arguments):
+            if len(self.tasks) == 4:
+                raise RuntimeError("broken")
+            return super().submit(function, *arguments)
+
+    found = swept(lag, executor=Breaks())
+    assert [(f.draw, f.message) for f in found.failures] == [(4, "RuntimeError: broken"), (5, "RuntimeError: broken")]
+    assert np.isfinite(found.metrics["step"]["settling_time"][:4]).all()
+
+
+# What a run or a builder does
+
+
+@pytest.mark.parametrize("executor", [None, InTurn], ids=["here", "executor"])
+@pytest.mark.parametrize("where", ["builder", "run"])
+def test_system_exit_is_the_failure_of_its_value(executor, where):
+    def build(rate):
+        def update(t, x, u, p):
+            if rate == 2.0 and t > 1.0:
+                sys.exit(f"at {where}")
+            return rate * (u - x)
+
+        if where == "run":
+            return ct.nlsys(update, None, states=1, inputs="r", outputs="y", name="lag")
+        return sys.exit(f"at {where}") if rate == 2.0 else lag(rate)
+
+    found = swept(build, executor=executor and executor())
+    assert [(f.draw, f.message) for f in found.failures] == [(3, f"SystemExit: at {where}")]
+    assert np.flatnonzero(np.isnan(found.metrics["step"]["settling_time"])).tolist() == [3]
+
+
+def test_system_exit_at_every_value_does_not_end_the_caller():
+    with pytest.raises(RuntimeError, match="SystemExit: 7"):
+        swept(lambda rate: sys.exit(7))
+    with pytest.raises(RuntimeError, match="SystemExit: 7"):
+        ensemble(lambda name, plan: sys.exit(7), PLANS, TIMES, {"tau": [1.0]}, None, False)
+
+
+@pytest.mark.parametrize("executor", [None, InTurn], ids=["here", "executor"])
+def test_system_exit_is_the_failure_of_its_draw(executor):
+    def update(t, x, u, p):
+        if p["tau"] > 1.9:
+            raise SystemExit
+        return (float(u[0]) - x) / p["tau"]
+
+    loop = ct.nlsys(update, None, states=1, inputs="r", outputs="y", params={"tau": 1.0}, name="lag")
+    found = ensemble(loop, PLANS, TIMES, {"tau": [2.0, 0.5, 1.0]}, executor and executor(), False)
+    assert [(f.draw, f.message) for f in found.failures] == [(0, "SystemExit")]
+    assert np.isfinite(found.metrics["step"]["settling_time"][1:]).all()
+
+
+# The time limit, on a clock of which every look takes a second
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    ticks = count()
+    monkeypatch.setattr(budget, "time", SimpleNamespace(monotonic=lambda: float(next(ticks))))
+
+
+def trembling(turn):
+    """A lag with an oscillator beside it, which takes more evaluations the faster it turns."""
+
+    def update(t, x, u, p):
+        return np.array([float(u[0]) - x[0], x[2], -(p["turn"] ** 2) * x[1]])
+
+    return ct.nlsys(
+        update, lambda t, x, u, p: x[:1], states=3, inputs="r", outputs="y", params={"turn": turn}, name="trembling"
+    )
+
+
+@pytest.mark.parametrize("executor", [None, InTurn, lambda: ThreadPoolExecutor(2)], ids=["here", "executor", "threads"])
+def test_a_run_that_takes_too_long_is_the_failure_of_its_value(executor, clock):
+    pool = executor and executor()
+    found = swept(trembling, [0.5, 1.0, 300.0], pool, timeout=4000.0, initial_state=[0.0, 1.0, 0.0])
+    (failure,) = found.failures
+    assert (failure.draw, failure.params) == (2, {"value": 300.0})
+    assert failure.message.startswith("TimeLimitError: a run must end within timeout = 4000 s, got no further at t = ")
+    np.testing.assert_allclose(found.metrics["step"]["settling_time"][:2], np.log(50.0), rtol=1e-5)
+
+
+@pytest.mark.parametrize("executor", [None, InTurn], ids=["here", "executor"])
+def test_a_run_that_takes_too_long_is_the_failure_of_its_draw(executor, clock):
+    settings = {"initial_state": [0.0, 1.0, 0.0], "only": ["settling_time"]}
+    build = trembling_by_name
+    found = ensemble(
+        build, PLANS, TIMES, {"turn": [300.0, 0.5, 2.0]}, executor and executor(), False, settings, timeout=4000.0
+    )
+    assert [(f.draw, f.message[:14]) for f in found.failures] == [(0, "TimeLimitError")]
+    np.testing.assert_allclose(found.metrics["step"]["settling_time"][1:], np.log(50.0), rtol=1e-5)
+
+
+def trembling_by_name(name, plan):
+    return trembling(1.0)
+
+
+@pytest.mark.parametrize("timeout", [0, -1.0, np.nan, np.inf, True, "5", [1.0]])
+@pytest.mark.parametrize("draws", [{}, {"params": {"tau": [1.0]}}], ids=["values", "draws"])
+def test_a_time_limit_is_a_number_of_seconds_above_0(timeout, draws):
+    with pytest.raises(ValueError, match="timeout must be a finite number of seconds above 0, or None, got"):
+        cp.sweep(not_to_be_built, None if draws else [1.0], PLANS, TIMES, None, False, timeout=timeout, **draws)
+
+
+# Interruptions: KeyboardInterrupt where a run, a builder or a wait is
+
+
+def interrupted_at(k, build):
+    def builds(rate):
+        if rate == RATES[k]:
+            raise KeyboardInterrupt
+        return build(rate)
+
+    return builds
+
+
+@pytest.mark.parametrize("build", [lag, bent])
+@pytest.mark.parametrize("k", [0, 1, 3, 5])
+def test_an_interruption_returns_every_value_that_was_finished(build, k):
+    with pytest.warns(UserWarning, match=f"the sweep was interrupted: {k} of 6 values are kept"):
+        found = swept(interrupted_at(k, build))
+    assert found.interrupted
+    assert found.values.tolist() == RATES[:k]
+    if k:
+        check(found, RATES[:k])
+    assert found.results([]) == {"value": RATES[:k]} | {plan: {} for plan in found.metrics}
+
+
+def test_a_sweep_that_is_not_interrupted_says_so():
+    assert not swept(lag).interrupted
+    assert not ensemble(drawn(), PLANS, TIMES, {"tau": [1.0]}, None, False).interrupted
+
+
+class Cancelled(InTurn):
+    """Some tasks are finished in no order; another is interrupted while it is waited for."""
+
+    def __init__(self, finished):
+        super().__init__()
+        self.finished, self.cancelled = finished, []
+
+    def answer(self, future, k):
+        def result():
+            if k in self.finished:
+                return self.run(k)
+            raise KeyboardInterrupt
+
+        return SimpleNamespace(
+            result=result,
+            done=lambda: k in self.finished and len(self.tasks) == 6,
+            exception=lambda: None,
+            cancel=lambda: self.cancelled.append(k),
+        )
+
+
+def test_an_interrupted_wait_keeps_what_is_finished_behind_a_slow_task(monkeypatch):
+    """The wait for task 0 is interrupted when 2, 3 and 5 are done, of which nobody was told yet."""
+    from ctrlplan.studies import executing
+
+    class Interrupts:
+        def put(self, k):
+            pass
+
+        def get(self, timeout):
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(executing, "SimpleQueue", Interrupts)
+    executor = Cancelled({2, 3, 5})
+    with pytest.warns(UserWarning, match="interrupted: 3 of 6 values are kept"):
+        found = swept(lag, executor=executor)
+    assert found.interrupted
+    check(found, [1.5, 2.0, 3.0])
+    assert set(executor.cancelled) == {0, 1, 4}
+
+
+def test_a_second_interruption_raises():
+    class InterruptedAgain(Cancelled):
+        def answer(self, future, k):
+            answer = super().answer(future, k)
+            answer.cancel = answer.done = answer.result  # which interrupt
+            return answer
+
+    with pytest.raises(KeyboardInterrupt):
+        swept(lag, executor=InterruptedAgain(()))
+
+
+def test_merged_sweeps_keep_failures_interruptions_and_metrics_of_one_alone():
+    def build(rate):
+        if rate in (1.0, 2.5):
+            raise ValueError("none")
+        return lag(rate)
+
+    one = swept(build, [1.0, 2.0, 3.0])
+    with pytest.warns(UserWarning, match="interrupted"):
+        other = swept(interrupted_at(5, build), [0.5, 1.5, 2.5, 3.0])
+    for both in (one.merged(other), other.merged(one)):
+        assert both.interrupted
+        assert both.values.tolist() == [0.5, 1.0, 1.5, 2.0, 2.5, 3.0]
+        assert [(f.draw, f.params["value"]) for f in both.failures] == [(1, 1.0), (4, 2.5)]
+        known = np.array([0, 2, 3, 5])
+        row = both.metrics["step"]["settling_time"]
+        np.testing.assert_allclose(row[known], np.log(50.0) / both.values[known], rtol=1e-5)
+        assert np.isnan(row[[1, 4]]).all()
+    with pytest.warns(UserWarning, match="interrupted"):
+        nothing = swept(interrupted_at(0, lag))
+    np.testing.assert_array_equal(
+        nothing.merged(one).metrics["step"]["settling_time"], one.metrics["step"]["settling_time"]
+    )
