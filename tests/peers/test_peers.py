@@ -174,7 +174,7 @@ def test_the_check_fails_where_the_table_and_the_run_are_at_odds():
         check(calls, {**differing, ("a_test.py::test_one", 3): text}, table)
     with pytest.raises(AssertionError, match=r"1 calls are listed and do not differ(?s:.*)test_one: 4: kind"):
         check(calls, {key: text for key in differing if key[1] != 4}, table)
-    with pytest.raises(AssertionError, match=r"1 calls are listed and are no longer made(?s:.*)test_one: 5 of 4"):
+    with pytest.raises(AssertionError, match=r"1 calls are listed and are no longer made(?s:.*)test_one: 5: kind"):
         check(Counter({"a_test.py::test_one": 4}), {key: text for key in differing if key[1] != 5}, table)
 
 
