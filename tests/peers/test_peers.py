@@ -11,6 +11,7 @@ everyday run takes the sample stated at `SAMPLE`.
 """
 
 import json
+import math
 import os
 import platform
 import subprocess
@@ -50,10 +51,10 @@ def versions():
     )
 
 
-def listed():
-    """Calls of the table: (test, call) to kind."""
+def listed(table):
+    """Calls of a table: (test, call) to kind."""
     found = {}
-    for kind in TABLE["kinds"]:
+    for kind in table["kinds"]:
         for line in kind["calls"]:
             test, _, numbers = line.rpartition(": ")
             for part in numbers.split(","):
@@ -95,20 +96,18 @@ def run(folder, *arguments, **environment):
     return calls, differing
 
 
-def check(calls, differing):
+def check(calls, differing, table=TABLE):
     """Fail where an unlisted call differs, and where a listed one agrees or is not made any more."""
-    known = {key: kind for key, kind in listed().items() if key[0] in calls}
-    unlisted = [f"{test}: {call}: {text:.400}" for (test, call), text in differing.items() if (test, call) not in known]
-    agreeing = [f"{test}: {call} ({kind})" for (test, call), kind in known.items() if (test, call) not in differing]
-    gone = [f"{test}: {call} of {calls[test]} ({kind})" for (test, call), kind in known.items() if call > calls[test]]
+    known = {key: kind for key, kind in listed(table).items() if key[0] in calls}
     summary = f"{sum(calls.values())} calls in {len(calls)} tests, {len(differing)} differ ({versions()})"
     print(summary)
     for title, entries in (
-        ("differ and are not listed", unlisted),
-        ("are listed and do not differ", [e for e in agreeing if e not in gone]),
-        ("are listed and are no longer made", gone),
+        ("differ and are not listed", [key for key in differing if key not in known]),
+        ("are listed and are no longer made", [(test, call) for test, call in known if call > calls[test]]),
+        ("are listed and do not differ", [key for key in known if key not in differing]),
     ):
-        assert not entries, f"{len(entries)} calls {title}; {summary}:\n" + "\n".join(entries[:40])
+        lines = [f"{test}: {call}: {known.get((test, call)) or differing[test, call]:.400}" for test, call in entries]
+        assert not lines, f"{len(lines)} calls {title}; {summary}:\n" + "\n".join(lines[:60])
 
 
 @pytest.fixture(scope="session")
@@ -143,7 +142,40 @@ def test_the_table_keeps_its_bounds():
     names = [kind["name"] for kind in TABLE["kinds"]]
     assert len(names) == len(set(names)) <= KINDS
     assert all(len(kind["reason"]) > 40 for kind in TABLE["kinds"])
-    assert len(listed()) <= CALLS
+    assert len(listed(TABLE)) <= CALLS
+
+
+OWN = """
+import control as ct
+
+def test_two():
+    ct.forced_response(ct.ss(-1, 1, 1, 0), [0, 1, 2], 1.0)
+    ct.forced_response(ct.ss(0.5, 1, 1, 0, None), [0, 1, 2], 1.0)  # discrete there, continuous here
+"""
+
+
+def test_calls_are_counted_and_one_that_differs_is_found(tmp_path):
+    (tmp_path / "own_test.py").write_text(OWN)
+    calls, differing = run(tmp_path, "-p", "no:xdist", tmp_path / "own_test.py")
+    assert calls == {"own_test.py::test_two": 2}
+    assert list(differing) == [("own_test.py::test_two", 2)]
+    # x' = x / 2 + 1 and x+ = x / 2 + 1, from 0.
+    assert f"{2 * math.expm1(1.0):.6g}"[:6] in differing["own_test.py::test_two", 2]
+    assert "for 1.5" in differing["own_test.py::test_two", 2]
+
+
+def test_the_check_fails_where_the_table_and_the_run_are_at_odds():
+    table = {"kinds": [{"name": "kind", "calls": ["a_test.py::test_one: 2, 4-5"]}]}
+    calls, text = Counter({"a_test.py::test_one": 5}), "outputs"
+    differing = {("a_test.py::test_one", call): text for call in (2, 4, 5)}
+    check(calls, differing, table)
+    check(Counter({"b_test.py::test_two": 1}), {}, table)  # a part of the tests
+    with pytest.raises(AssertionError, match=r"1 calls differ and are not listed.*control [0-9.]+(?s:.*)test_one: 3"):
+        check(calls, {**differing, ("a_test.py::test_one", 3): text}, table)
+    with pytest.raises(AssertionError, match=r"1 calls are listed and do not differ(?s:.*)test_one: 4: kind"):
+        check(calls, {key: text for key in differing if key[1] != 4}, table)
+    with pytest.raises(AssertionError, match=r"1 calls are listed and are no longer made(?s:.*)test_one: 5: kind"):
+        check(Counter({"a_test.py::test_one": 4}), {key: text for key in differing if key[1] != 5}, table)
 
 
 def test_a_sample_of_its_tests_agrees(tests, tmp_path):
@@ -159,6 +191,6 @@ def test_all_of_its_tests_and_examples_agree(tests, examples, tmp_path):
     arguments = ["-n", "2", "--dist", "worksteal", *ignored, HERE / "examples.py", tests]
     calls, differing = run(tmp_path, *arguments, CTRLPLAN_PEERS_EXAMPLES=str(examples))
     check(calls, differing)
-    missing = {test for test, _ in listed()} - set(calls)
+    missing = {test for test, _ in listed(TABLE)} - set(calls)
     assert not missing, f"{sorted(missing)} are listed and make no calls ({versions()})"
     assert sum(calls.values()) >= TABLE["calls"]
