@@ -10,6 +10,7 @@ import control as ct
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ctrlplan._types import EventName
 from ctrlplan.systems.admissible import AdmissibleSet, Limits
 from ctrlplan.systems.exposed import state_signals
 from ctrlplan.systems.hybrid import checked_seconds, refuse_alone
@@ -69,8 +70,8 @@ class Governor(ct.NonlinearIOSystem):  # type: ignore[misc]
         self.admission, self.period, self.offset, self.initial = admission, period, offset, initial
         self.feedthrough = False  # between samples
         self.watched = {
-            f"{name}: nothing admissible, reference held": (_refused, -math.inf, 0.5),
-            f"{name}: input lost, reference held": (_unread, -math.inf, 0.5),
+            EventName(f"{name}: nothing admissible, reference held"): (_refused, -math.inf, 0.5),
+            EventName(f"{name}: input lost, reference held"): (_unread, -math.inf, 0.5),
         }
         self._count = len(references)
 

@@ -12,6 +12,8 @@ import control as ct
 import numpy as np
 from numpy.typing import NDArray
 
+from ctrlplan._types import EventName
+
 Array = NDArray[np.float64]
 
 
@@ -107,7 +109,7 @@ def create_pid_iosystem(
     block = ct.nlsys(update, out, **names)
     if limits is not None:
         # What `ctrlplan.simulate` records the crossings of.
-        block.watched = {output: (partial(_asked, kp, kd / tf, bias), low, high)}
+        block.watched = {EventName(output, "was at its limit"): (partial(_asked, kp, kd / tf, bias), low, high)}
     return block
 
 

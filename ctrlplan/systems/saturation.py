@@ -9,6 +9,8 @@ import control as ct
 import numpy as np
 from numpy.typing import NDArray
 
+from ctrlplan._types import EventName
+
 Array = NDArray[np.float64]
 
 
@@ -52,7 +54,7 @@ def create_saturation_iosystem(
 
     block = ct.nlsys(None, out, inputs=[input], outputs=[output], dt=None, name=name)
     if math.isfinite(low) or math.isfinite(high):
-        block.watched = {output: (_asked, low, high)}
+        block.watched = {EventName(output, "was at its limit"): (_asked, low, high)}
     return block
 
 
