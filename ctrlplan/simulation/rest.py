@@ -171,48 +171,82 @@ def _scaled_solution(matrix: Array, right: Array) -> tuple[Array, float]:
 
 
 class _Equations:
-    """Rates at which a network moves away from a state, and its outputs, its references held.
+    """Rates at which a loop moves away from a state, and its outputs, its references held.
 
     A state of a discrete block moves by what a sample changes it. Discrete blocks that are not linear
-    are not called, since some remember their calls: they are `unknown`.
+    are not called, since some remember their calls: they are `unknown`, and their states `fixed`.
     """
 
     def __init__(self, prepared: Prepared, held: Array, time: float, params: Mapping[str, Any], start: Array) -> None:
-        network = prepared.network
-        if network is None:
-            raise ValueError(prepared.unsupported)
-        self._held, self._time, self._discrete = held, time, prepared.dt not in (None, 0)
+        self.discrete = prepared.dt not in (None, 0)
         self.unknown: tuple[str, ...] = ()
         self.fixed = np.zeros(prepared.nstates, dtype=bool)
-        self.linear = False
-        if not network.blocks:  # compiled for another process
-            drives = prepared.drives(input_drives(prepared.input_labels, 0.0, np.array([time, time + 1.0])), time)
-            form = prepared.compiled(params, drives, time, start)
-            p, t, d = form.parameters(params), np.array([time]), held[:, None]
-            self._rates: Vector = lambda x: form.rates(t, x[:, None], d, p)[:, 0]
-            self._outputs: Vector = lambda x: form.outputs(t, x[:, None], d, p)[:, 0]
-            return
-        blocks = list(zip(network.blocks, network.states, strict=True))
-        bent = [not (block.linear or block.driven) for block, _ in blocks]
-        samples = [block.period is not None for block, _ in blocks]
-        inner = [isinstance(getattr(block.system, "block", None), ct.StateSpace) for block, _ in blocks]
-        self.linear = all(not b or (s and i) for b, s, i in zip(bent, samples, inner, strict=True))
-        closed = [b and (self._discrete or s) and not i for b, s, i in zip(bent, samples, inner, strict=True)]
-        self.unknown = tuple(block.name for (block, _), c in zip(blocks, closed, strict=True) if c)
-        for (_, place), c in zip(blocks, closed, strict=True):
-            self.fixed[place] = c
+        self.late: Callable[[Array], str] = lambda x: ""
+        self._rates: Vector
+        self._outputs: Vector
+        self._gaps: Vector = lambda x: np.zeros(0)
+        if prepared.network is None:
+            self._by_control(prepared, held, time, params)
+        elif not prepared.network.blocks:
+            self._compiled(prepared, held, time, params, start)
+        else:
+            self._network(prepared, held, time, params, start)
+
+    def _by_control(self, prepared: Prepared, held: Array, time: float, params: Mapping[str, Any]) -> None:
+        """Equations of what only python-control runs."""
+        system, u = prepared.system, held[: prepared.ninputs]
+        if self.discrete:
+            self.unknown = (prepared.name,)
+        self._rates = lambda x: np.ravel(system.dynamics(time, x, u, dict(params)))
+        self._outputs = lambda x: np.ravel(system.output(time, x, u, dict(params)))
+
+    def _compiled(self, prepared: Prepared, held: Array, time: float, params: Mapping[str, Any], start: Array) -> None:
+        """Equations of a form that was compiled for another process."""
+        drives = prepared.drives(input_drives(prepared.input_labels, 0.0, np.array([time, time + 1.0])), time)
+        form = prepared.compiled(params, drives, time, start)
+        p, t, d = form.parameters(params), np.array([time]), held[:, None]
+        self._rates = lambda x: form.rates(t, x[:, None], d, p)[:, 0]
+        self._outputs = lambda x: form.outputs(t, x[:, None], d, p)[:, 0]
+
+    def _network(self, prepared: Prepared, held: Array, time: float, params: Mapping[str, Any], start: Array) -> None:
+        """Equations of a network of blocks."""
+        network: Any = prepared.network
+        sampled, unknown = [], []
+        for i, (block, place) in enumerate(zip(network.blocks, network.states, strict=True)):
+            linear = block.linear or block.driven or isinstance(getattr(block.system, "block", None), ct.StateSpace)
+            if not linear and (self.discrete or block.period is not None):
+                unknown.append(block.name)
+                self.fixed[place] = True
+            elif block.period is not None:
+                sampled.append((i, place))
+        self.unknown = tuple(unknown)
         equations = Interpreted(network, params, (time, start), prepared.trials)
-        sampled = [(i, place) for i, (_, place) in enumerate(blocks) if samples[i] and not closed[i]]
 
         def rates(x: Array) -> Array:
             moved = equations.rates(time, x, held)
-            if self._discrete:
+            if self.discrete:
                 return np.asarray(moved - x)
             for i, place in sampled:
                 moved[place] = equations.sampled((i,), time, x, held)[place] - x[place]
             return moved
 
-        self._rates = rates
+        def late(x: Array) -> str:
+            signals = equations.signals(time, x, held)
+            for i in network.blocks_with("delay"):
+                before, now = signals[network.outputs[i]], network.fed[i](signals)
+                if np.any(np.abs(now - before) > _FOUND * max(np.abs(held).max(), np.abs(before).max())):
+                    name = network.blocks[i].name
+                    return (
+                        f"the delay {name} puts out {_listed(before)} first, its initial=, where {_listed(now)} goes in"
+                    )
+            return ""
+
+        def gaps(x: Array) -> Array:
+            signals = equations.signals(time, x, held)
+            found = [network.fed[i](signals) - signals[network.outputs[i]] for i in network.blocks_with("delay")]
+            return np.concatenate([np.zeros(0), *found])
+
+        self._rates, self.late, self._gaps = rates, late, gaps
         self._outputs = lambda x: network.put_out(equations.signals(time, x, held))
 
     def rates(self, x: Array) -> Array:
@@ -222,6 +256,10 @@ class _Equations:
     def outputs(self, x: Array) -> Array:
         """Outputs of the whole, nan outside the domain of a block."""
         return self._tried(self._outputs, x)
+
+    def gaps(self, x: Array) -> Array:
+        """What goes into delays less what they put out."""
+        return self._tried(self._gaps, x)
 
     def _tried(self, function: Vector, x: Array) -> Array:
         try:
@@ -236,7 +274,7 @@ def _found(
 ) -> tuple[Array, str]:
     """Equilibrium of a network, from a few guesses; of several the one with outputs nearest to `target`."""
     free = free & ~equations.fixed
-    if equations.unknown and equations._discrete:
+    if equations.unknown and equations.discrete:
         return start, "" if not target.any() else _of_samples(equations)
 
     def whole(z: Array) -> Array:
@@ -249,9 +287,12 @@ def _found(
 
     def missing(z: Array) -> Array:
         found = equations.outputs(whole(z))
-        return found[rows] - target if found.size > max(rows, default=-1) else np.full(target.size, np.nan)
+        found = found[rows] - target if found.size > max(rows, default=-1) else np.full(target.size, np.nan)
+        return np.concatenate([found, equations.gaps(whole(z))])
 
     size = float(np.abs(target).max(initial=0.0)) or 1.0
+    if not rates(start[free]).any() and not missing(start[free]).any():
+        return start, equations.late(start)
     guesses = [guess for guess in _guesses(start[free], target) if _finite(rates(guess)) and _finite(missing(guess))]
     moves = np.max([np.abs(rates(guess)) for guess in guesses], axis=0, initial=0.0) if guesses else np.zeros(0)
     nearest: tuple[float, Array] | None = None
@@ -265,10 +306,11 @@ def _found(
         if distance <= _FOUND * size:
             break
     if nearest is None:
-        return start, _of_samples(equations) if equations.unknown else "none was found"
+        return start, _of_samples(equations) if equations.unknown else equations.late(start) or "none was found"
+    state = whole(nearest[1])
     if equations.unknown and nearest[0] > _FOUND * size:
-        return whole(nearest[1]), _of_samples(equations)
-    return whole(nearest[1]), ""
+        return state, _of_samples(equations)
+    return state, equations.late(state)
 
 
 def _of_samples(equations: _Equations) -> str:
@@ -343,6 +385,10 @@ def _jacobian(rates: Vector, z: Array, f: Array) -> Array:
     steps = np.where(steps > 0.0, steps, 1e-7)
     columns = [(rates(z + step * unit) - f) / step for step, unit in zip(steps, np.eye(z.size), strict=True)]
     return np.array(columns).T.reshape(f.size, z.size)
+
+
+def _listed(values: Array) -> str:
+    return ", ".join(f"{value:.4g}" for value in values)
 
 
 def _finite(values: Array) -> bool:
