@@ -25,7 +25,8 @@ from ctrlplan.studies.comparison import (
     waypoints_given,
 )
 from ctrlplan.studies.ensemble import Ensemble, Failure, ensemble
-from ctrlplan.studies.measures import MEASURES, control_metrics, path_metrics, response_metrics
+from ctrlplan.studies.measures import MEASURES, checked_names, control_metrics, path_metrics, response_metrics
+from ctrlplan.studies.units import Signals, checked_units
 from ctrlplan.trajectories import Trajectory, Waypoint
 
 if TYPE_CHECKING:
@@ -237,11 +238,17 @@ def _together(loops: list[Any], given: dict[str, Any]) -> list[Metrics] | None:
     form = _form(systems)
     if form is None or form.b.shape[2] != first.naxes or not _ordered(times):
         return None
-    if asked.measure is not None or asked.params or asked.events:
+    if asked.measure is not None or asked.measures or asked.params or asked.events:
         return None
     if asked.initial_state is not None and np.shape(asked.initial_state) not in ((), form.a.shape[2:]):
         return None
     tracked, acting = tracked_outputs(systems[0], asked.outputs, first), acting_outputs(systems[0], asked.controls)
+    if asked.only is not None:
+        checked_names(asked.only, MEASURES, "only")
+    units = checked_units(asked.units, plans.values(), systems)
+    named = Signals(dict(zip(first.labels, tracked, strict=True)), acting, units)
+    if any(named.separate(unit) for unit in ("{y}", "{u}")):  # signals without a worst
+        return None
     if asked.only is not None and not any(name.startswith("control") for name in asked.only):
         acting = ()
     rows = [systems[0].output_labels.index(name) for name in (*tracked, *acting)]
@@ -261,7 +268,7 @@ def _together(loops: list[Any], given: dict[str, Any]) -> list[Metrics] | None:
         values = _of_loops(responses, first.labels, each)
         values |= {key: np.where(unstable, np.inf, row) for key, row in values.items() if "settling_time" in key}
         values |= _of_loops(controls, acting, each)
-        of_plan = path_metrics(plan, asked.waypoints) if asked.only is None else {}
+        of_plan = path_metrics(plan, asked.waypoints, asked.only)
         for i, metrics in enumerate(found):
             metrics[name] = {key: float(row[i]) for key, row in values.items()} | of_plan
     return found
