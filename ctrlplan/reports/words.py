@@ -62,8 +62,11 @@ def summary(comparison: Comparison) -> str:
     if is_unstable(comparison):
         return comparison.notes[0]
     decided = [v for v in verdicts(comparison) if v.winners]
+    ended = (
+        f" Not ranked, since its run was ended early: {', '.join(comparison.stopped)}." if comparison.stopped else ""
+    )
     if not decided:
-        return "No metric tells the plans apart."
+        return f"No metric tells the plans apart.{ended}"
     parts = []
     for plan in comparison.plans:
         if plan in comparison.stopped:
@@ -72,11 +75,9 @@ def summary(comparison: Comparison) -> str:
         losses = sum(plan in v.losers for v in decided)
         parts.append(f"{plan} is best in {wins} and worst in {losses}")
     sentence = "; ".join(parts)
-    ended = ", ".join(comparison.stopped)
     return (
         f"Of {len(decided)} metrics that tell the plans apart, {sentence}. Values within 0.1 %, or within "
-        "a millionth of the scale of the metric, count as equal."
-        + (f" Not ranked, since its run was ended early: {ended}." if ended else "")
+        f"a millionth of the scale of the metric, count as equal.{ended}"
     )
 
 

@@ -154,8 +154,8 @@ def optimality_claim(grids: tuple[Grid, Grid]) -> tuple[str, ...]:
         f"minimum jerk and the shortest plan known through the same waypoints, the claim {fails}.",
         f"Length: with 16 s, of the trigonometric paths of the least degree and mean gamma the shortest has alpha = "
         f"{best.alpha:.4g} and {best.value:.4g} m. Alpha alone was searched for that; other freedoms give shorter "
-        f"ones: {freer}. {rival[0].upper()}{rival[1:]} has {shortest:.5g} m, and no path is shorter than the polyline's "
-        f"{bound:.4g} m. "
+        f"ones: {freer}. {rival[0].upper()}{rival[1:]} has {shortest:.4g} m, and no path is shorter than the "
+        f"polyline's {bound:.4g} m. "
         f"Against the one polynomial through all of them it is shorter in {polynomial} of {length.values[:, 1:].size} "
         "cases: that is what the paper compared with.",
         "Jerk: one quintic a leg has the least squared jerk of all plans through these entries, which is a theorem; "

@@ -8,7 +8,6 @@ import os
 import warnings
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from numbers import Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -554,9 +553,7 @@ def checked_start(start: Any, plans: Iterable[Trajectory], times: Array) -> floa
     """
     since = min(plan.start for plan in plans)
     if start is not None:
-        if isinstance(start, bool) or not isinstance(start, Real):
-            raise TypeError(f"start must be a time in seconds, got {start!r}")
-        since = float(start)
+        since = _number(start, "start")
         if not math.isfinite(since):
             raise ValueError(f"start must be a finite time [s], got {start!r}")
     usable = times.ndim == 1 and times.size > 1 and np.isfinite(times).all()  # otherwise simulate says so
@@ -570,11 +567,17 @@ def checked_start(start: Any, plans: Iterable[Trajectory], times: Array) -> floa
     return since
 
 
+def _number(value: Any, name: str) -> float:
+    """One real number, without a unit."""
+    number = real_array(value, name)
+    if number.ndim or isinstance(value, bool | np.bool_):
+        raise TypeError(f"{name} must be a number, got {value!r:.80}")
+    return float(number)
+
+
 def checked_band(band: Any) -> None:
     """Reject a settling band that is none."""
-    if isinstance(band, bool) or not isinstance(band, Real):
-        raise TypeError(f"band must be a number, got {band!r}")
-    if not 0.0 < float(band) < math.inf:
+    if not 0.0 < _number(band, "band") < math.inf:
         raise ValueError(f"band must be a finite number above 0, relative to the range of the plan, got {band!r}")
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -34,7 +35,8 @@ def check_reached(system: Any, outputs: Sequence[str], plan: Trajectory | None =
     ------
     ValueError
         If an input of the loop, or an axis of the plan inside, reaches none of
-        `outputs`, or another source inside reaches no output at all.
+        `outputs`, another source inside reaches no output at all, or an input
+        for a derivative of a source is connected to nothing.
     """
     network = prepared_form(system).network
     if network is None or not network.blocks:
@@ -62,24 +64,41 @@ def check_reached(system: Any, outputs: Sequence[str], plan: Trajectory | None =
             elif not seen[signals].any():
                 names = ", ".join(block.system.output_labels[axis * width : (axis + 1) * width])
                 raise _unconnected(system, network, f"{names} of block {block.name} that reach no output")
+    _check_derivatives(system, network)
     if plan is not None and np.any(carried & ~used):
         axes = ", ".join(np.array(plan.labels)[carried & ~used])
         what = f"{axes} of block {', '.join(dict.fromkeys(sources))} that reaches none of {', '.join(outputs)}"
         raise _unconnected(system, network, what)
 
 
+def _check_derivatives(system: Any, network: Any) -> None:
+    """Reject an input for a derivative of a reference that is not put out: it would be 0."""
+    known = {
+        _plain(label) for block in network.blocks if block.plan is not None for label in block.system.output_labels
+    }
+    for block, label in _open_inputs(network):
+        if _plain(label) in known:
+            what = f"{block}.{label}, to which nothing is connected: give the source more derivatives"
+            raise ValueError(f"references must be connected in the loop {system.name}, got {what}")
+
+
+def _plain(label: str) -> str:
+    """Label of a signal without that of its derivative."""
+    return re.sub(r"_d[0-9]+$", "", label)
+
+
 def _unconnected(system: Any, network: Any, what: str) -> ValueError:
-    open_inputs = list(_open_inputs(network))
-    to_do = f"; inputs of blocks that nothing is connected to: {', '.join(open_inputs)}" if open_inputs else ""
+    left = [f"{block}.{label}" for block, label in _open_inputs(network)]
+    to_do = f"; inputs of blocks that nothing is connected to: {', '.join(left)}" if left else ""
     return ValueError(f"references must be connected in the loop {system.name}, got {what}{to_do}")
 
 
-def _open_inputs(network: Any) -> Iterator[str]:
-    """Inputs of blocks that are connected to no signal, and so 0."""
+def _open_inputs(network: Any) -> Iterator[tuple[str, str]]:
+    """Inputs of blocks (block, label) that are connected to no signal, and so 0."""
     for block, place in zip(network.blocks, network.inputs, strict=True):
         for label, row in zip(block.system.input_labels or (), network.wire[place], strict=True):
             if not row.any():
-                yield f"{block.name}.{label}"
+                yield block.name, label
 
 
 def _reaching(network: Any, wanted: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -152,7 +152,7 @@ def _size(unit: str, signals: Signals, label: str | None) -> float:
             "%": 100.0,
             "{y}": span,
             "{y} s": span * t,
-            "{y}^2 s": span**2 * t,
+            "{y}^2 s": ROUNDING * span**2 * t,  # the square of rounding, in a metric that is a square
             "{y} s^2": span * t**2,
             "{y}^2/s^5": span**2 / np.float64(move) ** 5,
             "{u}": peak,

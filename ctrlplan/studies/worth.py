@@ -282,10 +282,11 @@ def worth(
         shapes = {f"{a:g}": TrigSpline(scaled, alpha=a) for a in alphas}
         rivals = rivals_through(scaled)
         ran = compared(scaled, shapes | rivals, set(decisive))
-        # What the plant cannot follow, and what an event has ended, loses.
-        lost = dict.fromkeys(decisive, np.inf)
-        rows = {name: {} if name in ran.stopped else ran.metrics.get(name, {}) for name in (*shapes, *rivals)}
-        tables.append({name: lost | row for name, row in rows.items()})
+        # What the plant cannot follow loses, and so does a plan that an event has ended; a baseline so ended has no
+        # figure.
+        lost, none = dict.fromkeys(decisive, np.inf), dict.fromkeys(decisive, np.nan)
+        rows = {name: lost | ran.metrics.get(name, {}) for name in (*shapes, *rivals)}
+        tables.append(rows | {name: lost if name in shapes else none for name in ran.stopped})
         names |= dict.fromkeys(rivals)
     grids = tuple(
         Grid(

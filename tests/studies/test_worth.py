@@ -421,13 +421,17 @@ def test_a_loop_without_controls_has_a_table_of_settling_alone():
     assert [grid.title for grid in found.grids] == ["Settling time"]
 
 
-def test_a_move_there_and_back_has_no_winner():
-    """Nothing is settled where the end is the beginning: undefined is neither won nor lost."""
+def test_a_move_there_and_back_is_settled_relative_to_its_range():
+    """The end is the beginning: a step there is none, and has no figure; every other plan has a range."""
     points = [cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1), cp.Waypoint(2, 0, 0, 0)]
     found = worth(loop(100.0), points, TIMES, alpha=1.0, alphas=(0.0, 1.0), factors=(1.0,))
-    assert np.isnan(found.grids[0].values).all()
-    assert found.grids[0].marks() == [["", ""]]
+    assert np.isfinite(found.grids[0].values).all()
+    assert np.isnan(found.grids[0].rivals["step"]).all()
     assert "nan" not in " ".join(found.verdicts)
+    plan = found.comparison.plans["trigonometric"]
+    y = cp.simulate(loop(100.0), t := np.linspace(0, 12, 120_001), plan).outputs[0]
+    last = np.flatnonzero(np.abs(y) > 0.02 * plan(t).max())[-1]
+    assert found.grids[0].values[0, 1] == pytest.approx(t[last], abs=2e-4)
 
 
 def test_a_run_that_is_ended_loses():
