@@ -215,10 +215,10 @@ def plot_motion(comparison: Comparison, wall: Wall, steps: int = 13) -> Figure:
         axes.axhline(0.0, color="#999999", linewidth=2)
         colour = colours[name]["color"]
         axes.plot(signals["x"], signals["z"], color=colour, linewidth=0.8)
-        for t in np.linspace(0.0, last, steps):
+        for t in np.linspace(0.0, min(last, signals["t"][-1]), steps):
             d, r, theta = (float(np.interp(t, signals["t"], signals[k])) for k in ("D", "R", "theta"))
             _draw_crane(axes, d, r, theta, colour)
-        axes.set_title(f"{name}: every {last / (steps - 1):.3g} s", loc="left", fontsize=9)
+        axes.set_title(f"{name}: every {min(last, signals['t'][-1]) / (steps - 1):.3g} s", loc="left", fontsize=9)
         axes.set_ylabel("z [m], down")
         axes.invert_yaxis()
         axes.set_aspect("equal")
@@ -310,7 +310,8 @@ CRANE_FIGURES = {
     ),
     "crane-step": (
         lambda study: plot_step(study.comparison),
-        "The step: force and torque at their limits (dashed), and a tension below 0 (filled), where the rope is slack.",
+        "The step: force and torque at their limits (dashed), up to the slack rope: where the tension comes to 0 the "
+        "model ends, and so does the run.",
     ),
     "crane-plane": (
         lambda study: plot_plane(study.comparison, study.wall),

@@ -375,13 +375,18 @@ def smoother_polynomials(waypoints: Sequence[Waypoint]) -> dict[str, Trajectory]
     for order, name in ((4, "septic"), (5, "nonic")):
         if max(len(point.jet) for point in ends) > order:
             continue
-        first, last = (Waypoint(point.time, point.position, *[0.0] * (order - 1)) for point in ends)
-        labels = ends[0].labels
+        first, last = (_at_rest(point, order) for point in ends)
         if len(points) == 2:
-            found[name] = PolySpline([first, last], labels=labels)
+            found[name] = PolySpline([first, last])
         else:
-            found[f"{name} a segment"] = optimize_waypoints([first, *points[1:-1], last], order, labels=labels).plan
+            found[f"{name} a segment"] = optimize_waypoints([first, *points[1:-1], last], order).plan
     return found
+
+
+def _at_rest(point: Waypoint, entries: int) -> Waypoint:
+    """Same position, with so many entries, the derivatives 0."""
+    still = [0.0] * point.naxes
+    return Waypoint.from_dict(point.to_dict() | {"jet": [point.position.tolist(), *[still] * (entries - 1)]})
 
 
 def _measured(decisive: Sequence[str], found: Comparison) -> list[str]:
