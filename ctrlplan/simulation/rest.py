@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
@@ -25,6 +26,9 @@ _AT_REST = 1e-9
 
 _FOUND = 1e-8
 """The same in a loop whose equilibrium was found by iteration."""
+
+_EVALUATIONS = 10_000
+"""Evaluations of the rates after which no further guess is tried."""
 
 _TURNS = 40
 """Steps of Newton's iteration."""
@@ -282,7 +286,10 @@ def _found(
         state[free] = z
         return state
 
+    asked = itertools.count(1)
+
     def rates(z: Array) -> Array:
+        next(asked)
         return equations.rates(whole(z))[free] if z.size else np.zeros(0)
 
     def missing(z: Array) -> Array:
@@ -297,6 +304,8 @@ def _found(
     moves = np.max([np.abs(rates(guess)) for guess in guesses], axis=0, initial=0.0) if guesses else np.zeros(0)
     nearest: tuple[float, Array] | None = None
     for guess in guesses:
+        if next(asked) > _EVALUATIONS:
+            break
         z = _equilibrium(rates, missing, guess, moves, size)
         if z is None:
             continue
@@ -342,7 +351,7 @@ def _equilibrium(rates: Vector, missing: Vector, guess: Array, moves: Array, siz
             ftol=1e-15,
             xtol=1e-15,
             gtol=1e-15,
-            max_nfev=200,
+            max_nfev=max(10, min(200, _EVALUATIONS // (z.size + 1))),
         )
         z = _newton(rates, near.x)
     return z if _still(rates, z, moves) else None

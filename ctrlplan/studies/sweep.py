@@ -257,7 +257,10 @@ def _together(loops: list[Any], given: dict[str, Any]) -> list[Metrics] | None:
     each = tuple(map(str, range(len(loops))))
     found: list[Metrics] = [{} for _ in loops]
     for name, plan in plans.items():
-        signals = _outputs(form, rows, plan, times, _starts(systems, plan, times, asked.initial_state)).swapaxes(0, 1)
+        initial = _starts(systems, plan, times, asked.initial_state)
+        if asked.initial_state is None and not _at_rest(form, plan, times, initial):
+            return None  # which is to be said of the loop concerned
+        signals = _outputs(form, rows, plan, times, initial).swapaxes(0, 1)
         axes = [plan] if plan.naxes == 1 else [plan.select([label]) for label in plan.labels]
         # One axis of all loops is measured like the axes of one.
         responses = [
@@ -298,6 +301,14 @@ def _starts(systems: list[Any], plan: Trajectory, times: Array, given: ArrayLike
     if given is None and position.any():
         return np.stack([rest_state(system, position) for system in systems])
     return np.broadcast_to(0.0 if given is None else np.asarray(given, dtype=float), (len(systems), systems[0].nstates))
+
+
+def _at_rest(form: LinearForm, plan: Trajectory, times: Array, initial: Array) -> bool:
+    """Whether states (nloops, nstates) are equilibria with the plan held at its first position."""
+    position = plan.jet(times[:1], 0, left=True)[0, :, 0]
+    moved = np.einsum("kij,kj->ki", form.a, initial) + form.b @ position
+    terms = np.einsum("kij,kj->ki", np.abs(form.a), np.abs(initial)) + np.abs(form.b) @ np.abs(position)
+    return bool(np.all(np.abs(moved) <= 1e-6 * terms.max(axis=1, initial=0.0, keepdims=True)))
 
 
 def _of_loops(measured: list[dict[str, float]], labels: Sequence[str], each: Sequence[str]) -> dict[str, Array]:

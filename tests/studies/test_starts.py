@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import ctrlplan as cp
+from ctrlplan.simulation import rest_at
 
 BEFORE = np.linspace(-3.0, 12.0, 301)  # the plan begins at 0: until then a loop at rest does not move
 
@@ -299,3 +300,41 @@ def test_each_draw_rests_at_its_own_parameters():
     )
     np.testing.assert_allclose(found.metrics["move"]["first"], table["c"] * math.sqrt(10.0), rtol=1e-7)
     np.testing.assert_allclose(found.metrics["move"]["level"], 10.0, rtol=1e-7)
+
+
+def test_a_sweep_of_loops_without_an_equilibrium_says_so_as_well():
+    """Integrators of the reference, many at once: as each by itself."""
+    build = lambda k: ct.ss(0.0, k, 1.0, 0.0, inputs="r", outputs="y")  # noqa: E731
+    with pytest.warns(UserWarning, match="no equilibrium .* initial_state="):
+        swept = cp.sweep(build, [1.0, 2.0, 3.0], {"move": move()}, BEFORE, progress=False)
+    with pytest.warns(UserWarning, match="no equilibrium"):
+        alone = cp.compare(build(2.0), {"move": move()}, BEFORE)
+    assert swept.metrics["move"]["iae"][1] == pytest.approx(alone.metrics["move"]["iae"], rel=1e-9)
+
+
+def test_the_search_for_an_equilibrium_ends():
+    """Rates that are noise have none: the search gives up after a known number of evaluations."""
+    rng, calls = np.random.default_rng(0), []
+
+    def rates(t, x, u, p):
+        calls.append(t)
+        return u - x + rng.standard_normal(3)
+
+    noisy = ct.nlsys(rates, lambda t, x, u, p: x[:1], inputs="r", outputs="y", states=3, name="noisy")
+    _, doubt = rest_at(noisy, move(), 0.0, [0])
+    assert doubt == "none was found"
+    assert len(calls) < 20_000
+
+
+def test_a_discrete_block_that_remembers_is_not_called():
+    """What a trial call leaves behind in a user's block would change the run."""
+    calls = []
+
+    def update(t, x, u, p):
+        calls.append(t)
+        return 0.5 * x + 0.5 * u
+
+    block = ct.nlsys(update, lambda t, x, u, p: x, inputs="r", outputs="y", states=1, dt=0.5, name="counting")
+    _, doubt = rest_at(block, move(), 0.0, [0])
+    assert calls == []
+    assert "counting" in doubt
