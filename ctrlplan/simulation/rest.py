@@ -342,7 +342,7 @@ def _guesses(start: Array, target: Array) -> Iterator[Array]:
 def _equilibrium(rates: Vector, missing: Vector, guess: Array, moves: Array, size: float) -> Array | None:
     """State from a guess at which all rates vanish; None where none is found."""
     z = guess
-    if not _still(rates, z, moves) or np.abs(missing(z)).max(initial=0.0) > _FOUND * size:
+    if z.size and (not _still(rates, z, moves) or np.abs(missing(z)).max(initial=0.0) > _FOUND * size):
         weight = 1.0 / np.where(moves > 0.0, moves, 1.0)
         near = least_squares(
             lambda v: np.concatenate([weight * rates(v), missing(v) / size]),

@@ -121,6 +121,8 @@ def _depends(block: Any) -> NDArray[np.bool_]:
     if not block.linear:
         return np.ones((block.system.noutputs, block.system.ninputs or 0), dtype=bool)
     a, b, c, d = (np.asarray(getattr(block.system, name)) != 0.0 for name in "ABCD")
+    if not len(a) and not d.any():  # a gain that is 0 now, and connected
+        return np.ones(d.shape, dtype=bool)
     moved = b
     for _ in range(len(a)):
         moved = moved | (a @ moved)

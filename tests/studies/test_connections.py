@@ -168,3 +168,10 @@ def test_what_the_path_is_asked_for_is_given():
     row = cp.compare(LOOP, points, T, only=("reference_jerk", "iae")).metrics["polynomial"]
     assert set(row) == {"reference_jerk", "iae"}
     assert row["reference_jerk"] == pytest.approx(720.0 * 2.0**2, rel=1e-9)  # 720 D^2/T^5 of the quintic
+
+
+def test_a_gain_of_zero_is_connected():
+    """One value of a parameter is no wire that is missing: the output stays where it is, and never settles."""
+    swept = cp.sweep(cp.plants.integrator_lag_loop, [0.0, 1.0, 5.0], {"step": cp.Step(1.0)}, T, progress=False)
+    assert swept.failures == ()
+    assert swept.metrics["step"]["iae"][0] == pytest.approx(4.0, rel=1e-9)

@@ -338,3 +338,22 @@ def test_a_discrete_block_that_remembers_is_not_called():
     _, doubt = rest_at(block, move(), 0.0, [0])
     assert calls == []
     assert "counting" in doubt
+
+
+@pytest.mark.parametrize("initial", [10.0, 0.0])
+def test_a_governor_holds_its_own_first_reference(initial):
+    """The loop states nothing, the governor holds `initial`: at rest where that is the plan's first position."""
+    loop = cp.plants.integrator_lag_loop(5.0, outputs=("y", "u"))
+    governor = cp.create_governor_iosystem(loop, 0.05, {"u": (-30.0, 30.0)}, initial=[initial])
+
+    def build(name, plan):
+        source = cp.create_source_iosystem(cp.stack([plan], labels=["r_asked"]))
+        exposed = cp.expose_states(loop)
+        return ct.interconnect([source, governor, exposed], inputs=0, outputs=["y", "u", "r"])
+
+    times = np.linspace(0.0, 12.0, 241)
+    if initial == 10.0:
+        assert output(compared(build, times=times, outputs=["y"]))[0] == pytest.approx(10.0, rel=1e-9)
+    else:
+        with pytest.warns(UserWarning, match="governor, which takes samples, are not known"):
+            compared(build, times=times, outputs=["y"])
