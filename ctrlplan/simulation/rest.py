@@ -240,9 +240,7 @@ class _Equations:
                 before, now = signals[network.outputs[i]], network.fed[i](signals)
                 if np.any(np.abs(now - before) > _FOUND * max(np.abs(held).max(), np.abs(before).max())):
                     name = network.blocks[i].name
-                    return (
-                        f"the delay {name} puts out {_listed(before)} first, its initial=, where {_listed(now)} goes in"
-                    )
+                    return f"the output of the delay {name} starts at {_listed(before)}, its initial=, and its input at {_listed(now)}"
             return ""
 
         def gaps(x: Array) -> Array:
@@ -262,7 +260,7 @@ class _Equations:
         return self._tried(self._outputs, x)
 
     def gaps(self, x: Array) -> Array:
-        """What goes into delays less what they put out."""
+        """Inputs of the delays less their outputs."""
         return self._tried(self._gaps, x)
 
     def _tried(self, function: Vector, x: Array) -> Array:
@@ -286,10 +284,10 @@ def _found(
         state[free] = z
         return state
 
-    asked = itertools.count(1)
+    evaluations = itertools.count(1)
 
     def rates(z: Array) -> Array:
-        next(asked)
+        next(evaluations)
         return equations.rates(whole(z))[free] if z.size else np.zeros(0)
 
     def missing(z: Array) -> Array:
@@ -304,7 +302,7 @@ def _found(
     moves = np.max([np.abs(rates(guess)) for guess in guesses], axis=0, initial=0.0) if guesses else np.zeros(0)
     nearest: tuple[float, Array] | None = None
     for guess in guesses:
-        if next(asked) > _EVALUATIONS:
+        if next(evaluations) > _EVALUATIONS:
             break
         z = _equilibrium(rates, missing, guess, moves, size)
         if z is None:
@@ -358,7 +356,7 @@ def _equilibrium(rates: Vector, missing: Vector, guess: Array, moves: Array, siz
 
 
 def _newton(rates: Vector, z: Array) -> Array:
-    """Newton's iteration on the rates alone, by steps of least length."""
+    """Newton's iteration on the rates alone, by steps of minimum norm."""
     f = rates(z)
     for _ in range(_TURNS):
         if not _finite(f) or not f.any():
@@ -379,7 +377,7 @@ def _newton(rates: Vector, z: Array) -> Array:
 
 
 def _still(rates: Vector, z: Array, moves: Array) -> bool:
-    """Whether rates are rounding beside the terms they are the sums of, or beside those elsewhere."""
+    """Whether the rates are rounding compared with the terms that they sum, or with rates at other states."""
     f = rates(z)
     if not _finite(f):
         return False

@@ -152,7 +152,7 @@ def optimality_claim(grids: tuple[Grid, Grid]) -> tuple[str, ...]:
     return (
         f"The paper calls its trigonometric path optimal. Over {cells // 2} pairs of alpha and end time, against "
         f"minimum jerk and the shortest plan known through the same waypoints, the claim {fails}.",
-        f"Length: with 16 s, of the trigonometric paths of the least degree and mean gamma the shortest has alpha = "
+        f"Length: with 16 s, of the trigonometric paths of lowest degree and mean gamma the shortest has alpha = "
         f"{best.alpha:.4g} and {best.value:.4g} m. Alpha alone was searched for that; other freedoms give shorter "
         f"ones: {freer}. {rival[0].upper()}{rival[1:]} has {shortest:.4g} m, and no path is shorter than the "
         f"polyline's {bound:.4g} m. "

@@ -634,7 +634,7 @@ def _benefit(
     shared: dict[str, Any],
     choices: bool | Mapping[str, Any],
 ) -> Worth:
-    """The planned reference beside its rivals."""
+    """The planned reference compared with its baselines."""
     from ctrlplan.studies.worth import worth
 
     shared["alpha"] = next((plan.alpha for plan in references.values() if isinstance(plan, TrigSpline)), alpha)

@@ -29,7 +29,7 @@ def check_reached(system: Any, outputs: Sequence[str], plan: Trajectory | None =
     outputs : sequence of str
         Outputs that follow the plan.
     plan : Trajectory, optional
-        The reference, where a block inside the loop may put it out.
+        The reference, where a block inside the loop may be its source.
 
     Raises
     ------
@@ -72,7 +72,7 @@ def check_reached(system: Any, outputs: Sequence[str], plan: Trajectory | None =
 
 
 def _check_derivatives(system: Any, network: Any) -> None:
-    """Reject an input for a derivative of a reference that is not put out: it would be 0."""
+    """Reject an input for a derivative of a reference that no source outputs: it would be 0."""
     known = {
         _plain(label) for block in network.blocks if block.plan is not None for label in block.system.output_labels
     }
@@ -115,7 +115,7 @@ def _reaching(network: Any, wanted: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def _depends(block: Any) -> NDArray[np.bool_]:
-    """Which outputs of a block depend on which inputs, at once or later, (noutputs, ninputs)."""
+    """Which outputs of a block depend on which inputs, directly or through states, (noutputs, ninputs)."""
     if block.delay is not None:  # signal by signal
         return np.eye(block.system.noutputs, dtype=bool)
     if not block.linear:

@@ -133,7 +133,7 @@ def test_a_delay_that_holds_what_goes_in_at_rest():
         return lambda name, p: joined(p, pi(0.5, 0.5), late, plant)
 
     assert rests(compared(build(10.0)), 10.0, 1e-8)
-    with pytest.warns(UserWarning, match=r"the delay pipe puts out 0 first, its initial=, .*initial_state="):
+    with pytest.warns(UserWarning, match=r"the output of the delay pipe starts at 0, its initial=, .*initial_state="):
         compared(build(0.0))
 
 
