@@ -239,8 +239,10 @@ class _Equations:
             for i in network.blocks_with("delay"):
                 before, now = signals[network.outputs[i]], network.fed[i](signals)
                 if np.any(np.abs(now - before) > _FOUND * max(np.abs(held).max(), np.abs(before).max())):
-                    name = network.blocks[i].name
-                    return f"the output of the delay {name} starts at {_listed(before)}, its initial=, and its input at {_listed(now)}"
+                    start = (
+                        f"the output of the delay {network.blocks[i].name} starts at {_listed(before)}, its initial="
+                    )
+                    return f"{start}, and its input at {_listed(now)}"
             return ""
 
         def gaps(x: Array) -> Array:
