@@ -426,7 +426,8 @@ CRANE_FIGURES = {
     ),
     "crane-step": (
         lambda study: plot_step(study.comparison),
-        "The step: force and torque at their limits (dashed), and a tension below 0 (filled), where the rope is slack.",
+        "The step: force and torque at their limits (dashed), up to the slack rope: where the tension comes to 0 the "
+        "model ends, and so does the run.",
     ),
     "crane-plane": (
         lambda study: plot_plane(study.comparison, study.wall),

@@ -105,6 +105,8 @@ class Alike:
             starts = self._starts(system)
         except (AttributeError, TypeError, ValueError):  # what is wrong is for `compare` to say
             return None
+        if self._given.initial_state is None and not self._at_rest(form, starts):
+            return None  # which is to be said of the loop concerned
         return Linear(tuple(system.output_labels), tracked, acting, form, starts)
 
     def _starts(self, system: Any) -> dict[str, Array]:
@@ -114,6 +116,15 @@ class Alike:
             state = np.broadcast_to(real_array(initial, "initial_state"), (system.nstates,))
             return dict.fromkeys(self._held, state)
         return {name: rest_state(system, position) for name, position in self._held.items()}
+
+    def _at_rest(self, form: LinearForm, starts: Mapping[str, Array]) -> bool:
+        """Whether states are equilibria with the plans held at their first positions."""
+        for name, position in self._held.items():
+            moved = form.a @ starts[name] + form.b @ position
+            terms = np.abs(form.a) @ np.abs(starts[name]) + np.abs(form.b) @ np.abs(position)
+            if np.any(np.abs(moved) > 1e-6 * terms.max(initial=0.0)):
+                return False
+        return True
 
     def fits(self, linear: Linear) -> bool:
         """Whether a loop differs from those that wait in numbers alone."""
@@ -157,7 +168,7 @@ def _metrics(given: Any, loops: list[Linear]) -> list[Metrics]:
         values = _of_loops(responses, first.labels, each)
         values |= {key: np.where(unstable, np.inf, row) for key, row in values.items() if "settling_time" in key}
         values |= _of_loops(controls, acting, each)
-        of_plan = path_metrics(plan, given.waypoints) if given.only is None else {}
+        of_plan = path_metrics(plan, given.waypoints, given.only)
         for i, metrics in enumerate(found):
             metrics[name] = {key: float(row[i]) for key, row in values.items()} | of_plan
     return found
