@@ -26,6 +26,7 @@ from ctrlplan.studies.linear import STEP_LIMIT, jumps
 from ctrlplan.studies.measures import MEASURES
 from ctrlplan.studies.study import Study
 from ctrlplan.studies.sweep import Sweep
+from ctrlplan.studies.units import in_units
 from ctrlplan.trajectories import Trajectory
 
 Array = NDArray[np.float64]

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 
 from ctrlplan.studies.comparison import Comparison
-from ctrlplan.studies.units import ROUNDING
+from ctrlplan.studies.units import ROUNDING, in_units
 
 TIE = 1e-3
 """Relative difference below which two values count as equal."""

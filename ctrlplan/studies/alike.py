@@ -15,7 +15,7 @@ from ctrlplan._checks import real_array
 from ctrlplan.simulation import rest_state, state_space, stated_start
 from ctrlplan.simulation.exact import exact_states
 from ctrlplan.simulation.linear import LinearForm, in_right_half, linear_form
-from ctrlplan.studies.comparison import acting_outputs, compare, is_builder, tracked_outputs
+from ctrlplan.studies.comparison import acting_outputs, checked_start, compare, is_builder, tracked_outputs
 from ctrlplan.studies.measures import MEASURES, control_metrics, path_metrics, response_metrics
 from ctrlplan.trajectories import Trajectory
 
@@ -149,7 +149,7 @@ def _metrics(given: Any, loops: list[Linear]) -> list[Metrics]:
     if given.only is not None and not any(name.startswith("control") for name in given.only):
         acting = ()
     rows = [labels.index(name) for name in (*tracked, *acting)]
-    start = min(plan.start for plan in plans.values()) if given.start is None else given.start
+    start = checked_start(given.start, plans.values(), times)
     a, b, c, d = (np.stack([getattr(loop.form, name) for loop in loops]) for name in "abcd")
     form = LinearForm(a, b, c, d, ())
     unstable = in_right_half(np.linalg.eigvals(form.a)).any(axis=1)
