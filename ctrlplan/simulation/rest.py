@@ -215,10 +215,10 @@ class _Equations:
 
     def _network(self, prepared: Prepared, held: Array, time: float, params: Mapping[str, Any], start: Array) -> None:
         """Equations of a network of blocks."""
-        network: Any = prepared.network
+        network: Any = prepared.network.for_trials() if prepared.network is not None else None
         sampled, unknown = [], []
         for i, (block, place) in enumerate(zip(network.blocks, network.states, strict=True)):
-            linear = block.linear or block.driven or isinstance(getattr(block.system, "block", None), ct.StateSpace)
+            linear = block.linear or block.driven or isinstance(block.traits.block, ct.StateSpace)
             if not linear and (self.discrete or block.period is not None):
                 unknown.append(block.name)
                 self.fixed[place] = True

@@ -222,8 +222,7 @@ def test_a_loop_that_states_its_start_has_it():
 
     def build(name, plan):
         loop = joined(plan, lag)
-        loop.initial_state = [3.0]
-        return loop
+        return cp.declare(loop, initial_state=[3.0])
 
     assert output(compared(build))[0] == 3.0
     assert output(compared(build, initial_state=[7.0]))[0] == 7.0
@@ -231,9 +230,8 @@ def test_a_loop_that_states_its_start_has_it():
 
 def test_a_start_that_is_nan_is_no_start():
     lag = ct.ss(-1.0, 1.0, 1.0, 0.0, inputs="r", outputs="y", name="lag")
-    lag.initial_state = [math.nan]
-    with pytest.raises(ValueError, match="initial_state of lag must be numbers"):
-        compared(lag)
+    with pytest.raises(ValueError, match="initial_state of lag must be a finite number"):
+        cp.declare(lag, initial_state=[math.nan])
 
 
 def drifting():
