@@ -175,7 +175,8 @@ def times_powers(values: Array, base: float, orders: NDArray[np.integer[Any]]) -
     with np.errstate(all="ignore"):
         found = np.where(values == 0.0, 0.0, values * base**orders)
         size = np.abs(found)
-        lost = (values != 0.0) & np.isfinite(values) & ~((size >= _TINY) & (size < np.inf))
+        shrunk = (size < _TINY) & (size < np.abs(values))
+        lost = (values != 0.0) & np.isfinite(values) & (shrunk | ~(size < np.inf))
     if lost.any():
         place = tuple(np.argwhere(lost)[0])
         raise ValueError(
