@@ -175,7 +175,7 @@ def times_powers(values: Array, base: float, orders: NDArray[np.integer[Any]]) -
     with np.errstate(all="ignore"):
         found = np.where(values == 0.0, 0.0, values * base**orders)
         size = np.abs(found)
-        shrunk = (size < _TINY) & (size < np.abs(values))
+        shrunk = (size < _TINY) & (np.abs(values) > 1e-290)  # what was nearly 0 may become it
         lost = (values != 0.0) & np.isfinite(values) & (shrunk | ~(size < np.inf))
     if lost.any():
         place = tuple(np.argwhere(lost)[0])

@@ -194,7 +194,7 @@ class Trajectory(Frozen, ABC):
         """
         order = checked_count(order, "order")
         if isinstance(t, Real):
-            return (self.jet(t, order).T / FACTORIALS[: order + 1]).tolist()
+            return (self.jet(np.asarray(t), order).T / FACTORIALS[: order + 1]).tolist()
         if t is None or isinstance(t, str | complex | list | tuple | np.ndarray | np.datetime64 | np.bool_):
             raise TypeError(f"t must be one number or a symbol, got {t!r:.80}")
         # Each leg counts where it holds; elsewhere it is taken at its ends, where it is finite.
