@@ -140,7 +140,6 @@ class NewtonSpline(Trajectory):
             _duration=duration,
             _systems=systems,
             _parts=parts,
-            _largest=max([float(np.abs(found).max()) for _, _, found in parts]),
         )
 
     def _again(self, waypoints: tuple[Waypoint, ...], options: Options) -> Self:
@@ -184,24 +183,6 @@ class NewtonSpline(Trajectory):
     def _leg_jet(self, leg: int, s: Array, order: int) -> Array:
         u = s / self._duration
         scale = derivative_scale(self._duration, order)
-        if self._largest > 1e250 / max(1.0, scale.max()):
-            return self._huge_jet(u, scale)
-        return self._jet(u, scale)
-
-    def _huge_jet(self, u: Array, scale: Array) -> Array:
-        """The same where it could overflow."""
-        with np.errstate(over="ignore", invalid="ignore"):
-            found = self._jet(u, scale)
-        if not np.isfinite(found).all():
-            raise ValueError(
-                f"derivatives up to {len(scale) - 1} must stay within floating point, got coefficients of up to "
-                f"{self._largest:g} over {self._duration:g} s"
-            )
-        return found
-
-    def _jet(self, u: Array, scale: Array) -> Array:
-        """Derivatives from order 0 at parts u of the duration."""
-        order = len(scale) - 1
         out = np.empty((order + 1, self.naxes, u.size))
         for axes, system, coefficients in self._parts:
             taylor = system.taylor(u, order)
@@ -239,7 +220,6 @@ class NewtonSpline(Trajectory):
     _apart: Array | None
     _duration: float
     _systems: dict[Kind, NewtonSystem]
-    _largest: float  # of the coefficients
     _parts: list[tuple[tuple[int, ...], NewtonSystem, Array]]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 import os
 import warnings
 from abc import ABC, abstractmethod
@@ -193,7 +194,7 @@ class Trajectory(Frozen, ABC):
         """
         order = checked_count(order, "order")
         if isinstance(t, Real):
-            return (self.jet(one_number(t, "t"), order).T / FACTORIALS[: order + 1]).tolist()
+            return (self.jet(np.asarray(t), order).T / FACTORIALS[: order + 1]).tolist()
         if t is None or isinstance(t, str | complex | list | tuple | np.ndarray | np.datetime64 | np.bool_):
             raise TypeError(f"t must be one number or a symbol, got {t!r:.80}")
         # Each leg counts where it holds; elsewhere it is taken at its ends, where it is finite.
@@ -426,7 +427,11 @@ class Trajectory(Frozen, ABC):
 
     def _moved(self, origin: float, target: float, rate: float) -> Self:
         """As `_map_time`, with what the rounding of times costs the intervals between them stated."""
-        moved = self._map_time(origin, target, rate)
+        try:
+            with np.errstate(over="raise", invalid="raise"):
+                moved = self._map_time(origin, target, rate)
+        except FloatingPointError as lost:
+            raise ValueError(f"times must stay within floating point, got a rate of {rate:g}: {lost}") from None
         before, after = (np.union1d(p.breakpoints, [w.time for w in p.waypoints]) for p in (self, moved))
         if before.size < 2:
             return moved
@@ -470,10 +475,21 @@ class Trajectory(Frozen, ABC):
         return out
 
     def _sample_leg(self, leg: int, s: Array, low: int, high: int) -> Array:
+        duration = float(self.breakpoints[leg + 1] - self.breakpoints[leg])
+        if abs(math.log10(duration)) * high > 200.0:
+            return self._extreme_jet(leg, s, low, high)
         if s.size <= _sampling.FEW:
             return self._leg_jet(leg, s, high)[low:]
-        duration = float(self.breakpoints[leg + 1] - self.breakpoints[leg])
         return _sampling.sample(lambda times, order: self._leg_jet(leg, times, order), duration, s, low, high)
+
+    def _extreme_jet(self, leg: int, s: Array, low: int, high: int) -> Array:
+        """Derivatives low to high of a segment whose duration, to the power of their order, leaves floating point."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            found = self._leg_jet(leg, s, high)[low:]
+        if not np.isfinite(found).all():
+            duration = self.breakpoints[leg + 1] - self.breakpoints[leg]
+            raise ValueError(f"derivative {high} must stay within floating point, got a duration of {duration:g} s")
+        return found
 
     def _jet_beside(self, moment: float, origin: float, s: Array, order: int) -> Array:
         """Jet at origin + s of the analytic function that holds at `moment`, which is no breakpoint."""

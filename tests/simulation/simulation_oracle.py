@@ -163,8 +163,8 @@ def both(times, axes, alpha=0.0, each_leg=False, labels=None):
         for i, t in enumerate(times)
     ]
     if each_leg:
-        return cp.PiecewiseSpline(points, alpha=alpha), [piecewise(times, axis, alpha) for axis in axes]
-    plan = cp.TrigSpline(points, alpha=alpha) if alpha else cp.PolySpline(points)
+        return cp.PiecewiseSpline(points, alpha=alpha, warn=False), [piecewise(times, axis, alpha) for axis in axes]
+    plan = cp.TrigSpline(points, alpha=alpha, warn=False) if alpha else cp.PolySpline(points, warn=False)
     return plan, [spline(times, axis, alpha) for axis in axes]
 
 

@@ -206,7 +206,7 @@ def test_an_undamped_oscillator_driven_at_its_own_frequency():
         cp.Waypoint(x, (1 - np.cos(w * x)) / 2, w * np.sin(w * x) / 2 if given else None)
         for x, given in ((0.0, True), (duration / 3, False), (duration, True))
     ]
-    plan = cp.TrigSpline(points, alpha=w * duration)
+    plan = cp.TrigSpline(points, alpha=w * duration, warn=False)
     t = np.linspace(0.0, duration, 37)
     assert np.abs(plan(t) - (1 - np.cos(w * t)) / 2).max() <= 1e-13
     found = cp.simulate(ct.ss([[0, 1], [-(w**2), 0]], [[0], [1]], [[1, 0]], 0), t, plan, method="exact")
@@ -273,7 +273,7 @@ def runs(draw):
     sampled = np.unique(np.concatenate([[0.0, 4.0], rng.uniform(0, 4, 25)]))
     return (
         ct.ss(*random_system(rng, nstates, naxes)),
-        cp.TrigSpline(points, alpha=alpha),
+        cp.TrigSpline(points, alpha=alpha, warn=False),
         sampled,
         rng.normal(size=nstates),
     )
@@ -329,7 +329,7 @@ def test_the_clock_may_start_anywhere(run, eighths):
     system, plan, t, initial = run
     t = np.unique(np.round(t * 1024) / 1024)
     points = [cp.Waypoint(np.round(w.time * 1024) / 1024, *w.jet) for w in plan.waypoints]
-    plan = cp.TrigSpline(points, alpha=plan.alpha)
+    plan = cp.TrigSpline(points, alpha=plan.alpha, warn=False)
     dt = eighths / 8
     close(cp.simulate(system, t + dt, plan.shift(dt), initial), cp.simulate(system, t, plan, initial))
 
