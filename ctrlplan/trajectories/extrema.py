@@ -330,13 +330,13 @@ _ENDS = chebyshev.chebvander(np.array([-1.0, 1.0]), _FIT).T
 @lru_cache(maxsize=16)
 def _between(count: int) -> Array:
     """Parts of an interval, evenly spaced but in step with no other grid."""
-    return readonly((np.arange(count) + 0.5 * (math.sqrt(5.0) - 1.0)) / count)
+    return readonly(np.asarray((np.arange(count) + 0.5 * (math.sqrt(5.0) - 1.0)) / count))
 
 
 @lru_cache(maxsize=16)
 def _basis(count: int) -> Array:
     """Chebyshev polynomials (degree + 1, ntime) there."""
-    return readonly(chebyshev.chebvander(2.0 * _between(count) - 1.0, _FIT).T)
+    return readonly(np.asarray(chebyshev.chebvander(2.0 * _between(count) - 1.0, _FIT).T, dtype=float))
 
 
 class _Candidates:
