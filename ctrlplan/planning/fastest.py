@@ -34,7 +34,7 @@ class Fastest:
     Attributes
     ----------
     plan : Trajectory
-        It.
+        Shortest plan found.
     margins : Margins
         Of every limit over the whole plan, the active one first.
     feasible : tuple of (float, float)

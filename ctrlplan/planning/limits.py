@@ -388,7 +388,8 @@ def _bound(name: str, limit: Any, order: int, axis: int | None) -> Bound:
         raise TypeError(f"limits of {name} must be a number or a pair, got {limit!r}")
     high = float(real_array(np.asarray(limit), f"limits of {name}"))
     if not 0.0 < high < math.inf:
-        raise ValueError(f"limits must be above 0 and finite, got {name} = {high:g}; {_FORMS}")
+        forms = "" if axis is None else f"; {_FORMS}"
+        raise ValueError(f"limits must be above 0 and finite, got {name} = {high:g}{forms}")
     return Bound(name, -high, high, high, order, axis)
 
 
