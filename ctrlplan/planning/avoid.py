@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import warnings
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -16,6 +17,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from ctrlplan.planning.clearance import Clearance, Rope, checked_obstacles, checked_rope, checked_size
 from ctrlplan.planning.clearance import clearance as certified_clearance
+from ctrlplan.planning.objectives import path_length
 from ctrlplan.planning.obstacles import Obstacle
 from ctrlplan.trajectories import PiecewiseSpline, PolySpline, Trajectory, TrigSpline, Waypoint
 from ctrlplan.trajectories.common import Array, checked_count
@@ -27,6 +29,7 @@ Mask = NDArray[np.bool_]
 
 _WAYS = 3  # classes of ways round the obstacles that are tried,
 _DETOUR = 1.5  # none longer than this many times the shortest
+_LONG = 2.0  # times the shortest way, above which there is a warning
 _SAMPLES = 257
 _WINDOW = 8  # samples that share one constraint: their least
 _TRIES = 3  # at a certificate with the same via points, each with more room
@@ -87,6 +90,12 @@ def avoid(
     TypeError
         If the plan is of another kind, or an obstacle is none.
 
+    Warns
+    -----
+    UserWarning
+        If the path is more than twice as long as the shortest way round the
+        obstacles.
+
     Examples
     --------
     >>> from ctrlplan.planning.obstacles import Disc
@@ -117,13 +126,26 @@ def avoid(
             elif certificate.least > best.least:
                 best = certificate
         if found:
-            return min(found, key=task.roughness)
+            plan = min(found, key=task.roughness)
+            _check_length(plan, sum(map(_length, ways[0])))
+            return plan
     x, z = best.position
     raise ValueError(
         f"no plan with {task.max_points} via points or fewer was found that keeps {task.wanted:g} from every obstacle: "
         f"the best keeps {best.least:.4g}, the {best.part} from obstacles[{best.obstacle}] "
-        f"with the load at ({x:.4g}, {z:.4g}) at {best.time:.4g} s"
+        f"with the load at ({x:.4g}, {z:.4g}) at {best.time:.4g} s; plans may exist that the search does not find: "
+        f"give via waypoints, more of them by max_points, or another clearance"
     )
+
+
+def _check_length(plan: Trajectory, shortest: float) -> None:
+    length = path_length(plan)
+    if length > _LONG * shortest:
+        warnings.warn(
+            f"the path found is {length:.4g} long, {length / shortest:.2g} times the shortest way round the obstacles: "
+            f"a local optimum; give via waypoints, or prescribe fewer derivatives",
+            stacklevel=3,
+        )
 
 
 @dataclass(frozen=True)

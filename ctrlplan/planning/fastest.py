@@ -35,7 +35,7 @@ class Fastest:
     Attributes
     ----------
     plan : Trajectory
-        It.
+        Shortest plan found.
     margins : Margins
         Of every limit over the whole plan, the active one first.
     feasible : tuple of (float, float)
@@ -202,7 +202,8 @@ def _check_open(plan: Trajectory) -> None:
     size, extrema = np.stack([plan.peak(nu) for nu in range(3)]), plan.extrema()
     slack = 1e-9 * size
     slack[0] = 1e-9 * (extrema.maximum - extrema.minimum) + 1e-14 * size[0]
-    same, moves = (np.abs(last - first) <= slack).all(axis=1), (np.abs(first) > slack).any(axis=1)
+    same = [bool(row.all()) for row in np.abs(last - first) <= slack]
+    moves = [bool(row.any()) for row in np.abs(first) > slack]
     if same[0] and same[1] and (moves[1] or (same[2] and moves[2])):
         raise ValueError(
             f"hold must be 'shape' or 'waypoints' for a closed plan, got 'path': from {plan.start:g} s to {plan.end:g} "

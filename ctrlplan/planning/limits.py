@@ -393,7 +393,7 @@ def _by_axis(name: str, limit: Any, naxes: int) -> list[Any]:
     flat = not any(map(np.iterable, rows))
     if flat and len(rows) == 2 and (given or naxes == 1):
         return [tuple(rows)] * naxes
-    if len(rows) == naxes and (not given if flat else all(np.iterable(row) and len(row) == 2 for row in rows)):
+    if len(rows) == naxes and (not given if flat else [np.size(row) for row in rows] == [2] * naxes):
         return rows
     raise ValueError(
         f"limits of {name} must be a number, a pair, or {naxes} numbers or pairs by axis, got {limit!r}; {_FORMS}"
@@ -413,9 +413,10 @@ def _bound(name: str, limit: Any, order: int, axis: int | None) -> Bound:
         return Bound(name, low, high, scale, order, axis)
     if isinstance(limit, bool) or not isinstance(limit, Real | np.ndarray):
         raise TypeError(f"limits of {name} must be a number or a pair, got {limit!r}")
-    high = float(real_array(limit, f"limits of {name}"))
+    high = float(real_array(np.asarray(limit), f"limits of {name}"))
     if not 0.0 < high < math.inf:
-        raise ValueError(f"limits must be above 0 and finite, got {name} = {high:g}; {_FORMS}")
+        forms = "" if axis is None else f"; {_FORMS}"
+        raise ValueError(f"limits must be above 0 and finite, got {name} = {high:g}{forms}")
     return Bound(name, -high, high, high, order, axis)
 
 

@@ -90,6 +90,10 @@ class Sum(_Combined):
     ----------
     parts : iterable of Trajectory
         One or more. Each holds its ends outside its own interval.
+    shaped : bool, optional
+        Whether the parts are delayed by the times of a shaper (`Shaper`), which
+        another duration would change: `retime`, alone or inside of a
+        combination, then raises a ValueError.
 
     Raises
     ------
@@ -97,9 +101,32 @@ class Sum(_Combined):
         If the numbers of axes differ.
     """
 
-    def __init__(self, parts: Iterable[Trajectory]) -> None:
+    shaped: bool = False
+
+    def __init__(self, parts: Iterable[Trajectory], *, shaped: bool = False) -> None:
         terms = _checked_parts(parts)
+        self.__dict__["shaped"] = shaped
         self._set(terms, terms[0].labels)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data that `trajectory_from_dict` reads."""
+        return super().to_dict() | ({"shaped": True} if self.shaped else {})
+
+    @classmethod
+    def _from_dict(cls, data: dict[str, Any]) -> Self:
+        found = super()._from_dict(data)
+        found.__dict__["shaped"] = bool(data.get("shaped", False))
+        return found
+
+    def _map_time(self, origin: float, target: float, rate: float) -> Self:
+        if self.shaped and not is_unit_rate(rate):
+            raise ValueError(
+                f"a shaped plan must keep its duration of {self.duration:g} s, got {self.duration / rate:g} s: the "
+                f"delays of the shaper would change with it; retime the plan first, then shape it"
+            )
+        moved = super()._map_time(origin, target, rate)
+        moved.__dict__["shaped"] = self.shaped
+        return moved
 
     def _set(self, parts: tuple[Trajectory, ...], labels: tuple[str, ...]) -> None:
         super()._set(_same_axes(parts), labels)
@@ -254,6 +281,17 @@ class Joined(Trajectory):
         return part._leg_series(own, s, order)
 
     _legs: list[tuple[Trajectory, int]]
+
+
+def is_unit_rate(rate: float) -> bool:
+    """Whether a rate leaves the delays of a shaper as they are, to what rounding of a duration costs."""
+    return abs(rate - 1.0) <= 1e-9
+
+
+def is_shaped(plan: Trajectory) -> bool:
+    """Whether a plan, or one that it is made of, is shaped."""
+    made_of = getattr(plan, "parts", (getattr(plan, "plan", None),))
+    return bool(getattr(plan, "shaped", False)) or any(is_shaped(p) for p in made_of if isinstance(p, Trajectory))
 
 
 def stack(plans: Iterable[Trajectory], labels: Sequence[str] | None = None) -> Trajectory:

@@ -238,10 +238,9 @@ class _Search:
         if values.ndim != 2 or values.shape[1] != t.size:
             raise ValueError(f"function must return values of shape (ntime,) or (m, ntime), got shape {values.shape}")
         if not np.isfinite(values).all():
-            row, place = np.argwhere(~np.isfinite(values))[0].tolist()
-            raise ValueError(
-                f"function must be finite over the plan, got {values[row, place]} at {self.legs[leg][0] + t[place]:g} s"
-            )
+            (origin, duration), bad = self.legs[leg], t[~np.isfinite(values).all(axis=0)]
+            where = f"between {origin:g} and {origin + duration:g} s, such as at {origin + bad[0]:g} s"
+            raise ValueError(f"function must be finite over the plan, got nan or inf {where}")
         return values
 
     def _give_up(self, leg: int, level: int, index: NDArray[np.int64], rest: float) -> NoReturn:
@@ -330,13 +329,13 @@ _ENDS = chebyshev.chebvander(np.array([-1.0, 1.0]), _FIT).T
 @lru_cache(maxsize=16)
 def _between(count: int) -> Array:
     """Parts of an interval, evenly spaced but in step with no other grid."""
-    return readonly((np.arange(count) + 0.5 * (math.sqrt(5.0) - 1.0)) / count)
+    return readonly(np.asarray((np.arange(count) + 0.5 * (math.sqrt(5.0) - 1.0)) / count))
 
 
 @lru_cache(maxsize=16)
 def _basis(count: int) -> Array:
     """Chebyshev polynomials (degree + 1, ntime) there."""
-    return readonly(chebyshev.chebvander(2.0 * _between(count) - 1.0, _FIT).T)
+    return readonly(np.asarray(chebyshev.chebvander(2.0 * _between(count) - 1.0, _FIT).T, dtype=float))
 
 
 class _Candidates:

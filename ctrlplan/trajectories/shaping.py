@@ -152,7 +152,7 @@ class Shaper(Frozen):
         if not isinstance(plan, Trajectory):
             raise TypeError(f"plan must be a Trajectory, got {type(plan).__name__}")
         pairs = zip(self.delays.tolist(), self.weights.tolist(), strict=True)
-        return Shaped(weight * plan.shift(delay) for delay, weight in pairs)
+        return Sum((weight * plan.shift(delay) for delay, weight in pairs), shaped=True)
 
     def then(self, other: Shaper) -> Shaper:
         """Both shapers one after the other, for two modes: every impulse split again."""
@@ -200,33 +200,6 @@ class Shaper(Frozen):
 
     def __repr__(self) -> str:
         return f"<Shaper of {self.delays.size} impulses over {self.duration:g} s>"
-
-
-class Shaped(Sum):
-    """Shaped reference; made by `Shaper`.
-
-    Its time scale is fixed: `retime`, alone or inside of a combination, raises
-    a ValueError.
-    """
-
-    def _map_time(self, origin: float, target: float, rate: float) -> Self:
-        if not is_unit_rate(rate):
-            raise ValueError(
-                f"a shaped plan must keep its duration of {self.duration:g} s, got {self.duration / rate:g} s: the "
-                f"delays of the shaper would change with it; retime the plan first, then shape it"
-            )
-        return super()._map_time(origin, target, rate)
-
-
-def is_unit_rate(rate: float) -> bool:
-    """Whether a rate leaves the delays of a shaper as they are, to what rounding of a duration costs."""
-    return abs(rate - 1.0) <= 1e-9
-
-
-def is_shaped(plan: Trajectory) -> bool:
-    """Whether a plan, or one that it is made of, is shaped."""
-    made_of = getattr(plan, "parts", (getattr(plan, "plan", None),))
-    return isinstance(plan, Shaped) or any(is_shaped(part) for part in made_of if isinstance(part, Trajectory))
 
 
 def _numbers(values: ArrayLike, name: str) -> Array:

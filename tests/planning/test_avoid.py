@@ -309,3 +309,18 @@ def test_plans_of_another_kind_are_refused():
     loop = cp.TrigSpline.cyclic([cp.Waypoint(0, [0, 0]), cp.Waypoint(1, [1, 2]), cp.Waypoint(2, [3, 1])], 4.0)
     with pytest.raises(ValueError, match="plan must end at its last waypoint, at 2 s, got 4 s"):
         avoid(loop, disc)
+
+
+def test_a_path_much_longer_than_the_shortest_way_is_said():
+    """At rest to order 4 a polynomial swings past a block; the shortest way round it is a polyline of its corners."""
+    still = [0.0] * 4
+    ends = [cp.Waypoint.from_jets(t, x=[x, *still], z=[50.0, *still]) for t, x in ((0.0, 0.0), (40.0, 50.0))]
+    things = [Rectangle((8.0, 15.0), (35.0, 60.0)), HalfPlane((0.0, 1.0), 52.0)]
+    with pytest.warns(UserWarning, match=r"the path found is (\S+) long, (\S+) times the shortest way") as caught:
+        found = avoid(cp.PolySpline(ends), things)
+    path = found(np.linspace(0.0, 40.0, 200_001))
+    length = float(np.hypot(*np.diff(path)).sum())
+    shortest = np.hypot(8.0, 15.0) + 7.0 + np.hypot(35.0, 15.0)
+    words = re.search(r"found is (\S+) long, (\S+) times", str(caught[0].message))
+    assert float(words[1]) == pytest.approx(length, rel=1e-3)
+    assert float(words[2]) == pytest.approx(length / shortest, rel=0.06)
