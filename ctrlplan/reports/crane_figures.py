@@ -227,14 +227,14 @@ def plot_motion(comparison: Comparison, wall: Wall, steps: int = 13) -> Figure:
         axes.plot(signals["x"], signals["z"], color=colour, linewidth=0.8)
         size, drum = max(np.ptp(signals["x"]), np.ptp(signals["z"])) / 25.0, abs(_drum_radius(signals))
         ends = [signals["D"], signals["x"], signals["z"], *_rope_top(signals)]
-        times = np.linspace(first, last, steps)
-        for t in times[times <= signals["t"][-1]]:  # an event can have ended the run
+        end = min(last, float(signals["t"][-1]))  # an event can have ended the run
+        for t in np.linspace(first, end, steps):
             trolley, x, z, top_x, top_z = (float(np.interp(t, signals["t"], row)) for row in ends)
             axes.add_patch(Rectangle((trolley - 0.5 * size, -0.3 * size), size, 0.3 * size, color="#333333", zorder=3))
             axes.add_patch(Circle((trolley, 0.0), drum, fill=False, color="#333333", linewidth=0.6, zorder=3))
             axes.plot([top_x, x], [top_z, z], color="#888888", linewidth=0.7)
             axes.plot(x, z, "o", color=colour, markersize=4.5, zorder=4)
-        axes.set_title(f"{as_text(name)}: every {(last - first) / (steps - 1):.3g} s", loc="left", fontsize=9)
+        axes.set_title(f"{as_text(name)}: every {(end - first) / (steps - 1):.3g} s", loc="left", fontsize=9)
         axes.set_ylabel("z [m], down")
         axes.invert_yaxis()
         axes.set_aspect("equal")
@@ -426,7 +426,8 @@ CRANE_FIGURES = {
     ),
     "crane-step": (
         lambda study: plot_step(study.comparison),
-        "The step: force and torque at their limits (dashed), and a tension below 0 (filled), where the rope is slack.",
+        "The step: force and torque at their limits (dashed), up to the slack rope: where the tension comes to 0 the "
+        "model ends, and so does the run.",
     ),
     "crane-plane": (
         lambda study: plot_plane(study.comparison, study.wall),

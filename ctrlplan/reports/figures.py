@@ -26,6 +26,7 @@ from ctrlplan.studies.linear import STEP_LIMIT, jumps
 from ctrlplan.studies.measures import MEASURES
 from ctrlplan.studies.study import Study
 from ctrlplan.studies.sweep import Sweep
+from ctrlplan.studies.units import in_units
 from ctrlplan.trajectories import Trajectory
 
 Array = NDArray[np.float64]
@@ -332,7 +333,9 @@ def _derivative_label(unit: str, order: int, name: str = "") -> str:
     word = DERIVATIVES[order] if order < len(DERIVATIVES) else f"derivative {order}"
     suffix = ("" if order == 0 else "/s" if order == 1 else f"/s$^{order}$") if unit or order else ""
     label = f"{name} {word}".strip() if name not in ("", "y") else word
-    return with_unit(label, (unit or "1") if suffix or unit else "", suffix)
+    if not suffix:
+        return with_unit(label, unit)
+    return with_unit(label, in_units("{y}/", unit or "1", "").removesuffix("/"), suffix)
 
 
 def _common(units: Any) -> str:

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import math
-import re
 from dataclasses import dataclass
 
 from ctrlplan.studies.comparison import Comparison
+from ctrlplan.studies.units import ROUNDING, in_units
 
 TIE = 1e-3
 """Relative difference below which two values count as equal."""
 
 _NOTHING = 1e-7
-"""Value below which a metric is the rounding of a solver."""
+"""Difference that is the rounding of a solver, in a metric of which no scale is known."""
 
 
 @dataclass(frozen=True)
@@ -43,15 +43,17 @@ class Verdict:
 
 
 def verdicts(comparison: Comparison) -> list[Verdict]:
-    """Winner and loser of every metric that at least two plans define."""
+    """Winner and loser of every metric that at least two plans define; runs that were ended early are not ranked."""
     found: list[Verdict] = []
     if is_unstable(comparison):
         return found  # nothing is won where nothing settles
     for key, measure in comparison.measures.items():
-        values = {plan: rows[key] for plan, rows in comparison.metrics.items() if key in rows}
-        values = {plan: value for plan, value in values.items() if not math.isnan(value)}
+        whole = {plan: rows for plan, rows in comparison.metrics.items() if plan not in comparison.stopped}
+        values = {plan: rows[key] for plan, rows in whole.items() if key in rows and not math.isnan(rows[key])}
         if len(values) > 1:
-            found.append(_verdict(key, measure.title, unit_of(comparison, key), values))
+            scale = comparison.scales.get(key, 100.0 if measure.unit == "%" else math.nan)
+            rounding = _NOTHING if math.isnan(scale) else ROUNDING * scale
+            found.append(_verdict(key, measure.title, unit_of(comparison, key), values, rounding))
     return found
 
 
@@ -60,15 +62,23 @@ def summary(comparison: Comparison) -> str:
     if is_unstable(comparison):
         return comparison.notes[0]
     decided = [v for v in verdicts(comparison) if v.winners]
+    ended = (
+        f" Not ranked, since its run was ended early: {', '.join(comparison.stopped)}." if comparison.stopped else ""
+    )
     if not decided:
-        return "No metric tells the plans apart."
+        return f"No metric tells the plans apart.{ended}"
     parts = []
     for plan in comparison.plans:
+        if plan in comparison.stopped:
+            continue
         wins = sum(plan in v.winners for v in decided)
         losses = sum(plan in v.losers for v in decided)
         parts.append(f"{plan} is best in {wins} and worst in {losses}")
     sentence = "; ".join(parts)
-    return f"Of {len(decided)} metrics that tell the plans apart, {sentence}. Values within 0.1 % count as equal."
+    return (
+        f"Of {len(decided)} metrics that tell the plans apart, {sentence}. Values within 0.1 %, or within "
+        f"a millionth of the scale of the metric, count as equal.{ended}"
+    )
 
 
 def is_unstable(comparison: Comparison) -> bool:
@@ -86,11 +96,7 @@ def unit_in(comparison: Comparison, unit: str) -> str:
     first = next(iter(comparison.plans.values()))
     y = _shared([comparison.units.get(label, "") for label in first.labels])
     u = _shared([comparison.units.get(name, "") for name in comparison.controls])
-    known = {"{y}": y, "{u}": u}
-    if any(name in unit and not stands_for for name, stands_for in known.items()):
-        return ""
-    # At once, since what stands for one of them is a user's text.
-    return re.sub(r"\{[yu]\}", lambda name: known[name[0]], unit.replace("^2", "²").replace("^5", "⁵"))
+    return in_units(unit.replace("^2", "²").replace("^5", "⁵"), y, u)
 
 
 def number(value: float, unit: str = "") -> str:
@@ -110,27 +116,29 @@ def number(value: float, unit: str = "") -> str:
     return f"{mantissa}·10^{int(exponent)}".replace("-", "−")
 
 
-def _verdict(key: str, title: str, unit: str, values: dict[str, float]) -> Verdict:
+def _verdict(key: str, title: str, unit: str, values: dict[str, float], rounding: float) -> Verdict:
     least, greatest = min(values.values()), max(values.values())
-    if _equal(least, greatest):
-        sentence = f"{title}: no difference between {_listed(tuple(values))}."
+    if _equal(least, greatest, rounding):
+        apart = greatest - least if least < greatest else 0.0
+        within = f", within {apart:.2g}{f' {unit}' if unit else ''}" if apart else ""
+        sentence = f"{title}: no difference between {_listed(tuple(values))}{within}."
         return Verdict(key, title, unit, (), (), least, greatest, sentence)
-    winners = tuple(plan for plan, value in values.items() if _equal(value, least))
-    losers = tuple(plan for plan, value in values.items() if _equal(value, greatest))
+    winners = tuple(plan for plan, value in values.items() if _equal(value, least, rounding))
+    losers = tuple(plan for plan, value in values.items() if _equal(value, greatest, rounding))
     with_unit = f" {unit}" if unit else ""
     verb, lose = ("wins" if len(winners) == 1 else "win"), ("loses" if len(losers) == 1 else "lose")
     worst = number(greatest, unit) + (with_unit if math.isfinite(greatest) else "")
     best = number(least) + with_unit
     sentence = f"{title}: {_listed(winners)} {verb} with {best}, {_listed(losers)} {lose} with {worst}"
-    if least > _NOTHING and math.isfinite(greatest) and 1.05 <= greatest / least < 1e4:
+    if least > rounding and math.isfinite(greatest) and 1.05 <= greatest / least < 1e4:
         sentence += f" ({greatest / least:.3g} times)"
     return Verdict(key, title, unit, winners, losers, least, greatest, sentence + ".")
 
 
-def _equal(one: float, other: float) -> bool:
+def _equal(one: float, other: float, rounding: float) -> bool:
     if math.isinf(one) or math.isinf(other):
         return one == other
-    return abs(one - other) <= max(TIE * max(abs(one), abs(other)), _NOTHING)
+    return abs(one - other) <= max(TIE * max(abs(one), abs(other)), rounding)
 
 
 def _listed(names: tuple[str, ...]) -> str:

@@ -11,6 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
+from ctrlplan._types import EventName
+
 Array = NDArray[np.float64]
 Signal = Callable[[Array, Array, Array, Array], Array]
 """(t, x, u, y) at many times, time last -> values (ntime,)."""
@@ -86,10 +88,17 @@ class Occurrence:
     def __str__(self) -> str:
         """In words."""
         end = ", where the run ends" if self.stop else ""
-        if ":" in self.name:  # a condition of a block, in words of its own
-            return f"{self.time:.6g} s: {self.name}{', over' if self.kind == 'inside' else ''}{end}"
+        if isinstance(self.name, EventName) and (self.kind != "inside" or not self.name.words):
+            return f"{self.time:.6g} s: {what_happened(self.name)}{', over' if self.kind == 'inside' else ''}{end}"
         where = "within its limits" if self.kind == "inside" else f"{self.kind} its limit"
         return f"{self.time:.6g} s: {self.name} {where}{end}"
+
+
+def what_happened(name: str) -> str:
+    """What an event is, in words: what its block says of it, or that the signal left its limits."""
+    if isinstance(name, EventName):
+        return f"{name} {name.words}" if name.words else str(name)
+    return f"{name} left its limits"
 
 
 @dataclass(frozen=True, eq=False)

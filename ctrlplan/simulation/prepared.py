@@ -55,7 +55,7 @@ class Prepared:
 
     def __init__(self, system: Any) -> None:
         self.original = system
-        self._initial_state: Any = None
+        self._stated: Array | None = None
         self.fingerprint = fingerprint(system)
         self.system = state_space(system)
         self.name = str(self.system.name)
@@ -93,7 +93,12 @@ class Prepared:
     @property
     def initial_state(self) -> Any:
         """Where the system says that it starts, or None."""
-        return self._initial_state if self.system is None else stated_start(self.system)
+        return _filled(self.stated)
+
+    @property
+    def stated(self) -> Array | None:
+        """States at which the system or its blocks say that they start, nan for the others; None where none does."""
+        return self._stated if self.system is None else stated_states(self.system)
 
     @property
     def ninputs(self) -> int:
@@ -266,7 +271,7 @@ class Prepared:
             "fingerprint": None,
             "network": network,
             "_compiled": usable,
-            "_initial_state": self.initial_state,
+            "_stated": self.stated,
         }
 
 
@@ -349,15 +354,22 @@ def prepared_form(system: Any) -> Prepared:
 
 def stated_start(system: Any) -> Array | None:
     """State at which a system says that it starts, or its blocks do, the rest of them at 0; None where none does."""
+    return _filled(stated_states(system))
+
+
+def stated_states(system: Any) -> Array | None:
+    """State at which a system or its blocks declare that they start, nan for those of other blocks."""
+    if isinstance(system, Prepared):
+        return system.stated
     own = traits_of(system).initial_state
     if own is not None:
         return own
     if not isinstance(system, ct.InterconnectedSystem):
         return None
-    parts = [(stated_start(block), block.nstates or 0) for block in system.syslist]
+    parts = [(stated_states(block), block.nstates or 0) for block in system.syslist]
     if all(start is None for start, _ in parts):
         return None
-    return np.concatenate([np.zeros(count) if start is None else start for start, count in parts])
+    return np.concatenate([np.full(count, np.nan) if start is None else start for start, count in parts])
 
 
 def state_space(system: Any) -> Any:
@@ -390,6 +402,11 @@ def fingerprint(system: Any) -> tuple[Any, ...]:
         () if traits.block is None else fingerprint(traits.block),
         _referred(system),
     )
+
+
+def _filled(stated: Array | None) -> Array | None:
+    """A stated start with 0 where nothing is stated."""
+    return None if stated is None else np.where(np.isnan(stated), 0.0, stated)
 
 
 def _checked_system(system: Any) -> Any:

@@ -1,19 +1,89 @@
-"""Where a linear loop rests, and whether it does."""
+"""Where a loop is in equilibrium while its references are held, and whether it stays there."""
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
+import control as ct
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import null_space
+from scipy.optimize import least_squares
 
 from ctrlplan._checks import real_array
-from ctrlplan.simulation.exact import state_scale
+from ctrlplan.simulation.drives import Drive, PlanDrive, input_drives
+from ctrlplan.simulation.interpreted import Interpreted
 from ctrlplan.simulation.linear import LinearForm, NotLinearError, in_right_half, linear_form
-from ctrlplan.simulation.prepared import Prepared
+from ctrlplan.simulation.prepared import Prepared, prepared_form
+from ctrlplan.trajectories import Trajectory
 
 Array = NDArray[np.float64]
+Vector = Callable[[Array], Array]
+
+_AT_REST = 1e-9
+"""Rate of a state at equilibrium, relative to the terms it is the sum of, in a linear loop."""
+
+_FOUND = 1e-8
+"""The same in a loop whose equilibrium was found by iteration."""
+
+_EVALUATIONS = 10_000
+"""Evaluations of the rates after which no further guess is tried."""
+
+_TURNS = 40
+"""Steps of Newton's iteration."""
+
+
+def rest_at(
+    system: Any, plan: Trajectory, time: float, outputs: Sequence[int], params: Mapping[str, Any] | None = None
+) -> tuple[Array, str]:
+    """State in which a loop is at equilibrium at the first position of a plan.
+
+    References, disturbances and all other plans in the loop are held at their
+    values at `time`, with zero derivatives. States that a block states itself
+    (``initial_state``) are kept; the others are found.
+
+    Parameters
+    ----------
+    system : control system or Prepared
+        The plan stands at its inputs, or inside as a block.
+    plan : Trajectory
+        Reference.
+    time : float
+        Start of the run [s].
+    outputs : sequence of int
+        Rows of the outputs that follow the plan. Of several equilibria, one
+        with these outputs near the plan's position is taken.
+    params : mapping, optional
+        Parameters of the blocks.
+
+    Returns
+    -------
+    state : ndarray, shape (nstates,)
+        The equilibrium; where none was found, the stated start, 0 for states
+        of which none is stated.
+    doubt : str
+        Why that is not known to be an equilibrium; empty where it is one.
+    """
+    prepared = prepared_form(system)
+    stated = prepared.stated
+    start = np.zeros(prepared.nstates) if stated is None else np.where(np.isnan(stated), 0.0, stated)
+    free = np.ones(prepared.nstates, dtype=bool) if stated is None else np.isnan(stated)
+    if not free.any():
+        return start, ""
+    given = input_drives(prepared.input_labels, plan if prepared.ninputs else None, np.array([time, time + 1.0]))
+    target = plan.jet(np.array([time]), 0, left=True)[0, :, 0]
+    rows = list(outputs)
+    held = np.concatenate([np.zeros(0), *(_held(drive, time) for drive in prepared.drives(given, time))])
+    if prepared.linear is not None:
+        form = prepared.linear
+        state = _linear_rest(form.a, form.b @ held, form.c[rows], form.d[rows] @ held, target, start, free)
+        return (start, "it has none") if state is None else (state, "")
+    try:
+        return _found(_Equations(prepared, held, time, params or {}, start), rows, target, start, free)
+    except Exception as error:  # whatever a block does outside its domain; a run that fails there says so itself
+        return start, f"its equations cannot be evaluated ({type(error).__name__}: {error})"
 
 
 def rest_state(system: Any, position: ArrayLike) -> Array:
@@ -33,30 +103,16 @@ def rest_state(system: Any, position: ArrayLike) -> Array:
         where there is none.
     """
     held = np.atleast_1d(real_array(position, "position"))
-    if not held.any():
-        return np.zeros(system.nstates or 0)
+    start = np.zeros(system.nstates or 0)
     try:
         form = _form(system)
     except NotLinearError:
-        return np.zeros(system.nstates or 0)
-    if form.b.shape[1] != held.size:
+        return start
+    if form.b.shape[1] != held.size or not held.any():
         return np.zeros(len(form.a))
-    # Rows and columns of one size: beside a fast pole a slow one is not taken for an integrator.
-    scale, supplied = state_scale(form.a), form.b @ held
-    rates = form.a * scale
-    size = np.abs(np.column_stack([rates, supplied])).max(axis=1, initial=0.0)
-    size[size == 0.0] = 1.0
-    rates, supplied = rates / size[:, None], supplied / size
-    state: Array = np.linalg.lstsq(rates, -supplied, rcond=None)[0]
-    left = np.abs(rates @ state + supplied).max(initial=0.0)
-    if left > 1e-9 * max(np.abs(state).max(initial=0.0), np.abs(supplied).max(initial=0.0)):
-        return np.zeros(len(form.a))
-    # Where integrators leave a choice, the outputs should be what is asked for.
-    idle, tracked = null_space(rates), form.c[: held.size] * scale
-    if idle.size and len(tracked) == held.size:
-        missing = held - tracked @ state - form.d[: held.size] @ held
-        state = state + idle @ np.linalg.lstsq(tracked @ idle, missing, rcond=None)[0]
-    return state * scale
+    c, d, free = form.c[: held.size], form.d[: held.size], np.ones(len(form.a), dtype=bool)
+    state = _linear_rest(form.a, form.b @ held, c, d @ held, held, np.zeros(len(form.a)), free)
+    return np.zeros(len(form.a)) if state is None else state
 
 
 def unstable_poles(system: Any) -> NDArray[np.complex128]:
@@ -74,3 +130,276 @@ def _form(system: Any) -> LinearForm:
     if system.linear is None:
         raise NotLinearError(system.not_linear)
     return system.linear
+
+
+def _held(drive: Drive, time: float) -> Array:
+    """Signals of a drive, held where they are before anything happens at `time`."""
+    if not isinstance(drive, PlanDrive):
+        return drive.at(np.array([time]))[:, 0]
+    jet = np.zeros((drive.plan.naxes, drive.derivatives + 1))
+    jet[:, 0] = drive.plan.jet(np.array([time]), 0, left=True)[0, :, 0]
+    return jet.ravel()
+
+
+def _linear_rest(
+    a: Array, supplied: Array, c: Array, passed: Array, target: Array, start: Array, free: NDArray[np.bool_]
+) -> Array | None:
+    """State at which the free rows of A x + supplied vanish; None where there is none.
+
+    Where integrators leave a choice, outputs C x + passed come as near to `target` as they can.
+    """
+    state = np.where(free, 0.0, start)
+    inner = a[np.ix_(free, free)]
+    wanted = -(supplied + a @ state)[free]
+    found, left = _scaled_solution(inner, wanted)
+    if left > _AT_REST:
+        return None
+    idle = null_space(inner)
+    if idle.size and len(c) == target.size:
+        missing = target - c[:, free] @ found - c @ state - passed
+        found = found + idle @ np.linalg.lstsq(c[:, free] @ idle, missing, rcond=None)[0]
+    state[free] = found
+    return state
+
+
+def _scaled_solution(matrix: Array, right: Array) -> tuple[Array, float]:
+    """Least-squares solution with rows and columns scaled to size 1, and its residual relative to what is scaled so."""
+    rows = np.maximum(np.abs(matrix).max(axis=1, initial=0.0), np.abs(right))
+    rows = 1.0 / np.where(rows > 0.0, rows, 1.0)
+    columns = np.abs(rows[:, None] * matrix).max(axis=0, initial=0.0)
+    columns = 1.0 / np.where(columns > 0.0, columns, 1.0)
+    scaled, wanted = rows[:, None] * matrix * columns, rows * right
+    found = np.linalg.lstsq(scaled, wanted, rcond=None)[0]
+    size = max(float(np.abs(found).max(initial=0.0)), float(np.abs(wanted).max(initial=0.0)))
+    left = float(np.abs(scaled @ found - wanted).max(initial=0.0))
+    return columns * found, left / size if size else 0.0
+
+
+class _Equations:
+    """Rates at which a loop moves away from a state, and its outputs, its references held.
+
+    A state of a discrete block moves by what a sample changes it. Discrete blocks that are not linear
+    are not called, since some remember their calls: they are `unknown`, and their states `fixed`.
+    """
+
+    def __init__(self, prepared: Prepared, held: Array, time: float, params: Mapping[str, Any], start: Array) -> None:
+        self.discrete = prepared.dt not in (None, 0)
+        self.unknown: tuple[str, ...] = ()
+        self.fixed = np.zeros(prepared.nstates, dtype=bool)
+        self.late: Callable[[Array], str] = lambda x: ""
+        self._rates: Vector
+        self._outputs: Vector
+        self._gaps: Vector = lambda x: np.zeros(0)
+        if prepared.network is None:
+            self._by_control(prepared, held, time, params)
+        elif not prepared.network.blocks:
+            self._compiled(prepared, held, time, params, start)
+        else:
+            self._network(prepared, held, time, params, start)
+
+    def _by_control(self, prepared: Prepared, held: Array, time: float, params: Mapping[str, Any]) -> None:
+        """Equations of what only python-control runs."""
+        system, u = prepared.system, held[: prepared.ninputs]
+        if self.discrete:
+            self.unknown = (prepared.name,)
+        self._rates = lambda x: np.ravel(system.dynamics(time, x, u, dict(params)))
+        self._outputs = lambda x: np.ravel(system.output(time, x, u, dict(params)))
+
+    def _compiled(self, prepared: Prepared, held: Array, time: float, params: Mapping[str, Any], start: Array) -> None:
+        """Equations of a form that was compiled for another process."""
+        drives = prepared.drives(input_drives(prepared.input_labels, 0.0, np.array([time, time + 1.0])), time)
+        form = prepared.compiled(params, drives, time, start)
+        p, t, d = form.parameters(params), np.array([time]), held[:, None]
+        self._rates = lambda x: form.rates(t, x[:, None], d, p)[:, 0]
+        self._outputs = lambda x: form.outputs(t, x[:, None], d, p)[:, 0]
+
+    def _network(self, prepared: Prepared, held: Array, time: float, params: Mapping[str, Any], start: Array) -> None:
+        """Equations of a network of blocks."""
+        network: Any = prepared.network
+        sampled, unknown = [], []
+        for i, (block, place) in enumerate(zip(network.blocks, network.states, strict=True)):
+            linear = block.linear or block.driven or isinstance(getattr(block.system, "block", None), ct.StateSpace)
+            if not linear and (self.discrete or block.period is not None):
+                unknown.append(block.name)
+                self.fixed[place] = True
+            elif block.period is not None:
+                sampled.append((i, place))
+        self.unknown = tuple(unknown)
+        equations = Interpreted(network, params, (time, start), prepared.trials)
+
+        def rates(x: Array) -> Array:
+            moved = equations.rates(time, x, held)
+            if self.discrete:
+                return np.asarray(moved - x)
+            for i, place in sampled:
+                moved[place] = equations.sampled((i,), time, x, held)[place] - x[place]
+            return moved
+
+        def late(x: Array) -> str:
+            signals = equations.signals(time, x, held)
+            for i in network.blocks_with("delay"):
+                before, now = signals[network.outputs[i]], network.fed[i](signals)
+                if np.any(np.abs(now - before) > _FOUND * max(np.abs(held).max(), np.abs(before).max())):
+                    start = (
+                        f"the output of the delay {network.blocks[i].name} starts at {_listed(before)}, its initial="
+                    )
+                    return f"{start}, and its input at {_listed(now)}"
+            return ""
+
+        def gaps(x: Array) -> Array:
+            signals = equations.signals(time, x, held)
+            found = [network.fed[i](signals) - signals[network.outputs[i]] for i in network.blocks_with("delay")]
+            return np.concatenate([np.zeros(0), *found])
+
+        self._rates, self.late, self._gaps = rates, late, gaps
+        self._outputs = lambda x: network.put_out(equations.signals(time, x, held))
+
+    def rates(self, x: Array) -> Array:
+        """Rates, nan outside the domain of a block."""
+        return self._tried(self._rates, x)
+
+    def outputs(self, x: Array) -> Array:
+        """Outputs of the whole, nan outside the domain of a block."""
+        return self._tried(self._outputs, x)
+
+    def gaps(self, x: Array) -> Array:
+        """Inputs of the delays less their outputs."""
+        return self._tried(self._gaps, x)
+
+    def _tried(self, function: Vector, x: Array) -> Array:
+        try:
+            with np.errstate(all="ignore"):
+                return np.asarray(function(x), dtype=float)
+        except Exception:  # a trial: a block may be defined elsewhere
+            return np.full(x.size, np.nan)
+
+
+def _found(
+    equations: _Equations, rows: list[int], target: Array, start: Array, free: NDArray[np.bool_]
+) -> tuple[Array, str]:
+    """Equilibrium of a network, from a few guesses; of several the one with outputs nearest to `target`."""
+    free = free & ~equations.fixed
+    if equations.unknown and equations.discrete:
+        return start, "" if not target.any() else _of_samples(equations)
+
+    def whole(z: Array) -> Array:
+        state = start.copy()
+        state[free] = z
+        return state
+
+    evaluations = itertools.count(1)
+
+    def rates(z: Array) -> Array:
+        next(evaluations)
+        return equations.rates(whole(z))[free] if z.size else np.zeros(0)
+
+    def missing(z: Array) -> Array:
+        found = equations.outputs(whole(z))
+        found = found[rows] - target if found.size > max(rows, default=-1) else np.full(target.size, np.nan)
+        return np.concatenate([found, equations.gaps(whole(z))])
+
+    size = float(np.abs(target).max(initial=0.0)) or 1.0
+    if not rates(start[free]).any() and not missing(start[free]).any():
+        return start, equations.late(start)
+    guesses = [guess for guess in _guesses(start[free], target) if _finite(rates(guess)) and _finite(missing(guess))]
+    moves = np.max([np.abs(rates(guess)) for guess in guesses], axis=0, initial=0.0) if guesses else np.zeros(0)
+    nearest: tuple[float, Array] | None = None
+    for guess in guesses:
+        if next(evaluations) > _EVALUATIONS:
+            break
+        z = _equilibrium(rates, missing, guess, moves, size)
+        if z is None:
+            continue
+        distance = float(np.abs(missing(z)).max(initial=0.0))
+        if nearest is None or distance < nearest[0]:
+            nearest = distance, z
+        if distance <= _FOUND * size:
+            break
+    if nearest is None:
+        return start, _of_samples(equations) if equations.unknown else equations.late(start) or "none was found"
+    state = whole(nearest[1])
+    if equations.unknown and nearest[0] > _FOUND * size:
+        return state, _of_samples(equations)
+    return state, equations.late(state)
+
+
+def _of_samples(equations: _Equations) -> str:
+    return f"the states of {', '.join(equations.unknown)}, which takes samples, are not known"
+
+
+def _guesses(start: Array, target: Array) -> Iterator[Array]:
+    """Where an equilibrium is looked for: at the stated start, and about the position."""
+    yield start
+    values = np.unique(np.concatenate([target, [1.0]]))
+    for value in values[values != 0.0]:
+        yield np.full(start.size, value)
+    rng = np.random.default_rng(0)
+    size = float(np.abs(values).max())
+    for _ in range(6):
+        yield size * rng.uniform(-1.0, 1.0, start.size)
+        yield size * rng.uniform(0.0, 2.0, start.size)
+
+
+def _equilibrium(rates: Vector, missing: Vector, guess: Array, moves: Array, size: float) -> Array | None:
+    """State from a guess at which all rates vanish; None where none is found."""
+    z = guess
+    if z.size and (not _still(rates, z, moves) or np.abs(missing(z)).max(initial=0.0) > _FOUND * size):
+        weight = 1.0 / np.where(moves > 0.0, moves, 1.0)
+        near = least_squares(
+            lambda v: np.concatenate([weight * rates(v), missing(v) / size]),
+            z,
+            x_scale="jac",
+            ftol=1e-15,
+            xtol=1e-15,
+            gtol=1e-15,
+            max_nfev=max(10, min(200, _EVALUATIONS // (z.size + 1))),
+        )
+        z = _newton(rates, near.x)
+    return z if _still(rates, z, moves) else None
+
+
+def _newton(rates: Vector, z: Array) -> Array:
+    """Newton's iteration on the rates alone, by steps of minimum norm."""
+    f = rates(z)
+    for _ in range(_TURNS):
+        if not _finite(f) or not f.any():
+            break
+        slope = _jacobian(rates, z, f)
+        if not _finite(slope):
+            break
+        step = _scaled_solution(slope, -f)[0]
+        for _ in range(8):
+            following = rates(z + step)
+            if _finite(following) and np.abs(following).max() < np.abs(f).max():
+                break
+            step = 0.5 * step
+        else:
+            break
+        z, f = z + step, following
+    return z
+
+
+def _still(rates: Vector, z: Array, moves: Array) -> bool:
+    """Whether the rates are rounding compared with the terms that they sum, or with rates at other states."""
+    f = rates(z)
+    if not _finite(f):
+        return False
+    if not f.any():
+        return True
+    terms = np.abs(_jacobian(rates, z, f)) @ np.abs(z)
+    return bool(np.all(np.abs(f) <= _FOUND * np.fmax(terms, moves)))
+
+
+def _jacobian(rates: Vector, z: Array, f: Array) -> Array:
+    steps = 1e-7 * np.maximum(np.abs(z), 1e-3 * np.abs(z).max(initial=0.0))
+    steps = np.where(steps > 0.0, steps, 1e-7)
+    columns = [(rates(z + step * unit) - f) / step for step, unit in zip(steps, np.eye(z.size), strict=True)]
+    return np.array(columns).T.reshape(f.size, z.size)
+
+
+def _listed(values: Array) -> str:
+    return ", ".join(f"{value:.4g}" for value in values)
+
+
+def _finite(values: Array) -> bool:
+    return bool(np.isfinite(values).all())

@@ -15,7 +15,7 @@ from ctrlplan._checks import real_array
 from ctrlplan.simulation import rest_state, state_space, stated_start
 from ctrlplan.simulation.exact import exact_states
 from ctrlplan.simulation.linear import LinearForm, in_right_half, linear_form
-from ctrlplan.studies.comparison import acting_outputs, compare, is_builder, tracked_outputs
+from ctrlplan.studies.comparison import acting_outputs, checked_start, compare, is_builder, tracked_outputs
 from ctrlplan.studies.measures import MEASURES, control_metrics, path_metrics, response_metrics
 from ctrlplan.trajectories import Trajectory
 
@@ -105,6 +105,8 @@ class Alike:
             starts = self._starts(system)
         except (AttributeError, TypeError, ValueError):  # what is wrong is for `compare` to say
             return None
+        if self._given.initial_state is None and not self._at_rest(form, starts):
+            return None  # which is to be said of the loop concerned
         return Linear(tuple(system.output_labels), tracked, acting, form, starts)
 
     def _starts(self, system: Any) -> dict[str, Array]:
@@ -114,6 +116,15 @@ class Alike:
             state = np.broadcast_to(real_array(initial, "initial_state"), (system.nstates,))
             return dict.fromkeys(self._held, state)
         return {name: rest_state(system, position) for name, position in self._held.items()}
+
+    def _at_rest(self, form: LinearForm, starts: Mapping[str, Array]) -> bool:
+        """Whether states are equilibria with the plans held at their first positions."""
+        for name, position in self._held.items():
+            moved = form.a @ starts[name] + form.b @ position
+            terms = np.abs(form.a) @ np.abs(starts[name]) + np.abs(form.b) @ np.abs(position)
+            if np.any(np.abs(moved) > 1e-6 * terms.max(initial=0.0)):
+                return False
+        return True
 
     def fits(self, linear: Linear) -> bool:
         """Whether a loop differs from those that wait in numbers alone."""
@@ -138,7 +149,7 @@ def _metrics(given: Any, loops: list[Linear]) -> list[Metrics]:
     if given.only is not None and not any(name.startswith("control") for name in given.only):
         acting = ()
     rows = [labels.index(name) for name in (*tracked, *acting)]
-    start = min(plan.start for plan in plans.values()) if given.start is None else given.start
+    start = checked_start(given.start, plans.values(), times)
     a, b, c, d = (np.stack([getattr(loop.form, name) for loop in loops]) for name in "abcd")
     form = LinearForm(a, b, c, d, ())
     unstable = in_right_half(np.linalg.eigvals(form.a)).any(axis=1)
@@ -157,7 +168,7 @@ def _metrics(given: Any, loops: list[Linear]) -> list[Metrics]:
         values = _of_loops(responses, first.labels, each)
         values |= {key: np.where(unstable, np.inf, row) for key, row in values.items() if "settling_time" in key}
         values |= _of_loops(controls, acting, each)
-        of_plan = path_metrics(plan, given.waypoints) if given.only is None else {}
+        of_plan = path_metrics(plan, given.waypoints, given.only)
         for i, metrics in enumerate(found):
             metrics[name] = {key: float(row[i]) for key, row in values.items()} | of_plan
     return found

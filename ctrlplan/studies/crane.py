@@ -30,6 +30,7 @@ from ctrlplan.studies.crane_setup import (
     CRANE,
     CRANE_MEASURES,
     FORCE_LIMITS,
+    SLACK,
     TORQUE_LIMITS,
     UNITS,
     WALL,
@@ -219,6 +220,7 @@ def _compared(
         {name: plan for name, (plan, _) in plans.items()},
         timepts,
         controls=("F", "C"),
+        events=(SLACK,),
         waypoints=points,
         measure=measure,
         measures=CRANE_MEASURES,
@@ -230,9 +232,11 @@ def _compared(
 
 
 def _limited_error(plan: Trajectory, options: dict[str, Any], timepts: Array) -> float:
-    """Greatest error of the load with force and torque limited as the step's are."""
+    """Greatest error of the load with force and torque limited as the step's are; nan where the rope goes slack."""
     loop = crane_loop(CRANE, plan, **options | {"force_limits": FORCE_LIMITS, "torque_limits": TORQUE_LIMITS})
-    response = simulate(loop, timepts)
+    response = simulate(loop, timepts, events=(SLACK,))
+    if response.time[-1] < timepts[-1]:
+        return np.nan
     signals = signals_of(response)
     return float(np.hypot(*(np.stack([signals["x"], signals["z"]]) - plan.jet(timepts, 0)[0])).max())
 
@@ -241,7 +245,11 @@ def _limits_note(found: Comparison) -> str:
     """What the plans ask of drives that have the step's limits, and what that costs."""
     names = ("polynomial", "trigonometric", "piecewise")
     asked = ", ".join(f"{name} {1e-3 * found.metrics[name]['force_peak']:.3g} kN" for name in names)
-    errors = ", ".join(f"{name} {found.metrics[name]['error_limited']:.2g} m" for name in names)
+    limited = {name: found.metrics[name]["error_limited"] for name in names}
+    errors = ", ".join(
+        f"{name} {'none, since the rope goes slack' if np.isnan(error) else f'{error:.2g} m'}"
+        for name, error in limited.items()
+    )
     return (
         f"Only the step runs with limited drives above; the plans ask for a force of up to {asked}, much of it where "
         f"their acceleration or speed begins and ends with a jump. With the step's limits (30 kN) their greatest "
@@ -256,11 +264,19 @@ def _parameters(t_end: float) -> dict[str, object]:
         "trolley": f"M_c = {crane.trolley_mass:g} kg, f1 = {crane.trolley_friction:g} N s/m",
         "drum": f"J = {crane.drum_inertia:g} kg m², b = {crane.drum_radius:g} m, f2 = {crane.drum_friction:g} N m s",
         "gravity": f"{crane.gravity:g} m/s²",
-        "PIDs": "triple pole at −5 rad/s on each drive, derivative filter 0.02 s",
+        "PIDs": "gains of a triple pole at −5 rad/s; with the derivative filter of 0.02 s the closed loop of the "
+        f"trolley has its poles at {_poles(crane.linear_trolley_loop())}, that of the hoist at "
+        f"{_poles(crane.linear_hoist_loop())} rad/s",
         "limits for the step": "|F| ≤ 30 kN, C from −3 to 1 kN m, with anti-windup",
         "start": "at rest at the first position",
         "run": f"{t_end:g} s",
     }
+
+
+def _poles(loop: Any) -> str:
+    """Poles of a loop, pairs once."""
+    poles = sorted((pole for pole in np.asarray(loop.poles()) if pole.imag >= 0.0), key=lambda pole: -pole.real)
+    return ", ".join(f"{p.real:.3g}" + (f" ± {p.imag:.3g}j" if p.imag else "") for p in poles).replace("-", "−")
 
 
 def _step_note(found: Comparison) -> str:
@@ -268,11 +284,15 @@ def _step_note(found: Comparison) -> str:
     response = found.responses["step"]
     force = np.asarray(response.outputs)[list(response.output_labels).index("F")]
     limited = float(metrics.saturation_time(np.asarray(response.time), force, *FORCE_LIMITS))
-    slack = f" and leaves the rope slack for {step['slack_time']:.2g} s" if step["slack_time"] > 0.0 else ""
-    return (
-        f"The step does what the introduction says: it holds the trolley's drive at its limit for {limited:.2g} s"
-        f"{slack}, and the load still swings by {step['sway_after']:.2g} rad after the other plans have arrived."
+    slack = found.stopped.get("step")
+    end = (
+        f"and the load still swings by {step['sway_after']:.2g} rad after the other plans have arrived."
+        if slack is None
+        else f"until the rope goes slack at {slack:.3g} s. There the model ends, and so does the run: what a step "
+        "would do afterwards is not known, and its figures are not ranked."
     )
+    held = f"it holds the trolley's drive at its limit for {limited:.2g} s"
+    return f"The step does what the introduction says: {held}, {end}"
 
 
 def _linear_loop(law: str) -> ct.StateSpace:

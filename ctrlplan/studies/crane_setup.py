@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctrlplan import metrics
+from ctrlplan.simulation import Event
 from ctrlplan.studies.comparison import Comparison
 from ctrlplan.studies.measures import Measure, signals_of
 from ctrlplan.systems.plants import Crane
@@ -20,6 +21,8 @@ FORCE_LIMITS = (-30e3, 30e3)
 TORQUE_LIMITS = (-3e3, 1e3)
 WALL = ((7.0, 13.0), (6.5, 12.0))
 """The obstacle of the third simulation: sides in x and in z (down) [m]."""
+SLACK = Event("T", low=0.0, stop=True, name="rope tension")
+"""Where the model ends: a rope only pulls."""
 
 CRANE_MEASURES = {
     "error_travel": Measure("Greatest error of the load on the way", "m"),
@@ -88,7 +91,7 @@ def load_metrics(plan: Trajectory, response: Any, last: float) -> dict[str, floa
         "error_after": _peak(t[after], error[after]),
         "sway_after": _peak(t[after], signals["theta"][after]),
         "force_peak": _limited_peak(t, signals["F"]),
-        "slack_time": slack,
+        "slack_time": slack if slack > 1e-9 * (t[-1] - t[0]) else 0.0,  # a run that ends there is at 0 to rounding
         "path_length": np.nan
         if travelled is None
         else float(metrics.path_length(np.linspace(plan.start, plan.end, 4001), travelled)),
@@ -108,7 +111,13 @@ def _peak(t: Array, values: Array) -> float:
 
 
 def marked_slack(found: Comparison) -> Comparison:
-    """Comparison with a mark on every plan whose rope goes slack."""
+    """Comparison with a mark on every plan whose rope goes slack, at `SLACK` or in a run that goes on."""
+    ended = {
+        name: f"the rope is slack from {time:.4g} s on, where the model of the crane ends"
+        for name, time in found.stopped.items()
+        if any(event.name == SLACK.name and event.stop for event in found.responses[name].events)
+    }
+    found = found.marked(ended)
     slack = {name: values["slack_time"] for name, values in found.metrics.items() if values["slack_time"] > 0.0}
     return found.marked(
         {

@@ -23,8 +23,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctrlplan.studies.comparison import compare, standard_plans
-from ctrlplan.studies.crane_setup import CRANE_MEASURES, load_metrics, marked_slack
+from ctrlplan.studies.crane_setup import CRANE_MEASURES, SLACK, load_metrics, marked_slack
 from ctrlplan.studies.study import Study
+from ctrlplan.studies.worth import smoother_polynomials
 from ctrlplan.systems.plants import LAWS, Crane, crane_loop, unity_feedback_loop
 from ctrlplan.trajectories import PiecewiseSpline, PolySpline, Step, Trajectory, TrigSpline, Waypoint
 from ctrlplan.trajectories.files import csv_header, signal_names, signal_rows
@@ -139,6 +140,7 @@ class StudyFile:
         last = self.waypoints[-1].time
         return {
             "controls": ("F", "C"),
+            "events": (SLACK,),
             "measure": lambda plan, response: load_metrics(plan, response, last),
             "measures": CRANE_MEASURES,
             "worth": self._asked_of_crane() if self.worth else False,
@@ -153,6 +155,7 @@ class StudyFile:
             "mode": (math.sqrt(crane.gravity / depth), 0.0) if depth > 0.0 else None,
             "decisive": ("settling_time", "sway_after", "force_peak"),
             "measure": load_metrics,
+            "baselines": smoother_polynomials,
         }
 
     def timepts(self, loop: Any) -> NDArray[np.float64]:

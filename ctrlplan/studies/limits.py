@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from ctrlplan.traits import traits_of
+
 
 def limits_of(loop: Any) -> dict[str, tuple[float, float]]:
     """Limits of a loop's outputs by their labels.
@@ -23,7 +25,7 @@ def limits_of(loop: Any) -> dict[str, tuple[float, float]]:
     found: dict[str, tuple[float, float]] = {}
     for block in getattr(loop, "syslist", None) or ():
         found |= limits_of(block)
-    for name, (_, low, high) in (getattr(loop, "watched", None) or {}).items():
+    for name, (_, low, high) in (traits_of(loop).watched or {}).items():
         found[name] = (float(low), float(high))
     known = loop.output_labels or ()
     return {name: pair for name, pair in found.items() if name in known}

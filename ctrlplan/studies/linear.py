@@ -8,6 +8,7 @@ from typing import Any
 import control as ct
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
 
 from ctrlplan.studies.comparison import Comparison, compare
 from ctrlplan.studies.study import Study
@@ -147,18 +148,18 @@ def _notes(comparison: Comparison, swept: Sweep) -> list[str]:
     """What the study finds, and each place where the paper's section 2 says otherwise."""
     step, plan = comparison.metrics["step"], comparison.metrics["trigonometric"]
     gains, trig, poly = swept.values, swept.metrics["trigonometric"], swept.metrics["polynomial"]
-    top = int(np.argmax(trig["overshoot_error"]))
-    slower = gains[trig["settling_time"] > swept.metrics["step"]["settling_time"]]
+    peak_gain, peak = overshoot_peak(gains, trig["overshoot_error"])
+    later = trig["settling_time"] > swept.metrics["step"]["settling_time"]
     last = {name: rows["overshoot_error"][-1] for name, rows in swept.metrics.items()}
     band = TrigSpline(WAYPOINTS, alpha=1.0)
     enters = _enters_band(band)
-    better = float(np.mean(poly["settling_time"] < trig["settling_time"]))
     return [
         f"At k = 5 the step overshoots {step['overshoot_error']:.4g} % and settles in {step['settling_time']:.4g} s, "
         f"the trigonometric plan {plan['overshoot_error']:.4g} % and {plan['settling_time']:.4g} s. The paper prints "
         "48 %, 7.6 s, 44 % and 8 s: the same figures, the overshoots cut off rather than rounded. Here the plan "
         "settles later than the step: at small gains planning buys nothing, as the paper says.",
-        "Equation (1) as printed lacks the gain and does not start at 0. The step response of this loop is "
+        "Equation (1) as printed lacks the factor k, and the sign in ξ = −cos φ, with φ the argument of the lower of "
+        "the two conjugate poles. With both it is the step response of this loop, "
         "y = 1 − (ω_n/ω_p) exp(−ξ ω_n t) sin(ω_p t + arccos ξ) with ω_n = √k and ξ = 1/(2 √k).",
         "The paper says that no closed form exists for the response to the trigonometric spline. It does: the spline "
         "is the output of a linear system, so loop and plan together are one matrix exponential. Every curve here is "
@@ -167,20 +168,43 @@ def _notes(comparison: Comparison, swept: Sweep) -> list[str]:
         f"{enters:.4g} s: the reference itself enters the ±2 % band that early, and a stiff loop follows it. "
         f"At k = 1000 the plan settles in {trig['settling_time'][-1]:.4g} s.",
         f"The paper says that the plan's overshoot rises to about 50 % and then falls to 0. It peaks at "
-        f"{trig['overshoot_error'][top]:.4g} % at k = {gains[top]:.3g} and is {last['trigonometric']:.3g} % "
-        "at k = 1000.",
+        f"{peak:.5g} % at k = {peak_gain:.2f} and is {last['trigonometric']:.3g} % at k = 1000.",
         f"The step's limit point for k → ∞ is ({STEP_LIMIT[0]:.4g} s, 100 %), as in the paper; at k = 1000 it is still "
         f"at {last['step']:.4g} %. Its settling time jumps wherever an oscillation leaves the band; gains are refined "
         "there, so that the jumps are drawn as jumps.",
-        f"The step settles sooner than the trigonometric plan at {slower.size} of {gains.size} gains, none of them "
-        f"above k = {slower.max():.3g}; the paper puts the limit at k = 10."
-        if slower.size
+        f"The step settles sooner than the trigonometric plan {_shares(gains, later)}, and at no gain above "
+        f"k = {gains[later].max():.3g}; the paper puts the limit at k = 10."
+        if later.any()
         else "The trigonometric plan settles sooner than the step at every gain.",
         f"With the plan's derivatives fed forward, r + (r'' + r')/k in place of r, the same loop follows the same plan "
         f"to {_digits(comparison.metrics[FED])} at k = 5 already: what flatness is for a linear loop.",
-        f"A quintic does as well as the trigonometric spline, as the paper foretells: it settles sooner at "
-        f"{100 * better:.0f} % of the gains. What is gained here is gained by planning, not by the kind of spline.",
+        f"A quintic does as well as the trigonometric spline, as the paper foretells: it settles sooner "
+        f"{_shares(gains, poly['settling_time'] < trig['settling_time'])}. What is gained here is gained by planning, "
+        "not by the kind of spline.",
     ]
+
+
+def overshoot_peak(gains: Array, overshoot: Array) -> tuple[float, float]:
+    """Gain at which the overshoot of the trigonometric plan peaks, and the peak [%], between the gains swept."""
+    plan = linear_plans()["trigonometric"]
+
+    def overshoot_at(log_gain: float) -> float:
+        found = compare(_loop(float(np.exp(log_gain))), {"it": plan}, TIMEPTS, only=("overshoot_error",))
+        return -found.metrics["it"]["overshoot_error"]
+
+    top = int(np.argmax(overshoot))
+    around = np.log(gains[[max(top - 1, 0), min(top + 1, gains.size - 1)]])
+    best = minimize_scalar(overshoot_at, bounds=tuple(around.tolist()), method="bounded", options={"xatol": 1e-5})
+    return float(np.exp(best.x)), -float(best.fun)
+
+
+def _shares(gains: Array, where: NDArray[np.bool_]) -> str:
+    """How much of the range of gains some of them stand for: they are not evenly spaced, and are not counted."""
+    shares = []
+    for scale in (np.log(gains), gains):
+        edges = np.concatenate([scale[:1], 0.5 * (scale[1:] + scale[:-1]), scale[-1:]])
+        shares.append(100.0 * float(np.diff(edges)[where].sum() / (edges[-1] - edges[0])))
+    return f"on {shares[0]:.0f} % of the range of gains on a logarithmic scale ({shares[1]:.0f} % on a linear one)"
 
 
 def _digits(found: dict[str, float]) -> str:

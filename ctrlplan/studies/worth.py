@@ -17,7 +17,7 @@ from ctrlplan.planning.fastest import fastest_within
 from ctrlplan.planning.limits import Limited
 from ctrlplan.simulation import state_space
 from ctrlplan.studies.comparison import Comparison, compare, finite_or_none, is_builder, waypoints_given
-from ctrlplan.studies.measures import MEASURES
+from ctrlplan.studies.units import ROUNDING
 from ctrlplan.trajectories import (
     PiecewiseSpline,
     PolySpline,
@@ -38,6 +38,12 @@ DECISIVE = ("settling_time", "control_peak")
 PLANNED = "trigonometric"
 _JUMPING = ("step", "shaped step")
 _DEGREES = {1: "straight line", 3: "cubic", 5: "quintic", 7: "septic", 9: "nonic"}
+OWN_LIMITS = (
+    "The limits are not those of a plant: they are the peak velocity, acceleration and jerk of the polynomial through "
+    "these waypoints, which therefore needs exactly the time of the waypoints. Other limits give other durations."
+)
+"""What must be said where limits are the polynomial's own peaks."""
+
 SAME = 1e-3
 """Relative difference up to which values count as equal."""
 
@@ -61,6 +67,9 @@ class Grid:
     beside : tuple of str
         Rivals that are shown but do not count: steps, which keep no limit, or
         a bound that no plan can reach.
+    scale : float
+        Size of the number, of which a millionth is rounding; 0 where it is not
+        known.
     """
 
     title: str
@@ -70,6 +79,7 @@ class Grid:
     values: Array
     rivals: dict[str, Array]
     beside: tuple[str, ...] = ()
+    scale: float = 0.0
 
     def best(self, row: int) -> tuple[str, float]:
         """Rival that does best at one of the durations, and its value; nan where none has one."""
@@ -81,7 +91,8 @@ class Grid:
     def marks(self) -> list[list[str]]:
         """Whether each trigonometric plan wins against its best rival, loses, or neither: "win", "lose", ""."""
         return [
-            [_mark(value, self.best(row)[1]) for value in values] for row, values in enumerate(self.values.tolist())
+            [_mark(value, self.best(row)[1], ROUNDING * self.scale) for value in values]
+            for row, values in enumerate(self.values.tolist())
         ]
 
     @property
@@ -188,6 +199,7 @@ def worth(
     factors: Sequence[float] = FACTORS,
     decisive: Sequence[str] = DECISIVE,
     measure: Callable[[Trajectory, Any, float], Mapping[str, float]] | None = None,
+    baselines: Callable[[tuple[Waypoint, ...]], Mapping[str, Trajectory]] | None = None,
     note: str = "",
     **options: Any,
 ) -> Worth:
@@ -218,6 +230,8 @@ def worth(
         Metrics of the tables.
     measure : callable, optional
         Maps a plan, its response, and the time of the last waypoint to further metrics.
+    baselines : callable, optional
+        Maps waypoints to further plans by name, as `smoother_polynomials` does.
     note : str, optional
         What a reader must know of how it was made.
     **options
@@ -239,6 +253,11 @@ def worth(
     limited = Limited(reference, held, quantities)
     shaper = _shaper(loop, reference, mode)
     planned = TrigSpline(points, alpha=alpha)
+    if limits is None:
+        note = " ".join(filter(None, (note, OWN_LIMITS)))
+
+    def rivals_through(points: tuple[Waypoint, ...]) -> dict[str, Trajectory]:
+        return rival_plans(points, held, shaper) | dict(baselines(points) if baselines is not None else {})
 
     def compared(points: tuple[Waypoint, ...], plans: dict[str, Trajectory], only: Any = None) -> Comparison:
         last, late = points[-1].time, points[-1].time - reference.end
@@ -253,7 +272,7 @@ def worth(
             **options,
         )
 
-    beside: dict[str, Trajectory] = {PLANNED: planned} | rival_plans(points, held, shaper)
+    beside: dict[str, Trajectory] = {PLANNED: planned} | rivals_through(points)
     found = compared(points, beside)
     decisive = _measured(decisive, found)
     tables: list[dict[str, dict[str, float]]] = []
@@ -261,16 +280,19 @@ def worth(
     for factor in factors:
         scaled = _scaled(points, factor)
         shapes = {f"{a:g}": TrigSpline(scaled, alpha=a, warn=False) for a in alphas}
-        rivals = rival_plans(scaled, held, shaper)
-        rows = compared(scaled, shapes | rivals, set(decisive)).metrics
-        # What the plant cannot follow, and what an event has ended, loses.
-        lost = dict.fromkeys(decisive, np.inf)
-        tables.append({name: lost | rows.get(name, {}) for name in (*shapes, *rivals)})
+        rivals = rivals_through(scaled)
+        ran = compared(scaled, shapes | rivals, set(decisive))
+        # What the plant cannot follow loses, and so does a plan that an event has ended; a baseline so ended has no
+        # figure.
+        lost, none = dict.fromkeys(decisive, np.inf), dict.fromkeys(decisive, np.nan)
+        rows = {name: lost | ran.metrics.get(name, {}) for name in (*shapes, *rivals)}
+        tables.append(rows | {name: lost if name in shapes else none for name in ran.stopped})
         names |= dict.fromkeys(rivals)
     grids = tuple(
         Grid(
-            title={**MEASURES, **found.measures}[key].title,
+            title=found.measures[key].title,
             unit=found.measures[key].unit,
+            scale=found.scales.get(key, 0.0),
             durations=reference.duration * np.array(factors),
             alphas=np.array(alphas, dtype=float),
             values=np.array([[rows[f"{a:g}"][key] for a in alphas] for rows in tables]),
@@ -327,6 +349,44 @@ def rival_plans(
     if np.abs(jerk.jet(t, 0) - legs.jet(t, 0)).max() <= 1e-9 * np.abs(legs.jet(t, 0)).max():
         return plans | {f"{name} (minimum jerk)": legs}
     return plans | {name: legs, "minimum jerk": jerk}
+
+
+def smoother_polynomials(waypoints: Sequence[Waypoint]) -> dict[str, Trajectory]:
+    """Polynomials that are smoother at their ends than what the waypoints prescribe.
+
+    Parameters
+    ----------
+    waypoints : sequence of Waypoint
+        Two or more, all positions given.
+
+    Returns
+    -------
+    dict of str to Trajectory
+        Between two waypoints at rest the septic (jerk 0 at both ends) and the
+        nonic (snap 0 as well); through more, the plans of minimum snap and of
+        minimum fifth derivative with such ends, of these degrees segment by
+        segment. None where an end is not at rest.
+    """
+    points = tuple(waypoints)
+    ends = points[0], points[-1]
+    if any(np.nan_to_num(point.jet[1:], nan=1.0).any() for point in ends):
+        return {}
+    found: dict[str, Trajectory] = {}
+    for order, name in ((4, "septic"), (5, "nonic")):
+        if max(len(point.jet) for point in ends) > order:
+            continue
+        first, last = (_at_rest(point, order) for point in ends)
+        if len(points) == 2:
+            found[name] = PolySpline([first, last])
+        else:
+            found[f"{name} a segment"] = optimize_waypoints([first, *points[1:-1], last], order).plan
+    return found
+
+
+def _at_rest(point: Waypoint, entries: int) -> Waypoint:
+    """Same position, with so many entries, the derivatives 0."""
+    still = [0.0] * point.naxes
+    return Waypoint.from_dict(point.to_dict() | {"jet": [point.position.tolist(), *[still] * (entries - 1)]})
 
 
 def _measured(decisive: Sequence[str], found: Comparison) -> list[str]:
@@ -497,9 +557,9 @@ def _need_sentence(needs: Sequence[Need]) -> str:
     return f"Under the same limits {first.name} is the fastest with {first.duration:.4g} s ({others}{without})."
 
 
-def _mark(value: float, rival: float) -> str:
+def _mark(value: float, rival: float, rounding: float = 0.0) -> str:
     if math.isnan(value) or math.isnan(rival) or value == rival:
         return ""
-    if math.isfinite(value - rival) and abs(value - rival) <= SAME * max(abs(value), abs(rival)):
+    if math.isfinite(value - rival) and abs(value - rival) <= max(SAME * max(abs(value), abs(rival)), rounding):
         return ""
     return "win" if value < rival else "lose"

@@ -10,6 +10,7 @@ import control as ct
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ctrlplan._types import EventName
 from ctrlplan.systems.admissible import AdmissibleSet, Limits
 from ctrlplan.systems.exposed import state_signals
 from ctrlplan.systems.hybrid import checked_seconds, refuse_alone
@@ -78,8 +79,8 @@ class Governor(ct.NonlinearIOSystem):  # type: ignore[misc]
             sample=self.sample,
             feedthrough=False,  # between samples
             watched={
-                f"{name}: nothing admissible, reference held": (_refused, -math.inf, 0.5),
-                f"{name}: input lost, reference held": (_unread, -math.inf, 0.5),
+                EventName(f"{name}: nothing admissible, reference held"): (_refused, -math.inf, 0.5),
+                EventName(f"{name}: input lost, reference held"): (_unread, -math.inf, 0.5),
             },
         )
         self._count = len(references)

@@ -12,6 +12,7 @@ import control as ct
 import numpy as np
 from numpy.typing import NDArray
 
+from ctrlplan._types import EventName
 from ctrlplan.traits import declare
 
 Array = NDArray[np.float64]
@@ -109,7 +110,7 @@ def create_pid_iosystem(
     block = ct.nlsys(update, out, **names)
     if limits is not None:
         # What `ctrlplan.simulate` records the crossings of.
-        declare(block, watched={output: (partial(_asked, kp, kd / tf, bias), low, high)})
+        declare(block, watched={EventName(output, "was at its limit"): (partial(_asked, kp, kd / tf, bias), low, high)})
     return block
 
 

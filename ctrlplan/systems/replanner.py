@@ -12,6 +12,7 @@ import control as ct
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ctrlplan._types import EventName
 from ctrlplan.systems.hybrid import checked_seconds, refuse_alone
 from ctrlplan.systems.source import create_source_iosystem
 from ctrlplan.traits import Declared, declare
@@ -314,8 +315,8 @@ class _Correction(ct.NonlinearIOSystem):  # type: ignore[misc]
             samples_first=True,  # what is measured may follow the reference directly
             feedthrough=signals.feedthrough,
             watched={
-                f"{name}: input lost": (partial(_state, _LOST), -math.inf, 0.5),
-                f"{name}: goal out of reach": (partial(_state, _MISSED), -math.inf, 0.5),
+                EventName(f"{name}: input lost"): (partial(_state, _LOST), -math.inf, 0.5),
+                EventName(f"{name}: goal out of reach"): (partial(_state, _MISSED), -math.inf, 0.5),
             },
         )
         self._plan, self._horizons, self._signals, self._trigger, self._limits = (

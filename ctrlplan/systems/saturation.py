@@ -9,6 +9,7 @@ import control as ct
 import numpy as np
 from numpy.typing import NDArray
 
+from ctrlplan._types import EventName
 from ctrlplan.traits import declare
 
 Array = NDArray[np.float64]
@@ -54,7 +55,7 @@ def create_saturation_iosystem(
 
     block = ct.nlsys(None, out, inputs=[input], outputs=[output], dt=None, name=name)
     if math.isfinite(low) or math.isfinite(high):
-        declare(block, watched={output: (_asked, low, high)})
+        declare(block, watched={EventName(output, "was at its limit"): (_asked, low, high)})
     return block
 
 

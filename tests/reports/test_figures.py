@@ -526,3 +526,10 @@ def test_only_reports_use_pyplot():
     root = Path(cp.__file__).parent
     users = {p.relative_to(root).parts[0] for p in root.rglob("*.py") if "matplotlib.pyplot" in set(imports(p))}
     assert users == {"reports"}
+
+
+def test_derivatives_of_a_quotient_have_its_unit_in_brackets():
+    """A plan in deg/s: its derivative is in (deg/s)/s, and not in deg/s/s."""
+    plan = cp.PolySpline([cp.Waypoint(0, 0, 0), cp.Waypoint(1, 1, 0)])
+    labels = [axes.get_ylabel() for axes in plot_trajectory(plan, 2, units=["deg/s"]).axes]
+    assert labels == ["position [deg/s]", "velocity [(deg/s)/s]", "acceleration [(deg/s)/s$^2$]"]

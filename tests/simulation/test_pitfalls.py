@@ -94,8 +94,13 @@ def stopping(events):
 def test_a_plan_whose_run_is_ended_wins_nothing(tmp_path):
     found = stopping([cp.Event("u", high=15.0, stop=True)])
     assert found.responses["violent"].time[-1] < 1.0
+    assert found.stopped == {"violent": found.responses["violent"].time[-1]}
     assert "iae" in found.metrics["gentle"]
-    assert "iae" not in found.metrics["violent"]
+    violent = found.responses["violent"]
+    error = np.abs(found.plans["violent"](violent.time) - violent.outputs[0])
+    area = np.sum(0.5 * (error[1:] + error[:-1]) * np.diff(violent.time))
+    assert found.metrics["violent"]["iae"] == pytest.approx(area, rel=1e-2)
+    assert found.metrics["violent"]["iae"] < found.metrics["gentle"]["iae"]  # and yet it is not the best
     assert "the run was ended" in found.marks["violent"]
     assert any("With violent, u left its limits 1 times" in note for note in found.notes)
     page = found.report(tmp_path / "page.html").read_text(encoding="utf-8")

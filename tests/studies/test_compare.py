@@ -485,3 +485,16 @@ def test_report_writes_a_page_into_a_folder_or_a_file(standard, tmp_path):
 def test_a_comparison_cannot_be_changed(standard):
     with pytest.raises(AttributeError):
         standard.title = "other"
+
+
+def test_one_loop_of_several_may_be_unstable():
+    """A builder's loops differ from plan to plan: each is told by itself, whichever comes last."""
+    closed = {"good": loop(5.0), "bad": cp.plants.unity_feedback_loop([1], [1, -3], 1.0, outputs=("y", "u"))}
+    for order in (("good", "bad"), ("bad", "good")):
+        plans = {name: cp.PolySpline(MOVE) for name in order}
+        found = cp.compare(lambda name, plan: closed[name], plans, TIMES)
+        (note,) = found.notes
+        assert note.startswith("With bad, the loop is unstable: it has a pole at 2 1/s")
+        assert found.metrics["bad"]["settling_time"] == np.inf
+        assert found.metrics["good"]["settling_time"] == pytest.approx(8.02505, rel=1e-4)
+        assert "settling_time" in {v.key for v in verdicts(found)}

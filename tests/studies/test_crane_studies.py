@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import ctrlplan as cp
+from ctrlplan.reports import verdicts
 from ctrlplan.studies import crane as studies
 from ctrlplan.systems.plants import Crane, crane_loop
 
@@ -120,3 +121,76 @@ def test_linearised_loops_of_the_study_have_the_slowest_poles_of_the_notes():
     assert grows.real == pytest.approx(0.00030, abs=5e-6)
     assert abs(grows.imag) == pytest.approx(0.990, abs=5e-4)
     assert damped.real == pytest.approx(-0.87, abs=5e-3)
+
+
+@pytest.fixture(scope="module")
+def nominal():
+    """The step and one plan of the nominal study."""
+    points = studies.nominal_waypoints()
+    plans = {"step": (studies._step(points), studies._STEP), "polynomial": (cp.PolySpline(points), {})}
+    return studies._compared(plans, points, 30.0, "Nominal")
+
+
+def test_a_step_ends_where_the_rope_goes_slack(nominal):
+    """The first root of the tension, by an independent look at a run that goes on."""
+    plan = nominal.plans["step"]
+    loop = crane_loop(Crane(), plan, "still", force_limits=studies.FORCE_LIMITS, torque_limits=studies.TORQUE_LIMITS)
+    t = np.linspace(5.0, 6.5, 15001)
+    found = cp.simulate(loop, np.concatenate([[0.0], t]), events=())
+    tension = np.asarray(found.outputs)[found.output_labels.index("T")][1:]
+    at = int(np.flatnonzero(tension < 0.0)[0])
+    root = t[at - 1] + (t[at] - t[at - 1]) * tension[at - 1] / (tension[at - 1] - tension[at])
+    assert nominal.stopped == {"step": pytest.approx(root, abs=1e-5)}
+    assert nominal.stopped["step"] == pytest.approx(5.87, abs=0.005)  # MATH.md, section 6
+    assert nominal.responses["step"].time[-1] == nominal.stopped["step"]
+    assert nominal.responses["polynomial"].time[-1] == 30.0
+
+
+def test_what_a_step_did_outside_the_model_is_not_reported(nominal):
+    row = nominal.results()["plans"]["step"]["metrics"]
+    assert row["error_after"] is None
+    assert row["sway_after"] is None
+    assert row["slack_time"] == 0.0
+    assert row["error_limited"] is None
+    assert "slack" in nominal.marks["step"]
+    assert any("the run was ended at 5.866 s, and is measured up to then" in note for note in nominal.notes)
+    assert all("step" not in (*v.winners, *v.losers) for v in verdicts(nominal))
+    note = studies._step_note(nominal)
+    assert "slack at 5.87 s" in note
+    assert "nan" not in note
+
+
+def test_the_poles_of_the_pids_are_those_of_their_loops(nominal):
+    """Roots of (M s^2 + f s) s (Tf s + 1) + (Kp s + Ki)(Tf s + 1) + Kd s^2, gains of a triple pole at -5."""
+    said = nominal.parameters["PIDs"]
+    crane, w, tf = Crane(), 5.0, 0.02
+    b = crane.drum_radius
+    drives = (
+        (crane.trolley_mass, crane.trolley_friction),
+        (crane.drum_inertia / b + crane.load_mass * b, crane.drum_friction / b),
+    )
+    for mass, friction in drives:
+        kp, ki, kd = 3 * mass * w**2, mass * w**3, 3 * mass * w - friction
+        closed = np.polymul(np.polymul([mass, friction, 0], [1, 0]), [tf, 1])
+        closed = np.polyadd(closed, np.polymul([kp, ki], [tf, 1]))
+        closed = np.polyadd(closed, [kd, 0, 0])
+        for pole in np.roots(closed):
+            if pole.imag > 0:
+                assert f"−{-pole.real:.3g} ± {pole.imag:.3g}j" in said
+
+
+def test_drives_are_at_their_limits_and_do_not_leave_them(nominal):
+    (note,) = (note for note in nominal.notes if note.startswith("With step"))
+    assert "F was at its limit" in note
+    assert "C was at its limit" in note
+    assert "left its limits" not in note.replace("rope tension left its limits", "")
+
+
+def test_no_control_of_the_crane_is_ranked_with_another_unit(nominal):
+    row = nominal.metrics["polynomial"]
+    assert math.isnan(row["control_peak"])
+    found = nominal.responses["polynomial"]
+    force = np.abs(np.asarray(found.outputs)[found.output_labels.index("F")]).max()
+    assert row["control_peak_F"] == pytest.approx(force, rel=5e-3)  # between samples, too
+    assert "control_effort_C" in nominal.measures
+    assert "the worst of x, z" in nominal.parameters["figures"]

@@ -1,11 +1,15 @@
 """The paper's section 2: the table, the jumps, and what is said where the paper differs."""
 
+import re
+
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 import ctrlplan as cp
 from ctrlplan.studies import PAPER, Study, linear_study
+from ctrlplan.studies.linear import _shares, overshoot_peak
 
 MOVE = [cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1, 0, 0)]
 TIMES = np.linspace(0.0, 20.0, 8001)
@@ -139,13 +143,70 @@ def test_notes_say_where_the_paper_differs_and_why(study):
 
 def test_notes_tell_what_the_numbers_say(study):
     gains, sweep = study.sweep.values, study.sweep.metrics
-    top = int(np.argmax(sweep["trigonometric"]["overshoot_error"]))
     (peak,) = (note for note in study.notes if "peaks at" in note)
-    assert f"{sweep['trigonometric']['overshoot_error'][top]:.4g} % at k = {gains[top]:.3g}" in peak
-    slower = gains[sweep["trigonometric"]["settling_time"] > sweep["step"]["settling_time"]]
-    (count,) = (note for note in study.notes if "sooner than the trigonometric plan" in note)
-    assert f"{slower.size} of {gains.size} gains" in count
-    assert f"{slower.max():.3g}" in count
+    assert "It peaks at 51.065 % at k = 12.50 " in peak  # MATH.md, section 6
+    later = sweep["trigonometric"]["settling_time"] > sweep["step"]["settling_time"]
+    (share,) = (note for note in study.notes if "sooner than the trigonometric plan" in note)
+    assert f"at no gain above k = {gains[later].max():.3g}" in share
+    said = re.search(r"on (\d+) % of the range of gains on a logarithmic scale \((\d+) % on a linear one\)", share)
+    # By Monte Carlo: gains drawn evenly on each scale, each answered for by the nearest gain swept.
+    rng = np.random.default_rng(0)
+    for scale, percent in zip((np.log(gains), gains), map(int, said.groups()), strict=True):
+        drawn = rng.uniform(scale[0], scale[-1], 40_000)
+        nearest = np.abs(scale[:, None] - drawn).argmin(axis=0)
+        assert percent == pytest.approx(100 * later[nearest].mean(), abs=1.5)
+
+
+def test_the_peak_of_the_overshoot_lies_between_the_gains_swept():
+    """Independent integration: lower at both sides of the gain found, and the peak there."""
+
+    def overshoot(k):
+        plan = cp.TrigSpline(MOVE, alpha=1.0)
+        t = np.linspace(0.0, 3.0, 3001)
+        options = {"method": "DOP853", "rtol": 1e-12, "atol": 1e-13}
+        inside = solve_ivp(
+            lambda s, x: [x[1], k * (float(plan(s)) - x[0]) - x[1]], (0, 1), [0, 0], t_eval=t[t <= 1], **options
+        )
+        after = solve_ivp(
+            lambda s, x: [x[1], k * (1.0 - x[0]) - x[1]], (1, 3), inside.y[:, -1], t_eval=t[t >= 1], **options
+        )
+        y = np.concatenate([inside.y[0], after.y[0][1:]])
+        top = int(np.argmax(y - plan(t)))
+        return 100 * np.polyval(
+            fit := np.polyfit(t[top - 2 : top + 3] - t[top], (y - plan(t))[top - 2 : top + 3], 2),
+            -fit[1] / (2 * fit[0]),
+        )
+
+    gain, peak = overshoot_peak(np.array([5.0, 20.0, 100.0]), np.array([44.5, 48.9, 11.5]))
+    assert (gain, peak) == (pytest.approx(12.50, abs=0.01), pytest.approx(51.065, abs=1e-3))
+    assert peak == pytest.approx(overshoot(gain), abs=1e-4)
+    assert overshoot(gain - 0.5) < peak > overshoot(gain + 0.5)
+
+
+@pytest.mark.parametrize("gain", [0.3, 5.0, 400.0])
+def test_equation_1_lacks_a_factor_and_a_sign(gain):
+    """Printed: 1/w_n^2 + e^(-xi w_n t) sin(w_p t + phi)/(w_n w_p) with phi the argument of a pole, xi = cos phi."""
+    lower = min(np.roots([1.0, 1.0, gain]), key=lambda pole: pole.imag)
+    phi, wn = np.angle(lower), abs(lower)
+    xi = -np.cos(phi)
+    wp = wn * np.sqrt(1 - xi**2)
+    t = np.linspace(0, 10, 101)
+    printed = 1 / wn**2 + np.exp(-xi * wn * t) * np.sin(wp * t + phi) / (wn * wp)
+    step = cp.simulate(cp.plants.integrator_lag_loop(gain), t, cp.Step(1.0)).outputs
+    np.testing.assert_allclose(gain * printed, step, rtol=0, atol=1e-11)
+
+
+def test_shares_are_of_the_range_and_not_of_the_count():
+    """Ten gains crowded in a hundredth of the range are a hundredth of it."""
+    gains = np.concatenate([np.linspace(1.0, 1.01, 10), [2.0, 1000.0]])
+    crowded = gains <= 1.01
+    log, linear = map(int, re.findall(r"(\d+) %", _shares(gains, crowded)))
+    assert log == round(100 * np.log(np.sqrt(1.01 * 2.0)) / np.log(1000.0))
+    assert linear == 0
+
+
+def test_the_limits_of_the_benefit_are_said_to_be_the_polynomials_own(study):
+    assert "peak velocity, acceleration and jerk of the polynomial" in study.comparison.worth.note
 
 
 def test_the_limit_point_of_the_step_is_that_of_the_paper():

@@ -370,3 +370,22 @@ def test_a_study_error_is_a_value_error():
 
 def test_the_data_of_these_tests_is_valid(stated):
     assert list(stated(VALID).plans) == ["trigonometric", "poly", "legs", "step"]
+
+
+def test_a_crane_of_a_file_ends_at_the_slack_rope(tmp_path):
+    data = {
+        "t_end": 10.0,
+        "samples": 501,
+        "loop": {"kind": "crane", "force_limits": [-30e3, 30e3], "torque_limits": [-3e3, 1e3]},
+        "plans": [{"family": "step"}, {"family": "polynomial"}],
+        "waypoints": [
+            {"time": 0.0, "x": [0.0, 0.0, 0.0], "z": [10.0, 0.0, 0.0]},
+            {"time": 9.0, "x": [20.0, 0.0, 0.0], "z": [11.0, 0.0, 0.0]},
+        ],
+    }
+    path = tmp_path / "crane.toml"
+    path.write_text(to_toml(data), encoding="utf-8")
+    found = load_study(path).run().comparison
+    assert found.stopped == {"step": pytest.approx(5.866, abs=1e-3)}
+    assert found.responses["step"].time[-1] == found.stopped["step"]
+    assert "slack" in found.marks["step"]

@@ -10,7 +10,7 @@ from scipy.interpolate import make_interp_spline
 from scipy.optimize import brentq
 
 import ctrlplan as cp
-from ctrlplan.studies.worth import Grid, Need, Worth, rival_plans, worth
+from ctrlplan.studies.worth import Grid, Need, Worth, rival_plans, smoother_polynomials, worth
 from ctrlplan.trajectories import SCurve, Shaper, Trapezoid
 
 MOVE = [cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1, 0, 0)]
@@ -421,13 +421,17 @@ def test_a_loop_without_controls_has_a_table_of_settling_alone():
     assert [grid.title for grid in found.grids] == ["Settling time"]
 
 
-def test_a_move_there_and_back_has_no_winner():
-    """Nothing is settled where the end is the beginning: undefined is neither won nor lost."""
+def test_a_move_there_and_back_is_settled_relative_to_its_range():
+    """The end is the beginning: a step there is none, and has no figure; every other plan has a range."""
     points = [cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1), cp.Waypoint(2, 0, 0, 0)]
     found = worth(loop(100.0), points, TIMES, alpha=1.0, alphas=(0.0, 1.0), factors=(1.0,))
-    assert np.isnan(found.grids[0].values).all()
-    assert found.grids[0].marks() == [["", ""]]
+    assert np.isfinite(found.grids[0].values).all()
+    assert np.isnan(found.grids[0].rivals["step"]).all()
     assert "nan" not in " ".join(found.verdicts)
+    plan = found.comparison.plans["trigonometric"]
+    y = cp.simulate(loop(100.0), t := np.linspace(0, 12, 120_001), plan).outputs[0]
+    last = np.flatnonzero(np.abs(y) > 0.02 * plan(t).max())[-1]
+    assert found.grids[0].values[0, 1] == pytest.approx(t[last], abs=2e-4)
 
 
 def test_a_run_that_is_ended_loses():
@@ -610,3 +614,49 @@ def test_what_cannot_be_asked():
         worth(loop(5.0), MOVE, TIMES, alpha=1.0, limits={"velocity": -1.0})
     with pytest.raises(ValueError, match=r"decisive"):
         worth(loop(5.0), MOVE, TIMES, alpha=1.0, decisive=("beauty",), alphas=(1.0,), factors=(1.0,))
+
+
+# Smoother baselines
+
+
+def test_smoother_polynomials_are_at_rest_to_higher_orders():
+    """Between two waypoints the septic and the nonic, by their Hermite data; through more, those and the points."""
+    two = [cp.Waypoint.from_jets(1, x=[0, 0, 0], z=[10, 0, 0]), cp.Waypoint.from_jets(3, x=[4, 0, 0], z=[9, 0, 0])]
+    for points, names in ((two, ["septic", "nonic"]), (VIA, ["septic a segment", "nonic a segment"])):
+        found = smoother_polynomials(points)
+        assert list(found) == names
+        for plan, order in zip(found.values(), (3, 4), strict=True):
+            assert plan.labels == ("x", "z")
+            for point in (points[0], points[-1]):
+                np.testing.assert_allclose(plan.jet(point.time, order)[1:], 0.0, rtol=0, atol=1e-8)
+            for point in points:
+                np.testing.assert_allclose(plan.jet(point.time, 2)[: len(point.jet)], point.jet, rtol=0, atol=1e-8)
+            assert not plan.jumps(order - 1)
+
+
+def test_ends_that_are_not_at_rest_have_no_smoother_polynomial():
+    assert smoother_polynomials([cp.Waypoint(0, 0, 1.0, 0), cp.Waypoint(1, 1, 0, 0)]) == {}
+    assert smoother_polynomials([cp.Waypoint(0, 0, None, 0), cp.Waypoint(1, 1, 0, 0)]) == {}
+
+
+def test_further_baselines_are_compared_and_count():
+    few = {"alphas": (1.0,), "factors": (1.0,), "decisive": ("settling_time",)}
+    found = worth(loop(100.0), MOVE, TIMES, alpha=1.0, baselines=smoother_polynomials, **few)
+    assert {"septic", "nonic"} <= set(found.comparison.plans)
+    assert {"septic", "nonic"} <= set(found.grids[0].rivals)
+    assert {"septic", "nonic"} <= {need.name for need in found.needs}
+
+
+def test_own_limits_are_said_to_be_so_and_given_ones_are_not():
+    few = {"alphas": (1.0,), "factors": (1.0,), "decisive": ("settling_time",)}
+    own = worth(loop(100.0), MOVE, TIMES, alpha=1.0, note="Mine.", **few)
+    assert own.note.startswith("Mine. The limits are not those of a plant")
+    given = worth(loop(100.0), MOVE, TIMES, alpha=1.0, note="Mine.", limits={"velocity": 3.0}, **few)
+    assert given.note == "Mine."
+
+
+def test_rounding_beside_the_scale_is_no_defeat():
+    tied = Grid("Overshoot", "%", np.ones(1), np.ones(1), np.array([[3e-7]]), {"one": np.zeros(1)}, scale=100.0)
+    assert tied.marks() == [[""]]
+    lost = Grid("Overshoot", "%", np.ones(1), np.ones(1), np.array([[3e-3]]), {"one": np.zeros(1)}, scale=100.0)
+    assert lost.marks() == [["lose"]]

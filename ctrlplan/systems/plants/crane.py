@@ -169,7 +169,7 @@ class Crane:
     # The flat maps
 
     def quantities(self, jet: ArrayLike) -> dict[str, Array]:
-        """States, tension and inputs from the jet of the load, (15a-d) corrected.
+        """States, tension and inputs from the jet of the load, (15a-d), in (15c) with the quadrant.
 
         Parameters
         ----------

@@ -1,0 +1,139 @@
+"""Whether a reference reaches the outputs that should follow it."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctrlplan.simulation import prepared_form
+from ctrlplan.trajectories import Trajectory
+
+_LOOKS = np.array([0.0, 0.0312, 0.1234, 0.25, 0.3456, 0.5, 0.6543, 0.75, 0.8765, 1.0])
+"""Where two plans are compared, as fractions of the duration of one."""
+
+
+def check_reached(system: Any, outputs: Sequence[str], plan: Trajectory | None = None) -> None:
+    """Reject a loop in which a reference reaches nothing.
+
+    What depends on what is read off the wiring and the matrices of linear
+    blocks; a block that is not linear passes on every input.
+
+    Parameters
+    ----------
+    system : control system or Prepared
+        A loop.
+    outputs : sequence of str
+        Outputs that follow the plan.
+    plan : Trajectory, optional
+        The reference, where a block inside the loop may be its source.
+
+    Raises
+    ------
+    ValueError
+        If an input of the loop, or an axis of the plan inside, reaches none of
+        `outputs`, another source inside reaches no output at all, or an input
+        for a derivative of a source is connected to nothing.
+    """
+    network = prepared_form(system).network
+    if network is None or not network.blocks:
+        return
+    tracked = [list(system.output_labels).index(name) for name in outputs]
+    followed = _reaching(network, np.any(network.read[tracked] != 0.0, axis=0))
+    seen = _reaching(network, np.any(network.read != 0.0, axis=0))
+    idle = [label for label, reaches in zip(system.input_labels or (), followed, strict=False) if not reaches]
+    if idle:
+        raise _unconnected(system, network, f"input {', '.join(idle)} that reaches none of {', '.join(outputs)}")
+    carried = np.zeros(0 if plan is None else plan.naxes, dtype=bool)
+    used, sources = carried.copy(), []
+    for block, place in zip(network.blocks, network.outputs, strict=True):
+        source = block.plan
+        if source is None:
+            continue
+        width = (place.stop - place.start) // source.naxes
+        for axis in range(source.naxes):
+            signals = slice(place.start + axis * width, place.start + (axis + 1) * width)
+            same = np.zeros(0, dtype=bool) if plan is None else _same_axes(plan, source, axis)
+            carried |= same
+            used |= same & followed[signals].any()
+            if same.any():
+                sources.append(block.name)
+            elif not seen[signals].any():
+                names = ", ".join(block.system.output_labels[axis * width : (axis + 1) * width])
+                raise _unconnected(system, network, f"{names} of block {block.name} that reach no output")
+    _check_derivatives(system, network)
+    if plan is not None and np.any(carried & ~used):
+        axes = ", ".join(np.array(plan.labels)[carried & ~used])
+        what = f"{axes} of block {', '.join(dict.fromkeys(sources))} that reaches none of {', '.join(outputs)}"
+        raise _unconnected(system, network, what)
+
+
+def _check_derivatives(system: Any, network: Any) -> None:
+    """Reject an input for a derivative of a reference that no source outputs: it would be 0."""
+    known = {
+        _plain(label) for block in network.blocks if block.plan is not None for label in block.system.output_labels
+    }
+    for block, label in _open_inputs(network):
+        if _plain(label) in known:
+            what = f"{block}.{label}, to which nothing is connected: give the source more derivatives"
+            raise ValueError(f"references must be connected in the loop {system.name}, got {what}")
+
+
+def _plain(label: str) -> str:
+    """Label of a signal without that of its derivative."""
+    return re.sub(r"_d[0-9]+$", "", label)
+
+
+def _unconnected(system: Any, network: Any, what: str) -> ValueError:
+    left = [f"{block}.{label}" for block, label in _open_inputs(network)]
+    to_do = f"; inputs of blocks that nothing is connected to: {', '.join(left)}" if left else ""
+    return ValueError(f"references must be connected in the loop {system.name}, got {what}{to_do}")
+
+
+def _open_inputs(network: Any) -> Iterator[tuple[str, str]]:
+    """Inputs of blocks (block, label) that are connected to no signal, and so 0."""
+    for block, place in zip(network.blocks, network.inputs, strict=True):
+        for label, row in zip(block.system.input_labels or (), network.wire[place], strict=True):
+            if not row.any():
+                yield block.name, label
+
+
+def _reaching(network: Any, wanted: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Which signals some others depend on, in time."""
+    found = wanted.copy()
+    depends = [_depends(block) for block in network.blocks]
+    while True:
+        before = np.count_nonzero(found)
+        for block, outs, ins in zip(depends, network.outputs, network.inputs, strict=True):
+            needed = block[found[outs]].any(axis=0)
+            found |= np.any(network.wire[ins][needed] != 0.0, axis=0)
+        if np.count_nonzero(found) == before:
+            return found
+
+
+def _depends(block: Any) -> NDArray[np.bool_]:
+    """Which outputs of a block depend on which inputs, directly or through states, (noutputs, ninputs)."""
+    if block.delay is not None:  # signal by signal
+        return np.eye(block.system.noutputs, dtype=bool)
+    if not block.linear:
+        return np.ones((block.system.noutputs, block.system.ninputs or 0), dtype=bool)
+    a, b, c, d = (np.asarray(getattr(block.system, name)) != 0.0 for name in "ABCD")
+    if not len(a) and not d.any():  # a gain that is 0 now, and connected
+        return np.ones(d.shape, dtype=bool)
+    moved = b
+    for _ in range(len(a)):
+        moved = moved | (a @ moved)
+    return np.asarray(d | (c @ moved))
+
+
+def _same_axes(plan: Trajectory, source: Trajectory, axis: int) -> NDArray[np.bool_]:
+    """Which axes of a plan an axis of a source is."""
+    if source is plan:
+        return np.arange(plan.naxes) == axis
+    t = plan.start + _LOOKS * (plan.duration or 1.0)
+    mine, other = plan.jet(t, 0)[0], source.jet(t, 0)[0, axis]
+    size = np.abs(mine).max(axis=1)
+    return np.asarray(np.all(np.abs(mine - other) <= 1e-12 * size[:, None], axis=1) & (np.ptp(mine, axis=1) > 0.0))
