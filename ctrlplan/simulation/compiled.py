@@ -207,6 +207,8 @@ class Compiled:
 
     def _at_many(self, name: str, t: Array, x: Array, driven: Array, p: Array) -> Array:
         function = self._functions[name]
+        if not function.numel_out(0):  # a system without inputs and outputs has no signals
+            return np.zeros((0, t.size))
         at_all = recent(self._maps, (name, t.size), _KEPT, lambda: function.map(t.size))
         return _called(at_all, (t, x, driven, np.repeat(p[:, None], t.size, axis=1)), function.numel_out(0))
 

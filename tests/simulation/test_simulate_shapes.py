@@ -178,3 +178,12 @@ def test_parameters_of_a_response_are_those_given():
     found = cp.simulate(system, t, 1.0, params=given)
     given["k"] = 5.0
     assert found.params == {"k": 4.0}
+
+
+@pytest.mark.parametrize("method", ["auto", "compiled", "python"])
+def test_a_system_of_states_alone(method):
+    times = np.linspace(0.0, 3.0, 31)
+    system = ct.nlsys(lambda t, x, u, p: [-(x[0] ** 2)], None, inputs=0, outputs=0, states=1)
+    found = cp.simulate(system, times, None, [1.0], method=method)
+    assert found.outputs.shape == found.inputs.shape == (0, times.size)
+    assert np.abs(found.states[0] - 1.0 / (1.0 + times)).max() <= 1e-6 * np.ptp(found.states[0])
