@@ -214,12 +214,24 @@ def input_drives(labels: Sequence[str], inputs: Inputs, times: Array) -> list[Dr
     return [_drive(value, name, times) for value, name in zip(given, labels, strict=True)]
 
 
+def rounding_of(drives: Sequence[Drive], times: Array) -> Array:
+    """Rounding errors of signals (nsignals,), by their largest values at some times: a sum may cancel elsewhere."""
+    largest = np.abs(driven_signals(drives, times)).max(axis=1, initial=0.0)
+    return np.asarray(64.0 * np.finfo(float).eps * np.where(np.isfinite(largest), largest, 0.0))
+
+
 def driven_signals(drives: Sequence[Drive], times: Array) -> Array:
     """All signals of some drives (nsignals, ntime), right-continuous."""
     return np.concatenate([np.zeros((0, times.size)), *(drive.at(times) for drive in drives)])
 
 
-def resolved(signals: Callable[[Array], Array], left: float, right: float, tolerance: float = RESOLVED) -> list[Series]:
+def resolved(
+    signals: Callable[[Array], Array],
+    left: float,
+    right: float,
+    tolerance: float = RESOLVED,
+    rounding: Array | float = 0.0,
+) -> list[Series]:
     """Series of analytic signals over a leg, as many as it takes.
 
     Parameters
@@ -229,7 +241,9 @@ def resolved(signals: Callable[[Array], Array], left: float, right: float, toler
     left, right : float
         The leg [s].
     tolerance : float, optional
-        Greatest size of what is cut off, relative to each signal.
+        Maximum size of what is cut off, relative to each signal.
+    rounding : ndarray, shape (nsignals,), or float, optional
+        Rounding errors of the signals, which no halving makes smaller.
     """
     # Never at the ends, where a neighbouring leg might be asked.
     duration = right - left
@@ -240,20 +254,20 @@ def resolved(signals: Callable[[Array], Array], left: float, right: float, toler
         coefficients = chebyshev_coefficients(signals(chebyshev_times(0.0, duration, width)))
         size = np.abs(coefficients)
         allowed = size.max(axis=1, keepdims=True)
-        if np.all(size[:, -3:] <= tolerance * allowed):
+        if np.all(size[:, -3:] <= np.maximum(tolerance * allowed, np.reshape(rounding, (-1, 1)))):
             return [_unbounded(left, right, coefficients)]
     # Terms that no longer fall are rounding errors of the signal itself, which shorter legs make no smaller: where a
     # plan comes to rest, its derivatives are next to nothing beside it.
     half, end = size[:, width // 2 : -width // 4], size[:, -width // 4 :]
     noise = np.maximum(half.max(axis=1), end.max(axis=1))
     flat = half.max(axis=1) <= 10.0 * end.max(axis=1)
-    if np.all(noise <= np.where(flat, _FLAT, max(_NOISE, 10.0 * tolerance)) * allowed[:, 0]):
+    if np.all(noise <= np.maximum(np.where(flat, _FLAT, max(_NOISE, 10.0 * tolerance)) * allowed[:, 0], rounding)):
         return [_unbounded(left, right, coefficients)]
     middle = 0.5 * (left + right)
     if not left < middle < right or duration < 1e-12 * max(abs(left), abs(right)):
         return [_unbounded(left, right, coefficients)]
-    first = resolved(signals, left, middle, tolerance)
-    return first + resolved(lambda s: signals(s + (middle - left)), middle, right, tolerance)
+    first = resolved(signals, left, middle, tolerance, rounding)
+    return first + resolved(lambda s: signals(s + (middle - left)), middle, right, tolerance, rounding)
 
 
 def chebyshev_times(left: float, right: float, width: int) -> Array:

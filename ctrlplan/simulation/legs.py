@@ -22,6 +22,7 @@ from ctrlplan.simulation.drives import (
     chebyshev_coefficients,
     chebyshev_times,
     resolved,
+    rounding_of,
 )
 from ctrlplan.simulation.interpreted import Interpreted, SolverError
 from ctrlplan.simulation.network import Network
@@ -184,6 +185,7 @@ def integrate(
     if pause is not None:
         longest = min(longest, (last - first) / 64.0)
     shortest = 1e-9 * (last - first) if pause is not None else np.inf
+    rounding = rounding_of(drives, np.union1d(np.linspace(first, last, 257), clock.marks))
     known: list[tuple[Array, Array]] = []  # times and states of each leg, its end left to the next
     legs: list[tuple[float, Series]] = []
     span: list[Series] = []
@@ -199,7 +201,7 @@ def integrate(
             accuracy = resolution if memory.delays else RESOLVED
             span = [
                 series.bounded(*_bounds(drives, moment, series.left, series.right))
-                for series in resolved(partial(_beside, drives, moment, left), left, until, accuracy)
+                for series in resolved(partial(_beside, drives, moment, left), left, until, accuracy, rounding)
             ]
         series = next(s for s in span if left < s.right)
         right = min(right, series.right)
@@ -286,6 +288,11 @@ class _Clock:
                 )
             self._periods[i] = _fraction(traits.period or 0.0)
             heapq.heappush(self._samples, (_fraction(first) + _fraction(traits.offset), i))
+
+    @property
+    def marks(self) -> list[float]:
+        """Breakpoints, and the end of the run."""
+        return self._fixed
 
     def following(self, t: float) -> float:
         """The next instant after t."""

@@ -121,3 +121,25 @@ def test_a_number_of_the_gear_is_an_index():
     found = cp.simulate(block, T, {"gear": 4.0, "r": PLAN})
     assert np.abs(found.outputs - 12.0 * np.array(lag_response(PLAN, T))).max() < 1e-6
     assert found.method == "python"
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_plan_whose_terms_cancel_is_followed_to_their_rounding(method):
+    """A shaped S-curve: where its jerk cancels, what is left is rounding, which no shorter segment makes smaller."""
+    curve = cp.SCurve([9.0], velocity=2.3, acceleration=0.9, jerk=1.7, labels=["r"])
+    plan = cp.Shaper.zv(0.93, 0.02)(curve)
+    block = ct.nlsys(
+        lambda t, x, u, params: [u[0] + 0.3 * u[2] + 0.1 * u[3] - x[0]],
+        inputs=["r", "r_d1", "r_d2", "r_d3"],
+        outputs="y",
+        states="y",
+        name="lag",
+    )
+    plain = ct.ss([[-1.0]], [[1.0, 0.0, 0.3, 0.1]], [[1.0]], [[0.0] * 4], inputs=block.input_labels, outputs="y")
+    t = np.linspace(0, 15, 151)
+    loops = [
+        ct.interconnect([cp.create_source_iosystem(plan, 3), system], inputs=0, outputs="y")
+        for system in (block, plain)
+    ]
+    found, exact = cp.simulate(loops[0], t, method=method), cp.simulate(loops[1], t, method="exact")
+    assert np.abs(found.outputs - exact.outputs).max() < 1e-7
