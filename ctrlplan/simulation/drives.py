@@ -214,12 +214,6 @@ def input_drives(labels: Sequence[str], inputs: Inputs, times: Array) -> list[Dr
     return [_drive(value, name, times) for value, name in zip(given, labels, strict=True)]
 
 
-def rounding_of(drives: Sequence[Drive], times: Array) -> Array:
-    """Rounding errors of signals (nsignals,), by their largest values at some times: a sum may cancel elsewhere."""
-    largest = np.abs(driven_signals(drives, times)).max(axis=1, initial=0.0)
-    return np.asarray(64.0 * np.finfo(float).eps * np.where(np.isfinite(largest), largest, 0.0))
-
-
 def driven_signals(drives: Sequence[Drive], times: Array) -> Array:
     """All signals of some drives (nsignals, ntime), right-continuous."""
     return np.concatenate([np.zeros((0, times.size)), *(drive.at(times) for drive in drives)])

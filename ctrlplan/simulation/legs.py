@@ -22,7 +22,6 @@ from ctrlplan.simulation.drives import (
     chebyshev_coefficients,
     chebyshev_times,
     resolved,
-    rounding_of,
 )
 from ctrlplan.simulation.interpreted import Interpreted, SolverError
 from ctrlplan.simulation.network import Network
@@ -46,6 +45,9 @@ _TOLERANCE = 1e-12
 
 _DENOMINATOR = 10**7
 """Largest denominator of times that are taken for fractions."""
+
+_ROUNDINGS = 64.0
+"""Rounding errors of a plan, in units of the last place of its largest values."""
 
 _LEGS = 2_000
 """Legs that blocks may ask for in a run."""
@@ -185,7 +187,9 @@ def integrate(
     if pause is not None:
         longest = min(longest, (last - first) / 64.0)
     shortest = 1e-9 * (last - first) if pause is not None else np.inf
-    rounding = rounding_of(drives, np.union1d(np.linspace(first, last, 257), clock.marks))
+    # A plan whose terms cancel in a segment has there the rounding errors of its largest values.
+    largest = np.abs(known_before(drives, np.union1d(np.linspace(first, last, 257), clock.marks))).max(axis=1)
+    rounding = _ROUNDINGS * np.finfo(float).eps * np.where(np.isfinite(largest), largest, 0.0)
     known: list[tuple[Array, Array]] = []  # times and states of each leg, its end left to the next
     legs: list[tuple[float, Series]] = []
     span: list[Series] = []
@@ -333,6 +337,14 @@ def _fraction(seconds: float) -> Fraction:
     """The fraction that a decimal or a quotient of small numbers was meant to be; otherwise the number itself."""
     simple = Fraction(seconds).limit_denominator(_DENOMINATOR)
     return simple if abs(float(simple) - seconds) <= 1e-15 * abs(seconds) else Fraction(seconds)
+
+
+def known_before(drives: Sequence[Drive], times: Array) -> Array:
+    """Signals (nsignals, ntime) that are known before a run; 0 for those that a delay outputs."""
+    rows = [
+        np.zeros((drive.width, times.size)) if isinstance(drive, DelayedDrive) else drive.at(times) for drive in drives
+    ]
+    return np.concatenate([np.zeros((0, times.size)), *rows])
 
 
 def _beside(drives: Sequence[Drive], moment: float, origin: float, s: Array) -> Array:

@@ -17,7 +17,7 @@ from ctrlplan.simulation.drives import Drive, breakpoints_of, driven_signals
 from ctrlplan.simulation.events import Snapshot, Watched
 from ctrlplan.simulation.interpreted import Interpreted, InterpretedSolver, SolverError
 from ctrlplan.simulation.job import Job, Record, unused, with_looks
-from ctrlplan.simulation.legs import Run, integrate
+from ctrlplan.simulation.legs import Run, integrate, known_before
 from ctrlplan.simulation.network import Network
 from ctrlplan.simulation.prepared import NotCompiledError
 from ctrlplan.simulation.scales import PASSES, Scales, Tolerances, doubt
@@ -137,7 +137,7 @@ class _Attempt:
             with_looks(job.times, self.watched, self._slope),
             job.state,
             resolution=10.0 * job.rtol,
-            marks=self.solver.instants(job.first, float(job.times[-1]), lambda t: driven_signals(self.drives, t)),
+            marks=self.solver.instants(job.first, float(job.times[-1]), lambda t: known_before(self.drives, t)),
             pause=self._pause if self.stops else None,
         )
         self._compare()
