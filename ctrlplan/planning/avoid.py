@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.integrate import trapezoid
 from scipy.optimize import minimize
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
@@ -123,7 +124,7 @@ def avoid(
             reached, certificate = _search(task, build, way)
             if certificate.certified:
                 found.append(reached)
-            elif certificate.least > best.least:
+            elif certificate.lower > best.least:  # certainly better: rounding is a tie, and the earlier plan stays
                 best = certificate
         if found:
             plan = min(found, key=task.roughness)
@@ -229,8 +230,8 @@ class _Task:
 def _roughness(t: Array, jet: Array, size: float) -> Array:
     """What the docstring of `avoid` says, by the trapezoidal rule, from jets (order + 1, 2, ..., ntime)."""
     duration = t[-1] - t[0]
-    jerk = np.trapezoid(np.sum(jet[3] ** 2, axis=0), t)
-    return np.asarray(duration**5 / (720.0 * size**2) * jerk + np.trapezoid(np.hypot(*jet[1]), t) / size)
+    jerk = trapezoid(np.sum(jet[3] ** 2, axis=0), t)
+    return np.asarray(duration**5 / (720.0 * size**2) * jerk + trapezoid(np.hypot(*jet[1]), t) / size)
 
 
 def _checked_plan(plan: Trajectory) -> Spline:
@@ -321,7 +322,8 @@ def _barred(task: _Task, nodes: Array, edges: Pairs, margin: float) -> Iterator[
 def _shortest(nodes: Array, edges: Pairs, npoints: int) -> list[Array]:
     """Shortest polyline from each waypoint to the next; none if one cannot be reached."""
     lengths = np.hypot(*(nodes[:, edges[1]] - nodes[:, edges[0]]))
-    graph = csr_array((lengths, (edges[0], edges[1])), shape=(nodes.shape[1],) * 2)
+    # csgraph of scipy 1.14 reads indices of 32 bits only.
+    graph = csr_array((lengths, tuple(edges.astype(np.int32))), shape=(nodes.shape[1],) * 2)
     far, before = dijkstra(graph, directed=False, indices=range(npoints - 1), return_predecessors=True)
     way = []
     for leg in range(npoints - 1):

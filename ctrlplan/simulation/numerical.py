@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.integrate import trapezoid
 
 from ctrlplan.simulation.compared import telling_states
 from ctrlplan.simulation.drives import Drive, breakpoints_of, driven_signals
@@ -155,7 +156,7 @@ class _Attempt:
         if t.size < 2 or not slopes.size or not np.isfinite(slopes).all():
             return False
         rates = np.maximum(np.linalg.eigvals(slopes).real.max(axis=1), 0.0)
-        return float(np.trapezoid(rates, t)) > math.log(_GROWTH)
+        return float(trapezoid(rates, t)) > math.log(_GROWTH)
 
     @property
     def _tolerances(self) -> Tolerances:

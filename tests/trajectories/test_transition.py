@@ -11,6 +11,7 @@ from scipy.interpolate import BPoly
 from trajectory_oracle import Direct
 
 from ctrlplan.trajectories import PolySpline, TrigSpline, Waypoint
+from ctrlplan.trajectories.newton import newton_series, pair_series
 from ctrlplan.trajectories.transition import Transition, extrapolated, series, transition
 
 # Data drawn at random and every alpha: most of these plans swing, on purpose.
@@ -77,9 +78,13 @@ def test_three_ways_to_its_values_agree(alpha):
         jet = made.jet(coefficients, np.array([s]), 5)[:, :, 0]
         rows = np.array(series(made.rate, coefficients.T.tolist(), s, s - 1.7, 5)) * factorials
         matrix = made.evaluation(s, 5) @ coefficients
-        size = np.abs(jet).max(axis=1, keepdims=True)
-        assert (np.abs(rows.T - jet) <= 1e-12 * size).all()
-        assert (np.abs(matrix - jet) <= 1e-12 * size).all()
+        # Each of the 4 pairs of factors costs at most 20 operations on the sum of the sizes of all terms; the sine of x
+        # amplifies the rounding of x by x |cot x|, below 2 + alpha for x up to alpha / 2 = 2.75.
+        sizes = [[np.abs(part) for part in pair] for pair in [pair_series(made.rate, s, s - 1.7, 5)] * 4]
+        terms = np.array([newton_series(sizes, column, 5) for column in np.abs(coefficients).T.tolist()]) * factorials
+        bound = 80 * (2 + alpha) * np.finfo(float).eps * terms.T
+        assert (np.abs(rows.T - jet) <= bound).all()
+        assert (np.abs(matrix - jet) <= bound).all()
 
 
 def test_a_transition_made_before_is_used_again():
