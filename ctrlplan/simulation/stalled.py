@@ -16,13 +16,17 @@ Values = Callable[[float, Array, Array], Array | None]
 """(t, state, input) of a block -> its outputs and rates; None outside of its domain."""
 
 _STEPS = 10.0 ** -np.arange(2.0, 13.0)
-"""Distances, relative to the scale of an argument, at which a block is asked on both sides."""
+"""Distances, relative to the scale of an argument, at which a block is evaluated on both sides."""
 
-_CLOSE = 3
-"""First of the distances at which a change counts as one of no distance."""
+_CLOSE, _LAST = 3, 4
+"""First of the close distances, and how many of the closest ones decide."""
 
-_JUMP, _STEEP = 0.3, 1e-2
-"""Change over a close distance, relative to that over the largest one: of a jump, and of an infinite slope."""
+_JUMP, _STEEP, _DROP = 0.7, 0.15, 0.02
+"""Change of values over a tenth of a distance, relative to that over the distance: 0.1 where they are smooth, 1 at a
+jump, in between where the slope is infinite; next to a jump it drops where the distance no longer reaches it."""
+
+_ROUNDING = 1e-13
+"""Change of values, relative to their size, below which it is taken for rounding."""
 
 SMOOTHING = (
     "replace it by a steep but continuous function, such as np.tanh(s/width) for np.sign(s) and "
@@ -67,17 +71,12 @@ def cause(network: Network, params: dict[str, object], t: float, x: Array, w: Ar
         for i, block, values in _continuous(network, params):
             state, fed = x[network.states[i]], network.fed[i](w)
             labels = ["t", *(block.system.state_labels or []), *(block.system.input_labels or [])]
-            worst, at = 0.0, ""
-            for label, change in zip(labels, _changes(values, t, state, fed, span), strict=False):
-                if change > worst:
-                    worst, at = change, label
-            if worst > _JUMP:
-                return (
-                    f"what block {block.name} returns jumps there with {at}, and the solution stays at the jump: "
-                    + SMOOTHING
-                )
-            if worst > _STEEP:
-                return f"what block {block.name} returns has an infinite slope there over {at}: " + SMOOTHING
+            kinds = dict(zip(labels, _kinds(values, t, state, fed, span), strict=False))
+            for kind, words in (("jump", "jumps there with"), ("slope", "has an infinite slope there over")):
+                at = next((label for label, found in kinds.items() if found == kind), None)
+                if at is not None:
+                    stays = ", and the solution stays at the jump: " if kind == "jump" else ": "
+                    return f"what block {block.name} returns {words} {at}{stays}{SMOOTHING}"
     return ""
 
 
@@ -102,23 +101,44 @@ def _values(block: Block, params: dict[str, object]) -> Values:
     return values
 
 
-def _changes(values: Values, t: float, x: Array, u: Array, span: float) -> Iterator[float]:
-    """Largest change of values over a close distance of each argument, relative to that over a large one."""
+def _kinds(values: Values, t: float, x: Array, u: Array, span: float) -> Iterator[str]:
+    """Whether values are smooth over each argument, "", or have a "jump" or an infinite "slope"."""
     arguments = np.concatenate([[t], x, u])
     scales = np.maximum(np.abs(arguments), 1.0)
     scales[0] = span
     for j, scale in enumerate(scales.tolist()):
-        sizes = []
+        pairs = []
         for step in _STEPS.tolist():
             sides = []
             for sign in (-1.0, 1.0):
                 moved = arguments.copy()
                 moved[j] += sign * step * scale
                 sides.append(values(float(moved[0]), moved[1 : 1 + x.size], moved[1 + x.size :]))
-            apart = None if sides[0] is None or sides[1] is None else np.abs(sides[1] - sides[0])
-            sizes.append(np.zeros(1) if apart is None or not np.isfinite(apart).all() else apart)
-        count = max(size.size for size in sizes)
-        table = np.array([size if size.size == count else np.zeros(count) for size in sizes])
-        large = table[:_CLOSE].max(axis=0)
-        close = table[_CLOSE:].max(axis=0)
-        yield float(np.divide(close, large, out=np.zeros(count), where=large > 0.0).max(initial=0.0))
+            pairs.append(sides)
+        known = [(low, high) for low, high in pairs if low is not None and high is not None]
+        if len(known) < _STEPS.size or len({side.size for pair in known for side in pair}) > 1:
+            yield ""
+            continue
+        low, high = (np.array(sides) for sides in zip(*known, strict=True))
+        with np.errstate(all="ignore"):
+            found = {_kind(np.abs(h - g), np.abs(h).max(initial=0.0)) for g, h in zip(low.T, high.T, strict=True)}
+        yield next((kind for kind in ("jump", "slope") if kind in found), "")
+
+
+def _kind(changes: Array, size: float) -> str:
+    """Kind of one value by its changes over smaller and smaller distances."""
+    if not np.isfinite(changes).all():
+        return ""
+    real = changes > _ROUNDING * size
+    both = real[1:] & real[:-1]
+    ratios = np.divide(changes[1:], changes[:-1], out=np.full(changes.size - 1, np.nan), where=both)
+    last = ratios[-_LAST:][both[-_LAST:]]
+    # From one distance to the next nothing is left of a change: the jump lies between.
+    gone = np.append(changes[1:] <= np.maximum(_DROP * changes[:-1], _ROUNDING * size), False) & real
+    stays = np.array([bool(np.all(changes[k + 1 :] <= _DROP * changes[k])) for k in range(changes.size)])
+    flat = np.append(False, ratios > 0.5 * _JUMP)
+    if bool((gone & stays & flat)[_CLOSE:].any()):
+        return "jump"
+    if last.size < 2 or np.median(last) <= _STEEP:
+        return ""
+    return "jump" if np.median(last) > _JUMP else "slope"
