@@ -27,7 +27,7 @@ from comparison import better_answers, differences
 
 FUNCTIONS = ("input_output_response", "forced_response")
 
-MAXIMUM_CALLS = 200_000
+MAXIMUM_CALLS = 400_000
 """Calls after which a process ends: three times those of all tests and examples."""
 
 
