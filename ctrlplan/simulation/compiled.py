@@ -320,7 +320,9 @@ class CompiledSolver:
         # A solution that explodes takes all the steps it may: few at first, then more, between outputs close together.
         close = np.union1d(relative, np.linspace(0.0, 1.0, _CLOSE)[1:])
         for outputs, allowed in ((relative, min(_FEW_STEPS, max_steps)), (close, max_steps)):
-            integrator = self._equations.integrator(width, outputs, self._stiff, *self._tolerances, allowed, longest)
+            settings = width, outputs, self._stiff, *self._tolerances, allowed, longest
+            with _passing_interruptions():
+                integrator = self._equations.integrator(*settings)
             try:
                 with _passing_interruptions():
                     found = _called(integrator, (start, np.empty(0), p), state.size, self._report)
@@ -342,8 +344,9 @@ def _passing_interruptions() -> Iterator[None]:
     """Let what signal handlers raise reach the caller, Ctrl-C among it.
 
     CVODES takes an exception that a handler raises while it runs for a failure
-    of the equations. Handlers run in the main thread alone, so there they are
-    accompanied; they are found as they were.
+    of the equations; one raised while a solver is made ends in a SystemError.
+    Handlers run in the main thread alone, so there they are accompanied; they
+    are found as they were.
     """
     raised: list[BaseException] = []
     handlers: dict[int, Any] = {}
@@ -363,7 +366,7 @@ def _passing_interruptions() -> Iterator[None]:
                 signal.signal(number, accompanied)
     try:
         yield
-    except RuntimeError:
+    except (RuntimeError, SystemError):
         if raised:
             raise raised[0] from None
         raise

@@ -432,7 +432,7 @@ def _flattened(system: Any, above: dict[str, Any]) -> _Part:
     from_out, from_in = outputs[:, : len(read)], outputs[:, len(read) :]
     # Parts take v = connect @ (read @ y + through @ v) + external @ r.
     wires = np.eye(len(connect)) - connect @ through
-    if np.linalg.matrix_rank(wires) < len(wires):
+    if wires.size and np.linalg.matrix_rank(wires) < len(wires):  # numpy 1.26 has no rank of an empty matrix
         raise ValueError(f"wires must not feed themselves, got such a one in {system.name}")
     v_y, v_r = np.linalg.solve(wires, connect @ read), np.linalg.solve(wires, external)
     put_out = from_out @ through + from_in

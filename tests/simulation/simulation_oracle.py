@@ -216,7 +216,8 @@ def response(a, b, c, d, signals, times, initial=None):
     x = np.array([[mp.re(v) for v in column] for column in states], dtype=object).T
     w = np.array([[mp.mpf(v) for v in _at(s, times)] for s in signals], dtype=object).reshape(len(signals), len(times))
     outputs = np.array(c.tolist(), dtype=object) @ x + np.array(d.tolist(), dtype=object) @ w
-    return outputs.astype(float), x.astype(float)
+    # By numpy 1.26 a cast of what is beyond floating point warns.
+    return tuple(np.array([float(v) for v in values.flat]).reshape(values.shape) for values in (outputs, x))
 
 
 def _at(signal, times):
