@@ -46,12 +46,12 @@ print(*(name for name in found if "512" in name or name == "X86_V4"))
 
 
 def minima():
-    """Constraints that pin every declared package to the newest release of its minimum's minor version."""
+    """Constraints that pin every declared package to its minimum."""
     with open(PROJECT / "pyproject.toml", "rb") as file:
         project = tomllib.load(file)["project"]
     declared = [*project["dependencies"], *project["optional-dependencies"]["fast"]]
     pairs = [line.partition(",")[0].split(">=") for line in declared if ">=" in line]
-    return [f"{name}=={minimum}.*" for name, minimum in pairs]
+    return [f"{name}=={minimum}" for name, minimum in pairs]
 
 
 def interpreter(version, given):
