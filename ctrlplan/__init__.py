@@ -6,7 +6,7 @@ Imported beside python-control: ``import control as ct; import ctrlplan as cp``.
 from importlib import import_module
 from typing import Any
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 _EXPORTS = {
     "traits": ("BlockTraits", "declare", "traits_of"),

@@ -262,6 +262,7 @@ class CompiledSolver:
         self._tolerances = tolerances
         self._longest, self._stiff = 0.0, False
         self.evaluations = 0
+        self.switches: list[float] = []
         self._report = self._count if equations.compared.is_expected else None
 
     def signals(self, times: Array, states: Array, driven: Array) -> Array:
@@ -310,7 +311,7 @@ class CompiledSolver:
             decay = self._equations.fastest_decay(left, state, series(left), self._p)
             self._longest, self._stiff = right - left, decay * (right - left) > _STIFF
         width = series.coefficients.shape[1]
-        span = [left, right - left, series.left, series.right, *within(left, right)]
+        span = [left, right - left, series.left, series.right, *within(left, right, self.switches)]
         scales, max_steps = self._scales, self._max_steps
         known = [series.coefficients.ravel(order="F"), series.low, series.high, span, scales.shift, scales.scale]
         p = np.concatenate([self._p, *known])

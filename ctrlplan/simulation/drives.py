@@ -8,6 +8,7 @@ the series; what is reported at the sample times are the plan's own jets.
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -311,14 +312,20 @@ def _drive(value: Any, name: str, times: Array) -> Drive:
     return SampledDrive(times, signal)
 
 
-def within(left: float, right: float) -> tuple[float, float]:
-    """First and last time of a segment at which its equations are evaluated: inside, by rounding of the times.
+def within(left: float, right: float, switches: Sequence[float]) -> tuple[float, float]:
+    """First and last time of a segment at which its equations are evaluated.
 
-    At the ends themselves a block that switches there may already be on the
-    other side.
+    At a switch of the equations these are inside, by rounding of the times: at
+    the switch itself a block may already be on the other side.
     """
+    if not switches:
+        return left, right
     inset = min(4.0 * float(np.spacing(max(abs(left), abs(right)))), 0.25 * (right - left))
-    return left + inset, right - inset
+    at_left, at_right = (
+        any(abs(t - end) <= 4.0 * inset for t in switches[max(0, bisect_left(switches, end) - 1) :][:2])
+        for end in (left, right)
+    )
+    return left + inset * at_left, right - inset * at_right
 
 
 def breakpoints_of(drives: Iterable[Drive]) -> list[float]:

@@ -282,6 +282,7 @@ class InterpretedSolver:
         self._rtol, self._atol = max(tolerances.rtol, _LEAST), tolerances.atol
         self._bounded = any(b.changes_unseen and b.depends_on_time for b in equations.network.blocks)
         self._segments, self._next = 0, 0
+        self.switches: list[float] = []
 
     def scaled_rates(self, t: float, z: Array, driven: Array) -> Array:
         """Rates of the states in their scales."""
@@ -518,7 +519,7 @@ class _Watched:
 
     def __init__(self, solver: InterpretedSolver, series: Series, left: float, right: float) -> None:
         self._solver, self.series, self.left, self.right = solver, series, left, right
-        self.defined, self._within = left, within(left, right)
+        self.defined, self._within = left, within(left, right, solver.switches)
         self.begin(_CALLS)
 
     def begin(self, calls: int) -> None:

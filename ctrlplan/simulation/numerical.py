@@ -23,7 +23,7 @@ from ctrlplan.simulation.network import Network
 from ctrlplan.simulation.prepared import NotCompiledError
 from ctrlplan.simulation.scales import PASSES, Scales, Tolerances, doubt
 from ctrlplan.simulation.stalled import unrepeatable
-from ctrlplan.simulation.untouched import tried
+from ctrlplan.simulation.untouched import same_answer, tried, untouched
 
 if TYPE_CHECKING:
     from ctrlplan.simulation.compiled import Compiled, CompiledSolver
@@ -117,7 +117,7 @@ class _Attempt:
         if self.method == "compiled":
             self._compile()
         elif self.equations is not None:
-            self._check_repeatable(self.equations)
+            self._check_repeatable()
             self.solver, self._compare = InterpretedSolver(self.equations, self._tolerances, self.scales), lambda: None
         else:
             raise NotCompiledError(f"{job.prepared.name} came from another process without its blocks")
@@ -130,6 +130,8 @@ class _Attempt:
     def go(self) -> None:
         """Run, and compare a compiled form with Python."""
         job = self.job
+        marks = self.solver.instants(job.first, float(job.times[-1]), lambda t: known_before(self.drives, t))
+        self.solver.switches = sorted([*job.blocks.breakpoints, *marks])
         self.run = integrate(
             job.blocks,
             self.equations,
@@ -138,7 +140,7 @@ class _Attempt:
             with_looks(job.times, self.watched, self._slope),
             job.state,
             resolution=10.0 * job.rtol,
-            marks=self.solver.instants(job.first, float(job.times[-1]), lambda t: known_before(self.drives, t)),
+            marks=marks,
             pause=self._pause if self.stops else None,
         )
         self._compare()
@@ -201,11 +203,18 @@ class _Attempt:
 
         self.solver, self._compare = solver, compare
 
-    def _check_repeatable(self, equations: Interpreted) -> None:
-        """Raise where a continuous block is random: such a loop has no solution."""
-        job = self.job
-        w = tried(lambda: _at_start(_equations(job, job.blocks.for_trials()), job, self.drives), None)
-        found = unrepeatable(job.blocks, job.params, job.first, job.state, w) if w is not None else ""
+    def _check_repeatable(self) -> None:
+        """Raise where rates are random: such a loop has no solution."""
+        job, known = self.job, self.job.blocks.for_trials()
+        tests, driven = _equations(job, known), driven_signals(self.drives, job.times[:1])[:, 0]
+        if tests is None:
+            return
+        with untouched():
+            first, second = (tried(lambda: tests.rates(job.first, job.state, driven), None) for _ in range(2))
+            if same_answer(first, second):
+                return
+            w = tried(lambda: tests.signals(job.first, job.state, driven), None)
+        found = unrepeatable(known, job.params, job.first, job.state, w) if w is not None else ""
         if found:
             raise SolverError(f"the solver must reach {job.times[-1]:g} s, got to {job.first:g} s: {found}")
 

@@ -211,7 +211,13 @@ def _conjugate(
         coefficients = system.coefficients(columns[leg + system.waypoint_index, orders] * scale[:, None])
         taylor = system.taylor(np.array([0.0, 1.0]), 2 * size - 1)
         jets = np.einsum("mkt,ma->tka", taylor, coefficients)
-        jets *= (FACTORIALS[: 2 * size] / duration ** np.arange(2 * size))[:, None]
+        with np.errstate(over="ignore", invalid="ignore"):
+            jets *= (FACTORIALS[: 2 * size] / duration ** np.arange(2 * size))[:, None]
+        if not np.isfinite(jets).all():
+            raise ValueError(
+                "derivatives at inner waypoints must stay within floating point, got larger ones from the data of "
+                f"waypoints {leg} and {leg + 1}"
+            )
         jump[leg] += jets[0]
         jump[leg + 1] -= jets[1]
     rows = np.array([jump[i, 2 * size - 1 - k] for i, k in free])

@@ -478,18 +478,29 @@ class Trajectory(Frozen, ABC):
         duration = float(self.breakpoints[leg + 1] - self.breakpoints[leg])
         if abs(math.log10(duration)) * high > 200.0:
             return self._extreme_jet(leg, s, low, high)
-        if s.size <= _sampling.FEW:
-            return self._leg_jet(leg, s, high)[low:]
-        return _sampling.sample(lambda times, order: self._leg_jet(leg, times, order), duration, s, low, high)
+        with np.errstate(over="ignore", invalid="ignore"):
+            if s.size <= _sampling.FEW:
+                found = self._leg_jet(leg, s, high)[low:]
+            else:
+                found = _sampling.sample(lambda u, order: self._leg_jet(leg, u, order), duration, s, low, high)
+        if not np.isfinite(found.sum()):
+            self._check_finite(found, leg, high)
+        return found
 
     def _extreme_jet(self, leg: int, s: Array, low: int, high: int) -> Array:
         """Derivatives low to high of a segment whose duration, to the power of their order, leaves floating point."""
         with np.errstate(over="ignore", invalid="ignore"):
             found = self._leg_jet(leg, s, high)[low:]
-        if not np.isfinite(found).all():
-            duration = self.breakpoints[leg + 1] - self.breakpoints[leg]
-            raise ValueError(f"derivative {high} must stay within floating point, got a duration of {duration:g} s")
+        self._check_finite(found, leg, high)
         return found
+
+    def _check_finite(self, jet: Array, leg: int, high: int) -> None:
+        if not np.isfinite(jet).all():
+            duration = self.breakpoints[leg + 1] - self.breakpoints[leg]
+            raise ValueError(
+                f"derivatives up to {high} must stay within floating point, got a segment of {duration:g} s with "
+                f"positions up to {np.abs(self._leg_jet(leg, np.zeros(1), 0)).max():g}"
+            )
 
     def _jet_beside(self, moment: float, origin: float, s: Array, order: int) -> Array:
         """Jet at origin + s of the analytic function that holds at `moment`, which is no breakpoint."""

@@ -200,7 +200,7 @@ def test_a_list_holds_what_each_input_takes():
 def test_none_is_the_stated_start_and_a_number_is_that_number():
     lag = ct.ss(-1.0, 1.0, 1.0, 0.0, inputs="u", outputs="y", name="lag")
     follower = cp.create_command_filter_iosystem(2.0, 2, input="y", name="follower")
-    follower.initial_state = np.array([3.0, -1.0, 0.5])
+    cp.declare(follower, initial_state=[3.0, -1.0, 0.5])
     loop = ct.interconnect([lag, follower], inputs="u", outputs=["y"], check_unused=False)
     t = [0.0, 1.0]
     for system in (loop, cp.prepare(loop)):
@@ -218,7 +218,7 @@ def test_none_is_the_stated_start_and_a_number_is_that_number():
 def test_what_runs_many_loops_starts_where_it_is_told():
     plan = cp.PolySpline([cp.Waypoint(0, 0, 0), cp.Waypoint(1, 1, 0)], labels=["r"])
     loop = ct.ss(-1.0, 1.0, 1.0, 0.0, inputs="r", outputs="y")
-    loop.initial_state = np.array([7.0])
+    cp.declare(loop, initial_state=[7.0])
     t = np.linspace(0.0, 2.0, 21)
     first = [
         cp.compare(loop, {"plan": plan}, t, initial_state=start).responses["plan"].states[0, 0]

@@ -58,7 +58,7 @@ def test_any_duration_is_right_or_refused(name, exponent):
     plan, duration = PLANS[name], 10.0**exponent
     moved, said = attempt(lambda: plan.retime(duration))
     if moved is None:
-        assert "floating point" in said
+        assert "floating point" in said or (name == "Shaped" and "a shaped plan must keep its duration" in said)
         return
     part = np.array([0.1, 0.3, 0.55, 0.8])
     size = np.abs(plan(np.linspace(plan.start, plan.end, 101))).max()
