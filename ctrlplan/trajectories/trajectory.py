@@ -483,7 +483,8 @@ class Trajectory(Frozen, ABC):
                 found = self._leg_jet(leg, s, high)[low:]
             else:
                 found = _sampling.sample(lambda u, order: self._leg_jet(leg, u, order), duration, s, low, high)
-        if not np.isfinite(found.sum()):
+            suspect = not np.isfinite(found.sum())
+        if suspect:
             self._check_finite(found, leg, high)
         return found
 
@@ -498,8 +499,8 @@ class Trajectory(Frozen, ABC):
         if not np.isfinite(jet).all():
             duration = self.breakpoints[leg + 1] - self.breakpoints[leg]
             raise ValueError(
-                f"derivatives up to {high} must stay within floating point, got a segment of {duration:g} s with "
-                f"positions up to {np.abs(self._leg_jet(leg, np.zeros(1), 0)).max():g}"
+                f"derivative {high} must stay within floating point, got a duration of {duration:g} s and a position "
+                f"of {np.abs(self._leg_jet(leg, np.zeros(1), 0)).max():g}"
             )
 
     def _jet_beside(self, moment: float, origin: float, s: Array, order: int) -> Array:

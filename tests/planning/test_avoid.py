@@ -312,15 +312,19 @@ def test_plans_of_another_kind_are_refused():
 
 
 def test_a_path_much_longer_than_the_shortest_way_is_said():
-    """At rest to order 4 a polynomial swings past a block; the shortest way round it is a polyline of its corners."""
-    still = [0.0] * 4
-    ends = [cp.Waypoint.from_jets(t, x=[x, *still], z=[50.0, *still]) for t, x in ((0.0, 0.0), (40.0, 50.0))]
-    things = [Rectangle((8.0, 15.0), (35.0, 60.0)), HalfPlane((0.0, 1.0), 52.0)]
+    """A family that swings at this alpha, past a disc on its way; the shortest way is the waypoints' polyline."""
+    ends = [
+        cp.Waypoint.from_jets(0.0, x=[0.0, 0.0, 0.0], z=[0.0, 0.0, 0.0]),
+        cp.Waypoint.from_jets(10.0, x=[25.0], z=[5.0]),
+        cp.Waypoint.from_jets(20.0, x=[50.0, 0.0, 0.0], z=[0.0, 0.0, 0.0]),
+    ]
+    plan = cp.TrigSpline(ends, alpha=5.2, warn=False)
+    x, z = plan(5.0).tolist()
     with pytest.warns(UserWarning, match=r"the path found is (\S+) long, (\S+) times the shortest way") as caught:
-        found = avoid(cp.PolySpline(ends), things)
-    path = found(np.linspace(0.0, 40.0, 200_001))
+        found = avoid(plan, [Disc((x, z), 0.5)])
+    path = found(np.linspace(0.0, 20.0, 200_001))
     length = float(np.hypot(*np.diff(path)).sum())
-    shortest = np.hypot(8.0, 15.0) + 7.0 + np.hypot(35.0, 15.0)
+    shortest = 2.0 * np.hypot(25.0, 5.0)
     words = re.search(r"found is (\S+) long, (\S+) times", str(caught[0].message))
     assert float(words[1]) == pytest.approx(length, rel=1e-3)
     assert float(words[2]) == pytest.approx(length / shortest, rel=0.06)

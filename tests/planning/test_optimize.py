@@ -609,7 +609,7 @@ def test_chosen_times_are_never_worse(seed, options):
         try:
             found = optimize_waypoints(points_of(times, table), free_times=True, **options)
         except ValueError as error:  # times that the search brought so close together that their cost has no digits
-            assert "must be resolved in double precision" in str(error)
+            assert "must be resolved in double precision" in str(error)  # noqa: PT017
             return
         assert found.cost <= optimize_waypoints(points_of(times, table), **options).cost
     chosen = [w.time for w in found]

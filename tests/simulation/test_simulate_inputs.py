@@ -208,7 +208,7 @@ def test_none_is_the_stated_start_and_a_number_is_that_number():
             begins = [cp.simulate(system, t, 0.0, *start, method=method).states[:, 0].tolist()
                       for start in ((), (None,), (0.0,), (0,), ([0.0] * 4,), (2.0,))]  # fmt: skip
             assert begins == [[0.0, 3.0, -1.0, 0.5]] * 2 + [[0.0] * 4] * 3 + [[2.0] * 4]
-    loop.initial_state = 5.0
+    cp.declare(loop, initial_state=5.0)
     assert cp.simulate(loop, t).states[:, 0].tolist() == [5.0] * 4
     assert cp.simulate(loop, t, initial_state=0.0).states[:, 0].tolist() == [0.0] * 4
     plain = ct.ss(-1.0, 1.0, 1.0, 0.0, 0.5)
