@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from strict import WARNINGS
 
 import ctrlplan as cp
 from ctrlplan.cli import main
@@ -61,7 +62,7 @@ def quintic(t):
 
 
 def python_m(*arguments, **options):
-    command = [sys.executable, "-W", "error", "-m", "ctrlplan", *map(str, arguments)]
+    command = [sys.executable, *WARNINGS, "-m", "ctrlplan", *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, check=False, **options)
 
 

@@ -27,6 +27,18 @@ def test_a_deprecation_by_our_own_call_fails_its_test(module):
         deprecated_in(module)
 
 
+def expected_beside(path):
+    warnings.warn("expected", UserWarning, stacklevel=1)
+    warnings.warn_explicit("an old name", DeprecationWarning, path, 1, module=path.split("/")[-1][:-3])
+
+
+def test_nor_one_that_expects_another_warning():
+    with pytest.warns(UserWarning, match="expected"):
+        expected_beside("/home/user/lib/site-packages/control/statesp.py")
+    with pytest.raises(DeprecationWarning), pytest.warns(UserWarning, match="expected"):
+        expected_beside("/home/user/lib/site-packages/ctrlplan/systems/pid.py")
+
+
 @pytest.mark.parametrize("category", [FutureWarning, RuntimeWarning, UserWarning])
 def test_every_other_warning_fails_its_test(category):
     """python-control's deprecations are FutureWarnings: they are about the call, which is ours."""

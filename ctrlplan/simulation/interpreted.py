@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import nullcontext
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.integrate import LSODA, RK45, OdeSolver
+from scipy.integrate import BDF, LSODA, RK45, OdeSolver
 
 from ctrlplan.simulation.budget import check
 from ctrlplan.simulation.drives import Series, within
@@ -34,6 +36,12 @@ Call = Callable[[float, Array, Array], None]
 
 _LEAST = 2.3e-14
 """Smallest relative tolerance of scipy's solvers."""
+
+_SHARED = tuple(int(part) for part in scipy.__version__.split(".")[:2]) < (1, 17)
+"""Whether all threads share the state of scipy's LSODA, which was Fortran before."""
+
+_ALONE = threading.Lock()
+"""Held by the run that uses LSODA where its state is shared."""
 
 _CALLS, _INSTANT = 2000, 1e-9
 """Calls about one instant, a part of the segment, after which a solver is taken to stay there."""
@@ -326,7 +334,8 @@ class InterpretedSolver:
         t, z = left, (state - shift) / scale
         with np.errstate(over="ignore", invalid="ignore"):  # what is infinite ends the run, and is said then
             for _ in range(_PASSES):
-                t, z, why = self._marched(LSODA, rates, t, z, grid, out)
+                with _implicit() as kind:
+                    t, z, why = self._marched(kind, rates, t, z, grid, out)
                 if t >= right:
                     return np.asarray(shift[:, None] + scale[:, None] * out)
                 # What no implicit step gets over an explicit one may pass: a state that comes to rest at a jump.
@@ -365,7 +374,7 @@ class InterpretedSolver:
         An explicit solver goes on only until its steps are long again.
         """
         right = float(grid[-1])
-        rates.begin(_CALLS if kind is LSODA else _PASSING)
+        rates.begin(_PASSING if kind is RK45 else _CALLS)
         # What depends on time is seen at least once a sample: a pulse as long cannot be passed over unseen.
         longest = float(np.diff(grid, prepend=rates.left).max()) if self._bounded else math.inf
         solver = kind(rates, t, z, right, rtol=self._rtol, atol=self._atol, max_step=longest)
@@ -403,6 +412,20 @@ class InterpretedSolver:
 
     def _message(self, rates: _Watched, why: str) -> SolverError:
         return SolverError(f"the solver must reach {rates.right:g} s, got to {rates.defined:g} s: {why}")
+
+
+@contextmanager
+def _implicit() -> Iterator[type[OdeSolver]]:
+    """LSODA, or BDF while another run, in a thread or inside a block, holds an LSODA whose state is shared."""
+    if not _SHARED:
+        yield LSODA
+    elif _ALONE.acquire(blocking=False):
+        try:
+            yield LSODA
+        finally:
+            _ALONE.release()
+    else:
+        yield BDF
 
 
 class _named:  # noqa: N801 (a context, of which a run opens thousands)

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from strict import WARNINGS
 
 import ctrlplan as cp
 
@@ -76,7 +77,7 @@ class Written:
 
 
 def run(name, folder, *arguments):
-    command = [sys.executable, "-W", "error", "-m", "ctrlplan", *map(str, arguments), "--out", str(folder)]
+    command = [sys.executable, *WARNINGS, "-m", "ctrlplan", *map(str, arguments), "--out", str(folder)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     return Written(name, folder, done.stdout, done.stderr)

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from strict import WARNINGS
 
 import ctrlplan as cp
 from ctrlplan.reports import FIGURES, CraneAnimation, render_page
@@ -298,7 +299,7 @@ def crane_file(folder, places, loop="", order="xz", end=60.0):
 def test_a_crane_study_file_may_have_any_number_of_waypoints(inner, tmp_path):
     places = [(2.0 * i, 10.0 - 0.3 * i) for i in range(inner + 2)]
     path = crane_file(tmp_path, places, "drum_radius = 1.5")
-    command = [sys.executable, "-W", "error", "-m", "ctrlplan", "report", path.name, "--out", "out"]
+    command = [sys.executable, *WARNINGS, "-m", "ctrlplan", "report", path.name, "--out", "out"]
     done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     page = (tmp_path / "out" / "index.html").read_text(encoding="utf-8")

@@ -11,11 +11,11 @@ import argparse
 import itertools
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
 import tempfile
-import time
 import tomllib
 from pathlib import Path
 
@@ -25,6 +25,9 @@ PYTHONS = ("3.11", "3.12", "3.13")
 KERNELS = ("Nehalem", "Sandybridge", "Haswell", "Zen", "SkylakeX", "Cooperlake", "Sapphirerapids")
 WIDE = ("SkylakeX", "Cooperlake", "Sapphirerapids")
 """Kernels of processors with AVX-512, which numpy's own loops then use as well."""
+
+SUMMARY = re.compile(r"\d+ (passed|failed|errors?|skipped|deselected)\b.* in [\d.]+s")
+"""Of pytest; Fortran libraries may print after it."""
 
 VERSIONS = f"""
 import json, platform
@@ -72,8 +75,7 @@ def output(command, **variables):
 
 
 def tested(python, options, **variables):
-    """Last line of the test run, which is shown as it goes."""
-    began = time.monotonic()
+    """Summary of the test run, which is shown as it goes."""
     command = [python, "-m", "pytest", "-q", *(["-m", "not slow"] if options.quick else []), *options.tests]
     shown = " ".join(f"{name}={value}" for name, value in variables.items())
     print("+", shown, *command, flush=True)
@@ -83,9 +85,8 @@ def tested(python, options, **variables):
     ) as process:
         for line in process.stdout:
             print(line, end="", flush=True)
-            last = line.strip() or last
-    result = last if process.returncode == 0 else f"FAILED ({process.returncode}): {last}"
-    return result if " in " in last else f"{result} in {time.monotonic() - began:.0f}s"
+            last = line.strip() if SUMMARY.search(line) else last
+    return last if process.returncode == 0 else f"FAILED ({process.returncode}): {last}"
 
 
 def versions(options):
