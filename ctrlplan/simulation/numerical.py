@@ -181,12 +181,12 @@ class _Attempt:
         return found * float(self.run.times[-1] - self.run.times[0])
 
     def _compile(self) -> None:
-        from ctrlplan.simulation.compiled import CompiledSolver
-
         job = self.job
         # Compiled forms are compared with Python on copies of what blocks remember.
         known = job.blocks.for_trials()
         form = job.prepared.compiled(job.params, self.drives, job.first, job.state)
+        from ctrlplan.simulation.compiled import CompiledSolver  # there is a form: so there is CasADi
+
         _at_start(_equations(job, known), job, self.drives)  # an algebraic loop without a solution is better named here
         # Beyond a stop there may be no solution: segments are short then, and must fail soon.
         most = 2_000 if self.stops else 20_000
