@@ -51,16 +51,6 @@ _PLAIN = (
 )
 
 
-def isolated(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Copy of a function that shares no memory with it.
-
-    Closures, defaults, global variables that the function names, and the
-    object of a method are copied; functions of libraries are shared, and so is
-    what cannot be copied, such as an open file.
-    """
-    return _function(function, {}, _DEPTH)
-
-
 def trial_copy(system: Any) -> Any:
     """Copy of a block whose functions share no memory with those of the block.
 
