@@ -14,7 +14,9 @@ from ctrlplan.trajectories.retimed import composed
 _PIECES = 16
 _SAMPLES = 161
 _STEP = 1e-6
-_STEPS = 40
+_STEPS = 150
+_ROUNDING = 1e-12
+"""Violation that is rounding, as a fraction of a limit's scale: of a position limit that the path touches."""
 
 
 def with_fastest_law(plan: Trajectory, limited: Limited) -> Trajectory:
@@ -24,7 +26,7 @@ def with_fastest_law(plan: Trajectory, limited: Limited) -> Trajectory:
     the clock always runs forwards and has four continuous derivatives, as many
     as a crane's force needs. The duration is the reciprocal of the mean rate.
     A fastest clock meets about as many limits as it has coefficients, so linear
-    programs within a trust region get there in some ten steps; after each the
+    programs within a trust region get there in tens of steps; after each the
     clock is slowed down as a whole until limits hold again.
 
     Parameters
@@ -88,12 +90,16 @@ class _Law:
     def within_limits(self, logs: Array) -> Array:
         """Same law, slowed down as a whole until limits hold at the samples."""
         slowest, fastest = logs - 3.0, logs
-        if self._room(fastest[:, None]).min() >= 0.0:
+        if self._holds(fastest):
             return fastest
         for _ in range(24):
             middle = 0.5 * (slowest + fastest)
-            slowest, fastest = (middle, fastest) if self._room(middle[:, None]).min() >= 0.0 else (slowest, middle)
+            slowest, fastest = (middle, fastest) if self._holds(middle) else (slowest, middle)
         return slowest
+
+    def _holds(self, logs: Array) -> bool:
+        """Whether every limit holds at the samples."""
+        return bool(self._room(logs[:, None]).min() >= -_ROUNDING)
 
     def clock(self, logs: Array) -> PiecewiseSpline:
         """The clock: a quintic a part, from the plan's start to its end."""
