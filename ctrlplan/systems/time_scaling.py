@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ctrlplan.traits import declare
 from ctrlplan.trajectories import Trajectory
+from ctrlplan.trajectories.combined import is_shaped
 from ctrlplan.trajectories.common import checked_count, checked_limits, checked_number, checked_pair, checked_time
 from ctrlplan.trajectories.files import signal_names
 from ctrlplan.trajectories.retimed import composed
@@ -94,7 +95,9 @@ def create_time_scaling_iosystem(
         If `plan` is not a trajectory.
     ValueError
         If an argument is out of range, neither limits nor errors are given, the
-        lag would not settle, or an output and an input would have the same name.
+        lag would not settle, or an output and an input would have the same name;
+        if the plan is shaped (`Shaper`), since a slower clock would change the
+        delays.
 
     References
     ----------
@@ -111,6 +114,11 @@ def create_time_scaling_iosystem(
     """
     if not isinstance(plan, Trajectory):
         raise TypeError(f"plan must be a Trajectory, got {type(plan).__name__}")
+    if is_shaped(plan):
+        raise ValueError(
+            f"a shaped plan must keep its duration of {plan.duration:g} s, got a clock that slows: the delays of the "
+            "shaper would change with it; take the plan before it is shaped"
+        )
     highest = checked_count(derivatives, "derivatives")
     for label, value in (("limits", limits), ("errors", errors)):
         if not isinstance(value, Mapping | None):

@@ -779,3 +779,24 @@ def test_bad_input_is_refused_by_name(kind, message, given):
     options = {"plan": ONE, "derivatives": 2, "limits": U, "suffix": "_ref"} | given
     with pytest.raises(kind, match=re.escape(message)):
         cp.create_time_scaling_iosystem(**options)
+
+
+SHAPED = cp.Shaper.zv(6.0)(ONE)
+
+
+@pytest.mark.parametrize(
+    "plan",
+    [
+        SHAPED,
+        0.5 * SHAPED,
+        SHAPED.shift(3.0),
+        cp.stack([cp.Step(1.0), SHAPED], labels=["a", "y"]),
+        rest((-1.0, 0.0), (0.0, 0.0)).then(SHAPED),
+    ],
+)
+def test_a_shaped_plan_is_rejected_wherever_it_stands(plan):
+    """A clock that slows stretches the delays between the impulses, which are times of the mode."""
+    with pytest.raises(
+        ValueError, match=r"a shaped plan must keep its duration of .* take the plan before it is shaped"
+    ):
+        cp.create_time_scaling_iosystem(plan, limits=U, suffix="_ref")
