@@ -16,6 +16,7 @@ import control.flatsys as fs
 import numpy as np
 from numpy.typing import NDArray
 
+from ctrlplan.systems.linear_flat import LinearMaps, is_linear, linear_maps
 from ctrlplan.trajectories import derivative_name
 from ctrlplan.trajectories.common import checked_labels, default_labels
 
@@ -88,8 +89,9 @@ def create_flat_iosystem(
     Warns
     -----
     UserWarning
-        If `flat_system` is a `LinearFlatSystem` whose output is a multiple of its
-        flat output, which python-control chose, and `labels` does not name it.
+        If `flat_system` is a `LinearFlatSystem` whose output is not its flat output,
+        which python-control chose, and `labels` does not name it: a multiple of it,
+        or, where the plant has zeros, a sum of its derivatives.
 
     Notes
     -----
@@ -99,7 +101,8 @@ def create_flat_iosystem(
 
     The plant of the loop must put out its states by their names, as those of
     `ctrlplan.plants` do. References are of the flat outputs: that of a
-    `LinearFlatSystem` is chosen by python-control and need not be its output.
+    `LinearFlatSystem` is chosen by python-control and need not be its output; its
+    maps are computed here from its matrices, without rounding.
 
     The law keeps the parameters `flat_system` has now: a loop simulated with
     others shows what an inexact model does.
@@ -121,9 +124,9 @@ def create_flat_iosystem(
     >>> bool(abs(found.outputs - plan(found.time)).max() < 1e-7)
     True
     """
-    plant = _checked_plant(flat_system)
+    plant = checked_plant(flat_system)
     if labels is None:
-        warn_of_gain(flat_system)
+        warn_of_output(flat_system)
     probes = _random_probes(plant)
     names = _flat_labels(plant, probes, labels)
     _check_linearises(plant, probes, names)
@@ -173,21 +176,30 @@ def create_flat_iosystem(
     )
 
 
-def warn_of_gain(flat_system: fs.FlatSystem) -> None:
-    """Warn where a linear system's flat output, which python-control chose, is its output in another unit."""
-    if not isinstance(flat_system, fs.LinearFlatSystem):
+def warn_of_output(flat_system: fs.FlatSystem) -> None:
+    """Warn where a linear system's flat output, which python-control chose, is not its output."""
+    if not is_linear(flat_system):
         return
-    output, chosen = np.ravel(flat_system.C), np.ravel(flat_system.Cf)
-    gain = float(output @ chosen / (chosen @ chosen))
-    rest = float(np.abs(output - gain * chosen).max() / np.abs(output).max(initial=np.finfo(float).tiny))
-    name = flat_system.output_labels[0]
-    if rest < _SAME and abs(gain - 1.0) > _SAME:
-        warnings.warn(
-            f"the flat output of {flat_system.name} is not its output, but {name} is {gain:.6g} times it: a plan of "
-            f"{name} must be multiplied by {1.0 / gain:.6g}, or flat_system be a control.flatsys.FlatSystem whose "
-            "flat output it is",
-            stacklevel=3,
-        )
+    coefficients = linear_maps(flat_system).output
+    name, chosen = flat_system.output_labels[0], f"the flat output of {flat_system.name} is not its output"
+    gain = float(coefficients[0])
+    if not coefficients[1:].any():
+        if abs(gain - 1.0) > _SAME:
+            warnings.warn(
+                f"{chosen}, but {name} is {gain:.6g} times it: a plan of {name} must be multiplied by "
+                f"{1.0 / gain:.6g}, or flat_system be a control.flatsys.FlatSystem whose flat output it is",
+                stacklevel=3,
+            )
+        return
+    terms = [f"{value:.6g} {derivative_name('z', k)}" for k, value in enumerate(coefficients.tolist()) if value]
+    at_rest = f"{name} is 0 wherever z is at rest"
+    if gain:
+        at_rest = f"it leads {name} from rest to rest where its positions are those of {name} times {1.0 / gain:.6g}"
+    warnings.warn(
+        f"{chosen}, since the plant has zeros: {name} = {' + '.join(terms)}, z the flat output. A plan is one of z, "
+        f"not of {name}; {at_rest}, and on the way {name} differs from its plan by the derivatives of z",
+        stacklevel=3,
+    )
 
 
 def check_maps(flat_system: fs.FlatSystem) -> None:
@@ -199,7 +211,9 @@ def check_maps(flat_system: fs.FlatSystem) -> None:
         With what was found: a state and an input whose flag `reverse` does not
         return to, or whose flag changes at other rates than it states.
     """
-    plant = _checked_plant(flat_system)
+    plant = checked_plant(flat_system)
+    if isinstance(plant, _LinearPlant):
+        return
     try:
         probes = _random_probes(plant)
     except ValueError:  # it is regular elsewhere: nothing is known of it
@@ -271,7 +285,7 @@ def _gains(poles: Any, orders: Sequence[int]) -> list[tuple[float, ...]]:
 
 
 @dataclass(frozen=True)
-class _Plant:
+class FlatPlant:
     """A flat system's maps at its own parameters."""
 
     system: Any
@@ -280,12 +294,15 @@ class _Plant:
     params: dict[str, Any]
 
     def forward(self, x: Any, u: Any) -> list[Any]:
+        """Flags of a state and an input."""
         return list(self.system.forward(x, u, self.params))
 
     def reverse(self, flag: list[Any]) -> list[Any]:
+        """State and input of flags."""
         return [np.ravel(values) for values in self.system.reverse(flag, self.params)]
 
     def rates(self, x: Array, u: Array) -> list[Any]:
+        """Rates of the states."""
         return [self.system.dynamics(0.0, x, u)]
 
 
@@ -302,7 +319,21 @@ class _Probe:
         return [len(row) - 1 for row in self.flag]
 
 
-def _checked_plant(flat_system: Any) -> _Plant:
+@dataclass(frozen=True)
+class _LinearPlant(FlatPlant):
+    """A linear flat system with maps of all digits."""
+
+    maps: LinearMaps
+
+    def forward(self, x: Any, u: Any) -> list[Any]:
+        return self.maps.forward(x, u)
+
+    def reverse(self, flag: list[Any]) -> list[Any]:
+        return self.maps.reverse(flag)
+
+
+def checked_plant(flat_system: Any) -> FlatPlant:
+    """Maps of a flat system in continuous time, which has states and inputs."""
     if not isinstance(flat_system, fs.FlatSystem):
         raise TypeError(f"flat_system must be a control.flatsys.FlatSystem, got {type(flat_system).__name__}")
     if flat_system.dt not in (None, 0):
@@ -310,7 +341,9 @@ def _checked_plant(flat_system: Any) -> _Plant:
     n, m = flat_system.nstates or 0, flat_system.ninputs or 0
     if not (n and m):
         raise ValueError(f"flat_system must have states and inputs, got {n} and {m}")
-    return _Plant(flat_system, n, m, dict(flat_system.params))
+    if is_linear(flat_system):
+        return _LinearPlant(flat_system, n, m, {}, linear_maps(flat_system))
+    return FlatPlant(flat_system, n, m, dict(flat_system.params))
 
 
 def _finite(function: Callable[..., Any], *args: Any) -> list[Array] | None:
@@ -323,7 +356,7 @@ def _finite(function: Callable[..., Any], *args: Any) -> list[Array] | None:
     return rows if all(np.isfinite(row).all() for row in rows) else None
 
 
-def _random_probes(plant: _Plant) -> list[_Probe]:
+def _random_probes(plant: FlatPlant) -> list[_Probe]:
     """Random states and inputs, where the flag is finite."""
     rng = np.random.default_rng(0)
     draws = [(rng.normal(size=plant.nstates), rng.normal(size=plant.ninputs)) for _ in range(_PROBES)]
@@ -341,7 +374,7 @@ def _random_probes(plant: _Plant) -> list[_Probe]:
     return probes
 
 
-def _planned_probes(plant: _Plant, orders: list[int]) -> list[_Probe]:
+def _planned_probes(plant: FlatPlant, orders: list[int]) -> list[_Probe]:
     """States and inputs of random flags, which have the plant's own size; and the zero state under the law's input."""
     rng = np.random.default_rng(1)
     flags = [[rng.normal(size=r + 1) for r in orders] for _ in range(_PROBES)]
@@ -356,14 +389,14 @@ def _planned_probes(plant: _Plant, orders: list[int]) -> list[_Probe]:
     return probes
 
 
-def _probe(plant: _Plant, x: Array, u: Array) -> Iterator[_Probe]:
+def _probe(plant: FlatPlant, x: Array, u: Array) -> Iterator[_Probe]:
     """The probe at a state and an input, if the flag is finite there."""
     flag = _finite(plant.forward, x, u)
     if flag is not None:
         yield _Probe(x, u, flag)
 
 
-def _reversed(plant: _Plant, flag: list[Array]) -> Iterator[tuple[Array, Array]]:
+def _reversed(plant: FlatPlant, flag: list[Array]) -> Iterator[tuple[Array, Array]]:
     """The state and the input of a flag, if they are finite."""
     found = _finite(plant.reverse, flag)
     if found is not None:
@@ -375,7 +408,7 @@ def _reversed(plant: _Plant, flag: list[Array]) -> Iterator[tuple[Array, Array]]
         yield x, u
 
 
-def _flat_labels(plant: _Plant, probes: list[_Probe], labels: Sequence[str] | str | None) -> tuple[str, ...]:
+def _flat_labels(plant: FlatPlant, probes: list[_Probe], labels: Sequence[str] | str | None) -> tuple[str, ...]:
     """Names of the flat outputs: the given ones, those of the outputs that they are, or y, y1, ..."""
     outputs = list(plant.system.output_labels or [])
     if labels is None and len(outputs) == plant.ninputs and not any("[" in label for label in outputs):
@@ -385,8 +418,10 @@ def _flat_labels(plant: _Plant, probes: list[_Probe], labels: Sequence[str] | st
     return checked_labels(labels, plant.ninputs)
 
 
-def _check_linearises(plant: _Plant, probes: list[_Probe], names: Sequence[str]) -> None:
+def _check_linearises(plant: FlatPlant, probes: list[_Probe], names: Sequence[str]) -> None:
     """Refuse maps of which the law would not make chains of integrators."""
+    if isinstance(plant, _LinearPlant):  # its maps are exact
+        return
     sizes = _sizes(probes)
     for probe in probes:
         _check_below(plant, probe, names, sizes)
@@ -408,7 +443,7 @@ def _sizes(probes: list[_Probe]) -> list[Array]:
     return [np.max(rows, axis=0) for rows in zip(*([np.abs(row) for row in p.flag] for p in probes), strict=True)]
 
 
-def _varied(plant: _Plant, probe: _Probe, step: float) -> Iterator[tuple[int, float, list[Array], list[Array]]]:
+def _varied(plant: FlatPlant, probe: _Probe, step: float) -> Iterator[tuple[int, float, list[Array], list[Array]]]:
     """Flags with each input in turn a step lower and higher."""
     for j in range(plant.ninputs):
         change = np.zeros(plant.ninputs)
@@ -418,7 +453,7 @@ def _varied(plant: _Plant, probe: _Probe, step: float) -> Iterator[tuple[int, fl
             yield j, 2.0 * change[j], low, high
 
 
-def _check_below(plant: _Plant, probe: _Probe, names: Sequence[str], sizes: list[Array]) -> None:
+def _check_below(plant: FlatPlant, probe: _Probe, names: Sequence[str], sizes: list[Array]) -> None:
     """Refuse where a derivative below the last depends on an input."""
     for j, _, low, high in _varied(plant, probe, 0.5):
         for name, below, above, size in zip(names, low, high, sizes, strict=True):
@@ -431,7 +466,7 @@ def _check_below(plant: _Plant, probe: _Probe, names: Sequence[str], sizes: list
                 )
 
 
-def _check_decoupling(plant: _Plant, probe: _Probe, names: Sequence[str]) -> None:
+def _check_decoupling(plant: FlatPlant, probe: _Probe, names: Sequence[str]) -> None:
     """Refuse where the inputs cannot set the last derivatives."""
     matrix = np.full((plant.ninputs, plant.ninputs), np.nan)
     for j, change, low, high in _varied(plant, probe, 1e-4):
@@ -459,7 +494,7 @@ def _check_decoupling(plant: _Plant, probe: _Probe, names: Sequence[str]) -> Non
         )
 
 
-def _check_derivatives(plant: _Plant, probe: _Probe, names: Sequence[str]) -> None:
+def _check_derivatives(plant: FlatPlant, probe: _Probe, names: Sequence[str]) -> None:
     """Refuse where an entry of a flag is not the derivative of the one before."""
     try:
         found = _finite(plant.rates, probe.x, probe.u)
@@ -485,7 +520,7 @@ def _check_derivatives(plant: _Plant, probe: _Probe, names: Sequence[str]) -> No
             )
 
 
-def _check_reverse(plant: _Plant, probe: _Probe, names: Sequence[str], sizes: list[Array]) -> None:
+def _check_reverse(plant: FlatPlant, probe: _Probe, names: Sequence[str], sizes: list[Array]) -> None:
     """Refuse where reverse does not undo forward; another state of the same flag will do."""
     for x, u in _reversed(plant, probe.flag):
         again = _finite(plant.forward, x, u) or [np.full(size.shape, np.nan) for size in sizes]

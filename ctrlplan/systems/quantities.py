@@ -9,7 +9,7 @@ import control.flatsys as fs
 import numpy as np
 from numpy.typing import NDArray
 
-from ctrlplan.systems.flat import check_maps, warn_of_gain
+from ctrlplan.systems.flat import FlatPlant, check_maps, checked_plant, warn_of_output
 
 Array = NDArray[np.float64]
 
@@ -44,7 +44,8 @@ def flat_quantities(flat_system: fs.FlatSystem) -> Callable[[Array], dict[str, A
     Warns
     -----
     UserWarning
-        If it is a `LinearFlatSystem` whose output is a multiple of its flat output.
+        If it is a `LinearFlatSystem` whose output is not its flat output, but a
+        multiple of it or, where the plant has zeros, a sum of its derivatives.
 
     Notes
     -----
@@ -62,19 +63,15 @@ def flat_quantities(flat_system: fs.FlatSystem) -> Callable[[Array], dict[str, A
     >>> round(found.duration, 3), found.active.bound.name
     (1.863, 'voltage')
     """
-    if not isinstance(flat_system, fs.FlatSystem):
-        raise TypeError(f"flat_system must be a control.flatsys.FlatSystem, got {type(flat_system).__name__}")
-    if flat_system.dt not in (None, 0):
-        raise ValueError(f"flat_system must be in continuous time, got dt = {flat_system.dt}")
-    warn_of_gain(flat_system)
+    plant = checked_plant(flat_system)
+    warn_of_output(flat_system)
     check_maps(flat_system)
     states, inputs = list(flat_system.state_labels), list(flat_system.input_labels)
-    params = dict(flat_system.params)
     # Off zero, where some flags are not finite.
-    flag = flat_system.forward(0.1 * np.ones(len(states)), 0.1 * np.ones(len(inputs)), params)
+    flag = plant.forward(0.1 * np.ones(len(states)), 0.1 * np.ones(len(inputs)))
     lengths = [len(row) for row in flag]
     longest = max(lengths)
-    undetermined = _undetermined_at_rest(flat_system, lengths, params)
+    undetermined = _undetermined_at_rest(plant, lengths)
 
     def quantities(jet: Array) -> dict[str, Array]:
         if len(jet) < longest - 1 or jet.shape[1] != len(lengths):
@@ -87,8 +84,8 @@ def flat_quantities(flat_system: fs.FlatSystem) -> Callable[[Array], dict[str, A
         columns: list[Any] = []
         with np.errstate(divide="ignore", invalid="ignore"):  # nan says the same
             for k in range(jet.shape[2]):
-                x, u = flat_system.reverse([values[:length, j, k] for j, length in enumerate(lengths)], params)
-                columns.append(np.concatenate([np.ravel(x), np.ravel(u)]))
+                x, u = plant.reverse([values[:length, j, k] for j, length in enumerate(lengths)])
+                columns.append(np.concatenate([x, u]))
         rows = np.array(columns, dtype=float).T
         if undetermined.any():
             speed = np.abs(values[1]).max(axis=0)
@@ -100,7 +97,7 @@ def flat_quantities(flat_system: fs.FlatSystem) -> Callable[[Array], dict[str, A
     return quantities
 
 
-def _undetermined_at_rest(flat_system: fs.FlatSystem, lengths: list[int], params: dict[str, Any]) -> NDArray[np.bool_]:
+def _undetermined_at_rest(plant: FlatPlant, lengths: list[int]) -> NDArray[np.bool_]:
     """Whether each state and input keeps depending on derivatives however slow the plan is."""
 
     def found(flag: list[Array], pace: float) -> Array | None:
@@ -108,15 +105,13 @@ def _undetermined_at_rest(flat_system: fs.FlatSystem, lengths: list[int], params
         slowed = [row * pace ** np.arange(row.size) for row in flag]
         with np.errstate(all="ignore"):
             try:
-                both = np.concatenate([np.ravel(part) for part in flat_system.reverse(slowed, params)]).astype(float)
+                both = np.concatenate(plant.reverse(slowed)).astype(float)
             except Exception:  # of a trial call, whatever it is
                 return None
         return both if np.isfinite(both).all() else None
 
     rng = np.random.default_rng(0)
-    undetermined: NDArray[np.bool_] = np.zeros(
-        len(flat_system.state_labels) + len(flat_system.input_labels), dtype=bool
-    )
+    undetermined: NDArray[np.bool_] = np.zeros(plant.nstates + plant.ninputs, dtype=bool)
     for _ in range(4):
         flags = [[rng.normal(size=length) for length in lengths] for _ in range(2)]
         for first, second in zip(*flags, strict=True):

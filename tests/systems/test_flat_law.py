@@ -280,7 +280,7 @@ def linear_plant():
 def test_a_linear_flat_system_of_python_control():
     system, measured = linear_plant()
     flat = fs.flatsys(system)
-    law = create_flat_iosystem(flat, POLES[1:])
+    law = create_flat_iosystem(flat, POLES[1:], labels="y")
     assert law.input_labels == ["y_ref", "y_ref_d1", "y_ref_d2", "y_ref_d3", "a", "b", "c"]
     plan = smooth(3)
     t = np.linspace(0.0, 4.0, 31)
@@ -291,7 +291,7 @@ def test_a_linear_flat_system_of_python_control():
 def test_without_references_it_places_the_poles():
     system, measured = linear_plant()
     for plant, flat in ((measured, fs.flatsys(system)), (ct.linearize(dc_motor(), np.zeros(3), 0), dc_motor())):
-        law = create_flat_iosystem(flat, POLES[1:])
+        law = create_flat_iosystem(flat, POLES[1:], labels="y")
         gain = ct.acker(plant.A, plant.B, POLES[1:])
         for x in np.eye(3):
             got = law.output(0.0, np.zeros(0), np.append(np.zeros(4), x))

@@ -1,0 +1,143 @@
+r"""Maps of linear flat systems, in exact arithmetic.
+
+With the characteristic polynomial s^n + a_(n-1) s^(n-1) + ... + a_0 of A and
+the flat output z of the reachable form,
+
+.. math:: z^{(k)} = q A^k x \ (k < n), \quad z^{(n)} = u - \sum_k a_k z^{(k)}, \quad
+    x = \sum_k w_k z^{(k)}, \quad w_{n-1} = B, \ w_{k-1} = A w_k + a_k B
+
+where q is the row with q w_k = 0 but for q w_0 = 1. Floating-point numbers are
+fractions, so that all of this is computed without rounding; python-control's
+`LinearFlatSystem` inverts the reachability matrix, which costs digits where
+time constants are far apart.
+"""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from typing import Any, NamedTuple
+
+import control.flatsys as fs
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Matrix = list[list[Fraction]]
+
+_NOTHING = 1e-9
+"""Part of its terms up to which a coefficient counts as 0."""
+
+
+class LinearMaps(NamedTuple):
+    """Flag and state of a linear flat system, and its output by the flag."""
+
+    flag: Array  # (n + 1, n + 1), z, ..., z^(n) by state and input
+    states: Array  # (n, n), by z, ..., z^(n - 1)
+    inputs: Array  # (1, n + 1), by z, ..., z^(n): a_0, ..., a_(n - 1), 1
+    output: Array  # (n + 1,), by z, ..., z^(n)
+
+    def forward(self, x: Any, u: Any) -> list[Any]:
+        """Flag of a state and an input."""
+        return [self.flag @ np.concatenate([x, u])]
+
+    def reverse(self, flag: list[Any]) -> list[Any]:
+        """State and input of a flag."""
+        return [self.states @ flag[0][:-1], self.inputs @ flag[0]]
+
+
+def is_linear(flat_system: fs.FlatSystem) -> bool:
+    """Whether the maps of a flat system are those of python-control's `LinearFlatSystem`."""
+    own, kind = type(flat_system), fs.LinearFlatSystem
+    return isinstance(flat_system, kind) and own.forward is kind.forward and own.reverse is kind.reverse
+
+
+def linear_maps(system: fs.LinearFlatSystem) -> LinearMaps:
+    """Maps of a linear flat system, every coefficient correct to rounding.
+
+    Parameters
+    ----------
+    system : control.flatsys.LinearFlatSystem
+        With one input and one output.
+
+    Returns
+    -------
+    LinearMaps
+
+    Raises
+    ------
+    ValueError
+        If the system is not controllable, or a coefficient is beyond floating point.
+    """
+    a, b, c = (_fractions(matrix) for matrix in (system.A, system.B, system.C))
+    n, through = len(a), Fraction(float(system.D[0, 0]))
+    polynomial = _characteristic(a)
+    column = [row[0] for row in b]
+    columns = [column]
+    for k in range(n - 1, 0, -1):
+        moved = _product(a, [[value] for value in columns[0]])
+        columns.insert(0, [row[0] + polynomial[k] * value for row, value in zip(moved, column, strict=True)])
+    rows = [_solution(columns, [Fraction(int(k == 0)) for k in range(n)], system.name)]
+    for _ in range(n):
+        rows.append(_product([rows[-1]], a)[0])
+    flag = [[*row, Fraction(int(k == n))] for k, row in enumerate(rows)]
+    output = [_dot(c[0], w) + through * p for w, p in zip(columns, polynomial, strict=True)]
+    terms = [_dot(map(abs, c[0]), map(abs, w)) + abs(through * p) for w, p in zip(columns, polynomial, strict=True)]
+    output = [value if abs(value) > _NOTHING * size else Fraction(0) for value, size in zip(output, terms, strict=True)]
+    try:
+        return LinearMaps(
+            _floats(flag), _floats(columns).T, _floats([[*polynomial, Fraction(1)]]), _floats([[*output, through]])[0]
+        )
+    except OverflowError:
+        raise ValueError(
+            f"coefficients of the flat maps of {system.name} must stay within floating point, got larger ones; "
+            "choose a time unit nearer to its time constants"
+        ) from None
+
+
+def _characteristic(a: Matrix) -> list[Fraction]:
+    """Coefficients of the characteristic polynomial, lowest first and without the leading 1 (Faddeev, LeVerrier)."""
+    n = len(a)
+    found = [Fraction(0)] * n
+    power = [[Fraction(0)] * n for _ in range(n)]
+    last = Fraction(1)
+    for k in range(1, n + 1):
+        power = _product(a, power)
+        for i in range(n):
+            power[i][i] += last
+        last = -sum(map(_dot, a, zip(*power, strict=True)), Fraction()) / k
+        found[n - k] = last
+    return found
+
+
+def _solution(matrix: Matrix, right: list[Fraction], name: str) -> list[Fraction]:
+    """Solution of a square system by Gaussian elimination."""
+    rows = [[*row, value] for row, value in zip(matrix, right, strict=True)]
+    n = len(rows)
+    for k in range(n):
+        pivot = next((i for i in range(k, n) if rows[i][k]), None)
+        if pivot is None:
+            raise ValueError(f"a linear flat system must be controllable, got {name}, which is not")
+        rows[k], rows[pivot] = rows[pivot], rows[k]
+        rows[k] = [value / rows[k][k] for value in rows[k]]
+        for i in range(n):
+            if i != k and rows[i][k]:
+                factor = rows[i][k]
+                rows[i] = [value - factor * other for value, other in zip(rows[i], rows[k], strict=True)]
+    return [row[-1] for row in rows]
+
+
+def _product(left: Matrix, right: Matrix) -> Matrix:
+    columns = list(zip(*right, strict=True))
+    return [[_dot(row, column) for column in columns] for row in left]
+
+
+def _dot(left: Any, right: Any) -> Fraction:
+    return sum((x * y for x, y in zip(left, right, strict=True) if x and y), Fraction())
+
+
+def _fractions(matrix: Any) -> Matrix:
+    return [[Fraction(value) for value in row] for row in np.asarray(matrix, dtype=float).tolist()]
+
+
+def _floats(rows: Matrix) -> Array:
+    return np.array([[float(value) for value in row] for row in rows])
