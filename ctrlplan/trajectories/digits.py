@@ -12,6 +12,7 @@ import decimal
 import math
 from collections.abc import Sequence
 from decimal import Decimal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +27,7 @@ def many_digits(
     times: Sequence[float],
     duration: float,
     constraints: tuple[NDArray[np.intp], NDArray[np.intp]],
-    values: Array,
+    values: NDArray[Any],
     fold: float,
     digits: int,
 ) -> Array:
@@ -42,7 +43,7 @@ def many_digits(
         Duration [s].
     constraints : pair of ndarray of int, shape (nconstraints,)
         Waypoint and order of each, in the order of the nodes.
-    values : ndarray, shape (nconstraints, naxes)
+    values : ndarray of float or Decimal, shape (nconstraints, naxes)
         Prescribed derivatives.
     fold : float
         Part of the function after the last one that is added to it.
@@ -59,7 +60,7 @@ def many_digits(
         u = [(Decimal(t) - Decimal(times[0])) / span for t in times]
         nodes = [u[i] for i in where]
         highest = {i: max(k for j, k in zip(where, orders, strict=True) if j == i) for i in set(where)}
-        bases = {i: _basis(Decimal(alpha), u[i], nodes, order, Decimal(fold)) for i, order in highest.items()}
+        bases = {i: basis_series(Decimal(alpha), u[i], nodes, order, Decimal(fold)) for i, order in highest.items()}
         columns: list[list[Decimal]] = [[] for _ in range(values.shape[1])]
         for row, (i, k) in enumerate(zip(where, orders, strict=True)):
             line = [series[k] for series in bases[i][: row + 1]]
@@ -70,8 +71,8 @@ def many_digits(
         return np.array([[float(value) for value in column] for column in columns]).T
 
 
-def _basis(alpha: Decimal, u: Decimal, nodes: list[Decimal], order: int, fold: Decimal) -> list[Series]:
-    """Taylor series about u of the functions of `newton`, pair by pair of nodes."""
+def basis_series(alpha: Decimal, u: Decimal, nodes: list[Decimal], order: int, fold: Decimal) -> list[Series]:
+    """Taylor series about u of the functions of `newton`, pair by pair of nodes, in the context's digits."""
     found = [[Decimal(1), *[Decimal(0)] * order]]
     for first, second in zip(nodes[::2], nodes[1::2], strict=False):
         both, one = _pair(alpha, u - first, u - second, order)

@@ -136,7 +136,7 @@ class NewtonSystem(Frozen):
             _first=nodes[0 : size - size % 2 : 2],
             _second=nodes[1::2],
             _scales={},
-            _hermite=all(g == tuple(range(len(g))) for g in given),
+            hermite=all(g == tuple(range(len(g))) for g in given),
             _positions=(orders == 0).astype(float)[:, None],
             _anchor=int((orders == 0).argmax()),
         )
@@ -147,8 +147,8 @@ class NewtonSystem(Frozen):
         collocation = jets[:, orders, waypoints].T
         self.__dict__["_triangle"], self.__dict__["_spread"] = (
             (np.asfortranarray(collocation), None)
-            if self._hermite and size == count
-            else _factor(collocation, self._hermite, self._roughness(smooth) if size > count else None, lead)
+            if self.hermite and size == count
+            else _factor(collocation, self.hermite, self._roughness(smooth) if size > count else None, lead)
         )
 
         if not self._triangle.diagonal().all():
@@ -190,11 +190,8 @@ class NewtonSystem(Frozen):
         loss = self.loss(taylor_data)
         if loss <= _KEPT:
             return self.coefficients(taylor_data)
-        if self._hermite and len(values) <= _MOST_DIGITS:
-            digits = math.ceil(math.log10(min(self._amplification, 1e300)))
-            constraints = self.waypoint_index, self.order_index
-            solved = many_digits(_effective(self.alpha), times, duration, constraints, values, self._fold, digits)
-            return solved if self._spread is None else self._spread @ solved
+        if self.hermite and len(values) <= _MOST_DIGITS:
+            return self.resolved(values, times, duration)
         if loss <= MOST_LOSS:
             return self.coefficients(taylor_data)
         why = "waypoints so close together amplify rounding: move them apart, or use PiecewiseSpline"
@@ -204,6 +201,16 @@ class NewtonSystem(Frozen):
             f"waypoints must determine the plan to {MOST_LOSS:g} of its range in floating point, got an estimated "
             f"loss of {loss:.1g}; {why}"
         )
+
+    def resolved(self, values: NDArray[Any], times: Sequence[float], duration: float, digits: int = 0) -> Array:
+        """The same in decimal arithmetic, where the triangle is that of the Newton form; values may be decimals.
+
+        `digits` are those that the caller expects to lose beyond those that the nodes cost.
+        """
+        digits += math.ceil(math.log10(min(self.amplification, 1e300)))
+        constraints = self.waypoint_index, self.order_index
+        solved = many_digits(_effective(self.alpha), times, duration, constraints, values, self._fold, digits)
+        return solved if self._spread is None else self._spread @ solved
 
     def taylor(self, u: Array, order: int) -> Array:
         """Taylor coefficients of every basis function.
@@ -272,7 +279,7 @@ class NewtonSystem(Frozen):
         The rounding of each product in the triangular solution, through the
         inverse to the plan: Skeel's componentwise bound, to first order.
         """
-        if self._amplification < _SUSPECT:
+        if self.amplification < _SUSPECT:
             return 0.0
         data = taylor_data - self._positions * taylor_data[self._anchor]
         solved = blas.dtrsm(1.0, self._triangle, data, lower=1)
@@ -289,7 +296,7 @@ class NewtonSystem(Frozen):
         return self.taylor(np.linspace(0.0, 1.0, 2 * self.size + 1), 0)[:, 0]
 
     @cached_property
-    def _amplification(self) -> float:
+    def amplification(self) -> float:
         """By how much rounding errors can grow in the solution, at most."""
         scaled = self._triangle / np.abs(self._triangle).max(axis=0)
         inverse: Array = blas.dtrsm(1.0, scaled, np.eye(len(scaled)), lower=1)
@@ -310,7 +317,7 @@ class NewtonSystem(Frozen):
         return np.sqrt(weights)[:, None] * top.T
 
     _scales: dict[float, Array]  # the last duration's, as a memory
-    _hermite: bool  # no gaps between the orders at any waypoint
+    hermite: bool  # no gaps between the orders at any waypoint
     _positions: Array  # 1 where a position is prescribed, else 0
     _anchor: int
     _triangle: Array

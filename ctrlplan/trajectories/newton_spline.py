@@ -6,6 +6,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ctrlplan.trajectories.common import Array, checked_count, checked_labels, derivative_scale, mapped_time, readonly
 from ctrlplan.trajectories.newton import NEARLY_CLOSED, NewtonSystem
@@ -163,6 +164,18 @@ class NewtonSpline(Trajectory):
             if self.alpha:
                 way_on = f"lower alpha from {self.alpha:.6g} (choose_alpha finds the best one) or {way_on}"
             warn_of_swing(values, self.waypoints, self.end, self.labels, way_on)
+
+    def resolved(self, table: NDArray[Any], digits: int) -> Self:
+        """The same plan with coefficients from decimals (nwaypoints, order + 1, naxes), where they can be had."""
+        parts = []
+        for axes, system, coefficients in self._parts:
+            values = table[system.waypoint_index, system.order_index][:, list(axes)]
+            if system.hermite:
+                coefficients = system.resolved(values, self._times, self._duration, digits)
+            parts.append((axes, system, coefficients))
+        plan = type(self).__new__(type(self))
+        plan.__dict__.update(self.__dict__, _parts=parts)
+        return plan
 
     def quiet(self) -> Self:
         """The same plan, which no longer warns where `through` or `with_values` swings."""

@@ -3,19 +3,31 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Iterable, Sequence
-from typing import Any, Literal, Self
+from typing import Any, Literal, NamedTuple, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ctrlplan.trajectories.common import FACTORIALS, Array, checked_labels, mapped_time, readonly, times_powers
-from ctrlplan.trajectories.newton import NewtonSystem
+from ctrlplan.trajectories.conjugate_digits import Ends, conjugate_digits
+from ctrlplan.trajectories.newton import NEARLY_CLOSED, NewtonSystem
 from ctrlplan.trajectories.newton_spline import NewtonSpline, checked_waypoints, given_entries, same_axes, same_times
 from ctrlplan.trajectories.polynomial import PolySpline
 from ctrlplan.trajectories.swing import warn_of_swing
 from ctrlplan.trajectories.trajectory import Trajectory
 from ctrlplan.trajectories.trigonometric import TrigSpline, chosen_alpha
 from ctrlplan.trajectories.waypoint import Waypoint
+
+_KEPT = 1e-12
+"""Relative error of the free entries, as estimated, up to which floating point solves for them."""
+
+_SINGULAR = 1e13
+"""Condition of their equations, with segments of one duration, from which they are not determined."""
+
+_SHORT = 0.02
+"""Part of the longest segment below which a segment needs its entries in more digits than floating point has."""
 
 _WITHIN = np.linspace(0.0, 1.0, 13)
 """Parts of a segment at which its swing is measured."""
@@ -78,18 +90,20 @@ class PiecewiseSpline(Trajectory):
         points = checked_waypoints(waypoints)
         shape = chosen_alpha(alpha, points, type(self), labels=labels)
         names = checked_labels(labels or points[0].labels, points[0].naxes)
-        filled = _filled(points, shape)
-        legs = tuple(
+        filled, decimals = _filled(points, shape)
+        legs: list[NewtonSpline] = [
             TrigSpline(pair, alpha=shape, labels=names, warn=False)
             if shape
             else PolySpline(pair, labels=names, warn=False)
             for pair in itertools.pairwise(filled)
-        )
+        ]
+        if decimals is not None:
+            _resolve(legs, decimals)
         self.__dict__.update(
             waypoints=points,
             alpha=shape,
             labels=names,
-            legs=legs,
+            legs=tuple(legs),
             breakpoints=readonly(np.array([p.time for p in points])),
             _warn=warn,
         )
@@ -163,20 +177,35 @@ class PiecewiseSpline(Trajectory):
         return self.legs[leg]._leg_series(0, s, order)
 
 
-def _filled(points: tuple[Waypoint, ...], alpha: float) -> list[Waypoint]:
-    """Waypoints whose inner ones have no free entry below the axis's highest order."""
+def _filled(points: tuple[Waypoint, ...], alpha: float) -> tuple[list[Waypoint], NDArray[np.object_] | None]:
+    """Waypoints whose inner ones have no free entry below the axis's highest order; and as decimals, where needed."""
     table, patterns = given_entries(points)
     filled = table.copy()
+    decimals: NDArray[np.object_] | None = None
     for pattern in dict.fromkeys(patterns):
         axes = [a for a, p in enumerate(patterns) if p == pattern]
         size = 1 + max((k for given in pattern for k in given), default=0)
         free = [(i, k) for i, g in enumerate(pattern[1:-1], 1) for k in range(size) if k not in g]
         if free:
             where = tuple(np.array(free).T)
-            filled[where[0][:, None], where[1][:, None], axes] = _conjugate(
-                points, pattern, size, free, table[:, :size, axes], alpha
-            )
-    return [Waypoint._of(p.time, jet, None) for p, jet in zip(points, filled, strict=True)]
+            found = _conjugate(points, pattern, size, free, table[:, :size, axes], alpha)
+            filled[where[0][:, None], where[1][:, None], axes] = found.astype(float)
+            if found.dtype == object:
+                decimals = filled.astype(object) if decimals is None else decimals
+                decimals[where[0][:, None], where[1][:, None], axes] = found
+            elif decimals is not None:
+                decimals[where[0][:, None], where[1][:, None], axes] = found
+    return [Waypoint._of(p.time, jet, None) for p, jet in zip(points, filled, strict=True)], decimals
+
+
+def _resolve(legs: list[NewtonSpline], decimals: NDArray[np.object_]) -> None:
+    """Replace short segments, whose higher derivatives rounding of the entries at their ends would change."""
+    durations = [leg.duration for leg in legs]
+    longest = max(durations)
+    for k, duration in enumerate(durations):
+        if duration < _SHORT * longest:
+            digits = math.ceil(2 * decimals.shape[1] * math.log10(longest / duration))
+            legs[k] = legs[k].resolved(decimals[k : k + 2], digits)
 
 
 def _conjugate(
@@ -186,55 +215,84 @@ def _conjugate(
     free: list[tuple[int, int]],
     table: Array,
     alpha: float,
-) -> Array:
-    """Free entries (nfree, naxes): those that leave no jump of the conjugate derivatives.
+) -> NDArray[Any]:
+    """Free entries (nfree, naxes) that leave no jump of the conjugate derivatives: floats, or decimals."""
+    last = len(points) - 1
+    ends: list[Ends] = []
+    for leg in range(last):
+        start, end = (pattern[i] if i in (0, last) else tuple(range(size)) for i in (leg, leg + 1))
+        if not (start or end):
+            raise ValueError(f"waypoints must prescribe something on every leg, got none from {leg} to {leg + 1}")
+        ends.append((start, end))
+    times = np.array([p.time for p in points])
+    unit = float(times[-1] - times[0]) / last
+    durations = np.diff(times)
+    orders = np.array([k for _, k in free])
+    equations = None
+    if durations.min() >= _SHORT * durations.max():
+        equations = _jumps(durations / unit, ends, free, times_powers(table, unit, np.arange(size)[:, None]), alpha)
+    if equations is not None and equations.loss <= _KEPT:
+        entries: NDArray[Any] = np.linalg.solve(equations.matrix, -equations.known)
+        return times_powers(entries, 1.0 / unit, orders[:, None])
+    # Whether the data determine the entries does not depend on the times, which may be far from even.
+    even = _jumps(np.ones(last), ends, free, table, alpha)
+    solution = None
+    if even is None or even.condition <= _SINGULAR or alpha > NEARLY_CLOSED:
+        solution = conjugate_digits(alpha, times.tolist(), ends, free, table)
+    if solution is None:
+        raise ValueError("the entries left free at inner waypoints must be determined by the others; prescribe more")
+    finite = np.isfinite(solution.astype(float))
+    if not finite.all():
+        i, k = free[int(np.argwhere(~finite)[0, 0])]
+        raise ValueError(
+            f"derivatives at inner waypoints must stay within floating point, got a larger derivative {k} at "
+            f"waypoints[{i}]; move waypoints apart that are so near in time"
+        )
+    return solution
+
+
+class _Equations(NamedTuple):
+    """Equations of the free entries, matrix (nfree, nfree) by known sides (nfree, naxes)."""
+
+    matrix: Array
+    known: Array
+    condition: float
+    loss: float  # estimated relative error of their solution
+
+
+def _jumps(
+    durations: Array, ends: list[Ends], free: list[tuple[int, int]], table: Array, alpha: float
+) -> _Equations | None:
+    """Jumps of the conjugate derivatives, scaled by rows; None where they are beyond floating point.
 
     The legs are linear in their data, so each free entry is tried as an axis of
-    its own beside the axes asked for; time is scaled to the mean leg.
+    its own after those given; times are in units of the mean leg.
     """
-    last = len(points) - 1
-    unit = (points[-1].time - points[0].time) / last
-    naxes = table.shape[2]
+    last, size, naxes = durations.size, table.shape[1], table.shape[2]
     columns = np.concatenate([np.nan_to_num(table), np.zeros((last + 1, size, len(free)))], axis=2)
-    columns = times_powers(columns, unit, np.arange(size)[:, None])
     for n, (i, k) in enumerate(free):
         columns[i, k, naxes + n] = 1.0
     jump = np.zeros((last + 1, 2 * size, columns.shape[2]))  # right limit minus left, at each waypoint
-    for leg in range(last):
-        ends = [pattern[i] if i in (0, last) else tuple(range(size)) for i in (leg, leg + 1)]
-        if not any(ends):
-            raise ValueError(f"waypoints must prescribe something on every leg, got none from {leg} to {leg + 1}")
-        duration = (points[leg + 1].time - points[leg].time) / unit
-        system = NewtonSystem(alpha, np.array([0.0, 1.0]), (ends[0], ends[1]))
+    amplification = 1.0
+    for leg, duration in enumerate(durations.tolist()):
+        system = NewtonSystem(alpha, np.array([0.0, 1.0]), ends[leg])
+        amplification = max(amplification, system.amplification)
         orders = system.order_index
-        scale = duration**orders / FACTORIALS[orders]
-        coefficients = system.coefficients(columns[leg + system.waypoint_index, orders] * scale[:, None])
-        taylor = system.taylor(np.array([0.0, 1.0]), 2 * size - 1)
-        jets = np.einsum("mkt,ma->tka", taylor, coefficients)
-        with np.errstate(over="ignore", invalid="ignore"):
+        with np.errstate(all="ignore"):
+            scale = duration**orders / FACTORIALS[orders]
+            coefficients = system.coefficients(columns[leg + system.waypoint_index, orders] * scale[:, None])
+            taylor = system.taylor(np.array([0.0, 1.0]), 2 * size - 1)
+            jets = np.einsum("mkt,ma->tka", taylor, coefficients)
             jets *= (FACTORIALS[: 2 * size] / duration ** np.arange(2 * size))[:, None]
-        if not np.isfinite(jets).all():
-            raise ValueError(
-                "derivatives at inner waypoints must stay within floating point, got larger ones from the data of "
-                f"waypoints {leg} and {leg + 1}"
-            )
         jump[leg] += jets[0]
         jump[leg + 1] -= jets[1]
     rows = np.array([jump[i, 2 * size - 1 - k] for i, k in free])
-    matrix, known = rows[:, naxes:], rows[:, :naxes]
-    scale = np.abs(matrix).max(axis=1, keepdims=True)
-    condition = np.linalg.cond(matrix / scale) if scale.min() > 0.0 else np.inf
-    if condition > 1e13:
-        steps = np.diff([p.time for p in points])
-        if np.ptp(steps) > 1e-9 * unit:
-            # Whether the data determine the entries does not depend on the times: this raises if they do not.
-            _conjugate(tuple(p.scaled(float(i), 1.0) for i, p in enumerate(points)), pattern, size, free, table, alpha)
-            k = int(steps.argmin())
-            raise ValueError(
-                f"the entries left free at inner waypoints must be determined in double precision, got a condition "
-                f"number of {condition:.1g}: {steps[k]:.3g} s from waypoints[{k}] to [{k + 1}] are "
-                f"{steps[k] / unit:.2g} of the mean segment; merge waypoints that are so near, or prescribe more there"
-            )
-        raise ValueError("the entries left free at inner waypoints must be determined by the others; prescribe more")
-    solution: Array = np.linalg.solve(matrix, -known)
-    return times_powers(solution, 1.0 / unit, np.array([k for _, k in free])[:, None])
+    if not np.isfinite(rows).all():
+        return None
+    size_of = np.abs(rows[:, naxes:]).max(axis=1, keepdims=True)
+    rows /= np.where(size_of > 0.0, size_of, 1.0)
+    matrix = rows[:, naxes:]
+    # Columns scaled, so that the units of the entries do not count.
+    size_of = size_of[:, 0] * np.abs(matrix).max(axis=0)
+    condition = float(np.linalg.cond(matrix / np.abs(matrix).max(axis=0))) if size_of.min() > 0.0 else np.inf
+    return _Equations(matrix, rows[:, :naxes], condition, np.finfo(float).eps * condition * amplification)

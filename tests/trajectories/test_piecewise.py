@@ -181,14 +181,6 @@ def test_what_is_not_determined_is_refused(jets):
         PiecewiseSpline(waypoints([0.0, 1.0, 2.0], jets))
 
 
-@pytest.mark.parametrize("gap", [1e-6, 1e-7, 1e-9])
-def test_a_short_segment_is_not_called_undetermined(gap):
-    """Minimum jerk through four points is determined; what is missing are digits."""
-    points = [Waypoint(0, 0, 0, 0), Waypoint(1, 1), Waypoint(1 + gap, 1.1), Waypoint(2, 2, 0, 0)]
-    with pytest.raises(ValueError, match=r"determined in double precision, got a condition .*waypoints\[1\] to \[2\]"):
-        PiecewiseSpline(points)
-
-
 def test_what_is_not_determined_stays_so_beside_a_short_segment():
     with pytest.raises(ValueError, match="must be determined by the others; prescribe more"):
         PiecewiseSpline(waypoints([0.0, 1.0, 1.0 + 1e-7, 2.0], [[None], [None], [None], [None]]))

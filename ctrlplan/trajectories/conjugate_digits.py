@@ -1,0 +1,146 @@
+"""Free entries of a piecewise spline in as many digits as their data need.
+
+Where segments are of very different durations, the equations of the free
+entries hold powers of those durations, and floating point loses their digits.
+The same equations are made and solved here in decimal arithmetic.
+"""
+
+from __future__ import annotations
+
+import decimal
+import itertools
+import math
+import operator
+from collections.abc import Sequence
+from decimal import Decimal
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctrlplan.trajectories.common import Array
+from ctrlplan.trajectories.digits import basis_series
+
+Ends = tuple[tuple[int, ...], tuple[int, ...]]
+"""Orders of the derivatives that determine a segment, at its start and at its end."""
+_Row = tuple[dict[int, Decimal], list[Decimal]]
+"""An equation: its coefficients by unknown, and its right sides."""
+
+
+def conjugate_digits(
+    alpha: float, times: Sequence[float], ends: Sequence[Ends], free: Sequence[tuple[int, int]], table: Array
+) -> NDArray[np.object_] | None:
+    """Free entries that leave no jump of their conjugate derivatives, correct to rounding.
+
+    Parameters
+    ----------
+    alpha : float
+        Shape parameter [rad] of each segment; 0 gives polynomials.
+    times : sequence of float
+        Times of the waypoints [s].
+    ends : sequence of Ends, of length nsegments
+        What determines each segment, free entries included.
+    free : sequence of (int, int)
+        Waypoint and order of each free entry, by waypoints.
+    table : ndarray, shape (nwaypoints, size, naxes)
+        Prescribed derivatives; what is free does not count.
+
+    Returns
+    -------
+    ndarray of Decimal, shape (nfree, naxes), or None
+        None where the equations are singular.
+    """
+    size = table.shape[1]
+    durations = np.diff(times)
+    # Each equation holds powers of the durations up to 2 size - 1, elimination the products of two of them; ends that
+    # are nearly one point on the circle divide by powers of their distance.
+    spread = max(float(durations.max() / durations.min()), 10.0)
+    digits = 40 + math.ceil(2 * size * (2.0 * math.log10(spread) + math.log10(2.0 * math.pi / (2.0 * math.pi - alpha))))
+    with decimal.localcontext(decimal.Context(digits, Emin=decimal.MIN_EMIN, Emax=decimal.MAX_EMAX)):
+        moments = [Decimal(t) for t in times]
+        steps = [b - a for a, b in itertools.pairwise(moments)]
+        place = {entry: n for n, entry in enumerate(free)}
+        weights = [_derivatives(alpha, pair, size, digits) for pair in ends]
+        solution = _solved([_jump(entry, place, steps, weights, ends, table) for entry in free])
+    return None if solution is None else np.array(solution, dtype=object)
+
+
+def _jump(
+    entry: tuple[int, int],
+    place: dict[tuple[int, int], int],
+    steps: list[Decimal],
+    weights: list[list[list[list[Decimal]]]],
+    ends: Sequence[Ends],
+    table: Array,
+) -> _Row:
+    """Equation of a free entry: the derivative conjugate to it does not jump."""
+    i, k = entry
+    order = 2 * table.shape[1] - 1 - k
+    unknown, known = dict[int, Decimal](), [Decimal(0)] * table.shape[2]
+    for leg, side in ((i - 1, 1), (i, 0)):
+        data = [(leg + end, given) for end in (0, 1) for given in ends[leg][end]]
+        for (waypoint, given), weight in zip(data, weights[leg][side][order], strict=True):
+            factor = weight * steps[leg] ** (given - order) * (1 - 2 * side)
+            n = place.get((waypoint, given))
+            if n is None:
+                values = table[waypoint, given].tolist()
+                known = [a - factor * Decimal(value) for a, value in zip(known, values, strict=True)]
+            else:
+                unknown[n] = unknown.get(n, Decimal(0)) + factor
+    return unknown, known
+
+
+@lru_cache(maxsize=64)
+def _derivatives(alpha: float, ends: Ends, size: int, digits: int) -> list[list[list[Decimal]]]:
+    """Derivatives 0, ..., 2 size - 1 at the start and at the end of the unit segment, by its data."""
+    with decimal.localcontext(decimal.Context(digits, Emin=decimal.MIN_EMIN, Emax=decimal.MAX_EMAX)):
+        nodes = [Decimal(end) for end in (0, 1) for _ in ends[end]]
+        taylor = [basis_series(Decimal(alpha), Decimal(end), nodes, 2 * size - 1, Decimal(0)) for end in (0, 1)]
+        values = [[[row[k] * math.factorial(k) for row in rows] for k in range(2 * size)] for rows in taylor]
+        rows: list[_Row] = []
+        for end, k in [(side, k) for side in (0, 1) for k in ends[side]]:
+            unit = [Decimal(int(n == len(rows))) for n in range(len(nodes))]
+            rows.append((dict(enumerate(values[end][k])), unit))
+        inverse = _solved(rows)
+        if inverse is None:
+            raise ValueError("the entries given at the ends of a segment must determine it, got a singular system")
+        columns = list(zip(*inverse, strict=True))
+        return [
+            [[sum(map(operator.mul, row, column), Decimal(0)) for column in columns] for row in side] for side in values
+        ]
+
+
+def _solved(rows: list[_Row]) -> list[list[Decimal]] | None:
+    """Solution of equations by elimination with pivots; None where they are singular."""
+    left = []
+    for coefficients, right in rows:
+        size = max(map(abs, coefficients.values()), default=Decimal(0)) or Decimal(1)
+        left.append(({n: v / size for n, v in coefficients.items() if v}, [v / size for v in right]))
+    # Rows come by waypoints. `first`: lowest unknown of a row and of all after it, so that few rows are searched.
+    starts = [min(coefficients, default=0) for coefficients, _ in left]
+    first = list(itertools.accumulate(starts[::-1], min))[::-1]
+    pivots: list[_Row] = []
+    for n in range(len(rows)):
+        held = [m for m in range(next((m for m, f in enumerate(first) if f > n), len(left))) if n in left[m][0]]
+        if not held:
+            return None
+        chosen = max(held, key=lambda m: abs(left[m][0][n]))
+        pivot, right = left[chosen]
+        for m in held:
+            coefficients, other = left[m]
+            if m != chosen:
+                factor = coefficients.pop(n) / pivot[n]
+                for q, value in pivot.items():
+                    if q != n:
+                        coefficients[q] = coefficients.get(q, Decimal(0)) - factor * value
+                left[m] = coefficients, [a - factor * b for a, b in zip(other, right, strict=True)]
+        pivots.append((pivot, right))
+        del left[chosen], first[chosen]
+    found: list[list[Decimal]] = [[]] * len(rows)
+    for n in range(len(rows) - 1, -1, -1):
+        coefficients, right = pivots[n]
+        for q, value in coefficients.items():
+            if q != n:
+                right = [a - value * b for a, b in zip(right, found[q], strict=True)]
+        found[n] = [value / coefficients[n] for value in right]
+    return found
