@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 TOLERANCE = 1e-9
 """Error of an extremum of a function of the jet, relative to the function's largest magnitude."""
 
-_SAMPLES = 8192  # times of a plan at which such a function is evaluated, however smooth it seems; 64 a segment at least
+_SAMPLES = 8192  # times of a plan at which such a function is evaluated, however smooth it seems
 
 _MAX_PIECES = 20_000
 _CHUNK = 256  # pieces that are evaluated together
@@ -121,8 +121,9 @@ def function_extrema(
 ) -> Extrema:
     """Extrema of a function of the jet, to `TOLERANCE` of its largest magnitude or of a scale.
 
-    The function is evaluated at 8192 times of the plan (64 of a segment at
-    least); what shows at none of them, such as a shorter pulse, is missed.
+    The function is evaluated at 8192 times of the plan, of each of n segments at
+    8192/n and at 64 at least; what shows at none of them, such as a shorter
+    pulse, is missed.
 
     Parameters
     ----------
@@ -169,14 +170,19 @@ class _Search:
         self.found = _Candidates()
         self._plan, self._function, self._order, self._scale = plan, function, order, scale
         self._spent = 0
-        self._samples = []
+        self._samples: list[Array] = []
+        self._best: dict[tuple[int, float], tuple[int, float, float]] = {}  # segment, time and value by row and sign
         for leg, (_, duration) in enumerate(self.legs):
-            count = 2 ** math.ceil(math.log2(max(_SAMPLES * duration / plan.duration, 64)))
+            share = max(duration / plan.duration, 1.0 / len(self.legs))
+            count = 2 ** math.ceil(math.log2(max(_SAMPLES * share, 64)))
             parts = np.array_split(duration * _between(count), -(-count // 1024))  # small enough for a cache
-            rows = [self._values(leg, t) for t in (*parts, np.array([0.0, duration]))]
-            self._samples.append(np.concatenate(rows, axis=1))
-        self._low = np.min([rows.min(axis=1) for rows in self._samples], axis=0)
-        self._high = np.max([rows.max(axis=1) for rows in self._samples], axis=0)
+            parts.append(np.array([0.0, duration]))
+            rows = np.concatenate([self._values(leg, t) for t in parts], axis=1)
+            self._samples.append(rows)
+            if leg == 0:
+                self._low, self._high = np.full(len(rows), np.inf), np.full(len(rows), -np.inf)
+            self._keep_best(leg, np.concatenate(parts), rows)
+            self._low, self._high = np.minimum(self._low, rows.min(axis=1)), np.maximum(self._high, rows.max(axis=1))
 
     def bisect(self, leg: int) -> None:
         """Add to what was found the times at which a segment can hold an extremum."""
@@ -197,17 +203,28 @@ class _Search:
         width, count = math.ldexp(duration, -level), samples.shape[1] >> level
         own = _SHARES if count >= _CHECKS else np.append(_SHARES, _between(_CHECKS))
         times = np.minimum(width * (index[:, None] + own), duration)
-        values = self._values(leg, times.ravel()).reshape(len(samples), *times.shape)
-        checks = values[..., _SHARES.size :]
-        if count >= _CHECKS:
-            checks = samples.reshape(len(samples), -1, count)[:, index]
+        found = self._values(leg, times.ravel())
+        self._keep_best(leg, times.ravel(), found)
+        values = found.reshape(len(samples), *times.shape)
         series = transform(values[..., : _FIT + 1])
-        missed = np.abs(series @ _basis(checks.shape[2]) - checks).max(axis=2)
-        missed = np.maximum(missed, np.abs(series @ _ENDS - values[..., _FIT + 1 : _FIT + 3]).max(axis=2))
+        missed = np.abs(series @ _ENDS - values[..., _FIT + 1 : _FIT + 3]).max(axis=2)
         missed = np.maximum(missed, np.abs(series[..., -8:]).max(axis=2))
+        checks = values[..., _SHARES.size :]
+        if checks.size:
+            missed = np.maximum(missed, np.abs(series @ _basis(_CHECKS) - checks).max(axis=2))
+        if count:  # samples of the piece, which may have met what its own times have not
+            seen = samples.reshape(len(samples), -1, count)[:, index]
+            missed = np.maximum(missed, np.abs(series @ _basis(count) - seen).max(axis=2))
+            checks = np.concatenate([checks, seen], axis=2)
 
         low = np.minimum(values.min(axis=2), checks.min(axis=2))
         high = np.maximum(values.max(axis=2), checks.max(axis=2))
+        for (row, _), (place, instant, value) in self._best.items():  # pieces too short for a sample must not lose it
+            k = int(np.searchsorted(index, math.floor(instant / width)))
+            if place == leg and k < index.size and 0.0 <= (part := instant / width - index[k]) <= 1.0:
+                miss = abs(float(chebyshev.chebval(2.0 * part - 1.0, series[row, k])) - value)
+                missed[row, k] = max(missed[row, k], miss)
+                low[row, k], high[row, k] = min(low[row, k], value), max(high[row, k], value)
         self._low, self._high = np.minimum(self._low, low.min(axis=1)), np.maximum(self._high, high.max(axis=1))
         magnitude = np.maximum(np.maximum(np.abs(self._low), np.abs(self._high)), self._scale)
         scale = np.maximum(magnitude, _TINY)[:, None]
@@ -231,6 +248,16 @@ class _Search:
     def _add(self, leg: int, t: Array) -> None:
         times, ends = _placed(self._plan, leg, t)
         self.found.add(times, self._values(leg, t), ends)
+
+    def _keep_best(self, leg: int, t: Array, values: Array) -> None:
+        """Make candidates of times at which a row exceeds all seen before: those near by may not reach it."""
+        for sign, seen in ((-1.0, self._low), (1.0, self._high)):
+            best = (sign * values).argmax(axis=1)
+            for row in np.flatnonzero((sign * values).max(axis=1) > sign * seen).tolist():
+                at = best[row : row + 1]
+                self._best[row, sign] = (leg, float(t[at[0]]), float(values[row, at[0]]))
+                times, ends = _placed(self._plan, leg, t[at])
+                self.found.add(times, values[:, at], ends)
 
     def _values(self, leg: int, t: Array) -> Array:
         """Values (nrows, ntime) of the function at times from the beginning of a segment."""

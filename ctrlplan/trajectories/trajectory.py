@@ -238,8 +238,8 @@ class Trajectory(Frozen, ABC):
         stationary points are solved for. Pieces are bisected until interpolant
         and function agree at times that the interpolant was not made from;
         kinks and jumps are enclosed. The function is evaluated at 8192 times
-        spread over the plan (64 on a segment at least) before it is taken for
-        smooth: what shows at none of them, such as a pulse shorter than their
+        spread over the plan (of each of n segments at 8192/n and at 64 at least)
+        before it is taken for smooth: what shows at none of them, such as a pulse shorter than their
         distance, is missed. `bounds` proves its result.
 
         Parameters

@@ -437,3 +437,41 @@ def test_bounds_are_not_rounded_inwards(seed):
 def test_bounds_that_cannot_be_reached_are_refused():
     with pytest.raises(ValueError, match="rtol = 1e-12 must be reached within 200 cells"):
         MOVE.bounds(lambda jet: jet[0, 0], 0, 1.0, rtol=1e-12, max_cells=200)
+
+
+# What one sample has met is not lost while its surroundings are bisected
+
+SMOOTH = PolySpline([Waypoint(0, 0, 0, 0), Waypoint(1, 1, 0, 0)])
+
+
+def test_a_cusp_that_one_time_meets_is_not_below_what_was_seen():
+    """-|y - c|^0.1 falls by 2 % within the rounding of y: the maximum is at least the largest value evaluated."""
+    seen = []
+
+    def cusp(jet):
+        seen.append(-(np.abs(jet[0, 0] - 0.5123) ** 0.1))
+        return seen[-1]
+
+    found = SMOOTH.extrema_of(cusp, 0)
+    assert found.maximum[0] >= max(values.max() for values in seen)
+    assert found.maximum[0] > -0.05
+
+
+@pytest.mark.parametrize("share", [0.3, 0.004, 0.3173])
+def test_a_pulse_that_one_sample_meets_is_climbed(share):
+    """Its width is a hundredth of the samples' distance; the sample that meets it stands on its flank."""
+    seen = []
+    SMOOTH.extrema_of(lambda jet: seen.append(jet[0, 0]) or jet[0, 0], 0)
+    samples = np.sort(np.concatenate(seen[:-1]))
+    at = samples[int(share * samples.size)]
+    width = 0.01 * np.diff(samples)[int(share * samples.size)]
+    found = SMOOTH.extrema_of(lambda jet: np.exp(-(((jet[0, 0] - at) / width - 1.2) ** 2)), 0)
+    assert found.maximum[0] == pytest.approx(1.0, rel=1e-9)
+
+
+def test_a_short_segment_before_a_long_one_is_searched_as_closely():
+    """A pulse of 1 ms in the first second of a thousand."""
+    rise = PolySpline([Waypoint(0, 0, 0, 0), Waypoint(1, 1, 0, 0)])
+    plan = rise.then(PolySpline([Waypoint(1, 1, 0, 0), Waypoint(1000, 2, 0, 0)]))
+    found = plan.extrema_of(lambda jet: np.exp(-(((jet[0, 0] - 0.4321) / 1e-3) ** 2)), 0)
+    assert found.maximum[0] == pytest.approx(1.0, rel=1e-9)
