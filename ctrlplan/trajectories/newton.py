@@ -55,6 +55,9 @@ _SUSPECT = 1e5
 _KEPT = 1e-10
 """Part of a plan's range up to which rounding may cost it before more digits are taken."""
 
+_ACROSS = 1e-2
+"""Way across the closed end [parts of a turn] below which products of alpha and times lose digits of their sine."""
+
 MOST_LOSS = 1e-6
 """The same where there are no more to take."""
 
@@ -188,6 +191,8 @@ class NewtonSystem(Frozen):
             If rounding could cost more than 1e-6 of the plan's range.
         """
         loss = self.loss(taylor_data)
+        if self._across(times, duration) < _ACROSS and self.hermite and len(values) <= _MOST_DIGITS:
+            loss = 1.0  # the triangle itself is rounded
         if loss <= _KEPT:
             return self.coefficients(taylor_data)
         if self.hermite and len(values) <= _MOST_DIGITS:
@@ -272,6 +277,14 @@ class NewtonSystem(Frozen):
         if self._fold:
             columns = [[*column, self._fold * column[-1]] for column in columns]
         return [newton_series(factors, column, order) for column in columns]
+
+    def _across(self, times: Sequence[float], duration: float) -> float:
+        """Shortest way on the circle from a waypoint near the end to one near the start, both ends excepted."""
+        if self.alpha <= NEARLY_CLOSED:
+            return 1.0
+        used = [times[i] for i in sorted(set(self.waypoint_index.tolist()))]
+        apart = max([times[-1] - t for t in used[1:2]] + [t - times[0] for t in used[-2:-1]], default=0.0)
+        return math.sin(0.5 * self.alpha * min(apart / duration, 1.0))
 
     def loss(self, taylor_data: Array) -> float:
         """Bound of what rounding costs the plan through the data, relative to its range.

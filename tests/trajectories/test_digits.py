@@ -235,3 +235,17 @@ def test_sine_and_cosine_of_many_digits():
         for x in ("0", "1e-30", "-2.5", "3.141592653589793", "6.283185307179586"):
             for ours, theirs in zip(_sin_cos(decimal.Decimal(x)), (mp.sin(mp.mpf(x)), mp.cos(mp.mpf(x))), strict=True):
                 assert abs(mp.mpf(str(ours)) - theirs) < mp.mpf(10) ** -55
+
+
+@pytest.mark.parametrize("gap", [1e-5, 1e-7, 1e-10])
+@pytest.mark.parametrize("alpha", [6.28, 6.2831853, 2.0 * np.pi * (1.0 - 2e-16)])
+def test_a_waypoint_near_the_end_is_near_the_start_too(alpha, gap):
+    """On the circle: products of alpha and times near a whole turn lose the digits of their sine."""
+    for times, jets in (
+        ([0.0, 1.0, 4.0 - gap, 4.0], [[1.0, 0.0, 0.0], [2.0], [1.1], [1.0, 0.0, 0.0]]),
+        ([0.0, gap, 2.0, 4.0], [[1.0, 0.0], [2.0], [1.1], [5.0, 0.0]]),
+    ):
+        plan = TrigSpline(waypoints(times, jets), alpha=alpha, warn=False)
+        t = np.linspace(0.0, 4.0, 17)
+        exact = Direct(times, jets, alpha, digits=150).jet(t, 2)
+        assert (np.abs(plan.jet(t, 2)[:, 0] - exact).max(axis=1) <= 1e-12 * np.abs(exact).max(axis=1)).all()
