@@ -134,6 +134,8 @@ def _check_kinds(values: Any, name: str) -> None:
 def checked_timepts(t: ArrayLike) -> Array:
     """Times as an array of any shape, without nan."""
     times = real_array(t, "times")
+    if times is not t and np.asarray(t).dtype.kind == "b":
+        raise TypeError(f"times must be numbers, got truth values {t!r:.60}; index times by a mask before")
     # One number tells: the minimum of times with a nan among them is nan.
     if times.size and np.isnan(times.min()):
         raise ValueError(f"times must not be nan, got nan at index {int(np.isnan(times).argmax())}")

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ctrlplan._files import write_bytes, write_text
-from ctrlplan.trajectories.common import Array, checked_timepts
+from ctrlplan.trajectories.common import Array, checked_count, checked_timepts
 from ctrlplan.trajectories.trajectory import Trajectory
 
 
@@ -121,9 +121,12 @@ def write_csv(plan: Trajectory, path: str | os.PathLike[str], timepts: ArrayLike
             f"timepts must be sample times of shape (ntime,), got {got}; for a row every {step} s give "
             f"np.arange(plan.start, plan.end, {step})"
         )
-    columns = np.concatenate([times[None], signal_rows(plan, times, order)])
+    highest = checked_count(order, "order")
+    columns = np.concatenate([times[None], signal_rows(plan, times, highest)])
     table = io.StringIO()
-    np.savetxt(table, columns.T, fmt="%.17g", delimiter=",", header=csv_header(column_names(plan, order)), comments="")
+    np.savetxt(
+        table, columns.T, fmt="%.17g", delimiter=",", header=csv_header(column_names(plan, highest)), comments=""
+    )
     # As numpy's own writing to a path of these endings.
     packers: dict[str, Callable[[bytes], bytes]] = {".gz": gzip.compress, ".bz2": bz2.compress, ".xz": lzma.compress}
     write_bytes(path, packers.get(Path(path).suffix, bytes)(table.getvalue().encode("utf-8")))
@@ -151,7 +154,7 @@ def signal_names(labels: Iterable[str], order: int) -> list[str]:
 
 def signal_rows(plan: Trajectory, times: Array, order: int) -> Array:
     """Values axis by axis, in the order of `signal_names`: (naxes (order + 1), ntime)."""
-    return plan.jet(times, order).transpose(1, 0, 2).reshape(-1, times.size)
+    return plan.jet(times, order).transpose(1, 0, 2).reshape(plan.naxes * (order + 1), times.size)
 
 
 def derivative_name(label: str, order: int) -> str:

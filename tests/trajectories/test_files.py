@@ -214,3 +214,24 @@ def test_a_write_that_fails_leaves_the_plan_before(write, tmp_path, monkeypatch)
         getattr(MOVE, write)(path)
     assert path.read_text() == "before"
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_table_of_no_times_has_its_names_alone(tmp_path):
+    plan = PolySpline([Waypoint(0, 0, 0), Waypoint(1, 1, 0)])
+    plan.to_csv(tmp_path / "none.csv", [], order=1)
+    assert (tmp_path / "none.csv").read_text() == "time,y,y_d1\n"
+
+
+def test_an_order_of_a_table_may_be_any_whole_number(tmp_path):
+    plan = PolySpline([Waypoint(0, 0, 0), Waypoint(1, 1, 0)])
+    plan.to_csv(tmp_path / "a.csv", [0.5], order=1.0)
+    plan.to_csv(tmp_path / "b.csv", [0.5], order=1)
+    assert (tmp_path / "a.csv").read_bytes() == (tmp_path / "b.csv").read_bytes()
+
+
+@pytest.mark.parametrize("times", [[True, False], np.array([0.0, 1.0]) > 0.5, True])
+def test_a_mask_is_no_time(times, tmp_path):
+    plan = PolySpline([Waypoint(0, 0, 0), Waypoint(1, 1, 0)])
+    for asked in (plan, lambda t: plan.jet(t, 1), lambda t: plan.to_csv(tmp_path / "a.csv", t)):
+        with pytest.raises(TypeError, match="times must be numbers, got truth values"):
+            asked(times)
