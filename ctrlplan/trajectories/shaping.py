@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from typing import Self
 
 import numpy as np
@@ -148,11 +149,28 @@ class Shaper(Frozen):
         ------
         TypeError
             If `plan` is not a trajectory.
+        ValueError
+            If times so far from 0 round the delays by more than 1e-3 of the duration.
+
+        Warns
+        -----
+        UserWarning
+            If they round them by more than 1e-6 of it.
         """
         if not isinstance(plan, Trajectory):
             raise TypeError(f"plan must be a Trajectory, got {type(plan).__name__}")
-        pairs = zip(self.delays.tolist(), self.weights.tolist(), strict=True)
-        return Sum((weight * plan.shift(delay) for delay, weight in pairs), shaped=True)
+        parts = [plan.shift(delay) for delay in self.delays.tolist()]
+        delayed = np.array([part.start for part in parts]) - plan.start
+        loss = float((np.abs(delayed - self.delays) / (self.duration or 1.0)).max())
+        if loss > 1e-6:
+            said = (
+                f"delays must be kept by the clock, got a loss of {loss:.1g} of the shaper's duration by rounding of "
+                f"times near {plan.start:.17g} s; count time from an origin nearer to the plan"
+            )
+            if loss > 1e-3:
+                raise ValueError(said)
+            warnings.warn(said, stacklevel=2)
+        return Sum((weight * part for part, weight in zip(parts, self.weights.tolist(), strict=True)), shaped=True)
 
     def then(self, other: Shaper) -> Shaper:
         """Both shapers one after the other, for two modes: every impulse split again."""

@@ -383,3 +383,17 @@ def test_what_retiming_would_do_to_a_shaper(wrong):
     scaled = Shaper(wrong * shaper.delays, shaper.weights)
     assert shaper.residual(6.0) <= 1e-15
     assert scaled.residual(6.0) == pytest.approx(abs(math.cos(0.5 * math.pi * wrong)), rel=1e-12)
+
+
+def test_delays_that_the_clock_cannot_hold_are_said():
+    """Times near 2^48 s are 1/16 s apart, near 2^35 s 8 us: a delay of pi/3 s loses a part of that."""
+    shaper = Shaper.zv(3.0)
+
+    def late(start):
+        return PolySpline([Waypoint(start, 0, 0, 0), Waypoint(start + 1.0, 1, 0, 0)])
+
+    with pytest.raises(ValueError, match=r"delays must be kept by the clock, got a loss of .* origin nearer"):
+        shaper(late(2.0**48))
+    with pytest.warns(UserWarning, match="delays must be kept by the clock"):
+        shaper(late(2.0**35))
+    assert shaper(late(2.0**20)).duration == pytest.approx(1.0 + math.pi / 3.0, rel=1e-9)
