@@ -336,6 +336,10 @@ class CompiledSolver:
                     break
         raise SolverError(f"the solver must reach {right:g} s from {left:g} s, got to where {why}")
 
+    def count(self) -> None:
+        """Count evaluations from now on."""
+        self._report = self._count
+
     def _count(self, stats: dict[str, Any]) -> None:
         self.evaluations += int(stats.get("nfevals", 0))
 

@@ -292,6 +292,14 @@ class InterpretedSolver:
         self._segments, self._next = 0, 0
         self.switches: list[float] = []
 
+    @property
+    def evaluations(self) -> int:
+        """Evaluations of the right-hand side so far."""
+        return self._equations.evaluations
+
+    def count(self) -> None:
+        """Evaluations are counted as it is."""
+
     def scaled_rates(self, t: float, z: Array, driven: Array) -> Array:
         """Rates of the states in their scales."""
         scales = self._scales

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import trapezoid
 
+from ctrlplan.simulation.budget import TimeLimitError
 from ctrlplan.simulation.compared import telling_states
 from ctrlplan.simulation.drives import Drive, breakpoints_of, driven_signals
 from ctrlplan.simulation.events import Snapshot, Watched
@@ -21,7 +23,7 @@ from ctrlplan.simulation.job import Job, Record, unused, with_looks
 from ctrlplan.simulation.legs import Run, integrate, known_before
 from ctrlplan.simulation.network import Network
 from ctrlplan.simulation.prepared import NotCompiledError
-from ctrlplan.simulation.scales import PASSES, Scales, Tolerances, doubt
+from ctrlplan.simulation.scales import PASSES, Scales, Tolerances, doubt, effects, remaining
 from ctrlplan.simulation.stalled import unrepeatable
 from ctrlplan.simulation.untouched import same_answer, tried, untouched
 
@@ -41,6 +43,12 @@ _CLOSE, _STRETCHES, _BETWEEN = 400, 8, 60
 
 _ASIDE = 1e-6
 """Distance, in the scales of the states, at which a neighbouring run starts."""
+
+_ASTRAY, _JITTER = 4, 1e-3
+"""Visited states that are displaced at random to see slopes elsewhere, and by which part of their size."""
+
+_STEEP = 30.0
+"""Change of a rate by a whole state, as its slope has it, over the largest rate, above which it bends on the way."""
 
 _GROWTH, _TIGHTEST = 30.0, 1e4
 """Growth of a distance along a run above which steps are made with smaller tolerances, and how much smaller at most."""
@@ -66,6 +74,8 @@ def numerical(job: Job, method: str, reason: str) -> Record:
         scales, attempt = found, following
     if job.atol is None and attempt.expands():
         attempt = _tightened(attempt, spare)
+    if attempt.tighter == 1.0:
+        attempt = _firmer(attempt, spare)
     return attempt.record(reason)
 
 
@@ -94,6 +104,24 @@ def _tightened(attempt: _Attempt, spare: Job) -> _Attempt:
     return again
 
 
+def _firmer(attempt: _Attempt, spare: Job) -> _Attempt:
+    """Run again, with large states integrated more closely where others depend on them absolutely, as on an angle."""
+    loose = attempt.loose()
+    if not loose.any():
+        return attempt
+    try:
+        again = _Attempt(spare, attempt.method, attempt.scales.firmer(attempt.run.states, loose, attempt.noise()))
+        again.solver.count()
+        again.go()
+    except SolverError:
+        attempt.drift = attempt.scales.uncertainty(attempt.run.states, attempt.job.rtol) @ attempt.effects.T
+        return attempt
+    _, first, second = np.intersect1d(attempt.run.times, again.run.times, return_indices=True)
+    apart = np.abs(attempt.run.states[:, first] - again.run.states[:, second]).max(axis=1, initial=0.0)
+    again.drift = apart * remaining(apart, again.run.states, loose, again.solver.evaluations)
+    return again
+
+
 @dataclass(eq=False)
 class _Attempt:
     """One run with some scales of the states."""
@@ -103,6 +131,7 @@ class _Attempt:
     scales: Scales
     tighter: float = 1.0
     growth: float = 1.0
+    drift: Array | float = 0.0
     drives: list[Drive] = field(init=False)
     watched: tuple[Watched, ...] = field(init=False)
     equations: Interpreted | None = field(init=False)
@@ -145,6 +174,47 @@ class _Attempt:
         )
         self._compare()
 
+    def loose(self) -> NDArray[np.bool_]:
+        """States (nstates,) whose tolerated error is too large for other states."""
+        states, scales = self.run.states, self.scales
+        if len(states) < 2 or not np.isfinite(states).all():
+            return np.zeros(len(states), dtype=bool)
+        error = scales.uncertainty(states, self.job.rtol)
+        allowed = max(_DOUBTED, 100.0 * self.job.rtol) * np.ptp(states, axis=1) + 10.0 * scales.atol * scales.scale
+        found = self.effects * error > allowed[:, None]
+        if found.any() and self.job.blocks.blocks_with("period"):
+            # What feeds back from sample to sample is in no slope: only what others depend on absolutely counts.
+            t, x, driven = self._visited()
+            size, rates = np.abs(states - scales.shift[:, None]).max(axis=1), self.solver.rates(t, x, driven)
+            found &= np.abs(self._slopes).max(axis=0) * size > _STEEP * np.abs(rates).max(axis=1, keepdims=True)
+        return np.asarray(found.any(axis=0))
+
+    @cached_property
+    def effects(self) -> Array:
+        """Largest displacement of each state by a lasting one of another, of size 1, shape (nstates, nstates)."""
+        t, x, driven = self._visited()
+        some = slice(None, None, _VISITED // _ASTRAY)
+        # Samples that are a turn of an angle apart see one slope of its sine, which may be 0.
+        astray = x[:, some] * (1.0 + _JITTER * np.random.default_rng(0).uniform(-1.0, 1.0, x[:, some].shape))
+        slopes = np.concatenate([self._slopes, self._slopes_at(t[some], astray, driven[:, some])])
+        return effects(slopes, float(t[-1] - t[0]))
+
+    @cached_property
+    def _slopes(self) -> Array:
+        """Derivatives of the rates by the states at some times of the run, (ntime, nstates, nstates)."""
+        return self._slopes_at(*self._visited())
+
+    def _slopes_at(self, t: Array, x: Array, driven: Array) -> Array:
+        """Derivatives at states that a run need not have reached; nan where blocks raise."""
+        with untouched():
+            try:
+                found: Array = self.solver.slopes(t, x, driven)
+            except TimeLimitError:
+                raise
+            except Exception:  # outside of a block's domain
+                found = np.full((t.size, len(x), len(x)), np.nan)
+        return found
+
     def record(self, reason: str) -> Record:
         """What the run left, and how accurate it is where that is worse than usual."""
         said = _in_doubt(self)
@@ -153,8 +223,7 @@ class _Attempt:
 
     def expands(self) -> bool:
         """Whether neighbouring solutions may part, by the fastest growing motion along the run."""
-        t, x, driven = self._visited()
-        slopes = self.solver.slopes(t, x, driven)
+        t, slopes = self._visited()[0], self._slopes
         if t.size < 2 or not slopes.size or not np.isfinite(slopes).all():
             return False
         rates = np.maximum(np.linalg.eigvals(slopes).real.max(axis=1), 0.0)
@@ -167,7 +236,7 @@ class _Attempt:
         first, last = job.first, float(job.times[-1])
         marks = {t for t in (*breakpoints_of(self.drives), *network.breakpoints) if first < t < last}
         samples = sum((last - first) / float(network.blocks[i].period or 1.0) for i in network.blocks_with("period"))
-        return Tolerances.of_run(job.rtol, self.scales.atol, len(marks) + int(samples), self.tighter)
+        return Tolerances.of_run(job.rtol, self.scales, len(marks) + int(samples), self.tighter)
 
     def noise(self) -> Array:
         """Rounding noise of the rates along the run, times its duration."""
@@ -260,13 +329,14 @@ def _at_start(equations: Interpreted | None, job: Job, drives: Sequence[Drive]) 
 
 def _in_doubt(attempt: _Attempt) -> str:
     """What is uncertain in the outputs, and the tolerance that would do, in words; empty where nothing is."""
-    job, run, solver = attempt.job, attempt.run, attempt.solver
+    job, run, solver, scales = attempt.job, attempt.run, attempt.solver, attempt.scales
     some = np.unique(np.linspace(0, run.times.size - 1, _VISITED).astype(int))
     t, x = run.times[some], run.states[:, some]
     if not x.size or not np.isfinite(x).all():
         return ""
     driven = driven_signals(attempt.drives, t)
-    uncertainty = attempt.scales.uncertainty(run.states, job.rtol) * attempt.growth / attempt.tighter
+    own = scales.uncertainty(run.states, job.rtol) * attempt.growth / attempt.tighter
+    uncertainty = own + attempt.drift
     worst, ranges = doubt(lambda near: solver.outputs(t, near, driven), x, uncertainty)
     allowed = max(_DOUBTED, 100.0 * job.rtol) * ranges
     lost = (ranges > 0.0) & (worst > allowed)
@@ -276,7 +346,9 @@ def _in_doubt(attempt: _Attempt) -> str:
     names = ", ".join(np.array(job.prepared.output_labels)[lost])
     needed = job.rtol * _DOUBTED / float(part.max())
     what = "are differences of larger terms" if attempt.growth <= _GROWTH else "grow apart from their neighbours"
-    advice = f"rtol = {needed:.0e} would do" if needed > 1e-12 else "no tolerance would do"
+    if np.any(attempt.drift > own):
+        what = "depend on small parts of large states"
+    advice = f"rtol = {needed:.0e} would do" if needed > 1e-12 / scales.relative else "no tolerance would do"
     return f"outputs {names} {what} and are uncertain by about {float(part.max()):.1g} of their range: {advice}"
 
 

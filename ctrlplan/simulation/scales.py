@@ -6,12 +6,18 @@ displacement from its start during the run, which only a run tells: the first
 one is made with scales of 1, and it is repeated where a state moves a thousand
 times less, or a hundred times less than it is away from zero. A state that
 moves little about an offset is integrated as its displacement from there.
+
+An angle of thousands of turns is accurate to a small part of itself, and a
+position that depends on its sine is then not. Where the slopes of the rates at
+some states of a run show that the tolerated error of one state displaces
+another by more than is tolerated there, the run is repeated with a thousandth
+of the relative tolerance; how far the two runs are apart tells the error.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -37,6 +43,15 @@ _NOISE = 1e11
 _ADDED = 0.3
 """Error of a state at the end of a run, relative to the tolerance of the run, as errors of steps add up."""
 
+_FIRM = 1e-3
+"""Part of the relative tolerance with which large states are integrated that others depend on absolutely."""
+
+_OWN = 0.1
+"""Scale of such a state at most, as a part of its size."""
+
+_FOLLOWED = 0.1
+"""Error of a run with the smaller tolerance, over that of the run before it; rounding besides."""
+
 _A_STEP, _A_SEGMENT = 100.0, 4.0
 """Tolerance of a run over that of a step; or, of many segments, so many times their number."""
 
@@ -48,10 +63,10 @@ class Tolerances(NamedTuple):
     atol: float
 
     @classmethod
-    def of_run(cls, rtol: float, atol: float, nsegments: int, tighter: float = 1.0) -> Tolerances:
+    def of_run(cls, rtol: float, scales: Scales, nsegments: int, tighter: float = 1.0) -> Tolerances:
         """Of a run that restarts at every segment: the errors of all add up."""
         divisor = tighter * max(_A_STEP, _A_SEGMENT * nsegments)
-        return cls(max(rtol / divisor, min(rtol, 1e-13)), atol / divisor)
+        return cls(max(rtol * scales.relative / divisor, min(rtol, 1e-13)), scales.atol / divisor)
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,11 +79,14 @@ class Scales:
         In the units of the states.
     atol : float
         Absolute tolerance in units of the scales.
+    relative : float
+        Part of the relative tolerance that is used.
     """
 
     shift: Array
     scale: Array
     atol: float
+    relative: float = 1.0
 
     @classmethod
     def plain(cls, nstates: int, atol: float | None) -> Scales:
@@ -103,7 +121,24 @@ class Scales:
     def uncertainty(self, states: Array, rtol: float) -> Array:
         """Error that the states of a run are taken to have (nstates,), where errors of steps do not grow."""
         size = np.abs(states - self.shift[:, None]).max(axis=1, initial=0.0)
-        return _ADDED * (rtol * size + self.atol * self.scale)
+        return _ADDED * (rtol * self.relative * size + self.atol * self.scale)
+
+    def firmer(self, states: Array, loose: NDArray[np.bool_], noise: Array) -> Scales:
+        """Scales with which large states that others depend on absolutely are integrated more closely.
+
+        Parameters
+        ----------
+        states : ndarray, shape (nstates, ntime)
+            States of a run.
+        loose : ndarray of bool, shape (nstates,)
+            States whose relative tolerance was too large for others.
+        noise : ndarray, shape (nstates,)
+            Rounding noise of each rate times the duration.
+        """
+        size = np.abs(states - self.shift[:, None]).max(axis=1, initial=0.0)
+        close = np.where(loose & (size > 0.0), np.maximum(_OWN * size, _NOISE * noise), np.inf)
+        scale = np.minimum(self.scale, close)
+        return replace(self, scale=scale, relative=_FIRM)
 
 
 def doubt(outputs: Callable[[Array], Array], states: Array, uncertainty: Array) -> tuple[Array, Array]:
@@ -129,3 +164,50 @@ def doubt(outputs: Callable[[Array], Array], states: Array, uncertainty: Array) 
             total += np.abs(outputs(near) - plain) * (error / step)
     worst = np.where(np.isfinite(total), total, 0.0).max(axis=1, initial=0.0)
     return worst, np.ptp(plain, axis=1) if plain.shape[1] else np.zeros(len(plain))
+
+
+def effects(slopes: Array, duration: float) -> Array:
+    """Largest displacement of each state by a lasting one of another, of size 1, shape (nstates, nstates).
+
+    Parameters
+    ----------
+    slopes : ndarray, shape (npoints, nstates, nstates)
+        Derivatives of the rates by the states at points of a run.
+    duration : float
+        Of the run [s].
+
+    Notes
+    -----
+    With x' = J x + e/T, an error that builds up to e in the duration T, and J as
+    at one point, the mean of x weighted by exp(-t/T) is (I - T J)^-1 e. Growth
+    is left out: J is shifted so that no motion grows.
+    """
+    n = slopes.shape[1]
+    slopes = slopes[np.isfinite(slopes).all(axis=(1, 2))]
+    growth = np.maximum(np.linalg.eigvals(slopes).real.max(axis=1, initial=0.0), 0.0)
+    matrices = (1.0 + duration * growth)[:, None, None] * np.eye(n) - duration * slopes
+    found: Array = np.abs(np.linalg.solve(matrices, np.broadcast_to(np.eye(n), matrices.shape))).max(
+        axis=0, initial=0.0
+    )
+    np.fill_diagonal(found, 0.0)
+    return found
+
+
+def remaining(apart: Array, states: Array, loose: NDArray[np.bool_], evaluations: int) -> float:
+    """Error of a run over its distance from the run before it, which was made with larger tolerances.
+
+    Parameters
+    ----------
+    apart : ndarray, shape (nstates,)
+        Largest distance of each state between the runs.
+    states : ndarray, shape (nstates, ntime)
+        States of the run.
+    loose : ndarray of bool, shape (nstates,)
+        States that were integrated more closely.
+    evaluations : int
+        Evaluations of the right-hand side: each rounds the states.
+    """
+    size = np.abs(states).max(axis=1, initial=0.0)
+    rounding = 0.25 * np.finfo(float).eps * size * evaluations
+    parts = rounding[loose] / np.maximum(apart[loose], np.finfo(float).tiny)
+    return float(min(1.0, _FOLLOWED + parts.max(initial=0.0)))

@@ -4,8 +4,10 @@ import control as ct
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from scipy.linalg import expm
 
 import ctrlplan as cp
+from ctrlplan.simulation.scales import effects
 
 METHODS = ["compiled", "python"]
 ALLOWED = 1e-6
@@ -200,3 +202,74 @@ def test_a_pendulum_that_falls_from_upright_is_accurate_or_says_that_it_is_not(m
     found = cp.simulate(block, t, None, [1e-8, 0.0], method=method)
     assert (np.abs(found.outputs - expected).max(axis=1) / np.ptp(expected, axis=1)).max() < ALLOWED
     assert "grow apart from their neighbours and are uncertain by about" in found.reason
+
+
+def turning(rate, phase, speed, start, duration, nsamples):
+    """Positions and angle of a car whose angle grows by phase(t), by Gauss quadrature in cells shorter than a turn."""
+    count = nsamples * int(np.ceil(4.0 * rate * duration / nsamples))
+    nodes, weights = np.polynomial.legendre.leggauss(12)
+    edges = np.linspace(0.0, duration, count + 1)
+    half = 0.5 * duration / count
+    inner = edges[:-1, None] + half * (1.0 + nodes)
+    angle = start + phase(inner)
+    speeds = np.stack([np.cos(angle), np.sin(angle)]) @ weights * speed * half
+    path = np.concatenate([np.zeros((2, 1)), np.cumsum(speeds, axis=1)], axis=1)[:, :: count // nsamples]
+    return np.vstack([path, start + phase(edges[:: count // nsamples])])
+
+
+def rough_turns(scale, method, start=2e4, mean=100.0, ripple=1000.0, duration=2.5):
+    """Error, relative to each range, of a car whose angle is huge and whose yaw rate ripples; and its response."""
+    speed = mean
+
+    def rates(t, x, u, params):
+        rate = mean * (1.0 + 0.5 * np.sin(ripple * t))
+        return [speed * np.cos(scale * x[2]), speed * np.sin(scale * x[2]), rate / scale]
+
+    car = ct.nlsys(rates, inputs=0, outputs=3, states=3, name="car")
+    t = np.linspace(0.0, duration, 101)
+    expected = turning(
+        ripple,
+        lambda t: mean * (t + (1.0 - np.cos(ripple * t)) / (2.0 * ripple)),
+        speed,
+        start,
+        duration,
+        100,
+    )
+    expected[2] /= scale
+    found = cp.simulate(car, t, None, [0.0, 0.0, start / scale], method=method)
+    return np.abs(found.outputs - expected).max(axis=1) / np.ptp(expected, axis=1), found
+
+
+@pytest.mark.parametrize("scale", [1.0, 7.0, 1e4], ids=["angle", "pole pairs", "turns in small units"])
+def test_positions_that_depend_on_the_sine_of_a_huge_angle(scale):
+    """The tolerance relative to an angle is too large for what depends on its sine: here far below rtol = 1e-8."""
+    errors, found = rough_turns(scale, "compiled")
+    assert errors.max() < 2e-9
+    assert "uncertain" not in found.reason
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("method", "start", "duration"), [("compiled", 0.0, 100.0), ("python", 0.0, 10.0), ("python", 1e4, 10.0)]
+)
+def test_many_turns_with_a_rippling_rate(method, start, duration):
+    """As far as 2500 rad in 16,000 periods of a ripple."""
+    errors, found = rough_turns(1.0, method, start, 25.0, 1000.0, duration)
+    assert errors.max() < 1e-7 or "depend on small parts of large states" in found.reason
+    assert errors.max() < ALLOWED
+
+
+def test_a_lasting_displacement_through_frozen_equations():
+    """Against the mean, weighted by exp(-t/T), of the solution of x' = J x + e/T by a matrix exponential."""
+    duration = 3.0
+    slopes = np.array(
+        [[[0.0, 2.0, 0.0], [-1.0, -0.3, 0.0], [5.0, 0.0, -1.0]], [[0.0, -4.0, 7.0], [0.0] * 3, [0.0] * 3]]
+    )
+    expected = np.zeros((3, 3))
+    for slope in slopes:
+        # The weighted mean of exp(J s), s >= 0, by Gauss-Laguerre, exact to 1e-10 for these slow motions.
+        steps, weights = np.polynomial.laguerre.laggauss(150)
+        mean = sum(w * expm(slope * duration * s) for s, w in zip(steps, weights, strict=True) if w > 1e-30)
+        expected = np.maximum(expected, np.abs(mean))
+    np.fill_diagonal(expected, 0.0)
+    assert effects(slopes, duration) == pytest.approx(expected, abs=1e-6)
