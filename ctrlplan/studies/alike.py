@@ -107,6 +107,8 @@ class Alike:
             return None
         if self._given.initial_state is None and not self._at_rest(form, starts):
             return None  # which is to be said of the loop concerned
+        if any(form.sensitivity(float(self._given.timepts[-1] - self._given.timepts[0]))):
+            return None  # `simulate` says which digits are lost
         return Linear(tuple(system.output_labels), tracked, acting, form, starts)
 
     def _starts(self, system: Any) -> dict[str, Array]:

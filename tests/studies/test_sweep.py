@@ -523,3 +523,19 @@ def test_every_measure_is_swept(swept):
     known = [name for name in MEASURES if not name.startswith("control")]
     assert set(swept.metrics["step"]) <= set(known)
     assert {"settling_time", "overshoot_error", "iae", "itae_final"} <= set(swept.metrics["step"])
+
+
+@pytest.mark.parametrize("fast", [1e10, 1e11])
+def test_lost_digits_are_said_the_same_of_a_loop_alone_and_among_others(fast):
+    """A step excites an undamped loop, and after 1e10 turns the last digits of its frequency decide."""
+
+    def loop(rate):
+        a, b = [[0.0, rate], [-rate, 0.0]], [[0.0], [rate]]
+        return ct.ss(a, b, [[1.0, 0.0]], [[0.0]], inputs="r", outputs="y", name="undamped")
+
+    times, plans = np.linspace(0.0, 10.0, 101), {"step": cp.Step(1.0)}
+    with pytest.warns(UserWarning, match="are uncertain by") as alone:
+        cp.compare(loop(fast), plans, times)
+    with pytest.warns(UserWarning, match="are uncertain by") as swept:
+        cp.sweep(loop, [1.0, 2.0, 3.0, fast], plans, times, progress=False)
+    assert [str(entry.message) for entry in swept] == [str(entry.message) for entry in alone]
