@@ -206,14 +206,7 @@ class _Attempt:
 
     def _slopes_at(self, t: Array, x: Array, driven: Array) -> Array:
         """Derivatives at states that a run need not have reached; nan where blocks raise."""
-        with untouched():
-            try:
-                found: Array = self.solver.slopes(t, x, driven)
-            except TimeLimitError:
-                raise
-            except Exception:  # outside of a block's domain
-                found = np.full((t.size, len(x), len(x)), np.nan)
-        return found
+        return _on_trial(self.solver.slopes, t, x, driven, (-1, len(x), len(x)))
 
     def record(self, reason: str) -> Record:
         """What the run left, and how accurate it is where that is worse than usual."""
@@ -242,10 +235,10 @@ class _Attempt:
         """Rounding noise of the rates along the run, times its duration."""
         t, x, driven = self._visited()
         rng = np.random.default_rng(0)
-        plain, found = self.solver.rates(t, x, driven), np.zeros(len(x))
+        plain, found = _on_trial(self.solver.rates, t, x, driven, (len(x), -1)), np.zeros(len(x))
         for _ in range(3):
             near = x * (1.0 + np.finfo(float).eps * rng.choice([-1.0, 1.0], x.shape))
-            apart = np.abs(self.solver.rates(t, near, driven) - plain)
+            apart = np.abs(_on_trial(self.solver.rates, t, near, driven, (len(x), -1)) - plain)
             found = np.maximum(found, np.where(np.isfinite(apart), apart, 0.0).max(axis=1, initial=0.0))
         return found * float(self.run.times[-1] - self.run.times[0])
 
@@ -320,6 +313,31 @@ def _equations(job: Job, network: Network) -> Interpreted | None:
     return Interpreted(network, job.params, (job.first, job.state), job.prepared.trials) if network.blocks else None
 
 
+def _on_trial(
+    function: Callable[[Array, Array, Array], Array], t: Array, x: Array, driven: Array, shape: tuple[int, ...]
+) -> Array:
+    """What a function of many times finds at states that a run need not have reached; nan where blocks raise there.
+
+    Its result has a shape, in which -1 stands for the times.
+    """
+    axis, empty = shape.index(-1), np.full([abs(size) for size in shape], np.nan)
+
+    def at(some: slice) -> Array | None:
+        try:
+            return function(t[some], x[:, some], driven[:, some])
+        except (KeyboardInterrupt, TimeLimitError):
+            raise
+        except BaseException:  # outside of a block's domain, which a made-up argument may leave
+            return None
+
+    with untouched():
+        whole = at(slice(None))
+        if whole is not None:
+            return whole
+        found = [at(slice(k, k + 1)) for k in range(t.size)]
+    return np.concatenate([empty if part is None else part for part in found], axis=axis)
+
+
 def _at_start(equations: Interpreted | None, job: Job, drives: Sequence[Drive]) -> Array | None:
     """Signals at the start of a run."""
     if equations is None:
@@ -336,8 +354,8 @@ def _in_doubt(attempt: _Attempt) -> str:
         return ""
     driven = driven_signals(attempt.drives, t)
     own = scales.uncertainty(run.states, job.rtol) * attempt.growth / attempt.tighter
-    uncertainty = own + attempt.drift
-    worst, ranges = doubt(lambda near: solver.outputs(t, near, driven), x, uncertainty)
+    uncertainty, count = own + attempt.drift, len(job.prepared.output_labels)
+    worst, ranges = doubt(lambda near: _on_trial(solver.outputs, t, near, driven, (count, -1)), x, uncertainty)
     allowed = max(_DOUBTED, 100.0 * job.rtol) * ranges
     lost = (ranges > 0.0) & (worst > allowed)
     if not lost.any():

@@ -348,3 +348,43 @@ def test_a_parameter_of_a_block_that_must_not_be_called():
     assert cp.prepare(block(update)).reads("k", 2.0)
     assert not cp.prepare(block(update)).reads("gain", 2.0)
     assert generator.bit_generator.state == state
+
+
+@pytest.mark.parametrize("method", ["auto", "python"])
+@pytest.mark.parametrize("kind", ["rates", "outputs", "exit", "table"])
+def test_what_a_block_raises_outside_the_states_of_a_run_when_its_accuracy_is_estimated(kind, method):
+    """A run from the very edge of a block's domain: states close to it are tried for the estimate alone."""
+    table = [0.0, 10.0, 20.0, 30.0]
+
+    def checked(x):
+        if x[0] > 3.0:
+            raise SystemExit(3) if kind == "exit" else KeyError("no such gear")
+        return x[0]
+
+    def rates(t, x, u, params):
+        return [-0.2 * (checked(x) if kind in ("rates", "exit") else x[0])]
+
+    def outputs(t, x, u, params):
+        return [table[int(np.ceil(x[0]))] if kind == "table" else checked(x) if kind == "outputs" else x[0]]
+
+    block = ct.nlsys(rates, outputs, inputs=0, outputs="y", states=1, name="gearbox")
+    times = np.linspace(0.0, 5.0, 21)
+    found = cp.simulate(block, times, None, 3.0, method=method)
+    state = 3.0 * np.exp(-0.2 * times)
+    expected = 10.0 * np.ceil(state) if kind == "table" else state
+    assert np.abs(found.outputs - expected).max() <= 1e-6
+
+
+@pytest.mark.parametrize("method", ["auto", "python"])
+def test_a_block_that_is_defined_only_where_it_rests(method):
+    """No state that is tried lies in its domain."""
+
+    def rates(t, x, u, params):
+        if x[0] != 1.0:
+            raise RuntimeError("limit switch")
+        return [0.0]
+
+    block = ct.nlsys(rates, inputs=0, outputs=1, states=1, name="locked")
+    assert np.array_equal(
+        cp.simulate(block, np.linspace(0.0, 5.0, 21), None, 1.0, method=method).states, np.ones((1, 21))
+    )
