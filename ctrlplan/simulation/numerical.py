@@ -186,27 +186,56 @@ class _Attempt:
             # What feeds back from sample to sample is in no slope: only what others depend on absolutely counts.
             t, x, driven = self._visited()
             size, rates = np.abs(states - scales.shift[:, None]).max(axis=1), self.solver.rates(t, x, driven)
-            found &= np.abs(self._slopes).max(axis=0) * size > _STEEP * np.abs(rates).max(axis=1, keepdims=True)
+            found &= np.abs(self._slopes[: t.size]).max(axis=0) * size > _STEEP * np.abs(rates).max(
+                axis=1, keepdims=True
+            )
         return np.asarray(found.any(axis=0))
 
     @cached_property
     def effects(self) -> Array:
         """Largest displacement of each state by a lasting one of another, of size 1, shape (nstates, nstates)."""
+        return effects(self._slopes, float(self.run.times[-1] - self.run.times[0]))
+
+    @cached_property
+    def _slopes(self) -> Array:
+        """Derivatives of the rates by the states, (nplaces, nstates, nstates), first at the visited times."""
         t, x, driven = self._visited()
         some = slice(None, None, _VISITED // _ASTRAY)
         # Samples that are a turn of an angle apart see one slope of its sine, which may be 0.
         astray = x[:, some] * (1.0 + _JITTER * np.random.default_rng(0).uniform(-1.0, 1.0, x[:, some].shape))
-        slopes = np.concatenate([self._slopes, self._slopes_at(t[some], astray, driven[:, some])])
-        return effects(slopes, float(t[-1] - t[0]))
+        places = np.append(t, t[some]), np.append(x, astray, axis=1), np.append(driven, driven[:, some], axis=1)
+        return self.on_trial(self.solver.slopes, *places, (-1, len(x), len(x)))
 
-    @cached_property
-    def _slopes(self) -> Array:
-        """Derivatives of the rates by the states at some times of the run, (ntime, nstates, nstates)."""
-        return self._slopes_at(*self._visited())
+    def on_trial(
+        self,
+        function: Callable[[Array, Array, Array], Array],
+        t: Array,
+        x: Array,
+        driven: Array,
+        shape: tuple[int, ...],
+    ) -> Array:
+        """What a function of many times finds at states that a run need not have reached; nan where blocks raise.
 
-    def _slopes_at(self, t: Array, x: Array, driven: Array) -> Array:
-        """Derivatives at states that a run need not have reached; nan where blocks raise."""
-        return _on_trial(self.solver.slopes, t, x, driven, (-1, len(x), len(x)))
+        Its result has a shape, in which -1 stands for the times.
+        """
+        if self.method == "compiled":
+            return function(t, x, driven)
+        axis, empty = shape.index(-1), np.full([abs(size) for size in shape], np.nan)
+
+        def at(some: slice) -> Array | None:
+            try:
+                return function(t[some], x[:, some], driven[:, some])
+            except (KeyboardInterrupt, TimeLimitError):
+                raise
+            except BaseException:  # outside of a block's domain, which a made-up argument may leave
+                return None
+
+        with untouched():
+            whole = at(slice(None))
+            if whole is not None:
+                return whole
+            found = [at(slice(k, k + 1)) for k in range(t.size)]
+        return np.concatenate([empty if part is None else part for part in found], axis=axis)
 
     def record(self, reason: str) -> Record:
         """What the run left, and how accurate it is where that is worse than usual."""
@@ -216,7 +245,8 @@ class _Attempt:
 
     def expands(self) -> bool:
         """Whether neighbouring solutions may part, by the fastest growing motion along the run."""
-        t, slopes = self._visited()[0], self._slopes
+        t = self._visited()[0]
+        slopes = self._slopes[: t.size]
         if t.size < 2 or not slopes.size or not np.isfinite(slopes).all():
             return False
         rates = np.maximum(np.linalg.eigvals(slopes).real.max(axis=1), 0.0)
@@ -235,10 +265,10 @@ class _Attempt:
         """Rounding noise of the rates along the run, times its duration."""
         t, x, driven = self._visited()
         rng = np.random.default_rng(0)
-        plain, found = _on_trial(self.solver.rates, t, x, driven, (len(x), -1)), np.zeros(len(x))
+        plain, found = self.on_trial(self.solver.rates, t, x, driven, (len(x), -1)), np.zeros(len(x))
         for _ in range(3):
             near = x * (1.0 + np.finfo(float).eps * rng.choice([-1.0, 1.0], x.shape))
-            apart = np.abs(_on_trial(self.solver.rates, t, near, driven, (len(x), -1)) - plain)
+            apart = np.abs(self.on_trial(self.solver.rates, t, near, driven, (len(x), -1)) - plain)
             found = np.maximum(found, np.where(np.isfinite(apart), apart, 0.0).max(axis=1, initial=0.0))
         return found * float(self.run.times[-1] - self.run.times[0])
 
@@ -313,31 +343,6 @@ def _equations(job: Job, network: Network) -> Interpreted | None:
     return Interpreted(network, job.params, (job.first, job.state), job.prepared.trials) if network.blocks else None
 
 
-def _on_trial(
-    function: Callable[[Array, Array, Array], Array], t: Array, x: Array, driven: Array, shape: tuple[int, ...]
-) -> Array:
-    """What a function of many times finds at states that a run need not have reached; nan where blocks raise there.
-
-    Its result has a shape, in which -1 stands for the times.
-    """
-    axis, empty = shape.index(-1), np.full([abs(size) for size in shape], np.nan)
-
-    def at(some: slice) -> Array | None:
-        try:
-            return function(t[some], x[:, some], driven[:, some])
-        except (KeyboardInterrupt, TimeLimitError):
-            raise
-        except BaseException:  # outside of a block's domain, which a made-up argument may leave
-            return None
-
-    with untouched():
-        whole = at(slice(None))
-        if whole is not None:
-            return whole
-        found = [at(slice(k, k + 1)) for k in range(t.size)]
-    return np.concatenate([empty if part is None else part for part in found], axis=axis)
-
-
 def _at_start(equations: Interpreted | None, job: Job, drives: Sequence[Drive]) -> Array | None:
     """Signals at the start of a run."""
     if equations is None:
@@ -355,7 +360,7 @@ def _in_doubt(attempt: _Attempt) -> str:
     driven = driven_signals(attempt.drives, t)
     own = scales.uncertainty(run.states, job.rtol) * attempt.growth / attempt.tighter
     uncertainty, count = own + attempt.drift, len(job.prepared.output_labels)
-    worst, ranges = doubt(lambda near: _on_trial(solver.outputs, t, near, driven, (count, -1)), x, uncertainty)
+    worst, ranges = doubt(lambda near: attempt.on_trial(solver.outputs, t, near, driven, (count, -1)), x, uncertainty)
     allowed = max(_DOUBTED, 100.0 * job.rtol) * ranges
     lost = (ranges > 0.0) & (worst > allowed)
     if not lost.any():

@@ -85,7 +85,9 @@ def simulate(
         Absolute tolerance for all states. None, the default, is 1e-10 of each
         state's own scale, its largest displacement from its start: a run in
         which a state moves less than 1e-3, or less than a hundredth of its
-        size, is repeated in the scales that it found (four runs at most).
+        size, is repeated in the scales that it found (four runs at most). A
+        run is also repeated, with a thousandth of `rtol`, where other states
+        depend on the sine of a huge angle, or on the like.
     params : mapping, optional
         Parameters of the blocks.
     events : sequence of Event, optional
