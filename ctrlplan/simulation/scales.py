@@ -49,7 +49,7 @@ _FIRM = 1e-3
 _OWN = 0.1
 """Scale of such a state at most, as a part of its size."""
 
-_FOLLOWED = 0.1
+_FOLLOWED = 0.02
 """Error of a run with the smaller tolerance, over that of the run before it; rounding besides."""
 
 _A_STEP, _A_SEGMENT = 100.0, 4.0

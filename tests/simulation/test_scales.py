@@ -273,3 +273,23 @@ def test_a_lasting_displacement_through_frozen_equations():
         expected = np.maximum(expected, np.abs(mean))
     np.fill_diagonal(expected, 0.0)
     assert effects(slopes, duration) == pytest.approx(expected, abs=1e-6)
+
+
+def test_a_plant_that_is_fed_by_the_phase_of_an_oscillator():
+    """x' = cos(phase) - x with a rippling frequency, by Gauss quadrature of its impulse response."""
+    mean, ripple, duration, start = 25.0, 1000.0, 10.0, 2e4
+
+    def rates(t, x, u, params):
+        return [np.cos(x[1]) - x[0], mean * (1.0 + 0.5 * np.sin(ripple * t))]
+
+    block = ct.nlsys(rates, lambda t, x, u, params: x[0], inputs=0, outputs="y", states=2, name="oscillator")
+    t, edges = np.linspace(0.0, duration, 101), np.linspace(0.0, duration, 20_001)
+    nodes, weights = np.polynomial.legendre.leggauss(12)
+    half = 0.5 * edges[1]
+    inner = edges[:-1, None] + half * (1.0 + nodes)
+    phase = start + mean * (inner + (1.0 - np.cos(ripple * inner)) / (2.0 * ripple))
+    sums = np.cumsum((np.cos(phase) * np.exp(inner)) @ weights * half)
+    expected = (np.exp(-edges) * np.append(0.0, sums))[::200]
+    found = cp.simulate(block, t, None, [0.0, start], method="compiled")
+    assert np.abs(found.outputs - expected).max() < ALLOWED * np.ptp(expected)
+    assert "uncertain" not in found.reason
