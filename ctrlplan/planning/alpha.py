@@ -18,7 +18,9 @@ from ctrlplan.trajectories.common import Array, readonly
 from ctrlplan.trajectories.newton_spline import checked_waypoints, given_entries
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    from control import ControlPlot
+
+    from ctrlplan.reports.style import AxesLike
 
 _TIE = 1e-9
 _BLOWN = 10.0
@@ -67,11 +69,22 @@ class AlphaChoice:
     def __repr__(self) -> str:
         return f"<AlphaChoice alpha = {self.alpha:.6g} rad: {self.objective} {self.value:.6g}>"
 
-    def plot(self) -> Figure:
-        """Objective over alpha up to where it blows up, the choice marked."""
+    def plot(self, *, ax: AxesLike | None = None) -> ControlPlot:
+        """Objective over alpha up to where it blows up, the choice marked.
+
+        Parameters
+        ----------
+        ax : Axes, optional
+            Where to draw; None: an empty current figure, or a new one.
+
+        Returns
+        -------
+        control.ControlPlot
+            Of shape (1, 1).
+        """
         from ctrlplan.reports.planning_figures import plot_alpha_choice
 
-        return plot_alpha_choice(self)
+        return plot_alpha_choice(self, ax=ax)
 
 
 def choose_alpha(

@@ -21,7 +21,9 @@ from ctrlplan.trajectories.common import Array, checked_pair
 from ctrlplan.trajectories.newton_spline import NewtonSpline
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    from control import ControlPlot
+
+    from ctrlplan.reports.style import AxesLike
 
 _HOLDS = ("shape", "waypoints", "path")
 _PER_OCTAVE = 24
@@ -88,11 +90,25 @@ class Fastest:
         cut = math.isfinite(self.searched[1]) and self.feasible[-1][1] >= self.searched[1] * (1.0 - 1e-9)
         return f"{found}, where the search ended" if cut else found
 
-    def plot(self, units: Mapping[str, str] | None = None) -> Figure:
-        """Every limited signal over time with its limits; units by the signals' names."""
+    def plot(self, units: Mapping[str, str] | None = None, *, ax: AxesLike | None = None) -> ControlPlot:
+        """Every limited signal over time with its limits.
+
+        Parameters
+        ----------
+        units : mapping of str to str, optional
+            Units by the signals' names.
+        ax : array of Axes, shape (number of limits,), optional
+            Where to draw, in the order of the limits; None: an empty current
+            figure, or a new one.
+
+        Returns
+        -------
+        control.ControlPlot
+            Of shape (number of limits, 1).
+        """
         from ctrlplan.reports.planning_figures import plot_limits
 
-        return plot_limits(self.plan, self.limited, units)
+        return plot_limits(self.plan, self.limited, units, ax=ax)
 
 
 def fastest(

@@ -6,20 +6,26 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
+from control import ControlPlot
 from jinja2.utils import htmlsafe_json_dumps
 from markupsafe import Markup
-from matplotlib.figure import Figure
+from matplotlib.axes import Axes
 from matplotlib.patches import Arc, Circle, FancyArrowPatch, FancyBboxPatch, Rectangle
 from numpy.typing import NDArray
 
 from ctrlplan.reports.style import (
+    AxesLike,
+    Drawing,
+    add_title,
     as_text,
-    house_style,
-    legend_above,
+    axis_styles,
+    font_size,
+    label_y,
     legend_label,
-    line_styles,
-    new_figure,
-    stacked_axes,
+    line_width,
+    marker_size,
+    plan_styles,
+    shade,
 )
 from ctrlplan.studies.comparison import Comparison
 from ctrlplan.studies.crane_setup import CRANE, nominal_waypoints
@@ -33,36 +39,45 @@ Array = NDArray[np.float64]
 Wall = tuple[tuple[float, float], tuple[float, float]] | None
 
 
-@house_style
-def plot_sketch() -> Figure:
-    """Figure 2: the crane and its variables."""
-    figure = new_figure(5.6, 4.4)
-    ((axes,),) = stacked_axes(figure, 1)
+def plot_sketch(*, ax: AxesLike | None = None) -> ControlPlot:
+    """Figure 2: the crane and its variables.
+
+    Parameters
+    ----------
+    ax : Axes, optional
+        Where to draw; None: an empty current figure, or a new one.
+
+    Returns
+    -------
+    control.ControlPlot
+        Of shape (1, 1).
+    """
+    drawing = Drawing(ax, (1, 1), (5.6, 4.4))
+    (axes,) = drawing.column
+    dark, middle, light = shade(0.8), shade(0.6), shade(0.4)
     axes.axis("off")
     axes.set_aspect("equal")
     d, b, r, theta = 2.4, 0.45, 3.6, 0.38
     tangent = np.array([d + b * np.cos(theta), -b * np.sin(theta)])
     load = tangent + r * np.array([np.sin(theta), np.cos(theta)])
-    axes.plot([-0.3, 6.6], [b + 0.28, b + 0.28], color="#999999", linewidth=3)
-    axes.add_patch(Rectangle((d - 0.8, b + 0.02), 1.6, 0.2, color="#333333"))
-    axes.add_patch(Circle((d, 0.0), b, fill=False, color="#333333", linewidth=1.6))
-    axes.plot([tangent[0], load[0]], [-tangent[1], -load[1]], color="#0072B2", linewidth=1.6)
+    axes.plot([-0.3, 6.6], [b + 0.28, b + 0.28], color=light, linewidth=line_width(1.9))
+    axes.add_patch(Rectangle((d - 0.8, b + 0.02), 1.6, 0.2, color=dark))
+    axes.add_patch(Circle((d, 0.0), b, fill=False, color=dark, linewidth=line_width(1.0)))
+    axes.plot([tangent[0], load[0]], [-tangent[1], -load[1]], color="#0072B2", linewidth=line_width(1.0))
     axes.add_patch(Circle((load[0], -load[1]), 0.22, color="#D55E00"))
-    axes.plot([tangent[0], tangent[0]], [-tangent[1], -3.0], color="#666666", linewidth=0.8, linestyle="--")
-    axes.add_patch(
-        Arc((tangent[0], -tangent[1]), 3.2, 3.2, theta1=270, theta2=270 + np.degrees(theta), color="#666666")
-    )
+    axes.plot([tangent[0], tangent[0]], [-tangent[1], -3.0], color=middle, linewidth=line_width(0.5), linestyle="--")
+    axes.add_patch(Arc((tangent[0], -tangent[1]), 3.2, 3.2, theta1=270, theta2=270 + np.degrees(theta), color=middle))
 
     def arrow(start: tuple[float, float], end: tuple[float, float], text: str, offset: tuple[float, float]) -> None:
-        axes.add_patch(FancyArrowPatch(start, end, arrowstyle="-|>", mutation_scale=12, color="#333333"))
-        axes.annotate(text, end, xytext=offset, textcoords="offset points", fontsize=11)
+        axes.add_patch(FancyArrowPatch(start, end, arrowstyle="-|>", mutation_scale=12, color=dark))
+        axes.annotate(text, end, xytext=offset, textcoords="offset points", fontsize=font_size(11))
 
     arrow((-0.2, 0.0), (1.0, 0.0), "x", (2, 4))
     arrow((-0.2, 0.0), (-0.2, -1.2), "z (down)", (5, -2))
     arrow((-0.2, 1.15), (d, 1.15), "D", (-38, 5))
     arrow((d + 0.8, b + 0.12), (d + 1.7, b + 0.12), "F", (3, -3))
     arrow((float(load[0]), -float(load[1])), (float(load[0]), -float(load[1]) - 0.95), "m g", (5, 0))
-    axes.add_patch(Arc((d, 0.0), 1.5, 1.5, theta1=120, theta2=240, color="#333333"))
+    axes.add_patch(Arc((d, 0.0), 1.5, 1.5, theta1=120, theta2=240, color=dark))
     for text, place in (
         ("C", (d - 1.05, 0.0)),
         ("b", (d + 0.08, -0.32)),
@@ -72,15 +87,25 @@ def plot_sketch() -> Figure:
         (r"$M_c$, $f_1$", (d - 2.1, b + 0.05)),
         (r"J, $f_2$", (d + 0.5, 0.05)),
     ):
-        axes.text(float(place[0]), float(place[1]), text, fontsize=11)
+        axes.text(float(place[0]), float(place[1]), text, fontsize=font_size(11))
     axes.set_xlim(-0.6, 6.8)
     axes.set_ylim(-4.9, 1.6)
-    return figure
+    return drawing.plot(legend=False)
 
 
-@house_style
-def plot_blocks() -> Figure:
-    """Figure 3: the controller, drawn from the blocks and connections of the model itself."""
+def plot_blocks(*, ax: AxesLike | None = None) -> ControlPlot:
+    """Figure 3: the controller, drawn from the blocks and connections of the model itself.
+
+    Parameters
+    ----------
+    ax : Axes, optional
+        Where to draw; None: an empty current figure, or a new one.
+
+    Returns
+    -------
+    control.ControlPlot
+        Of shape (1, 1).
+    """
     loop = crane_loop(CRANE, PolySpline(nominal_waypoints()))
     names = [block.name for block in loop.syslist]
     place = {
@@ -97,13 +122,14 @@ def plot_blocks() -> Figure:
     for row, column in np.argwhere(np.asarray(loop.connect_map) != 0.0):
         source, signal = out[column]
         joined.setdefault((source.name, into[row][0].name), []).append(signal)
-    figure = new_figure(8.4, 3.2)
-    ((axes,),) = stacked_axes(figure, 1)
+    drawing = Drawing(ax, (1, 1), (8.4, 3.2))
+    (axes,) = drawing.column
+    edge = shade(0.8)
     axes.axis("off")
     for name, (x, y) in place.items():
-        box = FancyBboxPatch((x - 0.75, y - 0.35), 1.5, 0.7, boxstyle="round,pad=0.02", fc="#f3f7f9", ec="#333333")
+        box = FancyBboxPatch((x - 0.75, y - 0.35), 1.5, 0.7, boxstyle="round,pad=0.02", fc=shade(0.045), ec=edge)
         axes.add_patch(box)
-        axes.text(x, y, titles.get(name, name), ha="center", va="center", fontsize=9)
+        axes.text(x, y, titles.get(name, name), ha="center", va="center", fontsize=font_size(9))
     for (source, sink), signals in joined.items():
         (x0, y0), (x1, y1) = place[source], place[sink]
         text = ", ".join(signals) if len(signals) < 3 else f"{signals[0]} … {signals[-1]}"
@@ -119,21 +145,35 @@ def plot_blocks() -> Figure:
             start, end, style = (x0, y0 + 0.38 * side), (x1, y1 + 0.38 * side), f"arc3,rad={0.5 * side}"
             at = (0.5 * (x0 + x1), y1 + 0.98 * side)
         axes.add_patch(
-            FancyArrowPatch(start, end, arrowstyle="-|>", mutation_scale=11, color="#333333", connectionstyle=style)
+            FancyArrowPatch(start, end, arrowstyle="-|>", mutation_scale=11, color=edge, connectionstyle=style)
         )
-        axes.text(*at, text, ha="center", va="center", fontsize=8, color="#0072B2")
+        axes.text(*at, text, ha="center", va="center", fontsize=font_size(8), color="#0072B2")
     axes.set_xlim(-0.9, 8.7)
     axes.set_ylim(-2.1, 2.1)
-    return figure
+    return drawing.plot(legend=False)
 
 
-@house_style
-def plot_time(comparison: Comparison) -> Figure:
-    """Load, error, sway and controls over time, as the paper's figures 4 and 5 lay them out."""
+def plot_time(comparison: Comparison, *, ax: AxesLike | None = None) -> ControlPlot:
+    """Load, error, sway and controls over time, as the paper's figures 4 and 5 lay them out.
+
+    Parameters
+    ----------
+    comparison : Comparison
+        Of cranes.
+    ax : array of Axes, shape (6,), optional
+        Where to draw x, z, error, sway, F and C; None: an empty current figure, or
+        a new one.
+
+    Returns
+    -------
+    control.ControlPlot
+        Of shape (6, 1).
+    """
     names = _moving(comparison) or list(comparison.plans)
-    styles = line_styles(comparison.plans)
-    figure = new_figure(7.4, 9.4)
-    rows = [row[0] for row in stacked_axes(figure, 6)]
+    labels = ("x [m]", "z [m]", "error [mm]", "sway [rad]", "F [kN]", "C [kN m]")
+    drawing = Drawing(ax, (6, 1), (7.4, 9.4), rows=labels)
+    rows = drawing.column
+    styles = plan_styles(comparison.plans, rows[0])
     for name in names:
         signals = _signals(comparison, name)
         t = signals["t"]
@@ -144,144 +184,223 @@ def plot_time(comparison: Comparison) -> Figure:
             strict=True,
         ):
             axes.plot(t, values, **styles[name])
-    for axes, label in zip(rows, ("x [m]", "z [m]", "error [mm]", "sway [rad]", "F [kN]", "C [kN m]"), strict=True):
-        axes.set_ylabel(label)
-    rows[1].invert_yaxis()
+    for axes, label in zip(rows, labels, strict=True):
+        label_y(axes, label)
+    rows[1].yaxis.set_inverted(True)
     rows[2].set_yscale("symlog", linthresh=1.0)
     rows[2].set_ylim(bottom=0.0)
-    rows[-1].set_xlabel("time [s]")
-    legend_above(figure, rows[0])
-    return figure
+    drawing.label_x("time [s]")
+    return drawing.plot()
 
 
-@house_style
-def plot_step(comparison: Comparison) -> Figure:
-    """What a step asks of the drives, with the limits of its own loop, and the rope it leaves slack."""
+def plot_step(comparison: Comparison, *, ax: AxesLike | None = None) -> ControlPlot:
+    """Controls of a step with the limits of its own loop, and the rope it leaves slack.
+
+    Parameters
+    ----------
+    comparison : Comparison
+        Of cranes.
+    ax : array of Axes, shape (4,), optional
+        Where to draw F, C, the tension T and the sway; None: an empty current
+        figure, or a new one.
+
+    Returns
+    -------
+    control.ControlPlot
+        Of shape (4, 1).
+
+    Raises
+    ------
+    ValueError
+        If all plans are without jumps.
+    """
     moving = _moving(comparison)
     name = next((name for name in comparison.plans if name not in moving), None)
     if name is None:
         raise ValueError("a comparison must have a step for this figure, got plans without jumps alone")
     signals = _signals(comparison, name)
-    t, colour = signals["t"], line_styles(comparison.plans)[name]["color"]
-    figure = new_figure(7.0, 6.4)
-    rows = [row[0] for row in stacked_axes(figure, 4)]
+    drawing = Drawing(ax, (4, 1), (7.0, 6.4), rows=("F", "C", "T", "sway"))
+    rows = drawing.column
+    style = plan_styles(comparison.plans, rows[0])[name]
+    t, colour = signals["t"], style["color"]
     limits = comparison.limits.get(name, {}) | {"T": (0.0, np.inf)}
     drawn = "limit"
     for axes, (signal, label) in zip(rows, (("F", "F [kN]"), ("C", "C [kN m]"), ("T", "T [kN]")), strict=False):
-        axes.plot(t, signals[signal] / 1e3, color=colour, linewidth=1.0, label=legend_label(name))
+        axes.plot(t, signals[signal] / 1e3, color=colour, linewidth=line_width(0.65), label=style["label"])
         for limit in limits.get(signal, ()):
             if np.isfinite(limit):
-                axes.axhline(limit / 1e3, color="#D55E00", linewidth=1.0, linestyle="--", label=drawn)
+                axes.axhline(limit / 1e3, color="#D55E00", linewidth=line_width(0.65), linestyle="--", label=drawn)
                 drawn = ""
-        axes.set_ylabel(label)
+        label_y(axes, label)
     rows[2].fill_between(t, signals["T"] / 1e3, 0.0, where=signals["T"] < 0.0, color="#D55E00", alpha=0.4)
-    rows[3].plot(t, signals["theta"], color=colour, linewidth=1.0)
-    rows[3].set_ylabel("sway [rad]")
-    rows[3].set_xlabel("time [s]")
-    legend_above(figure, rows[0])
-    return figure
+    rows[3].plot(t, signals["theta"], color=colour, linewidth=line_width(0.65))
+    label_y(rows[3], "sway [rad]")
+    drawing.label_x("time [s]")
+    return drawing.plot()
 
 
-@house_style
-def plot_plane(comparison: Comparison, wall: Wall) -> Figure:
-    """Paths of the load in the plane, z down, with the obstacle (figure 6)."""
-    styles = line_styles(comparison.plans)
-    figure = new_figure(7.4, 4.6)
-    ((axes,),) = stacked_axes(figure, 1)
+def plot_plane(comparison: Comparison, wall: Wall, *, ax: AxesLike | None = None) -> ControlPlot:
+    """Paths of the load in the plane, z down, with the obstacle (figure 6).
+
+    Parameters
+    ----------
+    comparison : Comparison
+        Of cranes.
+    wall : ((float, float), (float, float)) or None
+        An obstacle to draw: its sides in x and in z [m].
+    ax : Axes, optional
+        Where to draw; None: an empty current figure, or a new one.
+
+    Returns
+    -------
+    control.ControlPlot
+        Of shape (1, 1).
+    """
+    drawing = Drawing(ax, (1, 1), (7.4, 4.6))
+    (axes,) = drawing.column
+    styles = plan_styles(comparison.plans, axes)
     if wall:
         (left, right), (top, ground) = wall
-        axes.add_patch(Rectangle((left, top), right - left, ground - top, color="#bbbbbb", zorder=0))
-        axes.text(0.5 * (left + right), 0.5 * (top + ground), "wall", ha="center", fontsize=9)
+        axes.add_patch(Rectangle((left, top), right - left, ground - top, color=shade(0.267), zorder=0))
+        axes.text(0.5 * (left + right), 0.5 * (top + ground), "wall", ha="center", fontsize=font_size(9))
     last = _ends(comparison)[1]
     for name in _moving(comparison):  # steps take no path
         signals = _signals(comparison, name)
         way = signals["t"] <= last
-        axes.plot(*_planned(comparison, name, signals["t"][way]), color=styles[name]["color"], linewidth=0.7, alpha=0.6)
+        thin = {"color": styles[name]["color"], "linewidth": line_width(0.45), "alpha": 0.6}
+        axes.plot(*_planned(comparison, name, signals["t"][way]), **thin)
         axes.plot(signals["x"][way], signals["z"][way], **styles[name])
     for text, place in _named_places(comparison).items():
-        axes.plot(*place, "o", color="#444444", mfc="white", zorder=5)
-        axes.annotate(text, place, xytext=(6, -10), textcoords="offset points", fontsize=9)
-    axes.set_xlabel("x [m]")
-    axes.set_ylabel("z [m], down")
-    axes.invert_yaxis()
-    legend_above(figure, axes)
-    return figure
+        axes.plot(*place, "o", color=shade(0.73), mfc=axes.get_facecolor(), zorder=5)
+        axes.annotate(text, place, xytext=(6, -10), textcoords="offset points", fontsize=font_size(9))
+    drawing.label_x("x [m]")
+    label_y(axes, "z [m], down")
+    axes.yaxis.set_inverted(True)
+    return drawing.plot()
 
 
-@house_style
-def plot_motion(comparison: Comparison, wall: Wall, steps: int = 13) -> Figure:
-    """Trolley, rope and load at equal time steps along each plan."""
+def plot_motion(comparison: Comparison, wall: Wall, steps: int = 13, *, ax: AxesLike | None = None) -> ControlPlot:
+    """Trolley, rope and load at equal time steps along each plan.
+
+    Parameters
+    ----------
+    comparison : Comparison
+        Of cranes.
+    wall : ((float, float), (float, float)) or None
+        An obstacle to draw: its sides in x and in z [m].
+    steps : int, optional
+        Number of times.
+    ax : array of Axes, shape (nplans,), optional
+        Where to draw, two plans at most; None: an empty current figure, or a new
+        one.
+
+    Returns
+    -------
+    control.ControlPlot
+        Of shape (nplans, 1).
+    """
     known = [n for n in ("polynomial", "trigonometric") if n in comparison.plans]
     names = known or (_moving(comparison) or list(comparison.plans))[:2]
-    figure = new_figure(7.4, 3.4 * len(names))
-    rows = [row[0] for row in stacked_axes(figure, len(names))]
+    drawing = Drawing(ax, (len(names), 1), (7.4, 3.4 * len(names)), rows=names)
     first, last = _ends(comparison)
-    colours = line_styles(comparison.plans)
-    for name, axes in zip(names, rows, strict=True):
+    for name, axes in zip(names, drawing.column, strict=True):
         signals = _signals(comparison, name)
         if wall:
             (left, right), (top, ground) = wall
-            axes.add_patch(Rectangle((left, top), right - left, ground - top, color="#cccccc", zorder=0))
-        axes.axhline(0.0, color="#999999", linewidth=2)
-        colour = colours[name]["color"]
-        axes.plot(signals["x"], signals["z"], color=colour, linewidth=0.8)
-        size, drum = max(np.ptp(signals["x"]), np.ptp(signals["z"])) / 25.0, abs(_drum_radius(signals))
-        ends = [signals["D"], signals["x"], signals["z"], *_rope_top(signals)]
+            axes.add_patch(Rectangle((left, top), right - left, ground - top, color=shade(0.2), zorder=0))
+        axes.axhline(0.0, color=shade(0.4), linewidth=line_width(1.25))
+        colour = plan_styles(comparison.plans, axes)[name]["color"]
+        axes.plot(signals["x"], signals["z"], color=colour, linewidth=line_width(0.5))
         end = min(last, float(signals["t"][-1]))  # an event can have ended the run
         for t in np.linspace(first, end, steps):
-            trolley, x, z, top_x, top_z = (float(np.interp(t, signals["t"], row)) for row in ends)
-            axes.add_patch(Rectangle((trolley - 0.5 * size, -0.3 * size), size, 0.3 * size, color="#333333", zorder=3))
-            axes.add_patch(Circle((trolley, 0.0), drum, fill=False, color="#333333", linewidth=0.6, zorder=3))
-            axes.plot([top_x, x], [top_z, z], color="#888888", linewidth=0.7)
-            axes.plot(x, z, "o", color=colour, markersize=4.5, zorder=4)
-        axes.set_title(f"{as_text(name)}: every {(end - first) / (steps - 1):.3g} s", loc="left", fontsize=9)
-        axes.set_ylabel("z [m], down")
-        axes.invert_yaxis()
+            _crane_at(axes, signals, t, colour)
+        add_title(axes, f"{as_text(name)}: every {(end - first) / (steps - 1):.3g} s")
+        label_y(axes, "z [m], down")
+        axes.yaxis.set_inverted(True)
         axes.set_aspect("equal")
-    rows[-1].set_xlabel("x [m]")
-    return figure
+    drawing.label_x("x [m]")
+    return drawing.plot(legend=False)
 
 
-@house_style
-def plot_curves(study: Study) -> Figure:
-    """The curves that a study computed for itself."""
+def _crane_at(axes: Axes, signals: dict[str, Array], t: float, colour: str) -> None:
+    """Trolley, drum, rope and load at one time."""
+    size, drum = max(np.ptp(signals["x"]), np.ptp(signals["z"])) / 25.0, abs(_drum_radius(signals))
+    rows = [signals["D"], signals["x"], signals["z"], *_rope_top(signals)]
+    trolley, x, z, top_x, top_z = (float(np.interp(t, signals["t"], row)) for row in rows)
+    dark = shade(0.8)
+    axes.add_patch(Rectangle((trolley - 0.5 * size, -0.3 * size), size, 0.3 * size, color=dark, zorder=3))
+    axes.add_patch(Circle((trolley, 0.0), drum, fill=False, color=dark, linewidth=line_width(0.4), zorder=3))
+    axes.plot([top_x, x], [top_z, z], color=shade(0.467), linewidth=line_width(0.45))
+    axes.plot(x, z, "o", color=colour, markersize=marker_size(4.5), zorder=4)
+
+
+def plot_curves(study: Study, *, ax: AxesLike | None = None) -> ControlPlot:
+    """The curves that a study computed for itself.
+
+    Parameters
+    ----------
+    study : Study
+        With curves, of which the first are drawn.
+    ax : Axes, optional
+        Where to draw; None: an empty current figure, or a new one.
+
+    Returns
+    -------
+    control.ControlPlot
+        Of shape (1, 1).
+    """
     curves = study.curves[0]
-    figure = new_figure(7.0, 3.8)
-    ((axes,),) = stacked_axes(figure, 1)
-    palette = ("#0072B2", "#D55E00", "#009E73", "#000000", "#CC79A7", "#E69F00")
+    drawing = Drawing(ax, (1, 1), (7.0, 3.8))
+    (axes,) = drawing.column
+    names = list(curves.rows)
+    # Curves of a logarithmic axis come in pairs: a colour a pair, and dashes for the second.
+    told = axis_styles(names[::2] if curves.log else names, axes)
+    colours = [style["color"] for style in told.values()]
     for i, (name, row) in enumerate(curves.rows.items()):
         style = "-" if i % 2 == 0 else (0, (5, 1.5))
-        axes.plot(
-            curves.x, row, color=palette[(i // 2 if curves.log else i) % 6], linestyle=style, label=legend_label(name)
-        )
+        colour = colours[i // 2 if curves.log else i]
+        axes.plot(curves.x, row, color=colour, linestyle=style, label=legend_label(name))
     if curves.log:
         axes.set_yscale("log")
-    axes.set_xlabel(as_text(curves.x_label))
-    axes.set_ylabel(as_text(curves.y_label))
-    legend_above(figure, axes)
-    return figure
+    drawing.label_x(as_text(curves.x_label))
+    label_y(axes, as_text(curves.y_label))
+    return drawing.plot()
 
 
-@house_style
-def plot_online(comparison: Comparison) -> Figure:
-    """Load, reference in force, distance from the goal, sway and force of each way to run one plan."""
-    styles = line_styles(comparison.plans)
-    figure = new_figure(7.4, 8.2)
-    rows = [row[0] for row in stacked_axes(figure, 4)]
+def plot_online(comparison: Comparison, *, ax: AxesLike | None = None) -> ControlPlot:
+    """Load, reference in force, distance from the goal, sway and force of each way to run one plan.
+
+    Parameters
+    ----------
+    comparison : Comparison
+        Of cranes.
+    ax : array of Axes, shape (4,), optional
+        Where to draw x, distance, sway and F; None: an empty current figure, or a
+        new one.
+
+    Returns
+    -------
+    control.ControlPlot
+        Of shape (4, 1).
+    """
+    labels = ("x [m]", "distance from goal [m]", "sway [rad]", "F [kN]")
+    drawing = Drawing(ax, (4, 1), (7.4, 8.2), rows=labels)
+    rows = drawing.column
+    styles = plan_styles(comparison.plans, rows[0])
     for name, plan in comparison.plans.items():
         signals = _signals(comparison, name)
         x, z = _across_and_down(comparison, plan.labels, plan.final)
         distance = np.hypot(signals["x"] - x, signals["z"] - z)
-        rows[0].plot(signals["t"], signals["x_ref"], color=styles[name]["color"], linewidth=0.7, alpha=0.6)
+        thin = {"color": styles[name]["color"], "linewidth": line_width(0.45), "alpha": 0.6}
+        rows[0].plot(signals["t"], signals["x_ref"], **thin)
         for axes, values in zip(rows, (signals["x"], distance, signals["theta"], signals["F"] / 1e3), strict=True):
             axes.plot(signals["t"], values, **styles[name])
-    for axes, label in zip(rows, ("x [m]", "distance from goal [m]", "sway [rad]", "F [kN]"), strict=True):
-        axes.set_ylabel(label)
+    for axes, label in zip(rows, labels, strict=True):
+        label_y(axes, label)
     rows[1].set_yscale("log")
     rows[1].set_ylim(bottom=1e-3)
-    rows[-1].set_xlabel("time [s]")
-    legend_above(figure, rows[0])
-    return figure
+    drawing.label_x("time [s]")
+    return drawing.plot()
 
 
 _FRAMES = 20_000

@@ -26,7 +26,7 @@ from ctrlplan.planning import Fastest
 from ctrlplan.reports.crane_figures import Wall, animation_data, is_crane, plot_curves
 from ctrlplan.reports.figures import FIGURES
 from ctrlplan.reports.planning_figures import plot_rivals
-from ctrlplan.reports.style import line_styles, slug, to_svg
+from ctrlplan.reports.style import line_styles, page_style, slug, to_svg
 from ctrlplan.reports.words import number, summary, unit_in, unit_of, verdicts
 from ctrlplan.studies.comparison import Comparison
 from ctrlplan.studies.ensemble import Ensemble
@@ -107,7 +107,8 @@ def write_all(texts: Mapping[Path, str]) -> list[Path]:
 
 def render_page(studies: Sequence[Study], title: str) -> str:
     """The page as text."""
-    sections = [_section(study, key) for study, key in zip(studies, _keys(studies), strict=True)]
+    with page_style():
+        sections = [_section(study, key) for study, key in zip(studies, _keys(studies), strict=True)]
     script = _script("sort.js.html")
     if any(section["animation"] for section in sections):
         script += _script("animation.js.html")
@@ -221,7 +222,7 @@ def _section(study: Study, name: str) -> dict[str, Any]:
     figures = []
     for key in study.figures:
         draw, caption = FIGURES[key]
-        svg = to_svg(draw(study), f"{name}.{key}")
+        svg = to_svg(draw(study).figure, f"{name}.{key}")
         if draw is plot_curves:
             caption = study.curves[0].caption
         figures.append({"key": key, "svg": Markup(svg), "caption": caption})  # noqa: S704 (our own drawing)
@@ -264,7 +265,7 @@ def _fastest(found: Fastest, study: Study, name: str) -> dict[str, Any]:
             }
             for row in found.margins
         ],
-        "svg": Markup(to_svg(found.plot(units), f"{name}.fastest")),  # noqa: S704 (our own drawing)
+        "svg": Markup(to_svg(found.plot(units).figure, f"{name}.fastest")),  # noqa: S704 (our own drawing)
         "caption": "Every limited signal of the fastest plan, and where it comes nearest to its limits (dashed).",
     }
 
@@ -276,7 +277,7 @@ def _worth(worth: Worth, name: str) -> dict[str, Any]:
         "verdicts": worth.verdicts,
         "alpha": f"{worth.alpha:.4g}",
         "note": worth.note,
-        "svg": Markup(to_svg(plot_rivals(worth.comparison), f"{name}.worth")),  # noqa: S704 (our own drawing)
+        "svg": Markup(to_svg(plot_rivals(worth.comparison).figure, f"{name}.worth")),  # noqa: S704 (our own drawing)
         "caption": "References through the same waypoints in the same time, what the loop makes of them, and what "
         "that asks of its controls.",
         "table": _table(worth.comparison),

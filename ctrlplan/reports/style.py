@@ -1,31 +1,45 @@
-"""How figures look: colours that a colour-blind reader tells apart, and line styles besides."""
+"""How figures look: colours that a colour-blind reader tells apart, and line styles besides.
+
+Every figure obeys the user's rcParams and is known to pyplot, as those of
+python-control are. Figures of a page are drawn inside `page_style` instead:
+with settings of their own, so that the same results give the same page, and
+unknown to pyplot, which would keep them.
+"""
 
 from __future__ import annotations
 
 import io
 import re
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
-from functools import cache, wraps
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from contextvars import ContextVar
+from functools import cache
 from itertools import cycle
-from typing import Any, ParamSpec
+from typing import Any, TypeAlias
 
 import matplotlib as mpl
 import matplotlib.pyplot as plt
+import numpy as np
+from control import ControlPlot
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
+from matplotlib.colors import to_hex, to_rgb
+from matplotlib.figure import Figure, SubFigure
 from matplotlib.font_manager import FontProperties, findfont, get_font
+from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.legend import Legend
+from matplotlib.lines import Line2D
+from numpy.typing import NDArray
 
-P = ParamSpec("P")
+AxesLike: TypeAlias = Axes | Sequence[Axes] | NDArray[np.object_]
+"""One axes, or several in a sequence or an array."""
 
 # Okabe and Ito's colours; a plan keeps its own in every figure.
 COLOURS = {"step": "#000000", "polynomial": "#0072B2", "trigonometric": "#D55E00", "piecewise": "#009E73"}
 _OTHERS = ("#CC79A7", "#E69F00", "#56B4E9")
+_PALETTE = ("#0072B2", "#D55E00", "#009E73", *_OTHERS, "#000000")
 DASHES = {"step": (0, (1, 1)), "polynomial": (0, (5, 1.5)), "trigonometric": "-", "piecewise": (0, (5, 1.5, 1, 1.5))}
 
 _OTHER_DASHES = ((0, (3, 1, 1, 1)), (0, (7, 2)), (0, (2, 2)), (0, (9, 1.5, 1, 1.5, 1, 1.5)))
-
-_WITHOUT_WINDOW = ("agg", "backend_inline", "cairo", "inline", "pdf", "pgf", "ps", "svg", "template")
 
 _RC: dict[Any, Any] = {
     "font.size": 9,
@@ -40,19 +54,224 @@ _RC: dict[Any, Any] = {
     "svg.fonttype": "path",
 }
 
+_FOR_PAGE: ContextVar[bool] = ContextVar("for_page", default=False)
 
-class ShownFigure(Figure):
-    """Figure that a notebook shows where it stands last in a cell, whatever its backend."""
 
-    def _repr_png_(self) -> bytes:
-        buffer = io.BytesIO()
+@contextmanager
+def page_style() -> Iterator[None]:
+    """Draw for a page: with fixed settings whatever the user's are, in figures that pyplot does not know."""
+    token = _FOR_PAGE.set(True)
+    try:
         with _house_settings():
-            self.savefig(buffer, format="png", dpi=110)
-        return buffer.getvalue()
+            yield
+    finally:
+        _FOR_PAGE.reset(token)
+
+
+@contextmanager
+def _house_settings(**more: object) -> Iterator[None]:
+    with mpl.rc_context():
+        mpl.rcdefaults()
+        mpl.rcParams.update(_RC | more)
+        yield
+
+
+class Drawing:
+    """Axes that a plotting function draws in: new ones, or those of the user.
+
+    Parameters
+    ----------
+    ax : Axes, sequence or array of Axes, or None
+        Axes of the user; None for new ones, in the current figure where that is
+        empty, else in a new figure.
+    shape : (int, int)
+        Rows and columns. Where one of them is 1, axes of the user may be
+        arranged in any way; a grid must have this shape.
+    size : (float, float)
+        Width and height of a new figure [in], unless the user has set the
+        rcParam ``figure.figsize``.
+    rows : iterable of str
+        What each axes of one row or column, or each row of a grid, shows, for
+        the message of an error.
+    wrap : int, optional
+        Columns in which new axes of a shape (n, 1) are laid out.
+    sharex : bool, optional
+        Whether new axes share the x axis down the columns.
+
+    Attributes
+    ----------
+    axes : ndarray of Axes, shape (rows, columns)
+        Where to draw.
+
+    Raises
+    ------
+    TypeError
+        If `ax` is neither axes nor several of them.
+    ValueError
+        If there are too many or too few, or a grid has another shape.
+    """
+
+    def __init__(
+        self,
+        ax: AxesLike | None,
+        shape: tuple[int, int],
+        size: tuple[float, float],
+        *,
+        rows: Iterable[str] = (),
+        wrap: int = 1,
+        sharex: bool = True,
+    ) -> None:
+        self._wrap, self._own = wrap, ax is None
+        if ax is None:
+            figure = _empty_figure(*size)
+            lines = -(-shape[0] // wrap)
+            grid = figure.subplots(lines, max(shape[1], wrap), sharex="col" if sharex else False, squeeze=False)
+            for spare in grid.flat[shape[0] * shape[1] :]:
+                spare.remove()
+            self.axes = grid.flatten()[: shape[0] * shape[1]].reshape(shape)
+        else:
+            self.axes = _reshaped(given_axes(ax), shape, list(rows))
+        self.figure: Figure | SubFigure = self.axes[0, 0].figure
+        self._before = [len(axes.lines) for axes in self.axes.flat]
+
+    @property
+    def column(self) -> list[Axes]:
+        """All axes, row by row."""
+        return list(self.axes.flat)
+
+    def label_x(self, text: str) -> None:
+        """Label the x axis of the lowest axes of each column that have no label yet."""
+        lowest = set(self.column[-self._wrap :]) | set(self.axes[-1])
+        for axes in self.column:
+            spec = axes.get_subplotspec()
+            if axes in lowest or spec is None or spec.is_last_row():
+                if self._own:
+                    axes.xaxis.set_tick_params(labelbottom=True)  # above a place that is left empty as well
+                # Numbers that the user has turned off stand below other axes, and so does the label.
+                if not axes.get_xlabel() and axes.xaxis.get_tick_params().get("labelbottom", True):
+                    axes.set_xlabel(text)
+
+    def plot(self, legend: bool = True) -> Plot:
+        """What a plotting function returns, with one legend for all axes, of the labels of the first."""
+        made = self._legend() if legend else None
+        lines = np.empty(self.axes.shape, dtype=object)
+        for index, axes, before in zip(np.ndindex(lines.shape), self.axes.flat, self._before, strict=True):
+            lines[index] = list(axes.lines[before:])
+        return Plot(lines, self.axes, self.figure, made)
+
+    def _legend(self) -> Legend | None:
+        """Legend above all axes, where it hides no curve; inside the first where the figure has others as well."""
+        axes = self.axes[0, 0]
+        handles, labels = axes.get_legend_handles_labels()
+        if not handles:
+            return None
+        names = [letters(label.removeprefix(_HIDDEN)) for label in labels]
+        outside = isinstance(self.figure.get_layout_engine(), ConstrainedLayoutEngine)
+        if outside and set(self.figure.axes) == set(self.axes.flat):
+            for old in [legend for legend in self.figure.legends if legend.get_label() == _LEGEND]:
+                old.remove()
+            size = FontProperties(size=mpl.rcParams["legend.fontsize"]).get_size_in_points()
+            # At 9 points there are about eleven letters an inch.
+            fit = int(99.0 / size * axes.figure.get_figwidth() / (max(map(len, names)) + 6))
+            legend = self.figure.legend(
+                handles, labels, loc="outside upper center", ncols=max(1, min(len(names), 5, fit))
+            )
+            legend.set_label(_LEGEND)
+        else:
+            legend = axes.legend(handles, labels)
+        for text, name in zip(legend.get_texts(), names, strict=True):
+            text.set_parse_math(False)
+            text.set_text(as_text(name) if mpl.rcParams["text.usetex"] else name)
+        return legend
+
+
+class Plot(ControlPlot):  # type: ignore[misc]
+    """`control.ControlPlot` whose title leaves the layout of its figure alone.
+
+    Attributes
+    ----------
+    figure : matplotlib.figure.Figure
+    axes : ndarray of matplotlib.axes.Axes, shape (rows, columns)
+    lines : ndarray of list of matplotlib.lines.Line2D, shape (rows, columns)
+        Lines that were added to each axes.
+    legend : matplotlib.legend.Legend or None
+    """
+
+    def set_plot_title(self, title: str, frame: str = "axes") -> None:
+        """Set the title above all axes.
+
+        Parameters
+        ----------
+        title : str
+            Title, a user's text.
+        frame : {"axes", "figure"}, optional
+            Centred on the axes, or on the figure; always the latter where the
+            figure has a constrained layout.
+        """
+        # Over the axes python-control would give the current figure, not this one, a tight layout.
+        constrained = isinstance(self.figure.get_layout_engine(), ConstrainedLayoutEngine)
+        super().set_plot_title(title, frame="figure" if constrained else frame)
+
+
+def given_axes(ax: AxesLike) -> NDArray[np.object_]:
+    """Axes of a user as an array of at least one dimension.
+
+    Raises
+    ------
+    TypeError
+        If there is anything else.
+    """
+    several = isinstance(ax, Sequence | np.ndarray | np.flatiter) and not isinstance(ax, str)
+    array = np.empty(1, dtype=object)
+    if several:
+        array = np.array(ax, dtype=object)
+    else:
+        array[0] = ax
+    for one in array.flat:
+        if not isinstance(one, Axes):
+            hint = "; give its .axes" if isinstance(one, Figure | ControlPlot) else ""
+            raise TypeError(f"ax must be matplotlib axes or an array of them, got {type(one).__name__}{hint}")
+    return array
+
+
+def _reshaped(array: NDArray[np.object_], shape: tuple[int, int], rows: Sequence[str]) -> NDArray[np.object_]:
+    if 1 in shape:
+        if array.size == max(shape):
+            return array.reshape(shape)
+        wanted = "one axes" if shape == (1, 1) else f"axes of shape ({max(shape)},)"
+    else:
+        if array.shape == shape:
+            return array
+        wanted = f"axes of shape {shape}"
+    shown = f"; from the top they show {', '.join(rows)}" if rows and shape != (1, 1) else ""
+    raise ValueError(f"ax must be {wanted}, got shape {array.shape}{shown}")
+
+
+def _empty_figure(width: float, height: float) -> Figure:
+    """Figure to draw in: the current one if it is empty, as ``plt.figure()`` leaves it, else a new one."""
+    if _FOR_PAGE.get():
+        return Figure(figsize=(width, height), layout="constrained")
+    tight = mpl.rcParams["figure.autolayout"]
+    if plt.get_fignums() and plt.gcf().get_children() == [plt.gcf().patch]:
+        figure = plt.gcf()
+        if figure.get_layout_engine() is None and not tight:
+            figure.set_layout_engine("constrained")
+        return figure
+    sized = not _as_by_default("figure.figsize")
+    return plt.figure(figsize=None if sized else (width, height), layout=None if tight else "constrained")
+
+
+def _as_by_default(name: str) -> bool:
+    """Whether the user has left an rcParam at matplotlib's own value."""
+    given, default = mpl.rcParams[name], mpl.rcParamsDefault[name]  # type: ignore[index]
+    return list(given) == list(default)
+
+
+# Colours and dashes
 
 
 def line_styles(names: Iterable[str]) -> dict[str, dict[str, Any]]:
-    """Colour and dashes of each plan."""
+    """Colour and dashes of each plan where nothing is set by a user."""
     names = list(names)
     spare = cycle([*_OTHERS, *(colour for name, colour in COLOURS.items() if name not in names)])
     dashed = cycle(_OTHER_DASHES)
@@ -69,53 +288,101 @@ def line_styles(names: Iterable[str]) -> dict[str, dict[str, Any]]:
     return styles
 
 
-def house_style(draw: Callable[P, Figure]) -> Callable[P, Figure]:
-    """Let a function draw with the settings of the house, whatever the user's are."""
+def plan_styles(names: Iterable[str], axes: Axes) -> dict[str, dict[str, Any]]:
+    """Colour, dashes and label of each plan to be drawn in an axes.
 
-    @wraps(draw)
-    def styled(*args: P.args, **kwargs: P.kwargs) -> Figure:
-        with _house_settings():
-            return draw(*args, **kwargs)
-
-    return styled
+    Those of `line_styles`; in the colours of the user's cycle where one is set,
+    and unlike the curves that the axes have already.
+    """
+    return _told_apart(line_styles(names), axes)
 
 
-@contextmanager
-def _house_settings(**more: object) -> Iterator[None]:
-    with mpl.rc_context():
-        mpl.rcdefaults()
-        mpl.rcParams.update(_RC | more)
-        yield
+def axis_styles(labels: Iterable[str], axes: Axes) -> dict[str, dict[str, Any]]:
+    """Colour, dashes and label of each axis of one plan to be drawn in an axes."""
+    pairs = zip(labels, cycle(_PALETTE))
+    return _told_apart(
+        {name: {"color": c, "linestyle": "-", "label": legend_label(name), "zorder": 2.0} for name, c in pairs}, axes
+    )
 
 
-def new_figure(width: float, height: float) -> Figure:
-    """Figure that a notebook shows once and a script with a window shows by ``plt.show()``."""
-    if mpl.get_backend().lower().rpartition(".")[2] in _WITHOUT_WINDOW:
-        return ShownFigure(figsize=(width, height), layout="constrained")
-    return plt.figure(figsize=(width, height), layout="constrained")
+def _told_apart(styles: dict[str, dict[str, Any]], axes: Axes) -> dict[str, dict[str, Any]]:
+    """Styles with the user's colours and dashes, other than those of the curves that axes have."""
+    drawn = [line for line in axes.lines if line.get_linestyle() != "None"]
+    chosen = _users_cycle()
+    used = [to_hex(line.get_color()) for line in drawn]
+    colours = [props["color"] for props in chosen if "color" in props] or [*_PALETTE]
+    own = not any("color" in props for props in chosen)
+    dashes = cycle(_OTHER_DASHES)
+    for i, style in enumerate(styles.values()):
+        if own and style["color"] == "#000000":
+            style["color"] = shade(1.0)
+        if not own or (drawn and _is_like(style["color"], used)):
+            distance = _ALIKE if own else 0.02
+            style["color"] = next((c for c in colours if not _is_like(c, used, distance)), colours[i % len(colours)])
+        if chosen and "linestyle" in chosen[0]:
+            style["linestyle"] = chosen[(len(drawn) + i) % len(chosen)]["linestyle"]
+        elif drawn:
+            style["linestyle"] = next(dashes)
+            style["zorder"] = 2.5
+        elif mpl.rcParams["lines.linestyle"] != "-":
+            style["linestyle"] = mpl.rcParams["lines.linestyle"]
+        used.append(to_hex(style["color"]))
+        style["label"] = _another(style["label"], drawn)
+    return styles
 
 
-def stacked_axes(figure: Figure, rows: int, columns: int = 1, sharex: bool = True) -> list[list[Axes]]:
-    """Grid of axes, time shared down the columns."""
-    grid = figure.subplots(rows, columns, sharex="col" if sharex else False, squeeze=False)
-    return [list(row) for row in grid]
+_ALIKE = 0.25
+"""Distance of colours in the unit cube of RGB below which a reader takes one for the other: Okabe and Ito's are 0.26
+apart, and matplotlib's own blue and orange within 0.22 of theirs."""
 
 
-def legend_above(figure: Figure, axes: Axes) -> None:
-    """One legend above all axes, where it hides no curve; labels are those of `legend_label`."""
-    handles, labels = axes.get_legend_handles_labels()
-    if handles:
-        names = [letters(label.removeprefix(_HIDDEN)) for label in labels]
-        fit = int(11 * figure.get_figwidth() / (max(map(len, names)) + 6))  # of about eleven letters an inch
-        legend = figure.legend(
-            handles, labels, loc="outside upper center", ncols=max(1, min(len(names), 5, fit)), frameon=False
-        )
-        for text, name in zip(legend.get_texts(), names, strict=True):
-            text.set_parse_math(False)
-            text.set_text(name)
+def _is_like(colour: str, others: Iterable[str], distance: float = _ALIKE) -> bool:
+    return any(np.linalg.norm(np.subtract(to_rgb(colour), to_rgb(other))) < distance for other in others)
 
+
+def _another(label: str, drawn: Sequence[Line2D]) -> str:
+    """Label with a number where a curve has it already."""
+    known = {line.get_label() for line in drawn}
+    number = 1
+    numbered = label
+    while numbered in known:
+        number += 1
+        numbered = f"{label} ({number})"
+    return numbered
+
+
+def _users_cycle() -> list[dict[str, Any]]:
+    """Properties of curves in turn, as the user has set them; empty where they are matplotlib's own."""
+    chosen = mpl.rcParams["axes.prop_cycle"]
+    return [] if chosen == mpl.rcParamsDefault["axes.prop_cycle"] else list(chosen)
+
+
+def shade(weight: float) -> str:
+    """Grey between the background (0) and the text (1), dark and light as the user has them."""
+    text, ground = (np.array(to_rgb(mpl.rcParams[name])) for name in ("text.color", "axes.facecolor"))
+    return to_hex(ground + weight * (text - ground))
+
+
+def line_width(factor: float) -> float:
+    """Part of the width of curves [pt]."""
+    return float(factor * mpl.rcParams["lines.linewidth"])
+
+
+def marker_size(points: float) -> float:
+    """Size of a marker [pt], stated for the 6 points of matplotlib's own setting."""
+    return float(points / 6.0 * mpl.rcParams["lines.markersize"])
+
+
+def font_size(points: float) -> float:
+    """Size of a text [pt], stated for the 9 points of a page."""
+    return float(points / 9.0 * mpl.rcParams["font.size"])
+
+
+# Texts
 
 _HIDDEN = "\N{WORD JOINER}"
+_LEGEND = "one legend for all axes"
+_LONGEST = 60
 
 
 def legend_label(name: str) -> str:
@@ -123,7 +390,17 @@ def legend_label(name: str) -> str:
     return _HIDDEN + name if not name or name.startswith("_") else name
 
 
-_LONGEST = 60
+def label_y(axes: Axes, text: str) -> None:
+    """Label the y axis, unless it is labelled."""
+    if not axes.get_ylabel():
+        axes.set_ylabel(text)
+
+
+def add_title(axes: Axes, text: str) -> None:
+    """Small title on the left, below one of another text that is there."""
+    old = axes.get_title(loc="left")
+    if text not in old.split("\n"):
+        axes.set_title(f"{old}\n{text}" if old else text, loc="left", fontsize=font_size(8))
 
 
 def letters(text: str) -> str:
@@ -134,19 +411,35 @@ def letters(text: str) -> str:
     """
     if len(text) > _LONGEST:
         text = f"{text[: _LONGEST // 2]} … {text[-_LONGEST // 3 :]}"
-    return "".join(c if ord(c) in _glyphs() else " " if c.isspace() else f"<U+{ord(c):04X}>" for c in text)
+    known = [_glyphs(font) for font in _fonts()]
+    return "".join(
+        c if any(ord(c) in font for font in known) else " " if c.isspace() else f"<U+{ord(c):04X}>" for c in text
+    )
 
 
 def as_text(text: str) -> str:
-    """Text of a user for a label or a title, in which matplotlib finds no formula."""
+    """Text of a user for a label or a title, in which neither matplotlib nor TeX finds a formula."""
+    if mpl.rcParams["text.usetex"]:
+        return "".join(_TEX.get(c, c) for c in letters(text))
     return letters(text).replace("$", r"\$")
 
 
+_TEX = {c: f"\\{c}" for c in "{}$&#%_"} | {"\\": r"\textbackslash{}", "^": r"\^{}", "~": r"\~{}"}
+
+
+def _fonts() -> list[str]:
+    """Files of the fonts in which matplotlib looks for a letter, the first that has it writing it."""
+    found: list[str] = []
+    for family in FontProperties().get_family():
+        with suppress(ValueError):
+            found.append(findfont(FontProperties(family=[family]), fallback_to_default=False))
+    return found or [findfont(FontProperties())]
+
+
 @cache
-def _glyphs() -> frozenset[int]:
-    """Code points that the font of the figures has."""
-    with _house_settings():
-        return frozenset(get_font(findfont(FontProperties())).get_charmap())
+def _glyphs(font: str) -> frozenset[int]:
+    """Code points that a font has."""
+    return frozenset(get_font(font).get_charmap())
 
 
 def with_unit(name: str, unit: str | None, power: str = "") -> str:
@@ -160,7 +453,6 @@ def to_svg(figure: Figure, key: str) -> str:
     buffer = io.StringIO()
     with _house_settings(**{"svg.hashsalt": salt}):
         figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
-    plt.close(figure)
     text = buffer.getvalue()
     # Several drawings stand in one page: what they define must be their own.
     return re.sub(r'(\bid="|url\(#|href="#)', rf"\g<1>{salt}-", text[text.index("<svg") :])

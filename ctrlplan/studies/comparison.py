@@ -40,8 +40,9 @@ from ctrlplan.trajectories import PiecewiseSpline, PolySpline, Step, Trajectory,
 
 if TYPE_CHECKING:
     import pandas as pd
-    from matplotlib.figure import Figure
+    from control import ControlPlot
 
+    from ctrlplan.reports.style import AxesLike
     from ctrlplan.studies.worth import Worth
 
 Array = NDArray[np.float64]
@@ -141,11 +142,24 @@ class Comparison:
         both = {name: "; ".join(filter(None, (self.marks.get(name), mark))) for name, mark in marks.items()}
         return replace(self, marks=self.marks | both)
 
-    def plot(self) -> Figure:
-        """Responses, errors and controls over time."""
+    def plot(self, ax: AxesLike | None = None) -> ControlPlot:
+        """Responses, errors and controls over time.
+
+        Parameters
+        ----------
+        ax : array of Axes, optional
+            Where to draw: for each output one axes for it and one for its
+            error, then one for each control. None: an empty current figure, or
+            a new one.
+
+        Returns
+        -------
+        control.ControlPlot
+            Of shape (2 noutputs + ncontrols, 1).
+        """
         from ctrlplan.reports.figures import plot_responses
 
-        return plot_responses(self)
+        return plot_responses(self, ax=ax)
 
     def report(self, path: str | os.PathLike[str]) -> Path:
         """Write one self-contained HTML page and return its path.

@@ -34,7 +34,9 @@ from ctrlplan.trajectories import Trajectory, Waypoint
 
 if TYPE_CHECKING:
     import pandas as pd
-    from matplotlib.figure import Figure
+    from control import ControlPlot
+
+    from ctrlplan.reports.style import AxesLike
 
 Array = NDArray[np.float64]
 Distribution = Any
@@ -153,11 +155,23 @@ class Ensemble:
             ],
         }
 
-    def plot(self) -> Figure:
-        """Bands of outputs and controls over time."""
+    def plot(self, *, ax: AxesLike | None = None) -> ControlPlot:
+        """Bands of outputs, errors and controls over time.
+
+        Parameters
+        ----------
+        ax : array of Axes, shape (2 noutputs + ncontrols, nplans), optional
+            Where to draw: a column for each plan, a row for each output, its
+            error and each control. None: an empty current figure, or a new one.
+
+        Returns
+        -------
+        control.ControlPlot
+            Of the shape of `ax`.
+        """
         from ctrlplan.reports.figures import plot_bands
 
-        return plot_bands(self)
+        return plot_bands(self, ax=ax)
 
     def report(self, path: str | os.PathLike[str], title: str = "Spread over draws") -> Path:
         """Write one self-contained HTML page and return its path.

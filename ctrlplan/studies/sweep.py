@@ -21,7 +21,9 @@ from ctrlplan.trajectories import Trajectory, Waypoint
 
 if TYPE_CHECKING:
     import pandas as pd
-    from matplotlib.figure import Figure
+    from control import ControlPlot
+
+    from ctrlplan.reports.style import AxesLike
 
 Array = NDArray[np.float64]
 
@@ -91,11 +93,26 @@ class Sweep:
     def _column(self, plan: str, name: str) -> Array:
         return self.metrics.get(plan, {}).get(name, np.full(self.values.size, np.nan))
 
-    def plot(self, names: Sequence[str] = ("settling_time", "overshoot_error")) -> Figure:
-        """Metrics over the parameter."""
+    def plot(
+        self, names: Sequence[str] = ("settling_time", "overshoot_error"), *, ax: AxesLike | None = None
+    ) -> ControlPlot:
+        """Metrics over the parameter.
+
+        Parameters
+        ----------
+        names : sequence of str, optional
+            Metrics, an axes each.
+        ax : array of Axes, shape (number of metrics,), optional
+            Where to draw; None: an empty current figure, or a new one.
+
+        Returns
+        -------
+        control.ControlPlot
+            Of shape (number of metrics, 1).
+        """
         from ctrlplan.reports.figures import plot_sweep
 
-        return plot_sweep(self, names)
+        return plot_sweep(self, names, ax=ax)
 
 
 def sweep(

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ctrlplan._renamed import warn_renamed
 from ctrlplan.trajectories import extrema as _extrema
 from ctrlplan.trajectories import sampling as _sampling
 from ctrlplan.trajectories.common import (
@@ -30,8 +31,9 @@ from ctrlplan.trajectories.common import (
 from ctrlplan.trajectories.continuity import Jump, find_jumps
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    from control import ControlPlot
 
+    from ctrlplan.reports.style import AxesLike
     from ctrlplan.trajectories.waypoint import Waypoint
 
 
@@ -381,23 +383,59 @@ class Trajectory(Frozen, ABC):
 
         save_trajectory(self, path)
 
-    def plot(self, order: int = 2, units: Sequence[str] | None = None) -> Figure:
-        """Value and derivatives stacked, waypoints marked.
+    def plot(
+        self,
+        derivatives: int = 2,
+        *,
+        ax: AxesLike | None = None,
+        units: Sequence[str] | None = None,
+        order: int | None = None,
+    ) -> ControlPlot:
+        """Position and derivatives stacked, waypoints marked.
+
+        The figure is registered with pyplot, so that ``plt.show()`` shows it and
+        ``plt.savefig`` writes it, and obeys the user's rcParams. To compare plans,
+        draw the second in the axes of the first.
 
         Parameters
         ----------
-        order : int, optional
+        derivatives : int, optional
             Highest derivative drawn.
+        ax : Axes or array of Axes, optional
+            Where to draw: an array of n axes gets the derivatives 0 to n - 1, one
+            axes the position only. None: an empty current figure, or a new one.
         units : sequence of str, optional
-            Units of the axes.
+            Units of the plan's axes.
+        order : int, optional
+            Old name of `derivatives`.
 
         Returns
         -------
-        matplotlib.figure.Figure
+        control.ControlPlot
+            With `figure`, `axes` and `lines`, both of shape (derivatives + 1, 1).
+
+        Raises
+        ------
+        TypeError
+            If `ax` is neither axes nor an array of them.
+        ValueError
+            If `ax` has not one axes for each of the `derivatives` stated.
+
+        Examples
+        --------
+        >>> import ctrlplan as cp
+        >>> move = [cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1, 0, 0)]
+        >>> drawn = cp.PolySpline(move).plot(1)
+        >>> both = cp.TrigSpline(move, alpha=3.0).plot(ax=drawn.axes)
+        >>> both.figure is drawn.figure, both.axes.shape
+        (True, (2, 1))
         """
         from ctrlplan.reports.figures import plot_trajectory
 
-        return plot_trajectory(self, order=checked_count(order, "order"), units=units)
+        if order is not None:
+            warn_renamed("order=", "derivatives=")
+            derivatives = order
+        return plot_trajectory(self, checked_count(derivatives, "derivatives"), ax=ax, units=units)
 
     def __add__(self, other: Trajectory) -> Trajectory:
         from ctrlplan.trajectories.combined import Sum
