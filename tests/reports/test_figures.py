@@ -13,7 +13,7 @@ from matplotlib.colors import to_hex
 
 import ctrlplan as cp
 from ctrlplan.reports import FIGURES, plot_plane, plot_plans, plot_responses, plot_sweep, plot_trajectory, render_page
-from ctrlplan.reports.style import line_styles, to_svg
+from ctrlplan.reports.style import line_styles, page_style, to_svg
 from ctrlplan.studies import MEASURES, Study
 from ctrlplan.studies.crane import obstacle_waypoints
 from ctrlplan.studies.linear import STEP_LIMIT
@@ -95,7 +95,10 @@ def figure(request, compared, two_axes, swept, craned, spread):
         "trajectory": lambda: two_axes.plans["polynomial"].plot(),
         "one metric": lambda: plot_sweep(swept, ["iae"]),
     }
-    return others[request.param]() if request.param in others else FIGURES[request.param][0](study)
+    if request.param in others:
+        return others[request.param]().figure
+    with page_style():
+        return FIGURES[request.param][0](study).figure
 
 
 def drawing(figure):
@@ -128,6 +131,16 @@ def drawn(figure):
 def curves(axes):
     """Lines that are drawn, without the markers and the thin references."""
     return [line for line in axes.lines if line.get_linestyle() != "None" and line.get_linewidth() >= 1.0]
+
+
+def circles(axes):
+    """Points of the prescribed values."""
+    return [tuple(point) for marks in axes.collections for point in marks.get_offsets().tolist()]
+
+
+def axes_of(drawn):
+    """All axes of a plot, row by row."""
+    return list(drawn.axes.flat)
 
 
 def by_label(axes):
@@ -236,44 +249,44 @@ def test_a_plan_looks_the_same_whoever_stands_beside_it():
 
 def test_a_plan_keeps_its_colour_and_dashes_in_every_panel(compared):
     styles = line_styles(compared.plans)
-    for figure in (plot_plans(compared), plot_responses(compared)):
-        for axes in figure.axes:
+    for drawn in (plot_plans(compared), plot_responses(compared)):
+        for axes in axes_of(drawn):
             for line in curves(axes):
                 style = styles[line.get_label()]
                 assert to_hex(line.get_color()) == to_hex(style["color"])
 
 
 def test_the_legend_names_every_plan_once(compared, swept):
-    for figure, names in (
+    for drawn, names in (
         (plot_plans(compared), compared.plans),
         (plot_responses(compared), compared.plans),
         (plot_sweep(swept), swept.metrics),
     ):
-        (legend,) = figure.legends
-        assert [text.get_text() for text in legend.get_texts()] == list(names)
+        assert drawn.figure.legends == [drawn.legend]
+        assert [text.get_text() for text in drawn.legend.get_texts()] == list(names)
 
 
 # Plans
 
 
 def test_labels_of_plans_carry_units(compared, two_axes):
-    labels = [axes.get_ylabel() for axes in plot_plans(compared).axes]
+    labels = [axes.get_ylabel() for axes in axes_of(plot_plans(compared))]
     assert labels == ["x position [m]", "x velocity [m/s]", "x acceleration [m/s$^2$]"]
-    labels = [axes.get_ylabel() for axes in plot_plans(two_axes, order=1).axes]
+    labels = [axes.get_ylabel() for axes in axes_of(plot_plans(two_axes, 1))]
     assert labels == ["x position [m]", "theta position [rad]", "x velocity [m/s]", "theta velocity [rad/s]"]
-    assert plot_plans(compared).axes[-1].get_xlabel() == "time [s]"
-    labels = [axes.get_ylabel() for axes in plot_plans(compared, order=4).axes]
+    assert plot_plans(compared).axes[-1, 0].get_xlabel() == "time [s]"
+    labels = [axes.get_ylabel() for axes in axes_of(plot_plans(compared, 4))]
     assert labels[3:] == ["x jerk [m/s$^3$]", "x snap [m/s$^4$]"]
 
 
 def test_without_units_none_is_made_up(compared):
     loop = cp.plants.integrator_lag_loop(5.0)
-    figure = plot_plans(cp.compare(loop, MOVE, TIMES))
-    assert [axes.get_ylabel() for axes in figure.axes] == ["position", "velocity [1/s]", "acceleration [1/s$^2$]"]
+    drawn = plot_plans(cp.compare(loop, MOVE, TIMES))
+    assert [axes.get_ylabel() for axes in axes_of(drawn)] == ["position", "velocity [1/s]", "acceleration [1/s$^2$]"]
 
 
 def test_plans_are_drawn_as_they_are(compared):
-    for order, axes in enumerate(plot_plans(compared).axes):
+    for order, axes in enumerate(axes_of(plot_plans(compared))):
         lines = by_label(axes)
         assert set(lines) == {name for name in compared.plans if name != "step" or order == 0}
         for name, line in lines.items():
@@ -285,10 +298,7 @@ def test_plans_are_drawn_as_they_are(compared):
 
 
 def test_prescribed_values_are_circles_and_free_ones_are_not(compared):
-    marks = []
-    for axes in plot_plans(compared).axes:
-        (line,) = (line for line in axes.lines if line.get_linestyle() == "None")
-        marks.append([tuple(p) for p in line.get_xydata() if not np.isnan(p).any()])
+    marks = [[point for point in circles(axes) if not np.isnan(point).any()] for axes in axes_of(plot_plans(compared))]
     assert marks == [[(0, 0), (6, 5), (10, 1)], [(0, 0), (10, 0)], [(0, 0), (10, 0)]]
 
 
@@ -296,7 +306,7 @@ def test_no_line_is_drawn_through_a_jump():
     # Positions alone: the velocity jumps at both ends, and at the join.
     plan = cp.PiecewiseSpline([cp.Waypoint(0, 0), cp.Waypoint(1, 1), cp.Waypoint(2, 0)])
     found = cp.Comparison({"legs": plan}, {}, {}, outputs=("y",))
-    for axes in (plot_plans(found, order=1).axes[1], plot_trajectory(plan, order=1).axes[1]):
+    for axes in (plot_plans(found, 1).axes[1, 0], plot_trajectory(plan, 1).axes[1, 0]):
         (line,) = curves(axes)
         t, v = line.get_data()
         assert {1.0, -1.0, 0.0} == set(v[~np.isnan(v)].round(9))
@@ -309,40 +319,40 @@ def test_no_line_is_drawn_through_a_jump():
 
 def test_a_trajectory_marks_its_waypoints():
     plan = cp.TrigSpline(MOVE, alpha=2.0)
-    figure = plan.plot(order=3)
-    assert len(figure.axes) == 4
-    marked = []
-    for order, axes in enumerate(figure.axes):
+    drawn = plan.plot(3)
+    assert drawn.axes.shape == (4, 1)
+    for order, axes in enumerate(axes_of(drawn)):
         (line,) = curves(axes)
         t, y = line.get_data()
         known = ~np.isnan(y)
         np.testing.assert_allclose(y[known], plan(t[known], order), rtol=0, atol=1e-9)
-        marked.append([tuple(p) for m in axes.lines if m.get_linestyle() == "None" for p in m.get_xydata()])
-    assert marked == [[(0, 0), (6, 5), (10, 1)], [(0, 0), (10, 0)], [(0, 0), (10, 0)], []]
+    assert [circles(axes) for axes in axes_of(drawn)] == [
+        [(0, 0), (6, 5), (10, 1)],
+        [(0, 0), (10, 0)],
+        [(0, 0), (10, 0)],
+        [],
+    ]
 
 
 def test_each_axis_of_a_trajectory_is_marked_and_named():
     points = [cp.Waypoint.from_jets(0, x=[0.0, 0.0], z=[3.0]), cp.Waypoint.from_jets(2, x=[1.0], z=[4.0, 0.5])]
-    figure = cp.PolySpline(points).plot(order=1, units=["m", "m"])
-    assert [axes.get_ylabel() for axes in figure.axes] == ["position [m]", "velocity [m/s]"]
-    (legend,) = figure.legends
-    assert [text.get_text() for text in legend.get_texts()] == ["x", "z"]
-    marks = [
-        {tuple(p) for m in axes.lines if m.get_linestyle() == "None" for p in m.get_xydata()} for axes in figure.axes
-    ]
+    drawn = cp.PolySpline(points).plot(1, units=["m", "m"])
+    assert [axes.get_ylabel() for axes in axes_of(drawn)] == ["position [m]", "velocity [m/s]"]
+    assert [text.get_text() for text in drawn.legend.get_texts()] == ["x", "z"]
+    marks = [set(circles(axes)) for axes in axes_of(drawn)]
     assert marks == [{(0, 0), (2, 1), (0, 3), (2, 4)}, {(0, 0), (2, 0.5)}]
-    colours = {to_hex(line.get_color()) for line in curves(figure.axes[0])}
+    colours = {to_hex(line.get_color()) for line in curves(drawn.axes[0, 0])}
     assert len(colours) == 2
 
 
 def test_a_trajectory_without_waypoints_or_duration_is_drawn_too():
-    assert len(cp.Step(1.0).plot().axes) == 3
-    assert len((2.0 * cp.PolySpline(MOVE) + cp.PolySpline(MOVE)).plot().axes) == 3
+    assert len(axes_of(cp.Step(1.0).plot())) == 3
+    assert len(axes_of((2.0 * cp.PolySpline(MOVE) + cp.PolySpline(MOVE)).plot())) == 3
 
 
 def test_different_units_have_none_in_common():
     points = [cp.Waypoint.from_jets(0, x=[0.0], th=[3.0]), cp.Waypoint.from_jets(2, x=[1.0], th=[4.0])]
-    labels = [axes.get_ylabel() for axes in cp.PolySpline(points).plot(order=0, units=["m", "rad"]).axes]
+    labels = [axes.get_ylabel() for axes in axes_of(cp.PolySpline(points).plot(0, units=["m", "rad"]))]
     assert not any("[m]" in label or "[rad]" in label for label in labels)
 
 
@@ -350,13 +360,13 @@ def test_different_units_have_none_in_common():
 
 
 def test_labels_of_responses_carry_units(compared, two_axes):
-    assert [a.get_ylabel() for a in plot_responses(compared).axes] == ["y [m]", "error of y [m]", "u [N]"]
-    labels = [a.get_ylabel() for a in plot_responses(two_axes).axes]
+    assert [a.get_ylabel() for a in axes_of(plot_responses(compared))] == ["y [m]", "error of y [m]", "u [N]"]
+    labels = [a.get_ylabel() for a in axes_of(plot_responses(two_axes))]
     assert labels == ["x [m]", "error of x [m]", "theta [rad]", "error of theta [rad]"]
 
 
 def test_responses_are_drawn_as_they_are(compared):
-    output, error, control = plot_responses(compared).axes
+    output, error, control = axes_of(plot_responses(compared))
     for name, response in compared.responses.items():
         y, u = response.outputs
         for axes, signal in ((output, y), (error, compared.plans[name](TIMES) - y), (control, u)):
@@ -370,28 +380,28 @@ def test_responses_are_drawn_as_they_are(compared):
 
 
 def test_a_comparison_draws_its_responses(compared):
-    assert len(compared.plot().axes) == len(plot_responses(compared).axes) == 3
+    assert len(axes_of(compared.plot())) == len(axes_of(plot_responses(compared))) == 3
 
 
 def test_a_loop_without_controls_and_one_that_explodes_are_drawn_too(tmp_path):
     alone = cp.compare(cp.plants.integrator_lag_loop(5.0), MOVE, TIMES)
-    assert len(alone.plot().axes) == 2
+    assert len(axes_of(alone.plot())) == 2
     wild = cp.compare(cp.plants.integrator_lag_loop(-1e4), MOVE, np.linspace(0, 30, 301))
-    to_svg(wild.plot(), "wild")
+    to_svg(wild.plot().figure, "wild")
 
 
 # Sweeps
 
 
 def test_labels_of_a_sweep_carry_units(swept):
-    axes = plot_sweep(swept).axes
+    axes = axes_of(plot_sweep(swept))
     assert [a.get_ylabel() for a in axes] == ["Settling time [s]", "Overshoot on the error [%]"]
     assert {a.get_xlabel() for a in axes} == {"gain"}
     assert {a.get_xscale() for a in axes} == {"log"}
 
 
 def test_a_sweep_is_drawn_as_it_is_and_broken_where_it_jumps(swept):
-    settling, overshoot = plot_sweep(swept).axes
+    settling, overshoot = axes_of(plot_sweep(swept))
     for plan, rows in swept.metrics.items():
         line = by_label(overshoot)[plan]
         np.testing.assert_array_equal(line.get_ydata(), rows["overshoot_error"])
@@ -411,7 +421,7 @@ def test_a_sweep_is_drawn_as_it_is_and_broken_where_it_jumps(swept):
 
 def test_values_at_which_a_loop_never_settles_are_drawn_too():
     found = cp.sweep(cp.plants.integrator_lag_loop, [-2.0, -1.0, 1.0, 2.0], MOVE, TIMES, progress=False)
-    settling, _ = found.plot().axes
+    settling, _ = axes_of(found.plot())
     for line in by_label(settling).values():
         k, ts = line.get_data()
         assert set(k[np.isfinite(ts)]) == {1.0, 2.0}
@@ -420,13 +430,13 @@ def test_values_at_which_a_loop_never_settles_are_drawn_too():
 @pytest.mark.slow
 def test_every_measure_can_be_swept_and_drawn(swept):
     names = [name for name in MEASURES if name in swept.metrics["step"]]
-    figure = plot_sweep(swept, names)
+    figure = plot_sweep(swept, names).figure
     assert len(visible(figure)) == len(names)
     to_svg(figure, "all")
 
 
 def test_figure_1_is_the_plane_of_settling_and_overshoot(swept):
-    (axes,) = plot_plane(swept).axes
+    (axes,) = axes_of(plot_plane(swept))
     assert axes.get_xlabel() == "settling time ±2 % [s]"
     assert axes.get_ylabel() == "overshoot on the error [%]"
     (star,) = (line for line in axes.lines if line.get_marker() == "*")
@@ -444,7 +454,8 @@ def test_figure_1_is_the_plane_of_settling_and_overshoot(swept):
 
 
 def test_gains_beside_the_circles_can_be_read(swept):
-    figure = plot_plane(swept)
+    with page_style():
+        figure = plot_plane(swept).figure
     _, _, renderer = boxes(figure)
     (axes,) = figure.axes
     written = {text: text.get_window_extent(renderer) for text in axes.texts}
@@ -458,7 +469,7 @@ def test_gains_beside_the_circles_can_be_read(swept):
 
 
 def test_circles_stand_at_the_gains_written_beside_them(swept):
-    (axes,) = plot_plane(swept).axes
+    (axes,) = axes_of(plot_plane(swept))
     circles = {tuple(line.get_xydata()[0]) for line in axes.lines if line.get_marker() == "o"}
     for text in axes.texts:
         assert tuple(text.xy) in circles
@@ -470,37 +481,9 @@ def test_circles_stand_at_the_gains_written_beside_them(swept):
 # Manners
 
 
-@pytest.mark.slow
-def test_figures_do_not_pile_up_in_pyplot(compared, swept):
-    before = plt.get_fignums()
-    for _ in range(3):
-        compared.plot()
-        compared.plans["polynomial"].plot()
-        swept.plot()
-        plot_plans(compared)
-        plot_plane(swept)
-    assert plt.get_fignums() == before
-
-
-@pytest.mark.slow
-def test_a_page_leaves_no_window_open(compared, swept, monkeypatch):
-    monkeypatch.setattr(mpl, "get_backend", lambda: "QtAgg")  # where pyplot would manage them
-    before = plt.get_fignums()
-    render_page([Study("it", "It", compared, sweep=swept, figures=("plane", "plans"))], "It")
-    assert plt.get_fignums() == before
-
-
-def test_where_there_are_windows_a_figure_has_one(compared, monkeypatch):
-    monkeypatch.setattr(mpl, "get_backend", lambda: "TkAgg")
-    before = plt.get_fignums()
-    figure = compared.plot()
-    assert len(plt.get_fignums()) == len(before) + 1
-    plt.close(figure)
-
-
 def test_settings_of_the_user_are_left_alone(compared, swept):
     before = dict(mpl.rcParams)
-    to_svg(plot_plane(swept), "it")
+    to_svg(plot_plane(swept).figure, "it")
     compared.plot()
     assert dict(mpl.rcParams) == before
 
@@ -531,5 +514,5 @@ def test_only_reports_use_pyplot():
 def test_derivatives_of_a_quotient_have_its_unit_in_brackets():
     """A plan in deg/s: its derivative is in (deg/s)/s, and not in deg/s/s."""
     plan = cp.PolySpline([cp.Waypoint(0, 0, 0), cp.Waypoint(1, 1, 0)])
-    labels = [axes.get_ylabel() for axes in plot_trajectory(plan, 2, units=["deg/s"]).axes]
+    labels = [axes.get_ylabel() for axes in axes_of(plot_trajectory(plan, 2, units=["deg/s"]))]
     assert labels == ["position [deg/s]", "velocity [(deg/s)/s]", "acceleration [(deg/s)/s$^2$]"]

@@ -9,7 +9,7 @@ from matplotlib.colors import to_hex
 import ctrlplan as cp
 from ctrlplan.planning.limits import Limited
 from ctrlplan.reports.planning_figures import plot_alpha_choice, plot_limits, plot_rivals
-from ctrlplan.reports.style import to_svg
+from ctrlplan.reports.style import page_style, to_svg
 from ctrlplan.studies.worth import rival_plans
 
 MOVE = [cp.Waypoint(0, 0, 0, 0), cp.Waypoint(2, 1, 0, 0)]
@@ -20,8 +20,8 @@ PATH = [
 ]
 
 
-def labels(figure):
-    return [text.get_text() for legend in figure.legends for text in legend.get_texts()]
+def labels(drawn):
+    return [text.get_text() for legend in drawn.figure.legends for text in legend.get_texts()]
 
 
 def level(axes):
@@ -40,7 +40,7 @@ def choice():
 
 
 def test_the_objective_is_drawn_where_it_is_below_its_blow_up(choice):
-    (axes,) = plot_alpha_choice(choice).axes
+    (axes,) = plot_alpha_choice(choice).axes.flat
     curve, mark = axes.lines
     below = np.isfinite(choice.values) & (choice.alphas < choice.blow_up)
     np.testing.assert_array_equal(curve.get_xdata(), choice.alphas[below])
@@ -54,26 +54,26 @@ def test_the_objective_is_drawn_where_it_is_below_its_blow_up(choice):
 
 
 def test_the_legend_names_the_choice_and_where_plans_blow_up(choice):
-    figure = plot_alpha_choice(choice)
-    assert labels(figure) == [f"alpha = {choice.alpha:.4g} rad", "blows up"]
-    (band,) = figure.axes[0].patches
-    shown = figure.axes[0].transData.inverted().transform(band.get_window_extent().corners())[:, 0]
+    drawn = plot_alpha_choice(choice)
+    assert labels(drawn) == [f"alpha = {choice.alpha:.4g} rad", "blows up"]
+    (band,) = drawn.axes[0, 0].patches
+    shown = drawn.axes[0, 0].transData.inverted().transform(band.get_window_extent().corners())[:, 0]
     assert shown.min() == pytest.approx(choice.blow_up, rel=1e-9)
     assert shown.max() == pytest.approx(2 * np.pi, rel=1e-9)
 
 
 def test_without_a_blow_up_there_is_no_band():
     flat = cp.choose_alpha(MOVE, lambda plan: 5.0 + (plan.alpha - 1.0) ** 2)
-    figure = plot_alpha_choice(flat)
+    drawn = plot_alpha_choice(flat)
     assert flat.alpha == pytest.approx(1.0, abs=1e-6)
-    assert not figure.axes[0].patches
-    assert labels(figure) == ["alpha = 1 rad"]
-    assert figure.axes[0].get_yscale() == "linear"
+    assert not drawn.axes[0, 0].patches
+    assert labels(drawn) == ["alpha = 1 rad"]
+    assert drawn.axes[0, 0].get_yscale() == "linear"
 
 
 def test_objectives_are_named_in_words():
-    figure = cp.choose_alpha(MOVE, "peak_jerk").plot()
-    assert figure.axes[0].get_ylabel() == "peak jerk"
+    drawn = cp.choose_alpha(MOVE, "peak_jerk").plot()
+    assert drawn.axes[0, 0].get_ylabel() == "peak jerk"
 
 
 # Limits
@@ -86,11 +86,11 @@ def quintic():
 
 def test_every_limited_signal_has_a_row_with_its_unit(quintic):
     limited = Limited(quintic, {"y_d1": 1.0, "y_d2": 2.0})
-    figure = plot_limits(quintic, limited, {"y_d1": "m/s"})
+    drawn = plot_limits(quintic, limited, {"y_d1": "m/s"})
     t = np.linspace(0, 2, 2001)
-    assert [axes.get_ylabel() for axes in figure.axes] == ["y_d1 [m/s]", "y_d2"]
-    assert figure.axes[-1].get_xlabel() == "time [s]"
-    for k, axes in enumerate(figure.axes, 1):
+    assert [axes.get_ylabel() for axes in drawn.axes.flat] == ["y_d1 [m/s]", "y_d2"]
+    assert drawn.axes[-1, 0].get_xlabel() == "time [s]"
+    for k, axes in enumerate(drawn.axes.flat, 1):
         np.testing.assert_allclose(axes.lines[0].get_xdata(), t, rtol=0, atol=1e-12)
         u = t / 2
         expected = (30 * u**2 * (1 - u) ** 2 / 2, 60 * u * (1 - 3 * u + 2 * u**2) / 4)[k - 1]
@@ -98,8 +98,8 @@ def test_every_limited_signal_has_a_row_with_its_unit(quintic):
 
 
 def test_the_mark_is_where_the_signal_comes_nearest(quintic):
-    figure = plot_limits(quintic, Limited(quintic, {"y_d1": 1.0, "y_d2": (-2.0, 5.0)}))
-    speed, acceleration = (axes.lines[1] for axes in figure.axes)
+    drawn = plot_limits(quintic, Limited(quintic, {"y_d1": 1.0, "y_d2": (-2.0, 5.0)}))
+    speed, acceleration = (axes.lines[1] for axes in drawn.axes.flat)
     assert (speed.get_xdata()[0], speed.get_ydata()[0]) == pytest.approx((1.0, 15 / 16), rel=1e-9)
     peak = 10 / 3**0.5 / 4
     braking = 2 * (0.5 + 3**0.5 / 6)
@@ -107,34 +107,34 @@ def test_the_mark_is_where_the_signal_comes_nearest(quintic):
 
 
 def test_limits_that_are_near_are_lines_and_all_are_words(quintic):
-    figure = plot_limits(quintic, Limited(quintic, {"y_d1": 1.0, "y_d2": (-2.0, 500.0)}))
-    assert level(figure.axes[0]) == [-1.0, 1.0]
-    assert level(figure.axes[1]) == [-2.0]
-    titles = [axes.get_title(loc="left") for axes in figure.axes]
+    drawn = plot_limits(quintic, Limited(quintic, {"y_d1": 1.0, "y_d2": (-2.0, 500.0)}))
+    assert level(drawn.axes[0, 0]) == [-1.0, 1.0]
+    assert level(drawn.axes[1, 0]) == [-2.0]
+    titles = [axes.get_title(loc="left") for axes in drawn.axes.flat]
     assert titles[0] == "within ±1; 6.25 % left"
     assert titles[1].startswith("from -2 to 500; ")
-    low, high = figure.axes[1].get_ylim()
+    low, high = drawn.axes[1, 0].get_ylim()
     assert high - low < 10.0  # a limit of 500 would flatten the curve
 
 
 def test_a_constant_signal_has_a_figure_too():
     still = cp.PolySpline([cp.Waypoint(0, 3), cp.Waypoint(1, 3)])
-    figure = plot_limits(still, Limited(still, {"y": (2.0, 4.0)}))
-    assert level(figure.axes[0]) == pytest.approx([2.0, 4.0])
-    assert figure.axes[0].get_title(loc="left") == "from 2 to 4; 100 % left"
+    drawn = plot_limits(still, Limited(still, {"y": (2.0, 4.0)}))
+    assert level(drawn.axes[0, 0]) == pytest.approx([2.0, 4.0])
+    assert drawn.axes[0, 0].get_title(loc="left") == "from 2 to 4; 100 % left"
 
 
 def test_a_limit_that_is_broken_is_not_said_to_be_left(quintic):
-    figure = plot_limits(quintic, Limited(quintic, {"y_d1": 0.75}))
-    assert figure.axes[0].get_title(loc="left") == "within ±0.75; 25 % beyond"
+    drawn = plot_limits(quintic, Limited(quintic, {"y_d1": 0.75}))
+    assert drawn.axes[0, 0].get_title(loc="left") == "within ±0.75; 25 % beyond"
 
 
 def test_the_fastest_plan_draws_its_limits():
     found = cp.fastest(cp.PolySpline(PATH), {"velocity": 2.0, "x_d2": (-8.0, 6.0)})
-    figure = found.plot({"x_d1": "m/s", "z_d1": "m/s", "x_d2": "m/s²"})
-    assert [axes.get_ylabel() for axes in figure.axes] == ["x_d1 [m/s]", "z_d1 [m/s]", "x_d2 [m/s²]"]
-    assert any("; nothing left" in axes.get_title(loc="left") for axes in figure.axes)
-    for axes, (low, high) in zip(figure.axes, [(-2, 2), (-2, 2), (-8, 6)], strict=True):
+    drawn = found.plot({"x_d1": "m/s", "z_d1": "m/s", "x_d2": "m/s²"})
+    assert [axes.get_ylabel() for axes in drawn.axes.flat] == ["x_d1 [m/s]", "z_d1 [m/s]", "x_d2 [m/s²]"]
+    assert any("; nothing left" in axes.get_title(loc="left") for axes in drawn.axes.flat)
+    for axes, (low, high) in zip(drawn.axes.flat, [(-2, 2), (-2, 2), (-8, 6)], strict=True):
         row = axes.lines[0].get_ydata()
         assert low * (1 + 1e-9) <= row.min() < row.max() <= high * (1 + 1e-9)
 
@@ -152,8 +152,8 @@ def compared():
 
 @pytest.mark.slow
 def test_rivals_are_drawn_with_what_the_loop_makes_of_them(compared):
-    figure = plot_rivals(compared)
-    reference, output, control = (axes for axes in figure.axes if axes.get_visible())
+    drawn = plot_rivals(compared)
+    reference, output, control = (axes for axes in drawn.axes.flat if axes.get_visible())
     shown = (reference.get_ylabel(), output.get_ylabel(), control.get_ylabel())
     assert shown == ("reference of y [m]", "y [m]", "u [N]")
     assert control.get_xlabel() == "time [s]"
@@ -168,14 +168,14 @@ def test_rivals_are_drawn_with_what_the_loop_makes_of_them(compared):
 
 
 def test_the_legend_names_all_and_no_two_look_alike(compared):
-    figure = plot_rivals(compared)
-    assert labels(figure) == list(compared.plans)
-    looks = {(to_hex(line.get_color()), str(line._unscaled_dash_pattern)) for line in figure.axes[0].lines}
+    drawn = plot_rivals(compared)
+    assert labels(drawn) == list(compared.plans)
+    looks = {(to_hex(line.get_color()), str(line._unscaled_dash_pattern)) for line in drawn.axes[0, 0].lines}
     assert len(looks) == len(compared.plans)
 
 
 def test_a_step_does_not_flatten_what_the_others_ask_for(compared):
-    control = [axes for axes in plot_rivals(compared).axes if axes.get_visible()][-1]
+    control = [axes for axes in plot_rivals(compared).axes.flat if axes.get_visible()][-1]
     others = max(np.abs(r.outputs[1]).max() for name, r in compared.responses.items() if name != "step")
     step = np.abs(compared.responses["step"].outputs[1]).max()
     assert step > 4 * others
@@ -189,22 +189,27 @@ def test_rivals_of_two_axes_stand_side_by_side():
     side = ct.append(*loops)
     both = ct.ss(side.A, side.B, side.C, side.D, inputs=["rx", "rz"], outputs=["x", "z"])
     found = cp.compare(both, rival_plans(PATH), np.linspace(0, 5, 201), waypoints=PATH, units={"x": "m", "z": "mm"})
-    figure = plot_rivals(found)
-    assert [axes.get_ylabel() for axes in figure.axes] == [
+    drawn = plot_rivals(found)
+    assert [axes.get_ylabel() for axes in drawn.axes.flat] == [
         "reference of x [m]",
         "reference of z [mm]",
         "x [m]",
         "z [mm]",
     ]
-    bottom = figure.axes[-2:]
+    bottom = drawn.axes[-1]
     assert [axes.get_xlabel() for axes in bottom] == ["time [s]", "time [s]"]
-    z = dict(zip(found.plans, figure.axes[3].lines, strict=True))
+    z = dict(zip(found.plans, drawn.axes[1, 1].lines, strict=True))
     np.testing.assert_array_equal(z["S-curve"].get_ydata(), found.responses["S-curve"].outputs[1])
 
 
-def test_drawings_do_not_depend_on_the_users_settings(quintic):
+def test_drawings_of_a_page_do_not_depend_on_the_users_settings(quintic):
     limited = Limited(quintic, {"y_d1": 1.0})
-    first = to_svg(plot_limits(quintic, limited), "it")
+
+    def drawing():
+        with page_style():
+            return to_svg(plot_limits(quintic, limited).figure, "it")
+
+    first = drawing()
     with mpl.rc_context({"lines.linewidth": 9.0, "axes.grid": False, "font.size": 20}):
-        assert to_svg(plot_limits(quintic, limited), "it") == first
+        assert drawing() == first
     assert first.startswith("<svg")
