@@ -90,7 +90,7 @@ def plot_sketch(*, ax: AxesLike | None = None) -> ControlPlot:
         axes.text(float(place[0]), float(place[1]), text, fontsize=font_size(11))
     axes.set_xlim(-0.6, 6.8)
     axes.set_ylim(-4.9, 1.6)
-    return drawing.plot(legend=False)
+    return drawing.finish(legend=False)
 
 
 def plot_blocks(*, ax: AxesLike | None = None) -> ControlPlot:
@@ -150,7 +150,7 @@ def plot_blocks(*, ax: AxesLike | None = None) -> ControlPlot:
         axes.text(*at, text, ha="center", va="center", fontsize=font_size(8), color="#0072B2")
     axes.set_xlim(-0.9, 8.7)
     axes.set_ylim(-2.1, 2.1)
-    return drawing.plot(legend=False)
+    return drawing.finish(legend=False)
 
 
 def plot_time(comparison: Comparison, *, ax: AxesLike | None = None) -> ControlPlot:
@@ -190,7 +190,7 @@ def plot_time(comparison: Comparison, *, ax: AxesLike | None = None) -> ControlP
     rows[2].set_yscale("symlog", linthresh=1.0)
     rows[2].set_ylim(bottom=0.0)
     drawing.label_x("time [s]")
-    return drawing.plot()
+    return drawing.finish()
 
 
 def plot_step(comparison: Comparison, *, ax: AxesLike | None = None) -> ControlPlot:
@@ -236,7 +236,7 @@ def plot_step(comparison: Comparison, *, ax: AxesLike | None = None) -> ControlP
     rows[3].plot(t, signals["theta"], color=colour, linewidth=line_width(0.65))
     label_y(rows[3], "sway [rad]")
     drawing.label_x("time [s]")
-    return drawing.plot()
+    return drawing.finish()
 
 
 def plot_plane(comparison: Comparison, wall: Wall, *, ax: AxesLike | None = None) -> ControlPlot:
@@ -276,7 +276,7 @@ def plot_plane(comparison: Comparison, wall: Wall, *, ax: AxesLike | None = None
     drawing.label_x("x [m]")
     label_y(axes, "z [m], down")
     axes.yaxis.set_inverted(True)
-    return drawing.plot()
+    return drawing.finish()
 
 
 def plot_motion(comparison: Comparison, wall: Wall, steps: int = 13, *, ax: AxesLike | None = None) -> ControlPlot:
@@ -319,7 +319,7 @@ def plot_motion(comparison: Comparison, wall: Wall, steps: int = 13, *, ax: Axes
         axes.yaxis.set_inverted(True)
         axes.set_aspect("equal")
     drawing.label_x("x [m]")
-    return drawing.plot(legend=False)
+    return drawing.finish(legend=False)
 
 
 def _crane_at(axes: Axes, signals: dict[str, Array], t: float, colour: str) -> None:
@@ -364,7 +364,7 @@ def plot_curves(study: Study, *, ax: AxesLike | None = None) -> ControlPlot:
         axes.set_yscale("log")
     drawing.label_x(as_text(curves.x_label))
     label_y(axes, as_text(curves.y_label))
-    return drawing.plot()
+    return drawing.finish()
 
 
 def plot_online(comparison: Comparison, *, ax: AxesLike | None = None) -> ControlPlot:
@@ -400,7 +400,7 @@ def plot_online(comparison: Comparison, *, ax: AxesLike | None = None) -> Contro
     rows[1].set_yscale("log")
     rows[1].set_ylim(bottom=1e-3)
     drawing.label_x("time [s]")
-    return drawing.plot()
+    return drawing.finish()
 
 
 _FRAMES = 20_000

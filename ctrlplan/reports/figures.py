@@ -89,7 +89,7 @@ def plot_trajectory(
         label_y(axes, _derivative_label(_common(names.values()), k))
     drawing.label_x("time [s]")
     several = len(drawing.column[0].get_legend_handles_labels()[0]) > 1
-    return drawing.plot(legend=several)
+    return drawing.finish(legend=several)
 
 
 def plot_plans(comparison: Comparison, derivatives: int = 2, *, ax: AxesLike | None = None) -> ControlPlot:
@@ -130,7 +130,7 @@ def plot_plans(comparison: Comparison, derivatives: int = 2, *, ax: AxesLike | N
             _circles(axes, given, shade(0.73))
             label_y(axes, _derivative_label(comparison.units.get(first.labels[a], ""), k, first.labels[a]))
     drawing.label_x("time [s]")
-    return drawing.plot()
+    return drawing.finish()
 
 
 def plot_responses(comparison: Comparison, *, ax: AxesLike | None = None) -> ControlPlot:
@@ -176,7 +176,7 @@ def plot_responses(comparison: Comparison, *, ax: AxesLike | None = None) -> Con
     for c, control in enumerate(controls):
         label_y(rows[2 * len(outputs) + c], with_unit(control, comparison.units.get(control, "")))
     drawing.label_x("time [s]")
-    return drawing.plot()
+    return drawing.finish()
 
 
 def plot_sweep(
@@ -218,7 +218,7 @@ def plot_sweep(
         if sweep.values[0] > 0.0 and sweep.values[-1] > 20.0 * sweep.values[0]:
             axes.set_xscale("log")
     drawing.label_x(as_text(sweep.parameter))
-    return drawing.plot()
+    return drawing.finish()
 
 
 def plot_bands(ensemble: Ensemble, *, ax: AxesLike | None = None) -> ControlPlot:
@@ -258,7 +258,7 @@ def plot_bands(ensemble: Ensemble, *, ax: AxesLike | None = None) -> ControlPlot
         if not axes.get_title():
             axes.set_title(as_text(plan), fontsize=font_size(9))
     drawing.label_x("time [s]")
-    return drawing.plot()
+    return drawing.finish()
 
 
 def _plot_bands_of(
@@ -339,7 +339,7 @@ def plot_plane(sweep: Sweep, *, ax: AxesLike | None = None) -> ControlPlot:
     label_y(axes, "overshoot on the error [%]")
     axes.set_xlim(left=0.0)
     axes.set_ylim(-4.0, 108.0)
-    return drawing.plot()
+    return drawing.finish()
 
 
 def _of_the_paper(sweep: Sweep) -> bool:
@@ -429,11 +429,12 @@ def _with_gaps(x: Array, y: Array) -> tuple[Array, Array]:
 
 
 def _circles(axes: Axes, points: Sequence[tuple[float, float]], colour: str, marker: str = "o") -> None:
-    """Prescribed values; no lines, which legends and python-control's own plots would count."""
+    """Prescribed values, which ``legend([...])`` and python-control's own plots do not count among the curves."""
     if points:
         t, values = np.transpose(points)
         size, face = marker_size(5) ** 2, axes.get_facecolor()
-        axes.scatter(t, values, s=size, marker=marker, edgecolors=colour, facecolors=face, zorder=5)
+        circles = axes.scatter(t, values, s=size, marker=marker, edgecolors=colour, facecolors=face, zorder=5)
+        circles.set_label("_nolegend_")
 
 
 def _derivative_word(order: int) -> str:

@@ -62,7 +62,7 @@ def plot_alpha_choice(choice: AlphaChoice, *, ax: AxesLike | None = None) -> Con
         axes.axvspan(choice.blow_up, 2.0 * np.pi, color=shade(0.133), label="blows up")
     drawing.label_x("alpha [rad] (0: polynomial)")
     label_y(axes, as_text(choice.objective.replace("_", " ")))
-    return drawing.plot()
+    return drawing.finish()
 
 
 def plot_limits(
@@ -105,7 +105,7 @@ def plot_limits(
         label_y(axes, with_unit(bound.name, (units or {}).get(bound.name)))
         add_title(axes, as_text(f"{bound.range}; {margin.room}"))
     drawing.label_x("time [s]")
-    return drawing.plot(legend=False)
+    return drawing.finish(legend=False)
 
 
 def plot_rivals(comparison: Comparison, *, ax: AxesLike | None = None) -> ControlPlot:
@@ -151,7 +151,7 @@ def plot_rivals(comparison: Comparison, *, ax: AxesLike | None = None) -> Contro
             for axes in grid[2 + c, 1:]:
                 axes.set_visible(False)
     drawing.label_x("time [s]")
-    return drawing.plot()
+    return drawing.finish()
 
 
 def _clip(axes: Axes, comparison: Comparison, control: str) -> None:

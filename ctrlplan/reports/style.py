@@ -14,7 +14,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from functools import cache
-from itertools import cycle
+from itertools import cycle, islice
 from typing import Any, TypeAlias
 
 import matplotlib as mpl
@@ -151,7 +151,7 @@ class Drawing:
                 if not axes.get_xlabel() and axes.xaxis.get_tick_params().get("labelbottom", True):
                     axes.set_xlabel(text)
 
-    def plot(self, legend: bool = True) -> Plot:
+    def finish(self, legend: bool = True) -> Plot:
         """What a plotting function returns, with one legend for all axes, of the labels of the first."""
         made = self._legend() if legend else None
         lines = np.empty(self.axes.shape, dtype=object)
@@ -177,6 +177,7 @@ class Drawing:
                 handles, labels, loc="outside upper center", ncols=max(1, min(len(names), 5, fit))
             )
             legend.set_label(_LEGEND)
+            _set_below_title(self.figure, legend)
         else:
             legend = axes.legend(handles, labels)
         for text, name in zip(legend.get_texts(), names, strict=True):
@@ -211,6 +212,17 @@ class Plot(ControlPlot):  # type: ignore[misc]
         # Over the axes python-control would give the current figure, not this one, a tight layout.
         constrained = isinstance(self.figure.get_layout_engine(), ConstrainedLayoutEngine)
         super().set_plot_title(title, frame="figure" if constrained else frame)
+        for legend in self.figure.legends:
+            if legend.get_label() == _LEGEND:
+                _set_below_title(self.figure, legend)
+
+
+def _set_below_title(figure: Figure | SubFigure, legend: Legend) -> None:
+    """Move a legend outside the axes below the title of its figure: matplotlib puts both at the top."""
+    title = figure._suptitle  # type: ignore[union-attr]
+    if title is not None and title.get_text():
+        height = title.get_window_extent().height / figure.bbox.height
+        legend.set_bbox_to_anchor((0.0, 0.0, 1.0, 1.0 - height - 0.02), transform=figure.transSubfigure)
 
 
 def given_axes(ax: AxesLike) -> NDArray[np.object_]:
@@ -312,7 +324,8 @@ def _told_apart(styles: dict[str, dict[str, Any]], axes: Axes) -> dict[str, dict
     used = [to_hex(line.get_color()) for line in drawn]
     colours = [props["color"] for props in chosen if "color" in props] or [*_PALETTE]
     own = not any("color" in props for props in chosen)
-    dashes = cycle(_OTHER_DASHES)
+    # From the second plot on, other dashes each time.
+    dashes = islice(cycle(_OTHER_DASHES), max(len(drawn) - 1, 0), None)
     for i, style in enumerate(styles.values()):
         if own and style["color"] == "#000000":
             style["color"] = shade(1.0)
