@@ -218,11 +218,13 @@ class Plot(ControlPlot):  # type: ignore[misc]
 
 
 def _set_below_title(figure: Figure | SubFigure, legend: Legend) -> None:
-    """Move a legend outside the axes below the title of its figure: matplotlib puts both at the top."""
+    """Move a legend outside the axes, and the axes, below the title of the figure: matplotlib puts both at the top."""
     title = figure._suptitle  # type: ignore[union-attr]
-    if title is not None and title.get_text():
-        height = title.get_window_extent().height / figure.bbox.height
-        legend.set_bbox_to_anchor((0.0, 0.0, 1.0, 1.0 - height - 0.02), transform=figure.transSubfigure)
+    engine = figure.get_layout_engine()
+    if title is not None and title.get_text() and isinstance(engine, ConstrainedLayoutEngine):
+        below = 1.0 - title.get_window_extent().height / figure.bbox.height
+        legend.set_bbox_to_anchor((0.0, 0.0, 1.0, below - 0.005), transform=figure.transSubfigure)
+        engine.set(rect=(0.0, 0.0, 1.0, below - 0.025))
 
 
 def given_axes(ax: AxesLike) -> NDArray[np.object_]:
