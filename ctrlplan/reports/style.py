@@ -172,7 +172,7 @@ class Drawing:
                 old.remove()
             size = FontProperties(size=mpl.rcParams["legend.fontsize"]).get_size_in_points()
             # At 9 points there are about eleven letters an inch.
-            fit = int(99.0 / size * axes.figure.get_figwidth() / (max(map(len, names)) + 6))
+            fit = int(99.0 / size * self.figure.bbox.width / self.figure.get_dpi() / (max(map(len, names)) + 6))
             legend = self.figure.legend(
                 handles, labels, loc="outside upper center", ncols=max(1, min(len(names), 5, fit))
             )
@@ -220,7 +220,9 @@ class Plot(ControlPlot):  # type: ignore[misc]
 def _set_below_title(figure: Figure | SubFigure, legend: Legend) -> None:
     """Move a legend outside the axes, and the axes, below the title of the figure: matplotlib puts both at the top."""
     title = figure._suptitle  # type: ignore[union-attr]
-    engine = figure.get_layout_engine()
+    engine = (
+        figure.get_layout_engine() if isinstance(figure, Figure) else None
+    )  # a part of a figure has none of its own
     if title is not None and title.get_text() and isinstance(engine, ConstrainedLayoutEngine):
         below = 1.0 - title.get_window_extent().height / figure.bbox.height
         legend.set_bbox_to_anchor((0.0, 0.0, 1.0, below - 0.005), transform=figure.transSubfigure)
