@@ -4,12 +4,14 @@ import math
 import re
 
 import control as ct
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
 import ctrlplan as cp
 from ctrlplan.reports import render_page
 from ctrlplan.reports.figures import FIGURES, plot_bands
+from ctrlplan.reports.style import page_style
 from ctrlplan.studies import Study
 from ctrlplan.studies.ensemble import LEVELS, ensemble
 
@@ -159,6 +161,13 @@ def test_plans_keep_their_colours(grid):
 
 def test_draws_of_which_none_was_run_are_drawn_without_bands(nothing):
     assert all(not axes.collections for axes in plot_bands(nothing).axes.flat)
+
+
+def test_figures_of_a_page_do_not_pile_up_in_pyplot(drawn):
+    before = plt.get_fignums()
+    with page_style():
+        drawn.plot()
+    assert plt.get_fignums() == before
 
 
 def test_a_figure_of_bands_needs_draws(drawn):

@@ -481,6 +481,36 @@ def test_circles_stand_at_the_gains_written_beside_them(swept):
 # Manners
 
 
+@pytest.mark.slow
+def test_figures_of_a_page_do_not_pile_up_in_pyplot(compared, swept):
+    before = plt.get_fignums()
+    with page_style():
+        for _ in range(3):
+            compared.plot()
+            compared.plans["polynomial"].plot()
+            swept.plot()
+            plot_plans(compared)
+            plot_plane(swept)
+    assert plt.get_fignums() == before
+
+
+@pytest.mark.slow
+def test_a_page_leaves_no_window_open(compared, swept, monkeypatch):
+    monkeypatch.setattr(mpl, "get_backend", lambda: "QtAgg")  # where pyplot would manage them
+    before = plt.get_fignums()
+    render_page([Study("it", "It", compared, sweep=swept, figures=("plane", "plans"))], "It")
+    assert plt.get_fignums() == before
+
+
+def test_where_there_are_windows_a_figure_has_one(compared, monkeypatch):
+    monkeypatch.setattr(mpl, "get_backend", lambda: "TkAgg")
+    before = plt.get_fignums()
+    drawn = compared.plot()
+    assert len(plt.get_fignums()) == len(before) + 1
+    plt.close(drawn.figure)
+    assert plt.get_fignums() == before
+
+
 def test_settings_of_the_user_are_left_alone(compared, swept):
     before = dict(mpl.rcParams)
     to_svg(plot_plane(swept).figure, "it")
