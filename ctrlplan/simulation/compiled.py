@@ -51,6 +51,9 @@ _STIFF = 3000.0
 _EDGE = 100.0
 """Tolerances of a step about a state within which equations must be defined."""
 
+_SIGNALS = tuple(map(int, signal.valid_signals()))
+"""Numbers of the signals that may have handlers."""
+
 
 class Compiled:
     """Equations of a network as CasADi functions of (t, x, driven, p).
@@ -201,7 +204,8 @@ class Compiled:
                 "show_eval_warnings": False,
                 "disable_internal_warnings": True,
             }
-            return ca.integrator("leg", "cvodes", self._leg_equations(width), 0.0, grid.tolist(), options)
+            with _passing_interruptions():
+                return ca.integrator("leg", "cvodes", self._leg_equations(width), 0.0, grid.tolist(), options)
 
         return recent(self._integrators, key, _KEPT, made)
 
@@ -322,8 +326,7 @@ class CompiledSolver:
         close = np.union1d(relative, np.linspace(0.0, 1.0, _CLOSE)[1:])
         for outputs, allowed in ((relative, min(_FEW_STEPS, max_steps)), (close, max_steps)):
             settings = width, outputs, self._stiff, *self._tolerances, allowed, longest
-            with _passing_interruptions():
-                integrator = self._equations.integrator(*settings)
+            integrator = self._equations.integrator(*settings)
             try:
                 with _passing_interruptions():
                     found = _called(integrator, (start, np.empty(0), p), state.size, self._report)
@@ -364,7 +367,7 @@ def _passing_interruptions() -> Iterator[None]:
             raise
 
     if threading.current_thread() is threading.main_thread():
-        for number in map(int, signal.valid_signals()):
+        for number in _SIGNALS:
             handler = signal.getsignal(number)
             if callable(handler):
                 handlers[number] = handler
