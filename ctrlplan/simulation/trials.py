@@ -35,6 +35,9 @@ _LIBRARIES = frozenset({"casadi", "control", "ctrlplan", "math", "matplotlib", "
 _STORES = frozenset({"STORE_DEREF", "STORE_GLOBAL", "DELETE_DEREF", "DELETE_GLOBAL", "STORE_ATTR", "IMPORT_NAME"})
 """Instructions by which a function may leave something behind."""
 
+_CODES = 1024
+"""Codes of functions whose instructions are not read again."""
+
 _PLAIN = (
     type(None),
     bool,
@@ -105,8 +108,12 @@ def reads(function: Callable[..., Any], position: int) -> bool:
         call = next((vars(kind)["__call__"] for kind in type(function).__mro__ if "__call__" in vars(kind)), None)
         return not isinstance(call, FunctionType) or reads(call, position + 1)
     code = inspect.unwrap(function).__code__
-    if function.__code__ is not code or position >= code.co_argcount:
-        return True
+    return function.__code__ is not code or position >= code.co_argcount or _reads(code, position)
+
+
+@functools.lru_cache(_CODES)
+def _reads(code: CodeType, position: int) -> bool:
+    """Whether a code can read one of its arguments."""
     name = code.co_varnames[position]
     if name in code.co_cellvars or any(i.opname in ("IMPORT_NAME", "IMPORT_STAR") for i in dis.get_instructions(code)):
         return True
@@ -190,13 +197,19 @@ def _has_memory(value: Any, seen: set[int], depth: int) -> bool:
         code = value.__code__
         if "random" in _names(code):  # the generators of numpy, or of Python
             return True
-        if depth == 0 or any(i.opname in _STORES for i in dis.get_instructions(code)):
+        if depth == 0 or _stores(code):
             return True
         named = [value.__globals__[name] for name in _names(code) if name in value.__globals__]
         parts = (*_contents(value), *(value.__defaults__ or ()), *(value.__kwdefaults__ or {}).values(), *named)
     else:
         return not of_library(type(value))
     return any(_has_memory(part, seen, depth - 1) for part in parts)
+
+
+@functools.lru_cache(_CODES)
+def _stores(code: CodeType) -> bool:
+    """Whether a code may leave something behind."""
+    return any(i.opname in _STORES for i in dis.get_instructions(code))
 
 
 def _contents(function: FunctionType) -> Iterator[Any]:
