@@ -70,6 +70,9 @@ class _Law:
         self.size = _PIECES + 4
         passed = BSpline(knots, np.eye(self.size), 4).antiderivative()
         self._plan, self._limited = plan, limited
+        # Limits of positions hold on every clock; where one is touched, its room would be rounding.
+        self._moving = [k for k, bound in enumerate(limited.bounds) if bound.axis is None or bound.order]
+        self._bounds = [limited.bounds[k] for k in self._moving]
         self.weights = passed(1.0)
         samples = _graded(_SAMPLES - 1, limited)
         orders = range(limited.order + 1)
@@ -133,10 +136,9 @@ class _Law:
         try:
             values = self._limited.values(series * FACTORIALS[: order + 1, None, None])
         except ValueError:  # the plant refuses: far beyond every limit
-            return np.full((2 * len(self._limited.bounds) * _SAMPLES, logs.shape[1]), -1e3)
-        rows = []
-        for bound, row in zip(self._limited.bounds, values, strict=True):
-            rows += [(side - row) * sign / bound.scale for side, sign in ((bound.high, 1.0), (bound.low, -1.0))]
+            return np.full((2 * len(self._bounds) * _SAMPLES, logs.shape[1]), -1e3)
+        rows = [(b.high - row) / b.scale + b.slack for b, row in zip(self._bounds, values[self._moving], strict=True)]
+        rows += [(row - b.low) / b.scale + b.slack for b, row in zip(self._bounds, values[self._moving], strict=True)]
         room = np.minimum(np.array(rows), 1e3)
         return room.reshape(len(rows) * _SAMPLES, logs.shape[1])
 

@@ -214,6 +214,8 @@ def test_position_limits_stay_what_they_are():
     plan = PLANS["nominal"]
     found = fastest(plan, {"x": (0, 20), "z": (10, 11), "x_d1": 2.0, "x_d2": 0.5}, hold="path")
     assert trapezoid(20.0, 2.0, 0.5) <= found.duration <= 1.05 * trapezoid(20.0, 2.0, 0.5)
+    # The path is held, and its positions with it: limits that it touches leave the time law as it is.
+    assert found.duration == pytest.approx(fastest(plan, {"x_d1": 2.0, "x_d2": 0.5}, hold="path").duration, rel=1e-9)
     with pytest.raises(ValueError, match="limits must hold at rest"):
         fastest(plan, {"x": (0, 19), "x_d1": 2.0}, hold="path")
 
