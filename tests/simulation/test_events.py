@@ -69,7 +69,7 @@ def test_crossings_do_not_depend_on_the_samples(count, method):
     assert found.time.size == count
 
 
-@pytest.mark.parametrize("gain", [1.0, 5.0, 20.0, 100.0])
+@pytest.mark.parametrize("gain", [1.0, 100.0])
 @pytest.mark.parametrize("method", METHODS)
 def test_the_settling_of_a_step(gain, method):
     """Last entry into +-2 % of y = 1 - (w_n/w_p) exp(-t/2) sin(w_p t + arccos xi)."""

@@ -66,8 +66,8 @@ def test_the_double_pole_among_others():
     assert np.abs(found - (1 - (1 + t / 2) * np.exp(-t / 2))).max() <= 1e-12
 
 
-@pytest.mark.parametrize("alpha", [0.0, 1e-4, 1.0, 5.0])
-@pytest.mark.parametrize("count", [41, 401, 4001])
+@pytest.mark.parametrize("alpha", [0.0, 1e-4, 5.0])
+@pytest.mark.parametrize("count", [41, 4001])
 def test_loops_of_every_gain_at_even_times(alpha, count):
     plan, signals = both(*REST, alpha)
     t = np.linspace(0.0, 9.0, count)

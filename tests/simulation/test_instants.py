@@ -3,7 +3,7 @@
 import control as ct
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 import ctrlplan as cp
@@ -44,9 +44,10 @@ def test_a_jump_that_arrives_at_an_instant_is_seen_by_its_sample(step, delay, me
 
 
 @settings(max_examples=30)
+@example(1 / 44100, 2999, 3600.0)
 @given(
     st.sampled_from([0.1, 1e-3, 0.7e-3, 1 / 3, 1 / 44100, 2.0**-10, 0.3, 1.2e-3, 0.05]),
-    st.integers(1, 3000),
+    st.integers(1, 300),
     st.sampled_from([0.0, 0.1, -5.0, 1e4, 3600.0]),
 )
 def test_every_instant_sees_a_step_at_its_decimal_time(period, k, first):
@@ -88,9 +89,10 @@ def test_a_period_below_the_resolution_of_time_is_rejected():
         cp.simulate(held(1e-9), 1e9 + np.array([0.0, 1.0]), 1.0)
 
 
-def test_the_samples_of_a_long_run_do_not_drift():
-    """The 10,000th sample of a signal at 1 kHz is that of 10 s to rounding of the signal there."""
-    t = np.array([0.0, 9.9995])
+@pytest.mark.parametrize("end", [0.999, pytest.param(9.999, marks=pytest.mark.slow)])
+def test_the_samples_of_a_long_run_do_not_drift(end):
+    """The 10,000th sample of a signal at 1 kHz is that of 9.999 s to rounding of the signal there."""
+    t = np.array([0.0, end + 0.0005])
     sine = cp.TrigSpline([cp.Waypoint(0, 0, 1), cp.Waypoint(10, 3, -2)], alpha=3.0)
     found = cp.simulate(held(1e-3), t, sine, method="python")
-    assert float(np.ravel(found.outputs)[-1]) == float(sine(9.999))
+    assert float(np.ravel(found.outputs)[-1]) == float(sine(end))

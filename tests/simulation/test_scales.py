@@ -1,5 +1,7 @@
 """Accuracy in the signals' own scale: a millionth of each range, from nanometres to meganewtons, whatever the units."""
 
+from functools import cache
+
 import control as ct
 import numpy as np
 import pytest
@@ -26,9 +28,10 @@ def stage(size, kind):
     return ct.interconnect([limiter, plant], inputs="r", outputs=["y", "u"])
 
 
-def stage_by_hand(plan, t):
-    """The same for signals of size 1, with integration stopped where the limit is met."""
-    met = float(np.real_if_close(np.roots([6, -15, 10, 0, 0, -0.7]))[0].real)
+@cache
+def stage_by_hand():
+    """The same for signals of size 1: a plan, times and outputs, with integration stopped where the limit is met."""
+    plan, t = cp.PolySpline([cp.Waypoint(0, 0, 0, 0), cp.Waypoint(0.02, 1, 0, 0)]), np.linspace(0, 0.04, 201)
     roots = [r.real for r in np.roots([6, -15, 10, 0, 0, -0.7]) if abs(r.imag) < 1e-12 and 0 < r.real < 1]
     met = 0.02 * roots[0]
     y = np.empty_like(t)
@@ -46,17 +49,16 @@ def stage_by_hand(plan, t):
         )
         x = found.y[:, -1]
         y[inside] = found.y[0, : inside.sum()]
-    return y
+    return plan, t, y
 
 
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("kind", ["tf", "ss"])
-@pytest.mark.parametrize("size", [1e-9, 1e-6, 1e-3, 1.0, 1e6])
+@pytest.mark.parametrize("size", [1e-9, 1e-3, 1e6])
 def test_a_stage_of_any_size_in_any_realisation(size, kind, method):
-    t = np.linspace(0, 0.04, 201)
-    unit = cp.PolySpline([cp.Waypoint(0, 0, 0, 0), cp.Waypoint(0.02, 1, 0, 0)])
+    unit, t, expected = stage_by_hand()
     found = cp.simulate(stage(size, kind), t, size * unit, method=method)
-    assert np.abs(found.outputs[0] / size - stage_by_hand(unit, t)).max() < ALLOWED
+    assert np.abs(found.outputs[0] / size - expected).max() < ALLOWED
 
 
 @pytest.mark.parametrize("method", METHODS)

@@ -145,9 +145,8 @@ def test_no_timebase():
 
 
 @pytest.mark.parametrize("dt", [0.1, 1 / 3, 1e-3, 0.7e-3, 1 / 44100])
-@pytest.mark.parametrize("first", [0.0, -7.0, 1e5])
-def test_every_instant_of_a_long_clock_is_a_step(dt, first):
-    count = 10_000
+@pytest.mark.parametrize(("first", "count"), [(0.0, 1000), (-7.0, 1000), (1e5, 10_000)])
+def test_every_instant_of_a_long_clock_is_a_step(dt, first, count):
     counter = ct.ss(1.0, 1.0, 1.0, 0.0, dt)
     for t in (first + dt * np.arange(count), np.linspace(first, first + dt * (count - 1), count)):
         assert np.array_equal(cp.simulate(counter, t, 1.0).outputs, np.arange(count))

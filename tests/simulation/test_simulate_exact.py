@@ -44,7 +44,7 @@ def check(matrices, plan, signals, times, initial=None, tolerance=SMALL):
     assert gap(found.outputs, outputs) <= tolerance
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("alpha", ALPHAS)
 def test_random_plans_on_random_systems(alpha, seed):
     rng = np.random.default_rng([seed, int(1e4 * alpha)])
@@ -111,7 +111,7 @@ def kinds(alpha):
     }  # fmt: skip
 
 
-@pytest.mark.parametrize("alpha", ALPHAS)
+@pytest.mark.parametrize("alpha", ALPHAS[::2])
 @pytest.mark.parametrize("kind", sorted(kinds(1.0)))
 def test_plans_of_every_kind(kind, alpha):
     rng = np.random.default_rng(11)
@@ -229,7 +229,7 @@ def test_a_chain_of_integrators_gives_back_the_plan():
     assert gap(found.states, plan.jet(t, 2)[:, 0]) <= 1e-12
 
 
-@pytest.mark.parametrize("alpha", ALPHAS)
+@pytest.mark.parametrize("alpha", ALPHAS[::2])
 def test_beside_a_tight_numerical_integration(alpha):
     """A second opinion that shares nothing with the first: DOP853 at 1e-13, started anew at each breakpoint."""
     move, _ = both(*MOVE, alpha)

@@ -150,7 +150,7 @@ def test_a_scalar_initial_state_is_for_all_states():
 
 
 @pytest.mark.parametrize("method", ["compiled", "python"])
-@pytest.mark.parametrize("count", [301, 1501])
+@pytest.mark.parametrize("count", [301, pytest.param(1501, marks=pytest.mark.slow)])
 def test_many_samples_beside_a_plan_that_comes_to_rest(count, method):
     """Close to rest a plan's derivatives are rounding beside the plan: no leg is halved for them without end."""
     t = np.linspace(0.0, 6.0, count)
