@@ -1,10 +1,14 @@
 """One hypothesis profile for all tests: no deadline, for a loaded machine is no fault; what tests import; figures."""
 
+import os
 import sys
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
+
+# Matrices are small here: more threads of BLAS only wait for each other, and tests run in several processes already.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 sys.path.insert(0, str(Path(__file__).parent / "support"))
 
@@ -18,3 +22,13 @@ def _no_figure_is_left_open():
     yield
     if "matplotlib.pyplot" in sys.modules:
         sys.modules["matplotlib.pyplot"].close("all")
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config, log):
+    """Each process runs tests that follow each other, so that they share what files compute once; then it steals."""
+    if config.getoption("dist") != "load":  # another was chosen
+        return None
+    from xdist.scheduler import WorkStealingScheduling
+
+    return WorkStealingScheduling(config, log)
