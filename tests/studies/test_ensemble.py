@@ -18,7 +18,7 @@ from ctrlplan.studies.ensemble import LEVELS, ensemble
 
 TIMES = np.linspace(0.0, 10.0, 501)
 PLANS = {"step": cp.Step(1.0), "ramp": cp.PolySpline([cp.Waypoint(0, 0), cp.Waypoint(1, 1)])}
-LAGS = cp.draws(45, seed=3, tau=(0.5, 1.5))
+LAGS = cp.draws(21, seed=3, tau=(0.5, 1.5))
 
 
 def block(update, params, out=None, nstates=1, **names):
@@ -220,7 +220,7 @@ def test_what_is_no_distribution_is_refused(what):
 
 def test_metrics_are_those_of_the_closed_form(found):
     tau, end = LAGS["tau"], TIMES[-1]
-    assert found.ndraws == found.finished == 45
+    assert found.ndraws == found.finished == 21
     assert found.failures == ()
     np.testing.assert_array_equal(found.params["tau"], tau)
     step, ramp = found.metrics["step"], found.metrics["ramp"]
@@ -246,8 +246,8 @@ def test_quantiles_of_a_metric_are_values_that_were_drawn(found):
     tau = np.sort(LAGS["tau"])
     for plan, middle in found.quantiles("settling_time").items():
         assert np.isin(middle, found.metrics[plan]["settling_time"]).all()
-    # Of 45 values in order, the smallest at or below which the share lies.
-    ranks = [math.ceil(45 * level) - 1 for level in LEVELS]
+    # Of 21 values in order, the smallest at or below which the share lies.
+    ranks = [math.ceil(21 * level) - 1 for level in LEVELS]
     np.testing.assert_allclose(found.quantiles("settling_time")["step"], tau[ranks] * math.log(50), rtol=1e-5)
 
 
@@ -285,7 +285,7 @@ def test_two_parameters_are_drawn_together():
 
 
 def test_each_draw_is_a_comparison_of_its_own(found):
-    for k in (0, 7, 44):
+    for k in (0, 7, 20):
         alone = cp.compare(lag(), PLANS, TIMES, params={"tau": LAGS["tau"][k]}).metrics
         for plan, rows in alone.items():
             assert set(rows) == set(found.metrics[plan])
@@ -299,7 +299,7 @@ def test_the_nominal_run_has_the_loops_own_parameters(found):
 
 
 def test_order_and_company_of_draws_change_no_bit(found):
-    order = np.random.default_rng(0).permutation(45)[:25]
+    order = np.random.default_rng(0).permutation(21)[:12]
     mixed = run(lag(), {"tau": LAGS["tau"][order]})
     for plan, rows in mixed.metrics.items():
         for name, row in rows.items():
@@ -530,7 +530,7 @@ def counted(monkeypatch):
 
 @pytest.mark.parametrize("executor", [None, Elsewhere])
 def test_a_loop_is_built_once_for_all_plans_and_draws(counted, executor):
-    run(lag(), cp.draws(25, tau=(0.5, 1.5)), executor and executor())
+    run(lag(), cp.draws(6, tau=(0.5, 1.5)), executor and executor())
     # Without parameters, and with some: two forms of one block.
     assert counted == {"traced": 2, "compiled": 2, "prepared": 1}
 
@@ -543,7 +543,7 @@ def test_loops_are_built_once_a_plan(counted, executor):
         built.append(name)
         return lag()
 
-    run(build, cp.draws(25, tau=(0.5, 1.5)), executor and executor())
+    run(build, cp.draws(6, tau=(0.5, 1.5)), executor and executor())
     assert built == ["step", "ramp"]
     assert counted == {"traced": 4, "compiled": 4, "prepared": 2}
 
@@ -556,7 +556,7 @@ def test_blocks_are_called_no_more_for_more_draws():
         return (u - x) / params["tau"]
 
     counts = []
-    for count in (2, 25):
+    for count in (2, 9):
         calls.clear()
         run(lag(update), {"tau": np.full(count, 0.75)})
         counts.append(len(calls))
@@ -670,7 +670,7 @@ class Interrupted(Elsewhere):
 def test_what_an_executor_found_before_an_interruption_is_kept(found):
     executor = Interrupted(1)
     result = run(lag(), LAGS, executor)
-    assert 0 < result.finished < result.ndraws == 45
+    assert 0 < result.finished < result.ndraws == 21
     assert {1, 2} <= set(executor.cancelled)
     n = result.finished
     for plan, rows in result.metrics.items():
@@ -680,7 +680,7 @@ def test_what_an_executor_found_before_an_interruption_is_kept(found):
     curves = lag_response(LAGS["tau"][:n], TIMES)
     for plan in PLANS:
         np.testing.assert_allclose(result.bands[plan]["y"], np.quantile(curves[plan], LEVELS, axis=0), atol=1e-7)
-    assert f"The run was interrupted: {45 - n} draws were not reached." in result.notes()
+    assert f"The run was interrupted: {21 - n} draws were not reached." in result.notes()
     assert result.failures == ()
 
 
@@ -701,7 +701,7 @@ def test_answers_need_not_be_cancelled():
             return super().answer(k)
 
     result = run(lag(), LAGS, Ends())
-    assert 0 < result.finished < 45
+    assert 0 < result.finished < 21
 
 
 def interrupt_in_draw(monkeypatch, k):
@@ -721,15 +721,15 @@ def interrupt_in_draw(monkeypatch, k):
 
 
 def test_an_interruption_in_this_process_keeps_what_was_found(monkeypatch, found):
-    interrupt_in_draw(monkeypatch, 31)
+    interrupt_in_draw(monkeypatch, 15)
     result = run(lag(), LAGS)
     n = result.finished
-    assert 0 < n <= 31
+    assert 0 < n <= 15
     np.testing.assert_array_equal(result.metrics["ramp"]["iae"][:n], found.metrics["ramp"]["iae"][:n])
     assert np.isnan(result.metrics["ramp"]["iae"][n:]).all()
 
 
-@pytest.mark.parametrize("k", [31, 7])
+@pytest.mark.parametrize("k", [15, 7])
 def test_an_interruption_in_this_process_loses_no_draw(monkeypatch, k):
     interrupt_in_draw(monkeypatch, k)
     assert run(lag(), LAGS).finished == k
@@ -1025,14 +1025,14 @@ def test_results_are_plain_and_null_where_nothing_is_known(exploded):
 
 def test_to_pandas_has_a_row_a_draw_and_a_column_a_parameter_or_metric(found):
     table = found.to_pandas()
-    assert table.index.tolist() == list(range(45))
+    assert table.index.tolist() == list(range(21))
     assert table.index.name == "draw"
     assert table.columns.names == ["plan", "metric"]
     np.testing.assert_array_equal(table["params", "tau"], LAGS["tau"])
     for plan, rows in found.metrics.items():
         for name, row in rows.items():
             np.testing.assert_array_equal(table[plan, name], row)
-    assert table.shape == (45, 1 + sum(len(rows) for rows in found.metrics.values()))
+    assert table.shape == (21, 1 + sum(len(rows) for rows in found.metrics.values()))
 
 
 def test_a_metric_may_be_known_of_one_plan_only():

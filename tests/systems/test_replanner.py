@@ -549,7 +549,7 @@ def test_a_polynomial_plan_fitted_again_is_one_polynomial():
 
 
 @pytest.mark.parametrize("horizon", ["shrinking", 2.0])
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_runs_are_those_of_a_replanner_of_the_peers_polynomials(seed, horizon):
     """Two axes, goals that jump at random times, offsets of the clock: every derivative, all the way."""
     rng = np.random.default_rng(seed)
@@ -922,7 +922,7 @@ def test_a_goal_out_of_reach_is_not_taken_and_one_within_is_taken_up_again(metho
 
 
 @pytest.mark.parametrize("horizon", ["shrinking", 3.0])
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_limits_hold_and_the_same_goals_are_taken_as_by_the_peer(seed, horizon):
     """Random goals, limits on position, speed and acceleration; BPoly on a grid says which fits keep them."""
     rng = np.random.default_rng(100 + seed)
