@@ -358,27 +358,31 @@ def _passing_interruptions() -> Iterator[None]:
     """
     raised: list[BaseException] = []
     handlers: dict[int, Any] = {}
+    inside = False  # while handlers are exchanged, what they raise waits
 
     def accompanied(number: int, frame: Any) -> None:
         try:
             handlers[number](number, frame)
         except BaseException as error:
             raised.append(error)
-            raise
+            if inside:
+                raise
 
-    if threading.current_thread() is threading.main_thread():
-        for number in _SIGNALS:
+    try:
+        for number in _SIGNALS if threading.current_thread() is threading.main_thread() else ():
             handler = signal.getsignal(number)
             if callable(handler):
                 handlers[number] = handler
                 signal.signal(number, accompanied)
-    try:
-        yield
+        inside = True
+        if not raised:
+            yield
     except (RuntimeError, SystemError):
         if raised:
             raise raised[0] from None
         raise
     finally:
+        inside = False
         for key, handler in handlers.items():
             if signal.getsignal(key) is accompanied:
                 signal.signal(key, handler)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import ctrlplan as cp
+from ctrlplan.simulation import compiled
 
 pytestmark = pytest.mark.skipif(
     not hasattr(signal, "setitimer") or threading.current_thread() is not threading.main_thread(),
@@ -67,6 +68,22 @@ def test_an_interruption_of_a_comparison_reaches_the_caller(alarm):
     alarm(KeyboardInterrupt)
     with pytest.raises(KeyboardInterrupt):
         cp.compare(system, {"step": cp.Step(1.0)}, np.linspace(0, 3600, 360001), initial_state=[1.0, 0.0])
+
+
+def test_a_signal_while_handlers_are_exchanged_reaches_the_caller_and_leaves_them(alarm, monkeypatch):
+    class Signals:
+        def __iter__(self):
+            yield signal.SIGALRM
+            signal.raise_signal(signal.SIGALRM)
+            yield signal.SIGTERM
+
+    system = fast()
+    cp.simulate(system, [0.0, 0.001], None, [1.0, 0.0], method="compiled")  # compiled before
+    handler = alarm(KeyboardInterrupt)
+    monkeypatch.setattr(compiled, "_SIGNALS", Signals())
+    with pytest.raises(KeyboardInterrupt):
+        cp.simulate(system, [0.0, 0.001], None, [1.0, 0.0], method="compiled")
+    assert signal.getsignal(signal.SIGALRM) is handler
 
 
 def test_a_handler_that_raises_nothing_is_called_and_the_run_goes_on(alarm):
