@@ -86,14 +86,25 @@ def run(folder, *arguments, **environment):
     command = [sys.executable, "-m", "pytest", *options, *map(str, arguments)]
     done = subprocess.run(command, env=environment, cwd=folder, capture_output=True, text=True, check=False)
     assert done.returncode in (0, 1), done.stdout[-3000:] + done.stderr[-3000:]
-    calls, differing = Counter(), {}
+    calls, differing, spent = Counter(), {}, []
     for path in record.iterdir():
         for entry in map(json.loads, path.read_text(encoding="utf-8").splitlines()):
-            if "calls" in entry:
-                calls[entry["test"]] += entry["calls"]
-            else:
+            if "calls" not in entry:
                 differing[entry["test"], entry["call"]] = "; ".join(map(": ".join, entry["differs"]))
+                continue
+            spent.append((entry["cpu"], entry["ours"], entry["test"]))
+            if entry["calls"]:
+                calls[entry["test"]] += entry["calls"]
+    show_cost(spent, calls)
     return calls, differing
+
+
+def show_cost(spent, calls):
+    """Print CPU time of all tests, the part that comparisons take, and the ten longest tests."""
+    total, ours = (sum(entry[k] for entry in spent) for k in (0, 1))
+    print(f"\n{total:.0f} s of CPU time, {ours:.0f} s of it in comparisons; the longest tests:")
+    for cpu, compared, test in sorted(spent, reverse=True)[:10]:
+        print(f"{cpu:8.1f} s, {compared:6.1f} s in {calls[test]:6d} comparisons  {test}")
 
 
 def check(calls, differing, table=TABLE):
@@ -164,6 +175,15 @@ def test_calls_are_counted_and_one_that_differs_is_found(tmp_path):
     assert "for 1.5" in differing["own_test.py::test_two", 2]
 
 
+def test_the_longest_tests_go_first_and_their_cost_is_shown(tmp_path, capsys):
+    for name in ("b_test.py", "optimal_test.py"):
+        (tmp_path / name).write_text(OWN)
+    calls, _ = run(tmp_path, "-p", "no:xdist", tmp_path, "-k", "two")
+    assert list(calls) == ["optimal_test.py::test_two", "b_test.py::test_two"]
+    lines = capsys.readouterr().out.splitlines()
+    assert sum("in      2 comparisons" in line for line in lines) == 2
+
+
 def test_the_check_fails_where_the_table_and_the_run_are_at_odds():
     table = {"kinds": [{"name": "kind", "calls": ["a_test.py::test_one: 2, 4-5"]}]}
     calls, text = Counter({"a_test.py::test_one": 5}), "outputs"
@@ -188,7 +208,7 @@ def test_a_sample_of_its_tests_agrees(tests, tmp_path):
 @pytest.mark.peers
 def test_all_of_its_tests_and_examples_agree(tests, examples, tmp_path):
     ignored = [] if util.find_spec("numpydoc") else [f"--ignore={tests / OF_DOCUMENTATION}"]
-    arguments = ["-n", "2", "--dist", "worksteal", *ignored, HERE / "examples.py", tests]
+    arguments = ["-n", "2", "--dist", "load", "--maxschedchunk", "1", *ignored, HERE / "examples.py", tests]
     calls, differing = run(tmp_path, *arguments, CTRLPLAN_PEERS_EXAMPLES=str(examples))
     check(calls, differing)
     missing = {test for test, _ in listed(TABLE)} - set(calls)
