@@ -19,6 +19,7 @@ from ctrlplan.simulation.legs import DelayedDrive
 from ctrlplan.simulation.linear import LinearForm, NotLinearError, linear_form
 from ctrlplan.simulation.network import Network, UnsupportedError
 from ctrlplan.simulation.recent import BUILDING, recent
+from ctrlplan.simulation.trials import reads
 from ctrlplan.simulation.untouched import tried, untouched
 from ctrlplan.traits import traits_of
 
@@ -30,6 +31,9 @@ Array = NDArray[np.float64]
 
 _KEPT = 16
 """Systems that `simulate` keeps by itself."""
+
+_PARAMS = 3
+"""Position of the parameters among the arguments of a block's function."""
 
 
 class NotCompiledError(ValueError):
@@ -186,11 +190,15 @@ class Prepared:
         return self._read[name]
 
     def _is_read(self, network: Network, name: str, value: Any, initial_state: Any) -> bool:
+        blocks = [i for i, block in enumerate(network.blocks) if not (block.linear or block.driven)]
+        functions = {i: [*_functions(network.blocks[i].system)] for i in blocks}
+        # A call may take minutes, as that of an estimator which runs an optimiser: only what can tell is called.
+        tellers = {i: [f for f in functions[i] if reads(f, _PARAMS)] for i in blocks}
+        if not any(tellers.values()):
+            return False
         given = self.initial_state if initial_state is None else initial_state
         start = np.zeros(self.nstates) + (0.0 if given is None else np.asarray(given, dtype=float))
         w = np.zeros(network.nsignals)
-        blocks = [i for i, block in enumerate(network.blocks) if not (block.linear or block.driven)]
-        functions = {i: [*_functions(network.blocks[i].system)] for i in blocks}
         found = References((f"block {network.blocks[i].name}", f) for i in blocks for f in functions[i])
         if found.opaque:  # a call might leave something behind: what the code names counts
             return name in found.names or not found.names.isdisjoint(("keys", "values", "items"))
@@ -209,7 +217,7 @@ class Prepared:
                 for scale in (0.0, 0.1, 1.0):
                     x, u = start[network.states[i]], network.fed[i](w)
                     x, u = (v + scale * rng.standard_normal(v.size) * (1.0 + np.abs(v)) for v in (x, u))
-                    for function in functions[i]:
+                    for function in tellers[i]:
                         tried(partial(function, 10.0 * scale, x.copy(), u.copy(), noticing), None)
         keeper.restore()
         return name in read or _Noticing.ALL in read

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import warnings
+from functools import partial
 from itertools import count
 
 import control as ct
@@ -128,18 +130,58 @@ def better_answers(originals, function, system, options, first):
     largest = np.abs(first.x).max(axis=1)
     atol = 1e-13 * np.maximum(largest, 1e-6 * largest.max(initial=0.0)) + 1e-300
     kept = {name: value for name, value in given.items() if name not in ("rtol", "atol", "method", "t_eval")}
-    for solver in TIGHT:
-        steps = count()
-
-        def limit(_time, _state, steps=steps):
-            if next(steps) > MAXIMUM_STEPS:
-                raise RuntimeError("too many steps")
-            return 1.0
-
-        solver = kept | {"atol": atol, "max_step": np.diff(samples).max(), "events": limit} | solver
+    solvers = [kept | {"atol": atol, "max_step": np.diff(samples).max()} | solver for solver in TIGHT]
+    attempts = [partial(_whole, originals, system, options, solver) for solver in solvers]
+    if _has_kinks(first) and np.array_equal(first.t, samples):
+        attempts.insert(0, partial(_from_sample_to_sample, originals, system, options, solvers[1], first))
+    for attempt in attempts:
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
-                yield originals["input_output_response"](system, solve_ivp_kwargs=solver, **options)
+                yield attempt()
         except Exception:
             continue
+
+
+def _whole(originals, system, options, solver):
+    """Answer in one run."""
+    return originals["input_output_response"](system, solve_ivp_kwargs=solver | {"events": _limit()}, **options)
+
+
+def _from_sample_to_sample(originals, system, options, solver, first):
+    """Answer that begins again at each sample: a solver that passes a kink of an input takes many small steps there."""
+    states, outputs, limit = [first.x[:, 0]], [first.y[:, 0]], _limit()
+    for k in range(first.t.size - 1):
+        part = originals["input_output_response"](
+            system,
+            first.t[k : k + 2],
+            first.u[:, k : k + 2],
+            states[-1],
+            params=options.get("params"),
+            solve_ivp_kwargs=solver | {"events": limit},
+        )
+        states.append(part.x[:, -1])
+        outputs.append(part.y[:, -1])
+    better = copy.copy(first)
+    better.x, better.y = np.array(states).T, np.array(outputs).T
+    return better
+
+
+def _has_kinks(response):
+    """Whether an input, linear between samples, changes its slope."""
+    if response.u is None or response.u.ndim != 2 or response.t.size < 3:
+        return False
+    slopes = np.diff(response.u) / np.diff(response.t)
+    return bool(np.any(np.abs(np.diff(slopes)) > 1e-9 * np.abs(slopes).max(initial=0.0)))
+
+
+def _limit():
+    """An event that never comes, and ends a run of too many steps."""
+    steps = count()
+
+    def limit(_time, _state):
+        if next(steps) > MAXIMUM_STEPS:
+            raise RuntimeError("too many steps")
+        return 1.0
+
+    return limit

@@ -16,6 +16,7 @@ import importlib
 import json
 import os
 import sys
+import time
 import warnings
 import zlib
 from pathlib import Path
@@ -30,6 +31,15 @@ FUNCTIONS = ("input_output_response", "forced_response")
 MAXIMUM_CALLS = 400_000
 """Calls after which a process ends: three times those of all tests and examples."""
 
+LONGEST = (
+    "examples.py::test_example[cds112-L9_mhe-pvtol.ipynb]",
+    "examples.py::test_example[mhe-pvtol.ipynb]",
+    "examples.py::test_example[mpc_aircraft.ipynb]",
+    "optimal_test.py",
+    "examples.py",
+)
+"""Beginnings of the names of the longest tests, which go first: two processes then end at about the same time."""
+
 
 class Recorder:
     """Calls of one process: how many, and which differ."""
@@ -38,18 +48,19 @@ class Recorder:
         self.originals = {name: getattr(ct, name) for name in FUNCTIONS}
         self.path = Path(folder, f"calls-{os.getpid()}.jsonl").resolve()  # examples change the folder
         self.test, self.count, self.total = "import", 0, 0
+        self.started, self.ours = time.process_time(), 0.0  # CPU time [s] at the test's start, and of its comparisons
         self.compared, self.running, self.comparing = {}, [], False
 
     def begin(self, test):
         """Calls are named after the test and counted in it."""
         self.end()
         self.test, self.count, self.compared = test, 0, {}
+        self.started, self.ours = time.process_time(), 0.0
 
     def end(self):
-        """Write how many calls the test has made."""
-        if self.count:
-            self.write({"test": self.test, "calls": self.count})
-        self.count = 0
+        """Write how many calls the test has made, its CPU time, and how much of that the comparisons took."""
+        spent = time.process_time() - self.started
+        self.write({"test": self.test, "calls": self.count, "cpu": round(spent, 3), "ours": round(self.ours, 3)})
 
     def write(self, entry):
         """One line of the record."""
@@ -78,13 +89,14 @@ class Recorder:
             error = raised
         finally:
             self.running = outer
-        ended, self.comparing = np.random.get_state(), True
+        ended, self.comparing, compared = np.random.get_state(), True, time.process_time()
         try:
             with warnings.catch_warnings(), np.errstate(all="warn"):
                 warnings.simplefilter("ignore")
                 self.compare(number, function, system, args, kwargs, error or answer, begun)
         finally:
             self.comparing = False
+            self.ours += time.process_time() - compared
             np.random.set_state(ended)
         if error is not None:
             raise error
@@ -176,9 +188,10 @@ def pytest_configure(config):
 
 
 def pytest_collection_modifyitems(config, items):
-    """Keep the sample: of each file the tests whose name's CRC-32 a number divides."""
+    """Keep the sample: of each file the tests whose name's CRC-32 a number divides; the longest first."""
     sample = json.loads(os.environ.get("CTRLPLAN_PEERS_SAMPLE", "{}"))
     items[:] = [item for item in items if zlib.crc32(_name(item).encode()) % sample.get(item.path.name, 1) == 0]
+    items.sort(key=lambda item: [not _name(item).startswith(name) for name in LONGEST])
 
 
 def pytest_runtest_protocol(item):

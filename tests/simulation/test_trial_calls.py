@@ -335,6 +335,39 @@ def test_warnings_of_trials_do_not_show_and_filters_stay():
     assert warnings.filters == before
 
 
+def unscaled(t, x, u, params):
+    return x
+
+
+def scaled(t, x, u, params):
+    return params.get("k", 1.0) * x
+
+
+@pytest.mark.parametrize("output", [unscaled, scaled])
+def test_a_function_that_cannot_read_parameters_is_not_called_to_see_whether_it_does(output):
+    """An update may be an optimiser's run of minutes: it is called once a sample, and at no made-up state."""
+    calls = []
+
+    def update(t, x, u, params):
+        return 0.5 * x + 1.0
+
+    def count(frame, event, _):  # a list that the functions filled would be put back after a trial
+        if event == "call":
+            calls.append(frame.f_code)
+
+    slow = ct.nlsys(update, output, inputs=0, outputs=1, states=1, name="slow", dt=1.0)
+    times = np.arange(5.0)
+    sys.setprofile(count)
+    try:
+        with pytest.warns(UserWarning, match="params 'verbose' is read by no block of slow"):
+            found = cp.simulate(slow, times, params={"verbose": True})
+    finally:
+        sys.setprofile(None)
+    assert calls.count(update.__code__) == times.size
+    assert output is scaled or calls.count(output.__code__) == times.size
+    assert np.array_equal(found.states[0], 2.0 - 2.0 * 0.5**times)  # exact in binary
+
+
 def test_a_parameter_of_a_block_that_must_not_be_called():
     """Its code shows what it reads."""
     generator = np.random.default_rng(0)
