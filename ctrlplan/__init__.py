@@ -41,6 +41,7 @@ _EXPORTS = {
     ),
     "systems": (
         "AdmissibleSet",
+        "Law",
         "command_lead",
         "create_command_filter_iosystem",
         "create_delay_iosystem",

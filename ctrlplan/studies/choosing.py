@@ -33,7 +33,7 @@ from ctrlplan.studies.crane_setup import (
     obstacle_waypoints,
 )
 from ctrlplan.studies.worth import Grid, Worth, smoother_polynomials, worth
-from ctrlplan.systems.plants import crane_loop
+from ctrlplan.systems.plants import LAWS, crane_loop
 from ctrlplan.trajectories import PiecewiseSpline, Trajectory, TrigSpline, Waypoint
 
 LOAD_RADIUS, MARGIN = 0.5, 0.3
@@ -49,7 +49,7 @@ def nominal_worth() -> Worth:
 
     def build(name: str, plan: Trajectory) -> Any:
         # The flat map contains accelerations: where these jump, trolley and rope would have to.
-        law = "still" if plan.jumps(2) else "generator"
+        law = LAWS["setpoint" if plan.jumps(2) else "generator"]
         return crane_loop(CRANE, plan, law, force_limits=FORCE_LIMITS, torque_limits=TORQUE_LIMITS)
 
     depth = float(np.mean([point.position[1] for point in nominal_waypoints()]))

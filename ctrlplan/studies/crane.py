@@ -42,7 +42,7 @@ from ctrlplan.studies.crane_setup import (
 )
 from ctrlplan.studies.measures import signals_of
 from ctrlplan.studies.study import Curves, Study
-from ctrlplan.systems.plants import crane_loop
+from ctrlplan.systems.plants import LAWS, crane_loop
 from ctrlplan.trajectories import PiecewiseSpline, PolySpline, Step, Trajectory, TrigSpline, Waypoint
 
 Array = NDArray[np.float64]
@@ -191,7 +191,7 @@ def _via_points(plan: Trajectory) -> str:
 
 
 _KEPT: dict[str, Any] = {"clearance": MARGIN, "load": LOAD_RADIUS, "rope": CRANE.rope()}
-_STEP: dict[str, Any] = {"law": "still", "force_limits": FORCE_LIMITS, "torque_limits": TORQUE_LIMITS}
+_STEP: dict[str, Any] = {"law": "setpoint", "force_limits": FORCE_LIMITS, "torque_limits": TORQUE_LIMITS}
 
 
 def _step(points: tuple[Waypoint, ...]) -> Step:
@@ -298,7 +298,7 @@ def _step_note(found: Comparison) -> str:
 def _linear_loop(law: str) -> ct.StateSpace:
     """Closed loop linearised about rest at R = 10 m, with the sway as output."""
     rest = Step([0.0, 10.0], [0.0, 10.0], labels=["x", "z"])
-    loop = crane_loop(CRANE, rest, law)
+    loop = crane_loop(CRANE, rest, LAWS[law])
     linear = ct.linearize(loop, loop.initial_state, 0)
     row = loop.output_labels.index("theta")
     a = np.asarray(linear.A)

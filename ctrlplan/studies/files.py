@@ -27,6 +27,7 @@ from ctrlplan.studies.crane_setup import CRANE_MEASURES, SLACK, load_metrics, ma
 from ctrlplan.studies.study import Study
 from ctrlplan.studies.worth import smoother_polynomials
 from ctrlplan.systems.plants import LAWS, Crane, crane_loop, unity_feedback_loop
+from ctrlplan.systems.plants.crane.laws import as_law
 from ctrlplan.trajectories import PiecewiseSpline, PolySpline, Step, Trajectory, TrigSpline, Waypoint
 from ctrlplan.trajectories.files import csv_header, signal_names, signal_rows
 
@@ -337,17 +338,17 @@ def _crane(table: dict[str, Any], path: Path) -> Callable[[str, Trajectory], Any
         crane = Crane(**{key: value for key, value in table.items() if key in _CRANE_ENTRIES})
     except (ValueError, TypeError) as error:
         raise StudyError(f"{path}: loop: {error}") from None
-    law = table.get("law", "generator")
-    if law not in LAWS:
-        raise StudyError(f"{path}: loop.law: must be one of {', '.join(LAWS)}, got {_got(law)}")
-
+    try:
+        law = as_law(table.get("law", "generator"))
+    except (ValueError, TypeError):
+        raise StudyError(f"{path}: loop.law: must be one of {', '.join(LAWS)}, got {_got(table['law'])}") from None
     limits = {key: table[key] for key in ("force_limits", "torque_limits") if key in table}
     for key, pair in limits.items():
         if not (isinstance(pair, list) and len(pair) == 2 and all(map(_is_number, pair)) and pair[0] < pair[1]):
             raise StudyError(f"{path}: loop.{key}: must be two increasing numbers, got {_got(pair)}")
 
     def build(name: str, plan: Trajectory) -> Any:
-        return crane_loop(crane, plan, "still" if plan.jumps(0) else law, **limits)
+        return crane_loop(crane, plan, LAWS["setpoint"] if plan.jumps(0) else law, **limits)
 
     return build
 

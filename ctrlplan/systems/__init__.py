@@ -9,6 +9,7 @@ from ctrlplan.systems.flat import create_flat_iosystem, hurwitz_coefficients
 from ctrlplan.systems.governor import Admission, Governor, create_governor_iosystem
 from ctrlplan.systems.hybrid import Delay, SampleHold, create_delay_iosystem, sample_hold
 from ctrlplan.systems.pid import create_pid_iosystem
+from ctrlplan.systems.plants import Law
 from ctrlplan.systems.quantities import flat_quantities
 from ctrlplan.systems.replanner import create_replanner_iosystem
 from ctrlplan.systems.saturation import create_saturation_iosystem
@@ -20,6 +21,7 @@ __all__ = [
     "Admission",
     "Delay",
     "Governor",
+    "Law",
     "PlanSource",
     "SampleHold",
     "command_lead",

@@ -18,6 +18,9 @@ from ctrlplan.trajectories.common import FACTORIALS
 
 Array = NDArray[np.float64]
 
+Quantity = Any
+"""What formulas of plants take: a number, an array, a Taylor series or a symbol of a tracer."""
+
 
 def from_jet(jet: Array) -> Array:
     """Series of a jet (order + 1, ...) of derivatives."""
@@ -69,6 +72,87 @@ def arctan2(y: Array, x: Array) -> Array:
     rate = divide(turning, multiply(x, x) + multiply(y, y))
     steps = np.arange(1, len(rate) + 1).reshape(-1, *[1] * (rate.ndim - 1))
     return np.concatenate([first, rate / steps])
+
+
+def sincos(a: Array) -> tuple[Array, Array]:
+    """Sine and cosine, by integrating s' = c a', c' = -s a'."""
+    sine, cosine = [np.sin(a[0])], [np.cos(a[0])]
+    for k in range(1, len(a)):
+        slopes = [i * a[i] / k for i in range(1, k + 1)]
+        sine.append(_total(slope * cosine[k - i] for i, slope in enumerate(slopes, 1)))
+        cosine.append(-_total(slope * sine[k - i] for i, slope in enumerate(slopes, 1)))
+    return _stacked(sine), _stacked(cosine)
+
+
+class Taylor:
+    """Truncated Taylor series in arithmetic written for numbers.
+
+    Operators with numbers, arrays and other series, and `numpy.sin` and
+    `numpy.cos`, so that the equations of a plant, written once, also give the
+    derivatives of what they compute. A result is as long as its shorter argument.
+
+    Attributes
+    ----------
+    terms : ndarray, shape (order + 1, ...)
+        Derivatives over k!.
+    """
+
+    __array_priority__ = 1000.0  # of arrays on the left: they leave the operation to this class
+
+    def __init__(self, terms: Array) -> None:
+        self.terms = terms
+
+    @classmethod
+    def integral(cls, start: Array, rate: Taylor) -> Taylor:
+        """Series of the function with a value at 0 and a rate."""
+        counts = np.arange(1, len(rate.terms) + 1).reshape(-1, *[1] * (rate.terms.ndim - 1))
+        return cls(np.concatenate([np.broadcast_to(start, rate.terms.shape[1:])[None], rate.terms / counts]))
+
+    def __add__(self, other: Operand) -> Taylor:
+        n, terms = self._with(other)
+        return Taylor(self.terms[:n] + terms)
+
+    def __neg__(self) -> Taylor:
+        return Taylor(-self.terms)
+
+    def __sub__(self, other: Operand) -> Taylor:
+        n, terms = self._with(other)
+        return Taylor(self.terms[:n] - terms)
+
+    def __rsub__(self, other: Operand) -> Taylor:
+        return -self + other
+
+    def __mul__(self, other: Operand) -> Taylor:
+        return Taylor(multiply(self.terms, other.terms) if isinstance(other, Taylor) else self.terms * other)
+
+    def __truediv__(self, other: Operand) -> Taylor:
+        return Taylor(divide(self.terms, other.terms) if isinstance(other, Taylor) else self.terms / other)
+
+    def __rtruediv__(self, other: float | Array) -> Taylor:
+        return Taylor(divide(self._with(other)[1], self.terms))
+
+    def sin(self) -> Taylor:
+        """Sine, as `numpy.sin` calls it."""
+        return Taylor(sincos(self.terms)[0])
+
+    def cos(self) -> Taylor:
+        """Cosine, as `numpy.cos` calls it."""
+        return Taylor(sincos(self.terms)[1])
+
+    __radd__ = __add__
+    __rmul__ = __mul__
+
+    def _with(self, other: Operand) -> tuple[int, Array]:
+        """Common length, and that many terms of the other operand."""
+        if isinstance(other, Taylor):
+            n = min(len(self.terms), len(other.terms))
+            return n, other.terms[:n]
+        constant = np.zeros(self.terms.shape)
+        constant[0] = other
+        return len(constant), constant
+
+
+Operand = Taylor | float | Array
 
 
 def _total(terms: Iterable[Any]) -> Any:

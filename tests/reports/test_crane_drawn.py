@@ -34,7 +34,7 @@ def compared(places, plans=None, crane=None, law="generator", **options):
     loops = {key: options.pop(key) for key in ("force_limits", "torque_limits") if key in options}
 
     def build(name, plan):
-        return cp.plants.crane_loop(crane, plan, "still" if plan.jumps(0) else law, **loops)
+        return cp.plants.crane_loop(crane, plan, "setpoint" if plan.jumps(0) else law, **loops)
 
     start = places[0].time
     times = np.linspace(start, places[-1].time + 5.0, 301)

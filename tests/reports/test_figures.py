@@ -56,7 +56,7 @@ def craned():
     crane = cp.plants.Crane()
 
     def loop(name, plan):
-        return cp.plants.crane_loop(crane, plan, "still" if name == "step" else "generator")
+        return cp.plants.crane_loop(crane, plan, "setpoint" if name == "step" else "generator")
 
     found = cp.compare(loop, plans, np.linspace(0, 20, 401), waypoints=points)
     curves = Curves("alpha [rad]", "length [m]", TIMES[1:], {"one": TIMES[1:], "two": TIMES[1:] ** 2}, "Two curves.")

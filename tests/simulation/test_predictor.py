@@ -243,7 +243,7 @@ def test_it_is_immutable():
 @pytest.mark.slow
 def test_a_crane_whose_law_feeds_the_load_back():
     """The load is sent 4 m away by a jump: sway and force within their limits at all times."""
-    from ctrlplan.systems.plants.crane_laws import create_load_feedback_iosystem
+    from ctrlplan.systems.plants import create_load_feedback_iosystem
 
     crane = cp.plants.Crane()
     lags = np.kron(np.eye(2), [[0, 1, 0], [0, 0, 1], [-1.0, -3.0, -3.0]])

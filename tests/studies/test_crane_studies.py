@@ -82,7 +82,7 @@ def test_obstacle_waypoints_are_the_papers():
 
 def test_time_with_a_slack_rope_is_measured_and_marked():
     plan = cp.Step([20, 11], [0, 10], labels=["x", "z"])
-    loop = crane_loop(Crane(), plan, "still", force_limits=studies.FORCE_LIMITS, torque_limits=studies.TORQUE_LIMITS)
+    loop = crane_loop(Crane(), plan, "setpoint", force_limits=studies.FORCE_LIMITS, torque_limits=studies.TORQUE_LIMITS)
     t = np.linspace(0, 30, 3001)
     found = cp.simulate(loop, t, initial_state=loop.initial_state)
     tension = np.asarray(found.outputs)[found.output_labels.index("T")]
@@ -134,7 +134,7 @@ def nominal():
 def test_a_step_ends_where_the_rope_goes_slack(nominal):
     """The first root of the tension, by an independent look at a run that goes on."""
     plan = nominal.plans["step"]
-    loop = crane_loop(Crane(), plan, "still", force_limits=studies.FORCE_LIMITS, torque_limits=studies.TORQUE_LIMITS)
+    loop = crane_loop(Crane(), plan, "setpoint", force_limits=studies.FORCE_LIMITS, torque_limits=studies.TORQUE_LIMITS)
     t = np.linspace(5.0, 6.5, 15001)
     found = cp.simulate(loop, np.concatenate([[0.0], t]), events=())
     tension = np.asarray(found.outputs)[found.output_labels.index("T")][1:]

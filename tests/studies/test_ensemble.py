@@ -422,7 +422,7 @@ def test_draws_of_the_crane_are_the_hand_written_right_hand_side():
     plan = cp.PolySpline(points)
     times = np.linspace(0, 4, 81)
     result = run(
-        lambda name, plan: cp.plants.crane_loop(cp.plants.Crane(), plan, "still"),
+        lambda name, plan: cp.plants.crane_loop(cp.plants.Crane(), plan, "setpoint"),
         CRANE,
         plans={"planned": plan},
         times=times,
@@ -430,7 +430,7 @@ def test_draws_of_the_crane_are_the_hand_written_right_hand_side():
     )
     assert result.failures == ()
     curves = {name: [] for name in ("x", "z", "theta", "D", "R")}
-    start = cp.plants.crane_loop(cp.plants.Crane(), plan, "still").initial_state
+    start = cp.plants.crane_loop(cp.plants.Crane(), plan, "setpoint").initial_state
     for mass, friction in zip(*CRANE.values(), strict=True):
         rate = crane_rate(plan, mass, friction)
         before, after = times <= 3.0, times >= 3.0

@@ -78,7 +78,7 @@ def hand_rate(jet, law, wrap, force_limits=FREE, torque_limits=FREE):
     def driven(t, y):
         q, (x, _, x1, _) = y[4:], load_of(y[4:])
         p = jet(t)
-        if law == "still":
+        if law == "setpoint":
             d_ref, r_ref = p[0, 0] - B, p[0, 1]
         elif law == "generator":
             d_ref, r_ref = drives(p[0, 0], p[2, 0], p[0, 1], p[2, 1])
@@ -148,7 +148,7 @@ def by_hand(plan, law, wrap, state, t, **limits):
 
 
 @BOTH
-@pytest.mark.parametrize("law", ["still", "generator", "load_feedback", "dynamic"])
+@pytest.mark.parametrize("law", ["setpoint", "generator", "load_feedback", "dynamic"])
 def test_loops_are_the_hand_written_right_hand_side(law, wrap):
     """From a disturbed state, along a plan whose derivatives jump as far as the law allows, and past its end."""
     plan = plan_of(5 if law == "dynamic" else 2)
@@ -172,13 +172,13 @@ def test_loops_are_the_hand_written_right_hand_side(law, wrap):
 def test_saturated_step_is_the_hand_written_right_hand_side():
     plan = cp.Step([20, 11], [0, 10], labels=["x", "z"])
     limits = {"force_limits": (-30e3, 30e3), "torque_limits": (-3e3, 1e3)}
-    loop = crane_loop(Crane(), plan, "still", **limits)
+    loop = crane_loop(Crane(), plan, "setpoint", **limits)
     assert loop.initial_state[-6:] == pytest.approx([-B, 10, 0, 0, 0, 0])
     t = np.linspace(0, 0.2, 21)  # before the rope's slackness makes the model stiff
     held = np.zeros((5, 2))
     held[0] = 20, 11
     found = solve_ivp(
-        hand_rate(lambda _: held, "still", False, **limits),
+        hand_rate(lambda _: held, "setpoint", False, **limits),
         (0, 0.2),
         loop.initial_state,
         method="Radau",
@@ -193,13 +193,13 @@ def test_saturated_step_is_the_hand_written_right_hand_side():
 def test_step_saturates_the_drives_and_slackens_the_rope():
     plan = cp.Step([20, 11], [0, 10], labels=["x", "z"])
     limits = {"force_limits": (-30e3, 30e3), "torque_limits": (-3e3, 1e3)}
-    found = run(crane_loop(Crane(), plan, "still", **limits), np.linspace(0, 20, 2001), rtol=1e-8)
+    found = run(crane_loop(Crane(), plan, "setpoint", **limits), np.linspace(0, 20, 2001), rtol=1e-8)
     assert found.F.min() == -30e3
     assert found.F.max() == 30e3
     assert found.C.min() >= -3e3
     assert found.C.max() == 1e3
     assert found.T.min() < 0
-    free = run(crane_loop(Crane(), plan, "still"), np.linspace(0, 0.01, 3))
+    free = run(crane_loop(Crane(), plan, "setpoint"), np.linspace(0, 0.01, 3))
     assert free.F[0] > 30e3  # without limits it is asked for more
 
 
@@ -285,7 +285,7 @@ def assert_same_poles(found, expected):
 
 
 @pytest.mark.parametrize("length", [10.0, 5.0])
-@pytest.mark.parametrize("law", ["still", "generator"])
+@pytest.mark.parametrize("law", ["setpoint", "generator"])
 def test_poles_of_the_loop_are_those_of_the_transfer_functions(law, length):
     expected = expected_poles(law, length)
     assert assert_same_poles(loop_poles(law, length=length), expected) == []
@@ -337,7 +337,7 @@ def test_a_step_is_refused_where_derivatives_are_needed(law, smooth):
 
 
 def test_a_step_may_be_sent_at_rest_references():
-    assert crane_loop(Crane(), STEP, "still").initial_state[-6:].tolist() == [-0.25, 10, 0, 0, 0, 0]
+    assert crane_loop(Crane(), STEP, "setpoint").initial_state[-6:].tolist() == [-0.25, 10, 0, 0, 0, 0]
 
 
 @pytest.mark.parametrize("law", ["dynamic", "feedforward"])
@@ -379,14 +379,14 @@ def test_a_plan_the_rope_cannot_follow_is_refused(law):
 
 
 def test_what_does_not_go_together_is_refused():
-    with pytest.raises(ValueError, match="law must be one of still, generator"):
+    with pytest.raises(ValueError, match="law must be one of setpoint, generator"):
         crane_loop(Crane(), plan_of(3), "pid")
-    with pytest.raises(ValueError, match="limits must go with a law that drives the PIDs"):
+    with pytest.raises(ValueError, match="limits must go with a law that uses the PIDs"):
         crane_loop(Crane(), plan_of(5), "dynamic", force_limits=(-1, 1))
     with pytest.raises(ValueError, match="poles"):
         crane_loop(Crane(), plan_of(5), "dynamic", poles=(1, -1, -1, -1))
     with pytest.raises(ValueError, match="limits must increase"):
-        crane_loop(Crane(), plan_of(5), "still", force_limits=(1, -1))
+        crane_loop(Crane(), plan_of(5), "setpoint", force_limits=(1, -1))
     one = cp.PolySpline([cp.Waypoint(0, 5, 0, 0), cp.Waypoint(1, 6, 0, 0)])
     with pytest.raises(ValueError, match="axes x and z, got 1"):
         crane_loop(Crane(), one)

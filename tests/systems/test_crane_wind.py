@@ -350,10 +350,10 @@ def test_a_wind_whose_axis_has_any_name_and_breakpoints_of_its_own():
 
 
 @pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("law", ["generator", "load_feedback", "dynamic", "feedforward", "still"])
+@pytest.mark.parametrize("law", ["generator", "load_feedback", "dynamic", "feedforward", "setpoint"])
 def test_the_plans_source_as_the_reference_is_the_plain_loop(law, method):
     plan = move(4)
-    order = {"dynamic": 4, "feedforward": 4, "still": 0}.get(law, 2)
+    order = {"dynamic": 4, "feedforward": 4, "setpoint": 0}.get(law, 2)
     own = crane_loop(Crane(), plan, law, reference=[cp.create_source_iosystem(plan, order, "mine", suffix="_ref")])
     plain = crane_loop(Crane(), plan, law)
     assert own.output_labels == plain.output_labels

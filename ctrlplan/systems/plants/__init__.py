@@ -1,14 +1,21 @@
-"""Plants and the loops around them, one file each."""
+"""Plants and the loops around them, one file each, the crane a package."""
 
-from ctrlplan.systems.plants.crane import Crane
-from ctrlplan.systems.plants.crane_laws import (
+from ctrlplan.systems.plants.crane import (
+    LAWS,
+    Crane,
+    DynamicLaw,
+    FeedforwardLaw,
+    GeneratorLaw,
+    Law,
+    LoadFeedbackLaw,
+    SetpointLaw,
+    crane_loop,
     create_crane_feedforward_iosystem,
     create_dynamic_law_iosystem,
     create_generator_iosystem,
     create_load_feedback_iosystem,
     create_still_iosystem,
 )
-from ctrlplan.systems.plants.crane_loop import LAWS, crane_loop
 from ctrlplan.systems.plants.dc_motor import dc_motor
 from ctrlplan.systems.plants.flexible_joint import flexible_joint
 from ctrlplan.systems.plants.integrator_chain import integrator_chain
@@ -17,6 +24,12 @@ from ctrlplan.systems.plants.linear import integrator_lag_loop, unity_feedback_l
 __all__ = [
     "LAWS",
     "Crane",
+    "DynamicLaw",
+    "FeedforwardLaw",
+    "GeneratorLaw",
+    "Law",
+    "LoadFeedbackLaw",
+    "SetpointLaw",
     "crane_loop",
     "create_crane_feedforward_iosystem",
     "create_dynamic_law_iosystem",

@@ -1,4 +1,4 @@
-"""The crane's laws: from a plan of the load to references of the drives, or to force and torque.
+"""The crane's laws as blocks: from a plan of the load to references of the PIDs, or to force and torque.
 
 Each is a block that `control.interconnect` joins by name to a source with the
 suffix ``_ref`` and to the crane, and is finite at zero inputs.
@@ -6,48 +6,50 @@ suffix ``_ref`` and to the crane, and is finite at zero inputs.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
 
 import control as ct
 import numpy as np
 from numpy.typing import NDArray
 
 from ctrlplan.systems.flat import hurwitz_coefficients
-from ctrlplan.systems.plants.crane import Crane
+from ctrlplan.systems.plants.crane.flatness import checked_formulas
+from ctrlplan.systems.plants.crane.parameters import CraneParameters
+from ctrlplan.systems.series import Quantity
 from ctrlplan.trajectories import derivative_name
 
 Array = NDArray[np.float64]
+Params = Mapping[str, float]
 
 
-def create_still_iosystem(crane: Crane, name: str = "still") -> ct.NonlinearIOSystem:
-    """References of trolley and rope for a load at rest: what a step is sent through.
+def create_still_iosystem(crane: CraneParameters, name: str = "setpoint") -> ct.NonlinearIOSystem:
+    """References of trolley and rope for a load at rest: the set-point law, for steps.
 
     Inputs x_ref and z_ref; outputs D_ref = x - b and R_ref = z.
     """
     b = crane.drum_radius
 
-    def out(t: float, state: Any, u: Any, params: dict[str, Any]) -> Array:
+    def out(t: float, state: Array, u: Array, params: Params) -> Array:
         return np.array([u[0] - b, u[1]])
 
     return ct.nlsys(None, out, inputs=["x_ref", "z_ref"], outputs=["D_ref", "R_ref"], dt=None, name=name)
 
 
-def create_generator_iosystem(crane: Crane, name: str = "generator") -> ct.NonlinearIOSystem:
+def create_generator_iosystem(crane: CraneParameters, name: str = "generator") -> ct.NonlinearIOSystem:
     """Figure 3's generator of references, (15a,b) of the planned jets.
 
     Inputs x_ref, x_ref_d1, x_ref_d2 and the same of z; outputs D_ref and R_ref.
-    Without feedback from the load its sway is as undamped as the drives leave it.
+    Without feedback from the load, its sway is not damped.
     """
 
-    def out(t: float, state: Any, u: Any, params: dict[str, Any]) -> Array:
-        return np.array(_drives(crane, u[0], u[2], u[3], u[5]))
+    def out(t: float, state: Array, u: Array, params: Params) -> Array:
+        return np.array(_held(crane, u[0], u[2], u[3], u[5]))
 
     return ct.nlsys(None, out, inputs=_jet_names(2), outputs=["D_ref", "R_ref"], dt=None, name=name)
 
 
 def create_load_feedback_iosystem(
-    crane: Crane, bandwidth: float = 1.0, damping: float = 1.0, name: str = "load_feedback"
+    crane: CraneParameters, bandwidth: float = 1.0, damping: float = 1.0, name: str = "load_feedback"
 ) -> ct.NonlinearIOSystem:
     """Generator with feedback from the load's x, which damps the sway.
 
@@ -82,15 +84,15 @@ def create_load_feedback_iosystem(
             raise ValueError(f"{label} must be finite and above 0, got {value}")
     s0, s1 = bandwidth**2, 2.0 * damping * bandwidth
 
-    def out(t: float, state: Any, u: Any, params: dict[str, Any]) -> Array:
-        asked = u[2] - s1 * (u[7] - u[1]) - s0 * (u[6] - u[0])
-        return np.array(_drives(crane, u[6], asked, u[3], u[5]))
+    def out(t: float, state: Array, u: Array, params: Params) -> Array:
+        x2 = u[2] - s1 * (u[7] - u[1]) - s0 * (u[6] - u[0])
+        return np.array(_held(crane, u[6], x2, u[3], u[5]))
 
     return ct.nlsys(None, out, inputs=[*_jet_names(2), "x", "x_d1"], outputs=["D_ref", "R_ref"], dt=None, name=name)
 
 
 def create_dynamic_law_iosystem(
-    crane: Crane, poles: Sequence[complex] = (-1.0, -1.2, -1.4, -1.6), name: str = "dynamic_law"
+    crane: CraneParameters, poles: Sequence[complex] = (-1.0, -1.2, -1.4, -1.6), name: str = "dynamic_law"
 ) -> ct.NonlinearIOSystem:
     """The whole law (9)-(11), by dynamic extension: two chains of four integrators.
 
@@ -121,7 +123,7 @@ def create_dynamic_law_iosystem(
     sigma = hurwitz_coefficients(poles, 4)
     m, g, b = crane.load_mass, crane.gravity, crane.drum_radius
 
-    def second(state: Any, u: Any) -> tuple[Any, Any]:
+    def second(state: Array, u: Array) -> tuple[float, float]:
         """T'' and theta''."""
         tension, rate = m * g + state[0], state[1]
         x, z, x1, z1, _, theta, _, _, theta1 = (u[10 + i] for i in range(9))
@@ -137,10 +139,10 @@ def create_dynamic_law_iosystem(
         # [s, T c; c, -T s] [T''; theta''] = [p; q]
         return s * p + c * q, (c * p - s * q) / tension
 
-    def update(t: float, state: Any, u: Any, params: dict[str, Any]) -> Array:
+    def update(t: float, state: Array, u: Array, params: Params) -> Array:
         return np.array([state[1], second(state, u)[0]])
 
-    def out(t: float, state: Any, u: Any, params: dict[str, Any]) -> Array:
+    def out(t: float, state: Array, u: Array, params: Params) -> Array:
         tension, theta2 = m * g + state[0], second(state, u)[1]
         _, _, _, _, r, theta, d1, r1, theta1 = (u[10 + i] for i in range(9))
         s, c = np.sin(theta), np.cos(theta)
@@ -159,17 +161,17 @@ def create_dynamic_law_iosystem(
     )
 
 
-def create_crane_feedforward_iosystem(crane: Crane, name: str = "feedforward") -> ct.NonlinearIOSystem:
+def create_crane_feedforward_iosystem(crane: CraneParameters, name: str = "feedforward") -> ct.NonlinearIOSystem:
     """Force and torque from the planned jets alone: the open-loop half of the law.
 
     Inputs the jets of order 4 of x_ref and z_ref; outputs F and C, exact for
     the model and without any correction.
     """
 
-    def out(t: float, state: Any, u: Any, params: dict[str, Any]) -> Array:
+    def out(t: float, state: Array, u: Array, params: Params) -> Array:
         jet = np.stack([np.asarray(u[:5]), np.asarray(u[5:10])], axis=1)
-        # Of symbols nothing can be refused; `crane_loop` has looked at the whole plan.
-        found = crane._quantities(jet) if jet.dtype == object else crane.quantities(jet)
+        # Symbols are not checked; `crane_loop` has checked the whole plan.
+        found = checked_formulas(crane.numbers(), crane.rope_wrap, jet)
         return np.array([found["F"], found["C"]])
 
     return ct.nlsys(None, out, inputs=_jet_names(4), outputs=["F", "C"], dt=None, name=name)
@@ -179,7 +181,7 @@ def _jet_names(order: int) -> list[str]:
     return [derivative_name(axis, k) for axis in ("x_ref", "z_ref") for k in range(order + 1)]
 
 
-def _drives(crane: Crane, x: Any, x2: Any, z: Any, z2: Any) -> list[Any]:
+def _held(crane: CraneParameters, x: Quantity, x2: Quantity, z: Quantity, z2: Quantity) -> list[Quantity]:
     """D and R of (15a,b)."""
     b, hanging = crane.drum_radius, crane.gravity - z2
     pull = np.sqrt(x2 * x2 + hanging * hanging)
@@ -187,8 +189,16 @@ def _drives(crane: Crane, x: Any, x2: Any, z: Any, z2: Any) -> list[Any]:
 
 
 def _inputs(
-    crane: Crane, tension: Any, sine: Any, d1: Any, d2: Any, r1: Any, r2: Any, theta1: Any, theta2: Any
-) -> list[Any]:
+    crane: CraneParameters,
+    tension: Quantity,
+    sine: Quantity,
+    d1: Quantity,
+    d2: Quantity,
+    r1: Quantity,
+    r2: Quantity,
+    theta1: Quantity,
+    theta2: Quantity,
+) -> list[Quantity]:
     """F and C from (14)."""
     b = crane.drum_radius
     drum1, drum2 = r1 / b, r2 / b

@@ -1,0 +1,243 @@
+"""The flat-system interface: one class, whatever its maps come from."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+
+import control.flatsys as fs
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ctrlplan._checks import real_array
+from ctrlplan.trajectories import Trajectory
+from ctrlplan.trajectories.common import checked_labels, checked_timepts, default_labels
+
+Array = NDArray[np.float64]
+Params = Mapping[str, float] | None
+Flag = Sequence[Array]
+
+
+class FlatSystem(fs.FlatSystem):  # type: ignore[misc]
+    """Flat system with named flat outputs and maps over many times.
+
+    A `control.flatsys.FlatSystem`: `forward` and `reverse` work in
+    `control.flatsys.point_to_point`, and the system simulates and connects as
+    any other. `ctrlplan.fastest` and `ctrlplan.margins` take it as ``system=``.
+
+    Parameters
+    ----------
+    forward : callable
+        ``forward(x, u, params) -> flag``, the inputs held constant: for each
+        flat output y_j, ..., y_j^(r_j), shape (r_j + 1,).
+    reverse : callable
+        ``reverse(flag, params) -> (x, u)``. Rows of the flag have the shape
+        (r_j + 1, ...), x (nstates, ...) and u (ninputs, ...): the trailing axes
+        are times, which one call maps all.
+    updfcn, outfcn : callable
+        As in `control.nlsys`.
+    orders : sequence of int
+        r_j of each flat output: the highest derivative that `reverse` reads.
+    flat_labels : sequence of str
+        Names of the flat outputs.
+    states, inputs, outputs : sequence of str
+        Names of the signals.
+    name : str
+        Name of the system.
+    quantities : callable, optional
+        Replaces the method `quantities`, for signals beyond states and inputs.
+    params : mapping of str to float, optional
+        Default parameters.
+
+    Attributes
+    ----------
+    orders : tuple of int
+        See above. They add up to ``nstates + extension``.
+    extension : int
+        Number of states of the dynamic extension: 0 where static feedback
+        linearises the system.
+    flat_labels : tuple of str
+        Names of the flat outputs, in the order of the flag.
+
+    Raises
+    ------
+    ValueError
+        If orders or labels are not one for each input, or the orders add up to
+        less than the number of states.
+
+    Examples
+    --------
+    >>> import ctrlplan as cp
+    >>> flat = cp.plants.Crane().flat_system()
+    >>> flat.orders, flat.extension, flat.flat_labels
+    ((4, 4), 2, ('x', 'z'))
+    >>> plan = cp.PolySpline([
+    ...     cp.Waypoint.from_jets(0.0, x=[0, 0, 0, 0, 0], z=[10, 0, 0, 0, 0]),
+    ...     cp.Waypoint.from_jets(15.0, x=[20, 0, 0, 0, 0], z=[11, 0, 0, 0, 0]),
+    ... ])
+    >>> x, u = flat.states_and_inputs(plan, [0.0, 7.5, 15.0])
+    >>> x.shape, u.shape, u[:, 0].tolist()
+    ((6, 3), (2, 3), [0.0, -1226.25])
+    """
+
+    orders: tuple[int, ...]
+    extension: int
+    flat_labels: tuple[str, ...]
+
+    def __init__(
+        self,
+        forward: Callable[..., Flag],
+        reverse: Callable[..., tuple[Array, Array]],
+        updfcn: Callable[..., ArrayLike],
+        outfcn: Callable[..., ArrayLike],
+        *,
+        orders: Sequence[int],
+        flat_labels: Sequence[str],
+        states: Sequence[str],
+        inputs: Sequence[str],
+        outputs: Sequence[str],
+        name: str,
+        quantities: Callable[[ArrayLike], dict[str, Array]] | None = None,
+        params: Mapping[str, float] | None = None,
+    ) -> None:
+        super().__init__(
+            forward,
+            reverse,
+            updfcn,
+            outfcn,
+            states=list(states),
+            inputs=list(inputs),
+            outputs=list(outputs),
+            name=name,
+            params=dict(params or {}),
+        )
+        self.orders = tuple(orders)
+        self.extension = sum(self.orders) - len(states)
+        self.flat_labels = checked_labels(flat_labels, len(inputs))
+        self._own_quantities = quantities
+        if len(self.orders) != len(inputs) or min(self.orders) < 1:
+            raise ValueError(f"orders must be one of at least 1 for each of {len(inputs)} inputs, got {self.orders}")
+        if self.extension < 0:
+            raise ValueError(
+                f"orders must add up to at least the number of states, {len(states)}, got {sum(self.orders)}"
+            )
+
+    def states_and_inputs(
+        self, plan: Trajectory, timepts: ArrayLike, *, start: ArrayLike | None = None
+    ) -> tuple[Array, Array]:
+        """States and inputs along a plan of the flat outputs.
+
+        Parameters
+        ----------
+        plan : Trajectory
+            Plan of the flat outputs: by name where its labels are theirs, in
+            order where its labels are the default ones. Before its start and
+            after its end the positions are held.
+        timepts : array_like, any shape
+            Times [s], in any order.
+        start : array_like, shape (nstates,), optional
+            State at the plan's start. It selects among several states that have
+            the same flag; maps in closed form, as the crane's, have one branch
+            and do not read it.
+
+        Returns
+        -------
+        x : ndarray, shape (nstates, *timepts.shape)
+            States, in the order of `state_labels`.
+        u : ndarray, shape (ninputs, *timepts.shape)
+            Inputs, in the order of `input_labels`.
+
+        Raises
+        ------
+        TypeError
+            If `plan` is no trajectory.
+        ValueError
+            If the plan's labels are not those of the flat outputs, a derivative
+            below r_j jumps between the times (which, and when), `start` has a
+            wrong shape, or the maps are singular (which signal, and when).
+        """
+        plan = self._matched(plan)
+        times = checked_timepts(timepts)
+        if not np.isfinite(times).all():
+            raise ValueError("timepts must be finite, got inf")
+        if start is not None and real_array(start, "start").shape != (self.nstates,):
+            raise ValueError(f"start must have the shape ({self.nstates},), got {np.shape(start)}")
+        if times.size:
+            self._check_smooth(plan, float(times.min()), float(times.max()))
+        jet = plan.jet(times, max(self.orders))
+        x, u = self.reverse([jet[: r + 1, j] for j, r in enumerate(self.orders)], self.params)
+        for labels, rows in ((self.state_labels, x), (self.input_labels, u)):
+            for label, row in zip(labels, rows, strict=True):
+                self._check_regular(label, row, times)
+        return np.asarray(x), np.asarray(u)
+
+    def quantities(self, jet: ArrayLike) -> dict[str, Array]:
+        """Signals of the plant by name, as functions of the jet of the flat outputs.
+
+        Parameters
+        ----------
+        jet : array_like, shape (order + 1, nflat, ...)
+            Derivatives of the flat outputs. Inputs need the order max(orders),
+            states one less.
+
+        Returns
+        -------
+        dict of str to ndarray, shape (...)
+            States, inputs and what the plant adds; of a shorter jet those that
+            follow from it.
+
+        Raises
+        ------
+        ValueError
+            If the jet is too short or has another number of axes.
+        """
+        if self._own_quantities is not None:
+            return self._own_quantities(jet)
+        values = real_array(jet, "jet")
+        highest, count = max(self.orders), len(self.orders)
+        if values.ndim < 2 or len(values) < highest or values.shape[1] != count:
+            raise ValueError(
+                f"jet must have the shape (order + 1, {count}, ntime) with an order of {highest - 1} for states and "
+                f"{highest} for inputs, got {values.shape}"
+            )
+        known = len(values) > highest
+        if not known:  # the states do not depend on the last derivatives
+            values = np.concatenate([values, np.zeros((1, *values.shape[1:]))])
+        x, u = self.reverse([values[: r + 1, j] for j, r in enumerate(self.orders)], self.params)
+        found = dict(zip(self.state_labels, np.asarray(x), strict=True))
+        return found | dict(zip(self.input_labels, np.asarray(u), strict=True)) if known else found
+
+    def _matched(self, plan: Trajectory) -> Trajectory:
+        """Plan with the axes in the order of the flat outputs."""
+        if not isinstance(plan, Trajectory):
+            raise TypeError(f"plan must be a Trajectory, got {type(plan).__name__}")
+        if plan.labels in (self.flat_labels, default_labels(len(self.flat_labels))):
+            return plan
+        if set(plan.labels) == set(self.flat_labels):
+            return plan.select(self.flat_labels)
+        raise ValueError(
+            f"plan must have the axes {', '.join(self.flat_labels)}, the flat outputs of {self.name}, got "
+            f"{', '.join(plan.labels)}"
+        )
+
+    def _check_smooth(self, plan: Trajectory, first: float, last: float) -> None:
+        """Reject a plan of which a derivative below r_j jumps between two times."""
+        order_of = dict(zip(plan.labels, self.orders, strict=True))
+        for jump in plan.jumps(max(self.orders) - 1):
+            # At an inner breakpoint and at the start the value is that from the right, at the end that from the left.
+            between = first <= jump.time < last if jump.time == plan.end else first < jump.time <= last
+            if between and jump.order < order_of[jump.label]:
+                what = "position" if jump.order == 0 else f"derivative {jump.order}"
+                raise ValueError(
+                    f"plan must be continuous up to derivative {order_of[jump.label] - 1} of {jump.label} between "
+                    f"the times given, got one whose {what} jumps by {jump.size:.4g} at {jump.time:g} s"
+                )
+
+    def _check_regular(self, label: str, row: Array, times: Array) -> None:
+        """Reject a signal that the plan does not determine."""
+        wrong = np.broadcast_to(~np.isfinite(row), times.shape)
+        if wrong.any():
+            k = np.unravel_index(int(wrong.argmax()), times.shape)
+            raise ValueError(
+                f"{label} of {self.name} must be determined by the plan, got {np.asarray(row)[k]:g} at "
+                f"{float(times[k]):.6g} s: the maps are singular there"
+            )

@@ -1,0 +1,67 @@
+"""The crane of the paper's section 5: trolley, hoist and a load on a rope."""
+
+from __future__ import annotations
+
+from ctrlplan.systems.plants.crane import flatness, linear, model, rope
+from ctrlplan.systems.plants.crane.parameters import CraneParameters
+
+
+class Crane(CraneParameters):
+    """Crane with a trolley, a drum and a load; its equations, flat maps and loops.
+
+    z points down. Equation numbers in the methods are the paper's.
+
+    Parameters
+    ----------
+    load_mass : float
+        m [kg].
+    trolley_mass : float
+        M_c [kg].
+    drum_inertia : float
+        J [kg m^2].
+    drum_radius : float
+        b [m].
+    trolley_friction : float
+        f1 [N s/m].
+    drum_friction : float
+        f2 [N m s].
+    gravity : float
+        g [m/s^2].
+    rope_wrap : bool
+        False is the paper's (14b), which neglects that the rope winds on the
+        drum as theta turns; True keeps that term, and with it the energy.
+
+    Raises
+    ------
+    ValueError
+        If a mass, the inertia, the radius or gravity is not above 0, or a
+        friction is negative.
+
+    Examples
+    --------
+    >>> crane = Crane(load_mass=500.0)
+    >>> state, inputs = crane.equilibrium(x=0.0, z=10.0)
+    >>> inputs.tolist()
+    [0.0, -1226.25]
+    """
+
+    # The nonlinear plant: model.py
+    iosystem = model.iosystem
+    equilibrium = model.equilibrium
+    accelerations = model.accelerations
+    energy = model.energy
+
+    # Flat maps, and what a plan must meet: flatness.py, rope.py
+    flat_system = flatness.flat_system
+    quantities = flatness.quantities
+    check = flatness.check
+    rope = rope.rope
+
+    # Linear models and the study's controllers: linear.py
+    linear_trolley = linear.linear_trolley
+    linear_hoist = linear.linear_hoist
+    linear_coupled = linear.linear_coupled
+    trolley_pid = linear.trolley_pid
+    hoist_pid = linear.hoist_pid
+    linear_trolley_loop = linear.linear_trolley_loop
+    linear_hoist_loop = linear.linear_hoist_loop

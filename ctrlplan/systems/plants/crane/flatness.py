@@ -1,0 +1,202 @@
+"""The crane's flatness: states, tension and inputs from the jet of the load, (15a-d).
+
+In (15c) the angle is in the right quadrant, theta = atan2(-x'', g - z'').
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from functools import partial
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ctrlplan.flatness import FlatSystem
+from ctrlplan.systems import series
+from ctrlplan.systems.plants.crane import model
+from ctrlplan.systems.plants.crane.parameters import CraneParameters, Numbers
+from ctrlplan.systems.series import Taylor
+from ctrlplan.trajectories import Extrema, Trajectory
+
+Array = NDArray[np.float64]
+
+FLAT_LABELS = ("x", "z")
+ORDERS = (4, 4)
+
+
+def flat_system(crane: CraneParameters, name: str = "crane") -> FlatSystem:
+    """Crane as a flat system, its flat outputs the load's x and z.
+
+    States, inputs and outputs as those of `iosystem`; orders (4, 4), that is
+    an extension of two states (the tension and its rate). The maps are those of
+    `quantities`; parameters of a run named as this crane's own override them
+    where they are given to `forward` and `reverse`.
+
+    Examples
+    --------
+    >>> import ctrlplan as cp
+    >>> flat = cp.plants.Crane().flat_system()
+    >>> x, u = flat.reverse([[2.0, 0.0, 0.0, 0.0, 0.0], [10.0, 0.0, 0.0, 0.0, 0.0]])
+    >>> x[:2].tolist(), u.tolist()
+    ([1.75, 10.0], [0.0, -1226.25])
+    """
+    return FlatSystem(
+        partial(forward, crane),
+        partial(reverse, crane),
+        partial(model.update, crane),
+        partial(model.output, crane),
+        orders=ORDERS,
+        flat_labels=FLAT_LABELS,
+        states=model.STATES,
+        inputs=("F", "C"),
+        outputs=model.OUTPUTS,
+        name=name,
+        quantities=partial(quantities, crane),
+    )
+
+
+def quantities(crane: CraneParameters, jet: ArrayLike) -> dict[str, Array]:
+    """States, tension and inputs from the jet of the load, (15a-d), in (15c) with the quadrant.
+
+    Parameters
+    ----------
+    jet : array_like, shape (order + 1, 2, ...)
+        Derivatives of x and z; order 2 gives positions and tension, 3
+        their rates, 4 the inputs as well.
+
+    Returns
+    -------
+    dict of str to ndarray
+        D, R, theta, T; from order 3 on D_d1, R_d1, theta_d1, T_d1; from
+        order 4 on D_d2, R_d2, theta_d2, T_d2, F, C.
+
+    Raises
+    ------
+    ValueError
+        If the order is below 2, or g - z'' is not above 0 somewhere: the
+        rope cannot push.
+    """
+    values = np.asarray(jet, dtype=float)
+    if values.ndim < 2 or values.shape[1] != 2 or len(values) < 3:
+        raise ValueError(f"jet must have shape (order + 1, 2, ...) with order at least 2, got {values.shape}")
+    return checked_formulas(crane.numbers(), crane.rope_wrap, values)
+
+
+def forward(
+    crane: CraneParameters, x: Sequence[Array], u: Sequence[Array], params: Mapping[str, float] | None = None
+) -> list[Array]:
+    """Flag of a state and inputs: x and z with four derivatives, the inputs held constant."""
+    numbers = crane.numbers(params)
+    given = [np.asarray(value, dtype=float) for value in x]
+    state = [Taylor(value[None]) for value in given]
+    force, torque = (np.asarray(value, dtype=float) for value in u)
+    for _ in range(3):  # each pass gives one more derivative of the accelerations
+        second = model.solved(numbers, crane.rope_wrap, state, force, torque, 0.0)[:3]
+        rates = [Taylor.integral(start, rate) for start, rate in zip(given[3:], second, strict=True)]
+        state = [Taylor.integral(start, rate) for start, rate in zip(given[:3], rates, strict=True)] + rates
+    return [series.to_jet(position.terms) for position in model.load(numbers[3], state)[:2]]
+
+
+def reverse(
+    crane: CraneParameters, flag: Sequence[ArrayLike], params: Mapping[str, float] | None = None
+) -> tuple[Array, Array]:
+    """State (6, ...) and inputs (2, ...) of the flags of x and z, each (5, ...)."""
+    jet = np.stack([np.asarray(row)[: order + 1] for row, order in zip(flag, ORDERS, strict=True)], axis=1)
+    found = checked_formulas(crane.numbers(params), crane.rope_wrap, jet)
+    return np.stack([found[name] for name in model.STATES]), np.stack([found["F"], found["C"]])
+
+
+def checked_formulas(numbers: Numbers, rope_wrap: bool, jet: Array) -> dict[str, Array]:
+    """`formulas` of jets along which the rope is taut; of symbols nothing can be checked."""
+    if jet.dtype != object:
+        lowest = float(np.min(numbers[6] - jet[2, 1], initial=np.inf))
+        if not lowest > 0.0:
+            raise ValueError(f"g - z'' must be above 0 for a taut rope, got {lowest:.4g} m/s^2")
+    return formulas(numbers, rope_wrap, jet)
+
+
+def formulas(numbers: Numbers, rope_wrap: bool, jet: Array) -> dict[str, Array]:
+    """(15a-d) and the derivatives that the jet gives, of numbers or symbols."""
+    m, trolley, inertia, b, f1, f2, g = numbers
+    x, z = series.from_jet(jet[:, 0]), series.from_jet(jet[:, 1])
+    across, fall = series.derivative(x, 2), series.derivative(z, 2)
+    hanging = -fall
+    hanging[0] += g
+    pull = series.sqrt(series.multiply(across, across) + series.multiply(hanging, hanging))
+    theta = series.arctan2(-across, hanging)
+    r = series.divide(series.multiply(z, pull) - b * across, hanging)
+    d = x[: len(pull)] - series.divide(b * pull - series.multiply(z, across), hanging)
+    jets = {
+        "D": series.to_jet(d),
+        "R": series.to_jet(r),
+        "theta": series.to_jet(theta),
+        "T": m * series.to_jet(pull),
+    }
+    out = {name: values[0] for name, values in jets.items()}
+    for nu in range(1, len(pull)):
+        out |= {f"{name}_d{nu}": values[nu] for name, values in jets.items()}
+    if len(pull) > 2:
+        drum, drum_rate = out["R_d2"] / b, out["R_d1"] / b
+        if rope_wrap:
+            drum, drum_rate = drum - out["theta_d2"], drum_rate - out["theta_d1"]
+        out["F"] = trolley * out["D_d2"] + f1 * out["D_d1"] + m * jet[2, 0]
+        out["C"] = inertia * drum + f2 * drum_rate - b * out["T"]
+    return out
+
+
+def check(crane: CraneParameters, plan: Trajectory) -> None:
+    """Reject a plan of the load that the crane cannot follow.
+
+    Over the whole interval, not at samples: g - z'' and T must be above 0
+    (from the exact extrema of z''), and so must R (from certified bounds of
+    a function of the jet).
+
+    Parameters
+    ----------
+    plan : Trajectory
+        Plan of x and z.
+
+    Raises
+    ------
+    ValueError
+        With the quantity, its limit, the worst value and its time.
+    """
+    if plan.naxes != 2:
+        raise ValueError(f"a plan of the load must have the axes x and z, got {plan.naxes} axes")
+    g = crane.gravity
+    fall = plan.extrema(2)
+    if not g - fall.maximum[1] > 0.0:
+        raise ValueError(
+            f"the rope can only pull: g - z'' must be above 0, got {g - fall.maximum[1]:.4g} m/s^2 "
+            f"at {fall.time_max[1]:.4g} s (tension T <= 0)"
+        )
+    if not plan.duration:
+        shortest, time = float(min(plan.initial[1], plan.final[1])), plan.start
+    else:
+        shortest, time = _shortest_rope(crane, plan, fall)
+    if not shortest > 0.0:
+        raise ValueError(f"the rope length R must be above 0, got {shortest:.4g} m at {time:.4g} s")
+
+
+def _shortest_rope(crane: CraneParameters, plan: Trajectory, acceleration: Extrema) -> tuple[float, float]:
+    """Certified lower bound of R over a plan, or its minimum where that decides or no bound does."""
+    g, b = crane.gravity, crane.drum_radius
+
+    def length(jet: Array) -> Array:
+        across, hanging = jet[2, 0], g - jet[2, 1]
+        return (jet[0, 1] * np.hypot(across, hanging) - b * across) / hanging
+
+    depth, across = float(plan.peak()[1]), float(max(-acceleration.minimum[0], acceleration.maximum[0]))
+    low, high = g - float(acceleration.maximum[1]), g - float(acceleration.minimum[1])
+    pull = math.hypot(across, high)
+    # Bounds of dR/dz, dR/dx'' and dR/dz'' over the ranges of the plan.
+    slopes = np.zeros((3, 2))
+    slopes[0, 1] = pull / low
+    slopes[2] = (depth + b) / low, depth / low + (depth * pull + b * across) / low**2
+    try:
+        found = plan.bounds(length, 2, slopes, max_cells=200_000)
+    except ValueError:  # so near to a limit that no number of cells decides
+        resolved = plan.extrema_of(length, 2)
+        return float(resolved.minimum[0]), float(resolved.time_min[0])
+    return (found.lower, found.time_min) if found.minimum > 0.0 else (found.minimum, found.time_min)

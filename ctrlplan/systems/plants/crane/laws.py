@@ -1,0 +1,232 @@
+"""The crane's laws as values: what each needs of the plan, its options, and the block it builds."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+import control as ct
+
+from ctrlplan._renamed import warn_renamed
+from ctrlplan.systems.flat import hurwitz_coefficients
+from ctrlplan.systems.plants.crane import blocks
+from ctrlplan.systems.plants.crane.parameters import CraneParameters
+
+LawName = Literal["setpoint", "generator", "load_feedback", "dynamic", "feedforward"]
+
+
+@dataclass(frozen=True)
+class Law(ABC):
+    """Law of a crane's loop: which plans it takes, and its block.
+
+    A new law is a frozen dataclass whose fields are its options. It must define
+
+    - `name`, `order`, `continuity`, and `outputs` where they are not the
+      references of the PIDs,
+    - `build`, which returns the block.
+
+    An instance is given to `crane_loop`; one line in `LAWS` adds a name for it,
+    which study files read as well.
+
+    Attributes
+    ----------
+    name : str
+        Name of the law, in messages and in `LAWS`.
+    order : int
+        Highest derivative of the plan that the block reads.
+    continuity : int
+        Highest derivative of the plan that must not jump; -1 where positions
+        may jump.
+    outputs : tuple of str
+        D_ref and R_ref, which the PIDs follow, or the inputs F and C of the crane.
+
+    Examples
+    --------
+    Set points that are wrong by a constant, for a test of integral action:
+
+    >>> from dataclasses import dataclass
+    >>> import control as ct
+    >>> import ctrlplan as cp
+    >>> @dataclass(frozen=True)
+    ... class OffsetLaw(cp.Law):
+    ...     name = "offset"
+    ...     order = 0
+    ...     continuity = -1
+    ...     offset: float = 0.1
+    ...     def build(self, crane):
+    ...         gain = [[1.0, 0.0], [0.0, 1.0]]
+    ...         return ct.nlsys(
+    ...             None,
+    ...             lambda t, x, u, params: [u[0] - crane.drum_radius + self.offset, u[1]],
+    ...             inputs=["x_ref", "z_ref"], outputs=["D_ref", "R_ref"], name="offset",
+    ...         )
+    >>> step = cp.Step([1.0, 10.0], [0.0, 10.0], labels=["x", "z"])
+    >>> loop = cp.plants.crane_loop(cp.plants.Crane(), step, OffsetLaw(offset=0.2))
+    >>> "offset" in [block.name for block in loop.syslist]
+    True
+    """
+
+    name: ClassVar[str]
+    order: ClassVar[int]
+    continuity: ClassVar[int]
+    outputs: ClassVar[tuple[str, str]] = ("D_ref", "R_ref")
+
+    @abstractmethod
+    def build(self, crane: CraneParameters) -> ct.NonlinearIOSystem:
+        """Block of the law.
+
+        Parameters
+        ----------
+        crane : Crane
+            The plant as the law knows it.
+
+        Returns
+        -------
+        control.NonlinearIOSystem
+            Inputs among x_ref, x_ref_d1, ... up to `order`, the same of z, and
+            outputs of the crane; outputs those in `outputs`.
+        """
+
+
+@dataclass(frozen=True)
+class SetpointLaw(Law):
+    """References of a load at rest, for steps; block `create_still_iosystem`."""
+
+    name = "setpoint"
+    order = 0
+    continuity = -1
+
+    def build(self, crane: CraneParameters) -> ct.NonlinearIOSystem:
+        """Block from x_ref and z_ref to D_ref and R_ref."""
+        return blocks.create_still_iosystem(crane)
+
+
+@dataclass(frozen=True)
+class GeneratorLaw(Law):
+    """Figure 3's reference generator; block `create_generator_iosystem`."""
+
+    name = "generator"
+    order = 2
+    continuity = 0
+
+    def build(self, crane: CraneParameters) -> ct.NonlinearIOSystem:
+        """Block from the jets of order 2 to D_ref and R_ref."""
+        return blocks.create_generator_iosystem(crane)
+
+
+@dataclass(frozen=True)
+class LoadFeedbackLaw(Law):
+    """Reference generator with feedback from the load; block `create_load_feedback_iosystem`.
+
+    Parameters
+    ----------
+    load_bandwidth : float, optional
+        Natural frequency of the load's error [rad/s], above 0; stable with the
+        study's PIDs from 0.1 to 3.
+    damping : float, optional
+        Its damping ratio, above 0; 0.7 to 1.
+
+    Raises
+    ------
+    ValueError
+        If an option is not finite and above 0.
+    """
+
+    name = "load_feedback"
+    order = 2
+    continuity = 0
+
+    load_bandwidth: float = 1.0
+    damping: float = 1.0
+
+    def __post_init__(self) -> None:
+        for label, value in (("load_bandwidth", self.load_bandwidth), ("damping", self.damping)):
+            if not (math.isfinite(value) and value > 0.0):
+                raise ValueError(f"{label} must be finite and above 0, got {value}")
+
+    def build(self, crane: CraneParameters) -> ct.NonlinearIOSystem:
+        """Block from the jets of order 2 and the load's x to D_ref and R_ref."""
+        return blocks.create_load_feedback_iosystem(crane, self.load_bandwidth, self.damping)
+
+
+@dataclass(frozen=True)
+class DynamicLaw(Law):
+    """The whole law (9)-(11), by dynamic extension; block `create_dynamic_law_iosystem`.
+
+    Parameters
+    ----------
+    poles : sequence of complex, optional
+        Four poles [rad/s] of the error of x, and the same of z.
+
+    Raises
+    ------
+    ValueError
+        If the poles are not four, not conjugate pairs, or not stable.
+    """
+
+    name = "dynamic"
+    order = 4
+    continuity = 3
+    outputs = ("F", "C")
+
+    poles: Sequence[complex] = (-1.0, -1.2, -1.4, -1.6)
+
+    def __post_init__(self) -> None:
+        hurwitz_coefficients(self.poles, 4)
+        object.__setattr__(self, "poles", tuple(self.poles))
+
+    def build(self, crane: CraneParameters) -> ct.NonlinearIOSystem:
+        """Block from the jets of order 4 and the crane's outputs to F and C."""
+        return blocks.create_dynamic_law_iosystem(crane, self.poles)
+
+
+@dataclass(frozen=True)
+class FeedforwardLaw(Law):
+    """Force and torque from the plan alone; block `create_crane_feedforward_iosystem`."""
+
+    name = "feedforward"
+    order = 4
+    continuity = 3
+    outputs = ("F", "C")
+
+    def build(self, crane: CraneParameters) -> ct.NonlinearIOSystem:
+        """Block from the jets of order 4 to F and C."""
+        return blocks.create_crane_feedforward_iosystem(crane)
+
+
+LAWS: dict[str, Law] = {
+    law.name: law for law in (SetpointLaw(), GeneratorLaw(), LoadFeedbackLaw(), DynamicLaw(), FeedforwardLaw())
+}
+"""Laws by name, with their default options: the short form of a law."""
+
+_OLD_NAMES = {"still": "setpoint"}
+
+
+def as_law(law: Law | str) -> Law:
+    """Law itself, or the one of a name.
+
+    Raises
+    ------
+    TypeError
+        If it is neither a law nor a name.
+    ValueError
+        If the name is not in `LAWS`.
+
+    Warns
+    -----
+    FutureWarning
+        If the name is an old one.
+    """
+    if isinstance(law, Law):
+        return law
+    if not isinstance(law, str):
+        raise TypeError(f"law must be a Law or one of {', '.join(LAWS)}, got {law!r}")
+    if law in _OLD_NAMES:
+        warn_renamed(f'law "{law}"', f'"{_OLD_NAMES[law]}"')
+    name = _OLD_NAMES.get(law, law)
+    if name not in LAWS:
+        raise ValueError(f"law must be one of {', '.join(LAWS)}, got {law!r}")
+    return LAWS[name]

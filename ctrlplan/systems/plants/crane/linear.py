@@ -1,0 +1,137 @@
+"""Linear models of the crane's drives, and the PIDs tuned on them.
+
+The tension is a disturbance in the models of trolley and hoist alone.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import control as ct
+
+from ctrlplan.systems.pid import create_pid_iosystem
+from ctrlplan.systems.plants.crane.parameters import CraneParameters
+
+
+def linear_trolley(crane: CraneParameters, name: str = "trolley") -> ct.StateSpace:
+    """D/F = 1/(s (M_c s + f1)): trolley alone, the tension a disturbance."""
+    return _double(1.0 / crane.trolley_mass, crane.trolley_friction / crane.trolley_mass, "F", "D", name)
+
+
+def linear_hoist(crane: CraneParameters, name: str = "hoist", *, with_load: bool = False) -> ct.StateSpace:
+    """R/C = b/(s (J s + f2)): drum alone, the tension a disturbance.
+
+    With the load, whose weight is balanced, J + m b^2 stands for J: the
+    nonlinear crane linearised at equilibrium.
+    """
+    inertia = crane.drum_inertia + (crane.load_mass * crane.drum_radius**2 if with_load else 0.0)
+    return _double(crane.drum_radius / inertia, crane.drum_friction / inertia, "C", "R", name)
+
+
+def linear_coupled(crane: CraneParameters, rope_length: float, name: str = "crane") -> ct.InterconnectedSystem:
+    """Trolley and swing about equilibrium at a rope length, coupled by the tension.
+
+    An interconnection of the trolley and the pendulum; input F, outputs D
+    and theta: D/F = (R s^2 + g)/(s [(M_c s + f1)(R s^2 + g) + m g s]).
+    """
+    if not 0.0 < rope_length < math.inf:
+        raise ValueError(f"rope_length must be above 0 and finite, got {rope_length:g}")
+    g = crane.gravity
+    trolley = ct.ss(
+        [[0.0, 1.0], [0.0, -crane.trolley_friction / crane.trolley_mass]],
+        [[0.0, 0.0], [1.0 / crane.trolley_mass, crane.load_mass * g / crane.trolley_mass]],
+        [[1.0, 0.0], [0.0, -crane.trolley_friction / crane.trolley_mass]],
+        [[0.0, 0.0], [1.0 / crane.trolley_mass, crane.load_mass * g / crane.trolley_mass]],
+        inputs=["F", "theta"],
+        outputs=["D", "D_d2"],
+        states=["D", "D_d1"],
+        name="trolley",
+    )
+    pendulum = ct.ss(
+        [[0.0, 1.0], [-g / rope_length, 0.0]],
+        [[0.0], [-1.0 / rope_length]],
+        [[1.0, 0.0]],
+        [[0.0]],
+        inputs=["D_d2"],
+        outputs=["theta"],
+        states=["theta", "theta_d1"],
+        name="pendulum",
+    )
+    return ct.interconnect([trolley, pendulum], inputs=["F"], outputs=["D", "theta"], name=name)
+
+
+def trolley_pid(
+    crane: CraneParameters,
+    bandwidth: float = 5.0,
+    tf: float = 0.02,
+    *,
+    bias: float = 0.0,
+    limits: Sequence[float] | None = None,
+    tracking_time: float | None = None,
+) -> ct.StateSpace | ct.NonlinearIOSystem:
+    """PID on D with a triple pole at -bandwidth [rad/s] on the trolley alone; inputs D_ref and D, output F."""
+    return create_pid_iosystem(
+        *_triple_pole(crane.trolley_mass, crane.trolley_friction, bandwidth),
+        tf,
+        bias=bias,
+        limits=limits,
+        tracking_time=tracking_time,
+        inputs=("D_ref", "D"),
+        output="F",
+        name="trolley_pid",
+    )
+
+
+def hoist_pid(
+    crane: CraneParameters,
+    bandwidth: float = 5.0,
+    tf: float = 0.02,
+    *,
+    limits: Sequence[float] | None = None,
+    tracking_time: float | None = None,
+) -> ct.StateSpace | ct.NonlinearIOSystem:
+    """PID on R, the load's inertia included and its weight as the bias; inputs R_ref and R, output C."""
+    return create_pid_iosystem(
+        *_hoist_gains(crane, bandwidth),
+        tf,
+        bias=-crane.drum_radius * crane.load_mass * crane.gravity,
+        limits=limits,
+        tracking_time=tracking_time,
+        inputs=("R_ref", "R"),
+        output="C",
+        name="hoist_pid",
+    )
+
+
+def linear_trolley_loop(crane: CraneParameters, bandwidth: float = 5.0, tf: float = 0.02) -> ct.InterconnectedSystem:
+    """Trolley alone with its PID: input D_ref, output D."""
+    blocks = [trolley_pid(crane, bandwidth, tf), linear_trolley(crane)]
+    return ct.interconnect(blocks, inputs=["D_ref"], outputs=["D"], name="trolley_loop")
+
+
+def linear_hoist_loop(crane: CraneParameters, bandwidth: float = 5.0, tf: float = 0.02) -> ct.InterconnectedSystem:
+    """Drum and load with their PID, about the weight of the load: input R_ref, output R."""
+    pid = create_pid_iosystem(*_hoist_gains(crane, bandwidth), tf, inputs=("R_ref", "R"), output="C", name="hoist_pid")
+    return ct.interconnect(
+        [pid, linear_hoist(crane, with_load=True)], inputs=["R_ref"], outputs=["R"], name="hoist_loop"
+    )
+
+
+def _hoist_gains(crane: CraneParameters, bandwidth: float) -> tuple[float, float, float]:
+    b = crane.drum_radius
+    return _triple_pole(crane.drum_inertia / b + crane.load_mass * b, crane.drum_friction / b, bandwidth)
+
+
+def _double(gain: float, damping: float, source: str, sink: str, name: str) -> ct.StateSpace:
+    """gain/(s (s + damping))."""
+    return ct.ss(
+        [[0.0, 1.0], [0.0, -damping]], [[0.0], [gain]], [[1.0, 0.0]], [[0.0]], inputs=source, outputs=sink, name=name
+    )
+
+
+def _triple_pole(mass: float, friction: float, bandwidth: float) -> tuple[float, float, float]:
+    """Kp, Ki, Kd that put three poles at -bandwidth on 1/(s (mass s + friction))."""
+    if not (math.isfinite(bandwidth) and bandwidth > 0.0):
+        raise ValueError(f"bandwidth must be finite and above 0, got {bandwidth:g}")
+    return 3.0 * mass * bandwidth**2, mass * bandwidth**3, 3.0 * mass * bandwidth - friction

@@ -1,0 +1,222 @@
+"""The crane's closed loops: source, law, PIDs, crane."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import fields, replace
+
+import control as ct
+import numpy as np
+from numpy.typing import NDArray
+
+from ctrlplan.systems.plants.crane import linear, model
+from ctrlplan.systems.plants.crane.flatness import check
+from ctrlplan.systems.plants.crane.laws import Law, LawName, as_law
+from ctrlplan.systems.plants.crane.parameters import CraneParameters
+from ctrlplan.systems.source import create_source_iosystem
+from ctrlplan.traits import declare, traits_of
+from ctrlplan.trajectories import Trajectory, stack
+
+
+def crane_loop(
+    crane: CraneParameters,
+    plan: Trajectory,
+    law: Law | LawName = "generator",
+    *,
+    load_bandwidth: float | None = None,
+    damping: float | None = None,
+    poles: Sequence[complex] | None = None,
+    bandwidth: float = 5.0,
+    tf: float = 0.02,
+    force_limits: Sequence[float] | None = None,
+    torque_limits: Sequence[float] | None = None,
+    reference: Sequence[ct.InputOutputSystem] | None = None,
+    wind: Trajectory | None = None,
+    inputs: Sequence[str] = (),
+    name: str = "crane_loop",
+) -> ct.InterconnectedSystem:
+    """Closed loop of figure 3: source, law, two PIDs, crane.
+
+    Parameters
+    ----------
+    crane : Crane
+        The plant.
+    plan : Trajectory
+        Plan of the load's x and z (down) [m].
+    law : Law or {"setpoint", "generator", "load_feedback", "dynamic", "feedforward"}, optional
+        A law, or the name of one in `LAWS`: the references of a load at rest,
+        for steps; figure 3's reference generator; the generator with feedback
+        from the load; the whole law by dynamic extension; its open-loop half.
+        The first three output references of the PIDs, the others force and
+        torque without PIDs.
+    load_bandwidth, damping, poles : optional
+        Options of a law given by its name, as in `LoadFeedbackLaw` and
+        `DynamicLaw`.
+    bandwidth : float, optional
+        Triple pole of the PIDs [rad/s].
+    tf : float, optional
+        Their derivative filter [s].
+    force_limits, torque_limits : (float, float), optional
+        Limits of F [N] and C [N m], with anti-windup.
+    reference : sequence of control systems, optional
+        Blocks in the place of the plan's source: a replanner, a time scaling,
+        a command filter, with the blocks that supply their inputs. (A governor,
+        which reads the states of the whole loop, stands outside.) Their outputs
+        that no other block reads must be the jets that the law reads, x_ref,
+        x_ref_d1, ..., z_ref, .... A block that does not start at 0 declares its
+        ``initial_state``.
+    wind : Trajectory, optional
+        Horizontal force on the load [N], along x.
+    inputs : sequence of str, optional
+        Signals that are inputs of the loop: what blocks of `reference` read, and
+        wind, where it is no trajectory.
+    name : str, optional
+        Name of the loop.
+
+    Returns
+    -------
+    control.InterconnectedSystem
+        Without inputs unless given; outputs those of the crane, F and C, x_ref and z_ref.
+        Its attribute ``initial_state`` is the equilibrium at the plan's first position.
+
+    Raises
+    ------
+    TypeError
+        If `plan`, `law`, `inputs` or `reference` is of a wrong kind.
+    ValueError
+        If the law is unknown or has no such option, the crane cannot follow the
+        plan, or a derivative that the law needs jumps: the message says which
+        and when.
+
+    Examples
+    --------
+    >>> import ctrlplan as cp
+    >>> plan = cp.PolySpline([
+    ...     cp.Waypoint.from_jets(0.0, x=[0, 0, 0], z=[10, 0, 0]),
+    ...     cp.Waypoint.from_jets(15.0, x=[20, 0, 0], z=[11, 0, 0]),
+    ... ])
+    >>> loop = cp.plants.crane_loop(cp.plants.Crane(), plan)
+    >>> loop.output_labels[:3]
+    ['x', 'z', 'D']
+    >>> law = cp.plants.LoadFeedbackLaw(load_bandwidth=0.5)
+    >>> loop = cp.plants.crane_loop(cp.plants.Crane(), plan, law, force_limits=(-30e3, 30e3))
+    """
+    chosen = _with_options(law, {"load_bandwidth": load_bandwidth, "damping": damping, "poles": poles})
+    plan = _named(plan)
+    _check_smooth(plan, chosen)
+    check(crane, plan)
+    _check_signals(reference, wind, inputs)
+    sources = [create_source_iosystem(plan, chosen.order, suffix="_ref")] if reference is None else list(reference)
+    if wind is not None:
+        sources.append(create_source_iosystem(stack([wind], labels=["wind"]), name="gust"))
+    blocks = [*sources, _block(chosen, crane)]
+    if chosen.outputs != _ACTUATED:
+        blocks.append(linear.trolley_pid(crane, bandwidth, tf, limits=force_limits))
+        blocks.append(linear.hoist_pid(crane, bandwidth, tf, limits=torque_limits))
+    elif force_limits is not None or torque_limits is not None:
+        raise ValueError(f"limits must go with a law that uses the PIDs, got law {chosen.name!r}")
+    blocks.append(model.iosystem(crane, wind=wind is not None or "wind" in inputs))
+    _check_fed(reference or (), blocks, inputs)
+    outputs = [*model.OUTPUTS, "F", "C", "x_ref", "z_ref"]
+    loop = ct.interconnect(blocks, inputs=list(inputs) or 0, outputs=outputs, name=name)
+    rest = model.equilibrium(crane, float(plan.initial[0]), float(plan.initial[1]))[0]
+    # The crane comes last; the states of law and PIDs are 0 at rest.
+    before = [_start(block) for block in blocks[:-1]]
+    loop.initial_state = np.concatenate([*before, rest])
+    return declare(loop, initial_state=loop.initial_state)
+
+
+_REFERENCES = ("D_ref", "R_ref")
+_ACTUATED = ("F", "C")
+
+
+def _with_options(law: Law | str, options: dict[str, float | Sequence[complex] | None]) -> Law:
+    """The law, with the options that were given beside its name."""
+    found = as_law(law)
+    given = {name: value for name, value in options.items() if value is not None}
+    if given and isinstance(law, Law):
+        raise TypeError(f"options of a law must be given to the law itself, got {', '.join(given)} with {law!r}")
+    known = [entry.name for entry in fields(found)]
+    unknown = [name for name in given if name not in known]
+    if unknown:
+        raise ValueError(
+            f"options of the law {found.name!r} must be among {', '.join(known) or 'none'}, got {', '.join(unknown)}"
+        )
+    return replace(found, **given) if given else found
+
+
+def _block(law: Law, crane: CraneParameters) -> ct.NonlinearIOSystem:
+    """Block of a law, which must have the outputs that the law states."""
+    if law.outputs not in (_REFERENCES, _ACTUATED):
+        raise ValueError(
+            f"outputs of a law must be {_REFERENCES} or {_ACTUATED}, got {law.outputs} of the law {law.name!r}"
+        )
+    block = law.build(crane)
+    missing = set(law.outputs) - set(getattr(block, "output_labels", ()))
+    if missing:
+        raise ValueError(
+            f"the law {law.name!r} must build a block with the outputs {' and '.join(law.outputs)}, got one without "
+            f"{' and '.join(sorted(missing))}"
+        )
+    return block
+
+
+def _check_signals(
+    reference: Sequence[ct.InputOutputSystem] | None, wind: Trajectory | None, inputs: Sequence[str]
+) -> None:
+    """Reject blocks, wind and inputs of a wrong kind."""
+    for label, values in (("inputs", inputs), ("reference", reference)):
+        if isinstance(values, str | ct.InputOutputSystem):
+            raise TypeError(f"{label} must be a sequence, got {values!r:.60}")
+    if len(set(inputs)) < len(inputs):
+        raise ValueError(f"inputs must not name a signal twice, got {', '.join(inputs)}")
+    for block in reference or ():
+        if not isinstance(block, ct.InputOutputSystem):
+            raise TypeError(f"reference must hold control systems, got {type(block).__name__}")
+    if wind is not None and not (isinstance(wind, Trajectory) and wind.naxes == 1 and "wind" not in inputs):
+        got = "wind among inputs as well" if "wind" in inputs else repr(wind)
+        raise ValueError(f"wind must be a trajectory of one axis, or one of inputs, got {got:.60}")
+
+
+def _check_fed(
+    reference: Sequence[ct.InputOutputSystem], blocks: Sequence[ct.InputOutputSystem], inputs: Sequence[str]
+) -> None:
+    """Reject blocks of the reference with an input that no block outputs: it would be 0."""
+    known = {*inputs, *(label for block in blocks for label in block.output_labels)}
+    for block in reference:
+        missing = [label for label in block.input_labels or () if label not in known]
+        if missing:
+            raise ValueError(
+                f"inputs of {block.name} must be outputs of other blocks or among inputs, got none for "
+                f"{', '.join(missing)}"
+            )
+
+
+def _start(block: ct.InputOutputSystem) -> NDArray[np.float64]:
+    """Initial state of a block: the declared one, or 0."""
+    start = traits_of(block).initial_state
+    return np.zeros(block.nstates or 0) if start is None else start
+
+
+def _named(plan: Trajectory) -> Trajectory:
+    """Plan of x and z: by name where its axes are called so, else in order."""
+    if not isinstance(plan, Trajectory):
+        raise TypeError(f"plan must be a Trajectory, got {type(plan).__name__}")
+    if plan.naxes != 2:
+        raise ValueError(f"a plan of the load must have the axes x and z, got {plan.naxes} axes")
+    if plan.labels == ("x", "z"):
+        return plan
+    if set(plan.labels) == {"x", "z"}:
+        return plan.select(["x", "z"])
+    return stack([plan], labels=["x", "z"])
+
+
+def _check_smooth(plan: Trajectory, law: Law) -> None:
+    """Reject a plan of which a derivative jumps that the law needs continuous."""
+    smooth = law.continuity
+    for jump in plan.jumps(smooth) if smooth >= 0 else ():
+        what = "position" if jump.order == 0 else f"derivative {jump.order}"
+        raise ValueError(
+            f"the law {law.name!r} must be given a plan continuous up to derivative {smooth}, got one whose {what} of "
+            f"{jump.label} jumps by {jump.size:.4g} at {jump.time:g} s"
+        )

@@ -1,0 +1,137 @@
+"""Equations of motion (13) and (14) of the crane, and the plant made of them.
+
+z points down. The rope leaves a drum of radius b on the trolley and hangs with
+length R from the point of tangency, at the angle theta from the vertical.
+Formulas take numbers, arrays, Taylor series and the symbols of a tracer alike.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from functools import partial
+
+import control as ct
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ctrlplan.systems.plants.crane.parameters import CraneParameters, Numbers
+from ctrlplan.systems.series import Quantity
+from ctrlplan.traits import declare
+
+Array = NDArray[np.float64]
+Params = Mapping[str, float] | None
+
+STATES = ("D", "R", "theta", "D_d1", "R_d1", "theta_d1")
+OUTPUTS = ("x", "z", "D", "R", "theta", "x_d1", "z_d1", "D_d1", "R_d1", "theta_d1", "T")
+
+
+def iosystem(crane: CraneParameters, name: str = "crane", *, wind: bool = False) -> ct.NonlinearIOSystem:
+    """Nonlinear plant, equations (13) and (14).
+
+    States D, R, theta and their rates; inputs F [N] on the trolley, C [N m]
+    on the drum, and with `wind` the horizontal force wind [N] on the load,
+    along x; outputs x, z, D, R, theta, the rates x_d1, z_d1,
+    D_d1, R_d1, theta_d1, and the tension T [N]. Parameters of a run named
+    as this crane's own (``params={"load_mass": 1000.0}``) override them in
+    the plant alone: a payload that the controller does not know of.
+    """
+    block = ct.nlsys(
+        partial(update, crane),
+        partial(output, crane),
+        states=list(STATES),
+        inputs=["F", "C", "wind"] if wind else ["F", "C"],
+        outputs=list(OUTPUTS),
+        name=name,
+    )
+    # Forces and torque have a direct feedthrough to the tension alone.
+    declare(block, feedthrough=np.array([[output == "T"] * (2 + wind) for output in OUTPUTS]))
+    return block
+
+
+def equilibrium(crane: CraneParameters, x: float, z: float) -> tuple[Array, Array]:
+    """State and inputs (F, C) at which the load rests at (x, z).
+
+    Raises
+    ------
+    ValueError
+        If z is not above 0: the load hangs below the trolley.
+    """
+    if not z > 0.0:
+        raise ValueError(f"z must be above 0 (down), got {z:g}")
+    if not math.isfinite(x + z):
+        raise ValueError(f"x and z must be finite, got {x:g} and {z:g}")
+    state = np.array([x - crane.drum_radius, z, 0.0, 0.0, 0.0, 0.0])
+    return state, np.array([0.0, -crane.drum_radius * crane.load_mass * crane.gravity])
+
+
+def accelerations(
+    crane: CraneParameters, state: Quantity, force: Quantity, torque: Quantity, wind: Quantity = 0.0
+) -> tuple[Quantity, Quantity, Quantity, Quantity]:
+    """D'', R'', theta'' and the tension T, solved from (13) and (14)."""
+    return solved(crane.numbers(), crane.rope_wrap, state, force, torque, wind)
+
+
+def energy(crane: CraneParameters, state: ArrayLike) -> Array:
+    """Mechanical energy [J] of states (6, ...); zero potential at z = 0.
+
+    The drum turns at R'/b, or with `rope_wrap` at R'/b - theta'.
+    """
+    values = np.asarray(state, dtype=float)
+    m, trolley, inertia, b, _, _, g = crane.numbers()
+    _, z, x_rate, z_rate = load(b, values)
+    drum = values[4] / b - (values[5] if crane.rope_wrap else 0.0)
+    kinetic = 0.5 * (m * (x_rate**2 + z_rate**2) + trolley * values[3] ** 2 + inertia * drum**2)
+    return kinetic - m * g * z
+
+
+def update(crane: CraneParameters, t: float, state: Array, inputs: Array, params: Params) -> Array:
+    """Rates of the states, as `control.nlsys` calls them."""
+    d2, r2, theta2, _ = solved(crane.numbers(params), crane.rope_wrap, state, *_forces(inputs))
+    return np.array([state[3], state[4], state[5], d2, r2, theta2])
+
+
+def output(crane: CraneParameters, t: float, state: Array, inputs: Array, params: Params) -> Array:
+    """`OUTPUTS`, as `control.nlsys` calls them."""
+    numbers = crane.numbers(params)
+    x, z, x_rate, z_rate = load(numbers[3], state)
+    tension = solved(numbers, crane.rope_wrap, state, *_forces(inputs))[3]
+    return np.array([x, z, state[0], state[1], state[2], x_rate, z_rate, state[3], state[4], state[5], tension])
+
+
+def solved(
+    numbers: Numbers, rope_wrap: bool, state: Quantity, force: Quantity, torque: Quantity, wind: Quantity
+) -> tuple[Quantity, Quantity, Quantity, Quantity]:
+    """D'', R'', theta'' and T for given parameters."""
+    m, trolley, inertia, b, f1, f2, g = numbers
+    _, r, theta, d_rate, r_rate, rate = (state[i] for i in range(6))
+    s, c = np.sin(theta), np.cos(theta)
+    # Each acceleration is linear in T; the first equation of motion then gives T.
+    d0, d1 = (force - f1 * d_rate) / trolley, s / trolley
+    push = wind / m
+    swing = push * c - g * s - 2.0 * r_rate * rate + b * rate * rate
+    t0, t1 = (swing - c * d0) / r, -c * d1 / r
+    along = push * s + g * c + r * rate * rate
+    if rope_wrap:
+        r0, r1 = b / inertia * (torque - f2 * (r_rate / b - rate)), b * b / inertia
+        tension = (along - s * d0 - r0) / (s * d1 + r1 + 1.0 / m)
+        turning = t0 + t1 * tension
+        return d0 + d1 * tension, r0 + r1 * tension + b * turning, turning, tension
+    r0, r1 = b / inertia * (torque - f2 * r_rate / b), b * b / inertia
+    tension = (along - s * d0 - r0 + b * t0) / (s * d1 + r1 + 1.0 / m - b * t1)
+    return d0 + d1 * tension, r0 + r1 * tension, t0 + t1 * tension, tension
+
+
+def load(b: float, state: Quantity) -> tuple[Quantity, Quantity, Quantity, Quantity]:
+    """x, z and their rates of a state, b the radius of the drum."""
+    d, r, theta, d_rate, r_rate, rate = (state[i] for i in range(6))
+    s, c = np.sin(theta), np.cos(theta)
+    x, z = r * s + d + b * c, r * c - b * s
+    x_rate = r_rate * s + r * rate * c + d_rate - b * rate * s
+    z_rate = r_rate * c - r * rate * s - b * rate * c
+    return x, z, x_rate, z_rate
+
+
+def _forces(inputs: Array) -> tuple[float, float, float]:
+    """F, C and the wind, 0 where it is no input."""
+    return inputs[0], inputs[1], inputs[2] if inputs.shape[0] > 2 else 0.0
