@@ -38,6 +38,8 @@ def test_entries_are_derivatives_over_factorials():
         (lambda a, b: series.multiply(a, b), A * B),
         (lambda a, b: series.divide(a, b), A / B),
         (lambda a, b: series.sqrt(a), sp.sqrt(A)),
+        (lambda a, b: series.sincos(a)[0], sp.sin(A)),
+        (lambda a, b: series.sincos(b)[1], sp.cos(B)),
         (lambda a, b: series.arctan2(a, b), sp.atan2(A, B)),
         (lambda a, b: series.arctan2(-a, -b), sp.atan2(-A, -B)),
         (lambda a, b: series.sqrt(series.multiply(a, a) + series.multiply(b, b)), sp.sqrt(A**2 + B**2)),
@@ -76,3 +78,43 @@ def test_many_points_at_once(name):
         np.testing.assert_allclose(found[:, i], operation(a[:, i], b[:, i]), rtol=1e-14)
     np.testing.assert_allclose(series.sqrt(a)[:, 1], series.sqrt(a[:, 1]), rtol=1e-14)
     np.testing.assert_allclose(series.to_jet(series.from_jet(a)), a, rtol=1e-15)
+
+
+# Series in arithmetic written for numbers
+
+
+@pytest.mark.parametrize(
+    ("formula", "expression"),
+    [
+        (lambda a, b: a + b - a * b, A + B - A * B),
+        (lambda a, b: (2.0 - a) / (b + 3.0), (2 - A) / (B + 3)),
+        (lambda a, b: 1.5 / b - -a * 0.25, sp.Rational(3, 2) / B + A / 4),
+        (lambda a, b: np.sin(a) * np.cos(b) / 2.0, sp.sin(A) * sp.cos(B) / 2),
+        (lambda a, b: np.float64(2.0) * a + np.float64(1.0), 2 * A + 1),
+        (lambda a, b: np.array(2.0) - a, 2 - A),
+    ],
+)
+def test_formulas_of_numbers_take_series(formula, expression):
+    found = formula(series.Taylor(of(A)), series.Taylor(of(B)))
+    assert isinstance(found, series.Taylor)
+    assert_series(found.terms, expression)
+
+
+def test_arrays_beside_series_are_constants_at_each_time():
+    terms = np.stack([of(A, 3), of(B, 3)], axis=1)  # of two functions, as of two times
+    gains = np.array([2.0, -3.0])
+    found = gains * series.Taylor(terms) - gains
+    assert found.terms.shape == (4, 2)
+    assert_series(found.terms[:, 0], 2 * A - 2)
+    assert_series(found.terms[:, 1], -3 * B + 3)
+
+
+def test_the_shorter_series_decides():
+    short, long = series.Taylor(of(A, 2)), series.Taylor(of(B, 4))
+    for found in (short + long, long - short, short * long, long / short):
+        assert len(found.terms) == 3
+
+
+def test_integrals_start_where_they_are_told():
+    found = series.Taylor.integral(np.array(float((A).subs(T, sp.Rational(1, 3)))), series.Taylor(of(A.diff(T), 3)))
+    assert_series(found.terms, A)

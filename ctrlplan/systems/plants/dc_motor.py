@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-import control.flatsys as fs
 import numpy as np
 
+from ctrlplan.flatness import FlatSystem
 from ctrlplan.systems.plants.parameters import check_parameters, overruled
 
 
@@ -18,7 +18,7 @@ def dc_motor(
     inertia: float = 0.01,
     friction: float = 0.1,
     name: str = "dc_motor",
-) -> fs.FlatSystem:
+) -> FlatSystem:
     r"""Motor from the armature's voltage to the angle, of order 3.
 
     .. math:: J \ddot\varphi + b \dot\varphi = K i, \qquad L \dot i + R i + K \dot\varphi = V
@@ -46,7 +46,8 @@ def dc_motor(
 
     Returns
     -------
-    control.flatsys.FlatSystem
+    ctrlplan.flatness.FlatSystem
+        A `control.flatsys.FlatSystem`.
 
     Raises
     ------
@@ -84,11 +85,13 @@ def dc_motor(
         return np.array([angle, speed, current]), np.array([voltage])
 
     states = ["angle", "speed", "current"]
-    return fs.FlatSystem(
+    return FlatSystem(
         forward,
         reverse,
         update,
         lambda t, x, u, params: x,
+        orders=(3,),
+        flat_labels=("angle",),
         states=states,
         inputs=["voltage"],
         outputs=states,

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-import control.flatsys as fs
 import numpy as np
 
+from ctrlplan.flatness import FlatSystem
 from ctrlplan.systems.plants.parameters import check_parameters, overruled
 
 
@@ -19,7 +19,7 @@ def flexible_joint(
     length: float = 0.2,
     gravity: float = 9.81,
     name: str = "flexible_joint",
-) -> fs.FlatSystem:
+) -> FlatSystem:
     r"""Link behind an elastic joint, from the motor's torque, of order 4.
 
     .. math:: I \ddot q_1 + m g l \sin q_1 + k (q_1 - q_2) = 0, \qquad J \ddot q_2 + k (q_2 - q_1) = u
@@ -50,7 +50,8 @@ def flexible_joint(
 
     Returns
     -------
-    control.flatsys.FlatSystem
+    ctrlplan.flatness.FlatSystem
+        A `control.flatsys.FlatSystem`.
 
     Raises
     ------
@@ -98,11 +99,13 @@ def flexible_joint(
         return np.array([angle, motor, rate, motor_rate]), np.array([torque])
 
     states = ["q1", "q2", "q1_d1", "q2_d1"]
-    return fs.FlatSystem(
+    return FlatSystem(
         forward,
         reverse,
         update,
         lambda t, x, u, params: x,
+        orders=(4,),
+        flat_labels=("q1",),
         states=states,
         inputs=["u"],
         outputs=states,

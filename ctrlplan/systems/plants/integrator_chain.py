@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from typing import Any
 
-import control.flatsys as fs
 import numpy as np
 
+from ctrlplan.flatness import FlatSystem
 from ctrlplan.trajectories import derivative_name
 from ctrlplan.trajectories.common import checked_count, default_labels
 
 
-def integrator_chain(order: int, axes: int = 1, name: str = "integrator_chain") -> fs.FlatSystem:
+def integrator_chain(order: int, axes: int = 1, name: str = "integrator_chain") -> FlatSystem:
     """Chains of integrators side by side: y^(order) = u on each axis.
 
     States, which are the outputs as well: axis by axis y, y_d1, ... up to
@@ -29,7 +29,8 @@ def integrator_chain(order: int, axes: int = 1, name: str = "integrator_chain") 
 
     Returns
     -------
-    control.flatsys.FlatSystem
+    ctrlplan.flatness.FlatSystem
+        A `control.flatsys.FlatSystem`.
 
     Raises
     ------
@@ -54,11 +55,13 @@ def integrator_chain(order: int, axes: int = 1, name: str = "integrator_chain") 
         return np.array([value for row in forward(x, u, params) for value in row[1:]])
 
     states = [derivative_name(label, k) for label in default_labels(count) for k in range(r)]
-    return fs.FlatSystem(
+    return FlatSystem(
         forward,
         reverse,
         update,
         lambda t, x, u, params: x,
+        orders=(r,) * count,
+        flat_labels=default_labels(count),
         states=states,
         inputs=[label.replace("y", "u") for label in default_labels(count)],
         outputs=states,
