@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import sys
 import warnings
-from typing import TypeVar
-
-T = TypeVar("T")
+from typing import Any
 
 
 def warn_renamed(old: str, new: str) -> None:
@@ -31,7 +29,7 @@ def warn_renamed(old: str, new: str) -> None:
     )
 
 
-def renamed_argument(old: str, old_value: T | None, new: str, new_value: T | None) -> T | None:
+def renamed_argument(old: str, old_value: Any, new: str, new_value: Any) -> Any:
     """Value of a keyword argument that may be given under its old name.
 
     Parameters

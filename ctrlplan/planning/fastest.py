@@ -15,6 +15,7 @@ from scipy.optimize import brentq
 
 from ctrlplan.planning.curve import curve
 from ctrlplan.planning.limits import Limited, Margin, Margins
+from ctrlplan.planning.quantities import System, system_given
 from ctrlplan.planning.time_law import with_fastest_law
 from ctrlplan.trajectories import PiecewiseSpline, Trajectory
 from ctrlplan.trajectories.common import Array, checked_pair
@@ -114,10 +115,11 @@ class Fastest:
 def fastest(
     plan: Trajectory,
     limits: Mapping[str, Any],
-    quantities: Any = None,
+    system: System | None = None,
     *,
     hold: str = "shape",
     durations: tuple[float, float] | None = None,
+    quantities: System | None = None,
 ) -> Fastest:
     """Shortest duration for which limits hold over the whole interval.
 
@@ -128,9 +130,9 @@ def fastest(
     ----------
     plan : Trajectory
         What is retimed; one without duration has nothing to retime.
-    limits, quantities
-        As for `margins`: of derivatives, and of quantities of a flat plant
-        such as ``crane.quantities``.
+    limits, system
+        As for `margins`: of derivatives, and of quantities of a system: a flat
+        system, a `Crane`, or a function of the jet.
     hold : {"shape", "waypoints", "path"}, optional
         What is kept. "shape": all times move in proportion, derivatives scale
         with them, at the ends as well. "waypoints": their times move in
@@ -143,6 +145,8 @@ def fastest(
         Durations [s] between which is searched: unless given, from a 64th of
         the shortest that was found (of the plan's duration where waypoints are
         held) to 64 times the plan's.
+    quantities : optional
+        Old name of `system`, with a FutureWarning.
 
     Returns
     -------
@@ -188,10 +192,17 @@ def fastest(
     >>> found = cp.fastest(move, {"y_d1": 0.5, "y_d2": 2.0})
     >>> round(found.duration, 9), found.active.bound.name
     (3.75, 'y_d1')
+
+    A turn of a motor, as fast as 120 V allow:
+
+    >>> turn = cp.PolySpline([cp.Waypoint(0, 0, 0, 0, 0), cp.Waypoint(2, 6.28, 0, 0, 0)])
+    >>> found = cp.fastest(turn, {"voltage": 120.0}, cp.plants.dc_motor())
+    >>> round(found.duration, 3), found.active.bound.name
+    (1.863, 'voltage')
     """
     if hold not in _HOLDS:
         raise ValueError(f"hold must be one of {', '.join(_HOLDS)}, got {hold!r}")
-    limited = Limited(plan, limits, quantities)
+    limited = Limited(plan, limits, system_given(system, quantities))
     limited.check_smooth(plan)
     extrema = plan.extrema()
     if not (extrema.maximum - extrema.minimum > 1e-14 * plan.peak()).any():

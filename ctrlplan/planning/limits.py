@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from html import escape
 from numbers import Real
@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ctrlplan._checks import real_array
+from ctrlplan.planning.quantities import Quantities, System, quantities_of, system_given
 from ctrlplan.trajectories import Trajectory, derivative_name
 from ctrlplan.trajectories.common import Array, checked_limits
 from ctrlplan.trajectories.extrema import function_extrema
@@ -19,9 +20,6 @@ from ctrlplan.trajectories.waypoint import ENTRIES
 
 if TYPE_CHECKING:
     import pandas as pd
-
-Quantities = Callable[[Array], Mapping[str, Array]]
-"""Maps a jet (order + 1, naxes, ntime) to signals (ntime,) by name."""
 
 _SAMPLES = 193
 _HIGHEST = 8
@@ -167,7 +165,9 @@ class Margins:
         return f"<table><thead><tr>{heads}</tr></thead><tbody>{cells}</tbody></table>"
 
 
-def margins(plan: Trajectory, limits: Mapping[str, Any], quantities: Any = None) -> Margins:
+def margins(
+    plan: Trajectory, limits: Mapping[str, Any], system: System | None = None, *, quantities: System | None = None
+) -> Margins:
     """How near a plan comes to limits, over its whole interval.
 
     Parameters
@@ -181,10 +181,14 @@ def margins(plan: Trajectory, limits: Mapping[str, Any], quantities: Any = None)
         axis: a number, or a tuple (minimum, maximum), for all axes; a list or
         array of naxes numbers, or of shape (naxes, 2), by axis. A derivative
         must be allowed to be 0.
-    quantities : callable or object, optional
-        Maps a jet (order + 1, naxes, ntime) to a mapping of names to signals
-        (ntime,), such as ``crane.quantities``; or a plant that has such a
-        method.
+    system : flat system, Crane or callable, optional
+        Whose quantities are limited by name: a `control.flatsys.FlatSystem`
+        (states and inputs), a `Crane`, any plant with a method ``quantities``,
+        or a function that maps a jet (order + 1, naxes, ntime) to a mapping of
+        names to signals (ntime,). What the plan does not determine at rest
+        (heading and steering angle of a car) is nan there and rejected.
+    quantities : optional
+        Old name of `system`, with a FutureWarning.
 
     Returns
     -------
@@ -208,7 +212,7 @@ def margins(plan: Trajectory, limits: Mapping[str, Any], quantities: Any = None)
     >>> print(cp.margins(move, {"y_d1": 1.0}))
     y_d1 within ±1: 0.9375 at 1 s, 6.25 % left
     """
-    limited = Limited(plan, limits, quantities)
+    limited = Limited(plan, limits, system_given(system, quantities))
     limited.check_smooth(plan)
     return limited.margins(plan)
 
@@ -223,14 +227,14 @@ class Limited:
     Parameters are those of `margins`; the plan stands for others of its axes.
     """
 
-    def __init__(self, plan: Trajectory, limits: Mapping[str, Any], quantities: Any = None) -> None:
+    def __init__(self, plan: Trajectory, limits: Mapping[str, Any], system: System | None = None) -> None:
         if not isinstance(plan, Trajectory):
             raise TypeError(f"plan must be a Trajectory (the attribute plan of what was chosen), got {plan!r:.60}")
         if not plan.duration:
             raise ValueError("a plan that is limited must have a duration, got a step")
         if not isinstance(limits, Mapping):
             raise TypeError(f"limits must be a mapping of names to limits, got {type(limits).__name__}")
-        self._quantities = _checked_quantities(quantities)
+        self._quantities = quantities_of(system)
         self.bounds = tuple(self._bounds(plan, limits))
         if not self.bounds:
             raise ValueError("limits must name at least one signal, got none")
@@ -367,19 +371,12 @@ class Limited:
                     yield replace(_bound(name, own, order, axis), name=named)
             else:
                 plain = [quantity for quantity in orders if "_d" not in quantity]
-                known = f", or quantities ({', '.join(plain)}, ...)" if orders else "; quantities were not given"
+                known = f", or quantities ({', '.join(plain)}, ...)" if orders else "; a system was not given"
                 axes = ", ".join(derivative_name(label, 1) for label in plan.labels)
                 raise ValueError(
                     f"limits must name derivatives of the axes ({axes}, ...), velocity, acceleration, jerk or snap of "
                     f"them all{known}, got {name!r}"
                 )
-
-
-def _checked_quantities(quantities: Any) -> Quantities | None:
-    found = getattr(quantities, "quantities", quantities)
-    if found is not None and not callable(found):
-        raise TypeError(f"quantities must be a function of a jet, got {type(quantities).__name__}")
-    return found
 
 
 _FORMS = "a tuple (minimum, maximum) holds for every axis, a list of one number an axis gives magnitudes"

@@ -16,6 +16,7 @@ import control.flatsys as fs
 import numpy as np
 from numpy.typing import NDArray
 
+from ctrlplan._renamed import outside_stacklevel
 from ctrlplan.systems.linear_flat import LinearMaps, is_linear, linear_maps
 from ctrlplan.trajectories import derivative_name
 from ctrlplan.trajectories.common import checked_labels, default_labels
@@ -188,7 +189,7 @@ def warn_of_output(flat_system: fs.FlatSystem) -> None:
             warnings.warn(
                 f"{chosen}, but {name} is {gain:.6g} times it: a plan of {name} must be multiplied by "
                 f"{1.0 / gain:.6g}, or flat_system be a control.flatsys.FlatSystem whose flat output it is",
-                stacklevel=3,
+                stacklevel=outside_stacklevel(),
             )
         return
     terms = [f"{value:.6g} {derivative_name('z', k)}" for k, value in enumerate(coefficients.tolist()) if value]
@@ -198,7 +199,7 @@ def warn_of_output(flat_system: fs.FlatSystem) -> None:
     warnings.warn(
         f"{chosen}, since the plant has zeros: {name} = {' + '.join(terms)}, z the flat output. A plan is one of z, "
         f"not of {name}; {at_rest}, and on the way {name} differs from its plan by the derivatives of z",
-        stacklevel=3,
+        stacklevel=outside_stacklevel(),
     )
 
 

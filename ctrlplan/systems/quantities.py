@@ -1,4 +1,4 @@
-"""What a flat plant makes of a plan: its states and inputs, as planning asks for them."""
+"""States and inputs of flat systems without names of their own, as functions of the jet of a plan."""
 
 from __future__ import annotations
 
@@ -9,16 +9,30 @@ import control.flatsys as fs
 import numpy as np
 from numpy.typing import NDArray
 
+from ctrlplan._renamed import warn_renamed
+from ctrlplan.flatness import FlatSystem
 from ctrlplan.systems.flat import FlatPlant, check_maps, checked_plant, warn_of_output
 
 Array = NDArray[np.float64]
 
 
 def flat_quantities(flat_system: fs.FlatSystem) -> Callable[[Array], dict[str, Array]]:
-    """States and inputs of a flat system as functions of a plan of its flat outputs.
+    """Old name: `ctrlplan.fastest` and `ctrlplan.margins` take the flat system itself.
 
-    Handed to `ctrlplan.fastest` and `ctrlplan.margins`, so that limits can be
-    stated on them by name. (`Crane.quantities` is one already.)
+    Warns
+    -----
+    FutureWarning
+        Always.
+    """
+    warn_renamed("flat_quantities(flat_system)", "flat_system itself")
+    return quantities_of_flat_system(flat_system)
+
+
+def quantities_of_flat_system(flat_system: fs.FlatSystem) -> Callable[[Array], dict[str, Array]]:
+    """States and inputs of a flat system as functions of the jet of its flat outputs.
+
+    Those of a `ctrlplan.flatness.FlatSystem` itself; of any other of
+    python-control's by its reverse map, one time after the other.
 
     Parameters
     ----------
@@ -51,18 +65,9 @@ def flat_quantities(flat_system: fs.FlatSystem) -> Callable[[Array], dict[str, A
     -----
     What the flat output does not determine at rest (heading and steering angle of
     a car, quotients of derivatives that are 0 there) is nan at rest.
-
-    Examples
-    --------
-    A turn of a motor, as fast as 120 V allow:
-
-    >>> import ctrlplan as cp
-    >>> motor = cp.plants.dc_motor()
-    >>> turn = cp.PolySpline([cp.Waypoint(0, 0, 0, 0, 0), cp.Waypoint(2, 6.28, 0, 0, 0)])
-    >>> found = cp.fastest(turn, {"voltage": 120.0}, cp.flat_quantities(motor))
-    >>> round(found.duration, 3), found.active.bound.name
-    (1.863, 'voltage')
     """
+    if isinstance(flat_system, FlatSystem):
+        return flat_system.quantities
     plant = checked_plant(flat_system)
     warn_of_output(flat_system)
     check_maps(flat_system)

@@ -516,7 +516,7 @@ def test_unknown_holds(hold):
         ({"y_d1": -1.0}, ValueError, "limits must be above 0 and finite, got y_d1 = -1"),
         ({"y_d1": np.nan}, ValueError, "limits must be above 0 and finite, got y_d1 = nan"),
         ({"y_d1": (1.0, -1.0)}, ValueError, "limits of y_d1 must increase, got 1 and -1"),
-        ({"F": 1.0}, ValueError, "quantities were not given"),
+        ({"F": 1.0}, ValueError, "a system was not given"),
         ({"y_d4": 1.0}, ValueError, "y_d4 is limited, which needs a plan continuous up to derivative 3"),
         ({}, ValueError, "limits must name at least one signal, got none"),
         (None, TypeError, "limits must be a mapping"),

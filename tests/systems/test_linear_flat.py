@@ -9,6 +9,7 @@ from numpy.polynomial import Polynomial
 import ctrlplan as cp
 from ctrlplan.systems.flat import create_flat_iosystem
 from ctrlplan.systems.linear_flat import linear_maps
+from ctrlplan.systems.quantities import quantities_of_flat_system
 
 PLAN = cp.PolySpline([cp.Waypoint.from_jets(0, y=[0] * 7), cp.Waypoint.from_jets(1, y=[1, 0, 0, 0, 0, 0, 0])])
 """From 0 to 1 in 1 s, at rest to order 6."""
@@ -39,7 +40,7 @@ def test_time_constants_far_apart_cost_no_digits(times):
     """Each state is a polynomial of d/dt of the last one: closed form, term by term of one sign."""
     system, factors = lags(*times)
     with pytest.warns(UserWarning, match="is not its output, but y is"):
-        quantities = cp.flat_quantities(fs.LinearFlatSystem(system))
+        quantities = quantities_of_flat_system(fs.LinearFlatSystem(system))
     gain = 1.0 / np.prod(times)  # y = gain z
     jet = PLAN.jet(np.linspace(0.0, 1.0, 41), len(times))
     found = quantities(jet / gain)
@@ -64,7 +65,7 @@ def told(num, den):
     """Plant num/den, its flat output's warning, and the coefficients of the output by the flag."""
     flat = fs.LinearFlatSystem(ct.ss(ct.tf(num, den), outputs="y"))
     with pytest.warns(UserWarning, match="since the plant has zeros") as caught:
-        cp.flat_quantities(flat)
+        quantities_of_flat_system(flat)
     with pytest.warns(UserWarning, match="since the plant has zeros"):
         create_flat_iosystem(flat, -1.0 - np.arange(len(den) - 1))
     return flat, str(caught[0].message), linear_maps(flat).output
@@ -130,11 +131,11 @@ def test_what_is_not_controllable_is_an_error():
     flat = fs.LinearFlatSystem(ct.ss([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]], [[1.0, 0.0]], 0.0))
     flat.B = np.array([[1.0], [0.0]])
     with pytest.raises(ValueError, match="a linear flat system must be controllable"):
-        cp.flat_quantities(flat)
+        quantities_of_flat_system(flat)
 
 
 def test_coefficients_beyond_floating_point_are_an_error():
     flat = fs.LinearFlatSystem(ct.ss([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]], [[1.0, 0.0]], 0.0))
     flat.A = np.array([[-1e200, 1.0], [0.0, -1e200]])
     with pytest.raises(ValueError, match=r"flat maps of .* must stay within floating point"):
-        cp.flat_quantities(flat)
+        quantities_of_flat_system(flat)
