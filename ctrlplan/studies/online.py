@@ -243,7 +243,7 @@ def _governed(trouble: Trouble, **drives: Any) -> Any:
     """Goal itself through a governor and a filter: no plan."""
     core = _filtered_loop(wind=trouble.wind, **drives)
     governor = create_governor_iosystem(_admissible(trouble.force), initial=START[:1])
-    goal = stack([trouble.goal], labels=["x_command_asked", "z_command"])
+    goal = stack([trouble.goal], labels=["x_command_cmd", "z_command"])
     exposed = expose_states(core)
     unread = set(exposed.output_labels) - {*governor.input_labels, *core.output_labels}
     return ct.interconnect(

@@ -18,7 +18,7 @@ def create_command_filter_iosystem(
     order: int | None = None,
     *,
     initial: float = 0.0,
-    input: str = "r_asked",
+    input: str = "r_cmd",
     output: str = "r",
     name: str | None = None,
 ) -> ct.StateSpace:

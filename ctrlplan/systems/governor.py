@@ -65,7 +65,7 @@ class Governor(ct.NonlinearIOSystem):  # type: ignore[misc]
         super().__init__(
             self._no_rates,
             self._held,
-            inputs=[*(f"{label}_asked" for label in references), *state_signals(admission.states)],
+            inputs=[*(f"{label}_cmd" for label in references), *state_signals(admission.states)],
             outputs=references,
             states=[*(f"{label}_offset" for label in references), "fraction", "refused", "unread"],
             dt=0,
@@ -126,7 +126,7 @@ def create_governor_iosystem(
     the error in a PID, makes every step small: take the derivative of the
     output, or put `create_command_filter_iosystem` behind the governor.
 
-    Inputs: what is asked for, ``<reference>_asked``, then the states of the
+    Inputs: what is asked for, ``<reference>_cmd``, then the states of the
     loop as `expose_states` puts them out. Outputs: the references, by the
     loop's names, held between samples. States: the references as offsets from
     `initial`; fraction, the last kappa, 0 where v was held; refused and unread,
@@ -179,8 +179,8 @@ def create_governor_iosystem(
     >>> import ctrlplan as cp
     >>> loop = cp.plants.integrator_lag_loop(5.0, outputs=("y", "u"))
     >>> governor = cp.create_governor_iosystem(loop, 0.05, {"u": (-1.0, 1.0)})
-    >>> governed = ct.interconnect([governor, cp.expose_states(loop)], inputs=["r_asked"], outputs=["y", "u", "r"])
-    >>> found = cp.simulate(governed, np.linspace(0.0, 15.0, 301), {"r_asked": cp.Step(1.0)})
+    >>> governed = ct.interconnect([governor, cp.expose_states(loop)], inputs=["r_cmd"], outputs=["y", "u", "r"])
+    >>> found = cp.simulate(governed, np.linspace(0.0, 15.0, 301), {"r_cmd": cp.Step(1.0)})
     >>> y, u, r = found.outputs
     >>> round(float(np.abs(u).max()), 6), round(float(y[-1]), 3), round(float(r[0]), 3), float(r[-1])
     (0.999, 1.0, 0.2, 1.0)

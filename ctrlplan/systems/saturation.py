@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 
 
 def create_saturation_iosystem(
-    low: float, high: float, input: str = "u_asked", output: str = "u", name: str = "saturation"
+    low: float, high: float, input: str = "u_cmd", output: str = "u", name: str = "saturation"
 ) -> ct.NonlinearIOSystem:
     """Actuator that cannot go beyond its limits.
 

@@ -359,7 +359,7 @@ def test_a_pvtol_that_hovers(method):
 def test_a_saturated_loop(method):
     """x'' = -x' + sat(4 (r - x) - 2 x'), the plan fast enough for both limits."""
     plan = cp.PolySpline([cp.Waypoint(0.5, 0, 0, 0), cp.Waypoint(1.5, 3, 0, 0)], labels=["r"])
-    law = ct.ss([], [], [], [[4.0, -4.0, -2.0]], inputs=["r", "x", "v"], outputs="u_asked", name="law", dt=None)
+    law = ct.ss([], [], [], [[4.0, -4.0, -2.0]], inputs=["r", "x", "v"], outputs="u_cmd", name="law", dt=None)
     plant = ct.ss([[0, 1], [0, -1]], [[0], [1]], np.eye(2), 0, inputs="u", outputs=["x", "v"], name="plant")
     blocks = [cp.create_source_iosystem(plan), law, cp.create_saturation_iosystem(-0.5, 2.0), plant]
     loop = ct.interconnect(blocks, inputs=0, outputs=["x", "u"])

@@ -262,7 +262,7 @@ def test_a_stop_of_an_unstable_loop_that_leaves_the_range_of_numbers():
 def test_a_saturation_says_when_it_acts(method):
     """Asked for 2 exp(-t) - 1 within [-0.5, 0.5]: above until ln(4/3), below from ln 4 on."""
     lag = ct.ss(-1.0, 0.0, 2.0, 0.0, inputs="nothing", outputs="w", name="fading")
-    offset = ct.ss([], [], [], [[1.0, -1.0]], inputs=["w", "one"], outputs="u_asked", name="offset", dt=None)
+    offset = ct.ss([], [], [], [[1.0, -1.0]], inputs=["w", "one"], outputs="u_cmd", name="offset", dt=None)
     blocks = [lag, offset, cp.create_saturation_iosystem(-0.5, 0.5)]
     loop = ct.interconnect(blocks, inputs=["one", "nothing"], outputs=["u"])
     times = np.linspace(0.0, 3.0, 4)

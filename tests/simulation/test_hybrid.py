@@ -448,7 +448,7 @@ def test_a_bent_loop_with_two_delays(method):
 def test_a_delay_in_a_saturated_loop(method):
     """x' = sat(2 (1 - x(t - 0.6))) within 0.8: bends inside of legs."""
     late = cp.create_delay_iosystem(0.6, "x", "seen")
-    law = gain([2.0, -2.0], ["r", "seen"], "u_asked", "law")
+    law = gain([2.0, -2.0], ["r", "seen"], "u_cmd", "law")
     integrator = ct.ss(0.0, 1.0, 1.0, 0.0, inputs="u", outputs="x", name="integrator")
     loop = ct.interconnect([late, law, cp.create_saturation_iosystem(-0.8, 0.8), integrator], inputs="r", outputs="x")
     times = np.linspace(0.0, 6.0, 25)

@@ -262,10 +262,10 @@ def test_a_crane_whose_law_feeds_the_load_back():
     limits = {"theta": (-0.06, 0.06), "F": (-6000.0, 6000.0)}
     governor = cp.create_governor_iosystem(cp.Predictor(loop, limits, 40.0), 0.5, initial=[0.0, 10.0])
     outputs = [*plant.output_labels, "F", "C", "x_set", "z_set"]
-    asked = ["x_set_asked", "z_set_asked"]
+    asked = ["x_set_cmd", "z_set_cmd"]
     whole = ct.interconnect([governor, cp.expose_states(loop)], inputs=asked, outputs=outputs)
     start = np.concatenate([np.zeros(5), rest])
-    found = cp.simulate(whole, np.linspace(0.0, 60.0, 12001), {"x_set_asked": 4.0, "z_set_asked": 10.0}, start)
+    found = cp.simulate(whole, np.linspace(0.0, 60.0, 12001), {"x_set_cmd": 4.0, "z_set_cmd": 10.0}, start)
     y = dict(zip(outputs, found.outputs, strict=True))
     assert found.events == []
     assert np.abs(y["theta"]).max() <= 0.06

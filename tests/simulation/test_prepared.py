@@ -376,7 +376,7 @@ def test_a_linear_form_without_its_blocks_is_not_run_by_equations(method):
 
 def saturated():
     """y' = -y + u, u = 2 (r - y) within 0.5."""
-    law = ct.ss([], [], [], [[2.0, -2.0]], inputs=["r", "y"], outputs="u_asked", name="law", dt=None)
+    law = ct.ss([], [], [], [[2.0, -2.0]], inputs=["r", "y"], outputs="u_cmd", name="law", dt=None)
     lag = ct.ss(-1.0, 1.0, 1.0, 0.0, inputs="u", outputs="y", name="lag")
     blocks = [law, cp.create_saturation_iosystem(-0.5, 0.5), lag]
     return ct.interconnect(blocks, inputs="r", outputs=["y", "u"])

@@ -345,7 +345,7 @@ def test_a_governor_holds_its_own_first_reference(initial):
     governor = cp.create_governor_iosystem(loop, 0.05, {"u": (-30.0, 30.0)}, initial=[initial])
 
     def build(name, plan):
-        source = cp.create_source_iosystem(cp.stack([plan], labels=["r_asked"]))
+        source = cp.create_source_iosystem(cp.stack([plan], labels=["r_cmd"]))
         exposed = cp.expose_states(loop)
         return ct.interconnect([source, governor, exposed], inputs=0, outputs=["y", "u", "r"])
 

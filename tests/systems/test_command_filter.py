@@ -62,7 +62,7 @@ def test_outputs_are_derivatives_of_one_another_after_jumps_of_the_command():
     block = cp.create_command_filter_iosystem(3.0, 3, output="r")
     chains = [ct.ss(0, 1, 1, 0, inputs=f"r_d{k}", outputs=f"i{k}", name=f"chain{k}") for k in (1, 2, 3)]
     names = ["r", "r_d1", "r_d2", "r_d3"]
-    loop = ct.interconnect([block, *chains], inputs=["r_asked"], outputs=[*names, "i1", "i2", "i3"])
+    loop = ct.interconnect([block, *chains], inputs=["r_cmd"], outputs=[*names, "i1", "i2", "i3"])
     command = cp.Step(1.0, time=0.2) + cp.Step(-3.0, time=1.1) + cp.Step(2.5, time=1.2)
     found = cp.simulate(loop, np.linspace(0, 5, 101), command)
     outputs = np.asarray(found.outputs)
@@ -129,7 +129,7 @@ def led(plan, w, derivatives, order, outputs):
     """Source with all derivatives that the lead weighs, their sum, and the filter."""
     source = cp.create_source_iosystem(plan, order)
     names = source.output_labels
-    weighted = ct.ss([], [], [], [command_lead(w, order)], inputs=names, outputs=["r_asked"], name="lead")
+    weighted = ct.ss([], [], [], [command_lead(w, order)], inputs=names, outputs=["r_cmd"], name="lead")
     block = cp.create_command_filter_iosystem(w, derivatives, order)
     return ct.interconnect([source, weighted, block], inputs=0, outputs=outputs, name="led")
 
@@ -174,14 +174,14 @@ def commanded():
         [cp.Waypoint.from_jets(t, x=[x, 0, 0], z=[z, 0, 0]) for t, x, z in ((0, 1.0, 10.0), (6, 4.0, 9.0))]
     )
     filters = [
-        cp.create_command_filter_iosystem(w, 2, 3, input=f"{axis}_asked", output=f"{axis}_ref")
+        cp.create_command_filter_iosystem(w, 2, 3, input=f"{axis}_cmd", output=f"{axis}_ref")
         for axis, w in (("x", 1.5), ("z", 2.0))
     ]
     cp.declare(filters[0], initial_state=[1.0, 0.0, 0.0])
     cp.declare(filters[1], initial_state=[10.0, 0.0, 0.0])
-    loop = crane_loop(Crane(), plan, reference=filters, inputs=["x_asked", "z_asked"])
+    loop = crane_loop(Crane(), plan, reference=filters, inputs=["x_cmd", "z_cmd"])
     t = np.linspace(0, 12, 121)
-    asked = {"x_asked": cp.Step(4.0, 1.0, 1.0), "z_asked": cp.Step(9.0, 10.0, 1.0)}
+    asked = {"x_cmd": cp.Step(4.0, 1.0, 1.0), "z_cmd": cp.Step(9.0, 10.0, 1.0)}
     return loop, t, cp.simulate(loop, t, asked)
 
 
@@ -213,8 +213,8 @@ def test_references_in_a_loop_are_what_the_filters_make_of_the_commands(commande
 
 def test_without_its_initial_state_a_filter_starts_at_0():
     plan = cp.PolySpline([cp.Waypoint.from_jets(t, x=[x, 0, 0], z=[10.0, 0, 0]) for t, x in ((0, 0.0), (6, 4.0))])
-    filters = [cp.create_command_filter_iosystem(1.0, 2, input=f"{a}_asked", output=f"{a}_ref") for a in "xz"]
-    loop = crane_loop(Crane(), plan, reference=filters, inputs=["x_asked", "z_asked"])
+    filters = [cp.create_command_filter_iosystem(1.0, 2, input=f"{a}_cmd", output=f"{a}_ref") for a in "xz"]
+    loop = crane_loop(Crane(), plan, reference=filters, inputs=["x_cmd", "z_cmd"])
     assert np.all(loop.initial_state[:6] == 0.0)
 
 

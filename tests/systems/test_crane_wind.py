@@ -394,14 +394,14 @@ def test_initial_states_in_the_order_of_the_blocks():
     """Reference blocks that start where they say, a wind without states, law and drives at 0, the crane at rest."""
     plan = move()
     first, second = (
-        cp.create_command_filter_iosystem(1.0, 2, input=f"{axis}_asked", output=f"{axis}_ref") for axis in "xz"
+        cp.create_command_filter_iosystem(1.0, 2, input=f"{axis}_cmd", output=f"{axis}_ref") for axis in "xz"
     )
     cp.declare(first, initial_state=[1.0, 2.0, 3.0])
     cp.declare(second, initial_state=4.0)
-    loop = crane_loop(Crane(), plan, reference=[first, second], inputs=["x_asked", "z_asked"], wind=GUST)
-    assert loop.input_labels == ["x_asked", "z_asked"]
+    loop = crane_loop(Crane(), plan, reference=[first, second], inputs=["x_cmd", "z_cmd"], wind=GUST)
+    assert loop.input_labels == ["x_cmd", "z_cmd"]
     assert loop.initial_state.tolist() == [1, 2, 3, 4, 4, 4, 0, 0, 0, 0, -B, 10, 0, 0, 0, 0]
-    found = cp.simulate(loop, [0.0, 1.0], {"x_asked": 0.0, "z_asked": 10.0})
+    found = cp.simulate(loop, [0.0, 1.0], {"x_cmd": 0.0, "z_cmd": 10.0})
     assert np.asarray(found.states)[:, 0].tolist() == loop.initial_state.tolist()
 
 
@@ -449,7 +449,7 @@ def test_bad_input_of_the_loop(case):
 
 
 def test_an_initial_state_of_the_wrong_size_names_its_block():
-    other = cp.create_command_filter_iosystem(1.0, 2, input="z_asked", output="z_ref")
+    other = cp.create_command_filter_iosystem(1.0, 2, input="z_cmd", output="z_ref")
     with pytest.raises(ValueError, match="initial_state of z_ref_filter must be a finite number or 3 of them"):
         cp.declare(other, initial_state=[10.0, 0.0])
 

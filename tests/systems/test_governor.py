@@ -17,7 +17,7 @@ def lag_loop(**options):
     """k/(s^2 + s) in unity feedback with |u| <= 1, governed every 0.05 s."""
     loop = cp.plants.integrator_lag_loop(5.0, outputs=("y", "u"))
     governor = cp.create_governor_iosystem(loop, 0.05, {"u": (-1.0, 1.0)}, **options)
-    return ct.interconnect([governor, cp.expose_states(loop)], inputs=["r_asked"], outputs=["y", "u", "r"])
+    return ct.interconnect([governor, cp.expose_states(loop)], inputs=["r_cmd"], outputs=["y", "u", "r"])
 
 
 def random_governed(rng):
@@ -31,7 +31,7 @@ def random_governed(rng):
     limits = {"y": (-rng.uniform(0.5, 2.0), rng.uniform(0.5, 2.0)), "u": (-1.0, rng.uniform(0.5, 2.0))}
     found = cp.AdmissibleSet(loop, limits, rng.uniform(0.02, 0.3))
     governor = cp.create_governor_iosystem(found)
-    asked = [f"r{i}_asked" for i in range(m)]
+    asked = [f"r{i}_cmd" for i in range(m)]
     whole = ct.interconnect([governor, cp.expose_states(loop)], inputs=asked, outputs=["y", "u", *names["inputs"]])
     return loop, limits, found, whole
 
@@ -53,7 +53,7 @@ def test_limits_hold_at_all_times(seed):
     m, n = loop.ninputs, loop.nstates
     while not found.contains(x := rng.standard_normal(n) * rng.uniform(0.0, 2.0), np.zeros(m)):
         pass
-    inputs = {f"r{i}_asked": jumps(rng, 8.0, 3.0) for i in range(m)}
+    inputs = {f"r{i}_cmd": jumps(rng, 8.0, 3.0) for i in range(m)}
     start = np.concatenate([np.zeros(m + 3), x])
     response = cp.simulate(whole, np.linspace(0.0, 10.0, 8001), inputs, start, **TIGHT)
     for y, (low, high) in zip(response.outputs[:2], limits.values(), strict=True):
@@ -71,13 +71,13 @@ def test_limits_hold_whatever_a_bounded_disturbance_does():
         [[0, 1], [-4, -0.8]], [[0, 0.5], [4, 1]], [[1, 0]], 0, inputs=["r", "w"], outputs="y", states=2, name="loop"
     )
     governor = cp.create_governor_iosystem(loop, 0.1, {"y": (-1.0, 1.0)}, disturbances={"w": 0.15})
-    whole = ct.interconnect([governor, cp.expose_states(loop)], inputs=["r_asked", "w"], outputs=["y", "r"])
+    whole = ct.interconnect([governor, cp.expose_states(loop)], inputs=["r_cmd", "w"], outputs=["y", "r"])
     rng, times = np.random.default_rng(0), np.linspace(0.0, 20.0, 8001)
     for instants in (np.sort(rng.uniform(0.0, 20.0, 30)), np.arange(0.0, 20.0, math.pi / math.sqrt(4.0 - 0.16))):
         w = cp.Step(0.15)
         for k, t in enumerate(instants[1:]):
             w = w + cp.Step(0.3 if k % 2 else -0.3, time=float(t))
-        found = cp.simulate(whole, times, {"r_asked": jumps(rng, 15.0, 2.0), "w": w}, **TIGHT)
+        found = cp.simulate(whole, times, {"r_cmd": jumps(rng, 15.0, 2.0), "w": w}, **TIGHT)
         assert np.abs(found.outputs[0]).max() <= 1.0 + 1e-9
         assert found.events == []
         assert found.states[1].min() < 1.0
@@ -120,7 +120,7 @@ def test_every_sample_takes_the_largest_fraction(seed):
 )
 def test_what_is_admissible_passes_unchanged(plan):
     times = 0.05 * np.arange(161)
-    found = cp.simulate(lag_loop(), times, {"r_asked": plan})
+    found = cp.simulate(lag_loop(), times, {"r_cmd": plan})
     assert np.array_equal(found.states[1], np.ones(161))
     # A plan is known to a rounding error; the reference is not even that far from what was asked for.
     assert np.abs(found.outputs[2] - plan(times)).max() <= np.spacing(1.0)
@@ -129,7 +129,7 @@ def test_what_is_admissible_passes_unchanged(plan):
 
 def test_what_is_not_admissible_waits_and_arrives():
     plan = cp.TrigSpline([cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1.0, 1.0, 0, 0)], alpha=4.0)
-    found = cp.simulate(lag_loop(), np.linspace(0.0, 12.0, 2401), {"r_asked": plan}, **TIGHT)
+    found = cp.simulate(lag_loop(), np.linspace(0.0, 12.0, 2401), {"r_cmd": plan}, **TIGHT)
     y, u, r = found.outputs
     assert 0.99 < np.abs(u).max() <= 1.0 + 1e-9
     assert np.abs(cp.simulate(cp.plants.integrator_lag_loop(5.0, outputs=("u",)), found.time, plan).outputs).max() > 1.5
@@ -164,7 +164,7 @@ def test_a_sensor_that_fails_and_comes_back():
 
     plant = ct.ss([[-1.0]], [[1.0]], [[1.0]], 0, inputs="r", outputs="y", name="plant")
     sensor = ct.nlsys(None, broken, inputs="y", outputs="x_state", name="sensor")
-    whole = ct.interconnect([governor, plant, sensor], inputs="r_asked", outputs=["y", "r"])
+    whole = ct.interconnect([governor, plant, sensor], inputs="r_cmd", outputs=["y", "r"])
     times = 0.05 * np.arange(41)
     ramp = cp.PolySpline([cp.Waypoint(0.0, 0.0), cp.Waypoint(2.0, 2.0)])
     found = cp.simulate(whole, times, ramp, method="python")
@@ -196,10 +196,10 @@ def test_a_state_from_which_nothing_is_admissible():
 def test_two_references_move_on_a_line():
     loop = ct.ss(-np.eye(2), np.eye(2), [[1.0, 1.0]], 0, inputs=["a", "b"], outputs="y", states=["p", "q"], name="loop")
     governor = cp.create_governor_iosystem(loop, 0.1, {"y": (-1.0, 1.0)})
-    assert governor.input_labels == ["a_asked", "b_asked", "p_state", "q_state"]
+    assert governor.input_labels == ["a_cmd", "b_cmd", "p_state", "q_state"]
     assert governor.output_labels == ["a", "b"]
-    whole = ct.interconnect([governor, cp.expose_states(loop)], inputs=["a_asked", "b_asked"], outputs=["y", "a", "b"])
-    y, a, b = cp.simulate(whole, np.linspace(0.0, 10.0, 101), {"a_asked": 2.0, "b_asked": 1.0}).outputs
+    whole = ct.interconnect([governor, cp.expose_states(loop)], inputs=["a_cmd", "b_cmd"], outputs=["y", "a", "b"])
+    y, a, b = cp.simulate(whole, np.linspace(0.0, 10.0, 101), {"a_cmd": 2.0, "b_cmd": 1.0}).outputs
     assert np.abs(a - 2.0 * b).max() <= 1e-12
     assert 0.98 < y[-1] <= 0.99 + 1e-9
 
@@ -218,7 +218,7 @@ def test_an_admission_of_the_user():
     assert isinstance(Slowly(), Admission)
     governor = cp.create_governor_iosystem(Slowly(), 0.5, name="slow")
     plant = cp.expose_states(ct.ss([[-1.0]], [[1.0]], [[1.0]], 0, inputs="r", outputs="y", name="plant"))
-    whole = ct.interconnect([governor, plant], inputs="r_asked", outputs=["y", "r"])
+    whole = ct.interconnect([governor, plant], inputs="r_cmd", outputs=["y", "r"])
     times = 0.5 * np.arange(21)
     found = cp.simulate(whole, times, 1.0)
     assert np.abs(found.outputs[1] - (1.0 - 0.9 ** np.arange(1, 22))).max() <= 1e-12
@@ -241,7 +241,7 @@ def test_a_nonlinear_loop_behind_a_predictor():
     loop = ct.interconnect([law, pendulum], inputs="r", outputs=["y", "u"], name="loop")
     limits = {"y": (-1.2, 1.05), "u": (-12.0, 12.0)}
     governor = cp.create_governor_iosystem(cp.Predictor(loop, limits, 12.0), 0.2)
-    whole = ct.interconnect([governor, cp.expose_states(loop)], inputs="r_asked", outputs=["y", "u", "r"])
+    whole = ct.interconnect([governor, cp.expose_states(loop)], inputs="r_cmd", outputs=["y", "u", "r"])
     found = cp.simulate(whole, np.linspace(0.0, 10.0, 5001), cp.Step(1.0))
     assert found.events == []
     for value, (low, high) in zip(found.outputs, limits.values(), strict=False):
