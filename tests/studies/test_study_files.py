@@ -372,20 +372,36 @@ def test_the_data_of_these_tests_is_valid(stated):
     assert list(stated(VALID).plans) == ["trigonometric", "poly", "legs", "step"]
 
 
-def test_a_crane_of_a_file_ends_at_the_slack_rope(tmp_path):
-    data = {
+def crane_study(**loop):
+    return {
         "t_end": 10.0,
         "samples": 501,
-        "loop": {"kind": "crane", "force_limits": [-30e3, 30e3], "torque_limits": [-3e3, 1e3]},
+        "loop": {"kind": "crane", "force_limits": [-30e3, 30e3], "torque_limits": [-3e3, 1e3], **loop},
         "plans": [{"family": "step"}, {"family": "polynomial"}],
         "waypoints": [
             {"time": 0.0, "x": [0.0, 0.0, 0.0], "z": [10.0, 0.0, 0.0]},
             {"time": 9.0, "x": [20.0, 0.0, 0.0], "z": [11.0, 0.0, 0.0]},
         ],
     }
-    path = tmp_path / "crane.toml"
-    path.write_text(to_toml(data), encoding="utf-8")
-    found = load_study(path).run().comparison
+
+
+def test_a_crane_of_a_file_ends_at_the_slack_rope(stated):
+    found = stated(crane_study()).run().comparison
     assert found.stopped == {"step": pytest.approx(5.866, abs=1e-3)}
     assert found.responses["step"].time[-1] == found.stopped["step"]
     assert "slack" in found.marks["step"]
+
+
+def test_the_old_name_of_a_law_is_read_with_a_notice(stated):
+    with pytest.warns(FutureWarning, match='law "still" is deprecated.*use "setpoint"'):
+        old = stated(crane_study(law="still")).run().comparison
+    new = stated(crane_study(law="setpoint")).run().comparison
+    np.testing.assert_array_equal(old.responses["polynomial"].outputs, new.responses["polynomial"].outputs)
+
+
+@pytest.mark.parametrize("law", ["pid", 3, ["generator"], True])
+def test_an_unknown_law_is_named_with_those_there_are(stated, law):
+    with pytest.raises(
+        StudyError, match=r"loop\.law: must be one of setpoint, generator, load_feedback, dynamic, feed"
+    ):
+        stated(crane_study(law=law))
