@@ -6,13 +6,12 @@ from collections.abc import Callable, Mapping, Sequence
 
 import control.flatsys as fs
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from ctrlplan._checks import real_array
+from ctrlplan._checks import Array, real_array
 from ctrlplan.trajectories import Trajectory
 from ctrlplan.trajectories.common import checked_labels, checked_timepts, default_labels
 
-Array = NDArray[np.float64]
 Params = Mapping[str, float] | None
 Flag = Sequence[Array]
 

@@ -119,6 +119,23 @@ def test_it_is_the_crane():
     assert crane.flat_system(name="gantry").name == "gantry"
 
 
+def test_it_takes_the_crane_s_place_in_a_loop():
+    """Between figure 3's blocks, where a feedthrough undeclared would be an algebraic loop."""
+    crane, names = Crane(), list(OUTPUTS)
+    blocks = [
+        cp.create_source_iosystem(PLAN, 2, suffix="_ref"),
+        cp.plants.create_generator_iosystem(crane),
+        crane.trolley_pid(),
+        crane.hoist_pid(),
+    ]
+    start = np.concatenate([np.zeros(4), crane.equilibrium(0.0, 10.0)[0]])
+    found = [
+        cp.simulate(ct.interconnect([*blocks, plant], inputs=0, outputs=names), np.linspace(0, 9, 10), None, start)
+        for plant in (crane.flat_system(), crane.iosystem())
+    ]
+    np.testing.assert_allclose(found[0].outputs, found[1].outputs, atol=1e-7)
+
+
 def test_the_one_map():
     """`Crane.quantities`, the flat system's quantities and its states and inputs."""
     crane = Crane(**ODD, rope_wrap=True)

@@ -10,15 +10,15 @@ from collections.abc import Mapping, Sequence
 
 import control as ct
 import numpy as np
-from numpy.typing import NDArray
 
+from ctrlplan._checks import Array
 from ctrlplan.systems.flat import hurwitz_coefficients
 from ctrlplan.systems.plants.crane.flatness import checked_formulas
 from ctrlplan.systems.plants.crane.parameters import CraneParameters
+from ctrlplan.systems.plants.parameters import check_parameters
 from ctrlplan.systems.series import Quantity
 from ctrlplan.trajectories import derivative_name
 
-Array = NDArray[np.float64]
 Params = Mapping[str, float]
 
 
@@ -79,9 +79,7 @@ def create_load_feedback_iosystem(
     ValueError
         If `bandwidth` or `damping` is not above 0.
     """
-    for label, value in (("bandwidth", bandwidth), ("damping", damping)):
-        if not (np.isfinite(value) and value > 0.0):
-            raise ValueError(f"{label} must be finite and above 0, got {value}")
+    check_parameters({"bandwidth": bandwidth, "damping": damping}, {})
     s0, s1 = bandwidth**2, 2.0 * damping * bandwidth
 
     def out(t: float, state: Array, u: Array, params: Params) -> Array:

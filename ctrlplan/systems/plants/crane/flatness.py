@@ -10,16 +10,16 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ctrlplan._checks import Array
 from ctrlplan.flatness import FlatSystem
 from ctrlplan.systems import series
 from ctrlplan.systems.plants.crane import model
 from ctrlplan.systems.plants.crane.parameters import CraneParameters, Numbers
 from ctrlplan.systems.series import Taylor
+from ctrlplan.traits import declare
 from ctrlplan.trajectories import Extrema, Trajectory
-
-Array = NDArray[np.float64]
 
 FLAT_LABELS = ("x", "z")
 ORDERS = (4, 4)
@@ -41,7 +41,7 @@ def flat_system(crane: CraneParameters, name: str = "crane") -> FlatSystem:
     >>> x[:2].tolist(), u.tolist()
     ([1.75, 10.0], [0.0, -1226.25])
     """
-    return FlatSystem(
+    system = FlatSystem(
         partial(forward, crane),
         partial(reverse, crane),
         partial(model.update, crane),
@@ -54,6 +54,7 @@ def flat_system(crane: CraneParameters, name: str = "crane") -> FlatSystem:
         name=name,
         quantities=partial(quantities, crane),
     )
+    return declare(system, feedthrough=model.feedthrough(2))
 
 
 def quantities(crane: CraneParameters, jet: ArrayLike) -> dict[str, Array]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,6 +13,7 @@ from ctrlplan._renamed import warn_renamed
 from ctrlplan.systems.flat import hurwitz_coefficients
 from ctrlplan.systems.plants.crane import blocks
 from ctrlplan.systems.plants.crane.parameters import CraneParameters
+from ctrlplan.systems.plants.parameters import check_parameters
 
 LawName = Literal["setpoint", "generator", "load_feedback", "dynamic", "feedforward"]
 
@@ -131,6 +131,8 @@ class LoadFeedbackLaw(Law):
 
     Raises
     ------
+    TypeError
+        If an option is not a number.
     ValueError
         If an option is not finite and above 0.
     """
@@ -143,9 +145,7 @@ class LoadFeedbackLaw(Law):
     damping: float = 1.0
 
     def __post_init__(self) -> None:
-        for label, value in (("load_bandwidth", self.load_bandwidth), ("damping", self.damping)):
-            if not (math.isfinite(value) and value > 0.0):
-                raise ValueError(f"{label} must be finite and above 0, got {value}")
+        check_parameters({"load_bandwidth": self.load_bandwidth, "damping": self.damping}, {})
 
     def build(self, crane: CraneParameters) -> ct.NonlinearIOSystem:
         """Block from the jets of order 2 and the load's x to D_ref and R_ref."""

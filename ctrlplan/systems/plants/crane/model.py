@@ -15,11 +15,11 @@ import control as ct
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ctrlplan._checks import Array
 from ctrlplan.systems.plants.crane.parameters import CraneParameters, Numbers
 from ctrlplan.systems.series import Quantity
 from ctrlplan.traits import declare
 
-Array = NDArray[np.float64]
 Params = Mapping[str, float] | None
 
 STATES = ("D", "R", "theta", "D_d1", "R_d1", "theta_d1")
@@ -44,9 +44,7 @@ def iosystem(crane: CraneParameters, name: str = "crane", *, wind: bool = False)
         outputs=list(OUTPUTS),
         name=name,
     )
-    # Forces and torque have a direct feedthrough to the tension alone.
-    declare(block, feedthrough=np.array([[output == "T"] * (2 + wind) for output in OUTPUTS]))
-    return block
+    return declare(block, feedthrough=feedthrough(2 + wind))
 
 
 def equilibrium(crane: CraneParameters, x: float, z: float) -> tuple[Array, Array]:
@@ -97,6 +95,11 @@ def output(crane: CraneParameters, t: float, state: Array, inputs: Array, params
     x, z, x_rate, z_rate = load(numbers[3], state)
     tension = solved(numbers, crane.rope_wrap, state, *_forces(inputs))[3]
     return np.array([x, z, state[0], state[1], state[2], x_rate, z_rate, state[3], state[4], state[5], tension])
+
+
+def feedthrough(ninputs: int) -> NDArray[np.bool_]:
+    """Direct feedthrough (noutputs, ninputs): from forces and torque to the tension alone."""
+    return np.array([[label == "T"] * ninputs for label in OUTPUTS])
 
 
 def solved(

@@ -7,12 +7,10 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ctrlplan._checks import Array
 from ctrlplan.systems.plants.crane.parameters import CraneParameters
 from ctrlplan.trajectories import Trajectory
-
-Array = NDArray[np.float64]
 
 
 def rope(crane: CraneParameters) -> CraneRope:
