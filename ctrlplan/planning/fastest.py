@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 from html import escape
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any, Literal, NoReturn, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +26,8 @@ if TYPE_CHECKING:
 
     from ctrlplan.reports.style import AxesLike
 
-_HOLDS = ("shape", "waypoints", "path")
+Hold = Literal["shape", "waypoints", "path"]
+"""What `fastest` keeps of a plan."""
 _PER_OCTAVE = 24
 """Durations looked at while one doubles."""
 
@@ -117,7 +118,7 @@ def fastest(
     limits: Mapping[str, Any],
     system: System | None = None,
     *,
-    hold: str = "shape",
+    hold: Hold = "shape",
     durations: tuple[float, float] | None = None,
     quantities: System | None = None,
 ) -> Fastest:
@@ -200,8 +201,8 @@ def fastest(
     >>> round(found.duration, 3), found.active.bound.name
     (1.863, 'voltage')
     """
-    if hold not in _HOLDS:
-        raise ValueError(f"hold must be one of {', '.join(_HOLDS)}, got {hold!r}")
+    if hold not in get_args(Hold):
+        raise ValueError(f"hold must be one of {', '.join(get_args(Hold))}, got {hold!r}")
     limited = Limited(plan, limits, system_given(system, quantities))
     limited.check_smooth(plan)
     extrema = plan.extrema()

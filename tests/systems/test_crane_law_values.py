@@ -90,7 +90,7 @@ def test_options_of_a_loop_are_fields_of_the_law_by_the_same_name(name):
         ("dynamic", DynamicLaw(poles=(-2, -2.1, -2.2, -2.3)), {"poles": [-2, -2.1, -2.2, -2.3]}),
     ],
 )
-def test_options_beside_a_name_are_those_of_the_law(name, law, options):
+def test_options_given_with_a_name_are_those_of_the_law(name, law, options):
     short = outputs(crane_loop(CRANE, plan(), name, **options))
     np.testing.assert_array_equal(short, outputs(crane_loop(CRANE, plan(), law)))
 
@@ -124,7 +124,7 @@ def test_what_is_no_law(law):
         crane_loop(CRANE, plan(), law)
 
 
-def test_options_beside_a_law_are_ambiguous():
+def test_options_given_with_a_law_value_are_ambiguous():
     with pytest.raises(TypeError, match="options of a law must be given to the law itself, got damping"):
         crane_loop(CRANE, plan(), LoadFeedbackLaw(), damping=0.7)
 

@@ -100,7 +100,7 @@ def test_formulas_of_numbers_take_series(formula, expression):
     assert_series(found.terms, expression)
 
 
-def test_arrays_beside_series_are_constants_at_each_time():
+def test_arrays_next_to_series_are_constants_at_each_time():
     terms = np.stack([of(A, 3), of(B, 3)], axis=1)  # of two functions, as of two times
     gains = np.array([2.0, -3.0])
     found = gains * series.Taylor(terms) - gains
@@ -115,6 +115,6 @@ def test_the_shorter_series_decides():
         assert len(found.terms) == 3
 
 
-def test_integrals_start_where_they_are_told():
+def test_integrals_start_at_the_given_value():
     found = series.Taylor.integral(np.array(float((A).subs(T, sp.Rational(1, 3)))), series.Taylor(of(A.diff(T), 3)))
     assert_series(found.terms, A)

@@ -20,7 +20,7 @@ LawName = Literal["setpoint", "generator", "load_feedback", "dynamic", "feedforw
 
 @dataclass(frozen=True)
 class Law(ABC):
-    """Law of a crane's loop: which plans it takes, and its block.
+    """Law of a crane's loop: what it requires of the plan, and its block.
 
     A new law is a frozen dataclass whose fields are its options. It must define
 

@@ -131,7 +131,7 @@ _ACTUATED = ("F", "C")
 
 
 def _with_options(law: Law | str, options: dict[str, float | Sequence[complex] | None]) -> Law:
-    """The law, with the options that were given beside its name."""
+    """The law, with the options given with its name."""
     found = as_law(law)
     given = {name: value for name, value in options.items() if value is not None}
     if given and isinstance(law, Law):
