@@ -61,15 +61,15 @@ def sqrt(a: Array) -> Array:
     return _stacked(out)
 
 
-def arctan2(y: Array, x: Array) -> Array:
-    """Angle of (x, y), by integrating (y' x - y x')/(x^2 + y^2)."""
+def arctan2(y: Array, x: Array, squares: Array | None = None) -> Array:
+    """Angle of (x, y), by integrating (y' x - y x')/(x^2 + y^2); `squares` is x^2 + y^2 where it is known."""
     n = min(len(x), len(y))
     x, y = x[:n], y[:n]
     first = _stacked([np.arctan2(y[0], x[0])])
     if n == 1:
         return first
     turning = multiply(derivative(y), x) - multiply(y, derivative(x))
-    rate = divide(turning, multiply(x, x) + multiply(y, y))
+    rate = divide(turning, multiply(x, x) + multiply(y, y) if squares is None else squares)
     steps = np.arange(1, len(rate) + 1).reshape(-1, *[1] * (rate.ndim - 1))
     return np.concatenate([first, rate / steps])
 
@@ -156,7 +156,9 @@ Operand = Taylor | float | Array
 
 
 def _total(terms: Iterable[Any]) -> Any:
-    return sum(terms, 0.0)
+    """Sum, 0 of none; no term is added to 0, which would copy it."""
+    rest = iter(terms)
+    return sum(rest, next(rest, 0.0))
 
 
 def _stacked(terms: list[Any]) -> Array:

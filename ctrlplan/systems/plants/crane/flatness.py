@@ -124,8 +124,8 @@ def formulas(numbers: Numbers, rope_wrap: bool, jet: Array) -> dict[str, Array]:
     across, fall = series.derivative(x, 2), series.derivative(z, 2)
     hanging = -fall
     hanging[0] += g
-    pull = series.sqrt(series.multiply(across, across) + series.multiply(hanging, hanging))
-    theta = series.arctan2(-across, hanging)
+    squares = series.multiply(across, across) + series.multiply(hanging, hanging)
+    pull, theta = series.sqrt(squares), series.arctan2(-across, hanging, squares)
     r = series.divide(series.multiply(z, pull) - b * across, hanging)
     d = x[: len(pull)] - series.divide(b * pull - series.multiply(z, across), hanging)
     jets = {
