@@ -76,7 +76,8 @@ def output(command, **variables):
 
 def tested(python, options, **variables):
     """Summary of the test run, which is shown as it goes."""
-    command = [python, "-m", "pytest", "-q", "-n", "auto", *(["-m", "not slow"] if options.quick else []), *options.tests]
+    chosen = ["-m", "not slow"] if options.quick else []
+    command = [python, "-m", "pytest", "-q", "-n", "auto", *chosen, *options.tests]
     shown = " ".join(f"{name}={value}" for name, value in variables.items())
     print("+", shown, *command, flush=True)
     last = ""
