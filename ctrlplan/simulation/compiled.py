@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctrlplan.simulation.compared import Compared
-from ctrlplan.simulation.drives import Series, within
 from ctrlplan.simulation.interpreted import SolverError
 from ctrlplan.simulation.network import Block, Network, Step, known_feedthrough
 from ctrlplan.simulation.recent import recent
 from ctrlplan.simulation.scales import Scales, Tolerances
+from ctrlplan.simulation.signals import Series, within
 from ctrlplan.simulation.switches import changes_of_side, switch_arguments
 from ctrlplan.simulation.traced import NotTraceableError, Trace, agrees
 

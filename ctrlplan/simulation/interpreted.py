@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from scipy.integrate import BDF, LSODA, RK45, OdeSolver
 
 from ctrlplan.simulation.budget import check
-from ctrlplan.simulation.drives import Series, within
 from ctrlplan.simulation.network import (
     Map,
     Network,
@@ -25,6 +24,7 @@ from ctrlplan.simulation.network import (
     tried_feedthrough,
 )
 from ctrlplan.simulation.scales import Scales, Tolerances
+from ctrlplan.simulation.signals import Series, within
 from ctrlplan.simulation.stalled import cause
 from ctrlplan.simulation.trials import can_remember, trial_copy, values_of
 from ctrlplan.simulation.untouched import untouched

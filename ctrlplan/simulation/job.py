@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ctrlplan.simulation.drives import Drive
 from ctrlplan.simulation.events import Event, Snapshot, Watched, watched_events
 from ctrlplan.simulation.network import Network
 from ctrlplan.simulation.prepared import NotCompiledError, Prepared
+from ctrlplan.simulation.signals import TimeSignal
 from ctrlplan.simulation.trials import can_remember
 
 Array = NDArray[np.float64]
@@ -31,7 +31,7 @@ class Job:
 
     prepared: Prepared
     times: Array
-    inputs: list[Drive]
+    inputs: list[TimeSignal]
     state: Array
     params: dict[str, Any]
     rtol: float

@@ -14,17 +14,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctrlplan.simulation.budget import check
-from ctrlplan.simulation.drives import (
+from ctrlplan.simulation.interpreted import Interpreted, SolverError
+from ctrlplan.simulation.network import Network
+from ctrlplan.simulation.signals import (
     RESOLVED,
-    Drive,
     Series,
+    TimeSignal,
     breakpoints_of,
     chebyshev_coefficients,
     chebyshev_times,
     resolved,
 )
-from ctrlplan.simulation.interpreted import Interpreted, SolverError
-from ctrlplan.simulation.network import Network
 
 Array = NDArray[np.float64]
 
@@ -69,7 +69,7 @@ class Solver(Protocol):
         """Outputs (noutputs, ntime) of the whole."""
 
 
-class DelayedDrive:
+class DelayedSignal:
     """Signals of the past, kept as series of the legs they were seen on."""
 
     def __init__(self, delay: float, initial: Array, first: float) -> None:
@@ -139,7 +139,7 @@ def integrate(
     network: Network,
     equations: Interpreted | None,
     solver: Solver,
-    drives: Sequence[Drive],
+    time_signals: Sequence[TimeSignal],
     times: Array,
     state: Array,
     resolution: float,
@@ -152,7 +152,7 @@ def integrate(
     ----------
     network, equations, solver
         What is run, its equations by Python, and what carries states on.
-    drives : sequence of Drive
+    time_signals : sequence of TimeSignal
         One for the external inputs each, then one for each driven block.
     times : ndarray, shape (ntime,)
         Times at which states are wanted; the run goes from the first to the last.
@@ -172,11 +172,11 @@ def integrate(
         If the solver fails, or a state is no longer finite; the time is in the message.
     """
     first, last = float(times[0]), float(times[-1])
-    memory = _Memory(network, solver, drives, resolution)
+    memory = _Memory(network, solver, time_signals, resolution)
     for_ever = equations is not None and network.delays_feed_delays(equations.feeds)
     hops = _MARKS if for_ever else _HOPS
-    marks = [*breakpoints_of(drives), *network.breakpoints, *marks]
-    clock = _Clock(network, drives, _fixed(marks, first, last, memory.delays, hops), first, last)
+    marks = [*breakpoints_of(time_signals), *network.breakpoints, *marks]
+    clock = _Clock(network, time_signals, _fixed(marks, first, last, memory.delays, hops), first, last)
     longest = min([last - first, *memory.delays])
     if longest < _SHORTEST_DELAY * (last - first):
         raise ValueError(
@@ -188,7 +188,7 @@ def integrate(
         longest = min(longest, (last - first) / 64.0)
     shortest = 1e-9 * (last - first) if pause is not None else np.inf
     # A plan whose terms cancel in a segment has there the rounding errors of its largest values.
-    largest = np.abs(known_before(drives, np.union1d(np.linspace(first, last, 257), clock.marks))).max(axis=1)
+    largest = np.abs(known_before(time_signals, np.union1d(np.linspace(first, last, 257), clock.marks))).max(axis=1)
     rounding = _ROUNDINGS * np.finfo(float).eps * np.where(np.isfinite(largest), largest, 0.0)
     known: list[tuple[Array, Array]] = []  # times and states of each leg, its end left to the next
     legs: list[tuple[float, Series]] = []
@@ -204,8 +204,8 @@ def integrate(
             moment = 0.5 * (left + right)
             accuracy = resolution if memory.delays else RESOLVED
             span = [
-                series.bounded(*_bounds(drives, moment, series.left, series.right))
-                for series in resolved(partial(_beside, drives, moment, left), left, until, accuracy, rounding)
+                series.bounded(*_bounds(time_signals, moment, series.left, series.right))
+                for series in resolved(partial(_beside, time_signals, moment, left), left, until, accuracy, rounding)
             ]
         series = next(s for s in span if left < s.right)
         right = min(right, series.right)
@@ -237,29 +237,29 @@ def integrate(
 class _Memory:
     """What goes into delays, kept leg by leg."""
 
-    def __init__(self, network: Network, solver: Solver, drives: Sequence[Drive], resolution: float) -> None:
+    def __init__(self, network: Network, solver: Solver, time_signals: Sequence[TimeSignal], resolution: float) -> None:
         blocks = network.blocks_with("delay")
-        self._drives: list[Any] = [drive for drive in drives if isinstance(drive, DelayedDrive)]
+        self._time_signals: list[Any] = [signal for signal in time_signals if isinstance(signal, DelayedSignal)]
         self._fed = [network.fed[i] for i in blocks]
         self._wires, self._driven = [network.wire[network.inputs[i]] for i in blocks], network.driven
         self._solver, self._resolution = solver, resolution
-        self.delays = [drive.delay for drive in self._drives]
+        self.delays = [signal.delay for signal in self._time_signals]
 
     def nodes(self, left: float, right: float) -> Array:
         """Times of a leg at which states are needed."""
-        return chebyshev_times(left, right, _WIDTH) if self._drives else np.empty(0)
+        return chebyshev_times(left, right, _WIDTH) if self._time_signals else np.empty(0)
 
     def record(self, left: float, right: float, series: Series, grid: Array, states: Array) -> bool:
         """Keep a leg; False where it must be shorter for its signals to be resolved."""
-        if not self._drives:
+        if not self._time_signals:
             return True
         nodes = self.nodes(left, right)
         w = self._solver.signals(nodes, states[:, np.searchsorted(grid, nodes)], series.at(nodes))
         pieces = [chebyshev_coefficients(fed(w)) for fed in self._fed]
         if right - left > _SHORTEST * min(self.delays) and any(_unresolved(p, self._resolution) for p in pieces):
             return False
-        for drive, piece, wire in zip(self._drives, pieces, self._wires, strict=True):
-            drive.record(Series(left, right, piece, *_combined_bounds(wire, self._driven, series)))
+        for signal, piece, wire in zip(self._time_signals, pieces, self._wires, strict=True):
+            signal.record(Series(left, right, piece, *_combined_bounds(wire, self._driven, series)))
         return True
 
 
@@ -272,15 +272,15 @@ class _Clock:
     """
 
     def __init__(
-        self, network: Network, drives: Sequence[Drive], fixed: list[float], first: float, last: float
+        self, network: Network, time_signals: Sequence[TimeSignal], fixed: list[float], first: float, last: float
     ) -> None:
         self._fixed = [*fixed, last]
         latest = max(abs(first), abs(last))
         self._tolerance = max(4.0 * np.finfo(float).eps * latest, _TOLERANCE * (last - first))
-        self._drives = drives
-        for drive in drives:
-            if isinstance(drive, DelayedDrive):
-                drive.tolerance = self._tolerance
+        self._time_signals = time_signals
+        for signal in time_signals:
+            if isinstance(signal, DelayedSignal):
+                signal.tolerance = self._tolerance
         self._samples: list[tuple[Fraction, int]] = []
         self._periods: dict[int, Fraction] = {}
         for i in network.blocks_with("period"):
@@ -323,12 +323,12 @@ class _Clock:
             due.append(i)
         if not due or equations is None:
             return x
-        seen = [drive.at(np.array([self._after(drive, t)])) for drive in self._drives]
+        seen = [signal.at(np.array([self._after(signal, t)])) for signal in self._time_signals]
         return equations.sampled(tuple(sorted(due)), t, x, np.concatenate([np.zeros((0, 1)), *seen])[:, 0])
 
-    def _after(self, drive: Drive, t: float) -> float:
+    def _after(self, signal: TimeSignal, t: float) -> float:
         """Time at which a signal is read at an instant: at its breakpoint, where the two differ by rounding."""
-        marks = drive.breakpoints
+        marks = signal.breakpoints
         k = int(np.searchsorted(marks, t))
         return float(marks[k]) if k < len(marks) and marks[k] - t <= self._tolerance else t
 
@@ -339,20 +339,21 @@ def _fraction(seconds: float) -> Fraction:
     return simple if abs(float(simple) - seconds) <= 1e-15 * abs(seconds) else Fraction(seconds)
 
 
-def known_before(drives: Sequence[Drive], times: Array) -> Array:
+def known_before(time_signals: Sequence[TimeSignal], times: Array) -> Array:
     """Signals (nsignals, ntime) that are known before a run; 0 for those that a delay outputs."""
     rows = [
-        np.zeros((drive.width, times.size)) if isinstance(drive, DelayedDrive) else drive.at(times) for drive in drives
+        np.zeros((signal.width, times.size)) if isinstance(signal, DelayedSignal) else signal.at(times)
+        for signal in time_signals
     ]
     return np.concatenate([np.zeros((0, times.size)), *rows])
 
 
-def _beside(drives: Sequence[Drive], moment: float, origin: float, s: Array) -> Array:
-    return np.concatenate([np.zeros((0, s.size)), *(drive.beside(moment, origin, s) for drive in drives)])
+def _beside(time_signals: Sequence[TimeSignal], moment: float, origin: float, s: Array) -> Array:
+    return np.concatenate([np.zeros((0, s.size)), *(signal.beside(moment, origin, s) for signal in time_signals)])
 
 
-def _bounds(drives: Sequence[Drive], moment: float, left: float, right: float) -> tuple[Array, Array]:
-    found = [drive.bounds(moment, left, right) for drive in drives]
+def _bounds(time_signals: Sequence[TimeSignal], moment: float, left: float, right: float) -> tuple[Array, Array]:
+    found = [signal.bounds(moment, left, right) for signal in time_signals]
     return tuple(np.concatenate([np.zeros(0), *(pair[side] for pair in found)]) for side in (0, 1))  # type: ignore[return-value]
 
 

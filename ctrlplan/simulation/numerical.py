@@ -16,7 +16,6 @@ from scipy.integrate import trapezoid
 
 from ctrlplan.simulation.budget import TimeLimitError
 from ctrlplan.simulation.compared import telling_states
-from ctrlplan.simulation.drives import Drive, breakpoints_of, driven_signals
 from ctrlplan.simulation.events import Snapshot, Watched
 from ctrlplan.simulation.interpreted import Interpreted, InterpretedSolver, SolverError
 from ctrlplan.simulation.job import Job, Record, unused, with_looks
@@ -24,6 +23,7 @@ from ctrlplan.simulation.legs import Run, integrate, known_before
 from ctrlplan.simulation.network import Network
 from ctrlplan.simulation.prepared import NotCompiledError
 from ctrlplan.simulation.scales import PASSES, Scales, Tolerances, doubt, effects, remaining
+from ctrlplan.simulation.signals import TimeSignal, breakpoints_of, signal_values
 from ctrlplan.simulation.stalled import unrepeatable
 from ctrlplan.simulation.untouched import same_answer, tried, untouched
 
@@ -132,7 +132,7 @@ class _Attempt:
     tighter: float = 1.0
     growth: float = 1.0
     drift: Array | float = 0.0
-    drives: list[Drive] = field(init=False)
+    time_signals: list[TimeSignal] = field(init=False)
     watched: tuple[Watched, ...] = field(init=False)
     equations: Interpreted | None = field(init=False)
     solver: Any = field(init=False)
@@ -141,7 +141,7 @@ class _Attempt:
 
     def __post_init__(self) -> None:
         job, network = self.job, self.job.blocks
-        self.drives, self.watched = job.prepared.drives(job.inputs, job.first), job.watched()
+        self.time_signals, self.watched = job.prepared.time_signals(job.inputs, job.first), job.watched()
         self.equations = _equations(job, network)
         if self.method == "compiled":
             self._compile()
@@ -159,13 +159,13 @@ class _Attempt:
     def go(self) -> None:
         """Run, and compare a compiled form with Python."""
         job = self.job
-        marks = self.solver.instants(job.first, float(job.times[-1]), lambda t: known_before(self.drives, t))
+        marks = self.solver.instants(job.first, float(job.times[-1]), lambda t: known_before(self.time_signals, t))
         self.solver.switches = sorted([*job.blocks.breakpoints, *marks])
         self.run = integrate(
             job.blocks,
             self.equations,
             self.solver,
-            self.drives,
+            self.time_signals,
             with_looks(job.times, self.watched, self._slope),
             job.state,
             resolution=10.0 * job.rtol,
@@ -257,7 +257,7 @@ class _Attempt:
         """Tolerances of a step, so that the errors of all segments stay within those of the run."""
         job, network = self.job, self.job.blocks
         first, last = job.first, float(job.times[-1])
-        marks = {t for t in (*breakpoints_of(self.drives), *network.breakpoints) if first < t < last}
+        marks = {t for t in (*breakpoints_of(self.time_signals), *network.breakpoints) if first < t < last}
         samples = sum((last - first) / float(network.blocks[i].period or 1.0) for i in network.blocks_with("period"))
         return Tolerances.of_run(job.rtol, self.scales, len(marks) + int(samples), self.tighter)
 
@@ -276,10 +276,12 @@ class _Attempt:
         job = self.job
         # Compiled forms are compared with Python on copies of what blocks remember.
         known = job.blocks.for_trials()
-        form = job.prepared.compiled(job.params, self.drives, job.first, job.state)
+        form = job.prepared.compiled(job.params, self.time_signals, job.first, job.state)
         from ctrlplan.simulation.compiled import CompiledSolver  # there is a form: so there is CasADi
 
-        _at_start(_equations(job, known), job, self.drives)  # an algebraic loop without a solution is better named here
+        _at_start(
+            _equations(job, known), job, self.time_signals
+        )  # an algebraic loop without a solution is better named here
         # Beyond a stop there may be no solution: segments are short then, and must fail soon.
         most = 2_000 if self.stops else 20_000
         solver = CompiledSolver(form, job.params, self._tolerances, self.scales, max_steps=most)
@@ -289,7 +291,7 @@ class _Attempt:
                 raise SolverError(
                     f"the solver must reach {job.times[-1]:g} s, got to the edge of where equations are defined"
                 )
-            wrong = _disagreement(job, known, form, solver, self.drives, self.run) if known.blocks else ""
+            wrong = _disagreement(job, known, form, solver, self.time_signals, self.run) if known.blocks else ""
             if wrong:
                 raise job.prepared.distrust(form, wrong)
 
@@ -298,7 +300,7 @@ class _Attempt:
     def _check_repeatable(self) -> None:
         """Raise where rates are random: such a loop has no solution."""
         job, known = self.job, self.job.blocks.for_trials()
-        tests, driven = _equations(job, known), driven_signals(self.drives, job.times[:1])[:, 0]
+        tests, driven = _equations(job, known), signal_values(self.time_signals, job.times[:1])[:, 0]
         if tests is None:
             return
         with untouched():
@@ -314,10 +316,10 @@ class _Attempt:
         """Some times and states of the run, and the functions of time there."""
         some = np.unique(np.linspace(0, self.run.times.size - 1, _VISITED).astype(int))
         t = self.run.times[some]
-        return t, self.run.states[:, some], driven_signals(self.drives, t)
+        return t, self.run.states[:, some], signal_values(self.time_signals, t)
 
     def _see(self, t: Array, x: Array) -> Snapshot:
-        driven = driven_signals(self.drives, t)
+        driven = signal_values(self.time_signals, t)
         y = self.solver.outputs(t, x, driven)
         return Snapshot(t, x, driven[: self.job.prepared.ninputs], y, lambda: self.solver.signals(t, x, driven))
 
@@ -334,7 +336,7 @@ class _Attempt:
         equations, job = self.equations, self.job
         if equations is None:
             return np.zeros((0, 0))
-        driven = driven_signals(self.drives, job.times[:1])[:, 0]
+        driven = signal_values(self.time_signals, job.times[:1])[:, 0]
         return _slope(lambda x: equations.rates(job.first, x, driven), job.state)
 
 
@@ -343,11 +345,11 @@ def _equations(job: Job, network: Network) -> Interpreted | None:
     return Interpreted(network, job.params, (job.first, job.state), job.prepared.trials) if network.blocks else None
 
 
-def _at_start(equations: Interpreted | None, job: Job, drives: Sequence[Drive]) -> Array | None:
+def _at_start(equations: Interpreted | None, job: Job, time_signals: Sequence[TimeSignal]) -> Array | None:
     """Signals at the start of a run."""
     if equations is None:
         return None
-    return equations.signals(job.first, job.state, driven_signals(drives, job.times[:1])[:, 0])
+    return equations.signals(job.first, job.state, signal_values(time_signals, job.times[:1])[:, 0])
 
 
 def _in_doubt(attempt: _Attempt) -> str:
@@ -357,7 +359,7 @@ def _in_doubt(attempt: _Attempt) -> str:
     t, x = run.times[some], run.states[:, some]
     if not x.size or not np.isfinite(x).all():
         return ""
-    driven = driven_signals(attempt.drives, t)
+    driven = signal_values(attempt.time_signals, t)
     own = scales.uncertainty(run.states, job.rtol) * attempt.growth / attempt.tighter
     uncertainty, count = own + attempt.drift, len(job.prepared.output_labels)
     worst, ranges = doubt(lambda near: attempt.on_trial(solver.outputs, t, near, driven, (count, -1)), x, uncertainty)
@@ -376,16 +378,16 @@ def _in_doubt(attempt: _Attempt) -> str:
 
 
 def _disagreement(
-    job: Job, network: Network, form: Compiled, solver: CompiledSolver, drives: Sequence[Drive], run: Run
+    job: Job, network: Network, form: Compiled, solver: CompiledSolver, time_signals: Sequence[TimeSignal], run: Run
 ) -> str:
     """What is wrong with a compiled form at states of a run; empty where nothing, or where no comparison is due."""
     p = form.parameters(job.params)
-    driven = driven_signals(drives, run.times)
+    driven = signal_values(time_signals, run.times)
     if not form.compared.is_due(form.sides(run.times, run.states, driven, p)):
         return ""
     most = max(1, solver.evaluations // _SHARE) if solver.evaluations else _VISITED
     t, x = _closer(run, solver)
-    driven = driven_signals(drives, t)
+    driven = signal_values(time_signals, t)
     w, sides = form.signals(t, x, driven, p), form.sides(t, x, driven, p)
     places = telling_states(sides, np.concatenate([w, x]), most)
     # Blocks are compared at the inputs that the form computes: where each agrees, the whole does.

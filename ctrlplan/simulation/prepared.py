@@ -12,13 +12,13 @@ import control as ct
 import numpy as np
 from numpy.typing import NDArray
 
-from ctrlplan.simulation.drives import Drive, PlanDrive, driven_signals
 from ctrlplan.simulation.fingerprint import References, roots_of
 from ctrlplan.simulation.interpreted import Interpreted
-from ctrlplan.simulation.legs import DelayedDrive
+from ctrlplan.simulation.legs import DelayedSignal
 from ctrlplan.simulation.linear import LinearForm, NotLinearError, linear_form
 from ctrlplan.simulation.network import Network, UnsupportedError
 from ctrlplan.simulation.recent import BUILDING, recent
+from ctrlplan.simulation.signals import PlanSignal, TimeSignal, signal_values
 from ctrlplan.simulation.trials import reads
 from ctrlplan.simulation.untouched import tried, untouched
 from ctrlplan.traits import traits_of
@@ -85,7 +85,7 @@ class Prepared:
             if block.delay is not None or block.period is not None:
                 what = "puts out the past" if block.delay is not None else "takes samples"
                 self.not_linear = f"block {block.name} {what}"
-        self._sources = [PlanDrive(b.plan, b.traits.derivatives) for b in self._blocks() if b.plan is not None]
+        self._sources = [PlanSignal(b.plan, b.traits.derivatives) for b in self._blocks() if b.plan is not None]
         self.trusted = True
         self.trials = True
         self._read: dict[str, bool] = {}
@@ -109,7 +109,7 @@ class Prepared:
         """Number of inputs."""
         return len(self.input_labels)
 
-    def drives(self, inputs: list[Drive], first: float) -> list[Drive]:
+    def time_signals(self, inputs: list[TimeSignal], first: float) -> list[TimeSignal]:
         """Given inputs, then the driven blocks in order."""
         sources, found = iter(self._sources), list(inputs)
         for block in self._blocks():
@@ -117,10 +117,12 @@ class Prepared:
                 found.append(next(sources))
             elif block.delay is not None:
                 initial = np.broadcast_to(np.asarray(block.traits.initial, dtype=float), (block.system.ninputs,))
-                found.append(DelayedDrive(block.delay, initial, first))
+                found.append(DelayedSignal(block.delay, initial, first))
         return [*found, *sources]
 
-    def compiled(self, params: Mapping[str, Any], drives: list[Drive], first: float, state: Array) -> Compiled:
+    def compiled(
+        self, params: Mapping[str, Any], time_signals: list[TimeSignal], first: float, state: Array
+    ) -> Compiled:
         """Compiled form for some parameters, built once for all their values.
 
         Raises
@@ -133,7 +135,7 @@ class Prepared:
             with BUILDING:
                 form = self._known(params)
                 if form is None:
-                    form, baked = self._build(params, drives, first, state)
+                    form, baked = self._build(params, time_signals, first, state)
                     if self.original is not None:  # what blocks only write has turned out meanwhile
                         self.fingerprint = fingerprint(self.original)
                     self._compiled = [*self._compiled[-7:], (frozenset(params), baked, form)]
@@ -206,7 +208,7 @@ class Prepared:
 
         def starting() -> Array:
             equations = Interpreted(network, {name: value}, (0.0, start))
-            return equations.signals(0.0, start, driven_signals(self.drives([], 0.0), np.zeros(1))[:, 0])
+            return equations.signals(0.0, start, signal_values(self.time_signals([], 0.0), np.zeros(1))[:, 0])
 
         read: set[str] = set()
         rng = np.random.default_rng(0)
@@ -223,7 +225,7 @@ class Prepared:
         return name in read or _Noticing.ALL in read
 
     def _build(
-        self, params: Mapping[str, Any], drives: list[Drive], first: float, state: Array
+        self, params: Mapping[str, Any], time_signals: list[TimeSignal], first: float, state: Array
     ) -> tuple[Compiled | NotCompiledError, dict[str, Any]]:
         if find_spec("casadi") is None:
             return NotCompiledError("CasADi is not installed (pip install ctrlplan[fast])"), {}
@@ -242,7 +244,7 @@ class Prepared:
             keeper = callable_references(others, params).keeper()
             try:
                 equations = Interpreted(network.for_trials(), params, (first, state), self.trials)
-                w = equations.signals(first, state, driven_signals(drives, np.array([first]))[:, 0])
+                w = equations.signals(first, state, signal_values(time_signals, np.array([first]))[:, 0])
             finally:
                 keeper.restore()
             for block, states, fed in zip(network.blocks, network.states, network.fed, strict=True):

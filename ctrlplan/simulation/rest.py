@@ -13,10 +13,10 @@ from scipy.linalg import null_space
 from scipy.optimize import least_squares
 
 from ctrlplan._checks import real_array
-from ctrlplan.simulation.drives import Drive, PlanDrive, input_drives
 from ctrlplan.simulation.interpreted import Interpreted
 from ctrlplan.simulation.linear import LinearForm, NotLinearError, in_right_half, linear_form
 from ctrlplan.simulation.prepared import Prepared, prepared_form
+from ctrlplan.simulation.signals import PlanSignal, TimeSignal, input_signals
 from ctrlplan.trajectories import Trajectory
 
 Array = NDArray[np.float64]
@@ -72,10 +72,10 @@ def rest_at(
     free = np.ones(prepared.nstates, dtype=bool) if stated is None else np.isnan(stated)
     if not free.any():
         return start, ""
-    given = input_drives(prepared.input_labels, plan if prepared.ninputs else None, np.array([time, time + 1.0]))
+    given = input_signals(prepared.input_labels, plan if prepared.ninputs else None, np.array([time, time + 1.0]))
     target = plan.jet(np.array([time]), 0, left=True)[0, :, 0]
     rows = list(outputs)
-    held = np.concatenate([np.zeros(0), *(_held(drive, time) for drive in prepared.drives(given, time))])
+    held = np.concatenate([np.zeros(0), *(_held(signal, time) for signal in prepared.time_signals(given, time))])
     if prepared.linear is not None:
         form = prepared.linear
         state = _linear_rest(form.a, form.b @ held, form.c[rows], form.d[rows] @ held, target, start, free)
@@ -132,12 +132,12 @@ def _form(system: Any) -> LinearForm:
     return system.linear
 
 
-def _held(drive: Drive, time: float) -> Array:
-    """Signals of a drive, held where they are before anything happens at `time`."""
-    if not isinstance(drive, PlanDrive):
-        return drive.at(np.array([time]))[:, 0]
-    jet = np.zeros((drive.plan.naxes, drive.derivatives + 1))
-    jet[:, 0] = drive.plan.jet(np.array([time]), 0, left=True)[0, :, 0]
+def _held(signal: TimeSignal, time: float) -> Array:
+    """Values of a signal before anything happens at `time`, with derivatives of 0."""
+    if not isinstance(signal, PlanSignal):
+        return signal.at(np.array([time]))[:, 0]
+    jet = np.zeros((signal.plan.naxes, signal.derivatives + 1))
+    jet[:, 0] = signal.plan.jet(np.array([time]), 0, left=True)[0, :, 0]
     return jet.ravel()
 
 
@@ -207,8 +207,10 @@ class _Equations:
 
     def _compiled(self, prepared: Prepared, held: Array, time: float, params: Mapping[str, Any], start: Array) -> None:
         """Equations of a form that was compiled for another process."""
-        drives = prepared.drives(input_drives(prepared.input_labels, 0.0, np.array([time, time + 1.0])), time)
-        form = prepared.compiled(params, drives, time, start)
+        time_signals = prepared.time_signals(
+            input_signals(prepared.input_labels, 0.0, np.array([time, time + 1.0])), time
+        )
+        form = prepared.compiled(params, time_signals, time, start)
         p, t, d = form.parameters(params), np.array([time]), held[:, None]
         self._rates = lambda x: form.rates(t, x[:, None], d, p)[:, 0]
         self._outputs = lambda x: form.outputs(t, x[:, None], d, p)[:, 0]

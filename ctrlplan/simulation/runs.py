@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctrlplan.simulation.budget import check
-from ctrlplan.simulation.drives import PlanDrive, SampledDrive, breakpoints_of, driven_signals
 from ctrlplan.simulation.events import Snapshot
 from ctrlplan.simulation.exact import exact_states, sampled_states
 from ctrlplan.simulation.interpreted import Interpreted, SolverError
@@ -17,6 +16,7 @@ from ctrlplan.simulation.job import Job, Record, unused, with_looks
 from ctrlplan.simulation.linear import LinearForm
 from ctrlplan.simulation.numerical import numerical
 from ctrlplan.simulation.prepared import DisagreementError, NotCompiledError
+from ctrlplan.simulation.signals import PlanSignal, SampledSignal, breakpoints_of, signal_values
 
 if TYPE_CHECKING:
     pass
@@ -76,10 +76,13 @@ def recorded(job: Job, method: str) -> Record:
 
 def _exact(job: Job, form: LinearForm) -> Record:
     """Linear loop: one matrix exponential a leg, and one for each spacing of samples."""
-    drives = [*job.inputs, *(PlanDrive(plan, high) for plan, high in form.sources)]
-    plans = [(drive.plan, drive.derivatives) for drive in drives if isinstance(drive, PlanDrive)]
+    time_signals = [*job.inputs, *(PlanSignal(plan, high) for plan, high in form.sources)]
+    plans = [(signal.plan, signal.derivatives) for signal in time_signals if isinstance(signal, PlanSignal)]
     sampled = (
-        np.concatenate([np.full(drive.width, isinstance(drive, SampledDrive)) for drive in drives] or [np.zeros(0)]) > 0
+        np.concatenate(
+            [np.full(signal.width, isinstance(signal, SampledSignal)) for signal in time_signals] or [np.zeros(0)]
+        )
+        > 0
     )
     breakpoints = [t for plan, _ in plans for t in plan.breakpoints]
     watched = job.watched()
@@ -91,13 +94,13 @@ def _exact(job: Job, form: LinearForm) -> Record:
         return np.concatenate(signals, axis=1) if signals else np.zeros((order + 1, 0, s.size))
 
     def see(t: Array, x: Array) -> Snapshot:
-        driven = driven_signals(drives, t)
+        driven = signal_values(time_signals, t)
         return Snapshot(t, x, driven[: job.prepared.ninputs], form.outputs(x, driven))
 
     def states_at(t: Array, state: Array, a: Array = form.a) -> Array:
         found = exact_states(a, form.b[:, ~sampled], jet, breakpoints, t, state)
         if sampled.any():  # what plans and samples make of a linear loop adds up
-            samples = driven_signals(drives, t)[sampled]
+            samples = signal_values(time_signals, t)[sampled]
             found = found + sampled_states(a, form.b[:, sampled], samples, t, np.zeros_like(state))
         return _finite(found)
 
@@ -107,7 +110,7 @@ def _exact(job: Job, form: LinearForm) -> Record:
     states = states_at(times, job.state)
     growing, fast = form.sensitivity(float(times[-1] - times[0]))
     if growing or fast:
-        driven, nearly = driven_signals(drives, times), states_at(times, job.state, form.a * (1.0 + 2.0**-50))
+        driven, nearly = signal_values(time_signals, times), states_at(times, job.state, form.a * (1.0 + 2.0**-50))
         floor = form.rounding(states[:, :1] if growing else states, driven)
         _warn_of_lost_digits(job, form.outputs(states, driven), form.outputs(nearly, driven), floor)
     _warn_of_undefined(job, form, times, states)
@@ -160,10 +163,10 @@ def _discrete(job: Job, reason: str) -> Record:
     """
     prepared, network = job.prepared, job.blocks
     clock = _clock(job.times, prepared.dt)
-    drives = prepared.drives(job.inputs, job.first)
+    time_signals = prepared.time_signals(job.inputs, job.first)
     equations = Interpreted(network, job.params, (job.first, job.state), prepared.trials)
-    breakpoints = np.array(sorted(breakpoints_of(drives)))
-    driven = driven_signals(drives, _on_breakpoints(clock, breakpoints))
+    breakpoints = np.array(sorted(breakpoints_of(time_signals)))
+    driven = signal_values(time_signals, _on_breakpoints(clock, breakpoints))
     states = np.empty((job.state.size, clock.size))
     signals = np.empty((network.nsignals, clock.size))
     states[:, 0] = job.state
@@ -175,7 +178,7 @@ def _discrete(job: Job, reason: str) -> Record:
             states[:, k + 1] = following
 
     def see(t: Array, x: Array) -> Snapshot:
-        now = driven_signals(drives, _on_breakpoints(t, breakpoints))
+        now = signal_values(time_signals, _on_breakpoints(t, breakpoints))
         w = signals[:, np.searchsorted(clock, t, side="right") - 1]
         return Snapshot(t, x, now[: prepared.ninputs], network.put_out(w), lambda: w)
 

@@ -15,13 +15,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from ctrlplan._checks import real_array
 from ctrlplan.simulation.budget import begin_run
-from ctrlplan.simulation.drives import Inputs, driven_signals, input_drives
 from ctrlplan.simulation.events import Event, Occurrence, crossings
 from ctrlplan.simulation.interpreted import FeedthroughError
 from ctrlplan.simulation.job import Job, Record
 from ctrlplan.simulation.prepared import Prepared, prepared_form
 from ctrlplan.simulation.runs import METHODS, recorded
 from ctrlplan.simulation.scales import RELATIVE
+from ctrlplan.simulation.signals import Inputs, input_signals, signal_values
 
 Array = NDArray[np.float64]
 
@@ -163,12 +163,12 @@ def simulate(
     if method not in METHODS:
         raise ValueError(f"method must be one of {', '.join(METHODS)}, got {method!r}")
     prepared = prepared_form(system)
-    drives = input_drives(prepared.input_labels, inputs, times)
+    time_signals = input_signals(prepared.input_labels, inputs, times)
     state = _checked_state(prepared, initial_state)
     _warn_of_idle(prepared, params or {})
     if prepared.dt is None and prepared.nstates:
         warnings.warn(_NO_TIMEBASE.format(prepared.name), UserWarning, stacklevel=2)
-    job = Job(prepared, times, drives, state, dict(params or {}), rtol, atol, events, prepared.network)
+    job = Job(prepared, times, time_signals, state, dict(params or {}), rtol, atol, events, prepared.network)
     if prepared.network is None and prepared.linear is None and method in ("auto", "python"):
         return _delegated(job)
     try:
@@ -240,7 +240,7 @@ def _delegated(job: Job) -> ct.TimeResponseData:
         response = ct.input_output_response(
             prepared.system,
             job.times,
-            driven_signals(job.inputs, job.times) if job.inputs else 0,
+            signal_values(job.inputs, job.times) if job.inputs else 0,
             job.state,
             params=job.params or None,
             solve_ivp_method="LSODA",

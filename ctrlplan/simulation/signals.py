@@ -1,4 +1,4 @@
-"""Signals that are functions of time alone, as one short Chebyshev series a leg.
+"""Signals that are functions of time alone, as one short Chebyshev series a segment.
 
 A plan is analytic between its breakpoints. A solver that asks for it a
 thousand times a second, at a time and for all its derivatives, is served from
@@ -90,7 +90,7 @@ class Series:
         )
 
 
-class Drive(Protocol):
+class TimeSignal(Protocol):
     """Some signals that are functions of time, analytic between breakpoints."""
 
     @property
@@ -115,7 +115,7 @@ class Drive(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class PlanDrive:
+class PlanSignal:
     """A plan and its derivatives, axis by axis."""
 
     plan: Trajectory
@@ -145,7 +145,7 @@ class PlanDrive:
         return signal_rows(self.plan, times, self.derivatives)
 
 
-class SampledDrive:
+class SampledSignal:
     """One signal given by samples, straight in between; it breaks where it bends."""
 
     width = 1
@@ -177,8 +177,8 @@ class SampledDrive:
         return np.clip(found, np.minimum(first, second), np.maximum(first, second))[None]
 
 
-def input_drives(labels: Sequence[str], inputs: Inputs, times: Array) -> list[Drive]:
-    """What drives the inputs of a system, in order.
+def input_signals(labels: Sequence[str], inputs: Inputs, times: Array) -> list[TimeSignal]:
+    """Signals at the inputs of a system, in order.
 
     Raises
     ------
@@ -197,7 +197,7 @@ def input_drives(labels: Sequence[str], inputs: Inputs, times: Array) -> list[Dr
             raise ValueError(f"inputs must have {len(labels)} axes {known}, got {inputs.naxes}")
         # By name where the names are the same, whatever their order.
         crossed = set(inputs.labels) == set(labels) and inputs.labels != tuple(labels)
-        return [PlanDrive(inputs.select(labels) if crossed else inputs)]
+        return [PlanSignal(inputs.select(labels) if crossed else inputs)]
     elif inputs is None or (not isinstance(inputs, list | tuple) and np.ndim(inputs) == 0 and not callable(inputs)):
         given = [0.0 if inputs is None else inputs] * len(labels)
     elif (
@@ -212,12 +212,12 @@ def input_drives(labels: Sequence[str], inputs: Inputs, times: Array) -> list[Dr
         if rows.shape not in ((len(labels), times.size), (len(labels),)):
             raise ValueError(f"inputs must have shape ({len(labels)}, {times.size}), got {rows.shape}")
         given = list(rows)
-    return [_drive(value, name, times) for value, name in zip(given, labels, strict=True)]
+    return [_time_signal(value, name, times) for value, name in zip(given, labels, strict=True)]
 
 
-def driven_signals(drives: Sequence[Drive], times: Array) -> Array:
-    """All signals of some drives (nsignals, ntime), right-continuous."""
-    return np.concatenate([np.zeros((0, times.size)), *(drive.at(times) for drive in drives)])
+def signal_values(time_signals: Sequence[TimeSignal], times: Array) -> Array:
+    """All signals of some time_signals (nsignals, ntime), right-continuous."""
+    return np.concatenate([np.zeros((0, times.size)), *(signal.at(times) for signal in time_signals)])
 
 
 def resolved(
@@ -296,20 +296,20 @@ def _numbers(value: Any, what: str) -> Array:
     return real_array(value, what)
 
 
-def _drive(value: Any, name: str, times: Array) -> Drive:
+def _time_signal(value: Any, name: str, times: Array) -> TimeSignal:
     if isinstance(value, Trajectory):
         if value.naxes != 1:
             raise ValueError(f"input {name} must be driven by one axis, got {value.naxes}")
-        return PlanDrive(value)
+        return PlanSignal(value)
     signal = _numbers(value, f"input {name}")
     if not np.isfinite(signal).all():
         raise ValueError(f"input {name} must be finite, got nan or inf at index {int((~np.isfinite(signal)).argmax())}")
     if signal.ndim == 0:
-        return PlanDrive(Step(signal, initial=signal, time=times[0]))
+        return PlanSignal(Step(signal, initial=signal, time=times[0]))
     if signal.shape != times.shape:
         kinds = f"a trajectory, a number or {times.size} samples"
         raise ValueError(f"input {name} must be {kinds}, got shape {signal.shape}")
-    return SampledDrive(times, signal)
+    return SampledSignal(times, signal)
 
 
 def within(left: float, right: float, switches: Sequence[float]) -> tuple[float, float]:
@@ -328,9 +328,9 @@ def within(left: float, right: float, switches: Sequence[float]) -> tuple[float,
     return left + inset * at_left, right - inset * at_right
 
 
-def breakpoints_of(drives: Iterable[Drive]) -> list[float]:
-    """Times at which one of the drives is not analytic."""
-    return [float(t) for drive in drives for t in drive.breakpoints]
+def breakpoints_of(time_signals: Iterable[TimeSignal]) -> list[float]:
+    """Times at which one of the time_signals is not analytic."""
+    return [float(t) for signal in time_signals for t in signal.breakpoints]
 
 
 _LOOKS = np.array([0.0312345, 0.1234567, 0.25, 0.3456789, 0.5, 0.6543217, 0.75, 0.8765431, 0.9712345])
