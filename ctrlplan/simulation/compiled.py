@@ -14,10 +14,10 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from ctrlplan._lru import recent
 from ctrlplan.simulation.compared import Compared
 from ctrlplan.simulation.interpreted import SolverError
 from ctrlplan.simulation.network import Block, Network, Step, known_feedthrough
-from ctrlplan.simulation.recent import recent
 from ctrlplan.simulation.scales import Scales, Tolerances
 from ctrlplan.simulation.signals import Series, within
 from ctrlplan.simulation.switches import changes_of_side, switch_arguments
@@ -29,7 +29,7 @@ _KEPT = 64
 """Integrators kept, one for each pattern of output times; and functions, one for each number of times."""
 
 _FEW = 64
-"""Output times of a leg up to which their pattern is rounded, so that legs of one length share an integrator."""
+"""Output times of a segment up to which the pattern is rounded, so that segments of one length share an integrator."""
 
 _FEW_STEPS = 2_000
 """Steps from output to output at the first attempt."""
@@ -46,7 +46,7 @@ _FAILURES = {
 }
 
 _STIFF = 3000.0
-"""Times that the fastest motion could die out within a leg, above which BDF takes fewer steps than Adams."""
+"""Times that the fastest motion could die out within a segment, above which BDF takes fewer steps than Adams."""
 
 _EDGE = 100.0
 """Tolerances of a step about a state within which equations must be defined."""
@@ -190,7 +190,7 @@ class Compiled:
     def integrator(
         self, width: int, grid: Array, stiff: bool, rtol: float, atol: float, max_steps: int, longest: float
     ) -> Any:
-        """CVODES over a leg of length 1, with outputs at some of its times."""
+        """CVODES over a segment of length 1, with outputs at some of its times."""
         # CasADi runs without Python's lock: no integrator is used by two threads at once.
         key = (threading.get_ident(), width, grid.tobytes(), stiff, rtol, atol, max_steps, longest)
 
@@ -205,7 +205,7 @@ class Compiled:
                 "disable_internal_warnings": True,
             }
             with _passing_interruptions():
-                return ca.integrator("leg", "cvodes", self._leg_equations(width), 0.0, grid.tolist(), options)
+                return ca.integrator("segment", "cvodes", self._segment_equations(width), 0.0, grid.tolist(), options)
 
         return recent(self._integrators, key, _KEPT, made)
 
@@ -216,7 +216,7 @@ class Compiled:
         at_all = recent(self._maps, (name, t.size), _KEPT, lambda: function.map(t.size))
         return _called(at_all, (t, x, driven, np.repeat(p[:, None], t.size, axis=1)), function.numel_out(0))
 
-    def _leg_equations(self, width: int) -> dict[str, Any]:
+    def _segment_equations(self, width: int) -> dict[str, Any]:
         """Equations of scaled states in s from 0 to 1, the functions of time as Chebyshev series of some width."""
         if width not in self._equations:
             nx, nd, np_ = (self._rates.numel_in(k) for k in (1, 2, 3))
@@ -245,7 +245,7 @@ class Compiled:
 
 
 class CompiledSolver:
-    """CVODES on a compiled network, leg by leg.
+    """CVODES on a compiled network, segment by segment.
 
     Attributes
     ----------
@@ -304,12 +304,12 @@ class CompiledSolver:
         return self._equations.instants(first, last, driven, self._p)
 
     def advance(self, series: Series, left: float, grid: Array, state: Array) -> Array:
-        """States (nstates, ngrid) at times of a leg, of which the last is its end."""
+        """States (nstates, ngrid) at times of a segment, of which the last is its end."""
         if not state.size:
             return np.zeros((0, grid.size))
         right = float(grid[-1])
         relative = (grid - left) / (right - left)
-        if grid.size <= _FEW:  # a rounding error of the clock must not make a new integrator of every short leg
+        if grid.size <= _FEW:  # a rounding error of the clock must not make a new integrator of every short segment
             relative = np.round(relative, 12)
         if right - left > self._longest:
             decay = self._equations.fastest_decay(left, state, series(left), self._p)

@@ -283,7 +283,7 @@ class Interpreted:
 
 
 class InterpretedSolver:
-    """LSODA on a network's equations, leg by leg."""
+    """LSODA on a network's equations, segment by segment."""
 
     def __init__(self, equations: Interpreted, tolerances: Tolerances, scales: Scales) -> None:
         self._equations, self._scales = equations, scales

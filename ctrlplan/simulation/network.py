@@ -99,7 +99,7 @@ class Block:
 
     @property
     def driven(self) -> bool:
-        """Whether the outputs are, over a leg, functions of time alone."""
+        """Whether the outputs are, over a segment, functions of time alone."""
         return self.plan is not None or self.delay is not None
 
     def output(self, params: Mapping[str, Any]) -> Map:
@@ -271,7 +271,7 @@ class Network:
 
     @cached_property
     def driven(self) -> NDArray[np.intp]:
-        """Signals that are functions of time alone over a leg: inputs, plans, delayed signals."""
+        """Signals that are functions of time alone over a segment: inputs, plans, delayed signals."""
         rows = [np.arange(self.ninputs)]
         rows += [
             np.arange(place.start, place.stop)

@@ -19,10 +19,10 @@ from ctrlplan.simulation.compared import telling_states
 from ctrlplan.simulation.events import Snapshot, Watched
 from ctrlplan.simulation.interpreted import Interpreted, InterpretedSolver, SolverError
 from ctrlplan.simulation.job import Job, Record, unused, with_looks
-from ctrlplan.simulation.legs import Run, integrate, known_before
 from ctrlplan.simulation.network import Network
 from ctrlplan.simulation.prepared import NotCompiledError
 from ctrlplan.simulation.scales import PASSES, Scales, Tolerances, doubt, effects, remaining
+from ctrlplan.simulation.segments import Run, integrate, known_before
 from ctrlplan.simulation.signals import TimeSignal, breakpoints_of, signal_values
 from ctrlplan.simulation.stalled import unrepeatable
 from ctrlplan.simulation.untouched import same_answer, tried, untouched

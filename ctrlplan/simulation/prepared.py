@@ -12,12 +12,12 @@ import control as ct
 import numpy as np
 from numpy.typing import NDArray
 
+from ctrlplan._lru import BUILDING, recent
 from ctrlplan.simulation.fingerprint import References, roots_of
 from ctrlplan.simulation.interpreted import Interpreted
-from ctrlplan.simulation.legs import DelayedSignal
 from ctrlplan.simulation.linear import LinearForm, NotLinearError, linear_form
 from ctrlplan.simulation.network import Network, UnsupportedError
-from ctrlplan.simulation.recent import BUILDING, recent
+from ctrlplan.simulation.segments import DelayedSignal
 from ctrlplan.simulation.signals import PlanSignal, TimeSignal, signal_values
 from ctrlplan.simulation.trials import reads
 from ctrlplan.simulation.untouched import tried, untouched

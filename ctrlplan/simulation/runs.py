@@ -75,7 +75,7 @@ def recorded(job: Job, method: str) -> Record:
 
 
 def _exact(job: Job, form: LinearForm) -> Record:
-    """Linear loop: one matrix exponential a leg, and one for each spacing of samples."""
+    """Linear loop: one matrix exponential a segment, and one for each spacing of samples."""
     time_signals = [*job.inputs, *(PlanSignal(plan, high) for plan, high in form.sources)]
     plans = [(signal.plan, signal.derivatives) for signal in time_signals if isinstance(signal, PlanSignal)]
     sampled = (

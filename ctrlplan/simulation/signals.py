@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 Inputs = Trajectory | ArrayLike | Mapping[str, Trajectory | ArrayLike] | None
 
 WIDTHS = (1, 8, 16, 24, 32, 40, 48, 64)
-"""Numbers of terms of a series; a leg that needs more is halved."""
+"""Numbers of terms of a series; a segment that needs more is halved."""
 
 RESOLVED = 4e-15
 """Size of the last terms, relative to the greatest, at which a signal counts as resolved."""
@@ -132,7 +132,7 @@ class PlanSignal:
         return self.plan.naxes * (self.derivatives + 1)
 
     def beside(self, moment: float, origin: float, s: Array) -> Array:
-        """Values of the leg that holds at `moment`."""
+        """Values of the segment that holds at `moment`."""
         jet = self.plan._jet_beside(moment, origin, s, self.derivatives)
         return jet.transpose(1, 0, 2).reshape(-1, s.size)
 
@@ -227,20 +227,20 @@ def resolved(
     tolerance: float = RESOLVED,
     rounding: Array | float = 0.0,
 ) -> list[Series]:
-    """Series of analytic signals over a leg, as many as it takes.
+    """Series of analytic signals over a segment, as many as it takes.
 
     Parameters
     ----------
     signals : callable
         Maps times since `left` (ntime,) to values (nsignals, ntime).
     left, right : float
-        The leg [s].
+        The segment [s].
     tolerance : float, optional
         Maximum size of what is cut off, relative to each signal.
     rounding : ndarray, shape (nsignals,), or float, optional
         Rounding errors of the signals, which no halving makes smaller.
     """
-    # Never at the ends, where a neighbouring leg might be asked.
+    # Never at the ends, where a neighbouring segment might be asked.
     duration = right - left
     values = signals(duration * _LOOKS)
     if np.all(values == values[:, :1]):
@@ -251,8 +251,8 @@ def resolved(
         allowed = size.max(axis=1, keepdims=True)
         if np.all(size[:, -3:] <= np.maximum(tolerance * allowed, np.reshape(rounding, (-1, 1)))):
             return [_unbounded(left, right, coefficients)]
-    # Terms that no longer fall are rounding errors of the signal itself, which shorter legs make no smaller: where a
-    # plan comes to rest, its derivatives are next to nothing beside it.
+    # Terms that no longer fall are rounding errors of the signal itself, which shorter segments make no smaller: where
+    # a plan comes to rest, its derivatives are next to nothing compared with it.
     half, end = size[:, width // 2 : -width // 4], size[:, -width // 4 :]
     noise = np.maximum(half.max(axis=1), end.max(axis=1))
     flat = half.max(axis=1) <= 10.0 * end.max(axis=1)
@@ -266,7 +266,7 @@ def resolved(
 
 
 def chebyshev_times(left: float, right: float, width: int) -> Array:
-    """Increasing times of a leg at which `chebyshev_coefficients` wants values."""
+    """Increasing times of a segment at which `chebyshev_coefficients` wants values."""
     nodes, _ = _chebyshev(width)
     return left + (right - left) * (0.5 * (nodes + 1.0))
 
@@ -334,7 +334,7 @@ def breakpoints_of(time_signals: Iterable[TimeSignal]) -> list[float]:
 
 
 _LOOKS = np.array([0.0312345, 0.1234567, 0.25, 0.3456789, 0.5, 0.6543217, 0.75, 0.8765431, 0.9712345])
-"""Where a signal is looked at to see whether it is constant over a leg."""
+"""Where a signal is looked at to see whether it is constant over a segment."""
 
 
 @lru_cache(maxsize=32)

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from ctrlplan.simulation.recent import BUILDING
+from ctrlplan._lru import BUILDING
 
 T = TypeVar("T")
 

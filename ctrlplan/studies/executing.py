@@ -20,8 +20,8 @@ from uuid import uuid4
 
 from tqdm import tqdm
 
+from ctrlplan._lru import recent
 from ctrlplan.simulation.budget import time_limit
-from ctrlplan.simulation.recent import recent
 
 T = TypeVar("T")
 R = TypeVar("R")

@@ -1,4 +1,4 @@
-"""The way of every numerical run: from leg to leg, samples, delays and stops between them."""
+"""The way of every numerical run: from segment to segment, samples, delays and stops between them."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _WIDTH = 24
 """Terms with which a signal that will be delayed is kept."""
 
 _SHORTEST = 1.0 / 64.0
-"""Legs this much shorter than the delay are not halved for a signal's sake."""
+"""Segments this much shorter than the delay are not halved for a signal's sake."""
 
 _HOPS = 6
 """Delays after which what was a jump is smooth enough to be passed over."""
@@ -49,18 +49,18 @@ _DENOMINATOR = 10**7
 _ROUNDINGS = 64.0
 """Rounding errors of a plan, in units of the last place of its largest values."""
 
-_LEGS = 2_000
-"""Legs that blocks may ask for in a run."""
+_SEGMENTS = 2_000
+"""Segments that blocks may ask for in a run."""
 
 _MARKS = 20_000
 """Instants of jumps that a run stops at, at most."""
 
 
 class Solver(Protocol):
-    """What carries a state over a leg."""
+    """What carries a state over a segment."""
 
     def advance(self, series: Series, left: float, grid: Array, state: Array) -> Array:
-        """States (nstates, ngrid) at times of a leg, of which the last is its end."""
+        """States (nstates, ngrid) at times of a segment, of which the last is its end."""
 
     def signals(self, times: Array, states: Array, driven: Array) -> Array:
         """All signals (nsignals, ntime)."""
@@ -70,7 +70,7 @@ class Solver(Protocol):
 
 
 class DelayedSignal:
-    """Signals of the past, kept as series of the legs they were seen on."""
+    """Signals of the past, kept as series of the segments they were seen on."""
 
     def __init__(self, delay: float, initial: Array, first: float) -> None:
         self.delay, self.width = delay, initial.size
@@ -81,12 +81,12 @@ class DelayedSignal:
         self._ends: list[float] = []
 
     def record(self, piece: Series) -> None:
-        """Signals of a leg, as they went in."""
+        """Signals of a segment, as they went in."""
         self._pieces.append(piece)
         self._ends.append(piece.right)
 
     def beside(self, moment: float, origin: float, s: Array) -> Array:
-        """Values as they were; legs end where they break."""
+        """Values as they were; segments end where they break."""
         return self.at(origin + s)
 
     def bounds(self, moment: float, left: float, right: float) -> tuple[Array, Array]:
@@ -119,20 +119,20 @@ class Run:
     Attributes
     ----------
     times : ndarray, shape (ntime,)
-        Times asked for and those at which legs begin [s], as far as the run went.
+        Times asked for and those at which segments begin [s], as far as the run went.
     states : ndarray, shape (nstates, ntime)
         Right-continuous where a discrete block takes a sample.
-    legs : list of (float, Series)
-        Where each leg begins, and the driven signals over it.
+    segments : list of (float, Series)
+        Where each segment begins, and the driven signals over it.
     """
 
     times: Array
     states: Array
-    legs: list[tuple[float, Series]]
+    segments: list[tuple[float, Series]]
 
     def series(self, t: float) -> Series:
-        """Driven signals over the leg that begins at or before a time."""
-        return self.legs[max(0, bisect_right(self.legs, t, key=lambda leg: leg[0]) - 1)][1]
+        """Driven signals over the segment that begins at or before a time."""
+        return self.segments[max(0, bisect_right(self.segments, t, key=lambda segment: segment[0]) - 1)][1]
 
 
 def integrate(
@@ -163,8 +163,8 @@ def integrate(
     marks : sequence of float, optional
         Further times [s] at which equations switch.
     pause : callable, optional
-        Maps the times and states of a leg to whether the run may end behind
-        it; legs are then short.
+        Maps the times and states of a segment to whether the run may end behind
+        it; segments are then short.
 
     Raises
     ------
@@ -183,15 +183,15 @@ def integrate(
             f"a delay must be at least {_SHORTEST_DELAY:g} of the run of {last - first:g} s, got {longest:g} s"
         )
     declared = [block.traits.longest for block in network.blocks]
-    longest = min(longest, max(min(declared, default=np.inf), (last - first) / _LEGS))
+    longest = min(longest, max(min(declared, default=np.inf), (last - first) / _SEGMENTS))
     if pause is not None:
         longest = min(longest, (last - first) / 64.0)
     shortest = 1e-9 * (last - first) if pause is not None else np.inf
     # A plan whose terms cancel in a segment has there the rounding errors of its largest values.
     largest = np.abs(known_before(time_signals, np.union1d(np.linspace(first, last, 257), clock.marks))).max(axis=1)
     rounding = _ROUNDINGS * np.finfo(float).eps * np.where(np.isfinite(largest), largest, 0.0)
-    known: list[tuple[Array, Array]] = []  # times and states of each leg, its end left to the next
-    legs: list[tuple[float, Series]] = []
+    known: list[tuple[Array, Array]] = []  # times and states of each segment, its end left to the next
+    segments: list[tuple[float, Series]] = []
     span: list[Series] = []
     left, reach = first, longest
     x = clock.sample(equations, first, state)
@@ -223,19 +223,19 @@ def integrate(
         if not memory.record(left, right, series, grid, found):
             reach = 0.5 * (right - left)
             continue
-        legs.append((left, series))
+        segments.append((left, series))
         asked = np.isin(grid, inside)
         known.append((np.append(left, grid[asked]), np.column_stack([x, found[:, asked]])))
         before, x = x, clock.sample(equations, right, found[:, -1])
         left, reach = right, min(longest, 2.0 * reach)
-        if pause is not None and pause(np.append(legs[-1][0], grid), np.column_stack([before, found])):
+        if pause is not None and pause(np.append(segments[-1][0], grid), np.column_stack([before, found])):
             break
     known.append((np.array([left]), x[:, None]))
-    return Run(np.concatenate([t for t, _ in known]), np.concatenate([s for _, s in known], axis=1), legs)
+    return Run(np.concatenate([t for t, _ in known]), np.concatenate([s for _, s in known], axis=1), segments)
 
 
 class _Memory:
-    """What goes into delays, kept leg by leg."""
+    """What goes into delays, kept segment by segment."""
 
     def __init__(self, network: Network, solver: Solver, time_signals: Sequence[TimeSignal], resolution: float) -> None:
         blocks = network.blocks_with("delay")
@@ -246,11 +246,11 @@ class _Memory:
         self.delays = [signal.delay for signal in self._time_signals]
 
     def nodes(self, left: float, right: float) -> Array:
-        """Times of a leg at which states are needed."""
+        """Times of a segment at which states are needed."""
         return chebyshev_times(left, right, _WIDTH) if self._time_signals else np.empty(0)
 
     def record(self, left: float, right: float, series: Series, grid: Array, states: Array) -> bool:
-        """Keep a leg; False where it must be shorter for its signals to be resolved."""
+        """Keep a segment; False where it must be shorter for its signals to be resolved."""
         if not self._time_signals:
             return True
         nodes = self.nodes(left, right)
