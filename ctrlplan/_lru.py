@@ -1,26 +1,52 @@
-"""What was made lately, kept so that it need not be made again."""
+"""Built objects that are kept for further use, the most recently used ones."""
 
 from __future__ import annotations
 
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
-from typing import TypeVar
+from typing import Generic, TypeVar
 
 K = TypeVar("K", bound=Hashable)
 V = TypeVar("V")
 
 BUILDING = threading.RLock()
-"""Held by a thread that builds what others may use as well: one lock for all, so that none waits for another."""
+"""Held by a thread that builds what others may use as well: one lock for all, so that no two wait for each other."""
 
 
-def recent(store: OrderedDict[K, V], key: K, most: int, make: Callable[[], V]) -> V:
-    """What is kept under a key, made if it is not; of more than `most` the one longest unused goes."""
-    with BUILDING:
-        if key not in store:
-            made = make()
-            if len(store) >= most:
-                store.popitem(last=False)
-            store[key] = made
-        store.move_to_end(key)
-        return store[key]
+class Lru(Generic[K, V]):
+    """Bounded mapping that builds missing entries and drops the least recently used one; safe in threads.
+
+    A copy, or what another process receives, is empty.
+
+    Parameters
+    ----------
+    size : int
+        Maximum number of entries.
+    """
+
+    def __init__(self, size: int) -> None:
+        self.size = size
+        self._entries: OrderedDict[K, V] = OrderedDict()
+
+    def __len__(self) -> int:
+        return len(self._entries)
+
+    def __reduce__(self) -> tuple[type[Lru[K, V]], tuple[int]]:
+        return type(self), (self.size,)
+
+    def get(self, key: K, make: Callable[[], V]) -> V:
+        """Entry of a key, built if it is missing."""
+        with BUILDING:
+            if key not in self._entries:
+                made = make()
+                if len(self._entries) >= self.size:
+                    self._entries.popitem(last=False)
+                self._entries[key] = made
+            self._entries.move_to_end(key)
+            return self._entries[key]
+
+    def clear(self) -> None:
+        """Drop all entries."""
+        with BUILDING:
+            self._entries.clear()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 import signal
 import threading
-from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -14,7 +13,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from ctrlplan._lru import recent
+from ctrlplan._lru import Lru
 from ctrlplan.simulation.compared import Compared
 from ctrlplan.simulation.interpreted import SolverError
 from ctrlplan.simulation.network import Block, Network, Step, known_feedthrough
@@ -99,18 +98,13 @@ class Compiled:
             trace is not None and block.changes_unseen and trace.depends_on_time()
             for block, trace in zip(network.blocks, traces, strict=True)
         )
-        self._integrators: OrderedDict[Any, Any] = OrderedDict()
-        self._maps: OrderedDict[Any, Any] = OrderedDict()
+        self._integrators: Lru[tuple[object, ...], ca.Function] = Lru(_KEPT)
+        self._maps: Lru[tuple[str, int], ca.Function] = Lru(_KEPT)
         self._equations: dict[int, dict[str, Any]] = {}
 
     def __getstate__(self) -> dict[str, Any]:
         """Without what is made anew where it is needed."""
-        return self.__dict__ | {
-            "_traces": [],
-            "_integrators": OrderedDict(),
-            "_maps": OrderedDict(),
-            "_equations": {},
-        }
+        return self.__dict__ | {"_traces": [], "_equations": {}}
 
     def parameters(self, params: Mapping[str, Any]) -> Array:
         """Entries of p for a run."""
@@ -207,13 +201,13 @@ class Compiled:
             with _passing_interruptions():
                 return ca.integrator("segment", "cvodes", self._segment_equations(width), 0.0, grid.tolist(), options)
 
-        return recent(self._integrators, key, _KEPT, made)
+        return self._integrators.get(key, made)
 
     def _at_many(self, name: str, t: Array, x: Array, driven: Array, p: Array) -> Array:
         function = self._functions[name]
         if not function.numel_out(0):  # a system without inputs and outputs has no signals
             return np.zeros((0, t.size))
-        at_all = recent(self._maps, (name, t.size), _KEPT, lambda: function.map(t.size))
+        at_all = self._maps.get((name, t.size), lambda: function.map(t.size))
         return _called(at_all, (t, x, driven, np.repeat(p[:, None], t.size, axis=1)), function.numel_out(0))
 
     def _segment_equations(self, width: int) -> dict[str, Any]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Iterable, Iterator, Mapping
 from functools import partial
 from importlib.util import find_spec
@@ -12,7 +11,7 @@ import control as ct
 import numpy as np
 from numpy.typing import NDArray
 
-from ctrlplan._lru import BUILDING, recent
+from ctrlplan._lru import BUILDING, Lru
 from ctrlplan.simulation.fingerprint import References, roots_of
 from ctrlplan.simulation.interpreted import Interpreted
 from ctrlplan.simulation.linear import LinearForm, NotLinearError, linear_form
@@ -359,7 +358,7 @@ def prepared_form(system: Any) -> Prepared:
         system = system.original
     _checked_system(system)
     key = fingerprint(system)
-    return recent(_recent, key, _KEPT, lambda: Prepared(system))
+    return _FORMS.get(key, lambda: Prepared(system))
 
 
 def stated_start(system: Any) -> Array | None:
@@ -431,7 +430,7 @@ def _checked_system(system: Any) -> Any:
     return system
 
 
-_recent: OrderedDict[tuple[Any, ...], Prepared] = OrderedDict()
+_FORMS: Lru[tuple[object, ...], Prepared] = Lru(_KEPT)
 
 
 def _frozen(value: Any) -> Any:
