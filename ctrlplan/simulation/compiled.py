@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctrlplan._lru import Lru
-from ctrlplan.simulation.compared import Compared
 from ctrlplan.simulation.interpreted import SolverError
 from ctrlplan.simulation.network import Block, Network, Step, known_feedthrough
 from ctrlplan.simulation.scales import Scales, Tolerances
 from ctrlplan.simulation.signals import Series, within
-from ctrlplan.simulation.switches import changes_of_side, switch_arguments
-from ctrlplan.simulation.traced import NotTraceableError, Trace, agrees
+from ctrlplan.symbolic.comparison import Compared
+from ctrlplan.symbolic.switches import changes_of_side, switch_arguments
+from ctrlplan.symbolic.tracing import NotTraceableError, Trace, agrees
 
 Array = NDArray[np.float64]
 

@@ -26,8 +26,8 @@ from ctrlplan.simulation.network import (
 from ctrlplan.simulation.scales import Scales, Tolerances
 from ctrlplan.simulation.signals import Series, within
 from ctrlplan.simulation.stalled import cause
-from ctrlplan.simulation.trials import can_remember, trial_copy, values_of
-from ctrlplan.simulation.untouched import untouched
+from ctrlplan.symbolic.isolation import untouched
+from ctrlplan.symbolic.trials import can_remember, trial_copy, values_of
 
 Array = NDArray[np.float64]
 

@@ -14,7 +14,7 @@ from ctrlplan.simulation.events import Event, Snapshot, Watched, watched_events
 from ctrlplan.simulation.network import Network
 from ctrlplan.simulation.prepared import NotCompiledError, Prepared
 from ctrlplan.simulation.signals import TimeSignal
-from ctrlplan.simulation.trials import can_remember
+from ctrlplan.symbolic.trials import can_remember
 
 Array = NDArray[np.float64]
 

@@ -23,8 +23,8 @@ from scipy.linalg import block_diag
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
-from ctrlplan.simulation.trials import can_remember, of_library, reads, trial_copy, values_of
-from ctrlplan.simulation.untouched import untouched
+from ctrlplan.symbolic.isolation import untouched
+from ctrlplan.symbolic.trials import can_remember, of_library, reads, trial_copy, values_of
 from ctrlplan.traits import BlockTraits, traits_of
 from ctrlplan.trajectories import Trajectory
 

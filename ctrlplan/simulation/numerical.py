@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from scipy.integrate import trapezoid
 
 from ctrlplan.simulation.budget import TimeLimitError
-from ctrlplan.simulation.compared import telling_states
 from ctrlplan.simulation.events import Snapshot, Watched
 from ctrlplan.simulation.interpreted import Interpreted, InterpretedSolver, SolverError
 from ctrlplan.simulation.job import Job, Record, unused, with_looks
@@ -25,7 +24,8 @@ from ctrlplan.simulation.scales import PASSES, Scales, Tolerances, doubt, effect
 from ctrlplan.simulation.segments import Run, integrate, known_before
 from ctrlplan.simulation.signals import TimeSignal, breakpoints_of, signal_values
 from ctrlplan.simulation.stalled import unrepeatable
-from ctrlplan.simulation.untouched import same_answer, tried, untouched
+from ctrlplan.symbolic.comparison import telling_states
+from ctrlplan.symbolic.isolation import same_answer, tried, untouched
 
 if TYPE_CHECKING:
     from ctrlplan.simulation.compiled import Compiled, CompiledSolver

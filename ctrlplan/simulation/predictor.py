@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
@@ -13,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from ctrlplan.simulation.interpreted import LoopError, SolverError
 from ctrlplan.simulation.prepared import Prepared, prepare
 from ctrlplan.simulation.simulate import simulate
+from ctrlplan.symbolic import missing_casadi
 from ctrlplan.trajectories.common import Frozen, checked_limits, checked_time
 
 Array = NDArray[np.float64]
@@ -247,7 +247,7 @@ class Predictor(Frozen):
     def _methods(self) -> tuple[str, ...]:
         if self._prepared.linear is not None:
             return ("exact",)
-        return ("python",) if find_spec("casadi") is None else ("compiled", "python")
+        return ("python",) if missing_casadi() else ("compiled", "python")
 
     def _checked(self, x: ArrayLike, *references: ArrayLike) -> list[Array]:
         found = [np.asarray(x, dtype=float), *(np.atleast_1d(np.asarray(v, dtype=float)) for v in references)]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from functools import partial
-from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
 import control as ct
@@ -12,19 +11,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctrlplan._lru import BUILDING, Lru
-from ctrlplan.simulation.fingerprint import References, roots_of
 from ctrlplan.simulation.interpreted import Interpreted
 from ctrlplan.simulation.linear import LinearForm, NotLinearError, linear_form
 from ctrlplan.simulation.network import Network, UnsupportedError
 from ctrlplan.simulation.segments import DelayedSignal
 from ctrlplan.simulation.signals import PlanSignal, TimeSignal, signal_values
-from ctrlplan.simulation.trials import reads
-from ctrlplan.simulation.untouched import tried, untouched
+from ctrlplan.symbolic import missing_casadi
+from ctrlplan.symbolic.fingerprint import References, roots_of
+from ctrlplan.symbolic.isolation import tried, untouched
+from ctrlplan.symbolic.trials import reads
 from ctrlplan.traits import traits_of
 
 if TYPE_CHECKING:
     from ctrlplan.simulation.compiled import Compiled
-    from ctrlplan.simulation.traced import Trace
+    from ctrlplan.symbolic.tracing import Trace
 
 Array = NDArray[np.float64]
 
@@ -226,10 +226,10 @@ class Prepared:
     def _build(
         self, params: Mapping[str, Any], time_signals: list[TimeSignal], first: float, state: Array
     ) -> tuple[Compiled | NotCompiledError, dict[str, Any]]:
-        if find_spec("casadi") is None:
-            return NotCompiledError("CasADi is not installed (pip install ctrlplan[fast])"), {}
+        if missing := missing_casadi():
+            return NotCompiledError(missing), {}
         from ctrlplan.simulation.compiled import Compiled
-        from ctrlplan.simulation.traced import NotTraceableError, callable_references, traced
+        from ctrlplan.symbolic.tracing import NotTraceableError, callable_references, traced
 
         network = self.network
         if network is None:

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctrlplan.simulation.network import Block, Network
-from ctrlplan.simulation.trials import can_remember, trial_copy, values_of
-from ctrlplan.simulation.untouched import untouched
+from ctrlplan.symbolic.isolation import untouched
+from ctrlplan.symbolic.trials import can_remember, trial_copy, values_of
 
 Array = NDArray[np.float64]
 Values = Callable[[float, Array, Array], Array | None]

@@ -25,8 +25,8 @@ from typing import Any
 
 import numpy as np
 
+from ctrlplan._types import Frozen
 from ctrlplan.traits import traits_of
-from ctrlplan.trajectories.common import Frozen
 
 _MOST = 20_000
 """Objects that a fingerprint covers."""

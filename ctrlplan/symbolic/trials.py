@@ -21,7 +21,7 @@ import control as ct
 import numpy as np
 from numpy.typing import NDArray
 
-from ctrlplan.simulation.untouched import tried
+from ctrlplan.symbolic.isolation import tried
 from ctrlplan.traits import declare, traits_of
 
 Array = NDArray[np.float64]
