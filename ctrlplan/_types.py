@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
-from typing import NoReturn, Self
+from typing import TYPE_CHECKING, NoReturn, Self, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+if TYPE_CHECKING:
+    import control as ct
+
 Array = NDArray[np.float64]
+
+System: TypeAlias = "ct.InputOutputSystem"
+"""Any system of python-control, which has no types of its own."""
 
 
 class Frozen:

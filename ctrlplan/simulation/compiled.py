@@ -243,9 +243,13 @@ class CompiledSolver:
 
     Attributes
     ----------
+    form : Compiled
+        The compiled equations.
     evaluations : int
         Evaluations of the right-hand side so far, counted where a comparison with Python is expected.
     """
+
+    calls_blocks = False
 
     def __init__(
         self,
@@ -255,7 +259,7 @@ class CompiledSolver:
         scales: Scales,
         max_steps: int = 20_000,
     ) -> None:
-        self._equations, self._p = equations, equations.parameters(params)
+        self.form, self._p = equations, equations.parameters(params)
         self._scales, self._max_steps = scales, max_steps
         self._tolerances = tolerances
         self._longest, self._stiff = 0.0, False
@@ -265,20 +269,20 @@ class CompiledSolver:
 
     def signals(self, times: Array, states: Array, driven: Array) -> Array:
         """All signals (nsignals, ntime) of the network."""
-        return self._equations.signals(times, states, driven, self._p)
+        return self.form.signals(times, states, driven, self._p)
 
     def outputs(self, times: Array, states: Array, driven: Array) -> Array:
         """Outputs (noutputs, ntime) of the whole."""
-        return self._equations.outputs(times, states, driven, self._p)
+        return self.form.outputs(times, states, driven, self._p)
 
     def slopes(self, times: Array, states: Array, driven: Array) -> Array:
         """Derivatives of the rates by the states, (ntime, nstates, nstates)."""
         n = len(states)
-        return self._equations.slopes(times, states, driven, self._p).reshape(n, n, times.size).transpose(2, 1, 0)
+        return self.form.slopes(times, states, driven, self._p).reshape(n, n, times.size).transpose(2, 1, 0)
 
     def rates(self, times: Array, states: Array, driven: Array) -> Array:
         """Rates (nstates, ntime) of the states."""
-        return self._equations.rates(times, states, driven, self._p)
+        return self.form.rates(times, states, driven, self._p)
 
     def at_edge(self, times: Array, states: Array, driven: Array) -> bool:
         """Whether equations are undefined within the tolerances of states found.
@@ -289,13 +293,13 @@ class CompiledSolver:
         rtol, atol = self._tolerances
         reach = (rtol * np.abs(states) + (atol * self._scales.scale)[:, None]) * _EDGE
         return not all(
-            np.isfinite(self._equations.rates(times, near, driven, self._p)).all()
+            np.isfinite(self.form.rates(times, near, driven, self._p)).all()
             for near in (states - reach, states, states + reach)
         )
 
     def instants(self, first: float, last: float, driven: Callable[[Array], Array]) -> list[float]:
         """Times of a run at which the equations switch, where functions of time alone decide."""
-        return self._equations.instants(first, last, driven, self._p)
+        return self.form.instants(first, last, driven, self._p)
 
     def advance(self, series: Series, left: float, grid: Array, state: Array) -> Array:
         """States (nstates, ngrid) at times of a segment, of which the last is its end."""
@@ -306,7 +310,7 @@ class CompiledSolver:
         if grid.size <= _FEW:  # a rounding error of the clock must not make a new integrator of every short segment
             relative = np.round(relative, 12)
         if right - left > self._longest:
-            decay = self._equations.fastest_decay(left, state, series(left), self._p)
+            decay = self.form.fastest_decay(left, state, series(left), self._p)
             self._longest, self._stiff = right - left, decay * (right - left) > _STIFF
         width = series.coefficients.shape[1]
         span = [left, right - left, series.left, series.right, *within(left, right, self.switches)]
@@ -315,12 +319,12 @@ class CompiledSolver:
         p = np.concatenate([self._p, *known])
         start = (state - scales.shift) / scales.scale
         # What depends on time is seen at least once a sample: a pulse cannot be passed over unseen.
-        longest = round(float(np.diff(relative, prepend=0.0).max()), 6) if self._equations.depends_on_time else 0.0
+        longest = round(float(np.diff(relative, prepend=0.0).max()), 6) if self.form.depends_on_time else 0.0
         # A solution that explodes takes all the steps it may: few at first, then more, between outputs close together.
         close = np.union1d(relative, np.linspace(0.0, 1.0, _CLOSE)[1:])
         for outputs, allowed in ((relative, min(_FEW_STEPS, max_steps)), (close, max_steps)):
             settings = width, outputs, self._stiff, *self._tolerances, allowed, longest
-            integrator = self._equations.integrator(*settings)
+            integrator = self.form.integrator(*settings)
             try:
                 with _passing_interruptions():
                     found = _called(integrator, (start, np.empty(0), p), state.size, self._report)

@@ -13,7 +13,7 @@ from scipy.linalg import null_space
 from scipy.optimize import least_squares
 
 from ctrlplan._checks import real_array
-from ctrlplan.simulation.interpreted import Interpreted
+from ctrlplan.simulation.interpreted import FeedthroughError, Interpreted
 from ctrlplan.simulation.linear import LinearForm, NotLinearError, in_right_half, linear_form
 from ctrlplan.simulation.prepared import Prepared, prepared_form
 from ctrlplan.simulation.signals import PlanSignal, TimeSignal, input_signals
@@ -81,7 +81,11 @@ def rest_at(
         state = _linear_rest(form.a, form.b @ held, form.c[rows], form.d[rows] @ held, target, start, free)
         return (start, "it has none") if state is None else (state, "")
     try:
-        return _found(_Equations(prepared, held, time, params or {}, start), rows, target, start, free)
+        try:
+            return _found(_Equations(prepared, held, time, params or {}, start), rows, target, start, free)
+        except FeedthroughError:  # no algebraic loop at the start, but elsewhere
+            again = _Equations(prepared, held, time, params or {}, start, trials=False)
+            return _found(again, rows, target, start, free)
     except Exception as error:  # whatever a block does outside its domain; a run that fails there says so itself
         return start, f"its equations cannot be evaluated ({type(error).__name__}: {error})"
 
@@ -182,8 +186,16 @@ class _Equations:
     are not called, since some remember their calls: they are `unknown`, and their states `fixed`.
     """
 
-    def __init__(self, prepared: Prepared, held: Array, time: float, params: Mapping[str, Any], start: Array) -> None:
-        self.discrete = prepared.dt not in (None, 0)
+    def __init__(
+        self,
+        prepared: Prepared,
+        held: Array,
+        time: float,
+        params: Mapping[str, Any],
+        start: Array,
+        trials: bool = True,
+    ) -> None:
+        self.discrete, self._trials = prepared.is_discrete, trials
         self.unknown: tuple[str, ...] = ()
         self.fixed = np.zeros(prepared.nstates, dtype=bool)
         self.late: Callable[[Array], str] = lambda x: ""
@@ -227,7 +239,7 @@ class _Equations:
             elif block.period is not None:
                 sampled.append((i, place))
         self.unknown = tuple(unknown)
-        equations = Interpreted(network, params, (time, start), prepared.trials)
+        equations = Interpreted(network, params, (time, start), self._trials)
 
         def rates(x: Array) -> Array:
             moved = equations.rates(time, x, held)
@@ -272,6 +284,8 @@ class _Equations:
         try:
             with np.errstate(all="ignore"):
                 return np.asarray(function(x), dtype=float)
+        except FeedthroughError:
+            raise
         except Exception:  # a trial: a block may be defined elsewhere
             return np.full(x.size, np.nan)
 

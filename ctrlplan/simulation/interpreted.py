@@ -285,6 +285,8 @@ class Interpreted:
 class InterpretedSolver:
     """LSODA on a network's equations, segment by segment."""
 
+    calls_blocks = True
+
     def __init__(self, equations: Interpreted, tolerances: Tolerances, scales: Scales) -> None:
         self._equations, self._scales = equations, scales
         self._rtol, self._atol = max(tolerances.rtol, _LEAST), tolerances.atol

@@ -27,7 +27,31 @@ _LOOKS_A_TURN = 16
 
 @dataclass(frozen=True, eq=False)
 class Job:
-    """What one call of `simulate` asks for."""
+    """What one call of `simulate` is to run.
+
+    Attributes
+    ----------
+    prepared : Prepared
+        Built form of the system.
+    times : ndarray, shape (ntime,)
+        Sample times [s].
+    inputs : list of TimeSignal
+        Signals at the inputs, in order.
+    state : ndarray, shape (nstates,)
+        Initial state.
+    params : dict
+        Parameters of the blocks.
+    rtol, atol : float, float or None
+        Tolerances of a numerical solver.
+    events : sequence of Event or None
+        See `simulate`.
+    network : Network or None
+        Blocks that are run; of another attempt copies, which have the memory that the blocks had before.
+    reason : str
+        Why the method was chosen that runs the job.
+    trials : bool
+        Whether trial calls at the start may rule out an algebraic loop.
+    """
 
     prepared: Prepared
     times: Array
@@ -38,6 +62,8 @@ class Job:
     atol: float | None
     events: Sequence[Event] | None
     network: Network | None
+    reason: str = ""
+    trials: bool = True
 
     @property
     def blocks(self) -> Network:

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ctrlplan.simulation import methods
 from ctrlplan.simulation.interpreted import LoopError, SolverError
-from ctrlplan.simulation.prepared import Prepared, prepare
-from ctrlplan.simulation.simulate import simulate
-from ctrlplan.symbolic import missing_casadi
+from ctrlplan.simulation.prepared import NotApplicableError, Prepared, prepare
+from ctrlplan.simulation.simulate import checked_job, response_to
 from ctrlplan.trajectories.common import Frozen, checked_limits, checked_time
 
 Array = NDArray[np.float64]
@@ -229,25 +229,17 @@ class Predictor(Frozen):
         """Limited outputs (nlimits, count) of a run, or None where it fails."""
         inputs = dict(zip(self.references, reference.tolist(), strict=True))
         with np.errstate(all="ignore"):
-            for method in self._methods():
+            for method in methods.applicable(methods.METHODS, self._prepared):
+                job = checked_job(self._prepared, self._times, inputs, state, *_TOLERANCES, self._params, events=())
                 try:
-                    found = simulate(
-                        self._prepared, self._times, inputs, state, method, *_TOLERANCES, self._params, events=()
-                    )
+                    found = response_to(job, [method])
                 except (SolverError, LoopError):
                     return None
-                except ValueError:
-                    if method != "compiled":  # what cannot be compiled is run by Python
-                        raise
+                except NotApplicableError:  # what cannot be compiled is run by Python
                     continue
-                outputs: Array = np.atleast_2d(found.y[self._rows, ...].reshape(len(self._rows), -1))
+                outputs = np.atleast_2d(found.y[self._rows, ...].reshape(len(self._rows), -1))
                 return outputs if np.isfinite(outputs).all() else None
-        raise AssertionError("the last method is tried in any case")
-
-    def _methods(self) -> tuple[str, ...]:
-        if self._prepared.linear is not None:
-            return ("exact",)
-        return ("python",) if missing_casadi() else ("compiled", "python")
+        raise AssertionError("Python runs every system that the constructor accepts")
 
     def _checked(self, x: ArrayLike, *references: ArrayLike) -> list[Array]:
         found = [np.asarray(x, dtype=float), *(np.atleast_1d(np.asarray(v, dtype=float)) for v in references)]

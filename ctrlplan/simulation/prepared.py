@@ -35,7 +35,11 @@ _PARAMS = 3
 """Position of the parameters among the arguments of a block's function."""
 
 
-class NotCompiledError(ValueError):
+class NotApplicableError(ValueError):
+    """A method of simulation that does not apply to a system, and why."""
+
+
+class NotCompiledError(NotApplicableError):
     """A system that cannot be compiled, and why."""
 
 
@@ -86,7 +90,6 @@ class Prepared:
                 self.not_linear = f"block {block.name} {what}"
         self._sources = [PlanSignal(b.plan, b.traits.derivatives) for b in self._blocks() if b.plan is not None]
         self.trusted = True
-        self.trials = True
         self._read: dict[str, bool] = {}
         self._compiled: list[tuple[frozenset[str], dict[str, Any], Compiled | NotCompiledError]] = []
 
@@ -108,6 +111,16 @@ class Prepared:
         """Number of inputs."""
         return len(self.input_labels)
 
+    @property
+    def is_discrete(self) -> bool:
+        """Whether the system is in discrete time."""
+        return self.dt not in (None, 0)
+
+    @property
+    def has_blocks(self) -> bool:
+        """Whether python-control's blocks are at hand: not in a form from another process."""
+        return self.network is not None and bool(self.network.blocks)
+
     def time_signals(self, inputs: list[TimeSignal], first: float) -> list[TimeSignal]:
         """Given inputs, then the driven blocks in order."""
         sources, found = iter(self._sources), list(inputs)
@@ -120,7 +133,7 @@ class Prepared:
         return [*found, *sources]
 
     def compiled(
-        self, params: Mapping[str, Any], time_signals: list[TimeSignal], first: float, state: Array
+        self, params: Mapping[str, Any], time_signals: list[TimeSignal], first: float, state: Array, trials: bool = True
     ) -> Compiled:
         """Compiled form for some parameters, built once for all their values.
 
@@ -134,7 +147,7 @@ class Prepared:
             with BUILDING:
                 form = self._known(params)
                 if form is None:
-                    form, baked = self._build(params, time_signals, first, state)
+                    form, baked = self._build(params, time_signals, first, state, trials)
                     if self.original is not None:  # what blocks only write has turned out meanwhile
                         self.fingerprint = fingerprint(self.original)
                     self._compiled = [*self._compiled[-7:], (frozenset(params), baked, form)]
@@ -224,7 +237,7 @@ class Prepared:
         return name in read or _Noticing.ALL in read
 
     def _build(
-        self, params: Mapping[str, Any], time_signals: list[TimeSignal], first: float, state: Array
+        self, params: Mapping[str, Any], time_signals: list[TimeSignal], first: float, state: Array, trials: bool
     ) -> tuple[Compiled | NotCompiledError, dict[str, Any]]:
         if missing := missing_casadi():
             return NotCompiledError(missing), {}
@@ -242,7 +255,7 @@ class Prepared:
             others = [block for block in network.blocks if not (block.linear or block.driven)]
             keeper = callable_references(others, params).keeper()
             try:
-                equations = Interpreted(network.for_trials(), params, (first, state), self.trials)
+                equations = Interpreted(network.for_trials(), params, (first, state), trials)
                 w = equations.signals(first, state, signal_values(time_signals, np.array([first]))[:, 0])
             finally:
                 keeper.restore()
