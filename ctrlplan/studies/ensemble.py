@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ctrlplan._checks import real_array
 from ctrlplan.simulation import Prepared, SolverError, prepare
-from ctrlplan.simulation.methods import DELEGATED
+from ctrlplan.simulation.methods.delegated import DELEGATED
 from ctrlplan.simulation.prepared import NotCompiledError
 from ctrlplan.studies.comparison import (
     Comparison,

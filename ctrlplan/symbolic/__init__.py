@@ -5,9 +5,6 @@ result counts only if it agrees with Python (`comparison`), and only as long as
 nothing has changed to which the block's functions refer (`fingerprint`).
 """
 
-from importlib.util import find_spec
+from ctrlplan.symbolic.extra import missing_casadi
 
-
-def missing_casadi() -> str:
-    """Reason why nothing can be traced, with what to do; empty where CasADi is installed."""
-    return "" if find_spec("casadi") is not None else "CasADi is not installed (pip install ctrlplan[fast])"
+__all__ = ["missing_casadi"]

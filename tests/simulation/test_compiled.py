@@ -12,7 +12,7 @@ from scipy.integrate import solve_ivp
 from scipy.special import expit
 
 import ctrlplan as cp
-from ctrlplan import symbolic
+from ctrlplan.symbolic import extra
 from ctrlplan.symbolic import tracing as traced_module
 
 METHODS = ("compiled", "python")
@@ -765,7 +765,7 @@ def test_a_table_with_the_state_as_its_key():
 
 
 def test_without_casadi_python_runs_and_says_what_to_install(monkeypatch):
-    monkeypatch.setattr(symbolic, "find_spec", lambda name: None)
+    monkeypatch.setattr(extra, "find_spec", lambda name: None)
     block = ct.nlsys(lambda t, x, u, p: -(x**3), None, inputs=0, outputs=1, states=1, name="uncompiled")
     found = cp.simulate(block, T, None, 1.0)
     assert found.method == "python"

@@ -22,7 +22,7 @@ DELEGATED = threading.RLock()
 
 
 class Delegated:
-    """`control.input_output_response`, without events, for blocks with equations of a kind of their own."""
+    """Runs by `control.input_output_response`, without events, of blocks with equations of a kind of their own."""
 
     name = "python"
 
