@@ -170,7 +170,7 @@ def traits_of(system: Any) -> BlockTraits:
     return found if isinstance(found, BlockTraits) else _NONE
 
 
-class Declared:
+class DeclaredTrait:
     """Attribute of a block class that reads and sets a declared trait of the same name."""
 
     def __set_name__(self, owner: type, name: str) -> None:

@@ -160,7 +160,7 @@ class Step:
 
 
 @dataclass(frozen=True, eq=False)
-class Declared:
+class WatchedSignal:
     """Signal of a block that declares its limits: a function of (t, x, u, params) of the block, time last."""
 
     name: str
@@ -190,7 +190,7 @@ class Network:
         External inputs, the first of the signals.
     breakpoints : tuple of float
         Times [s] that blocks name at which their equations change.
-    watched : tuple of Declared
+    watched : tuple of WatchedSignal
         Signals of blocks that declare limits.
     """
 
@@ -200,7 +200,7 @@ class Network:
     read: Array
     ninputs: int
     breakpoints: tuple[float, ...] = ()
-    watched: tuple[Declared, ...] = ()
+    watched: tuple[WatchedSignal, ...] = ()
 
     @classmethod
     def of(cls, system: Any) -> Network:
@@ -221,7 +221,7 @@ class Network:
             system.ninputs or 0,
             tuple(t for b in part.blocks for t in b.traits.breakpoints or ()),
         )
-        return replace(network, watched=tuple(network._declared()))
+        return replace(network, watched=tuple(network._watched_signals()))
 
     def for_trials(self) -> Network:
         """Same network with blocks whose memory, if they have one, is not that of the run."""
@@ -335,10 +335,10 @@ class Network:
         """Blocks by name, in words."""
         return ", ".join(self.blocks[i].name for i in blocks)
 
-    def _declared(self) -> Iterator[Declared]:
+    def _watched_signals(self) -> Iterator[WatchedSignal]:
         for block, states, fed in zip(self.blocks, self.states, self.fed, strict=True):
             for name, (function, low, high) in (block.traits.watched or {}).items():
-                yield Declared(name, function, low, high, states, fed, block.params)
+                yield WatchedSignal(name, function, low, high, states, fed, block.params)
 
     def _owners(self, rows: NDArray[np.intp]) -> tuple[int, ...]:
         return tuple(i for i, place in enumerate(self.outputs) if np.any((rows >= place.start) & (rows < place.stop)))

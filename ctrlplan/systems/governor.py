@@ -14,7 +14,7 @@ from ctrlplan._types import EventName
 from ctrlplan.systems.admissible import AdmissibleSet, Limits
 from ctrlplan.systems.exposed import state_signals
 from ctrlplan.systems.hybrid import checked_seconds, refuse_alone
-from ctrlplan.traits import Declared, declare
+from ctrlplan.traits import DeclaredTrait, declare
 from ctrlplan.trajectories.common import checked_time
 
 Array = NDArray[np.float64]
@@ -57,8 +57,8 @@ class Governor(ct.NonlinearIOSystem):  # type: ignore[misc]
         Reference before the first sample.
     """
 
-    period = Declared()
-    offset = Declared()
+    period = DeclaredTrait()
+    offset = DeclaredTrait()
 
     def __init__(self, admission: Admission, period: float, offset: float, initial: Array, name: str) -> None:
         references = list(admission.references)

@@ -11,7 +11,7 @@ import control as ct
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ctrlplan.traits import Declared, declare
+from ctrlplan.traits import DeclaredTrait, declare
 
 Array = NDArray[np.float64]
 
@@ -27,9 +27,9 @@ class SampleHold(ct.NonlinearIOSystem):  # type: ignore[misc]
         It takes them at offset, offset + period, ... [s] after the run begins.
     """
 
-    block = Declared()
-    period = Declared()
-    offset = Declared()
+    block = DeclaredTrait()
+    period = DeclaredTrait()
+    offset = DeclaredTrait()
 
     def __init__(self, block: Any, period: float, offset: float, name: str) -> None:
         held = [f"{label}_held" for label in block.output_labels]
@@ -73,8 +73,8 @@ class Delay(ct.NonlinearIOSystem):  # type: ignore[misc]
         What it puts out before anything has come through.
     """
 
-    delay = Declared()
-    initial = Declared()
+    delay = DeclaredTrait()
+    initial = DeclaredTrait()
 
     def __init__(self, delay: float, initial: Array, inputs: list[str], outputs: list[str], name: str) -> None:
         super().__init__(None, self._past, inputs=inputs, outputs=outputs, dt=0, name=name)

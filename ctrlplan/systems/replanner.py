@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from ctrlplan._types import EventName
 from ctrlplan.systems.hybrid import checked_seconds, refuse_alone
 from ctrlplan.systems.source import create_source_iosystem
-from ctrlplan.traits import Declared, declare
+from ctrlplan.traits import DeclaredTrait, declare
 from ctrlplan.trajectories import Trajectory
 from ctrlplan.trajectories.common import checked_count, checked_time
 from ctrlplan.trajectories.extrema import stationary_times
@@ -281,8 +281,8 @@ class _Signals:
 class _Correction(ct.NonlinearIOSystem):  # type: ignore[misc]
     """Jets of a plan plus those of the transition last fitted."""
 
-    period = Declared()
-    offset = Declared()
+    period = DeclaredTrait()
+    offset = DeclaredTrait()
 
     def __init__(
         self,

@@ -8,7 +8,7 @@ import control as ct
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ctrlplan.traits import Declared, declare
+from ctrlplan.traits import DeclaredTrait, declare
 from ctrlplan.trajectories import Trajectory
 from ctrlplan.trajectories.common import checked_count
 from ctrlplan.trajectories.files import signal_names, signal_rows
@@ -30,8 +30,8 @@ class PlanSource(ct.NonlinearIOSystem):  # type: ignore[misc]
         integrator should stop there.
     """
 
-    plan = Declared()
-    derivatives = Declared()
+    plan = DeclaredTrait()
+    derivatives = DeclaredTrait()
 
     def __init__(self, plan: Trajectory, derivatives: int, name: str, suffix: str) -> None:
         labels = signal_names([label + suffix for label in plan.labels], derivatives)
