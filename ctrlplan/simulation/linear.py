@@ -108,7 +108,7 @@ def linear_forms(systems: Sequence[Any]) -> LinearForm:
         return LinearForm(a, b, c, d, ())
     sources = [traits_of(system) for system in systems]
     plan, high = sources[0].plan, sources[0].derivatives
-    if any(source.plan is not plan or source.derivatives != high for source in sources):
+    if plan is None or any(source.plan is not plan or source.derivatives != high for source in sources):
         raise _unlike(systems)
     count, n = len(systems), systems[0].noutputs
     a, b, c = map(np.zeros, ((count, 0, 0), (count, 0, n), (count, n, 0)))

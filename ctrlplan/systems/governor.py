@@ -57,8 +57,8 @@ class Governor(ct.NonlinearIOSystem):  # type: ignore[misc]
         Reference before the first sample.
     """
 
-    period = DeclaredTrait()
-    offset = DeclaredTrait()
+    period = DeclaredTrait[float]()
+    offset = DeclaredTrait[float]()
 
     def __init__(self, admission: Admission, period: float, offset: float, initial: Array, name: str) -> None:
         references = list(admission.references)

@@ -27,9 +27,9 @@ class SampleHold(ct.NonlinearIOSystem):  # type: ignore[misc]
         It takes them at offset, offset + period, ... [s] after the run begins.
     """
 
-    block = DeclaredTrait()
-    period = DeclaredTrait()
-    offset = DeclaredTrait()
+    block = DeclaredTrait[ct.InputOutputSystem]()
+    period = DeclaredTrait[float]()
+    offset = DeclaredTrait[float]()
 
     def __init__(self, block: Any, period: float, offset: float, name: str) -> None:
         held = [f"{label}_held" for label in block.output_labels]
@@ -73,8 +73,8 @@ class Delay(ct.NonlinearIOSystem):  # type: ignore[misc]
         What it puts out before anything has come through.
     """
 
-    delay = DeclaredTrait()
-    initial = DeclaredTrait()
+    delay = DeclaredTrait[float]()
+    initial = DeclaredTrait[ArrayLike]()
 
     def __init__(self, delay: float, initial: Array, inputs: list[str], outputs: list[str], name: str) -> None:
         super().__init__(None, self._past, inputs=inputs, outputs=outputs, dt=0, name=name)

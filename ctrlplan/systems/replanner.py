@@ -281,8 +281,8 @@ class _Signals:
 class _Correction(ct.NonlinearIOSystem):  # type: ignore[misc]
     """Jets of a plan plus those of the transition last fitted."""
 
-    period = DeclaredTrait()
-    offset = DeclaredTrait()
+    period = DeclaredTrait[float]()
+    offset = DeclaredTrait[float]()
 
     def __init__(
         self,

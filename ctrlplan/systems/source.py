@@ -30,8 +30,8 @@ class PlanSource(ct.NonlinearIOSystem):  # type: ignore[misc]
         integrator should stop there.
     """
 
-    plan = DeclaredTrait()
-    derivatives = DeclaredTrait()
+    plan = DeclaredTrait[Trajectory]()
+    derivatives = DeclaredTrait[int]()
 
     def __init__(self, plan: Trajectory, derivatives: int, name: str, suffix: str) -> None:
         labels = signal_names([label + suffix for label in plan.labels], derivatives)
