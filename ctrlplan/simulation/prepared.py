@@ -17,8 +17,10 @@ from ctrlplan.simulation.network import Network, UnsupportedError
 from ctrlplan.simulation.segments import DelayedSignal
 from ctrlplan.simulation.signals import PlanSignal, TimeSignal, signal_values
 from ctrlplan.symbolic import missing_casadi
-from ctrlplan.symbolic.fingerprint import References, roots_of
+from ctrlplan.symbolic.fingerprint import fingerprint, value_token
 from ctrlplan.symbolic.isolation import tried, untouched
+from ctrlplan.symbolic.keeper import Keeper
+from ctrlplan.symbolic.references import References
 from ctrlplan.symbolic.trials import reads
 from ctrlplan.traits import traits_of
 
@@ -159,7 +161,7 @@ class Prepared:
         """Form built before, in which the parameters that are no symbols have the same values."""
         for names, baked, form in self._compiled:
             numbers = isinstance(form, NotCompiledError) or all(np.ndim(params.get(k, 0.0)) == 0 for k in form.symbols)
-            if names == frozenset(params) and numbers and all(_token(params[k]) == v for k, v in baked.items()):
+            if names == frozenset(params) and numbers and all(value_token(params[k]) == v for k, v in baked.items()):
                 return form
         return None
 
@@ -216,7 +218,7 @@ class Prepared:
         found = References((f"block {network.blocks[i].name}", f) for i in blocks for f in functions[i])
         if found.opaque:  # a call might leave something behind: what the code names counts
             return name in found.names or not found.names.isdisjoint(("keys", "values", "items"))
-        keeper = found.keeper()
+        keeper = Keeper(found)
 
         def starting() -> Array:
             equations = Interpreted(network, {name: value}, (0.0, start))
@@ -253,7 +255,7 @@ class Prepared:
         baked: dict[str, Any] = {}
         try:
             others = [block for block in network.blocks if not (block.linear or block.driven)]
-            keeper = callable_references(others, params).keeper()
+            keeper = Keeper(callable_references(others, params))
             try:
                 equations = Interpreted(network.for_trials(), params, (first, state), trials)
                 w = equations.signals(first, state, signal_values(time_signals, np.array([first]))[:, 0])
@@ -266,10 +268,10 @@ class Prepared:
                 trace = traced(block, params, first, state[states], fed(w))
                 traces.append(trace)
                 # What is a constant in the trace must be so in every run of it.
-                baked |= {key: _token(params[key]) for key in params if key not in trace.symbols}
+                baked |= {key: value_token(params[key]) for key in params if key not in trace.symbols}
             return Compiled(network, traces), baked
         except NotTraceableError as error:
-            return NotCompiledError(str(error)), {key: _token(value) for key, value in params.items()}
+            return NotCompiledError(str(error)), {key: value_token(value) for key, value in params.items()}
 
     def _blocks(self) -> tuple[Any, ...]:
         return self.network.blocks if self.network is not None else ()
@@ -401,31 +403,6 @@ def state_space(system: Any) -> Any:
     return ct.ss(system, name=system.name, inputs=system.input_labels, outputs=system.output_labels)
 
 
-def fingerprint(system: Any) -> tuple[Any, ...]:
-    """What a run depends on: equal only where nothing has changed."""
-    own = (id(system), str(system.name), system.dt, _token(getattr(system, "params", None)))
-    labels = (tuple(system.input_labels or ()), tuple(system.output_labels or ()), tuple(system.state_labels or ()))
-    if isinstance(system, ct.InterconnectedSystem):
-        maps = tuple(np.asarray(m).tobytes() for m in (system.connect_map, system.input_map, system.output_map))
-        return (own, labels, maps, tuple(fingerprint(block) for block in system.syslist))
-    if isinstance(system, ct.StateSpace):
-        return (own, labels, tuple(np.asarray(m).tobytes() for m in (system.A, system.B, system.C, system.D)))
-    if isinstance(system, ct.TransferFunction):
-        return (own, labels, _frozen([system.num, system.den]))
-    # The functions themselves, not their addresses: those of the dead are given to others.
-    functions = tuple(_frozen(getattr(system, name, None)) for name in ("updfcn", "outfcn"))
-    # Traits are immutable and compared by identity.
-    traits = traits_of(system)
-    return (
-        own,
-        labels,
-        functions,
-        traits,
-        () if traits.block is None else fingerprint(traits.block),
-        _referred(system),
-    )
-
-
 def _filled(stated: Array | None) -> Array | None:
     """A stated start with 0 where nothing is stated."""
     return None if stated is None else np.where(np.isnan(stated), 0.0, stated)
@@ -444,35 +421,6 @@ def _checked_system(system: Any) -> Any:
 
 
 _FORMS: Lru[tuple[object, ...], Prepared] = Lru(_KEPT)
-
-
-def _frozen(value: Any) -> Any:
-    """Something hashable that changes with a value."""
-    if isinstance(value, Mapping):
-        return tuple((key, _frozen(entry)) for key, entry in value.items())
-    if isinstance(value, list | tuple):
-        return tuple(_frozen(entry) for entry in value)
-    if isinstance(value, np.ndarray):
-        return value.shape, value.tobytes() if value.dtype != object else tuple(map(_frozen, value.ravel()))
-    try:
-        hash(value)
-    except TypeError:
-        return id(value)
-    return value
-
-
-def _referred(system: Any) -> tuple[Any, ...]:
-    """What the functions of a block refer to, where they may be compiled."""
-    traits = traits_of(system)
-    if traits.plan is not None or traits.delay is not None:
-        return ()
-    found = References(roots_of(system))
-    return found.tokens, found.cached
-
-
-def _token(value: Any) -> tuple[Any, ...]:
-    """Fingerprint of a parameter."""
-    return References([("params", value)]).tokens
 
 
 def _functions(system: Any) -> Iterator[Any]:

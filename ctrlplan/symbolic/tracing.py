@@ -14,8 +14,10 @@ import control as ct
 import numpy as np
 from numpy.typing import NDArray
 
-from ctrlplan.symbolic.fingerprint import Keeper, References, roots_of
+from ctrlplan.symbolic.fingerprint import roots_of
 from ctrlplan.symbolic.isolation import same_answer, tried, untouched
+from ctrlplan.symbolic.keeper import Keeper
+from ctrlplan.symbolic.references import References
 from ctrlplan.symbolic.symbols import Symbol, column_of, symbol_array
 
 Array = NDArray[np.float64]
@@ -104,7 +106,7 @@ def traced(block: Traceable, params: Mapping[str, Any], t: float, x: Array, u: A
         block is random or has memory.
     """
     values = {**block.params, **params}
-    keeper = callable_references([block], params).keeper()
+    keeper = Keeper(callable_references([block], params))
     try:
         with untouched():
             known = _known(block, list(_points(block, values, t, x, u)))

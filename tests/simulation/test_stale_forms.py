@@ -20,7 +20,7 @@ import pytest
 from scipy.interpolate import CubicSpline
 
 import ctrlplan as cp
-from ctrlplan.symbolic.fingerprint import References
+from ctrlplan.symbolic.references import References
 
 T = np.linspace(0.0, 2.0, 9)
 
