@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NoReturn, Self, TypeAlias
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any, NoReturn, Self, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,15 @@ Array = NDArray[np.float64]
 
 System: TypeAlias = "ct.InputOutputSystem"
 """Any system of python-control, which has no types of its own."""
+
+Value: TypeAlias = Any
+"""Number, array or symbol, or a sequence of them: what the functions of a block take and return."""
+
+Params: TypeAlias = Mapping[str, Value]
+"""Parameters of blocks by name, of any kind that a block can use."""
+
+BlockMap: TypeAlias = Callable[[Value, Value, Value], Value]
+"""(t, state, input) of a block -> its outputs or rates."""
 
 
 class Frozen:

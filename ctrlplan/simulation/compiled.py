@@ -7,13 +7,14 @@ import signal
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any
+from types import FrameType
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ctrlplan._lru import Lru
+from ctrlplan._types import Params, Value
 from ctrlplan.simulation.interpreted import SolverError
 from ctrlplan.simulation.network import Block, Network, Step, known_feedthrough
 from ctrlplan.simulation.scales import Scales, Tolerances
@@ -23,6 +24,8 @@ from ctrlplan.symbolic.switches import changes_of_side, switch_arguments
 from ctrlplan.symbolic.tracing import NotTraceableError, Trace, agrees
 
 Array = NDArray[np.float64]
+Stats = Mapping[str, float]
+"""Statistics of an integrator, by name."""
 
 _KEPT = 64
 """Integrators kept, one for each pattern of output times; and functions, one for each number of times."""
@@ -100,13 +103,13 @@ class Compiled:
         )
         self._integrators: Lru[tuple[object, ...], ca.Function] = Lru(_KEPT)
         self._maps: Lru[tuple[str, int], ca.Function] = Lru(_KEPT)
-        self._equations: dict[int, dict[str, Any]] = {}
+        self._equations: dict[int, dict[str, ca.SX]] = {}
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> dict[str, object]:
         """Without what is made anew where it is needed."""
         return self.__dict__ | {"_traces": [], "_equations": {}}
 
-    def parameters(self, params: Mapping[str, Any]) -> Array:
+    def parameters(self, params: Params) -> Array:
         """Entries of p for a run."""
         return np.array([float(params.get(key, default)) for key, default in self._defaults])
 
@@ -148,7 +151,9 @@ class Compiled:
                 found += changes_of_side(sides, first, last)
         return sorted(set(found))
 
-    def _of_time(self, name: str, switches: Any, network: Network, argument: int) -> tuple[str, Any]:
+    def _of_time(
+        self, name: str, switches: ca.Function, network: Network, argument: int
+    ) -> tuple[str, ca.Function | None]:
         """Those of some switches that depend on time (0) or functions of time (2), and on no state; None without."""
         late = np.zeros(network.nsignals, dtype=bool)
         for i in network.blocks_with("delay"):
@@ -167,7 +172,7 @@ class Compiled:
         """On which side of its switches the form is at many times, (nswitches, ntime): -1, 0 or 1."""
         return np.sign(self._at_many("switches", t, x, driven, p))
 
-    def disagreement(self, network: Network, params: Mapping[str, Any], t: Array, x: Array, w: Array) -> str:
+    def disagreement(self, network: Network, params: Params, t: Array, x: Array, w: Array) -> str:
         """What is wrong with a trace at visited times, states and signals; empty where nothing."""
         for block, trace, states, fed in zip(network.blocks, self._traces, network.states, network.fed, strict=True):
             if trace is not None:
@@ -183,12 +188,12 @@ class Compiled:
 
     def integrator(
         self, width: int, grid: Array, stiff: bool, rtol: float, atol: float, max_steps: int, longest: float
-    ) -> Any:
+    ) -> ca.Function:
         """CVODES over a segment of length 1, with outputs at some of its times."""
         # CasADi runs without Python's lock: no integrator is used by two threads at once.
         key = (threading.get_ident(), width, grid.tobytes(), stiff, rtol, atol, max_steps, longest)
 
-        def made() -> Any:
+        def made() -> ca.Function:
             options = {
                 "linear_multistep_method": "bdf" if stiff else "adams",
                 "reltol": rtol,
@@ -210,7 +215,7 @@ class Compiled:
         at_all = self._maps.get((name, t.size), lambda: function.map(t.size))
         return _called(at_all, (t, x, driven, np.repeat(p[:, None], t.size, axis=1)), function.numel_out(0))
 
-    def _segment_equations(self, width: int) -> dict[str, Any]:
+    def _segment_equations(self, width: int) -> dict[str, ca.SX]:
         """Equations of scaled states in s from 0 to 1, the functions of time as Chebyshev series of some width."""
         if width not in self._equations:
             nx, nd, np_ = (self._rates.numel_in(k) for k in (1, 2, 3))
@@ -231,7 +236,7 @@ class Compiled:
             }
         return self._equations[width]
 
-    def _own_parameters(self, p: Any) -> list[Any]:
+    def _own_parameters(self, p: ca.SX) -> list[ca.SX]:
         """Each block's part of p."""
         return [
             ca.vertcat(*[p[k] for k, (j, _) in enumerate(self._places) if j == i]) for i in range(len(self._traces))
@@ -254,7 +259,7 @@ class CompiledSolver:
     def __init__(
         self,
         equations: Compiled,
-        params: Mapping[str, Any],
+        params: Params,
         tolerances: Tolerances,
         scales: Scales,
         max_steps: int = 20_000,
@@ -341,7 +346,7 @@ class CompiledSolver:
         """Count evaluations from now on."""
         self._report = self._count
 
-    def _count(self, stats: dict[str, Any]) -> None:
+    def _count(self, stats: Stats) -> None:
         self.evaluations += int(stats.get("nfevals", 0))
 
 
@@ -355,10 +360,10 @@ def _passing_interruptions() -> Iterator[None]:
     are found as they were.
     """
     raised: list[BaseException] = []
-    handlers: dict[int, Any] = {}
+    handlers: dict[int, Callable[[int, FrameType | None], object]] = {}
     inside = False  # while handlers are exchanged, what they raise waits
 
-    def accompanied(number: int, frame: Any) -> None:
+    def accompanied(number: int, frame: FrameType | None) -> None:
         try:
             handlers[number](number, frame)
         except BaseException as error:
@@ -389,11 +394,12 @@ def _passing_interruptions() -> Iterator[None]:
 
 
 def _called(
-    function: Any, arguments: Sequence[Array], nrows: int, report: Callable[[dict[str, Any]], None] | None = None
+    function: ca.Function, arguments: Sequence[Array], nrows: int, report: Callable[[Stats], None] | None = None
 ) -> Array:
     """First result (nrows, n) of a function, without a detour through CasADi's own matrices."""
     out = np.zeros((function.numel_out(0) // nrows if nrows else 0, nrows))
-    buffer, evaluate = function.buffer()
+    given: tuple[Value, Callable[[], None]] = function.buffer()  # with a signature that CasADi's stubs do not have
+    buffer, evaluate = given
     kept = [np.ravel(values, order="F").astype(float) for values in arguments]
     for k, values in enumerate(kept):
         if values.size:
@@ -413,8 +419,8 @@ def _feedthrough(block: Block, trace: Trace | None) -> NDArray[np.bool_]:
 
 
 def _signals(
-    network: Network, traces: list[Trace | None], own: list[Any], steps: list[Step], t: Any, x: Any, driven: Any
-) -> Any:
+    network: Network, traces: list[Trace | None], own: list[ca.SX], steps: list[Step], t: ca.SX, x: ca.SX, driven: ca.SX
+) -> ca.SX:
     """Column of all signals."""
     known = [ca.SX(0)] * network.nsignals
     for k, row in enumerate(network.driven):
@@ -445,7 +451,7 @@ def _signals(
 
 
 def _evaluate(
-    network: Network, traces: list[Trace | None], own: list[Any], i: int, t: Any, x: Any, known: list[Any]
+    network: Network, traces: list[Trace | None], own: list[ca.SX], i: int, t: ca.SX, x: ca.SX, known: list[ca.SX]
 ) -> None:
     """Put a block's outputs among the known signals."""
     block, states, outs = network.blocks[i], network.states[i], network.outputs[i]
@@ -459,7 +465,7 @@ def _evaluate(
         known[outs.start + k] = column[k]
 
 
-def _rates(network: Network, traces: list[Trace | None], own: list[Any], t: Any, x: Any, w: Any) -> Any:
+def _rates(network: Network, traces: list[Trace | None], own: list[ca.SX], t: ca.SX, x: ca.SX, w: ca.SX) -> ca.SX:
     rows = []
     for block, trace, states, inputs, p in zip(
         network.blocks, traces, network.states, network.inputs, own, strict=True
@@ -475,22 +481,22 @@ def _rates(network: Network, traces: list[Trace | None], own: list[Any], t: Any,
     return ca.densify(ca.vertcat(*rows))
 
 
-def _part(x: Any, rows: slice) -> Any:
+def _part(x: ca.SX, rows: slice) -> ca.SX:
     """Rows of a column, which where there are none is still a column."""
     return x[rows] if rows.stop > rows.start else ca.SX(0, 1)
 
 
-def _linear(a: Any, b: Any, x: Any, u: Any) -> Any:
+def _linear(a: ArrayLike, b: ArrayLike, x: ca.SX, u: ca.SX) -> ca.SX:
     """Sum a x + b u."""
     return _sparse(a) @ x + _sparse(b) @ u
 
 
-def _sparse(matrix: Any) -> Any:
+def _sparse(matrix: ArrayLike) -> ca.DM:
     """Matrix without its zeros: 0 times nan is 0, and the equations are shorter."""
     return ca.sparsify(ca.DM(np.asarray(matrix, dtype=float)))
 
 
-def _series(coefficients: Any, u: Any) -> Any:
+def _series(coefficients: ca.SX, u: ca.SX) -> ca.SX:
     """Chebyshev series (nsignals, width) at u; the polynomials are shared by all signals."""
     width = coefficients.shape[1]
     values = [ca.SX(1), u]

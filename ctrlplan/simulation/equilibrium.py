@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Iterator, Sequence
 
 import control as ct
 import numpy as np
@@ -13,6 +12,7 @@ from scipy.linalg import null_space
 from scipy.optimize import least_squares
 
 from ctrlplan._checks import real_array
+from ctrlplan._types import Params, System
 from ctrlplan.simulation.interpreted import FeedthroughError, Interpreted
 from ctrlplan.simulation.linear import LinearForm, NotLinearError, in_right_half, linear_form
 from ctrlplan.simulation.prepared import Prepared, prepared_form
@@ -36,7 +36,7 @@ _TURNS = 40
 
 
 def rest_at(
-    system: Any, plan: Trajectory, time: float, outputs: Sequence[int], params: Mapping[str, Any] | None = None
+    system: System | Prepared, plan: Trajectory, time: float, outputs: Sequence[int], params: Params | None = None
 ) -> tuple[Array, str]:
     """State in which a loop is at equilibrium at the first position of a plan.
 
@@ -90,7 +90,7 @@ def rest_at(
         return start, f"its equations cannot be evaluated ({type(error).__name__}: {error})"
 
 
-def rest_state(system: Any, position: ArrayLike) -> Array:
+def rest_state(system: System | Prepared, position: ArrayLike) -> Array:
     """State at which a linear loop rests when its inputs are held.
 
     Parameters
@@ -119,7 +119,7 @@ def rest_state(system: Any, position: ArrayLike) -> Array:
     return np.zeros(len(form.a)) if state is None else state
 
 
-def unstable_poles(system: Any) -> NDArray[np.complex128]:
+def unstable_poles(system: System | Prepared) -> NDArray[np.complex128]:
     """Poles in the right half plane of a linear continuous system; of others none are known."""
     try:
         poles = np.linalg.eigvals(_form(system).a).astype(complex)
@@ -128,7 +128,7 @@ def unstable_poles(system: Any) -> NDArray[np.complex128]:
     return poles[in_right_half(poles)]
 
 
-def _form(system: Any) -> LinearForm:
+def _form(system: System | Prepared) -> LinearForm:
     if not isinstance(system, Prepared):
         return linear_form(system)
     if system.linear is None:
@@ -191,7 +191,7 @@ class _Equations:
         prepared: Prepared,
         held: Array,
         time: float,
-        params: Mapping[str, Any],
+        params: Params,
         start: Array,
         trials: bool = True,
     ) -> None:
@@ -209,7 +209,7 @@ class _Equations:
         else:
             self._network(prepared, held, time, params, start)
 
-    def _by_control(self, prepared: Prepared, held: Array, time: float, params: Mapping[str, Any]) -> None:
+    def _by_control(self, prepared: Prepared, held: Array, time: float, params: Params) -> None:
         """Equations of what only python-control runs."""
         system, u = prepared.system, held[: prepared.ninputs]
         if self.discrete:
@@ -217,7 +217,7 @@ class _Equations:
         self._rates = lambda x: np.ravel(system.dynamics(time, x, u, dict(params)))
         self._outputs = lambda x: np.ravel(system.output(time, x, u, dict(params)))
 
-    def _compiled(self, prepared: Prepared, held: Array, time: float, params: Mapping[str, Any], start: Array) -> None:
+    def _compiled(self, prepared: Prepared, held: Array, time: float, params: Params, start: Array) -> None:
         """Equations of a form that was compiled for another process."""
         time_signals = prepared.time_signals(
             input_signals(prepared.input_labels, 0.0, np.array([time, time + 1.0])), time
@@ -227,9 +227,11 @@ class _Equations:
         self._rates = lambda x: form.rates(t, x[:, None], d, p)[:, 0]
         self._outputs = lambda x: form.outputs(t, x[:, None], d, p)[:, 0]
 
-    def _network(self, prepared: Prepared, held: Array, time: float, params: Mapping[str, Any], start: Array) -> None:
+    def _network(self, prepared: Prepared, held: Array, time: float, params: Params, start: Array) -> None:
         """Equations of a network of blocks."""
-        network: Any = prepared.network.for_trials() if prepared.network is not None else None
+        if prepared.network is None:
+            raise TypeError(prepared.unsupported)
+        network = prepared.network.for_trials()
         sampled, unknown = [], []
         for i, (block, place) in enumerate(zip(network.blocks, network.states, strict=True)):
             linear = block.linear or block.driven or isinstance(block.traits.block, ct.StateSpace)

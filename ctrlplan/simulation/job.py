@@ -5,16 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ctrlplan._types import Params
 from ctrlplan.simulation.events import Event, Snapshot, Watched, watched_events
 from ctrlplan.simulation.network import Network
 from ctrlplan.simulation.prepared import NotCompiledError, Prepared
 from ctrlplan.simulation.signals import TimeSignal
 from ctrlplan.symbolic.trials import can_remember
+from ctrlplan.traits import BlockFunction
 
 Array = NDArray[np.float64]
 
@@ -57,7 +58,7 @@ class Job:
     times: Array
     inputs: list[TimeSignal]
     state: Array
-    params: dict[str, Any]
+    params: Params
     rtol: float
     atol: float | None
     events: Sequence[Event] | None
@@ -136,7 +137,9 @@ def with_looks(times: Array, watched: Sequence[Watched], slope: Callable[[], Arr
     return np.union1d(times, np.linspace(times[0], times[-1], count))
 
 
-def _of_block(function: Any, states: slice, fed: Any, params: dict[str, Any], seen: Snapshot) -> Array:
+def _of_block(
+    function: BlockFunction, states: slice, fed: Callable[[Array], Array], params: Params, seen: Snapshot
+) -> Array:
     """Signal that a block declares, from its states and inputs."""
     return np.asarray(function(seen.t, seen.x[states], fed(seen.w), params))
 

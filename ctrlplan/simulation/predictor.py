@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ctrlplan._types import Params, System
 from ctrlplan.simulation import methods
 from ctrlplan.simulation.interpreted import LoopError, SolverError
 from ctrlplan.simulation.prepared import NotApplicableError, Prepared, prepare
@@ -116,11 +116,11 @@ class Predictor(Frozen):
     _high: Array
     _inset: Array
     _resolution: float
-    _params: dict[str, Any]
+    _params: Params
 
     def __init__(
         self,
-        system: Any,
+        system: System | Prepared,
         limits: Mapping[str, Sequence[float]],
         horizon: float,
         *,
@@ -128,7 +128,7 @@ class Predictor(Frozen):
         margin: float = 0.02,
         count: int = 200,
         resolution: float = 1.0 / 64.0,
-        params: Mapping[str, Any] | None = None,
+        params: Params | None = None,
     ) -> None:
         prepared = prepare(system)
         _check_autonomous(prepared)

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import partial
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -239,7 +239,7 @@ class _Memory:
 
     def __init__(self, network: Network, solver: Solver, time_signals: Sequence[TimeSignal], resolution: float) -> None:
         blocks = network.blocks_with("delay")
-        self._time_signals: list[Any] = [signal for signal in time_signals if isinstance(signal, DelayedSignal)]
+        self._time_signals = [signal for signal in time_signals if isinstance(signal, DelayedSignal)]
         self._fed = [network.fed[i] for i in blocks]
         self._wires, self._driven = [network.wire[network.inputs[i]] for i in blocks], network.driven
         self._solver, self._resolution = solver, resolution

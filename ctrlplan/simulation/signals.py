@@ -12,7 +12,7 @@ from bisect import bisect_left
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -185,7 +185,7 @@ def input_signals(labels: Sequence[str], inputs: Inputs, times: Array) -> list[T
     ValueError
         If an input is unknown, or what is given does not fit the inputs or the times.
     """
-    given: list[Any]
+    given: list[Trajectory | ArrayLike]
     if isinstance(inputs, Mapping):
         for name in inputs:
             if name not in labels:
@@ -290,13 +290,13 @@ def _ordered(ends: Array) -> tuple[Array, Array]:
     return ends.min(axis=1), ends.max(axis=1)
 
 
-def _numbers(value: Any, what: str) -> Array:
+def _numbers(value: Trajectory | ArrayLike, what: str) -> Array:
     if callable(value):
         raise TypeError(f"{what} must be a trajectory, a number or samples, got {value!r:.80}")
     return real_array(value, what)
 
 
-def _time_signal(value: Any, name: str, times: Array) -> TimeSignal:
+def _time_signal(value: Trajectory | ArrayLike, name: str, times: Array) -> TimeSignal:
     if isinstance(value, Trajectory):
         if value.naxes != 1:
             raise ValueError(f"input {name} must be driven by one axis, got {value.naxes}")
@@ -338,7 +338,7 @@ _LOOKS = np.array([0.0312345, 0.1234567, 0.25, 0.3456789, 0.5, 0.6543217, 0.75, 
 
 
 @lru_cache(maxsize=32)
-def _chebyshev(width: int) -> tuple[Array, Any]:
+def _chebyshev(width: int) -> tuple[Array, Array]:
     """Nodes of the first kind, increasing, and the matrix from values there to coefficients."""
     angles = np.pi * (np.arange(width)[::-1] + 0.5) / width
     matrix = 2.0 / width * np.cos(np.outer(angles, np.arange(width)))
