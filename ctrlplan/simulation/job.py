@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from ctrlplan._types import Params
 from ctrlplan.simulation.events import Event, Snapshot, Watched, watched_events
+from ctrlplan.simulation.learned import NotCompiledError
 from ctrlplan.simulation.network import Network
-from ctrlplan.simulation.prepared import NotCompiledError, Prepared
+from ctrlplan.simulation.prepared import Prepared
 from ctrlplan.simulation.signals import TimeSignal
 from ctrlplan.symbolic.trials import can_remember
 from ctrlplan.traits import BlockFunction

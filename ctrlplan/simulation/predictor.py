@@ -11,7 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 from ctrlplan._types import Params, System
 from ctrlplan.simulation import methods
 from ctrlplan.simulation.interpreted import LoopError, SolverError
-from ctrlplan.simulation.prepared import NotApplicableError, Prepared, prepare
+from ctrlplan.simulation.learned import NotApplicableError
+from ctrlplan.simulation.prepared import Prepared, prepare
 from ctrlplan.simulation.simulate import checked_job, response_to
 from ctrlplan.trajectories.common import Frozen, checked_limits, checked_time
 

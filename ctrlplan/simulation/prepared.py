@@ -2,26 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import control as ct
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from ctrlplan._lru import BUILDING, Lru
+from ctrlplan._lru import Lru
+from ctrlplan._types import Params, System, Value
 from ctrlplan.simulation.interpreted import Interpreted
+from ctrlplan.simulation.learned import BuiltForm, DisagreementError, Learned, NotCompiledError
 from ctrlplan.simulation.linear import LinearForm, NotLinearError, linear_form
-from ctrlplan.simulation.network import Network, UnsupportedError
+from ctrlplan.simulation.network import Block, Network, UnsupportedError
 from ctrlplan.simulation.segments import DelayedSignal
 from ctrlplan.simulation.signals import PlanSignal, TimeSignal, signal_values
+from ctrlplan.simulation.unread import is_read
 from ctrlplan.symbolic import missing_casadi
 from ctrlplan.symbolic.fingerprint import fingerprint, value_token
-from ctrlplan.symbolic.isolation import tried, untouched
 from ctrlplan.symbolic.keeper import Keeper
-from ctrlplan.symbolic.references import References
-from ctrlplan.symbolic.trials import reads
 from ctrlplan.traits import traits_of
 
 if TYPE_CHECKING:
@@ -32,21 +32,6 @@ Array = NDArray[np.float64]
 
 _KEPT = 16
 """Systems that `simulate` keeps by itself."""
-
-_PARAMS = 3
-"""Position of the parameters among the arguments of a block's function."""
-
-
-class NotApplicableError(ValueError):
-    """A method of simulation that does not apply to a system, and why."""
-
-
-class NotCompiledError(NotApplicableError):
-    """A system that cannot be compiled, and why."""
-
-
-class DisagreementError(NotCompiledError):
-    """A compiled system that is not what Python says at states that a run visited."""
 
 
 class Prepared:
@@ -62,7 +47,7 @@ class Prepared:
         Number of states.
     """
 
-    def __init__(self, system: Any) -> None:
+    def __init__(self, system: System) -> None:
         self.original = system
         self._stated: Array | None = None
         self.fingerprint = fingerprint(system)
@@ -91,16 +76,14 @@ class Prepared:
                 what = "puts out the past" if block.delay is not None else "takes samples"
                 self.not_linear = f"block {block.name} {what}"
         self._sources = [PlanSignal(b.plan, b.traits.derivatives) for b in self._blocks() if b.plan is not None]
-        self.trusted = True
-        self._read: dict[str, bool] = {}
-        self._compiled: list[tuple[frozenset[str], dict[str, Any], Compiled | NotCompiledError]] = []
+        self._learned = Learned()
 
     def __repr__(self) -> str:
         return f"<Prepared form of {self.name}: {self.nstates} states>"
 
     @property
-    def initial_state(self) -> Any:
-        """Where the system says that it starts, or None."""
+    def initial_state(self) -> Array | None:
+        """Declared initial state, or None."""
         return _filled(self.stated)
 
     @property
@@ -135,7 +118,7 @@ class Prepared:
         return [*found, *sources]
 
     def compiled(
-        self, params: Mapping[str, Any], time_signals: list[TimeSignal], first: float, state: Array, trials: bool = True
+        self, params: Params, time_signals: list[TimeSignal], first: float, state: Array, trials: bool = True
     ) -> Compiled:
         """Compiled form for some parameters, built once for all their values.
 
@@ -144,37 +127,18 @@ class Prepared:
         NotCompiledError
             If CasADi is missing, or a block cannot be traced; it is named.
         """
-        form = self._known(params)
-        if form is None:
-            with BUILDING:
-                form = self._known(params)
-                if form is None:
-                    form, baked = self._build(params, time_signals, first, state, trials)
-                    if self.original is not None:  # what blocks only write has turned out meanwhile
-                        self.fingerprint = fingerprint(self.original)
-                    self._compiled = [*self._compiled[-7:], (frozenset(params), baked, form)]
-        if isinstance(form, NotCompiledError):
-            raise NotCompiledError(str(form))
-        return form
 
-    def _known(self, params: Mapping[str, Any]) -> Compiled | NotCompiledError | None:
-        """Form built before, in which the parameters that are no symbols have the same values."""
-        for names, baked, form in self._compiled:
-            numbers = isinstance(form, NotCompiledError) or all(np.ndim(params.get(k, 0.0)) == 0 for k in form.symbols)
-            if names == frozenset(params) and numbers and all(value_token(params[k]) == v for k, v in baked.items()):
-                return form
-        return None
+        def build() -> BuiltForm:
+            built = self._build(params, time_signals, first, state, trials)
+            if self.original is not None:  # what blocks only write has turned out meanwhile
+                self.fingerprint = fingerprint(self.original)
+            return built
+
+        return self._learned.form(params, build)
 
     def distrust(self, form: Compiled, why: str) -> DisagreementError:
-        """Drop a compiled form that was found wrong: once, for what it was made of may have changed; then for good."""
-        with BUILDING:
-            again, self.trusted = not self.trusted, False
-            self._compiled = [
-                (names, baked, NotCompiledError(why) if known is form else known)
-                for names, baked, known in self._compiled
-                if again or known is not form
-            ]
-        return DisagreementError(why)
+        """Drop a compiled form that was found wrong; the error to raise."""
+        return self._learned.distrust(form, why)
 
     def detached(self, names: Iterable[str] = ()) -> Prepared:
         """Same form without python-control's blocks, for other processes and for many runs with some parameters.
@@ -190,77 +154,43 @@ class Prepared:
         other = object.__new__(Prepared)
         other.__dict__.update(self.__getstate__())
         if self.linear is None:
-            other._compiled = [entry for entry in other._compiled if entry[0] == frozenset(names) and not entry[1]]
-            if not other._compiled:
+            other._learned = other._learned.for_any(names)
+            if not other._learned.forms:
                 raise TypeError(f"{self.name} is not compiled for any values of {', '.join(names) or 'no parameters'}")
         return other
 
-    def reads(self, name: str, value: Any, initial_state: Any = None) -> bool:
+    def reads(self, name: str, value: Value, initial_state: ArrayLike | None = None) -> bool:
         """Whether a block has a parameter, or reads one of that name where a run begins or near it."""
         network = self.network
         if network is None or not network.blocks or any(name in block.params for block in network.blocks):
             return True
-        if name in self._read:
-            return self._read[name]
-        self._read[name] = self._is_read(network, name, value, initial_state)
-        return self._read[name]
-
-    def _is_read(self, network: Network, name: str, value: Any, initial_state: Any) -> bool:
-        blocks = [i for i, block in enumerate(network.blocks) if not (block.linear or block.driven)]
-        functions = {i: [*_functions(network.blocks[i].system)] for i in blocks}
-        # A call may take minutes, as that of an estimator which runs an optimiser: only what can tell is called.
-        tellers = {i: [f for f in functions[i] if reads(f, _PARAMS)] for i in blocks}
-        if not any(tellers.values()):
-            return False
         given = self.initial_state if initial_state is None else initial_state
         start = np.zeros(self.nstates) + (0.0 if given is None else np.asarray(given, dtype=float))
-        w = np.zeros(network.nsignals)
-        found = References((f"block {network.blocks[i].name}", f) for i in blocks for f in functions[i])
-        if found.opaque:  # a call might leave something behind: what the code names counts
-            return name in found.names or not found.names.isdisjoint(("keys", "values", "items"))
-        keeper = Keeper(found)
 
-        def starting() -> Array:
-            equations = Interpreted(network, {name: value}, (0.0, start))
-            return equations.signals(0.0, start, signal_values(self.time_signals([], 0.0), np.zeros(1))[:, 0])
+        def at_start() -> Array:
+            return signal_values(self.time_signals([], 0.0), np.zeros(1))[:, 0]
 
-        read: set[str] = set()
-        rng = np.random.default_rng(0)
-        with untouched():
-            w = tried(starting, np.zeros(network.nsignals))
-            for i in blocks:
-                noticing = _Noticing({**network.blocks[i].params, name: value}, read)
-                for scale in (0.0, 0.1, 1.0):
-                    x, u = start[network.states[i]], network.fed[i](w)
-                    x, u = (v + scale * rng.standard_normal(v.size) * (1.0 + np.abs(v)) for v in (x, u))
-                    for function in tellers[i]:
-                        tried(partial(function, 10.0 * scale, x.copy(), u.copy(), noticing), None)
-        keeper.restore()
-        return name in read or _Noticing.ALL in read
+        return self._learned.reads(name, partial(is_read, network, name, value, start, at_start))
 
     def _build(
-        self, params: Mapping[str, Any], time_signals: list[TimeSignal], first: float, state: Array, trials: bool
-    ) -> tuple[Compiled | NotCompiledError, dict[str, Any]]:
+        self, params: Params, time_signals: list[TimeSignal], first: float, state: Array, trials: bool
+    ) -> BuiltForm:
+        """Compiled form of all blocks, or why there is none."""
+        names, network = frozenset(params), self.network
         if missing := missing_casadi():
-            return NotCompiledError(missing), {}
+            return BuiltForm(names, {}, NotCompiledError(missing))
         from ctrlplan.simulation.compiled import Compiled
-        from ctrlplan.symbolic.tracing import NotTraceableError, callable_references, traced
+        from ctrlplan.symbolic.tracing import NotTraceableError, traced
 
-        network = self.network
         if network is None:
-            return NotCompiledError(self.unsupported), {}
+            return BuiltForm(names, {}, NotCompiledError(self.unsupported))
         if not network.blocks:
-            return NotCompiledError(f"{self.name} is without its blocks, compiled for other parameters"), {}
+            why = f"{self.name} is without its blocks, compiled for other parameters"
+            return BuiltForm(names, {}, NotCompiledError(why))
         traces: list[Trace | None] = []
-        baked: dict[str, Any] = {}
+        constants: dict[str, tuple[object, ...]] = {}
         try:
-            others = [block for block in network.blocks if not (block.linear or block.driven)]
-            keeper = Keeper(callable_references(others, params))
-            try:
-                equations = Interpreted(network.for_trials(), params, (first, state), trials)
-                w = equations.signals(first, state, signal_values(time_signals, np.array([first]))[:, 0])
-            finally:
-                keeper.restore()
+            w = self._signals_at_start(network, params, time_signals, first, state, trials)
             for block, states, fed in zip(network.blocks, network.states, network.fed, strict=True):
                 if block.linear or block.driven:
                     traces.append(None)
@@ -268,20 +198,41 @@ class Prepared:
                 trace = traced(block, params, first, state[states], fed(w))
                 traces.append(trace)
                 # What is a constant in the trace must be so in every run of it.
-                baked |= {key: value_token(params[key]) for key in params if key not in trace.symbols}
-            return Compiled(network, traces), baked
+                constants |= {key: value_token(params[key]) for key in params if key not in trace.symbols}
+            return BuiltForm(names, constants, Compiled(network, traces))
         except NotTraceableError as error:
-            return NotCompiledError(str(error)), {key: value_token(value) for key, value in params.items()}
+            every = {key: value_token(value) for key, value in params.items()}
+            return BuiltForm(names, every, NotCompiledError(str(error)))
 
-    def _blocks(self) -> tuple[Any, ...]:
+    def _signals_at_start(
+        self,
+        network: Network,
+        params: Params,
+        time_signals: list[TimeSignal],
+        first: float,
+        state: Array,
+        trials: bool,
+    ) -> Array:
+        """Signals at the start of a run, by calls that leave nothing behind."""
+        from ctrlplan.symbolic.tracing import callable_references
+
+        others = [block for block in network.blocks if not (block.linear or block.driven)]
+        keeper = Keeper(callable_references(others, params))
+        try:
+            equations = Interpreted(network.for_trials(), params, (first, state), trials)
+            return equations.signals(first, state, signal_values(time_signals, np.array([first]))[:, 0])
+        finally:
+            keeper.restore()
+
+    def _blocks(self) -> tuple[Block, ...]:
         return self.network.blocks if self.network is not None else ()
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> dict[str, object]:
         """Without python-control's objects, whose functions cannot be sent to another process."""
-        usable = [entry for entry in self._compiled if not isinstance(entry[2], NotCompiledError)]
+        usable = self._learned.usable()
         if self.linear is None:
             special = any(block.delay is not None or block.period is not None for block in self._blocks())
-            if not usable or special:
+            if not usable.forms or special:
                 raise TypeError(
                     f"{self.name} must be linear or compiled, without delays and samples, to be sent to another "
                     "process; give a function that builds it"
@@ -294,50 +245,12 @@ class Prepared:
             "system": None,
             "fingerprint": None,
             "network": network,
-            "_compiled": usable,
+            "_learned": usable,
             "_stated": self.stated,
         }
 
 
-class _Noticing(dict[str, Any]):
-    """Parameters that notice which of them are read."""
-
-    ALL = ""
-
-    def __init__(self, values: Mapping[str, Any], read: set[str]) -> None:
-        super().__init__(values)
-        self.read = read
-
-    def __getitem__(self, key: str) -> Any:
-        self.read.add(key)
-        return super().__getitem__(key)
-
-    def __contains__(self, key: object) -> bool:
-        self.read.add(str(key))
-        return super().__contains__(key)
-
-    def get(self, key: str, default: Any = None) -> Any:
-        self.read.add(key)
-        return super().get(key, default)
-
-    def __iter__(self) -> Iterator[str]:
-        self.read.add(self.ALL)
-        return super().__iter__()
-
-    def keys(self) -> Any:
-        self.read.add(self.ALL)
-        return super().keys()
-
-    def items(self) -> Any:
-        self.read.add(self.ALL)
-        return super().items()
-
-    def values(self) -> Any:
-        self.read.add(self.ALL)
-        return super().values()
-
-
-def prepare(system: Any) -> Prepared:
+def prepare(system: System | Prepared) -> Prepared:
     """Built form of a system, for many runs.
 
     `simulate` takes it in the system's place; what it builds on the way
@@ -365,7 +278,7 @@ def prepare(system: Any) -> Prepared:
     return Prepared(_checked_system(system))
 
 
-def prepared_form(system: Any) -> Prepared:
+def prepared_form(system: System | Prepared) -> Prepared:
     """Form built before of the same system, or a new one where its maps, parameters or blocks have changed."""
     if isinstance(system, Prepared):
         if system.original is None or fingerprint(system.original) == system.fingerprint:
@@ -376,12 +289,12 @@ def prepared_form(system: Any) -> Prepared:
     return _FORMS.get(key, lambda: Prepared(system))
 
 
-def stated_start(system: Any) -> Array | None:
+def stated_start(system: System | Prepared) -> Array | None:
     """State at which a system says that it starts, or its blocks do, the rest of them at 0; None where none does."""
     return _filled(stated_states(system))
 
 
-def stated_states(system: Any) -> Array | None:
+def stated_states(system: System | Prepared) -> Array | None:
     """State at which a system or its blocks declare that they start, nan for those of other blocks."""
     if isinstance(system, Prepared):
         return system.stated
@@ -396,7 +309,7 @@ def stated_states(system: Any) -> Array | None:
     return np.concatenate([np.full(count, np.nan) if start is None else start for start, count in parts])
 
 
-def state_space(system: Any) -> Any:
+def state_space(system: System) -> System:
     """Same system with states, where it is a transfer function."""
     if not isinstance(system, ct.TransferFunction):
         return system
@@ -408,7 +321,7 @@ def _filled(stated: Array | None) -> Array | None:
     return None if stated is None else np.where(np.isnan(stated), 0.0, stated)
 
 
-def _checked_system(system: Any) -> Any:
+def _checked_system(system: System) -> System:
     if not isinstance(system, ct.InputOutputSystem):
         raise TypeError(f"system must be a control system, got {type(system).__name__}")
     states = 0 if isinstance(system, ct.TransferFunction) else system.nstates
@@ -421,8 +334,3 @@ def _checked_system(system: Any) -> Any:
 
 
 _FORMS: Lru[tuple[object, ...], Prepared] = Lru(_KEPT)
-
-
-def _functions(system: Any) -> Iterator[Any]:
-    """Functions of a block that are called with its parameters."""
-    return filter(None, (system.outfcn, system.updfcn, traits_of(system).sample))

@@ -15,8 +15,8 @@ import pytest
 import ctrlplan as cp
 from ctrlplan.simulation import methods
 from ctrlplan.simulation.interpreted import InterpretedSolver, SolverError
+from ctrlplan.simulation.learned import NotApplicableError
 from ctrlplan.simulation.numerical import numerical
-from ctrlplan.simulation.prepared import NotApplicableError
 from ctrlplan.simulation.simulate import MethodName
 
 T = np.linspace(0.0, 2.0, 21)

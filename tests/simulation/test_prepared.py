@@ -294,8 +294,8 @@ def test_the_forms_that_are_kept_do_not_grow_without_bound():
     for k in range(20):
         with pytest.warns(UserWarning, match=f"params 'p{k}' is read by no block"):
             simulate(ready, T[:2], 1.0, params={f"p{k}": 1.0})
-    assert len(ready._compiled) <= 8
-    form = ready._compiled[-1][2]
+    assert len(ready._learned.forms) <= 8
+    form = ready._learned.forms[-1].form
     for n in range(2, 150):
         with pytest.warns(UserWarning, match="params 'p19' is read by no block"):
             simulate(ready, np.linspace(0.0, 1.0 + 0.01 * n, n), 1.0, params={"p19": 1.0})

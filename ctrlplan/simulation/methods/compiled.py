@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from ctrlplan.simulation.interpreted import SolverError
 from ctrlplan.simulation.job import Job, Record, unused
+from ctrlplan.simulation.learned import DisagreementError
 from ctrlplan.simulation.numerical import VISITED, Attempt, equations_of, numerical
-from ctrlplan.simulation.prepared import DisagreementError, Prepared
+from ctrlplan.simulation.prepared import Prepared
 from ctrlplan.simulation.segments import Run
 from ctrlplan.simulation.signals import signal_values
 from ctrlplan.symbolic import missing_casadi

@@ -8,7 +8,8 @@ from typing import Protocol
 
 from ctrlplan.simulation.interpreted import SolverError
 from ctrlplan.simulation.job import Job, Record, unused
-from ctrlplan.simulation.prepared import NotApplicableError, Prepared
+from ctrlplan.simulation.learned import NotApplicableError
+from ctrlplan.simulation.prepared import Prepared
 
 
 class Method(Protocol):
