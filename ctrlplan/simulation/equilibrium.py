@@ -268,7 +268,7 @@ class _Equations:
             return np.concatenate([np.zeros(0), *found])
 
         self._rates, self.late, self._gaps = rates, late, gaps
-        self._outputs = lambda x: network.put_out(equations.signals(time, x, held))
+        self._outputs = lambda x: network.to_outputs(equations.signals(time, x, held))
 
     def rates(self, x: Array) -> Array:
         """Rates, nan outside the domain of a block."""

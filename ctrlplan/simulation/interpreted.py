@@ -316,7 +316,7 @@ class InterpretedSolver:
 
     def outputs(self, times: Array, states: Array, driven: Array) -> Array:
         """Outputs (noutputs, ntime) of the whole."""
-        return self._equations.network.put_out(self.signals(times, states, driven))
+        return self._equations.network.to_outputs(self.signals(times, states, driven))
 
     def slopes(self, times: Array, states: Array, driven: Array) -> Array:
         """Derivatives of the rates by the states, by differences, (ntime, nstates, nstates)."""

@@ -1,4 +1,4 @@
-"""What a run is asked for, and what it leaves."""
+"""Arguments of a run, and its result."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from ctrlplan.traits import BlockFunction
 
 Array = NDArray[np.float64]
 
-_LOOKS = 400, 20_000
-"""Times at least and at most, beside those asked for, at which the signals of events are looked at."""
+_EVENT_TIMES = 400, 20_000
+"""Minimum and maximum number of times, in addition to the sample times, at which signals of events are evaluated."""
 
-_LOOKS_A_TURN = 16
-"""Such times in a turn of the fastest oscillation about the state where a run begins."""
+_EVENT_TIMES_A_PERIOD = 16
+"""Such times in a period of the fastest oscillation about the state where a run begins."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,12 +80,12 @@ class Job:
         return float(self.times[0])
 
     def watched(self) -> tuple[Watched, ...]:
-        """Events asked for, and unless none are wanted those that blocks declare."""
+        """Events of the call, and those that blocks declare unless an empty sequence was given."""
         prepared = self.prepared
         # An output hides an input or a state of the same name.
         kinds = (("u", prepared.input_labels), ("x", prepared.state_labels), ("y", prepared.output_labels))
         labels = {label: (kind, row) for kind, names in kinds for row, label in enumerate(names)}
-        asked = watched_events(self.events or (), labels)
+        given = watched_events(self.events or (), labels)
         if self.events is not None and not self.events:
             return ()
         known = prepared.network.watched if prepared.network is not None else ()
@@ -93,20 +93,20 @@ class Job:
             Watched(w.name, partial(_of_block, w.function, w.states, w.fed, {**w.params, **self.params}), w.low, w.high)
             for w in known
         ]
-        return (*declared, *asked)
+        return (*declared, *given)
 
 
 @dataclass(frozen=True, eq=False)
 class Record:
-    """States at the times of a run, and how to see more of it.
+    """States at the times of a run, and how to evaluate it elsewhere.
 
     Attributes
     ----------
     times, states : ndarray, shapes (ntime,) and (nstates, ntime)
         As far as the run went.
-    see : callable
+    snapshot : callable
         Maps times and states to all signals.
-    carry : callable
+    interpolate : callable
         Maps k and a time between times[k] and the next to the state there.
     watched : tuple of Watched
         Signals whose limits count as events.
@@ -116,25 +116,25 @@ class Record:
 
     times: Array
     states: Array
-    see: Callable[[Array, Array], Snapshot]
-    carry: Callable[[int, float], Array]
+    snapshot: Callable[[Array, Array], Snapshot]
+    interpolate: Callable[[int, float], Array]
     watched: tuple[Watched, ...]
     method: str
     reason: str
 
     def state_at(self, k: int, t: float) -> Array:
         """State at a time from times[k] to the next."""
-        return self.carry(k, t) if t > self.times[k] else self.states[:, k]
+        return self.interpolate(k, t) if t > self.times[k] else self.states[:, k]
 
 
-def with_looks(times: Array, watched: Sequence[Watched], slope: Callable[[], Array]) -> Array:
-    """Times asked for, and more where events are watched, so that no crossing hides between two."""
+def with_event_times(times: Array, watched: Sequence[Watched], slope: Callable[[], Array]) -> Array:
+    """Sample times, and more where events are watched, so that no crossing is missed between two."""
     if not watched:
         return times
     matrix = slope()
     fastest = float(np.abs(np.linalg.eigvals(matrix).imag).max(initial=0.0)) if np.isfinite(matrix).all() else 0.0
-    turns = fastest * float(times[-1] - times[0]) / (2.0 * np.pi)
-    count = int(min(max(_LOOKS[0], _LOOKS_A_TURN * turns), _LOOKS[1]))
+    periods = fastest * float(times[-1] - times[0]) / (2.0 * np.pi)
+    count = int(min(max(_EVENT_TIMES[0], _EVENT_TIMES_A_PERIOD * periods), _EVENT_TIMES[1]))
     return np.union1d(times, np.linspace(times[0], times[-1], count))
 
 

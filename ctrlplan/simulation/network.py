@@ -252,7 +252,7 @@ class Network:
         return [_product(self.wire[rows]) for rows in self.inputs]
 
     @cached_property
-    def put_out(self) -> Callable[[Array], Array]:
+    def to_outputs(self) -> Callable[[Array], Array]:
         """Map of all signals, time last, to the outputs of the whole."""
         return _product(self.read)
 

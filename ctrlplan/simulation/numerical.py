@@ -15,7 +15,7 @@ from scipy.integrate import trapezoid
 from ctrlplan.simulation.budget import TimeLimitError
 from ctrlplan.simulation.events import Snapshot, Watched
 from ctrlplan.simulation.interpreted import Interpreted, SolverError
-from ctrlplan.simulation.job import Job, Record, unused, with_looks
+from ctrlplan.simulation.job import Job, Record, unused, with_event_times
 from ctrlplan.simulation.network import Network
 from ctrlplan.simulation.scales import PASSES, Scales, Tolerances, doubt, effects, remaining
 from ctrlplan.simulation.segments import Run, Solver, integrate, known_before
@@ -206,7 +206,7 @@ class Attempt(Generic[S]):
             self.equations,
             self.solver,
             self.time_signals,
-            with_looks(job.times, self.watched, self._slope),
+            with_event_times(job.times, self.watched, self._slope),
             job.state,
             resolution=10.0 * job.rtol,
             marks=marks,

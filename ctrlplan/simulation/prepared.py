@@ -107,7 +107,7 @@ class Prepared:
         return self.network is not None and bool(self.network.blocks)
 
     def time_signals(self, inputs: list[TimeSignal], first: float) -> list[TimeSignal]:
-        """Given inputs, then the driven blocks in order."""
+        """Signals at the inputs, then the outputs of blocks that are functions of time, in order."""
         sources, found = iter(self._sources), list(inputs)
         for block in self._blocks():
             if block.plan is not None:

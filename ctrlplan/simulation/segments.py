@@ -1,4 +1,4 @@
-"""The way of every numerical run: from segment to segment, samples, delays and stops between them."""
+"""Numerical runs from segment to segment, with samples, delays and stops between them."""
 
 from __future__ import annotations
 
@@ -50,14 +50,14 @@ _ROUNDINGS = 64.0
 """Rounding errors of a plan, in units of the last place of its largest values."""
 
 _SEGMENTS = 2_000
-"""Segments that blocks may ask for in a run."""
+"""Maximum number of segments in a run that blocks require by their longest step."""
 
 _MARKS = 20_000
 """Instants of jumps that a run stops at, at most."""
 
 
 class Solver(Protocol):
-    """What carries a state over a segment."""
+    """Integrator of the states over a segment."""
 
     def advance(self, series: Series, left: float, grid: Array, state: Array) -> Array:
         """States (nstates, ngrid) at times of a segment, of which the last is its end."""
@@ -81,11 +81,11 @@ class DelayedSignal:
         self._ends: list[float] = []
 
     def record(self, piece: Series) -> None:
-        """Signals of a segment, as they went in."""
+        """Record the inputs of the delay over a segment."""
         self._pieces.append(piece)
         self._ends.append(piece.right)
 
-    def beside(self, moment: float, origin: float, s: Array) -> Array:
+    def analytic_at(self, moment: float, origin: float, s: Array) -> Array:
         """Values as they were; segments end where they break."""
         return self.at(origin + s)
 
@@ -119,11 +119,11 @@ class Run:
     Attributes
     ----------
     times : ndarray, shape (ntime,)
-        Times asked for and those at which segments begin [s], as far as the run went.
+        Sample times and those at which segments begin [s], as far as the run went.
     states : ndarray, shape (nstates, ntime)
         Right-continuous where a discrete block takes a sample.
     segments : list of (float, Series)
-        Where each segment begins, and the driven signals over it.
+        Where each segment begins, and the signals that are functions of time over it.
     """
 
     times: Array
@@ -131,7 +131,7 @@ class Run:
     segments: list[tuple[float, Series]]
 
     def series(self, t: float) -> Series:
-        """Driven signals over the segment that begins at or before a time."""
+        """Signals that are functions of time over the segment that begins at or before a time."""
         return self.segments[max(0, bisect_right(self.segments, t, key=lambda segment: segment[0]) - 1)][1]
 
 
@@ -151,9 +151,9 @@ def integrate(
     Parameters
     ----------
     network, equations, solver
-        What is run, its equations by Python, and what carries states on.
+        What is run, its equations by Python, and the integrator.
     time_signals : sequence of TimeSignal
-        One for the external inputs each, then one for each driven block.
+        Signals at the inputs, then the outputs of each block that are functions of time.
     times : ndarray, shape (ntime,)
         Times at which states are wanted; the run goes from the first to the last.
     state : ndarray, shape (nstates,)
@@ -173,8 +173,8 @@ def integrate(
     """
     first, last = float(times[0]), float(times[-1])
     memory = _Memory(network, solver, time_signals, resolution)
-    for_ever = equations is not None and network.delays_feed_delays(equations.feeds)
-    hops = _MARKS if for_ever else _HOPS
+    endless = equations is not None and network.delays_feed_delays(equations.feeds)
+    hops = _MARKS if endless else _HOPS
     marks = [*breakpoints_of(time_signals), *network.breakpoints, *marks]
     clock = _Clock(network, time_signals, _fixed(marks, first, last, memory.delays, hops), first, last)
     longest = min([last - first, *memory.delays])
@@ -205,7 +205,9 @@ def integrate(
             accuracy = resolution if memory.delays else RESOLVED
             span = [
                 series.bounded(*_bounds(time_signals, moment, series.left, series.right))
-                for series in resolved(partial(_beside, time_signals, moment, left), left, until, accuracy, rounding)
+                for series in resolved(
+                    partial(_analytic_at, time_signals, moment, left), left, until, accuracy, rounding
+                )
             ]
         series = next(s for s in span if left < s.right)
         right = min(right, series.right)
@@ -224,8 +226,8 @@ def integrate(
             reach = 0.5 * (right - left)
             continue
         segments.append((left, series))
-        asked = np.isin(grid, inside)
-        known.append((np.append(left, grid[asked]), np.column_stack([x, found[:, asked]])))
+        wanted = np.isin(grid, inside)
+        known.append((np.append(left, grid[wanted]), np.column_stack([x, found[:, wanted]])))
         before, x = x, clock.sample(equations, right, found[:, -1])
         left, reach = right, min(longest, 2.0 * reach)
         if pause is not None and pause(np.append(segments[-1][0], grid), np.column_stack([before, found])):
@@ -309,7 +311,7 @@ class _Clock:
         return self._fixed[min(bisect_right(self._fixed, t + self._tolerance), len(self._fixed) - 1)]
 
     def on(self, times: Array, t: float) -> float:
-        """The time asked for that an instant is but for rounding, so that it counts as after it."""
+        """Sample time that equals an instant but for rounding, so that it counts as after it."""
         near = times[max(0, int(np.searchsorted(times, t)) - 1) :][:2]
         close = near[np.abs(near - t) <= self._tolerance]
         return float(close[0]) if close.size else t
@@ -348,8 +350,8 @@ def known_before(time_signals: Sequence[TimeSignal], times: Array) -> Array:
     return np.concatenate([np.zeros((0, times.size)), *rows])
 
 
-def _beside(time_signals: Sequence[TimeSignal], moment: float, origin: float, s: Array) -> Array:
-    return np.concatenate([np.zeros((0, s.size)), *(signal.beside(moment, origin, s) for signal in time_signals)])
+def _analytic_at(time_signals: Sequence[TimeSignal], moment: float, origin: float, s: Array) -> Array:
+    return np.concatenate([np.zeros((0, s.size)), *(signal.analytic_at(moment, origin, s) for signal in time_signals)])
 
 
 def _bounds(time_signals: Sequence[TimeSignal], moment: float, left: float, right: float) -> tuple[Array, Array]:
@@ -370,7 +372,7 @@ def _combined_bounds(wire: Array, driven: NDArray[np.intp], series: Series) -> t
 
 
 def _fixed(marks: Sequence[float], first: float, last: float, delays: list[float], hops: int) -> list[float]:
-    """Breakpoints inside the run, and where delays carry them to."""
+    """Breakpoints inside the run, and the times to which delays shift them."""
     found = {t for t in marks if first < t < last}
     fresh = {*found, first}
     for _ in range(hops if delays else 0):

@@ -1,8 +1,8 @@
 """Signals that are functions of time alone, as one short Chebyshev series a segment.
 
-A plan is analytic between its breakpoints. A solver that asks for it a
-thousand times a second, at a time and for all its derivatives, is served from
-the series; what is reported at the sample times are the plan's own jets.
+A plan is analytic between its breakpoints. A solver evaluates it,
+with all its derivatives, thousands of times: it does so by the series. Values at
+the sample times are the plan's own jets.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ WIDTHS = (1, 8, 16, 24, 32, 40, 48, 64)
 """Numbers of terms of a series; a segment that needs more is halved."""
 
 RESOLVED = 4e-15
-"""Size of the last terms, relative to the greatest, at which a signal counts as resolved."""
+"""Size of the last terms, relative to the largest, at which a signal counts as resolved."""
 
 
 _FLAT = 1e-7
@@ -101,7 +101,7 @@ class TimeSignal(Protocol):
     def width(self) -> int:
         """How many signals."""
 
-    def beside(self, moment: float, origin: float, s: Array) -> Array:
+    def analytic_at(self, moment: float, origin: float, s: Array) -> Array:
         """Values (nsignals, ntime) at origin + s of the analytic functions that hold at `moment`."""
 
     def bounds(self, moment: float, left: float, right: float) -> tuple[Array, Array]:
@@ -131,14 +131,14 @@ class PlanSignal:
         """Signals of all axes."""
         return self.plan.naxes * (self.derivatives + 1)
 
-    def beside(self, moment: float, origin: float, s: Array) -> Array:
+    def analytic_at(self, moment: float, origin: float, s: Array) -> Array:
         """Values of the segment that holds at `moment`."""
         jet = self.plan._jet_beside(moment, origin, s, self.derivatives)
         return jet.transpose(1, 0, 2).reshape(-1, s.size)
 
     def bounds(self, moment: float, left: float, right: float) -> tuple[Array, Array]:
         """The plan's own values at both ends."""
-        return _ordered(self.beside(moment, left, np.array([0.0, right - left])))
+        return _ordered(self.analytic_at(moment, left, np.array([0.0, right - left])))
 
     def at(self, times: Array) -> Array:
         """Values of the plan."""
@@ -158,7 +158,7 @@ class SampledSignal:
         slope = np.diff(values) / np.diff(times)
         self.breakpoints = times[1:-1][slope[1:] != slope[:-1]]
 
-    def beside(self, moment: float, origin: float, s: Array) -> Array:
+    def analytic_at(self, moment: float, origin: float, s: Array) -> Array:
         """Values of the straight line that holds at `moment`."""
         left = min(max(int(np.searchsorted(self.times, moment)) - 1, 0), self.times.size - 2)
         (t0, t1), (v0, v1) = self.times[left : left + 2], self.values[left : left + 2]
@@ -240,9 +240,9 @@ def resolved(
     rounding : ndarray, shape (nsignals,), or float, optional
         Rounding errors of the signals, which no halving makes smaller.
     """
-    # Never at the ends, where a neighbouring segment might be asked.
+    # Never at the ends, where a neighbouring segment might be evaluated.
     duration = right - left
-    values = signals(duration * _LOOKS)
+    values = signals(duration * _PROBES)
     if np.all(values == values[:, :1]):
         return [_unbounded(left, right, values[:, :1])]
     for width in WIDTHS[1:]:
@@ -252,7 +252,7 @@ def resolved(
         if np.all(size[:, -3:] <= np.maximum(tolerance * allowed, np.reshape(rounding, (-1, 1)))):
             return [_unbounded(left, right, coefficients)]
     # Terms that no longer fall are rounding errors of the signal itself, which shorter segments make no smaller: where
-    # a plan comes to rest, its derivatives are next to nothing compared with it.
+    # a plan is at rest, its derivatives are next to nothing compared with it.
     half, end = size[:, width // 2 : -width // 4], size[:, -width // 4 :]
     noise = np.maximum(half.max(axis=1), end.max(axis=1))
     flat = half.max(axis=1) <= 10.0 * end.max(axis=1)
@@ -299,7 +299,7 @@ def _numbers(value: Trajectory | ArrayLike, what: str) -> Array:
 def _time_signal(value: Trajectory | ArrayLike, name: str, times: Array) -> TimeSignal:
     if isinstance(value, Trajectory):
         if value.naxes != 1:
-            raise ValueError(f"input {name} must be driven by one axis, got {value.naxes}")
+            raise ValueError(f"input {name} must be a trajectory of one axis, got {value.naxes}")
         return PlanSignal(value)
     signal = _numbers(value, f"input {name}")
     if not np.isfinite(signal).all():
@@ -333,8 +333,8 @@ def breakpoints_of(time_signals: Iterable[TimeSignal]) -> list[float]:
     return [float(t) for signal in time_signals for t in signal.breakpoints]
 
 
-_LOOKS = np.array([0.0312345, 0.1234567, 0.25, 0.3456789, 0.5, 0.6543217, 0.75, 0.8765431, 0.9712345])
-"""Where a signal is looked at to see whether it is constant over a segment."""
+_PROBES = np.array([0.0312345, 0.1234567, 0.25, 0.3456789, 0.5, 0.6543217, 0.75, 0.8765431, 0.9712345])
+"""Parts of a segment at which a signal is compared, to find whether it is constant."""
 
 
 @lru_cache(maxsize=32)

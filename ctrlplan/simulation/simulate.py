@@ -218,7 +218,7 @@ def _response(job: Job, record: Record) -> SimulationResponse:
         end = record.state_at(int(np.searchsorted(record.times, last, side="right")) - 1, last)
         times, states = np.append(times[times < last], last), np.column_stack([states[:, times < last], end])
         found = [occurrence for occurrence in found if occurrence.time <= last]
-    seen = record.see(times, states)
+    seen = record.snapshot(times, states)
     return SimulationResponse(
         times,
         seen.y.reshape(len(prepared.output_labels), times.size),
@@ -242,7 +242,7 @@ def _occurrences(record: Record) -> list[Occurrence]:
     """Every crossing of what was watched, in order of time."""
     if not record.watched:
         return []
-    seen, found = record.see(record.times, record.states), []
+    seen, found = record.snapshot(record.times, record.states), []
     for entry in record.watched:
         found += crossings(entry, record.times, entry.value(seen), partial(_value_at, record, entry))
     return sorted(found, key=lambda occurrence: occurrence.time)
@@ -250,7 +250,7 @@ def _occurrences(record: Record) -> list[Occurrence]:
 
 def _value_at(record: Record, entry: Watched, k: int, t: float) -> float:
     """Watched signal at a time from times[k] of a record to the next."""
-    return float(entry.value(record.see(np.array([t]), record.state_at(k, t)[:, None]))[0])
+    return float(entry.value(record.snapshot(np.array([t]), record.state_at(k, t)[:, None]))[0])
 
 
 def _checked_state(prepared: Prepared, initial_state: ArrayLike | None) -> Array:

@@ -34,7 +34,9 @@ class Delegated:
         """States at the times of a job, within its tolerances."""
         prepared = job.prepared
         warnings.warn(
-            f"{prepared.unsupported}: run by control.input_output_response, without events", UserWarning, stacklevel=5
+            f"{prepared.unsupported}: run by control.input_output_response, without events",
+            UserWarning,
+            stacklevel=5,
         )
         u = signal_values(job.inputs, job.times) if job.inputs else np.zeros((0, job.times.size))
         with DELEGATED:
@@ -49,8 +51,10 @@ class Delegated:
             )
         outputs: Array = response.y.reshape(len(prepared.output_labels), job.times.size)
 
-        def see(t: Array, x: Array) -> Snapshot:
+        def snapshot(t: Array, x: Array) -> Snapshot:
             at = np.searchsorted(job.times, t, side="right") - 1
             return Snapshot(t, x, u[:, at], outputs[:, at])
 
-        return Record(job.times, response.x, see, lambda k, t: response.x[:, k], (), self.name, prepared.unsupported)
+        return Record(
+            job.times, response.x, snapshot, lambda k, t: response.x[:, k], (), self.name, prepared.unsupported
+        )

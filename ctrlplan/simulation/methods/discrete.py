@@ -44,24 +44,24 @@ class Discrete:
         time_signals = prepared.time_signals(job.inputs, job.first)
         equations = Interpreted(network, job.params, (job.first, job.state), job.trials)
         breakpoints = np.array(sorted(breakpoints_of(time_signals)))
-        driven = signal_values(time_signals, _on_breakpoints(clock, breakpoints))
+        values = signal_values(time_signals, _on_breakpoints(clock, breakpoints))
         states = np.empty((job.state.size, clock.size))
         signals = np.empty((network.nsignals, clock.size))
         states[:, 0] = job.state
         for k, t in enumerate(clock.tolist()):
             check(t)
-            signals[:, k] = equations.signals(t, states[:, k], driven[:, k])
+            signals[:, k] = equations.signals(t, states[:, k], values[:, k])
             following = equations.rates_of(t, states[:, k], signals[:, k])
             if k + 1 < clock.size:
                 states[:, k + 1] = following
 
-        def see(t: Array, x: Array) -> Snapshot:
+        def snapshot(t: Array, x: Array) -> Snapshot:
             now = signal_values(time_signals, _on_breakpoints(t, breakpoints))
             w = signals[:, np.searchsorted(clock, t, side="right") - 1]
-            return Snapshot(t, x, now[: prepared.ninputs], network.put_out(w), lambda: w)
+            return Snapshot(t, x, now[: prepared.ninputs], network.to_outputs(w), lambda: w)
 
         # Between samples nothing happens: what crosses a limit does so at the later one.
-        return Record(clock, states, see, lambda k, t: states[:, k], job.watched(), self.name, job.reason)
+        return Record(clock, states, snapshot, lambda k, t: states[:, k], job.watched(), self.name, job.reason)
 
 
 def _clock(times: Array, dt: float | bool) -> Array:

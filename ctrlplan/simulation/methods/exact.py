@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ctrlplan.simulation.events import Snapshot
 from ctrlplan.simulation.exact import exact_states, sampled_states
-from ctrlplan.simulation.job import Job, Record, with_looks
+from ctrlplan.simulation.job import Job, Record, with_event_times
 from ctrlplan.simulation.linear import LinearForm
 from ctrlplan.simulation.prepared import Prepared
 from ctrlplan.simulation.signals import PlanSignal, SampledSignal, signal_values
@@ -48,16 +48,16 @@ def _run(job: Job, form: LinearForm) -> Record:
     )
     breakpoints = [t for plan, _ in plans for t in plan.breakpoints]
     watched = job.watched()
-    times = with_looks(job.times, watched, lambda: form.a)
+    times = with_event_times(job.times, watched, lambda: form.a)
 
     def jet(moment: float, origin: float, s: Array, order: int) -> Array:
         rows = [plan._jet_beside(moment, origin, s, order + high) for plan, high in plans]
         signals = [_derivatives(row, high, order) for row, (_, high) in zip(rows, plans, strict=True)]
         return np.concatenate(signals, axis=1) if signals else np.zeros((order + 1, 0, s.size))
 
-    def see(t: Array, x: Array) -> Snapshot:
-        driven = signal_values(time_signals, t)
-        return Snapshot(t, x, driven[: job.prepared.ninputs], form.outputs(x, driven))
+    def snapshot(t: Array, x: Array) -> Snapshot:
+        values = signal_values(time_signals, t)
+        return Snapshot(t, x, values[: job.prepared.ninputs], form.outputs(x, values))
 
     def states_at(t: Array, state: Array, a: Array = form.a) -> Array:
         found = exact_states(a, form.b[:, ~sampled], jet, breakpoints, t, state)
@@ -66,17 +66,17 @@ def _run(job: Job, form: LinearForm) -> Record:
             found = found + sampled_states(a, form.b[:, sampled], samples, t, np.zeros_like(state))
         return _finite(found)
 
-    def carry(k: int, t: float) -> Array:
+    def interpolate(k: int, t: float) -> Array:
         return states_at(np.array([times[k], t]), states[:, k])[:, 1]
 
     states = states_at(times, job.state)
     growing, fast = form.sensitivity(float(times[-1] - times[0]))
     if growing or fast:
-        driven, nearly = signal_values(time_signals, times), states_at(times, job.state, form.a * (1.0 + 2.0**-50))
-        floor = form.rounding(states[:, :1] if growing else states, driven)
-        _warn_of_uncertainty(job, form.outputs(states, driven), form.outputs(nearly, driven), floor)
+        values, nearly = signal_values(time_signals, times), states_at(times, job.state, form.a * (1.0 + 2.0**-50))
+        floor = form.rounding(states[:, :1] if growing else states, values)
+        _warn_of_uncertainty(job, form.outputs(states, values), form.outputs(nearly, values), floor)
     _warn_of_undefined(job, form, times, states)
-    return Record(times, states, see, carry, watched, "exact", "linear and continuous")
+    return Record(times, states, snapshot, interpolate, watched, "exact", "linear and continuous")
 
 
 def _warn_of_uncertainty(job: Job, outputs: Array, others: Array, floor: Array) -> None:
