@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ctrlplan._checks import real_array
+from ctrlplan._renamed import outside_stacklevel
 from ctrlplan._types import System
 from ctrlplan.simulation import methods
 from ctrlplan.simulation.budget import begin_run
@@ -158,7 +159,7 @@ def simulate(
         job = replace(job, reason=f'method "{method}" was requested')
     _warn_of_unread(job)
     if job.prepared.dt is None and job.prepared.nstates:
-        warnings.warn(_NO_TIMEBASE.format(job.prepared.name), UserWarning, stacklevel=2)
+        warnings.warn(_NO_TIMEBASE.format(job.prepared.name), UserWarning, stacklevel=outside_stacklevel())
     return response_to(job, chosen)
 
 
@@ -204,7 +205,11 @@ def _warn_of_unread(job: Job) -> None:
     """Warn of parameters that no block reads: they are misspelt."""
     for name, value in job.params.items():
         if np.ndim(value) == 0 and not job.prepared.reads(name, value):
-            warnings.warn(f"params {name!r} is read by no block of {job.prepared.name}", UserWarning, stacklevel=3)
+            warnings.warn(
+                f"params {name!r} is read by no block of {job.prepared.name}",
+                UserWarning,
+                stacklevel=outside_stacklevel(),
+            )
 
 
 def _response(job: Job, record: Record) -> SimulationResponse:

@@ -1,4 +1,9 @@
-"""Trial calls of functions that leave behind what they found."""
+"""Trial calls of functions that leave behind what they found.
+
+For calls with symbols, which must not stay anywhere, and to tell whether calls
+have changed anything: what cannot be put back is not called. Calls with numbers
+are made on copies, see `ctrlplan.symbolic.trials`.
+"""
 
 from __future__ import annotations
 

@@ -5,6 +5,12 @@ depend directly on which inputs, whether two calls with equal arguments give
 equal values. Such trial calls are made on copies of the functions, with copies
 of the objects that they refer to, so that a block with a memory does not
 remember them.
+
+A `Keeper` calls the functions themselves and puts back what they found. Neither
+replaces the other: two memories at one time, of a run and of a second attempt,
+need copies, and so do random generators, whose state cannot be compared; that
+*nothing* is left behind, wherever a function stored it, only a keeper can
+guarantee, and it alone tells whether a call has changed anything.
 """
 
 from __future__ import annotations

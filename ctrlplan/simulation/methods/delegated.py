@@ -9,6 +9,7 @@ import control as ct
 import numpy as np
 from numpy.typing import NDArray
 
+from ctrlplan._renamed import outside_stacklevel
 from ctrlplan.simulation.events import Snapshot
 from ctrlplan.simulation.job import Job, Record
 from ctrlplan.simulation.prepared import Prepared
@@ -36,7 +37,7 @@ class Delegated:
         warnings.warn(
             f"{prepared.unsupported}: run by control.input_output_response, without events",
             UserWarning,
-            stacklevel=5,
+            stacklevel=outside_stacklevel(),
         )
         u = signal_values(job.inputs, job.times) if job.inputs else np.zeros((0, job.times.size))
         with DELEGATED:

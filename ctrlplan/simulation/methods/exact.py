@@ -7,6 +7,7 @@ import warnings
 import numpy as np
 from numpy.typing import NDArray
 
+from ctrlplan._renamed import outside_stacklevel
 from ctrlplan.simulation.events import Snapshot
 from ctrlplan.simulation.exact import exact_states, sampled_states
 from ctrlplan.simulation.job import Job, Record, with_event_times
@@ -95,7 +96,7 @@ def _warn_of_uncertainty(job: Job, outputs: Array, others: Array, floor: Array) 
             f"rounding errors in the system's matrices change them by that much over {span:g} s; "
             "shorten the run, or remove modes that are so fast or so unstable",
             UserWarning,
-            stacklevel=7,
+            stacklevel=outside_stacklevel(),
         )
 
 
@@ -114,7 +115,7 @@ def _warn_of_undefined(job: Job, form: LinearForm, times: Array, states: Array) 
             f"outputs {names} of {job.prepared.name} are undefined from {begin:g} s on: they are differences of states "
             "that have overflowed, and are given as infinite",
             UserWarning,
-            stacklevel=7,
+            stacklevel=outside_stacklevel(),
         )
 
 
