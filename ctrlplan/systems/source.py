@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import control as ct
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ctrlplan._types import Params
 from ctrlplan.traits import DeclaredTrait, declare
 from ctrlplan.trajectories import Trajectory
 from ctrlplan.trajectories.common import checked_count
@@ -43,7 +42,7 @@ class PlanSource(ct.NonlinearIOSystem):  # type: ignore[misc]
         """Breakpoints of the plan."""
         return np.asarray(self.plan.breakpoints)
 
-    def _output(self, t: float, x: Array, u: Array, params: dict[str, Any]) -> Array:
+    def _output(self, t: float, x: Array, u: Array, params: Params) -> Array:
         return self.plan.jet(t, self.derivatives).T.ravel()
 
 
