@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctrlplan._types import Params
-from ctrlplan.simulation.events import Event, Snapshot, Watched, watched_events
+from ctrlplan.simulation.events import Events, Snapshot, Watched, watched_events
 from ctrlplan.simulation.learned import NotCompiledError
 from ctrlplan.simulation.network import Network
 from ctrlplan.simulation.prepared import Prepared
@@ -62,7 +62,7 @@ class Job:
     params: Params
     rtol: float
     atol: float | None
-    events: Sequence[Event] | None
+    events: Events
     network: Network | None
     reason: str = ""
     trials: bool = True

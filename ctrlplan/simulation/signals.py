@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ctrlplan._checks import real_array
-from ctrlplan.trajectories import Step, Trajectory
+from ctrlplan.trajectories import Step, Trajectory, chebyshev
 from ctrlplan.trajectories.files import signal_rows
 
 Array = NDArray[np.float64]
@@ -267,13 +267,12 @@ def resolved(
 
 def chebyshev_times(left: float, right: float, width: int) -> Array:
     """Increasing times of a segment at which `chebyshev_coefficients` wants values."""
-    nodes, _ = _chebyshev(width)
-    return left + (right - left) * (0.5 * (nodes + 1.0))
+    return chebyshev.points(width - 1, left, right)[::-1]
 
 
 def chebyshev_coefficients(values: Array) -> Array:
     """Coefficients (nsignals, width) from values (nsignals, width) at `chebyshev_times`; of a constant, itself."""
-    coefficients = values @ _chebyshev(values.shape[1])[1]
+    coefficients = chebyshev.transform(values[:, ::-1])
     constant = np.all(values == values[:, :1], axis=1)
     coefficients[constant] = 0.0
     coefficients[constant, 0] = values[constant, 0]
@@ -335,15 +334,6 @@ def breakpoints_of(time_signals: Iterable[TimeSignal]) -> list[float]:
 
 _PROBES = np.array([0.0312345, 0.1234567, 0.25, 0.3456789, 0.5, 0.6543217, 0.75, 0.8765431, 0.9712345])
 """Parts of a segment at which a signal is compared, to find whether it is constant."""
-
-
-@lru_cache(maxsize=32)
-def _chebyshev(width: int) -> tuple[Array, Array]:
-    """Nodes of the first kind, increasing, and the matrix from values there to coefficients."""
-    angles = np.pi * (np.arange(width)[::-1] + 0.5) / width
-    matrix = 2.0 / width * np.cos(np.outer(angles, np.arange(width)))
-    matrix[:, 0] *= 0.5
-    return np.cos(angles), matrix
 
 
 @lru_cache(maxsize=32)

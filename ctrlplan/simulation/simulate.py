@@ -18,7 +18,7 @@ from ctrlplan._renamed import outside_stacklevel
 from ctrlplan._types import System
 from ctrlplan.simulation import methods
 from ctrlplan.simulation.budget import begin_run
-from ctrlplan.simulation.events import Event, Occurrence, Watched, crossings
+from ctrlplan.simulation.events import Events, Occurrence, Watched, crossings
 from ctrlplan.simulation.interpreted import FeedthroughError
 from ctrlplan.simulation.job import Job, Record, unused
 from ctrlplan.simulation.methods import Method
@@ -50,7 +50,7 @@ def simulate(
     rtol: float = 1e-8,
     atol: float | None = None,
     params: Mapping[str, object] | None = None,
-    events: Sequence[Event] | None = None,
+    events: Events = None,
 ) -> SimulationResponse:
     """Response of a system to plans.
 
@@ -171,7 +171,7 @@ def checked_job(
     rtol: float = 1e-8,
     atol: float | None = None,
     params: Mapping[str, object] | None = None,
-    events: Sequence[Event] | None = None,
+    events: Events = None,
 ) -> Job:
     """Arguments of `simulate`, checked."""
     begin_run()
