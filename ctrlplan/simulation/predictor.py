@@ -262,7 +262,7 @@ def _peaks(values: Array) -> Array:
 
 def _check_autonomous(prepared: Prepared) -> None:
     """Refuse what a run from a state and constant inputs does not predict."""
-    if prepared.dt not in (None, 0):
+    if prepared.is_discrete:
         raise ValueError(f"system must be continuous, got {prepared.name} with dt = {prepared.dt}")
     if prepared.network is None:
         raise ValueError(f"system must be one that ctrlplan runs itself, but {prepared.unsupported}")

@@ -177,19 +177,11 @@ def integrate(
     hops = _MARKS if endless else _HOPS
     marks = [*breakpoints_of(time_signals), *network.breakpoints, *marks]
     clock = _Clock(network, time_signals, _fixed(marks, first, last, memory.delays, hops), first, last)
-    longest = min([last - first, *memory.delays])
-    if longest < _SHORTEST_DELAY * (last - first):
-        raise ValueError(
-            f"a delay must be at least {_SHORTEST_DELAY:g} of the run of {last - first:g} s, got {longest:g} s"
-        )
-    declared = [block.traits.longest for block in network.blocks]
-    longest = min(longest, max(min(declared, default=np.inf), (last - first) / _SEGMENTS))
+    longest = _longest(network, memory.delays, last - first)
     if pause is not None:
         longest = min(longest, (last - first) / 64.0)
     shortest = 1e-9 * (last - first) if pause is not None else np.inf
-    # A plan whose terms cancel in a segment has there the rounding errors of its largest values.
-    largest = np.abs(known_before(time_signals, np.union1d(np.linspace(first, last, 257), clock.marks))).max(axis=1)
-    rounding = _ROUNDINGS * np.finfo(float).eps * np.where(np.isfinite(largest), largest, 0.0)
+    rounding = _rounding(time_signals, np.union1d(np.linspace(first, last, 257), clock.marks))
     known: list[tuple[Array, Array]] = []  # times and states of each segment, its end left to the next
     segments: list[tuple[float, Series]] = []
     span: list[Series] = []
@@ -201,14 +193,8 @@ def integrate(
         right = clock.on(times, right) if right - left <= reach * (1.0 + 1e-9) else left + reach
         if memory.delays or not (span and span[-1].right >= right):
             until = right if memory.delays else clock.fixed_after(left)
-            moment = 0.5 * (left + right)
             accuracy = resolution if memory.delays else RESOLVED
-            span = [
-                series.bounded(*_bounds(time_signals, moment, series.left, series.right))
-                for series in resolved(
-                    partial(_analytic_at, time_signals, moment, left), left, until, accuracy, rounding
-                )
-            ]
+            span = _resolved(time_signals, 0.5 * (left + right), left, until, accuracy, rounding)
         series = next(s for s in span if left < s.right)
         right = min(right, series.right)
         inside = times[slice(*np.searchsorted(times, [left, right]))]
@@ -234,6 +220,34 @@ def integrate(
             break
     known.append((np.array([left]), x[:, None]))
     return Run(np.concatenate([t for t, _ in known]), np.concatenate([s for _, s in known], axis=1), segments)
+
+
+def _longest(network: Network, delays: list[float], duration: float) -> float:
+    """Longest segment of a run [s] that its delays and the declarations of its blocks allow."""
+    longest = min([duration, *delays])
+    if longest < _SHORTEST_DELAY * duration:
+        raise ValueError(
+            f"a delay must be at least {_SHORTEST_DELAY:g} of the run of {duration:g} s, got {longest:g} s"
+        )
+    declared = min((block.traits.longest for block in network.blocks), default=np.inf)
+    return min(longest, max(declared, duration / _SEGMENTS))
+
+
+def _rounding(time_signals: Sequence[TimeSignal], times: Array) -> Array:
+    """Rounding errors of signals (nsignals,): where the terms of a plan cancel, those of its largest values."""
+    largest = np.abs(known_before(time_signals, times)).max(axis=1)
+    return np.asarray(_ROUNDINGS * np.finfo(float).eps * np.where(np.isfinite(largest), largest, 0.0))
+
+
+def _resolved(
+    time_signals: Sequence[TimeSignal], moment: float, left: float, until: float, accuracy: float, rounding: Array
+) -> list[Series]:
+    """Series, with their bounds, of the signals that hold at a moment."""
+    signals = partial(_analytic_at, time_signals, moment, left)
+    return [
+        series.bounded(*_bounds(time_signals, moment, series.left, series.right))
+        for series in resolved(signals, left, until, accuracy, rounding)
+    ]
 
 
 class _Memory:

@@ -77,7 +77,7 @@ def _run(job: Job, form: LinearForm) -> Record:
         floor = form.rounding(states[:, :1] if growing else states, values)
         _warn_of_uncertainty(job, form.outputs(states, values), form.outputs(nearly, values), floor)
     _warn_of_undefined(job, form, times, states)
-    return Record(times, states, snapshot, interpolate, watched, "exact", "linear and continuous")
+    return Record(times, states, snapshot, interpolate, watched, Exact.name, "linear and continuous")
 
 
 def _warn_of_uncertainty(job: Job, outputs: Array, others: Array, floor: Array) -> None:
