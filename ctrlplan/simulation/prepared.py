@@ -10,7 +10,7 @@ import control as ct
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ctrlplan._lru import Lru
+from ctrlplan._lru import BUILDING, Lru
 from ctrlplan._types import Params, System, Value
 from ctrlplan.simulation.interpreted import Interpreted
 from ctrlplan.simulation.learned import BuiltForm, DisagreementError, Learned, NotCompiledError
@@ -132,6 +132,7 @@ class Prepared:
             built = self._build(params, time_signals, first, state, trials)
             if self.original is not None:  # what blocks only write has turned out meanwhile
                 self.fingerprint = fingerprint(self.original)
+                _FORMS.get(self.fingerprint, lambda: self)
             return built
 
         return self._learned.form(params, build)
@@ -280,13 +281,15 @@ def prepare(system: System | Prepared) -> Prepared:
 
 def prepared_form(system: System | Prepared) -> Prepared:
     """Form built before of the same system, or a new one where its maps, parameters or blocks have changed."""
-    if isinstance(system, Prepared):
-        if system.original is None or fingerprint(system.original) == system.fingerprint:
-            return system
-        system = system.original
-    _checked_system(system)
-    key = fingerprint(system)
-    return _FORMS.get(key, lambda: Prepared(system))
+    if isinstance(system, Prepared) and system.original is None:
+        return system
+    with BUILDING:  # no other thread is calling a block on trial
+        if isinstance(system, Prepared):
+            if fingerprint(system.original) == system.fingerprint:
+                return system
+            system = system.original
+        _checked_system(system)
+        return _FORMS.get(fingerprint(system), partial(Prepared, system))
 
 
 def stated_start(system: System | Prepared) -> Array | None:

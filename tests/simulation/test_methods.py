@@ -342,3 +342,34 @@ def test_threads_run_one_system_as_one_thread_does():
     for one, other in zip(expected, found, strict=True):
         assert (one.method, one.reason) == (other.method, other.reason)
         assert np.array_equal(one.y, other.y)
+
+
+@pytest.mark.parametrize("prepared", [False, True])
+def test_threads_trace_a_block_with_a_log_once(monkeypatch, prepared):
+    """A block that writes a log: while one thread traces it, no other takes what is in the log for a change."""
+    from ctrlplan.symbolic import tracing
+
+    traces, plain = [], tracing.traced
+    monkeypatch.setattr(tracing, "traced", lambda *given: traces.append(given) or plain(*given))
+    log = []
+
+    def update(t, x, u, params):
+        log.append(x[0])
+        return -(x**3)
+
+    system = ct.nlsys(update, None, inputs=0, outputs="x", states="x", name="logging")
+    ready = cp.prepare(system) if prepared else system
+    barrier = threading.Barrier(4)
+
+    def run(start):
+        barrier.wait()
+        return cp.simulate(ready, T, None, start)
+
+    starts = [0.5, 1.0, 1.5, 2.0]
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(run, starts))
+    assert len(traces) == 1
+    assert all(isinstance(entry, float) for entry in log)
+    for start, response in zip(starts, found, strict=True):
+        assert response.method == "compiled"
+        assert np.abs(response.outputs - start / np.sqrt(1.0 + 2.0 * start**2 * T)).max() <= 1e-6

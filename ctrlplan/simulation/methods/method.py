@@ -16,7 +16,8 @@ class Method(Protocol):
     """A way to run a system.
 
     A new method is a file with a class of these three members, and its line in
-    ``ctrlplan.simulation.methods.METHODS``. One that solves differential
+    ``ctrlplan.simulation.methods.METHODS``; for type checkers its name is one
+    of ``MethodName`` as well. One that solves differential
     equations may leave segments, scales, delays, samples and events to
     `ctrlplan.simulation.numerical.numerical`, and give the solver alone.
     """
