@@ -59,7 +59,16 @@ _EXPORTS = {
         "sample_hold",
         "source_samples",
     ),
-    "simulation": ("Event", "Occurrence", "Predictor", "Prepared", "SolverError", "prepare", "simulate"),
+    "simulation": (
+        "Event",
+        "Occurrence",
+        "Predictor",
+        "Prepared",
+        "SimulationResponse",
+        "SolverError",
+        "prepare",
+        "simulate",
+    ),
     "studies": ("Comparison", "Ensemble", "Sweep", "compare", "draws", "sweep"),
 }
 _HOME = {name: module for module, names in _EXPORTS.items() for name in names}

@@ -2,6 +2,51 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any, NoReturn, Self, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    import control as ct
+
+Array = NDArray[np.float64]
+
+System: TypeAlias = "ct.InputOutputSystem"
+"""Any system of python-control, which has no types of its own."""
+
+Value: TypeAlias = Any
+"""Number, array or symbol, or a sequence of them: what the functions of a block take and return."""
+
+Params: TypeAlias = Mapping[str, Value]
+"""Parameters of blocks by name, of any kind that a block can use."""
+
+BlockMap: TypeAlias = Callable[[Value, Value, Value], Value]
+"""(t, state, input) of a block -> its outputs or rates."""
+
+
+class Frozen:
+    """Base of the public objects: attributes are set by the constructor only."""
+
+    def __setattr__(self, name: str, value: object) -> NoReturn:
+        raise AttributeError(f"{type(self).__name__} is immutable; make a new one instead of setting {name}")
+
+    def __delattr__(self, name: str) -> NoReturn:
+        raise AttributeError(f"{type(self).__name__} is immutable; {name} cannot be deleted")
+
+    def __copy__(self) -> Self:
+        return self
+
+    def __deepcopy__(self, memo: dict[int, object]) -> Self:
+        return self
+
+    def __setstate__(self, state: dict[str, object]) -> None:
+        for value in state.values():
+            if isinstance(value, np.ndarray):
+                value.flags.writeable = False
+        self.__dict__.update(state)
+
 
 class EventName(str):
     """Name of an event that says in words of its own what happened.

@@ -12,13 +12,21 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, Self, SupportsFloat, TypeAlias, TypeVar, overload
 
 import control as ct
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+if TYPE_CHECKING:
+    from ctrlplan.trajectories import Trajectory
+
 S = TypeVar("S")
+T = TypeVar("T")
+BlockFunction: TypeAlias = Callable[..., ArrayLike]
+"""(t, x, u, params) of a block -> values."""
+Watched: TypeAlias = Mapping[str, tuple[BlockFunction, float, float]]
+"""Name -> (function of (t, x, u, params), lower and upper limit)."""
 
 _ATTRIBUTE = "_ctrlplan_traits"
 
@@ -74,23 +82,23 @@ class BlockTraits:
     feedthrough: bool | NDArray[np.bool_] | None = None
     initial_state: NDArray[np.float64] | None = None
     longest: float = math.inf
-    watched: Mapping[str, tuple[Callable[..., Any], float, float]] | None = None
+    watched: Watched | None = None
     period: float | None = None
     offset: float = 0.0
-    sample: Callable[..., Any] | None = None
+    sample: BlockFunction | None = None
     samples_first: bool = False
-    plan: Any = None
+    plan: Trajectory | None = None
     derivatives: int = 0
     delay: float | None = None
     initial: ArrayLike = 0.0
-    block: Any = None
+    block: ct.InputOutputSystem | None = None
 
 
 _NAMES = tuple(field.name for field in fields(BlockTraits))
 _NONE = BlockTraits()
 
 
-def declare(system: S, **traits: Any) -> S:
+def declare(system: S, **traits: object) -> S:
     """Declare traits of a block to `ctrlplan.simulate`.
 
     Traits declared before stay unless they are given again.
@@ -116,23 +124,60 @@ def declare(system: S, **traits: Any) -> S:
 
     Examples
     --------
-    A torque that is applied for one second, and a controller without direct
-    feedthrough:
+    A block with breakpoints. A force acts for one second; its jumps are
+    declared, so that no step of the integrator passes over them, however far
+    apart the sample times are:
 
     >>> import control as ct
+    >>> import numpy as np
     >>> import ctrlplan as cp
-    >>> pulse = ct.nlsys(None, lambda t, x, u, params: [1.0 if 2 <= t < 3 else 0.0], inputs=0, outputs="torque", dt=0)
-    >>> cp.traits_of(cp.declare(pulse, breakpoints=[2, 3])).breakpoints
-    (2.0, 3.0)
+    >>> def force(t, x, u, params):
+    ...     return 1.0 if 2 <= t < 3 else 0.0
+    >>> pulse = cp.declare(ct.nlsys(None, force, inputs=0, outputs="F", name="pulse"), breakpoints=[2, 3])
+    >>> mass = ct.tf([1], [1, 0], inputs="F", outputs="v", name="mass")
+    >>> loop = ct.interconnect([pulse, mass], inputs=0, outputs="v")
+    >>> cp.simulate(loop, [0, 10, 20]).outputs.round(9).tolist()
+    [[0.0, 1.0, 1.0]]
 
-    A block that counts samples, every 0.1 s:
+    A sampled block. A PI controller computes its output every 0.1 s and holds
+    it in between. `sample` returns the states after a sample, here the held
+    output and the sum of errors; ``outfcn`` gives the output between samples,
+    which does not depend on the input at that time:
 
-    >>> def count(t, x, u, params):
-    ...     return [x[0] + 1]
-    >>> counter = ct.nlsys(lambda t, x, u, params: [0.0], lambda t, x, u, params: x, inputs=0, outputs="n", states="n")
-    >>> response = cp.simulate(cp.declare(counter, period=0.1, sample=count, feedthrough=False), [0.0, 0.25, 0.5])
-    >>> response.outputs[0].tolist()
-    [1.0, 3.0, 6.0]
+    >>> def sample(t, x, u, params):
+    ...     error = u[0] - u[1]
+    ...     total = x[1] + 0.1 * params["ki"] * error
+    ...     return [params["kp"] * error + total, total]
+    >>> controller = ct.nlsys(
+    ...     lambda t, x, u, params: [0.0, 0.0],
+    ...     lambda t, x, u, params: x[0],
+    ...     inputs=["r", "y"], outputs="u", states=["held", "total"], params={"kp": 2.0, "ki": 1.0}, name="pi",
+    ... )
+    >>> controller = cp.declare(controller, period=0.1, sample=sample, feedthrough=False)
+    >>> plant = ct.tf([1], [1, 1], inputs="u", outputs="y", name="plant")
+    >>> loop = ct.interconnect([controller, plant], inputs="r", outputs=["y", "u"])
+    >>> response = cp.simulate(loop, np.linspace(0, 10, 201), 1.0)
+    >>> response.outputs["u"][:4].round(4).tolist()
+    [2.1, 2.1, 1.7803, 1.7803]
+
+    A block without direct feedthrough. An observer's output is an estimate that
+    a function of states and measurements computes together with other values;
+    which of them depend on the input, its code does not say. Without the
+    declaration the loop through it would be an algebraic one, to be ruled out
+    by trial calls:
+
+    >>> def observer(x, u, params):
+    ...     return x, 3.0 * (u - x)  # estimate, and its rate
+    >>> filtered = ct.nlsys(
+    ...     lambda t, x, u, params: observer(x, u, params)[1],
+    ...     lambda t, x, u, params: observer(x, u, params)[0],
+    ...     inputs="y", outputs="estimate", states="estimate", name="observer",
+    ... )
+    >>> filtered = cp.declare(filtered, feedthrough=False)
+    >>> difference = ct.ss([], [], [], [[1, -1]], inputs=["r", "estimate"], outputs="y", name="difference", dt=None)
+    >>> loop = ct.interconnect([filtered, difference], inputs="r", outputs="estimate")
+    >>> cp.simulate(loop, [0.0, 0.5, 10.0], 1.0).outputs.round(4).tolist()  # (1 - exp(-6 t))/2
+    [0.0, 0.4751, 0.5]
     """
     for name in traits:
         if name not in _NAMES:
@@ -147,7 +192,7 @@ def declare(system: S, **traits: Any) -> S:
     return system
 
 
-def traits_of(system: Any) -> BlockTraits:
+def traits_of(system: object) -> BlockTraits:
     """Traits that a block has declared; the defaults where it has declared none.
 
     Parameters
@@ -170,20 +215,26 @@ def traits_of(system: Any) -> BlockTraits:
     return found if isinstance(found, BlockTraits) else _NONE
 
 
-class Declared:
+class DeclaredTrait(Generic[T]):
     """Attribute of a block class that reads and sets a declared trait of the same name."""
 
     def __set_name__(self, owner: type, name: str) -> None:
         self._name = name
 
-    def __get__(self, block: Any, owner: type | None = None) -> Any:
+    @overload
+    def __get__(self, block: None, owner: type) -> Self: ...
+
+    @overload
+    def __get__(self, block: object, owner: type | None = None) -> T: ...
+
+    def __get__(self, block: object | None, owner: type | None = None) -> Self | T:
         return self if block is None else getattr(traits_of(block), self._name)
 
-    def __set__(self, block: Any, value: Any) -> None:
+    def __set__(self, block: object, value: T) -> None:
         declare(block, **{self._name: value})
 
 
-def _check_kind(system: Any, traits: Mapping[str, Any], label: str) -> None:
+def _check_kind(system: ct.InputOutputSystem, traits: Mapping[str, object], label: str) -> None:
     """Raise where a trait would have no effect on a system of this kind."""
     if isinstance(system, ct.NonlinearIOSystem) and not isinstance(system, ct.InterconnectedSystem | ct.StateSpace):
         return
@@ -196,14 +247,14 @@ def _check_kind(system: Any, traits: Mapping[str, Any], label: str) -> None:
             raise TypeError(f"{name} has no effect on {label}, {what}")
 
 
-def _check_function_of_time(traits: BlockTraits, system: Any, label: str) -> None:
+def _check_function_of_time(traits: BlockTraits, system: ct.InputOutputSystem, label: str) -> None:
     """Raise unless a delay, or the source of a plan, has the signals that belong to it."""
     if traits.delay is None and traits.plan is None:
         return
     if traits.delay is not None and traits.plan is not None:
         raise ValueError(f"{label} must be a delay or the source of a plan, got both")
     inputs, outputs, states = system.ninputs or 0, system.noutputs, system.nstates or 0
-    wanted = inputs if traits.delay is not None else traits.plan.naxes * (traits.derivatives + 1)
+    wanted = inputs if traits.plan is None else traits.plan.naxes * (traits.derivatives + 1)
     if states or outputs != wanted or (traits.plan is not None and inputs):
         kind = "a delay" if traits.delay is not None else f"the source of a plan with {traits.derivatives} derivatives"
         raise ValueError(
@@ -212,18 +263,18 @@ def _check_function_of_time(traits: BlockTraits, system: Any, label: str) -> Non
         )
 
 
-def _checked(name: str, value: Any, system: Any) -> Any:
+def _checked(name: str, value: object, system: ct.InputOutputSystem) -> Any:  # by the field that it is for
     label = f"{name} of {_label(system)}"
     check = _CHECKS.get(name)
     return value if check is None else check(value, label, system)
 
 
-def _label(system: Any) -> str:
+def _label(system: ct.InputOutputSystem) -> str:
     return str(getattr(system, "name", None) or type(system).__name__)
 
 
-def _seconds(value: Any, label: str) -> float:
-    if isinstance(value, bool | str) or not np.isrealobj(value):
+def _seconds(value: object, label: str) -> float:
+    if isinstance(value, bool | str) or not isinstance(value, SupportsFloat) or np.asarray(value).dtype.kind == "c":
         raise TypeError(f"{label} must be a number of seconds, got {value!r}")
     try:
         return float(value)
@@ -231,7 +282,7 @@ def _seconds(value: Any, label: str) -> float:
         raise TypeError(f"{label} must be a number of seconds, got {value!r}") from None
 
 
-def _breakpoints(value: Any, label: str, system: Any) -> tuple[float, ...] | None:
+def _breakpoints(value: object, label: str, system: ct.InputOutputSystem) -> tuple[float, ...] | None:
     if value is None:
         return None
     entries = value if isinstance(value, Sequence | np.ndarray) and not isinstance(value, str) else [value]
@@ -241,7 +292,7 @@ def _breakpoints(value: Any, label: str, system: Any) -> tuple[float, ...] | Non
     return tuple(times)
 
 
-def _feedthrough(value: Any, label: str, system: Any) -> bool | NDArray[np.bool_] | None:
+def _feedthrough(value: object, label: str, system: ct.InputOutputSystem) -> bool | NDArray[np.bool_] | None:
     if value is None or isinstance(value, bool | np.bool_):
         return value if value is None else bool(value)
     found = np.asarray(value)
@@ -253,7 +304,7 @@ def _feedthrough(value: Any, label: str, system: Any) -> bool | NDArray[np.bool_
     return found
 
 
-def _initial_state(value: Any, label: str, system: Any) -> NDArray[np.float64] | None:
+def _initial_state(value: ArrayLike | None, label: str, system: ct.InputOutputSystem) -> NDArray[np.float64] | None:
     if value is None:
         return None
     found, count = np.asarray(value, dtype=float), system.nstates or 0
@@ -264,7 +315,7 @@ def _initial_state(value: Any, label: str, system: Any) -> NDArray[np.float64] |
     return found
 
 
-def _positive(value: Any, label: str, system: Any) -> float | None:
+def _positive(value: object, label: str, system: ct.InputOutputSystem) -> float | None:
     if value is None:
         return None
     found = _seconds(value, label)
@@ -273,20 +324,20 @@ def _positive(value: Any, label: str, system: Any) -> float | None:
     return found
 
 
-def _offset(value: Any, label: str, system: Any) -> float:
+def _offset(value: object, label: str, system: ct.InputOutputSystem) -> float:
     found = _seconds(value, label)
     if not 0.0 <= found < math.inf:
         raise ValueError(f"{label} must be finite and at least 0 s, got {value}")
     return found
 
 
-def _function(value: Any, label: str, system: Any) -> Any:
+def _function(value: object, label: str, system: ct.InputOutputSystem) -> object:
     if value is not None and not callable(value):
         raise TypeError(f"{label} must be a function of (t, x, u, params), got {value!r:.80}")
     return value
 
 
-def _watched(value: Any, label: str, system: Any) -> Mapping[str, Any] | None:
+def _watched(value: Watched | None, label: str, system: ct.InputOutputSystem) -> Watched | None:
     for name, entry in (value or {}).items():
         if len(entry) != 3 or not callable(entry[0]) or not float(entry[1]) < float(entry[2]):
             raise ValueError(
@@ -295,7 +346,7 @@ def _watched(value: Any, label: str, system: Any) -> Mapping[str, Any] | None:
     return dict(value) if value else None
 
 
-_CHECKS: dict[str, Callable[[Any, str, Any], Any]] = {
+_CHECKS: dict[str, Callable[[Any, str, ct.InputOutputSystem], object]] = {
     "breakpoints": _breakpoints,
     "feedthrough": _feedthrough,
     "initial_state": _initial_state,

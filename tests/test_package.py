@@ -154,7 +154,7 @@ def test_names_of_the_design_are_there(name):
         ("Waypoint", ["time", "position", "velocity", "acceleration", "jerk", "snap"]),
         ("create_source_iosystem", ["plan", "derivatives", "name"]),
         ("plants.integrator_lag_loop", ["gain"]),
-        ("simulate", ["system", "timepts", "inputs", "initial_state", "method", "rtol", "atol", "params"]),
+        ("simulate", ["system", "timepts", "inputs", "initial_state"]),
         ("compare", ["loop", "plans", "timepts"]),
         ("sweep", ["build", "values", "plans", "timepts", "executor", "progress"]),
         ("create_governor_iosystem", ["loop", "dt", "limits"]),

@@ -14,12 +14,14 @@ cut is of fourth order too, so that the order of every metric stays.
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ctrlplan.metrics._records import Array
+
+G = TypeVar("G", bound=np.generic)
 
 _NEIGHBOURS = 4.0  # times a neighbouring third difference: more is a kink
 _CURVATURES = 0.5  # of the smaller curvature: two curvatures as close as this are smooth
@@ -46,23 +48,23 @@ class Pieces:
     end: Array
     jump: NDArray[np.bool_]
 
-    def __getitem__(self, chosen: Any) -> "Pieces":
+    def __getitem__(self, chosen: NDArray[np.generic] | tuple[NDArray[np.generic] | slice, ...]) -> "Pieces":
         """Return the pieces of some of the intervals."""
         return Pieces(*(getattr(self, name)[chosen] for name in self.__dataclass_fields__))
 
-    def __call__(self, s: Any) -> Array:
+    def __call__(self, s: float | Array) -> Array:
         """Return the values at s, shape (..., m)."""
         return np.asarray(self.a + s * (self.b + s * (self.c + s * self.d)))
 
-    def slope(self, s: Any) -> Array:
+    def slope(self, s: float | Array) -> Array:
         """Return the derivatives by s, shape (..., m)."""
         return np.asarray(self.b + s * (2 * self.c + s * 3 * self.d))
 
-    def time(self, s: Any) -> Array:
+    def time(self, s: float | Array) -> Array:
         """Return the times at s, shape (..., m)."""
         return np.asarray(self.begin + s * self.step)
 
-    def held(self, s: Any) -> Array:
+    def held(self, s: float | Array) -> Array:
         """Return the values at s with each jump in the middle of its interval, as the trapezoidal rule has it."""
         values = self(s)
         if self.jump.any():
@@ -95,7 +97,7 @@ class Pieces:
         zeros = np.where(np.sign(values[:-1]) * np.sign(values[1:]) < 0, self.crossing(0.0, low, high), low)
         return np.concatenate([np.stack([low, zeros], axis=1).reshape(6, -1), cuts[-1:]])
 
-    def crossing(self, level: Any, low: Array, high: Array) -> Array:
+    def crossing(self, level: float | Array, low: Array, high: Array) -> Array:
         """Return s where p = level, for p monotone from low to high and on either side of the level there."""
         low, high = np.broadcast_arrays(low, high)
         rising = self(high) > self(low)
@@ -260,7 +262,7 @@ def _cut(c: Array, before: Array, after: Array) -> Array:
     return np.minimum(np.maximum(c, low), high)
 
 
-def _between(first: Any, inner: Any, last: Any) -> Any:
+def _between(first: NDArray[G], inner: NDArray[G], last: NDArray[G]) -> NDArray[G]:
     return np.concatenate([first[..., None], inner, last[..., None]], axis=-1)
 
 

@@ -1,10 +1,11 @@
-"""Responses of loops: exact where they are linear, compiled where they can be, right in any case."""
+"""Responses of loops: exact where they are linear, compiled where they can be, otherwise by Python."""
 
+from ctrlplan.simulation.equilibrium import rest_at, rest_state, unstable_poles
 from ctrlplan.simulation.events import Event, Occurrence, what_happened
 from ctrlplan.simulation.interpreted import SolverError
 from ctrlplan.simulation.predictor import Predictor
 from ctrlplan.simulation.prepared import Prepared, prepare, prepared_form, state_space, stated_start
-from ctrlplan.simulation.rest import rest_at, rest_state, unstable_poles
+from ctrlplan.simulation.response import SimulationResponse
 from ctrlplan.simulation.simulate import simulate
 
 __all__ = [
@@ -12,6 +13,7 @@ __all__ = [
     "Occurrence",
     "Predictor",
     "Prepared",
+    "SimulationResponse",
     "SolverError",
     "prepare",
     "prepared_form",

@@ -5,31 +5,33 @@ from __future__ import annotations
 import re
 import signal
 import threading
-from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any
+from types import FrameType
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from ctrlplan.simulation.compared import Compared
-from ctrlplan.simulation.drives import Series, within
+from ctrlplan._lru import Lru
+from ctrlplan._types import Params, Value
 from ctrlplan.simulation.interpreted import SolverError
 from ctrlplan.simulation.network import Block, Network, Step, known_feedthrough
-from ctrlplan.simulation.recent import recent
 from ctrlplan.simulation.scales import Scales, Tolerances
-from ctrlplan.simulation.switches import changes_of_side, switch_arguments
-from ctrlplan.simulation.traced import NotTraceableError, Trace, agrees
+from ctrlplan.simulation.signals import Series, within
+from ctrlplan.symbolic.comparison import Compared
+from ctrlplan.symbolic.switches import changes_of_side, switch_arguments
+from ctrlplan.symbolic.tracing import NotTraceableError, Trace, agrees
 
 Array = NDArray[np.float64]
+Stats = Mapping[str, float]
+"""Statistics of an integrator, by name."""
 
 _KEPT = 64
 """Integrators kept, one for each pattern of output times; and functions, one for each number of times."""
 
 _FEW = 64
-"""Output times of a leg up to which their pattern is rounded, so that legs of one length share an integrator."""
+"""Output times of a segment up to which the pattern is rounded, so that segments of one length share an integrator."""
 
 _FEW_STEPS = 2_000
 """Steps from output to output at the first attempt."""
@@ -46,7 +48,7 @@ _FAILURES = {
 }
 
 _STIFF = 3000.0
-"""Times that the fastest motion could die out within a leg, above which BDF takes fewer steps than Adams."""
+"""Times that the fastest motion could die out within a segment, above which BDF takes fewer steps than Adams."""
 
 _EDGE = 100.0
 """Tolerances of a step about a state within which equations must be defined."""
@@ -99,20 +101,15 @@ class Compiled:
             trace is not None and block.changes_unseen and trace.depends_on_time()
             for block, trace in zip(network.blocks, traces, strict=True)
         )
-        self._integrators: OrderedDict[Any, Any] = OrderedDict()
-        self._maps: OrderedDict[Any, Any] = OrderedDict()
-        self._equations: dict[int, dict[str, Any]] = {}
+        self._integrators: Lru[tuple[object, ...], ca.Function] = Lru(_KEPT)
+        self._maps: Lru[tuple[str, int], ca.Function] = Lru(_KEPT)
+        self._equations: dict[int, dict[str, ca.SX]] = {}
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> dict[str, object]:
         """Without what is made anew where it is needed."""
-        return self.__dict__ | {
-            "_traces": [],
-            "_integrators": OrderedDict(),
-            "_maps": OrderedDict(),
-            "_equations": {},
-        }
+        return self.__dict__ | {"_traces": [], "_equations": {}}
 
-    def parameters(self, params: Mapping[str, Any]) -> Array:
+    def parameters(self, params: Params) -> Array:
         """Entries of p for a run."""
         return np.array([float(params.get(key, default)) for key, default in self._defaults])
 
@@ -154,7 +151,9 @@ class Compiled:
                 found += changes_of_side(sides, first, last)
         return sorted(set(found))
 
-    def _of_time(self, name: str, switches: Any, network: Network, argument: int) -> tuple[str, Any]:
+    def _of_time(
+        self, name: str, switches: ca.Function, network: Network, argument: int
+    ) -> tuple[str, ca.Function | None]:
         """Those of some switches that depend on time (0) or functions of time (2), and on no state; None without."""
         late = np.zeros(network.nsignals, dtype=bool)
         for i in network.blocks_with("delay"):
@@ -173,7 +172,7 @@ class Compiled:
         """On which side of its switches the form is at many times, (nswitches, ntime): -1, 0 or 1."""
         return np.sign(self._at_many("switches", t, x, driven, p))
 
-    def disagreement(self, network: Network, params: Mapping[str, Any], t: Array, x: Array, w: Array) -> str:
+    def disagreement(self, network: Network, params: Params, t: Array, x: Array, w: Array) -> str:
         """What is wrong with a trace at visited times, states and signals; empty where nothing."""
         for block, trace, states, fed in zip(network.blocks, self._traces, network.states, network.fed, strict=True):
             if trace is not None:
@@ -189,12 +188,12 @@ class Compiled:
 
     def integrator(
         self, width: int, grid: Array, stiff: bool, rtol: float, atol: float, max_steps: int, longest: float
-    ) -> Any:
-        """CVODES over a leg of length 1, with outputs at some of its times."""
+    ) -> ca.Function:
+        """CVODES over a segment of length 1, with outputs at some of its times."""
         # CasADi runs without Python's lock: no integrator is used by two threads at once.
         key = (threading.get_ident(), width, grid.tobytes(), stiff, rtol, atol, max_steps, longest)
 
-        def made() -> Any:
+        def made() -> ca.Function:
             options = {
                 "linear_multistep_method": "bdf" if stiff else "adams",
                 "reltol": rtol,
@@ -205,18 +204,18 @@ class Compiled:
                 "disable_internal_warnings": True,
             }
             with _passing_interruptions():
-                return ca.integrator("leg", "cvodes", self._leg_equations(width), 0.0, grid.tolist(), options)
+                return ca.integrator("segment", "cvodes", self._segment_equations(width), 0.0, grid.tolist(), options)
 
-        return recent(self._integrators, key, _KEPT, made)
+        return self._integrators.get(key, made)
 
     def _at_many(self, name: str, t: Array, x: Array, driven: Array, p: Array) -> Array:
         function = self._functions[name]
         if not function.numel_out(0):  # a system without inputs and outputs has no signals
             return np.zeros((0, t.size))
-        at_all = recent(self._maps, (name, t.size), _KEPT, lambda: function.map(t.size))
+        at_all = self._maps.get((name, t.size), lambda: function.map(t.size))
         return _called(at_all, (t, x, driven, np.repeat(p[:, None], t.size, axis=1)), function.numel_out(0))
 
-    def _leg_equations(self, width: int) -> dict[str, Any]:
+    def _segment_equations(self, width: int) -> dict[str, ca.SX]:
         """Equations of scaled states in s from 0 to 1, the functions of time as Chebyshev series of some width."""
         if width not in self._equations:
             nx, nd, np_ = (self._rates.numel_in(k) for k in (1, 2, 3))
@@ -237,7 +236,7 @@ class Compiled:
             }
         return self._equations[width]
 
-    def _own_parameters(self, p: Any) -> list[Any]:
+    def _own_parameters(self, p: ca.SX) -> list[ca.SX]:
         """Each block's part of p."""
         return [
             ca.vertcat(*[p[k] for k, (j, _) in enumerate(self._places) if j == i]) for i in range(len(self._traces))
@@ -245,23 +244,27 @@ class Compiled:
 
 
 class CompiledSolver:
-    """CVODES on a compiled network, leg by leg.
+    """CVODES on a compiled network, segment by segment.
 
     Attributes
     ----------
+    form : Compiled
+        The compiled equations.
     evaluations : int
         Evaluations of the right-hand side so far, counted where a comparison with Python is expected.
     """
 
+    calls_blocks = False
+
     def __init__(
         self,
         equations: Compiled,
-        params: Mapping[str, Any],
+        params: Params,
         tolerances: Tolerances,
         scales: Scales,
         max_steps: int = 20_000,
     ) -> None:
-        self._equations, self._p = equations, equations.parameters(params)
+        self.form, self._p = equations, equations.parameters(params)
         self._scales, self._max_steps = scales, max_steps
         self._tolerances = tolerances
         self._longest, self._stiff = 0.0, False
@@ -271,20 +274,20 @@ class CompiledSolver:
 
     def signals(self, times: Array, states: Array, driven: Array) -> Array:
         """All signals (nsignals, ntime) of the network."""
-        return self._equations.signals(times, states, driven, self._p)
+        return self.form.signals(times, states, driven, self._p)
 
     def outputs(self, times: Array, states: Array, driven: Array) -> Array:
         """Outputs (noutputs, ntime) of the whole."""
-        return self._equations.outputs(times, states, driven, self._p)
+        return self.form.outputs(times, states, driven, self._p)
 
     def slopes(self, times: Array, states: Array, driven: Array) -> Array:
         """Derivatives of the rates by the states, (ntime, nstates, nstates)."""
         n = len(states)
-        return self._equations.slopes(times, states, driven, self._p).reshape(n, n, times.size).transpose(2, 1, 0)
+        return self.form.slopes(times, states, driven, self._p).reshape(n, n, times.size).transpose(2, 1, 0)
 
     def rates(self, times: Array, states: Array, driven: Array) -> Array:
         """Rates (nstates, ntime) of the states."""
-        return self._equations.rates(times, states, driven, self._p)
+        return self.form.rates(times, states, driven, self._p)
 
     def at_edge(self, times: Array, states: Array, driven: Array) -> bool:
         """Whether equations are undefined within the tolerances of states found.
@@ -295,24 +298,24 @@ class CompiledSolver:
         rtol, atol = self._tolerances
         reach = (rtol * np.abs(states) + (atol * self._scales.scale)[:, None]) * _EDGE
         return not all(
-            np.isfinite(self._equations.rates(times, near, driven, self._p)).all()
+            np.isfinite(self.form.rates(times, near, driven, self._p)).all()
             for near in (states - reach, states, states + reach)
         )
 
     def instants(self, first: float, last: float, driven: Callable[[Array], Array]) -> list[float]:
         """Times of a run at which the equations switch, where functions of time alone decide."""
-        return self._equations.instants(first, last, driven, self._p)
+        return self.form.instants(first, last, driven, self._p)
 
     def advance(self, series: Series, left: float, grid: Array, state: Array) -> Array:
-        """States (nstates, ngrid) at times of a leg, of which the last is its end."""
+        """States (nstates, ngrid) at times of a segment, of which the last is its end."""
         if not state.size:
             return np.zeros((0, grid.size))
         right = float(grid[-1])
         relative = (grid - left) / (right - left)
-        if grid.size <= _FEW:  # a rounding error of the clock must not make a new integrator of every short leg
+        if grid.size <= _FEW:  # a rounding error of the clock must not make a new integrator of every short segment
             relative = np.round(relative, 12)
         if right - left > self._longest:
-            decay = self._equations.fastest_decay(left, state, series(left), self._p)
+            decay = self.form.fastest_decay(left, state, series(left), self._p)
             self._longest, self._stiff = right - left, decay * (right - left) > _STIFF
         width = series.coefficients.shape[1]
         span = [left, right - left, series.left, series.right, *within(left, right, self.switches)]
@@ -321,12 +324,12 @@ class CompiledSolver:
         p = np.concatenate([self._p, *known])
         start = (state - scales.shift) / scales.scale
         # What depends on time is seen at least once a sample: a pulse cannot be passed over unseen.
-        longest = round(float(np.diff(relative, prepend=0.0).max()), 6) if self._equations.depends_on_time else 0.0
+        longest = round(float(np.diff(relative, prepend=0.0).max()), 6) if self.form.depends_on_time else 0.0
         # A solution that explodes takes all the steps it may: few at first, then more, between outputs close together.
         close = np.union1d(relative, np.linspace(0.0, 1.0, _CLOSE)[1:])
         for outputs, allowed in ((relative, min(_FEW_STEPS, max_steps)), (close, max_steps)):
             settings = width, outputs, self._stiff, *self._tolerances, allowed, longest
-            integrator = self._equations.integrator(*settings)
+            integrator = self.form.integrator(*settings)
             try:
                 with _passing_interruptions():
                     found = _called(integrator, (start, np.empty(0), p), state.size, self._report)
@@ -343,7 +346,7 @@ class CompiledSolver:
         """Count evaluations from now on."""
         self._report = self._count
 
-    def _count(self, stats: dict[str, Any]) -> None:
+    def _count(self, stats: Stats) -> None:
         self.evaluations += int(stats.get("nfevals", 0))
 
 
@@ -357,10 +360,10 @@ def _passing_interruptions() -> Iterator[None]:
     are found as they were.
     """
     raised: list[BaseException] = []
-    handlers: dict[int, Any] = {}
+    handlers: dict[int, Callable[[int, FrameType | None], object]] = {}
     inside = False  # while handlers are exchanged, what they raise waits
 
-    def accompanied(number: int, frame: Any) -> None:
+    def accompanied(number: int, frame: FrameType | None) -> None:
         try:
             handlers[number](number, frame)
         except BaseException as error:
@@ -391,11 +394,12 @@ def _passing_interruptions() -> Iterator[None]:
 
 
 def _called(
-    function: Any, arguments: Sequence[Array], nrows: int, report: Callable[[dict[str, Any]], None] | None = None
+    function: ca.Function, arguments: Sequence[Array], nrows: int, report: Callable[[Stats], None] | None = None
 ) -> Array:
     """First result (nrows, n) of a function, without a detour through CasADi's own matrices."""
     out = np.zeros((function.numel_out(0) // nrows if nrows else 0, nrows))
-    buffer, evaluate = function.buffer()
+    given: tuple[Value, Callable[[], None]] = function.buffer()  # with a signature that CasADi's stubs do not have
+    buffer, evaluate = given
     kept = [np.ravel(values, order="F").astype(float) for values in arguments]
     for k, values in enumerate(kept):
         if values.size:
@@ -415,8 +419,8 @@ def _feedthrough(block: Block, trace: Trace | None) -> NDArray[np.bool_]:
 
 
 def _signals(
-    network: Network, traces: list[Trace | None], own: list[Any], steps: list[Step], t: Any, x: Any, driven: Any
-) -> Any:
+    network: Network, traces: list[Trace | None], own: list[ca.SX], steps: list[Step], t: ca.SX, x: ca.SX, driven: ca.SX
+) -> ca.SX:
     """Column of all signals."""
     known = [ca.SX(0)] * network.nsignals
     for k, row in enumerate(network.driven):
@@ -447,7 +451,7 @@ def _signals(
 
 
 def _evaluate(
-    network: Network, traces: list[Trace | None], own: list[Any], i: int, t: Any, x: Any, known: list[Any]
+    network: Network, traces: list[Trace | None], own: list[ca.SX], i: int, t: ca.SX, x: ca.SX, known: list[ca.SX]
 ) -> None:
     """Put a block's outputs among the known signals."""
     block, states, outs = network.blocks[i], network.states[i], network.outputs[i]
@@ -461,7 +465,7 @@ def _evaluate(
         known[outs.start + k] = column[k]
 
 
-def _rates(network: Network, traces: list[Trace | None], own: list[Any], t: Any, x: Any, w: Any) -> Any:
+def _rates(network: Network, traces: list[Trace | None], own: list[ca.SX], t: ca.SX, x: ca.SX, w: ca.SX) -> ca.SX:
     rows = []
     for block, trace, states, inputs, p in zip(
         network.blocks, traces, network.states, network.inputs, own, strict=True
@@ -477,22 +481,22 @@ def _rates(network: Network, traces: list[Trace | None], own: list[Any], t: Any,
     return ca.densify(ca.vertcat(*rows))
 
 
-def _part(x: Any, rows: slice) -> Any:
+def _part(x: ca.SX, rows: slice) -> ca.SX:
     """Rows of a column, which where there are none is still a column."""
     return x[rows] if rows.stop > rows.start else ca.SX(0, 1)
 
 
-def _linear(a: Any, b: Any, x: Any, u: Any) -> Any:
+def _linear(a: ArrayLike, b: ArrayLike, x: ca.SX, u: ca.SX) -> ca.SX:
     """Sum a x + b u."""
     return _sparse(a) @ x + _sparse(b) @ u
 
 
-def _sparse(matrix: Any) -> Any:
+def _sparse(matrix: ArrayLike) -> ca.DM:
     """Matrix without its zeros: 0 times nan is 0, and the equations are shorter."""
     return ca.sparsify(ca.DM(np.asarray(matrix, dtype=float)))
 
 
-def _series(coefficients: Any, u: Any) -> Any:
+def _series(coefficients: ca.SX, u: ca.SX) -> ca.SX:
     """Chebyshev series (nsignals, width) at u; the polynomials are shared by all signals."""
     width = coefficients.shape[1]
     values = [ca.SX(1), u]

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,8 @@ from ctrlplan._types import EventName
 Array = NDArray[np.float64]
 Signal = Callable[[Array, Array, Array, Array], Array]
 """(t, x, u, y) at many times, time last -> values (ntime,)."""
+Events: TypeAlias = Sequence["Event"] | None
+"""Events of a run. None: the limits that blocks declare; some: these in addition; an empty sequence: none at all."""
 
 
 @dataclass(frozen=True)

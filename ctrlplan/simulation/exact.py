@@ -86,7 +86,7 @@ def exact_states(
         for left, right in zip([first, *inner], [*inner, last], strict=True):
             begin, end = np.searchsorted(timepts, [left, right], side="left")
             end += right == last
-            state = _leg(a, b, jet, left, right, timepts[begin:end] - left, state, read, out[:, :, begin:end])
+            state = _segment(a, b, jet, left, right, timepts[begin:end] - left, state, read, out[:, :, begin:end])
     return out
 
 
@@ -172,7 +172,7 @@ def _balanced(a: Array, b: Array, initial: Array) -> tuple[Array, Array, Array, 
     return scale, a * (scale / scale[:, None]), b / scale[:, None], initial / scale
 
 
-def _leg(
+def _segment(
     a: Array,
     b: Array,
     jet: Jet,
@@ -183,7 +183,7 @@ def _leg(
     read: Array,
     out: Array,
 ) -> Array:
-    """Write what is read at the samples (times since `left`) of one analytic leg, and return the states at its end."""
+    """Write what is read at the samples (times since `left`) of an analytic segment, return the states at its end."""
     moment, duration = 0.5 * (left + right), right - left
 
     def series(starts: Array, h: float) -> Array:
@@ -199,17 +199,17 @@ def _leg(
         while per >= _FEWEST and not np.isfinite(changes[-1]).all():  # an unstable system outgrows a cell
             changes, per, h = changes[:-1], per // 2, 0.5 * h
         if per >= _FEWEST:
-            return _even_leg(a, b, series, duration, nterms, per, h, changes, samples, state, read, out)
+            return _even_segment(a, b, series, duration, nterms, per, h, changes, samples, state, read, out)
     h = duration / ncells
     terms = series(h * np.arange(ncells, dtype=float), h)
     ends = np.empty_like(state)
     for i in range(len(a)):
-        values, ends[i] = _any_leg(h * a[i], h * b[i], terms, samples / h, state[i])
+        values, ends[i] = _any_segment(h * a[i], h * b[i], terms, samples / h, state[i])
         out[i] = matrix_product(read[i], values)
     return ends
 
 
-def _even_leg(
+def _even_segment(
     a: Array,
     b: Array,
     series: Callable[[Array, float], Array],
@@ -226,7 +226,7 @@ def _even_leg(
     """Same, for evenly spaced samples, a power of two of them, `per`, in each cell of length h."""
     (count, n), m = state.shape, b.shape[-1]
     whole, rest = divmod(samples.size, per)
-    last = int(duration // h)  # the cell in which the leg ends
+    last = int(duration // h)  # the cell in which the segment ends
     cells = series(h * np.arange(max(last, whole) + 1, dtype=float), h)
     chain = cells.reshape(-1, cells.shape[2])
     known = np.empty((count, cells.shape[2], n + len(chain)))
@@ -266,8 +266,8 @@ def _part(a: Array, b: Array, nterms: int, h: float, part: float) -> Array:
     return change
 
 
-def _any_leg(a: Array, b: Array, series: Array, samples: Array, state: Array) -> tuple[Array, Array]:
-    """States of one system at any samples, and at the end of the leg; the unit of time is a cell."""
+def _any_segment(a: Array, b: Array, series: Array, samples: Array, state: Array) -> tuple[Array, Array]:
+    """States of one system at any samples, and at the end of the segment; the unit of time is a cell."""
     n, ncells = len(a), series.shape[2]
     changes = _changes(a, b, len(series))
     states = _marched(state[None], [change[None] for change in changes], series)[0]
@@ -325,7 +325,7 @@ def _samples_per_cell(samples: Array, duration: float, longest: float) -> int:
 
 
 def _spacing(samples: Array, duration: float) -> float:
-    """Spacing of evenly spaced samples, to rounding of the leg's own clock; 0 where they are not."""
+    """Spacing of evenly spaced samples, to rounding of the segment's own clock; 0 where they are not."""
     if samples.size < 2:
         return 0.0
     step = float(samples[-1] - samples[0]) / (samples.size - 1)

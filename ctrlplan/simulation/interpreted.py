@@ -4,20 +4,20 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
-from typing import Any
+from types import TracebackType
+from typing import NoReturn
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 from scipy.integrate import BDF, LSODA, RK45, OdeSolver
 
+from ctrlplan._types import BlockMap, Params
 from ctrlplan.simulation.budget import check
-from ctrlplan.simulation.drives import Series, within
 from ctrlplan.simulation.network import (
-    Map,
     Network,
     Step,
     known_feedthrough,
@@ -25,9 +25,10 @@ from ctrlplan.simulation.network import (
     tried_feedthrough,
 )
 from ctrlplan.simulation.scales import Scales, Tolerances
+from ctrlplan.simulation.signals import Series, within
 from ctrlplan.simulation.stalled import cause
-from ctrlplan.simulation.trials import can_remember, trial_copy, values_of
-from ctrlplan.simulation.untouched import untouched
+from ctrlplan.symbolic.isolation import untouched
+from ctrlplan.symbolic.trials import can_remember, trial_copy, values_of
 
 Array = NDArray[np.float64]
 
@@ -84,9 +85,7 @@ class Interpreted:
         what depends on what; it is then solved as one otherwise.
     """
 
-    def __init__(
-        self, network: Network, params: Mapping[str, Any], probe: tuple[float, Array], trials: bool = True
-    ) -> None:
+    def __init__(self, network: Network, params: Params, probe: tuple[float, Array], trials: bool = True) -> None:
         self.network = network
         self.params = dict(params)
         self._probe = probe
@@ -174,7 +173,9 @@ class Interpreted:
             needed[self.network.outputs[i]] = True
         return self._steps(outputs, needed, self._feeds(outputs, blocks)[0])
 
-    def _feeds(self, outputs: Sequence[Map], sampled: Sequence[int] = ()) -> tuple[list[NDArray[np.bool_]], list[int]]:
+    def _feeds(
+        self, outputs: Sequence[BlockMap], sampled: Sequence[int] = ()
+    ) -> tuple[list[NDArray[np.bool_]], list[int]]:
         """Feedthrough of every block, and the blocks of which it was tried.
 
         It is assumed where nothing is known, and tried only where a loop seems to be.
@@ -220,10 +221,12 @@ class Interpreted:
             self._check(t, x, w)
         return w
 
-    def _steps(self, outputs: list[Map], needed: NDArray[np.bool_], feeds: Sequence[NDArray[np.bool_]]) -> list[Call]:
+    def _steps(
+        self, outputs: list[BlockMap], needed: NDArray[np.bool_], feeds: Sequence[NDArray[np.bool_]]
+    ) -> list[Call]:
         return [self._step(step, outputs) for step in self.network.schedule(feeds, needed)]
 
-    def _step(self, step: Step, outputs: list[Map]) -> Call:
+    def _step(self, step: Step, outputs: list[BlockMap]) -> Call:
         calls = [self._call(i, outputs[i]) for i in step.blocks]
         if step.unknown is None:
             return calls[0]
@@ -258,7 +261,7 @@ class Interpreted:
 
         return solve
 
-    def _call(self, i: int, output: Map) -> Call:
+    def _call(self, i: int, output: BlockMap) -> Call:
         network = self.network
         states, outs = network.states[i], network.outputs[i]
         fed = network.fed[i]
@@ -283,7 +286,9 @@ class Interpreted:
 
 
 class InterpretedSolver:
-    """LSODA on a network's equations, leg by leg."""
+    """LSODA on a network's equations, segment by segment."""
+
+    calls_blocks = True
 
     def __init__(self, equations: Interpreted, tolerances: Tolerances, scales: Scales) -> None:
         self._equations, self._scales = equations, scales
@@ -311,7 +316,7 @@ class InterpretedSolver:
 
     def outputs(self, times: Array, states: Array, driven: Array) -> Array:
         """Outputs (noutputs, ntime) of the whole."""
-        return self._equations.network.put_out(self.signals(times, states, driven))
+        return self._equations.network.to_outputs(self.signals(times, states, driven))
 
     def slopes(self, times: Array, states: Array, driven: Array) -> Array:
         """Derivatives of the rates by the states, by differences, (ntime, nstates, nstates)."""
@@ -447,7 +452,9 @@ class _named:  # noqa: N801 (a context, of which a run opens thousands)
     def __enter__(self) -> None:
         pass
 
-    def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
         if error is not None:
             error.add_note(f"in block {self._name} at {self._t:g} s")
 
@@ -535,7 +542,7 @@ class _StalledError(Exception):
 class _Failures(dict[int, str]):
     """Messages of LSODA that are raised in place of being shown as warnings."""
 
-    def get(self, key: int, default: Any = None) -> Any:
+    def get(self, key: int, default: object = None) -> NoReturn:
         raise _StalledError(f"LSODA: {super().get(key, default)}")
 
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import control as ct
 import numpy as np
 from numpy.typing import NDArray
 
 from ctrlplan._checks import real_array
+from ctrlplan._types import System
 from ctrlplan.simulation.exact import matrix_product, state_scale
 from ctrlplan.traits import traits_of
 from ctrlplan.trajectories import Trajectory
@@ -64,7 +64,7 @@ class LinearForm:
         return np.asarray(64.0 * np.finfo(float).eps * fed)
 
 
-def linear_form(system: Any) -> LinearForm:
+def linear_form(system: System) -> LinearForm:
     """Flatten a linear system, nested interconnections and plan sources included.
 
     States, inputs and outputs keep python-control's order.
@@ -81,7 +81,7 @@ def linear_form(system: Any) -> LinearForm:
     return LinearForm(form.a[0], form.b[0], form.c[0], form.d[0], form.sources)
 
 
-def linear_forms(systems: Sequence[Any]) -> LinearForm:
+def linear_forms(systems: Sequence[System]) -> LinearForm:
     """Flatten linear systems of one wiring together, as `linear_form` does each.
 
     Raises
@@ -108,26 +108,26 @@ def linear_forms(systems: Sequence[Any]) -> LinearForm:
         return LinearForm(a, b, c, d, ())
     sources = [traits_of(system) for system in systems]
     plan, high = sources[0].plan, sources[0].derivatives
-    if any(source.plan is not plan or source.derivatives != high for source in sources):
+    if plan is None or any(source.plan is not plan or source.derivatives != high for source in sources):
         raise _unlike(systems)
     count, n = len(systems), systems[0].noutputs
     a, b, c = map(np.zeros, ((count, 0, 0), (count, 0, n), (count, n, 0)))
     return LinearForm(a, b, c, np.tile(np.eye(n), (count, 1, 1)), ((plan, high),))
 
 
-def in_right_half(poles: NDArray[Any]) -> NDArray[np.bool_]:
+def in_right_half(poles: NDArray[np.inexact]) -> NDArray[np.bool_]:
     """Which poles lie in the right half plane, beyond rounding."""
     return np.asarray(poles.real > 1e-9 * np.maximum(1e-300, np.abs(poles)))
 
 
-def _matrix(system: Any, name: str) -> Array:
+def _matrix(system: System, name: str) -> Array:
     matrix = real_array(getattr(system, name), f"{name} of {system.name}")
     if not np.isfinite(matrix).all():
         raise ValueError(f"{name} of {system.name} must be finite, got nan or inf")
     return matrix
 
 
-def _kind(system: Any) -> type:
+def _kind(system: System) -> type:
     if system.dt not in (None, 0):
         raise NotLinearError(f"block {system.name} is discrete (dt = {system.dt})")
     for kind in (ct.InterconnectedSystem, ct.StateSpace, ct.TransferFunction):
@@ -138,11 +138,11 @@ def _kind(system: Any) -> type:
     raise NotLinearError(f"block {system.name} ({type(system).__name__}) is not linear")
 
 
-def _unlike(systems: Sequence[Any]) -> ValueError:
+def _unlike(systems: Sequence[System]) -> ValueError:
     return ValueError(f"systems must differ in numbers alone, got other blocks or wires in one named {systems[0].name}")
 
 
-def _interconnections(systems: Sequence[Any]) -> LinearForm:
+def _interconnections(systems: Sequence[System]) -> LinearForm:
     first = systems[0]
     names = ("connect_map", "input_map", "output_map")
     connect, external, outputs = (np.asarray(getattr(first, name), dtype=float) for name in names)

@@ -11,10 +11,9 @@ from __future__ import annotations
 
 import pickle
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import Any
 
 import control as ct
 import numpy as np
@@ -23,15 +22,13 @@ from scipy.linalg import block_diag
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
-from ctrlplan.simulation.trials import can_remember, of_library, reads, trial_copy, values_of
-from ctrlplan.simulation.untouched import untouched
-from ctrlplan.traits import BlockTraits, traits_of
+from ctrlplan._types import BlockMap, Params, System, Value
+from ctrlplan.symbolic.isolation import untouched
+from ctrlplan.symbolic.trials import can_remember, of_library, reads, trial_copy, values_of
+from ctrlplan.traits import BlockFunction, BlockTraits, traits_of
 from ctrlplan.trajectories import Trajectory
 
 Array = NDArray[np.float64]
-Map = Callable[[Any, Any, Any], Any]
-"""(t, state of the block, input of the block) -> outputs or rates; of numbers, or of symbols."""
-
 
 _TIME, _INPUT = 0, 2
 """Positions of time and input among the arguments (t, x, u, params) of a block's functions."""
@@ -45,8 +42,8 @@ class UnsupportedError(ValueError):
 class Block:
     """Innermost block and the parameters that reach it, before those of a run."""
 
-    system: Any
-    params: dict[str, Any]
+    system: System
+    params: Params
 
     @property
     def name(self) -> str:
@@ -92,17 +89,17 @@ class Block:
         return any(f is not None and reads(f, _TIME) for f in (self.system.outfcn, self.system.updfcn))
 
     @property
-    def held(self) -> Any:
+    def held(self) -> System | None:
         """Discrete system inside a sampled block whose held outputs are the block's; None of other blocks."""
         inner = self.traits.block if self.period is not None else None
         return inner if inner is not None and inner.noutputs == self.system.noutputs else None
 
     @property
     def driven(self) -> bool:
-        """Whether the outputs are, over a leg, functions of time alone."""
+        """Whether the outputs are, over a segment, functions of time alone."""
         return self.plan is not None or self.delay is not None
 
-    def output(self, params: Mapping[str, Any]) -> Map:
+    def output(self, params: Params) -> BlockMap:
         """Outputs, at the parameters of a run."""
         if self.linear:
             c, d = np.asarray(self.system.C, dtype=float), np.asarray(self.system.D, dtype=float)
@@ -112,7 +109,7 @@ class Block:
             return lambda t, x, u: x
         return lambda t, x, u: out(t, x, u, own)
 
-    def update(self, params: Mapping[str, Any]) -> Map:
+    def update(self, params: Params) -> BlockMap:
         """Rates of a continuous block, next states of a discrete one."""
         if self.linear:
             a, b = np.asarray(self.system.A, dtype=float), np.asarray(self.system.B, dtype=float)
@@ -122,7 +119,7 @@ class Block:
             return lambda t, x, u: np.zeros(len(x))
         return lambda t, x, u: update(t, x, u, own)
 
-    def sampled(self, params: Mapping[str, Any]) -> tuple[Map, Map]:
+    def sampled(self, params: Params) -> tuple[BlockMap, BlockMap]:
         """Outputs of a discrete block in a continuous loop when it takes a sample, and its states after it.
 
         Of a system that is held, output and update apart; the update returns
@@ -160,16 +157,16 @@ class Step:
 
 
 @dataclass(frozen=True, eq=False)
-class Declared:
+class WatchedSignal:
     """Signal of a block that declares its limits: a function of (t, x, u, params) of the block, time last."""
 
     name: str
-    function: Callable[..., Any]
+    function: BlockFunction
     low: float
     high: float
     states: slice
     fed: Callable[[Array], Array]
-    params: dict[str, Any]
+    params: Params
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,7 +187,7 @@ class Network:
         External inputs, the first of the signals.
     breakpoints : tuple of float
         Times [s] that blocks name at which their equations change.
-    watched : tuple of Declared
+    watched : tuple of WatchedSignal
         Signals of blocks that declare limits.
     """
 
@@ -200,10 +197,10 @@ class Network:
     read: Array
     ninputs: int
     breakpoints: tuple[float, ...] = ()
-    watched: tuple[Declared, ...] = ()
+    watched: tuple[WatchedSignal, ...] = ()
 
     @classmethod
-    def of(cls, system: Any) -> Network:
+    def of(cls, system: System) -> Network:
         """Flatten a system, nested at will.
 
         Raises
@@ -221,7 +218,7 @@ class Network:
             system.ninputs or 0,
             tuple(t for b in part.blocks for t in b.traits.breakpoints or ()),
         )
-        return replace(network, watched=tuple(network._declared()))
+        return replace(network, watched=tuple(network._watched_signals()))
 
     def for_trials(self) -> Network:
         """Same network with blocks whose memory, if they have one, is not that of the run."""
@@ -255,7 +252,7 @@ class Network:
         return [_product(self.wire[rows]) for rows in self.inputs]
 
     @cached_property
-    def put_out(self) -> Callable[[Array], Array]:
+    def to_outputs(self) -> Callable[[Array], Array]:
         """Map of all signals, time last, to the outputs of the whole."""
         return _product(self.read)
 
@@ -271,7 +268,7 @@ class Network:
 
     @cached_property
     def driven(self) -> NDArray[np.intp]:
-        """Signals that are functions of time alone over a leg: inputs, plans, delayed signals."""
+        """Signals that are functions of time alone over a segment: inputs, plans, delayed signals."""
         rows = [np.arange(self.ninputs)]
         rows += [
             np.arange(place.start, place.stop)
@@ -335,10 +332,10 @@ class Network:
         """Blocks by name, in words."""
         return ", ".join(self.blocks[i].name for i in blocks)
 
-    def _declared(self) -> Iterator[Declared]:
+    def _watched_signals(self) -> Iterator[WatchedSignal]:
         for block, states, fed in zip(self.blocks, self.states, self.fed, strict=True):
             for name, (function, low, high) in (block.traits.watched or {}).items():
-                yield Declared(name, function, low, high, states, fed, block.params)
+                yield WatchedSignal(name, function, low, high, states, fed, block.params)
 
     def _owners(self, rows: NDArray[np.intp]) -> tuple[int, ...]:
         return tuple(i for i, place in enumerate(self.outputs) if np.any((rows >= place.start) & (rows < place.stop)))
@@ -369,7 +366,7 @@ def sampled_feedthrough(block: Block) -> NDArray[np.bool_] | None:
     return known_feedthrough(Block(inner, block.params))
 
 
-def tried_feedthrough(output: Map, noutputs: int, nin: int, t: float, x: Array) -> NDArray[np.bool_]:
+def tried_feedthrough(output: BlockMap, noutputs: int, nin: int, t: float, x: Array) -> NDArray[np.bool_]:
     """Which outputs change when an input does, about a time and a state; all, where no trial tells."""
     found = np.zeros((noutputs, nin), dtype=bool)
     known = np.zeros(nin, dtype=bool)
@@ -392,11 +389,11 @@ def tried_feedthrough(output: Map, noutputs: int, nin: int, t: float, x: Array) 
     return found | ~known
 
 
-def _once(sample: Map) -> Map:
+def _once(sample: BlockMap) -> BlockMap:
     """States after a sample, taken once though a run asks for them and for the outputs that follow from them."""
-    last: tuple[Any, Array] = (None, np.empty(0))
+    last: tuple[object, Array] = (None, np.empty(0))
 
-    def taken(t: Any, x: Array, u: Array) -> Array:
+    def taken(t: float, x: Array, u: Array) -> Array:
         nonlocal last
         asked = t, x.tobytes(), u.tobytes()
         if asked != last[0]:
@@ -417,7 +414,7 @@ class _Part:
     through: Array  # and from inputs of the level
 
 
-def _flattened(system: Any, above: dict[str, Any]) -> _Part:
+def _flattened(system: System, above: Params) -> _Part:
     if not isinstance(system, ct.InterconnectedSystem):
         return _innermost(system, above)
     # python-control lets a level's parameters overrule those inside it.
@@ -445,7 +442,7 @@ def _flattened(system: Any, above: dict[str, Any]) -> _Part:
     )
 
 
-def _innermost(system: Any, above: dict[str, Any]) -> _Part:
+def _innermost(system: System, above: Params) -> _Part:
     if isinstance(system, ct.TransferFunction):
         system = ct.ss(system)
     plain = isinstance(system, ct.NonlinearIOSystem) and all(
@@ -458,11 +455,11 @@ def _innermost(system: Any, above: dict[str, Any]) -> _Part:
     return _Part([block], np.zeros((nin, nout)), np.eye(nin), np.eye(nout), np.zeros((nout, nin)))
 
 
-def _warn_of_shared_parameters(system: Any) -> None:
+def _warn_of_shared_parameters(system: System) -> None:
     """Two blocks with one key: python-control gives both the value of the last, and so does a run here."""
     if not isinstance(system, ct.InterconnectedSystem):
         return
-    seen: dict[str, tuple[str, Any]] = {}
+    seen: dict[str, tuple[str, Value]] = {}
     for block in system.syslist:
         _warn_of_shared_parameters(block)
         for key, value in block.params.items():
@@ -489,7 +486,7 @@ def _taken(rows: NDArray[np.intp], signals: Array) -> Array:
     return signals[rows]
 
 
-def _multiplied(matrix: Any, signals: Array) -> Array:
+def _multiplied(matrix: csr_array, signals: Array) -> Array:
     return np.asarray(matrix @ signals)
 
 
@@ -528,7 +525,7 @@ def _first_loop(depends: NDArray[np.bool_], open_: NDArray[np.bool_]) -> NDArray
     raise AssertionError("of the groups of a finite graph one depends on no other")
 
 
-def _can_be_sent(what: Any) -> bool:
+def _can_be_sent(what: object) -> bool:
     try:
         pickle.dumps(what)
     except Exception:  # whatever pickle meets in a user's function

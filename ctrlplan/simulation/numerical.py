@@ -1,45 +1,31 @@
-"""Numerical runs of a network, compiled or by Python."""
+"""Numerical runs of a network: from segment to segment, in scales that fit the states."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import trapezoid
 
 from ctrlplan.simulation.budget import TimeLimitError
-from ctrlplan.simulation.compared import telling_states
-from ctrlplan.simulation.drives import Drive, breakpoints_of, driven_signals
 from ctrlplan.simulation.events import Snapshot, Watched
-from ctrlplan.simulation.interpreted import Interpreted, InterpretedSolver, SolverError
-from ctrlplan.simulation.job import Job, Record, unused, with_looks
-from ctrlplan.simulation.legs import Run, integrate, known_before
+from ctrlplan.simulation.interpreted import Interpreted, SolverError
+from ctrlplan.simulation.job import Job, Record, unused, with_event_times
 from ctrlplan.simulation.network import Network
-from ctrlplan.simulation.prepared import NotCompiledError
 from ctrlplan.simulation.scales import PASSES, Scales, Tolerances, doubt, effects, remaining
-from ctrlplan.simulation.stalled import unrepeatable
-from ctrlplan.simulation.untouched import same_answer, tried, untouched
-
-if TYPE_CHECKING:
-    from ctrlplan.simulation.compiled import Compiled, CompiledSolver
+from ctrlplan.simulation.segments import Run, Solver, integrate, known_before
+from ctrlplan.simulation.signals import TimeSignal, breakpoints_of, signal_values
+from ctrlplan.symbolic.isolation import untouched
 
 Array = NDArray[np.float64]
 
-_VISITED = 12
+VISITED = 12
 """Visited states at which equations must be defined; and of a comparison where evaluations were not counted."""
-
-_SHARE = 5
-"""A compiled form is compared with Python at states a fifth as many as the run's evaluations of its equations."""
-
-_CLOSE, _STRETCHES, _BETWEEN = 400, 8, 60
-"""A run with fewer times is followed once more, in some stretches with so many times each, to see where it switches."""
 
 _ASIDE = 1e-6
 """Distance, in the scales of the states, at which a neighbouring run starts."""
@@ -57,16 +43,60 @@ _DOUBTED = 1e-6
 """Uncertainty of an output, relative to its range, above which the response says so."""
 
 
-def numerical(job: Job, method: str, reason: str) -> Record:
+class NumericalSolver(Solver, Protocol):
+    """Solver of a network's equations, and the equations themselves at many times."""
+
+    switches: list[float]
+    """Times of the run [s] at which the equations jump, set before it: no evaluation lies on one."""
+
+    @property
+    def evaluations(self) -> int:
+        """Evaluations of the right-hand side so far, where they are counted."""
+
+    @property
+    def calls_blocks(self) -> bool:
+        """Whether the blocks' own functions are called, which may raise outside of their domain."""
+
+    def count(self) -> None:
+        """Count evaluations from now on."""
+
+    def instants(self, first: float, last: float, values: Callable[[Array], Array]) -> list[float]:
+        """Times of a run at which the equations switch, where functions of time (n,) -> (nsignals, n) alone decide."""
+
+    def rates(self, times: Array, states: Array, driven: Array) -> Array:
+        """Rates (nstates, ntime) of the states."""
+
+    def slopes(self, times: Array, states: Array, driven: Array) -> Array:
+        """Derivatives of the rates by the states, (ntime, nstates, nstates)."""
+
+
+S = TypeVar("S", bound=NumericalSolver)
+
+
+class NumericalMethod(Protocol[S]):
+    """Method that solves differential equations from segment to segment."""
+
+    @property
+    def name(self) -> str:
+        """Name by which `simulate` takes it."""
+
+    def solver(self, attempt: Attempt[S]) -> S:
+        """Solver of one attempt, built before it runs."""
+
+    def check(self, attempt: Attempt[S]) -> None:
+        """Raise where what an attempt has found does not hold."""
+
+
+def numerical(job: Job, method: NumericalMethod[S]) -> Record:
     """Run from segment to segment, repeated where the scales of the states were not known."""
     scales, spare = Scales.plain(job.state.size, job.atol), unused(job)
-    attempt = _Attempt(job, method, scales)
+    attempt = Attempt(job, method, scales)
     attempt.go()
     for _ in range(PASSES - 1 if job.atol is None else 0):
         found = scales.renewed(attempt.run.states, attempt.noise)
         if found is None:
             break
-        following = _Attempt(spare, method, found)
+        following = Attempt(spare, method, found)
         try:
             following.go()
         except SolverError:  # the run before stands, with what is said of its accuracy
@@ -76,15 +106,15 @@ def numerical(job: Job, method: str, reason: str) -> Record:
         attempt = _tightened(attempt, spare)
     if attempt.tighter == 1.0:
         attempt = _firmer(attempt, spare)
-    return attempt.record(reason)
+    return attempt.record()
 
 
-def _tightened(attempt: _Attempt, spare: Job) -> _Attempt:
+def _tightened(attempt: Attempt[S], spare: Job) -> Attempt[S]:
     """Run whose errors of steps grow: measured by a run from beside, and made again with smaller ones."""
     scales, aside = attempt.scales, _ASIDE * attempt.scales.scale
     aside = aside * np.where(np.arange(aside.size) % 2, -1.0, 1.0)
     try:
-        near = _Attempt(replace(spare, state=spare.state + aside), attempt.method, scales)
+        near = Attempt(replace(spare, state=spare.state + aside), attempt.method, scales)
         near.go()
     except SolverError:
         return attempt
@@ -96,7 +126,7 @@ def _tightened(attempt: _Attempt, spare: Job) -> _Attempt:
         return attempt
     tighter = min(growth / _GROWTH, _TIGHTEST)
     try:
-        again = _Attempt(spare, attempt.method, scales, tighter)
+        again = Attempt(spare, attempt.method, scales, tighter)
         again.go()
     except SolverError:
         return attempt
@@ -104,13 +134,13 @@ def _tightened(attempt: _Attempt, spare: Job) -> _Attempt:
     return again
 
 
-def _firmer(attempt: _Attempt, spare: Job) -> _Attempt:
+def _firmer(attempt: Attempt[S], spare: Job) -> Attempt[S]:
     """Run again, with large states integrated more closely where others depend on them absolutely, as on an angle."""
     loose = attempt.loose()
     if not loose.any():
         return attempt
     try:
-        again = _Attempt(spare, attempt.method, attempt.scales.firmer(attempt.run.states, loose, attempt.noise()))
+        again = Attempt(spare, attempt.method, attempt.scales.firmer(attempt.run.states, loose, attempt.noise()))
         again.solver.count()
         again.go()
     except SolverError:
@@ -123,33 +153,43 @@ def _firmer(attempt: _Attempt, spare: Job) -> _Attempt:
 
 
 @dataclass(eq=False)
-class _Attempt:
-    """One run with some scales of the states."""
+class Attempt(Generic[S]):
+    """One run with some scales of the states.
+
+    Attributes
+    ----------
+    job, method, scales
+        What is run, how, and in which coordinates.
+    tighter : float
+        Factor by which the tolerances of a step are smaller than usual.
+    growth : float
+        Measured growth of the distance of neighbouring solutions.
+    time_signals : list of TimeSignal
+        Inputs, then the outputs of blocks that are functions of time.
+    copies : Network
+        Same network, with blocks whose memory is not that of the run: for trial calls.
+    equations : Interpreted or None
+        By Python; None without blocks.
+    """
 
     job: Job
-    method: str
+    method: NumericalMethod[S]
     scales: Scales
     tighter: float = 1.0
     growth: float = 1.0
     drift: Array | float = 0.0
-    drives: list[Drive] = field(init=False)
+    time_signals: list[TimeSignal] = field(init=False)
     watched: tuple[Watched, ...] = field(init=False)
     equations: Interpreted | None = field(init=False)
-    solver: Any = field(init=False)
+    copies: Network = field(init=False)
+    solver: S = field(init=False)
     run: Run = field(init=False)
-    _compare: Callable[[], None] = field(init=False)
 
     def __post_init__(self) -> None:
         job, network = self.job, self.job.blocks
-        self.drives, self.watched = job.prepared.drives(job.inputs, job.first), job.watched()
-        self.equations = _equations(job, network)
-        if self.method == "compiled":
-            self._compile()
-        elif self.equations is not None:
-            self._check_repeatable()
-            self.solver, self._compare = InterpretedSolver(self.equations, self._tolerances, self.scales), lambda: None
-        else:
-            raise NotCompiledError(f"{job.prepared.name} came from another process without its blocks")
+        self.time_signals, self.watched = job.prepared.time_signals(job.inputs, job.first), job.watched()
+        self.equations, self.copies = equations_of(job, network), network.for_trials()
+        self.solver = self.method.solver(self)
 
     @property
     def stops(self) -> bool:
@@ -157,22 +197,22 @@ class _Attempt:
         return any(entry.stop for entry in self.watched)
 
     def go(self) -> None:
-        """Run, and compare a compiled form with Python."""
+        """Run, and check what was found."""
         job = self.job
-        marks = self.solver.instants(job.first, float(job.times[-1]), lambda t: known_before(self.drives, t))
+        marks = self.solver.instants(job.first, float(job.times[-1]), lambda t: known_before(self.time_signals, t))
         self.solver.switches = sorted([*job.blocks.breakpoints, *marks])
         self.run = integrate(
             job.blocks,
             self.equations,
             self.solver,
-            self.drives,
-            with_looks(job.times, self.watched, self._slope),
+            self.time_signals,
+            with_event_times(job.times, self.watched, self._slope),
             job.state,
             resolution=10.0 * job.rtol,
             marks=marks,
             pause=self._pause if self.stops else None,
         )
-        self._compare()
+        self.method.check(self)
 
     def loose(self) -> NDArray[np.bool_]:
         """States (nstates,) whose tolerated error is too large for other states."""
@@ -184,7 +224,7 @@ class _Attempt:
         found = self.effects * error > allowed[:, None]
         if found.any() and self.job.blocks.blocks_with("period"):
             # What feeds back from sample to sample is in no slope: only what others depend on absolutely counts.
-            t, x, driven = self._visited()
+            t, x, driven = self.visited()
             size, rates = np.abs(states - scales.shift[:, None]).max(axis=1), self.solver.rates(t, x, driven)
             found &= np.abs(self._slopes[: t.size]).max(axis=0) * size > _STEEP * np.abs(rates).max(
                 axis=1, keepdims=True
@@ -199,8 +239,8 @@ class _Attempt:
     @cached_property
     def _slopes(self) -> Array:
         """Derivatives of the rates by the states, (nplaces, nstates, nstates), first at the visited times."""
-        t, x, driven = self._visited()
-        some = slice(None, None, _VISITED // _ASTRAY)
+        t, x, driven = self.visited()
+        some = slice(None, None, VISITED // _ASTRAY)
         # Samples that are a turn of an angle apart see one slope of its sine, which may be 0.
         astray = x[:, some] * (1.0 + _JITTER * np.random.default_rng(0).uniform(-1.0, 1.0, x[:, some].shape))
         places = np.append(t, t[some]), np.append(x, astray, axis=1), np.append(driven, driven[:, some], axis=1)
@@ -218,7 +258,7 @@ class _Attempt:
 
         Its result has a shape, in which -1 stands for the times.
         """
-        if self.method == "compiled":
+        if not self.solver.calls_blocks:
             return function(t, x, driven)
         axis, empty = shape.index(-1), np.full([abs(size) for size in shape], np.nan)
 
@@ -237,15 +277,15 @@ class _Attempt:
             found = [at(slice(k, k + 1)) for k in range(t.size)]
         return np.concatenate([empty if part is None else part for part in found], axis=axis)
 
-    def record(self, reason: str) -> Record:
+    def record(self) -> Record:
         """What the run left, and how accurate it is where that is worse than usual."""
         said = _in_doubt(self)
-        reason = f"{reason}; {said}" if said else reason
-        return Record(self.run.times, self.run.states, self._see, self._carry, self.watched, self.method, reason)
+        reason = f"{self.job.reason}; {said}" if said else self.job.reason
+        return Record(self.run.times, self.run.states, self._see, self._carry, self.watched, self.method.name, reason)
 
     def expands(self) -> bool:
         """Whether neighbouring solutions may part, by the fastest growing motion along the run."""
-        t = self._visited()[0]
+        t = self.visited()[0]
         slopes = self._slopes[: t.size]
         if t.size < 2 or not slopes.size or not np.isfinite(slopes).all():
             return False
@@ -253,17 +293,17 @@ class _Attempt:
         return float(trapezoid(rates, t)) > math.log(_GROWTH)
 
     @property
-    def _tolerances(self) -> Tolerances:
+    def tolerances(self) -> Tolerances:
         """Tolerances of a step, so that the errors of all segments stay within those of the run."""
         job, network = self.job, self.job.blocks
         first, last = job.first, float(job.times[-1])
-        marks = {t for t in (*breakpoints_of(self.drives), *network.breakpoints) if first < t < last}
+        marks = {t for t in (*breakpoints_of(self.time_signals), *network.breakpoints) if first < t < last}
         samples = sum((last - first) / float(network.blocks[i].period or 1.0) for i in network.blocks_with("period"))
         return Tolerances.of_run(job.rtol, self.scales, len(marks) + int(samples), self.tighter)
 
     def noise(self) -> Array:
         """Rounding noise of the rates along the run, times its duration."""
-        t, x, driven = self._visited()
+        t, x, driven = self.visited()
         rng = np.random.default_rng(0)
         plain, found = self.on_trial(self.solver.rates, t, x, driven, (len(x), -1)), np.zeros(len(x))
         for _ in range(3):
@@ -272,52 +312,14 @@ class _Attempt:
             found = np.maximum(found, np.where(np.isfinite(apart), apart, 0.0).max(axis=1, initial=0.0))
         return found * float(self.run.times[-1] - self.run.times[0])
 
-    def _compile(self) -> None:
-        job = self.job
-        # Compiled forms are compared with Python on copies of what blocks remember.
-        known = job.blocks.for_trials()
-        form = job.prepared.compiled(job.params, self.drives, job.first, job.state)
-        from ctrlplan.simulation.compiled import CompiledSolver  # there is a form: so there is CasADi
-
-        _at_start(_equations(job, known), job, self.drives)  # an algebraic loop without a solution is better named here
-        # Beyond a stop there may be no solution: segments are short then, and must fail soon.
-        most = 2_000 if self.stops else 20_000
-        solver = CompiledSolver(form, job.params, self._tolerances, self.scales, max_steps=most)
-
-        def compare() -> None:
-            if solver.at_edge(*self._visited()):
-                raise SolverError(
-                    f"the solver must reach {job.times[-1]:g} s, got to the edge of where equations are defined"
-                )
-            wrong = _disagreement(job, known, form, solver, self.drives, self.run) if known.blocks else ""
-            if wrong:
-                raise job.prepared.distrust(form, wrong)
-
-        self.solver, self._compare = solver, compare
-
-    def _check_repeatable(self) -> None:
-        """Raise where rates are random: such a loop has no solution."""
-        job, known = self.job, self.job.blocks.for_trials()
-        tests, driven = _equations(job, known), driven_signals(self.drives, job.times[:1])[:, 0]
-        if tests is None:
-            return
-        with untouched():
-            first, second = (tried(lambda: tests.rates(job.first, job.state, driven), None) for _ in range(2))
-            if same_answer(first, second):
-                return
-            w = tried(lambda: tests.signals(job.first, job.state, driven), None)
-        found = unrepeatable(known, job.params, job.first, job.state, w) if w is not None else ""
-        if found:
-            raise SolverError(f"the solver must reach {job.times[-1]:g} s, got to {job.first:g} s: {found}")
-
-    def _visited(self) -> tuple[Array, Array, Array]:
+    def visited(self) -> tuple[Array, Array, Array]:
         """Some times and states of the run, and the functions of time there."""
-        some = np.unique(np.linspace(0, self.run.times.size - 1, _VISITED).astype(int))
+        some = np.unique(np.linspace(0, self.run.times.size - 1, VISITED).astype(int))
         t = self.run.times[some]
-        return t, self.run.states[:, some], driven_signals(self.drives, t)
+        return t, self.run.states[:, some], signal_values(self.time_signals, t)
 
     def _see(self, t: Array, x: Array) -> Snapshot:
-        driven = driven_signals(self.drives, t)
+        driven = signal_values(self.time_signals, t)
         y = self.solver.outputs(t, x, driven)
         return Snapshot(t, x, driven[: self.job.prepared.ninputs], y, lambda: self.solver.signals(t, x, driven))
 
@@ -334,30 +336,23 @@ class _Attempt:
         equations, job = self.equations, self.job
         if equations is None:
             return np.zeros((0, 0))
-        driven = driven_signals(self.drives, job.times[:1])[:, 0]
+        driven = signal_values(self.time_signals, job.times[:1])[:, 0]
         return _slope(lambda x: equations.rates(job.first, x, driven), job.state)
 
 
-def _equations(job: Job, network: Network) -> Interpreted | None:
+def equations_of(job: Job, network: Network) -> Interpreted | None:
     """Equations by Python, where there are blocks."""
-    return Interpreted(network, job.params, (job.first, job.state), job.prepared.trials) if network.blocks else None
+    return Interpreted(network, job.params, (job.first, job.state), job.trials) if network.blocks else None
 
 
-def _at_start(equations: Interpreted | None, job: Job, drives: Sequence[Drive]) -> Array | None:
-    """Signals at the start of a run."""
-    if equations is None:
-        return None
-    return equations.signals(job.first, job.state, driven_signals(drives, job.times[:1])[:, 0])
-
-
-def _in_doubt(attempt: _Attempt) -> str:
+def _in_doubt(attempt: Attempt[S]) -> str:
     """What is uncertain in the outputs, and the tolerance that would do, in words; empty where nothing is."""
     job, run, solver, scales = attempt.job, attempt.run, attempt.solver, attempt.scales
-    some = np.unique(np.linspace(0, run.times.size - 1, _VISITED).astype(int))
+    some = np.unique(np.linspace(0, run.times.size - 1, VISITED).astype(int))
     t, x = run.times[some], run.states[:, some]
     if not x.size or not np.isfinite(x).all():
         return ""
-    driven = driven_signals(attempt.drives, t)
+    driven = signal_values(attempt.time_signals, t)
     own = scales.uncertainty(run.states, job.rtol) * attempt.growth / attempt.tighter
     uncertainty, count = own + attempt.drift, len(job.prepared.output_labels)
     worst, ranges = doubt(lambda near: attempt.on_trial(solver.outputs, t, near, driven, (count, -1)), x, uncertainty)
@@ -373,41 +368,6 @@ def _in_doubt(attempt: _Attempt) -> str:
         what = "depend on small parts of large states"
     advice = f"rtol = {needed:.0e} would do" if needed > 1e-12 / scales.relative else "no tolerance would do"
     return f"outputs {names} {what} and are uncertain by about {float(part.max()):.1g} of their range: {advice}"
-
-
-def _disagreement(
-    job: Job, network: Network, form: Compiled, solver: CompiledSolver, drives: Sequence[Drive], run: Run
-) -> str:
-    """What is wrong with a compiled form at states of a run; empty where nothing, or where no comparison is due."""
-    p = form.parameters(job.params)
-    driven = driven_signals(drives, run.times)
-    if not form.compared.is_due(form.sides(run.times, run.states, driven, p)):
-        return ""
-    most = max(1, solver.evaluations // _SHARE) if solver.evaluations else _VISITED
-    t, x = _closer(run, solver)
-    driven = driven_signals(drives, t)
-    w, sides = form.signals(t, x, driven, p), form.sides(t, x, driven, p)
-    places = telling_states(sides, np.concatenate([w, x]), most)
-    # Blocks are compared at the inputs that the form computes: where each agrees, the whole does.
-    return form.disagreement(network, job.params, t[places], x[:, places], w[:, places])
-
-
-def _closer(run: Run, solver: CompiledSolver) -> tuple[Array, Array]:
-    """Times and states of a run, with more between them where they are few."""
-    times, states = [run.times], [run.states]
-    marks = np.unique(np.linspace(0, run.times.size - 1, _STRETCHES + 1).astype(int))
-    for k, following in pairwise(marks.tolist() if run.times.size < _CLOSE else []):
-        left, right = float(run.times[k]), float(run.times[following])
-        series = run.series(left)
-        right = min(right, series.right)
-        grid = np.linspace(left, right, _BETWEEN + 1)[1:]
-        with suppress(SolverError):
-            found = solver.advance(series, left, grid, run.states[:, k])
-            times.append(grid)
-            states.append(found)
-    t, x = np.concatenate(times), np.concatenate(states, axis=1)
-    order = np.argsort(t, kind="stable")
-    return t[order], x[:, order]
 
 
 def _slope(rates: Callable[[Array], Array], state: Array) -> Array:

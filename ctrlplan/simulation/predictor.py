@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from importlib.util import find_spec
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ctrlplan._types import Params, System
+from ctrlplan.simulation import methods
 from ctrlplan.simulation.interpreted import LoopError, SolverError
+from ctrlplan.simulation.learned import NotApplicableError
 from ctrlplan.simulation.prepared import Prepared, prepare
-from ctrlplan.simulation.simulate import simulate
+from ctrlplan.simulation.simulate import checked_job, response_to
 from ctrlplan.trajectories.common import Frozen, checked_limits, checked_time
 
 Array = NDArray[np.float64]
@@ -116,11 +117,11 @@ class Predictor(Frozen):
     _high: Array
     _inset: Array
     _resolution: float
-    _params: dict[str, Any]
+    _params: Params
 
     def __init__(
         self,
-        system: Any,
+        system: System | Prepared,
         limits: Mapping[str, Sequence[float]],
         horizon: float,
         *,
@@ -128,7 +129,7 @@ class Predictor(Frozen):
         margin: float = 0.02,
         count: int = 200,
         resolution: float = 1.0 / 64.0,
-        params: Mapping[str, Any] | None = None,
+        params: Params | None = None,
     ) -> None:
         prepared = prepare(system)
         _check_autonomous(prepared)
@@ -229,25 +230,17 @@ class Predictor(Frozen):
         """Limited outputs (nlimits, count) of a run, or None where it fails."""
         inputs = dict(zip(self.references, reference.tolist(), strict=True))
         with np.errstate(all="ignore"):
-            for method in self._methods():
+            for method in methods.applicable(methods.METHODS, self._prepared):
+                job = checked_job(self._prepared, self._times, inputs, state, *_TOLERANCES, self._params, events=())
                 try:
-                    found = simulate(
-                        self._prepared, self._times, inputs, state, method, *_TOLERANCES, self._params, events=()
-                    )
+                    found = response_to(job, [method])
                 except (SolverError, LoopError):
                     return None
-                except ValueError:
-                    if method != "compiled":  # what cannot be compiled is run by Python
-                        raise
+                except NotApplicableError:  # what cannot be compiled is run by Python
                     continue
-                outputs: Array = np.atleast_2d(found.y[self._rows, ...].reshape(len(self._rows), -1))
+                outputs = np.atleast_2d(found.y[self._rows, ...].reshape(len(self._rows), -1))
                 return outputs if np.isfinite(outputs).all() else None
-        raise AssertionError("the last method is tried in any case")
-
-    def _methods(self) -> tuple[str, ...]:
-        if self._prepared.linear is not None:
-            return ("exact",)
-        return ("python",) if find_spec("casadi") is None else ("compiled", "python")
+        raise AssertionError("Python runs every system that the constructor accepts")
 
     def _checked(self, x: ArrayLike, *references: ArrayLike) -> list[Array]:
         found = [np.asarray(x, dtype=float), *(np.atleast_1d(np.asarray(v, dtype=float)) for v in references)]
@@ -269,7 +262,7 @@ def _peaks(values: Array) -> Array:
 
 def _check_autonomous(prepared: Prepared) -> None:
     """Refuse what a run from a state and constant inputs does not predict."""
-    if prepared.dt not in (None, 0):
+    if prepared.is_discrete:
         raise ValueError(f"system must be continuous, got {prepared.name} with dt = {prepared.dt}")
     if prepared.network is None:
         raise ValueError(f"system must be one that ctrlplan runs itself, but {prepared.unsupported}")

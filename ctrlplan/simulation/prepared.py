@@ -2,46 +2,36 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable
 from functools import partial
-from importlib.util import find_spec
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import control as ct
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from ctrlplan.simulation.drives import Drive, PlanDrive, driven_signals
-from ctrlplan.simulation.fingerprint import References, roots_of
+from ctrlplan._lru import BUILDING, Lru
+from ctrlplan._types import Params, System, Value
 from ctrlplan.simulation.interpreted import Interpreted
-from ctrlplan.simulation.legs import DelayedDrive
+from ctrlplan.simulation.learned import BuiltForm, DisagreementError, Learned, NotCompiledError
 from ctrlplan.simulation.linear import LinearForm, NotLinearError, linear_form
-from ctrlplan.simulation.network import Network, UnsupportedError
-from ctrlplan.simulation.recent import BUILDING, recent
-from ctrlplan.simulation.trials import reads
-from ctrlplan.simulation.untouched import tried, untouched
+from ctrlplan.simulation.network import Block, Network, UnsupportedError
+from ctrlplan.simulation.segments import DelayedSignal
+from ctrlplan.simulation.signals import PlanSignal, TimeSignal, signal_values
+from ctrlplan.simulation.unread import is_read
+from ctrlplan.symbolic import missing_casadi
+from ctrlplan.symbolic.fingerprint import fingerprint, value_token
+from ctrlplan.symbolic.keeper import Keeper
 from ctrlplan.traits import traits_of
 
 if TYPE_CHECKING:
     from ctrlplan.simulation.compiled import Compiled
-    from ctrlplan.simulation.traced import Trace
+    from ctrlplan.symbolic.tracing import Trace
 
 Array = NDArray[np.float64]
 
 _KEPT = 16
 """Systems that `simulate` keeps by itself."""
-
-_PARAMS = 3
-"""Position of the parameters among the arguments of a block's function."""
-
-
-class NotCompiledError(ValueError):
-    """A system that cannot be compiled, and why."""
-
-
-class DisagreementError(NotCompiledError):
-    """A compiled system that is not what Python says at states that a run visited."""
 
 
 class Prepared:
@@ -57,7 +47,7 @@ class Prepared:
         Number of states.
     """
 
-    def __init__(self, system: Any) -> None:
+    def __init__(self, system: System) -> None:
         self.original = system
         self._stated: Array | None = None
         self.fingerprint = fingerprint(system)
@@ -85,18 +75,15 @@ class Prepared:
             if block.delay is not None or block.period is not None:
                 what = "puts out the past" if block.delay is not None else "takes samples"
                 self.not_linear = f"block {block.name} {what}"
-        self._sources = [PlanDrive(b.plan, b.traits.derivatives) for b in self._blocks() if b.plan is not None]
-        self.trusted = True
-        self.trials = True
-        self._read: dict[str, bool] = {}
-        self._compiled: list[tuple[frozenset[str], dict[str, Any], Compiled | NotCompiledError]] = []
+        self._sources = [PlanSignal(b.plan, b.traits.derivatives) for b in self._blocks() if b.plan is not None]
+        self._learned = Learned()
 
     def __repr__(self) -> str:
         return f"<Prepared form of {self.name}: {self.nstates} states>"
 
     @property
-    def initial_state(self) -> Any:
-        """Where the system says that it starts, or None."""
+    def initial_state(self) -> Array | None:
+        """Declared initial state, or None."""
         return _filled(self.stated)
 
     @property
@@ -109,18 +96,30 @@ class Prepared:
         """Number of inputs."""
         return len(self.input_labels)
 
-    def drives(self, inputs: list[Drive], first: float) -> list[Drive]:
-        """Given inputs, then the driven blocks in order."""
+    @property
+    def is_discrete(self) -> bool:
+        """Whether the system is in discrete time."""
+        return self.dt not in (None, 0)
+
+    @property
+    def has_blocks(self) -> bool:
+        """Whether python-control's blocks are at hand: not in a form from another process."""
+        return self.network is not None and bool(self.network.blocks)
+
+    def time_signals(self, inputs: list[TimeSignal], first: float) -> list[TimeSignal]:
+        """Signals at the inputs, then the outputs of blocks that are functions of time, in order."""
         sources, found = iter(self._sources), list(inputs)
         for block in self._blocks():
             if block.plan is not None:
                 found.append(next(sources))
             elif block.delay is not None:
                 initial = np.broadcast_to(np.asarray(block.traits.initial, dtype=float), (block.system.ninputs,))
-                found.append(DelayedDrive(block.delay, initial, first))
+                found.append(DelayedSignal(block.delay, initial, first))
         return [*found, *sources]
 
-    def compiled(self, params: Mapping[str, Any], drives: list[Drive], first: float, state: Array) -> Compiled:
+    def compiled(
+        self, params: Params, time_signals: list[TimeSignal], first: float, state: Array, trials: bool = True
+    ) -> Compiled:
         """Compiled form for some parameters, built once for all their values.
 
         Raises
@@ -128,37 +127,19 @@ class Prepared:
         NotCompiledError
             If CasADi is missing, or a block cannot be traced; it is named.
         """
-        form = self._known(params)
-        if form is None:
-            with BUILDING:
-                form = self._known(params)
-                if form is None:
-                    form, baked = self._build(params, drives, first, state)
-                    if self.original is not None:  # what blocks only write has turned out meanwhile
-                        self.fingerprint = fingerprint(self.original)
-                    self._compiled = [*self._compiled[-7:], (frozenset(params), baked, form)]
-        if isinstance(form, NotCompiledError):
-            raise NotCompiledError(str(form))
-        return form
 
-    def _known(self, params: Mapping[str, Any]) -> Compiled | NotCompiledError | None:
-        """Form built before, in which the parameters that are no symbols have the same values."""
-        for names, baked, form in self._compiled:
-            numbers = isinstance(form, NotCompiledError) or all(np.ndim(params.get(k, 0.0)) == 0 for k in form.symbols)
-            if names == frozenset(params) and numbers and all(_token(params[k]) == v for k, v in baked.items()):
-                return form
-        return None
+        def build() -> BuiltForm:
+            built = self._build(params, time_signals, first, state, trials)
+            if self.original is not None:  # what blocks only write has turned out meanwhile
+                self.fingerprint = fingerprint(self.original)
+                _FORMS.get(self.fingerprint, lambda: self)
+            return built
+
+        return self._learned.form(params, build)
 
     def distrust(self, form: Compiled, why: str) -> DisagreementError:
-        """Drop a compiled form that was found wrong: once, for what it was made of may have changed; then for good."""
-        with BUILDING:
-            again, self.trusted = not self.trusted, False
-            self._compiled = [
-                (names, baked, NotCompiledError(why) if known is form else known)
-                for names, baked, known in self._compiled
-                if again or known is not form
-            ]
-        return DisagreementError(why)
+        """Drop a compiled form that was found wrong; the error to raise."""
+        return self._learned.distrust(form, why)
 
     def detached(self, names: Iterable[str] = ()) -> Prepared:
         """Same form without python-control's blocks, for other processes and for many runs with some parameters.
@@ -174,77 +155,43 @@ class Prepared:
         other = object.__new__(Prepared)
         other.__dict__.update(self.__getstate__())
         if self.linear is None:
-            other._compiled = [entry for entry in other._compiled if entry[0] == frozenset(names) and not entry[1]]
-            if not other._compiled:
+            other._learned = other._learned.for_any(names)
+            if not other._learned.forms:
                 raise TypeError(f"{self.name} is not compiled for any values of {', '.join(names) or 'no parameters'}")
         return other
 
-    def reads(self, name: str, value: Any, initial_state: Any = None) -> bool:
+    def reads(self, name: str, value: Value, initial_state: ArrayLike | None = None) -> bool:
         """Whether a block has a parameter, or reads one of that name where a run begins or near it."""
         network = self.network
         if network is None or not network.blocks or any(name in block.params for block in network.blocks):
             return True
-        if name in self._read:
-            return self._read[name]
-        self._read[name] = self._is_read(network, name, value, initial_state)
-        return self._read[name]
-
-    def _is_read(self, network: Network, name: str, value: Any, initial_state: Any) -> bool:
-        blocks = [i for i, block in enumerate(network.blocks) if not (block.linear or block.driven)]
-        functions = {i: [*_functions(network.blocks[i].system)] for i in blocks}
-        # A call may take minutes, as that of an estimator which runs an optimiser: only what can tell is called.
-        tellers = {i: [f for f in functions[i] if reads(f, _PARAMS)] for i in blocks}
-        if not any(tellers.values()):
-            return False
         given = self.initial_state if initial_state is None else initial_state
         start = np.zeros(self.nstates) + (0.0 if given is None else np.asarray(given, dtype=float))
-        w = np.zeros(network.nsignals)
-        found = References((f"block {network.blocks[i].name}", f) for i in blocks for f in functions[i])
-        if found.opaque:  # a call might leave something behind: what the code names counts
-            return name in found.names or not found.names.isdisjoint(("keys", "values", "items"))
-        keeper = found.keeper()
 
-        def starting() -> Array:
-            equations = Interpreted(network, {name: value}, (0.0, start))
-            return equations.signals(0.0, start, driven_signals(self.drives([], 0.0), np.zeros(1))[:, 0])
+        def at_start() -> Array:
+            return signal_values(self.time_signals([], 0.0), np.zeros(1))[:, 0]
 
-        read: set[str] = set()
-        rng = np.random.default_rng(0)
-        with untouched():
-            w = tried(starting, np.zeros(network.nsignals))
-            for i in blocks:
-                noticing = _Noticing({**network.blocks[i].params, name: value}, read)
-                for scale in (0.0, 0.1, 1.0):
-                    x, u = start[network.states[i]], network.fed[i](w)
-                    x, u = (v + scale * rng.standard_normal(v.size) * (1.0 + np.abs(v)) for v in (x, u))
-                    for function in tellers[i]:
-                        tried(partial(function, 10.0 * scale, x.copy(), u.copy(), noticing), None)
-        keeper.restore()
-        return name in read or _Noticing.ALL in read
+        return self._learned.reads(name, partial(is_read, network, name, value, start, at_start))
 
     def _build(
-        self, params: Mapping[str, Any], drives: list[Drive], first: float, state: Array
-    ) -> tuple[Compiled | NotCompiledError, dict[str, Any]]:
-        if find_spec("casadi") is None:
-            return NotCompiledError("CasADi is not installed (pip install ctrlplan[fast])"), {}
+        self, params: Params, time_signals: list[TimeSignal], first: float, state: Array, trials: bool
+    ) -> BuiltForm:
+        """Compiled form of all blocks, or why there is none."""
+        names, network = frozenset(params), self.network
+        if missing := missing_casadi():
+            return BuiltForm(names, {}, NotCompiledError(missing))
         from ctrlplan.simulation.compiled import Compiled
-        from ctrlplan.simulation.traced import NotTraceableError, callable_references, traced
+        from ctrlplan.symbolic.tracing import NotTraceableError, traced
 
-        network = self.network
         if network is None:
-            return NotCompiledError(self.unsupported), {}
+            return BuiltForm(names, {}, NotCompiledError(self.unsupported))
         if not network.blocks:
-            return NotCompiledError(f"{self.name} is without its blocks, compiled for other parameters"), {}
+            why = f"{self.name} is without its blocks, compiled for other parameters"
+            return BuiltForm(names, {}, NotCompiledError(why))
         traces: list[Trace | None] = []
-        baked: dict[str, Any] = {}
+        constants: dict[str, tuple[object, ...]] = {}
         try:
-            others = [block for block in network.blocks if not (block.linear or block.driven)]
-            keeper = callable_references(others, params).keeper()
-            try:
-                equations = Interpreted(network.for_trials(), params, (first, state), self.trials)
-                w = equations.signals(first, state, driven_signals(drives, np.array([first]))[:, 0])
-            finally:
-                keeper.restore()
+            w = self._signals_at_start(network, params, time_signals, first, state, trials)
             for block, states, fed in zip(network.blocks, network.states, network.fed, strict=True):
                 if block.linear or block.driven:
                     traces.append(None)
@@ -252,20 +199,41 @@ class Prepared:
                 trace = traced(block, params, first, state[states], fed(w))
                 traces.append(trace)
                 # What is a constant in the trace must be so in every run of it.
-                baked |= {key: _token(params[key]) for key in params if key not in trace.symbols}
-            return Compiled(network, traces), baked
+                constants |= {key: value_token(params[key]) for key in params if key not in trace.symbols}
+            return BuiltForm(names, constants, Compiled(network, traces))
         except NotTraceableError as error:
-            return NotCompiledError(str(error)), {key: _token(value) for key, value in params.items()}
+            every = {key: value_token(value) for key, value in params.items()}
+            return BuiltForm(names, every, NotCompiledError(str(error)))
 
-    def _blocks(self) -> tuple[Any, ...]:
+    def _signals_at_start(
+        self,
+        network: Network,
+        params: Params,
+        time_signals: list[TimeSignal],
+        first: float,
+        state: Array,
+        trials: bool,
+    ) -> Array:
+        """Signals at the start of a run, by calls that leave nothing behind."""
+        from ctrlplan.symbolic.tracing import callable_references
+
+        others = [block for block in network.blocks if not (block.linear or block.driven)]
+        keeper = Keeper(callable_references(others, params))
+        try:
+            equations = Interpreted(network.for_trials(), params, (first, state), trials)
+            return equations.signals(first, state, signal_values(time_signals, np.array([first]))[:, 0])
+        finally:
+            keeper.restore()
+
+    def _blocks(self) -> tuple[Block, ...]:
         return self.network.blocks if self.network is not None else ()
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> dict[str, object]:
         """Without python-control's objects, whose functions cannot be sent to another process."""
-        usable = [entry for entry in self._compiled if not isinstance(entry[2], NotCompiledError)]
+        usable = self._learned.usable()
         if self.linear is None:
             special = any(block.delay is not None or block.period is not None for block in self._blocks())
-            if not usable or special:
+            if not usable.forms or special:
                 raise TypeError(
                     f"{self.name} must be linear or compiled, without delays and samples, to be sent to another "
                     "process; give a function that builds it"
@@ -278,50 +246,12 @@ class Prepared:
             "system": None,
             "fingerprint": None,
             "network": network,
-            "_compiled": usable,
+            "_learned": usable,
             "_stated": self.stated,
         }
 
 
-class _Noticing(dict[str, Any]):
-    """Parameters that notice which of them are read."""
-
-    ALL = ""
-
-    def __init__(self, values: Mapping[str, Any], read: set[str]) -> None:
-        super().__init__(values)
-        self.read = read
-
-    def __getitem__(self, key: str) -> Any:
-        self.read.add(key)
-        return super().__getitem__(key)
-
-    def __contains__(self, key: object) -> bool:
-        self.read.add(str(key))
-        return super().__contains__(key)
-
-    def get(self, key: str, default: Any = None) -> Any:
-        self.read.add(key)
-        return super().get(key, default)
-
-    def __iter__(self) -> Iterator[str]:
-        self.read.add(self.ALL)
-        return super().__iter__()
-
-    def keys(self) -> Any:
-        self.read.add(self.ALL)
-        return super().keys()
-
-    def items(self) -> Any:
-        self.read.add(self.ALL)
-        return super().items()
-
-    def values(self) -> Any:
-        self.read.add(self.ALL)
-        return super().values()
-
-
-def prepare(system: Any) -> Prepared:
+def prepare(system: System | Prepared) -> Prepared:
     """Built form of a system, for many runs.
 
     `simulate` takes it in the system's place; what it builds on the way
@@ -349,23 +279,25 @@ def prepare(system: Any) -> Prepared:
     return Prepared(_checked_system(system))
 
 
-def prepared_form(system: Any) -> Prepared:
+def prepared_form(system: System | Prepared) -> Prepared:
     """Form built before of the same system, or a new one where its maps, parameters or blocks have changed."""
-    if isinstance(system, Prepared):
-        if system.original is None or fingerprint(system.original) == system.fingerprint:
-            return system
-        system = system.original
-    _checked_system(system)
-    key = fingerprint(system)
-    return recent(_recent, key, _KEPT, lambda: Prepared(system))
+    if isinstance(system, Prepared) and system.original is None:
+        return system
+    with BUILDING:  # no other thread is calling a block on trial
+        if isinstance(system, Prepared):
+            if fingerprint(system.original) == system.fingerprint:
+                return system
+            system = system.original
+        _checked_system(system)
+        return _FORMS.get(fingerprint(system), partial(Prepared, system))
 
 
-def stated_start(system: Any) -> Array | None:
+def stated_start(system: System | Prepared) -> Array | None:
     """State at which a system says that it starts, or its blocks do, the rest of them at 0; None where none does."""
     return _filled(stated_states(system))
 
 
-def stated_states(system: Any) -> Array | None:
+def stated_states(system: System | Prepared) -> Array | None:
     """State at which a system or its blocks declare that they start, nan for those of other blocks."""
     if isinstance(system, Prepared):
         return system.stated
@@ -380,36 +312,11 @@ def stated_states(system: Any) -> Array | None:
     return np.concatenate([np.full(count, np.nan) if start is None else start for start, count in parts])
 
 
-def state_space(system: Any) -> Any:
+def state_space(system: System) -> System:
     """Same system with states, where it is a transfer function."""
     if not isinstance(system, ct.TransferFunction):
         return system
     return ct.ss(system, name=system.name, inputs=system.input_labels, outputs=system.output_labels)
-
-
-def fingerprint(system: Any) -> tuple[Any, ...]:
-    """What a run depends on: equal only where nothing has changed."""
-    own = (id(system), str(system.name), system.dt, _token(getattr(system, "params", None)))
-    labels = (tuple(system.input_labels or ()), tuple(system.output_labels or ()), tuple(system.state_labels or ()))
-    if isinstance(system, ct.InterconnectedSystem):
-        maps = tuple(np.asarray(m).tobytes() for m in (system.connect_map, system.input_map, system.output_map))
-        return (own, labels, maps, tuple(fingerprint(block) for block in system.syslist))
-    if isinstance(system, ct.StateSpace):
-        return (own, labels, tuple(np.asarray(m).tobytes() for m in (system.A, system.B, system.C, system.D)))
-    if isinstance(system, ct.TransferFunction):
-        return (own, labels, _frozen([system.num, system.den]))
-    # The functions themselves, not their addresses: those of the dead are given to others.
-    functions = tuple(_frozen(getattr(system, name, None)) for name in ("updfcn", "outfcn"))
-    # Traits are immutable and compared by identity.
-    traits = traits_of(system)
-    return (
-        own,
-        labels,
-        functions,
-        traits,
-        () if traits.block is None else fingerprint(traits.block),
-        _referred(system),
-    )
 
 
 def _filled(stated: Array | None) -> Array | None:
@@ -417,7 +324,7 @@ def _filled(stated: Array | None) -> Array | None:
     return None if stated is None else np.where(np.isnan(stated), 0.0, stated)
 
 
-def _checked_system(system: Any) -> Any:
+def _checked_system(system: System) -> System:
     if not isinstance(system, ct.InputOutputSystem):
         raise TypeError(f"system must be a control system, got {type(system).__name__}")
     states = 0 if isinstance(system, ct.TransferFunction) else system.nstates
@@ -429,38 +336,4 @@ def _checked_system(system: Any) -> Any:
     return system
 
 
-_recent: OrderedDict[tuple[Any, ...], Prepared] = OrderedDict()
-
-
-def _frozen(value: Any) -> Any:
-    """Something hashable that changes with a value."""
-    if isinstance(value, Mapping):
-        return tuple((key, _frozen(entry)) for key, entry in value.items())
-    if isinstance(value, list | tuple):
-        return tuple(_frozen(entry) for entry in value)
-    if isinstance(value, np.ndarray):
-        return value.shape, value.tobytes() if value.dtype != object else tuple(map(_frozen, value.ravel()))
-    try:
-        hash(value)
-    except TypeError:
-        return id(value)
-    return value
-
-
-def _referred(system: Any) -> tuple[Any, ...]:
-    """What the functions of a block refer to, where they may be compiled."""
-    traits = traits_of(system)
-    if traits.plan is not None or traits.delay is not None:
-        return ()
-    found = References(roots_of(system))
-    return found.tokens, found.cached
-
-
-def _token(value: Any) -> tuple[Any, ...]:
-    """Fingerprint of a parameter."""
-    return References([("params", value)]).tokens
-
-
-def _functions(system: Any) -> Iterator[Any]:
-    """Functions of a block that are called with its parameters."""
-    return filter(None, (system.outfcn, system.updfcn, traits_of(system).sample))
+_FORMS: Lru[tuple[object, ...], Prepared] = Lru(_KEPT)

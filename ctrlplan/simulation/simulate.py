@@ -3,30 +3,33 @@
 from __future__ import annotations
 
 import math
-import threading
 import warnings
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import partial
 from numbers import Real
-from typing import Any
+from typing import Literal
 
-import control as ct
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ctrlplan._checks import real_array
+from ctrlplan._renamed import outside_stacklevel
+from ctrlplan._types import System
+from ctrlplan.simulation import methods
 from ctrlplan.simulation.budget import begin_run
-from ctrlplan.simulation.drives import Inputs, driven_signals, input_drives
-from ctrlplan.simulation.events import Event, Occurrence, crossings
+from ctrlplan.simulation.events import Events, Occurrence, Watched, crossings
 from ctrlplan.simulation.interpreted import FeedthroughError
-from ctrlplan.simulation.job import Job, Record
+from ctrlplan.simulation.job import Job, Record, unused
+from ctrlplan.simulation.methods import Method
 from ctrlplan.simulation.prepared import Prepared, prepared_form
-from ctrlplan.simulation.runs import METHODS, recorded
-from ctrlplan.simulation.scales import RELATIVE
+from ctrlplan.simulation.response import SimulationResponse
+from ctrlplan.simulation.signals import Inputs, input_signals
 
 Array = NDArray[np.float64]
 
-DELEGATED = threading.RLock()
-"""One run by python-control at a time: it keeps the parameters of a run in the system."""
+MethodName = Literal["auto", "exact", "compiled", "python"]
+"""Methods of the package, and the choice among them."""
 
 _LONGEST = 1e15
 """Seconds after which a double cannot tell one microsecond from the next, by far."""
@@ -38,16 +41,17 @@ _NO_TIMEBASE = (
 
 
 def simulate(
-    system: Any,
+    system: System | Prepared,
     timepts: ArrayLike,
     inputs: Inputs = None,
     initial_state: ArrayLike | None = None,
-    method: str = "auto",
+    *,
+    method: MethodName = "auto",
     rtol: float = 1e-8,
     atol: float | None = None,
-    params: Mapping[str, Any] | None = None,
-    events: Sequence[Event] | None = None,
-) -> ct.TimeResponseData:
+    params: Mapping[str, object] | None = None,
+    events: Events = None,
+) -> SimulationResponse:
     """Response of a system to plans.
 
     A continuous linear system, interconnections and plan sources included, is
@@ -90,21 +94,22 @@ def simulate(
         depend on the sine of a huge angle, or on the like.
     params : mapping, optional
         Parameters of the blocks.
-    events : sequence of Event, optional
-        Limits of signals whose crossings are recorded, and may end the run.
+    events : sequence of Event or None, optional
+        Limits of signals whose crossings are recorded, and may end the run, in
+        addition to those that blocks declare, as a PID does. None, the default:
+        the declared ones alone. An empty sequence: none at all, not even those.
         Signals are evaluated at the sample times and at sixteen instants in a
         period of the loop's fastest oscillation: closer crossings need closer
-        sample times. Limits that blocks declare, as a PID does, are watched as
-        well, unless an empty sequence is given.
+        sample times.
 
     Returns
     -------
-    control.TimeResponseData
-        Labelled and ordered as python-control does, with the attributes
-        ``method`` and ``reason`` saying what ran and why, and ``events``, a
-        list of `Occurrence` in order of time. Where an event ended the run its
-        time is the last. Where an output is not accurate to 1e-6 of its range,
-        ``reason`` gives the estimate and the tolerance that would do.
+    SimulationResponse
+        A `control.TimeResponseData` with the fields ``method`` and ``reason``,
+        what ran and why, and ``events``, a list of `Occurrence` in order of
+        time. Where an event ended the run its time is the last. Where an output
+        is not accurate to 1e-6 of its range, ``reason`` gives the estimate and
+        the tolerance that suffices.
 
     Raises
     ------
@@ -148,44 +153,66 @@ def simulate(
     (and 300 for each segment between breakpoints and samples) have been spent
     and a block jumps, has an infinite slope or is random at that time.
     """
+    job = checked_job(system, timepts, inputs, initial_state, rtol, atol, params, events)
+    chosen = methods.named(methods.METHODS, method)
+    if method != "auto":
+        job = replace(job, reason=f'method "{method}" was requested')
+    _warn_of_unread(job)
+    if job.prepared.dt is None and job.prepared.nstates:
+        warnings.warn(_NO_TIMEBASE.format(job.prepared.name), UserWarning, stacklevel=outside_stacklevel())
+    return response_to(job, chosen)
+
+
+def checked_job(
+    system: System | Prepared,
+    timepts: ArrayLike,
+    inputs: Inputs = None,
+    initial_state: ArrayLike | None = None,
+    rtol: float = 1e-8,
+    atol: float | None = None,
+    params: Mapping[str, object] | None = None,
+    events: Events = None,
+) -> Job:
+    """Arguments of `simulate`, checked."""
     begin_run()
     times = real_array(timepts, "timepts")
     if times.ndim != 1 or times.size < 2 or not np.isfinite(times).all() or not np.all(np.diff(times) > 0):
         raise ValueError(f"timepts must be two or more finite times that increase strictly, got {timepts!r:.80}")
     if times[-1] - times[0] > _LONGEST:
         raise ValueError(f"timepts must span {_LONGEST:g} s at most, got {times[-1] - times[0]:g} s")
-    for label, value in (("rtol", rtol), ("atol", atol)):
-        number: Any = value
+    tolerances: tuple[tuple[str, object], ...] = (("rtol", rtol), ("atol", atol))
+    for label, value in tolerances:
         if value is None and label == "atol":
             continue
-        if isinstance(number, bool) or not isinstance(number, Real) or not 0.0 < float(number) < math.inf:
+        if isinstance(value, bool) or not isinstance(value, Real) or not 0.0 < float(value) < math.inf:
             raise ValueError(f"{label} must be a finite number above 0, got {value!r}")
-    if method not in METHODS:
-        raise ValueError(f"method must be one of {', '.join(METHODS)}, got {method!r}")
     prepared = prepared_form(system)
-    drives = input_drives(prepared.input_labels, inputs, times)
+    signals = input_signals(prepared.input_labels, inputs, times)
     state = _checked_state(prepared, initial_state)
-    _warn_of_idle(prepared, params or {})
-    if prepared.dt is None and prepared.nstates:
-        warnings.warn(_NO_TIMEBASE.format(prepared.name), UserWarning, stacklevel=2)
-    job = Job(prepared, times, drives, state, dict(params or {}), rtol, atol, events, prepared.network)
-    if prepared.network is None and prepared.linear is None and method in ("auto", "python"):
-        return _delegated(job)
+    return Job(prepared, times, signals, state, dict(params or {}), rtol, atol, events, prepared.network)
+
+
+def response_to(job: Job, chosen: Sequence[Method]) -> SimulationResponse:
+    """Response by the first of some methods that applies."""
+    spare = unused(job)
     try:
-        return _response(job, recorded(job, method))
-    except FeedthroughError:  # a loop that is none at the start: solved as one from now on
-        prepared.trials = False
-        return _response(job, recorded(job, method))
+        return _response(job, methods.recorded(job, chosen))
+    except FeedthroughError:  # no algebraic loop at the start, but later: solved as one from the start on
+        return _response(spare, methods.recorded(replace(spare, trials=False), chosen))
 
 
-def _warn_of_idle(prepared: Prepared, params: Mapping[str, Any]) -> None:
-    """Say which parameters are read by no block: they are misspelt."""
-    for name, value in params.items():
-        if np.ndim(value) == 0 and not prepared.reads(name, value):
-            warnings.warn(f"params {name!r} is read by no block of {prepared.name}", UserWarning, stacklevel=3)
+def _warn_of_unread(job: Job) -> None:
+    """Warn of parameters that no block reads: they are misspelt."""
+    for name, value in job.params.items():
+        if np.ndim(value) == 0 and not job.prepared.reads(name, value):
+            warnings.warn(
+                f"params {name!r} is read by no block of {job.prepared.name}",
+                UserWarning,
+                stacklevel=outside_stacklevel(),
+            )
 
 
-def _response(job: Job, record: Record) -> ct.TimeResponseData:
+def _response(job: Job, record: Record) -> SimulationResponse:
     """Response at the times asked for, up to the event that ends it."""
     prepared = job.prepared
     found = _occurrences(record)
@@ -196,8 +223,8 @@ def _response(job: Job, record: Record) -> ct.TimeResponseData:
         end = record.state_at(int(np.searchsorted(record.times, last, side="right")) - 1, last)
         times, states = np.append(times[times < last], last), np.column_stack([states[:, times < last], end])
         found = [occurrence for occurrence in found if occurrence.time <= last]
-    seen = record.see(times, states)
-    response = ct.TimeResponseData(
+    seen = record.snapshot(times, states)
+    return SimulationResponse(
         times,
         seen.y.reshape(len(prepared.output_labels), times.size),
         states,
@@ -210,44 +237,25 @@ def _response(job: Job, record: Record) -> ct.TimeResponseData:
         sysname=prepared.name,
         title=f"Response of {prepared.name}",
         plot_inputs=bool(len(seen.u)),
+        method=record.method,
+        reason=record.reason,
+        events=found,
     )
-    response.method, response.reason, response.events = record.method, record.reason, found
-    return response
 
 
 def _occurrences(record: Record) -> list[Occurrence]:
     """Every crossing of what was watched, in order of time."""
     if not record.watched:
         return []
-    seen, found = record.see(record.times, record.states), []
+    seen, found = record.snapshot(record.times, record.states), []
     for entry in record.watched:
-
-        def value_at(k: int, t: float, entry: Any = entry) -> float:
-            state = record.state_at(k, t)
-            return float(entry.value(record.see(np.array([t]), state[:, None]))[0])
-
-        found += crossings(entry, record.times, entry.value(seen), value_at)
+        found += crossings(entry, record.times, entry.value(seen), partial(_value_at, record, entry))
     return sorted(found, key=lambda occurrence: occurrence.time)
 
 
-def _delegated(job: Job) -> ct.TimeResponseData:
-    """Response by python-control, of what only it runs."""
-    prepared = job.prepared
-    warnings.warn(
-        f"{prepared.unsupported}: run by control.input_output_response, without events", UserWarning, stacklevel=3
-    )
-    with DELEGATED:
-        response = ct.input_output_response(
-            prepared.system,
-            job.times,
-            driven_signals(job.inputs, job.times) if job.inputs else 0,
-            job.state,
-            params=job.params or None,
-            solve_ivp_method="LSODA",
-            solve_ivp_kwargs={"rtol": job.rtol, "atol": RELATIVE if job.atol is None else job.atol},
-        )
-    response.method, response.reason, response.events = "python", prepared.unsupported, []
-    return response
+def _value_at(record: Record, entry: Watched, k: int, t: float) -> float:
+    """Watched signal at a time from times[k] of a record to the next."""
+    return float(entry.value(record.snapshot(np.array([t]), record.state_at(k, t)[:, None]))[0])
 
 
 def _checked_state(prepared: Prepared, initial_state: ArrayLike | None) -> Array:

@@ -7,9 +7,10 @@ from collections.abc import Callable, Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from ctrlplan._types import Params
 from ctrlplan.simulation.network import Block, Network
-from ctrlplan.simulation.trials import can_remember, trial_copy, values_of
-from ctrlplan.simulation.untouched import untouched
+from ctrlplan.symbolic.isolation import untouched
+from ctrlplan.symbolic.trials import can_remember, trial_copy, values_of
 
 Array = NDArray[np.float64]
 Values = Callable[[float, Array, Array], Array | None]
@@ -34,7 +35,7 @@ SMOOTHING = (
 )
 
 
-def unrepeatable(network: Network, params: dict[str, object], t: float, x: Array, w: Array) -> str:
+def unrepeatable(network: Network, params: Params, t: float, x: Array, w: Array) -> str:
     """Block that answers differently to equal arguments, in words; empty where none does.
 
     Parameters
@@ -59,7 +60,7 @@ def unrepeatable(network: Network, params: dict[str, object], t: float, x: Array
     return ""
 
 
-def cause(network: Network, params: dict[str, object], t: float, x: Array, w: Array, span: float) -> str:
+def cause(network: Network, params: Params, t: float, x: Array, w: Array, span: float) -> str:
     """What keeps a solver at a time and state, in words; empty where no block shows it.
 
     A jump, or an infinite slope, in one of the arguments of a block.
@@ -80,7 +81,7 @@ def cause(network: Network, params: dict[str, object], t: float, x: Array, w: Ar
     return ""
 
 
-def _continuous(network: Network, params: dict[str, object]) -> Iterator[tuple[int, Block, Values]]:
+def _continuous(network: Network, params: Params) -> Iterator[tuple[int, Block, Values]]:
     """Nonlinear continuous blocks, and their values on copies of what they remember."""
     for i, block in enumerate(network.blocks):
         if block.linear or block.driven or block.period is not None:
@@ -89,7 +90,7 @@ def _continuous(network: Network, params: dict[str, object]) -> Iterator[tuple[i
         yield i, block, _values(own, params)
 
 
-def _values(block: Block, params: dict[str, object]) -> Values:
+def _values(block: Block, params: Params) -> Values:
     output, update = block.output(params), block.update(params)
     states = bool(block.system.nstates)
 

@@ -16,8 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from ctrlplan._checks import real_array
 from ctrlplan.simulation import Prepared, SolverError, prepare
-from ctrlplan.simulation.prepared import NotCompiledError
-from ctrlplan.simulation.simulate import DELEGATED
+from ctrlplan.simulation.learned import NotCompiledError
+from ctrlplan.simulation.methods.delegated import DELEGATED
 from ctrlplan.studies.comparison import (
     Comparison,
     all_run,

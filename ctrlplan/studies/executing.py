@@ -7,7 +7,6 @@ import pickle
 import signal
 import threading
 from asyncio import CancelledError
-from collections import OrderedDict
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
@@ -20,8 +19,8 @@ from uuid import uuid4
 
 from tqdm import tqdm
 
+from ctrlplan._lru import Lru
 from ctrlplan.simulation.budget import time_limit
-from ctrlplan.simulation.recent import recent
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -283,7 +282,7 @@ class Shared(Generic[T]):
 
     def made(self, make: Callable[[T], R]) -> R:
         """What is made of the value, in this thread: kept, so that no two threads share it."""
-        return recent(_kept(), self._key, _KEPT, lambda: make(self._own()))
+        return _kept().get(self._key, lambda: make(self._own()))
 
     def _own(self) -> T:
         return pickle.loads(self._data) if self._data else self._value  # noqa: S301 (its own)
@@ -298,11 +297,11 @@ def _received(key: str, data: bytes, value: Any) -> Shared[Any]:
 _HERE = threading.local()
 
 
-def _kept() -> OrderedDict[Any, Any]:
+def _kept() -> Lru[str, Any]:
     """What this thread has made of shared values."""
     if not hasattr(_HERE, "kept"):
-        _HERE.kept = OrderedDict()
-    kept: OrderedDict[Any, Any] = _HERE.kept
+        _HERE.kept = Lru(_KEPT)
+    kept: Lru[str, Any] = _HERE.kept
     return kept
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import linprog
 
+from ctrlplan._types import System
 from ctrlplan.systems.output_cells import Problem, elevated, erosion, output_cells, seen_directions
 from ctrlplan.systems.polytope import Polytope, Rows
 from ctrlplan.trajectories.common import Frozen, checked_limits, checked_time, readonly
@@ -115,7 +116,7 @@ class AdmissibleSet(Frozen):
 
     def __init__(
         self,
-        loop: Any,
+        loop: System,
         limits: Limits,
         dt: float,
         *,
@@ -194,7 +195,9 @@ class AdmissibleSet(Frozen):
         return _inside(room, rise, 0.0 if least >= -self._margin else math.nan)
 
 
-def _problem(loop: Any, limits: Limits, references: Sequence[str] | None, disturbances: Mapping[str, float]) -> Problem:
+def _problem(
+    loop: System, limits: Limits, references: Sequence[str] | None, disturbances: Mapping[str, float]
+) -> Problem:
     if isinstance(loop, ct.TransferFunction):
         loop = ct.ss(loop, name=loop.name, inputs=loop.input_labels, outputs=loop.output_labels)
     if not isinstance(loop, ct.StateSpace):

@@ -6,19 +6,19 @@ import copy
 import re
 from collections.abc import Collection, Sequence
 from functools import partial
-from typing import Any
 
 import control as ct
 import numpy as np
 from control.statesp import LinearICSystem
 from numpy.typing import NDArray
 
+from ctrlplan._types import Params, System, Value
 from ctrlplan.traits import declare, traits_of
 
 Array = NDArray[np.float64]
 
 
-def expose_states(system: Any, name: str | None = None) -> Any:
+def expose_states(system: System, name: str | None = None) -> System:
     """Same system with its states among its outputs.
 
     Interconnections are made anew around blocks that put out their states, so
@@ -94,7 +94,7 @@ def state_signals(labels: Sequence[str]) -> list[str]:
     return found
 
 
-def _exposed(system: Any, names: Sequence[str]) -> Any:
+def _exposed(system: System, names: Sequence[str]) -> System:
     """System with its states put out under some names; the same object where it has none."""
     if not isinstance(system, ct.StateSpace | ct.NonlinearIOSystem):
         raise TypeError(f"system must be a control system with states, got {type(system).__name__}")
@@ -138,7 +138,7 @@ def _block(system: ct.NonlinearIOSystem, names: Sequence[str]) -> ct.NonlinearIO
 
 
 def _interconnection(system: ct.InterconnectedSystem, names: Sequence[str]) -> ct.InterconnectedSystem:
-    blocks: list[Any] = []
+    blocks: list[System] = []
     kept: list[int] = []
     states: list[int] = []
     first = 0
@@ -172,7 +172,7 @@ def _interconnection(system: ct.InterconnectedSystem, names: Sequence[str]) -> c
     return declare(found, initial_state=traits_of(system).initial_state)
 
 
-def _with_states(outputs: Any, t: Any, x: Any, u: Any, params: dict[str, Any]) -> Any:
+def _with_states(outputs: Value, t: Value, x: Value, u: Value, params: Params) -> Value:
     """Outputs of a block, then its states: of numbers or of symbols."""
     own = x if outputs is None else outputs(t, x, u, params)
     if isinstance(own, np.ndarray) and isinstance(x, np.ndarray):
@@ -180,7 +180,7 @@ def _with_states(outputs: Any, t: Any, x: Any, u: Any, params: dict[str, Any]) -
     return [*_entries(own), *_entries(x)]
 
 
-def _entries(values: Any) -> list[Any]:
+def _entries(values: Value) -> list[Value]:
     """Entries of a column: a list, an array, or a symbol of CasADi, which counts them by a method."""
     count = getattr(values, "numel", None)
     return [values[k] for k in range(count())] if count is not None else list(np.ravel(values))

@@ -9,7 +9,6 @@ import math
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import control as ct
 import control.flatsys as fs
@@ -17,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctrlplan._renamed import outside_stacklevel
+from ctrlplan._types import Params, System, Value
 from ctrlplan.systems.linear_flat import LinearMaps, is_linear, linear_maps
 from ctrlplan.trajectories import derivative_name
 from ctrlplan.trajectories.common import checked_labels, default_labels
@@ -34,7 +34,7 @@ _MUST = "static feedback must linearise flat_system"
 
 def create_flat_iosystem(
     flat_system: fs.FlatSystem,
-    poles: Sequence[Any],
+    poles: Sequence[Value],
     name: str = "flat_law",
     *,
     labels: Sequence[str] | str | None = None,
@@ -143,7 +143,7 @@ def create_flat_iosystem(
         raise ValueError(f"labels must not make references of the names of states, got {', '.join(shared)}")
     idle = np.zeros(plant.ninputs)
 
-    def law(t: float, x: Any, u: Any, params: dict[str, Any]) -> Any:
+    def law(t: float, x: Value, u: Value, params: Params) -> Value:
         # Below the last derivative the flag does not depend on the input.
         measured = plant.forward(u[len(references) :], idle)
         flag, first = [], 0
@@ -157,7 +157,7 @@ def create_flat_iosystem(
 
     regular = np.concatenate([*planned[0].flag, planned[0].x])
 
-    def law_off_zero(t: float, x: Any, u: Any, params: dict[str, Any]) -> Any:
+    def law_off_zero(t: float, x: Value, u: Value, params: Params) -> Value:
         # Blocks are first evaluated with all inputs zero, where this plant is singular: there the law is taken
         # elsewhere, and is 0. Without a condition, so that it can be traced.
         idles = math.prod(value == 0.0 for value in u)
@@ -270,7 +270,7 @@ def hurwitz_coefficients(poles: Sequence[complex], count: int, where: str = "") 
     return tuple(coefficients.real[:0:-1].tolist())
 
 
-def _gains(poles: Any, orders: Sequence[int]) -> list[tuple[float, ...]]:
+def _gains(poles: Value, orders: Sequence[int]) -> list[tuple[float, ...]]:
     """Coefficients of each flat output's polynomial."""
     if not np.iterable(poles):
         raise TypeError(f"poles must be one sequence for each flat output, got {poles!r}")
@@ -289,20 +289,20 @@ def _gains(poles: Any, orders: Sequence[int]) -> list[tuple[float, ...]]:
 class FlatPlant:
     """A flat system's maps at its own parameters."""
 
-    system: Any
+    system: System
     nstates: int
     ninputs: int
-    params: dict[str, Any]
+    params: Params
 
-    def forward(self, x: Any, u: Any) -> list[Any]:
+    def forward(self, x: Value, u: Value) -> list[Value]:
         """Flags of a state and an input."""
         return list(self.system.forward(x, u, self.params))
 
-    def reverse(self, flag: list[Any]) -> list[Any]:
+    def reverse(self, flag: list[Value]) -> list[Value]:
         """State and input of flags."""
         return [np.ravel(values) for values in self.system.reverse(flag, self.params)]
 
-    def rates(self, x: Array, u: Array) -> list[Any]:
+    def rates(self, x: Array, u: Array) -> list[Value]:
         """Rates of the states."""
         return [self.system.dynamics(0.0, x, u)]
 
@@ -326,14 +326,14 @@ class _LinearPlant(FlatPlant):
 
     maps: LinearMaps
 
-    def forward(self, x: Any, u: Any) -> list[Any]:
+    def forward(self, x: Value, u: Value) -> list[Value]:
         return self.maps.forward(x, u)
 
-    def reverse(self, flag: list[Any]) -> list[Any]:
+    def reverse(self, flag: list[Value]) -> list[Value]:
         return self.maps.reverse(flag)
 
 
-def checked_plant(flat_system: Any) -> FlatPlant:
+def checked_plant(flat_system: System) -> FlatPlant:
     """Maps of a flat system in continuous time, which has states and inputs."""
     if not isinstance(flat_system, fs.FlatSystem):
         raise TypeError(f"flat_system must be a control.flatsys.FlatSystem, got {type(flat_system).__name__}")
@@ -347,7 +347,7 @@ def checked_plant(flat_system: Any) -> FlatPlant:
     return FlatPlant(flat_system, n, m, dict(flat_system.params))
 
 
-def _finite(function: Callable[..., Any], *args: Any) -> list[Array] | None:
+def _finite(function: Callable[..., Value], *args: Value) -> list[Array] | None:
     """What a map returns, row by row, or None outside of its domain."""
     with np.errstate(all="raise", under="ignore"):
         try:

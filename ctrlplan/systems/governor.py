@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, NoReturn, Protocol, runtime_checkable
+from typing import NoReturn, Protocol, runtime_checkable
 
 import control as ct
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ctrlplan._types import EventName
+from ctrlplan._types import EventName, Params, System, Value
 from ctrlplan.systems.admissible import AdmissibleSet, Limits
 from ctrlplan.systems.exposed import state_signals
 from ctrlplan.systems.hybrid import checked_seconds, refuse_alone
-from ctrlplan.traits import Declared, declare
+from ctrlplan.traits import DeclaredTrait, declare
 from ctrlplan.trajectories.common import checked_time
 
 Array = NDArray[np.float64]
@@ -57,8 +57,8 @@ class Governor(ct.NonlinearIOSystem):  # type: ignore[misc]
         Reference before the first sample.
     """
 
-    period = Declared()
-    offset = Declared()
+    period = DeclaredTrait[float]()
+    offset = DeclaredTrait[float]()
 
     def __init__(self, admission: Admission, period: float, offset: float, initial: Array, name: str) -> None:
         references = list(admission.references)
@@ -85,7 +85,7 @@ class Governor(ct.NonlinearIOSystem):  # type: ignore[misc]
         )
         self._count = len(references)
 
-    def sample(self, t: float, x: Array, u: Array, params: dict[str, Any]) -> Array:
+    def sample(self, t: float, x: Array, u: Array, params: Params) -> Array:
         """States after a sample: the reference moved as far as is admissible."""
         n = self._count
         if not np.isfinite(u).all():
@@ -98,22 +98,22 @@ class Governor(ct.NonlinearIOSystem):  # type: ignore[misc]
         moved = asked if kappa == 1.0 else held + kappa * (asked - held)
         return np.array([*(moved - self.initial), kappa, 0.0, 0.0])
 
-    def _held(self, t: float, x: Any, u: Any, params: dict[str, Any]) -> Any:
+    def _held(self, t: float, x: Value, u: Value, params: Params) -> Value:
         return np.array([x[k] + value for k, value in enumerate(self.initial.tolist())])
 
-    def _no_rates(self, t: float, x: Any, u: Any, params: dict[str, Any]) -> NoReturn:
+    def _no_rates(self, t: float, x: Value, u: Value, params: Params) -> NoReturn:
         refuse_alone(self.name, "takes samples")
 
 
 def create_governor_iosystem(
-    loop: Any,
+    loop: System,
     dt: float | None = None,
     limits: Limits | None = None,
     *,
     initial: ArrayLike = 0.0,
     offset: float = 0.0,
     name: str = "governor",
-    **options: Any,
+    **options: Value,
 ) -> Governor:
     """Reference governor in front of a closed loop.
 
@@ -203,7 +203,7 @@ def create_governor_iosystem(
     return Governor(admission, period, start, np.broadcast_to(before, (count,)).copy(), name)
 
 
-def _admission(loop: Any, dt: float | None, limits: Limits | None, options: dict[str, Any]) -> Admission:
+def _admission(loop: System, dt: float | None, limits: Limits | None, options: dict[str, Value]) -> Admission:
     if isinstance(loop, ct.InputOutputSystem):
         if dt is None or limits is None:
             raise ValueError("dt and limits must be given beside a loop")
@@ -219,9 +219,9 @@ def _admission(loop: Any, dt: float | None, limits: Limits | None, options: dict
     return loop
 
 
-def _refused(t: Any, x: Any, u: Any, params: dict[str, Any]) -> Any:
+def _refused(t: Value, x: Value, u: Value, params: Params) -> Value:
     return x[-2]
 
 
-def _unread(t: Any, x: Any, u: Any, params: dict[str, Any]) -> Any:
+def _unread(t: Value, x: Value, u: Value, params: Params) -> Value:
     return x[-1]

@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from numbers import Real
-from typing import Any, NoReturn
+from typing import NoReturn
 
 import control as ct
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ctrlplan.traits import Declared, declare
+from ctrlplan._types import Params, System, Value
+from ctrlplan.traits import DeclaredTrait, declare
 
 Array = NDArray[np.float64]
 
@@ -27,11 +28,11 @@ class SampleHold(ct.NonlinearIOSystem):  # type: ignore[misc]
         It takes them at offset, offset + period, ... [s] after the run begins.
     """
 
-    block = Declared()
-    period = Declared()
-    offset = Declared()
+    block = DeclaredTrait[ct.InputOutputSystem]()
+    period = DeclaredTrait[float]()
+    offset = DeclaredTrait[float]()
 
-    def __init__(self, block: Any, period: float, offset: float, name: str) -> None:
+    def __init__(self, block: System, period: float, offset: float, name: str) -> None:
         held = [f"{label}_held" for label in block.output_labels]
         super().__init__(
             self._no_rates,
@@ -47,7 +48,7 @@ class SampleHold(ct.NonlinearIOSystem):  # type: ignore[misc]
         declare(self, block=block, period=period, offset=offset, sample=self.sample, feedthrough=False)
         self._inner = block.nstates or 0
 
-    def sample(self, t: float, x: Array, u: Array, params: dict[str, Any]) -> Array:
+    def sample(self, t: float, x: Array, u: Array, params: Params) -> Array:
         """States after a sample: the block's next ones, and the outputs that are held."""
         own = None if isinstance(self.block, ct.StateSpace) else params
         state = x[: self._inner]
@@ -55,10 +56,10 @@ class SampleHold(ct.NonlinearIOSystem):  # type: ignore[misc]
         following = np.ravel(self.block.dynamics(t, state, u, own)) if self._inner else np.empty(0)
         return np.concatenate([following, outputs])
 
-    def _held(self, t: float, x: Any, u: Any, params: dict[str, Any]) -> Any:
+    def _held(self, t: float, x: Value, u: Value, params: Params) -> Value:
         return x[self._inner :]
 
-    def _no_rates(self, t: float, x: Any, u: Any, params: dict[str, Any]) -> NoReturn:
+    def _no_rates(self, t: float, x: Value, u: Value, params: Params) -> NoReturn:
         refuse_alone(self.name, "takes samples")
 
 
@@ -73,18 +74,18 @@ class Delay(ct.NonlinearIOSystem):  # type: ignore[misc]
         What it puts out before anything has come through.
     """
 
-    delay = Declared()
-    initial = Declared()
+    delay = DeclaredTrait[float]()
+    initial = DeclaredTrait[ArrayLike]()
 
     def __init__(self, delay: float, initial: Array, inputs: list[str], outputs: list[str], name: str) -> None:
         super().__init__(None, self._past, inputs=inputs, outputs=outputs, dt=0, name=name)
         declare(self, delay=delay, initial=initial)
 
-    def _past(self, t: float, x: Any, u: Any, params: dict[str, Any]) -> NoReturn:
+    def _past(self, t: float, x: Value, u: Value, params: Params) -> NoReturn:
         refuse_alone(self.name, "has a memory of its input")
 
 
-def sample_hold(block: Any, dt: float, offset: float = 0.0, name: str | None = None) -> SampleHold:
+def sample_hold(block: System, dt: float, offset: float = 0.0, name: str | None = None) -> SampleHold:
     """Discrete-time block for a continuous loop, its outputs held between samples.
 
     python-control refuses to join the two kinds; the block that is returned
@@ -194,7 +195,7 @@ def create_delay_iosystem(
     return Delay(seconds, np.broadcast_to(before, (len(given),)).copy(), given, made, name)
 
 
-def checked_seconds(label: str, value: Any, positive: bool) -> float:
+def checked_seconds(label: str, value: Value, positive: bool) -> float:
     """Finite number of seconds, above 0 or from 0."""
     if isinstance(value, bool) or not isinstance(value, Real):
         raise TypeError(f"{label} must be a number of seconds, got {value!r}")

@@ -15,11 +15,13 @@ time constants are far apart.
 from __future__ import annotations
 
 from fractions import Fraction
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import control.flatsys as fs
 import numpy as np
 from numpy.typing import NDArray
+
+from ctrlplan._types import Value
 
 Array = NDArray[np.float64]
 Matrix = list[list[Fraction]]
@@ -36,11 +38,11 @@ class LinearMaps(NamedTuple):
     inputs: Array  # (1, n + 1), by z, ..., z^(n): a_0, ..., a_(n - 1), 1
     output: Array  # (n + 1,), by z, ..., z^(n)
 
-    def forward(self, x: Any, u: Any) -> list[Any]:
+    def forward(self, x: Value, u: Value) -> list[Value]:
         """Flag of a state and an input."""
         return [self.flag @ np.concatenate([x, u])]
 
-    def reverse(self, flag: list[Any]) -> list[Any]:
+    def reverse(self, flag: list[Value]) -> list[Value]:
         """State and input of a flag."""
         return [self.states @ flag[0][:-1], self.inputs @ flag[0]]
 
@@ -131,11 +133,11 @@ def _product(left: Matrix, right: Matrix) -> Matrix:
     return [[_dot(row, column) for column in columns] for row in left]
 
 
-def _dot(left: Any, right: Any) -> Fraction:
+def _dot(left: Value, right: Value) -> Fraction:
     return sum((x * y for x, y in zip(left, right, strict=True) if x and y), Fraction())
 
 
-def _fractions(matrix: Any) -> Matrix:
+def _fractions(matrix: Value) -> Matrix:
     return [[Fraction(value) for value in row] for row in np.asarray(matrix, dtype=float).tolist()]
 
 

@@ -6,13 +6,12 @@ import math
 from collections.abc import Sequence
 from functools import partial
 from numbers import Real
-from typing import Any
 
 import control as ct
 import numpy as np
 from numpy.typing import NDArray
 
-from ctrlplan._types import EventName
+from ctrlplan._types import EventName, Params, Value
 from ctrlplan.traits import declare
 
 Array = NDArray[np.float64]
@@ -69,7 +68,7 @@ def create_pid_iosystem(
     >>> create_pid_iosystem(3.0, 1.0, 2.0, 0.1).state_labels
     ['integral', 'filter']
     """
-    numbers: dict[str, Any] = {"kp": kp, "ki": ki, "kd": kd, "bias": bias, "tf": tf}
+    numbers: dict[str, Value] = {"kp": kp, "ki": ki, "kd": kd, "bias": bias, "tf": tf}
     for label, value in numbers.items():
         if isinstance(value, bool) or not isinstance(value, Real):
             raise TypeError(f"{label} must be a number, got {value!r}")
@@ -79,7 +78,7 @@ def create_pid_iosystem(
         raise ValueError(f"limits must be two numbers, got {limits!r}")
     if tracking_time is not None and not (math.isfinite(tracking_time) and tracking_time > 0.0):
         raise ValueError(f"tracking_time must be finite and above 0, got {tracking_time}")
-    names: dict[str, Any] = {
+    names: dict[str, Value] = {
         "inputs": list(inputs),
         "outputs": [output],
         "states": ["integral", "filter"],
@@ -97,14 +96,14 @@ def create_pid_iosystem(
 
     total = partial(_total, kp, kd / tf, bias)
 
-    def limited(value: Any) -> Any:
+    def limited(value: Value) -> Value:
         return value if limits is None else np.fmin(np.fmax(value, low), high)
 
-    def update(t: float, x: Any, u: Any, params: dict[str, Any]) -> Array:
+    def update(t: float, x: Value, u: Value, params: Params) -> Array:
         error, asked = u[0] - u[1], total(x, u)
         return np.array([ki * error + back * (limited(asked) - asked), (error - x[1]) / tf])
 
-    def out(t: float, x: Any, u: Any, params: dict[str, Any]) -> Array:
+    def out(t: float, x: Value, u: Value, params: Params) -> Array:
         return np.array([limited(total(x, u))])
 
     block = ct.nlsys(update, out, **names)
@@ -114,13 +113,13 @@ def create_pid_iosystem(
     return block
 
 
-def _total(kp: float, kd: float, bias: float, x: Any, u: Any) -> Any:
+def _total(kp: float, kd: float, bias: float, x: Value, u: Value) -> Value:
     """What is asked for, before the limits; kd over the filter's time constant."""
     error = u[0] - u[1]
     return bias + kp * error + x[0] + kd * (error - x[1])
 
 
-def _asked(kp: float, kd: float, bias: float, t: Any, x: Any, u: Any, params: dict[str, Any]) -> Any:
+def _asked(kp: float, kd: float, bias: float, t: Value, x: Value, u: Value, params: Params) -> Value:
     return _total(kp, kd, bias, x, u)
 
 

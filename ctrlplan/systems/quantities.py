@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import control.flatsys as fs
 import numpy as np
@@ -86,7 +85,7 @@ def quantities_of_flat_system(flat_system: fs.FlatSystem) -> Callable[[Array], d
             )
         known = len(jet) >= longest
         values = jet if known else np.concatenate([jet, np.zeros((1, *jet.shape[1:]))])
-        columns: list[Any] = []
+        columns: list[NDArray[np.generic]] = []
         with np.errstate(divide="ignore", invalid="ignore"):  # nan says the same
             for k in range(jet.shape[2]):
                 x, u = plant.reverse([values[:length, j, k] for j, length in enumerate(lengths)])

@@ -6,16 +6,16 @@ import itertools
 import math
 from collections.abc import Mapping
 from functools import partial
-from typing import Any, Literal, NoReturn
+from typing import Literal, NoReturn
 
 import control as ct
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ctrlplan._types import EventName
+from ctrlplan._types import EventName, Params, Value
 from ctrlplan.systems.hybrid import checked_seconds, refuse_alone
 from ctrlplan.systems.source import create_source_iosystem
-from ctrlplan.traits import Declared, declare
+from ctrlplan.traits import DeclaredTrait, declare
 from ctrlplan.trajectories import Trajectory
 from ctrlplan.trajectories.common import checked_count, checked_time
 from ctrlplan.trajectories.extrema import stationary_times
@@ -281,8 +281,8 @@ class _Signals:
 class _Correction(ct.NonlinearIOSystem):  # type: ignore[misc]
     """Jets of a plan plus those of the transition last fitted."""
 
-    period = Declared()
-    offset = Declared()
+    period = DeclaredTrait[float]()
+    offset = DeclaredTrait[float]()
 
     def __init__(
         self,
@@ -338,7 +338,7 @@ class _Correction(ct.NonlinearIOSystem):  # type: ignore[misc]
         if horizons.shrinking:
             self._arrival = _without_rounding(plan.jet(plan.end, order), np.array(self._scales)[:, None], self._range)
 
-    def sample(self, t: float, x: Array, u: Array, params: dict[str, Any]) -> Array:
+    def sample(self, t: float, x: Array, u: Array, params: Params) -> Array:
         """States after a fit, or where none is due the same."""
         after = x.copy()
         after[_LOST] = 0.0 if math.isfinite(sum(u.tolist())) else 1.0
@@ -427,7 +427,7 @@ class _Correction(ct.NonlinearIOSystem):  # type: ignore[misc]
                     return False
         return True
 
-    def _put_out(self, t: Any, x: Any, u: Any, params: dict[str, Any]) -> Array:
+    def _put_out(self, t: Value, x: Value, u: Value, params: Params) -> Array:
         added = itertools.chain.from_iterable(self._corrections(t, x, self._signals.put_out))
         return np.array([u[row] + value for row, value in zip(self._passed, added, strict=True)])
 
@@ -438,7 +438,7 @@ class _Correction(ct.NonlinearIOSystem):  # type: ignore[misc]
             return step @ x[self._fitted].reshape(-1, self._naxes)
         return np.array(self._corrections(t, x.tolist(), order)).T
 
-    def _corrections(self, t: Any, x: Any, order: int) -> list[list[Any]]:
+    def _corrections(self, t: Value, x: Value, order: int) -> list[list[Value]]:
         """Jets of the correction axis by axis, of numbers or of symbols."""
         live = t <= x[_END]
         now = (t if live else x[_END]) if isinstance(live, bool) else np.fmin(t, x[_END])
@@ -456,7 +456,7 @@ class _Correction(ct.NonlinearIOSystem):  # type: ignore[misc]
             found.append([value * live * math.factorial(k) + kept[k] for k, value in enumerate(row)])
         return found
 
-    def _no_rates(self, t: float, x: Any, u: Any, params: dict[str, Any]) -> NoReturn:
+    def _no_rates(self, t: float, x: Value, u: Value, params: Params) -> NoReturn:
         refuse_alone(self.name, "plans again every period")
 
 
@@ -467,7 +467,7 @@ def _without_rounding(jet: Array, scale: Array, size: float) -> Array:
     return np.where(small, 0.0, jet)
 
 
-def _state(row: int, t: Any, x: Any, u: Any, params: dict[str, Any]) -> Any:
+def _state(row: int, t: Value, x: Value, u: Value, params: Params) -> Value:
     return x[row]
 
 

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import control as ct
 import numpy as np
 from numpy.typing import NDArray
 
-from ctrlplan._types import EventName
+from ctrlplan._types import EventName, Params, Value
 from ctrlplan.traits import declare
 
 Array = NDArray[np.float64]
@@ -50,7 +49,7 @@ def create_saturation_iosystem(
     if not float(low) < float(high):
         raise ValueError(f"high must be above low, got {low} and {high}")
 
-    def out(t: float, x: Any, u: Any, params: dict[str, Any]) -> Any:
+    def out(t: float, x: Value, u: Value, params: Params) -> Value:
         return np.array([np.fmin(np.fmax(u[0], low), high)])
 
     block = ct.nlsys(None, out, inputs=[input], outputs=[output], dt=None, name=name)
@@ -59,5 +58,5 @@ def create_saturation_iosystem(
     return block
 
 
-def _asked(t: Any, x: Any, u: Any, params: dict[str, Any]) -> Any:
+def _asked(t: Value, x: Value, u: Value, params: Params) -> Value:
     return u[0]

@@ -9,16 +9,16 @@ Entries may be arrays, numbers, or the symbols of a tracer.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ctrlplan._types import Value
 from ctrlplan.trajectories.common import FACTORIALS
 
 Array = NDArray[np.float64]
 
-Quantity = Any
+Quantity = Value
 """What formulas of plants take: a number, an array, a Taylor series or a symbol of a tracer."""
 
 
@@ -155,13 +155,13 @@ class Taylor:
 Operand = Taylor | float | Array
 
 
-def _total(terms: Iterable[Any]) -> Any:
+def _total(terms: Iterable[Value]) -> Value:
     """Sum, 0 of none; no term is added to 0, which would copy it."""
     rest = iter(terms)
     return sum(rest, next(rest, 0.0))
 
 
-def _stacked(terms: list[Any]) -> Array:
+def _stacked(terms: list[Value]) -> Array:
     if isinstance(terms[0], np.ndarray | np.generic | float):
         return np.stack(terms)
     out = np.empty(len(terms), dtype=object)

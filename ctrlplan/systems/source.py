@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import control as ct
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ctrlplan.traits import Declared, declare
+from ctrlplan._types import Params
+from ctrlplan.traits import DeclaredTrait, declare
 from ctrlplan.trajectories import Trajectory
 from ctrlplan.trajectories.common import checked_count
 from ctrlplan.trajectories.files import signal_names, signal_rows
@@ -30,8 +29,8 @@ class PlanSource(ct.NonlinearIOSystem):  # type: ignore[misc]
         integrator should stop there.
     """
 
-    plan = Declared()
-    derivatives = Declared()
+    plan = DeclaredTrait[Trajectory]()
+    derivatives = DeclaredTrait[int]()
 
     def __init__(self, plan: Trajectory, derivatives: int, name: str, suffix: str) -> None:
         labels = signal_names([label + suffix for label in plan.labels], derivatives)
@@ -43,7 +42,7 @@ class PlanSource(ct.NonlinearIOSystem):  # type: ignore[misc]
         """Breakpoints of the plan."""
         return np.asarray(self.plan.breakpoints)
 
-    def _output(self, t: float, x: Array, u: Array, params: dict[str, Any]) -> Array:
+    def _output(self, t: float, x: Array, u: Array, params: Params) -> Array:
         return self.plan.jet(t, self.derivatives).T.ravel()
 
 

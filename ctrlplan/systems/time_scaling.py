@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import control as ct
 import numpy as np
 from numpy.typing import NDArray
 
+from ctrlplan._types import Params, Value
 from ctrlplan.traits import declare
 from ctrlplan.trajectories import Trajectory
 from ctrlplan.trajectories.combined import is_shaped
@@ -156,7 +156,7 @@ def create_time_scaling_iosystem(
     axes = [plan.labels.index(label) for label in bands]
     weights = _rate_weights(n, w)
 
-    def severity(t: Any, x: Any, u: Any) -> Any:
+    def severity(t: Value, x: Value, u: Value) -> Value:
         found = [_nearness(u[k], *bound) for k, bound in enumerate(bounds.values())]
         if bands:
             reference = _series(plan, t - x[0], 0)
@@ -167,13 +167,13 @@ def create_time_scaling_iosystem(
             worst = np.fmax(worst, value)
         return np.fmin(np.fmax(worst, 0.0), 1.0)
 
-    def update(t: Any, x: Any, u: Any, params: dict[str, Any]) -> Array:
+    def update(t: Value, x: Value, u: Value, params: Params) -> Array:
         free = np.fmin(np.fmax(1.0 + x[0] / horizon, least), most)
         wanted = least + (1.0 - severity(t, x, u)) * (free - least)
         slow = [1.0 - wanted, *(x[k] for k in range(1, n + 1))]
         return np.array([x[n], *(w * (slow[k] - slow[k + 1]) for k in range(n))])
 
-    def out(t: Any, x: Any, u: Any, params: dict[str, Any]) -> Array:
+    def out(t: Value, x: Value, u: Value, params: Params) -> Array:
         clock = [sum(weight * x[k + 1] for k, weight in enumerate(row)) for row in weights[:highest]]
         if clock:
             clock[0] = 1.0 + clock[0]
@@ -194,7 +194,7 @@ def create_time_scaling_iosystem(
     return declare(block, feedthrough=False, breakpoints=plan.breakpoints, longest=0.5 * _shortest_move(plan))
 
 
-def _series(plan: Trajectory, t: Any, order: int) -> list[list[Any]]:
+def _series(plan: Trajectory, t: Value, order: int) -> list[list[Value]]:
     """Series of a plan; nan of a loop that is lost, which the run then says."""
     if isinstance(t, float) and not math.isfinite(t):
         return [[math.nan] * (order + 1)] * plan.naxes
@@ -222,13 +222,13 @@ def _rate_weights(n: int, w: float) -> list[list[float]]:
     return rows
 
 
-def _nearness(value: Any, low: float, high: float, reach: float) -> Any:
+def _nearness(value: Value, low: float, high: float, reach: float) -> Value:
     """0 up to `reach` inside the limits, 1 at a limit."""
     distance = np.fmin(value - low, high - value)
     return 1.0 - distance / reach
 
 
-def _checked_limits(label: str, pair: Any, margin: float) -> tuple[float, float, float]:
+def _checked_limits(label: str, pair: Sequence[float], margin: float) -> tuple[float, float, float]:
     """Limits, and the distance from them within which the rate falls."""
     low, high, size = checked_limits(pair, f"limits of {label}")
     both = math.isfinite(low) and math.isfinite(high)
@@ -237,7 +237,7 @@ def _checked_limits(label: str, pair: Any, margin: float) -> tuple[float, float,
     return low, high, margin * (2.0 * size if both else size)
 
 
-def _checked_band(label: str, pair: Any, plan: Trajectory) -> tuple[float, float]:
+def _checked_band(label: str, pair: Sequence[float], plan: Trajectory) -> tuple[float, float]:
     if label not in plan.labels:
         raise ValueError(f"errors must name axes of the plan, {', '.join(plan.labels)}, got {label!r}")
     soft, hard = checked_pair(pair, f"errors of {label}")

@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from numbers import Real
-from typing import Any, NoReturn, Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ctrlplan._checks import real_array
+from ctrlplan._types import Frozen as Frozen
 
 Array = NDArray[np.float64]
 
@@ -19,28 +20,6 @@ FACTORIALS.flags.writeable = False
 
 MOST = 100
 """Highest order of a derivative, and highest degree."""
-
-
-class Frozen:
-    """Base of the public objects: attributes are set by the constructor only."""
-
-    def __setattr__(self, name: str, value: object) -> NoReturn:
-        raise AttributeError(f"{type(self).__name__} is immutable; make a new one instead of setting {name}")
-
-    def __delattr__(self, name: str) -> NoReturn:
-        raise AttributeError(f"{type(self).__name__} is immutable; {name} cannot be deleted")
-
-    def __copy__(self) -> Self:
-        return self
-
-    def __deepcopy__(self, memo: dict[int, Any]) -> Self:
-        return self
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        for value in state.values():
-            if isinstance(value, np.ndarray):
-                value.flags.writeable = False
-        self.__dict__.update(state)
 
 
 def readonly(values: Array) -> Array:

@@ -101,7 +101,7 @@ def test_nonlinear_loop_beside_input_output_response(benchmark, capsys, tight):
         return cp.simulate(ready, T, method="compiled", rtol=RTOL, atol=ATOL)
 
     def built():
-        prepared._recent.clear()
+        prepared._FORMS.clear()
         return cp.simulate(crane_loop(), T, method="compiled", rtol=RTOL, atol=ATOL)
 
     def interpreted():

@@ -7,10 +7,10 @@ import pytest
 
 import ctrlplan as cp
 from ctrlplan.simulation import compiled as compiled_module
-from ctrlplan.simulation.compared import Compared, telling_states
+from ctrlplan.symbolic.comparison import Compared, telling_states
 
 ca = pytest.importorskip("casadi")
-switches_module = pytest.importorskip("ctrlplan.simulation.switches")
+switches_module = pytest.importorskip("ctrlplan.symbolic.switches")
 
 OSCILLATION = np.pi * np.arange(13)
 """Times at which sin is 0."""

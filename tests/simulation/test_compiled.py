@@ -12,8 +12,8 @@ from scipy.integrate import solve_ivp
 from scipy.special import expit
 
 import ctrlplan as cp
-from ctrlplan.simulation import prepared as prepared_module
-from ctrlplan.simulation import traced as traced_module
+from ctrlplan.symbolic import extra
+from ctrlplan.symbolic import tracing as traced_module
 
 METHODS = ("compiled", "python")
 RISE = np.polynomial.Polynomial([0, 0, 0, 0, 0, 126, -420, 540, -315, 70])
@@ -765,7 +765,7 @@ def test_a_table_with_the_state_as_its_key():
 
 
 def test_without_casadi_python_runs_and_says_what_to_install(monkeypatch):
-    monkeypatch.setattr(prepared_module, "find_spec", lambda name: None)
+    monkeypatch.setattr(extra, "find_spec", lambda name: None)
     block = ct.nlsys(lambda t, x, u, p: -(x**3), None, inputs=0, outputs=1, states=1, name="uncompiled")
     found = cp.simulate(block, T, None, 1.0)
     assert found.method == "python"
@@ -809,7 +809,7 @@ def test_one_compiled_form_for_all_values(monkeypatch):
             assert found.method == "compiled"
             assert np.abs(found.states[0] - start / np.sqrt(1 + 2 * k * start**2 * T)).max() <= 1e-6
     assert calls == ["cubic"]
-    assert len(ready._compiled) == 1
+    assert len(ready._learned.forms) == 1
 
 
 def test_one_compiled_form_for_all_plans_and_times(monkeypatch):

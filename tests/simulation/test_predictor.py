@@ -9,7 +9,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import ctrlplan as cp
-from ctrlplan.simulation import predictor as module
+from ctrlplan.symbolic import extra
 
 
 def rates(x, r):
@@ -137,7 +137,7 @@ def test_a_prediction_that_fails_is_not_admissible(law):
 def test_without_casadi_python_says_the_same(monkeypatch):
     predictor = cp.Predictor(pendulum(), {"torque": (-10.0, 10.0)}, 8.0)
     compiled = predictor.fraction([0.0, 0.0], [0.0], [1.0])
-    monkeypatch.setattr(module, "find_spec", lambda name: None)
+    monkeypatch.setattr(extra, "find_spec", lambda name: None)
     assert importlib.util.find_spec("casadi") is not None
     assert predictor.fraction([0.0, 0.0], [0.0], [1.0]) == compiled
 

@@ -50,7 +50,7 @@ def test_methods(method):
         (TWO, {"r": PLAN, "y": 0.1}, "inputs must be among r, d, got 'y'"),
         (LOOP, cp.stack([PLAN, PLAN], ["a", "b"]), r"inputs must have 1 axes \(r\), got 2"),
         (TWO, PLAN, r"inputs must have 2 axes \(r, d\), got 1"),
-        (TWO, {"d": cp.stack([PLAN, PLAN], ["a", "b"])}, "input d must be driven by one axis, got 2"),
+        (TWO, {"d": cp.stack([PLAN, PLAN], ["a", "b"])}, "input d must be a trajectory of one axis, got 2"),
         (TWO, {"d": T[:-1]}, r"input d must be .*11 samples, got shape \(10,\)"),
         (TWO, {"d": np.ones((2, 11))}, r"input d must be .*got shape \(2, 11\)"),
         (TWO, np.ones((3, 11)), r"inputs must have shape \(2, 11\), got \(3, 11\)"),

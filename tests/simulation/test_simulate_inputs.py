@@ -168,13 +168,13 @@ def test_many_samples_beside_a_plan_that_comes_to_rest(count, method):
 
 
 def test_samples_on_a_line_do_not_bend_by_rounding():
-    from ctrlplan.simulation.drives import SampledDrive
+    from ctrlplan.simulation.signals import SampledSignal
 
     t = np.linspace(0.3, 7.0, 5001)
-    assert SampledDrive(t, 1.0 + t / 3.0).breakpoints.size == 0
+    assert SampledSignal(t, 1.0 + t / 3.0).breakpoints.size == 0
     bent = np.where(t < t[2000], 1.0 + t / 3.0, 1.0 + t[2000] / 3.0 + (1 / 3 + 1e-9) * (t - t[2000]))
-    assert t[2000] in SampledDrive(t, bent).breakpoints
-    assert np.array_equal(SampledDrive(t, bent).at(t)[0], bent)
+    assert t[2000] in SampledSignal(t, bent).breakpoints
+    assert np.array_equal(SampledSignal(t, bent).at(t)[0], bent)
 
 
 def test_a_list_holds_what_each_input_takes():

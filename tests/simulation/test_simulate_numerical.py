@@ -257,7 +257,7 @@ def test_the_reason_names_what_ran_and_why():
     plan = both(*MOVE, 1.0)[0]
     assert cp.simulate(loop, T, plan).method == "exact"
     asked = cp.simulate(loop, T, plan, method="python")
-    assert (asked.method, asked.reason) == ("python", 'method "python" was asked for')
+    assert (asked.method, asked.reason) == ("python", 'method "python" was requested')
     assert cp.simulate(loop, T, np.sin(T)).method == "exact"
     bent = cp.simulate(saturated(), T, plan)
     assert bent.method == "compiled"

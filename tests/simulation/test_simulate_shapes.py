@@ -72,7 +72,7 @@ def test_shapes(name, method, squeeze, monkeypatch):
     if squeeze is not None:
         monkeypatch.setitem(ct.config.defaults, "control.squeeze_time_response", squeeze)
     found, peer, plan = pair(name, method, squeeze)
-    assert type(found) is type(peer)
+    assert isinstance(found, type(peer))
     assert found.outputs.shape == peer.outputs.shape
     assert found.states.shape == peer.states.shape
     assert np.array_equal(found.time, T)

@@ -20,7 +20,7 @@ import pytest
 from scipy.interpolate import CubicSpline
 
 import ctrlplan as cp
-from ctrlplan.simulation.fingerprint import References
+from ctrlplan.symbolic.references import References
 
 T = np.linspace(0.0, 2.0, 9)
 
@@ -456,7 +456,7 @@ def test_what_a_parameter_refers_to_may_change(where):
 
 def test_one_form_while_nothing_changes(monkeypatch):
     """An object with parts of no use to the equations, a property and a matrix: traced once."""
-    from ctrlplan.simulation import traced as traced_module
+    from ctrlplan.symbolic import tracing as traced_module
 
     traces = []
     plain = traced_module.traced

@@ -13,7 +13,7 @@ import ctrlplan as cp
 from ctrlplan.simulation.network import Block
 
 ca = pytest.importorskip("casadi")
-symbols = pytest.importorskip("ctrlplan.simulation.symbols")
+symbols = pytest.importorskip("ctrlplan.symbolic.symbols")
 
 MATRIX = np.array([[1.0, -2.0, 0.5], [0.25, 3.0, -1.0]])
 
@@ -239,7 +239,7 @@ def test_while_a_block_is_traced_casadi_is_as_it_was():
 
 def trace_of(system, params):
     """Trace of a block, whatever its parameters refer to."""
-    from ctrlplan.simulation import traced as module
+    from ctrlplan.symbolic import tracing as module
 
     block = Block(system, dict(system.params))
     points = list(module._points(block, params, 0.0, np.ones(1), np.zeros(0)))
@@ -273,7 +273,7 @@ def test_threads_share_a_prepared_form():
     with ThreadPoolExecutor(8) as executor:
         runs = executor.map(lambda n: (n, cp.simulate(ready, np.linspace(0.0, 3.0, n), PLAN).outputs), counts * 8)
         assert all(np.array_equal(found, alone[n]) for n, found in runs)
-    assert len(ready._compiled) == 1
+    assert len(ready._learned.forms) == 1
 
 
 def test_a_sweep_in_threads_leaves_casadi_as_it_was():

@@ -250,7 +250,7 @@ LOGS = [log for name, log in sorted(globals().items()) if name.startswith("log_"
 @pytest.mark.parametrize("log", LOGS, ids=lambda log: log.__name__)
 def test_what_is_written_and_never_read_does_not_matter(monkeypatch, log):
     """Trials do not count; the form is kept though the counter moves on."""
-    from ctrlplan.simulation import traced as traced_module
+    from ctrlplan.symbolic import tracing as traced_module
 
     traces = []
     plain = traced_module.traced
@@ -305,7 +305,7 @@ def test_a_block_with_two_values_for_equal_arguments_is_named():
 def test_global_random_generators_are_found_as_they_were():
     """Trials of a block whose function draws through a library: the next numbers are those without it."""
     from ctrlplan.simulation.network import Block
-    from ctrlplan.simulation.traced import NotTraceableError, traced
+    from ctrlplan.symbolic.tracing import NotTraceableError, traced
 
     def update(t, x, u, p):
         return [-x[0] + 1e-9 * stats.norm.rvs()]

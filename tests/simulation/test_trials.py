@@ -2,6 +2,7 @@
 
 import math
 import random
+import types
 
 import control as ct
 import numpy as np
@@ -240,3 +241,61 @@ def test_random_generators_are_found_as_they_were():
                 np.random.normal(), random.random()  # noqa: NPY002
         drawn.append((np.random.normal(), random.random()))  # noqa: NPY002
     assert drawn[0] == drawn[1]
+
+
+# Copies and keepers: what each can do and the other cannot
+
+
+def counting(box):
+    """Block that counts its calls in an attribute of a module."""
+
+    def out(t, x, u, params):
+        box.calls = box.calls + 1
+        return [u[0]]
+
+    return ct.nlsys(None, out, inputs="u", outputs="y", name="counting", dt=0)
+
+
+def test_a_keeper_puts_back_what_stands_in_a_module():
+    from ctrlplan.symbolic.fingerprint import roots_of
+    from ctrlplan.symbolic.keeper import Keeper
+    from ctrlplan.symbolic.references import References
+
+    box = types.ModuleType("box")
+    box.calls = 7
+    system = counting(box)
+    keeper = Keeper(References(roots_of(system)))
+    system.outfcn(0.0, np.empty(0), np.ones(1), {})
+    assert box.calls == 8
+    assert "calls" in [key for _, key in keeper.changes()]
+    keeper.restore()
+    assert box.calls == 7
+    assert keeper.changes() == []
+
+
+def test_a_copy_draws_what_the_block_will_draw_and_a_keeper_says_that_it_cannot():
+    from ctrlplan.symbolic.fingerprint import roots_of
+    from ctrlplan.symbolic.references import References
+    from ctrlplan.symbolic.trials import trial_copy
+
+    generator = np.random.default_rng(3)
+    system = ct.nlsys(None, lambda t, x, u, p: [generator.normal()], inputs="u", outputs="y", name="noise", dt=0)
+    assert "random numbers" in References(roots_of(system)).opaque
+    copied = [trial_copy(system).outfcn(0.0, [], [0.0], {}) for _ in range(2)]
+    assert copied[0] == copied[1] == system.outfcn(0.0, [], [0.0], {})
+
+
+def test_two_memories_at_one_time():
+    from ctrlplan.symbolic.trials import trial_copy
+
+    total = [0.0]
+
+    def out(t, x, u, params):
+        total[0] += u[0]
+        return [total[0]]
+
+    system = ct.nlsys(None, out, inputs="u", outputs="y", name="sum", dt=0)
+    system.outfcn(0.0, [], [1.0], {})
+    other = trial_copy(system)
+    assert [system.outfcn(0.0, [], [1.0], {}), other.outfcn(0.0, [], [10.0], {})] == [[2.0], [11.0]]
+    assert [system.outfcn(0.0, [], [1.0], {}), other.outfcn(0.0, [], [10.0], {})] == [[3.0], [21.0]]

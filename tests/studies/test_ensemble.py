@@ -13,8 +13,9 @@ from scipy import stats
 from scipy.integrate import solve_ivp
 
 import ctrlplan as cp
-from ctrlplan.simulation import compiled, prepared, traced
+from ctrlplan.simulation import compiled, prepared
 from ctrlplan.studies.ensemble import LEVELS, ensemble
+from ctrlplan.symbolic import tracing as traced
 
 TIMES = np.linspace(0.0, 10.0, 501)
 PLANS = {"step": cp.Step(1.0), "ramp": cp.PolySpline([cp.Waypoint(0, 0), cp.Waypoint(1, 1)])}

@@ -75,7 +75,7 @@ def test_the_same_system_with_its_states(name, method):
     n, p = exposed.nstates, plain.noutputs
     assert exposed.output_labels == [*plain.output_labels, *state_signals(exposed.state_labels)]
     start = 0.1 * np.arange(1, n + 1)
-    one, two = (cp.simulate(s, TIMES, PLAN, start, method, **TIGHT) for s in (plain, exposed))
+    one, two = (cp.simulate(s, TIMES, PLAN, start, method=method, **TIGHT) for s in (plain, exposed))
     assert one.method == two.method
     assert np.abs(two.y[:p] - one.y).max() <= 1e-8
     assert np.array_equal(two.y[p:], two.x)

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
+from ctrlplan._types import Params, Value
 from ctrlplan.flatness import FlatSystem
 from ctrlplan.systems.plants.parameters import check_parameters, overruled
 
@@ -70,15 +69,15 @@ def dc_motor(
     R, L, K, J, b = resistance, inductance, motor_constant, inertia, friction
     own = {**parameters, "friction": friction}
 
-    def update(t: float, x: Any, u: Any, params: dict[str, Any]) -> Any:
+    def update(t: float, x: Value, u: Value, params: Params) -> Value:
         R, L, K, J, b = overruled(own, params)
         return np.array([x[1], (K * x[2] - b * x[1]) / J, (u[0] - R * x[2] - K * x[1]) / L])
 
-    def forward(x: Any, u: Any, params: Any = None) -> list[Any]:
+    def forward(x: Value, u: Value, params: Params | None = None) -> list[Value]:
         _, second, current_rate = update(0.0, x, u, {})
         return [np.array([x[0], x[1], second, (K * current_rate - b * second) / J])]
 
-    def reverse(flag: Any, params: Any = None) -> tuple[Any, Any]:
+    def reverse(flag: Value, params: Params | None = None) -> tuple[Value, Value]:
         angle, speed, second, third = flag[0]
         current = (J * second + b * speed) / K
         voltage = L * (J * third + b * second) / K + R * current + K * speed

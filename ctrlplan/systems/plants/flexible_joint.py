@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
+from ctrlplan._types import Params, Value
 from ctrlplan.flatness import FlatSystem
 from ctrlplan.systems.plants.parameters import check_parameters, overruled
 
@@ -76,20 +75,20 @@ def flexible_joint(
 
     own = {**parameters, "gravity": gravity}
 
-    def update(t: float, x: Any, u: Any, params: dict[str, Any]) -> Any:
+    def update(t: float, x: Value, u: Value, params: Params) -> Value:
         I, J, k, m, l, g = overruled(own, params)  # noqa: E741
         weight = m * g * l
         spring = k * (x[1] - x[0])
         return np.array([x[2], x[3], (spring - weight * np.sin(x[0])) / I, (u[0] - spring) / J])
 
-    def forward(x: Any, u: Any, params: Any = None) -> list[Any]:
+    def forward(x: Value, u: Value, params: Params | None = None) -> list[Value]:
         rate, motor_rate, second, motor_second = update(0.0, x, u, {})
         s, c = np.sin(x[0]), np.cos(x[0])
         third = (k * (motor_rate - rate) - weight * c * rate) / I
         fourth = (k * (motor_second - second) - weight * (c * second - s * rate * rate)) / I
         return [np.array([x[0], rate, second, third, fourth])]
 
-    def reverse(flag: Any, params: Any = None) -> tuple[Any, Any]:
+    def reverse(flag: Value, params: Params | None = None) -> tuple[Value, Value]:
         angle, rate, second, third, fourth = flag[0]
         s, c = np.sin(angle), np.cos(angle)
         motor = angle + (I * second + weight * s) / k

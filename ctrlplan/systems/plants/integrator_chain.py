@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
+from ctrlplan._types import Params, Value
 from ctrlplan.flatness import FlatSystem
 from ctrlplan.trajectories import derivative_name
 from ctrlplan.trajectories.common import checked_count, default_labels
@@ -45,13 +44,13 @@ def integrator_chain(order: int, axes: int = 1, name: str = "integrator_chain") 
     """
     r, count = checked_count(order, "order", 1), checked_count(axes, "axes", 1)
 
-    def forward(x: Any, u: Any, params: Any = None) -> list[Any]:
+    def forward(x: Value, u: Value, params: Params | None = None) -> list[Value]:
         return [np.array([*x[r * i : r * (i + 1)], u[i]]) for i in range(count)]
 
-    def reverse(flag: Any, params: Any = None) -> tuple[Any, Any]:
+    def reverse(flag: Value, params: Params | None = None) -> tuple[Value, Value]:
         return np.array([value for row in flag for value in row[:r]]), np.array([row[r] for row in flag])
 
-    def update(t: float, x: Any, u: Any, params: dict[str, Any]) -> Any:
+    def update(t: float, x: Value, u: Value, params: Params) -> Value:
         return np.array([value for row in forward(x, u, params) for value in row[1:]])
 
     states = [derivative_name(label, k) for label in default_labels(count) for k in range(r)]

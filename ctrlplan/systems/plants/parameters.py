@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from numbers import Real
-from typing import Any
+
+from ctrlplan._types import Params, Value
 
 
-def check_parameters(positive: Mapping[str, Any], not_negative: Mapping[str, Any]) -> None:
+def check_parameters(positive: Params, not_negative: Params) -> None:
     """Refuse parameters that are no finite numbers above 0, or of the second kind at least 0.
 
     Raises
@@ -27,7 +27,7 @@ def check_parameters(positive: Mapping[str, Any], not_negative: Mapping[str, Any
             raise ValueError(f"{name} must be finite and {least}, got {value}")
 
 
-def overruled(own: Mapping[str, Any], params: Mapping[str, Any] | None) -> tuple[Any, ...]:
+def overruled(own: Params, params: Params | None) -> tuple[Value, ...]:
     """A plant's own parameters in order, each overruled by the parameter of a run of its name."""
     given = params or {}
     return tuple(given.get(name, value) for name, value in own.items())

@@ -5,21 +5,24 @@ A trace counts only after it has agreed with Python.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Protocol
 
 import casadi as ca
+import control as ct
 import numpy as np
 from numpy.typing import NDArray
 
-from ctrlplan.simulation.fingerprint import Keeper, References, roots_of
-from ctrlplan.simulation.network import Block
-from ctrlplan.simulation.symbols import Symbol, column_of, symbol_array
-from ctrlplan.simulation.untouched import same_answer, tried, untouched
+from ctrlplan._types import BlockMap, Params, Value
+from ctrlplan.symbolic.fingerprint import roots_of
+from ctrlplan.symbolic.isolation import same_answer, tried, untouched
+from ctrlplan.symbolic.keeper import Keeper
+from ctrlplan.symbolic.references import References
+from ctrlplan.symbolic.symbols import Symbol, column_of, symbol_array
 
 Array = NDArray[np.float64]
-Point = tuple[Any, Array, Array, dict[str, Any]]
+Point = tuple[float, Array, Array, Params]
 """Time, state and input of a block, and parameters."""
 Answer = tuple[Array, Array]
 """Outputs and rates of a block."""
@@ -38,6 +41,28 @@ class NotTraceableError(ValueError):
     """A block that CasADi's symbols cannot go through; it is named."""
 
 
+class Traceable(Protocol):
+    """Block that can be traced: a python-control system and the parameters that reach it."""
+
+    @property
+    def name(self) -> str:
+        """Name in messages."""
+
+    @property
+    def system(self) -> ct.NonlinearIOSystem:
+        """The system itself."""
+
+    @property
+    def params(self) -> Params:
+        """Its parameters, before those of a run."""
+
+    def output(self, params: Params) -> BlockMap:
+        """Outputs, at the parameters of a run."""
+
+    def update(self, params: Params) -> BlockMap:
+        """Rates of the states, at the parameters of a run."""
+
+
 @dataclass(frozen=True, eq=False)
 class Trace:
     """Outputs and rates of a block as functions of (t, x, u, p).
@@ -50,8 +75,8 @@ class Trace:
         Parameters that are the entries of p; the others are constants in the functions.
     """
 
-    output: Any
-    update: Any
+    output: ca.Function
+    update: ca.Function
     symbols: tuple[str, ...]
 
     def depends_on_time(self) -> bool:
@@ -67,7 +92,7 @@ class Trace:
         return found
 
 
-def traced(block: Block, params: Mapping[str, Any], t: float, x: Array, u: Array) -> Trace:
+def traced(block: Traceable, params: Params, t: float, x: Array, u: Array) -> Trace:
     """Trace a block and compare with Python about a time, a state and an input.
 
     What the block's functions refer to is left as it was; a block that cannot
@@ -80,7 +105,7 @@ def traced(block: Block, params: Mapping[str, Any], t: float, x: Array, u: Array
         block is random or has memory.
     """
     values = {**block.params, **params}
-    keeper = callable_references([block], params).keeper()
+    keeper = Keeper(callable_references([block], params))
     try:
         with untouched():
             known = _known(block, list(_points(block, values, t, x, u)))
@@ -95,7 +120,7 @@ def traced(block: Block, params: Mapping[str, Any], t: float, x: Array, u: Array
 
 
 def _is_log_only(
-    block: Block, values: dict[str, Any], trace: Trace, known: list[tuple[Point, Answer]], keeper: Keeper
+    block: Traceable, values: Params, trace: Trace, known: list[tuple[Point, Answer]], keeper: Keeper
 ) -> bool:
     """Whether what a block writes, such as a log or a counter of its calls, has no influence on its values.
 
@@ -111,7 +136,7 @@ def _is_log_only(
     return traces[1] is not None and not _disagreement(traces[1], known)
 
 
-def callable_references(blocks: Iterable[Block], params: Mapping[str, Any]) -> References:
+def callable_references(blocks: Iterable[Traceable], params: Params) -> References:
     """What blocks refer to that can be called and put back as they were.
 
     Raises
@@ -130,16 +155,16 @@ def callable_references(blocks: Iterable[Block], params: Mapping[str, Any]) -> R
     return References(roots)
 
 
-def agrees(block: Block, trace: Trace, params: Mapping[str, Any], t: Array, x: Array, u: Array) -> str:
+def agrees(block: Traceable, trace: Trace, params: Params, t: Array, x: Array, u: Array) -> str:
     """What is wrong with a trace at times (n,), states (nstates, n) and inputs (ninputs, n); empty where nothing."""
     values = {**block.params, **params}
-    points = [(t[k], x[:, k], u[:, k], values) for k in range(t.size)]
+    points: list[Point] = [(t[k], x[:, k], u[:, k], values) for k in range(t.size)]
     with untouched():
         known = [(point, found) for point in points if (found := _finite(block, point)) is not None]
     return _disagreement(trace, known)
 
 
-def _known(block: Block, points: list[Point]) -> list[tuple[Point, Answer]]:
+def _known(block: Traceable, points: list[Point]) -> list[tuple[Point, Answer]]:
     """Points inside the block's domain with Python's values, which are the same in a second call."""
     first = [_finite(block, point) for point in points]
     again = [_finite(block, point) for point in points[::_AGAIN]]
@@ -153,7 +178,7 @@ def _known(block: Block, points: list[Point]) -> list[tuple[Point, Answer]]:
     return known
 
 
-def _agreed(block: Block, values: dict[str, Any], known: list[tuple[Point, Answer]]) -> Trace:
+def _agreed(block: Traceable, values: Params, known: list[tuple[Point, Answer]]) -> Trace:
     """Trace that agrees with Python, numbers among the parameters as symbols if that can be."""
     numbers = tuple(
         key for key, value in values.items() if np.ndim(value) == 0 and np.asarray(value).dtype.kind in "iuf"
@@ -176,7 +201,7 @@ def _agreed(block: Block, values: dict[str, Any], known: list[tuple[Point, Answe
     )
 
 
-def _points(block: Block, values: dict[str, Any], t: float, x: Array, u: Array) -> Iterator[Point]:
+def _points(block: Traceable, values: Params, t: float, x: Array, u: Array) -> Iterator[Point]:
     """Times, states, inputs and parameters near the given ones and far from them."""
     rng = np.random.default_rng(0)
     for scale in (0.0, 1e-3, 0.1, 1.0):
@@ -194,7 +219,7 @@ def _points(block: Block, values: dict[str, Any], t: float, x: Array, u: Array) 
         yield t, rng.standard_normal(x.size), rng.standard_normal(u.size), values
 
 
-def _finite(block: Block, point: Point) -> Answer | None:
+def _finite(block: Traceable, point: Point) -> Answer | None:
     """Outputs and rates by Python, or None outside of the block's domain."""
     t, x, u, values = point
 
@@ -207,19 +232,19 @@ def _finite(block: Block, point: Point) -> Answer | None:
     return tried(answer, None)
 
 
-def _real(values: Any) -> Array:
+def _real(values: Value) -> Array:
     found = np.ravel(values)
     if found.dtype.kind == "c":
         raise TypeError("values must be real")
     return np.array(found, dtype=float)
 
 
-def _trace(block: Block, values: dict[str, Any], symbols: tuple[str, ...]) -> Trace:
+def _trace(block: Traceable, values: Params, symbols: tuple[str, ...]) -> Trace:
     nx, nu = block.system.nstates or 0, block.system.ninputs or 0
     t, x, u, p = (ca.SX.sym(name, n) for name, n in (("t", 1), ("x", nx), ("u", nu), ("p", len(symbols))))
     given = {**values, **{key: Symbol(p[k]) for k, key in enumerate(symbols)}}
     functions = []
-    parts: tuple[tuple[str, Callable[..., Any], int], ...] = (
+    parts: tuple[tuple[str, BlockMap, int], ...] = (
         ("output", block.output(given), block.system.noutputs),
         ("update", block.update(given), nx),
     )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -18,7 +17,7 @@ _HALVINGS = 60
 """Halvings from a grid's spacing to rounding of a time."""
 
 
-def switch_arguments(function: Any, bends: bool = True) -> Any:
+def switch_arguments(function: ca.Function, bends: bool = True) -> ca.Function:
     """Arguments whose changes of sign switch the equations of a function.
 
     Parameters
@@ -37,8 +36,8 @@ def switch_arguments(function: Any, bends: bool = True) -> Any:
     """
     inputs = [ca.SX.sym(function.name_in(i), function.sparsity_in(i)) for i in range(function.n_in())]
     entries = [value.nz for value in inputs]
-    work: dict[int, Any] = {}
-    found: list[Any] = []
+    work: dict[int, ca.SX] = {}
+    found: list[ca.SX] = []
     for k in range(function.n_instructions()):
         kind, places = function.instruction_id(k), function.instruction_output(k)
         if kind == ca.OP_OUTPUT:
@@ -106,15 +105,15 @@ def _located(sides: Callable[[Array], Array], t: Array) -> Array:
     return np.unique(right)
 
 
-def _difference(x: Any, y: Any) -> Any:
+def _difference(x: ca.SX, y: ca.SX) -> ca.SX:
     return x - y
 
 
-def _first(x: Any, *_: Any) -> Any:
+def _first(x: ca.SX, *_: ca.SX) -> ca.SX:
     return x
 
 
-def _whole(x: Any, *_: Any) -> Any:
+def _whole(x: ca.SX, *_: ca.SX) -> ca.SX:
     return ca.sin(np.pi * x)
 
 

@@ -1,8 +1,8 @@
-"""Signals that are functions of time alone, as one short Chebyshev series a leg.
+"""Signals that are functions of time alone, as one short Chebyshev series a segment.
 
-A plan is analytic between its breakpoints. A solver that asks for it a
-thousand times a second, at a time and for all its derivatives, is served from
-the series; what is reported at the sample times are the plan's own jets.
+A plan is analytic between its breakpoints. A solver evaluates it,
+with all its derivatives, thousands of times: it does so by the series. Values at
+the sample times are the plan's own jets.
 """
 
 from __future__ import annotations
@@ -12,13 +12,13 @@ from bisect import bisect_left
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ctrlplan._checks import real_array
-from ctrlplan.trajectories import Step, Trajectory
+from ctrlplan.trajectories import Step, Trajectory, chebyshev
 from ctrlplan.trajectories.files import signal_rows
 
 Array = NDArray[np.float64]
@@ -26,10 +26,10 @@ Array = NDArray[np.float64]
 Inputs = Trajectory | ArrayLike | Mapping[str, Trajectory | ArrayLike] | None
 
 WIDTHS = (1, 8, 16, 24, 32, 40, 48, 64)
-"""Numbers of terms of a series; a leg that needs more is halved."""
+"""Numbers of terms of a series; a segment that needs more is halved."""
 
 RESOLVED = 4e-15
-"""Size of the last terms, relative to the greatest, at which a signal counts as resolved."""
+"""Size of the last terms, relative to the largest, at which a signal counts as resolved."""
 
 
 _FLAT = 1e-7
@@ -90,7 +90,7 @@ class Series:
         )
 
 
-class Drive(Protocol):
+class TimeSignal(Protocol):
     """Some signals that are functions of time, analytic between breakpoints."""
 
     @property
@@ -101,7 +101,7 @@ class Drive(Protocol):
     def width(self) -> int:
         """How many signals."""
 
-    def beside(self, moment: float, origin: float, s: Array) -> Array:
+    def analytic_at(self, moment: float, origin: float, s: Array) -> Array:
         """Values (nsignals, ntime) at origin + s of the analytic functions that hold at `moment`."""
 
     def bounds(self, moment: float, left: float, right: float) -> tuple[Array, Array]:
@@ -115,7 +115,7 @@ class Drive(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class PlanDrive:
+class PlanSignal:
     """A plan and its derivatives, axis by axis."""
 
     plan: Trajectory
@@ -131,21 +131,21 @@ class PlanDrive:
         """Signals of all axes."""
         return self.plan.naxes * (self.derivatives + 1)
 
-    def beside(self, moment: float, origin: float, s: Array) -> Array:
-        """Values of the leg that holds at `moment`."""
+    def analytic_at(self, moment: float, origin: float, s: Array) -> Array:
+        """Values of the segment that holds at `moment`."""
         jet = self.plan._jet_beside(moment, origin, s, self.derivatives)
         return jet.transpose(1, 0, 2).reshape(-1, s.size)
 
     def bounds(self, moment: float, left: float, right: float) -> tuple[Array, Array]:
         """The plan's own values at both ends."""
-        return _ordered(self.beside(moment, left, np.array([0.0, right - left])))
+        return _ordered(self.analytic_at(moment, left, np.array([0.0, right - left])))
 
     def at(self, times: Array) -> Array:
         """Values of the plan."""
         return signal_rows(self.plan, times, self.derivatives)
 
 
-class SampledDrive:
+class SampledSignal:
     """One signal given by samples, straight in between; it breaks where it bends."""
 
     width = 1
@@ -158,7 +158,7 @@ class SampledDrive:
         slope = np.diff(values) / np.diff(times)
         self.breakpoints = times[1:-1][slope[1:] != slope[:-1]]
 
-    def beside(self, moment: float, origin: float, s: Array) -> Array:
+    def analytic_at(self, moment: float, origin: float, s: Array) -> Array:
         """Values of the straight line that holds at `moment`."""
         left = min(max(int(np.searchsorted(self.times, moment)) - 1, 0), self.times.size - 2)
         (t0, t1), (v0, v1) = self.times[left : left + 2], self.values[left : left + 2]
@@ -177,15 +177,15 @@ class SampledDrive:
         return np.clip(found, np.minimum(first, second), np.maximum(first, second))[None]
 
 
-def input_drives(labels: Sequence[str], inputs: Inputs, times: Array) -> list[Drive]:
-    """What drives the inputs of a system, in order.
+def input_signals(labels: Sequence[str], inputs: Inputs, times: Array) -> list[TimeSignal]:
+    """Signals at the inputs of a system, in order.
 
     Raises
     ------
     ValueError
         If an input is unknown, or what is given does not fit the inputs or the times.
     """
-    given: list[Any]
+    given: list[Trajectory | ArrayLike]
     if isinstance(inputs, Mapping):
         for name in inputs:
             if name not in labels:
@@ -197,7 +197,7 @@ def input_drives(labels: Sequence[str], inputs: Inputs, times: Array) -> list[Dr
             raise ValueError(f"inputs must have {len(labels)} axes {known}, got {inputs.naxes}")
         # By name where the names are the same, whatever their order.
         crossed = set(inputs.labels) == set(labels) and inputs.labels != tuple(labels)
-        return [PlanDrive(inputs.select(labels) if crossed else inputs)]
+        return [PlanSignal(inputs.select(labels) if crossed else inputs)]
     elif inputs is None or (not isinstance(inputs, list | tuple) and np.ndim(inputs) == 0 and not callable(inputs)):
         given = [0.0 if inputs is None else inputs] * len(labels)
     elif (
@@ -212,12 +212,12 @@ def input_drives(labels: Sequence[str], inputs: Inputs, times: Array) -> list[Dr
         if rows.shape not in ((len(labels), times.size), (len(labels),)):
             raise ValueError(f"inputs must have shape ({len(labels)}, {times.size}), got {rows.shape}")
         given = list(rows)
-    return [_drive(value, name, times) for value, name in zip(given, labels, strict=True)]
+    return [_time_signal(value, name, times) for value, name in zip(given, labels, strict=True)]
 
 
-def driven_signals(drives: Sequence[Drive], times: Array) -> Array:
-    """All signals of some drives (nsignals, ntime), right-continuous."""
-    return np.concatenate([np.zeros((0, times.size)), *(drive.at(times) for drive in drives)])
+def signal_values(time_signals: Sequence[TimeSignal], times: Array) -> Array:
+    """All signals of some time_signals (nsignals, ntime), right-continuous."""
+    return np.concatenate([np.zeros((0, times.size)), *(signal.at(times) for signal in time_signals)])
 
 
 def resolved(
@@ -227,22 +227,22 @@ def resolved(
     tolerance: float = RESOLVED,
     rounding: Array | float = 0.0,
 ) -> list[Series]:
-    """Series of analytic signals over a leg, as many as it takes.
+    """Series of analytic signals over a segment, as many as it takes.
 
     Parameters
     ----------
     signals : callable
         Maps times since `left` (ntime,) to values (nsignals, ntime).
     left, right : float
-        The leg [s].
+        The segment [s].
     tolerance : float, optional
         Maximum size of what is cut off, relative to each signal.
     rounding : ndarray, shape (nsignals,), or float, optional
         Rounding errors of the signals, which no halving makes smaller.
     """
-    # Never at the ends, where a neighbouring leg might be asked.
+    # Never at the ends, where a neighbouring segment might be evaluated.
     duration = right - left
-    values = signals(duration * _LOOKS)
+    values = signals(duration * _PROBES)
     if np.all(values == values[:, :1]):
         return [_unbounded(left, right, values[:, :1])]
     for width in WIDTHS[1:]:
@@ -251,8 +251,8 @@ def resolved(
         allowed = size.max(axis=1, keepdims=True)
         if np.all(size[:, -3:] <= np.maximum(tolerance * allowed, np.reshape(rounding, (-1, 1)))):
             return [_unbounded(left, right, coefficients)]
-    # Terms that no longer fall are rounding errors of the signal itself, which shorter legs make no smaller: where a
-    # plan comes to rest, its derivatives are next to nothing beside it.
+    # Terms that no longer fall are rounding errors of the signal itself, which shorter segments make no smaller: where
+    # a plan is at rest, its derivatives are next to nothing compared with it.
     half, end = size[:, width // 2 : -width // 4], size[:, -width // 4 :]
     noise = np.maximum(half.max(axis=1), end.max(axis=1))
     flat = half.max(axis=1) <= 10.0 * end.max(axis=1)
@@ -266,14 +266,13 @@ def resolved(
 
 
 def chebyshev_times(left: float, right: float, width: int) -> Array:
-    """Increasing times of a leg at which `chebyshev_coefficients` wants values."""
-    nodes, _ = _chebyshev(width)
-    return left + (right - left) * (0.5 * (nodes + 1.0))
+    """Increasing times of a segment at which `chebyshev_coefficients` wants values."""
+    return chebyshev.points(width - 1, left, right)[::-1]
 
 
 def chebyshev_coefficients(values: Array) -> Array:
     """Coefficients (nsignals, width) from values (nsignals, width) at `chebyshev_times`; of a constant, itself."""
-    coefficients = values @ _chebyshev(values.shape[1])[1]
+    coefficients = chebyshev.transform(values[:, ::-1])
     constant = np.all(values == values[:, :1], axis=1)
     coefficients[constant] = 0.0
     coefficients[constant, 0] = values[constant, 0]
@@ -290,26 +289,26 @@ def _ordered(ends: Array) -> tuple[Array, Array]:
     return ends.min(axis=1), ends.max(axis=1)
 
 
-def _numbers(value: Any, what: str) -> Array:
+def _numbers(value: Trajectory | ArrayLike, what: str) -> Array:
     if callable(value):
         raise TypeError(f"{what} must be a trajectory, a number or samples, got {value!r:.80}")
     return real_array(value, what)
 
 
-def _drive(value: Any, name: str, times: Array) -> Drive:
+def _time_signal(value: Trajectory | ArrayLike, name: str, times: Array) -> TimeSignal:
     if isinstance(value, Trajectory):
         if value.naxes != 1:
-            raise ValueError(f"input {name} must be driven by one axis, got {value.naxes}")
-        return PlanDrive(value)
+            raise ValueError(f"input {name} must be a trajectory of one axis, got {value.naxes}")
+        return PlanSignal(value)
     signal = _numbers(value, f"input {name}")
     if not np.isfinite(signal).all():
         raise ValueError(f"input {name} must be finite, got nan or inf at index {int((~np.isfinite(signal)).argmax())}")
     if signal.ndim == 0:
-        return PlanDrive(Step(signal, initial=signal, time=times[0]))
+        return PlanSignal(Step(signal, initial=signal, time=times[0]))
     if signal.shape != times.shape:
         kinds = f"a trajectory, a number or {times.size} samples"
         raise ValueError(f"input {name} must be {kinds}, got shape {signal.shape}")
-    return SampledDrive(times, signal)
+    return SampledSignal(times, signal)
 
 
 def within(left: float, right: float, switches: Sequence[float]) -> tuple[float, float]:
@@ -328,22 +327,13 @@ def within(left: float, right: float, switches: Sequence[float]) -> tuple[float,
     return left + inset * at_left, right - inset * at_right
 
 
-def breakpoints_of(drives: Iterable[Drive]) -> list[float]:
-    """Times at which one of the drives is not analytic."""
-    return [float(t) for drive in drives for t in drive.breakpoints]
+def breakpoints_of(time_signals: Iterable[TimeSignal]) -> list[float]:
+    """Times at which one of the time_signals is not analytic."""
+    return [float(t) for signal in time_signals for t in signal.breakpoints]
 
 
-_LOOKS = np.array([0.0312345, 0.1234567, 0.25, 0.3456789, 0.5, 0.6543217, 0.75, 0.8765431, 0.9712345])
-"""Where a signal is looked at to see whether it is constant over a leg."""
-
-
-@lru_cache(maxsize=32)
-def _chebyshev(width: int) -> tuple[Array, Any]:
-    """Nodes of the first kind, increasing, and the matrix from values there to coefficients."""
-    angles = np.pi * (np.arange(width)[::-1] + 0.5) / width
-    matrix = 2.0 / width * np.cos(np.outer(angles, np.arange(width)))
-    matrix[:, 0] *= 0.5
-    return np.cos(angles), matrix
+_PROBES = np.array([0.0312345, 0.1234567, 0.25, 0.3456789, 0.5, 0.6543217, 0.75, 0.8765431, 0.9712345])
+"""Parts of a segment at which a signal is compared, to find whether it is constant."""
 
 
 @lru_cache(maxsize=32)

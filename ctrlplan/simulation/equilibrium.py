@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Iterator, Sequence
 
 import control as ct
 import numpy as np
@@ -13,10 +12,11 @@ from scipy.linalg import null_space
 from scipy.optimize import least_squares
 
 from ctrlplan._checks import real_array
-from ctrlplan.simulation.drives import Drive, PlanDrive, input_drives
-from ctrlplan.simulation.interpreted import Interpreted
+from ctrlplan._types import Params, System
+from ctrlplan.simulation.interpreted import FeedthroughError, Interpreted
 from ctrlplan.simulation.linear import LinearForm, NotLinearError, in_right_half, linear_form
 from ctrlplan.simulation.prepared import Prepared, prepared_form
+from ctrlplan.simulation.signals import PlanSignal, TimeSignal, input_signals
 from ctrlplan.trajectories import Trajectory
 
 Array = NDArray[np.float64]
@@ -36,7 +36,7 @@ _TURNS = 40
 
 
 def rest_at(
-    system: Any, plan: Trajectory, time: float, outputs: Sequence[int], params: Mapping[str, Any] | None = None
+    system: System | Prepared, plan: Trajectory, time: float, outputs: Sequence[int], params: Params | None = None
 ) -> tuple[Array, str]:
     """State in which a loop is at equilibrium at the first position of a plan.
 
@@ -72,21 +72,25 @@ def rest_at(
     free = np.ones(prepared.nstates, dtype=bool) if stated is None else np.isnan(stated)
     if not free.any():
         return start, ""
-    given = input_drives(prepared.input_labels, plan if prepared.ninputs else None, np.array([time, time + 1.0]))
+    given = input_signals(prepared.input_labels, plan if prepared.ninputs else None, np.array([time, time + 1.0]))
     target = plan.jet(np.array([time]), 0, left=True)[0, :, 0]
     rows = list(outputs)
-    held = np.concatenate([np.zeros(0), *(_held(drive, time) for drive in prepared.drives(given, time))])
+    held = np.concatenate([np.zeros(0), *(_held(signal, time) for signal in prepared.time_signals(given, time))])
     if prepared.linear is not None:
         form = prepared.linear
         state = _linear_rest(form.a, form.b @ held, form.c[rows], form.d[rows] @ held, target, start, free)
         return (start, "it has none") if state is None else (state, "")
     try:
-        return _found(_Equations(prepared, held, time, params or {}, start), rows, target, start, free)
+        try:
+            return _found(_Equations(prepared, held, time, params or {}, start), rows, target, start, free)
+        except FeedthroughError:  # no algebraic loop at the start, but elsewhere
+            again = _Equations(prepared, held, time, params or {}, start, trials=False)
+            return _found(again, rows, target, start, free)
     except Exception as error:  # whatever a block does outside its domain; a run that fails there says so itself
         return start, f"its equations cannot be evaluated ({type(error).__name__}: {error})"
 
 
-def rest_state(system: Any, position: ArrayLike) -> Array:
+def rest_state(system: System | Prepared, position: ArrayLike) -> Array:
     """State at which a linear loop rests when its inputs are held.
 
     Parameters
@@ -115,7 +119,7 @@ def rest_state(system: Any, position: ArrayLike) -> Array:
     return np.zeros(len(form.a)) if state is None else state
 
 
-def unstable_poles(system: Any) -> NDArray[np.complex128]:
+def unstable_poles(system: System | Prepared) -> NDArray[np.complex128]:
     """Poles in the right half plane of a linear continuous system; of others none are known."""
     try:
         poles = np.linalg.eigvals(_form(system).a).astype(complex)
@@ -124,7 +128,7 @@ def unstable_poles(system: Any) -> NDArray[np.complex128]:
     return poles[in_right_half(poles)]
 
 
-def _form(system: Any) -> LinearForm:
+def _form(system: System | Prepared) -> LinearForm:
     if not isinstance(system, Prepared):
         return linear_form(system)
     if system.linear is None:
@@ -132,12 +136,12 @@ def _form(system: Any) -> LinearForm:
     return system.linear
 
 
-def _held(drive: Drive, time: float) -> Array:
-    """Signals of a drive, held where they are before anything happens at `time`."""
-    if not isinstance(drive, PlanDrive):
-        return drive.at(np.array([time]))[:, 0]
-    jet = np.zeros((drive.plan.naxes, drive.derivatives + 1))
-    jet[:, 0] = drive.plan.jet(np.array([time]), 0, left=True)[0, :, 0]
+def _held(signal: TimeSignal, time: float) -> Array:
+    """Values of a signal before anything happens at `time`, with derivatives of 0."""
+    if not isinstance(signal, PlanSignal):
+        return signal.at(np.array([time]))[:, 0]
+    jet = np.zeros((signal.plan.naxes, signal.derivatives + 1))
+    jet[:, 0] = signal.plan.jet(np.array([time]), 0, left=True)[0, :, 0]
     return jet.ravel()
 
 
@@ -182,8 +186,16 @@ class _Equations:
     are not called, since some remember their calls: they are `unknown`, and their states `fixed`.
     """
 
-    def __init__(self, prepared: Prepared, held: Array, time: float, params: Mapping[str, Any], start: Array) -> None:
-        self.discrete = prepared.dt not in (None, 0)
+    def __init__(
+        self,
+        prepared: Prepared,
+        held: Array,
+        time: float,
+        params: Params,
+        start: Array,
+        trials: bool = True,
+    ) -> None:
+        self.discrete, self._trials = prepared.is_discrete, trials
         self.unknown: tuple[str, ...] = ()
         self.fixed = np.zeros(prepared.nstates, dtype=bool)
         self.late: Callable[[Array], str] = lambda x: ""
@@ -197,7 +209,7 @@ class _Equations:
         else:
             self._network(prepared, held, time, params, start)
 
-    def _by_control(self, prepared: Prepared, held: Array, time: float, params: Mapping[str, Any]) -> None:
+    def _by_control(self, prepared: Prepared, held: Array, time: float, params: Params) -> None:
         """Equations of what only python-control runs."""
         system, u = prepared.system, held[: prepared.ninputs]
         if self.discrete:
@@ -205,17 +217,21 @@ class _Equations:
         self._rates = lambda x: np.ravel(system.dynamics(time, x, u, dict(params)))
         self._outputs = lambda x: np.ravel(system.output(time, x, u, dict(params)))
 
-    def _compiled(self, prepared: Prepared, held: Array, time: float, params: Mapping[str, Any], start: Array) -> None:
+    def _compiled(self, prepared: Prepared, held: Array, time: float, params: Params, start: Array) -> None:
         """Equations of a form that was compiled for another process."""
-        drives = prepared.drives(input_drives(prepared.input_labels, 0.0, np.array([time, time + 1.0])), time)
-        form = prepared.compiled(params, drives, time, start)
+        time_signals = prepared.time_signals(
+            input_signals(prepared.input_labels, 0.0, np.array([time, time + 1.0])), time
+        )
+        form = prepared.compiled(params, time_signals, time, start)
         p, t, d = form.parameters(params), np.array([time]), held[:, None]
         self._rates = lambda x: form.rates(t, x[:, None], d, p)[:, 0]
         self._outputs = lambda x: form.outputs(t, x[:, None], d, p)[:, 0]
 
-    def _network(self, prepared: Prepared, held: Array, time: float, params: Mapping[str, Any], start: Array) -> None:
+    def _network(self, prepared: Prepared, held: Array, time: float, params: Params, start: Array) -> None:
         """Equations of a network of blocks."""
-        network: Any = prepared.network.for_trials() if prepared.network is not None else None
+        if prepared.network is None:
+            raise TypeError(prepared.unsupported)
+        network = prepared.network.for_trials()
         sampled, unknown = [], []
         for i, (block, place) in enumerate(zip(network.blocks, network.states, strict=True)):
             linear = block.linear or block.driven or isinstance(block.traits.block, ct.StateSpace)
@@ -225,7 +241,7 @@ class _Equations:
             elif block.period is not None:
                 sampled.append((i, place))
         self.unknown = tuple(unknown)
-        equations = Interpreted(network, params, (time, start), prepared.trials)
+        equations = Interpreted(network, params, (time, start), self._trials)
 
         def rates(x: Array) -> Array:
             moved = equations.rates(time, x, held)
@@ -252,7 +268,7 @@ class _Equations:
             return np.concatenate([np.zeros(0), *found])
 
         self._rates, self.late, self._gaps = rates, late, gaps
-        self._outputs = lambda x: network.put_out(equations.signals(time, x, held))
+        self._outputs = lambda x: network.to_outputs(equations.signals(time, x, held))
 
     def rates(self, x: Array) -> Array:
         """Rates, nan outside the domain of a block."""
@@ -270,6 +286,8 @@ class _Equations:
         try:
             with np.errstate(all="ignore"):
                 return np.asarray(function(x), dtype=float)
+        except FeedthroughError:
+            raise
         except Exception:  # a trial: a block may be defined elsewhere
             return np.full(x.size, np.nan)
 

@@ -1,4 +1,4 @@
-"""The way of every numerical run: from leg to leg, samples, delays and stops between them."""
+"""Numerical runs from segment to segment, with samples, delays and stops between them."""
 
 from __future__ import annotations
 
@@ -8,23 +8,23 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import partial
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ctrlplan.simulation.budget import check
-from ctrlplan.simulation.drives import (
+from ctrlplan.simulation.interpreted import Interpreted, SolverError
+from ctrlplan.simulation.network import Network
+from ctrlplan.simulation.signals import (
     RESOLVED,
-    Drive,
     Series,
+    TimeSignal,
     breakpoints_of,
     chebyshev_coefficients,
     chebyshev_times,
     resolved,
 )
-from ctrlplan.simulation.interpreted import Interpreted, SolverError
-from ctrlplan.simulation.network import Network
 
 Array = NDArray[np.float64]
 
@@ -32,7 +32,7 @@ _WIDTH = 24
 """Terms with which a signal that will be delayed is kept."""
 
 _SHORTEST = 1.0 / 64.0
-"""Legs this much shorter than the delay are not halved for a signal's sake."""
+"""Segments this much shorter than the delay are not halved for a signal's sake."""
 
 _HOPS = 6
 """Delays after which what was a jump is smooth enough to be passed over."""
@@ -49,18 +49,18 @@ _DENOMINATOR = 10**7
 _ROUNDINGS = 64.0
 """Rounding errors of a plan, in units of the last place of its largest values."""
 
-_LEGS = 2_000
-"""Legs that blocks may ask for in a run."""
+_SEGMENTS = 2_000
+"""Maximum number of segments in a run that blocks require by their longest step."""
 
 _MARKS = 20_000
 """Instants of jumps that a run stops at, at most."""
 
 
 class Solver(Protocol):
-    """What carries a state over a leg."""
+    """Integrator of the states over a segment."""
 
     def advance(self, series: Series, left: float, grid: Array, state: Array) -> Array:
-        """States (nstates, ngrid) at times of a leg, of which the last is its end."""
+        """States (nstates, ngrid) at times of a segment, of which the last is its end."""
 
     def signals(self, times: Array, states: Array, driven: Array) -> Array:
         """All signals (nsignals, ntime)."""
@@ -69,8 +69,8 @@ class Solver(Protocol):
         """Outputs (noutputs, ntime) of the whole."""
 
 
-class DelayedDrive:
-    """Signals of the past, kept as series of the legs they were seen on."""
+class DelayedSignal:
+    """Signals of the past, kept as series of the segments they were seen on."""
 
     def __init__(self, delay: float, initial: Array, first: float) -> None:
         self.delay, self.width = delay, initial.size
@@ -81,12 +81,12 @@ class DelayedDrive:
         self._ends: list[float] = []
 
     def record(self, piece: Series) -> None:
-        """Signals of a leg, as they went in."""
+        """Record the inputs of the delay over a segment."""
         self._pieces.append(piece)
         self._ends.append(piece.right)
 
-    def beside(self, moment: float, origin: float, s: Array) -> Array:
-        """Values as they were; legs end where they break."""
+    def analytic_at(self, moment: float, origin: float, s: Array) -> Array:
+        """Values as they were; segments end where they break."""
         return self.at(origin + s)
 
     def bounds(self, moment: float, left: float, right: float) -> tuple[Array, Array]:
@@ -119,27 +119,27 @@ class Run:
     Attributes
     ----------
     times : ndarray, shape (ntime,)
-        Times asked for and those at which legs begin [s], as far as the run went.
+        Sample times and those at which segments begin [s], as far as the run went.
     states : ndarray, shape (nstates, ntime)
         Right-continuous where a discrete block takes a sample.
-    legs : list of (float, Series)
-        Where each leg begins, and the driven signals over it.
+    segments : list of (float, Series)
+        Where each segment begins, and the signals that are functions of time over it.
     """
 
     times: Array
     states: Array
-    legs: list[tuple[float, Series]]
+    segments: list[tuple[float, Series]]
 
     def series(self, t: float) -> Series:
-        """Driven signals over the leg that begins at or before a time."""
-        return self.legs[max(0, bisect_right(self.legs, t, key=lambda leg: leg[0]) - 1)][1]
+        """Signals that are functions of time over the segment that begins at or before a time."""
+        return self.segments[max(0, bisect_right(self.segments, t, key=lambda segment: segment[0]) - 1)][1]
 
 
 def integrate(
     network: Network,
     equations: Interpreted | None,
     solver: Solver,
-    drives: Sequence[Drive],
+    time_signals: Sequence[TimeSignal],
     times: Array,
     state: Array,
     resolution: float,
@@ -151,9 +151,9 @@ def integrate(
     Parameters
     ----------
     network, equations, solver
-        What is run, its equations by Python, and what carries states on.
-    drives : sequence of Drive
-        One for the external inputs each, then one for each driven block.
+        What is run, its equations by Python, and the integrator.
+    time_signals : sequence of TimeSignal
+        Signals at the inputs, then the outputs of each block that are functions of time.
     times : ndarray, shape (ntime,)
         Times at which states are wanted; the run goes from the first to the last.
     state : ndarray, shape (nstates,)
@@ -163,8 +163,8 @@ def integrate(
     marks : sequence of float, optional
         Further times [s] at which equations switch.
     pause : callable, optional
-        Maps the times and states of a leg to whether the run may end behind
-        it; legs are then short.
+        Maps the times and states of a segment to whether the run may end behind
+        it; segments are then short.
 
     Raises
     ------
@@ -172,26 +172,18 @@ def integrate(
         If the solver fails, or a state is no longer finite; the time is in the message.
     """
     first, last = float(times[0]), float(times[-1])
-    memory = _Memory(network, solver, drives, resolution)
-    for_ever = equations is not None and network.delays_feed_delays(equations.feeds)
-    hops = _MARKS if for_ever else _HOPS
-    marks = [*breakpoints_of(drives), *network.breakpoints, *marks]
-    clock = _Clock(network, drives, _fixed(marks, first, last, memory.delays, hops), first, last)
-    longest = min([last - first, *memory.delays])
-    if longest < _SHORTEST_DELAY * (last - first):
-        raise ValueError(
-            f"a delay must be at least {_SHORTEST_DELAY:g} of the run of {last - first:g} s, got {longest:g} s"
-        )
-    declared = [block.traits.longest for block in network.blocks]
-    longest = min(longest, max(min(declared, default=np.inf), (last - first) / _LEGS))
+    memory = _Memory(network, solver, time_signals, resolution)
+    endless = equations is not None and network.delays_feed_delays(equations.feeds)
+    hops = _MARKS if endless else _HOPS
+    marks = [*breakpoints_of(time_signals), *network.breakpoints, *marks]
+    clock = _Clock(network, time_signals, _fixed(marks, first, last, memory.delays, hops), first, last)
+    longest = _longest(network, memory.delays, last - first)
     if pause is not None:
         longest = min(longest, (last - first) / 64.0)
     shortest = 1e-9 * (last - first) if pause is not None else np.inf
-    # A plan whose terms cancel in a segment has there the rounding errors of its largest values.
-    largest = np.abs(known_before(drives, np.union1d(np.linspace(first, last, 257), clock.marks))).max(axis=1)
-    rounding = _ROUNDINGS * np.finfo(float).eps * np.where(np.isfinite(largest), largest, 0.0)
-    known: list[tuple[Array, Array]] = []  # times and states of each leg, its end left to the next
-    legs: list[tuple[float, Series]] = []
+    rounding = _rounding(time_signals, np.union1d(np.linspace(first, last, 257), clock.marks))
+    known: list[tuple[Array, Array]] = []  # times and states of each segment, its end left to the next
+    segments: list[tuple[float, Series]] = []
     span: list[Series] = []
     left, reach = first, longest
     x = clock.sample(equations, first, state)
@@ -201,12 +193,8 @@ def integrate(
         right = clock.on(times, right) if right - left <= reach * (1.0 + 1e-9) else left + reach
         if memory.delays or not (span and span[-1].right >= right):
             until = right if memory.delays else clock.fixed_after(left)
-            moment = 0.5 * (left + right)
             accuracy = resolution if memory.delays else RESOLVED
-            span = [
-                series.bounded(*_bounds(drives, moment, series.left, series.right))
-                for series in resolved(partial(_beside, drives, moment, left), left, until, accuracy, rounding)
-            ]
+            span = _resolved(time_signals, 0.5 * (left + right), left, until, accuracy, rounding)
         series = next(s for s in span if left < s.right)
         right = min(right, series.right)
         inside = times[slice(*np.searchsorted(times, [left, right]))]
@@ -223,43 +211,71 @@ def integrate(
         if not memory.record(left, right, series, grid, found):
             reach = 0.5 * (right - left)
             continue
-        legs.append((left, series))
-        asked = np.isin(grid, inside)
-        known.append((np.append(left, grid[asked]), np.column_stack([x, found[:, asked]])))
+        segments.append((left, series))
+        wanted = np.isin(grid, inside)
+        known.append((np.append(left, grid[wanted]), np.column_stack([x, found[:, wanted]])))
         before, x = x, clock.sample(equations, right, found[:, -1])
         left, reach = right, min(longest, 2.0 * reach)
-        if pause is not None and pause(np.append(legs[-1][0], grid), np.column_stack([before, found])):
+        if pause is not None and pause(np.append(segments[-1][0], grid), np.column_stack([before, found])):
             break
     known.append((np.array([left]), x[:, None]))
-    return Run(np.concatenate([t for t, _ in known]), np.concatenate([s for _, s in known], axis=1), legs)
+    return Run(np.concatenate([t for t, _ in known]), np.concatenate([s for _, s in known], axis=1), segments)
+
+
+def _longest(network: Network, delays: list[float], duration: float) -> float:
+    """Longest segment of a run [s] that its delays and the declarations of its blocks allow."""
+    longest = min([duration, *delays])
+    if longest < _SHORTEST_DELAY * duration:
+        raise ValueError(
+            f"a delay must be at least {_SHORTEST_DELAY:g} of the run of {duration:g} s, got {longest:g} s"
+        )
+    declared = min((block.traits.longest for block in network.blocks), default=np.inf)
+    return min(longest, max(declared, duration / _SEGMENTS))
+
+
+def _rounding(time_signals: Sequence[TimeSignal], times: Array) -> Array:
+    """Rounding errors of signals (nsignals,): where the terms of a plan cancel, those of its largest values."""
+    largest = np.abs(known_before(time_signals, times)).max(axis=1)
+    return np.asarray(_ROUNDINGS * np.finfo(float).eps * np.where(np.isfinite(largest), largest, 0.0))
+
+
+def _resolved(
+    time_signals: Sequence[TimeSignal], moment: float, left: float, until: float, accuracy: float, rounding: Array
+) -> list[Series]:
+    """Series, with their bounds, of the signals that hold at a moment."""
+    signals = partial(_analytic_at, time_signals, moment, left)
+    return [
+        series.bounded(*_bounds(time_signals, moment, series.left, series.right))
+        for series in resolved(signals, left, until, accuracy, rounding)
+    ]
 
 
 class _Memory:
-    """What goes into delays, kept leg by leg."""
+    """What goes into delays, kept segment by segment."""
 
-    def __init__(self, network: Network, solver: Solver, drives: Sequence[Drive], resolution: float) -> None:
+    def __init__(self, network: Network, solver: Solver, time_signals: Sequence[TimeSignal], resolution: float) -> None:
         blocks = network.blocks_with("delay")
-        self._drives: list[Any] = [drive for drive in drives if isinstance(drive, DelayedDrive)]
+        self._time_signals = [signal for signal in time_signals if isinstance(signal, DelayedSignal)]
         self._fed = [network.fed[i] for i in blocks]
         self._wires, self._driven = [network.wire[network.inputs[i]] for i in blocks], network.driven
         self._solver, self._resolution = solver, resolution
-        self.delays = [drive.delay for drive in self._drives]
+        self.delays = [signal.delay for signal in self._time_signals]
 
     def nodes(self, left: float, right: float) -> Array:
-        """Times of a leg at which states are needed."""
-        return chebyshev_times(left, right, _WIDTH) if self._drives else np.empty(0)
+        """Times of a segment at which states are needed."""
+        return chebyshev_times(left, right, _WIDTH) if self._time_signals else np.empty(0)
 
     def record(self, left: float, right: float, series: Series, grid: Array, states: Array) -> bool:
-        """Keep a leg; False where it must be shorter for its signals to be resolved."""
-        if not self._drives:
+        """Keep a segment; False where it must be shorter for its signals to be resolved."""
+        if not self._time_signals:
             return True
         nodes = self.nodes(left, right)
         w = self._solver.signals(nodes, states[:, np.searchsorted(grid, nodes)], series.at(nodes))
         pieces = [chebyshev_coefficients(fed(w)) for fed in self._fed]
         if right - left > _SHORTEST * min(self.delays) and any(_unresolved(p, self._resolution) for p in pieces):
             return False
-        for drive, piece, wire in zip(self._drives, pieces, self._wires, strict=True):
-            drive.record(Series(left, right, piece, *_combined_bounds(wire, self._driven, series)))
+        for signal, piece, wire in zip(self._time_signals, pieces, self._wires, strict=True):
+            signal.record(Series(left, right, piece, *_combined_bounds(wire, self._driven, series)))
         return True
 
 
@@ -272,15 +288,15 @@ class _Clock:
     """
 
     def __init__(
-        self, network: Network, drives: Sequence[Drive], fixed: list[float], first: float, last: float
+        self, network: Network, time_signals: Sequence[TimeSignal], fixed: list[float], first: float, last: float
     ) -> None:
         self._fixed = [*fixed, last]
         latest = max(abs(first), abs(last))
         self._tolerance = max(4.0 * np.finfo(float).eps * latest, _TOLERANCE * (last - first))
-        self._drives = drives
-        for drive in drives:
-            if isinstance(drive, DelayedDrive):
-                drive.tolerance = self._tolerance
+        self._time_signals = time_signals
+        for signal in time_signals:
+            if isinstance(signal, DelayedSignal):
+                signal.tolerance = self._tolerance
         self._samples: list[tuple[Fraction, int]] = []
         self._periods: dict[int, Fraction] = {}
         for i in network.blocks_with("period"):
@@ -309,7 +325,7 @@ class _Clock:
         return self._fixed[min(bisect_right(self._fixed, t + self._tolerance), len(self._fixed) - 1)]
 
     def on(self, times: Array, t: float) -> float:
-        """The time asked for that an instant is but for rounding, so that it counts as after it."""
+        """Sample time that equals an instant but for rounding, so that it counts as after it."""
         near = times[max(0, int(np.searchsorted(times, t)) - 1) :][:2]
         close = near[np.abs(near - t) <= self._tolerance]
         return float(close[0]) if close.size else t
@@ -323,12 +339,12 @@ class _Clock:
             due.append(i)
         if not due or equations is None:
             return x
-        seen = [drive.at(np.array([self._after(drive, t)])) for drive in self._drives]
+        seen = [signal.at(np.array([self._after(signal, t)])) for signal in self._time_signals]
         return equations.sampled(tuple(sorted(due)), t, x, np.concatenate([np.zeros((0, 1)), *seen])[:, 0])
 
-    def _after(self, drive: Drive, t: float) -> float:
+    def _after(self, signal: TimeSignal, t: float) -> float:
         """Time at which a signal is read at an instant: at its breakpoint, where the two differ by rounding."""
-        marks = drive.breakpoints
+        marks = signal.breakpoints
         k = int(np.searchsorted(marks, t))
         return float(marks[k]) if k < len(marks) and marks[k] - t <= self._tolerance else t
 
@@ -339,20 +355,21 @@ def _fraction(seconds: float) -> Fraction:
     return simple if abs(float(simple) - seconds) <= 1e-15 * abs(seconds) else Fraction(seconds)
 
 
-def known_before(drives: Sequence[Drive], times: Array) -> Array:
+def known_before(time_signals: Sequence[TimeSignal], times: Array) -> Array:
     """Signals (nsignals, ntime) that are known before a run; 0 for those that a delay outputs."""
     rows = [
-        np.zeros((drive.width, times.size)) if isinstance(drive, DelayedDrive) else drive.at(times) for drive in drives
+        np.zeros((signal.width, times.size)) if isinstance(signal, DelayedSignal) else signal.at(times)
+        for signal in time_signals
     ]
     return np.concatenate([np.zeros((0, times.size)), *rows])
 
 
-def _beside(drives: Sequence[Drive], moment: float, origin: float, s: Array) -> Array:
-    return np.concatenate([np.zeros((0, s.size)), *(drive.beside(moment, origin, s) for drive in drives)])
+def _analytic_at(time_signals: Sequence[TimeSignal], moment: float, origin: float, s: Array) -> Array:
+    return np.concatenate([np.zeros((0, s.size)), *(signal.analytic_at(moment, origin, s) for signal in time_signals)])
 
 
-def _bounds(drives: Sequence[Drive], moment: float, left: float, right: float) -> tuple[Array, Array]:
-    found = [drive.bounds(moment, left, right) for drive in drives]
+def _bounds(time_signals: Sequence[TimeSignal], moment: float, left: float, right: float) -> tuple[Array, Array]:
+    found = [signal.bounds(moment, left, right) for signal in time_signals]
     return tuple(np.concatenate([np.zeros(0), *(pair[side] for pair in found)]) for side in (0, 1))  # type: ignore[return-value]
 
 
@@ -369,7 +386,7 @@ def _combined_bounds(wire: Array, driven: NDArray[np.intp], series: Series) -> t
 
 
 def _fixed(marks: Sequence[float], first: float, last: float, delays: list[float], hops: int) -> list[float]:
-    """Breakpoints inside the run, and where delays carry them to."""
+    """Breakpoints inside the run, and the times to which delays shift them."""
     found = {t for t in marks if first < t < last}
     fresh = {*found, first}
     for _ in range(hops if delays else 0):

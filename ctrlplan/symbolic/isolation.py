@@ -5,13 +5,14 @@ from __future__ import annotations
 import pickle
 import random
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from ctrlplan.simulation.recent import BUILDING
+from ctrlplan._lru import BUILDING
 
 T = TypeVar("T")
 
@@ -49,7 +50,7 @@ def tried(call: Callable[[], T], otherwise: T) -> T:
         return otherwise
 
 
-def same_answer(a: Any, b: Any) -> bool:
+def same_answer(a: Iterable[ArrayLike] | None, b: Iterable[ArrayLike] | None) -> bool:
     """Whether two results of trial calls are equal, entry by entry, where there are any."""
     if a is None or b is None:
         return a is b

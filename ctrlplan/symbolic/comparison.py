@@ -7,7 +7,7 @@ import random
 import numpy as np
 from numpy.typing import NDArray
 
-from ctrlplan.simulation.recent import BUILDING
+from ctrlplan._lru import BUILDING
 
 Array = NDArray[np.float64]
 

@@ -9,10 +9,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any, NoReturn
+from typing import NoReturn, TypeAlias
 
 import casadi as ca
 import numpy as np
+
+from ctrlplan._types import Value
+
+Operation: TypeAlias = Callable[..., Value]
+"""Function of such values."""
 
 _LN2 = math.log(2.0)
 
@@ -32,7 +37,7 @@ class Symbol:
     __hash__ = None  # type: ignore[assignment]
     __array_priority__ = 2000.0  # CasADi's values leave an operation to the one of higher priority
 
-    def __init__(self, sx: Any, truth: bool = False) -> None:
+    def __init__(self, sx: ca.SX, truth: bool = False) -> None:
         self.sx, self.truth = sx, truth
 
     def __repr__(self) -> str:
@@ -41,30 +46,34 @@ class Symbol:
     def __bool__(self) -> NoReturn:
         raise TypeError("a branch on a signal or parameter cannot be traced; use np.where")
 
-    def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **kwargs: Any) -> Any:
+    def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Value, **kwargs: Value) -> Value:
         return _by_elements(ufunc, method, inputs, kwargs)
 
-    def __array_function__(self, function: Any, types: Any, args: Iterable[Any], kwargs: Mapping[str, Any]) -> Any:
+    def __array_function__(
+        self, function: Value, types: Value, args: Iterable[Value], kwargs: Mapping[str, Value]
+    ) -> Value:
         return _by_function(function, args, kwargs)
 
-    def clip(self, low: Any = None, high: Any = None) -> Any:
+    def clip(self, low: Value = None, high: Value = None) -> Value:
         """Value within limits."""
         return _clip(self, low, high)
 
 
-class SymbolArray(np.ndarray[Any, Any]):
+class SymbolArray(np.ndarray[tuple[int, ...], np.dtype[np.object_]]):
     """Array of symbols, and of numbers among them."""
 
     __array_priority__ = 2000.0
 
-    def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **kwargs: Any) -> Any:
+    def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Value, **kwargs: Value) -> Value:
         return _by_elements(ufunc, method, inputs, kwargs)
 
-    def __array_function__(self, function: Any, types: Any, args: Iterable[Any], kwargs: Mapping[str, Any]) -> Any:
+    def __array_function__(
+        self, function: Value, types: Value, args: Iterable[Value], kwargs: Mapping[str, Value]
+    ) -> Value:
         return _by_function(function, args, kwargs)
 
 
-def symbol_array(column: Any) -> SymbolArray:
+def symbol_array(column: ca.SX) -> SymbolArray:
     """Entries of a column of CasADi as an array of symbols."""
     out = np.empty(column.numel(), dtype=object)
     for k in range(out.size):
@@ -72,7 +81,7 @@ def symbol_array(column: Any) -> SymbolArray:
     return out.view(SymbolArray)
 
 
-def column_of(values: Any) -> Any:
+def column_of(values: object) -> ca.SX:
     """Column of CasADi from whatever a block returns: a symbol, a number, a list or an array of them.
 
     Raises
@@ -87,19 +96,19 @@ def column_of(values: Any) -> Any:
 # Scalar operations
 
 
-def _sx(value: Any) -> Any:
+def _sx(value: Value) -> ca.SX:
     return value.sx if isinstance(value, Symbol) else ca.SX(float(value))
 
 
-def _of(function: Callable[..., Any], truth: bool = False) -> Callable[..., Any]:
+def _of(function: Operation, truth: bool = False) -> Operation:
     """Operation on symbols and numbers from one on CasADi's expressions."""
     return lambda *values: Symbol(function(*map(_sx, values)), truth)
 
 
-def _no_truths(function: Callable[..., Any]) -> Callable[..., Any]:
+def _no_truths(function: Operation) -> Operation:
     """Operation that numpy defines for conditions in another way than for numbers."""
 
-    def checked(*values: Any) -> Any:
+    def checked(*values: Value) -> Value:
         if all(isinstance(value, bool | np.bool_) or getattr(value, "truth", False) for value in values):
             raise TypeError("sums and signs of conditions cannot be traced: numpy adds conditions by 'or'")
         return _of(function)(*values)
@@ -107,10 +116,10 @@ def _no_truths(function: Callable[..., Any]) -> Callable[..., Any]:
     return checked
 
 
-def _truths(function: Callable[..., Any]) -> Callable[..., Any]:
+def _truths(function: Operation) -> Operation:
     """Operation on conditions alone: of numbers it is one on their bits."""
 
-    def checked(*values: Any) -> Any:
+    def checked(*values: Value) -> Value:
         if not all(isinstance(value, bool | np.bool_) or getattr(value, "truth", False) for value in values):
             raise TypeError("operations on bits cannot be traced")
         return _of(function, truth=True)(*values)
@@ -118,19 +127,19 @@ def _truths(function: Callable[..., Any]) -> Callable[..., Any]:
     return checked
 
 
-def _remainder(x: Any, y: Any) -> Any:
+def _remainder(x: ca.SX, y: ca.SX) -> ca.SX:
     """Remainder with the sign of y, exact as Python's."""
     rest = ca.fmod(x, y)
     return rest + ca.if_else(rest * y < 0, y, 0.0)
 
 
-def _floor_divide(x: Any, y: Any) -> Any:
+def _floor_divide(x: ca.SX, y: ca.SX) -> ca.SX:
     """Python's quotient: (x - remainder)/y, rounded to the nearest whole number."""
     exact = (x - _remainder(x, y)) / y
     return ca.floor(exact + 0.5)
 
 
-def _rint(x: Any) -> Any:
+def _rint(x: ca.SX) -> ca.SX:
     """Nearest whole number, halves to the even one."""
     low = ca.floor(x)
     rest = x - low
@@ -138,19 +147,19 @@ def _rint(x: Any) -> Any:
     return low + up
 
 
-def _xor(x: Any, y: Any) -> Any:
+def _xor(x: ca.SX, y: ca.SX) -> ca.SX:
     return ca.ne(ca.ne(x, 0.0), ca.ne(y, 0.0))
 
 
-def _heaviside(x: Any, at_zero: Any) -> Any:
+def _heaviside(x: ca.SX, at_zero: ca.SX) -> ca.SX:
     return ca.if_else(ca.eq(x, 0.0), at_zero, x > 0.0)
 
 
-def _logaddexp(x: Any, y: Any) -> Any:
+def _logaddexp(x: ca.SX, y: ca.SX) -> ca.SX:
     return ca.fmax(x, y) + ca.log1p(ca.exp(-ca.fabs(x - y)))
 
 
-_OPERATIONS: dict[str, Callable[..., Any]] = {
+_OPERATIONS: dict[str, Operation] = {
     **{
         name: _of(getattr(ca, name))
         for name in str.split("sqrt exp expm1 log log1p log10 sin cos tan sinh cosh tanh floor ceil sign")
@@ -203,7 +212,7 @@ _OPERATIONS: dict[str, Callable[..., Any]] = {
 """numpy's elementwise functions, by name, on symbols and numbers."""
 
 
-def _clip(x: Any, low: Any = None, high: Any = None) -> Any:
+def _clip(x: Value, low: Value = None, high: Value = None) -> Value:
     above = x if low is None else _OPERATIONS["maximum"](x, low)
     return above if high is None else _OPERATIONS["minimum"](above, high)
 
@@ -211,7 +220,7 @@ def _clip(x: Any, low: Any = None, high: Any = None) -> Any:
 _OPERATIONS["clip"] = _clip
 
 
-def _choice(condition: Any, x: Any, y: Any) -> Any:
+def _choice(condition: Value, x: Value, y: Value) -> Value:
     if not isinstance(condition, Symbol):
         return x if condition else y
     truth = all(getattr(value, "truth", isinstance(value, bool | np.bool_)) for value in (x, y))
@@ -221,7 +230,7 @@ def _choice(condition: Any, x: Any, y: Any) -> Any:
 # numpy's protocols
 
 
-def _by_elements(ufunc: Any, method: str, inputs: Sequence[Any], kwargs: dict[str, Any]) -> Any:
+def _by_elements(ufunc: np.ufunc, method: str, inputs: Sequence[Value], kwargs: dict[str, Value]) -> Value:
     """Elementwise function of numpy, entry by entry."""
     plain = [_plain(value) for value in inputs]
     out = kwargs.pop("out", None)
@@ -247,7 +256,7 @@ def _by_elements(ufunc: Any, method: str, inputs: Sequence[Any], kwargs: dict[st
     return out[0]
 
 
-def _by_function(function: Any, args: Iterable[Any], kwargs: Mapping[str, Any]) -> Any:
+def _by_function(function: Value, args: Iterable[Value], kwargs: Mapping[str, Value]) -> Value:
     """Function of numpy: from the table, or as numpy writes it by others."""
     known = _FUNCTIONS.get(function)
     if known is not None:
@@ -257,29 +266,29 @@ def _by_function(function: Any, args: Iterable[Any], kwargs: Mapping[str, Any]) 
     return _wrapped(np.ndarray.__array_function__(proxy, function, (SymbolArray,), *given))
 
 
-def _where(condition: Any, x: Any, y: Any) -> Any:
+def _where(condition: Value, x: Value, y: Value) -> Value:
     return _wrapped(np.frompyfunc(_choice, 3, 1)(*map(_plain, (condition, x, y))))
 
 
-def _select(conditions: Sequence[Any], choices: Sequence[Any], default: Any = 0) -> Any:
+def _select(conditions: Sequence[Value], choices: Sequence[Value], default: Value = 0) -> Value:
     found = default
     for condition, choice in zip(reversed(list(conditions)), reversed(list(choices)), strict=True):
         found = _where(condition, choice, found)
     return found
 
 
-def _clipped(a: Any, a_min: Any = None, a_max: Any = None, **kwargs: Any) -> Any:
+def _clipped(a: Value, a_min: Value = None, a_max: Value = None, **kwargs: Value) -> Value:
     low, high = kwargs.pop("min", a_min), kwargs.pop("max", a_max)
     if any(value is not None for value in kwargs.values()):
         raise TypeError("options of np.clip cannot be traced")
     return _wrapped(np.frompyfunc(_clip, 3, 1)(*map(_plain, (a, low, high))))
 
 
-def _of_nan(*_: Any, **__: Any) -> NoReturn:
+def _of_nan(*_: Value, **__: Value) -> NoReturn:
     raise TypeError("functions of nan cannot be traced")
 
 
-_FUNCTIONS: dict[Any, Callable[..., Any]] = {
+_FUNCTIONS: dict[Value, Operation] = {
     np.where: _where,
     np.select: _select,
     np.clip: _clipped,
@@ -288,7 +297,7 @@ _FUNCTIONS: dict[Any, Callable[..., Any]] = {
 """Functions of numpy that are not written by others of it."""
 
 
-def _plain(value: Any) -> Any:
+def _plain(value: Value) -> Value:
     """Plain array of objects, or the number itself."""
     if isinstance(value, Symbol):
         out = np.empty((), dtype=object)
@@ -297,23 +306,23 @@ def _plain(value: Any) -> Any:
     return value.view(np.ndarray) if isinstance(value, SymbolArray) else value
 
 
-def _wrapped(value: Any) -> Any:
+def _wrapped(value: Value) -> Value:
     if type(value) is np.ndarray and value.dtype == object:
         return value.view(SymbolArray) if value.ndim else value[()]
     return value
 
 
-def _arrays(value: Any) -> Any:
+def _arrays(value: Value) -> Value:
     """Arguments with arrays in the places of symbols, in lists as well."""
     if isinstance(value, Symbol):
         return _plain(value).view(SymbolArray)
     return type(value)(map(_arrays, value)) if type(value) in (list, tuple) else value
 
 
-def _operator(name: str, reflected: bool) -> Callable[[Symbol, Any], Any]:
+def _operator(name: str, reflected: bool) -> Callable[[Symbol, Value], Value]:
     ufunc = getattr(np, name)
 
-    def operation(self: Symbol, other: Any) -> Any:
+    def operation(self: Symbol, other: Value) -> Value:
         if not isinstance(other, Symbol | int | float | np.generic | np.ndarray):
             return NotImplemented
         return ufunc(other, self) if reflected else ufunc(self, other)

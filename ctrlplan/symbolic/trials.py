@@ -5,6 +5,12 @@ depend directly on which inputs, whether two calls with equal arguments give
 equal values. Such trial calls are made on copies of the functions, with copies
 of the objects that they refer to, so that a block with a memory does not
 remember them.
+
+A `Keeper` calls the functions themselves and puts back what they found. Neither
+replaces the other: two memories at one time, of a run and of a second attempt,
+need copies, and so do random generators, whose state cannot be compared; that
+*nothing* is left behind, wherever a function stored it, only a keeper can
+guarantee, and it alone tells whether a call has changed anything.
 """
 
 from __future__ import annotations
@@ -15,13 +21,13 @@ import functools
 import inspect
 from collections.abc import Callable, Iterator
 from types import BuiltinFunctionType, CellType, CodeType, FunctionType, MethodType, ModuleType
-from typing import Any
 
 import control as ct
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from ctrlplan.simulation.untouched import tried
+from ctrlplan._types import System, Value
+from ctrlplan.symbolic.isolation import tried
 from ctrlplan.traits import declare, traits_of
 
 Array = NDArray[np.float64]
@@ -54,7 +60,7 @@ _PLAIN = (
 )
 
 
-def trial_copy(system: Any) -> Any:
+def trial_copy(system: System) -> System:
     """Copy of a block whose functions share no memory with those of the block.
 
     Parameters
@@ -75,7 +81,7 @@ def trial_copy(system: Any) -> Any:
     return made
 
 
-def can_remember(system: Any) -> bool:
+def can_remember(system: System) -> bool:
     """Whether a block may have a memory besides its state: False is certain, True is not."""
     traits = traits_of(system)
     inner = traits.block
@@ -85,12 +91,12 @@ def can_remember(system: Any) -> bool:
     return any(function is not None and _has_memory(function, set(), _DEPTH) for function in functions)
 
 
-def values_of(function: Callable[..., Any], *arguments: Any) -> Array | None:
+def values_of(function: Callable[..., ArrayLike], *arguments: object) -> Array | None:
     """Values of a trial call as an array (n,); None where the arguments are outside of the function's domain."""
     return tried(lambda: np.array(np.ravel(function(*arguments)), dtype=float), None)
 
 
-def reads(function: Callable[..., Any], position: int) -> bool:
+def reads(function: Callable[..., Value], position: int) -> bool:
     """Whether a function can read one of its arguments, by its code: False is certain, True is not.
 
     Parameters
@@ -126,7 +132,7 @@ def _loads(code: CodeType) -> Iterator[dis.Instruction]:
     return (i for i in dis.get_instructions(code) if i.opname.startswith("LOAD_") or "FAST" in i.opname)
 
 
-def _function(function: Any, memo: dict[int, Any], depth: int) -> Any:
+def _function(function: Value, memo: dict[int, object], depth: int) -> Value:
     """Copy of something that is called."""
     if isinstance(function, functools.partial):
         arguments = [_value(entry, memo, depth) for entry in function.args]
@@ -158,7 +164,7 @@ def _function(function: Any, memo: dict[int, Any], depth: int) -> Any:
     return made
 
 
-def _value(value: Any, memo: dict[int, Any], depth: int) -> Any:
+def _value(value: Value, memo: dict[int, object], depth: int) -> Value:
     """Copy of something that a function refers to."""
     if isinstance(value, _PLAIN) or value is None:
         return value
@@ -172,13 +178,13 @@ def _value(value: Any, memo: dict[int, Any], depth: int) -> Any:
         return value
 
 
-def _has_memory(value: Any, seen: set[int], depth: int) -> bool:
+def _has_memory(value: object, seen: set[int], depth: int) -> bool:
     """Whether a function, or what it refers to, may keep something from call to call."""
     if isinstance(value, _PLAIN) or id(value) in seen:
         return False
     seen.add(id(value))
     if isinstance(value, functools.partial):
-        parts: tuple[Any, ...] = (value.func, *value.args, *value.keywords.values())
+        parts: tuple[object, ...] = (value.func, *value.args, *value.keywords.values())
     elif isinstance(value, tuple | frozenset):
         parts = tuple(value)
     elif isinstance(value, np.ndarray):
@@ -212,7 +218,7 @@ def _stores(code: CodeType) -> bool:
     return any(i.opname in _STORES for i in dis.get_instructions(code))
 
 
-def _contents(function: FunctionType) -> Iterator[Any]:
+def _contents(function: FunctionType) -> Iterator[object]:
     for cell in function.__closure__ or ():
         try:
             yield cell.cell_contents
@@ -220,14 +226,14 @@ def _contents(function: FunctionType) -> Iterator[Any]:
             continue
 
 
-def of_library(thing: Any) -> bool:
+def of_library(thing: object) -> bool:
     """Whether a function or class is of a library whose objects, but for arrays, are not changed by being called."""
     if isinstance(thing, functools.partial):
         return of_library(thing.func)
     return str(getattr(thing, "__module__", "")).partition(".")[0] in _LIBRARIES
 
 
-def _levels(system: Any) -> bool:
+def _levels(system: System) -> bool:
     return isinstance(system, ct.InterconnectedSystem) and not isinstance(system, ct.StateSpace)
 
 

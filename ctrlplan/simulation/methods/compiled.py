@@ -1,0 +1,117 @@
+"""Continuous systems compiled by CasADi, and SUNDIALS' CVODES on them."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctrlplan.simulation.interpreted import SolverError
+from ctrlplan.simulation.job import Job, Record, unused
+from ctrlplan.simulation.learned import DisagreementError
+from ctrlplan.simulation.numerical import VISITED, Attempt, equations_of, numerical
+from ctrlplan.simulation.prepared import Prepared
+from ctrlplan.simulation.segments import Run
+from ctrlplan.simulation.signals import signal_values
+from ctrlplan.symbolic import missing_casadi
+from ctrlplan.symbolic.comparison import telling_states
+
+if TYPE_CHECKING:
+    from ctrlplan.simulation.compiled import CompiledSolver
+
+Array = NDArray[np.float64]
+
+_SHARE = 5
+"""A compiled form is compared with Python at states a fifth as many as the run's evaluations of its equations."""
+
+_CLOSE, _STRETCHES, _BETWEEN = 400, 8, 60
+"""A run with fewer times is followed once more, in some stretches with so many times each, to see where it switches."""
+
+_STEPS, _STEPS_WITH_STOPS = 20_000, 2_000
+"""Maximum steps of a segment; fewer where an event may end the run: beyond it there may be no solution."""
+
+
+class CompiledMethod:
+    """CVODES with the exact Jacobian, on equations that agree with Python at states that the run visits."""
+
+    name = "compiled"
+
+    def why_not(self, prepared: Prepared) -> str:
+        """Reason why a system cannot be compiled, as far as it is known before its blocks are traced."""
+        if prepared.is_discrete:
+            return f"{prepared.name} is discrete (dt = {prepared.dt})"
+        return prepared.unsupported or missing_casadi()
+
+    def run(self, job: Job) -> Record:
+        """States at the times of a job, within its tolerances.
+
+        Raises
+        ------
+        NotCompiledError
+            If a block cannot be traced at these parameters, or disagrees with Python.
+        """
+        spare = unused(job)
+        try:
+            return numerical(job, self)
+        except DisagreementError:  # what a function refers to may have changed since it was traced
+            return numerical(spare, self)
+
+    def solver(self, attempt: Attempt[CompiledSolver]) -> CompiledSolver:
+        """CVODES on the compiled form."""
+        job = attempt.job
+        form = job.prepared.compiled(job.params, attempt.time_signals, job.first, job.state, job.trials)
+        from ctrlplan.simulation.compiled import CompiledSolver  # there is a form: so there is CasADi
+
+        known = equations_of(job, attempt.copies)
+        if known is not None:  # an algebraic loop without a solution has a better name here
+            known.signals(job.first, job.state, signal_values(attempt.time_signals, job.times[:1])[:, 0])
+        most = _STEPS_WITH_STOPS if attempt.stops else _STEPS
+        return CompiledSolver(form, job.params, attempt.tolerances, attempt.scales, max_steps=most)
+
+    def check(self, attempt: Attempt[CompiledSolver]) -> None:
+        """Compare with Python, at states of the run."""
+        solver, job = attempt.solver, attempt.job
+        if solver.at_edge(*attempt.visited()):
+            raise SolverError(
+                f"the solver must reach {job.times[-1]:g} s, got to the edge of where equations are defined"
+            )
+        wrong = _disagreement(attempt, solver) if attempt.copies.blocks else ""
+        if wrong:
+            raise job.prepared.distrust(solver.form, wrong)
+
+
+def _disagreement(attempt: Attempt[CompiledSolver], solver: CompiledSolver) -> str:
+    """What is wrong with a compiled form at states of a run; empty where nothing, or where no comparison is due."""
+    job, run, form = attempt.job, attempt.run, solver.form
+    p = form.parameters(job.params)
+    values = signal_values(attempt.time_signals, run.times)
+    if not form.compared.is_due(form.sides(run.times, run.states, values, p)):
+        return ""
+    most = max(1, solver.evaluations // _SHARE) if solver.evaluations else VISITED
+    t, x = _closer(run, solver)
+    values = signal_values(attempt.time_signals, t)
+    w, sides = form.signals(t, x, values, p), form.sides(t, x, values, p)
+    places = telling_states(sides, np.concatenate([w, x]), most)
+    # Blocks are compared at the inputs that the form computes: where each agrees, the whole does.
+    return form.disagreement(attempt.copies, job.params, t[places], x[:, places], w[:, places])
+
+
+def _closer(run: Run, solver: CompiledSolver) -> tuple[Array, Array]:
+    """Times and states of a run, with more between them where they are few."""
+    times, states = [run.times], [run.states]
+    marks = np.unique(np.linspace(0, run.times.size - 1, _STRETCHES + 1).astype(int))
+    for k, following in pairwise(marks.tolist() if run.times.size < _CLOSE else []):
+        left, right = float(run.times[k]), float(run.times[following])
+        series = run.series(left)
+        right = min(right, series.right)
+        grid = np.linspace(left, right, _BETWEEN + 1)[1:]
+        with suppress(SolverError):
+            found = solver.advance(series, left, grid, run.states[:, k])
+            times.append(grid)
+            states.append(found)
+    t, x = np.concatenate(times), np.concatenate(states, axis=1)
+    order = np.argsort(t, kind="stable")
+    return t[order], x[:, order]

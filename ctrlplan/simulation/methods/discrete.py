@@ -1,0 +1,106 @@
+"""Discrete systems, from sample to sample."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctrlplan.simulation.budget import check
+from ctrlplan.simulation.events import Snapshot
+from ctrlplan.simulation.interpreted import Interpreted
+from ctrlplan.simulation.job import Job, Record
+from ctrlplan.simulation.prepared import Prepared
+from ctrlplan.simulation.signals import breakpoints_of, signal_values
+
+Array = NDArray[np.float64]
+
+_MOST_STEPS = 1e8
+"""Maximum number of steps of a discrete system in a run."""
+
+_OFF_CLOCK = 1e-5
+"""Part of a sampling time by which a time may miss an instant, besides rounding of the times."""
+
+
+class Discrete:
+    """Difference equations by Python.
+
+    At each sample first the outputs, in the order of the signal flow, then the
+    updates. Each function of a block is called once a sample, so that a block
+    may have a memory besides its states.
+    """
+
+    name = "python"
+
+    def why_not(self, prepared: Prepared) -> str:
+        """Reason why a system is not run from sample to sample; empty where it is discrete."""
+        if prepared.network is None:
+            return prepared.unsupported
+        return "" if prepared.is_discrete else f"{prepared.name} is continuous"
+
+    def run(self, job: Job) -> Record:
+        """States at every sample of a job."""
+        prepared, network = job.prepared, job.blocks
+        clock = _clock(job.times, prepared.dt)
+        time_signals = prepared.time_signals(job.inputs, job.first)
+        equations = Interpreted(network, job.params, (job.first, job.state), job.trials)
+        breakpoints = np.array(sorted(breakpoints_of(time_signals)))
+        values = signal_values(time_signals, _on_breakpoints(clock, breakpoints))
+        states = np.empty((job.state.size, clock.size))
+        signals = np.empty((network.nsignals, clock.size))
+        states[:, 0] = job.state
+        for k, t in enumerate(clock.tolist()):
+            check(t)
+            signals[:, k] = equations.signals(t, states[:, k], values[:, k])
+            following = equations.rates_of(t, states[:, k], signals[:, k])
+            if k + 1 < clock.size:
+                states[:, k + 1] = following
+
+        def snapshot(t: Array, x: Array) -> Snapshot:
+            now = signal_values(time_signals, _on_breakpoints(t, breakpoints))
+            w = signals[:, np.searchsorted(clock, t, side="right") - 1]
+            return Snapshot(t, x, now[: prepared.ninputs], network.to_outputs(w), lambda: w)
+
+        # Between samples nothing happens: what crosses a limit does so at the later one.
+        return Record(clock, states, snapshot, lambda k, t: states[:, k], job.watched(), self.name, job.reason)
+
+
+def _clock(times: Array, dt: float | bool) -> Array:
+    """Sampling instants of a discrete system from the first time to the last, the times themselves among them."""
+    rounding = 4.0 * np.finfo(float).eps * np.abs(times).max()
+    if isinstance(dt, bool):
+        spacing = np.diff(times)
+        if np.ptp(spacing) > _OFF_CLOCK * spacing.mean() + rounding:
+            raise ValueError(
+                "timepts must be evenly spaced for a system with unspecified sampling time (dt = True), "
+                f"got spacings from {spacing.min():g} to {spacing.max():g} s"
+            )
+        return times
+    period = float(dt)
+    if not rounding < 0.1 * period < np.inf:
+        raise ValueError(f"timepts must tell instants {period:g} s apart, got times up to {np.abs(times).max():g} s")
+    steps = (times - times[0]) / period
+    if steps[-1] > _MOST_STEPS:
+        raise ValueError(f"timepts must span {_MOST_STEPS:g} periods of a discrete system at most, got {steps[-1]:.3g}")
+    wanted = np.round(steps)
+    off = np.abs(steps - wanted)
+    if off.max() > _OFF_CLOCK + rounding / period:
+        at = float(times[off.argmax()])
+        raise ValueError(
+            f"timepts must be whole periods of {period:g} s apart in a discrete system, got {at:g} s, "
+            f"{off.max():.2g} periods off"
+        )
+    if np.any(np.diff(wanted) < 1.0):
+        raise ValueError(f"timepts must be at least a period of {period:g} s apart in a discrete system, got less")
+    clock: Array = times[0] + period * np.arange(wanted[-1] + 1.0)
+    clock[wanted.astype(int)] = times
+    return clock
+
+
+def _on_breakpoints(times: Array, breakpoints: Array) -> Array:
+    """Times, but the breakpoint itself where a time is one but for rounding: 29 times 0.01 s is 0.29 s."""
+    if not breakpoints.size:
+        return times
+    after = np.clip(np.searchsorted(breakpoints, times), 1, max(1, breakpoints.size - 1))
+    before, following = breakpoints[after - 1], breakpoints[np.minimum(after, breakpoints.size - 1)]
+    nearest = np.where(times - before < following - times, before, following)
+    return np.where(np.abs(times - nearest) <= 4.0 * np.finfo(float).eps * np.abs(times).max(), nearest, times)

@@ -1,0 +1,131 @@
+"""Linear continuous systems, solved exactly."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctrlplan._renamed import outside_stacklevel
+from ctrlplan.simulation.events import Snapshot
+from ctrlplan.simulation.exact import exact_states, sampled_states
+from ctrlplan.simulation.job import Job, Record, with_event_times
+from ctrlplan.simulation.linear import LinearForm
+from ctrlplan.simulation.prepared import Prepared
+from ctrlplan.simulation.signals import PlanSignal, SampledSignal, signal_values
+
+Array = NDArray[np.float64]
+
+_UNCERTAIN = 1e-6
+"""Part of an output's size from which on its uncertainty is reported."""
+
+
+class Exact:
+    """Matrix exponentials: one a segment between breakpoints, and one for each spacing of samples."""
+
+    name = "exact"
+
+    def why_not(self, prepared: Prepared) -> str:
+        """Block that is not linear or not continuous, in words; empty where there is none."""
+        return "" if prepared.linear is not None else prepared.not_linear
+
+    def run(self, job: Job) -> Record:
+        """States at the times of a job, to rounding."""
+        form = job.prepared.linear
+        if form is None:
+            raise TypeError(f"{job.prepared.name} must be linear and continuous, but {job.prepared.not_linear}")
+        return _run(job, form)
+
+
+def _run(job: Job, form: LinearForm) -> Record:
+    time_signals = [*job.inputs, *(PlanSignal(plan, high) for plan, high in form.sources)]
+    plans = [(signal.plan, signal.derivatives) for signal in time_signals if isinstance(signal, PlanSignal)]
+    sampled = (
+        np.concatenate(
+            [np.full(signal.width, isinstance(signal, SampledSignal)) for signal in time_signals] or [np.zeros(0)]
+        )
+        > 0
+    )
+    breakpoints = [t for plan, _ in plans for t in plan.breakpoints]
+    watched = job.watched()
+    times = with_event_times(job.times, watched, lambda: form.a)
+
+    def jet(moment: float, origin: float, s: Array, order: int) -> Array:
+        rows = [plan._jet_beside(moment, origin, s, order + high) for plan, high in plans]
+        signals = [_derivatives(row, high, order) for row, (_, high) in zip(rows, plans, strict=True)]
+        return np.concatenate(signals, axis=1) if signals else np.zeros((order + 1, 0, s.size))
+
+    def snapshot(t: Array, x: Array) -> Snapshot:
+        values = signal_values(time_signals, t)
+        return Snapshot(t, x, values[: job.prepared.ninputs], form.outputs(x, values))
+
+    def states_at(t: Array, state: Array, a: Array = form.a) -> Array:
+        found = exact_states(a, form.b[:, ~sampled], jet, breakpoints, t, state)
+        if sampled.any():  # superposition of the responses to plans and to samples
+            samples = signal_values(time_signals, t)[sampled]
+            found = found + sampled_states(a, form.b[:, sampled], samples, t, np.zeros_like(state))
+        return _finite(found)
+
+    def interpolate(k: int, t: float) -> Array:
+        return states_at(np.array([times[k], t]), states[:, k])[:, 1]
+
+    states = states_at(times, job.state)
+    growing, fast = form.sensitivity(float(times[-1] - times[0]))
+    if growing or fast:
+        values, nearly = signal_values(time_signals, times), states_at(times, job.state, form.a * (1.0 + 2.0**-50))
+        floor = form.rounding(states[:, :1] if growing else states, values)
+        _warn_of_uncertainty(job, form.outputs(states, values), form.outputs(nearly, values), floor)
+    _warn_of_undefined(job, form, times, states)
+    return Record(times, states, snapshot, interpolate, watched, Exact.name, "linear and continuous")
+
+
+def _warn_of_uncertainty(job: Job, outputs: Array, others: Array, floor: Array) -> None:
+    """Warn of outputs that change by more than a floor when all rates change in their last digits."""
+    known = np.isfinite(outputs) & np.isfinite(others)
+    with np.errstate(all="ignore"):
+        apart = np.where(known, np.abs(outputs - others), 0.0).max(axis=1)
+    size = np.where(known, np.abs(outputs), 0.0).max(axis=1)
+    uncertain = apart > np.maximum(_UNCERTAIN * size, floor)
+    if uncertain.any():
+        percent = 100.0 * float((apart[uncertain] / np.maximum(size[uncertain], 0.5 * apart[uncertain])).max())
+        span = float(job.times[-1] - job.times[0])
+        names = ", ".join(np.array(job.prepared.output_labels)[uncertain])
+        warnings.warn(
+            f"outputs {names} of {job.prepared.name} are uncertain by {percent:.3g} % of their size: "
+            f"rounding errors in the system's matrices change them by that much over {span:g} s; "
+            "shorten the run, or remove modes that are so fast or so unstable",
+            UserWarning,
+            stacklevel=outside_stacklevel(),
+        )
+
+
+def _warn_of_undefined(job: Job, form: LinearForm, times: Array, states: Array) -> None:
+    """Warn of outputs that are differences of states that have overflowed."""
+    if np.isfinite(states).all():
+        return
+    up, down = (states == np.inf).astype(float), (states == -np.inf).astype(float)
+    added = (form.c > 0.0) @ up + (form.c < 0.0) @ down > 0.0
+    taken = (form.c > 0.0) @ down + (form.c < 0.0) @ up > 0.0
+    undefined = added & taken
+    if undefined.any():
+        names = ", ".join(np.array(job.prepared.output_labels)[undefined.any(axis=1)])
+        begin = times[undefined.any(axis=0).argmax()]
+        warnings.warn(
+            f"outputs {names} of {job.prepared.name} are undefined from {begin:g} s on: they are differences of states "
+            "that have overflowed, and are given as infinite",
+            UserWarning,
+            stacklevel=outside_stacklevel(),
+        )
+
+
+def _derivatives(jet: Array, high: int, order: int) -> Array:
+    """Jets (order + 1, naxes (high + 1), ntime) of a plan and its derivatives, axis by axis."""
+    shifted = np.stack([jet[k : k + order + 1] for k in range(high + 1)], axis=2)
+    return shifted.reshape(order + 1, -1, jet.shape[2])
+
+
+def _finite(values: Array) -> Array:
+    """An unstable loop that has left the range of numbers is infinite, not undefined."""
+    values[np.isnan(values)] = np.inf
+    return values

@@ -1,0 +1,74 @@
+"""What a run of a system depends on, as one value that is equal only where nothing has changed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+import control as ct
+import numpy as np
+
+from ctrlplan._types import System
+from ctrlplan.symbolic.references import References
+from ctrlplan.traits import traits_of
+
+
+def fingerprint(system: System) -> tuple[object, ...]:
+    """What a run depends on: equal only where nothing has changed."""
+    own = (id(system), str(system.name), system.dt, value_token(getattr(system, "params", None)))
+    labels = (tuple(system.input_labels or ()), tuple(system.output_labels or ()), tuple(system.state_labels or ()))
+    if isinstance(system, ct.InterconnectedSystem):
+        maps = tuple(np.asarray(m).tobytes() for m in (system.connect_map, system.input_map, system.output_map))
+        return (own, labels, maps, tuple(fingerprint(block) for block in system.syslist))
+    if isinstance(system, ct.StateSpace):
+        return (own, labels, tuple(np.asarray(m).tobytes() for m in (system.A, system.B, system.C, system.D)))
+    if isinstance(system, ct.TransferFunction):
+        return (own, labels, _frozen([system.num, system.den]))
+    # The functions themselves, not their addresses: those of the dead are given to others.
+    functions = tuple(_frozen(getattr(system, name, None)) for name in ("updfcn", "outfcn"))
+    # Traits are immutable and compared by identity.
+    traits = traits_of(system)
+    return (
+        own,
+        labels,
+        functions,
+        traits,
+        () if traits.block is None else fingerprint(traits.block),
+        _referred(system),
+    )
+
+
+def _frozen(value: object) -> object:
+    """Something hashable that changes with a value."""
+    if isinstance(value, Mapping):
+        return tuple((key, _frozen(entry)) for key, entry in value.items())
+    if isinstance(value, list | tuple):
+        return tuple(_frozen(entry) for entry in value)
+    if isinstance(value, np.ndarray):
+        return value.shape, value.tobytes() if value.dtype != object else tuple(map(_frozen, value.ravel()))
+    try:
+        hash(value)
+    except TypeError:
+        return id(value)
+    return value
+
+
+def _referred(system: System) -> tuple[object, ...]:
+    """What the functions of a block refer to, where they may be compiled."""
+    traits = traits_of(system)
+    if traits.plan is not None or traits.delay is not None:
+        return ()
+    found = References(roots_of(system))
+    return found.tokens, found.cached
+
+
+def value_token(value: object) -> tuple[object, ...]:
+    """Fingerprint of a parameter."""
+    return References([("params", value)]).tokens
+
+
+def roots_of(system: System) -> Iterator[tuple[str, object]]:
+    """Functions of a block that a compiled form is made of; those of a sampled block are run by Python."""
+    for name in ("outfcn",) if traits_of(system).period is not None else ("outfcn", "updfcn"):
+        function = getattr(system, name, None)
+        if function is not None:
+            yield getattr(function, "__name__", name), function
