@@ -69,7 +69,19 @@ _EXPORTS = {
         "prepare",
         "simulate",
     ),
-    "studies": ("Comparison", "Ensemble", "Sweep", "compare", "draws", "sweep"),
+    "studies": (
+        "Benefit",
+        "Comparison",
+        "Ensemble",
+        "Experiment",
+        "Measure",
+        "Sweep",
+        "benefit",
+        "compare",
+        "draws",
+        "monte_carlo",
+        "sweep",
+    ),
 }
 _HOME = {name: module for module, names in _EXPORTS.items() for name in names}
 

@@ -6,11 +6,15 @@ import argparse
 import contextlib
 import os
 import sys
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import ctrlplan
+
+if TYPE_CHECKING:
+    from ctrlplan.studies.files import StudyFile
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -83,9 +87,8 @@ def _all_of(studies: Mapping[str, Callable[..., Any]], folder: Path, title: str)
 
 def _report(options: argparse.Namespace) -> list[Path]:
     from ctrlplan.reports import write_report
-    from ctrlplan.studies.files import load_study
 
-    stated = load_study(options.study)
+    stated = _stated(options.study)
     _checked_folder(options.out)
     _say(f"study {stated.name}")
     study = stated.run()
@@ -95,14 +98,26 @@ def _report(options: argparse.Namespace) -> list[Path]:
 
 def _plan(options: argparse.Namespace) -> list[Path]:
     from ctrlplan.reports import write_all
-    from ctrlplan.studies.files import load_study, plans_as_csv, plans_as_json
+    from ctrlplan.studies.files import plans_as_csv, plans_as_json
 
     writers = {".csv": plans_as_csv, ".json": plans_as_json}
     if options.out.suffix not in writers:
         raise ValueError(f"--out must end in .csv or .json, got {options.out}")
-    stated = load_study(options.study)
+    stated = _stated(options.study)
     _say(f"plans of {stated.name}")
     return write_all({options.out: writers[options.out.suffix](stated)})
+
+
+def _stated(path: Path) -> StudyFile:
+    """A study file; notices of former names are said in one line each."""
+    from ctrlplan.studies.files import load_study
+
+    with warnings.catch_warnings(record=True) as notices:
+        warnings.simplefilter("always", FutureWarning)
+        stated = load_study(path)
+    for notice in notices:
+        _say(str(notice.message))
+    return stated
 
 
 def _checked_folder(folder: Path) -> None:

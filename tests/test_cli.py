@@ -284,7 +284,9 @@ def test_a_file_name_that_is_no_text_is_a_name(tmp_path, capsys):
 @pytest.mark.skipif(os.name == "nt", reason="names of files are texts there")
 def test_a_page_of_a_file_whose_name_is_no_text_is_written(tmp_path, capsys):
     path = Path(os.fsdecode(bytes(tmp_path) + b'/"><img src=x onerror=hit()>\xe9.toml'))
-    path.write_text(STUDY.replace('title = "Over the wall"', "worth = true").replace("samples = 201", "samples = 101"))
+    path.write_text(
+        STUDY.replace('title = "Over the wall"', "benefit = true").replace("samples = 201", "samples = 101")
+    )
     assert main(["report", str(path), "--out", str(tmp_path / "out")]) == 0
     page = (tmp_path / "out" / "index.html").read_text(encoding="utf-8")
     assert "<img" not in page

@@ -28,10 +28,11 @@ from ctrlplan.reports.figures import FIGURES
 from ctrlplan.reports.planning_figures import plot_rivals
 from ctrlplan.reports.style import line_styles, page_style, slug, to_svg
 from ctrlplan.reports.words import number, summary, unit_in, unit_of, verdicts
+from ctrlplan.studies.benefit import Benefit
 from ctrlplan.studies.comparison import Comparison
 from ctrlplan.studies.ensemble import Ensemble
+from ctrlplan.studies.grids import SAME, Grid
 from ctrlplan.studies.study import Study
-from ctrlplan.studies.worth import SAME, Grid, Worth
 
 
 def write_page(studies: Sequence[Study], path: str | os.PathLike[str], title: str) -> Path:
@@ -240,7 +241,7 @@ def _section(study: Study, name: str) -> dict[str, Any]:
         "marks": comparison.marks,
         "failures": comparison.failures,
         "parameters": {k: str(v) for k, v in comparison.parameters.items()},
-        "worth": None if comparison.worth is None else _worth(comparison.worth, name),
+        "worth": None if comparison.benefit is None else _worth(comparison.benefit, name),
         "claim": study.claim,
         "grids": [_grid(grid, grid.unit) for grid in study.grids],
         "fastest": None if study.fastest is None else _fastest(study.fastest, study, name),
@@ -270,7 +271,7 @@ def _fastest(found: Fastest, study: Study, name: str) -> dict[str, Any]:
     }
 
 
-def _worth(worth: Worth, name: str) -> dict[str, Any]:
+def _worth(worth: Benefit, name: str) -> dict[str, Any]:
     """The section on whether planning is worth it."""
     least = min((need.duration for need in worth.needs if math.isfinite(need.duration)), default=math.nan)
     return {

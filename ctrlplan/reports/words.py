@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 
 from ctrlplan.studies.comparison import Comparison
+from ctrlplan.studies.roles import Stability
 from ctrlplan.studies.units import ROUNDING, in_units
 
 TIE = 1e-3
@@ -83,7 +84,7 @@ def summary(comparison: Comparison) -> str:
 
 def is_unstable(comparison: Comparison) -> bool:
     """Whether the loop is known to be unstable."""
-    return any(note.startswith("The loop is unstable") for note in comparison.notes)
+    return comparison.stability is Stability.UNSTABLE
 
 
 def unit_of(comparison: Comparison, key: str) -> str:

@@ -1,18 +1,25 @@
 """Plans compared: one loop, many loops, and the paper's experiments."""
 
-from ctrlplan.studies.comparison import Comparison, compare, standard_plans
+from ctrlplan.studies.benefit import Benefit, benefit
+from ctrlplan.studies.comparison import Comparison
 from ctrlplan.studies.crane import crane_first_order_study, crane_nominal_study, crane_obstacle_study
-from ctrlplan.studies.ensemble import Ensemble, draws
+from ctrlplan.studies.draws import draws
+from ctrlplan.studies.ensemble import Ensemble
+from ctrlplan.studies.experiment import Experiment
+from ctrlplan.studies.former import compare, sweep
 from ctrlplan.studies.linear import linear_study
 from ctrlplan.studies.measures import MEASURES, Measure
+from ctrlplan.studies.monte_carlo import monte_carlo
 from ctrlplan.studies.online import (
     online_goal_study,
     online_gust_study,
     online_payload_study,
     online_saturated_study,
 )
+from ctrlplan.studies.plans import standard_plans
+from ctrlplan.studies.roles import Role, Stability
 from ctrlplan.studies.study import Study
-from ctrlplan.studies.sweep import Sweep, sweep
+from ctrlplan.studies.sweep import Sweep
 
 PAPER = {
     "linear": linear_study,
@@ -34,17 +41,23 @@ __all__ = [
     "MEASURES",
     "ONLINE",
     "PAPER",
+    "Benefit",
     "Comparison",
     "Ensemble",
+    "Experiment",
     "Measure",
+    "Role",
+    "Stability",
     "Study",
     "Sweep",
+    "benefit",
     "compare",
     "crane_first_order_study",
     "crane_nominal_study",
     "crane_obstacle_study",
     "draws",
     "linear_study",
+    "monte_carlo",
     "online_goal_study",
     "online_gust_study",
     "online_payload_study",

@@ -1,38 +1,21 @@
-"""Linear loops that differ in numbers alone, solved and measured together."""
+"""Linear loops that differ in numbers alone, solved together."""
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ctrlplan._checks import real_array
 from ctrlplan.simulation import rest_state, state_space, stated_start
 from ctrlplan.simulation.exact import exact_states
 from ctrlplan.simulation.linear import LinearForm, in_right_half, linear_form
-from ctrlplan.studies.comparison import acting_outputs, checked_start, compare, is_builder, tracked_outputs
-from ctrlplan.studies.measures import MEASURES, control_metrics, path_metrics, response_metrics
+from ctrlplan.studies.running import System, acting_outputs, tracked_outputs
 from ctrlplan.trajectories import Trajectory
 
 Array = NDArray[np.float64]
-Metrics = dict[str, dict[str, float]]
-"""Plan, metric, value."""
-
-_SAMPLES = 2**19
-"""Samples of a signal of all the loops that are taken together, at most."""
-
-_FIRST = 4
-"""Loops that are taken together at first; then twice as many each time, so that an interruption loses little."""
-
-_MEASURED = ("plans", "timepts", "outputs", "controls", "waypoints", "initial_state", "band", "start", "only")
-_WITHOUT_EFFECT = ("alpha", "title", "parameters")
-_SHARED = {"loop", *_MEASURED, *_WITHOUT_EFFECT}
-"""Arguments of `compare` that are used here; with any other each loop must be compared by itself."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,142 +38,95 @@ class Linear:
     form: LinearForm
     starts: dict[str, Array]
 
+    def fits(self, other: Linear) -> bool:
+        """Whether two loops differ in numbers alone."""
+        same = (getattr(self.form, name).shape == getattr(other.form, name).shape for name in "abcd")
+        return self.labels == other.labels and all(same)
 
-class Alike:
-    """Loops that wait to be measured together, as `compare` measures each.
+
+def numbers_of(
+    loop: System,
+    first: Trajectory,
+    held: Mapping[str, Array],
+    duration: float,
+    outputs: Sequence[str] | None = None,
+    controls: Sequence[str] | None = None,
+    initial_state: ArrayLike | None = None,
+) -> Linear | None:
+    """Numbers of a linear loop; None where it must be run by itself.
 
     Parameters
     ----------
-    given : mapping
-        Arguments of `compare` but the loop. With some of them no loop is
-        accepted: each must then be compared by itself.
-
-    Attributes
-    ----------
-    waiting : dict of int to Linear
-        By the number of the loop.
+    loop : control system
+        As `compare` takes it.
+    first : Trajectory
+        The first of the plans.
+    held : mapping of str to ndarray, shape (naxes,)
+        First position of each plan.
+    duration : float
+        Length of the run [s].
+    outputs, controls, initial_state
+        As for `compare`.
     """
-
-    def __init__(self, given: Mapping[str, Any]) -> None:
-        signature = inspect.signature(compare)
-        bound = signature.bind(None, **given)
-        bound.apply_defaults()
-        self._given = SimpleNamespace(**bound.arguments)
-        own = [name for name in signature.parameters if name not in _SHARED]
-        self._possible = _ordered(self._given.timepts) and all(
-            bound.arguments[name] is signature.parameters[name].default for name in own
-        )
-        self._size, self._most = _FIRST, max(2, _SAMPLES // max(1, self._given.timepts.size))
-        plans, begin = self._given.plans, self._given.timepts[:1]
-        self._held = {k: plan.jet(begin, 0, left=True)[0, :, 0] for k, plan in plans.items()} if self._possible else {}
-        self._first = next(iter(plans.values()))
-        self.waiting: dict[int, Linear] = {}
-
-    @property
-    def full(self) -> bool:
-        """Whether as many wait as are taken together."""
-        return len(self.waiting) >= self._size
-
-    def linear(self, loop: Any) -> Linear | None:
-        """The numbers of a loop; None where it cannot be measured together with others."""
-        if not self._possible or is_builder(loop):
+    try:
+        system = state_space(loop)
+        form, stated = linear_form(system), stated_start(system)
+        if form.sources or stated is not None or form.b.shape[1] != first.naxes:
             return None
-        try:
-            system = state_space(loop)
-            form, stated = linear_form(system), stated_start(system)
-            if form.sources or stated is not None or form.b.shape[1] != self._first.naxes:
-                return None
-            tracked = tracked_outputs(system, self._given.outputs, self._first)
-            acting = acting_outputs(system, self._given.controls)
-            starts = self._starts(system)
-        except (AttributeError, TypeError, ValueError):  # what is wrong is for `compare` to say
-            return None
-        if self._given.initial_state is None and not self._at_rest(form, starts):
-            return None  # which is to be said of the loop concerned
-        if any(form.sensitivity(float(self._given.timepts[-1] - self._given.timepts[0]))):
-            return None  # `simulate` says which digits are lost
-        return Linear(tuple(system.output_labels), tracked, acting, form, starts)
-
-    def _starts(self, system: Any) -> dict[str, Array]:
-        """States at the first sample by plan: as given, or at rest where the plan is."""
-        initial = self._given.initial_state
-        if initial is not None:
-            state = np.broadcast_to(real_array(initial, "initial_state"), (system.nstates,))
-            return dict.fromkeys(self._held, state)
-        return {name: rest_state(system, position) for name, position in self._held.items()}
-
-    def _at_rest(self, form: LinearForm, starts: Mapping[str, Array]) -> bool:
-        """Whether states are equilibria with the plans held at their first positions."""
-        for name, position in self._held.items():
-            moved = form.a @ starts[name] + form.b @ position
-            terms = np.abs(form.a) @ np.abs(starts[name]) + np.abs(form.b) @ np.abs(position)
-            if np.any(np.abs(moved) > 1e-6 * terms.max(initial=0.0)):
-                return False
-        return True
-
-    def fits(self, linear: Linear) -> bool:
-        """Whether a loop differs from those that wait in numbers alone."""
-        other = next(iter(self.waiting.values()), linear)
-        same = (getattr(other.form, name).shape == getattr(linear.form, name).shape for name in "abcd")
-        return other.labels == linear.labels and all(same)
-
-    def clear(self) -> None:
-        """Begin again, with twice as many."""
-        self.waiting, self._size = {}, min(2 * self._size, self._most)
-
-    def metrics(self) -> dict[int, Metrics]:
-        """Metrics of those that wait, by their numbers."""
-        loops = list(self.waiting.values())
-        return dict(zip(self.waiting, _metrics(self._given, loops), strict=True)) if loops else {}
+        tracked = tracked_outputs(system, outputs, first)
+        acting = acting_outputs(system, controls)
+        if initial_state is not None:
+            state = np.broadcast_to(real_array(initial_state, "initial_state"), (system.nstates,))
+            starts = dict.fromkeys(held, state)
+        else:
+            starts = {name: rest_state(system, position) for name, position in held.items()}
+    except (AttributeError, TypeError, ValueError):  # what is wrong is said where the loop is run by itself
+        return None
+    if initial_state is None and not _at_rest(form, starts, held):
+        return None  # which is to be said of the loop concerned
+    if any(form.sensitivity(duration)):
+        return None  # `simulate` says which digits are lost
+    return Linear(tuple(system.output_labels), tracked, acting, form, starts)
 
 
-def _metrics(given: Any, loops: list[Linear]) -> list[Metrics]:
-    """What `compare` finds of each loop."""
-    plans, times, labels = given.plans, given.timepts, list(loops[0].labels)
-    first, tracked, acting = next(iter(plans.values())), loops[0].tracked, loops[0].acting
-    if given.only is not None and not any(name.startswith("control") for name in given.only):
-        acting = ()
-    rows = [labels.index(name) for name in (*tracked, *acting)]
-    start = checked_start(given.start, plans.values(), times)
+def _at_rest(form: LinearForm, starts: Mapping[str, Array], held: Mapping[str, Array]) -> bool:
+    """Whether states are equilibria with the plans held at their first positions."""
+    for name, position in held.items():
+        moved = form.a @ starts[name] + form.b @ position
+        terms = np.abs(form.a) @ np.abs(starts[name]) + np.abs(form.b) @ np.abs(position)
+        if np.any(np.abs(moved) > 1e-6 * terms.max(initial=0.0)):
+            return False
+    return True
+
+
+def outputs_together(
+    loops: Sequence[Linear], names: Sequence[str], plans: Mapping[str, Trajectory], times: Array
+) -> tuple[dict[str, Array], NDArray[np.bool_]]:
+    """Outputs of loops that fit each other, and whether each is unstable.
+
+    Parameters
+    ----------
+    loops : sequence of Linear
+        The loops.
+    names : sequence of str
+        Outputs wanted.
+    plans : mapping of str to Trajectory
+        The plans at their inputs.
+    times : ndarray, shape (ntime,)
+        Sample times [s].
+
+    Returns
+    -------
+    dict of str to ndarray, shape (nloops, nnames, ntime)
+        By plan.
+    ndarray of bool, shape (nloops,)
+    """
+    rows = [loops[0].labels.index(name) for name in names]
     a, b, c, d = (np.stack([getattr(loop.form, name) for loop in loops]) for name in "abcd")
     form = LinearForm(a, b, c, d, ())
-    unstable = in_right_half(np.linalg.eigvals(form.a)).any(axis=1)
-    each = tuple(map(str, range(len(loops))))
-    found: list[Metrics] = [{} for _ in loops]
-    for name, plan in plans.items():
-        initial = np.stack([loop.starts[name] for loop in loops])
-        signals = _outputs(form, rows, plan, times, initial).swapaxes(0, 1)
-        axes = [plan] if plan.naxes == 1 else [plan.select([label]) for label in plan.labels]
-        # One axis of all loops is measured like the axes of one.
-        responses = [
-            response_metrics(times, y, axis, start, given.band, each, given.only)
-            for y, axis in zip(signals[: len(axes)], axes, strict=True)
-        ]
-        controls = [control_metrics(times, u, start, each, given.only) for u in signals[len(axes) :]]
-        values = _of_loops(responses, first.labels, each)
-        values |= {key: np.where(unstable, np.inf, row) for key, row in values.items() if "settling_time" in key}
-        values |= _of_loops(controls, acting, each)
-        of_plan = path_metrics(plan, given.waypoints, given.only)
-        for i, metrics in enumerate(found):
-            metrics[name] = {key: float(row[i]) for key, row in values.items()} | of_plan
-    return found
-
-
-def _ordered(times: Array) -> bool:
-    return times.ndim == 1 and times.size > 1 and bool(np.isfinite(times).all() and np.all(np.diff(times) > 0.0))
-
-
-def _of_loops(measured: list[dict[str, float]], labels: Sequence[str], each: Sequence[str]) -> dict[str, Array]:
-    """Metrics (nloops,) as `compare` names them, from those of each label: the worst, and each where there are more."""
-    names = [name for name in measured[0] if name in MEASURES] if measured else []
-    # Of one loop alone there is the worst, which it is.
-    keys = {name: [f"{name}_{i}" for i in each] if len(each) > 1 else [name] for name in names}
-    rows = {name: np.array([[found[key] for key in keys[name]] for found in measured]) for name in names}
-    worst = {name: np.fmax.reduce(row) for name, row in rows.items()}
-    if len(labels) > 1:
-        for name, row in rows.items():
-            worst |= {f"{name}_{label}": values for label, values in zip(labels, row, strict=True)}
-    return worst
+    unstable = np.asarray(in_right_half(np.linalg.eigvals(form.a)).any(axis=1))
+    starts = {name: np.stack([loop.starts[name] for loop in loops]) for name in plans}
+    return {name: _outputs(form, rows, plan, times, starts[name]) for name, plan in plans.items()}, unstable
 
 
 def _outputs(form: LinearForm, rows: list[int], plan: Trajectory, times: Array, initial: Array) -> Array:

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from functools import cache
 from typing import Any
 
+import control as ct
 import numpy as np
 from scipy.optimize import minimize
 
@@ -20,19 +21,22 @@ from ctrlplan.planning import (
     optimize_waypoints,
     path_length,
 )
+from ctrlplan.studies.baselines import smoother_polynomials
+from ctrlplan.studies.benefit import PLANNED, Benefit, Choices, benefit_of
 from ctrlplan.studies.crane_setup import (
     CRANE,
     CRANE_MEASURES,
     FORCE_LIMITS,
+    LOAD,
     SLACK,
     TORQUE_LIMITS,
     UNITS,
     WALL,
-    load_metrics,
     nominal_waypoints,
     obstacle_waypoints,
 )
-from ctrlplan.studies.worth import Grid, Worth, smoother_polynomials, worth
+from ctrlplan.studies.experiment import Experiment
+from ctrlplan.studies.grids import Grid
 from ctrlplan.systems.plants import LAWS, crane_loop
 from ctrlplan.trajectories import PiecewiseSpline, Trajectory, TrigSpline, Waypoint
 
@@ -44,19 +48,25 @@ _COMFORT = {"velocity": 2.5, "acceleration": 0.6, "jerk": 0.4, "theta": 0.06, "R
 _POLYLINE = "polyline (no path is shorter)"
 
 
-def nominal_worth() -> Worth:
-    """The nominal move beside its baselines, all of them through the flat map that are smooth enough for it."""
+def nominal_benefit() -> Benefit:
+    """The nominal move compared with its baselines, all through the flat map that are smooth enough for it."""
 
-    def build(name: str, plan: Trajectory) -> Any:
+    def build(name: str, plan: Trajectory) -> ct.InterconnectedSystem:
         # The flat map contains accelerations: where these jump, trolley and rope would have to.
         law = LAWS["setpoint" if plan.jumps(2) else "generator"]
         return crane_loop(CRANE, plan, law, force_limits=FORCE_LIMITS, torque_limits=TORQUE_LIMITS)
 
-    depth = float(np.mean([point.position[1] for point in nominal_waypoints()]))
-    return worth(
-        build,
-        nominal_waypoints(),
+    points = nominal_waypoints()
+    depth = float(np.mean([point.position[1] for point in points]))
+    experiment = Experiment(
+        {PLANNED: TrigSpline(points, alpha=1.0)},
         np.linspace(0.0, 40.0, 2001),
+        waypoints=points,
+        controls=("F", "C"),
+        events=(SLACK,),
+        measures=CRANE_MEASURES | {"load": LOAD},
+    )
+    choices = Choices(
         alpha=1.0,
         limits=_COMFORT,
         quantities=CRANE,
@@ -64,18 +74,14 @@ def nominal_worth() -> Worth:
         alphas=(0.0, 1.0, 2.0, 3.0, 4.0),
         factors=(0.75, 1.0, 1.5),
         decisive=("settling_time", "sway_after", "force_peak"),
-        measure=load_metrics,
-        measures=CRANE_MEASURES,
         baselines=smoother_polynomials,
-        controls=("F", "C"),
-        events=(SLACK,),
-        units=UNITS,
-        title="Crane, nominal case: planned beside its rivals",
         note="Every plan with a continuous acceleration goes to the drives through the flat map of the load (figure "
         "3): splines, polynomials up to the nonic, S-curves, shaped or not. Steps and the trapezoid, whose "
         "acceleration jumps, go there as if the load hung at rest. All drives are limited. A run ends where the rope "
         "goes slack.",
     )
+    title = "Crane, nominal case: planned beside its rivals"
+    return benefit_of(experiment, build, choices, units=UNITS, title=title)
 
 
 @cache

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -20,8 +19,8 @@ from ctrlplan.studies.choosing import (
     WALLS,
     clearance_note,
     fastest_notes,
+    nominal_benefit,
     nominal_fastest,
-    nominal_worth,
     optimality_claim,
     optimality_grids,
 )
@@ -30,17 +29,17 @@ from ctrlplan.studies.crane_setup import (
     CRANE,
     CRANE_MEASURES,
     FORCE_LIMITS,
+    LOAD,
     SLACK,
     TORQUE_LIMITS,
     UNITS,
     WALL,
     first_order_waypoints,
-    load_metrics,
     marked_slack,
     nominal_waypoints,
     obstacle_waypoints,
 )
-from ctrlplan.studies.measures import signals_of
+from ctrlplan.studies.measures import Measure, Run, signals_of
 from ctrlplan.studies.study import Curves, Study
 from ctrlplan.systems.plants import LAWS, crane_loop
 from ctrlplan.trajectories import PiecewiseSpline, PolySpline, Step, Trajectory, TrigSpline, Waypoint
@@ -63,7 +62,7 @@ def crane_nominal_study(progress: bool = True) -> Study:
     }
     found = _compared(plans, points, 30.0, "Crane, nominal case (simulation 1)")
     poly, trig = found.metrics["polynomial"], found.metrics["trigonometric"]
-    found = replace(found, worth=nominal_worth())
+    found = found.with_benefit(nominal_benefit())
     limited = nominal_fastest()
     whole = found.metrics["C4 polynomial, dynamic law"]
     grows, damped = _slowest(_linear_loop("generator")), _slowest(_linear_loop("load_feedback"))
@@ -201,19 +200,17 @@ def _step(points: tuple[Waypoint, ...]) -> Step:
 def _compared(
     plans: Mapping[str, tuple[Trajectory, dict[str, Any]]], points: tuple[Waypoint, ...], t_end: float, title: str
 ) -> Comparison:
-    last = points[-1].time
     timepts = np.union1d(np.linspace(0.0, t_end, int(100 * t_end) + 1), [w.time for w in points])
 
-    def build(name: str, plan: Trajectory) -> Any:
+    def build(name: str, plan: Trajectory) -> ct.InterconnectedSystem:
         return crane_loop(CRANE, plan, **plans[name][1])
 
     laws = {id(plan): options for plan, options in plans.values()}
 
-    def measure(plan: Trajectory, response: Any) -> dict[str, float]:
-        found, options = load_metrics(plan, response, last), laws[id(plan)]
-        if options.get("law", "generator") in ("dynamic", "feedforward"):
-            return found | {"error_limited": np.nan}  # they command force and torque themselves
-        return found | {"error_limited": _limited_error(plan, options, timepts)}
+    def limited(run: Run) -> dict[str, float]:
+        options = laws[id(run.plan)]
+        own = options.get("law", "generator") in ("dynamic", "feedforward")  # these command force and torque themselves
+        return {"error_limited": np.nan if own else _limited_error(run.plan, options, timepts)}
 
     found = compare(
         build,
@@ -222,8 +219,7 @@ def _compared(
         controls=("F", "C"),
         events=(SLACK,),
         waypoints=points,
-        measure=measure,
-        measures=CRANE_MEASURES,
+        measures=CRANE_MEASURES | {"load": LOAD, "limited": Measure("Limited drives", of="run", function=limited)},
         units=UNITS,
         title=title,
         parameters=_parameters(t_end),

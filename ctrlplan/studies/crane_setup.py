@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
-
+import control as ct
 import numpy as np
 from numpy.typing import NDArray
 
@@ -62,7 +61,7 @@ def obstacle_waypoints(duration: float = 16.0) -> tuple[Waypoint, ...]:
     )
 
 
-def load_metrics(plan: Trajectory, response: Any, last: float) -> dict[str, float]:
+def load_metrics(plan: Trajectory, response: ct.TimeResponseData, last: float) -> dict[str, float]:
     """Metrics of the load against its plan, the way before `last` [s] and the time after.
 
     Parameters
@@ -97,6 +96,10 @@ def load_metrics(plan: Trajectory, response: Any, last: float) -> dict[str, floa
         else float(metrics.path_length(np.linspace(plan.start, plan.end, 4001), travelled)),
         "load_path": float(metrics.path_length(t, load)),
     }
+
+
+LOAD = Measure("Load against its plan", of="run", function=lambda run: load_metrics(run.plan, run.response, run.last))
+"""Metrics of the load, which `CRANE_MEASURES` describes."""
 
 
 def _limited_peak(t: Array, values: Array) -> float:

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from numbers import Real
 from queue import Empty, SimpleQueue
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 from uuid import uuid4
 
 from tqdm import tqdm
@@ -33,6 +33,13 @@ _POLL_BESIDE_CALLBACKS = 0.5
 
 _KEPT = 2
 """Shared values that a thread keeps."""
+
+
+class Executor(Protocol):
+    """Where tasks run: `concurrent.futures.Executor` and whatever submits as it does."""
+
+    def submit(self, function: Callable[..., Any], /, *arguments: Any) -> Any:
+        """Future of a call: an object with ``result``."""
 
 
 @dataclass(frozen=True)
@@ -115,7 +122,7 @@ class Account(Generic[R]):
         raise lost[0]
 
 
-def checked_executor(executor: Any) -> Any:
+def checked_executor(executor: Executor | None) -> Executor | None:
     """Executor, or None for this process.
 
     Raises
@@ -205,7 +212,12 @@ def _ready(outcomes: Generator[tuple[int, Any], None, None]) -> Iterator[tuple[i
 
 
 def executed(
-    run: Callable[[T], R], tasks: Sequence[T], executor: Any, timeout: float | None, label: str, progress: bool
+    run: Callable[[T], R],
+    tasks: Sequence[T],
+    executor: Executor | None,
+    timeout: float | None,
+    label: str,
+    progress: bool,
 ) -> Account[R]:
     """Outcomes of tasks, taken as they complete, until the last or until Ctrl-C.
 
@@ -348,7 +360,9 @@ def _bar(count: int, label: str, progress: bool) -> Iterator[Callable[[], Any]]:
         bar.close()
 
 
-def _submit(run: Callable[[T], Any], tasks: Sequence[T], executor: Any, futures: dict[int, Any]) -> dict[int, Failed]:
+def _submit(
+    run: Callable[[T], Any], tasks: Sequence[T], executor: Executor, futures: dict[int, Any]
+) -> dict[int, Failed]:
     """Hand out all tasks; those that the executor does not take, and why."""
     for k, task in enumerate(tasks):
         try:

@@ -11,8 +11,8 @@ import math
 import os
 import sys
 import tomllib
-from collections.abc import Callable, Collection
-from dataclasses import dataclass, field, fields
+from collections.abc import Collection
+from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
 from types import UnionType
@@ -22,10 +22,16 @@ import control as ct
 import numpy as np
 from numpy.typing import NDArray
 
-from ctrlplan.studies.comparison import compare, standard_plans
-from ctrlplan.studies.crane_setup import CRANE_MEASURES, SLACK, load_metrics, marked_slack
+from ctrlplan._renamed import warn_renamed
+from ctrlplan.simulation import Event
+from ctrlplan.studies.baselines import smoother_polynomials
+from ctrlplan.studies.benefit import Choices, benefit_of
+from ctrlplan.studies.comparison import comparison_of
+from ctrlplan.studies.crane_setup import CRANE_MEASURES, LOAD, SLACK, marked_slack
+from ctrlplan.studies.experiment import Experiment
+from ctrlplan.studies.plans import standard_plans
+from ctrlplan.studies.running import Builder, System
 from ctrlplan.studies.study import Study
-from ctrlplan.studies.worth import smoother_polynomials
 from ctrlplan.systems.plants import LAWS, Crane, crane_loop, unity_feedback_loop
 from ctrlplan.systems.plants.crane.laws import as_law
 from ctrlplan.trajectories import PiecewiseSpline, PolySpline, Step, Trajectory, TrigSpline, Waypoint
@@ -84,8 +90,10 @@ class StudyFile:
         The table [loop].
     units : dict of str to str
         Units by label.
-    worth : bool
-        Whether the report should ask if planning is worth it.
+    benefit : bool
+        Whether the report compares planning with its baselines.
+    experiment : dict
+        The table [experiment]: further fields of `Experiment` by name.
     """
 
     path: Path
@@ -97,7 +105,8 @@ class StudyFile:
     plans: dict[str, Trajectory]
     loop: dict[str, Any]
     units: dict[str, str] = field(default_factory=dict)
-    worth: bool = False
+    benefit: bool = False
+    experiment: dict[str, Any] = field(default_factory=dict)
 
     def run(self) -> Study:
         """Simulate and measure.
@@ -108,18 +117,17 @@ class StudyFile:
             If the loop does not fit the plans.
         """
         loop = build_loop(self.loop, self.path)
+        fields_of, choices = self._crane() if self.loop["kind"] == "crane" else (self.experiment, Choices())
         try:
+            experiment = Experiment(self.plans, self.timepts(loop), waypoints=self.waypoints, **fields_of)
             with np.errstate(over="ignore", invalid="ignore"):  # a run that leaves all bounds says so itself
-                comparison = compare(
-                    loop,
-                    self.plans,
-                    self.timepts(loop),
-                    waypoints=self.waypoints,
-                    units=self.units,
-                    title=self.title,
-                    parameters=self.parameters(),
-                    **{"worth": self.worth} | self._crane_options(),
-                )
+                found = experiment.run(loop)
+                comparison = comparison_of(experiment, found, self.units, self.parameters(), self.title)
+                if self.benefit:
+                    alphas = (plan.alpha for plan in comparison.plans.values() if isinstance(plan, TrigSpline))
+                    choices = replace(choices, alpha=next(alphas, 1.0))
+                    benefit = benefit_of(experiment, loop, choices, units=self.units)
+                    comparison = comparison.with_benefit(benefit)
         except StudyError:
             raise
         except (ValueError, TypeError, RuntimeError) as error:
@@ -131,41 +139,34 @@ class StudyFile:
         figures = ("crane-plane", "plans", "crane-time", "crane-motion")
         return Study(self.name, self.title, marked_slack(comparison), notes=comparison.notes, figures=figures)
 
-    def _crane_options(self) -> dict[str, Any]:
-        """What a comparison of cranes measures besides."""
-        if self.loop["kind"] != "crane":
-            return {}
-        if set(self.waypoints[0].labels or ()) != {"x", "z"}:
-            axes = ", ".join(self.waypoints[0].labels or ())
-            raise StudyError(f"{self.path}: waypoints: a crane's axes must be x and z (down), got {axes}")
-        last = self.waypoints[-1].time
-        return {
-            "controls": ("F", "C"),
-            "events": (SLACK,),
-            "measure": lambda plan, response: load_metrics(plan, response, last),
-            "measures": CRANE_MEASURES,
-            "worth": self._asked_of_crane() if self.worth else False,
-        }
-
-    def _asked_of_crane(self) -> dict[str, Any]:
-        """How planning is judged on a crane: by its sway, and beside references shaped for its pendulum."""
+    def _crane(self) -> tuple[dict[str, Any], Choices]:
+        """Fields of the experiment with a crane, and how planning is judged: by sway, and against shaped references."""
+        labels = self.waypoints[0].labels or ()
+        if set(labels) != {"x", "z"}:
+            raise StudyError(f"{self.path}: waypoints: a crane's axes must be x and z (down), got {', '.join(labels)}")
         crane = Crane(**{key: value for key, value in self.loop.items() if key in _CRANE_ENTRIES})
-        depth = float(np.mean([point.position[(point.labels or ()).index("z")] for point in self.waypoints]))
-        return {
-            "quantities": crane,
-            "mode": (math.sqrt(crane.gravity / depth), 0.0) if depth > 0.0 else None,
-            "decisive": ("settling_time", "sway_after", "force_peak"),
-            "measure": load_metrics,
-            "baselines": smoother_polynomials,
-        }
+        depth = float(np.mean([point.position[labels.index("z")] for point in self.waypoints]))
+        measures = CRANE_MEASURES | {"load": LOAD}
+        own = [replace(measure, name=name) for name, measure in measures.items()]
+        stated = self.experiment.get("measures")
+        fields_of = {"controls": ("F", "C")} | self.experiment
+        fields_of["events"] = (SLACK, *self.experiment.get("events", ()))
+        fields_of["measures"] = measures if stated is None else [*own, *stated]
+        return fields_of, Choices(
+            quantities=crane,
+            mode=(math.sqrt(crane.gravity / depth), 0.0) if depth > 0.0 else None,
+            decisive=("settling_time", "sway_after", "force_peak"),
+            baselines=smoother_polynomials,
+        )
 
-    def timepts(self, loop: Any) -> NDArray[np.float64]:
+    def timepts(self, loop: System | Builder) -> NDArray[np.float64]:
         """Sample times: those asked for and the waypoints', or the periods of a discrete loop."""
         start = self.waypoints[0].time
-        if getattr(loop, "dt", None):
-            period = 1.0 if loop.dt is True else float(loop.dt)
+        dt = getattr(loop, "dt", None)
+        if dt:
+            period = 1.0 if dt is True else float(dt)
             count = (self.t_end - start) / period
-            _check_memory(count, len(self.plans), self.worth, f"{self.path}: t_end: periods of {period:g} s")
+            _check_memory(count, len(self.plans), self.benefit, f"{self.path}: t_end: periods of {period:g} s")
             return start + period * np.arange(int((self.t_end - start) / period * (1 + 1e-12)) + 1, dtype=float)
         return np.union1d(np.linspace(start, self.t_end, self.samples), [w.time for w in self.waypoints])
 
@@ -181,6 +182,11 @@ class StudyFile:
         points: dict[str, object] = {f"waypoint {i}": repr(w) for i, w in enumerate(self.waypoints)}
         run = f"{self.waypoints[0].time:g} to {self.t_end:g} s, {self.samples} samples"
         return loop | plans | points | {"run": run}
+
+
+_ENTRIES = ("title", "t_end", "samples", "benefit", "worth", "units", "experiment", "loop", "plans", "waypoints")
+_EXPERIMENT = ("start", "band", "outputs", "controls", "initial_state", "params", "events", "measures")
+"""Fields of `Experiment` that the table [experiment] may state; the others have entries of their own."""
 
 
 def load_study(path: str | os.PathLike[str]) -> StudyFile:
@@ -203,7 +209,7 @@ def load_study(path: str | os.PathLike[str]) -> StudyFile:
     source = Path(path)
     data = _parsed(source)
     reader = _Reader(source)
-    reader.known(data, ("title", "t_end", "samples", "worth", "units", "loop", "plans", "waypoints"), "the file")
+    reader.known(data, _ENTRIES, "the file")
     waypoints = reader.waypoints(data)
     t_end = reader.number(data, "t_end", "t_end", default=None)
     if not t_end > waypoints[-1].time:
@@ -216,9 +222,7 @@ def load_study(path: str | os.PathLike[str]) -> StudyFile:
     title = data.get("title", source.stem)
     if not isinstance(title, str):
         raise reader.error("title", f"must be a string, got {_got(title)}")
-    worth = data.get("worth", False)
-    if not isinstance(worth, bool):
-        raise reader.error("worth", f"must be true or false, got {_got(worth)}")
+    benefit = reader.benefit(data)
     units = reader.table(data, "units", needed=False)
     for label, unit in units.items():
         if not isinstance(unit, str):
@@ -227,8 +231,11 @@ def load_study(path: str | os.PathLike[str]) -> StudyFile:
         if label not in known and loop["kind"] == "linear":
             raise reader.error(f"units.{label}", f"must be of one of {', '.join(known)}, got {label!r}")
     plans = reader.plans(data, waypoints)
-    _check_memory(samples, len(plans), worth, f"{source}: samples")
-    return StudyFile(source, source.stem, title, t_end, int(samples), waypoints, plans, loop, units, worth)
+    _check_memory(samples, len(plans), benefit, f"{source}: samples")
+    experiment = reader.experiment(data, plans, (waypoints[0].time, t_end))
+    return StudyFile(
+        source, source.stem, title, t_end, int(samples), waypoints, plans, loop, units, benefit, experiment
+    )
 
 
 _MEMORY = 2.0**30
@@ -238,9 +245,9 @@ _BESIDE, _EACH, _RIVALS = 750, 450, 8
 """Bytes a sample, as measured with a crane: once, and for each plan; and how many plans a benefit report adds."""
 
 
-def _check_memory(samples: float, plans: int, worth: bool, place: str) -> None:
+def _check_memory(samples: float, plans: int, benefit: bool, place: str) -> None:
     """Raise where the samples of all plans would take more memory than a study may."""
-    each = _BESIDE + _EACH * (plans + _RIVALS * worth)
+    each = _BESIDE + _EACH * (plans + _RIVALS * benefit)
     if samples * each > _MEMORY:
         raise StudyError(
             f"{place} must be at most {int(_MEMORY / each)} with {plans} plans, for about {_MEMORY / 1e9:.2g} GB of "
@@ -272,7 +279,7 @@ def _parsed(source: Path) -> dict[str, Any]:
         raise StudyError(f"{source}: must be valid TOML, got {error}") from None
 
 
-def build_loop(table: dict[str, Any], path: Path) -> Any:
+def build_loop(table: dict[str, Any], path: Path) -> System | Builder:
     """Loop that the table [loop] asks for.
 
     Raises
@@ -294,7 +301,7 @@ def build_loop(table: dict[str, Any], path: Path) -> Any:
 _SIGNATURE = "def build() -> control.InputOutputSystem:"
 
 
-def _loop_of_module(kind: str, path: Path) -> Any:
+def _loop_of_module(kind: str, path: Path) -> System:
     """Loop that a function of a module returns, called only where it is declared to return one."""
     _, module, name = kind.split(":")
     try:
@@ -332,7 +339,7 @@ def _check_declared(function: Any) -> None:
         raise TypeError(f"its return annotation must be a class of control systems, got {got}")
 
 
-def _crane(table: dict[str, Any], path: Path) -> Callable[[str, Trajectory], Any]:
+def _crane(table: dict[str, Any], path: Path) -> Builder:
     """Loop of each plan: steps, shaped or not, go to the drives as at rest, every other plan through the law."""
     try:
         crane = Crane(**{key: value for key, value in table.items() if key in _CRANE_ENTRIES})
@@ -347,7 +354,7 @@ def _crane(table: dict[str, Any], path: Path) -> Callable[[str, Trajectory], Any
         if not (isinstance(pair, list) and len(pair) == 2 and all(map(_is_number, pair)) and pair[0] < pair[1]):
             raise StudyError(f"{path}: loop.{key}: must be two increasing numbers, got {_got(pair)}")
 
-    def build(name: str, plan: Trajectory) -> Any:
+    def build(name: str, plan: Trajectory) -> System:
         return crane_loop(crane, plan, LAWS["setpoint"] if plan.jumps(0) else law, **limits)
 
     return build
@@ -460,6 +467,42 @@ class _Reader:
             return PolySpline(points, warn=False).waypoints
         except ValueError as error:
             raise self.error("waypoints", error) from None
+
+    def benefit(self, data: dict[str, Any]) -> bool:
+        """Whether planning is compared with its baselines; "worth" is the former name of the entry."""
+        if "worth" in data and "benefit" in data:
+            raise self.error("worth", "must not be given beside benefit, got both")
+        key = "worth" if "worth" in data else "benefit"
+        value = data.get(key, False)
+        if not isinstance(value, bool):
+            raise self.error(key, f"must be true or false, got {_got(value)}")
+        if key == "worth":
+            warn_renamed(f"{self.path}: worth =", "benefit =")
+        return value
+
+    def experiment(
+        self, data: dict[str, Any], plans: dict[str, Trajectory], span: tuple[float, float]
+    ) -> dict[str, Any]:
+        """The table [experiment], checked as `Experiment` does."""
+        found = dict(self.table(data, "experiment", needed=False))
+        self.known(found, _EXPERIMENT, "experiment")
+        events = found.get("events", [])
+        if not isinstance(events, list) or not all(isinstance(table, dict) for table in events):
+            raise self.error("experiment.events", f"must be tables, each with a signal, got {_got(events)}")
+        for key in ("start", "band"):
+            if key in found:
+                self.number(found, key, f"experiment.{key}", default=None)
+        for table in events:
+            self.known(table, [entry.name for entry in fields(Event)], "experiment.events")
+            if not isinstance(table.get("signal"), str):
+                raise self.error("experiment.events", f"must have a signal, the label of one, got {_got(table)}")
+        try:
+            if events:
+                found["events"] = [Event(**table) for table in events]
+            Experiment(plans, np.linspace(*span, 1001), **found)
+        except (ValueError, TypeError) as error:
+            raise self.error("experiment", error) from None
+        return found
 
     def plans(self, data: dict[str, Any], waypoints: tuple[Waypoint, ...]) -> dict[str, Trajectory]:
         plans: dict[str, Trajectory] = {}

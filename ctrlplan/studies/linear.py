@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import Any
+from collections.abc import Mapping
 
 import control as ct
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
+from ctrlplan.studies.benefit import benefit
 from ctrlplan.studies.comparison import Comparison, compare
+from ctrlplan.studies.running import Builder
 from ctrlplan.studies.study import Study
 from ctrlplan.studies.sweep import Sweep, sweep
-from ctrlplan.studies.worth import worth
 from ctrlplan.systems import create_feedforward_iosystem, create_source_iosystem
 from ctrlplan.systems.plants import integrator_lag_loop
 from ctrlplan.trajectories import PolySpline, Step, Trajectory, TrigSpline, Waypoint
@@ -60,8 +60,9 @@ def linear_study(progress: bool = True, count: int = 241, finest: float = 1e-3) 
         Named "linear": a comparison at gain 5, and a sweep from 0.25 to 1000.
     """
     plans = linear_plans()
+    fed: Mapping[str, Builder] = {FED: _fed_loop}
     comparison = compare(
-        _loop_of_plan,
+        lambda name, plan: fed.get(name, _plain_loop)(name, plan),
         plans | {FED: plans["trigonometric"]},
         TIMEPTS,
         waypoints=WAYPOINTS,
@@ -75,7 +76,7 @@ def linear_study(progress: bool = True, count: int = 241, finest: float = 1e-3) 
             "run": f"{TIMEPTS[-1]:g} s",
         },
     )
-    comparison = replace(comparison, worth=worth(_loop(GAIN), WAYPOINTS, TIMEPTS, alpha=1.0))
+    comparison = comparison.with_benefit(benefit(comparison, _loop(GAIN)))
     swept = _refined_sweep(count, finest, progress)
     return Study(
         "linear",
@@ -108,17 +109,20 @@ def jumps(gains: Array, settling: Array, slope: float = 3.0) -> NDArray[np.bool_
     return found
 
 
-def _loop_of_plan(name: str, plan: Trajectory) -> Any:
-    """Loop at the study's gain, the plan's derivatives fed forward where its name says so."""
+def _plain_loop(name: str, plan: Trajectory) -> ct.StateSpace:
+    """Loop at the study's gain."""
+    return _loop(GAIN)
+
+
+def _fed_loop(name: str, plan: Trajectory) -> ct.InterconnectedSystem:
+    """Loop at the study's gain, the plan's derivatives fed forward."""
     loop = _loop(GAIN)
-    if name != FED:
-        return loop
     forward = create_feedforward_iosystem(integrator_lag_loop(GAIN))
     source = create_source_iosystem(plan, forward.ninputs - 1, suffix="_ref")
     return ct.interconnect([source, forward, loop], inputs=0, outputs=["y", "u"], name="fed loop")
 
 
-def _loop(gain: float) -> Any:
+def _loop(gain: float) -> ct.StateSpace:
     return integrator_lag_loop(gain, outputs=("y", "u"))
 
 
@@ -126,8 +130,7 @@ def _refined_sweep(count: int, finest: float, progress: bool) -> Sweep:
     """Sweep over the gain, refined between gains where a settling time jumps."""
 
     def swept(gains: Array) -> Sweep:
-        found = sweep(_loop, gains, linear_plans(), TIMEPTS, progress=progress, parameter="gain", only=SWEPT)
-        assert isinstance(found, Sweep)  # noqa: S101 (of values, not of draws)
+        found = sweep(_loop, gains, linear_plans(), TIMEPTS, progress=progress, parameter="gain", measures=SWEPT)
         if found.interrupted:  # a study is made whole or not at all
             raise KeyboardInterrupt
         return found
@@ -189,7 +192,7 @@ def overshoot_peak(gains: Array, overshoot: Array) -> tuple[float, float]:
     plan = linear_plans()["trigonometric"]
 
     def overshoot_at(log_gain: float) -> float:
-        found = compare(_loop(float(np.exp(log_gain))), {"it": plan}, TIMEPTS, only=("overshoot_error",))
+        found = compare(_loop(float(np.exp(log_gain))), {"it": plan}, TIMEPTS, measures=("overshoot_error",))
         return -found.metrics["it"]["overshoot_error"]
 
     top = int(np.argmax(overshoot))

@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Iterable, Mapping
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
+import control as ct
 import numpy as np
 from numpy.typing import NDArray
 
 from ctrlplan import metrics
 from ctrlplan.planning import SquaredDerivative
+from ctrlplan.simulation import Occurrence, Prepared
 from ctrlplan.trajectories import Trajectory, Waypoint
 
 Array = NDArray[np.float64]
-Wanted = Collection[str] | None
-"""Names of the metrics wanted, None for all."""
+
+Kind = Literal["", "response", "control", "path", "run"]
+"""What a measure is of."""
 
 _TURNED = 1e-9
 """Net change, relative to the range of a plan, up to which the plan ends where it began."""
@@ -110,6 +113,64 @@ class Path:
         return bool(self.plan.jumps(0))
 
 
+@dataclass(frozen=True, eq=False)
+class Run:
+    """One plan through its loop, as a `Measure` of runs receives it.
+
+    Attributes
+    ----------
+    plan : Trajectory
+        The reference.
+    system : control system or Prepared
+        The loop.
+    response : control.TimeResponseData
+        Its response, as of `simulate`.
+    outputs, controls : tuple of str
+        Outputs that follow the plan, and outputs that are controls.
+    last : float
+        Time of the last waypoint [s], or the end of the plan where waypoints
+        are not known.
+    unstable : ndarray of complex, or None
+        Poles in the right half plane; None where the loop is not linear.
+    doubt : str
+        Why the run may not start at equilibrium; empty where it does.
+    stop : Occurrence or None
+        Event that ended the run before its time.
+    """
+
+    plan: Trajectory
+    system: ct.InputOutputSystem | Prepared
+    response: ct.TimeResponseData
+    outputs: tuple[str, ...]
+    controls: tuple[str, ...]
+    last: float
+    unstable: NDArray[np.complex128] | None = None
+    doubt: str = ""
+    stop: Occurrence | None = None
+
+    @property
+    def is_unstable(self) -> bool:
+        """Whether the loop is known to be unstable."""
+        return self.unstable is not None and self.unstable.size > 0
+
+    @cached_property
+    def t(self) -> Array:
+        """Sample times [s], (ntime,)."""
+        return np.asarray(self.response.time)
+
+    @cached_property
+    def signals(self) -> dict[str, Array]:
+        """Outputs of the loop (ntime,) by their labels."""
+        rows = np.asarray(self.response.outputs).reshape(-1, self.t.size)
+        return dict(zip(self.response.output_labels, rows, strict=True))
+
+    def rows(self, names: tuple[str, ...]) -> Array:
+        """Some of the outputs, (nnames, ntime)."""
+        labels = list(self.response.output_labels)
+        signals = np.asarray(self.response.outputs).reshape(-1, self.t.size)
+        return signals[[labels.index(name) for name in names]]
+
+
 @dataclass(frozen=True)
 class Measure:
     """A metric: how it is called, and how it is computed; less is better in every one.
@@ -120,11 +181,16 @@ class Measure:
         In words.
     unit : str
         Unit, where ``{y}`` and ``{u}`` stand for those of output and control.
-    of : {"response", "control", "path"} or ""
-        What `function` is given: `Tracked`, `Acting` or `Path`; empty where the
-        values come from the `measure` of a comparison.
+    of : {"response", "control", "path", "run"} or ""
+        What `function` is given: `Tracked`, `Acting`, `Path` or `Run`. Empty
+        without a function: the measure then describes a value that a function
+        of runs returns by its name.
     function : callable, optional
-        Maps that to one value for each axis or control, or, of a path, to one.
+        Maps a `Tracked` or `Acting` to one value for each axis or control, a
+        `Path` to one value, and a `Run` to one value or to a mapping of names to
+        values: metrics that share their computation.
+    name : str
+        Key of the metric in a comparison; its title unless given.
 
     Examples
     --------
@@ -132,8 +198,7 @@ class Measure:
 
     >>> import numpy as np
     >>> import ctrlplan as cp
-    >>> from ctrlplan.studies import Measure
-    >>> late = Measure("Error at the end", "{y}", "response", lambda seen: np.abs(seen.error[:, -1]))
+    >>> late = cp.Measure("Error at the end", "{y}", "response", lambda seen: np.abs(seen.error[:, -1]))
     >>> move = [cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1, 0, 0)]
     >>> loop = cp.plants.unity_feedback_loop([1.0], [1.0, 1.0], 3.0)
     >>> found = cp.compare(loop, move, np.linspace(0, 20, 401), measures={"late": late})
@@ -143,12 +208,13 @@ class Measure:
 
     title: str
     unit: str = ""
-    of: Literal["", "response", "control", "path"] = ""
+    of: Kind = ""
     function: Callable[[Any], Any] | None = None
+    name: str = ""
 
     def __post_init__(self) -> None:
-        if self.of not in ("", "response", "control", "path"):
-            raise ValueError(f'of must be "response", "control" or "path", got {self.of!r}')
+        if self.of not in get_args(Kind):
+            raise ValueError(f'of must be "response", "control", "path" or "run", got {self.of!r}')
         if bool(self.of) != (self.function is not None):
             what = "a function" if self.of else "what it is of"
             raise ValueError(
@@ -257,61 +323,241 @@ def signals_of(response: Any) -> dict[str, Array]:
     return dict(zip(response.output_labels, np.asarray(response.outputs), strict=True))
 
 
-def response_metrics(
-    timepts: Array,
-    y: Array,
-    plan: Trajectory,
-    start: float,
-    band: float,
-    labels: tuple[str, ...],
-    only: Wanted = None,
-    measures: Mapping[str, Measure] = MEASURES,
-) -> dict[str, float]:
-    """Metrics of tracked outputs (naxes, ntime) against their plan.
+@dataclass(frozen=True)
+class Record:
+    """Signals of one loop with a plan, or of loops that are measured together.
 
-    Each is the worst over the axes; with more than one axis those of each axis
-    follow, with the axis's label behind the name.
+    Attributes
+    ----------
+    t : ndarray, shape (ntime,)
+        Sample times [s].
+    y, u : ndarray, shapes (nloops, naxes, ntime) and (nloops, ncontrols, ntime)
+        Outputs that follow the plan, and controls.
+    axes, controls : tuple of str
+        Labels of the plan's axes, and of the controls.
+    unstable : ndarray of bool, shape (nloops,)
+        Whether a loop is unstable: it never settles.
     """
-    known = slice(int(np.searchsorted(timepts, start)), None)  # no copy of the rows
-    t, y = timepts[known], y[:, known]
-    reference = plan.jet(t, 0)[0]
-    extrema = plan.extrema()
-    span = np.maximum(extrema.maximum - extrema.minimum, np.abs(plan.final - plan.initial))
-    seen = Tracked(t, y, reference, plan.initial, plan.final, span, band, start)
-    return _measured("response", seen, labels, only, measures)
+
+    t: Array
+    y: Array
+    u: Array
+    axes: tuple[str, ...]
+    controls: tuple[str, ...]
+    unstable: NDArray[np.bool_]
 
 
-def control_metrics(
-    timepts: Array,
-    u: Array,
-    start: float,
-    labels: tuple[str, ...],
-    only: Wanted = None,
-    measures: Mapping[str, Measure] = MEASURES,
-) -> dict[str, float]:
-    """Metrics of the controls (ncontrols, ntime): the worst, and each where there are more."""
-    known = slice(int(np.searchsorted(timepts, start)), None)  # no copy of the rows
-    return _measured("control", Acting(timepts[known], u[:, known], start), labels, only, measures)
+def signal_metrics(
+    record: Record, plan: Trajectory, start: float, band: float, measures: Mapping[str, Measure]
+) -> dict[str, Array]:
+    """Metrics of responses and controls: the one function that measures signals.
+
+    Each is the worst over the axes or controls; with more than one of these
+    those of each follow, with its label behind the name.
+
+    Parameters
+    ----------
+    record : Record
+        The signals.
+    plan : Trajectory
+        What the outputs should follow.
+    start, band : float
+        Time from which metrics count [s], and the settling band.
+    measures : mapping of str to Measure
+        Metrics wanted.
+
+    Returns
+    -------
+    dict of str to ndarray, shape (nloops,)
+    """
+    known = slice(int(np.searchsorted(record.t, start)), None)  # no copy of the rows
+    t, y, u = record.t[known], record.y[..., known], record.u[..., known]
+    kinds: list[tuple[Kind, list[Any], tuple[str, ...]]] = [
+        ("response", _tracked(t, y, plan, band, start), record.axes),
+        ("control", [Acting(t, rows, start) for rows in _rows(u)], record.controls),
+    ]
+    found: dict[str, Array] = {}
+    for kind, seen, labels in kinds:
+        tables = {}
+        for name, function in _functions(kind, measures) if labels else ():
+            tables[name] = _table(function, seen, len(y))
+            if name in _NEVER_UNSTABLE:
+                tables[name][record.unstable] = np.inf
+        found |= {name: np.fmax.reduce(table, axis=1) for name, table in tables.items()}
+        for name, table in tables.items() if len(labels) > 1 else ():
+            found |= {f"{name}_{label}": row for label, row in zip(labels, table.T, strict=True)}
+    return found
+
+
+_NEVER_UNSTABLE = ("settling_time", "tracking_settling_time")
+"""Metrics that are infinite where the loop is unstable, however short the run."""
+
+
+def _rows(signals: Array) -> list[Array]:
+    """Rows (nrows, ntime) that are measured at once: all signals of one loop, or one signal of all loops."""
+    return [signals[0]] if len(signals) == 1 else list(signals.swapaxes(0, 1))
+
+
+def _tracked(t: Array, y: Array, plan: Trajectory, band: float, start: float) -> list[Tracked]:
+    """What a measure of responses is given for each of `_rows`."""
+    plans = [plan] if len(y) == 1 or plan.naxes == 1 else [plan.select([label]) for label in plan.labels]
+    found = []
+    for one, rows in zip(plans, _rows(y), strict=True):
+        extrema = one.extrema()
+        span = np.maximum(extrema.maximum - extrema.minimum, np.abs(one.final - one.initial))
+        found.append(Tracked(t, rows, one.jet(t, 0)[0], one.initial, one.final, span, band, start))
+    return found
+
+
+def _table(function: Callable[[Any], Any], seen: list[Any], nloops: int) -> Array:
+    """Values (nloops, nsignals) of a measure."""
+    values = [np.atleast_1d(np.asarray(function(one), dtype=float)) for one in seen]
+    if nloops == 1:
+        return values[0].reshape(1, -1).copy()
+    table = np.stack(values, axis=1)
+    if len(table) != nloops:
+        raise ValueError(f"a measure must give one value for each of {nloops} rows, got {len(table)}")
+    return table
+
+
+def run_metrics(run: Run, measures: Mapping[str, Measure]) -> dict[str, float]:
+    """Metrics of a run as a whole: measures of one's own.
+
+    Raises
+    ------
+    TypeError
+        If a value is no number and no mapping of names to numbers.
+    ValueError
+        If a name returned is that of another metric.
+    """
+    found: dict[str, float] = {}
+    for name, function in _functions("run", measures):
+        values = function(run)
+        if not isinstance(values, Mapping):
+            if np.ndim(values):
+                raise TypeError(
+                    f"measures[{name!r}] must return a number or a mapping of names to numbers, got {values!r:.80}"
+                )
+            found[name] = float(values)
+            continue
+        for key, value in values.items():
+            if (measures.get(key, _NONE).of and key != name) or key in MEASURES:
+                raise ValueError(
+                    f"measures[{name!r}] must return metrics by names of their own, got {key!r}, which is another's"
+                )
+            found[key] = float(value)
+    return found
 
 
 def path_metrics(
-    plan: Trajectory,
-    waypoints: tuple[Waypoint, ...],
-    only: Wanted = None,
-    measures: Mapping[str, Measure] = MEASURES,
+    plan: Trajectory, waypoints: tuple[Waypoint, ...], measures: Mapping[str, Measure] | None = None
 ) -> dict[str, float]:
-    """Metrics of the reference's own path between the waypoints it was asked to meet."""
+    """Metrics of the reference's own path between the waypoints that it must meet."""
     points = np.array([w.position for w in waypoints]).T
     if len(waypoints) < 2 or np.isnan(points).any():
         return {}
     t = np.linspace(waypoints[0].time, waypoints[-1].time, 2001)
     seen = Path(plan, t, plan.jet(t, 0)[0], points)
-    return {name: float(function(seen)) for name, function in _functions("path", only, measures)}
+    wanted = MEASURES if measures is None else measures
+    return {name: float(function(seen)) for name, function in _functions("path", wanted)}
 
 
 def jerk_cost(plan: Trajectory) -> float:
     """Integral of the squared jerk, inf where position, velocity or acceleration jumps."""
     return np.inf if plan.jumps(2) else SquaredDerivative(3)(plan)
+
+
+Chosen = tuple["str | Measure", ...] | None
+"""Metrics wanted: names of `MEASURES` and measures of one's own, each with its name; None for all."""
+
+
+def checked_measures(given: Collection[str | Measure] | Mapping[str, Measure] | None) -> Chosen:
+    """Metrics wanted, as they are given to a comparison.
+
+    Parameters
+    ----------
+    given : collection of str or Measure, mapping of str to Measure, or None
+        A collection is what is measured: names of `MEASURES`, and measures of
+        one's own. A mapping is measured in addition to all of `MEASURES`.
+
+    Raises
+    ------
+    TypeError
+        If it is a string, or something in it is no name and no measure.
+    ValueError
+        If a name is unknown or stands twice, or a measure has no function and
+        there is no measure of runs that could return it.
+    """
+    if given is None:
+        return None
+    own: list[Measure] = []
+    names: list[str] = []
+    if isinstance(given, Mapping):
+        for key, value in given.items():
+            if not isinstance(value, Measure):
+                raise TypeError(f"measures[{key!r}] must be a Measure, got {type(value).__name__}")
+            if MEASURES.get(key) is not value:
+                own.append(replace(value, name=key))
+        names = list(MEASURES)
+    else:
+        listed = f"a collection of names and Measures, of {', '.join(MEASURES)}"
+        if isinstance(given, str) or not isinstance(given, Iterable):
+            what = f"the string {given!r}" if isinstance(given, str) else f"{given!r:.80}"
+            raise TypeError(f"measures must be {listed}, got {what}")
+        for one in given:
+            if isinstance(one, Measure):
+                own.append(replace(one, name=one.name or one.title))
+            elif not isinstance(one, str):
+                raise TypeError(f"measures must be {listed}, got {one!r:.80}")
+            elif one not in MEASURES:
+                raise ValueError(f"measures must be among {', '.join(MEASURES)}, or be Measures, got {one!r}")
+            else:
+                names.append(one)
+    _check_own(own)
+    return (*own, *dict.fromkeys(names))
+
+
+def _check_own(own: list[Measure]) -> None:
+    of_runs = any(measure.of == "run" for measure in own)
+    seen: set[str] = set()
+    for measure in own:
+        if measure.name in MEASURES or measure.name in seen:
+            whose = "every comparison has" if measure.name in MEASURES else "another has"
+            raise ValueError(f"measures must have names of their own, got {measure.name!r}, which {whose}")
+        seen.add(measure.name)
+        if not measure.of and not of_runs:
+            raise ValueError(
+                f"measures[{measure.name!r}] must have a function, or come from a measure of runs, got neither"
+            )
+
+
+def wanted_measures(chosen: Chosen) -> dict[str, Measure]:
+    """Measures wanted by name, those of one's own first, the others in the order of `MEASURES`."""
+    if chosen is None:
+        return dict(MEASURES)
+    names = {one for one in chosen if isinstance(one, str)}
+    return own_measures(chosen) | {name: measure for name, measure in MEASURES.items() if name in names}
+
+
+def own_measures(chosen: Chosen) -> dict[str, Measure]:
+    """Measures of one's own by name."""
+    return {one.name: one for one in chosen or () if isinstance(one, Measure)}
+
+
+def shown_measures(chosen: Chosen, found: Iterable[Mapping[str, float]]) -> dict[str, Measure]:
+    """Every measure of a comparison, those of one's own first.
+
+    A name that a measure of runs returns and nothing describes is its own title.
+    """
+    own = {
+        name: measure
+        for name, measure in own_measures(chosen).items()
+        if measure.of != "run" or any(name in values for values in found)
+    }
+    returned = dict.fromkeys(name for values in found for name in values)
+    described = tuple({**own, **MEASURES})
+    plain = {name: Measure(name) for name in returned if not name.startswith(described)}
+    return own | plain | MEASURES
 
 
 def checked_names(names: Any, known: Collection[str], what: str) -> tuple[str, ...]:
@@ -334,24 +580,13 @@ def checked_names(names: Any, known: Collection[str], what: str) -> tuple[str, .
     return found
 
 
-def _functions(of: str, only: Wanted, measures: Mapping[str, Measure]) -> Sequence[tuple[str, Callable[[Any], Any]]]:
-    """Metrics wanted of one kind, by name."""
-    if isinstance(only, str):
-        checked_names(only, measures, "only")
+_NONE = Measure("")
+
+
+def _functions(of: Kind, measures: Mapping[str, Measure]) -> list[tuple[str, Callable[[Any], Any]]]:
+    """Functions of the measures of one kind, by name."""
     return [
         (name, measure.function)
         for name, measure in measures.items()
-        if measure.of == of and measure.function is not None and (only is None or name in only)
+        if measure.of == of and measure.function is not None
     ]
-
-
-def _measured(
-    of: str, seen: Any, labels: tuple[str, ...], only: Wanted, measures: Mapping[str, Measure]
-) -> dict[str, float]:
-    """The metrics wanted: the worst over the labels, then each where there are more than one."""
-    rows = {name: np.atleast_1d(function(seen)) for name, function in _functions(of, only, measures)}
-    found = {name: float(np.nan if np.isnan(row).all() else np.nanmax(row)) for name, row in rows.items()}
-    if len(labels) > 1:
-        for name, row in rows.items():
-            found |= {f"{name}_{label}": float(v) for label, v in zip(labels, row, strict=True)}
-    return found

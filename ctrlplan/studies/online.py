@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Any
 
@@ -16,7 +16,7 @@ from ctrlplan.planning import fastest, margins
 from ctrlplan.simulation import simulate
 from ctrlplan.studies.comparison import Comparison, compare
 from ctrlplan.studies.crane_setup import CRANE, TORQUE_LIMITS, UNITS, nominal_waypoints
-from ctrlplan.studies.measures import Measure, signals_of
+from ctrlplan.studies.measures import Measure, Run, signals_of
 from ctrlplan.studies.study import Study
 from ctrlplan.systems import (
     AdmissibleSet,
@@ -318,8 +318,8 @@ def _compared(trouble: Trouble, title: str, what: str) -> Comparison:
     def build(name: str, plan: Trajectory) -> Any:
         return WAYS[name](trouble, **drives)
 
-    def measure(plan: Trajectory, response: Any) -> Mapping[str, float]:
-        return online_metrics(trouble.goal.final, trouble.force, response)
+    def measure(run: Run) -> Mapping[str, float]:
+        return online_metrics(trouble.goal.final, trouble.force, run.response)
 
     return compare(
         build,
@@ -327,10 +327,11 @@ def _compared(trouble: Trouble, title: str, what: str) -> Comparison:
         timepts,
         outputs=("x", "z"),
         controls=("F", "C"),
-        only=(),
         params=trouble.params,
-        measure=measure,
-        measures=ONLINE_MEASURES,
+        measures=[
+            *(replace(one, name=name) for name, one in ONLINE_MEASURES.items()),
+            Measure("Crane against its goal", of="run", function=measure),
+        ],
         units=UNITS,
         title=title,
         parameters={

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from ctrlplan.planning import Fastest
 from ctrlplan.studies.comparison import Comparison
 from ctrlplan.studies.ensemble import Ensemble
+from ctrlplan.studies.grids import Grid
 from ctrlplan.studies.sweep import Sweep
-from ctrlplan.studies.worth import Grid
 
 
 @dataclass(frozen=True)

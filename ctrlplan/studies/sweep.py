@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import inspect
 import warnings
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -13,10 +12,23 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ctrlplan._checks import real_array
-from ctrlplan.studies.alike import Alike, Metrics
-from ctrlplan.studies.comparison import all_run, compare, finite_or_none, is_builder, references_of, waypoints_given
-from ctrlplan.studies.ensemble import Ensemble, Failure, ensemble
-from ctrlplan.studies.executing import Account, Failed, checked_executor, checked_timeout, executed, gathered, tried
+from ctrlplan.simulation import Event
+from ctrlplan.studies.alike import Linear
+from ctrlplan.studies.comparison import finite_or_none, shown_in_units
+from ctrlplan.studies.ensemble import Failure
+from ctrlplan.studies.executing import (
+    Account,
+    Executor,
+    Failed,
+    checked_executor,
+    checked_timeout,
+    executed,
+    gathered,
+    tried,
+)
+from ctrlplan.studies.experiment import Experiment, Metrics
+from ctrlplan.studies.measures import Measure
+from ctrlplan.studies.running import Builder, System, is_builder
 from ctrlplan.trajectories import Trajectory, Waypoint
 
 if TYPE_CHECKING:
@@ -116,74 +128,85 @@ class Sweep:
 
 
 def sweep(
-    build: Any,
-    values: ArrayLike | None = None,
-    plans: Mapping[str, Trajectory] | Iterable[Waypoint] = (),
-    timepts: ArrayLike = (),
-    executor: Any = None,
-    progress: bool = True,
+    build: Callable[[float], System | Builder],
+    values: ArrayLike,
+    plans: Mapping[str, Trajectory] | Iterable[Waypoint],
+    timepts: ArrayLike,
     *,
-    params: Mapping[str, ArrayLike] | None = None,
     parameter: str = "value",
+    waypoints: Iterable[Waypoint] = (),
+    start: float | None = None,
+    band: float = 0.02,
+    outputs: Sequence[str] | None = None,
+    controls: Sequence[str] | None = None,
+    initial_state: ArrayLike | None = None,
+    params: Mapping[str, Any] | None = None,
+    events: Sequence[Event] | None = None,
+    measures: Collection[str | Measure] | Mapping[str, Measure] | None = None,
+    units: Mapping[str, str] | None = None,
+    executor: Executor | None = None,
+    progress: bool = True,
     timeout: float | None = None,
-    **options: Any,
-) -> Sweep | Ensemble:
-    """Compare plans in a loop for each value of a parameter, or for each of many draws.
+) -> Sweep:
+    """Compare plans in a loop for each value of a parameter.
 
-    A value or draw that cannot be run, whose worker process dies, that takes
-    too long, or that calls ``sys.exit`` is recorded in `failures` with the
-    reason; the others are kept. Ctrl-C ends the sweep: what is finished is
-    returned with a warning, and tasks that have not begun are cancelled; an
-    executor finishes those that have. A second Ctrl-C, or one before the first
-    draw, raises KeyboardInterrupt.
+    A value that cannot be run, whose worker process dies, that takes too long,
+    or that calls ``sys.exit`` is recorded in `Sweep.failures` with the reason;
+    the others are kept. Ctrl-C ends the sweep: what is finished is returned
+    with a warning, and tasks that have not begun are cancelled; an executor
+    finishes those that have. A second Ctrl-C raises KeyboardInterrupt.
 
     Parameters
     ----------
-    build : callable or control system
-        Maps a value to a loop; with `params`, a loop as `compare` takes it.
-    values : array_like, shape (nvalues,), optional
+    build : callable
+        Maps a value to a loop, as `compare` takes it.
+    values : array_like, shape (nvalues,)
         Values of the parameter, increasing.
-    plans, timepts, **options
-        As for `compare`; ``worth`` with `params` only, for the nominal loop.
+    plans, timepts
+        As for `compare`.
+    parameter : str, optional
+        Name of what is varied.
+    waypoints, start, band, outputs, controls, initial_state, params, events, measures : optional
+        As in `Experiment`.
+    units : mapping of str to str, optional
+        Units by label, as for `compare`: of signals that differ in unit there
+        is no worst, which becomes nan.
     executor : concurrent.futures.Executor or alike, optional
         Where the comparisons run: anything with ``submit`` whose result has
         ``result``, as of `dask.distributed`, `loky` or `mpi4py.futures`; not a
         `multiprocessing.Pool`. Results are taken as they complete. Other
-        processes need a `build` that the executor can send, or with `params` a
-        loop that can be compiled. Without an executor, linear loops that differ
-        in numbers alone are solved and measured together, which is faster by far.
+        processes need a `build` that the executor can send. Without an
+        executor, linear loops that differ in numbers alone are solved and
+        measured together, which is faster by far.
     progress : bool, optional
         Show a bar on stderr.
-    params : mapping of str to array_like, shape (ndraws,), optional
-        In place of `values`: draws of the blocks' parameters, as `draws` makes
-        them. The loop is built once for all.
-    parameter : str, optional
-        Name of what is varied.
     timeout : float, optional
-        Time limit of one run, one plan in one loop [s]. It is checked between
-        evaluations of the loop's equations, of a compiled loop between the
-        segments of a run (from breakpoint to breakpoint): a function of yours
-        that never returns is not stopped, and a compiled segment is finished.
-        Linear loops are solved in closed form, and have no limit.
+        Time limit of one value [s]. It is checked between evaluations of the
+        loop's equations, of a compiled loop between the segments of a run (from
+        breakpoint to breakpoint): a function of yours that never returns is not
+        stopped, and a compiled segment is finished. Linear loops are solved in
+        closed form, and have no limit.
 
     Returns
     -------
-    Sweep or Ensemble
-        An `Ensemble` with `params`.
+    Sweep
 
     Raises
     ------
     TypeError
-        If `executor` has no ``submit``, or an option is none of `compare`.
+        If `executor` has no ``submit``, or `build` is no function.
     ValueError
-        If the values are not finite or do not increase, draws are not as many
-        of each parameter, or a parameter is none of a block. What a comparison
+        If the values are not finite or do not increase. What a comparison
         raises at every value is raised, SystemExit as a RuntimeError.
 
     Warns
     -----
     UserWarning
         If Ctrl-C ended it.
+
+    See Also
+    --------
+    monte_carlo : Random draws of several parameters.
 
     Examples
     --------
@@ -195,54 +218,41 @@ def sweep(
     array([16.3, 85.4])
     """
     executor, timeout = checked_executor(executor), checked_timeout(timeout)
-    # An iterator would be used up by the first of the comparisons.
-    options = {name: tuple(value) if isinstance(value, Iterator) else value for name, value in options.items()}
-    inspect.signature(compare).bind(None, plans, timepts, **options)
-    found: Sweep | Ensemble
-    if params is not None:
-        if values is not None:
-            raise ValueError("values must not be given beside params, got both")
-        found = ensemble(build, plans, timepts, params, executor, progress, options, timeout)
-        done, count, what = found.finished, found.ndraws, "draws"
+    points = _checked_values(values)
+    if not is_builder(build):
+        raise TypeError(f"build must be a function from a value to a loop, got {type(build).__name__}")
+    experiment = Experiment(
+        plans,
+        timepts,
+        waypoints=waypoints,
+        start=start,
+        band=band,
+        outputs=outputs,
+        controls=controls,
+        initial_state=initial_state,
+        params=params,
+        events=events,
+        measures=measures,
+    )
+    if executor is None:
+        outcomes = _outcomes(build, points.tolist(), experiment, units, timeout)
+        account = gathered(outcomes, points.size, parameter, progress)
     else:
-        points = _checked_values(values)
-        if not is_builder(build):
-            raise TypeError(f"build must be a function from a value to a loop, got {type(build).__name__}")
-        given = _given(plans, timepts, options)
-        if executor is None:
-            account = gathered(_outcomes(build, points.tolist(), given, timeout), points.size, parameter, progress)
-        else:
-            run = partial(_compared, build, given)
-            account = executed(run, points.tolist(), executor, timeout, parameter, progress)
-            account.raise_if_all_lost("build")
-        found = _swept(parameter, points, account)
-        done, count, what = found.values.size, points.size, "values"
+        run = partial(_built, build, experiment, units)
+        account = executed(run, points.tolist(), executor, timeout, parameter, progress)
+        account.raise_if_all_lost("build")
+    found = _swept(parameter, points, account)
     if found.interrupted:
-        warnings.warn(f"the sweep was interrupted: {done} of {count} {what} are kept", UserWarning, stacklevel=2)
+        kept = f"{found.values.size} of {points.size} values are kept"
+        warnings.warn(f"the sweep was interrupted: {kept}", UserWarning, stacklevel=2)
     return found
 
 
-def _checked_values(values: ArrayLike | None) -> Array:
-    if values is None:
-        raise ValueError("values, or draws as params, must be given, got neither")
+def _checked_values(values: ArrayLike) -> Array:
     points = np.atleast_1d(real_array(values, "values"))
     if points.ndim != 1 or not points.size or not np.isfinite(points).all() or np.any(np.diff(points) <= 0.0):
         raise ValueError(f"values must be finite and increase strictly, got {points.tolist()!s:.80}")
     return points
-
-
-def _given(plans: Any, timepts: ArrayLike, options: Mapping[str, Any]) -> dict[str, Any]:
-    """Arguments of `compare` for every value."""
-    given = dict(options)
-    worth: Any = given.get("worth", False)
-    if worth is not False:
-        raise (ValueError if isinstance(worth, bool | Mapping) else TypeError)(
-            "worth must be False in a sweep over values, which has no place for it, got "
-            f"{worth!r:.80}; give it to compare at the value of interest"
-        )
-    given["waypoints"] = tuple(given.get("waypoints", ())) if isinstance(plans, Mapping) else waypoints_given(plans)
-    given["plans"] = references_of(plans if isinstance(plans, Mapping) else given["waypoints"], given.get("alpha", 1.0))
-    return given | {"timepts": real_array(timepts, "timepts")}
 
 
 def _swept(parameter: str, points: Array, account: Account[Metrics]) -> Sweep:
@@ -261,46 +271,71 @@ def _swept(parameter: str, points: Array, account: Account[Metrics]) -> Sweep:
     return Sweep(parameter, reached, rows, failures, account.interrupted)
 
 
-def _metrics(given: dict[str, Any], loop: Any) -> Metrics:
+def _metrics(experiment: Experiment, units: Mapping[str, str] | None, loop: System | Builder) -> Metrics:
     """Metrics of one loop."""
-    return all_run(compare(loop, **given)).metrics
+    found = experiment.run(loop).whole()
+    if units is not None:
+        shown_in_units(experiment, found, units)
+    return found.metrics
 
 
-def _compared(build: Callable[[float], Any], given: dict[str, Any], value: float) -> Metrics:
+def _built(
+    build: Callable[[float], System | Builder],
+    experiment: Experiment,
+    units: Mapping[str, str] | None,
+    value: float,
+) -> Metrics:
     """Metrics for one value."""
-    return _metrics(given, build(value))
+    return _metrics(experiment, units, build(value))
+
+
+_SAMPLES = 2**19
+"""Samples of a signal of all the loops that are run together, at most."""
+
+_FIRST = 4
+"""Loops that are run together at first; then twice as many each time, so that an interruption loses little."""
 
 
 def _outcomes(
-    build: Callable[[float], Any], values: list[float], given: dict[str, Any], timeout: float | None
+    build: Callable[[float], System | Builder],
+    values: list[float],
+    experiment: Experiment,
+    units: Mapping[str, str] | None,
+    timeout: float | None,
 ) -> Generator[tuple[int, Metrics | Failed], None, None]:
     """Outcome of each value, of many at once where their loops are linear and differ in numbers alone.
 
-    The first of these is compared by itself, so that `compare` checks the options.
+    The first of these is run by itself, which checks what depends on the loop.
     """
-    alike, checked = Alike(given), False
+    waiting: dict[int, Linear] = {}
+    checked, size = False, _FIRST
+    largest = max(2, _SAMPLES // max(1, experiment.timepts.size))
 
     def together() -> Iterator[tuple[int, Metrics | Failed]]:
+        nonlocal size
         try:
-            yield from alike.metrics().items()
+            found = (experiment.run_alike(list(waiting.values())) or []) if waiting else []
+            yield from ((k, one.metrics) for k, one in zip(waiting, found, strict=True))
         except Exception:  # one of them, which is found so
-            for k in alike.waiting:
-                yield k, tried(partial(_compared, build, given), values[k], timeout)
-        alike.clear()
+            for k in waiting:
+                yield k, tried(partial(_built, build, experiment, units), values[k], timeout)
+        waiting.clear()
+        size = min(2 * size, largest)
 
     try:
         for k, value in enumerate(values):
             loop = tried(build, value, timeout)
-            linear = None if isinstance(loop, Failed) else alike.linear(loop)
+            linear = None if isinstance(loop, Failed) or units is not None else experiment.numbers_of(loop)
             if linear is None or not checked:
-                outcome = loop if isinstance(loop, Failed) else tried(partial(_metrics, given), loop, timeout)
+                run = partial(_metrics, experiment, units)
+                outcome = loop if isinstance(loop, Failed) else tried(run, loop, timeout)
                 checked = checked or (linear is not None and not isinstance(outcome, Failed))
                 yield k, outcome
                 continue
-            if not alike.fits(linear):
+            if waiting and not linear.fits(next(iter(waiting.values()))):
                 yield from together()
-            alike.waiting[k] = linear
-            if alike.full:
+            waiting[k] = linear
+            if len(waiting) >= size:
                 yield from together()
         yield from together()
     except KeyboardInterrupt:  # what has been built is soon measured

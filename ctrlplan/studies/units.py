@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ctrlplan.studies.measures import Measure, checked_names
+from ctrlplan.studies.measures import Measure, Run, checked_names
 from ctrlplan.trajectories import Trajectory
 
 ROUNDING = 1e-6
@@ -54,6 +54,31 @@ class Signals:
         """Units of the signals in whose unit a measure is, where they are known to differ; empty where not."""
         units = self.of_axes() if "{y}" in unit else self.of_controls() if "{u}" in unit else {}
         return units if len(set(filter(None, units.values()))) > 1 else {}
+
+
+def signals_of_runs(
+    plans: Mapping[str, Trajectory], runs: Mapping[str, Run], units: dict[str, str], since: float
+) -> Signals:
+    """The signals measured, with their units and sizes."""
+    axes = next(iter(plans.values())).labels
+    last = list(runs.values())[-1]
+    extrema = [plan.extrema() for plan in plans.values()]
+    spans = np.max([found.maximum - found.minimum for found in extrema], axis=0)
+    return Signals(
+        dict(zip(axes, last.outputs, strict=True)),
+        last.controls,
+        units,
+        dict(zip(axes, spans.tolist(), strict=True)),
+        {name: max(_peak_of(run, name) for run in runs.values()) for name in last.controls},
+        max(float(run.response.time[-1]) for run in runs.values()) - since,
+        max(plan.duration for plan in plans.values()),
+    )
+
+
+def _peak_of(run: Run, name: str) -> float:
+    """Largest finite magnitude of a control."""
+    row = run.rows((name,))[0]
+    return float(np.abs(row[np.isfinite(row)]).max(initial=0.0))
 
 
 def listed_measures(

@@ -145,7 +145,7 @@ def test_draws_beside_runs_by_hand(benchmark, capsys, tight):
             progress=False,
             outputs=("x", "z"),
             controls=("F", "C"),
-            only=only,
+            measures=only,
         )
 
     def peer():

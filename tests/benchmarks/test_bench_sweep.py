@@ -62,7 +62,7 @@ def responses():
 
 
 def sweep():
-    return cp.sweep(build, GAINS, PLANS, TIMES, progress=False, only=("settling_time", "overshoot_error"))
+    return cp.sweep(build, GAINS, PLANS, TIMES, progress=False, measures=("settling_time", "overshoot_error"))
 
 
 @pytest.mark.benchmark

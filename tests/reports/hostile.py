@@ -8,8 +8,9 @@ import numpy as np
 
 import ctrlplan as cp
 from ctrlplan.studies import Measure, Study
+from ctrlplan.studies.benefit import Benefit, Need
+from ctrlplan.studies.grids import Grid
 from ctrlplan.studies.study import Curves
-from ctrlplan.studies.worth import Grid, Need, Worth
 
 HIT = "window.hit=1"
 MARKUP = {
@@ -115,7 +116,7 @@ def study(text, drawn=True):
         {text("rival"): np.array([1.5, 2.5])},
     )
     needs = (Need(text("need"), 1.0, text("limit of it"), text("kept")),)
-    worth = Worth(found, {text("bounded"): 2.0}, needs, (grid,), 1.0, text("worth note"))
+    worth = Benefit(found, {text("bounded"): 2.0}, needs, (grid,), 1.0, text("worth note"))
     speed = text("quantity")
     fast = cp.fastest(plans[0], {speed: 9.0}, lambda jet: {speed: np.hypot(jet[1, 0], jet[1, 1])}) if drawn else None
     curves = Curves(
@@ -128,7 +129,7 @@ def study(text, drawn=True):
     return Study(
         text("name"),
         text("heading"),
-        replace(found, worth=worth if drawn else None),
+        replace(found, benefit=worth if drawn else None),
         summary=text("summary"),
         notes=(text("finding"),),
         figures=("plans", "responses", "crane-time", "crane-plane", "crane-motion", "crane-sway") if drawn else (),

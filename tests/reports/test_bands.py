@@ -13,7 +13,7 @@ from ctrlplan.reports import render_page
 from ctrlplan.reports.figures import FIGURES, plot_bands
 from ctrlplan.reports.style import page_style
 from ctrlplan.studies import Study
-from ctrlplan.studies.ensemble import LEVELS, ensemble
+from ctrlplan.studies.ensemble import LEVELS
 
 TIMES = np.linspace(0.0, 6.0, 301)
 TAU = np.linspace(0.5, 1.5, 21)  # quantiles at 1, 5, 10, 15, 19
@@ -58,18 +58,18 @@ def responses():
 
 @pytest.fixture(scope="module")
 def drawn():
-    return ensemble(lag(), PLANS, TIMES, {"tau": TAU}, None, False, {"units": {"y": "m", "u": "N"}, "title": "Lag"})
+    return cp.monte_carlo(lag(), {"tau": TAU}, PLANS, TIMES, progress=False, units={"y": "m", "u": "N"})
 
 
 @pytest.fixture(scope="module")
 def failed():
-    return ensemble(refusing(), PLANS, TIMES, {"tau": [0.5, 3.0, 1.0]}, None, False)
+    return cp.monte_carlo(refusing(), {"tau": [0.5, 3.0, 1.0]}, PLANS, TIMES, progress=False)
 
 
 @pytest.fixture(scope="module")
 def nothing():
     """Draws of which none was run."""
-    return ensemble(refusing(), PLANS, TIMES, {"tau": [3.0, 4.0]}, None, False)
+    return cp.monte_carlo(refusing(), {"tau": [3.0, 4.0]}, PLANS, TIMES, progress=False)
 
 
 @pytest.fixture(scope="module")
@@ -148,7 +148,7 @@ def test_without_units_none_is_made_up(failed):
 
 
 def test_one_plan_is_one_column():
-    alone = ensemble(lag(), {"step": PLANS["step"]}, TIMES, {"tau": TAU[:2]}, None, False)
+    alone = cp.monte_carlo(lag(), {"tau": TAU[:2]}, {"step": PLANS["step"]}, TIMES, progress=False)
     assert alone.plot().axes.shape == (3, 1)
 
 
@@ -250,7 +250,7 @@ def test_a_page_without_any_draw_that_was_run_is_whole(nothing, tmp_path, read):
 
 @pytest.mark.slow
 def test_values_that_are_never_reached_are_words_that_sort_last(tmp_path, read):
-    slow = ensemble(lag(), PLANS, TIMES, {"tau": [0.5, 9.0, 9.5]}, None, False)
+    slow = cp.monte_carlo(lag(), {"tau": [0.5, 9.0, 9.5]}, PLANS, TIMES, progress=False)
     rows, _ = spread(read(slow.report(tmp_path).read_text(encoding="utf-8")))
     cell = rows["Settling time"][1][0]
     assert cell.words() == "never (1.956 to never)"
@@ -263,13 +263,11 @@ def test_results_of_a_study_hold_its_draws(drawn):
 
 
 def test_a_metric_of_one_plan_only_is_on_the_page(tmp_path, read):
-    from ctrlplan.studies.measures import Measure
+    def last(run):
+        return {"last": float(run.response.outputs[0, -1])} if run.plan is PLANS["step"] else {}
 
-    def measure(plan, response):
-        return {"last": float(response.outputs[0, -1])} if plan is PLANS["step"] else {}
-
-    options = {"measure": measure, "measures": {"last": Measure("Last value", "m")}}
-    found = ensemble(lag(), PLANS, TIMES, {"tau": TAU[:4]}, None, False, options)
+    measures = {"last": cp.Measure("Last value", "m"), "ends": cp.Measure("Ends", of="run", function=last)}
+    found = cp.monte_carlo(lag(), {"tau": TAU[:4]}, PLANS, TIMES, progress=False, measures=measures)
     rows, _ = spread(read(found.report(tmp_path).read_text(encoding="utf-8")))
     step, ramp = rows["Last value"][1]
     ends = 2 - 2 * np.exp(-6 / TAU[:4])

@@ -68,8 +68,6 @@ def spread(compared):
     """A lag that is not known well, behind two plans."""
     import control as ct
 
-    from ctrlplan.studies.ensemble import ensemble
-
     loop = ct.nlsys(
         lambda t, x, u, params: (u - x) / params["tau"],
         lambda t, x, u, params: np.array([x[0], u[0] - x[0]]),
@@ -80,7 +78,8 @@ def spread(compared):
         name="lag",
     )
     plans = {name: compared.plans[name] for name in ("step", "trigonometric")}
-    return ensemble(loop, plans, TIMES, cp.draws(20, tau=(0.5, 2.0)), None, False, {"units": {"y": "m", "u": "N"}})
+    drawn = cp.draws(20, tau=(0.5, 2.0))
+    return cp.monte_carlo(loop, drawn, plans, TIMES, progress=False, units={"y": "m", "u": "N"})
 
 
 @pytest.fixture(

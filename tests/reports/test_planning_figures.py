@@ -10,7 +10,7 @@ import ctrlplan as cp
 from ctrlplan.planning.limits import Limited
 from ctrlplan.reports.planning_figures import plot_alpha_choice, plot_limits, plot_rivals
 from ctrlplan.reports.style import page_style, to_svg
-from ctrlplan.studies.worth import rival_plans
+from ctrlplan.studies.baselines import baseline_plans
 
 MOVE = [cp.Waypoint(0, 0, 0, 0), cp.Waypoint(2, 1, 0, 0)]
 PATH = [
@@ -146,7 +146,7 @@ def test_the_fastest_plan_draws_its_limits():
 def compared():
     t = np.linspace(0, 8, 401)
     loop = cp.plants.integrator_lag_loop(100.0, outputs=("y", "u"))
-    plans = {"trigonometric": cp.TrigSpline(MOVE, alpha=1.0)} | rival_plans(MOVE)
+    plans = {"trigonometric": cp.TrigSpline(MOVE, alpha=1.0)} | baseline_plans(MOVE)
     return cp.compare(loop, plans, t, waypoints=MOVE, units={"y": "m", "u": "N"})
 
 
@@ -188,7 +188,7 @@ def test_rivals_of_two_axes_stand_side_by_side():
     loops = [ct.ss(cp.plants.integrator_lag_loop(k)) for k in (50.0, 200.0)]
     side = ct.append(*loops)
     both = ct.ss(side.A, side.B, side.C, side.D, inputs=["rx", "rz"], outputs=["x", "z"])
-    found = cp.compare(both, rival_plans(PATH), np.linspace(0, 5, 201), waypoints=PATH, units={"x": "m", "z": "mm"})
+    found = cp.compare(both, baseline_plans(PATH), np.linspace(0, 5, 201), waypoints=PATH, units={"x": "m", "z": "mm"})
     drawn = plot_rivals(found)
     assert [axes.get_ylabel() for axes in drawn.axes.flat] == [
         "reference of x [m]",

@@ -11,11 +11,11 @@ import pytest
 import ctrlplan as cp
 from ctrlplan.reports import render_page, write_report
 from ctrlplan.studies import Study
-from ctrlplan.studies.worth import Grid, Need, Worth
+from ctrlplan.studies.benefit import Benefit, Need
+from ctrlplan.studies.grids import Grid
 
 MOVE = [cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1, 0, 0)]
 TIMES = np.linspace(0, 10, 501)
-FEW = {"alphas": (0.0, 1.0, 3.0), "factors": (1.0, 1.5)}
 WORTH, FASTEST, OPTIMAL = "Is it worth it?", "As fast as limits allow", "Is the trigonometric path optimal?"
 
 
@@ -26,7 +26,8 @@ def loop(gain):
 @pytest.fixture(scope="module")
 def study():
     """All three sections, the numbers of the last made by hand."""
-    compared = cp.compare(loop(100.0), MOVE, TIMES, worth=FEW, units={"y": "m", "u": "N", "y_d1": "m/s"})
+    compared = cp.compare(loop(100.0), MOVE, TIMES, units={"y": "m", "u": "N", "y_d1": "m/s"})
+    compared = compared.with_benefit(cp.benefit(compared, loop(100.0), alphas=(0.0, 1.0, 3.0), durations=(1.0, 1.5)))
     grid = Grid(
         "Length & width",
         "m²/s⁵",
@@ -121,8 +122,8 @@ def test_words_of_others_are_escaped(html):
 
 @pytest.mark.slow
 def test_without_units_there_are_no_brackets(shown, study):
-    worth = replace(study.comparison.worth, comparison=replace(study.comparison.worth.comparison, units={}))
-    words, _ = shown(replace(study.comparison, units={}, worth=worth))
+    worth = replace(study.comparison.benefit, comparison=replace(study.comparison.benefit.comparison, units={}))
+    words, _ = shown(replace(study.comparison, units={}, benefit=worth))
     assert "Peak of the control over duration and alpha:" in words
     assert "[]" not in words
     assert not re.search(r"\{\w*\}|\bnan\b", words)
@@ -133,11 +134,11 @@ def test_without_units_there_are_no_brackets(shown, study):
 
 def test_all_rivals_are_in_the_table_of_the_section(study, page):
     (beside,) = tables(page, "rivals")
-    assert titles(beside) == ["metric", "unit", *study.comparison.worth.comparison.plans]
+    assert titles(beside) == ["metric", "unit", *study.comparison.benefit.comparison.plans]
     expected = {"step", "trapezoid", "S-curve", "shaped step", "quintic (minimum jerk)"}
     assert expected <= set(titles(beside))
     found = {row[0]: row[2:] for row in rows(beside)}
-    metrics = study.comparison.worth.comparison.metrics
+    metrics = study.comparison.benefit.comparison.metrics
     for title, key in (("Settling time", "settling_time"), ("Peak of the control", "control_peak")):
         for text, values in zip(found[title], metrics.values(), strict=True):
             assert number(text) == pytest.approx(values[key], rel=5e-4)
@@ -154,7 +155,7 @@ def test_needs_are_shown_with_the_limit_that_is_active_and_where(study, page):
         "limits in the time above",
     ]
     shown = rows(table)
-    for (name, text, why, kept), need in zip(shown, study.comparison.worth.needs, strict=True):
+    for (name, text, why, kept), need in zip(shown, study.comparison.benefit.needs, strict=True):
         assert (name, why, kept) == (need.name, need.limit, need.kept)
         if math.isnan(need.duration):
             assert text == "–"
@@ -163,7 +164,7 @@ def test_needs_are_shown_with_the_limit_that_is_active_and_where(study, page):
     takes = {name: text for name, text, *_ in shown}
     kept = {name: words for name, _, _, words in shown}
     assert kept["quintic (minimum jerk)"] == kept["S-curve"] == "all kept"
-    plan = study.comparison.worth.comparison.plans["trigonometric"]
+    plan = study.comparison.benefit.comparison.plans["trigonometric"]
     beyond = np.abs(plan(np.linspace(0, 1, 20_001), 2)).max() / (10.0 / math.sqrt(3.0)) - 1.0
     assert beyond > np.abs(plan(np.linspace(0, 1, 20_001), 1)).max() / 1.875 - 1.0 > 0.0
     assert kept["trigonometric"] == f"y_d2 {100 * beyond:.3g} % beyond"
@@ -179,7 +180,7 @@ def test_alpha_and_limits_are_said_in_words(page):
 
 
 def test_verdicts_are_there(study, page):
-    for sentence in study.comparison.worth.verdicts:
+    for sentence in study.comparison.benefit.verdicts:
         assert sentence in page.words()
 
 
@@ -187,7 +188,7 @@ def test_verdicts_are_there(study, page):
 def test_limits_of_every_form_and_the_note_are_said(study, shown):
     limits = {"velocity": 3, "y_d1": (-2.0, 3.0), "y_d2": [None, 3.0], "y_d3": np.array([-2.0, 3.0])}
     words, _ = shown(
-        replace(study.comparison, worth=replace(study.comparison.worth, limits=limits, note="Rope & drum."))
+        replace(study.comparison, benefit=replace(study.comparison.benefit, limits=limits, note="Rope & drum."))
     )
     expected = "velocity within ±3; y_d1 from -2 to 3; y_d2 from any to 3; y_d3 from -2 to 3"
     assert f"Under the same limits ({expected})" in words
@@ -196,7 +197,7 @@ def test_limits_of_every_form_and_the_note_are_said(study, shown):
 
 def test_tables_over_alpha_and_duration_are_those_of_the_grids(study, page):
     shown = tables(page, "grid")
-    grids = (*study.comparison.worth.grids, *study.grids)
+    grids = (*study.comparison.benefit.grids, *study.grids)
     assert len(shown) == len(grids) == 3
     for table, grid in zip(shown, grids, strict=True):
         alphas = [f"alpha {a:.3g}" if a else "alpha 0 (polynomial)" for a in grid.alphas]
@@ -218,7 +219,7 @@ def test_units_are_in_the_headings_of_the_tables(page):
 
 def test_the_figure_of_the_rivals_names_all(html, study):
     comments = re.findall(r"<!-- (.*?) -->", html)
-    for plan in study.comparison.worth.comparison.plans:
+    for plan in study.comparison.benefit.comparison.plans:
         assert plan in comments
     for label in ("reference of y [m]", "y [m]", "u [N]", "time [s]", "y_d1 [m/s]"):
         assert label in comments
@@ -263,10 +264,10 @@ def test_marks_of_wins_losses_and_ties(page):
 @pytest.mark.slow
 def test_a_table_where_nothing_is_defined_has_a_page(study, shown):
     """Such as of settling, for a move there and back."""
-    one, _ = study.comparison.worth.grids
+    one, _ = study.comparison.benefit.grids
     rivals = dict.fromkeys(one.rivals, np.full(2, math.nan))
     bare = replace(one, values=np.full((2, 3), math.nan), rivals=rivals)
-    words, page = shown(replace(study.comparison, worth=replace(study.comparison.worth, grids=(bare,))))
+    words, page = shown(replace(study.comparison, benefit=replace(study.comparison.benefit, grids=(bare,))))
     assert not re.search(r"\bnan\b", words)
     (table,) = tables(page, "grid")
     assert {text for row in rows(table) for text in row[1:]} == {"–"}
@@ -274,8 +275,8 @@ def test_a_table_where_nothing_is_defined_has_a_page(study, shown):
 
 @pytest.mark.slow
 def test_limits_that_no_plan_can_keep_have_a_page(study, shown):
-    needs = tuple(Need(need.name, math.nan, "never") for need in study.comparison.worth.needs)
-    words, page = shown(replace(study.comparison, worth=replace(study.comparison.worth, needs=needs)))
+    needs = tuple(Need(need.name, math.nan, "never") for need in study.comparison.benefit.needs)
+    words, page = shown(replace(study.comparison, benefit=replace(study.comparison.benefit, needs=needs)))
     assert "Under these limits no plan is possible." in words
     (table,) = tables(page, "needs")
     assert {row[1] for row in rows(table)} == {"–"}
@@ -284,8 +285,8 @@ def test_limits_that_no_plan_can_keep_have_a_page(study, shown):
 
 @pytest.mark.slow
 def test_a_worth_without_needs_or_tables_has_a_page(study, shown):
-    bare = Worth(study.comparison.worth.comparison, {}, (), (), 1.0)
-    assert WORTH in heads(shown(replace(study.comparison, worth=bare))[1])
+    bare = Benefit(study.comparison.benefit.comparison, {}, (), (), 1.0)
+    assert WORTH in heads(shown(replace(study.comparison, benefit=bare))[1])
 
 
 def test_the_results_are_those_of_the_study(study, written, tmp_path):
@@ -294,7 +295,7 @@ def test_the_results_are_those_of_the_study(study, written, tmp_path):
 
     data = json.loads(written[1].read_text(encoding="utf-8"), parse_constant=forbidden)
     found = data["studies"]["mine"]["worth"]
-    assert found == json.loads(json.dumps(study.comparison.worth.results()))
+    assert found == json.loads(json.dumps(study.comparison.benefit.results()))
     assert list(found) == ["plans", "needs", "grids"]
     study.comparison.save(tmp_path / "saved.json")
     assert json.loads((tmp_path / "saved.json").read_text())["worth"] == found

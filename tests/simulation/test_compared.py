@@ -192,7 +192,7 @@ def test_of_many_draws_the_first_and_a_random_one_are_compared(monkeypatch):
     gains = np.linspace(1.0, 2.0, 12)
     plan = cp.PolySpline([cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1, 0, 0)], labels=["r"])
     times = np.linspace(0.0, 2.0, 21)
-    cp.sweep(block, params={"k": gains}, plans={"plan": plan}, timepts=times, outputs={"y": "r"}, progress=False)
+    cp.monte_carlo(block, {"k": gains}, {"plan": plan}, times, outputs={"y": "r"}, progress=False)
     drawn = [k for k in compared if k is not None]
     assert gains[0] in drawn
     assert set(drawn) & set(gains[1:])

@@ -126,7 +126,7 @@ def explosive():
 @pytest.mark.slow
 def test_a_draw_counts_for_the_plans_that_get_through():
     plans = {"small": cp.Step(0.2), "large": cp.Step(3.0)}
-    found = cp.sweep(explosive(), plans=plans, timepts=T, params={"g": [0.0, 0.1, 5.0]}, progress=False)
+    found = cp.monte_carlo(explosive(), {"g": [0.0, 0.1, 5.0]}, plans, T, progress=False)
     assert np.isfinite(found.metrics["small"]["iae"]).all()
     assert np.isnan(found.metrics["large"]["iae"]).tolist() == [False, False, True]
     assert [(failure.draw, failure.plan) for failure in found.failures] == [(2, "large")]
@@ -138,7 +138,7 @@ def test_a_draw_counts_for_the_plans_that_get_through():
 def test_reprs_are_short():
     plans = {"small": cp.Step(0.2)}
     swept = cp.sweep(cp.plants.integrator_lag_loop, [1.0, 2.0], plans, T, progress=False)
-    spread = cp.sweep(explosive(), plans=plans, timepts=T, params={"g": [0.0, 1.0]}, progress=False)
+    spread = cp.monte_carlo(explosive(), {"g": [0.0, 1.0]}, plans, T, progress=False)
     found = [repr(swept), repr(spread), repr(spread.nominal), repr(cp.prepare(explosive()))]
     assert found[0] == "<Sweep of small over 2 values of value>"
     assert max(map(len, found)) < 120
@@ -154,8 +154,12 @@ def test_reprs_are_short():
         ),
         (lambda: cp.compare(explosive(), [PLAN], T), TypeError, "or waypoints, got TrigSpline"),
         (lambda: cp.sweep(explosive(), [1.0, 2.0], {"p": PLAN}, T), TypeError, "build must be a function"),
-        (lambda: cp.sweep(explosive, plans={"p": PLAN}, timepts=T), ValueError, "values, or draws as params"),
-        (lambda: cp.sweep(explosive(), [1.0], {"p": PLAN}, T, params={"g": [1.0]}), ValueError, "beside params"),
+        (lambda: cp.sweep(explosive, plans={"p": PLAN}, timepts=T), TypeError, "'values'; for draws use monte_carlo"),
+        (
+            lambda: cp.sweep(explosive(), [1.0], {"p": PLAN}, T, params={"g": 1.0}),
+            TypeError,
+            "build must be a function",
+        ),
     ],
 )
 def test_calls_that_cannot_be_meant(call, kind, match):

@@ -14,8 +14,8 @@ from ctrlplan.reports import verdicts
 from ctrlplan.studies.choosing import (
     clearance_note,
     fastest_notes,
+    nominal_benefit,
     nominal_fastest,
-    nominal_worth,
     optimality_claim,
     optimality_grids,
 )
@@ -292,7 +292,7 @@ def test_clearance_is_that_of_dense_samples():
 
 @pytest.fixture(scope="module")
 def beside():
-    return nominal_worth()
+    return nominal_benefit()
 
 
 @pytest.mark.slow

@@ -114,7 +114,7 @@ def test_without_waypoints_nothing_is_said_of_wandering():
 
 
 def test_only_what_is_wanted_is_measured(standard):
-    found = cp.compare(loop(5.0), MOVE, TIMES, only=("settling_time", "control_effort"))
+    found = cp.compare(loop(5.0), MOVE, TIMES, measures=("settling_time", "control_effort"))
     for plan, row in found.metrics.items():
         assert row == {name: standard.metrics[plan][name] for name in ("settling_time", "control_effort")}
 

@@ -130,14 +130,18 @@ LOOP = cp.plants.integrator_lag_loop(5.0, outputs=("y", "u"))
 PLANS = {"move": move("r")}
 
 
+def OF_RUNS(function):
+    return Measure("mine", of="run", function=function)
+
+
 @pytest.mark.parametrize(
     ("options", "kind", "message"),
     [
-        ({"only": ["settling"]}, ValueError, "only must be among settling_time, .*, got 'settling'"),
-        ({"only": ["settling_time", "Iae"]}, ValueError, "only must be among settling_time, .* iae, .*, got 'Iae'"),
-        ({"only": "settling_time"}, TypeError, "of settling_time, .*, got the string 'settling_time'"),
-        ({"only": ""}, TypeError, "got the string ''"),
-        ({"only": {"late"}, "measure": lambda p, r: {"early": 1.0}}, ValueError, "among early, .*, got 'late'"),
+        ({"measures": ["settling"]}, ValueError, "measures must be among settling_time, .*, got 'settling'"),
+        ({"measures": ["settling_time", "Iae"]}, ValueError, "must be among settling_time, .* iae, .*, got 'Iae'"),
+        ({"measures": "settling_time"}, TypeError, "of settling_time, .*, got the string 'settling_time'"),
+        ({"measures": ""}, TypeError, "got the string ''"),
+        ({"measures": ["late", OF_RUNS(lambda run: {"early": 1.0})]}, ValueError, "or be Measures, got 'late'"),
         ({"outputs": "y"}, TypeError, "outputs must be a collection of names, of y, u, got the string 'y'"),
         ({"controls": "u"}, TypeError, "controls must be a collection of names, of y, u, got the string 'u'"),
         ({"controls": ["u", "v"]}, ValueError, "among y, u, got 'v'"),
@@ -145,11 +149,18 @@ PLANS = {"move": move("r")}
         ({"units": {"y": 3}}, TypeError, r"units\['y'\] must be a string, got 3"),
         ({"units": "m"}, TypeError, "units must be a mapping of labels to units, got str"),
         ({"measures": {"late": "Late"}}, TypeError, r"measures\['late'\] must be a Measure, got str"),
-        ({"measures": ["late"]}, TypeError, "measures must be a mapping of names to Measure, got list"),
+        ({"measures": [3]}, TypeError, "measures must be a collection of names and Measures, of .*, got 3"),
+        ({"measures": 3}, TypeError, "measures must be a collection of names and Measures, of .*, got 3"),
+        ({"measures": [Measure("Late", name="iae")]}, ValueError, "names of their own, got 'iae'"),
+        ({"measures": 2 * [OF_RUNS(float)]}, ValueError, "names of their own, got 'mine', which another has"),
         ({"measures": {"iae": Measure("Mine")}}, ValueError, "names of their own, got 'iae'"),
-        ({"measures": {"late": Measure("Late")}}, ValueError, "must have a function, or come from measure"),
-        ({"measure": lambda p, r: 3.0}, TypeError, "measure must return a mapping of names to numbers, got float"),
-        ({"measure": lambda p, r: {"iae": 3.0}}, ValueError, "names of their own, got 'iae'"),
+        ({"measures": {"late": Measure("Late")}}, ValueError, "must have a function, or come from a measure of runs"),
+        (
+            {"measures": [OF_RUNS(lambda run: [3.0])]},
+            TypeError,
+            "must return a number or a mapping of names to numbers",
+        ),
+        ({"measures": [OF_RUNS(lambda run: {"iae": 3.0})]}, ValueError, "names of their own, got 'iae'"),
     ],
 )
 def test_names_that_are_none_are_errors_with_those_that_are(options, kind, message):
@@ -165,7 +176,7 @@ def test_units_of_derivatives_and_of_signals_inside_are_known():
 def test_what_the_path_is_asked_for_is_given():
     """Metrics of the path, too, are those that are wanted."""
     points = [cp.Waypoint(0, 1.0, 0, 0), cp.Waypoint(1, 3.0, 0, 0)]
-    row = cp.compare(LOOP, points, T, only=("reference_jerk", "iae")).metrics["polynomial"]
+    row = cp.compare(LOOP, points, T, measures=("reference_jerk", "iae")).metrics["polynomial"]
     assert set(row) == {"reference_jerk", "iae"}
     assert row["reference_jerk"] == pytest.approx(720.0 * 2.0**2, rel=1e-9)  # 720 D^2/T^5 of the quintic
 

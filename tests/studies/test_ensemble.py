@@ -1,5 +1,6 @@
 """Comparisons over draws: closed forms, the same bits wherever they run, failures recorded, interruptions survived."""
 
+import importlib
 import json
 import math
 import pickle
@@ -14,7 +15,7 @@ from scipy.integrate import solve_ivp
 
 import ctrlplan as cp
 from ctrlplan.simulation import compiled, prepared
-from ctrlplan.studies.ensemble import LEVELS, ensemble
+from ctrlplan.studies.ensemble import LEVELS
 from ctrlplan.symbolic import tracing as traced
 
 TIMES = np.linspace(0.0, 10.0, 501)
@@ -98,7 +99,7 @@ def lag_response(tau, t):
 
 
 def run(loop, params, executor=None, plans=PLANS, times=TIMES, progress=False, **options):
-    return ensemble(loop, plans, times, params, executor, progress, options)
+    return cp.monte_carlo(loop, params, plans, times, executor=executor, progress=progress, **options)
 
 
 def same_bits(one, other):
@@ -325,18 +326,18 @@ def test_bands_of_a_long_run_are_kept_at_some_of_its_times():
 
 
 def test_options_reach_each_draw():
-    result = run(lag(), {"tau": [0.5, 1.0]}, band=0.05, only=["settling_time"], units={"y": "m"}, title="Lag")
-    assert (result.nominal.title, result.nominal.units) == ("Lag", {"y": "m"})
+    result = run(lag(), {"tau": [0.5, 1.0]}, band=0.05, measures=["settling_time"], units={"y": "m"})
+    assert result.nominal.units == {"y": "m"}
     assert list(result.metrics["step"]) == ["settling_time"]
     np.testing.assert_allclose(result.metrics["step"]["settling_time"], np.log(20) * np.array([0.5, 1.0]), rtol=1e-5)
 
 
 def test_waypoints_stand_for_the_standard_plans_even_from_a_generator():
     move = [cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1, 0, 0)]
-    result = run(lag(), {"tau": [0.5, 1.0]}, plans=(w for w in move), alpha=2.0)
+    result = run(lag(), {"tau": [0.5, 1.0]}, plans=(w for w in move))
     plans = {"step", "polynomial", "trigonometric", "piecewise"}
     assert set(result.metrics) == set(result.bands) == set(result.nominal.plans) == plans
-    expected = cp.compare(lag(), move, TIMES, alpha=2.0, params={"tau": 0.5}).metrics["trigonometric"]["ise"]
+    expected = cp.compare(lag(), move, TIMES, params={"tau": 0.5}).metrics["trigonometric"]["ise"]
     assert result.metrics["trigonometric"]["ise"][0] == pytest.approx(expected, rel=1e-9)
 
 
@@ -668,6 +669,7 @@ class Interrupted(Elsewhere):
         return super().answer(k)
 
 
+@pytest.mark.filterwarnings("ignore:monte_carlo was interrupted:UserWarning")
 def test_what_an_executor_found_before_an_interruption_is_kept(found):
     executor = Interrupted(1)
     result = run(lag(), LAGS, executor)
@@ -694,6 +696,7 @@ def test_an_interruption_before_anything_was_found_leaves_the_nominal_run(tmp_pa
     assert result.report(tmp_path).exists()
 
 
+@pytest.mark.filterwarnings("ignore:monte_carlo was interrupted:UserWarning")
 def test_answers_need_not_be_cancelled():
     class Ends(Elsewhere):
         def answer(self, k):
@@ -707,9 +710,8 @@ def test_answers_need_not_be_cancelled():
 
 def interrupt_in_draw(monkeypatch, k):
     """Interrupt the run of draw k in this process."""
-    from ctrlplan.studies import ensemble as module
-
-    known = module._one
+    module = importlib.import_module("ctrlplan.studies.monte_carlo")
+    known = module._of_forms
     done = []
 
     def one(*arguments):
@@ -718,9 +720,10 @@ def interrupt_in_draw(monkeypatch, k):
             raise KeyboardInterrupt
         return known(*arguments)
 
-    monkeypatch.setattr(module, "_one", one)
+    monkeypatch.setattr(module, "_of_forms", one)
 
 
+@pytest.mark.filterwarnings("ignore:monte_carlo was interrupted:UserWarning")
 def test_an_interruption_in_this_process_keeps_what_was_found(monkeypatch, found):
     interrupt_in_draw(monkeypatch, 15)
     result = run(lag(), LAGS)
@@ -730,6 +733,7 @@ def test_an_interruption_in_this_process_keeps_what_was_found(monkeypatch, found
     assert np.isnan(result.metrics["ramp"]["iae"][n:]).all()
 
 
+@pytest.mark.filterwarnings("ignore:monte_carlo was interrupted:UserWarning")
 @pytest.mark.parametrize("k", [15, 7])
 def test_an_interruption_in_this_process_loses_no_draw(monkeypatch, k):
     interrupt_in_draw(monkeypatch, k)
@@ -744,19 +748,19 @@ def test_an_interruption_in_this_process_loses_no_draw(monkeypatch, k):
     [{}, {"tau": []}, {"tau": [[1.0, 2.0]]}, {"tau": [1.0, 2.0], "other": [1.0]}, {"tau": [1.0, 2.0], "other": 1.0}],
 )
 def test_there_are_as_many_draws_of_each_parameter(params):
-    with pytest.raises(ValueError, match="params must hold as many draws of each parameter, at least one, got shapes"):
+    with pytest.raises(ValueError, match="draws must hold as many values of each parameter, at least one, got shapes"):
         run(lag(), params)
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 def test_draws_are_finite(value):
-    with pytest.raises(ValueError, match=r"params must be finite, got (nan|inf|-inf) of 'tau'"):
+    with pytest.raises(ValueError, match=r"draws must be finite, got (nan|inf|-inf) of 'tau'"):
         run(lag(), {"tau": [1.0, value]})
 
 
 @pytest.mark.parametrize("loop", [lag, lag_by_python])
 def test_a_parameter_that_no_block_reads_is_refused(loop):
-    with pytest.raises(ValueError, match="params must be parameters of a block, got 'tua', which none reads"):
+    with pytest.raises(ValueError, match="draws must be of parameters of a block, got 'tua', which none reads"):
         run(loop(), {"tau": [1.0, 2.0], "tua": [1.0, 2.0]})
 
 
@@ -772,8 +776,8 @@ def test_a_parameter_that_no_block_reads_is_refused(loop):
 )
 def test_a_linear_loop_has_no_parameters_and_the_error_says_what_has(loop):
     said = (
-        "params must be parameters of a block, got 'gain', which none reads; .* is linear, and its matrices have no "
-        "parameters: give sweep a function from a value of 'gain' to a loop, with values="
+        "draws must be of parameters of a block, got 'gain', which none reads; .* is linear, and its matrices have no "
+        "parameters: give a function of gain that returns a loop in its place"
     )
     with pytest.raises(ValueError, match=said):
         run(loop, {"gain": [1.0, 2.0]})
@@ -782,7 +786,7 @@ def test_a_linear_loop_has_no_parameters_and_the_error_says_what_has(loop):
 @pytest.mark.parametrize("build", [lambda gain: None, lambda mass, friction: None, cp.plants.integrator_lag_loop])
 def test_a_function_of_the_parameters_is_not_taken_for_one_of_a_plan(build):
     table = {"gain": [1.0, 2.0], "mass": [1.0, 2.0], "friction": [1.0, 2.0]}
-    said = "build must be, with params, a loop whose blocks read the parameters, or a function of a plan's name and"
+    said = "loop must be a control system whose blocks read the parameters, a function whose parameters are named as"
     with pytest.raises(ValueError, match=said):
         run(build, table)
 
@@ -797,9 +801,9 @@ def test_a_builder_may_have_further_arguments_named_as_the_parameters():
 def test_metrics_of_draws_count_from_the_start_that_a_comparison_takes(start):
     """The earliest start of a plan unless given: of both plans for both, though each draw runs plan by plan."""
     plans = {"step": cp.Step(1.0, time=2.0), "ramp": cp.PolySpline([cp.Waypoint(1, 0), cp.Waypoint(2, 1)])}
-    result = run(lag(), {"tau": [0.5, 1.0]}, plans=plans, start=start, only=["settling_time", "itae"])
+    result = run(lag(), {"tau": [0.5, 1.0]}, plans=plans, start=start, measures=["settling_time", "itae"])
     for k, tau in enumerate((0.5, 1.0)):
-        alone = cp.compare(lag(), plans, TIMES, params={"tau": tau}, start=start, only=["settling_time", "itae"])
+        alone = cp.compare(lag(), plans, TIMES, params={"tau": tau}, start=start, measures=["settling_time", "itae"])
         for plan, row in alone.metrics.items():
             np.testing.assert_allclose([result.metrics[plan][n][k] for n in row], list(row.values()), rtol=1e-9)
     since = 1.0 if start is None else start
@@ -811,7 +815,7 @@ def test_metrics_of_draws_count_from_the_start_that_a_comparison_takes(start):
 @pytest.mark.parametrize("values", [["0.5", "1.0"], [0.5 + 0j], np.ma.masked_array([0.5, 1.0], [0, 1])])
 def test_draws_are_plain_numbers(values):
     with pytest.raises(
-        (TypeError, ValueError), match=r"params\['tau'\] must (be real numbers|have no masked values), got"
+        (TypeError, ValueError), match=r"draws\['tau'\] must (be real numbers|have no masked values), got"
     ):
         run(lag(), {"tau": values})
 
@@ -851,7 +855,7 @@ def test_a_parameter_may_be_read_where_the_loop_is_allowed_to_be():
 
 @pytest.mark.parametrize("values", [[2.0], [2.0, 2.0]])
 def test_a_parameter_of_equal_draws_is_looked_for_too(values):
-    with pytest.raises(ValueError, match="params must be parameters of a block, got 'tua'"):
+    with pytest.raises(ValueError, match="draws must be of parameters of a block, got 'tua'"):
         run(lag(), {"tua": values})
 
 
@@ -963,9 +967,9 @@ def test_all_plans_are_measured_on_the_outputs_that_a_comparison_takes():
         outputs=["r_seen", "y"],
     )
     plans = {"step": cp.Step(1.0), "ramp": cp.PolySpline([cp.Waypoint(0, 0), cp.Waypoint(1, 1)], labels=["height"])}
-    result = run(loop, {"tau": [0.5, 2.0]}, plans=plans, only=["iae_final"])
+    result = run(loop, {"tau": [0.5, 2.0]}, plans=plans, measures=["iae_final"])
     for k, tau in enumerate((0.5, 2.0)):
-        alone = cp.compare(loop, plans, TIMES, params={"tau": tau}, only=["iae_final"]).metrics
+        alone = cp.compare(loop, plans, TIMES, params={"tau": tau}, measures=["iae_final"]).metrics
         for plan, row in alone.items():
             assert result.metrics[plan]["iae_final"][k] == pytest.approx(row["iae_final"], rel=1e-9)
 
@@ -980,9 +984,9 @@ def test_draws_of_a_loop_that_only_python_control_runs_do_not_mix_in_threads():
 
     loop = Own(_lag_rate, _lag_out, states=1, inputs="r", outputs="y", params={"tau": 1.0}, name="own")
     tau, times = np.linspace(0.5, 2.0, 12), np.linspace(0, 10, 401)
-    alone = run(loop, {"tau": tau}, None, {"step": cp.Step(1.0)}, times, only=["iae_final"])
+    alone = run(loop, {"tau": tau}, None, {"step": cp.Step(1.0)}, times, measures=["iae_final"])
     with ThreadPoolExecutor(4) as pool:
-        same_bits(alone, run(loop, {"tau": tau}, pool, {"step": cp.Step(1.0)}, times, only=["iae_final"]))
+        same_bits(alone, run(loop, {"tau": tau}, pool, {"step": cp.Step(1.0)}, times, measures=["iae_final"]))
 
 
 # The bar
@@ -999,7 +1003,7 @@ def test_progress_is_a_bar_on_stderr(executor, capsys):
 
 
 def test_progress_is_shown_unless_it_is_declined(capsys):
-    ensemble(lag(), PLANS, TIMES, {"tau": [0.5, 1.0]})
+    cp.monte_carlo(lag(), {"tau": [0.5, 1.0]}, PLANS, TIMES)
     assert "/2" in capsys.readouterr().err
 
 
@@ -1037,8 +1041,8 @@ def test_to_pandas_has_a_row_a_draw_and_a_column_a_parameter_or_metric(found):
 
 
 def test_a_metric_may_be_known_of_one_plan_only():
-    def measure(plan, response):
-        return {"last": float(response.outputs[-1])} if plan is PLANS["step"] else {}
+    def last(run):
+        return {"last": float(run.response.outputs[-1])} if run.plan is PLANS["step"] else {}
 
-    result = run(lag(), {"tau": [0.5, 1.0, 2.0]}, measure=measure)
+    result = run(lag(), {"tau": [0.5, 1.0, 2.0]}, measures=[cp.Measure("last", of="run", function=last)])
     np.testing.assert_allclose(result.quantiles("last")["step"][2], 1 - math.exp(-10), rtol=1e-6)

@@ -13,7 +13,6 @@ import pytest
 
 import ctrlplan as cp
 from ctrlplan.simulation import budget
-from ctrlplan.studies.ensemble import ensemble
 from ctrlplan.studies.executing import Failed
 
 TIMES = np.linspace(0.0, 10.0, 201)
@@ -40,7 +39,9 @@ def drawn(tau=1.0, **names):
 
 
 def swept(build, values=RATES, executor=None, **options):
-    return cp.sweep(build, values, PLANS, TIMES, executor, False, only=["settling_time"], **options)
+    return cp.sweep(
+        build, values, PLANS, TIMES, executor=executor, progress=False, measures=["settling_time"], **options
+    )
 
 
 def check(found, values):
@@ -120,7 +121,7 @@ def test_results_are_taken_as_they_complete_from_whatever_has_submit_and_result(
 @pytest.mark.parametrize("executor", [InTurn, LastFirst, LastFirstByCallback])
 def test_draws_are_taken_as_they_complete_too(executor):
     tau = np.array([0.5, 1.0, 2.0])
-    found = ensemble(drawn(), PLANS, TIMES, {"tau": tau}, executor(), False)
+    found = cp.monte_carlo(drawn(), {"tau": tau}, PLANS, TIMES, executor=executor(), progress=False)
     np.testing.assert_allclose(found.metrics["step"]["settling_time"], np.log(50.0) * tau, rtol=1e-5)
     assert (found.finished, found.failures, found.interrupted) == (3, (), False)
 
@@ -129,7 +130,9 @@ def not_to_be_built(*arguments):
     raise AssertionError("built")
 
 
-@pytest.mark.parametrize("draws", [{}, {"params": {"tau": [1.0]}}], ids=["values", "draws"])
+@pytest.mark.parametrize(
+    ("run", "given"), [(cp.sweep, [1.0]), (cp.monte_carlo, {"tau": [1.0]})], ids=["values", "draws"]
+)
 @pytest.mark.parametrize(
     ("executor", "said"),
     [
@@ -139,9 +142,9 @@ def not_to_be_built(*arguments):
         (SimpleNamespace(submit=None), "executor must be an object with submit"),
     ],
 )
-def test_what_is_no_executor_is_rejected_before_a_loop_is_built(executor, said, draws):
+def test_what_is_no_executor_is_rejected_before_a_loop_is_built(executor, said, run, given):
     with pytest.raises(TypeError, match=said):
-        cp.sweep(not_to_be_built, None if draws else [1.0], PLANS, TIMES, executor, False, **draws)
+        run(not_to_be_built, given, PLANS, TIMES, executor=executor, progress=False)
 
 
 def test_a_multiprocessing_pool_is_rejected_before_a_loop_is_built():
@@ -164,9 +167,11 @@ class Pickling(InTurn):
 def test_functions_that_only_pickle_rejects_run_where_nothing_is_pickled():
     with ThreadPoolExecutor(2) as pool:
         check(swept(lambda rate: bent(rate), executor=pool), RATES)
-        found = ensemble(lambda name, plan: drawn(), PLANS, TIMES, {"tau": [0.5, 2.0]}, pool, False)
+        found = cp.monte_carlo(
+            lambda name, plan: drawn(), {"tau": [0.5, 2.0]}, PLANS, TIMES, executor=pool, progress=False
+        )
         float_only = drawn_by_python()
-        alone = ensemble(float_only, PLANS, TIMES, {"tau": [0.5, 2.0]}, pool, False)
+        alone = cp.monte_carlo(float_only, {"tau": [0.5, 2.0]}, PLANS, TIMES, executor=pool, progress=False)
     for one in (found, alone):
         np.testing.assert_allclose(one.metrics["step"]["settling_time"], np.log(50.0) * np.array([0.5, 2]), rtol=1e-5)
 
@@ -182,7 +187,7 @@ def test_what_cannot_be_sent_is_said_in_the_executors_words():
     with pytest.raises(ValueError, match=r"build must go to other processes, but .*lambda.*; give a function that"):
         swept(lambda rate: lag(rate), executor=Pickling())
     with pytest.raises(ValueError, match=r"the loop must go to other processes, but lag must be linear or compiled"):
-        ensemble(drawn_by_python(), PLANS, TIMES, {"tau": [0.5]}, Pickling(), False)
+        cp.monte_carlo(drawn_by_python(), {"tau": [0.5]}, PLANS, TIMES, executor=Pickling(), progress=False)
 
 
 def broken(*_args):
@@ -239,13 +244,13 @@ def test_draws_that_a_worker_takes_with_it_are_named_and_run_nowhere_else():
     run = []
     loop = drawn()
 
-    def measure(plan, response):
-        run.append(float(response.outputs[1]))
+    def measure(one):
+        run.append(float(one.response.outputs[1]))
         return {}
 
-    found = ensemble(
-        loop, PLANS, TIMES, {"tau": tau}, Losing({3, 11}, RuntimeError("gone")), False, {"measure": measure}
-    )
+    lost = Losing({3, 11}, RuntimeError("gone"))
+    measures = {"counted": cp.Measure("Counted", of="run", function=measure)}
+    found = cp.monte_carlo(loop, {"tau": tau}, PLANS, TIMES, executor=lost, progress=False, measures=measures)
     assert len(run) == 3 + 10  # the nominal loop, two draws that are compared with Python, and all but the lost
     assert [(f.draw, f.params, f.message) for f in found.failures] == [
         (k, {"tau": tau[k]}, "RuntimeError: gone") for k in (3, 11)
@@ -258,7 +263,14 @@ def test_an_executor_that_loses_everything_is_heard_of():
     with pytest.raises(RuntimeError, match="all gone"):
         swept(lag, executor=lost)
     with pytest.raises(RuntimeError, match="all gone"):
-        ensemble(drawn(), PLANS, TIMES, {"tau": [0.5, 1.0]}, Losing(range(2), RuntimeError("all gone")), False)
+        cp.monte_carlo(
+            drawn(),
+            {"tau": [0.5, 1.0]},
+            PLANS,
+            TIMES,
+            executor=Losing(range(2), RuntimeError("all gone")),
+            progress=False,
+        )
 
 
 def test_an_executor_that_takes_no_more_keeps_what_it_has():
@@ -298,7 +310,7 @@ def test_system_exit_at_every_value_does_not_end_the_caller():
     with pytest.raises(RuntimeError, match="SystemExit: 7"):
         swept(lambda rate: sys.exit(7))
     with pytest.raises(RuntimeError, match="SystemExit: 7"):
-        ensemble(lambda name, plan: sys.exit(7), PLANS, TIMES, {"tau": [1.0]}, None, False)
+        cp.monte_carlo(lambda name, plan: sys.exit(7), {"tau": [1.0]}, PLANS, TIMES, progress=False)
 
 
 @pytest.mark.parametrize("executor", [None, InTurn], ids=["here", "executor"])
@@ -309,7 +321,9 @@ def test_system_exit_is_the_failure_of_its_draw(executor):
         return (float(u[0]) - x) / p["tau"]
 
     loop = ct.nlsys(update, None, states=1, inputs="r", outputs="y", params={"tau": 1.0}, name="lag")
-    found = ensemble(loop, PLANS, TIMES, {"tau": [2.0, 0.5, 1.0]}, executor and executor(), False)
+    found = cp.monte_carlo(
+        loop, {"tau": [2.0, 0.5, 1.0]}, PLANS, TIMES, executor=executor and executor(), progress=False
+    )
     assert [(f.draw, f.message) for f in found.failures] == [(0, "SystemExit")]
     assert np.isfinite(found.metrics["step"]["settling_time"][1:]).all()
 
@@ -346,11 +360,10 @@ def test_a_run_that_takes_too_long_is_the_failure_of_its_value(executor, clock):
 
 @pytest.mark.parametrize("executor", [None, InTurn], ids=["here", "executor"])
 def test_a_run_that_takes_too_long_is_the_failure_of_its_draw(executor, clock):
-    settings = {"initial_state": [0.0, 1.0, 0.0], "only": ["settling_time"]}
+    settings = {"initial_state": [0.0, 1.0, 0.0], "measures": ["settling_time"]}
     build = trembling_by_name
-    found = ensemble(
-        build, PLANS, TIMES, {"turn": [300.0, 0.5, 2.0]}, executor and executor(), False, settings, timeout=4000.0
-    )
+    options = {"executor": executor and executor(), "progress": False, "timeout": 4000.0}
+    found = cp.monte_carlo(build, {"turn": [300.0, 0.5, 2.0]}, PLANS, TIMES, **settings, **options)
     assert [(f.draw, f.message[:14]) for f in found.failures] == [(0, "TimeLimitError")]
     np.testing.assert_allclose(found.metrics["step"]["settling_time"][1:], np.log(50.0), rtol=1e-5)
 
@@ -360,10 +373,12 @@ def trembling_by_name(name, plan):
 
 
 @pytest.mark.parametrize("timeout", [0, -1.0, np.nan, np.inf, True, "5", [1.0]])
-@pytest.mark.parametrize("draws", [{}, {"params": {"tau": [1.0]}}], ids=["values", "draws"])
-def test_a_time_limit_is_a_number_of_seconds_above_0(timeout, draws):
+@pytest.mark.parametrize(
+    ("run", "given"), [(cp.sweep, [1.0]), (cp.monte_carlo, {"tau": [1.0]})], ids=["values", "draws"]
+)
+def test_a_time_limit_is_a_number_of_seconds_above_0(timeout, run, given):
     with pytest.raises(ValueError, match="timeout must be a finite number of seconds above 0, or None, got"):
-        cp.sweep(not_to_be_built, None if draws else [1.0], PLANS, TIMES, None, False, timeout=timeout, **draws)
+        run(not_to_be_built, given, PLANS, TIMES, progress=False, timeout=timeout)
 
 
 # Interruptions: KeyboardInterrupt where a run, a builder or a wait is
@@ -417,7 +432,7 @@ def test_an_interruption_between_two_results_loses_none(build, k, monkeypatch):
 
 def test_a_sweep_that_is_not_interrupted_says_so():
     assert not swept(lag).interrupted
-    assert not ensemble(drawn(), PLANS, TIMES, {"tau": [1.0]}, None, False).interrupted
+    assert not cp.monte_carlo(drawn(), {"tau": [1.0]}, PLANS, TIMES, progress=False).interrupted
 
 
 class Cancelled(InTurn):

@@ -52,10 +52,17 @@ def drawn(name, plan):
 def interrupt(pid=None):
     os.kill(pid or os.getpid(), signal.SIGINT)
 
+def own(function):
+    return [cp.Measure("own", of="run", function=function), "settling_time"]
+
 def swept(build, values, executor=None, **options):
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
-        found = cp.sweep(build, values, PLANS, TIMES, executor, False, only=["settling_time"], **options)
+        options = {"measures": ["settling_time"], **options, "executor": executor, "progress": False}
+        if "draws" in options:
+            found = cp.monte_carlo(build, options.pop("draws"), PLANS, TIMES, **options)
+        else:
+            found = cp.sweep(build, values, PLANS, TIMES, **options)
     return found, [str(one.message) for one in said]
 
 def said_of(found, said):
@@ -127,14 +134,14 @@ with ThreadPoolExecutor(2) as pool:
     found["threads"] = said_of(*swept(build, values, pool))
     go_on.set()
 
-def measure(plan, response):
+def measure(run):
     if len(seen) == 7 + 3:  # the nominal loop, two draws that are compared with Python, and seven draws
         interrupt()
     seen.append(1)
     return {}
 
 seen = []
-found["draws"] = said_of(*swept(drawn, None, params={"tau": np.linspace(0.5, 1.5, 20)}, measure=measure))
+found["draws"] = said_of(*swept(drawn, None, draws={"tau": np.linspace(0.5, 1.5, 20)}, measures=own(measure)))
 
 def build(rate):
     def update(t, x, u, p):
@@ -227,7 +234,7 @@ def test_signals_keep_what_is_finished_in_this_process_and_in_threads(tmp_path):
     assert draws["settling"][:7] == pytest.approx(np.log(50.0) * tau[:7], rel=1e-4)
     assert draws["settling"][7:] == [None] * 13
     assert (draws["interrupted"], draws["finished"], draws["failures"]) == (True, 7, [])
-    assert draws["said"] == ["the sweep was interrupted: 7 of 20 draws are kept"]
+    assert draws["said"] == ["monte_carlo was interrupted: 7 of 20 draws are kept"]
     assert found["handler"]
     assert found["again"] == "returned"  # one signal alone, while tasks are handed out
     assert found["twice"] == found["twice at once"] == "raised"
@@ -241,10 +248,10 @@ def build(rate):
         os.kill(os.getpid(), signal.SIGKILL)
     return lag(rate)
 
-def measure(plan, response):
+def measure(run):
     with open(HERE / "drawn", "a") as file:
         print(os.getpid(), file=file)
-    dies(response, 1.0)
+    dies(run.response, 1.0)
     return {}
 
 if __name__ == "__main__":
@@ -254,7 +261,7 @@ if __name__ == "__main__":
         found["values"] = said_of(*swept(build, np.arange(1.0, 8.0), pool))
     with ProcessPoolExecutor(1, mp_context=context) as pool:
         params = {"tau": [0.5, 0.75, 1.0, 1.25, 1.5]}
-        found["draws"] = said_of(*swept(drawn, None, pool, params=params, measure=measure))
+        found["draws"] = said_of(*swept(drawn, None, pool, draws=params, measures=own(measure)))
     with ProcessPoolExecutor(1, mp_context=context) as pool:
         try:
             swept(lambda rate: lag(rate), [1.0, 2.0], pool)
@@ -387,8 +394,8 @@ def killing(rate):
         os.kill(os.getpid(), signal.SIGKILL)
     return lag(rate)
 
-def measure(plan, response):
-    dies(response, 1.0)
+def measure(run):
+    dies(run.response, 1.0)
     return {}
 
 def tasks(client):
@@ -416,7 +423,7 @@ if __name__ == "__main__":
         found["killed"] = said_of(*swept(killing, np.arange(1.0, 11.0), client))
         client.wait_for_workers(2)
         params = {"tau": np.linspace(0.5, 1.5, 11)}
-        found["draws"] = said_of(*swept(drawn, None, client, params=params, measure=measure))
+        found["draws"] = said_of(*swept(drawn, None, client, draws=params, measures=own(measure)))
     print(json.dumps(found))
 """
 

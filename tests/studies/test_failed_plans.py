@@ -91,10 +91,11 @@ def test_whatever_a_builder_raises_is_the_reason_in_one_line(error, told):
 
 
 def test_what_a_measure_raises_of_one_plan_is_its_reason():
-    def measure(plan, response):
-        return {"ratio": 1.0 / (plan.final[0] - 2.0)} if plan.final[0] == 0.5 else {"ratio": [][0]}
+    def measure(run):
+        return 1.0 / (run.plan.final[0] - 2.0) if run.plan.final[0] == 0.5 else [][0]
 
-    found = cp.compare(cp.plants.integrator_lag_loop(5.0), PLANS, TIMES, measure=measure)
+    ratio = cp.Measure("Ratio", of="run", function=measure)
+    found = cp.compare(cp.plants.integrator_lag_loop(5.0), PLANS, TIMES, measures={"ratio": ratio})
     assert list(found.failures) == ["far"]
     assert found.failures["far"].startswith("IndexError")
     assert set(found.responses) == set(found.metrics) == {"near", "planned"}

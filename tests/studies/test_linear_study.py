@@ -206,7 +206,7 @@ def test_shares_are_of_the_range_and_not_of_the_count():
 
 
 def test_the_limits_of_the_benefit_are_said_to_be_the_polynomials_own(study):
-    assert "peak velocity, acceleration and jerk of the polynomial" in study.comparison.worth.note
+    assert "peak velocity, acceleration and jerk of the polynomial" in study.comparison.benefit.note
 
 
 def test_the_limit_point_of_the_step_is_that_of_the_paper():

@@ -258,7 +258,7 @@ def test_a_metric_is_added_by_one_entry_of_the_list(monkeypatch, tmp_path):
 def test_a_metric_of_one_comparison_is_computed_and_swept():
     measures = {"late": Measure("Error at the end", "{y}", "response", late)}
     closed = cp.plants.unity_feedback_loop([1.0], [1.0, 1.0], 3.0)
-    found = cp.compare(closed, MOVE, T, measures=measures, only=["late"])
+    found = cp.compare(closed, MOVE, T, measures=[Measure("Error at the end", "{y}", "response", late, "late")])
     assert found.metrics["step"] == {"late": pytest.approx(0.25, rel=1e-9)}
     build = lambda k: cp.plants.unity_feedback_loop([1.0], [1.0, 1.0], k)  # noqa: E731
     swept = cp.sweep(build, [1.0, 3.0], MOVE, T, progress=False, measures=measures)
@@ -266,7 +266,9 @@ def test_a_metric_of_one_comparison_is_computed_and_swept():
 
 
 def test_a_metric_that_a_function_returns_is_shown_by_its_name_alone():
-    found = cp.compare(loop(5.0), MOVE, T, measure=lambda plan, response: {"last": response.outputs[0, -1]})
+    last = Measure("Ends", of="run", function=lambda run: {"last": run.response.outputs[0, -1]})
+    found = cp.compare(loop(5.0), MOVE, T, measures={"ends": last})
+    assert "ends" not in found.measures
     assert found.measures["last"].title == "last"
     assert "last" in {v.key for v in verdicts(found)}
     assert ">last<" in found._repr_html_()
@@ -301,9 +303,9 @@ def test_a_measure_that_is_not_whole(arguments, message):
         ({"start": [1.0]}, TypeError, "start must be a number, got"),
         ({"band": "wide"}, TypeError, "band must be real numbers, got 'wide'"),
         ({"band": True}, TypeError, "band must be a number, got True"),
-        ({"band": math.nan, "only": ["iae"]}, ValueError, "band must be a finite number above 0"),
-        ({"worth": 3}, TypeError, "worth must be True, False or a mapping of choices, got 3"),
-        ({"worth": None}, TypeError, "worth must be"),
+        ({"band": math.nan, "measures": ["iae"]}, ValueError, "band must be a finite number above 0"),
+        ({"waypoints": 3}, TypeError, "waypoints must be Waypoints, got int"),
+        ({"measures": 3}, TypeError, "measures must be"),
     ],
 )
 def test_options_are_checked_before_anything_runs(options, kind, message):
@@ -360,12 +362,12 @@ def test_many_loops_at_once_name_and_rank_as_one():
     """A sweep of linear loops takes the same names, metrics of the path, and signals that have no worst."""
     build = lambda k: ct.ss([], [], [], k * np.eye(2), inputs=["rx", "rt"], outputs=["x", "theta"])  # noqa: E731
     points = [cp.Waypoint.from_jets(t, x=[x, 0, 0], theta=[a, 0, 0]) for t, x, a in ((0, 0, 0), (1, 2, 0.1))]
-    for options in ({"only": ["reference_jerk", "iae"]}, {"units": {"x": "m", "theta": "rad"}}):
+    for options in ({"measures": ["reference_jerk", "iae"]}, {"units": {"x": "m", "theta": "rad"}}):
         swept = cp.sweep(build, [0.5, 0.9], points, T, progress=False, **options)
         for plan, row in cp.compare(build(0.9), points, T, **options).metrics.items():
             assert set(swept.metrics[plan]) == set(row)
             for name, value in row.items():
                 assert swept.metrics[plan][name][1] == pytest.approx(value, rel=1e-9, abs=1e-12, nan_ok=True)
-    for options, kind in (({"only": ["nothing"]}, ValueError), ({"only": "iae"}, TypeError)):
+    for options, kind in (({"measures": ["nothing"]}, ValueError), ({"measures": "iae"}, TypeError)):
         with pytest.raises(kind, match="settling_time"):
             cp.sweep(build, [0.5, 0.9], points, T, progress=False, **options)

@@ -286,15 +286,19 @@ def test_a_run_that_fails_for_want_of_a_start_says_so():
 
 def test_each_draw_rests_at_its_own_parameters():
     table = {"c": np.array([2.0, 5.0])}
-    found = cp.sweep(
+    first = {
+        name: cp.Measure(name, of="run", function=lambda run, row=row: run.response.outputs[row][0])
+        for name, row in (("first", 1), ("level", 0))
+    }
+    found = cp.monte_carlo(
         lambda name, plan: joined(plan, pi(), tank(), outputs=("y", "q")),
-        plans={"move": move()},
-        timepts=BEFORE,
-        params=table,
+        table,
+        {"move": move()},
+        BEFORE,
         progress=False,
         outputs=["y"],
         controls=["q"],
-        measure=lambda plan, response: {"first": float(response.outputs[1][0]), "level": float(response.outputs[0][0])},
+        measures=first,
     )
     np.testing.assert_allclose(found.metrics["move"]["first"], table["c"] * math.sqrt(10.0), rtol=1e-7)
     np.testing.assert_allclose(found.metrics["move"]["level"], 10.0, rtol=1e-7)

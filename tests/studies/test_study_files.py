@@ -145,12 +145,12 @@ def test_a_gamma_cannot_be_chosen(stated):
 
 @pytest.mark.slow
 def test_a_file_can_ask_whether_planning_is_worth_it(stated):
-    assert stated(valid()).run().comparison.worth is None
-    data = valid(worth=True, plans=[{"family": "polynomial"}], samples=601)
+    assert stated(valid()).run().comparison.benefit is None
+    data = valid(benefit=True, plans=[{"family": "polynomial"}], samples=601)
     found = stated(data).run().comparison
-    assert found.worth.comparison.units == {"x": "m", "u": "N"}
+    assert found.benefit.comparison.units == {"x": "m", "u": "N"}
     assert {"trigonometric", "step", "trapezoid", "S-curve", "shaped step", "minimum jerk"} <= set(
-        found.worth.comparison.plans
+        found.benefit.comparison.plans
     )
     assert list(found.results()) == ["plans", "worth"]
 

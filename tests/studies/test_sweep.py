@@ -1,6 +1,6 @@
 """Comparisons over a parameter: the same numbers however they are computed."""
 
-import functools
+import dataclasses
 import inspect
 import json
 import tracemalloc
@@ -58,7 +58,7 @@ def test_a_single_value_is_a_sweep_too(swept):
 
 
 def test_waypoints_stand_for_the_standard_plans_even_from_a_generator():
-    found = cp.sweep(BUILD, GAINS, (w for w in MOVE), TIMES, progress=False, only=["overshoot_error"])
+    found = cp.sweep(BUILD, GAINS, (w for w in MOVE), TIMES, progress=False, measures=["overshoot_error"])
     assert list(found.metrics) == ["step", "polynomial", "trigonometric", "piecewise"]
     # MATH.md, section 2.
     np.testing.assert_allclose(found.metrics["polynomial"]["overshoot_error"], [16.0148, 44.4532, 48.4222], rtol=1e-4)
@@ -68,7 +68,9 @@ def test_waypoints_stand_for_the_standard_plans_even_from_a_generator():
 
 
 def test_options_reach_each_comparison():
-    found = cp.sweep(BUILD, GAINS, PLANS, TIMES, progress=False, only=["settling_time"], band=0.05, parameter="gain")
+    found = cp.sweep(
+        BUILD, GAINS, PLANS, TIMES, progress=False, measures=["settling_time"], band=0.05, parameter="gain"
+    )
     assert found.parameter == "gain"
     assert list(found.metrics["step"]) == ["settling_time"]
     alone = cp.compare(BUILD(20.0), PLANS, TIMES, band=0.05)
@@ -100,7 +102,9 @@ def two_axes(stiffness):
     a[2:, 2:] = -np.diag([w, 0.3 * w])
     b = np.vstack([np.zeros((2, 2)), -a[2:, :2]])  # at rest where the plans are
     c = np.vstack([np.eye(2, 4), -a[2:3]])
-    return ct.ss(a, b, c, np.vstack([np.zeros((2, 2)), b[2:3]]), inputs=["x_ref", "z_ref"], outputs=["x", "z", "u"])
+    return ct.ss(
+        a, b, c, np.vstack([np.zeros((2, 2)), b[2:3]]), inputs=["x_ref", "z_ref"], outputs=["x", "z", "u"], name="axes"
+    )
 
 
 def plans_of_two_axes():
@@ -113,15 +117,17 @@ def plans_of_two_axes():
 
 OPTIONS = {
     "all": {},
-    "none but two": {"only": ["overshoot_final", "control_peak"]},
-    "a wider band": {"band": 0.1, "only": ["settling_time", "tracking_settling_time"]},
+    "none but two": {"measures": ["overshoot_final", "control_peak"]},
+    "a wider band": {"band": 0.1, "measures": ["settling_time", "tracking_settling_time"]},
     "outputs by name": {"outputs": ["z", "x"], "controls": ["u", "x"]},
     "no controls": {"controls": []},
     "a state for all": {"initial_state": np.array([0.1, -0.2, 0.3, 0.0])},
     "a number for all states": {"initial_state": 0.1},
     "waypoints": {"waypoints": [cp.Waypoint(0.3, [1.0, -2.0]), cp.Waypoint(2.0, [2.0, 0.5])]},
-    "a measure of one's own": {"measure": lambda plan, response: {"last": response.outputs[0, -1]}},
-    "texts": {"title": "Title", "units": {"x": "m"}, "parameters": {"mass": 1.0}},
+    "a measure of one's own": {
+        "measures": {"last": Measure("Last", of="run", function=lambda run: run.response.outputs[0, -1])}
+    },
+    "units": {"units": {"x": "m"}},
 }
 
 
@@ -145,16 +151,15 @@ class Here:
         return task
 
 
-# Right and wrong values of every parameter of compare; those that are used up are made for each call.
+# Right and wrong values of every parameter of compare that a sweep has; those that are used up are made for each call.
 CHOICES = {
-    "alpha": [3.0, np.nan, "a", None],
     "outputs": [["z", "x"], ("x", "u"), "xz", ["x", "no"], [], 3, lambda: iter(["z", "x"])],
     "controls": [["u", "x"], ("u", "u"), "u", ["no"], [], 3, lambda: iter(["u"])],
     "waypoints": [OPTIONS["waypoints"]["waypoints"], lambda: iter(OPTIONS["waypoints"]["waypoints"]), [], [1.0], 3],
     "initial_state": [0.1, [0.1, -0.2, 0.3, 0.0], np.nan, [np.inf] * 4, "a", [1.0], [[0.0] * 4], 1j, None],
     "band": [0.1, 1, np.nan, 0.0, -0.1, np.inf, "a", None, [0.02, 0.05]],
     "start": [0.7, 0.0, -3.0, 11.95, 12.0, 50.0, np.nan, np.inf, -np.inf, "a", "0.7", [0.7], 1j, None],
-    "only": [
+    "measures": [
         ["iae", "control_effort"],
         {"itae"},
         "settling_time",
@@ -163,15 +168,14 @@ CHOICES = {
         3,
         lambda: iter(["ise", "itae"]),
         ["wandering"],
+        [Measure("Last", of="run", function=lambda run: run.response.outputs[0, -1]), "iae"],
+        {"late": Measure("Late", "{y}", "response", lambda seen: np.abs(seen.error[:, -1]))},
+        [Measure("Wrong", of="run", function=lambda run: [1.0])],
+        {"last": Measure("Last value")},
     ],
     "events": [(), [], [cp.Event("x", high=1.5, stop=True)], [cp.Event("x", high=1.5)], [cp.Event("no", high=1.0)], 3],
-    "measure": [lambda plan, response: {"last": response.outputs[0, -1]}, lambda plan, response: 1.0, 3],
-    "measures": [{"last": Measure("Last value")}, 3],
     "units": [{"x": "m"}, {"no": "m"}, 3],
-    "title": ["Title", 3],
-    "parameters": [{"mass": 1.0}, 3],
-    "worth": [False],
-    "params": [],  # of a sweep these are draws
+    "params": [{}, {"mass": 1.0}, 3, None],
 }
 
 
@@ -184,22 +188,26 @@ def outcome(function):
 
 
 def test_every_parameter_of_compare_is_among_the_choices():
-    assert set(CHOICES) == set(inspect.signature(cp.compare).parameters) - {"loop", "plans", "timepts"}
+    known = {
+        name for name in inspect.signature(cp.compare).parameters if name in inspect.signature(cp.sweep).parameters
+    }
+    assert set(CHOICES) == known - {"plans", "timepts"}
+    assert {entry.name for entry in dataclasses.fields(cp.Experiment)} <= known
 
 
 @pytest.mark.parametrize(("name", "value"), [(name, value) for name, values in CHOICES.items() for value in values])
 def test_an_option_means_and_is_checked_the_same_however_loops_are_run(name, value):
     """As in a comparison of each loop by itself."""
     values, times = np.array([2.0, 60.0]), np.linspace(0.0, 12.0, 31)
-    lasting = value if name == "measure" or not callable(value) else list(value())
+    lasting = list(value()) if callable(value) else value
 
     def alone(stiffness):
         return outcome(lambda: cp.compare(two_axes(stiffness), plans_of_two_axes(), times, **{name: lasting}).metrics)
 
     def swept(executor):
         given = value if lasting is value else value()
-        sweep = functools.partial(cp.sweep, two_axes, values, plans_of_two_axes(), times, executor, False)
-        return outcome(lambda: sweep(**{name: given}).metrics)
+        options = {"executor": executor, "progress": False, name: given}
+        return outcome(lambda: cp.sweep(two_axes, values, plans_of_two_axes(), times, **options).metrics)
 
     expected = [alone(stiffness) for stiffness in values]
     for found in (swept(None), swept(Here())):
@@ -216,8 +224,9 @@ def test_an_option_means_and_is_checked_the_same_however_loops_are_run(name, val
 @pytest.mark.parametrize("executor", [None, Here()], ids=["together", "one by one"])
 @pytest.mark.parametrize(("worth", "kind"), [(3, TypeError), (None, TypeError), (True, ValueError), ({}, ValueError)])
 def test_a_sweep_has_no_place_for_the_benefit(worth, kind, executor):
-    with pytest.raises(kind, match="worth must be False in a sweep over values, which has no place for it, got"):
-        cp.sweep(BUILD, GAINS, MOVE, TIMES, executor, progress=False, worth=worth)
+    said = "worth must be False in a sweep over values, which has no place for it, got"
+    with pytest.warns(FutureWarning, match="worth= of sweep"), pytest.raises(kind, match=said):
+        cp.sweep(BUILD, GAINS, MOVE, TIMES, executor=executor, progress=False, worth=worth)
 
 
 @pytest.mark.parametrize("start", [0.0, 0.5, 1.75])
@@ -264,7 +273,7 @@ def test_a_builder_may_change_one_loop_from_value_to_value():
         return ct.interconnect([lag], inputs=["r"], outputs=["y"], name="loop")
 
     rates = np.array([0.25, 0.5, 0.75, 1.0, 1.5, 2.0])
-    found = cp.sweep(build, rates, {"step": cp.Step(1.0)}, TIMES, progress=False, only=["settling_time"])
+    found = cp.sweep(build, rates, {"step": cp.Step(1.0)}, TIMES, progress=False, measures=["settling_time"])
     np.testing.assert_allclose(found.metrics["step"]["settling_time"], np.log(50.0) / rates, rtol=1e-5)
 
 
@@ -273,7 +282,12 @@ def test_a_loop_is_built_once_for_each_value(count):
     built = []
     gains = np.linspace(1.0, 20.0, count)
     found = cp.sweep(
-        lambda gain: built.append(gain) or BUILD(gain), gains, PLANS, TIMES, progress=False, only=["overshoot_error"]
+        lambda gain: built.append(gain) or BUILD(gain),
+        gains,
+        PLANS,
+        TIMES,
+        progress=False,
+        measures=["overshoot_error"],
     )
     assert built == found.values.tolist() == gains.tolist()
     expected = 100 * np.exp(-0.5 * np.pi / np.sqrt(gains - 0.25))
@@ -289,7 +303,7 @@ def test_a_loop_is_built_once_for_each_value_even_where_one_cannot_be():
             raise ValueError("none at 5")
         return BUILD(gain)
 
-    found = cp.sweep(build, np.arange(1.0, 10.0), PLANS, TIMES, progress=False, only=["overshoot_error"])
+    found = cp.sweep(build, np.arange(1.0, 10.0), PLANS, TIMES, progress=False, measures=["overshoot_error"])
     assert built == found.values.tolist() == list(range(1, 10))
     assert [(f.draw, f.params, f.message) for f in found.failures] == [(4, {"value": 5.0}, "ValueError: none at 5")]
     expected = 100 * np.exp(-0.5 * np.pi / np.sqrt(found.values - 0.25))
@@ -312,7 +326,7 @@ def test_an_axis_that_starts_elsewhere_starts_at_rest():
             np.kron(np.eye(2), a), np.kron(np.eye(2), b), np.kron(np.eye(2), c), np.zeros((2, 2)), inputs=2, outputs=2
         )
 
-    found = cp.sweep(apart, values, plans, times, progress=False, only=["overshoot_final", "iae"]).metrics["step"]
+    found = cp.sweep(apart, values, plans, times, progress=False, measures=["overshoot_final", "iae"]).metrics["step"]
     expected = 100 * np.exp(-np.pi * 0.2 / np.sqrt(1 - 0.04))
     np.testing.assert_allclose(found["overshoot_final_x"], expected, rtol=1e-4)
     assert np.isnan(found["overshoot_final_z"]).all()
@@ -345,7 +359,7 @@ def test_loops_with_a_state_of_their_own_start_there():
         cp.declare(loop, initial_state=[3.0])
         return loop
 
-    found = cp.sweep(build, [1.0, 2.0], {"step": cp.Step(1.0)}, TIMES, progress=False, only=["iae"])
+    found = cp.sweep(build, [1.0, 2.0], {"step": cp.Step(1.0)}, TIMES, progress=False, measures=["iae"])
     # y - 1 = 2 exp(-rate t), and its integral over 20 s.
     np.testing.assert_allclose(found.metrics["step"]["iae"], [2.0, 1.0], rtol=1e-6)
 
@@ -360,7 +374,7 @@ def test_plans_as_blocks_are_swept_too():
         return loop
 
     plans = {"step": cp.Step(1.0, labels=["r"]), "planned": cp.TrigSpline(MOVE, alpha=1.0, labels=["r"])}
-    found = cp.sweep(build, GAINS, plans, TIMES, progress=False, only=["overshoot_error"])
+    found = cp.sweep(build, GAINS, plans, TIMES, progress=False, measures=["overshoot_error"])
     expected = 100 * np.exp(-0.5 * np.pi / np.sqrt(np.array(GAINS) - 0.25))
     np.testing.assert_allclose(found.metrics["step"]["overshoot_error"], expected, rtol=1e-5)
 
@@ -403,7 +417,7 @@ def test_an_unstable_loop_among_others_spoils_none_of_them():
 def test_memory_does_not_grow_with_the_number_of_values():
     times = np.linspace(0.0, 20.0, 20_001)
     tracemalloc.start()
-    cp.sweep(BUILD, np.geomspace(0.25, 1000.0, 400), PLANS, times, progress=False, only=["settling_time"])
+    cp.sweep(BUILD, np.geomspace(0.25, 1000.0, 400), PLANS, times, progress=False, measures=["settling_time"])
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 128e6  # which y of both plans would be alone, and its metrics take several times as much
@@ -418,7 +432,7 @@ def test_progress_is_a_bar_on_stderr(executor, capsys):
         cp.sweep(BUILD, GAINS, PLANS, TIMES, progress=True, parameter="gain k")
     else:
         with executor(1) as pool:
-            cp.sweep(BUILD, GAINS, PLANS, TIMES, pool, progress=True, parameter="gain k")
+            cp.sweep(BUILD, GAINS, PLANS, TIMES, executor=pool, progress=True, parameter="gain k")
     said = capsys.readouterr()
     assert said.out == ""
     assert "gain k" in said.err
@@ -441,7 +455,7 @@ def test_without_progress_nothing_is_said(capfd):
 
 def test_threads_find_the_same(swept):
     with ThreadPoolExecutor(2) as pool:
-        same(swept, cp.sweep(BUILD, GAINS, PLANS, TIMES, pool, progress=False))
+        same(swept, cp.sweep(BUILD, GAINS, PLANS, TIMES, executor=pool, progress=False))
 
 
 @pytest.mark.slow
@@ -477,7 +491,7 @@ def test_any_object_with_submit_will_do(swept):
             self.owner.run()
             return self.task.result()
 
-    same(swept, cp.sweep(BUILD, GAINS, PLANS, TIMES, Later(), progress=False))
+    same(swept, cp.sweep(BUILD, GAINS, PLANS, TIMES, executor=Later(), progress=False))
 
 
 def test_a_build_that_fails_is_heard_of():
@@ -487,7 +501,7 @@ def test_a_build_that_fails_is_heard_of():
     with pytest.raises(ZeroDivisionError, match="no loop at 1"):
         cp.sweep(build, GAINS, PLANS, TIMES, progress=False)
     with ThreadPoolExecutor(2) as pool, pytest.raises(ZeroDivisionError, match="no loop at 1"):
-        cp.sweep(build, GAINS, PLANS, TIMES, pool, progress=False)
+        cp.sweep(build, GAINS, PLANS, TIMES, executor=pool, progress=False)
 
 
 # What it can be turned into

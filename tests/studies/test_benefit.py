@@ -1,5 +1,6 @@
 """Is it worth it: rivals that meet the same waypoints, in the same time; who wins and who loses is counted by hand."""
 
+import dataclasses
 import json
 import math
 
@@ -10,7 +11,9 @@ from scipy.interpolate import make_interp_spline
 from scipy.optimize import brentq
 
 import ctrlplan as cp
-from ctrlplan.studies.worth import Grid, Need, Worth, rival_plans, smoother_polynomials, worth
+from ctrlplan.studies.baselines import baseline_plans, smoother_polynomials
+from ctrlplan.studies.benefit import Benefit, Choices, Need, benefit_of
+from ctrlplan.studies.grids import Grid
 from ctrlplan.trajectories import SCurve, Shaper, Trapezoid
 
 MOVE = [cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1, 0, 0)]
@@ -43,6 +46,13 @@ def loop(gain, outputs=("y", "u")):
     return cp.plants.integrator_lag_loop(gain, outputs=outputs)
 
 
+def worth(system, points, times, *, units=None, **choices):
+    """Benefit with choices that the public function does not have."""
+    fields = {name: choices.pop(name) for name in ("events", "measures") if name in choices}
+    experiment = cp.Experiment({"any": cp.PolySpline(points)}, times, waypoints=points, **fields)
+    return benefit_of(experiment, system, Choices(**{"alpha": "auto"} | choices), units=units)
+
+
 @pytest.fixture(scope="module")
 def stiff():
     return worth(loop(100.0), MOVE, TIMES, alpha=1.0, **TABLES)
@@ -55,7 +65,7 @@ def soft():
 
 @pytest.fixture(scope="module")
 def rivals():
-    return rival_plans(VIA, None, SHAPER)
+    return baseline_plans(VIA, None, SHAPER)
 
 
 # The rivals
@@ -94,7 +104,7 @@ def test_an_axis_that_stands_still_on_a_leg_stays_where_it_is(rivals):
 def test_a_leg_on_which_nothing_moves_waits():
     points = [cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1), cp.Waypoint(2, 1), cp.Waypoint(3, 4, 0, 0)]
     for name in ("trapezoid", "S-curve"):
-        plan = rival_plans(points)[name]
+        plan = baseline_plans(points)[name]
         np.testing.assert_allclose(plan(np.linspace(1, 2, 11)), 1.0, rtol=0, atol=1e-12)
         np.testing.assert_allclose(plan([0.0, 1.0, 2.0, 3.0]), [0, 1, 1, 4], rtol=0, atol=1e-9)
 
@@ -113,7 +123,7 @@ def test_steps_go_to_the_goal_at_once(rivals):
 def test_profiles_have_the_proportions_of_the_fastest_ones():
     """A move of 3 in 4 s: the trapezoid under v = 2, a = 4 takes 2 s and is slowed down to twice that."""
     points = [cp.Waypoint(0, 0, 0, 0), cp.Waypoint(4, 3, 0, 0)]
-    found = rival_plans(points, {"velocity": 2.0, "acceleration": 4.0, "jerk": 32.0})
+    found = baseline_plans(points, {"velocity": 2.0, "acceleration": 4.0, "jerk": 32.0})
     assert found["trapezoid"].peak(1) == pytest.approx([2.0 / 2], rel=1e-12)
     assert found["trapezoid"].peak(2) == pytest.approx([4.0 / 4], rel=1e-12)
     ratio = 4.0 / (3 / 2 + 2 / 4 + 4 / 32)
@@ -123,7 +133,7 @@ def test_profiles_have_the_proportions_of_the_fastest_ones():
 
 def test_where_a_limit_is_not_given_it_is_that_of_a_move_in_equal_thirds():
     """v = 1.5, a = 4.5: thirds. With the acceleration reached in half of a third, j = 27, it takes 2/3 + 1/3 + 1/6."""
-    found = rival_plans(MOVE, {"velocity": 1.5})
+    found = baseline_plans(MOVE, {"velocity": 1.5})
     np.testing.assert_allclose(found["trapezoid"].breakpoints, np.arange(4) / 3, rtol=0, atol=1e-12)
     for order, limit in ((1, 1.5), (2, 4.5), (3, 27.0)):
         assert found["S-curve"].peak(order) == pytest.approx([limit * (7 / 6) ** order], rel=1e-12)
@@ -136,7 +146,7 @@ def test_without_limits_profiles_are_those_of_what_the_polynomial_needs(kind):
     if kind is Trapezoid:
         del limits["jerk"]
     expected = kind(5.0, 2.0, time=1.0, **limits).retime(took)
-    found = rival_plans([cp.Waypoint(1, 2, 0, 0), cp.Waypoint(3, 5, 0, 0)])
+    found = baseline_plans([cp.Waypoint(1, 2, 0, 0), cp.Waypoint(3, 5, 0, 0)])
     t = np.linspace(1, 3, 101)
     name = "S-curve" if kind is SCurve else "trapezoid"
     np.testing.assert_allclose(found[name](t), expected(t), rtol=0, atol=1e-9)
@@ -158,7 +168,7 @@ def test_a_quintic_a_leg_meets_every_entry(rivals):
 
 def test_where_velocities_alone_are_given_minimum_jerk_chooses_accelerations():
     """Closed form: y''' = -60 t (1 - t), so that y'' = 5 - 30 t^2 + 20 t^3."""
-    found = rival_plans([cp.Waypoint(0, 0, 0), cp.Waypoint(1, 1, 0)])
+    found = baseline_plans([cp.Waypoint(0, 0, 0), cp.Waypoint(1, 1, 0)])
     t = np.linspace(0, 1, 51)
     np.testing.assert_allclose(found["minimum jerk"](t, 2), 5 - 30 * t**2 + 20 * t**3, rtol=0, atol=1e-10)
     np.testing.assert_allclose(found["cubic"](t), 3 * t**2 - 2 * t**3, rtol=0, atol=1e-12)
@@ -176,15 +186,15 @@ def test_where_velocities_alone_are_given_minimum_jerk_chooses_accelerations():
 )
 def test_rivals_are_called_what_they_are(rest, names):
     still = [0.0] * (rest - 1)
-    found = rival_plans([cp.Waypoint(0, 0, *still), cp.Waypoint(2, 1, *still)])
+    found = baseline_plans([cp.Waypoint(0, 0, *still), cp.Waypoint(2, 1, *still)])
     assert [name for name in found if name not in ("step", "trapezoid", "S-curve")] == names
 
 
 def test_no_shaped_profile_where_the_shaper_takes_the_time_of_the_move():
     slow, quick = Shaper.zvd(2.0), Shaper.zvd(10.0)
-    assert "shaped S-curve" not in rival_plans(MOVE, None, slow)
-    assert rival_plans(MOVE, None, slow)["shaped step"].end == pytest.approx(np.pi)
-    assert rival_plans(MOVE, None, quick)["shaped S-curve"].duration == pytest.approx(1.0, abs=1e-12)
+    assert "shaped S-curve" not in baseline_plans(MOVE, None, slow)
+    assert baseline_plans(MOVE, None, slow)["shaped step"].end == pytest.approx(np.pi)
+    assert baseline_plans(MOVE, None, quick)["shaped S-curve"].duration == pytest.approx(1.0, abs=1e-12)
 
 
 # The limits
@@ -268,7 +278,7 @@ def test_a_sign_may_be_a_limit():
 
 def test_no_plan_is_possible_where_limits_are_none_that_time_can_keep():
     lone = (Need("step", math.nan, "jumps"), Need("quintic", math.nan, "no"))
-    found = Worth(None, {}, lone, (), 1.0)
+    found = Benefit(None, {}, lone, (), 1.0)
     assert found.verdicts == ("Under these limits no plan is possible.",)
 
 
@@ -538,7 +548,7 @@ def test_results_are_json_with_keys_that_stay(stiff, soft):
 
 
 def test_what_is_infinite_or_undefined_is_null():
-    lone = Worth(
+    lone = Benefit(
         cp.compare(loop(5.0), {"step": cp.Step(1.0)}, TIMES),
         {},
         (Need("step", math.nan, "jumps"),),
@@ -551,28 +561,30 @@ def test_what_is_infinite_or_undefined_is_null():
     assert data["grids"][0]["rivals"] == {"one": [None]}
 
 
-# As an option of compare
+# From a comparison
 
 
 def test_compare_asks_when_it_is_asked_to(stiff):
-    few = {"alphas": (0.0, 1.0, 3.0), "factors": (1.0, 1.5)}
-    found = cp.compare(loop(100.0), MOVE, TIMES, worth=few, units={"y": "m"})
-    assert found.worth.comparison.metrics == stiff.comparison.metrics
-    assert found.worth.comparison.units == {"y": "m"}
-    assert found.results()["worth"] == stiff.results()
-    assert list(found.plans) == ["step", "polynomial", "trigonometric", "piecewise"]
-    assert "worth" not in cp.compare(loop(100.0), MOVE, TIMES).results()
+    compared = cp.compare(loop(100.0), MOVE, TIMES, units={"y": "m"})
+    found = cp.benefit(compared, loop(100.0), alphas=(0.0, 1.0, 3.0), durations=(1.0, 1.5))
+    assert found.comparison.metrics == stiff.comparison.metrics
+    assert found.comparison.units == {"y": "m"}
+    assert found.results() == stiff.results()
+    shown = compared.with_benefit(found)
+    assert shown.results()["worth"] == stiff.results()
+    assert list(shown.plans) == ["step", "polynomial", "trigonometric", "piecewise"]
+    assert "worth" not in compared.results()
 
 
 def test_compare_hands_on_what_it_was_given():
-    few = {"alphas": (1.0,), "factors": (1.0,), "limits": {"velocity": 3.0}}
     plans = {"mine": cp.PolySpline(MOVE)}
-    measured = {"last": cp.studies.Measure("Last", "s")}
-    options = {"waypoints": MOVE, "alpha": 2.0, "band": 0.05, "start": 0.25, "controls": ("u",), "measures": measured}
-    found = cp.compare(loop(100.0), plans, TIMES, measure=lambda p, r: {"last": r.time[-1]}, worth=few, **options)
-    inner = found.worth.comparison
-    assert found.worth.limits == {"velocity": 3.0}
-    assert inner.plans["trigonometric"].alpha == 2.0
+    measures = {"last": cp.Measure("Last", "s", "run", lambda run: run.t[-1])}
+    options = {"waypoints": MOVE, "band": 0.05, "start": 0.25, "controls": ("u",), "measures": measures}
+    found = cp.compare(loop(100.0), plans, TIMES, **options)
+    gain = cp.benefit(found, loop(100.0), limits={"velocity": 3.0}, alphas=1.0, durations=1.0)
+    inner = gain.comparison
+    assert gain.limits == {"velocity": 3.0}
+    assert inner.plans["trigonometric"].alpha == 1.0  # no plan of the comparison has another
     assert inner.metrics["trigonometric"]["last"] == TIMES[-1]
     own = found.metrics["mine"]
     assert inner.metrics["quintic (minimum jerk)"]["settling_time"] == pytest.approx(own["settling_time"], rel=1e-9)
@@ -580,11 +592,20 @@ def test_compare_hands_on_what_it_was_given():
 
 
 def test_compare_judges_the_trigonometric_plan_that_it_was_given():
-    few = {"alphas": (1.0,), "factors": (1.0,), "decisive": ("settling_time",)}
     plans = {"poly": cp.PolySpline(MOVE), "mine": cp.TrigSpline(MOVE, alpha=2.5)}
-    found = cp.compare(loop(100.0), plans, TIMES[::4], waypoints=MOVE, worth=few)
-    assert found.worth.alpha == 2.5
-    assert found.worth.comparison.metrics["trigonometric"] == found.metrics["mine"]
+    found = cp.compare(loop(100.0), plans, TIMES[::4], waypoints=MOVE)
+    gain = cp.benefit(found, loop(100.0), alphas=[1.0], durations=[1.0])
+    assert gain.alpha == 2.5
+    assert gain.comparison.metrics["trigonometric"] == found.metrics["mine"]
+    assert {name: role.value for name, role in gain.comparison.roles.items()} == {
+        "trigonometric": "planned",
+        "step": "step",
+        "trapezoid": "baseline",
+        "S-curve": "baseline",
+        "shaped step": "step",
+        "shaped S-curve": "baseline",
+        "quintic (minimum jerk)": "baseline",
+    }
 
 
 @pytest.mark.slow
@@ -595,8 +616,7 @@ def test_further_metrics_can_be_decisive():
         MOVE,
         TIMES,
         alpha=1.0,
-        measure=lambda plan, response, last: {"half": plan.peak(1)[0] * last},
-        measures={"half": cp.studies.Measure("Peak speed times time", "m")},
+        measures={"half": cp.Measure("Peak speed times time", "m", "run", lambda run: run.plan.peak(1)[0] * run.last)},
         **few,
     )
     (table,) = found.grids
@@ -606,10 +626,23 @@ def test_further_metrics_can_be_decisive():
 
 
 def test_what_cannot_be_asked():
-    with pytest.raises(ValueError, match=r"worth needs waypoints, .*got none"):
-        cp.compare(loop(5.0), {"step": cp.Step(1.0)}, TIMES, worth=True)
-    with pytest.raises(TypeError, match=r"plans must be .* waypoints, got Step"):
-        worth(loop(5.0), [cp.Step(1.0)], TIMES)
+    without = cp.compare(loop(5.0), {"step": cp.Step(1.0)}, TIMES)
+    with pytest.raises(ValueError, match=r"comparison must have waypoints, .*got none"):
+        cp.benefit(without, loop(5.0))
+    with pytest.raises(ValueError, match="comparison must be made by compare"):
+        cp.benefit(dataclasses.replace(without, experiment=None), loop(5.0))
+    with pytest.raises(TypeError, match="comparison must be a Comparison, got StateSpace"):
+        cp.benefit(ct.ss(loop(5.0)), loop(5.0))
+    compared = cp.compare(loop(5.0), MOVE, TIMES)
+    for wrong in (0.0, [1.0, -1.0]):
+        with pytest.raises(ValueError, match="durations must be above 0, got"):
+            cp.benefit(compared, loop(5.0), durations=wrong)
+    for name in ("alphas", "durations"):
+        for wrong in ([], np.nan, [[1.0]]):
+            with pytest.raises(ValueError, match=f"{name} must be finite numbers, one or more, got"):
+                cp.benefit(compared, loop(5.0), **{name: wrong})
+    with pytest.raises(TypeError, match=r"waypoints must be Waypoints, got Step"):
+        cp.Experiment({"step": cp.Step(1.0)}, TIMES, waypoints=[cp.Step(1.0)])
     with pytest.raises(ValueError, match="limits must be above 0 and finite, got velocity = -1"):
         worth(loop(5.0), MOVE, TIMES, alpha=1.0, limits={"velocity": -1.0})
     with pytest.raises(ValueError, match=r"decisive"):

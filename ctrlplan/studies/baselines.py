@@ -1,0 +1,214 @@
+"""What a designer could send in the place of a planned reference: steps, profiles, polynomials."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import reduce
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctrlplan.planning import optimize_waypoints
+from ctrlplan.planning.limits import Limited
+from ctrlplan.trajectories import (
+    PiecewiseSpline,
+    PolySpline,
+    SCurve,
+    Shaper,
+    Step,
+    Trajectory,
+    Trapezoid,
+    Waypoint,
+)
+
+Array = NDArray[np.float64]
+
+_DEGREES = {1: "straight line", 3: "cubic", 5: "quintic", 7: "septic", 9: "nonic"}
+
+
+def baseline_plans(
+    waypoints: Sequence[Waypoint], limits: Mapping[str, Any] | None = None, shaper: Shaper | None = None
+) -> dict[str, Trajectory]:
+    """What a designer could send in the place of a trigonometric plan, in the same time.
+
+    Parameters
+    ----------
+    waypoints : sequence of Waypoint
+        Two or more, all positions given.
+    limits : mapping, optional
+        Of velocity, acceleration and jerk, as for `fastest`: profiles have the
+        proportions of the fastest ones under them.
+    shaper : Shaper, optional
+        What step and S-curve are shaped by, for a lightly damped mode.
+
+    Returns
+    -------
+    dict of str to Trajectory
+        step (to the goal at once), trapezoid and S-curve (at rest at every
+        waypoint), shaped step and shaped S-curve where there is a shaper,
+        quintic a leg (or what the entries given make of it), minimum jerk
+        (through the positions); one under both names where they are equal.
+    """
+    points = tuple(waypoints)
+    legs = PiecewiseSpline(points)
+    bounds = derivative_limits(legs, limits if limits is not None else needed_by(PolySpline(points, warn=False)))
+    plans: dict[str, Trajectory] = {
+        "step": Step(legs.final, legs.initial, legs.start, legs.labels),
+    }
+    timed = profiles(points, legs.labels, bounds, shaper)
+    shaped = {} if shaper is None else {"shaped step": shaper(plans["step"])}
+    plans |= {name: timed.pop(name) for name in ("trapezoid", "S-curve")} | shaped | timed
+    # Entries above the acceleration leave minimum jerk nothing to choose.
+    ends = (0, len(points) - 1)
+    freed = [point.truncated(2 if i in ends else 0) for i, point in enumerate(points)]
+    jerk = optimize_waypoints(freed, 3, labels=legs.labels).plan
+    degree = max(max(leg.degree) for leg in legs.legs)
+    name = f"{_DEGREES.get(degree, f'degree {degree}')}{' a leg' if len(points) > 2 else ''}"
+    t = np.linspace(legs.start, legs.end, 101)
+    if np.abs(jerk.jet(t, 0) - legs.jet(t, 0)).max() <= 1e-9 * np.abs(legs.jet(t, 0)).max():
+        return plans | {f"{name} (minimum jerk)": legs}
+    return plans | {name: legs, "minimum jerk": jerk}
+
+
+def profiles(
+    waypoints: Sequence[Waypoint],
+    labels: tuple[str, ...],
+    limits: Limits,
+    shaper: Shaper | None = None,
+    *,
+    timed: bool = True,
+) -> dict[str, Trajectory]:
+    """Profiles at rest at every waypoint: trapezoid, S-curve, and the S-curve shaped where there is time for it.
+
+    Parameters
+    ----------
+    waypoints : sequence of Waypoint
+        Two or more, all positions given.
+    labels : tuple of str
+        Labels of the axes.
+    limits : tuple of ndarray
+        Velocity, acceleration and jerk, axis by axis; inf where there is none.
+    shaper : Shaper, optional
+        For a lightly damped mode.
+    timed : bool, optional
+        Whether each takes the time between its waypoints; otherwise it is as
+        fast as the limits allow.
+    """
+    found = {
+        "trapezoid": _profile(waypoints, labels, Trapezoid, limits, timed),
+        "S-curve": _profile(waypoints, labels, SCurve, limits, timed),
+    }
+    if shaper is not None and shaper.duration < 0.9 * np.diff([point.time for point in waypoints]).min():
+        found["shaped S-curve"] = _profile(waypoints, labels, SCurve, limits, timed, shaper)
+    return found
+
+
+def smoother_polynomials(waypoints: Sequence[Waypoint]) -> dict[str, Trajectory]:
+    """Polynomials that are smoother at their ends than what the waypoints prescribe.
+
+    Parameters
+    ----------
+    waypoints : sequence of Waypoint
+        Two or more, all positions given.
+
+    Returns
+    -------
+    dict of str to Trajectory
+        Between two waypoints at rest the septic (jerk 0 at both ends) and the
+        nonic (snap 0 as well); through more, the plans of minimum snap and of
+        minimum fifth derivative with such ends, of these degrees segment by
+        segment. None where an end is not at rest.
+    """
+    points = tuple(waypoints)
+    ends = points[0], points[-1]
+    if any(np.nan_to_num(point.jet[1:], nan=1.0).any() for point in ends):
+        return {}
+    found: dict[str, Trajectory] = {}
+    for order, name in ((4, "septic"), (5, "nonic")):
+        if max(len(point.jet) for point in ends) > order:
+            continue
+        first, last = (_at_rest(point, order) for point in ends)
+        if len(points) == 2:
+            found[name] = PolySpline([first, last])
+        else:
+            found[f"{name} a segment"] = optimize_waypoints([first, *points[1:-1], last], order).plan
+    return found
+
+
+def _at_rest(point: Waypoint, entries: int) -> Waypoint:
+    """Same position, with so many entries, the derivatives 0."""
+    still = [0.0] * point.naxes
+    return Waypoint.from_dict(point.to_dict() | {"jet": [point.position.tolist(), *[still] * (entries - 1)]})
+
+
+def needed_by(plan: Trajectory) -> dict[str, Any]:
+    """Velocity, acceleration and jerk that a plan needs, axis by axis."""
+    peaks = {order: plan.peak(order) for order in (1, 2, 3)}
+    names = [[label, f"{label}_d1", f"{label}_d2", f"{label}_d3"] for label in plan.labels]
+    return {
+        names[axis][order]: float(peak)
+        for order, values in peaks.items()
+        for axis, peak in enumerate(values)
+        if peak > 1e-9 * values.max()
+    }
+
+
+Limits = tuple[Array, Array, Array]
+"""Velocity, acceleration and jerk, axis by axis; inf where there is none."""
+
+
+def derivative_limits(plan: Trajectory, limits: Mapping[str, Any]) -> Limits:
+    """Limits of velocity, acceleration and jerk among others, axis by axis."""
+    found = np.full((3, plan.naxes), np.inf)
+    known = {name: limit for name, limit in limits.items() if name in _names(plan)}
+    for bound in Limited(plan, known).bounds if known else ():
+        if bound.axis is not None:
+            # Where only one sign is allowed, of that sign.
+            sides = [side for side in (bound.high, -bound.low) if side > 0.0]
+            found[bound.order - 1, bound.axis] = min(sides, default=np.inf)
+    return found[0], found[1], found[2]
+
+
+def _names(plan: Trajectory) -> set[str]:
+    return {"velocity", "acceleration", "jerk"} | {f"{label}_d{k}" for label in plan.labels for k in (1, 2, 3)}
+
+
+def _profile(
+    points: Sequence[Waypoint],
+    labels: tuple[str, ...],
+    kind: Callable[..., Trajectory],
+    limits: Limits,
+    timed: bool,
+    shaper: Shaper | None = None,
+) -> Trajectory:
+    """Profiles from rest to rest, one after the other: each in the time of its leg, or as fast as it can be."""
+    parts: list[Trajectory] = []
+    for first, last in pairwise(points):
+        duration, way = last.time - first.time, np.abs(last.position - first.position)
+        if not way.any():
+            parts.append(PolySpline([Waypoint(p.time, p.position, 0, 0) for p in (first, last)], labels=labels))
+            continue
+        way = np.maximum(way, 1e-9 * way.max())
+        # Where there is no limit, that of a move in equal thirds.
+        velocity, acceleration, jerk = (
+            np.where(np.isfinite(limit), limit, usual * way / duration**order)
+            for order, usual, limit in zip((1, 2, 3), (1.5, 4.5, 27.0), limits, strict=True)
+        )
+        more = {"jerk": jerk} if kind is SCurve else {}
+        part: Trajectory = kind(
+            last.position,
+            first.position,
+            velocity=velocity,
+            acceleration=acceleration,
+            time=first.time,
+            labels=labels,
+            **more,
+        )
+        if shaper is not None:
+            part = shaper(part.retime(duration - shaper.duration) if timed else part)
+        elif timed:
+            part = part.retime(duration)
+        parts.append(part)
+    return reduce(lambda one, other: one.then(other), parts)

@@ -1,0 +1,447 @@
+"""What planning gains: a planned reference compared with its baselines under the same limits."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ctrlplan._checks import real_array
+from ctrlplan.planning.fastest import fastest_within
+from ctrlplan.planning.limits import Limited
+from ctrlplan.simulation import state_space
+from ctrlplan.studies.baselines import baseline_plans, derivative_limits, needed_by, profiles
+from ctrlplan.studies.comparison import Comparison, comparison_of, finite_or_none
+from ctrlplan.studies.experiment import Experiment, Measured
+from ctrlplan.studies.grids import SAME, Grid
+from ctrlplan.studies.measures import MEASURES, Chosen, Measure
+from ctrlplan.studies.roles import Role, role_of
+from ctrlplan.studies.running import Builder, System, is_builder
+from ctrlplan.trajectories import PolySpline, Shaper, Trajectory, TrigSpline, Waypoint
+
+Array = NDArray[np.float64]
+
+ALPHAS = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0)
+FACTORS = (0.75, 1.0, 1.5, 2.0)
+DECISIVE = ("settling_time", "control_peak")
+PLANNED = "trigonometric"
+"""Name of the planned reference."""
+
+OWN_LIMITS = (
+    "The limits are not those of a plant: they are the peak velocity, acceleration and jerk of the polynomial through "
+    "these waypoints, which therefore needs exactly the time of the waypoints. Other limits give other durations."
+)
+"""What must be said where limits are the polynomial's own peaks."""
+
+
+@dataclass(frozen=True)
+class Need:
+    """Minimum duration of a plan under the same limits.
+
+    Attributes
+    ----------
+    name : str
+        The plan.
+    duration : float
+        Minimum duration [s], nan where there is none.
+    limit : str
+        Active limit, or why there is no duration.
+    kept : str
+        Whether it satisfies the limits in the time of the waypoints.
+    """
+
+    name: str
+    duration: float
+    limit: str
+    kept: str = ""
+
+
+@dataclass(frozen=True)
+class Benefit:
+    """A planned reference compared with its baselines; made by `benefit`.
+
+    Attributes
+    ----------
+    comparison : Comparison
+        Of all plans, through the same waypoints in the same time.
+    limits : dict of str to object
+        Limits that all must satisfy.
+    needs : tuple of Need
+        Minimum duration of each under these limits.
+    grids : tuple of Grid
+        Metrics of trigonometric plans and baselines over alpha and duration.
+    alpha : float
+        Shape parameter of the trigonometric plan [rad].
+    note : str
+        What a reader must know of how it was made.
+    """
+
+    comparison: Comparison
+    limits: dict[str, Any]
+    needs: tuple[Need, ...]
+    grids: tuple[Grid, ...]
+    alpha: float = 0.0
+    note: str = ""
+
+    @property
+    def verdicts(self) -> tuple[str, ...]:
+        """What was found, in sentences."""
+        return (*([_need_sentence(self.needs)] if self.needs else []), *(grid.verdict for grid in self.grids))
+
+    def results(self) -> dict[str, Any]:
+        """Plain data for ``results.json``."""
+        return {
+            "plans": self.comparison.results()["plans"],
+            "needs": {need.name: finite_or_none(need.duration) for need in self.needs},
+            "grids": [
+                {
+                    "title": grid.title,
+                    "durations": grid.durations.tolist(),
+                    "alphas": grid.alphas.tolist(),
+                    "values": [[finite_or_none(v) for v in row] for row in grid.values.tolist()],
+                    "rivals": {name: [finite_or_none(v) for v in row.tolist()] for name, row in grid.rivals.items()},
+                }
+                for grid in self.grids
+            ],
+        }
+
+
+@dataclass(frozen=True, kw_only=True)
+class Choices:
+    """How a benefit report is made.
+
+    Attributes
+    ----------
+    alpha : float or "auto"
+        Shape parameter of the planned reference [rad].
+    limits, quantities
+        As for `fastest`; without limits, the velocity, acceleration and jerk
+        that the polynomial needs, axis by axis.
+    mode : (float, float) or None
+        Frequency [rad/s] and damping ratio of the mode that shapers are made
+        for: unless given, that of the slowest complex poles where the loop is
+        linear.
+    alphas : tuple of float
+        Shape parameters of the tables [rad].
+    factors : tuple of float
+        Durations of the tables, as multiples of the waypoints' own.
+    decisive : tuple of str or None
+        Metrics of the tables: settling time and peak of the control, as far as
+        they are measured, unless given.
+    baselines : callable or None
+        Maps waypoints to further plans by name, as `smoother_polynomials` does.
+    note : str
+        What a reader must know of how it was made.
+    """
+
+    alpha: float | Literal["auto"] = 1.0
+    limits: Mapping[str, Any] | None = None
+    quantities: Any = None
+    mode: tuple[float, float] | None = None
+    alphas: Sequence[float] = ALPHAS
+    factors: Sequence[float] = FACTORS
+    decisive: Sequence[str] | None = None
+    baselines: Callable[[tuple[Waypoint, ...]], Mapping[str, Trajectory]] | None = None
+    note: str = ""
+
+
+def benefit(
+    comparison: Comparison,
+    loop: System | Builder,
+    *,
+    limits: Mapping[str, Any] | None = None,
+    alphas: ArrayLike | None = None,
+    durations: ArrayLike | None = None,
+) -> Benefit:
+    """Compare a planned reference with what else a designer could send.
+
+    A trigonometric plan through the waypoints of a comparison is compared with
+    a step, a trapezoid, an S-curve, a shaped step, the quintic and the minimum
+    jerk plan: in the same time, and under the same limits. Everything else is
+    measured as in the comparison.
+
+    Parameters
+    ----------
+    comparison : Comparison
+        Made by `compare`, with waypoints. The shape of its first trigonometric
+        plan is that of the planned reference; alpha = 1 where it has none.
+    loop : control system or callable
+        As for `compare`.
+    limits : mapping, optional
+        As for `fastest`; unless given, the velocity, acceleration and jerk that
+        the polynomial through the waypoints needs, axis by axis.
+    alphas : array_like, optional
+        Shape parameters of the tables [rad]; 0 to 5 unless given.
+    durations : array_like, optional
+        Durations of the tables [s]; 0.75, 1, 1.5 and 2 times that of the
+        waypoints unless given.
+
+    Returns
+    -------
+    Benefit
+        `Comparison.with_benefit` shows it on the page of the comparison.
+
+    Raises
+    ------
+    ValueError
+        If the comparison has no waypoints or was not made by `compare`,
+        durations are not above 0, or as `compare` and `fastest`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import ctrlplan as cp
+    >>> move = [cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1, 0, 0)]
+    >>> loop = cp.plants.integrator_lag_loop(100)
+    >>> found = cp.benefit(cp.compare(loop, move, np.linspace(0, 10, 1001)), loop, alphas=[1.0], durations=[1.0])
+    >>> settles = {plan: values["settling_time"] for plan, values in found.comparison.metrics.items()}
+    >>> settles["shaped step"] < settles["trigonometric"] < settles["step"]
+    True
+    """
+    if not isinstance(comparison, Comparison):
+        raise TypeError(f"comparison must be a Comparison, got {type(comparison).__name__}")
+    if comparison.experiment is None:
+        raise ValueError("comparison must be made by compare, got one without its experiment")
+    if not comparison.waypoints:
+        raise ValueError("comparison must have waypoints, in the place of plans or as waypoints=, got none")
+    choices = Choices(
+        alpha=next((plan.alpha for plan in comparison.plans.values() if isinstance(plan, TrigSpline)), 1.0),
+        limits=limits,
+        alphas=ALPHAS if alphas is None else tuple(_numbers(alphas, "alphas").tolist()),
+    )
+    if durations is not None:
+        times = _numbers(durations, "durations")
+        if np.any(times <= 0.0):
+            raise ValueError(f"durations must be above 0, got {times.min():g} s")
+        points = comparison.waypoints
+        choices = replace(choices, factors=tuple((times / (points[-1].time - points[0].time)).tolist()))
+    return benefit_of(comparison.experiment, loop, choices, units=comparison.units)
+
+
+def benefit_of(
+    experiment: Experiment,
+    loop: System | Builder,
+    choices: Choices,
+    *,
+    units: Mapping[str, str] | None = None,
+    title: str = "Step versus planned",
+) -> Benefit:
+    """Compare a planned reference with its baselines, as chosen.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        With waypoints, in the place of whose plans others are run.
+    loop : control system or callable
+        As for `compare`.
+    choices : Choices
+        How the report is made.
+    units, title : optional
+        As for `compare`.
+    """
+    points = experiment.waypoints
+    reference = PolySpline(points, warn=False)
+    held = dict(choices.limits) if choices.limits is not None else needed_by(reference)
+    limited = Limited(reference, held, choices.quantities)
+    setting = _Setting(experiment, loop, choices, held, _shaper(loop, reference, choices.mode), reference)
+    planned = TrigSpline(points, alpha=choices.alpha)
+    plans: dict[str, Trajectory] = {PLANNED: planned} | setting.baselines(points)
+    own, ran = setting.run(points, plans, experiment.measures)
+    found = comparison_of(own, ran, units, title=title)
+    roles = {name: Role.BASELINE if role is Role.PLANNED else role for name, role in found.roles.items()}
+    found = replace(found, roles={name: Role.PLANNED if name == PLANNED else role for name, role in roles.items()})
+    grids = _grids(setting, found, _decisive(choices.decisive, found))
+    note = choices.note if choices.limits is not None else " ".join(filter(None, (choices.note, OWN_LIMITS)))
+    return Benefit(found, held, _needs(setting, plans, planned, limited), grids, planned.alpha, note)
+
+
+@dataclass(frozen=True)
+class _Setting:
+    """A loop, and what all plans share.
+
+    Attributes
+    ----------
+    experiment, loop, choices
+        As for `benefit_of`.
+    limits : mapping
+        Limits that all must satisfy.
+    shaper : Shaper or None
+        What step and S-curve are shaped by.
+    reference : PolySpline
+        The polynomial through the waypoints.
+    """
+
+    experiment: Experiment
+    loop: System | Builder
+    choices: Choices
+    limits: Mapping[str, Any]
+    shaper: Shaper | None
+    reference: PolySpline
+
+    def baselines(self, points: tuple[Waypoint, ...]) -> dict[str, Trajectory]:
+        """Plans that the planned reference is compared with."""
+        further = self.choices.baselines
+        return baseline_plans(points, self.limits, self.shaper) | dict(further(points) if further is not None else {})
+
+    def run(
+        self, points: tuple[Waypoint, ...], plans: dict[str, Trajectory], measures: Chosen
+    ) -> tuple[Experiment, Measured]:
+        """Run plans through waypoints; longer plans are run longer."""
+        times, late = self.experiment.timepts, points[-1].time - self.reference.end
+        more = np.arange(times[-1], times[-1] + max(late, 0.0), np.median(np.diff(times)))[1:]
+        experiment = replace(
+            self.experiment,
+            plans=_followable(self.loop, plans),
+            timepts=np.concatenate([times, more]),
+            waypoints=points,
+            measures=measures,
+        )
+        return experiment, experiment.run(self.loop)
+
+    def rows(self, factor: float, decisive: Sequence[str]) -> tuple[dict[str, dict[str, float]], list[str]]:
+        """Metrics of trigonometric plans, by alpha, and of baselines over another duration; names of the latter.
+
+        A plan for which the loop cannot be built, or whose run is ended by an
+        event, counts as worst; a baseline so ended has no value.
+        """
+        scaled = _scaled(self.experiment.waypoints, factor)
+        shapes: dict[str, Trajectory] = {f"{a:g}": TrigSpline(scaled, alpha=a, warn=False) for a in self.choices.alphas}
+        rivals = self.baselines(scaled)
+        _, ran = self.run(scaled, shapes | rivals, _only(self.experiment.measures, decisive))
+        worst, none = dict.fromkeys(decisive, np.inf), dict.fromkeys(decisive, np.nan)
+        rows = {name: worst | ran.metrics.get(name, {}) for name in (*shapes, *rivals)}
+        stopped = [name for name, run in ran.runs.items() if run.stop is not None]
+        return rows | {name: worst if name in shapes else none for name in stopped}, list(rivals)
+
+
+def _grids(setting: _Setting, found: Comparison, decisive: Sequence[str]) -> tuple[Grid, ...]:
+    """Tables over alpha and duration, one for each decisive metric."""
+    alphas, factors = setting.choices.alphas, setting.choices.factors
+    tables = [setting.rows(factor, decisive) for factor in factors] if decisive else []
+    names = dict.fromkeys(name for _, rivals in tables for name in rivals)  # a move can be too short to be shaped
+    steps = [name for name, role in found.roles.items() if role is Role.STEP]
+    steps += [name for name, plan in setting.baselines(setting.experiment.waypoints).items() if _is_step(plan)]
+    return tuple(
+        Grid(
+            title=found.measures[key].title,
+            unit=found.measures[key].unit,
+            scale=found.scales.get(key, 0.0),
+            durations=setting.reference.duration * np.array(factors),
+            alphas=np.array(alphas, dtype=float),
+            values=np.array([[rows[f"{a:g}"][key] for a in alphas] for rows, _ in tables]),
+            rivals={name: np.array([rows.get(name, {}).get(key, np.nan) for rows, _ in tables]) for name in names},
+            beside=tuple(name for name in names if name in steps),
+        )
+        for key in decisive
+    )
+
+
+def _is_step(plan: Trajectory) -> bool:
+    return role_of(plan) is Role.STEP
+
+
+def _decisive(wanted: Sequence[str] | None, found: Comparison) -> list[str]:
+    """Metrics of the tables that the loop has: without controls, none of them."""
+    if wanted is None:
+        wanted = [key for key in DECISIVE if key in found.measures]
+    for key in wanted:
+        if key not in found.measures:
+            raise ValueError(f"decisive must be metrics ({', '.join(found.measures)}), got {key!r}")
+    return [key for key in wanted if any(key in rows for rows in found.metrics.values())]
+
+
+def _only(chosen: Chosen, decisive: Sequence[str]) -> Chosen:
+    """Of the metrics wanted, those of the tables, and those that a measure of runs returns."""
+    own = [one for one in chosen or () if isinstance(one, Measure)]
+    kept = [one for one in own if one.of in ("", "run") or one.name in decisive]
+    return (*kept, *(name for name in decisive if name in MEASURES))
+
+
+def _followable(loop: System | Builder, plans: dict[str, Trajectory]) -> dict[str, Trajectory]:
+    """Plans for which a builder of loops does not raise."""
+    if not is_builder(loop):
+        return plans
+    found = {}
+    error = None
+    for name, plan in plans.items():
+        try:
+            loop(name, plan)
+        except ValueError as reason:
+            error = error or reason
+            continue
+        found[name] = plan
+    if error is not None and not found:
+        raise error
+    return found
+
+
+def _scaled(points: Sequence[Waypoint], factor: float) -> tuple[Waypoint, ...]:
+    """Same waypoints over another duration, passed at speeds in proportion."""
+    start = points[0].time
+    return tuple(point.scaled(start + factor * (point.time - start), 1.0 / factor) for point in points)
+
+
+def _shaper(loop: System | Builder, plan: Trajectory, mode: tuple[float, float] | None) -> Shaper | None:
+    """Shaper with two zeros at a mode: the one given, or the loop's own where it is linear."""
+    if mode is None:
+        if is_builder(loop) or not hasattr(loop, "poles"):
+            return None
+        system = state_space(loop)
+        poles = np.asarray(system.poles(), dtype=complex)
+        if system.dt:
+            poles = np.log(poles[poles != 0.0]) / float(system.dt)
+        swinging = poles[(poles.imag > 0.0) & (poles.real < 0.0)]
+        if not swinging.size:
+            return None
+        slowest = swinging[swinging.real.argmax()]
+        mode = float(abs(slowest)), float(-slowest.real / abs(slowest))
+    return Shaper.zvd(*mode)
+
+
+def _numbers(values: ArrayLike, name: str) -> Array:
+    """One or more finite numbers."""
+    numbers = np.atleast_1d(real_array(values, name))
+    if numbers.ndim != 1 or not numbers.size or not np.isfinite(numbers).all():
+        raise ValueError(f"{name} must be finite numbers, one or more, got {values!r:.80}")
+    return numbers
+
+
+def _needs(setting: _Setting, timed: dict[str, Trajectory], planned: Trajectory, limited: Limited) -> tuple[Need, ...]:
+    """Minimum duration, under the same limits, of plans that take the time of the waypoints."""
+    bounds = derivative_limits(planned, setting.limits)
+    # Profiles are as fast as they can be, each segment by itself; shaping adds its own time to each.
+    fast = profiles(setting.experiment.waypoints, planned.labels, bounds, setting.shaper, timed=False)
+    return tuple(_need(name, plan, fast.get(name, plan), limited) for name, plan in timed.items())
+
+
+def _need(name: str, plan: Trajectory, fast: Trajectory, limited: Limited) -> Need:
+    if plan.jumps(0):
+        return Need(name, math.nan, "jumps: no limit on a derivative holds", "broken")
+    try:
+        limited.check_smooth(plan)
+        worst = limited.margins(plan).active
+        kept = "all kept" if worst.fraction >= -SAME else f"{worst.bound.name} {worst.share} beyond"
+        shortest = limited.margins(fast)
+        duration = fast.duration
+        if fast is plan or not shortest.hold:
+            found = fastest_within(fast, limited)
+            duration, shortest = found.duration, found.margins
+    except ValueError as refusal:
+        return Need(name, math.nan, str(refusal), "broken")
+    active = shortest.active
+    return Need(name, duration, f"{active.bound.name} {active.bound.range}, at {active.time:.3g} s", kept)
+
+
+def _need_sentence(needs: Sequence[Need]) -> str:
+    possible = [need for need in needs if not math.isnan(need.duration)]
+    if not possible:
+        return "Under these limits no plan is possible."
+    first = min(possible, key=lambda need: need.duration)
+    others = ", ".join(f"{need.name} {need.duration:.4g} s" for need in possible if need is not first)
+    never = [need.name for need in needs if math.isnan(need.duration)]
+    without = f"; {', '.join(never)} cannot keep them at any" if never else ""
+    return f"Under the same limits {first.name} is the fastest with {first.duration:.4g} s ({others}{without})."

@@ -1,0 +1,375 @@
+"""What is compared: one value that holds every check, and runs and measures loops."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ctrlplan._checks import real_array
+from ctrlplan.simulation import Event
+from ctrlplan.studies.alike import Linear, numbers_of, outputs_together
+from ctrlplan.studies.measures import (
+    Chosen,
+    Measure,
+    Record,
+    Run,
+    checked_measures,
+    path_metrics,
+    run_metrics,
+    signal_metrics,
+    wanted_measures,
+)
+from ctrlplan.studies.plans import references_of, waypoints_given
+from ctrlplan.studies.running import Builder, System, check_has_inputs, is_builder, run_plan
+from ctrlplan.trajectories import Trajectory, Waypoint
+
+Array = NDArray[np.float64]
+Metrics = dict[str, dict[str, float]]
+"""Plan, metric, value."""
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What an experiment found of one loop.
+
+    Attributes
+    ----------
+    metrics : dict of str to dict of str to float
+        Plan, metric, value.
+    runs : dict of str to Run
+        By plan; none of loops that were run together.
+    failures : dict of str to str
+        Plans that could not be run, and why: they are in no other entry.
+    """
+
+    metrics: Metrics
+    runs: dict[str, Run] = field(default_factory=dict)
+    failures: dict[str, str] = field(default_factory=dict)
+
+    def whole(self) -> Measured:
+        """The same, where every plan could be run.
+
+        Raises
+        ------
+        RuntimeError
+            If one could not, with its reason.
+        """
+        if self.failures:
+            reasons = (f"{plan} could not be run: {reason}" for plan, reason in self.failures.items())
+            raise RuntimeError("; ".join(reasons))
+        return self
+
+
+@dataclass(frozen=True, init=False, eq=False)
+class Experiment:
+    """Plans, the times at which loops are sampled, and what is measured of each response.
+
+    `compare`, `sweep`, `monte_carlo`, `benefit` and study files each make one,
+    and run loops by it: a field means the same in all of them, and is checked
+    here.
+
+    Attributes
+    ----------
+    plans : dict of str to Trajectory
+        The references by name; waypoints stand for the standard set of
+        `ctrlplan.studies.standard_plans`: step, polynomial, trigonometric,
+        piecewise.
+    timepts : ndarray, shape (ntime,)
+        Sample times [s]; metrics are refined between them.
+    waypoints : tuple of Waypoint
+        What the plans must meet, for the metrics of the path.
+    start : float or None
+        Time [s] from which metrics count: the earliest start of a plan unless given.
+    band : float
+        Half width of the settling band relative to the range of the plan.
+    outputs : tuple of str or None
+        Outputs of the loop that follow the plan: those named like its axes,
+        otherwise the first ones, unless given.
+    controls : tuple of str or None
+        Outputs that are controls: those whose names begin with u unless given.
+    initial_state : array_like or None
+        State at the first sample time. Unless given, the attribute
+        ``initial_state`` of a loop or of a block is where it starts, and all
+        other states are at equilibrium with every plan held at its first
+        position; a warning says where no equilibrium is found.
+    params : mapping or None
+        Parameters of the loop's blocks, as for `simulate`.
+    events : tuple of Event or None
+        As for `simulate`; those that blocks declare unless given. A plan whose
+        run an event ends is measured up to then.
+    measures : tuple of str and Measure, or None
+        What is measured: names of `ctrlplan.studies.MEASURES`, and measures of
+        one's own; all of `MEASURES` unless given. A mapping of names to
+        measures stands for these in addition to all of `MEASURES`.
+
+    Raises
+    ------
+    ValueError
+        If there is no plan, plans differ in axes, `start` or `band` is out of
+        range, or a measure is unknown.
+    TypeError
+        If a plan is not a trajectory, or an argument is of a wrong kind.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import ctrlplan as cp
+    >>> move = [cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1, 0, 0)]
+    >>> experiment = cp.Experiment(move, np.linspace(0, 10, 2001), measures=["overshoot_error"])
+    >>> found = experiment.run(cp.plants.integrator_lag_loop(100))
+    >>> round(found.metrics["step"]["overshoot_error"], 1)
+    85.4
+    """
+
+    plans: dict[str, Trajectory]
+    timepts: Array
+    _: KW_ONLY
+    waypoints: tuple[Waypoint, ...] = ()
+    start: float | None = None
+    band: float = 0.02
+    outputs: tuple[str, ...] | None = None
+    controls: tuple[str, ...] | None = None
+    initial_state: ArrayLike | None = None
+    params: Mapping[str, Any] | None = None
+    events: tuple[Event, ...] | None = None
+    measures: Chosen = None
+
+    def __init__(
+        self,
+        plans: Mapping[str, Trajectory] | Iterable[Waypoint],
+        timepts: ArrayLike,
+        *,
+        waypoints: Iterable[Waypoint] = (),
+        start: float | None = None,
+        band: float = 0.02,
+        outputs: Iterable[str] | None = None,
+        controls: Iterable[str] | None = None,
+        initial_state: ArrayLike | None = None,
+        params: Mapping[str, Any] | None = None,
+        events: Iterable[Event] | None = None,
+        measures: Collection[str | Measure] | Mapping[str, Measure] | None = None,
+    ) -> None:
+        points = waypoints_given(waypoints, "waypoints")
+        if not isinstance(plans, Mapping):
+            plans = points = waypoints_given(plans)
+        references = references_of(plans)
+        times = real_array(timepts, "timepts")
+        _check_start(start, references.values(), times)
+        _check_band(band)
+        checked = {
+            "plans": references,
+            "timepts": times,
+            "waypoints": points,
+            "start": start,
+            "band": band,
+            "outputs": _once(outputs),
+            "controls": _once(controls),
+            "initial_state": initial_state,
+            "params": params,
+            "events": _once(events),
+            "measures": checked_measures(measures),
+        }
+        for name, value in checked.items():
+            object.__setattr__(self, name, value)
+
+    @property
+    def axes(self) -> tuple[str, ...]:
+        """Labels of the axes, those of the first plan."""
+        return next(iter(self.plans.values())).labels
+
+    @property
+    def since(self) -> float:
+        """Time from which metrics count [s]."""
+        return min(plan.start for plan in self.plans.values()) if self.start is None else float(self.start)
+
+    def run(self, loop: System | Builder) -> Measured:
+        """Run every plan through a loop, and measure each response.
+
+        Parameters
+        ----------
+        loop : control system or callable
+            As for `compare`.
+
+        Returns
+        -------
+        Measured
+
+        Raises
+        ------
+        Exception
+            What the first plan's run raised, where no plan can be run. Where
+            others can be, it is recorded in `Measured.failures`.
+        """
+        if not is_builder(loop):
+            check_has_inputs(loop)
+        found, failures = _each(lambda name: self.run_plan(loop, name), list(self.plans))
+        metrics = {name: values for name, (_, values) in found.items()}
+        return Measured(metrics, {name: run for name, (run, _) in found.items()}, failures)
+
+    def run_plan(
+        self, loop: System | Builder, name: str, params: Mapping[str, Any] | None = None
+    ) -> tuple[Run, dict[str, float]]:
+        """Run one of the plans through a loop, and measure the response.
+
+        Parameters
+        ----------
+        loop : control system or callable
+            As for `compare`.
+        name : str
+            Name of the plan.
+        params : mapping, optional
+            Parameters of the loop's blocks in addition to those of the experiment.
+        """
+        plan = self.plans[name]
+        last = self.waypoints[-1].time if self.waypoints else plan.end
+        merged = self.params if params is None else {**(self.params or {}), **params}
+        run = run_plan(
+            loop,
+            name,
+            plan,
+            self.timepts,
+            axes=self.axes,
+            last=last,
+            outputs=self.outputs,
+            controls=self.controls,
+            initial_state=self.initial_state,
+            params=merged,
+            events=self.events,
+        )
+        return run, self._metrics(run)
+
+    def numbers_of(self, loop: System | Builder) -> Linear | None:
+        """Numbers of a linear loop as it is now, for `run_alike`.
+
+        Returns
+        -------
+        Linear or None
+            None where the loop must be run by itself: it is not linear, it has
+            events or parameters, or a measure is one's own.
+        """
+        if is_builder(loop) or self._held is None:
+            return None
+        first, duration = next(iter(self.plans.values())), float(self.timepts[-1] - self.timepts[0])
+        return numbers_of(loop, first, self._held, duration, self.outputs, self.controls, self.initial_state)
+
+    @cached_property
+    def _held(self) -> dict[str, Array] | None:
+        """First positions of the plans, where linear loops are held at first; None where none are run together."""
+        times = self.timepts
+        ordered = times.ndim == 1 and times.size > 1 and np.isfinite(times).all() and np.all(np.diff(times) > 0.0)
+        own = any(isinstance(measure, Measure) for measure in self.measures or ())
+        if not ordered or self.events or self.params or own or self._listed("run"):
+            return None
+        return {name: plan.jet(times[:1], 0, left=True)[0, :, 0] for name, plan in self.plans.items()}
+
+    def run_alike(self, loops: Sequence[System | Linear]) -> list[Measured] | None:
+        """Run every plan through linear loops together, and measure the responses as `run` does.
+
+        Parameters
+        ----------
+        loops : sequence of control systems or Linear
+            Loops that differ in numbers alone.
+
+        Returns
+        -------
+        list of Measured, or None
+            Without runs, which are not kept. None where one of the loops must
+            be run by itself.
+        """
+        numbers = [loop if isinstance(loop, Linear) else self.numbers_of(loop) for loop in loops]
+        alike = [loop for loop in numbers if loop is not None]
+        if not alike or len(alike) < len(numbers) or not all(loop.fits(alike[0]) for loop in alike):
+            return None
+        tracked, wanted = alike[0].tracked, wanted_measures(self.measures)
+        acting = alike[0].acting if self._listed("control") else ()
+        signals, unstable = outputs_together(alike, (*tracked, *acting), self.plans, self.timepts)
+        found: list[Metrics] = [{} for _ in alike]
+        for name, plan in self.plans.items():
+            y, u = np.split(signals.pop(name), [len(tracked)], axis=1)
+            record = Record(self.timepts, y, u, self.axes, acting, unstable)
+            values = signal_metrics(record, plan, self.since, self.band, wanted)
+            of_path = path_metrics(plan, self.waypoints, wanted)
+            for i, metrics in enumerate(found):
+                metrics[name] = {key: float(row[i]) for key, row in values.items()} | of_path
+        return [Measured(metrics) for metrics in found]
+
+    def _metrics(self, run: Run) -> dict[str, float]:
+        """Metrics of a run, up to where it was ended."""
+        wanted = wanted_measures(self.measures)
+        values = run_metrics(run, wanted)
+        if np.count_nonzero(run.t >= self.since) >= 2:  # otherwise it was ended before there was anything to measure
+            unstable = np.array([run.is_unstable])
+            y, u = run.rows(run.outputs)[None], run.rows(run.controls)[None]
+            record = Record(run.t, y, u, self.axes, run.controls, unstable)
+            found = signal_metrics(record, run.plan, self.since, self.band, wanted)
+            values |= {key: float(row[0]) for key, row in found.items()}
+        return values | path_metrics(run.plan, self.waypoints, wanted)
+
+    def _listed(self, kind: str) -> bool:
+        """Whether a measure of a kind is wanted."""
+        return any(measure.of == kind for measure in wanted_measures(self.measures).values())
+
+
+def _each(
+    measured: Callable[[str], tuple[Run, dict[str, float]]], names: Sequence[str]
+) -> tuple[dict[str, tuple[Run, dict[str, float]]], dict[str, str]]:
+    """Results of all plans; and of those that fail, why. An error that meets all of them is raised."""
+    results: dict[str, tuple[Run, dict[str, float]]] = {}
+    errors: dict[str, Exception] = {}
+    for name in names:
+        try:
+            results[name] = measured(name)
+        except Exception as error:  # whatever a loop does with this plan
+            errors[name] = error
+    if len(errors) == len(names):
+        raise next(iter(errors.values()))
+    return results, {name: _reason(error) for name, error in errors.items()}
+
+
+def _reason(error: Exception) -> str:
+    """Message of an error in one line; with its type where the message alone says little."""
+    told = " ".join(str(error).split())
+    speaks = told and isinstance(error, ValueError | TypeError | RuntimeError)
+    return told if speaks else f"{type(error).__name__}: {told}".rstrip(": ")
+
+
+def _once(values: Any) -> Any:
+    """Values of an iterator, which could be read once only; anything else as it is."""
+    return values if values is None or isinstance(values, str) or not isinstance(values, Iterable) else tuple(values)
+
+
+def _check_start(start: Any, plans: Iterable[Trajectory], times: Array) -> None:
+    """Reject a start that is no finite time, or that leaves fewer than two sample times."""
+    since = min(plan.start for plan in plans)
+    if start is not None:
+        since = _number(start, "start")
+        if not math.isfinite(since):
+            raise ValueError(f"start must be a finite time [s], got {start!r}")
+    usable = times.ndim == 1 and times.size > 1 and np.isfinite(times).all()  # otherwise simulate says so
+    if usable and np.count_nonzero(times >= since) < 2:
+        end = float(times[-1])
+        if start is None:
+            raise ValueError(
+                f"timepts must reach beyond the start of the plans at {since:g} s, got {end:g} s as the last"
+            )
+        raise ValueError(f"start must leave two of timepts or more, which end at {end:g} s, got {start!r}")
+
+
+def _check_band(band: Any) -> None:
+    """Reject a settling band that is none."""
+    if not 0.0 < _number(band, "band") < math.inf:
+        raise ValueError(f"band must be a finite number above 0, relative to the range of the plan, got {band!r}")
+
+
+def _number(value: Any, name: str) -> float:
+    """One real number, without a unit."""
+    number = real_array(value, name)
+    if number.ndim or isinstance(value, bool | np.bool_):
+        raise TypeError(f"{name} must be a number, got {value!r:.80}")
+    return float(number)

@@ -1,0 +1,79 @@
+"""The references that are compared: by name, or the standard set through waypoints."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+
+from ctrlplan.trajectories import PiecewiseSpline, PolySpline, Step, Trajectory, TrigSpline, Waypoint
+
+
+def waypoints_given(points: Any, name: str = "plans") -> tuple[Waypoint, ...]:
+    """Waypoints, alone or in the place of plans.
+
+    Raises
+    ------
+    TypeError
+        If they are plans without names, or nothing of the kind.
+    """
+    found = tuple(points) if np.iterable(points) else (points,)
+    kinds = "Waypoints" if name == "waypoints" else "a mapping of names to trajectories, or waypoints"
+    for point in found:
+        if not isinstance(point, Waypoint):
+            raise TypeError(f"{name} must be {kinds}, got {type(point).__name__}")
+    return found
+
+
+def standard_plans(waypoints: Iterable[Waypoint], alpha: float = 1.0) -> dict[str, Trajectory]:
+    """Plans that a designer would compare through the same waypoints.
+
+    Parameters
+    ----------
+    waypoints : iterable of Waypoint
+        Two or more.
+    alpha : float, optional
+        Shape parameter of the trigonometric one [rad].
+
+    Returns
+    -------
+    dict of str to Trajectory
+        step (from the first position to the last, at the start), polynomial,
+        trigonometric, piecewise.
+    """
+    points = tuple(waypoints)
+    polynomial = PolySpline(points, warn=False)  # one of the baselines, however it swings
+    return {
+        "step": Step(polynomial.final, polynomial.initial, polynomial.start, polynomial.labels),
+        "polynomial": polynomial,
+        "trigonometric": TrigSpline(points, alpha=alpha),
+        "piecewise": PiecewiseSpline(points),
+    }
+
+
+def references_of(plans: Mapping[str, Trajectory] | Iterable[Waypoint], alpha: float = 1.0) -> dict[str, Trajectory]:
+    """The references by name: those given, or the standard set through waypoints.
+
+    Raises
+    ------
+    ValueError
+        If there is none, or they differ in axes.
+    TypeError
+        If one is not a trajectory.
+    """
+    return _checked_plans(plans if isinstance(plans, Mapping) else standard_plans(plans, alpha))
+
+
+def _checked_plans(plans: Mapping[str, Trajectory]) -> dict[str, Trajectory]:
+    references = dict(plans)
+    if not references:
+        raise ValueError("plans must hold at least one trajectory, got none")
+    naxes = None
+    for name, plan in references.items():
+        if not isinstance(plan, Trajectory):
+            raise TypeError(f"plans[{name!r}] must be a Trajectory, got {type(plan).__name__}")
+        if naxes is not None and plan.naxes != naxes:
+            raise ValueError(f"plans must have the same axes, got {plan.naxes} in {name!r} after {naxes}")
+        naxes = plan.naxes
+    return references

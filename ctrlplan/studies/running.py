@@ -1,0 +1,152 @@
+"""One plan through one loop: the one function that runs."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, TypeAlias, TypeGuard
+
+import control as ct
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ctrlplan.simulation import Event, Prepared, prepared_form, rest_at, simulate, state_space, unstable_poles
+from ctrlplan.studies.connections import check_reached
+from ctrlplan.studies.measures import Run, checked_names
+from ctrlplan.trajectories import Trajectory
+
+Array = NDArray[np.float64]
+System: TypeAlias = "ct.InputOutputSystem | Prepared"
+"""A loop."""
+Builder: TypeAlias = Callable[[str, Trajectory], System]
+"""Function of a plan's name and the plan that returns a loop."""
+
+
+def run_plan(
+    loop: System | Builder,
+    name: str,
+    plan: Trajectory,
+    times: Array,
+    *,
+    axes: tuple[str, ...],
+    last: float,
+    outputs: Sequence[str] | None = None,
+    controls: Sequence[str] | None = None,
+    initial_state: ArrayLike | None = None,
+    params: Mapping[str, Any] | None = None,
+    events: Sequence[Event] | None = None,
+) -> Run:
+    """Simulate a loop with a plan.
+
+    Parameters
+    ----------
+    loop, outputs, controls, initial_state, params, events
+        As for `compare`.
+    name : str
+        Name of the plan.
+    plan : Trajectory
+        The plan.
+    times : ndarray, shape (ntime,)
+        Sample times [s].
+    axes : tuple of str
+        Labels by which the outputs that follow the plan are found.
+    last : float
+        Time of the last waypoint [s].
+
+    Warns
+    -----
+    UserWarning
+        If the run does not start at equilibrium.
+    """
+    system = state_space(loop(name, plan) if is_builder(loop) else loop)
+    tracked, acting = _tracked(system, outputs, axes), acting_outputs(system, controls)
+    check_reached(system, tracked, plan)
+    state, doubt = initial_state, ""
+    if state is None and times.ndim == 1 and times.size and np.isfinite(times).all():  # otherwise simulate says so
+        rows = [system.output_labels.index(label) for label in tracked]
+        state, why = rest_at(system, plan, float(times[0]), rows, params)
+        doubt = f"With {name}, {_doubt(plan, times, state, why)}." if why else ""
+    inputs, start = (plan if system.ninputs else None), (0.0 if state is None else state)
+    try:
+        response = simulate(system, times, inputs, initial_state=start, params=params, events=events)
+    except Exception as error:
+        if doubt:
+            error.add_note(doubt)
+        raise
+    if doubt:
+        warnings.warn(doubt, UserWarning, stacklevel=3)
+    early = response.time[-1] < times[-1]
+    stop = next(event for event in response.events if event.stop) if early else None
+    return Run(plan, system, response, tracked, acting, last, _unstable(system), doubt, stop)
+
+
+def _unstable(system: System) -> NDArray[np.complex128] | None:
+    """Poles in the right half plane; None where the loop is not linear, and none are known."""
+    poles = unstable_poles(system)
+    return poles if poles.size or prepared_form(system).linear is not None else None
+
+
+def _doubt(plan: Trajectory, times: Array, state: Array, why: str) -> str:
+    held = ", ".join(f"{value:.4g}" for value in plan.jet(times[:1], 0, left=True)[0, :, 0])
+    where = "the start that blocks state" if np.any(state) else "the zero state"
+    return (
+        f"no equilibrium of the loop is known with the plan held at its first position {held}: {why}. The run starts "
+        f"at {where}; give initial_state= where it should start elsewhere"
+    )
+
+
+def is_builder(loop: object) -> TypeGuard[Callable[..., System]]:
+    """Whether something is a function that returns a loop; systems can be called as well."""
+    return callable(loop) and not hasattr(loop, "output_labels")
+
+
+def check_has_inputs(loop: System) -> System:
+    """Reject a loop that has no input for a plan."""
+    if not loop.ninputs:
+        raise ValueError(
+            "loop must have inputs for the plans, got one without; give a function of name and plan that returns "
+            "a loop where the plan is a block inside"
+        )
+    return loop
+
+
+def tracked_outputs(loop: System, outputs: Sequence[str] | None, plan: Trajectory) -> tuple[str, ...]:
+    """Outputs that follow a plan: as given, those named like its axes, or the first ones.
+
+    Raises
+    ------
+    ValueError
+        If they are not as many as the axes, one is unknown, or an input of the
+        loop reaches none of them.
+    TypeError
+        If they are a string.
+    """
+    names = _tracked(loop, outputs, plan.labels)
+    check_reached(loop, names)
+    return names
+
+
+def acting_outputs(loop: System, controls: Sequence[str] | None) -> tuple[str, ...]:
+    """Outputs that are controls: as given, or those whose names begin with u."""
+    if controls is None:
+        return tuple(name for name in loop.output_labels if name.startswith("u"))
+    return _known(loop, controls, "controls")
+
+
+def _tracked(loop: System, outputs: Sequence[str] | None, axes: tuple[str, ...]) -> tuple[str, ...]:
+    labels = list(loop.output_labels)
+    if outputs is not None:
+        names = _known(loop, outputs, "outputs")
+    elif all(label in labels for label in axes):
+        names = axes
+    else:
+        names = tuple(labels[: len(axes)])
+    if len(names) != len(axes):
+        raise ValueError(f"outputs must be as many as the plan's axes, {len(axes)}, got {', '.join(names) or 'none'}")
+    return names
+
+
+def _known(loop: System, names: Sequence[str], what: str) -> tuple[str, ...]:
+    if isinstance(names, str):
+        checked_names(names, loop.output_labels, what)
+    return checked_names(names, loop.output_labels, "outputs and controls")
