@@ -8,6 +8,7 @@ import pytest
 import ctrlplan as cp
 from ctrlplan.reports import verdicts
 from ctrlplan.studies import crane as studies
+from ctrlplan.studies.crane_setup import load_metrics
 from ctrlplan.systems.plants import Crane, crane_loop
 
 
@@ -46,7 +47,7 @@ def test_load_errors_and_sway_are_those_of_the_table(row):
     sway = np.abs(out["theta"])
     measured = (error[t <= last].max(), error[t >= last].max(), sway[t >= last].max())
     assert measured == pytest.approx(expected, rel=0.02)
-    metrics = studies.load_metrics(plan, found, last)
+    metrics = load_metrics(plan, found, last)
     assert (metrics["error_travel"], metrics["error_after"], metrics["sway_after"]) == pytest.approx(measured, rel=1e-3)
     assert metrics["slack_time"] == 0.0
     way = np.hypot(*np.diff([out["x"], out["z"]], axis=1)).sum()
@@ -70,7 +71,7 @@ def test_path_lengths_over_the_obstacle():
         assert length == pytest.approx(expected, abs=0.005)
         loop = crane_loop(Crane(), plan)
         found = cp.simulate(loop, np.linspace(0, 17, 18), initial_state=loop.initial_state)
-        assert studies.load_metrics(plan, found, 16.0)["path_length"] == pytest.approx(length, rel=1e-5)
+        assert load_metrics(plan, found, 16.0)["path_length"] == pytest.approx(length, rel=1e-5)
 
 
 def test_obstacle_waypoints_are_the_papers():
@@ -86,7 +87,7 @@ def test_time_with_a_slack_rope_is_measured_and_marked():
     t = np.linspace(0, 30, 3001)
     found = cp.simulate(loop, t, initial_state=loop.initial_state)
     tension = np.asarray(found.outputs)[found.output_labels.index("T")]
-    metrics = studies.load_metrics(plan, found, 15.0)
+    metrics = load_metrics(plan, found, 15.0)
     assert tension.min() < 0
     assert metrics["slack_time"] == pytest.approx(0.01 * (tension < 0).sum(), abs=0.011)
     assert metrics["sway_after"] > 0.1
