@@ -23,6 +23,7 @@ from ctrlplan.studies.notes import how_measured, mark_of, notes_of
 from ctrlplan.studies.plans import references_of, waypoints_given
 from ctrlplan.studies.roles import Role, Stability, role_of, stability_of
 from ctrlplan.studies.running import Builder, System
+from ctrlplan.studies.study import Study
 from ctrlplan.studies.units import Signals, checked_units, listed_measures, scales_of, signals_of_runs
 from ctrlplan.trajectories import Trajectory, Waypoint
 
@@ -177,7 +178,6 @@ class Comparison:
             The file, or a folder for ``index.html`` in it.
         """
         from ctrlplan.reports import write_page
-        from ctrlplan.studies.study import Study
 
         return write_page([Study("comparison", self.title, self, notes=self.notes)], path, title=self.title)
 

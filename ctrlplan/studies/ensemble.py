@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctrlplan.studies.comparison import Comparison, finite_or_none
+from ctrlplan.studies.study import Study
 from ctrlplan.studies.units import ROUNDING
 
 if TYPE_CHECKING:
@@ -159,7 +160,6 @@ class Ensemble:
             Heading.
         """
         from ctrlplan.reports import write_page
-        from ctrlplan.studies.study import Study
 
         notes = (*self.nominal.notes, *self.notes())
         study = Study("draws", title, self.nominal, notes=notes, figures=("bands", "responses"), ensemble=self)

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ctrlplan.planning import Fastest
-from ctrlplan.studies.comparison import Comparison
-from ctrlplan.studies.ensemble import Ensemble
-from ctrlplan.studies.grids import Grid
-from ctrlplan.studies.sweep import Sweep
+if TYPE_CHECKING:  # comparisons and ensembles make studies of themselves for their pages
+    from ctrlplan.planning import Fastest
+    from ctrlplan.studies.comparison import Comparison
+    from ctrlplan.studies.ensemble import Ensemble
+    from ctrlplan.studies.grids import Grid
+    from ctrlplan.studies.sweep import Sweep
 
 
 @dataclass(frozen=True)

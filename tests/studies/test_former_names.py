@@ -23,7 +23,7 @@ def lag():
 
 
 def test_only_is_measures():
-    with pytest.warns(FutureWarning, match="only= of compare works in this release only; use measures="):
+    with pytest.warns(FutureWarning, match="only= of compare is deprecated .* use measures="):
         found = cp.compare(LOOP, PLANS, TIMES, only=["iae", "control_peak"])
     assert found.metrics == cp.compare(LOOP, PLANS, TIMES, measures=["iae", "control_peak"]).metrics
     with pytest.warns(FutureWarning), pytest.raises(ValueError, match=r"only must be among .*, got 'no'"):
@@ -130,11 +130,11 @@ def test_the_notice_names_the_line_that_calls():
 def test_a_study_file_may_say_worth(tmp_path, capsys):
     path = tmp_path / "study.toml"
     path.write_text(to_toml(valid(worth=True)))
-    with pytest.warns(FutureWarning, match="study.toml: worth = works in this release only; use benefit ="):
+    with pytest.warns(FutureWarning, match="study.toml: worth = is deprecated .*; use benefit ="):
         assert load_study(path).benefit
     assert main(["plan", str(path), "--out", str(tmp_path / "plan.csv")]) == 0
     first = capsys.readouterr().err.splitlines()[0]
-    assert first == f"ctrlplan: {path}: worth = works in this release only; use benefit ="
+    assert first == f"ctrlplan: {path}: worth = is deprecated and will be removed in the next release; use benefit ="
     path.write_text(to_toml(valid(worth=1)))
     with pytest.raises(StudyError, match="worth: must be true or false, got 1"):
         load_study(path)
