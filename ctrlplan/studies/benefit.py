@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
@@ -11,14 +10,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ctrlplan._checks import real_array
-from ctrlplan.planning.fastest import fastest_within
 from ctrlplan.planning.limits import Limited
 from ctrlplan.simulation import state_space
 from ctrlplan.studies.baselines import baseline_plans, derivative_limits, needed_by, profiles
 from ctrlplan.studies.comparison import Comparison, comparison_of, finite_or_none
 from ctrlplan.studies.experiment import Experiment, Measured
-from ctrlplan.studies.grids import SAME, Grid
+from ctrlplan.studies.grids import Grid
 from ctrlplan.studies.measures import MEASURES, Chosen, Measure
+from ctrlplan.studies.needs import Need, need_of, sentence_of
 from ctrlplan.studies.roles import Role, role_of
 from ctrlplan.studies.running import Builder, System, is_builder
 from ctrlplan.trajectories import PolySpline, Shaper, Trajectory, TrigSpline, Waypoint
@@ -36,28 +35,6 @@ OWN_LIMITS = (
     "these waypoints, which therefore needs exactly the time of the waypoints. Other limits give other durations."
 )
 """What must be said where limits are the polynomial's own peaks."""
-
-
-@dataclass(frozen=True)
-class Need:
-    """Minimum duration of a plan under the same limits.
-
-    Attributes
-    ----------
-    name : str
-        The plan.
-    duration : float
-        Minimum duration [s], nan where there is none.
-    limit : str
-        Active limit, or why there is no duration.
-    kept : str
-        Whether it satisfies the limits in the time of the waypoints.
-    """
-
-    name: str
-    duration: float
-    limit: str
-    kept: str = ""
 
 
 @dataclass(frozen=True)
@@ -90,7 +67,7 @@ class Benefit:
     @property
     def verdicts(self) -> tuple[str, ...]:
         """What was found, in sentences."""
-        return (*([_need_sentence(self.needs)] if self.needs else []), *(grid.verdict for grid in self.grids))
+        return (*([sentence_of(self.needs)] if self.needs else []), *(grid.verdict for grid in self.grids))
 
     def results(self) -> dict[str, Any]:
         """Plain data for ``results.json``."""
@@ -415,33 +392,4 @@ def _needs(setting: _Setting, timed: dict[str, Trajectory], planned: Trajectory,
     bounds = derivative_limits(planned, setting.limits)
     # Profiles are as fast as they can be, each segment by itself; shaping adds its own time to each.
     fast = profiles(setting.experiment.waypoints, planned.labels, bounds, setting.shaper, timed=False)
-    return tuple(_need(name, plan, fast.get(name, plan), limited) for name, plan in timed.items())
-
-
-def _need(name: str, plan: Trajectory, fast: Trajectory, limited: Limited) -> Need:
-    if plan.jumps(0):
-        return Need(name, math.nan, "jumps: no limit on a derivative holds", "broken")
-    try:
-        limited.check_smooth(plan)
-        worst = limited.margins(plan).active
-        kept = "all kept" if worst.fraction >= -SAME else f"{worst.bound.name} {worst.share} beyond"
-        shortest = limited.margins(fast)
-        duration = fast.duration
-        if fast is plan or not shortest.hold:
-            found = fastest_within(fast, limited)
-            duration, shortest = found.duration, found.margins
-    except ValueError as refusal:
-        return Need(name, math.nan, str(refusal), "broken")
-    active = shortest.active
-    return Need(name, duration, f"{active.bound.name} {active.bound.range}, at {active.time:.3g} s", kept)
-
-
-def _need_sentence(needs: Sequence[Need]) -> str:
-    possible = [need for need in needs if not math.isnan(need.duration)]
-    if not possible:
-        return "Under these limits no plan is possible."
-    first = min(possible, key=lambda need: need.duration)
-    others = ", ".join(f"{need.name} {need.duration:.4g} s" for need in possible if need is not first)
-    never = [need.name for need in needs if math.isnan(need.duration)]
-    without = f"; {', '.join(never)} cannot keep them at any" if never else ""
-    return f"Under the same limits {first.name} is the fastest with {first.duration:.4g} s ({others}{without})."
+    return tuple(need_of(name, plan, fast.get(name, plan), limited) for name, plan in timed.items())

@@ -14,11 +14,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ctrlplan._checks import real_array
+from ctrlplan._renamed import outside_stacklevel
 from ctrlplan.simulation import Event, Prepared, SolverError, prepare
 from ctrlplan.simulation.learned import NotCompiledError
 from ctrlplan.simulation.methods.delegated import DELEGATED
 from ctrlplan.studies.comparison import Comparison, comparison_of
-from ctrlplan.studies.ensemble import LEVELS, Ensemble, Failure
+from ctrlplan.studies.ensemble import Ensemble
 from ctrlplan.studies.executing import (
     Account,
     Executor,
@@ -30,6 +31,7 @@ from ctrlplan.studies.executing import (
     tried,
 )
 from ctrlplan.studies.experiment import Experiment
+from ctrlplan.studies.kept import Kept, Outcome, kept_samples
 from ctrlplan.studies.measures import Measure, shown_measures
 from ctrlplan.studies.running import Builder, System, check_has_inputs, is_builder
 from ctrlplan.trajectories import Trajectory, Waypoint
@@ -40,9 +42,6 @@ Forms: TypeAlias = Mapping[str, System]
 
 _STAND_INS = 20
 """Draws of which the first that runs stands for a nominal loop that does not."""
-
-_SAMPLES = 1001
-"""Times at which bands are kept, at most."""
 
 
 def monte_carlo(
@@ -146,12 +145,12 @@ def monte_carlo(
     nominal, nominal_draw = _nominal(drawn_loop, experiment, table, units, timeout)
     account = drawn_loop.account(experiment, table, executor, timeout, progress)
     shown = shown_measures(experiment.measures, list(nominal.metrics.values()))
-    kept = _Kept(_count(table), experiment.timepts, shown.keys() - nominal.measures.keys())
+    kept = Kept(_count(table), experiment.timepts, shown.keys() - nominal.measures.keys())
     for k, outcome in account.in_order().items():
         kept.add(k, _draw(table, k), outcome)
     if account.interrupted:
         text = f"monte_carlo was interrupted: {kept.finished} of {_count(table)} draws are kept"
-        warnings.warn(text, UserWarning, stacklevel=2)
+        warnings.warn(text, UserWarning, stacklevel=outside_stacklevel())
     return Ensemble(
         nominal,
         table,
@@ -212,15 +211,11 @@ def _binds(signature: inspect.Signature, *arguments: object, **named: object) ->
     return True
 
 
-Outcome: TypeAlias = dict[str, tuple[dict[str, float], dict[str, Array]] | Failed]
-"""By plan: metrics, and signals at the times of the bands; or what went wrong."""
-
-
 def _outcome(
     forms: Callable[[str], System | Builder], experiment: Experiment, plans: Iterable[str], params: Any
 ) -> Outcome:
     """One draw, plan by plan: one may succeed where another fails."""
-    wanted = experiment.timepts[_some(experiment.timepts)]
+    wanted = experiment.timepts[kept_samples(experiment.timepts)]
 
     def measured(plan: str) -> tuple[dict[str, float], dict[str, Array]]:
         form = forms(plan)
@@ -453,70 +448,3 @@ def _light(forms: Mapping[str, Prepared], table: dict[str, Array]) -> dict[str, 
 
 def _of_solver(outcome: Any) -> bool:
     return isinstance(outcome, Failed) and isinstance(outcome.error, SolverError | NotCompiledError)
-
-
-class _Kept:
-    """What of all draws is kept.
-
-    Parameters
-    ----------
-    count : int
-        Number of draws.
-    times : ndarray, shape (ntime,)
-        Sample times [s].
-    mixed : collection of str
-        Metrics of signals that differ in unit, of which there is no worst.
-    """
-
-    def __init__(self, count: int, times: Array, mixed: Collection[str]) -> None:
-        self._mixed = mixed
-        self.timepts = times[_some(times)]
-        self.metrics: dict[str, dict[str, Array]] = {}
-        self.failures: list[Failure] = []
-        self.finished = 0
-        self._signals: dict[str, dict[str, Array]] = {}
-        self._count = count
-
-    def add(self, k: int, params: dict[str, float], outcome: Outcome | Failed) -> None:
-        """One draw, or what went wrong with it."""
-        self.finished += 1
-        if isinstance(outcome, Failed):
-            self.failures.append(Failure(k, params, outcome.message))
-            return
-        wrong = [found.message for found in outcome.values() if isinstance(found, Failed)]
-        if len(wrong) == len(outcome) and len(set(wrong)) == 1:
-            self.failures.append(Failure(k, params, wrong[0]))
-            return
-        for plan, found in outcome.items():
-            if isinstance(found, Failed):
-                self.failures.append(Failure(k, params, found.message, plan))
-                continue
-            metrics, signals = found
-            for name, value in metrics.items():
-                column = self.metrics.setdefault(plan, {}).setdefault(name, np.full(self._count, np.nan))
-                column[k] = np.nan if name in self._mixed else value
-            for name, curve in signals.items():
-                known = self._signals.setdefault(plan, {})
-                if name not in known:
-                    known[name] = np.full((self._count, self.timepts.size), np.nan)
-                known[name][k, : curve.size] = curve
-
-    def bands(self) -> dict[str, dict[str, Array]]:
-        """Quantiles over the draws that were run."""
-        return {plan: {name: _quantiles(rows) for name, rows in found.items()} for plan, found in self._signals.items()}
-
-
-def _quantiles(rows: Array) -> Array:
-    """Quantiles (nlevels, ntime) over rows, of which those that an event ended are nan from there on."""
-    out = np.full((len(LEVELS), rows.shape[1]), np.nan)
-    known = ~np.isnan(rows)
-    for full in (True, False):
-        columns = known.all(axis=0) if full else known.any(axis=0) & ~known.all(axis=0)
-        if columns.any():
-            quantile = np.quantile if full else np.nanquantile
-            out[:, columns] = quantile(rows[:, columns], LEVELS, axis=0)
-    return out
-
-
-def _some(times: Array) -> NDArray[np.intp]:
-    return np.unique(np.linspace(0, times.size - 1, min(times.size, _SAMPLES)).round().astype(np.intp))

@@ -10,6 +10,7 @@ import control as ct
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ctrlplan._renamed import outside_stacklevel
 from ctrlplan.simulation import Event, Prepared, prepared_form, rest_at, simulate, state_space, unstable_poles
 from ctrlplan.studies.connections import check_reached
 from ctrlplan.studies.measures import Run, checked_names
@@ -74,7 +75,7 @@ def run_plan(
             error.add_note(doubt)
         raise
     if doubt:
-        warnings.warn(doubt, UserWarning, stacklevel=3)
+        warnings.warn(doubt, UserWarning, stacklevel=outside_stacklevel())
     early = response.time[-1] < times[-1]
     stop = next(event for event in response.events if event.stop) if early else None
     return Run(plan, system, response, tracked, acting, last, _unstable(system), doubt, stop)

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ctrlplan._checks import real_array
+from ctrlplan._renamed import outside_stacklevel
 from ctrlplan.simulation import Event
 from ctrlplan.studies.alike import Linear
 from ctrlplan.studies.comparison import finite_or_none, shown_in_units
@@ -244,7 +245,7 @@ def sweep(
     found = _swept(parameter, points, account)
     if found.interrupted:
         kept = f"{found.values.size} of {points.size} values are kept"
-        warnings.warn(f"the sweep was interrupted: {kept}", UserWarning, stacklevel=2)
+        warnings.warn(f"the sweep was interrupted: {kept}", UserWarning, stacklevel=outside_stacklevel())
     return found
 
 

@@ -8,8 +8,9 @@ import numpy as np
 
 import ctrlplan as cp
 from ctrlplan.studies import Measure, Study
-from ctrlplan.studies.benefit import Benefit, Need
+from ctrlplan.studies.benefit import Benefit
 from ctrlplan.studies.grids import Grid
+from ctrlplan.studies.needs import Need
 from ctrlplan.studies.study import Curves
 
 HIT = "window.hit=1"

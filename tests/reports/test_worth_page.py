@@ -11,8 +11,9 @@ import pytest
 import ctrlplan as cp
 from ctrlplan.reports import render_page, write_report
 from ctrlplan.studies import Study
-from ctrlplan.studies.benefit import Benefit, Need
+from ctrlplan.studies.benefit import Benefit
 from ctrlplan.studies.grids import Grid
+from ctrlplan.studies.needs import Need
 
 MOVE = [cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1, 0, 0)]
 TIMES = np.linspace(0, 10, 501)

@@ -12,8 +12,9 @@ from scipy.optimize import brentq
 
 import ctrlplan as cp
 from ctrlplan.studies.baselines import baseline_plans, smoother_polynomials
-from ctrlplan.studies.benefit import Benefit, Choices, Need, benefit_of
+from ctrlplan.studies.benefit import Benefit, Choices, benefit_of
 from ctrlplan.studies.grids import Grid
+from ctrlplan.studies.needs import Need
 from ctrlplan.trajectories import SCurve, Shaper, Trapezoid
 
 MOVE = [cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1, 0, 0)]

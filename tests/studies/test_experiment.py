@@ -320,12 +320,13 @@ def test_plans_tie_where_their_values_differ_by_rounding():
     assert found.nominal.scales["iae"] == pytest.approx(1.0005 * END, rel=1e-9)
 
 
-def test_a_function_of_the_draws_builds_a_loop_for_each():
+@pytest.mark.parametrize("executor", [None, Here()], ids=["here", "executor"])
+def test_a_function_of_the_draws_builds_a_loop_for_each(executor):
     """The first draw stands for the nominal loop where the function has no values of its own."""
     gains = np.array([1.0, 5.0, 20.0])
     plans, times = {"step": cp.Step(1.0)}, np.linspace(0.0, 20.0, 2001)
     build = cp.plants.integrator_lag_loop
-    found = cp.monte_carlo(build, {"gain": gains}, plans, times, progress=False)
+    found = cp.monte_carlo(build, {"gain": gains}, plans, times, executor=executor, progress=False)
     expected = 100 * np.exp(-0.5 * np.pi / np.sqrt(gains - 0.25))
     np.testing.assert_allclose(found.metrics["step"]["overshoot_error"], expected, rtol=1e-5)
     assert found.nominal_draw == 0
