@@ -93,7 +93,7 @@ def _swept(function: Callable[P, R]) -> Callable[P, R]:
                 f"{worth!r:.80}; give compare's result at the value of interest to benefit"
             )
         texts: dict[str, Any] = {name: kwargs.pop(name) for name in ("title", "parameters") if name in kwargs}
-        kwargs = _with_measures({**_named(args), **kwargs})
+        kwargs = _with_measures(_named(args, kwargs))
         if "alpha" in kwargs:
             kwargs |= _through(kwargs.get("plans", ()), kwargs.pop("alpha"))
         if not drawn:
@@ -103,8 +103,13 @@ def _swept(function: Callable[P, R]) -> Callable[P, R]:
     return called
 
 
-def _named(args: tuple[Any, ...]) -> dict[str, Any]:
-    return dict(zip(("build", "values", "plans", "timepts"), args, strict=False))
+def _named(args: tuple[Any, ...], kwargs: dict[str, Any]) -> dict[str, Any]:
+    """All arguments by name."""
+    named = dict(zip(("build", "values", "plans", "timepts"), args, strict=False))
+    for name in named:
+        if name in kwargs:
+            raise TypeError(f"sweep() got multiple values for argument {name!r}")
+    return named | kwargs
 
 
 def _drawn(given: dict[str, Any], texts: Mapping[str, Any], worth: Any) -> Any:

@@ -121,6 +121,15 @@ def test_sweep_takes_its_arguments_as_it_did(capsys):
         cp.sweep(cp.plants.integrator_lag_loop, [1.0], PLANS, TIMES, progress=False, title="No effect")
 
 
+def test_arguments_of_a_sweep_are_given_once():
+    with pytest.raises(TypeError, match=r"sweep\(\) got multiple values for argument 'plans'"):
+        cp.sweep(cp.plants.integrator_lag_loop, [1.0], PLANS, TIMES, plans=PLANS)
+    with pytest.raises(TypeError, match="unexpected keyword argument 'bandwidth'"):
+        cp.sweep(cp.plants.integrator_lag_loop, [1.0], PLANS, TIMES, bandwidth=0.1)
+    with pytest.raises(TypeError, match="unexpected keyword argument 'bandwidth'"):
+        cp.compare(LOOP, PLANS, TIMES, bandwidth=0.1)
+
+
 def test_the_notice_names_the_line_that_calls():
     with pytest.warns(FutureWarning) as said:
         cp.compare(LOOP, PLANS, TIMES, only=["iae"])
