@@ -311,7 +311,8 @@ def comparison_of(
     runs, plans = found.runs, {name: experiment.plans[name] for name in found.runs}
     listed, signals = shown_in_units(experiment, found, units)
     last = next(reversed(runs.values()))
-    measured = experiment.measures is None or bool(len(experiment.measures))
+    chosen = experiment.measures
+    measured = chosen is None or any(isinstance(one, str) or one.of in ("response", "control") for one in chosen)
     stopped = {name: run.stop for name, run in runs.items() if run.stop is not None}
     return Comparison(
         plans=plans,

@@ -688,6 +688,7 @@ def test_what_an_executor_found_before_an_interruption_is_kept(found):
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:monte_carlo was interrupted:UserWarning")
 def test_an_interruption_before_anything_was_found_leaves_the_nominal_run(tmp_path):
     result = run(lag(), LAGS, Interrupted(0))
     assert result.finished == 0

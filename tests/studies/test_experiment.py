@@ -251,6 +251,8 @@ def test_a_run_measure_is_given_the_whole_run():
     assert [run.last for run in seen] == [1.0, 1.0]
     assert [run.plan for run in seen] == list(BASE["plans"].values())
     assert found.measures["Seen"].unit == "{u}"
+    assert "settling band" not in found.parameters  # which nothing here is measured by
+    assert "settling band" in cp.compare(linear(), **BASE | {"measures": [measure, "iae"]}).parameters
 
 
 def test_an_experiment_keeps_what_it_was_given_once():
