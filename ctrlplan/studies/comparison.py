@@ -10,12 +10,11 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import control as ct
 from numpy.typing import ArrayLike
 
 from ctrlplan._files import write_text
 from ctrlplan._renamed import warn_renamed
-from ctrlplan.simulation import Event
+from ctrlplan.simulation import Event, SimulationResponse
 from ctrlplan.studies.experiment import Experiment, Measured
 from ctrlplan.studies.limits import limits_of
 from ctrlplan.studies.measures import MEASURES, Measure, shown_measures
@@ -43,7 +42,7 @@ class Comparison:
     ----------
     plans : dict of str to Trajectory
         The references by name.
-    responses : dict of str to control.TimeResponseData
+    responses : dict of str to SimulationResponse
         Of the loop to each.
     metrics : dict of str to dict of str to float
         Plan, metric, value: see `ctrlplan.studies.MEASURES`; inf where never
@@ -87,7 +86,7 @@ class Comparison:
     """
 
     plans: dict[str, Trajectory]
-    responses: dict[str, ct.TimeResponseData]
+    responses: dict[str, SimulationResponse]
     metrics: dict[str, dict[str, float]]
     outputs: tuple[str, ...]
     controls: tuple[str, ...] = ()

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ctrlplan import metrics
 from ctrlplan.planning import SquaredDerivative
-from ctrlplan.simulation import Occurrence, Prepared
+from ctrlplan.simulation import Occurrence, Prepared, SimulationResponse
 from ctrlplan.trajectories import Trajectory, Waypoint
 
 Array = NDArray[np.float64]
@@ -123,7 +123,7 @@ class Run:
         The reference.
     system : control system or Prepared
         The loop.
-    response : control.TimeResponseData
+    response : SimulationResponse
         Its response, as of `simulate`.
     outputs, controls : tuple of str
         Outputs that follow the plan, and outputs that are controls.
@@ -140,7 +140,7 @@ class Run:
 
     plan: Trajectory
     system: ct.InputOutputSystem | Prepared
-    response: ct.TimeResponseData
+    response: SimulationResponse
     outputs: tuple[str, ...]
     controls: tuple[str, ...]
     last: float
