@@ -18,6 +18,8 @@ class _Combined(Trajectory):
     """Trajectory of several parts; a new kind says how their jets combine."""
 
     parts: tuple[Trajectory, ...]
+    initial: Array
+    final: Array
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data that `trajectory_from_dict` reads."""
@@ -28,7 +30,8 @@ class _Combined(Trajectory):
         }
 
     @classmethod
-    def _from_dict(cls, data: dict[str, Any]) -> Self:
+    def from_dict(cls, data: dict[str, Any]) -> Self:
+        """Trajectory from the plain data of `to_dict`."""
         parts = _checked_parts(trajectory_from_dict(part) for part in data["parts"])
         return cls._of(parts, tuple(data["labels"]))
 
@@ -46,7 +49,7 @@ class _Combined(Trajectory):
                 f"positions must stay within floating point, got {initial.tolist()} and {final.tolist()} at the ends"
             )
         joined = np.unique(np.concatenate([part.breakpoints for part in parts]))
-        self.__dict__.update(
+        self._set_fields(
             parts=parts,
             labels=checked_labels(labels, initial.size),
             breakpoints=readonly(joined),
@@ -58,8 +61,9 @@ class _Combined(Trajectory):
     def _combine(self, values: list[Array]) -> Array:
         """Jets, or held positions, of the whole from those of the parts (axes second to last)."""
 
-    def _map_time(self, origin: float, target: float, rate: float) -> Self:
-        return self._of(tuple(part._map_time(origin, target, rate) for part in self.parts), self.labels)
+    def map_time(self, origin: float, target: float, rate: float) -> Self:
+        """Same path at other times; as `Trajectory.map_time`."""
+        return self._of(tuple(part.map_time(origin, target, rate) for part in self.parts), self.labels)
 
     def _sample(self, t: Array, low: int, high: int, left: bool) -> Array:
         out = super()._sample(t, low, high, left)
@@ -68,14 +72,15 @@ class _Combined(Trajectory):
             out[:, :, at_end] = self._combine([part._sample(t[at_end], low, high, left) for part in self.parts])
         return out
 
-    def _leg_jet(self, leg: int, s: Array, order: int) -> Array:
-        leg %= self.breakpoints.size - 1
-        origin = float(self.breakpoints[leg])
-        moment = 0.5 * (origin + float(self.breakpoints[leg + 1]))
+    def segment_jet(self, segment: int, s: Array, order: int) -> Array:
+        """Derivatives of a segment; as `Trajectory.segment_jet`."""
+        origin, end = self.breakpoints[segment : segment + 2].tolist()
+        moment = 0.5 * (origin + end)
         return self._combine([part._jet_beside(moment, origin, s, order) for part in self.parts])
 
-    def _leg_series(self, leg: int, s: Any, order: int) -> list[list[Any]]:
-        origin, end = (float(edge) for edge in self.breakpoints[leg : leg + 2])
+    def segment_series(self, segment: int, s: Any, order: int) -> list[list[Any]]:
+        """Taylor series of a segment; as `Trajectory.segment_series`."""
+        origin, end = self.breakpoints[segment : segment + 2].tolist()
         rows = [part._series_beside(0.5 * (origin + end), origin, s, order) for part in self.parts]
         found: list[list[Any]] = self._combine([_objects(row) for row in rows]).T.tolist()
         return found
@@ -105,7 +110,7 @@ class Sum(_Combined):
 
     def __init__(self, parts: Iterable[Trajectory], *, shaped: bool = False) -> None:
         terms = _checked_parts(parts)
-        self.__dict__["shaped"] = shaped
+        self._set_fields(shaped=shaped)
         self._set(terms, terms[0].labels)
 
     def to_dict(self) -> dict[str, Any]:
@@ -113,20 +118,18 @@ class Sum(_Combined):
         return super().to_dict() | ({"shaped": True} if self.shaped else {})
 
     @classmethod
-    def _from_dict(cls, data: dict[str, Any]) -> Self:
-        found = super()._from_dict(data)
-        found.__dict__["shaped"] = bool(data.get("shaped", False))
-        return found
+    def from_dict(cls, data: dict[str, Any]) -> Self:
+        """Trajectory from the plain data of `to_dict`."""
+        return super().from_dict(data)._with_fields(shaped=bool(data.get("shaped", False)))
 
-    def _map_time(self, origin: float, target: float, rate: float) -> Self:
+    def map_time(self, origin: float, target: float, rate: float) -> Self:
+        """Same path at other times; as `Trajectory.map_time`."""
         if self.shaped and not is_unit_rate(rate):
             raise ValueError(
                 f"a shaped plan must keep its duration of {self.duration:g} s, got {self.duration / rate:g} s: the "
                 f"delays of the shaper would change with it; retime the plan first, then shape it"
             )
-        moved = super()._map_time(origin, target, rate)
-        moved.__dict__["shaped"] = self.shaped
-        return moved
+        return super().map_time(origin, target, rate)._with_fields(shaped=self.shaped)
 
     def _set(self, parts: tuple[Trajectory, ...], labels: tuple[str, ...]) -> None:
         super()._set(_same_axes(parts), labels)
@@ -154,6 +157,8 @@ class Stacked(_Combined):
 class Selected(_Combined):
     """Some axes of a trajectory; made by `select`."""
 
+    _axes: list[int]
+
     def __init__(self, part: Trajectory, labels: Iterable[str]) -> None:
         (member,) = _checked_parts([part])
         self._set((member,), tuple(labels))
@@ -162,13 +167,11 @@ class Selected(_Combined):
         for label in labels:
             if label not in parts[0].labels:
                 raise ValueError(f"labels must be among {', '.join(parts[0].labels)}, got {label!r}")
-        self.__dict__["_axes"] = [parts[0].labels.index(label) for label in labels]
+        self._set_fields(_axes=[parts[0].labels.index(label) for label in labels])
         super()._set(parts, labels)
 
     def _combine(self, values: list[Array]) -> Array:
         return values[0].take(self._axes, axis=0 if values[0].ndim == 1 else 1)
-
-    _axes: list[int]
 
 
 class Scaled(_Combined):
@@ -185,7 +188,7 @@ class Scaled(_Combined):
     factor: float
 
     def __init__(self, part: Trajectory, factor: float) -> None:
-        self.__dict__["factor"] = checked_time(factor, "factor")
+        self._set_fields(factor=checked_time(factor, "factor"))
         self._set(_checked_parts([part]), part.labels)
 
     def to_dict(self) -> dict[str, Any]:
@@ -193,11 +196,13 @@ class Scaled(_Combined):
         return super().to_dict() | {"factor": self.factor}
 
     @classmethod
-    def _from_dict(cls, data: dict[str, Any]) -> Self:
+    def from_dict(cls, data: dict[str, Any]) -> Self:
+        """Trajectory from the plain data of `to_dict`."""
         return cls(trajectory_from_dict(data["parts"][0]), data["factor"])
 
-    def _map_time(self, origin: float, target: float, rate: float) -> Self:
-        return type(self)(self.parts[0]._map_time(origin, target, rate), self.factor)
+    def map_time(self, origin: float, target: float, rate: float) -> Self:
+        """Same path at other times; as `Trajectory.map_time`."""
+        return type(self)(self.parts[0].map_time(origin, target, rate), self.factor)
 
     def _combine(self, values: list[Array]) -> Array:
         return self.factor * values[0]
@@ -220,6 +225,9 @@ class Joined(Trajectory):
     """
 
     parts: tuple[Trajectory, ...]
+    initial: Array
+    final: Array
+    _segments: list[tuple[Trajectory, int]]  # for each segment a part and one of its own
 
     def __init__(self, parts: Iterable[Trajectory]) -> None:
         members = list(_checked_parts(parts))
@@ -230,21 +238,21 @@ class Joined(Trajectory):
         self._set(tuple(members), members[0].labels)
 
     def _set(self, parts: tuple[Trajectory, ...], labels: tuple[str, ...]) -> None:
-        times, legs = [parts[0].start], []
+        times, segments = [parts[0].start], []
         waypoints = list(parts[0].waypoints)
         for part in parts:
             times += part.breakpoints[1:].tolist()
-            legs += [(part, leg) for leg in range(part.breakpoints.size - 1)]
+            segments += [(part, k) for k in range(part.breakpoints.size - 1)]
             if part is not parts[0]:
                 waypoints += part.waypoints[1:]
-        self.__dict__.update(
+        self._set_fields(
             parts=parts,
             labels=checked_labels(labels, parts[0].naxes),
             waypoints=tuple(waypoints),
             breakpoints=readonly(np.array(times)),
             initial=parts[0].initial,
             final=parts[-1].final,
-            _legs=legs,
+            _segments=segments,
         )
 
     def to_dict(self) -> dict[str, Any]:
@@ -253,7 +261,8 @@ class Joined(Trajectory):
         return {"type": "Joined", "parts": parts, "labels": list(self.labels)}
 
     @classmethod
-    def _from_dict(cls, data: dict[str, Any]) -> Self:
+    def from_dict(cls, data: dict[str, Any]) -> Self:
+        """Trajectory from the plain data of `to_dict`."""
         self = cls.__new__(cls)
         parts = _checked_parts(trajectory_from_dict(part) for part in data["parts"])
         for before, after in pairwise(_same_axes(parts)):
@@ -261,9 +270,10 @@ class Joined(Trajectory):
         self._set(parts, tuple(data["labels"]))
         return self
 
-    def _map_time(self, origin: float, target: float, rate: float) -> Self:
+    def map_time(self, origin: float, target: float, rate: float) -> Self:
+        """Same path at other times; as `Trajectory.map_time`."""
         self_ = type(self).__new__(type(self))
-        self_._set(tuple(part._map_time(origin, target, rate) for part in self.parts), self.labels)
+        self_._set(tuple(part.map_time(origin, target, rate) for part in self.parts), self.labels)
         return self_
 
     def _sample(self, t: Array, low: int, high: int, left: bool) -> Array:
@@ -272,15 +282,15 @@ class Joined(Trajectory):
             out[0][:, t == self.end] = self.final[:, None]  # a step at the very end
         return out
 
-    def _leg_jet(self, leg: int, s: Array, order: int) -> Array:
-        part, own = self._legs[leg]
-        return part._leg_jet(own, s, order)
+    def segment_jet(self, segment: int, s: Array, order: int) -> Array:
+        """Derivatives of a segment; as `Trajectory.segment_jet`."""
+        part, own = self._segments[segment]
+        return part.segment_jet(own, s, order)
 
-    def _leg_series(self, leg: int, s: Any, order: int) -> list[list[Any]]:
-        part, own = self._legs[leg]
-        return part._leg_series(own, s, order)
-
-    _legs: list[tuple[Trajectory, int]]
+    def segment_series(self, segment: int, s: Any, order: int) -> list[list[Any]]:
+        """Taylor series of a segment; as `Trajectory.segment_series`."""
+        part, own = self._segments[segment]
+        return part.segment_series(own, s, order)
 
 
 def is_unit_rate(rate: float) -> bool:

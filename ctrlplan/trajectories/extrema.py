@@ -80,7 +80,7 @@ def derivative_extrema(plan: Trajectory, nu: int) -> Extrema:
     for leg, (_, duration) in enumerate(_legs(plan)):
 
         def jet(t: Array, order: int, leg: int = leg) -> Array:
-            return plan._leg_jet(leg, t, order)
+            return plan.segment_jet(leg, t, order)
 
         t = stationary_times(jet, duration, nu)
         times, ends = _placed(plan, leg, t)
@@ -261,7 +261,7 @@ class _Search:
 
     def _values(self, leg: int, t: Array) -> Array:
         """Values (nrows, ntime) of the function at times from the beginning of a segment."""
-        values = np.atleast_2d(np.asarray(self._function(self._plan._leg_jet(leg, t, self._order)), dtype=float))
+        values = np.atleast_2d(np.asarray(self._function(self._plan.segment_jet(leg, t, self._order)), dtype=float))
         if values.ndim != 2 or values.shape[1] != t.size:
             raise ValueError(f"function must return values of shape (ntime,) or (m, ntime), got shape {values.shape}")
         if not np.isfinite(values).all():
@@ -313,7 +313,7 @@ def certified_bounds(
     least, greatest = np.inf, -np.inf
     for leg, (_, duration) in enumerate(legs):
         s = np.linspace(0.0, duration, 129)
-        values = evaluated(plan._leg_jet(leg, s, order))
+        values = evaluated(plan.segment_jet(leg, s, order))
         found.add(_placed(plan, leg, s)[0], values[None])
         least, greatest = min(least, float(values.min())), max(greatest, float(values.max()))
     for leg, (_, duration) in enumerate(legs):
@@ -323,7 +323,7 @@ def certified_bounds(
             spent += centres.size
             if spent > max_cells:
                 raise ValueError(f"rtol = {rtol:g} must be reached within {max_cells} cells; raise either of them")
-            jet = plan._leg_jet(leg, centres, order + 1)
+            jet = plan.segment_jet(leg, centres, order + 1)
             values = evaluated(jet[:-1])
             # In its cell a derivative moves by no more than the next one's value at the centre and slope allow.
             slope = np.minimum(first, np.abs(jet[1:]) + radius * second)

@@ -43,7 +43,7 @@ def trajectory_from_dict(data: dict[str, Any]) -> Trajectory:
     if not isinstance(kind, str) or kind not in Trajectory.kinds:
         raise ValueError(f"type must be one of {', '.join(sorted(Trajectory.kinds))}, got {kind!r}")
     try:
-        return Trajectory.kinds[kind]._from_dict(data)
+        return Trajectory.kinds[kind].from_dict(data)
     except KeyError as missing:
         raise ValueError(f"a {kind} needs the entry {missing}, got {', '.join(map(str, data))}") from None
     except RecursionError:

@@ -43,8 +43,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import blas
 
-from ctrlplan.trajectories.common import FACTORIALS, Array, Frozen, readonly
+from ctrlplan.trajectories.common import FACTORIALS, Array, readonly
 from ctrlplan.trajectories.digits import many_digits
+from ctrlplan.trajectories.fields import Fields
 
 _MEET = 0.25
 """Ends meet where they are nearer to each other, on the circle, than this part of all neighbours."""
@@ -68,7 +69,7 @@ NEARLY_CLOSED = 5.0
 """Alpha [rad] from which on both ends may count as one point."""
 
 
-class NewtonSystem(Frozen):
+class NewtonSystem(Fields):
     """Factorised collocation for one pattern of times and given entries.
 
     It depends on alpha, the relative times and which entries are given, not on
@@ -108,6 +109,15 @@ class NewtonSystem(Frozen):
     gamma: float | None  # of the top harmonic; None for odd sizes and for polynomials
     waypoint_index: NDArray[np.intp]
     order_index: NDArray[np.intp]
+    hermite: bool  # no gaps between the orders at any waypoint
+    _orders: tuple[int, ...]  # `order_index` as a key
+    _positions: Array  # 1 where a position is prescribed, else 0
+    _anchor: int
+    _triangle: Array
+    _spread: Array | None
+    _fold: float
+    _first: Array
+    _second: Array
 
     def __init__(
         self,
@@ -129,16 +139,16 @@ class NewtonSystem(Frozen):
         mean = math.fsum(nodes) / count
         nodes = np.concatenate([nodes, _spare_nodes(mean, size - count)]) if size > count else nodes
         phase, fold = _top_harmonic(alpha, size, mean, gamma)
-        self.__dict__.update(
+        self._set_fields(
             alpha=alpha,
             size=size,
             gamma=phase,
             waypoint_index=waypoints,
             order_index=orders,
+            _orders=tuple(orders.tolist()),
             _fold=fold,
             _first=nodes[0 : size - size % 2 : 2],
             _second=nodes[1::2],
-            _scales={},
             hermite=all(g == tuple(range(len(g))) for g in given),
             _positions=(orders == 0).astype(float)[:, None],
             _anchor=int((orders == 0).argmax()),
@@ -148,29 +158,19 @@ class NewtonSystem(Frozen):
             beyond[:, :count] = apart[:, waypoints]
         jets = self._taylor(beyond.T[: size - size % 2 : 2], beyond.T[1:size:2], max(orders))
         collocation = jets[:, orders, waypoints].T
-        self.__dict__["_triangle"], self.__dict__["_spread"] = (
+        triangle, spread = (
             (np.asfortranarray(collocation), None)
             if self.hermite and size == count
             else _factor(collocation, self.hermite, self._roughness(smooth) if size > count else None, lead)
         )
+        self._set_fields(_triangle=triangle, _spread=spread)
 
         if not self._triangle.diagonal().all():
             raise ValueError("the constraints do not determine the plan: the system is singular")
 
     def taylor_scale(self, duration: float) -> Array:
         """Column that turns prescribed derivatives into normalised Taylor data."""
-        scale: Array | None = self._scales.get(duration)
-        if scale is None:
-            with np.errstate(over="ignore", under="ignore"):
-                scale = (duration**self.order_index / FACTORIALS[self.order_index])[:, None]
-            if not (scale.min() > 1e-290 and scale.max() < np.inf):
-                raise ValueError(
-                    f"powers of the duration must stay within floating point, got {duration:g} s to the power "
-                    f"{self.order_index.max()}; choose another unit of time"
-                )
-            self._scales.clear()
-            self._scales[duration] = scale
-        return scale
+        return _taylor_scale(duration, self._orders)
 
     def coefficients(self, taylor_data: Array) -> Array:
         """Coefficients (size, naxes) from Taylor data (nconstraints, naxes)."""
@@ -329,15 +329,19 @@ class NewtonSystem(Frozen):
         top = self.taylor(0.5 * (nodes + 1.0), smooth)[:, smooth]
         return np.sqrt(weights)[:, None] * top.T
 
-    _scales: dict[float, Array]  # the last duration's, as a memory
-    hermite: bool  # no gaps between the orders at any waypoint
-    _positions: Array  # 1 where a position is prescribed, else 0
-    _anchor: int
-    _triangle: Array
-    _spread: Array | None
-    _fold: float
-    _first: Array
-    _second: Array
+
+@lru_cache(maxsize=256)
+def _taylor_scale(duration: float, orders: tuple[int, ...]) -> Array:
+    """Powers of a duration over factorials, as a column."""
+    exponents = np.array(orders)
+    with np.errstate(over="ignore", under="ignore"):
+        scale: Array = (duration**exponents / FACTORIALS[exponents])[:, None]
+    if not (scale.min() > 1e-290 and scale.max() < np.inf):
+        raise ValueError(
+            f"powers of the duration must stay within floating point, got {duration:g} s to the power "
+            f"{max(orders)}; choose another unit of time"
+        )
+    return readonly(scale)
 
 
 Pair = tuple[list[Any], list[Any]]

@@ -46,6 +46,13 @@ class NewtonSpline(Trajectory):
     """
 
     alpha: float
+    _options: Options
+    _times: list[float]
+    _relative: Array
+    _apart: Array | None
+    _duration: float
+    _systems: dict[Kind, NewtonSystem]
+    _parts: list[tuple[tuple[int, ...], NewtonSystem, Array]]  # axes, their system and coefficients
 
     def with_values(self, waypoints: Iterable[Waypoint]) -> Self:
         """Plan with the same times and shape through new values.
@@ -129,7 +136,7 @@ class NewtonSpline(Trajectory):
             breakpoints = donor.breakpoints
         else:
             breakpoints = readonly(np.array([start, times[-1] if period is None else start + period]))
-        self.__dict__.update(
+        self._set_fields(
             waypoints=waypoints,
             alpha=alpha,
             labels=labels,
@@ -173,9 +180,7 @@ class NewtonSpline(Trajectory):
             if system.hermite:
                 coefficients = system.resolved(values, self._times, self._duration, digits)
             parts.append((axes, system, coefficients))
-        plan = type(self).__new__(type(self))
-        plan.__dict__.update(self.__dict__, _parts=parts)
-        return plan
+        return self._with_fields(_parts=parts)
 
     def quiet(self) -> Self:
         """The same plan, which no longer warns where `through` or `with_values` swings."""
@@ -183,17 +188,18 @@ class NewtonSpline(Trajectory):
 
     def _loaded(self) -> Self:
         """The plan as it was saved: it was warned of when it was made, and its `through` warns."""
-        self.__dict__["_options"] = self._options._replace(warn=True)
-        return self
+        return self._with_fields(_options=self._options._replace(warn=True))
 
-    def _map_time(self, origin: float, target: float, rate: float) -> Self:
+    def map_time(self, origin: float, target: float, rate: float) -> Self:
+        """Same path at other times; as `Trajectory.map_time`."""
         moved = tuple(w.scaled(mapped_time(w.time, origin, target, rate), rate) for w in self.waypoints)
         options = self._options
         if options.period is not None:
             options = options._replace(period=options.period / rate)
         return self._again(moved, options)
 
-    def _leg_jet(self, leg: int, s: Array, order: int) -> Array:
+    def segment_jet(self, segment: int, s: Array, order: int) -> Array:
+        """Derivatives of a segment; as `Trajectory.segment_jet`."""
         u = s / self._duration
         scale = derivative_scale(self._duration, order)
         out = np.empty((order + 1, self.naxes, u.size))
@@ -206,7 +212,8 @@ class NewtonSpline(Trajectory):
             out[:, list(axes)] = values
         return out
 
-    def _leg_series(self, leg: int, s: Any, order: int) -> list[list[Any]]:
+    def segment_series(self, segment: int, s: Any, order: int) -> list[list[Any]]:
+        """Taylor series of a segment; as `Trajectory.segment_series`."""
         found: list[list[Any]] = [[]] * self.naxes
         for axes, system, coefficients in self._parts:
             for axis, row in zip(axes, system.series(coefficients, s / self._duration, order), strict=True):
@@ -226,14 +233,6 @@ class NewtonSpline(Trajectory):
             "labels": list(self.labels),
         }
         return data | {k: v for k, v in self._options.given().items() if k != "labels"}
-
-    _options: Options
-    _times: list[float]
-    _relative: Array
-    _apart: Array | None
-    _duration: float
-    _systems: dict[Kind, NewtonSystem]
-    _parts: list[tuple[tuple[int, ...], NewtonSystem, Array]]
 
 
 def checked_waypoints(waypoints: Iterable[Waypoint], least: int = 2) -> tuple[Waypoint, ...]:

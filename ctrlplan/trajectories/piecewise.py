@@ -99,7 +99,7 @@ class PiecewiseSpline(Trajectory):
         ]
         if decimals is not None:
             _resolve(legs, decimals)
-        self.__dict__.update(
+        self._set_fields(
             waypoints=points,
             alpha=shape,
             labels=names,
@@ -143,21 +143,21 @@ class PiecewiseSpline(Trajectory):
         }
 
     @classmethod
-    def _from_dict(cls, data: dict[str, Any]) -> Self:
+    def from_dict(cls, data: dict[str, Any]) -> Self:
+        """Trajectory from the plain data of `to_dict`."""
         points = [Waypoint.from_dict(w) for w in data["waypoints"]]
         plan = cls(points, alpha=data["alpha"], labels=data["labels"], warn=False)
-        plan.__dict__["_warn"] = True  # of what is made from it
-        return plan
+        return plan._with_fields(_warn=True)  # of what is made from it
 
-    def _map_time(self, origin: float, target: float, rate: float) -> Self:
+    def map_time(self, origin: float, target: float, rate: float) -> Self:
+        """Same path at other times; as `Trajectory.map_time`."""
         moved = [w.scaled(mapped_time(w.time, origin, target, rate), rate) for w in self.waypoints]
         return self._again(moved, self._warn)
 
     def _again(self, points: Iterable[Waypoint], warn: bool) -> Self:
         """Plan of the same shape through other waypoints, without a warning now."""
         plan = type(self)(points, alpha=self.alpha, labels=self.labels, warn=False)
-        plan.__dict__["_warn"] = warn
-        return plan
+        return plan._with_fields(_warn=warn)
 
     def quiet(self) -> Self:
         """The same plan, which no longer warns where `through` or `with_values` swings."""
@@ -166,15 +166,17 @@ class PiecewiseSpline(Trajectory):
     def _check_swing(self) -> None:
         """Warn, where it was not declined, of a plan that swings far beyond its waypoints."""
         if self._warn:
-            values = [leg._leg_jet(0, leg.duration * _WITHIN, 0)[0] for leg in self.legs]
+            values = [leg.segment_jet(0, leg.duration * _WITHIN, 0)[0] for leg in self.legs]
             way_on = f"lower alpha from {self.alpha:.6g}" if self.alpha else "prescribe velocities at inner waypoints"
             warn_of_swing(np.concatenate(values, axis=1), self.waypoints, self.end, self.labels, way_on)
 
-    def _leg_jet(self, leg: int, s: Array, order: int) -> Array:
-        return self.legs[leg]._leg_jet(0, s, order)
+    def segment_jet(self, segment: int, s: Array, order: int) -> Array:
+        """Derivatives of a segment; as `Trajectory.segment_jet`."""
+        return self.legs[segment].segment_jet(0, s, order)
 
-    def _leg_series(self, leg: int, s: Any, order: int) -> list[list[Any]]:
-        return self.legs[leg]._leg_series(0, s, order)
+    def segment_series(self, segment: int, s: Any, order: int) -> list[list[Any]]:
+        """Taylor series of a segment; as `Trajectory.segment_series`."""
+        return self.legs[segment].segment_series(0, s, order)
 
 
 def _filled(points: tuple[Waypoint, ...], alpha: float) -> tuple[list[Waypoint], NDArray[np.object_] | None]:

@@ -67,6 +67,7 @@ class PolySpline(NewtonSpline):
         self._check_swing()
 
     @classmethod
-    def _from_dict(cls, data: dict[str, Any]) -> Self:
+    def from_dict(cls, data: dict[str, Any]) -> Self:
+        """Trajectory from the plain data of `to_dict`."""
         points = [Waypoint.from_dict(w) for w in data["waypoints"]]
         return cls(points, warn=False, **{k: data[k] for k in ("labels", "degree", "smooth") if k in data})._loaded()

@@ -25,6 +25,12 @@ class _Profile(Trajectory):
 
     velocity: Array
     acceleration: Array
+    initial: Array
+    final: Array
+    _change: Array
+    _lasts: list[float]
+    _taylor: list[list[float]]
+    _nfall: int
 
     _names: ClassVar[tuple[str, ...]]
     _ramp: ClassVar[Array]  # the highest continuous derivative at both ends of each leg of the rise, to scale
@@ -41,7 +47,8 @@ class _Profile(Trajectory):
         }
 
     @classmethod
-    def _from_dict(cls, data: dict[str, Any]) -> Self:
+    def from_dict(cls, data: dict[str, Any]) -> Self:
+        """Trajectory from the plain data of `to_dict`."""
         ends = Step(data["final"], data["initial"], data["time"], data["labels"])
         return cls._of(ends, [data[name] for name in cls._names])
 
@@ -51,7 +58,8 @@ class _Profile(Trajectory):
         self._set(ends, *limits)
         return self
 
-    def _map_time(self, origin: float, target: float, rate: float) -> Self:
+    def map_time(self, origin: float, target: float, rate: float) -> Self:
+        """Same path at other times; as `Trajectory.map_time`."""
         ends = Step(self.final, self.initial, mapped_time(self.start, origin, target, rate), self.labels)
         limits = np.array([getattr(self, name) for name in self._names])
         return self._of(ends, list(times_powers(limits, rate, np.arange(1, len(limits) + 1)[:, None])))
@@ -91,8 +99,8 @@ class _Profile(Trajectory):
         if not np.isfinite(cruise).all():
             raise ValueError(f"limits must give segments within floating point, got durations {durations.tolist()} s")
         whole = before + float(lasts[len(ramp) : -len(ramp)].sum()) + after
-        self.__dict__.update(
-            zip(self._names, given, strict=True),
+        self._set_fields(
+            **dict(zip(self._names, given, strict=True)),
             initial=ends.initial,
             final=ends.final,
             labels=ends.labels,
@@ -103,30 +111,26 @@ class _Profile(Trajectory):
             _nfall=len(ramp),
         )
 
-    def _leg_jet(self, leg: int, s: Array, order: int) -> Array:
-        anchor, series = self._law(leg, s, order)
+    def segment_jet(self, segment: int, s: Array, order: int) -> Array:
+        """Derivatives of a segment; as `Trajectory.segment_jet`."""
+        anchor, series = self._law(segment, s, order)
         law = np.array([np.broadcast_to(row, s.shape) for row in series]) * FACTORIALS[: order + 1, None]
         out: Array = self._change[:, None] * law[:, None]
         out[0] += anchor[:, None]
         return out
 
-    def _leg_series(self, leg: int, s: Any, order: int) -> list[list[Any]]:
-        anchor, (first, *rest) = self._law(leg, s, order)
+    def segment_series(self, segment: int, s: Any, order: int) -> list[list[Any]]:
+        """Taylor series of a segment; as `Trajectory.segment_series`."""
+        anchor, (first, *rest) = self._law(segment, s, order)
         axes = zip(anchor.tolist(), self._change.tolist(), strict=True)
         return [[position + change * first, *(change * value for value in rest)] for position, change in axes]
 
-    def _law(self, leg: int, s: Any, order: int) -> tuple[Array, list[Any]]:
-        """Position that a leg counts from, and the Taylor series of the part of the line beyond it."""
-        leg %= len(self._lasts)
-        if leg < len(self._lasts) - self._nfall:
-            return self.initial, _shifted(self._taylor[leg], s, order)
-        mirrored = _shifted(self._taylor[leg], self._lasts[leg] - s, order)
+    def _law(self, segment: int, s: Any, order: int) -> tuple[Array, list[Any]]:
+        """Position that a segment counts from, and the Taylor series of the part of the line beyond it."""
+        if segment < len(self._lasts) - self._nfall:
+            return self.initial, _shifted(self._taylor[segment], s, order)
+        mirrored = _shifted(self._taylor[segment], self._lasts[segment] - s, order)
         return self.final, [value if k % 2 else -value for k, value in enumerate(mirrored)]
-
-    _change: Array
-    _lasts: list[float]
-    _taylor: list[list[float]]
-    _nfall: int
 
 
 class Trapezoid(_Profile):

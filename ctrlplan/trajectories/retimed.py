@@ -57,6 +57,9 @@ class Retimed(Trajectory):
 
     plan: Trajectory
     law: Trajectory
+    initial: Array
+    final: Array
+    _segments: list[tuple[int, int]]  # of the law, and of the plan, for each segment
 
     def __init__(self, plan: Trajectory, law: Trajectory, labels: Sequence[str] | None = None) -> None:
         for name, value in (("plan", plan), ("law", law)):
@@ -67,17 +70,17 @@ class Retimed(Trajectory):
         values = _checked_law(plan, law, slack)
         passed = np.array([_passing(law, values, float(b), slack) for b in plan.breakpoints[1:-1]])
         breakpoints = np.union1d(law.breakpoints, passed)
-        legs = [
+        segments = [
             np.searchsorted(times, breakpoints[:-1], side="right").tolist() for times in (law.breakpoints[1:], passed)
         ]
-        self.__dict__.update(
+        self._set_fields(
             plan=plan,
             law=law,
             labels=names,
             breakpoints=readonly(breakpoints),
             initial=plan.initial,
             final=plan.final,
-            _legs=list(zip(*legs, strict=True)),
+            _segments=list(zip(*segments, strict=True)),
         )
 
     def to_dict(self) -> dict[str, Any]:
@@ -90,11 +93,13 @@ class Retimed(Trajectory):
         }
 
     @classmethod
-    def _from_dict(cls, data: dict[str, Any]) -> Self:
+    def from_dict(cls, data: dict[str, Any]) -> Self:
+        """Trajectory from the plain data of `to_dict`."""
         return cls(trajectory_from_dict(data["plan"]), trajectory_from_dict(data["law"]), data["labels"])
 
-    def _map_time(self, origin: float, target: float, rate: float) -> Self:
-        return type(self)(self.plan, self.law._map_time(origin, target, rate), self.labels)
+    def map_time(self, origin: float, target: float, rate: float) -> Self:
+        """Same path at other times; as `Trajectory.map_time`."""
+        return type(self)(self.plan, self.law.map_time(origin, target, rate), self.labels)
 
     def _sample(self, t: Array, low: int, high: int, left: bool) -> Array:
         out = super()._sample(t, low, high, left)
@@ -104,23 +109,23 @@ class Retimed(Trajectory):
             out[:, :, at_end] = _composed_jets(*jets)[low:]
         return out
 
-    def _leg_jet(self, leg: int, s: Array, order: int) -> Array:
-        clock, leg_of_plan = self._legs[leg]
-        inner = self.law._leg_jet(clock, s + self._since(leg), order)
-        elapsed = inner[0, 0] - self.plan.breakpoints[leg_of_plan]
-        return _composed_jets(self.plan._leg_jet(leg_of_plan, elapsed, order), inner)
+    def segment_jet(self, segment: int, s: Array, order: int) -> Array:
+        """Derivatives of a segment; as `Trajectory.segment_jet`."""
+        of_law, of_plan = self._segments[segment]
+        inner = self.law.segment_jet(of_law, s + self._since(segment), order)
+        elapsed = inner[0, 0] - self.plan.breakpoints[of_plan]
+        return _composed_jets(self.plan.segment_jet(of_plan, elapsed, order), inner)
 
-    def _leg_series(self, leg: int, s: Any, order: int) -> list[list[Any]]:
-        clock, leg_of_plan = self._legs[leg]
-        ((time, *rates),) = self.law._leg_series(clock, s + self._since(leg), order)
-        elapsed = time - float(self.plan.breakpoints[leg_of_plan])
-        return [composed(row, rates) for row in self.plan._leg_series(leg_of_plan, elapsed, order)]
+    def segment_series(self, segment: int, s: Any, order: int) -> list[list[Any]]:
+        """Taylor series of a segment; as `Trajectory.segment_series`."""
+        of_law, of_plan = self._segments[segment]
+        ((time, *rates),) = self.law.segment_series(of_law, s + self._since(segment), order)
+        elapsed = time - float(self.plan.breakpoints[of_plan])
+        return [composed(row, rates) for row in self.plan.segment_series(of_plan, elapsed, order)]
 
-    def _since(self, leg: int) -> float:
-        """Time [s] from the beginning of the law's leg to that of one of the whole."""
-        return float(self.breakpoints[:-1][leg] - self.law.breakpoints[self._legs[leg][0]])
-
-    _legs: list[tuple[int, int]]
+    def _since(self, segment: int) -> float:
+        """Time [s] from the beginning of the law's segment to that of one of the whole."""
+        return float(self.breakpoints[segment] - self.law.breakpoints[self._segments[segment][0]])
 
 
 def composed(outer: Sequence[Any], inner: Sequence[Any]) -> list[Any]:
@@ -187,7 +192,7 @@ def _passing(law: Trajectory, values: Array, target: float, slack: float) -> flo
     origin, end = law.breakpoints[leg : leg + 2].tolist()
 
     def excess(s: float) -> float:
-        return float(law._leg_jet(leg, np.array([s]), 0)[0, 0, 0]) - target
+        return float(law.segment_jet(leg, np.array([s]), 0)[0, 0, 0]) - target
 
     eps = np.finfo(float).eps
     return origin + float(brentq(excess, 0.0, end - origin, xtol=eps * (end - origin), rtol=4.0 * eps))

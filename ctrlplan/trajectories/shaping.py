@@ -11,11 +11,12 @@ from numpy.typing import ArrayLike
 from scipy.special import comb
 
 from ctrlplan.trajectories.combined import Sum
-from ctrlplan.trajectories.common import Array, Frozen, checked_count, checked_time, new_numbers, readonly
+from ctrlplan.trajectories.common import Array, checked_count, checked_time, new_numbers, readonly
+from ctrlplan.trajectories.fields import Fields
 from ctrlplan.trajectories.trajectory import Trajectory
 
 
-class Shaper(Frozen):
+class Shaper(Fields):
     r"""Impulses that any reference is convolved with.
 
     The shaped reference is :math:`\sum_i w_i\,r(t - t_i)`. A mode whose response
@@ -72,7 +73,7 @@ class Shaper(Frozen):
         total = math.fsum(parts)
         if abs(total - 1.0) > 1e-12:
             raise ValueError(f"weights must sum to 1, got {total}")
-        self.__dict__.update(delays=readonly(times), weights=readonly(parts / total))
+        self._set_fields(delays=readonly(times), weights=readonly(parts / total))
 
     @classmethod
     def zv(cls, frequency: float, damping: float = 0.0) -> Self:

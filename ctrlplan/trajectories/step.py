@@ -37,6 +37,9 @@ class Step(Trajectory):
     array([0., 2., 2.])
     """
 
+    initial: Array
+    final: Array
+
     def __init__(
         self,
         final: ArrayLike,
@@ -51,7 +54,7 @@ class Step(Trajectory):
             raise ValueError(
                 f"initial must have the shape of final {np.shape(final)} or be a scalar, got {np.shape(initial)}"
             )
-        self.__dict__.update(
+        self._set_fields(
             initial=readonly(low),
             final=readonly(high),
             labels=checked_labels(labels, high.size),
@@ -69,14 +72,17 @@ class Step(Trajectory):
         }
 
     @classmethod
-    def _from_dict(cls, data: dict[str, Any]) -> Self:
+    def from_dict(cls, data: dict[str, Any]) -> Self:
+        """Trajectory from the plain data of `to_dict`."""
         return cls(data["final"], data["initial"], data["time"], data["labels"])
 
-    def _map_time(self, origin: float, target: float, rate: float) -> Self:
+    def map_time(self, origin: float, target: float, rate: float) -> Self:
+        """Same path at other times; as `Trajectory.map_time`."""
         return type(self)(self.final, self.initial, mapped_time(self.start, origin, target, rate), self.labels)
 
-    def _leg_jet(self, leg: int, s: Array, order: int) -> Array:
-        raise AssertionError("a step has no legs")
+    def segment_jet(self, segment: int, s: Array, order: int) -> Array:
+        """Derivatives of a segment; as `Trajectory.segment_jet`."""
+        raise AssertionError("a step has no segments")
 
 
 def _positions(values: ArrayLike, name: str) -> Array:

@@ -21,14 +21,15 @@ from ctrlplan.trajectories import sampling as _sampling
 from ctrlplan.trajectories.common import (
     FACTORIALS,
     Array,
-    Frozen,
     checked_count,
+    checked_number,
     checked_time,
     checked_timepts,
     one_number,
     readonly,
 )
 from ctrlplan.trajectories.continuity import Jump, find_jumps
+from ctrlplan.trajectories.fields import Fields
 
 if TYPE_CHECKING:
     from control import ControlPlot
@@ -37,21 +38,65 @@ if TYPE_CHECKING:
     from ctrlplan.trajectories.waypoint import Waypoint
 
 
-class Trajectory(Frozen, ABC):
+class Trajectory(Fields, ABC):
     """Function of time with exact derivatives.
 
     Between breakpoints it is analytic. Before the start it holds its first
     position, after the end its last, with every derivative zero there. At a
     breakpoint it takes the value and derivatives of what follows, at the end
-    its own. A new kind sets `labels` and `breakpoints` and gives the jet of
-    each of its legs; everything else is derived here.
+    its own.
+
+    A new kind of trajectory must define
+
+    - its fields, annotated at the top of the class, and a constructor that sets
+      them by ``self._set_fields(...)``: each once, and with them `labels` (tuple
+      of str) and `breakpoints` (ndarray, increasing);
+    - `segment_jet`, the derivatives between two breakpoints;
+    - `map_time`, the same path at other times: `retime` and `shift`;
+    - `to_dict` and `from_dict`, plain data: `save` and `load_trajectory`.
+
+    `segment_series` is needed only where the time is a symbol of CasADi, as under
+    a time scaling in a compiled simulation. A kind that is made through
+    waypoints derives from `WaypointSpline`. Everything else is derived here.
 
     Attributes
     ----------
     labels : tuple of str
         Names of the axes: y, or y1, y2, ... unless given.
-    breakpoints : ndarray, shape (nlegs + 1,)
+    breakpoints : ndarray, shape (nsegments + 1,)
         Times [s] of the start, of every join, and of the end.
+
+    Examples
+    --------
+    A sine, whose nth derivative is A w^n sin(w s + n pi/2):
+
+    >>> import numpy as np
+    >>> class Sine(Trajectory):
+    ...     amplitude: float
+    ...     rate: float
+    ...
+    ...     def __init__(self, amplitude, rate, start, end, labels=("y",)):
+    ...         breakpoints = np.array([start, end], dtype=float)
+    ...         self._set_fields(labels=tuple(labels), breakpoints=breakpoints, amplitude=amplitude, rate=rate)
+    ...
+    ...     def segment_jet(self, segment, s, order):
+    ...         n = np.arange(order + 1)[:, None, None]
+    ...         return self.amplitude * self.rate**n * np.sin(self.rate * s + 0.5 * np.pi * n)
+    ...
+    ...     def map_time(self, origin, target, rate):
+    ...         start, end = target + (self.breakpoints - origin) / rate
+    ...         return Sine(self.amplitude, self.rate * rate, start, end, self.labels)
+    ...
+    ...     def to_dict(self):
+    ...         own = [self.amplitude, self.rate, self.start, self.end, list(self.labels)]
+    ...         return {"type": "Sine", "arguments": own}
+    ...
+    ...     @classmethod
+    ...     def from_dict(cls, data):
+    ...         return cls(*data["arguments"])
+    >>> plan = Sine(2.0, np.pi, 0.0, 0.5)
+    >>> plan(0.5).round(12), plan.peak(1).round(12), plan.retime(1.0).peak(1).round(12)
+    (2.0, array([6.28318531]), array([3.14159265]))
     """
 
     labels: tuple[str, ...]
@@ -64,33 +109,87 @@ class Trajectory(Frozen, ABC):
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
-        if not (cls.__name__.startswith("_") or getattr(cls._from_dict, "__isabstractmethod__", False)):
-            Trajectory.kinds[cls.__name__] = cls
+        if cls.__name__.startswith("_") or getattr(cls.from_dict, "__isabstractmethod__", False):
+            return
+        former = Trajectory.kinds.setdefault(cls.__name__, cls)
+        # A class that is defined again, in a cell or by a reload, replaces itself.
+        if (former.__module__, former.__qualname__) != (cls.__module__, cls.__qualname__):
+            raise ValueError(
+                f"kinds of trajectories must have names of their own, by which they are saved, got {cls.__name__} "
+                f"in {cls.__module__} after that in {former.__module__}; rename the class, or begin its name with _"
+            )
+        Trajectory.kinds[cls.__name__] = cls
 
     @abstractmethod
-    def _leg_jet(self, leg: int, s: Array, order: int) -> Array:
-        """Jet (order + 1, naxes, ntime) of the analytic function that the leg is a part of.
+    def segment_jet(self, segment: int, s: Array, order: int) -> Array:
+        """Derivatives of the analytic function that a segment is a part of.
 
-        Times s are counted from the leg's own beginning: what a clock that
-        started long ago has lost to rounding is lost once, in the subtraction.
+        Times are counted from the beginning of the segment: what a start long
+        after 0 costs by rounding is lost once, in the subtraction. They may lie a
+        little outside of it.
+
+        Parameters
+        ----------
+        segment : int
+            Number of the segment, from 0: between ``breakpoints[segment]`` and
+            ``breakpoints[segment + 1]``.
+        s : ndarray, shape (ntime,)
+            Times [s] since the beginning of the segment, in any order.
+        order : int
+            Highest derivative.
+
+        Returns
+        -------
+        ndarray, shape (order + 1, naxes, ntime)
         """
 
     @abstractmethod
-    def _map_time(self, origin: float, target: float, rate: float) -> Self:
-        """Same path with time t moved to target + (t - origin)/rate."""
+    def map_time(self, origin: float, target: float, rate: float) -> Self:
+        """Same path with time t moved to target + (t - origin)/rate.
+
+        Parameters
+        ----------
+        origin, target : float
+            A time [s], and where it is moved.
+        rate : float
+            Factor of the speed, above 0: the nth derivative is multiplied by rate^n.
+        """
 
     @abstractmethod
     def to_dict(self) -> dict[str, Any]:
-        """Plain data (numbers, strings, lists) that `trajectory_from_dict` reads."""
+        """Plain data (numbers, strings, lists, dicts) for `from_dict`; "type" is the name of the class."""
 
     @classmethod
     @abstractmethod
-    def _from_dict(cls, data: dict[str, Any]) -> Trajectory:
-        """Trajectory from the plain data of `to_dict`."""
+    def from_dict(cls, data: dict[str, Any]) -> Trajectory:
+        """Trajectory from the plain data of `to_dict`, with equal values to every bit."""
 
-    def _leg_series(self, leg: int, s: Any, order: int) -> list[list[Any]]:
-        """Taylor series axis by axis of a leg at a symbol of a tracer."""
-        raise TypeError(f"the time of a {type(self).__name__} must be a number, got {type(s).__name__}")
+    def segment_series(self, segment: int, s: Any, order: int) -> list[list[Any]]:
+        """Taylor series of a segment at a symbol of CasADi.
+
+        Parameters
+        ----------
+        segment : int
+            Number of the segment.
+        s : symbol
+            Time [s] since its beginning.
+        order : int
+            Highest coefficient.
+
+        Returns
+        -------
+        list of list, naxes by (order + 1)
+            Coefficient k is the k-th derivative / k!.
+
+        Raises
+        ------
+        TypeError
+            If this kind does not define it.
+        """
+        raise TypeError(
+            f"the time of a {type(self).__name__} must be a number, got {type(s).__name__}: this kind of trajectory "
+            "does not define segment_series"
+        )
 
     @property
     def start(self) -> float:
@@ -115,12 +214,46 @@ class Trajectory(Frozen, ABC):
     @cached_property
     def initial(self) -> Array:
         """Position held before the start, shape (naxes,)."""
-        return readonly(self._leg_jet(0, np.zeros(1), 0)[0, :, 0].copy())
+        return readonly(self.segment_jet(0, np.zeros(1), 0)[0, :, 0].copy())
 
     @cached_property
     def final(self) -> Array:
         """Position held after the end, shape (naxes,)."""
-        return readonly(self._leg_jet(-1, self.breakpoints[-1:] - self.breakpoints[-2], 0)[0, :, 0].copy())
+        last = self.breakpoints.size - 2
+        return readonly(self.segment_jet(last, np.diff(self.breakpoints[last:]), 0)[0, :, 0].copy())
+
+    def breakpoints_between(self, t0: float, t1: float) -> Array:
+        """Breakpoints in the half-open interval [t0, t1).
+
+        Intervals that follow one another have every breakpoint in exactly one
+        of them, as an inner breakpoint belongs to what follows it.
+
+        Parameters
+        ----------
+        t0, t1 : float
+            Times [s], t0 <= t1; both may be infinite.
+
+        Returns
+        -------
+        ndarray, shape (nbreakpoints,)
+            Increasing; the breakpoint at t0 is among them, that at t1 is not.
+
+        Raises
+        ------
+        ValueError
+            If a time is nan or t1 is below t0.
+
+        Examples
+        --------
+        >>> import ctrlplan as cp
+        >>> cp.PiecewiseSpline([cp.Waypoint(0, 0), cp.Waypoint(1, 1), cp.Waypoint(3, 0)]).breakpoints_between(0, 3)
+        array([0., 1.])
+        """
+        first, last = checked_number(t0, "t0"), checked_number(t1, "t1")
+        if last < first:
+            raise ValueError(f"t1 must not be below t0, got {last:g} s after {first:g} s")
+        begin, end = np.searchsorted(self.breakpoints, [first, last]).tolist()
+        return self.breakpoints[begin:end].copy()
 
     def __call__(self, t: ArrayLike, nu: int = 0) -> Array:
         """Value, or the nu-th derivative.
@@ -199,11 +332,11 @@ class Trajectory(Frozen, ABC):
             return (self.jet(np.asarray(t), order).T / FACTORIALS[: order + 1]).tolist()
         if t is None or isinstance(t, str | complex | list | tuple | np.ndarray | np.datetime64 | np.bool_):
             raise TypeError(f"t must be one number or a symbol, got {t!r:.80}")
-        # Each leg counts where it holds; elsewhere it is taken at its ends, where it is finite.
+        # Each segment counts where it holds; elsewhere it is taken at its ends, where it is finite.
         found = [[value * (t < self.start), *[0.0] * order] for value in self.initial.tolist()]
-        for leg, (left, right) in enumerate(itertools.pairwise(self.breakpoints.tolist())):
+        for segment, (left, right) in enumerate(itertools.pairwise(self.breakpoints.tolist())):
             holds = (t >= left) * (t < right)
-            rows = self._leg_series(leg, np.fmin(np.fmax(t - left, 0.0), right - left), order)
+            rows = self.segment_series(segment, np.fmin(np.fmax(t - left, 0.0), right - left), order)
             found = [[a + holds * b for a, b in zip(*pair, strict=True)] for pair in zip(found, rows, strict=True)]
         for row, value in zip(found, self.final.tolist(), strict=True):
             row[0] = row[0] + value * (t > self.end)
@@ -464,10 +597,10 @@ class Trajectory(Frozen, ABC):
         return f"<{type(self).__name__} of {axes} {when}>"
 
     def _moved(self, origin: float, target: float, rate: float) -> Self:
-        """As `_map_time`, with what the rounding of times costs the intervals between them stated."""
+        """As `map_time`, with what the rounding of times costs the intervals between them stated."""
         try:
             with np.errstate(over="raise", invalid="raise"):
-                moved = self._map_time(origin, target, rate)
+                moved = self.map_time(origin, target, rate)
         except FloatingPointError as lost:
             raise ValueError(f"times must stay within floating point, got a rate of {rate:g}: {lost}") from None
         before, after = (np.union1d(p.breakpoints, [w.time for w in p.waypoints]) for p in (self, moved))
@@ -488,74 +621,74 @@ class Trajectory(Frozen, ABC):
 
     def _sample(self, t: Array, low: int, high: int, left: bool) -> Array:
         """Derivatives low to high, shape (high - low + 1, naxes, ntime)."""
-        nlegs = self.breakpoints.size - 1
-        if nlegs == 1 and not left and t.size and t.min() >= self.breakpoints[0] and t.max() <= self.breakpoints[1]:
+        nsegments = self.breakpoints.size - 1
+        if nsegments == 1 and not left and t.size and t.min() >= self.breakpoints[0] and t.max() <= self.breakpoints[1]:
             origin = self.breakpoints[0]
-            return self._sample_leg(0, t - origin if origin else t, low, high)
-        legs = np.searchsorted(self.breakpoints, t, side="left" if left else "right") - 1
-        if nlegs and not left:
-            legs[t == self.breakpoints[-1]] = nlegs - 1
+            return self._sample_segment(0, t - origin if origin else t, low, high)
+        segments = np.searchsorted(self.breakpoints, t, side="left" if left else "right") - 1
+        if nsegments and not left:
+            segments[t == self.breakpoints[-1]] = nsegments - 1
         out = np.zeros((high - low + 1, self.naxes, t.size))
-        in_order = bool(np.all(legs[1:] >= legs[:-1]))
-        for leg in range(-1, nlegs + 1):
+        in_order = bool(np.all(segments[1:] >= segments[:-1]))
+        for segment in range(-1, nsegments + 1):
             where: slice | NDArray[np.intp]
             if in_order:
-                begin, end = np.searchsorted(legs, [leg, leg + 1]).tolist()
+                begin, end = np.searchsorted(segments, [segment, segment + 1]).tolist()
                 where = slice(begin, end)
             else:
-                where = np.flatnonzero(legs == leg)
+                where = np.flatnonzero(segments == segment)
             if not t[where].size:
                 continue
-            if 0 <= leg < nlegs:
-                out[:, :, where] = self._sample_leg(leg, t[where] - self.breakpoints[leg], low, high)
+            if 0 <= segment < nsegments:
+                out[:, :, where] = self._sample_segment(segment, t[where] - self.breakpoints[segment], low, high)
             elif low == 0:
-                out[0][:, where] = (self.initial if leg < 0 else self.final)[:, None]
+                out[0][:, where] = (self.initial if segment < 0 else self.final)[:, None]
         return out
 
-    def _sample_leg(self, leg: int, s: Array, low: int, high: int) -> Array:
-        duration = float(self.breakpoints[leg + 1] - self.breakpoints[leg])
+    def _sample_segment(self, segment: int, s: Array, low: int, high: int) -> Array:
+        duration = float(self.breakpoints[segment + 1] - self.breakpoints[segment])
         if abs(math.log10(duration)) * high > 200.0:
-            return self._extreme_jet(leg, s, low, high)
+            return self._extreme_jet(segment, s, low, high)
         with np.errstate(over="ignore", invalid="ignore"):
             if s.size <= _sampling.FEW:
-                found = self._leg_jet(leg, s, high)[low:]
+                found = self.segment_jet(segment, s, high)[low:]
             else:
-                found = _sampling.sample(lambda u, order: self._leg_jet(leg, u, order), duration, s, low, high)
+                found = _sampling.sample(lambda u, order: self.segment_jet(segment, u, order), duration, s, low, high)
             suspect = not np.isfinite(found.sum())
         if suspect:
-            self._check_finite(found, leg, high)
+            self._check_finite(found, segment, high)
         return found
 
-    def _extreme_jet(self, leg: int, s: Array, low: int, high: int) -> Array:
+    def _extreme_jet(self, segment: int, s: Array, low: int, high: int) -> Array:
         """Derivatives low to high of a segment whose duration, to the power of their order, leaves floating point."""
         with np.errstate(over="ignore", invalid="ignore"):
-            found = self._leg_jet(leg, s, high)[low:]
-        self._check_finite(found, leg, high)
+            found = self.segment_jet(segment, s, high)[low:]
+        self._check_finite(found, segment, high)
         return found
 
-    def _check_finite(self, jet: Array, leg: int, high: int) -> None:
+    def _check_finite(self, jet: Array, segment: int, high: int) -> None:
         if not np.isfinite(jet).all():
-            duration = self.breakpoints[leg + 1] - self.breakpoints[leg]
+            duration = self.breakpoints[segment + 1] - self.breakpoints[segment]
             raise ValueError(
                 f"derivative {high} must stay within floating point, got a duration of {duration:g} s and a position "
-                f"of {np.abs(self._leg_jet(leg, np.zeros(1), 0)).max():g}"
+                f"of {np.abs(self.segment_jet(segment, np.zeros(1), 0)).max():g}"
             )
 
     def _jet_beside(self, moment: float, origin: float, s: Array, order: int) -> Array:
         """Jet at origin + s of the analytic function that holds at `moment`, which is no breakpoint."""
-        leg = int(np.searchsorted(self.breakpoints, moment)) - 1
-        if 0 <= leg < self.breakpoints.size - 1:
-            return self._leg_jet(leg, s + (origin - self.breakpoints[leg]), order)
+        segment = int(np.searchsorted(self.breakpoints, moment)) - 1
+        if 0 <= segment < self.breakpoints.size - 1:
+            return self.segment_jet(segment, s + (origin - self.breakpoints[segment]), order)
         held = np.zeros((order + 1, self.naxes, s.size))
-        held[0] = (self.initial if leg < 0 else self.final)[:, None]
+        held[0] = (self.initial if segment < 0 else self.final)[:, None]
         return held
 
     def _series_beside(self, moment: float, origin: float, s: Any, order: int) -> list[list[Any]]:
         """The same as Taylor series, of numbers or of symbols."""
-        leg = int(np.searchsorted(self.breakpoints, moment)) - 1
-        if 0 <= leg < self.breakpoints.size - 1:
-            return self._leg_series(leg, s + (origin - float(self.breakpoints[leg])), order)
-        return [[value, *[0.0] * order] for value in (self.initial if leg < 0 else self.final).tolist()]
+        segment = int(np.searchsorted(self.breakpoints, moment)) - 1
+        if 0 <= segment < self.breakpoints.size - 1:
+            return self.segment_series(segment, s + (origin - float(self.breakpoints[segment])), order)
+        return [[value, *[0.0] * order] for value in (self.initial if segment < 0 else self.final).tolist()]
 
 
 def _is_factor(value: object) -> bool:

@@ -7,15 +7,16 @@ from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ctrlplan._checks import real_array
-from ctrlplan.trajectories.common import FACTORIALS, Array, Frozen, checked_count, checked_time, derivative_scale
+from ctrlplan.trajectories.common import FACTORIALS, Array, checked_count, checked_time, derivative_scale
+from ctrlplan.trajectories.fields import Fields
 from ctrlplan.trajectories.newton import NewtonSystem, newton_series, pair_series
 from ctrlplan.trajectories.trigonometric import checked_alpha
 
 
-class Transition(Frozen):
+class Transition(Fields):
     r"""Splines from jet to jet in one horizon, factorised once.
 
     Replanning every instant towards 0 with the horizon kept is the constant law
@@ -58,6 +59,10 @@ class Transition(Frozen):
     horizon: float
     alpha: float
     rate: float
+    _system: NewtonSystem
+    _rows: NDArray[np.intp]
+    _data_scale: Array
+    _time_scale: Array
 
     def __init__(self, order: int, horizon: float, alpha: float = 0.0) -> None:
         order = checked_count(order, "order")
@@ -70,7 +75,7 @@ class Transition(Frozen):
             raise ValueError(
                 f"powers of the horizon must stay within floating point, got {horizon:g} s to the power {2 * order + 1}"
             )
-        self.__dict__.update(
+        self._set_fields(
             order=order,
             horizon=horizon,
             alpha=alpha,
@@ -122,17 +127,12 @@ class Transition(Frozen):
         first = np.eye(self.order + 1)
         return self.evaluation(s, order) @ self.coefficients(np.concatenate([first, np.zeros_like(first)]))
 
-    _system: NewtonSystem
-    _rows: Any
-    _data_scale: Array
-    _time_scale: Array
-
 
 class _Family(NamedTuple):
     """What transitions of one order and alpha share, whatever the horizon."""
 
     system: NewtonSystem
-    rows: Any  # of the jets at both ends, in the system's order
+    rows: NDArray[np.intp]  # of the jets at both ends, in the system's order
     exponents: Array
     inverse: Array  # of the factorials
 

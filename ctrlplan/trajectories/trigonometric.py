@@ -157,7 +157,8 @@ class TrigSpline(NewtonSpline):
         return super().to_dict() | {"alpha": self.alpha}
 
     @classmethod
-    def _from_dict(cls, data: dict[str, Any]) -> Self:
+    def from_dict(cls, data: dict[str, Any]) -> Self:
+        """Trajectory from the plain data of `to_dict`."""
         points = [Waypoint.from_dict(w) for w in data["waypoints"]]
         chosen = {k: data[k] for k in ("gamma", "labels", "degree", "smooth") if k in data}
         if "period" in data:

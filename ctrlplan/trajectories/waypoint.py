@@ -8,12 +8,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ctrlplan.trajectories.common import Array, Frozen, checked_time, new_numbers, readonly, times_powers
+from ctrlplan.trajectories.common import Array, checked_time, new_numbers, readonly, times_powers
+from ctrlplan.trajectories.fields import Fields
 
 ENTRIES = ("position", "velocity", "acceleration", "jerk", "snap")
 
 
-class Waypoint(Frozen):
+class Waypoint(Fields):
     """What a plan must meet at one instant.
 
     Parameters
@@ -120,7 +121,7 @@ class Waypoint(Frozen):
             order, axis = np.argwhere(np.isinf(jet))[0]
             name = ENTRIES[order] if order < len(ENTRIES) else f"derivative {order}"
             raise ValueError(f"{name} must be finite or nan (free), got {jet[order, axis]} at time {time:g}")
-        self.__dict__.update(time=time, jet=readonly(jet), labels=labels, complete=complete, naxes=jet.shape[1])
+        self._set_fields(time=time, jet=readonly(jet), labels=labels, complete=complete, naxes=jet.shape[1])
 
     @property
     def position(self) -> Array:

@@ -52,18 +52,18 @@ def test_a_single_harmonic_has_its_closed_form():
         def __init__(self):
             self.__dict__.update(labels=("y",), breakpoints=np.array([0.0, 2 * np.pi]))
 
-        def _leg_jet(self, leg, s, order):
+        def segment_jet(self, leg, s, order):
             rows = [(s - np.sin(s)), 1 - np.cos(s), np.sin(s), np.cos(s), -np.sin(s)]
             return np.array(rows[: order + 1])[:, None, :] / (2 * np.pi)
 
-        def _map_time(self, origin, shift, rate):
+        def map_time(self, origin, shift, rate):
             raise NotImplementedError
 
         def to_dict(self):
             raise NotImplementedError
 
         @classmethod
-        def _from_dict(cls, data):
+        def from_dict(cls, data):
             raise NotImplementedError
 
     del cp.Trajectory.kinds["Cycloid"]

@@ -81,7 +81,7 @@ def check(times, rows, size, alpha, tolerance=1e-13):
     with mpmath.workdps(80):
         wanted = np.array([reference(times, jets, size, alpha) for jets in rows])
     for leg, h in enumerate(np.diff(times)):
-        got = plan._leg_jet(leg, h * np.array(WITHIN), 2 * size - 1)
+        got = plan.segment_jet(leg, h * np.array(WITHIN), 2 * size - 1)
         peak = np.abs(wanted).max(axis=(1, 3)).T[..., None]
         assert (np.abs(got - wanted[:, leg].transpose(1, 0, 2)) <= tolerance * peak).all()
     return plan

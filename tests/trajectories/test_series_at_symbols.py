@@ -257,19 +257,19 @@ def foreign():
         def __init__(self):
             self.__dict__.update(labels=("y",), breakpoints=np.array([0.0, 1.0]))
 
-        def _leg_jet(self, leg, s, order):
+        def segment_jet(self, leg, s, order):
             out = np.zeros((order + 1, 1, s.size))
             out[:2] = np.array([s, np.ones_like(s)])[: order + 1, None]
             return out
 
-        def _map_time(self, origin, target, rate):
+        def map_time(self, origin, target, rate):
             return self
 
         def to_dict(self):
             return {"type": "Ramp"}
 
         @classmethod
-        def _from_dict(cls, data):
+        def from_dict(cls, data):
             return cls()
 
     yield Ramp()

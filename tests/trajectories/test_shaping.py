@@ -230,7 +230,7 @@ def test_a_shaped_plan_is_a_trajectory_like_others(tmp_path):
     shaped = Shaper.zvd(3.0, 0.1)(stack([SPLINE, Step(1.0)]))
     shaped.save(tmp_path / "plan.json")
     t = np.linspace(0.0, 4.0, 41)
-    np.testing.assert_array_equal(type(shaped)._from_dict(shaped.to_dict()).jet(t, 2), shaped.jet(t, 2))
+    np.testing.assert_array_equal(type(shaped).from_dict(shaped.to_dict()).jet(t, 2), shaped.jet(t, 2))
     assert shaped.shift(1.0).end == pytest.approx(shaped.end + 1.0, rel=1e-15)
 
 

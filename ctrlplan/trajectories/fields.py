@@ -1,0 +1,58 @@
+"""Objects whose fields are declared at the top of the class and set once."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from inspect import get_annotations
+from typing import Any, Self
+
+import numpy as np
+
+from ctrlplan.trajectories.common import Frozen
+
+
+class Fields(Frozen):
+    """Immutable object; its fields are the annotated names of its classes."""
+
+    def _set_fields(self, **values: Any) -> None:
+        """Set fields, each once; arrays are stored read-only, as copies where they were not.
+
+        Raises
+        ------
+        AttributeError
+            If a name is not annotated in the class or one of its bases, or is
+            set already.
+        """
+        unknown = values.keys() - _declared(type(self).__mro__)
+        if unknown:
+            raise AttributeError(
+                f"fields of {type(self).__name__} must be annotated in the class, as ``{min(unknown)}: float``, "
+                f"got {', '.join(sorted(unknown))}"
+            )
+        again = values.keys() & self.__dict__.keys()
+        if again:
+            raise AttributeError(f"{type(self).__name__} is immutable; {min(again)} is set already")
+        for name, value in values.items():
+            if isinstance(value, np.ndarray) and value.flags.writeable:
+                values[name] = value.copy(order="K")
+                values[name].flags.writeable = False
+        self.__dict__.update(values)
+
+    def _with_fields(self, **values: Any) -> Self:
+        """The same object with some fields changed; what was cached is computed again."""
+        declared = _declared(type(self).__mro__)
+        kept = {name: value for name, value in self.__dict__.items() if name in declared}
+        found = type(self).__new__(type(self))
+        found._set_fields(**(kept | values))
+        return found
+
+
+@lru_cache(maxsize=1024)
+def _declared(classes: tuple[type, ...]) -> frozenset[str]:
+    """Names annotated in a class and its bases, without class variables."""
+    return frozenset(
+        name
+        for base in classes
+        for name, annotation in get_annotations(base).items()
+        if not str(annotation).removeprefix("typing.").startswith("ClassVar")
+    )
