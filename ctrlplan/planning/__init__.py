@@ -1,7 +1,7 @@
 """Choosing what the designer left free: shape, derivatives, times, durations, ways around obstacles."""
 
 from ctrlplan.planning.alpha import AlphaChoice, choose_alpha
-from ctrlplan.planning.avoid import avoid
+from ctrlplan.planning.avoid import Avoidance, avoid
 from ctrlplan.planning.clearance import Clearance, Rope, clearance
 from ctrlplan.planning.fastest import Fastest, fastest
 from ctrlplan.planning.limits import Bound, Margin, Margins, margins
@@ -12,6 +12,7 @@ from ctrlplan.planning.optimize import Optimum, optimize_waypoints
 __all__ = [
     "OBJECTIVES",
     "AlphaChoice",
+    "Avoidance",
     "Bound",
     "Clearance",
     "Disc",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
@@ -13,9 +14,10 @@ from scipy.optimize import minimize_scalar
 
 from ctrlplan.planning.curve import curve
 from ctrlplan.planning.objectives import Objective, SquaredDerivative, checked_objective, wandering
-from ctrlplan.trajectories import PiecewiseSpline, Trajectory, TrigSpline, Waypoint
+from ctrlplan.trajectories import Trajectory, TrigSpline, Waypoint
 from ctrlplan.trajectories.common import Array, readonly
-from ctrlplan.trajectories.newton_spline import checked_waypoints, given_entries
+from ctrlplan.trajectories.newton_spline import given_entries
+from ctrlplan.trajectories.waypoint_spline import checked_waypoints
 
 if TYPE_CHECKING:
     from control import ControlPlot
@@ -139,8 +141,7 @@ def choose_alpha(
         raise TypeError(f"family must be TrigSpline, PiecewiseSpline or a function like them, got {family!r}")
 
     # Candidates swing wherever alpha is too large: only the choice may warn.
-    warns = isinstance(family, type) and issubclass(family, TrigSpline | PiecewiseSpline)
-    quiet = options | {"warn": False} if warns else options
+    quiet = options | {"warn": False} if _can_be_quiet(family) else options
 
     def plan_of(alpha: float) -> Trajectory:
         return family(points, alpha=alpha, **quiet)
@@ -169,6 +170,14 @@ def choose_alpha(
         tied=flat,
         objective=objective if isinstance(objective, str) else str(getattr(objective, "__name__", objective)),
     )
+
+
+def _can_be_quiet(family: Callable[..., Trajectory]) -> bool:
+    """Whether a family has an argument `warn`."""
+    try:
+        return "warn" in inspect.signature(family).parameters
+    except ValueError:  # of a function written in another language nothing is known
+        return False
 
 
 class _Search:

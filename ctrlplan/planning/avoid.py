@@ -10,20 +10,20 @@ from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.integrate import trapezoid
 from scipy.optimize import minimize
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
+from ctrlplan._renamed import warn_renamed
 from ctrlplan.planning.clearance import Clearance, Rope, checked_obstacles, checked_rope, checked_size
 from ctrlplan.planning.clearance import clearance as certified_clearance
 from ctrlplan.planning.objectives import path_length
 from ctrlplan.planning.obstacles import Obstacle
-from ctrlplan.trajectories import PiecewiseSpline, PolySpline, Trajectory, TrigSpline, Waypoint
+from ctrlplan.trajectories import PiecewiseSpline, Trajectory, Waypoint, WaypointSpline
 from ctrlplan.trajectories.common import Array, checked_count
 
-Spline = TrigSpline | PolySpline | PiecewiseSpline
 Build = Callable[[Iterable[Waypoint]], Trajectory]
 Pairs = NDArray[np.intp]
 Mask = NDArray[np.bool_]
@@ -38,6 +38,62 @@ _STEP = 1e-7  # of differences, of unknowns about 1 in size
 _PRICE = 3e2  # of a clearance missed by the length of the path, in units of the roughness at first
 
 
+@dataclass(frozen=True, eq=False, repr=False)
+class Avoidance:
+    """Plan that keeps clear of obstacles; made by `avoid`.
+
+    For one release it can be used as the plan itself, with a FutureWarning.
+
+    Attributes
+    ----------
+    plan : Trajectory
+        The plan.
+    clearance : Clearance
+        Its certified clearance over the whole interval.
+    """
+
+    plan: Trajectory
+    clearance: Clearance
+
+    __array_ufunc__ = None
+
+    def __repr__(self) -> str:
+        return f"<Avoidance with {self.plan!r}: {self.clearance}>"
+
+    def _as_plan(self) -> Trajectory:
+        warn_renamed("avoid(...) used as a plan", "avoid(...).plan")
+        return self.plan
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__") or not hasattr(self.plan, name):
+            raise AttributeError(f"an Avoidance has the attributes plan and clearance, got {name!r}")
+        return getattr(self._as_plan(), name)
+
+    def __call__(self, t: ArrayLike, nu: int = 0) -> Array:
+        """Value of the plan, or its nu-th derivative; as ``avoid(...).plan``."""
+        return self._as_plan()(t, nu)
+
+    def __add__(self, other: Trajectory) -> Trajectory:
+        return self._as_plan() + other
+
+    def __sub__(self, other: Trajectory) -> Trajectory:
+        return self._as_plan() - other
+
+    def __mul__(self, factor: float) -> Trajectory:
+        return self._as_plan() * factor
+
+    __rmul__ = __mul__
+
+    def __truediv__(self, factor: float) -> Trajectory:
+        return self._as_plan() / factor
+
+    def __neg__(self) -> Trajectory:
+        return -self._as_plan()
+
+
+WaypointSpline.register(Avoidance)
+
+
 def avoid(
     plan: Trajectory,
     obstacles: Iterable[Obstacle],
@@ -46,7 +102,7 @@ def avoid(
     load: float = 0.0,
     rope: Rope | None = None,
     max_points: int = 4,
-) -> Trajectory:
+) -> Avoidance:
     r"""Plan through the same waypoints that keeps clear of obstacles.
 
     Shortest polylines, one a class of ways round the obstacles, give the first
@@ -64,9 +120,11 @@ def avoid(
 
     Parameters
     ----------
-    plan : TrigSpline, PolySpline or PiecewiseSpline
-        Plan of two axes. It is returned itself if it keeps clear; its waypoints
-        are kept, all entries and times.
+    plan : Trajectory
+        Plan of two axes. The result has the plan itself if it keeps clear.
+        Otherwise it must be made through waypoints, a `WaypointSpline` such as
+        `PolySpline`, whose axes do not depend on each other; its waypoints are
+        kept, all entries and times.
     obstacles : iterable of Obstacle
         One or more.
     clearance : float, optional
@@ -80,7 +138,8 @@ def avoid(
 
     Returns
     -------
-    TrigSpline, PolySpline or PiecewiseSpline
+    Avoidance
+        The plan, and its certified clearance.
 
     Raises
     ------
@@ -89,7 +148,8 @@ def avoid(
         settles it; or if no plan is found: with the best clearance reached,
         where, when, and to which obstacle.
     TypeError
-        If the plan is of another kind, or an obstacle is none.
+        If the plan comes too near and is not made through waypoints (an S-curve,
+        a shaped plan, a sum of plans), or an obstacle is none.
 
     Warns
     -----
@@ -100,10 +160,13 @@ def avoid(
     Examples
     --------
     >>> from ctrlplan.planning.obstacles import Disc
+    >>> from ctrlplan.trajectories import PolySpline
     >>> start, goal = Waypoint(0, [0, 0], 0, 0), Waypoint(4, [10, 0], 0, 0)
     >>> found = avoid(PolySpline([start, goal]), [Disc((5.0, 1.0), 2.0)], clearance=0.5)
-    >>> type(found).__name__, len(found.waypoints), bool(found(2.0)[1] < -1.49)
+    >>> type(found.plan).__name__, len(found.plan.waypoints), bool(found.plan(2.0)[1] < -1.49)
     ('PolySpline', 3, True)
+    >>> found.clearance.certified
+    True
     """
     task = _Task(
         _checked_plan(plan),
@@ -115,21 +178,22 @@ def avoid(
     )
     task.check_waypoints()
     if task.given.certified:
-        return plan
+        return Avoidance(plan, task.given)
     best = task.given
+    spline = _made_through_waypoints(task)
     ways = _ways(task)
-    for build in _kinds(task.plan):
+    for build in _kinds(spline):
         found = []
         for way in ways:
             reached, certificate = _search(task, build, way)
             if certificate.certified:
-                found.append(reached)
+                found.append(Avoidance(reached, certificate))
             elif certificate.lower > best.least:  # certainly better: rounding is a tie, and the earlier plan stays
                 best = certificate
         if found:
-            plan = min(found, key=task.roughness)
-            _check_length(plan, sum(map(_length, ways[0])))
-            return plan
+            smoothest = min(found, key=lambda avoidance: task.roughness(avoidance.plan))
+            _check_length(smoothest.plan, sum(map(_length, ways[0])))
+            return smoothest
     x, z = best.position
     raise ValueError(
         f"no plan with {task.max_points} via points or fewer was found that keeps {task.wanted:g} from every obstacle: "
@@ -153,7 +217,7 @@ def _check_length(plan: Trajectory, shortest: float) -> None:
 class _Task:
     """What is asked for, and what every candidate is measured by."""
 
-    plan: Spline
+    plan: Trajectory
     obstacles: tuple[Obstacle, ...]
     wanted: float
     load: float
@@ -188,6 +252,8 @@ class _Task:
 
     def check_waypoints(self) -> None:
         """Refuse waypoints that are too near to an obstacle, whatever the way between them."""
+        if not self.plan.waypoints:
+            return
         slack = 1e-9 * float(np.abs(self.points).max())
         for i, point in enumerate(self.plan.waypoints):
             jet = point.jet[:, :, None]
@@ -234,20 +300,37 @@ def _roughness(t: Array, jet: Array, size: float) -> Array:
     return np.asarray(duration**5 / (720.0 * size**2) * jerk + trapezoid(np.hypot(*jet[1]), t) / size)
 
 
-def _checked_plan(plan: Trajectory) -> Spline:
-    if not isinstance(plan, Spline):
-        raise TypeError(f"plan must be a TrigSpline, PolySpline or PiecewiseSpline, got {type(plan).__name__}")
+def _checked_plan(plan: Trajectory) -> Trajectory:
+    if not isinstance(plan, Trajectory):
+        raise TypeError(f"plan must be a Trajectory, got {type(plan).__name__}")
     if plan.naxes != 2:
         raise ValueError(f"a plan among obstacles must have two axes, got {plan.naxes}")
-    if plan.end != plan.waypoints[-1].time:
-        raise ValueError(f"plan must end at its last waypoint, at {plan.waypoints[-1].time:g} s, got {plan.end:g} s")
-    for i, point in enumerate(plan.waypoints):
-        if np.isnan(point.position).any():
-            raise ValueError(f"positions must be prescribed on both axes, got waypoints[{i}] with {point.position}")
+    if not plan.duration:
+        raise TypeError(f"plan must have a duration, made through waypoints, got a {type(plan).__name__}")
+    if isinstance(plan, WaypointSpline):
+        if plan.end != plan.waypoints[-1].time:
+            last = plan.waypoints[-1].time
+            raise ValueError(f"plan must end at its last waypoint, at {last:g} s, got {plan.end:g} s")
+        for i, point in enumerate(plan.waypoints):
+            if np.isnan(point.position).any():
+                place = f"waypoints[{i}] with {point.position}"
+                raise ValueError(f"positions must be prescribed on both axes, got {place}")
     return plan
 
 
-def _kinds(plan: Spline) -> Iterator[Build]:
+def _made_through_waypoints(task: _Task) -> WaypointSpline:
+    """The plan given, of which others through further waypoints can be made."""
+    plan, given = task.plan, task.given
+    if not isinstance(plan, WaypointSpline):
+        raise TypeError(
+            f"plan must be made through waypoints to be led round obstacles (a WaypointSpline, such as PolySpline), "
+            f"got a {type(plan).__name__} that keeps {given.least:.4g} from obstacles[{given.obstacle}] at "
+            f"{given.time:.4g} s; plan a spline through the same points, and shape or combine the result"
+        )
+    return plan
+
+
+def _kinds(plan: WaypointSpline) -> Iterator[Build]:
     """How plans through other waypoints are made: as the given one, then of minimum-jerk legs."""
     yield plan.quiet().through
     if not (isinstance(plan, PiecewiseSpline) and plan.alpha == 0.0):

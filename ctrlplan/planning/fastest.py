@@ -17,9 +17,8 @@ from ctrlplan.planning.curve import curve
 from ctrlplan.planning.limits import Limited, Margin, Margins
 from ctrlplan.planning.quantities import System, system_given
 from ctrlplan.planning.time_law import with_fastest_law
-from ctrlplan.trajectories import PiecewiseSpline, Trajectory
+from ctrlplan.trajectories import Trajectory, WaypointSpline
 from ctrlplan.trajectories.common import Array, checked_pair
-from ctrlplan.trajectories.newton_spline import NewtonSpline
 
 if TYPE_CHECKING:
     from control import ControlPlot
@@ -258,9 +257,10 @@ class _Replanned:
     """A plan of any duration, the derivatives at its waypoints held."""
 
     def __init__(self, plan: Trajectory, limited: Limited) -> None:
-        if not isinstance(plan, NewtonSpline | PiecewiseSpline):
+        if not isinstance(plan, WaypointSpline):
             raise TypeError(
-                f"waypoints are held of a spline made through them, got a {type(plan).__name__}; hold the shape"
+                f"waypoints are held of a spline made through them (a WaypointSpline, such as PolySpline), "
+                f"got a {type(plan).__name__}; hold the shape or the path"
             )
         self._plan, self.limited = plan.quiet(), limited
 

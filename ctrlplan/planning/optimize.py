@@ -32,8 +32,9 @@ from scipy.optimize import minimize
 from ctrlplan.trajectories import Joined, PiecewiseSpline, PolySpline, Trajectory, TrigSpline, Waypoint
 from ctrlplan.trajectories.common import FACTORIALS, Array, checked_count, checked_labels, checked_time, readonly
 from ctrlplan.trajectories.newton import NewtonSystem
-from ctrlplan.trajectories.newton_spline import checked_waypoints, given_entries
+from ctrlplan.trajectories.newton_spline import given_entries
 from ctrlplan.trajectories.trigonometric import checked_alpha
+from ctrlplan.trajectories.waypoint_spline import checked_waypoints
 
 _EPS = float(np.finfo(float).eps)
 _FEW, _NONE = 1e-6, 1e-2  # estimated relative errors of the cost, above which there is a warning, an error

@@ -144,7 +144,7 @@ def crane_obstacle_study(progress: bool = True) -> Study:
         "polynomial": (PolySpline(points), {}),
         "trigonometric": (TrigSpline(points, alpha=4.0), {}),
         "piecewise": (PiecewiseSpline(points), {}),
-        "via points chosen": (avoid(PolySpline([points[0], points[-1]]), WALLS, **_KEPT), {}),
+        "via points chosen": (avoid(PolySpline([points[0], points[-1]]), WALLS, **_KEPT).plan, {}),
     }
     found = _compared(plans, points, 30.0, "Crane, obstacle (simulation 3)")
     rows = found.metrics

@@ -14,6 +14,7 @@ from ctrlplan.trajectories.trajectory import Trajectory
 from ctrlplan.trajectories.transition import Transition
 from ctrlplan.trajectories.trigonometric import FourierCoefficients, TrigSpline
 from ctrlplan.trajectories.waypoint import Waypoint
+from ctrlplan.trajectories.waypoint_spline import WaypointSpline
 
 __all__ = [
     "Bounds",
@@ -36,6 +37,7 @@ __all__ = [
     "Trapezoid",
     "TrigSpline",
     "Waypoint",
+    "WaypointSpline",
     "derivative_name",
     "load_trajectory",
     "stack",

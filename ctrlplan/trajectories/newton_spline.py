@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple, Self
 
@@ -11,8 +12,8 @@ from numpy.typing import NDArray
 from ctrlplan.trajectories.common import Array, checked_count, checked_labels, derivative_scale, mapped_time, readonly
 from ctrlplan.trajectories.newton import NEARLY_CLOSED, NewtonSystem
 from ctrlplan.trajectories.swing import warn_of_swing
-from ctrlplan.trajectories.trajectory import Trajectory
 from ctrlplan.trajectories.waypoint import Waypoint
+from ctrlplan.trajectories.waypoint_spline import WaypointSpline, checked_waypoints, increasing, same_axes, same_times
 
 Given = tuple[tuple[int, ...], ...]
 Kind = tuple[Given, float | None, bool]
@@ -34,7 +35,7 @@ class Options(NamedTuple):
         return {k: v for k, v in self._asdict().items() if k != "warn" and v != self._field_defaults[k]}
 
 
-class NewtonSpline(Trajectory):
+class NewtonSpline(WaypointSpline):
     """What the trigonometric and the polynomial spline share.
 
     Attributes
@@ -153,7 +154,7 @@ class NewtonSpline(Trajectory):
     def _again(self, waypoints: tuple[Waypoint, ...], options: Options) -> Self:
         """Plan of this kind through other waypoints, with what can be reused of this one."""
         plan = type(self).__new__(type(self))
-        plan._fit(_checked_waypoints(waypoints), self.alpha, options, self)
+        plan._fit(increasing(waypoints), self.alpha, options, self)
         return plan
 
     def _check_swing(self) -> None:
@@ -220,6 +221,11 @@ class NewtonSpline(Trajectory):
                 found[axis] = [value / self._duration**k for k, value in enumerate(row)]
         return found
 
+    @classmethod
+    @abstractmethod
+    def from_dict(cls, data: dict[str, Any]) -> Self:
+        """Trajectory from the plain data of `to_dict`."""
+
     def _per_axis(self) -> list[tuple[NewtonSystem, Array]]:
         """System and coefficients (size,) of each axis in order."""
         found = {a: (s, c[:, i]) for axes, s, c in self._parts for i, a in enumerate(axes)}
@@ -233,37 +239,6 @@ class NewtonSpline(Trajectory):
             "labels": list(self.labels),
         }
         return data | {k: v for k, v in self._options.given().items() if k != "labels"}
-
-
-def checked_waypoints(waypoints: Iterable[Waypoint], least: int = 2) -> tuple[Waypoint, ...]:
-    """Waypoints as a tuple: enough of them, alike, at increasing times."""
-    if not isinstance(waypoints, Iterable):
-        raise TypeError(f"waypoints must be a sequence of Waypoint, got {type(waypoints).__name__}")
-    points = tuple(waypoints)
-    if len(points) < least:
-        number = {1: "one waypoint", 2: "two waypoints"}[least]
-        raise ValueError(f"a plan needs at least {number}, got {len(points)}")
-    return _checked_waypoints(points)
-
-
-def _checked_waypoints(points: tuple[Waypoint, ...]) -> tuple[Waypoint, ...]:
-    before: Waypoint | None = None
-    for i, point in enumerate(points):
-        if not isinstance(point, Waypoint):
-            raise TypeError(f"waypoints[{i}] must be a Waypoint, got {type(point).__name__}")
-        if before is not None:
-            if point.naxes != before.naxes or point.labels != before.labels:
-                raise ValueError(
-                    f"waypoints must have the same axes, got waypoints[{i}] with {_axes(point)} "
-                    f"after waypoints[{i - 1}] with {_axes(before)}"
-                )
-            if not point.time > before.time:
-                raise ValueError(
-                    f"times must increase strictly, got waypoints[{i}].time = {point.time} "
-                    f"after waypoints[{i - 1}].time = {before.time}"
-                )
-        before = point
-    return points
 
 
 def _solved(system: NewtonSystem, data: Array, times: list[float], duration: float) -> Array:
@@ -300,29 +275,6 @@ def _size(alpha: float, count: int, degree: int | None) -> int | None:
     if degree < least:
         raise ValueError(f"degree must be at least {least} for {count} constraints an axis, got {degree}")
     return max(2 * degree if alpha else degree + 1, count)
-
-
-def _axes(point: Waypoint) -> str:
-    return f"{point.naxes} axes" if point.labels is None else f"axes {', '.join(point.labels)}"
-
-
-def same_times(waypoints: Iterable[Waypoint], before: tuple[Waypoint, ...]) -> tuple[Waypoint, ...]:
-    """Waypoints at the same times and of as many axes as others before them."""
-    points = tuple(waypoints)
-    for i, point in enumerate(points):
-        if not isinstance(point, Waypoint):
-            raise TypeError(f"waypoints[{i}] must be a Waypoint, got {type(point).__name__}")
-    times = [w.time for w in before]
-    if [w.time for w in points] != times:
-        raise ValueError(f"waypoints must keep the times {times}, got {[w.time for w in points]}")
-    return same_axes(points, before[0].naxes)
-
-
-def same_axes(points: tuple[Waypoint, ...], naxes: int) -> tuple[Waypoint, ...]:
-    """Waypoints of a number of axes."""
-    if points[0].naxes != naxes:
-        raise ValueError(f"waypoints must keep the number of axes, {naxes}, got {points[0].naxes}")
-    return points
 
 
 def given_entries(waypoints: Sequence[Waypoint]) -> tuple[Array, list[Given]]:

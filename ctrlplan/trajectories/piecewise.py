@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 from ctrlplan.trajectories.common import FACTORIALS, Array, checked_labels, mapped_time, readonly, times_powers
 from ctrlplan.trajectories.conjugate_digits import Ends, conjugate_digits
 from ctrlplan.trajectories.newton import NEARLY_CLOSED, NewtonSystem
-from ctrlplan.trajectories.newton_spline import NewtonSpline, checked_waypoints, given_entries, same_axes, same_times
+from ctrlplan.trajectories.newton_spline import NewtonSpline, given_entries
 from ctrlplan.trajectories.polynomial import PolySpline
 from ctrlplan.trajectories.swing import warn_of_swing
-from ctrlplan.trajectories.trajectory import Trajectory
 from ctrlplan.trajectories.trigonometric import TrigSpline, chosen_alpha
 from ctrlplan.trajectories.waypoint import Waypoint
+from ctrlplan.trajectories.waypoint_spline import WaypointSpline, checked_waypoints, same_axes, same_times
 
 _KEPT = 1e-12
 """Relative error of the free entries, as estimated, up to which floating point solves for them."""
@@ -33,7 +33,7 @@ _WITHIN = np.linspace(0.0, 1.0, 13)
 """Parts of a segment at which its swing is measured."""
 
 
-class PiecewiseSpline(Trajectory):
+class PiecewiseSpline(WaypointSpline):
     """One spline for each leg between waypoints.
 
     With K - 1 the highest order that an axis prescribes anywhere, an entry of
@@ -74,6 +74,9 @@ class PiecewiseSpline(Trajectory):
     UserWarning
         If the plan swings far beyond its waypoints (`warn`).
     """
+
+    family = "piecewise"
+    options = ("alpha",)
 
     alpha: float
     legs: tuple[NewtonSpline, ...]

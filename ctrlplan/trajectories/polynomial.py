@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import Any, Self
 
-from ctrlplan.trajectories.newton_spline import NewtonSpline, Options, checked_degree, checked_waypoints
+from ctrlplan.trajectories.newton_spline import NewtonSpline, Options, checked_degree
 from ctrlplan.trajectories.waypoint import Waypoint
+from ctrlplan.trajectories.waypoint_spline import checked_waypoints
 
 
 class PolySpline(NewtonSpline):
@@ -52,6 +53,9 @@ class PolySpline(NewtonSpline):
     >>> plan.degree, round(float(plan.peak(1)[0]), 12)
     ((5,), 1.875)
     """
+
+    family = "polynomial"
+    options = ("degree", "smooth")
 
     def __init__(
         self,

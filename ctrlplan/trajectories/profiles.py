@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -12,9 +12,11 @@ from numpy.typing import ArrayLike
 from ctrlplan.trajectories.common import FACTORIALS, Array, mapped_time, new_numbers, readonly, times_powers
 from ctrlplan.trajectories.step import Step
 from ctrlplan.trajectories.trajectory import Trajectory
+from ctrlplan.trajectories.waypoint import Waypoint
+from ctrlplan.trajectories.waypoint_spline import FromWaypoints, checked_waypoints
 
 
-class _Profile(Trajectory):
+class _Profile(Trajectory, FromWaypoints):
     """Line initial + (final - initial) s(t) from rest to rest, s a rise of velocity, a cruise and the rise mirrored.
 
     The rise is counted from the start and the fall backwards from the end, so
@@ -51,6 +53,31 @@ class _Profile(Trajectory):
         """Trajectory from the plain data of `to_dict`."""
         ends = Step(data["final"], data["initial"], data["time"], data["labels"])
         return cls._of(ends, [data[name] for name in cls._names])
+
+    @classmethod
+    def from_waypoints(cls, waypoints: Iterable[Waypoint], **options: Any) -> Self:
+        """Move from the first of two waypoints, at rest, to the second, which it reaches in time.
+
+        It starts at the time of the first and rests from its end on; what jumps
+        there (the acceleration of a trapezoid) has its other limit at rest.
+
+        Raises
+        ------
+        ValueError
+            If there are more than two waypoints, one leaves a position free or
+            prescribes motion, or the limits do not allow the move in the time
+            between them.
+        """
+        start, end = _rest_to_rest(checked_waypoints(waypoints), cls.__name__)
+        found = cls._of(
+            Step(end.position, start.position, start.time, start.labels), [options[name] for name in cls._names]
+        )
+        if found.duration > (end.time - start.time) * (1.0 + 1e-9):
+            raise ValueError(
+                f"limits must allow the move within the {end.time - start.time:g} s between its waypoints, "
+                f"got {found.duration:.6g} s"
+            )
+        return found
 
     @classmethod
     def _of(cls, ends: Step, limits: list[ArrayLike]) -> Self:
@@ -175,7 +202,9 @@ class Trapezoid(_Profile):
     array([0., 1., 2.])
     """
 
-    _names = ("velocity", "acceleration")
+    family = "trapezoid"
+    options = ("velocity", "acceleration")
+    _names = options
     _ramp = readonly(np.array([[0.0, 1.0]]))
 
     def __init__(
@@ -233,7 +262,9 @@ class SCurve(_Profile):
 
     jerk: Array
 
-    _names = ("velocity", "acceleration", "jerk")
+    family = "s_curve"
+    options = ("velocity", "acceleration", "jerk")
+    _names = options
     _ramp = readonly(np.array([[0.0, 1.0], [1.0, 1.0], [1.0, 0.0]]))
 
     def __init__(
@@ -248,6 +279,18 @@ class SCurve(_Profile):
         labels: Sequence[str] | None = None,
     ) -> None:
         self._set(Step(final, initial, time, labels), velocity, acceleration, jerk)
+
+
+def _rest_to_rest(points: tuple[Waypoint, ...], kind: str) -> tuple[Waypoint, Waypoint]:
+    """Two waypoints at rest, between which a profile can move."""
+    if len(points) != 2:
+        raise ValueError(f"a {kind} must lead from one waypoint to one other, got {len(points)} waypoints")
+    for i, point in enumerate(points):
+        if np.isnan(point.position).any():
+            raise ValueError(f"a {kind} must have its positions prescribed, got waypoints[{i}] = {point}")
+        if np.nan_to_num(point.jet[1:]).any():
+            raise ValueError(f"a {kind} must be at rest at its waypoints, got waypoints[{i}] = {point}")
+    return points[0], points[1]
 
 
 def _fastest(velocity: float, acceleration: float, jerk: float = math.inf) -> Array:

@@ -95,8 +95,8 @@ class Trajectory(Fields, ABC):
     ...     def from_dict(cls, data):
     ...         return cls(*data["arguments"])
     >>> plan = Sine(2.0, np.pi, 0.0, 0.5)
-    >>> plan(0.5).round(12), plan.peak(1).round(12), plan.retime(1.0).peak(1).round(12)
-    (2.0, array([6.28318531]), array([3.14159265]))
+    >>> plan.jet(0.5, 1).ravel().round(12) + 0.0, plan.peak(1), plan.retime(1.0).peak(1)
+    (array([2., 0.]), array([6.28318531]), array([3.14159265]))
     """
 
     labels: tuple[str, ...]
@@ -109,7 +109,8 @@ class Trajectory(Fields, ABC):
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
-        if cls.__name__.startswith("_") or getattr(cls.from_dict, "__isabstractmethod__", False):
+        abstract = (getattr(f, "__isabstractmethod__", False) for f in (cls.segment_jet, cls.map_time, cls.from_dict))
+        if cls.__name__.startswith("_") or any(abstract):
             return
         former = Trajectory.kinds.setdefault(cls.__name__, cls)
         # A class that is defined again, in a cell or by a reload, replaces itself.

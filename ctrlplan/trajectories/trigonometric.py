@@ -11,8 +11,9 @@ import numpy as np
 
 from ctrlplan.trajectories.common import Array, checked_time, one_number
 from ctrlplan.trajectories.newton import NewtonSystem
-from ctrlplan.trajectories.newton_spline import NewtonSpline, Options, checked_degree, checked_waypoints
+from ctrlplan.trajectories.newton_spline import NewtonSpline, Options, checked_degree
 from ctrlplan.trajectories.waypoint import Waypoint
+from ctrlplan.trajectories.waypoint_spline import checked_waypoints
 
 
 class TrigSpline(NewtonSpline):
@@ -69,6 +70,9 @@ class TrigSpline(NewtonSpline):
     >>> round(float(plan(0.5)), 12), plan.degree, round(plan.gamma[0], 12)
     (0.5, (3,), 0.5)
     """
+
+    family = "trigonometric"
+    options = ("alpha", "gamma", "degree", "smooth")
 
     def __init__(
         self,

@@ -1,10 +1,13 @@
 """Ways around obstacles: the wall of the paper without its via points, verified by dense sampling of the test's own."""
 
+import copy
 import math
+import pickle
 import re
 
 import numpy as np
 import pytest
+from natural import NaturalCubic
 
 import ctrlplan as cp
 from ctrlplan.planning.avoid import avoid
@@ -74,7 +77,7 @@ def check(plan, found, obstacles, *, gap, load=0.0, crane=None, points=4):
 def test_the_wall_of_the_paper_is_passed_without_its_via_points(family):
     plan = FAMILIES[family](PAPER)
     obstacles = [Rectangle(*WALL), GROUND]
-    found = avoid(plan, obstacles, clearance=0.3, load=0.5, rope=Crane().rope())
+    found = avoid(plan, obstacles, clearance=0.3, load=0.5, rope=Crane().rope()).plan
     check(plan, found, obstacles, gap=0.3, load=0.5, crane=Crane())
     assert type(found) is type(plan)
     assert found.alpha == plan.alpha
@@ -88,7 +91,7 @@ def test_the_wall_of_the_paper_is_passed_without_its_via_points(family):
 @EVERY_FAMILY
 def test_without_rope_and_ground_below_the_wall_is_nearer(family):
     plan = FAMILIES[family](PAPER)
-    found = avoid(plan, [Rectangle(*WALL)], clearance=0.3, load=0.5)
+    found = avoid(plan, [Rectangle(*WALL)], clearance=0.3, load=0.5).plan
     check(plan, found, [Rectangle(*WALL)], gap=0.3, load=0.5)
     if family != "trigonometric 4":
         assert found(8.0)[1] > 12.8
@@ -96,12 +99,12 @@ def test_without_rope_and_ground_below_the_wall_is_nearer(family):
 
 def test_a_plan_that_keeps_clear_is_returned_itself():
     plan = cp.PolySpline(PAPER)
-    assert avoid(plan, [Rectangle((7.0, 13.0), (12.0, 13.0))], clearance=0.3, load=0.5) is plan
+    assert avoid(plan, [Rectangle((7.0, 13.0), (12.0, 13.0))], clearance=0.3, load=0.5).plan is plan
 
 
 def test_it_moves_no_farther_than_it_must():
     plan = cp.PolySpline(ACROSS)
-    found = avoid(plan, [Disc((10.0, 5.2), 2.0)], clearance=0.5)
+    found = avoid(plan, [Disc((10.0, 5.2), 2.0)], clearance=0.5).plan
     check(plan, found, [Disc((10.0, 5.2), 2.0)], gap=0.5)
     # By symmetry the extreme is at the middle, above the disc: 5.2 - 2.5 up to the margin of the search.
     assert found(8.0)[0] == pytest.approx(10.0, abs=1e-2)
@@ -112,8 +115,8 @@ def test_among_several_ways_the_least_rough_is_taken():
     """Two mirrored problems have mirrored answers, though their shortest way is found on the other side."""
     obstacles = [Disc((10.0, 5.2), 2.0), Disc((7.0, 1.6), 1.0)]
     mirrored = [Disc((10.0, 4.8), 2.0), Disc((7.0, 8.4), 1.0)]
-    found = avoid(cp.PolySpline(ACROSS), obstacles, clearance=0.3)
-    other = avoid(cp.PolySpline(ACROSS), mirrored, clearance=0.3)
+    found = avoid(cp.PolySpline(ACROSS), obstacles, clearance=0.3).plan
+    other = avoid(cp.PolySpline(ACROSS), mirrored, clearance=0.3).plan
     check(cp.PolySpline(ACROSS), found, obstacles, gap=0.3)
     t = np.linspace(0.0, 16.0, 101)
     np.testing.assert_allclose(found(t)[1], 10.0 - other(t)[1], rtol=0, atol=0.02)
@@ -123,7 +126,7 @@ def test_among_several_ways_the_least_rough_is_taken():
 def test_a_slalom_between_walls_without_end(family):
     plan = FAMILIES[family](rest([0.0, 0.0], [20.0, 0.0]))
     obstacles = [Rectangle((5.0, 6.0), (-1.0, INF)), Rectangle((13.0, 14.0), (-INF, 1.0))]
-    found = avoid(plan, obstacles, clearance=0.2, load=0.3)
+    found = avoid(plan, obstacles, clearance=0.2, load=0.3).plan
     check(plan, found, obstacles, gap=0.2, load=0.3)
 
 
@@ -133,21 +136,21 @@ def test_windows_in_two_walls():
         *(Rectangle((6.0, 6.5), side) for side in ((-INF, 8.0), (9.5, INF))),
         *(Rectangle((13.0, 13.5), side) for side in ((-INF, 1.0), (2.5, INF))),
     ]
-    check(plan, avoid(plan, obstacles, clearance=0.2, load=0.3), obstacles, gap=0.2, load=0.3)
+    check(plan, avoid(plan, obstacles, clearance=0.2, load=0.3).plan, obstacles, gap=0.2, load=0.3)
 
 
 def test_many_discs():
     plan = cp.PolySpline(ACROSS)
     places = [(3, 5.5), (7, 4), (11, 6), (15, 4.5), (9, 8), (13, 1), (5, 1)]
     obstacles = [Disc(place, 1.0 + 0.05 * k) for k, place in enumerate(places)]
-    check(plan, avoid(plan, obstacles, clearance=0.3), obstacles, gap=0.3)
+    check(plan, avoid(plan, obstacles, clearance=0.3).plan, obstacles, gap=0.3)
 
 
 @pytest.mark.slow
 def test_a_long_tunnel():
     plan = cp.PiecewiseSpline(ACROSS)
     obstacles = [Rectangle((6.0, 14.0), (-INF, 6.0)), Rectangle((6.0, 14.0), (7.0, INF))]
-    check(plan, avoid(plan, obstacles, clearance=0.15, load=0.3), obstacles, gap=0.15, load=0.3)
+    check(plan, avoid(plan, obstacles, clearance=0.15, load=0.3).plan, obstacles, gap=0.15, load=0.3)
 
 
 @pytest.mark.slow
@@ -164,7 +167,7 @@ def test_scenes_at_random_without_a_rope_are_all_solved(family):
             Disc((x[2], z[2]), 0.4),
         ]
         plan = FAMILIES[family](rest([0.0, rng.uniform(0.0, 10.0)], [20.0, rng.uniform(0.0, 10.0)], 10.0))
-        found = avoid(plan, obstacles, clearance=0.3, load=0.3)
+        found = avoid(plan, obstacles, clearance=0.3, load=0.3).plan
         if found is not plan:
             check(plan, found, obstacles, gap=0.3, load=0.3)
             solved += 1
@@ -175,24 +178,24 @@ def test_waypoints_of_the_user_stay_with_all_entries():
     points = [ACROSS[0], cp.Waypoint(8.0, [10.0, 5.0], [2.0, 0.1]), ACROSS[1]]
     plan = cp.PolySpline(points, labels=["x", "z"])
     obstacles = [Disc((5.0, 5.2), 2.0), Disc((15.0, 4.9), 2.0)]
-    check(plan, avoid(plan, obstacles, clearance=0.4), obstacles, gap=0.4)
+    check(plan, avoid(plan, obstacles, clearance=0.4).plan, obstacles, gap=0.4)
 
 
 def test_there_and_back():
     points = [cp.Waypoint(0, [0, 0], 0, 0), cp.Waypoint(8, [10, 0], 0, 0), cp.Waypoint(16, [0, 0], 0, 0)]
     plan = cp.PolySpline(points)
-    check(plan, avoid(plan, [Disc((5.0, 0.1), 2.0)], clearance=0.5), [Disc((5.0, 0.1), 2.0)], gap=0.5)
+    check(plan, avoid(plan, [Disc((5.0, 0.1), 2.0)], clearance=0.5).plan, [Disc((5.0, 0.1), 2.0)], gap=0.5)
 
 
 def test_positions_alone_leave_no_jerk_to_spare():
     plan = cp.PolySpline([cp.Waypoint(0, [0, 5]), cp.Waypoint(16, [20, 5])])
-    check(plan, avoid(plan, [Disc((10.0, 5.2), 2.0)], clearance=0.5), [Disc((10.0, 5.2), 2.0)], gap=0.5)
+    check(plan, avoid(plan, [Disc((10.0, 5.2), 2.0)], clearance=0.5).plan, [Disc((10.0, 5.2), 2.0)], gap=0.5)
 
 
 def test_a_waypoint_as_near_as_allowed_is_no_hindrance():
     plan = cp.PolySpline(rest([0.0, 12.0], [20.0, 12.0]))
     obstacles = [HalfPlane((0.0, 1.0), 12.5), Rectangle((8.0, 12.0), (6.0, 13.0))]
-    check(plan, avoid(plan, obstacles, clearance=0.2, load=0.3), obstacles, gap=0.2, load=0.3)
+    check(plan, avoid(plan, obstacles, clearance=0.2, load=0.3).plan, obstacles, gap=0.2, load=0.3)
 
 
 @pytest.mark.parametrize(
@@ -205,7 +208,7 @@ def test_a_waypoint_as_near_as_allowed_is_no_hindrance():
     ],
 )
 def test_options_of_the_plan_are_kept(plan):
-    found = avoid(plan, [Disc((10.0, 5.2), 2.0)], clearance=0.5)
+    found = avoid(plan, [Disc((10.0, 5.2), 2.0)], clearance=0.5).plan
     check(plan, found, [Disc((10.0, 5.2), 2.0)], gap=0.5)
     assert type(found) is type(plan)
     assert found.to_dict() == plan.to_dict() | {"waypoints": found.to_dict()["waypoints"]}
@@ -214,14 +217,14 @@ def test_options_of_the_plan_are_kept(plan):
 def test_what_one_polynomial_cannot_do_is_left_to_legs():
     """With its degree fixed there is no room for a via point: the answer is of another kind."""
     plan = cp.TrigSpline(ACROSS, alpha=2.0, gamma=[1.0, None], degree=3)
-    found = avoid(plan, [Disc((10.0, 5.2), 2.0)], clearance=0.5)
+    found = avoid(plan, [Disc((10.0, 5.2), 2.0)], clearance=0.5).plan
     check(plan, found, [Disc((10.0, 5.2), 2.0)], gap=0.5)
     assert type(found) is cp.PiecewiseSpline
 
 
 def test_the_same_question_has_the_same_answer():
     plan = cp.TrigSpline(PAPER, alpha=1.0)
-    first, second = (avoid(plan, [Rectangle(*WALL), GROUND], clearance=0.3) for _ in range(2))
+    first, second = (avoid(plan, [Rectangle(*WALL), GROUND], clearance=0.3).plan for _ in range(2))
     assert first.to_dict() == second.to_dict()
 
 
@@ -258,7 +261,7 @@ def test_a_gap_too_narrow_is_said_with_what_it_would_allow():
 def test_a_rope_has_no_way_under_what_reaches_above_the_trolley():
     plan = cp.PolySpline(rest([0.0, 9.0], [20.0, 9.0]))
     beam = Rectangle((8.0, 12.0), (-1.0, 3.0))
-    assert avoid(plan, [beam], clearance=0.3, load=0.3) is plan
+    assert avoid(plan, [beam], clearance=0.3, load=0.3).plan is plan
     with pytest.raises(ValueError, match=r"keeps 0.3 .* the rope from obstacles\[0\] with the load at \(\S+, \S+\) at"):
         avoid(plan, [beam], clearance=0.3, load=0.3, rope=Crane().rope(), max_points=1)
 
@@ -300,7 +303,7 @@ def test_options_are_checked():
 
 def test_plans_of_another_kind_are_refused():
     disc = [Disc((10.0, 5.2), 2.0)]
-    with pytest.raises(TypeError, match="plan must be a TrigSpline, PolySpline or PiecewiseSpline, got Step"):
+    with pytest.raises(TypeError, match="plan must have a duration, made through waypoints, got a Step"):
         avoid(cp.Step([1.0, 2.0]), disc)
     with pytest.raises(ValueError, match="must have two axes, got 1"):
         avoid(cp.PolySpline([cp.Waypoint(0, 1), cp.Waypoint(1, 2)]), disc)
@@ -321,10 +324,87 @@ def test_a_path_much_longer_than_the_shortest_way_is_said():
     plan = cp.TrigSpline(ends, alpha=5.2, warn=False)
     x, z = plan(5.0).tolist()
     with pytest.warns(UserWarning, match=r"the path found is (\S+) long, (\S+) times the shortest way") as caught:
-        found = avoid(plan, [Disc((x, z), 0.5)])
+        found = avoid(plan, [Disc((x, z), 0.5)]).plan
     path = found(np.linspace(0.0, 20.0, 200_001))
     length = float(np.hypot(*np.diff(path)).sum())
     shortest = 2.0 * np.hypot(25.0, 5.0)
     words = re.search(r"found is (\S+) long, (\S+) times", str(caught[0].message))
     assert float(words[1]) == pytest.approx(length, rel=1e-3)
     assert float(words[2]) == pytest.approx(length / shortest, rel=0.06)
+
+
+# Plans that are not made through waypoints, and those of a user's own
+
+
+def test_a_plan_of_any_kind_that_keeps_clear_is_returned():
+    plan = cp.SCurve([20.0, 5.0], [0.0, 5.0], velocity=2.0, acceleration=1.0, jerk=1.0, labels=["x", "z"])
+    found = avoid(plan, [Disc((10.0, 0.0), 2.0)], clearance=2.9)
+    assert found.plan is plan
+    assert found.clearance.certified
+    assert found.clearance.least == pytest.approx(3.0, abs=1e-9)  # the line passes 5 m above the centre
+    shaped = cp.Shaper.zv(2.0)(plan)
+    assert avoid(shaped, [Disc((10.0, 0.0), 2.0)], clearance=2.9).plan is shaped
+
+
+@pytest.mark.parametrize("shaper", [None, cp.Shaper.zv(2.0)])
+def test_what_cannot_be_led_round_says_which_capability_is_missing(shaper):
+    plan = cp.SCurve([20.0, 5.0], [0.0, 5.0], velocity=2.0, acceleration=1.0, jerk=1.0, labels=["x", "z"])
+    plan = plan if shaper is None else shaper(plan)
+    name = type(plan).__name__
+    message = rf"made through waypoints .* \(a WaypointSpline, such as PolySpline\), got a {name} that keeps -2"
+    with pytest.raises(TypeError, match=message):
+        avoid(plan, [Disc((10.0, 5.0), 2.0)], clearance=0.5)
+
+
+def test_a_spline_of_a_users_own_is_led_round():
+    plan = NaturalCubic([cp.Waypoint(0.0, [0.0, 5.0]), cp.Waypoint(16.0, [20.0, 5.0])])
+    found = avoid(plan, [Disc((10.0, 5.2), 2.0)], clearance=0.5).plan
+    check(plan, found, [Disc((10.0, 5.2), 2.0)], gap=0.5)
+    assert type(found) is NaturalCubic
+
+
+# The result, and its use as a plan, which works for one release
+
+
+def test_a_result_has_the_plan_and_its_clearance():
+    plan, disc = cp.PolySpline(ACROSS), [Disc((10.0, 5.2), 2.0)]
+    found = avoid(plan, disc, clearance=0.5)
+    assert isinstance(found, cp.Avoidance)
+    assert found.clearance.certified
+    assert found.clearance.required == 0.5
+    again = clearance(found.plan, disc, required=0.5)
+    assert again == found.clearance
+    assert "PolySpline" in repr(found)
+
+
+@pytest.mark.parametrize(
+    "use",
+    [
+        lambda p: p(3.0).tolist(),
+        lambda p: p.jet([1.0, 2.0], 2).tolist(),
+        lambda p: p.to_dict(),
+        lambda p: (2.0 * p + p - p / 4.0)(3.0).tolist(),
+        lambda p: (-p)(3.0).tolist(),
+        lambda p: cp.margins(p, {"velocity": 9.0}).active.value,
+        lambda p: cp.fastest(p, {"velocity": 9.0}, hold="waypoints", durations=(8.0, 32.0)).duration,
+        lambda p: clearance(p, [Disc((10.0, 0.0), 1.0)]).least,
+        lambda p: avoid(p, [Disc((10.0, 0.0), 1.0)]).plan.to_dict(),
+        lambda p: p.then(cp.Step([20.0, 5.0], [20.0, 5.0])).end,
+        lambda p: cp.Retimed(p, cp.PolySpline([cp.Waypoint(0, 0), cp.Waypoint(8, 16)])).end,
+    ],
+)
+def test_a_result_used_as_a_plan_is_that_plan_with_a_notice(use):
+    found = avoid(cp.PolySpline(ACROSS), [Disc((10.0, 0.0), 1.0)])
+    expected = use(found.plan)
+    with pytest.warns(FutureWarning, match=r"avoid\(...\) used as a plan is deprecated .* use avoid\(...\).plan"):
+        assert use(found) == expected
+
+
+def test_a_result_says_nothing_where_it_is_used_as_one():
+    found = avoid(cp.PolySpline(ACROSS), [Disc((10.0, 0.0), 1.0)])
+    for again in (copy.copy(found), copy.deepcopy(found), pickle.loads(pickle.dumps(found))):
+        assert again.plan.to_dict() == found.plan.to_dict()
+        assert again.clearance == found.clearance
+    assert repr(found)
+    with pytest.raises(AttributeError, match="an Avoidance has the attributes plan and clearance, got 'way'"):
+        found.way  # noqa: B018

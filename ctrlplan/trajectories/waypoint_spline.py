@@ -1,0 +1,256 @@
+"""Trajectories that are made through waypoints, and the families that waypoints alone can choose."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterable
+from typing import Any, ClassVar, Self
+
+from ctrlplan.trajectories.common import mapped_time
+from ctrlplan.trajectories.trajectory import Trajectory
+from ctrlplan.trajectories.waypoint import Waypoint
+
+
+class FromWaypoints(ABC):
+    """Capability of a kind of trajectory to be made from waypoints.
+
+    Study files name such a kind by its family.
+
+    Attributes
+    ----------
+    family : str, class variable
+        Name of the family; the name of the class where it is not stated in the
+        class itself.
+    options : tuple of str, class variable
+        Keyword arguments that a study file may state.
+    """
+
+    family: ClassVar[str] = ""
+    options: ClassVar[tuple[str, ...]] = ()
+
+    @classmethod
+    @abstractmethod
+    def from_waypoints(cls, waypoints: Iterable[Waypoint], **options: Any) -> Trajectory:
+        """Trajectory of this kind through waypoints.
+
+        Parameters
+        ----------
+        waypoints : iterable of Waypoint
+            Two or more, times increasing.
+        **options
+            Of those named in `options`.
+
+        Raises
+        ------
+        ValueError
+            If this kind does not lead through such waypoints, or an option is wrong.
+        """
+
+
+class WaypointSpline(Trajectory, FromWaypoints):
+    """Trajectory that can be made again through other waypoints.
+
+    `avoid`, ``fastest(hold="waypoints")``, `choose_alpha` and study files take
+    every trajectory of this kind, whatever its class.
+
+    A new kind must define
+
+    - a constructor ``(waypoints, *, labels=None, ...)`` that sets the fields
+      `waypoints`, `labels`, `breakpoints` and those of its own
+      (`Trajectory`), by ``self._set_fields(...)``;
+    - `segment_jet`, the derivatives between two breakpoints;
+    - `options`, the names of further arguments of the constructor, each stored
+      in a field of that name, if there are any.
+
+    `through`, `with_values`, `map_time`, `to_dict` and `from_dict` follow from
+    these. `map_time` makes the spline again through waypoints at other times: a
+    kind of which that is another path must define its own.
+
+    Attributes
+    ----------
+    waypoints : tuple of Waypoint
+        What the plan meets, two or more.
+
+    Examples
+    --------
+    The natural cubic spline of scipy, through positions only:
+
+    >>> import numpy as np
+    >>> from scipy.interpolate import CubicSpline
+    >>> import ctrlplan as cp
+    >>> class Natural(cp.WaypointSpline):
+    ...     _spline: CubicSpline
+    ...
+    ...     def __init__(self, waypoints, *, labels=None):
+    ...         points = tuple(waypoints)
+    ...         times = np.array([point.time for point in points])
+    ...         names = labels or points[0].labels or [f"y{i + 1}" for i in range(points[0].naxes)]
+    ...         spline = CubicSpline(times, [point.position for point in points], bc_type="natural")
+    ...         self._set_fields(waypoints=points, labels=tuple(names), breakpoints=times, _spline=spline)
+    ...
+    ...     def segment_jet(self, segment, s, order):
+    ...         c = self._spline.c[:, segment]  # (4, naxes), the highest power first
+    ...         rows = []
+    ...         for _ in range(order + 1):
+    ...             rows.append(sum(c[-1 - k][:, None] * s**k for k in range(len(c))) + 0.0 * s)
+    ...             c = c[:-1] * np.arange(len(c) - 1, 0, -1)[:, None] if len(c) > 1 else 0.0 * c
+    ...         return np.array(rows)
+    >>> way = Natural([cp.Waypoint(0, [0, 0]), cp.Waypoint(2, [5, 1]), cp.Waypoint(4, [10, 0])])
+    >>> cp.avoid(way, [cp.Disc((2.0, 0.0), 0.5)], clearance=0.5).clearance.certified
+    True
+    >>> round(cp.fastest(way, {"y1_d1": 5.0}, hold="waypoints").duration, 9)
+    2.0
+    """
+
+    waypoints: tuple[Waypoint, ...]
+
+    @classmethod
+    def from_waypoints(cls, waypoints: Iterable[Waypoint], **options: Any) -> Self:
+        """Spline of this kind through waypoints, by its constructor."""
+        kind: Any = cls  # whose constructor is that of the subclass
+        found: Self = kind(waypoints, **options)
+        return found
+
+    def through(self, waypoints: Iterable[Waypoint]) -> Self:
+        """Spline of the same kind and options through other waypoints.
+
+        Parameters
+        ----------
+        waypoints : iterable of Waypoint
+            Of as many axes as before, at any times.
+
+        Raises
+        ------
+        ValueError
+            If the axes differ in number; otherwise as the constructor.
+        """
+        points = same_axes(checked_waypoints(waypoints), self.naxes)
+        return type(self).from_waypoints(points, labels=self.labels, **self._own_options())
+
+    def with_values(self, waypoints: Iterable[Waypoint]) -> Self:
+        """Spline of the same kind and times through other values.
+
+        Parameters
+        ----------
+        waypoints : iterable of Waypoint
+            As many as before and at the same times.
+
+        Raises
+        ------
+        ValueError
+            If a time differs.
+        """
+        return self.through(same_times(waypoints, self.waypoints))
+
+    def quiet(self) -> Self:
+        """The same spline, of which `through` and `with_values` do not warn."""
+        return self
+
+    def map_time(self, origin: float, target: float, rate: float) -> Self:
+        """Same path at other times; as `Trajectory.map_time`."""
+        return self.through(w.scaled(mapped_time(w.time, origin, target, rate), rate) for w in self.waypoints)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data: type, waypoints, labels and options."""
+        return {
+            "type": type(self).__name__,
+            "waypoints": [w.to_dict() for w in self.waypoints],
+            "labels": list(self.labels),
+            **self._own_options(),
+        }
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any]) -> Self:
+        """Trajectory from the plain data of `to_dict`."""
+        points = [Waypoint.from_dict(w) for w in data["waypoints"]]
+        chosen = {name: data[name] for name in cls.options if name in data}
+        return cls.from_waypoints(points, labels=data["labels"], **chosen)
+
+    def _own_options(self) -> dict[str, Any]:
+        return {name: getattr(self, name) for name in self.options}
+
+
+def families() -> dict[str, type[FromWaypoints]]:
+    """Kinds of trajectories that can be made from waypoints, by family.
+
+    Returns
+    -------
+    dict of str to type
+        Those of this package and every other that has been imported.
+
+    Raises
+    ------
+    ValueError
+        If two kinds have a family in common.
+    """
+    found: dict[str, type[FromWaypoints]] = {}
+    for kind in Trajectory.kinds.values():
+        if issubclass(kind, FromWaypoints):
+            name = family_name(kind)
+            if name in found:
+                raise ValueError(
+                    f"families of trajectories must have names of their own, got {name!r} of {found[name].__name__} "
+                    f"and of {kind.__name__}"
+                )
+            found[name] = kind
+    return found
+
+
+def family_name(kind: type[FromWaypoints]) -> str:
+    """Name of a family: the one that the class itself states, or the name of the class."""
+    return str(kind.__dict__.get("family", kind.__name__))
+
+
+def checked_waypoints(waypoints: Iterable[Waypoint], least: int = 2) -> tuple[Waypoint, ...]:
+    """Waypoints as a tuple: enough of them, alike, at increasing times."""
+    if not isinstance(waypoints, Iterable):
+        raise TypeError(f"waypoints must be a sequence of Waypoint, got {type(waypoints).__name__}")
+    points = tuple(waypoints)
+    if len(points) < least:
+        number = {1: "one waypoint", 2: "two waypoints"}[least]
+        raise ValueError(f"a plan needs at least {number}, got {len(points)}")
+    return increasing(points)
+
+
+def increasing(points: tuple[Waypoint, ...]) -> tuple[Waypoint, ...]:
+    """Waypoints that are alike, at increasing times."""
+    before: Waypoint | None = None
+    for i, point in enumerate(points):
+        if not isinstance(point, Waypoint):
+            raise TypeError(f"waypoints[{i}] must be a Waypoint, got {type(point).__name__}")
+        if before is not None:
+            if point.naxes != before.naxes or point.labels != before.labels:
+                raise ValueError(
+                    f"waypoints must have the same axes, got waypoints[{i}] with {_axes(point)} "
+                    f"after waypoints[{i - 1}] with {_axes(before)}"
+                )
+            if not point.time > before.time:
+                raise ValueError(
+                    f"times must increase strictly, got waypoints[{i}].time = {point.time} "
+                    f"after waypoints[{i - 1}].time = {before.time}"
+                )
+        before = point
+    return points
+
+
+def _axes(point: Waypoint) -> str:
+    return f"{point.naxes} axes" if point.labels is None else f"axes {', '.join(point.labels)}"
+
+
+def same_times(waypoints: Iterable[Waypoint], before: tuple[Waypoint, ...]) -> tuple[Waypoint, ...]:
+    """Waypoints at the same times and of as many axes as others before them."""
+    points = tuple(waypoints)
+    for i, point in enumerate(points):
+        if not isinstance(point, Waypoint):
+            raise TypeError(f"waypoints[{i}] must be a Waypoint, got {type(point).__name__}")
+    times = [w.time for w in before]
+    if [w.time for w in points] != times:
+        raise ValueError(f"waypoints must keep the times {times}, got {[w.time for w in points]}")
+    return same_axes(points, before[0].naxes)
+
+
+def same_axes(points: tuple[Waypoint, ...], naxes: int) -> tuple[Waypoint, ...]:
+    """Waypoints of a number of axes."""
+    if points[0].naxes != naxes:
+        raise ValueError(f"waypoints must keep the number of axes, {naxes}, got {points[0].naxes}")
+    return points
