@@ -34,16 +34,9 @@ from ctrlplan.studies.running import Builder, System
 from ctrlplan.studies.study import Study
 from ctrlplan.systems.plants import LAWS, Crane, crane_loop, unity_feedback_loop
 from ctrlplan.systems.plants.crane.laws import as_law
-from ctrlplan.trajectories import PiecewiseSpline, PolySpline, Step, Trajectory, TrigSpline, Waypoint
+from ctrlplan.trajectories import PolySpline, Trajectory, TrigSpline, Waypoint
 from ctrlplan.trajectories.files import csv_header, signal_names, signal_rows
-
-FAMILIES = {
-    "trigonometric": (TrigSpline, ("alpha", "gamma", "degree", "smooth")),
-    "polynomial": (PolySpline, ("degree", "smooth")),
-    "piecewise": (PiecewiseSpline, ("alpha",)),
-    "step": (Step, ()),
-}
-"""Families of plans by name, and the choices that each takes."""
+from ctrlplan.trajectories.waypoint_spline import FromWaypoints, families, family_name
 
 LOOPS = {
     "linear": ("num", "den", "gain"),
@@ -504,29 +497,71 @@ class _Reader:
             raise self.error("experiment", error) from None
         return found
 
+    def family(self, family: object, place: str) -> type[FromWaypoints] | None:
+        """Kind of trajectory that a family names; None is the step."""
+        known = families()
+        if family == "step":
+            return None
+        if isinstance(family, str) and family in known:
+            return known[family]
+        if isinstance(family, str) and family.startswith("python:") and family.count(":") == 2:
+            return _kind_of_module(family, self.path, place)
+        names = ", ".join([*sorted(known), "step", '"python:module:Class"'])
+        raise self.error(place, f"must be one of {names}, got {_got(family)}")
+
     def plans(self, data: dict[str, Any], waypoints: tuple[Waypoint, ...]) -> dict[str, Trajectory]:
         plans: dict[str, Trajectory] = {}
         for i, table in enumerate(self.tables(data, "plans")):
             place = f"plans[{i}]"
             family = table.get("family", table.get("name"))
-            if not isinstance(family, str) or family not in FAMILIES:
-                raise self.error(f"{place}.family", f"must be one of {', '.join(FAMILIES)}, got {_got(family)}")
-            name = table.get("name", family)
+            kind = self.family(family, f"{place}.family")
+            name = table.get("name", family if kind is None else family_name(kind))
             if not isinstance(name, str) or not name or name in plans:
                 raise self.error(f"{place}.name", f"must be a name of its own, got {_got(name)}")
-            kind, choices = FAMILIES[family]
+            choices = () if kind is None else kind.options
             self.known(table, ("name", "family", *choices), place)
             chosen = {key: self.choice(table, key, f"{place}.{key}") for key in choices if key in table}
             try:
-                if kind is Step:
-                    plans[name] = standard_plans(waypoints)["step"]
-                elif kind is TrigSpline and "alpha" not in chosen:
-                    raise ValueError("a trigonometric plan needs alpha, a number in [0, 2 pi), got none")
-                else:
-                    plans[name] = kind(waypoints, **chosen)
+                plans[name] = (
+                    standard_plans(waypoints)["step"] if kind is None else _made(kind, waypoints, str(family), chosen)
+                )
             except (ValueError, TypeError) as error:
                 raise self.error(place, error) from None
+            except Exception as error:  # whatever a kind of the user's own raises
+                raise self.error(place, f"must make a plan, got {type(error).__name__}: {error}") from error
         return plans or standard_plans(waypoints)
+
+
+def _kind_of_module(family: str, path: Path, place: str) -> type[FromWaypoints]:
+    """Kind of trajectory that a module defines: beside the study file, or of an installed package."""
+    _, module, name = family.split(":")
+    try:
+        if not all(part.isidentifier() for part in (*module.split("."), name)):
+            raise ValueError("module and class must be names, with dots between packages")
+        kind = getattr(_module(module, path.resolve().parent), name)
+    except (Exception, SystemExit) as error:  # whatever a user's own module does must end in one line
+        raise StudyError(
+            f"{path}: {place}: must name a module and a class in it, got {family!r}: "
+            f"{type(error).__name__}: {_one_line(str(error), 300)}"
+        ) from None
+    if not (inspect.isclass(kind) and issubclass(kind, FromWaypoints)) or inspect.isabstract(kind):
+        what = kind.__name__ if inspect.isclass(kind) else type(kind).__name__
+        raise StudyError(
+            f"{path}: {place}: {family!r} must be made from waypoints, a class derived from WaypointSpline, got {what}"
+        )
+    return kind
+
+
+def _made(
+    kind: type[FromWaypoints], waypoints: tuple[Waypoint, ...], family: str, chosen: dict[str, Any]
+) -> Trajectory:
+    """Plan of a kind with the options chosen, of which none that it needs may be missing."""
+    parameters = inspect.signature(kind).parameters
+    for name in kind.options:
+        if name not in chosen and name in parameters and parameters[name].default is inspect.Parameter.empty:
+            known = ", a number in [0, 2 pi)" if name == "alpha" else ""
+            raise ValueError(f"a plan of the family {family} needs {name}{known}, got none")
+    return kind.from_waypoints(waypoints, **chosen)
 
 
 def _checked_loop(loop: dict[str, Any], reader: _Reader) -> None:
@@ -572,5 +607,6 @@ def _is_number(value: object, finite: bool = True) -> bool:
 
 
 def _described(plan: Trajectory) -> str:
-    shape = f", alpha = {plan.alpha:g} rad" if isinstance(plan, (TrigSpline, PiecewiseSpline)) else ""
+    alpha = getattr(plan, "alpha", None) if "alpha" in getattr(plan, "options", ()) else None
+    shape = "" if alpha is None else f", alpha = {alpha:g} rad"
     return f"{type(plan).__name__}{shape}, {plan.start:g} to {plan.end:g} s"

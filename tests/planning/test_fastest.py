@@ -369,7 +369,10 @@ def test_waypoints_held_with_quantities():
 
 def test_waypoints_are_held_of_splines_alone():
     there_and_back = MOVE.then(cp.PolySpline([Waypoint(1, 1, 0, 0), Waypoint(2, 0, 0, 0)]))
-    with pytest.raises(TypeError, match=r"waypoints are held of a spline made through them .*, got a Joined; hold the shape or the path"):
+    with pytest.raises(
+        TypeError,
+        match=r"waypoints are held of a spline made through them .*, got a Joined; hold the shape or the path",
+    ):
         fastest(there_and_back, {"y_d1": 1.0}, hold="waypoints")
 
 

@@ -7,10 +7,16 @@ import tomllib
 import control as ct
 import numpy as np
 import pytest
+from natural import NaturalCubic
 from study_text import VALID, Verbatim, to_toml, valid
 
 import ctrlplan as cp
-from ctrlplan.studies.files import FAMILIES, StudyError, StudyFile, build_loop, load_study, plans_as_csv, plans_as_json
+from ctrlplan.studies.files import StudyError, StudyFile, build_loop, load_study, plans_as_csv, plans_as_json
+from ctrlplan.trajectories.waypoint_spline import families
+
+FAMILIES = {"step": cp.Step, **{name: k for name, k in families().items() if k.__module__.startswith("ctrlplan.")}}
+REST = [{"time": 0.0, "x": [0.0, 0.0, 0.0]}, {"time": 16.0, "x": [20.0, 0.0, 0.0]}]
+PROFILE = {"velocity": 3.0, "acceleration": 2.0, "jerk": 4.0}
 
 # The study file of the design, around a linear loop.
 DESIGN = """
@@ -92,9 +98,13 @@ def test_without_plans_the_standard_set_is_compared(stated):
 
 @pytest.mark.parametrize("family", sorted(FAMILIES))
 def test_every_family_can_be_asked_for(family, stated):
-    choice = {"alpha": 1.5} if "alpha" in FAMILIES[family][1] else {}
-    (plan,) = stated(valid(plans=[{"family": family, **choice}])).plans.values()
-    assert type(plan) is FAMILIES[family][0]
+    options = getattr(FAMILIES[family], "options", ())
+    choice = {"alpha": 1.5} if "alpha" in options else {}
+    limits = {name: value for name, value in PROFILE.items() if name in options}
+    points = {"waypoints": REST} if limits else {}
+    (plan,) = stated(valid(plans=[{"family": family, **choice, **limits}], **points)).plans.values()
+    assert type(plan) is FAMILIES[family]
+    assert [float(getattr(plan, name)[0]) for name in limits] == list(limits.values())
     assert plan.labels == ("x",)
     assert plan(16.0) == pytest.approx(20.0, abs=1e-12)
     assert plan(-1.0) == pytest.approx(0.0, abs=1e-12)
@@ -103,7 +113,75 @@ def test_every_family_can_be_asked_for(family, stated):
 
 
 def test_families_are_those_of_the_design():
-    assert set(FAMILIES) >= {"trigonometric", "polynomial", "piecewise", "step"}
+    assert set(FAMILIES) == {"trigonometric", "polynomial", "piecewise", "step", "s_curve", "trapezoid"}
+
+
+NATURAL = """
+from natural import NaturalCubic
+
+class Heavy(NaturalCubic):
+    family = "heavy"
+"""
+
+
+@pytest.fixture
+def kinds(monkeypatch):
+    monkeypatch.setattr(cp.Trajectory, "kinds", dict(cp.Trajectory.kinds))
+
+
+@pytest.mark.parametrize("by", ["imported", "module"])
+def test_a_spline_of_a_users_own_can_be_asked_for(by, stated, tmp_path, kinds):
+    points = [{"time": 0.0, "x": [0.0]}, {"time": 6.0, "x": [5.0]}, {"time": 16.0, "x": [20.0]}]
+    (tmp_path / "mine_natural.py").write_text(NATURAL)
+    family = {"imported": "NaturalCubic", "module": "python:mine_natural:Heavy"}[by]
+    for _ in range(2):  # a module that is loaded again defines the same kind again
+        study = stated(valid(plans=[{"family": family, "weight": 2.0}], waypoints=points))
+        ((name, plan),) = study.plans.items()
+        assert isinstance(plan, NaturalCubic)
+        assert name == {"imported": "NaturalCubic", "module": "heavy"}[by]
+        np.testing.assert_allclose(plan([0.0, 6.0, 16.0]), [0.0, 10.0, 40.0], rtol=0, atol=1e-12)
+        assert type(plan).__name__ in " ".join(map(str, study.parameters().values()))
+    assert study.run().comparison.metrics[name]
+
+
+@pytest.mark.parametrize(
+    ("family", "message"),
+    [
+        ("python:mine_natural:Nothing", "must name a module and a class in it.*AttributeError"),
+        ("python:mine_natural:np", "derived from WaypointSpline, got module"),
+        ("python:mine_natural:Polynomial", "derived from WaypointSpline, got Polynomial"),
+        ("python:mine_natural:WaypointSpline", "derived from WaypointSpline, got WaypointSpline"),
+        ("python:nowhere_at_all:Heavy", "must name a module and a class in it.*nowhere_at_all"),
+        ("python:a b:Heavy", "must be names"),
+        ("python:mine_natural:Broken", "must make a plan, got KeyError: 'lost'"),
+    ],
+)
+def test_a_kind_that_cannot_be_made_says_why(family, message, stated, tmp_path, kinds):
+    broken = "\nclass Broken(NaturalCubic):\n    def __init__(self, *args, **kwargs):\n        raise KeyError('lost')\n"
+    others = "import numpy as np\nfrom numpy.polynomial import Polynomial\nfrom ctrlplan import WaypointSpline\n"
+    (tmp_path / "mine_natural.py").write_text(others + NATURAL + broken)
+    with pytest.raises(StudyError, match=rf"plans\[0\].*{message}") as error:
+        stated(valid(plans=[{"family": family}]))
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("plan", "waypoints", "message"),
+    [
+        ({"family": "s_curve", "velocity": 3.0, "acceleration": 2.0}, REST, "a plan of the family s_curve needs jerk, got none"),
+        ({"family": "trapezoid", "velocity": 3.0, "acceleration": 2.0}, None, "one waypoint to one other, got 3"),
+        ({"family": "s_curve", **PROFILE, "velocity": 1.0}, REST, "within the 16 s between its waypoints, got 2"),
+        (
+            {"family": "s_curve", **PROFILE, "velocity": [1.0, 2.0]},
+            REST,
+            r"velocity must be a scalar or of shape \(1,\)",
+        ),
+    ],
+)
+def test_a_profile_that_does_not_fit_the_waypoints_says_why(plan, waypoints, message, stated):
+    data = valid(plans=[plan]) if waypoints is None else valid(plans=[plan], waypoints=waypoints)
+    with pytest.raises(StudyError, match=rf"plans\[0\]: .*{message}"):
+        stated(data)
 
 
 def test_choices_reach_the_plan(stated):
@@ -128,7 +206,7 @@ def test_alpha_can_be_left_to_be_chosen(family, stated):
     """The shortest path, of all that a scan finds; from then on alpha is a number."""
     stated_file = stated(valid(plans=[{"family": family, "alpha": "auto"}]))
     (plan,) = stated_file.plans.values()
-    kind, t = FAMILIES[family][0], np.linspace(0, 16, 1001)
+    kind, t = FAMILIES[family], np.linspace(0, 16, 1001)
 
     def way(alpha):
         return np.abs(np.diff(kind(stated_file.waypoints, alpha=alpha, warn=False)(t))).sum()
