@@ -12,8 +12,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from ctrlplan.planning.curve import curve
-from ctrlplan.planning.objectives import Objective, SquaredDerivative, checked_objective, wandering
+from ctrlplan.planning.objectives import (
+    Objective,
+    ObjectiveName,
+    SquaredDerivative,
+    checked_objective,
+    declared_size,
+)
+from ctrlplan.planning.scalar_search import bisected, scan
 from ctrlplan.trajectories import Trajectory, TrigSpline, Waypoint
 from ctrlplan.trajectories.common import Array, readonly
 from ctrlplan.trajectories.newton_spline import given_entries
@@ -91,7 +97,7 @@ class AlphaChoice:
 
 def choose_alpha(
     waypoints: Iterable[Waypoint],
-    objective: str | Objective = "path",
+    objective: ObjectiveName | Objective = "path",
     *,
     family: Callable[..., Trajectory] = TrigSpline,
     **options: Any,
@@ -147,11 +153,12 @@ def choose_alpha(
         return family(points, alpha=alpha, **quiet)
 
     search = _Search(plan_of, goal)
-    alphas, values = curve(search, _grid(points))
+    alphas, values = scan(search, _grid(points))
     best = float(values.min())
     if math.isinf(best):
         raise search.refusal or ValueError("objective must be finite for some alpha, got inf for all of [0, 2 pi)")
-    scale = 1.0 if goal is wandering else abs(best)
+    declared = declared_size(goal)
+    scale = abs(best) if declared is None else declared
     level = best + _TIE * scale
     tied = np.flatnonzero(values <= level)
     # Of one valley only its bottom is tied; of a plateau, or of several valleys, whole steps of the grid.
@@ -222,7 +229,8 @@ def _smoothest(
     k = int(tied[int(np.argmax(costs <= costs.min() * (1.0 + 1e-12)))])
     here = float(alphas[k])
     low, high = (
-        _edge(search, here, float(alphas[k + step]), level) if 0 <= k + step < alphas.size else here for step in (-1, 1)
+        _level_edge(search, here, float(alphas[k + step]), level) if 0 <= k + step < alphas.size else here
+        for step in (-1, 1)
     )
     if low < high:
         found = minimize_scalar(jerk, bounds=(low, high), method="bounded", options={"xatol": 1e-8})
@@ -231,14 +239,11 @@ def _smoothest(
     return here, search(here)
 
 
-def _edge(search: Callable[[float], float], inside: float, outside: float, level: float) -> float:
+def _level_edge(search: Callable[[float], float], inside: float, outside: float, level: float) -> float:
     """How far towards a neighbour the objective stays at its least."""
     if search(outside) <= level:
         return outside
-    while abs(outside - inside) > 1e-9:
-        middle = 0.5 * (inside + outside)
-        inside, outside = (middle, outside) if search(middle) <= level else (inside, middle)
-    return inside
+    return bisected(lambda alpha: search(alpha) <= level, inside, outside, 1e-9)[0]
 
 
 def _blow_up(alphas: Array, values: Array, bound: float) -> float:

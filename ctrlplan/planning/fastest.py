@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
-from ctrlplan.planning.curve import curve
 from ctrlplan.planning.limits import Limited, Margin, Margins
 from ctrlplan.planning.quantities import System, system_given
+from ctrlplan.planning.scalar_search import bisected, scan
 from ctrlplan.planning.time_law import with_fastest_law
 from ctrlplan.trajectories import Trajectory, WaypointSpline
 from ctrlplan.trajectories.common import Array, checked_pair
@@ -59,7 +59,7 @@ class Fastest:
     plan: Trajectory
     margins: Margins
     feasible: tuple[tuple[float, float], ...]
-    hold: str
+    hold: Hold
     limited: Limited
     refusal: str = ""
     searched: tuple[float, float] = (0.0, math.inf)
@@ -343,12 +343,12 @@ def _span(scaled: _Scaled, duration: float, least: float) -> tuple[float, float]
     return max(low, 0.999 * least), 1.01 * high
 
 
-def _searched(family: _Scaled | _Replanned, span: tuple[float, float], hold: str, endless: bool) -> Fastest:
+def _searched(family: _Scaled | _Replanned, span: tuple[float, float], hold: Hold, endless: bool) -> Fastest:
     """Feasible durations within a span, and the plan of the shortest; endless where every slower plan is feasible."""
     limited = family.limited
     exact = cache(lambda duration: limited.exact_excess(family.plan(duration)))
     count = max(9, math.ceil(_PER_OCTAVE * math.log2(span[1] / span[0])))
-    durations, excess = curve(family.excess, np.geomspace(*span, count), 0.0)
+    durations, excess = scan(family.excess, np.geomspace(*span, count), 0.0)
     feasible = []
     for low, high in _runs(excess <= 0.0):
         inside = low + np.argsort(excess[low : high + 1])[:8]
@@ -359,7 +359,7 @@ def _searched(family: _Scaled | _Replanned, span: tuple[float, float], hold: str
         ends = [
             float(durations[inner])
             if not 0 <= outer < durations.size
-            else _edge(exact, family.excess, middle, float(durations[outer]))
+            else _feasible_edge(exact, family.excess, middle, float(durations[outer]))
             for inner, outer in ((low, low - 1), (high, high + 1))
         ]
         feasible.append((ends[0], ends[1]))
@@ -381,18 +381,18 @@ def _runs(inside: NDArray[np.bool_]) -> list[tuple[int, int]]:
     return [(int(a), int(b) - 1) for a, b in change.reshape(-1, 2)]
 
 
-def _edge(exact: Callable[[float], float], sampled: Callable[[float], float], inside: float, outside: float) -> float:
+def _feasible_edge(
+    exact: Callable[[float], float], sampled: Callable[[float], float], inside: float, outside: float
+) -> float:
     """Duration between a feasible and an infeasible one at which limits begin to hold."""
-    good, bad = inside, outside
-    while abs(bad - good) > 1e-6 * good:  # samples come cheap, and tell where to look
-        middle = 0.5 * (good + bad)
-        good, bad = (middle, bad) if sampled(middle) <= 0.0 else (good, middle)
+    # Samples come cheap, and tell where to look.
+    good, bad = bisected(lambda duration: sampled(duration) <= 0.0, inside, outside, 0.0, 1e-6)
     step = good - bad
     while exact(good) > 0.0:  # the whole interval says more than its samples: go inwards
         good, bad, step = good + step, good, 8.0 * step
         if (good - inside) * step > 0.0:
             good = inside
-    while math.isinf(exact(bad)) and abs(bad - good) > 1e-13 * good:  # the plant refuses: there is no root
+    while math.isinf(exact(bad)) and abs(bad - good) > 1e-13 * good:  # the plant cannot follow: there is no root
         middle = 0.5 * (good + bad)
         good, bad = (middle, bad) if exact(middle) <= 0.0 else (good, middle)
     if math.isinf(exact(bad)):

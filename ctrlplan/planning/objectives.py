@@ -11,13 +11,53 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
+from typing import Literal, TypeVar
 
 import numpy as np
 
 from ctrlplan.trajectories import Trajectory
 from ctrlplan.trajectories.common import Array, checked_count
+from ctrlplan.trajectories.quadrature import gauss
+
+F = TypeVar("F")
 
 Objective = Callable[[Trajectory], float]
+
+ObjectiveName = Literal[
+    "path",
+    "wandering",
+    "peak_velocity",
+    "peak_acceleration",
+    "peak_jerk",
+    "peak_snap",
+    "squared_velocity",
+    "squared_acceleration",
+    "squared_jerk",
+    "squared_snap",
+]
+"""Names of `OBJECTIVES`."""
+
+_SIZE = "_ctrlplan_size"
+
+
+def of_size(size: float) -> Callable[[F], F]:
+    """Declare the size of an objective whose minimum may be 0, as that of a fraction is 1.
+
+    Differences of an objective count as fractions of its size: of the magnitude
+    of its minimum where no size is declared.
+    """
+
+    def declare(objective: F) -> F:
+        vars(objective)[_SIZE] = size
+        return objective
+
+    return declare
+
+
+def declared_size(objective: Objective) -> float | None:
+    """Size that an objective declares, None where it declares none."""
+    size: float | None = getattr(objective, _SIZE, None)
+    return size
 
 
 def path_length(plan: Trajectory) -> float:
@@ -37,9 +77,10 @@ def path_length(plan: Trajectory) -> float:
         axes nearly stops.
     """
     length = _variation if plan.naxes == 1 else _arc
-    return sum(length(plan, left, right) for left, right in _legs(plan))
+    return sum(length(plan, left, right) for left, right in pairwise(plan.breakpoints.tolist()))
 
 
+@of_size(1.0)
 def wandering(plan: Trajectory) -> float:
     """Length of a plan's path beyond the polyline of its waypoints, as a fraction of it.
 
@@ -89,7 +130,10 @@ class PeakDerivative:
     def __call__(self, plan: Trajectory) -> float:
         """Greatest magnitude over the whole plan, in units of the axes per s^nu."""
         count = 64 + 16 * max((point.jet.shape[0] for point in plan.waypoints), default=0)
-        return max((_peak(plan, left, right, self.nu, count) for left, right in _legs(plan)), default=0.0)
+        return max(
+            (_peak(plan, left, right, self.nu, count) for left, right in pairwise(plan.breakpoints.tolist())),
+            default=0.0,
+        )
 
 
 @dataclass(frozen=True)
@@ -120,15 +164,15 @@ class SquaredDerivative:
 
     def __call__(self, plan: Trajectory) -> float:
         """Integral over the whole plan."""
-        nodes, weights = _gauss(64)
+        nodes, weights = gauss(64)
         total = 0.0
-        for left, right in _legs(plan):
+        for left, right in pairwise(plan.breakpoints.tolist()):
             values = plan.jet(left + (right - left) * nodes, self.nu)[self.nu]
             total += (right - left) * float(weights @ np.sum(values**2, axis=0))
         return total
 
 
-OBJECTIVES: dict[str, Objective] = {
+OBJECTIVES: dict[ObjectiveName, Objective] = {
     "path": path_length,
     "wandering": wandering,
     "peak_velocity": PeakDerivative(1),
@@ -143,7 +187,7 @@ OBJECTIVES: dict[str, Objective] = {
 """Objectives by name."""
 
 
-def checked_objective(objective: str | Objective) -> Objective:
+def checked_objective(objective: ObjectiveName | Objective) -> Objective:
     """Objective by its name, or the function itself."""
     if isinstance(objective, str):
         if objective not in OBJECTIVES:
@@ -154,13 +198,9 @@ def checked_objective(objective: str | Objective) -> Objective:
     return objective
 
 
-def _legs(plan: Trajectory) -> list[tuple[float, float]]:
-    return list(pairwise(plan.breakpoints.tolist()))
-
-
 def _arc(plan: Trajectory, left: float, right: float) -> float:
     """Length of one leg in panels; where the speed nearly vanishes, in ever smaller ones about its least value."""
-    nodes, weights = _gauss(16)
+    nodes, weights = gauss(16)
     edges = np.linspace(left, right, 13)
     squares = _squares(plan, edges[:-1], edges[1:])
     speed = np.sqrt(squares)
@@ -180,7 +220,7 @@ def _arc(plan: Trajectory, left: float, right: float) -> float:
 
 def _variation(plan: Trajectory, left: float, right: float) -> float:
     """Length of one leg of one axis: from turning point to turning point."""
-    t = left + (right - left) * _gauss(128)[0]
+    t = left + (right - left) * gauss(128)[0]
     # Between points of inflection the slope is monotone: no two turning points can hide between samples.
     t = np.sort(np.concatenate([t, _crossings(plan, t, 2)]))
     ends = plan.jet([left], 0)[0, 0], plan.jet([right], 0, left=True)[0, 0]
@@ -202,7 +242,7 @@ def _crossings(plan: Trajectory, t: Array, nu: int) -> Array:
 
 def _squares(plan: Trajectory, begin: Array, end: Array) -> Array:
     """Squared speed (npanels, 16) at the Gauss points of panels."""
-    rates = plan.jet(begin[:, None] + (end - begin)[:, None] * _gauss(16)[0], 1)[1]
+    rates = plan.jet(begin[:, None] + (end - begin)[:, None] * gauss(16)[0], 1)[1]
     return np.einsum("apt,apt->pt", rates, rates)
 
 
@@ -212,13 +252,6 @@ def _vertex(x: Array, y: Array) -> Array:
     curve = (rise - fall) / (x[:, 2] - x[:, 0])
     bent = curve > 0.0
     return np.where(bent, 0.5 * (x[:, 0] + x[:, 1] - fall / np.where(bent, curve, 1.0)), x[:, 1])
-
-
-@lru_cache(maxsize=8)
-def _gauss(count: int) -> tuple[Array, Array]:
-    """Nodes and weights of the Gauss rule on [0, 1]."""
-    nodes, weights = np.polynomial.legendre.leggauss(count)
-    return 0.5 * (nodes + 1.0), 0.5 * weights
 
 
 @lru_cache(maxsize=8)

@@ -325,14 +325,14 @@ class _Whole:
     def __init__(self, times: Array, alpha: float, order: int, derivative: int) -> None:
         given = (tuple(range(order + 1)),) * times.size
         self.system = NewtonSystem(alpha, times, given)
-        self.samples = _samples(self.system, derivative)
+        self.samples = self.system.squared_samples(derivative)
         self.jets = (self.system.taylor(times, order + 1) * FACTORIALS[: order + 2, None]).transpose(2, 1, 0)
         # The part of the top harmonic that turns its phase is what a system of another gamma has more than this one.
         self.turn = None
         if self.system.gamma is not None:
             m = self.system.size // 2
             turned = NewtonSystem(alpha, times, given, self.system.gamma + 0.25 * np.pi / m)
-            self.turn = 2.0 * alpha * m / times.size * (_samples(turned, derivative) - self.samples)[:, -1]
+            self.turn = 2.0 * alpha * m / times.size * (turned.squared_samples(derivative) - self.samples)[:, -1]
 
     def solve(self, known: NDArray[np.bool_], table: Array, loose: NDArray[np.bool_]) -> _Solution:
         """Optimum of axes that share a pattern of prescribed entries."""
@@ -365,7 +365,7 @@ def _leg_root(alpha: float, order: int, derivative: int) -> Array:
     """Matrix R with int_0^1 (y^(derivative))^2 = |R d|^2, d the jet at 0, then that at 1."""
     given = tuple(range(order + 1))
     system = NewtonSystem(alpha, np.array([0.0, 1.0]), (given, given))
-    return readonly(np.linalg.qr(_samples(system, derivative) @ _fitted(system, np.eye(system.size))).R)
+    return readonly(np.linalg.qr(system.squared_samples(derivative) @ _fitted(system, np.eye(system.size))).R)
 
 
 def _fitted(system: NewtonSystem, entries: Array) -> Array:
@@ -373,20 +373,6 @@ def _fitted(system: NewtonSystem, entries: Array) -> Array:
     orders = system.order_index
     rows = system.waypoint_index * (orders.max() + 1) + orders
     return system.coefficients(entries[rows] / FACTORIALS[orders, None])
-
-
-def _samples(system: NewtonSystem, derivative: int) -> Array:
-    """Weighted samples G with int_0^1 (y^(derivative))^2 = |G coefficients|^2."""
-    exact = max(system.size - derivative, 1)
-    nodes, weights = _gauss(2 * system.size + int(4.0 * system.alpha) + 8 if system.alpha else exact)
-    return (FACTORIALS[derivative] * weights * system.taylor(nodes, derivative)[:, derivative]).T
-
-
-@lru_cache(maxsize=256)
-def _gauss(count: int) -> tuple[Array, Array]:
-    """Nodes on [0, 1], and square roots of the weights."""
-    nodes, weights = np.polynomial.legendre.leggauss(count)
-    return readonly(0.5 * (nodes + 1.0)), readonly(np.sqrt(0.5 * weights))
 
 
 def _least_squares(matrix: Array, right: Array, weight: Array) -> tuple[Array, bool]:

@@ -46,6 +46,7 @@ from scipy.linalg import blas
 from ctrlplan.trajectories.common import FACTORIALS, Array, readonly
 from ctrlplan.trajectories.digits import many_digits
 from ctrlplan.trajectories.fields import Fields
+from ctrlplan.trajectories.quadrature import gauss
 
 _MEET = 0.25
 """Ends meet where they are nearer to each other, on the circle, than this part of all neighbours."""
@@ -161,7 +162,7 @@ class NewtonSystem(Fields):
         triangle, spread = (
             (np.asfortranarray(collocation), None)
             if self.hermite and size == count
-            else _factor(collocation, self.hermite, self._roughness(smooth) if size > count else None, lead)
+            else _factor(collocation, self.hermite, self.squared_samples(smooth) if size > count else None, lead)
         )
         self._set_fields(_triangle=triangle, _spread=spread)
 
@@ -323,11 +324,11 @@ class NewtonSystem(Fields):
         functions = functions if self._spread is None else functions @ self._spread
         return functions, functions @ blas.dtrsm(1.0, self._triangle, np.eye(len(self._triangle)), lower=1)
 
-    def _roughness(self, smooth: int) -> Array:
-        """Weighted samples G with int (y^(smooth))^2 = |G coefficients|^2."""
-        nodes, weights = np.polynomial.legendre.leggauss(2 * self.size + int(4 * self.alpha) + 8)
-        top = self.taylor(0.5 * (nodes + 1.0), smooth)[:, smooth]
-        return np.sqrt(weights)[:, None] * top.T
+    def squared_samples(self, order: int) -> Array:
+        """Weighted samples G with int_0^1 (y^(order))^2 = |G coefficients|^2, to rounding."""
+        exact = max(self.size - order, 1)
+        nodes, weights = gauss(2 * self.size + int(4.0 * self.alpha) + 8 if self.alpha else exact)
+        return (FACTORIALS[order] * np.sqrt(weights) * self.taylor(nodes, order)[:, order]).T
 
 
 @lru_cache(maxsize=256)

@@ -2,6 +2,7 @@
 
 from itertools import pairwise
 from math import asinh, cos, pi, sin, sqrt
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from scipy.interpolate import BPoly, PPoly
 import ctrlplan as cp
 from ctrlplan import Waypoint
 from ctrlplan.planning import OBJECTIVES, PeakDerivative, SquaredDerivative, path_length, wandering
+from ctrlplan.planning.objectives import ObjectiveName, declared_size, of_size
 
 REST = [Waypoint(0, 0, 0, 0), Waypoint(1, 1, 0, 0)]
 MOVE = cp.PolySpline(REST)
@@ -221,3 +223,22 @@ def test_a_turned_path_is_as_long(angle):
     assert path_length(turned) == pytest.approx(path_length(PLANS["trigonometric"]), rel=1e-8)
     assert wandering(turned) == pytest.approx(wandering(PLANS["trigonometric"]), rel=1e-8)
     assert SquaredDerivative(3)(turned) == pytest.approx(SquaredDerivative(3)(PLANS["trigonometric"]), rel=1e-10)
+
+
+def test_the_names_of_objectives_are_their_type():
+    assert set(get_args(ObjectiveName)) == set(OBJECTIVES)
+
+
+def test_an_objective_of_a_users_own_may_declare_its_size():
+    """Excess of a fraction: what ties is a part of 1, not of a minimum that is nearly 0."""
+
+    @of_size(1.0)
+    def excess(plan):
+        return OBJECTIVES["wandering"](plan)
+
+    points = [cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1, 0, 0)]
+    own, known = (cp.choose_alpha(points, objective) for objective in (excess, "wandering"))
+    assert (own.alpha, own.tied, own.blow_up) == (known.alpha, known.tied, known.blow_up)
+    assert own.tied
+    assert declared_size(excess) == 1.0
+    assert declared_size(OBJECTIVES["path"]) is None

@@ -168,7 +168,11 @@ def test_a_kind_that_cannot_be_made_says_why(family, message, stated, tmp_path, 
 @pytest.mark.parametrize(
     ("plan", "waypoints", "message"),
     [
-        ({"family": "s_curve", "velocity": 3.0, "acceleration": 2.0}, REST, "a plan of the family s_curve needs jerk, got none"),
+        (
+            {"family": "s_curve", "velocity": 3.0, "acceleration": 2.0},
+            REST,
+            "a plan of the family s_curve needs jerk, got none",
+        ),
         ({"family": "trapezoid", "velocity": 3.0, "acceleration": 2.0}, None, "one waypoint to one other, got 3"),
         ({"family": "s_curve", **PROFILE, "velocity": 1.0}, REST, "within the 16 s between its waypoints, got 2"),
         (

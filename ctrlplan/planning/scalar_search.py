@@ -1,4 +1,4 @@
-"""A function of one number over an interval: looked at on a grid, its valleys solved for."""
+"""Search over one number: a grid whose valleys are solved for, and bisection."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from scipy.optimize import minimize_scalar
 from ctrlplan.trajectories.common import Array
 
 
-def curve(function: Callable[[float], float], grid: Array, target: float | None = None) -> tuple[Array, Array]:
+def scan(function: Callable[[float], float], grid: Array, target: float | None = None) -> tuple[Array, Array]:
     """Points of a function that include the bottom of every valley that matters.
 
     Parameters
@@ -41,6 +41,31 @@ def curve(function: Callable[[float], float], grid: Array, target: float | None 
     points = np.concatenate([grid, [x for x, _ in found]])
     points, first = np.unique(points, return_index=True)
     return points, np.concatenate([values, [v for _, v in found]])[first]
+
+
+def bisected(
+    holds: Callable[[float], bool], inside: float, outside: float, atol: float, rtol: float = 0.0
+) -> tuple[float, float]:
+    """Two near points between which a condition ceases to hold.
+
+    Parameters
+    ----------
+    holds : callable
+        The condition, of one number: true at `inside`.
+    inside, outside : float
+        Points between which it ceases to hold, in any order.
+    atol, rtol : float
+        Distance at the end, and as a fraction of the point inside.
+
+    Returns
+    -------
+    (float, float)
+        A point at which the condition holds, and one at which it does not.
+    """
+    while abs(outside - inside) > atol + rtol * inside:
+        middle = 0.5 * (inside + outside)
+        inside, outside = (middle, outside) if holds(middle) else (inside, middle)
+    return inside, outside
 
 
 def _valleys(values: Array, target: float) -> list[int]:
