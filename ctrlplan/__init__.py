@@ -34,6 +34,7 @@ _EXPORTS = {
         "Disc",
         "Fastest",
         "HalfPlane",
+        "Limits",
         "Margins",
         "Optimum",
         "PeakDerivative",

@@ -4,7 +4,7 @@ from ctrlplan.planning.alpha import AlphaChoice, choose_alpha
 from ctrlplan.planning.avoid import Avoidance, avoid
 from ctrlplan.planning.clearance import Clearance, Rope, clearance
 from ctrlplan.planning.fastest import Fastest, fastest
-from ctrlplan.planning.limits import Bound, Margin, Margins, margins
+from ctrlplan.planning.limits import Bound, Limits, Margin, Margins, margins
 from ctrlplan.planning.objectives import OBJECTIVES, PeakDerivative, SquaredDerivative, path_length, wandering
 from ctrlplan.planning.obstacles import Disc, HalfPlane, Obstacle, Rectangle
 from ctrlplan.planning.optimize import Optimum, optimize_waypoints
@@ -18,6 +18,7 @@ __all__ = [
     "Disc",
     "Fastest",
     "HalfPlane",
+    "Limits",
     "Margin",
     "Margins",
     "Obstacle",

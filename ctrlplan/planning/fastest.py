@@ -114,7 +114,7 @@ class Fastest:
 
 def fastest(
     plan: Trajectory,
-    limits: Mapping[str, Any],
+    limits: Mapping[str, object],
     system: System | None = None,
     *,
     hold: Hold = "shape",

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from html import escape
 from numbers import Real
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeGuard
 
 import numpy as np
 
@@ -24,6 +24,88 @@ if TYPE_CHECKING:
 _SAMPLES = 193
 _HIGHEST = 8
 """Derivatives up to which limits are looked for."""
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Limits of one signal, for `fastest` and `margins`.
+
+    A number above 0 is the short form of limits of the magnitude, ``Limits(-5.0,
+    5.0)``; a pair is that of both sides, with None where there is none.
+
+    Parameters
+    ----------
+    low, high : float, optional
+        Minimum and maximum, in the unit of the signal; None or an infinite one
+        where there is none.
+
+    Raises
+    ------
+    ValueError
+        If neither is finite, one is nan, or `high` is not above `low`.
+    TypeError
+        If one is not a number.
+
+    Examples
+    --------
+    >>> import ctrlplan as cp
+    >>> move = cp.PolySpline([cp.Waypoint(0, 0, 0, 0), cp.Waypoint(2, 1, 0, 0)])
+    >>> print(cp.margins(move, {"y_d1": cp.Limits(high=1.0)}))
+    y_d1 at most 1: 0.9375 at 1 s, 0.0625 left
+    """
+
+    low: float | None = None
+    high: float | None = None
+
+    def __post_init__(self) -> None:
+        self._check("Limits")
+
+    @classmethod
+    def of(cls, limit: object, name: str) -> Limits:
+        """Limits from themselves or from a short form.
+
+        Parameters
+        ----------
+        limit : Limits, float or (float, float)
+            What was given.
+        name : str
+            Signal, for messages.
+
+        Raises
+        ------
+        ValueError, TypeError
+            As the constructor; if a lone number is not above 0 and finite.
+        """
+        if isinstance(limit, Limits):
+            return limit
+        if _is_listed(limit):
+            if len(limit) != 2:
+                raise ValueError(f"limits of {name} must be a number or a pair, got {limit!r}")
+            found = cls.__new__(cls)
+            for side, value in zip(("low", "high"), limit, strict=True):
+                object.__setattr__(found, side, value)
+            found._check(f"limits of {name}")
+            return found
+        if isinstance(limit, bool) or not isinstance(limit, Real | np.ndarray):
+            raise TypeError(f"limits of {name} must be a number or a pair, got {limit!r}")
+        magnitude = float(real_array(np.asarray(limit), f"limits of {name}"))
+        if not 0.0 < magnitude < math.inf:
+            raise ValueError(f"limits must be above 0 and finite, got {name} = {magnitude:g}")
+        return cls(-magnitude, magnitude)
+
+    def _check(self, name: str) -> None:
+        """Make the sides numbers, once they are found to be limits; messages call them by a name."""
+        low, high, _ = checked_limits(self._sides(), name)
+        object.__setattr__(self, "low", None if math.isinf(low) else low)
+        object.__setattr__(self, "high", None if math.isinf(high) else high)
+
+    def _sides(self) -> tuple[float, float]:
+        return -math.inf if self.low is None else self.low, math.inf if self.high is None else self.high
+
+    def bound(self, name: str, order: int, axis: int | None) -> Bound:
+        """Limits of a signal that is made of derivatives up to an order."""
+        low, high, scale = checked_limits(self._sides(), f"limits of {name}")
+        return Bound(name, low, high, scale, order, axis)
 
 
 @dataclass(frozen=True)
@@ -166,7 +248,7 @@ class Margins:
 
 
 def margins(
-    plan: Trajectory, limits: Mapping[str, Any], system: System | None = None, *, quantities: System | None = None
+    plan: Trajectory, limits: Mapping[str, object], system: System | None = None, *, quantities: System | None = None
 ) -> Margins:
     """How near a plan comes to limits, over its whole interval.
 
@@ -174,10 +256,10 @@ def margins(
     ----------
     plan : Trajectory
         Of any duration above 0.
-    limits : mapping of str to float, (float, float) or array_like
+    limits : mapping of str to float, (float, float), Limits or array_like
         By the name of a derivative (x, x_d1, x_d2, ...) or of a quantity: a
         number above 0 for a magnitude, or minimum and maximum, None where there
-        is none. By velocity, acceleration, jerk or snap for those of every
+        is none; or `Limits`. By velocity, acceleration, jerk or snap for those of every
         axis: a number, or a tuple (minimum, maximum), for all axes; a list or
         array of naxes numbers, or of shape (naxes, 2), by axis. A derivative
         must be allowed to be 0.
@@ -227,7 +309,7 @@ class Limited:
     Parameters are those of `margins`; the plan stands for others of its axes.
     """
 
-    def __init__(self, plan: Trajectory, limits: Mapping[str, Any], system: System | None = None) -> None:
+    def __init__(self, plan: Trajectory, limits: Mapping[str, object], system: System | None = None) -> None:
         if not isinstance(plan, Trajectory):
             raise TypeError(f"plan must be a Trajectory (the attribute plan of what was chosen), got {plan!r:.60}")
         if not plan.duration:
@@ -351,7 +433,7 @@ class Limited:
             touched = abs(float(bound.excess(values).max())) <= rounding
             yield replace(bound, slack=rounding if touched else 0.0)
 
-    def _bounds(self, plan: Trajectory, limits: Mapping[str, Any]) -> Iterator[Bound]:
+    def _bounds(self, plan: Trajectory, limits: Mapping[str, object]) -> Iterator[Bound]:
         derivatives = {
             derivative_name(label, k): (k, axis) for k in range(_HIGHEST + 1) for axis, label in enumerate(plan.labels)
         }
@@ -382,7 +464,7 @@ class Limited:
 _FORMS = "a tuple (minimum, maximum) holds for every axis, a list of one number an axis gives magnitudes"
 
 
-def _by_axis(name: str, limit: Any, naxes: int) -> list[Any]:
+def _by_axis(name: str, limit: object, naxes: int) -> list[object]:
     """Limits of each axis, from those of all of them."""
     if isinstance(limit, str | Mapping) or not np.iterable(limit):
         return [limit] * naxes
@@ -397,24 +479,24 @@ def _by_axis(name: str, limit: Any, naxes: int) -> list[Any]:
     )
 
 
-def _bound(name: str, limit: Any, order: int, axis: int | None) -> Bound:
-    if np.ndim(limit):
-        if np.size(limit) != 2:
-            raise ValueError(f"limits of {name} must be a number or a pair, got {limit!r}")
-        pair = [side if side is not None else math.inf * (2 * i - 1) for i, side in enumerate(limit)]
-        low, high, scale = checked_limits(pair, f"limits of {name}")
-        if axis is not None and order and not low <= 0.0 <= high:
-            raise ValueError(
-                f"limits of {name} must allow 0, which every plan has at rest, got from {low:g} to {high:g}; {_FORMS}"
-            )
-        return Bound(name, low, high, scale, order, axis)
-    if isinstance(limit, bool) or not isinstance(limit, Real | np.ndarray):
-        raise TypeError(f"limits of {name} must be a number or a pair, got {limit!r}")
-    high = float(real_array(np.asarray(limit), f"limits of {name}"))
-    if not 0.0 < high < math.inf:
-        forms = "" if axis is None else f"; {_FORMS}"
-        raise ValueError(f"limits must be above 0 and finite, got {name} = {high:g}{forms}")
-    return Bound(name, -high, high, high, order, axis)
+def _is_listed(limit: object) -> TypeGuard[Sequence[float | None]]:
+    """Whether limits are several numbers."""
+    given: Any = limit
+    return bool(np.ndim(given))
+
+
+def _bound(name: str, limit: object, order: int, axis: int | None) -> Bound:
+    try:
+        bound = Limits.of(limit, name).bound(name, order, axis)
+    except ValueError as error:
+        forms = f"; {_FORMS}" if axis is not None and not isinstance(limit, Limits) and not _is_listed(limit) else ""
+        raise ValueError(f"{error}{forms}") from None
+    if axis is not None and order and not bound.low <= 0.0 <= bound.high:
+        raise ValueError(
+            f"limits of {name} must allow 0, which every plan has at rest, got from {bound.low:g} to {bound.high:g}; "
+            f"{_FORMS}"
+        )
+    return bound
 
 
 def _orders(quantities: Quantities, plan: Trajectory) -> dict[str, int]:

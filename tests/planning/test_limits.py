@@ -438,3 +438,51 @@ def test_margins_move_with_the_clock_and_limits_with_the_signal(shift, factor):
     for name, row in ours.items():
         assert theirs[name].fraction == pytest.approx(row.fraction, abs=1e-9)
         assert theirs[name].time - shift == pytest.approx(row.time, abs=1e-5)
+
+
+# One value for the limits of a signal
+
+
+@pytest.mark.parametrize(
+    ("short", "value"),
+    [
+        (2.0, cp.Limits(-2.0, 2.0)),
+        ((-1.0, 3.0), cp.Limits(-1.0, 3.0)),
+        ((None, 3.0), cp.Limits(high=3.0)),
+        ((-1, None), cp.Limits(low=-1)),
+        (np.array([-1.0, inf]), cp.Limits(low=-1.0)),
+        ((-inf, 3.0), cp.Limits(high=3.0)),
+    ],
+)
+@pytest.mark.parametrize("name", ["y_d1", "velocity", "speed"])
+def test_short_forms_are_limits(short, value, name):
+    system = (lambda jet: {"speed": jet[1, 0]},) if name == "speed" else ()
+    assert margins(MOVE, {name: value}, *system).rows == margins(MOVE, {name: short}, *system).rows
+    if not (name == "velocity" and isinstance(short, np.ndarray)):
+        assert cp.Limits.of(short, name) == value
+    assert cp.Limits.of(value, name) is value
+
+
+def test_limits_of_each_axis_may_be_values():
+    plan = cp.stack([MOVE, 2.0 * MOVE], labels=["x", "z"])
+    found = rows(margins(plan, {"velocity": [cp.Limits(high=4.0), cp.Limits(-5.0, 5.0)]}))
+    assert found["x_d1"].bound.range == "at most 4"
+    assert found["x_d1"].fraction == pytest.approx(1.0 - 15 / 8 / 4.0, rel=1e-12)
+    assert found["z_d1"].fraction == pytest.approx(1.0 - 15 / 4 / 5.0, rel=1e-12)
+    same = rows(margins(plan, {"velocity": cp.Limits(-5.0, 5.0)}))
+    assert {row.bound.high for row in same.values()} == {5.0}
+
+
+@pytest.mark.parametrize(
+    ("sides", "error", "message"),
+    [
+        ((), ValueError, "Limits must hold a finite one, got -inf and inf"),
+        ((1.0, 1.0), ValueError, "Limits must increase, got 1 and 1"),
+        ((np.nan, 1.0), ValueError, "Limits must be a number, got nan"),
+        (("1", 2.0), TypeError, "Limits must be a number, got '1'"),
+        ((0.0, True), TypeError, "Limits must be a number, got True"),
+    ],
+)
+def test_wrong_values(sides, error, message):
+    with pytest.raises(error, match=message):
+        cp.Limits(*sides)
