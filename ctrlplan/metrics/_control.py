@@ -44,7 +44,7 @@ def effort(timepts: ArrayLike, u: ArrayLike) -> Value:
     3.141593
     """
     t = times(timepts)
-    control = checked("u", u, t)
+    control = checked(u, "u", t)
     return squared(t, control)
 
 
@@ -79,7 +79,7 @@ def peak(timepts: ArrayLike, signal: ArrayLike) -> Value:
     2.25
     """
     t = times(timepts)
-    record = checked("signal", signal, t)
+    record = checked(signal, "signal", t)
     rows = record.reshape(-1, t.size)
     with np.errstate(**QUIET):
         return plain(np.maximum(maxima(t, rows), maxima(t, -rows)), record.shape[:-1])
@@ -118,7 +118,7 @@ def total_variation(timepts: ArrayLike, signal: ArrayLike) -> Value:
     5.656854
     """
     t = times(timepts)
-    record = checked("signal", signal, t)
+    record = checked(signal, "signal", t)
     return each(lambda f: variation(t, f), record.shape[:-1], record)
 
 
@@ -161,9 +161,9 @@ def saturation_time(timepts: ArrayLike, u: ArrayLike, lower: ArrayLike, upper: A
     5.0
     """
     t = times(timepts)
-    control = checked("u", u, t)
-    low = fitted("lower", real("lower", lower), control.shape[:-1])
-    high = fitted("upper", real("upper", upper), control.shape[:-1])
+    control = checked(u, "u", t)
+    low = fitted(real(lower, "lower"), "lower", control.shape[:-1])
+    high = fitted(real(upper, "upper"), "upper", control.shape[:-1])
     if not (low < high).all():
         raise ValueError(f"lower must be below upper, got lower = {low} and upper = {high}")
     return each(lambda u, low, high: _saturated(t, u, float(low), float(high)), control.shape[:-1], control, low, high)

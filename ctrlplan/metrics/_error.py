@@ -43,7 +43,7 @@ def iae(timepts: ArrayLike, error: ArrayLike) -> Value:
     4.0
     """
     t = times(timepts)
-    e = signal("error", error, t)
+    e = signal(error, "error", t)
     return each(lambda e: _absolute(t, e), e.shape[:-1], e)
 
 
@@ -83,7 +83,7 @@ def itae(timepts: ArrayLike, error: ArrayLike, start: float | None = None) -> Va
     1.0
     """
     t = times(timepts)
-    e = signal("error", error, t)
+    e = signal(error, "error", t)
     since = instant(start, t)
     return each(lambda e: _absolute(t, e, since), e.shape[:-1], e)
 
@@ -121,7 +121,7 @@ def ise(timepts: ArrayLike, error: ArrayLike) -> Value:
     9.0
     """
     t = times(timepts)
-    e = signal("error", error, t)
+    e = signal(error, "error", t)
     return squared(t, e)
 
 

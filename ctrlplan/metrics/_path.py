@@ -48,7 +48,7 @@ def path_length(timepts: ArrayLike, path: ArrayLike) -> float:
     3.141593
     """
     t = times(timepts)
-    positions = axes("path", path, t)
+    positions = axes(path, "path", t)
     return float(each(lambda p: _length(t, p), (), positions))
 
 
@@ -88,7 +88,7 @@ def wandering(timepts: ArrayLike, path: ArrayLike, points: ArrayLike) -> float:
     0.570796
     """
     t = times(timepts)
-    positions = axes("path", path, t)
+    positions = axes(path, "path", t)
     polyline = waypoints(points, positions)
 
     def excess(positions: Array) -> float:
@@ -136,7 +136,7 @@ def excess_variation(timepts: ArrayLike, path: ArrayLike, points: ArrayLike) -> 
     1.0
     """
     t = times(timepts)
-    positions = axes("path", path, t)
+    positions = axes(path, "path", t)
     polyline = waypoints(points, positions)
 
     def excess(positions: Array) -> float:
@@ -184,7 +184,7 @@ def turning_points(timepts: ArrayLike, path: ArrayLike, points: ArrayLike) -> in
     2
     """
     t = times(timepts)
-    positions = axes("path", path, t)
+    positions = axes(path, "path", t)
     polyline = waypoints(points, positions)
     size = float(np.ptp(polyline, axis=1).max())
     if size == 0:
@@ -229,7 +229,7 @@ def outside_box(timepts: ArrayLike, path: ArrayLike, points: ArrayLike) -> float
     1.0
     """
     t = times(timepts)
-    positions = axes("path", path, t)
+    positions = axes(path, "path", t)
     polyline = waypoints(points, positions)
 
     def distance(positions: Array) -> float:
@@ -278,7 +278,7 @@ def jerk_cost(timepts: ArrayLike, jerk: ArrayLike) -> float:
     720.0
     """
     t = times(timepts)
-    jerks = axes("jerk", jerk, t)
+    jerks = axes(jerk, "jerk", t)
     return float(np.sum(squared(t, jerks)))
 
 

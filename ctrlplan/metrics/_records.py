@@ -15,7 +15,7 @@ QUIET: dict[str, Any] = {"over": "ignore", "invalid": "ignore", "divide": "ignor
 HUGE = np.finfo(np.float64).max / 1e3
 
 
-def real(name: str, value: ArrayLike) -> Array:
+def real(value: ArrayLike, name: str) -> Array:
     """Return an array of floats without nan, or say what is wrong with `name`."""
     try:
         kind = np.asarray(value).dtype
@@ -24,20 +24,20 @@ def real(name: str, value: ArrayLike) -> Array:
     if kind.kind not in "buifmM":
         raise TypeError(f"{name} must be an array of real numbers, got dtype {kind}")
     array = real_array(value, name)  # without units, dates and masks
-    _forbid(name, array, np.isnan(array), "hold no nan")
+    _forbid(array, name, np.isnan(array), "hold no nan")
     return array
 
 
-def finite(name: str, value: ArrayLike) -> Array:
+def finite(value: ArrayLike, name: str) -> Array:
     """Return an array of finite floats, or say what is wrong with `name`."""
-    array = real(name, value)
-    _forbid(name, array, np.isinf(array), "be finite")
+    array = real(value, name)
+    _forbid(array, name, np.isinf(array), "be finite")
     return array
 
 
 def times(timepts: ArrayLike) -> Array:
     """Return sample times, shape (ntime,), checked to increase strictly."""
-    t = finite("timepts", timepts)
+    t = finite(timepts, "timepts")
     if t.ndim != 1 or t.size < 2:
         raise ValueError(f"timepts must be 1-D with at least 2 samples, got shape {t.shape}")
     late = np.flatnonzero(t[1:] <= t[:-1])
@@ -47,18 +47,18 @@ def times(timepts: ArrayLike) -> Array:
     return t
 
 
-def signal(name: str, value: ArrayLike, t: Array) -> Array:
+def signal(value: ArrayLike, name: str, t: Array) -> Array:
     """Return a signal, shape (..., ntime), with time last."""
-    array = real(name, value)
+    array = real(value, name)
     if array.ndim == 0 or array.shape[-1] != t.size:
         raise ValueError(f"{name} must have {t.size} samples on its last axis, as timepts has, got shape {array.shape}")
     # Records are walked along time.
     return array if array.strides[-1] == array.itemsize else np.ascontiguousarray(array)
 
 
-def axes(name: str, value: ArrayLike, t: Array) -> Array:
+def axes(value: ArrayLike, name: str, t: Array) -> Array:
     """Return a signal of one or more axes, shape (naxes, ntime)."""
-    array = signal(name, value, t)
+    array = signal(value, name, t)
     if array.ndim > 2:
         raise ValueError(f"{name} must have shape (ntime,) or (naxes, ntime), got shape {array.shape}")
     return np.atleast_2d(array)
@@ -66,13 +66,13 @@ def axes(name: str, value: ArrayLike, t: Array) -> Array:
 
 def waypoints(value: ArrayLike, path: Array) -> Array:
     """Return the points of a polyline, shape (naxes, npoints), for a path (naxes, ntime)."""
-    points = np.atleast_2d(finite("points", value))
+    points = np.atleast_2d(finite(value, "points"))
     if points.ndim != 2 or points.shape[1] == 0 or points.shape[0] != path.shape[0]:
         raise ValueError(f"points must have shape ({path.shape[0]}, npoints), as path has axes, got {points.shape}")
     return points
 
 
-def fitted(name: str, array: Array, shape: tuple[int, ...]) -> Array:
+def fitted(array: Array, name: str, shape: tuple[int, ...]) -> Array:
     """Broadcast a level or a reference to the shape of what it is compared with."""
     try:
         return np.broadcast_to(array, shape)
@@ -89,7 +89,7 @@ def instant(start: float | None, t: Array) -> float:
     """Return the time that counts as zero, the first sample unless given."""
     if start is None:
         return float(t[0])
-    since = finite("start", start)
+    since = finite(start, "start")
     if since.ndim or since > t[-1]:
         raise ValueError(f"start must be a time not after timepts[-1] = {t[-1]}, got {start}")
     return float(since)
@@ -112,7 +112,7 @@ def plain(values: Array, lead: tuple[int, ...]) -> Value:
     return values.reshape(lead) if lead else float(values.item())
 
 
-def _forbid(name: str, array: Array, bad: NDArray[np.bool_], rule: str) -> None:
+def _forbid(array: Array, name: str, bad: NDArray[np.bool_], rule: str) -> None:
     if bad.any():
         place = tuple(int(i) for i in np.argwhere(bad)[0])
         where = f"{name}[{', '.join(map(str, place))}]" if place else name

@@ -62,8 +62,8 @@ def settling_time(
     3.91202
     """
     t = times(timepts)
-    response = signal("y", y, t)
-    target = fitted("final", finite("final", final), response.shape[:-1])
+    response = signal(y, "y", t)
+    target = fitted(finite(final, "final"), "final", response.shape[:-1])
     return _settling(t, response, target[..., None], target, initial, band, start)
 
 
@@ -120,9 +120,9 @@ def tracking_settling_time(
     3.91202
     """
     t = times(timepts)
-    response = signal("y", y, t)
-    target = fitted("final", finite("final", final), response.shape[:-1])
-    return _settling(t, response, finite("reference", reference), target, initial, band, start)
+    response = signal(y, "y", t)
+    target = fitted(finite(final, "final"), "final", response.shape[:-1])
+    return _settling(t, response, finite(reference, "reference"), target, initial, band, start)
 
 
 def overshoot(
@@ -220,11 +220,11 @@ def _settling(
     t: Array, y: Array, reference: Array, target: Array, initial: ArrayLike, band: float, start: float | None
 ) -> Value:
     lead = y.shape[:-1]
-    origin = fitted("initial", finite("initial", initial), lead)
-    width = finite("band", band)
+    origin = fitted(finite(initial, "initial"), "initial", lead)
+    width = finite(band, "band")
     if width.ndim or width <= 0:
         raise ValueError(f"band must be a positive fraction of the change, got {band}")
-    reference = fitted("reference", reference, y.shape)
+    reference = fitted(reference, "reference", y.shape)
     since = instant(start, t)
     edges = width * np.abs(target - origin) + _ROUNDING * np.maximum(np.abs(target), np.abs(origin))
     with np.errstate(**QUIET):
@@ -268,12 +268,12 @@ def _excess(
     timepts: ArrayLike, y: ArrayLike, final: ArrayLike, initial: ArrayLike, reference: ArrayLike | None, side: float
 ) -> Value:
     t = times(timepts)
-    response = signal("y", y, t)
+    response = signal(y, "y", t)
     lead = response.shape[:-1]
-    target = fitted("final", finite("final", final), lead)
-    origin = fitted("initial", finite("initial", initial), lead)
-    followed = target[..., None] if reference is None else finite("reference", reference)
-    followed = fitted("reference", followed, response.shape)
+    target = fitted(finite(final, "final"), "final", lead)
+    origin = fitted(finite(initial, "initial"), "initial", lead)
+    followed = target[..., None] if reference is None else finite(reference, "reference")
+    followed = fitted(followed, "reference", response.shape)
 
     change = target - origin
     with np.errstate(**QUIET):

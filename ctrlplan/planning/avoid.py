@@ -16,13 +16,14 @@ from scipy.optimize import minimize
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
+from ctrlplan._checks import checked_count, not_negative
 from ctrlplan._renamed import warn_renamed
-from ctrlplan.planning.clearance import Clearance, Rope, checked_obstacles, checked_rope, checked_size
+from ctrlplan.planning.clearance import Clearance, Rope, checked_obstacles, checked_rope
 from ctrlplan.planning.clearance import clearance as certified_clearance
 from ctrlplan.planning.objectives import path_length
 from ctrlplan.planning.obstacles import Obstacle
 from ctrlplan.trajectories import PiecewiseSpline, Trajectory, Waypoint, WaypointSpline
-from ctrlplan.trajectories.common import Array, checked_count
+from ctrlplan.trajectories.common import Array
 
 Build = Callable[[Iterable[Waypoint]], Trajectory]
 Pairs = NDArray[np.intp]
@@ -171,8 +172,8 @@ def avoid(
     task = _Task(
         _checked_plan(plan),
         checked_obstacles(obstacles),
-        checked_size(clearance, "clearance"),
-        checked_size(load, "load"),
+        not_negative(clearance, "clearance"),
+        not_negative(load, "load"),
         checked_rope(rope),
         checked_count(max_points, "max_points", 1),
     )

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 
+from ctrlplan._checks import checked_number, not_negative
 from ctrlplan.planning.obstacles import Obstacle
 from ctrlplan.trajectories import Trajectory
-from ctrlplan.trajectories.common import Array, checked_number
+from ctrlplan.trajectories.common import Array
 
 _TIGHT = 1e-6  # gap between the bound and what is attained, where the size itself is asked for
 _ROUNDING = 1e-9  # of the coordinates: a plan that rests just as far from an obstacle as it must keeps clear of it
@@ -133,7 +133,7 @@ def clearance(
     (True, 1.5, 'load')
     """
     things = checked_obstacles(obstacles)
-    radius = checked_size(load, "load")
+    radius = not_negative(load, "load")
     goal = None if required is None else checked_number(required, "required")
     checked_rope(rope)
     if plan.naxes != 2:
@@ -183,14 +183,6 @@ def checked_rope(rope: Rope | None) -> Rope | None:
     if rope is not None and not isinstance(rope, Rope):
         raise TypeError(f"rope must be a rope such as crane.rope(), got {rope!r:.60}")
     return rope
-
-
-def checked_size(value: object, name: str) -> float:
-    """Finite length of at least 0."""
-    size = checked_number(value, name)
-    if not 0.0 <= size < math.inf:
-        raise ValueError(f"{name} must be finite and at least 0, got {size:g}")
-    return size
 
 
 class _Cells:

@@ -13,12 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
+from ctrlplan._checks import checked_pair
 from ctrlplan.planning.limits import Limited, Margin, Margins
 from ctrlplan.planning.quantities import System, system_given
 from ctrlplan.planning.scalar_search import bisected, scan
 from ctrlplan.planning.time_law import with_fastest_law
 from ctrlplan.trajectories import Trajectory, WaypointSpline
-from ctrlplan.trajectories.common import Array, checked_pair
+from ctrlplan.trajectories.common import Array
 
 if TYPE_CHECKING:
     from control import ControlPlot

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any, TypeGuard
 
 import numpy as np
 
-from ctrlplan._checks import real_array
+from ctrlplan._checks import checked_limits, real_array
 from ctrlplan.planning.quantities import Quantities, System, quantities_of, system_given
 from ctrlplan.trajectories import Trajectory, derivative_name
-from ctrlplan.trajectories.common import Array, checked_limits
+from ctrlplan.trajectories.common import Array
 from ctrlplan.trajectories.extrema import function_extrema
 from ctrlplan.trajectories.waypoint import ENTRIES
 

@@ -15,8 +15,9 @@ from typing import Literal, TypeVar
 
 import numpy as np
 
+from ctrlplan._checks import checked_count
 from ctrlplan.trajectories import Trajectory
-from ctrlplan.trajectories.common import Array, checked_count
+from ctrlplan.trajectories.common import Array
 from ctrlplan.trajectories.quadrature import gauss
 
 F = TypeVar("F")

@@ -10,7 +10,8 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ctrlplan.trajectories.common import Array, checked_number, checked_pair
+from ctrlplan._checks import checked_number, checked_pair
+from ctrlplan.trajectories.common import Array
 
 
 @runtime_checkable

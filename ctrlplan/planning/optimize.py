@@ -29,8 +29,9 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import blas, qr
 from scipy.optimize import minimize
 
+from ctrlplan._checks import checked_count, checked_labels, checked_time
 from ctrlplan.trajectories import Joined, PiecewiseSpline, PolySpline, Trajectory, TrigSpline, Waypoint
-from ctrlplan.trajectories.common import FACTORIALS, Array, checked_count, checked_labels, checked_time, readonly
+from ctrlplan.trajectories.common import FACTORIALS, Array, readonly
 from ctrlplan.trajectories.newton import NewtonSystem
 from ctrlplan.trajectories.newton_spline import given_entries
 from ctrlplan.trajectories.trigonometric import checked_alpha

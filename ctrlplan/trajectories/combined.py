@@ -9,7 +9,8 @@ from typing import Any, Self
 
 import numpy as np
 
-from ctrlplan.trajectories.common import Array, checked_labels, checked_time, default_labels, readonly
+from ctrlplan._checks import checked_labels, checked_time, default_labels
+from ctrlplan.trajectories.common import Array, readonly
 from ctrlplan.trajectories.files import trajectory_from_dict
 from ctrlplan.trajectories.trajectory import Trajectory
 

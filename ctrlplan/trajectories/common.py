@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from numbers import Real
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from ctrlplan._checks import real_array
+from ctrlplan._checks import checked_count as checked_count
+from ctrlplan._checks import checked_labels as checked_labels
+from ctrlplan._checks import checked_limits as checked_limits
+from ctrlplan._checks import checked_number as checked_number
+from ctrlplan._checks import checked_pair as checked_pair
+from ctrlplan._checks import checked_time as checked_time
+from ctrlplan._checks import default_labels as default_labels
 from ctrlplan._types import Frozen as Frozen
 
 Array = NDArray[np.float64]
@@ -18,137 +22,11 @@ Array = NDArray[np.float64]
 FACTORIALS: Array = np.array([float(math.factorial(k)) for k in range(171)])
 FACTORIALS.flags.writeable = False
 
-MOST = 100
-"""Highest order of a derivative, and highest degree."""
-
 
 def readonly(values: Array) -> Array:
     """Same array, which can no longer be written to."""
     values.flags.writeable = False
     return values
-
-
-def default_labels(naxes: int) -> tuple[str, ...]:
-    """Names y, or y1, y2, ... for more than one axis."""
-    return ("y",) if naxes == 1 else tuple(f"y{i + 1}" for i in range(naxes))
-
-
-def checked_labels(labels: Sequence[str] | str | None, naxes: int) -> tuple[str, ...]:
-    """Labels as a tuple: as many as axes, unique, without dots."""
-    if labels is None:
-        return default_labels(naxes)
-    names = (labels,) if isinstance(labels, str) else tuple(labels)
-    if len(names) != naxes:
-        raise ValueError(f"labels must be as many as axes, {naxes}, got {len(names)}: {names}")
-    for name in names:
-        if not isinstance(name, str):
-            raise TypeError(f"labels must be strings, got {name!r}")
-        if not name or "." in name:
-            raise ValueError(f"labels must not be empty or contain a dot, got {name!r}")
-    if len(set(names)) < naxes:
-        raise ValueError(f"labels must be unique, got {names}")
-    return names
-
-
-def checked_time(time: float, name: str, positive: bool = False) -> float:
-    """Finite number of seconds, above 0 where it is a duration."""
-    value = one_number(time, name)
-    if not math.isfinite(value) or (positive and value <= 0.0):
-        raise ValueError(f"{name} must be finite{' and above 0' if positive else ''}, got {value}")
-    return value
-
-
-def one_number(value: object, name: str, rule: str = "a number") -> float:
-    """One number: no truth value, text, complex number, date, nor anything with a unit."""
-    if type(value) is float:
-        return value
-    given: Any = value
-    wrong = TypeError(f"{name} must be {rule}, got {value!r:.80}")
-    if isinstance(value, _NO_NUMBERS) or bool(getattr(given, "ndim", False)) or np.ma.is_masked(given):
-        raise wrong
-    if getattr(getattr(given, "dtype", None), "kind", "f") not in "iufO" or _has_unit(given):
-        raise wrong
-    try:
-        return float(given)
-    except OverflowError:
-        raise ValueError(f"{name} must be within floating point, got {value!r:.80}") from None
-    except (TypeError, ValueError):
-        raise wrong from None
-
-
-_NO_NUMBERS = (bool, np.bool_, str, bytes, complex, np.complexfloating, np.datetime64, np.timedelta64)
-
-
-def _has_unit(value: Any) -> bool:
-    unit = getattr(value, "units", None) or getattr(value, "unit", None)
-    return unit is not None and str(unit) not in ("", "dimensionless")
-
-
-def new_numbers(values: object, name: str) -> Array:
-    """Numbers as a new array of floats; None is nan. The kinds that `one_number` rejects are rejected here."""
-    _check_kinds(values, name)
-    try:
-        return np.array(values, dtype=float)
-    except (TypeError, ValueError, OverflowError):
-        raise ValueError(f"{name} must be numbers, got {values!r:.200}") from None
-
-
-def _check_kinds(values: Any, name: str) -> None:
-    """Reject what numpy would convert to numbers without being some."""
-    if type(values) in (float, int) or values is None:
-        return
-    if isinstance(values, list | tuple):
-        for value in values:
-            _check_kinds(value, name)
-        return
-    kind = getattr(getattr(values, "dtype", None), "kind", None)
-    if isinstance(values, bool | str | bytes | complex) or (kind is not None and kind in "bcSU"):
-        raise ValueError(f"{name} must be numbers, got {values!r:.80}")
-    if kind == "O" and isinstance(values, np.ndarray):
-        _check_kinds(values.tolist(), name)
-    elif type(values) is not np.ndarray or kind not in ("i", "u", "f"):
-        real_array(values, name)  # what has a unit, is a date, or is masked
-
-
-def checked_timepts(t: ArrayLike) -> Array:
-    """Times as an array of any shape, without nan."""
-    times = real_array(t, "times")
-    if times is not t and np.asarray(t).dtype.kind == "b":
-        raise TypeError(f"times must be numbers, got truth values {t!r:.60}; index times by a mask before")
-    # One number tells: the minimum of times with a nan among them is nan.
-    if times.size and np.isnan(times.min()):
-        raise ValueError(f"times must not be nan, got nan at index {int(np.isnan(times).argmax())}")
-    return times
-
-
-def checked_number(value: object, name: str) -> float:
-    """Number that is not nan."""
-    if not isinstance(value, Real):
-        raise TypeError(f"{name} must be a number, got {value!r}")
-    number = one_number(value, name)
-    if math.isnan(number):
-        raise ValueError(f"{name} must be a number, got nan")
-    return number
-
-
-def checked_pair(pair: object, name: str) -> tuple[float, float]:
-    """Two numbers that increase."""
-    if not isinstance(pair, Sequence | np.ndarray) or isinstance(pair, str) or len(pair) != 2:
-        raise ValueError(f"{name} must be two numbers, got {pair!r}")
-    low, high = checked_number(pair[0], name), checked_number(pair[1], name)
-    if not low < high:
-        raise ValueError(f"{name} must increase, got {low:g} and {high:g}")
-    return low, high
-
-
-def checked_limits(pair: object, name: str) -> tuple[float, float, float]:
-    """Least and greatest value, of which one may be infinite; and half their distance, or the size of the only one."""
-    low, high = checked_pair(pair, name)
-    if math.isinf(low) and math.isinf(high):
-        raise ValueError(f"{name} must hold a finite one, got {low:g} and {high:g}")
-    if math.isfinite(low) and math.isfinite(high):
-        return low, high, 0.5 * (high - low)
-    return low, high, abs(low if math.isfinite(low) else high) or 1.0
 
 
 def times_powers(values: Array, base: float, orders: NDArray[np.integer[Any]]) -> Array:
@@ -180,15 +58,3 @@ _TINY = float(np.finfo(float).tiny)
 def mapped_time(time: float, origin: float, target: float, rate: float) -> float:
     """Time moved to target + (time - origin)/rate: exact at the origin."""
     return target + (time - origin) / rate
-
-
-def checked_count(value: float | Real, name: str, least: int = 0) -> int:
-    """Whole number of some least value."""
-    if not isinstance(value, Real):
-        raise TypeError(f"{name} must be a whole number from {least}, got {value!r}")
-    number = one_number(value, name, f"a whole number from {least}")
-    if not math.isfinite(number) or number != int(number) or number < least:
-        raise ValueError(f"{name} must be a whole number from {least}, got {value}")
-    if number > MOST:
-        raise ValueError(f"{name} must be at most {MOST}, got {value}")
-    return int(number)

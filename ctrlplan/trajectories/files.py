@@ -16,8 +16,9 @@ from typing import Any, NoReturn
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ctrlplan._checks import checked_count, checked_timepts
 from ctrlplan._files import write_bytes, write_text
-from ctrlplan.trajectories.common import Array, checked_count, checked_timepts
+from ctrlplan.trajectories.common import Array
 from ctrlplan.trajectories.trajectory import Trajectory
 
 

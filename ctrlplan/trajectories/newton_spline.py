@@ -9,7 +9,8 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from ctrlplan.trajectories.common import Array, checked_count, checked_labels, derivative_scale, mapped_time, readonly
+from ctrlplan._checks import checked_count, checked_labels
+from ctrlplan.trajectories.common import Array, derivative_scale, mapped_time, readonly
 from ctrlplan.trajectories.newton import NEARLY_CLOSED, NewtonSystem
 from ctrlplan.trajectories.swing import warn_of_swing
 from ctrlplan.trajectories.waypoint import Waypoint

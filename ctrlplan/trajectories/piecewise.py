@@ -10,7 +10,8 @@ from typing import Any, Literal, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from ctrlplan.trajectories.common import FACTORIALS, Array, checked_labels, mapped_time, readonly, times_powers
+from ctrlplan._checks import checked_labels
+from ctrlplan.trajectories.common import FACTORIALS, Array, mapped_time, readonly, times_powers
 from ctrlplan.trajectories.conjugate_digits import Ends, conjugate_digits
 from ctrlplan.trajectories.newton import NEARLY_CLOSED, NewtonSystem
 from ctrlplan.trajectories.newton_spline import NewtonSpline, given_entries

@@ -8,8 +8,9 @@ from typing import Any, Self
 import numpy as np
 from scipy.optimize import brentq
 
+from ctrlplan._checks import checked_labels
 from ctrlplan.trajectories.combined import is_shaped, is_unit_rate
-from ctrlplan.trajectories.common import FACTORIALS, Array, checked_labels, readonly
+from ctrlplan.trajectories.common import FACTORIALS, Array, readonly
 from ctrlplan.trajectories.files import trajectory_from_dict
 from ctrlplan.trajectories.trajectory import Trajectory
 

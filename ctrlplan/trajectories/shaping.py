@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import comb
 
+from ctrlplan._checks import checked_count, checked_time, finite_vector, new_numbers
 from ctrlplan.trajectories.combined import Sum
-from ctrlplan.trajectories.common import Array, checked_count, checked_time, new_numbers, readonly
+from ctrlplan.trajectories.common import Array, readonly
 from ctrlplan.trajectories.fields import Fields
 from ctrlplan.trajectories.trajectory import Trajectory
 
@@ -63,7 +64,9 @@ class Shaper(Fields):
     weights: Array
 
     def __init__(self, delays: ArrayLike, weights: ArrayLike) -> None:
-        times, parts = _numbers(delays, "delays"), _numbers(weights, "weights")
+        times, parts = (
+            finite_vector(values, name, "nimpulses") for values, name in ((delays, "delays"), (weights, "weights"))
+        )
         if times.size != parts.size:
             raise ValueError(f"weights must be as many as delays, {times.size}, got {parts.size}")
         if times[0] < 0.0:
@@ -219,16 +222,6 @@ class Shaper(Fields):
 
     def __repr__(self) -> str:
         return f"<Shaper of {self.delays.size} impulses over {self.duration:g} s>"
-
-
-def _numbers(values: ArrayLike, name: str) -> Array:
-    """One or more finite numbers as a new array."""
-    found = new_numbers(values, name)
-    if found.ndim != 1 or not found.size:
-        raise ValueError(f"{name} must be of shape (nimpulses,), got shape {found.shape}")
-    if not np.isfinite(found).all():
-        raise ValueError(f"{name} must be finite, got {found.tolist()}")
-    return found
 
 
 def _checked_damping(damping: ArrayLike) -> Array:

@@ -8,7 +8,8 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ctrlplan.trajectories.common import Array, checked_labels, checked_time, mapped_time, new_numbers, readonly
+from ctrlplan._checks import checked_labels, checked_time, finite_vector
+from ctrlplan.trajectories.common import Array, mapped_time, readonly
 from ctrlplan.trajectories.trajectory import Trajectory
 
 
@@ -47,7 +48,10 @@ class Step(Trajectory):
         time: float = 0.0,
         labels: Sequence[str] | None = None,
     ) -> None:
-        high, low = _positions(final, "final"), _positions(initial, "initial")
+        high, low = (
+            finite_vector(values, name, "naxes", scalar=True)
+            for values, name in ((final, "final"), (initial, "initial"))
+        )
         if low.size == 1 and high.size > 1:
             low = np.repeat(low, high.size)
         if low.shape != high.shape:
@@ -83,13 +87,3 @@ class Step(Trajectory):
     def segment_jet(self, segment: int, s: Array, order: int) -> Array:
         """Derivatives of a segment; as `Trajectory.segment_jet`."""
         raise AssertionError("a step has no segments")
-
-
-def _positions(values: ArrayLike, name: str) -> Array:
-    """Positions as a new array (naxes,)."""
-    found = new_numbers(values, name)
-    if found.ndim > 1 or not found.size:
-        raise ValueError(f"{name} must be a scalar or of shape (naxes,), got shape {found.shape}")
-    if not np.isfinite(found).all():
-        raise ValueError(f"{name} must be finite, got {found.tolist()}")
-    return np.atleast_1d(found)

@@ -15,19 +15,11 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ctrlplan._checks import checked_count, checked_number, checked_time, checked_timepts, one_number
 from ctrlplan._renamed import warn_renamed
 from ctrlplan.trajectories import extrema as _extrema
 from ctrlplan.trajectories import sampling as _sampling
-from ctrlplan.trajectories.common import (
-    FACTORIALS,
-    Array,
-    checked_count,
-    checked_number,
-    checked_time,
-    checked_timepts,
-    one_number,
-    readonly,
-)
+from ctrlplan.trajectories.common import FACTORIALS, Array, readonly
 from ctrlplan.trajectories.continuity import Jump, find_jumps
 from ctrlplan.trajectories.fields import Fields
 

@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ctrlplan._checks import real_array
-from ctrlplan.trajectories.common import FACTORIALS, Array, checked_count, checked_time, derivative_scale
+from ctrlplan._checks import checked_count, checked_time, real_array
+from ctrlplan.trajectories.common import FACTORIALS, Array, derivative_scale
 from ctrlplan.trajectories.fields import Fields
 from ctrlplan.trajectories.newton import NewtonSystem, newton_series, pair_series
 from ctrlplan.trajectories.trigonometric import checked_alpha

@@ -9,7 +9,8 @@ from typing import Any, Literal, Self
 
 import numpy as np
 
-from ctrlplan.trajectories.common import Array, checked_time, one_number
+from ctrlplan._checks import checked_time, one_number
+from ctrlplan.trajectories.common import Array
 from ctrlplan.trajectories.newton import NewtonSystem
 from ctrlplan.trajectories.newton_spline import NewtonSpline, Options, checked_degree
 from ctrlplan.trajectories.waypoint import Waypoint

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ctrlplan.trajectories.common import Array, checked_time, new_numbers, readonly, times_powers
+from ctrlplan._checks import checked_time, new_numbers
+from ctrlplan.trajectories.common import Array, readonly, times_powers
 from ctrlplan.trajectories.fields import Fields
 
 ENTRIES = ("position", "velocity", "acceleration", "jerk", "snap")
