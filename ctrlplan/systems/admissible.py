@@ -11,10 +11,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import linprog
 
+from ctrlplan._checks import checked_limits, checked_time
 from ctrlplan._types import System
 from ctrlplan.systems.output_cells import Problem, elevated, erosion, output_cells, seen_directions
 from ctrlplan.systems.polytope import Polytope, Rows
-from ctrlplan.trajectories.common import Frozen, checked_limits, checked_time, readonly
+from ctrlplan.trajectories.common import readonly
+from ctrlplan.trajectories.fields import Fields
 
 Array = NDArray[np.float64]
 Limits: TypeAlias = Mapping[str, Sequence[float]]
@@ -29,7 +31,7 @@ _FAR = 1e6
 """Where an output has one limit, the other is so many times its size away: of unbounded sets rows have no end."""
 
 
-class AdmissibleSet(Frozen):
+class AdmissibleSet(Fields):
     r"""Maximal output admissible set of a linear loop.
 
     The pairs of a state x and a constant reference v from which every limited
@@ -133,7 +135,7 @@ class AdmissibleSet(Frozen):
         rows, last = _determined(problem, share)
         of_reference = rows.reference - rows.state @ problem.rest
         bounds = rows.bound + _shift(rows.state, of_reference, origin)
-        self.__dict__.update(
+        self._set_fields(
             references=problem.references,
             states=problem.states,
             dt=period,

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from natural import NaturalCubic
 from scipy.interpolate import BPoly
 from scipy.optimize import brentq
 
@@ -586,3 +587,45 @@ def test_figure():
     drawn = fastest(HOIST, {"F": 3e4, "x_d1": 5.0}, CRANE).plot()
     assert drawn.axes.shape == (2, 1)
     plt.close(drawn.figure)
+
+
+PROFILES = {
+    "s_curve": cp.SCurve(4.0, velocity=1.0, acceleration=0.5, jerk=0.5),
+    "trapezoid": cp.Trapezoid(4.0, velocity=1.0, acceleration=0.5),
+    "two s-curves": cp.SCurve(4.0, velocity=1.0, acceleration=0.5, jerk=0.5).then(
+        cp.SCurve(0.0, 4.0, velocity=1.0, acceleration=0.5, jerk=0.5)
+    ),
+    "natural cubic": NaturalCubic([Waypoint(0, 0), Waypoint(2, 3), Waypoint(5, 4)]),
+}
+
+
+@pytest.mark.parametrize("name", PROFILES)
+def test_plans_of_every_kind_are_retimed(name):
+    """With the shape held the speed scales with the reciprocal of the duration."""
+    plan = PROFILES[name]
+    found = fastest(plan, {"velocity": 0.8})
+    peak = np.abs(plan(np.linspace(plan.start, plan.end, 200_001), 1)).max()
+    assert found.duration == pytest.approx(plan.duration * peak / 0.8, rel=1e-6)
+    assert type(found.plan) is type(plan)
+
+
+def test_a_time_law_is_found_for_plans_of_every_kind():
+    for name in ("s_curve", "natural cubic"):
+        plan = PROFILES[name]
+        uniform, path = (fastest(plan, {"velocity": 0.8}, hold=hold).duration for hold in ("shape", "path"))
+        length = np.ptp(plan([plan.start, plan.end]))  # both rise from end to end
+        assert length / 0.8 <= path <= uniform * (1.0 + 1e-9)
+
+
+@pytest.mark.parametrize("name", ["s_curve", "trapezoid", "two s-curves"])
+def test_waypoints_are_held_only_of_what_is_made_through_them(name):
+    plan = PROFILES[name]
+    with pytest.raises(TypeError, match=rf"\(a WaypointSpline, such as PolySpline\), got a {type(plan).__name__}"):
+        fastest(plan, {"velocity": 0.8}, hold="waypoints")
+
+
+def test_a_shaped_plan_says_that_its_delays_would_change():
+    shaped = cp.Shaper.zv(2.0)(PROFILES["s_curve"])
+    with pytest.raises(ValueError, match="delays of the shaper would change"):
+        fastest(shaped, {"velocity": 0.8})
+    assert cp.margins(shaped, {"velocity": 1.0}).hold

@@ -255,7 +255,7 @@ def foreign():
 
     class Ramp(Trajectory):
         def __init__(self):
-            self.__dict__.update(labels=("y",), breakpoints=np.array([0.0, 1.0]))
+            self._set_fields(labels=("y",), breakpoints=np.array([0.0, 1.0]))
 
         def segment_jet(self, leg, s, order):
             out = np.zeros((order + 1, 1, s.size))
