@@ -8,9 +8,8 @@ import control.flatsys as fs
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ctrlplan._checks import Array, real_array
+from ctrlplan._checks import Array, checked_labels, checked_timepts, default_labels, real_array
 from ctrlplan.trajectories import Trajectory
-from ctrlplan.trajectories.common import checked_labels, checked_timepts, default_labels
 
 Params = Mapping[str, float] | None
 Flag = Sequence[Array]

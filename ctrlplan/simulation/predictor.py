@@ -8,13 +8,13 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ctrlplan._types import Params, System
+from ctrlplan._checks import checked_limits, checked_time
+from ctrlplan._types import Frozen, Params, System
 from ctrlplan.simulation import methods
 from ctrlplan.simulation.interpreted import LoopError, SolverError
 from ctrlplan.simulation.learned import NotApplicableError
 from ctrlplan.simulation.prepared import Prepared, prepare
 from ctrlplan.simulation.simulate import checked_job, response_to
-from ctrlplan.trajectories.common import Frozen, checked_limits, checked_time
 
 Array = NDArray[np.float64]
 

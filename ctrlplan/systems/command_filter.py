@@ -7,9 +7,9 @@ import math
 import control as ct
 import numpy as np
 
+from ctrlplan._checks import checked_count, checked_number, checked_time
 from ctrlplan.traits import declare
 from ctrlplan.trajectories import derivative_name
-from ctrlplan.trajectories.common import checked_count, checked_number, checked_time
 
 
 def create_command_filter_iosystem(

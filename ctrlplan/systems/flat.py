@@ -15,11 +15,11 @@ import control.flatsys as fs
 import numpy as np
 from numpy.typing import NDArray
 
+from ctrlplan._checks import checked_labels, default_labels
 from ctrlplan._renamed import outside_stacklevel
 from ctrlplan._types import Params, System, Value
 from ctrlplan.systems.linear_flat import LinearMaps, is_linear, linear_maps
 from ctrlplan.trajectories import derivative_name
-from ctrlplan.trajectories.common import checked_labels, default_labels
 
 Array = NDArray[np.float64]
 

@@ -10,12 +10,12 @@ import control as ct
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ctrlplan._checks import checked_time
 from ctrlplan._types import EventName, Params, System, Value
 from ctrlplan.systems.admissible import AdmissibleSet, Limits
 from ctrlplan.systems.exposed import state_signals
 from ctrlplan.systems.hybrid import checked_seconds, refuse_alone
 from ctrlplan.traits import DeclaredTrait, declare
-from ctrlplan.trajectories.common import checked_time
 
 Array = NDArray[np.float64]
 

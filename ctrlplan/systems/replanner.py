@@ -12,12 +12,12 @@ import control as ct
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ctrlplan._checks import checked_count, checked_time
 from ctrlplan._types import EventName, Params, Value
 from ctrlplan.systems.hybrid import checked_seconds, refuse_alone
 from ctrlplan.systems.source import create_source_iosystem
 from ctrlplan.traits import DeclaredTrait, declare
 from ctrlplan.trajectories import Trajectory
-from ctrlplan.trajectories.common import checked_count, checked_time
 from ctrlplan.trajectories.extrema import stationary_times
 from ctrlplan.trajectories.files import signal_names
 from ctrlplan.trajectories.newton_spline import NewtonSpline

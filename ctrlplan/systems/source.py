@@ -6,10 +6,10 @@ import control as ct
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ctrlplan._checks import checked_count
 from ctrlplan._types import Params
 from ctrlplan.traits import DeclaredTrait, declare
 from ctrlplan.trajectories import Trajectory
-from ctrlplan.trajectories.common import checked_count
 from ctrlplan.trajectories.files import signal_names, signal_rows
 
 Array = NDArray[np.float64]

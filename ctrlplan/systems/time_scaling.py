@@ -9,11 +9,11 @@ import control as ct
 import numpy as np
 from numpy.typing import NDArray
 
+from ctrlplan._checks import checked_count, checked_limits, checked_number, checked_pair, checked_time
 from ctrlplan._types import Params, Value
 from ctrlplan.traits import declare
 from ctrlplan.trajectories import Trajectory
 from ctrlplan.trajectories.combined import is_shaped
-from ctrlplan.trajectories.common import checked_count, checked_limits, checked_number, checked_pair, checked_time
 from ctrlplan.trajectories.files import signal_names
 from ctrlplan.trajectories.retimed import composed
 

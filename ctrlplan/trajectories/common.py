@@ -8,15 +8,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ctrlplan._checks import checked_count as checked_count
-from ctrlplan._checks import checked_labels as checked_labels
-from ctrlplan._checks import checked_limits as checked_limits
-from ctrlplan._checks import checked_number as checked_number
-from ctrlplan._checks import checked_pair as checked_pair
-from ctrlplan._checks import checked_time as checked_time
-from ctrlplan._checks import default_labels as default_labels
-from ctrlplan._types import Frozen as Frozen
-
 Array = NDArray[np.float64]
 
 FACTORIALS: Array = np.array([float(math.factorial(k)) for k in range(171)])

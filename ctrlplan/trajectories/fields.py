@@ -8,7 +8,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from ctrlplan.trajectories.common import Frozen
+from ctrlplan._types import Frozen
 
 
 class Fields(Frozen):

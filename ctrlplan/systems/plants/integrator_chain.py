@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from ctrlplan._checks import checked_count, default_labels
 from ctrlplan._types import Params, Value
 from ctrlplan.flatness import FlatSystem
 from ctrlplan.trajectories import derivative_name
-from ctrlplan.trajectories.common import checked_count, default_labels
 
 
 def integrator_chain(order: int, axes: int = 1, name: str = "integrator_chain") -> FlatSystem:
