@@ -189,6 +189,16 @@ def finite_vector(values: ArrayLike, name: str, size: str, scalar: bool = False)
     return np.atleast_1d(found)
 
 
+def checked_seconds(value: object, name: str, positive: bool) -> float:
+    """Finite number of seconds, above 0 or from 0."""
+    if isinstance(value, bool) or not isinstance(value, Real):
+        raise TypeError(f"{name} must be a number of seconds, got {value!r}")
+    seconds = float(value)
+    if not math.isfinite(seconds) or seconds < 0.0 or (positive and not seconds):
+        raise ValueError(f"{name} must be finite and {'above' if positive else 'at least'} 0 s, got {value}")
+    return seconds
+
+
 def not_negative(value: object, name: str) -> float:
     """Finite number that is at least 0."""
     number = checked_number(value, name)

@@ -10,11 +10,11 @@ import control as ct
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ctrlplan._checks import checked_time
+from ctrlplan._checks import checked_seconds, checked_time
 from ctrlplan._types import EventName, Params, System, Value
 from ctrlplan.systems.admissible import AdmissibleSet, Limits
 from ctrlplan.systems.exposed import state_signals
-from ctrlplan.systems.hybrid import checked_seconds, refuse_alone
+from ctrlplan.systems.hybrid import refuse_alone
 from ctrlplan.traits import DeclaredTrait, declare
 
 Array = NDArray[np.float64]
@@ -195,7 +195,7 @@ def create_governor_iosystem(
     period = checked_time(given, "dt", positive=True)
     if own is not None and abs(period - own) > 1e-12 * own:
         raise ValueError(f"dt must be the period of the admissible set, {own:g} s, got {period:g} s")
-    start = checked_seconds("offset", offset, positive=False)
+    start = checked_seconds(offset, "offset", positive=False)
     count = len(admission.references)
     before = np.asarray(initial, dtype=float)
     if before.shape not in ((), (count,)) or not np.isfinite(before).all():

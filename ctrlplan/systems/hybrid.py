@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from numbers import Real
 from typing import NoReturn
 
 import control as ct
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ctrlplan._checks import checked_seconds
 from ctrlplan._types import Params, System, Value
 from ctrlplan.traits import DeclaredTrait, declare
 
@@ -132,8 +131,8 @@ def sample_hold(block: System, dt: float, offset: float = 0.0, name: str | None 
     """
     if not isinstance(block, ct.InputOutputSystem):
         raise TypeError(f"block must be a control system, got {type(block).__name__}")
-    period = checked_seconds("dt", dt, positive=True)
-    start = checked_seconds("offset", offset, positive=False)
+    period = checked_seconds(dt, "dt", positive=True)
+    start = checked_seconds(offset, "offset", positive=False)
     if block.dt == 0 and (block.nstates or isinstance(block, ct.TransferFunction)):
         raise ValueError(f"block must be discrete, got {block.name} with dt = 0: see control.sample_system")
     if isinstance(block.dt, float | int) and block.dt is not True and block.dt and abs(block.dt - period) > 1e-12 * dt:
@@ -185,7 +184,7 @@ def create_delay_iosystem(
     >>> cp.simulate(late, [0.0, 0.5, 1.0], cp.Step(1.0)).outputs.round(9).tolist()
     [0.0, 1.0, 1.0]
     """
-    seconds = checked_seconds("delay", delay, positive=True)
+    seconds = checked_seconds(delay, "delay", positive=True)
     given, made = ([names] if isinstance(names, str) else list(names) for names in (inputs, outputs))
     if len(given) != len(made) or not given:
         raise ValueError(f"outputs must be as many as inputs, {len(given)}, got {len(made)}")
@@ -193,16 +192,6 @@ def create_delay_iosystem(
     if before.shape not in ((), (len(given),)) or not np.isfinite(before).all():
         raise ValueError(f"initial must be a finite number or {len(given)} of them, got {initial!r}")
     return Delay(seconds, np.broadcast_to(before, (len(given),)).copy(), given, made, name)
-
-
-def checked_seconds(label: str, value: Value, positive: bool) -> float:
-    """Finite number of seconds, above 0 or from 0."""
-    if isinstance(value, bool) or not isinstance(value, Real):
-        raise TypeError(f"{label} must be a number of seconds, got {value!r}")
-    seconds = float(value)
-    if not math.isfinite(seconds) or seconds < 0.0 or (positive and not seconds):
-        raise ValueError(f"{label} must be finite and {'above' if positive else 'at least'} 0 s, got {value}")
-    return seconds
 
 
 def refuse_alone(name: str, why: str) -> NoReturn:

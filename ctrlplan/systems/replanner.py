@@ -12,9 +12,9 @@ import control as ct
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ctrlplan._checks import checked_count, checked_time
+from ctrlplan._checks import checked_count, checked_seconds, checked_time
 from ctrlplan._types import EventName, Params, Value
-from ctrlplan.systems.hybrid import checked_seconds, refuse_alone
+from ctrlplan.systems.hybrid import refuse_alone
 from ctrlplan.systems.source import create_source_iosystem
 from ctrlplan.traits import DeclaredTrait, declare
 from ctrlplan.trajectories import Trajectory
@@ -171,7 +171,7 @@ def create_replanner_iosystem(
     limited = _checked_limits(plan, limits)
     signals = _Signals(plan.labels, max(put_out, order), put_out, goal_derivatives, measured, suffix)
     core = _Correction(
-        plan, horizons, checked_seconds("offset", offset, positive=False), signals, trigger_over, limited, name
+        plan, horizons, checked_seconds(offset, "offset", positive=False), signals, trigger_over, limited, name
     )
     source = create_source_iosystem(plan, signals.planned, name=f"{name}_plan", suffix=signals.inside)
     return ct.interconnect(
