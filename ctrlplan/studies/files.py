@@ -48,6 +48,8 @@ Besides, "python:module:function": a function beside the study file or of an
 installed package, which takes nothing and is declared to return a loop by its
 return annotation, ``def build() -> control.InputOutputSystem``. A study file
 that names one is code: whoever runs the study runs the module.
+The same holds of a family of plans "python:module:Class", a class derived from
+`WaypointSpline`.
 """
 
 
