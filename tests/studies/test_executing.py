@@ -2,8 +2,8 @@
 
 import pickle
 import sys
+import threading
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
-from itertools import count
 from multiprocessing.pool import ThreadPool
 from types import SimpleNamespace
 
@@ -333,8 +333,14 @@ def test_system_exit_is_the_failure_of_its_draw(executor):
 
 @pytest.fixture
 def clock(monkeypatch):
-    ticks = count()
-    monkeypatch.setattr(budget, "time", SimpleNamespace(monotonic=lambda: float(next(ticks))))
+    """A clock that moves on by a second at each reading, in each thread by itself."""
+    own = threading.local()
+
+    def monotonic():
+        own.seconds = getattr(own, "seconds", 0.0) + 1.0
+        return own.seconds
+
+    monkeypatch.setattr(budget, "time", SimpleNamespace(monotonic=monotonic))
 
 
 def trembling(turn):
