@@ -4,6 +4,8 @@ Between breakpoints the input is analytic. It is cut into cells so short that
 its Taylor series dies within a few terms; series and state together are then a
 linear system without input (a nilpotent chain behind the loop's state), and one
 matrix exponential, by scaling and squaring, carries the state over every cell.
+It is squared no more often than its Taylor series requires, and in twice the
+digits where its squares cancel, as those of matrices far from normal do.
 
 Where samples are evenly spaced, every cell holds the same number of them, and
 one table of exponentials, made by doubling, reads all samples off the states at
@@ -19,11 +21,15 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Callable, Sequence
+from fractions import Fraction
 from functools import lru_cache
+from math import factorial
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import matrix_balance, pascal
+
+from ctrlplan.simulation.pairs import pair_product, pair_sum
 
 Array = NDArray[np.float64]
 
@@ -34,7 +40,13 @@ _FEWEST = 8
 """Samples in a cell from which on a table for all cells is quicker than a series in each; and states up to which
 products of their matrices are quicker than steps one by one."""
 
-_NUMBERS = 2**20
+_POWERS = 5
+"""Powers of a matrix after the first of which norms are taken: p (p - 1) <= _TERMS + 2."""
+
+_CANCELLED = 16.0
+"""Ratio of the terms of a matrix product to its result from which on it is made in twice the digits, or avoided."""
+
+_NUMBERS = 2**17
 """Numbers in an array of exponentials, where there is one for each spacing."""
 
 Jet = Callable[[float, float, Array, int], Array]
@@ -161,6 +173,13 @@ def state_scale(a: Array) -> Array:
     with np.errstate(invalid="ignore"):  # scipy reads a scale as an index as well, which it does not use
         scale: Array = matrix_balance(a, permute=False, separate=True)[1][0]
     return scale
+
+
+def largest_change(a: Array, duration: float) -> float:
+    """Largest number in exp(a t) - 1 for t = duration, duration/2, ..., 0."""
+    with np.errstate(all="ignore"):
+        changes = _changes(duration * a, np.zeros((len(a), 0)), 1)
+    return max(float(np.abs(change).max(initial=0.0)) for change in changes)
 
 
 def _balanced(a: Array, b: Array, initial: Array) -> tuple[Array, Array, Array, Array]:
@@ -337,31 +356,124 @@ def _changes(a: Array, b: Array, nterms: int, halvings: int = 0) -> list[Array]:
     """Change of states over ..., 1/4, 1/2, 1 units of time; at least so many halvings.
 
     States (..., n, n + nterms * ninputs) from states and the input's Taylor
-    terms, each in the time that it is for. The shortest by its Taylor series,
-    each next one from two of the one before. The change, not the state: beside
-    a fast mode, squaring would cost a slow one a digit every three levels.
+    terms, each in the time that it is for. By the Taylor series up to the time
+    that `_products` gives for each system, then each from two of the one
+    before. The change, not the state: beside a fast mode, squaring would cost a
+    slow one a digit every three levels.
     """
-    n, m = b.shape[-2:]
-    norm = float(np.abs(a).sum(axis=-2).max(initial=1.0))
-    if not (np.isfinite(norm) and np.isfinite(b).all()):
+    if a.ndim == 2:
+        return [change[0] for change in _changes(a[None], b[None], nterms, halvings)]
+    products, least = _products(a, b)
+    levels = max(halvings, int(least.max()))
+    found = _doubled(products, least, nterms, levels)
+    lost = _cancelling(found) | (np.abs(products[:, :, : a.shape[1], 0]).sum(axis=1).max(axis=1) > 0.25 * _CANCELLED)
+    if lost.any():
+        precise = _doubled_precisely(products[lost, :, :, 0], least[lost], nterms, levels)
+        for change, better in zip(found, precise, strict=True):
+            change[lost] = np.where(np.isfinite(better).all(axis=(1, 2), keepdims=True), better, change[lost])
+    return found
+
+
+def _products(a: Array, b: Array) -> tuple[Array, NDArray[np.intp]]:
+    """Products a^k [a, b] (nsystems, n, n + ninputs, nproducts) in a time of 2^-halvings, and halvings (nsystems,).
+
+    So many that the Taylor series converges: the roots of norms of the matrix's
+    powers are at most 1. Of a matrix that is not normal they are far smaller
+    than its norm. Al-Mohy and Higham, A new scaling and squaring algorithm for
+    the matrix exponential, SIAM J. Matrix Anal. Appl. 31 (2009), 970-989:
+    ``norm(a^k) <= max(norm(a^p)^(1/p), norm(a^(p+1))^(1/(p+1)))^k`` for k >= p (p - 1).
+    """
+    norm = np.abs(a).sum(axis=1).max(axis=1)
+    if not (np.isfinite(norm).all() and np.isfinite(b).all()):
         raise ValueError("rates and input gains of the system times the duration must be below 1e308, got more")
-    levels = max(halvings, int(np.ceil(np.log2(norm))))
-    rate = np.zeros((*a.shape[:-2], n + nterms * m, n + nterms * m))
-    rate[..., :n, :n], rate[..., :n, n : n + m] = a * 0.5**levels, b * 0.5**levels
-    rate[..., n:, n:] = np.diag(np.repeat(np.arange(1.0, nterms), m), m)
-    term: Array = np.eye(n, n + nterms * m)
-    change = np.zeros((*a.shape[:-2], n, n + nterms * m))
-    for j in range(1, _TERMS + 2):
-        term = term @ rate / j
-        change += term
-    shift = _shift(nterms, m, 1.0)
-    powers = np.repeat(0.5 ** np.arange(nterms), m)
-    found = [change]
-    for _ in range(levels):
-        change = _followed(change[..., None, :], change, shift)[..., 0, :]
-        change[..., n:] *= powers
+    halvings = np.ceil(np.log2(np.maximum(norm, 1.0)))
+    both = np.concatenate([a, b], axis=2) * 0.5 ** halvings[:, None, None]
+    n, products = a.shape[1], [both]
+    for _ in range(_POWERS):
+        products.append(both[..., :n] @ products[-1])
+    if halvings.any():
+        sizes = np.abs(products)[..., :n].sum(axis=2).max(axis=2)
+        roots = sizes ** (1.0 / np.arange(1.0, _POWERS + 2.0)[:, None])
+        root = np.maximum(roots[:-1], roots[1:]).min(axis=0)
+        # The bounds keep the products, and what rounding leaves of them, within the range of numbers.
+        spare = np.floor(-np.log2(np.clip(root, 2.0**-50, 1.0))) * (np.abs(b).max(axis=(1, 2), initial=0.0) < 1e200)
+        spare = np.minimum(spare, halvings)
+        halvings, factor = halvings - spare, 2.0 ** spare[:, None, None]
+        products = [product * factor ** (k + 1.0) for k, product in enumerate(products)]
+        both = products[0]
+    while len(products) <= _TERMS:
+        products.append(both[..., :n] @ products[-1])
+    return np.stack(products, axis=-1), halvings.astype(np.intp)
+
+
+def _doubled(products: Array, least: NDArray[np.intp], nterms: int, levels: int) -> list[Array]:
+    """Changes over 2^-levels, ..., 1/2, 1 units of time: by the series up to 2^-least, then by squaring."""
+    n, m = products.shape[1], products.shape[2] - products.shape[1]
+    shift, powers = _shift(nterms, m, 1.0), np.repeat(0.5 ** np.arange(nterms), m)
+    orders = np.arange(1.0, products.shape[3] + 1.0)
+    found: list[Array] = []
+    for level in range(levels, -1, -1):
+        change, squared = np.empty((len(least), n, n + nterms * m)), least > level
+        if squared.any():
+            before = found[-1][squared]
+            after = _followed(before[:, :, None, :], before, shift)[:, :, 0]
+            after[..., n:] *= powers
+            change[squared] = after
+        if not squared.all():
+            terms, shorter = (products, least) if not squared.any() else (products[~squared], least[~squared])
+            if (shorter < level).any():
+                terms = terms * (0.5 ** (level - shorter[:, None, None, None])) ** orders
+            # By einsum, equal rows have equal sums, which a product of matrices does not promise.
+            sums = np.einsum("rk,jk->rj", terms.reshape(-1, orders.size), _WEIGHTS[:nterms])
+            change[~squared] = _arranged(sums, n, m)
         found.append(change)
     return found
+
+
+def _cancelling(changes: list[Array]) -> NDArray[np.bool_]:
+    """Systems (nsystems,) whose changes lose digits when squared: sums of numbers far larger than what is left."""
+    n = changes[0].shape[1]
+    own = np.abs([change[..., :n] for change in changes])
+    terms, result = (own[:-1] @ own[:-1]).max(axis=(2, 3)), own.max(axis=(2, 3), initial=1.0)
+    lost: NDArray[np.bool_] = (terms > _CANCELLED * np.maximum(result[:-1], result[1:])).any(axis=0)
+    return lost
+
+
+def _doubled_precisely(both: Array, least: NDArray[np.intp], nterms: int, levels: int) -> list[Array]:
+    """Same as `_doubled` in twice the digits, from [a, b] in a time of 2^-least."""
+    n, m = both.shape[1], both.shape[2] - both.shape[1]
+    powers = np.concatenate([np.ones(n), np.repeat(0.5 ** np.arange(nterms), m)])
+    shift, orders = _shift(nterms, m, 1.0), np.arange(1.0, _TERMS + 2.0)
+    products = [(both, np.zeros_like(both))]
+    while len(products) < orders.size:
+        products.append(pair_product((both[..., :n], np.zeros_like(both[..., :n])), products[-1]))
+    series = [np.stack(half, axis=-1) for half in zip(*products, strict=True)]
+    change, rest = (np.zeros((len(least), n, powers.size)) for _ in range(2))
+    found: list[Array] = []
+    for level in range(levels, -1, -1):
+        squared = least > level
+        if squared.any():
+            old = change[squared], rest[squared]
+            new = pair_sum(old, old, pair_product((old[0][..., :n], old[1][..., :n]), old))
+            if m:
+                more = pair_product((old[0][..., n:], old[1][..., n:]), (shift, np.zeros_like(shift)), m)
+                forced = pair_sum((new[0][..., n:], new[1][..., n:]), more)
+                new[0][..., n:], new[1][..., n:] = forced
+            change[squared], rest[squared] = new[0] * powers, new[1] * powers
+        if not squared.all():
+            part = 0.5 ** (level - least[~squared, None, None, None])
+            terms, small = ((half[~squared] * part**orders).reshape(-1, orders.size) for half in series)
+            sums = pair_product((terms, small), (_WEIGHTS[:nterms].T, _WEIGHTS_REST[:nterms].T))
+            change[~squared], rest[~squared] = (_arranged(half, n, m) for half in sums)
+        found.append(change.copy())
+    return found
+
+
+def _arranged(sums: Array, n: int, m: int) -> Array:
+    """Change of states (nsystems, n, n + nterms * m) from sums (nsystems * n * (n + m), nterms) of products."""
+    sums = sums.reshape(-1, n, n + m, sums.shape[-1])
+    forced = sums[:, :, n:].swapaxes(2, 3).reshape(len(sums), n, -1)
+    return np.concatenate([sums[:, :, :n, 0], forced], axis=2)
 
 
 @lru_cache(maxsize=64)
@@ -445,11 +557,7 @@ def _recurrence(change: Array, forced: Array, state: Array) -> Array:
     """
     nsteps, n = change.shape[:2]
     if n > _FEWEST:
-        found = np.empty((nsteps, n))
-        for k in range(nsteps):
-            state = state + (change[k] @ state + forced[k, :, 0])
-            found[k] = state
-        return found
+        return _one_by_one(change, forced, state)
     per = int(np.ceil(nsteps**0.5))
     steps = np.zeros((per * -(-nsteps // per), n, n + 1))
     steps[:nsteps, :, :n], steps[:nsteps, :, n:] = change, forced
@@ -457,11 +565,27 @@ def _recurrence(change: Array, forced: Array, state: Array) -> Array:
     for j in range(1, per):
         before = steps[:, j - 1]
         steps[:, j] += before + steps[:, j, :, :n] @ before
+    if per > 1:
+        terms = (np.abs(change[per - 1 :: per]) @ np.abs(steps[: nsteps // per, -2, :, :n])).max(
+            axis=(1, 2), initial=0.0
+        )
+        result = np.abs(steps[: nsteps // per, -2:, :, :n]).max(axis=(1, 2, 3), initial=1.0)
+        if (terms > _CANCELLED * result).any():
+            return _one_by_one(change, forced, state)
     starts = np.empty((len(steps), 1, n, 1))
     for k, block in enumerate(steps[:, -1]):
         starts[k, 0] = state[:, None]
         state = state + (block[:, :n] @ state + block[:, n])
     return (starts + (steps[..., :n] @ starts + steps[..., n:])).reshape(-1, n)[:nsteps]
+
+
+def _one_by_one(change: Array, forced: Array, state: Array) -> Array:
+    """Same, each step from the one before."""
+    found = np.empty(change.shape[:2])
+    for k in range(len(found)):
+        state = state + (change[k] @ state + forced[k, :, 0])
+        found[k] = state
+    return found
 
 
 def _halved(series: Array) -> tuple[Array, Array]:
@@ -474,7 +598,7 @@ def _halved(series: Array) -> tuple[Array, Array]:
 
 
 def _taylor(a: Array, b: Array, states: Array, series: Array) -> list[Array]:
-    """Taylor terms of the state over a unit of time, where norm(a) <= 1."""
+    """Taylor terms of the state over the unit of time of the first of `_changes`."""
     terms = [states]
     for j in range(_TERMS + 1):
         following = matrix_product(a, terms[-1])
@@ -500,3 +624,8 @@ def _evaluated(terms: list[Array], where: NDArray[np.intp], sigma: Array) -> Arr
 _FACTORIALS = np.cumprod(np.concatenate([[1.0], np.arange(1.0, _TERMS)]))
 _LONG_FACTORIALS = np.cumprod(np.concatenate([[1.0], np.arange(1.0, _TERMS + 8)]))
 _PASCAL: Array = np.triu(pascal(_TERMS, kind="upper")).astype(float)
+_RATIOS = [[Fraction(factorial(j), factorial(i + j + 1)) for i in range(_TERMS + 1)] for j in range(_TERMS)]
+_WEIGHTS: Array = np.array(_RATIOS, dtype=float)
+"""j!/(i + j + 1)!: what a^i b, in units of time, adds to the change of states by the input's Taylor term j."""
+_WEIGHTS_REST: Array = np.array([[ratio - Fraction(float(ratio)) for ratio in row] for row in _RATIOS], dtype=float)
+"""What rounding cuts off them."""

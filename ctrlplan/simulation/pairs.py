@@ -1,0 +1,66 @@
+"""Matrices of numbers in two parts, 106 binary digits together.
+
+A pair is two arrays of one shape, the numbers and what rounding has cut off
+them. Matrix products are made of products of leading digits, so short that
+floating point holds their sums without rounding.
+
+References
+----------
+Ozaki, Ogita, Oishi and Rump, Error-free transformations of matrix
+multiplication by using fast routines of matrix multiplication and its
+applications, Numerical Algorithms 59 (2012), 95-118. Dekker, A floating-point
+technique for extending the available precision, Numerische Mathematik 18
+(1971), 224-242.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Pair = tuple[Array, Array]
+
+
+def pair_sum(*pairs: Pair) -> Pair:
+    """Sum of pairs of one shape."""
+    total, rest = pairs[0]
+    for value, more in pairs[1:]:
+        before, total = total, total + value
+        part = total - before
+        rest = rest + more + ((before - (total - part)) + (value - part))
+    found = total + rest
+    return found, rest - (found - total)
+
+
+def pair_product(left: Pair, right: Pair, groups: int = 1) -> Pair:
+    """Matrix product of pairs, (..., n, k) and (..., k, m).
+
+    The error is at most 8 k^2 2^-105 times the product of the largest numbers
+    in a row and in a column of k, and a few roundings of the single products.
+
+    Parameters
+    ----------
+    left, right : tuple of two ndarray
+        The pairs.
+    groups : int
+        Columns of `left` whose indices differ by multiples of this number are
+        of one size; others may be of another.
+    """
+    height, k = left[0].shape[-2:]
+    size = np.abs(left[0]).reshape(*left[0].shape[:-2], height, -1, groups).max(axis=-2)
+    digits = (53 - (k - 1).bit_length()) // 2
+    one, two, three = _split(left, np.tile(size, k // groups), digits)
+    first, second, third = _split(right, np.abs(right[0]).max(axis=-2, keepdims=True), digits)
+    none = np.zeros(())
+    small = one @ third + two @ (second + third) + three @ right[0]
+    return pair_sum((one @ first, small), (one @ second, none), (two @ first, none))
+
+
+def _split(values: Pair, size: Array, digits: int) -> tuple[Array, Array, Array]:
+    """Binary digits of values, so many below the first one of a size, as many again, and the rest."""
+    unit = np.ldexp(1.5, np.frexp(size)[1] + 52 - digits)
+    first = (values[0] + unit) - unit
+    rest, unit = values[0] - first, np.ldexp(unit, -digits)
+    second = (rest + unit) - unit
+    return first, second, (rest - second) + values[1]
