@@ -11,14 +11,16 @@ from numpy.typing import NDArray
 
 from ctrlplan._checks import real_array
 from ctrlplan._types import System
-from ctrlplan.simulation.exact import matrix_product, state_scale
+from ctrlplan.simulation.exact import largest_change, matrix_product, state_scale
 from ctrlplan.traits import traits_of
 from ctrlplan.trajectories import Trajectory
 
 Array = NDArray[np.float64]
 
 _TURNS, _GROWTH = 1e9, 20.0
-"""Durations in units of the fastest pole, and of the fastest growth, up to which rounding stays below 1e-6."""
+"""Durations in units of the fastest pole, and of the fastest growth, up to which rounding stays below `_DOUBT`."""
+
+_DOUBT = 1e-6
 
 
 class NotLinearError(ValueError):
@@ -51,10 +53,25 @@ class LinearForm:
         found[np.isnan(found)] = np.inf
         return found
 
-    def sensitivity(self, duration: float) -> tuple[bool, bool]:
-        """Whether growth, or poles so fast, make a run of some duration [s] depend on last digits to 1e-6."""
-        poles = np.linalg.eigvals(self.a) if self.a.size else np.zeros(1)
-        return bool(duration * poles.real.max() > _GROWTH), bool(duration * np.abs(poles).max() > _TURNS)
+    def sensitivity(self, duration: float) -> tuple[bool, bool, bool]:
+        """Whether growth, poles so fast, or a matrix so far from normal, make a run depend on last digits to 1e-6.
+
+        The duration is in s. A perturbation of the matrix changes its
+        exponential by at most duration * norm(perturbation) * max(norm(exp(A t)))^2.
+        """
+        if not self.a.size:
+            return False, False, False
+        poles = np.linalg.eigvals(self.a)
+        growing, fast = duration * poles.real.max() > _GROWTH, duration * np.abs(poles).max() > _TURNS
+        if growing or fast:
+            return bool(growing), bool(fast), False
+        scale = state_scale(self.a)
+        a = duration * self.a * (scale / scale[:, None])
+        rounding = np.finfo(float).eps * np.abs(a).sum(axis=0).max()
+        # norm(exp(a)) <= exp(greatest eigenvalue of the symmetric part), which most often is enough.
+        bound = np.exp(np.clip(np.linalg.eigvalsh(a + a.T).max(), 0.0, 700.0))
+        nonnormal = rounding * bound > _DOUBT and rounding * largest_change(a, 1.0) ** 2 > _DOUBT
+        return False, False, bool(nonnormal)
 
     def rounding(self, states: Array, inputs: Array) -> Array:
         """What rounding of states and inputs of a size leaves in the outputs, shape (noutputs,)."""

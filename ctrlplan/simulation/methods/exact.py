@@ -71,9 +71,12 @@ def _run(job: Job, form: LinearForm) -> Record:
         return states_at(np.array([times[k], t]), states[:, k])[:, 1]
 
     states = states_at(times, job.state)
-    growing, fast = form.sensitivity(float(times[-1] - times[0]))
-    if growing or fast:
-        values, nearly = signal_values(time_signals, times), states_at(times, job.state, form.a * (1.0 + 2.0**-50))
+    growing, fast, nonnormal = form.sensitivity(float(times[-1] - times[0]))
+    if growing or fast or nonnormal:
+        # One factor for all entries turns a phase most; of a matrix far from normal each must change by itself.
+        signs = np.random.default_rng(0).choice([-1.0, 1.0], form.a.shape) if nonnormal else np.ones_like(form.a)
+        nearly = states_at(times, job.state, form.a * (1.0 + 2.0**-50 * signs))
+        values = signal_values(time_signals, times)
         floor = form.rounding(states[:, :1] if growing else states, values)
         _warn_of_uncertainty(job, form.outputs(states, values), form.outputs(nearly, values), floor)
     _warn_of_undefined(job, form, times, states)
@@ -81,7 +84,7 @@ def _run(job: Job, form: LinearForm) -> Record:
 
 
 def _warn_of_uncertainty(job: Job, outputs: Array, others: Array, floor: Array) -> None:
-    """Warn of outputs that change by more than a floor when all rates change in their last digits."""
+    """Warn of outputs that change by more than a floor when rates change in their last digits."""
     known = np.isfinite(outputs) & np.isfinite(others)
     with np.errstate(all="ignore"):
         apart = np.where(known, np.abs(outputs - others), 0.0).max(axis=1)
@@ -94,7 +97,8 @@ def _warn_of_uncertainty(job: Job, outputs: Array, others: Array, floor: Array) 
         warnings.warn(
             f"outputs {names} of {job.prepared.name} are uncertain by {percent:.3g} % of their size: "
             f"rounding errors in the system's matrices change them by that much over {span:g} s; "
-            "shorten the run, or remove modes that are so fast or so unstable",
+            "shorten the run, remove modes that are so fast or so unstable, or choose states (a modal or balanced "
+            "realization) in which the matrix is closer to a normal one",
             UserWarning,
             stacklevel=outside_stacklevel(),
         )
