@@ -22,7 +22,7 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections.abc import Callable, Sequence
 from fractions import Fraction
-from functools import lru_cache
+from functools import lru_cache, reduce
 from math import factorial
 
 import numpy as np
@@ -366,7 +366,13 @@ def _changes(a: Array, b: Array, nterms: int, halvings: int = 0) -> list[Array]:
     products, least = _products(a, b)
     levels = max(halvings, int(least.max()))
     found = _doubled(products, least, nterms, levels)
-    lost = _cancelling(found) | (np.abs(products[:, :, : a.shape[1], 0]).sum(axis=1).max(axis=1) > 0.25 * _CANCELLED)
+    n = a.shape[1]
+    own = np.array([change[..., :n] for change in found])
+    lost = _cancelling(own[:-1], own[:-1], own[1:]).any(axis=0)
+    large = np.abs(products[:, :, :n, 0]).sum(axis=1).max(axis=1) > 0.25 * _CANCELLED
+    if large.any():
+        powers = np.moveaxis(products[large, :, :n], -1, 0)
+        lost[large] |= _cancelling(powers[:1], powers[:-1], powers[1:]).any(axis=0)
     if lost.any():
         precise = _doubled_precisely(products[lost, :, :, 0], least[lost], nterms, levels)
         for change, better in zip(found, precise, strict=True):
@@ -430,13 +436,12 @@ def _doubled(products: Array, least: NDArray[np.intp], nterms: int, levels: int)
     return found
 
 
-def _cancelling(changes: list[Array]) -> NDArray[np.bool_]:
-    """Systems (nsystems,) whose changes lose digits when squared: sums of numbers far larger than what is left."""
-    n = changes[0].shape[1]
-    own = np.abs([change[..., :n] for change in changes])
-    terms, result = (own[:-1] @ own[:-1]).max(axis=(2, 3)), own.max(axis=(2, 3), initial=1.0)
-    lost: NDArray[np.bool_] = (terms > _CANCELLED * np.maximum(result[:-1], result[1:])).any(axis=0)
-    return lost
+def _cancelling(left: Array, right: Array, result: Array) -> NDArray[np.bool_]:
+    """Products (...) of matrices that cost digits: with terms far larger than factors and result, and than 1."""
+    terms = (np.abs(left) @ np.abs(right)).max(axis=(-2, -1))
+    sizes = (np.abs(matrix).max(axis=(-2, -1), initial=1.0) for matrix in (left, right, result))
+    found: NDArray[np.bool_] = terms > _CANCELLED * reduce(np.maximum, sizes)
+    return found
 
 
 def _doubled_precisely(both: Array, least: NDArray[np.intp], nterms: int, levels: int) -> list[Array]:
@@ -566,11 +571,8 @@ def _recurrence(change: Array, forced: Array, state: Array) -> Array:
         before = steps[:, j - 1]
         steps[:, j] += before + steps[:, j, :, :n] @ before
     if per > 1:
-        terms = (np.abs(change[per - 1 :: per]) @ np.abs(steps[: nsteps // per, -2, :, :n])).max(
-            axis=(1, 2), initial=0.0
-        )
-        result = np.abs(steps[: nsteps // per, -2:, :, :n]).max(axis=(1, 2, 3), initial=1.0)
-        if (terms > _CANCELLED * result).any():
+        whole = steps[: nsteps // per, :, :, :n]
+        if _cancelling(change[per - 1 :: per], whole[:, -2], whole[:, -1]).any():
             return _one_by_one(change, forced, state)
     starts = np.empty((len(steps), 1, n, 1))
     for k, block in enumerate(steps[:, -1]):
