@@ -368,11 +368,11 @@ def _changes(a: Array, b: Array, nterms: int, halvings: int = 0) -> list[Array]:
     found = _doubled(products, least, nterms, levels)
     n = a.shape[1]
     own = np.array([change[..., :n] for change in found])
-    lost = _cancelling(own[:-1], own[:-1], own[1:]).any(axis=0)
+    lost = np.any(_cancelling(own[:-1], own[:-1], own[1:]), axis=0, out=np.zeros(len(a), dtype=bool))
     large = np.abs(products[:, :, :n, 0]).sum(axis=1).max(axis=1) > 0.25 * _CANCELLED
     if large.any():
         powers = np.moveaxis(products[large, :, :n], -1, 0)
-        lost[large] |= _cancelling(powers[:1], powers[:-1], powers[1:]).any(axis=0)
+        lost[large] |= np.any(_cancelling(powers[:1], powers[:-1], powers[1:]), axis=0)
     if lost.any():
         precise = _doubled_precisely(products[lost, :, :, 0], least[lost], nterms, levels)
         for change, better in zip(found, precise, strict=True):
