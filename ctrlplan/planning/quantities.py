@@ -48,7 +48,7 @@ def quantities_of(system: Any) -> Quantities | None:
         if callable(own):
             return own
         if hasattr(system, "forward") and hasattr(system, "reverse"):
-            from ctrlplan.systems.quantities import quantities_of_flat_system
+            from ctrlplan.flatness.quantities import quantities_of_flat_system
 
             return quantities_of_flat_system(system)
         if callable(system) and not hasattr(system, "ninputs"):  # python-control's systems are callable

@@ -1,5 +1,6 @@
 """Blocks that python-control interconnects: plans, laws and plants."""
 
+from ctrlplan.flatness.quantities import flat_quantities
 from ctrlplan.systems import plants
 from ctrlplan.systems.admissible import AdmissibleSet
 from ctrlplan.systems.command_filter import command_lead, create_command_filter_iosystem
@@ -10,7 +11,6 @@ from ctrlplan.systems.governor import Admission, Governor, create_governor_iosys
 from ctrlplan.systems.hybrid import Delay, SampleHold, create_delay_iosystem, sample_hold
 from ctrlplan.systems.pid import create_pid_iosystem
 from ctrlplan.systems.plants import Law
-from ctrlplan.systems.quantities import flat_quantities
 from ctrlplan.systems.replanner import create_replanner_iosystem
 from ctrlplan.systems.saturation import create_saturation_iosystem
 from ctrlplan.systems.source import PlanSource, create_source_iosystem, source_samples

@@ -7,9 +7,9 @@ import pytest
 from numpy.polynomial import Polynomial
 
 import ctrlplan as cp
+from ctrlplan.flatness.linear import linear_maps
+from ctrlplan.flatness.quantities import quantities_of_flat_system
 from ctrlplan.systems.flat import create_flat_iosystem
-from ctrlplan.systems.linear_flat import linear_maps
-from ctrlplan.systems.quantities import quantities_of_flat_system
 
 PLAN = cp.PolySpline([cp.Waypoint.from_jets(0, y=[0] * 7), cp.Waypoint.from_jets(1, y=[1, 0, 0, 0, 0, 0, 0])])
 """From 0 to 1 in 1 s, at rest to order 6."""

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import ctrlplan as cp
+from ctrlplan.flatness.quantities import quantities_of_flat_system
 from ctrlplan.systems.flat import create_flat_iosystem
 from ctrlplan.systems.plants.integrator_chain import integrator_chain
-from ctrlplan.systems.quantities import quantities_of_flat_system
 
 TURN = cp.PolySpline([cp.Waypoint(0, 0, 0, 0, 0), cp.Waypoint(2, 6.28, 0, 0, 0)])
 R, L, K, J, B = 1.0, 0.5, 0.01, 0.01, 0.1  # of the motor, as dc_motor has them

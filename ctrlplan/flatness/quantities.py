@@ -8,11 +8,10 @@ import control.flatsys as fs
 import numpy as np
 from numpy.typing import NDArray
 
+from ctrlplan._checks import Array
 from ctrlplan._renamed import warn_renamed
-from ctrlplan.flatness import FlatSystem
-from ctrlplan.systems.flat import FlatPlant, check_maps, checked_plant, warn_of_output
-
-Array = NDArray[np.float64]
+from ctrlplan.flatness.system import FlatSystem
+from ctrlplan.flatness.verify import FlatPlant, check_maps, checked_plant, warn_of_output
 
 
 def flat_quantities(flat_system: fs.FlatSystem) -> Callable[[Array], dict[str, Array]]:
