@@ -50,6 +50,7 @@ _EXPORTS = {
     "systems": (
         "AdmissibleSet",
         "Law",
+        "command_filter_gains",
         "command_lead",
         "create_command_filter_iosystem",
         "create_delay_iosystem",

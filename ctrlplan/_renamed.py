@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+import functools
+import inspect
 import sys
 import warnings
-from typing import Any
+from collections.abc import Callable, Mapping
+from typing import Any, ParamSpec, TypeVar
+
+P = ParamSpec("P")
+T = TypeVar("T")
 
 
 def warn_renamed(old: str, new: str) -> None:
@@ -55,6 +61,84 @@ def renamed_argument(old: str, old_value: Any, new: str, new_value: Any) -> Any:
         raise TypeError(f"{old}= is the old name of {new}=: only one of them may be given, got both")
     warn_renamed(f"{old}=", f"{new}=")
     return old_value
+
+
+def former_signature(
+    *positional: str,
+    renamed: Mapping[str, str] | None = None,
+    implied: Mapping[str, Mapping[str, object]] | None = None,
+) -> Callable[[Callable[P, T]], Callable[P, T]]:
+    """Decorator: a call as it was written before still works, with a warning.
+
+    Parameters
+    ----------
+    *positional : str
+        Names of the arguments that could be given by position, after those that
+        still can; old names where they have new ones.
+    renamed : mapping of str to str, optional
+        New keyword of each old one.
+    implied : mapping of str to mapping, optional
+        Keywords that come with an old one, so that its meaning is kept.
+
+    Returns
+    -------
+    callable
+        Decorator of a function of the present signature, which it still shows.
+
+    Raises
+    ------
+    TypeError
+        By the function, where an argument is given twice or under both names.
+
+    Warns
+    -----
+    FutureWarning
+        By the function, where an old form is used.
+
+    Examples
+    --------
+    >>> @former_signature("name", renamed={"output": "outputs"})
+    ... def block(gain, *, outputs="u", name="block"):
+    ...     return gain, outputs, name
+    >>> import warnings
+    >>> with warnings.catch_warnings(record=True) as caught:
+    ...     warnings.simplefilter("always")
+    ...     block(2.0, "mine", output="F")
+    (2.0, 'F', 'mine')
+    >>> [str(warning.message).partition(" is deprecated")[0] for warning in caught]
+    ['name by position in block', 'output=']
+    """
+    new_names, also = renamed or {}, implied or {}
+
+    def decorate(function: Callable[P, T]) -> Callable[P, T]:
+        call: Callable[..., T] = function
+        parameters = inspect.signature(function).parameters.values()
+        count = sum(parameter.kind is parameter.POSITIONAL_OR_KEYWORD for parameter in parameters)
+
+        @functools.wraps(function)
+        def called(*args: Any, **kwargs: Any) -> T:
+            extra = dict(zip(positional, args[count:], strict=False))
+            if len(args) - count > len(positional) or extra.keys() & kwargs.keys():
+                return call(*args, **kwargs)  # too many arguments, or one of them twice: Python says which
+            if extra:
+                keywords = [f"{new_names.get(name, name)}=" for name in extra]
+                keywords += [f"{k}={v!r}" for name in extra for k, v in also.get(name, {}).items()]
+                warn_renamed(f"{', '.join(extra)} by position in {function.__name__}", ", ".join(keywords))
+            given = extra | kwargs
+            for old, new in new_names.items():
+                if given.get(old) is not None:
+                    if given.get(new) is not None:
+                        raise TypeError(f"{old}= is the old name of {new}=: only one of them may be given, got both")
+                    implied_now = dict(also.get(old, {}))
+                    if old not in extra:
+                        warn_renamed(f"{old}=", ", ".join([f"{new}=", *(f"{k}={v!r}" for k, v in implied_now.items())]))
+                    given = implied_now | given | {new: given[old]}
+                given.pop(old, None)
+            return call(*args[:count], **given)
+
+        return called
+
+    return decorate
 
 
 def outside_stacklevel() -> int:

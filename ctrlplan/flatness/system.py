@@ -8,7 +8,7 @@ import control.flatsys as fs
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ctrlplan._checks import Array, checked_labels, checked_timepts, default_labels, real_array
+from ctrlplan._checks import Array, check_kind, checked_labels, checked_timepts, default_labels, real_array
 from ctrlplan.trajectories import Trajectory
 
 Params = Mapping[str, float] | None
@@ -206,8 +206,7 @@ class FlatSystem(fs.FlatSystem):  # type: ignore[misc]
 
     def _matched(self, plan: Trajectory) -> Trajectory:
         """Plan with the axes in the order of the flat outputs."""
-        if not isinstance(plan, Trajectory):
-            raise TypeError(f"plan must be a Trajectory, got {type(plan).__name__}")
+        check_kind(plan, "plan", Trajectory)
         if plan.labels in (self.flat_labels, default_labels(len(self.flat_labels))):
             return plan
         if set(plan.labels) == set(self.flat_labels):

@@ -14,11 +14,10 @@ from typing import Any
 import control.flatsys as fs
 import numpy as np
 
-from ctrlplan._checks import Array
+from ctrlplan._checks import Array, checked_labels, default_labels
 from ctrlplan._renamed import outside_stacklevel
 from ctrlplan.flatness.linear import LinearMaps, is_linear, linear_maps
 from ctrlplan.trajectories import derivative_name
-from ctrlplan.trajectories.common import checked_labels, default_labels
 
 _PROBES = 8
 """Points of each kind at which the maps are evaluated."""

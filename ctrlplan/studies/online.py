@@ -272,7 +272,9 @@ WAYS: dict[str, Callable[..., Any]] = {
 def _filtered_loop(wind: Trajectory | None = None, **drives: Any) -> Any:
     """Crane with load feedback behind filters of commands x_command and z_command."""
     filters = [
-        create_command_filter_iosystem(_FILTER, 2, _LAGS, initial=start, input=f"{axis}_command", output=f"{axis}_ref")
+        create_command_filter_iosystem(
+            _FILTER, 2, _LAGS, initial=start, inputs=f"{axis}_command", outputs=f"{axis}_ref"
+        )
         for axis, start in zip(("x", "z"), START.tolist(), strict=True)
     ]
     inputs = ["x_command", "z_command"]

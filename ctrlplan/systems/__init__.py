@@ -3,7 +3,7 @@
 from ctrlplan.flatness.quantities import flat_quantities
 from ctrlplan.systems import plants
 from ctrlplan.systems.admissible import AdmissibleSet
-from ctrlplan.systems.command_filter import command_lead, create_command_filter_iosystem
+from ctrlplan.systems.command_filter import command_filter_gains, command_lead, create_command_filter_iosystem
 from ctrlplan.systems.exposed import expose_states, state_signals
 from ctrlplan.systems.feedforward import create_feedforward_iosystem
 from ctrlplan.systems.flat import create_flat_iosystem, hurwitz_coefficients
@@ -24,6 +24,7 @@ __all__ = [
     "Law",
     "PlanSource",
     "SampleHold",
+    "command_filter_gains",
     "command_lead",
     "create_command_filter_iosystem",
     "create_delay_iosystem",

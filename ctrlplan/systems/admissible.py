@@ -11,15 +11,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import linprog
 
-from ctrlplan._checks import checked_limits, checked_time
-from ctrlplan._types import System
+from ctrlplan._checks import Array, Range, checked_finite, checked_limits, checked_number
 from ctrlplan.systems.output_cells import Problem, elevated, erosion, output_cells, seen_directions
 from ctrlplan.systems.polytope import Polytope, Rows
-from ctrlplan.trajectories.common import readonly
-from ctrlplan.trajectories.fields import Fields
+from ctrlplan.trajectories.common import Frozen, readonly
 
-Array = NDArray[np.float64]
-Limits: TypeAlias = Mapping[str, Sequence[float]]
+Limits: TypeAlias = Mapping[str, Range]
 
 _SPARED = 0.1
 """Part of the margin that is given away so that rows which hardly matter can be left out."""
@@ -50,9 +47,10 @@ class AdmissibleSet(Fields):
     ----------
     loop : control.StateSpace or control.TransferFunction
         Continuous and stable, linear interconnections included.
-    limits : mapping of str to (float, float)
-        Least and greatest value of each limited output. One may be infinite;
-        it then stands for a million times the other (or 1) away from it.
+    limits : mapping of str to (float, float) or float
+        Minimum and maximum of each limited output; a number a for (-a, a). One
+        of them may be infinite; it then stands for a million times the other
+        (or 1) away from it.
     dt : float
         Period of the governor [s], above 0.
     references : sequence of str, optional
@@ -127,8 +125,8 @@ class AdmissibleSet(Fields):
         disturbances: Mapping[str, float] | None = None,
         origin: tuple[ArrayLike, ArrayLike] | None = None,
     ) -> None:
-        period = checked_time(dt, "dt", positive=True)
-        share = float(margin)
+        period = checked_finite(dt, "dt", above=0.0)
+        share = checked_number(margin, "margin")
         if not 0.0 < share < 1.0:
             raise ValueError(f"margin must lie in (0, 1), got {margin}")
         problem = _problem(loop, limits, references, dict(disturbances or {}))
@@ -227,9 +225,6 @@ def _problem(
         raise ValueError(f"references must not name an input twice, got {', '.join(governed)}")
     if not limits:
         raise ValueError("limits must name an output at least, got none")
-    for label, most in disturbances.items():
-        if not (math.isfinite(most) and most >= 0.0):
-            raise ValueError(f"disturbances of {label} must be finite and at least 0, got {most}")
     a, b, c, d = _matrices(loop)
     poles = np.linalg.eigvals(a)
     if poles.size and not poles.real.max() < -1e-9 * np.abs(poles).max():
@@ -239,7 +234,9 @@ def _problem(
     pairs, scale = found[:, :2], found[:, 2]
     rows, columns = [outputs.index(label) for label in limits], [inputs.index(label) for label in governed]
     shaken = [inputs.index(label) for label in disturbances]
-    sizes = np.array([float(most) for most in disturbances.values()])
+    sizes = np.array(
+        [checked_finite(most, f"disturbances of {label}", minimum=0.0) for label, most in disturbances.items()]
+    )
     c, d = c[rows] / scale[:, None], d[rows] / scale[:, None]
     rest = np.asarray(-np.linalg.solve(a, b[:, columns]), dtype=float)
     low, high = pairs.T / scale

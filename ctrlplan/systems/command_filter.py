@@ -3,54 +3,123 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import control as ct
 import numpy as np
 
-from ctrlplan._checks import checked_count, checked_number, checked_time
+from ctrlplan._checks import checked_count, checked_finite, checked_names
+from ctrlplan._renamed import former_signature, warn_renamed
 from ctrlplan.traits import declare
 from ctrlplan.trajectories import derivative_name
 
 
+@former_signature(renamed={"input": "inputs", "output": "outputs"})
 def create_command_filter_iosystem(
     bandwidth: float,
     derivatives: int = 2,
     order: int | None = None,
     *,
     initial: float = 0.0,
-    input: str = "r_cmd",
-    output: str = "r",
+    inputs: Sequence[str] | str | None = None,
+    outputs: Sequence[str] | str | None = None,
     name: str | None = None,
 ) -> ct.StateSpace:
-    """Filter 1/(s/w + 1)^n that puts out derivatives of what it makes of a command.
+    """Command filter 1/(s/w + 1)^n with derivative outputs.
 
-    What a law that reads derivatives needs before it where the reference comes
-    in steps, as from a governor. Behind a plan it lags by n/w, unless the plan
-    is put in with the lead of `command_lead`.
+    For a law that reads derivatives of a reference that comes in steps, as from
+    a governor. The output of a plan lags by n/w, unless the command is the sum
+    of its derivatives weighted by `command_filter_gains`.
 
-    States: the reference and n - 1 derivatives; outputs: the first of them, r,
-    r_d1, ...; input: the command.
+    States: r and its derivatives r_d1, ... up to n - 1. Inputs: the command
+    r_cmd. Outputs: r, r_d1, ... up to `derivatives`.
 
     Parameters
     ----------
     bandwidth : float
         w [rad/s], above 0.
     derivatives : int, optional
-        Highest derivative put out.
+        Highest derivative among the outputs.
     order : int, optional
-        n, at least one above `derivatives`, which is taken unless given: the
-        derivative n jumps with the command.
+        n, at least ``derivatives + 1``, which is the default: the derivative n
+        jumps with the command.
     initial : float, optional
-        Reference at which it rests in the beginning, by its attribute
-        ``initial_state``.
-    input, output : str, optional
-        Names of the signals.
+        Reference at the start of a run, in equilibrium; the declared initial state.
+    inputs : str, optional
+        Name of the command: r_cmd unless given.
+    outputs : str or sequence of str, optional
+        Name of the reference, r unless given, which its derivatives are named
+        after; or a name for each output.
     name : str, optional
-        Name of the block; `output` with ``_filter`` unless given.
+        Name of the block: that of the first output with ``_filter`` unless given.
 
     Returns
     -------
     control.StateSpace
+        In continuous time.
+
+    Raises
+    ------
+    TypeError
+        If an argument is of a wrong kind.
+    ValueError
+        If an argument is out of range, or names are not as many as signals.
+
+    Examples
+    --------
+    >>> import control as ct
+    >>> import numpy as np
+    >>> import ctrlplan as cp
+    >>> block = cp.create_command_filter_iosystem(2.0)
+    >>> block.input_labels, block.output_labels
+    (['r_cmd'], ['r', 'r_d1', 'r_d2'])
+    >>> plant = cp.plants.integrator_lag_loop(5.0)
+    >>> loop = ct.interconnect([block, plant], inputs=["r_cmd"], outputs=["y", *block.output_labels])
+    >>> found = cp.simulate(loop, np.linspace(0.0, 30.0, 7), cp.Step(1.0))
+    >>> found.outputs[:, -1].round(5).tolist()
+    [1.0, 1.0, 0.0, 0.0]
+    """
+    w = checked_finite(bandwidth, "bandwidth", above=0.0)
+    count = checked_count(derivatives, "derivatives") + 1
+    n = count if order is None else checked_count(order, "order", count)
+    start = checked_finite(initial, "initial")
+    a = np.diag(np.ones(n - 1), 1)
+    a[-1] = [-math.comb(n, k) * w ** (n - k) for k in range(n)]
+    b = np.zeros((n, 1))
+    b[-1] = w**n
+    base = checked_names("r" if outputs is None else outputs, "outputs")
+    labels = [derivative_name(base[0], k) for k in range(n)]
+    block = ct.ss(
+        a,
+        b,
+        np.eye(count, n),
+        np.zeros((count, 1)),
+        inputs=checked_names("r_cmd" if inputs is None else inputs, "inputs", 1),
+        outputs=labels[:count] if len(base) == 1 else checked_names(base, "outputs", count),
+        states=labels,
+        name=name or f"{base[0]}_filter",
+    )
+    if start:
+        declare(block, initial_state=np.array([start, *[0.0] * (n - 1)]))
+    return block
+
+
+def command_filter_gains(bandwidth: float, order: int) -> tuple[float, ...]:
+    """Gains of a plan's derivatives in the command of a filter.
+
+    With this command the output of `create_command_filter_iosystem` is the plan.
+
+    Parameters
+    ----------
+    bandwidth : float
+        w [rad/s] of the filter, above 0.
+    order : int
+        n of the filter, at least 1.
+
+    Returns
+    -------
+    tuple of float
+        Coefficients of (s/w + 1)^n, of the derivatives 0 to n [s^k].
 
     Raises
     ------
@@ -59,50 +128,21 @@ def create_command_filter_iosystem(
 
     Examples
     --------
-    >>> create_command_filter_iosystem(2.0).output_labels
-    ['r', 'r_d1', 'r_d2']
+    >>> command_filter_gains(2.0, 2)
+    (1.0, 1.0, 0.25)
     """
-    w = checked_time(bandwidth, "bandwidth", positive=True)
-    count = checked_count(derivatives, "derivatives") + 1
-    n = count if order is None else checked_count(order, "order", count)
-    a = np.diag(np.ones(n - 1), 1)
-    a[-1] = [-math.comb(n, k) * w ** (n - k) for k in range(n)]
-    b = np.zeros((n, 1))
-    b[-1] = w**n
-    labels = [derivative_name(output, k) for k in range(n)]
-    block = ct.ss(
-        a,
-        b,
-        np.eye(count, n),
-        np.zeros((count, 1)),
-        inputs=[input],
-        outputs=labels[:count],
-        states=labels,
-        name=name or f"{output}_filter",
-    )
-    if checked_number(initial, "initial"):
-        declare(block, initial_state=np.array([initial, *[0.0] * (n - 1)]))
-    return block
+    w = checked_finite(bandwidth, "bandwidth", above=0.0)
+    n = checked_count(order, "order", 1)
+    return tuple(math.comb(n, k) / w**k for k in range(n + 1))
 
 
 def command_lead(bandwidth: float, order: int) -> tuple[float, ...]:
-    """Weights of a plan's derivatives 0 to n in the command that a filter turns into the plan.
+    """Old name of `command_filter_gains`.
 
-    Parameters
-    ----------
-    bandwidth, order
-        w [rad/s] and n of `create_command_filter_iosystem`.
-
-    Returns
-    -------
-    tuple of float
-        Coefficients of (s/w + 1)^n, lowest first.
-
-    Examples
-    --------
-    >>> command_lead(2.0, 2)
-    (1.0, 1.0, 0.25)
+    Warns
+    -----
+    FutureWarning
+        Always.
     """
-    w = checked_time(bandwidth, "bandwidth", positive=True)
-    n = checked_count(order, "order", 1)
-    return tuple(math.comb(n, k) / w**k for k in range(n + 1))
+    warn_renamed("command_lead", "command_filter_gains")
+    return command_filter_gains(bandwidth, order)

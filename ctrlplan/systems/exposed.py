@@ -9,13 +9,9 @@ from functools import partial
 
 import control as ct
 import numpy as np
-from control.statesp import LinearICSystem
-from numpy.typing import NDArray
 
 from ctrlplan._types import Params, System, Value
 from ctrlplan.traits import declare, traits_of
-
-Array = NDArray[np.float64]
 
 
 def expose_states(system: System, name: str | None = None) -> System:
@@ -168,7 +164,7 @@ def _interconnection(system: ct.InterconnectedSystem, names: Sequence[str]) -> c
     found.set_input_map(np.array(system.input_map))
     found.set_output_map(np.vstack([own_outputs, state_outputs]))
     if isinstance(system, ct.StateSpace):  # of linear blocks python-control keeps the matrices as well
-        found = LinearICSystem(found, _state_space(system, names), system.connection_type)
+        found = ct.LinearICSystem(found, _state_space(system, names), system.connection_type)
     return declare(found, initial_state=traits_of(system).initial_state)
 
 

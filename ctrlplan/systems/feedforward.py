@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import control as ct
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import null_space
 
+from ctrlplan._checks import Array, checked_labels
+from ctrlplan._renamed import former_signature
 from ctrlplan.trajectories import derivative_name
-
-Array = NDArray[np.float64]
 
 _SMALL = 1e-9
 """Relative size up to which numbers count as 0."""
 
 
+@former_signature("label", "name", renamed={"label": "labels"}, implied={"label": {"suffix": ""}})
 def create_feedforward_iosystem(
-    loop: ct.StateSpace | ct.TransferFunction, label: str | None = None, name: str = "feedforward"
+    loop: ct.StateSpace | ct.TransferFunction,
+    *,
+    labels: Sequence[str] | str | None = None,
+    suffix: str = "_ref",
+    name: str = "feedforward",
 ) -> ct.StateSpace:
     r"""Exact inverse of a linear loop without finite zeros.
 
@@ -28,17 +34,19 @@ def create_feedforward_iosystem(
     makes y = y_d, from a start on the plan; for k/(s^2 + s) in unity feedback
     it is y_d + (y_d'' + y_d')/k. The loop's own poles say how errors decay.
 
-    No states. Inputs: {label}, {label}_d1, ... up to order n, as
-    `create_source_iosystem` puts them out. Output: the input of the loop by name.
+    No states. Inputs: y_ref, y_ref_d1, ... up to order n, y the output of the
+    loop, as `create_source_iosystem` names its outputs with ``suffix="_ref"``.
+    Outputs: the input r of the loop, by the loop's names.
 
     Parameters
     ----------
     loop : control.StateSpace or control.TransferFunction
         Linear and continuous, with one input and one output; interconnections
         of linear blocks are.
-    label : str, optional
-        Name of the plan's axis: {y}_ref unless given, y the output of the loop,
-        for a source with ``suffix="_ref"``.
+    labels : sequence of str or str, optional
+        Name of the plan's axis: that of the output of the loop unless given.
+    suffix : str, optional
+        Appended to the label.
     name : str, optional
         Name of the block.
 
@@ -54,8 +62,8 @@ def create_feedforward_iosystem(
     ValueError
         If it is discrete, has more than one input or output, does not bring its
         input to its output, or has finite zeros (its inverse is then no sum of
-        derivatives; they are in the message); or if `label` is a signal of the
-        loop.
+        derivatives; they are in the message); or if the label with the suffix is a
+        signal of the loop.
 
     Examples
     --------
@@ -74,9 +82,11 @@ def create_feedforward_iosystem(
     """
     system = _checked_loop(loop)
     given, reached = loop.input_labels[0], loop.output_labels[0]
-    label = f"{reached}_ref" if label is None else label
+    label = checked_labels([reached] if labels is None else labels, 1)[0] + suffix
     if label in (given, reached):
-        raise ValueError(f"label must differ from the signals of the loop, which would be added to it, got {label!r}")
+        raise ValueError(
+            f"labels and suffix must not name a signal of the loop, which would be added to it, got {label!r}"
+        )
     gains = _inverse(*(np.asarray(m, dtype=float) for m in (system.A, system.B, system.C, system.D)))
     names = [derivative_name(label, k) for k in range(gains.size)]
     return ct.ss([], [], [], [gains], inputs=names, outputs=[given], dt=None, name=name)

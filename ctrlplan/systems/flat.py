@@ -12,8 +12,8 @@ from typing import Any
 import control as ct
 import control.flatsys as fs
 import numpy as np
-from numpy.typing import NDArray
 
+from ctrlplan._renamed import former_signature
 from ctrlplan.flatness.verify import (
     check_linearises,
     checked_plant,
@@ -25,15 +25,15 @@ from ctrlplan.flatness.verify import (
 )
 from ctrlplan.trajectories import derivative_name
 
-Array = NDArray[np.float64]
 
-
+@former_signature("name")
 def create_flat_iosystem(
     flat_system: fs.FlatSystem,
-    poles: Sequence[Value],
-    name: str = "flat_law",
+    poles: Sequence[Any],
     *,
     labels: Sequence[str] | str | None = None,
+    suffix: str = "_ref",
+    name: str = "flat_law",
 ) -> ct.NonlinearIOSystem:
     r"""Law under which flat outputs follow their plan, (9)-(11) corrected.
 
@@ -46,10 +46,10 @@ def create_flat_iosystem(
     of y_j^(r_j). Plant and law together are chains of r_j integrators, on which
     the errors obey the linear equation with the poles p_j.
 
-    No states. Inputs: of each flat output in turn the references {label}_ref,
-    {label}_ref_d1, ... up to order r_j, as `create_source_iosystem` puts them
-    out with ``suffix="_ref"``; then the plant's states by name. Outputs: the
-    plant's inputs by name.
+    No states. Inputs: of each flat output in turn the references, y_ref,
+    y_ref_d1, ... up to order r_j for one called y, as `create_source_iosystem`
+    names its outputs with ``suffix="_ref"``; then the plant's states by name.
+    Outputs: the plant's inputs by name, u of a plant whose input is u.
 
     Parameters
     ----------
@@ -60,11 +60,13 @@ def create_flat_iosystem(
     poles : sequence of sequences of complex
         For each flat output r_j poles [rad/s], closed under conjugation and
         with negative real parts; one flat sequence where there is one flat output.
-    name : str, optional
-        Name of the block.
-    labels : sequence of str, optional
+    labels : sequence of str or str, optional
         Names of the flat outputs: unless given, those of the plant's outputs
         where these are the flat outputs and are named, else y, or y1, y2, ...
+    suffix : str, optional
+        Appended to each label in the names of the references.
+    name : str, optional
+        Name of the block.
 
     Returns
     -------
@@ -132,11 +134,11 @@ def create_flat_iosystem(
     orders = probes[0].orders
     gains = _gains(poles, orders)
     references = [
-        derivative_name(f"{label}_ref", k) for label, r in zip(names, orders, strict=True) for k in range(r + 1)
+        derivative_name(label + suffix, k) for label, r in zip(names, orders, strict=True) for k in range(r + 1)
     ]
     states = list(plant.system.state_labels)
     if shared := sorted(set(references) & set(states)):
-        raise ValueError(f"labels must not make references of the names of states, got {', '.join(shared)}")
+        raise ValueError(f"labels and suffix must not give references the names of states, got {', '.join(shared)}")
     idle = np.zeros(plant.ninputs)
 
     def law(t: float, x: Value, u: Value, params: Params) -> Value:

@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import NoReturn, Protocol, runtime_checkable
+from collections.abc import Mapping, Sequence
+from typing import Any, NoReturn, Protocol, runtime_checkable
 
 import control as ct
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from ctrlplan._checks import checked_seconds, checked_time
-from ctrlplan._types import EventName, Params, System, Value
+from ctrlplan._checks import Array, checked_finite, checked_names, checked_vector
+from ctrlplan._types import EventName
 from ctrlplan.systems.admissible import AdmissibleSet, Limits
 from ctrlplan.systems.exposed import state_signals
 from ctrlplan.systems.hybrid import refuse_alone
-from ctrlplan.traits import DeclaredTrait, declare
-
-Array = NDArray[np.float64]
+from ctrlplan.traits import Declared, declare
 
 
 @runtime_checkable
@@ -60,14 +58,22 @@ class Governor(ct.NonlinearIOSystem):  # type: ignore[misc]
     period = DeclaredTrait[float]()
     offset = DeclaredTrait[float]()
 
-    def __init__(self, admission: Admission, period: float, offset: float, initial: Array, name: str) -> None:
-        references = list(admission.references)
+    def __init__(
+        self,
+        admission: Admission,
+        period: float,
+        offset: float,
+        initial: Array,
+        inputs: list[str],
+        outputs: list[str],
+        name: str,
+    ) -> None:
         super().__init__(
             self._no_rates,
             self._held,
-            inputs=[*(f"{label}_cmd" for label in references), *state_signals(admission.states)],
-            outputs=references,
-            states=[*(f"{label}_offset" for label in references), "fraction", "refused", "unread"],
+            inputs=inputs,
+            outputs=outputs,
+            states=[*(f"{label}_offset" for label in outputs), "fraction", "refused", "unread"],
             dt=0,
             name=name,
         )
@@ -83,19 +89,19 @@ class Governor(ct.NonlinearIOSystem):  # type: ignore[misc]
                 EventName(f"{name}: input lost, reference held"): (_unread, -math.inf, 0.5),
             },
         )
-        self._count = len(references)
+        self._count = len(outputs)
 
     def sample(self, t: float, x: Array, u: Array, params: Params) -> Array:
         """States after a sample: the reference moved as far as is admissible."""
         n = self._count
         if not np.isfinite(u).all():
             return np.array([*x[:n], 0.0, 0.0, 1.0])
-        held, asked = x[:n] + self.initial, u[:n]
-        kappa = float(self.admission.fraction(u[n:], held, asked))
+        held, command = x[:n] + self.initial, u[:n]
+        kappa = float(self.admission.fraction(u[n:], held, command))
         if math.isnan(kappa):
             return np.array([*x[:n], 0.0, 1.0, 0.0])
-        # The whole way is what was asked for itself, without a rounding error.
-        moved = asked if kappa == 1.0 else held + kappa * (asked - held)
+        # The whole way is the command itself, without a rounding error.
+        moved = command if kappa == 1.0 else held + kappa * (command - held)
         return np.array([*(moved - self.initial), kappa, 0.0, 0.0])
 
     def _held(self, t: float, x: Value, u: Value, params: Params) -> Value:
@@ -112,25 +118,32 @@ def create_governor_iosystem(
     *,
     initial: ArrayLike = 0.0,
     offset: float = 0.0,
+    references: Sequence[str] | None = None,
+    margin: float | None = None,
+    disturbances: Mapping[str, float] | None = None,
+    origin: tuple[ArrayLike, ArrayLike] | None = None,
+    inputs: Sequence[str] | str | None = None,
+    outputs: Sequence[str] | str | None = None,
     name: str = "governor",
-    **options: Value,
 ) -> Governor:
     """Reference governor in front of a closed loop.
 
-    Every period the reference moves towards what is asked for,
+    Every period the reference v moves towards the command r,
     v+ = v + kappa (r - v), by the largest kappa in [0, 1] for which the loop,
-    with v+ held from now on, keeps its limits for ever. What is admissible
-    passes unchanged, kappa = 1. Where nothing is, not even holding, or an input
-    is not finite, v is held, and a run by `ctrlplan.simulate` records it as an
-    event. What a step of the reference sets off at once, as the derivative of
-    the error in a PID, makes every step small: take the derivative of the
-    output, or put `create_command_filter_iosystem` behind the governor.
+    with v+ held constant, satisfies its limits for all future times. An
+    admissible command passes unchanged, kappa = 1. Where nothing is admissible,
+    not even the present reference, or an input is not finite, v is held, and a
+    run by `ctrlplan.simulate` records it as an event. Direct feedthrough of the
+    reference, as through the derivative of the error in a PID, makes every step
+    small: take the derivative of the output, or connect
+    `create_command_filter_iosystem` after the governor.
 
-    Inputs: what is asked for, ``<reference>_cmd``, then the states of the
-    loop as `expose_states` puts them out. Outputs: the references, by the
-    loop's names, held between samples. States: the references as offsets from
-    `initial`; fraction, the last kappa, 0 where v was held; refused and unread,
-    1 while that is so.
+    States: the references as offsets from `initial`, ``<reference>_offset``;
+    fraction, the last kappa, 0 where v was held; refused and unread, 1 while
+    nothing is admissible or an input is not finite. Inputs: the commands,
+    ``<reference>_cmd``, then the states of the loop as `expose_states` names
+    them, ``<state>_state``. Outputs: the references, by the loop's names, held
+    between samples.
 
     Parameters
     ----------
@@ -139,17 +152,21 @@ def create_governor_iosystem(
         nonlinear loops, or any object with `references`, `states` and `fraction`.
     dt : float, optional
         Period [s], above 0: that of the admissible set unless given.
-    limits : mapping of str to (float, float), optional
-        Least and greatest value of each limited output of a linear loop.
+    limits : mapping of str to (float, float) or float, optional
+        Minimum and maximum of each limited output of a linear loop; a number a
+        for (-a, a).
     initial : array_like, optional
         Reference before the first sample, one for all or one each; it must be admissible where the run begins.
     offset : float, optional
         Time of the first sample after a run begins [s], from 0.
+    references, margin, disturbances, origin : optional
+        Of the `AdmissibleSet` of a linear loop, with its defaults.
+    inputs : sequence of str or str, optional
+        Names of the commands, or of all inputs.
+    outputs : sequence of str or str, optional
+        Names of the references: those of the loop unless given.
     name : str, optional
         Name of the block.
-    **options
-        For the `AdmissibleSet` of a linear loop: references, margin,
-        disturbances, origin.
 
     Returns
     -------
@@ -159,10 +176,11 @@ def create_governor_iosystem(
     Raises
     ------
     TypeError
-        If `loop` is none of these, or limits or options are given beside something that has its own.
+        If `loop` is none of these, or what belongs to an `AdmissibleSet` is
+        given with an object that is one already.
     ValueError
-        If `dt` is missing or is not that of the set, `initial` does not fit, or the
-        `AdmissibleSet` refuses; the reason is in the message.
+        If `dt` is missing or is not that of the set, `initial` or names do not
+        fit, or the `AdmissibleSet` raises; the reason is in the message.
 
     References
     ----------
@@ -172,13 +190,15 @@ def create_governor_iosystem(
 
     Examples
     --------
-    A step that would ask for five times the control there is:
+    A step for which the loop would need five times the available control:
 
     >>> import control as ct
     >>> import numpy as np
     >>> import ctrlplan as cp
     >>> loop = cp.plants.integrator_lag_loop(5.0, outputs=("y", "u"))
-    >>> governor = cp.create_governor_iosystem(loop, 0.05, {"u": (-1.0, 1.0)})
+    >>> governor = cp.create_governor_iosystem(loop, 0.05, {"u": 1.0})
+    >>> governor.input_labels, governor.output_labels
+    (['r_cmd', 'plant_x_0_state', 'plant_x_1_state'], ['r'])
     >>> governed = ct.interconnect([governor, cp.expose_states(loop)], inputs=["r_cmd"], outputs=["y", "u", "r"])
     >>> found = cp.simulate(governed, np.linspace(0.0, 15.0, 301), {"r_cmd": cp.Step(1.0)})
     >>> y, u, r = found.outputs
@@ -187,26 +207,43 @@ def create_governor_iosystem(
     >>> found.state_labels[:2]
     ['governor_r_offset', 'governor_fraction']
     """
-    admission = _admission(loop, dt, limits, options)
+    options = {"references": references, "margin": margin, "disturbances": disturbances, "origin": origin}
+    given = {label: value for label, value in options.items() if value is not None}
+    admission = _admission(loop, dt, limits, given)
     own = getattr(admission, "dt", None)
-    given = own if dt is None else dt
-    if given is None:
+    period = own if dt is None else dt
+    if period is None:
         raise ValueError("dt must be given, the period in s")
-    period = checked_time(given, "dt", positive=True)
+    period = checked_finite(period, "dt", above=0.0)
     if own is not None and abs(period - own) > 1e-12 * own:
         raise ValueError(f"dt must be the period of the admissible set, {own:g} s, got {period:g} s")
-    start = checked_seconds(offset, "offset", positive=False)
+    start = checked_finite(offset, "offset", minimum=0.0)
+    before = checked_vector(initial, "initial", len(admission.references))
+    commands = _command_names(admission, inputs)
+    governed = list(admission.references)
+    if outputs is not None:
+        governed = checked_names(outputs, "outputs", len(governed))
+    return Governor(admission, period, start, before, commands, governed, name)
+
+
+def _command_names(admission: Admission, inputs: Sequence[str] | str | None) -> list[str]:
+    """Names of all inputs: commands, then states of the loop."""
+    states = state_signals(admission.states)
+    if inputs is None:
+        return [*(f"{label}_cmd" for label in admission.references), *states]
+    given = checked_names(inputs, "inputs")
     count = len(admission.references)
-    before = np.asarray(initial, dtype=float)
-    if before.shape not in ((), (count,)) or not np.isfinite(before).all():
-        raise ValueError(f"initial must be a finite number or {count} of them, got {initial!r}")
-    return Governor(admission, period, start, np.broadcast_to(before, (count,)).copy(), name)
+    if len(given) not in (count, count + len(states)):
+        raise ValueError(
+            f"inputs must be names of {count} commands, or of them and {len(states)} states, got {len(given)}"
+        )
+    return given if len(given) > count else checked_names([*given, *states], "inputs")
 
 
 def _admission(loop: System, dt: float | None, limits: Limits | None, options: dict[str, Value]) -> Admission:
     if isinstance(loop, ct.InputOutputSystem):
         if dt is None or limits is None:
-            raise ValueError("dt and limits must be given beside a loop")
+            raise ValueError("dt and limits must be given with a loop")
         return AdmissibleSet(loop, limits, dt, **options)
     if not isinstance(loop, Admission):
         raise TypeError(

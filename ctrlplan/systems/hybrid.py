@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import control as ct
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from ctrlplan._checks import checked_seconds
-from ctrlplan._types import Params, System, Value
-from ctrlplan.traits import DeclaredTrait, declare
-
-Array = NDArray[np.float64]
+from ctrlplan._checks import Array, check_kind, checked_finite, checked_names, checked_vector
+from ctrlplan._renamed import former_signature
+from ctrlplan.traits import Declared, declare
 
 
 class SampleHold(ct.NonlinearIOSystem):  # type: ignore[misc]
@@ -31,14 +29,15 @@ class SampleHold(ct.NonlinearIOSystem):  # type: ignore[misc]
     period = DeclaredTrait[float]()
     offset = DeclaredTrait[float]()
 
-    def __init__(self, block: System, period: float, offset: float, name: str) -> None:
-        held = [f"{label}_held" for label in block.output_labels]
+    def __init__(
+        self, block: Any, period: float, offset: float, inputs: list[str], outputs: list[str], name: str
+    ) -> None:
         super().__init__(
             self._no_rates,
             self._held,
-            inputs=block.input_labels,
-            outputs=block.output_labels,
-            states=[*(block.state_labels or []), *held],
+            inputs=inputs,
+            outputs=outputs,
+            states=[*(block.state_labels or []), *(f"{label}_held" for label in outputs)],
             dt=0,
             name=name,
             params=dict(getattr(block, "params", {})),
@@ -84,15 +83,25 @@ class Delay(ct.NonlinearIOSystem):  # type: ignore[misc]
         refuse_alone(self.name, "has a memory of its input")
 
 
-def sample_hold(block: System, dt: float, offset: float = 0.0, name: str | None = None) -> SampleHold:
+@former_signature("name")
+def sample_hold(
+    block: Any,
+    dt: float,
+    offset: float = 0.0,
+    *,
+    inputs: Sequence[str] | str | None = None,
+    outputs: Sequence[str] | str | None = None,
+    name: str | None = None,
+) -> SampleHold:
     """Discrete-time block for a continuous loop, its outputs held between samples.
 
-    python-control refuses to join the two kinds; the block that is returned
-    it joins, and `ctrlplan.simulate` runs the loop from sample to sample.
+    python-control does not connect the two kinds; it connects the block that is
+    returned, and `ctrlplan.simulate` runs the loop from sample to sample.
     Blocks that take a sample at the same instant see each other's new outputs
-    where these pass on at once.
+    where these have direct feedthrough.
 
-    States: those of the block, then the held outputs. Inputs and outputs: its own.
+    States: those of the block, then the held outputs, ``<output>_held``.
+    Inputs: those of the block. Outputs: those of the block.
 
     Parameters
     ----------
@@ -102,6 +111,8 @@ def sample_hold(block: System, dt: float, offset: float = 0.0, name: str | None 
         Period [s], above 0; that of the block, where it has one.
     offset : float, optional
         Time of the first sample after a run begins [s], from 0; outputs are 0 until then.
+    inputs, outputs : sequence of str or str, optional
+        Names of the signals: those of `block` unless given.
     name : str, optional
         Name of the block: that of `block` unless given.
 
@@ -113,9 +124,10 @@ def sample_hold(block: System, dt: float, offset: float = 0.0, name: str | None 
     Raises
     ------
     TypeError
-        If `block` is no control system.
+        If `block` is no control system, or another argument is of a wrong kind.
     ValueError
-        If it is continuous with states, has another period, or a time is out of range.
+        If it is continuous with states, has another period, a time is out of
+        range, or names are not as many as signals.
 
     Examples
     --------
@@ -124,45 +136,52 @@ def sample_hold(block: System, dt: float, offset: float = 0.0, name: str | None 
     >>> import ctrlplan as cp
     >>> plant = ct.ss([[0.0]], [[1.0]], [[1.0]], [[0.0]], inputs="u", outputs="y")
     >>> gain = ct.ss([], [], [], [[1.0, -1.0]], 0.1, inputs=["r", "y"], outputs="u", name="controller")
-    >>> loop = ct.interconnect([cp.sample_hold(gain, 0.1), plant], inputs="r", outputs="y")
+    >>> sampled = cp.sample_hold(gain, 0.1)
+    >>> sampled.state_labels
+    ['u_held']
+    >>> loop = ct.interconnect([sampled, plant], inputs="r", outputs="y")
     >>> found = cp.simulate(loop, [0.0, 0.1, 0.2], 1.0)
     >>> found.outputs.round(3).tolist()
     [0.0, 0.1, 0.19]
     """
-    if not isinstance(block, ct.InputOutputSystem):
-        raise TypeError(f"block must be a control system, got {type(block).__name__}")
-    period = checked_seconds(dt, "dt", positive=True)
-    start = checked_seconds(offset, "offset", positive=False)
+    check_kind(block, "block", ct.InputOutputSystem, "a control system")
+    period = checked_finite(dt, "dt", above=0.0)
+    start = checked_finite(offset, "offset", minimum=0.0)
     if block.dt == 0 and (block.nstates or isinstance(block, ct.TransferFunction)):
         raise ValueError(f"block must be discrete, got {block.name} with dt = 0: see control.sample_system")
     if isinstance(block.dt, float | int) and block.dt is not True and block.dt and abs(block.dt - period) > 1e-12 * dt:
         raise ValueError(f"dt must be the period of the block, {block.dt:g} s, got {period:g} s")
     if isinstance(block, ct.TransferFunction):
         block = ct.ss(block, name=block.name, inputs=block.input_labels, outputs=block.output_labels)
-    return SampleHold(block, period, start, name or block.name)
+    given = block.input_labels if inputs is None else checked_names(inputs, "inputs", block.ninputs)
+    held = block.output_labels if outputs is None else checked_names(outputs, "outputs", block.noutputs)
+    return SampleHold(block, period, start, given, held, name or block.name)
 
 
+@former_signature("inputs", "outputs", "initial", "name")
 def create_delay_iosystem(
     delay: float,
-    inputs: Sequence[str] | str = ("u",),
-    outputs: Sequence[str] | str = ("y",),
+    *,
     initial: ArrayLike = 0.0,
+    inputs: Sequence[str] | str | None = None,
+    outputs: Sequence[str] | str | None = None,
     name: str = "delay",
 ) -> Delay:
-    """Transport delay: outputs are the inputs, some time ago.
+    """Transport delay: y(t) = u(t - delay).
 
-    No states that python-control knows; `ctrlplan.simulate` keeps the past as
-    series and stops where a jump comes through, so that nothing is approximated
-    by a rational function.
+    No states that python-control knows: `ctrlplan.simulate` keeps the past
+    input as series and stops where a jump arrives, without a rational
+    approximation. Inputs: u. Outputs: y.
 
     Parameters
     ----------
     delay : float
-        How much later [s], above 0.
-    inputs, outputs : sequence of str or str, optional
-        Names of the signals, as many of each.
+        Delay [s], above 0.
     initial : array_like, optional
-        What is put out before anything has come through, one for all or one each.
+        Outputs until the first input has passed, one number for all or one
+        each, in the inputs' unit.
+    inputs, outputs : sequence of str or str, optional
+        Names of the signals, as many of each: u and y unless given.
     name : str, optional
         Name of the block.
 
@@ -173,25 +192,29 @@ def create_delay_iosystem(
 
     Raises
     ------
+    TypeError
+        If an argument is of a wrong kind.
     ValueError
         If the delay is not above 0, or inputs, outputs and initial do not fit.
 
     Examples
     --------
-    >>> import numpy as np
+    An integrator with a delayed input:
+
+    >>> import control as ct
     >>> import ctrlplan as cp
-    >>> late = cp.create_delay_iosystem(0.5)
-    >>> cp.simulate(late, [0.0, 0.5, 1.0], cp.Step(1.0)).outputs.round(9).tolist()
-    [0.0, 1.0, 1.0]
+    >>> late = cp.create_delay_iosystem(0.5, outputs="u_late")
+    >>> integrator = ct.ss([[0.0]], [[1.0]], [[1.0]], [[0.0]], inputs="u_late", outputs="y")
+    >>> plant = ct.interconnect([late, integrator], inputs="u", outputs="y")
+    >>> cp.simulate(plant, [0.0, 0.5, 1.0], cp.Step(1.0)).outputs.round(9).tolist()
+    [0.0, 0.0, 0.5]
     """
-    seconds = checked_seconds(delay, "delay", positive=True)
-    given, made = ([names] if isinstance(names, str) else list(names) for names in (inputs, outputs))
-    if len(given) != len(made) or not given:
-        raise ValueError(f"outputs must be as many as inputs, {len(given)}, got {len(made)}")
-    before = np.asarray(initial, dtype=float)
-    if before.shape not in ((), (len(given),)) or not np.isfinite(before).all():
-        raise ValueError(f"initial must be a finite number or {len(given)} of them, got {initial!r}")
-    return Delay(seconds, np.broadcast_to(before, (len(given),)).copy(), given, made, name)
+    seconds = checked_finite(delay, "delay", above=0.0)
+    given = checked_names("u" if inputs is None else inputs, "inputs")
+    late = checked_names("y" if outputs is None else outputs, "outputs")
+    if len(given) != len(late) or not given:
+        raise ValueError(f"outputs must be as many as inputs, {len(given)}, got {len(late)}")
+    return Delay(seconds, checked_vector(initial, "initial", len(given)), given, late, name)
 
 
 def refuse_alone(name: str, why: str) -> NoReturn:

@@ -5,93 +5,98 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import partial
-from numbers import Real
+from typing import Any
 
 import control as ct
 import numpy as np
-from numpy.typing import NDArray
 
-from ctrlplan._types import EventName, Params, Value
+from ctrlplan._checks import Array, Range, checked_finite, checked_names, checked_range
+from ctrlplan._renamed import former_signature
+from ctrlplan._types import EventName
 from ctrlplan.traits import declare
 
-Array = NDArray[np.float64]
 
-
+@former_signature("bias", "limits", "tracking_time", "name", renamed={"output": "outputs"})
 def create_pid_iosystem(
     kp: float,
     ki: float,
     kd: float,
     tf: float,
-    bias: float = 0.0,
-    limits: Sequence[float] | None = None,
-    tracking_time: float | None = None,
-    name: str = "pid",
     *,
-    inputs: Sequence[str] = ("r", "y"),
-    output: str = "u",
+    bias: float = 0.0,
+    limits: Range | None = None,
+    tracking_time: float | None = None,
+    inputs: Sequence[str] | None = None,
+    outputs: Sequence[str] | str | None = None,
+    name: str = "pid",
 ) -> ct.StateSpace | ct.NonlinearIOSystem:
     """PID on the error r - y: Kp + Ki/s + Kd s/(Tf s + 1).
 
-    States integral (of Ki times the error) and filter (of the error); inputs
-    r and y; output u. Without bias and limits it is a `control.StateSpace`.
+    States: integral (of Ki times the error) and filter (of the error). Inputs:
+    r and y. Outputs: u. Without bias and limits it is a `control.StateSpace`.
 
     Parameters
     ----------
     kp, ki, kd : float
-        Gains, finite; `ki` and `kd` may be 0.
+        Gains, finite; `ki` and `kd` may be 0. Units: that of u over that of y,
+        over seconds for `ki`, times seconds for `kd`.
     tf : float
         Time constant of the derivative filter [s], above 0.
     bias : float, optional
-        Added to the output.
-    limits : (float, float), optional
-        Least and greatest output, acting on the total.
+        Constant added to the output.
+    limits : (float, float) or float, optional
+        Minimum and maximum of the output, bias included; a number a for (-a, a).
     tracking_time : float, optional
-        Time constant [s] with which the integral is led back while a limit
-        acts: sqrt(kd/ki), or kp/ki where kd is 0, unless given.
+        Time constant [s] of the anti-windup, with which the integral tracks the
+        limited output: sqrt(kd/ki), or kp/ki where kd is 0, unless given.
+    inputs : sequence of str, optional
+        Names of reference and measurement: r and y unless given.
+    outputs : str, optional
+        Name of the control: u unless given.
     name : str, optional
         Name of the block.
-    inputs, output : optional
-        Names of the signals.
 
     Returns
     -------
     control.StateSpace or control.NonlinearIOSystem
+        In continuous time.
 
     Raises
     ------
+    TypeError
+        If a number or a name is of a wrong kind.
     ValueError
-        If a gain is not finite, `tf` or `tracking_time` is not above 0, or
-        the limits do not increase.
+        If a gain is not finite, `tf` or `tracking_time` is not above 0, the
+        limits do not increase, or names are not two and one.
 
     Examples
     --------
-    >>> create_pid_iosystem(3.0, 1.0, 2.0, 0.1).state_labels
+    >>> import control as ct
+    >>> import numpy as np
+    >>> import ctrlplan as cp
+    >>> pid = cp.create_pid_iosystem(3.0, 1.0, 2.0, 0.1)
+    >>> pid.state_labels
     ['integral', 'filter']
+    >>> plant = ct.ss([[-1.0]], [[1.0]], [[1.0]], [[0.0]], inputs="u", outputs="y")
+    >>> loop = ct.interconnect([pid, plant], inputs="r", outputs=["y", "u"])
+    >>> cp.simulate(loop, np.linspace(0.0, 60.0, 7), cp.Step(1.0)).outputs[:, -1].round(6).tolist()
+    [1.0, 1.0]
     """
-    numbers: dict[str, Value] = {"kp": kp, "ki": ki, "kd": kd, "bias": bias, "tf": tf}
-    for label, value in numbers.items():
-        if isinstance(value, bool) or not isinstance(value, Real):
-            raise TypeError(f"{label} must be a number, got {value!r}")
-        if not math.isfinite(value) or (label == "tf" and not float(value) > 0.0):
-            raise ValueError(f"{label} must be finite{' and above 0' if label == 'tf' else ''}, got {value}")
-    if limits is not None and np.shape(limits) != (2,):
-        raise ValueError(f"limits must be two numbers, got {limits!r}")
-    if tracking_time is not None and not (math.isfinite(tracking_time) and tracking_time > 0.0):
-        raise ValueError(f"tracking_time must be finite and above 0, got {tracking_time}")
-    names: dict[str, Value] = {
-        "inputs": list(inputs),
-        "outputs": [output],
-        "states": ["integral", "filter"],
-        "name": name,
-    }
+    kp, ki, kd, bias = (
+        checked_finite(value, label) for label, value in (("kp", kp), ("ki", ki), ("kd", kd), ("bias", bias))
+    )
+    tf = checked_finite(tf, "tf", above=0.0)
+    low, high = (-math.inf, math.inf) if limits is None else checked_range(limits, "limits")
+    if tracking_time is not None:
+        tracking_time = checked_finite(tracking_time, "tracking_time", above=0.0)
+    measured = checked_names(("r", "y") if inputs is None else inputs, "inputs", 2)
+    control = checked_names("u" if outputs is None else outputs, "outputs", 1)
+    names: dict[str, Any] = {"inputs": measured, "outputs": control, "states": ["integral", "filter"], "name": name}
     if limits is None and bias == 0.0:
         a = [[0.0, 0.0], [0.0, -1.0 / tf]]
         b = [[ki, -ki], [1.0 / tf, -1.0 / tf]]
         gain = kp + kd / tf
         return ct.ss(a, b, [[1.0, -kd / tf]], [[gain, -gain]], **names)
-    low, high = (-math.inf, math.inf) if limits is None else (float(limits[0]), float(limits[1]))
-    if not low < high:
-        raise ValueError(f"limits must increase, got {low} and {high}")
     back = _tracking_rate(kp, ki, kd, tracking_time) if limits is not None else 0.0
 
     total = partial(_total, kp, kd / tf, bias)
@@ -99,9 +104,9 @@ def create_pid_iosystem(
     def limited(value: Value) -> Value:
         return value if limits is None else np.fmin(np.fmax(value, low), high)
 
-    def update(t: float, x: Value, u: Value, params: Params) -> Array:
-        error, asked = u[0] - u[1], total(x, u)
-        return np.array([ki * error + back * (limited(asked) - asked), (error - x[1]) / tf])
+    def update(t: float, x: Any, u: Any, params: dict[str, Any]) -> Array:
+        error, command = u[0] - u[1], total(x, u)
+        return np.array([ki * error + back * (limited(command) - command), (error - x[1]) / tf])
 
     def out(t: float, x: Value, u: Value, params: Params) -> Array:
         return np.array([limited(total(x, u))])
@@ -109,17 +114,18 @@ def create_pid_iosystem(
     block = ct.nlsys(update, out, **names)
     if limits is not None:
         # What `ctrlplan.simulate` records the crossings of.
-        declare(block, watched={EventName(output, "was at its limit"): (partial(_asked, kp, kd / tf, bias), low, high)})
+        command = partial(_command, kp, kd / tf, bias)
+        declare(block, watched={EventName(control[0], "was at its limit"): (command, low, high)})
     return block
 
 
-def _total(kp: float, kd: float, bias: float, x: Value, u: Value) -> Value:
-    """What is asked for, before the limits; kd over the filter's time constant."""
+def _total(kp: float, kd: float, bias: float, x: Any, u: Any) -> Any:
+    """Output before the limits; kd over the filter's time constant."""
     error = u[0] - u[1]
     return bias + kp * error + x[0] + kd * (error - x[1])
 
 
-def _asked(kp: float, kd: float, bias: float, t: Value, x: Value, u: Value, params: Params) -> Value:
+def _command(kp: float, kd: float, bias: float, t: Any, x: Any, u: Any, params: dict[str, Any]) -> Any:
     return _total(kp, kd, bias, x, u)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Literal, NoReturn
 
@@ -12,18 +12,16 @@ import control as ct
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ctrlplan._checks import checked_count, checked_seconds, checked_time
-from ctrlplan._types import EventName, Params, Value
+from ctrlplan._checks import Array, check_kind, checked_count, checked_finite, new_numbers
+from ctrlplan._types import EventName
 from ctrlplan.systems.hybrid import refuse_alone
-from ctrlplan.systems.source import create_source_iosystem
-from ctrlplan.traits import DeclaredTrait, declare
+from ctrlplan.systems.source import axis_signals, create_source_iosystem
+from ctrlplan.traits import Declared, declare
 from ctrlplan.trajectories import Trajectory
 from ctrlplan.trajectories.extrema import stationary_times
 from ctrlplan.trajectories.files import signal_names
 from ctrlplan.trajectories.newton_spline import NewtonSpline
 from ctrlplan.trajectories.transition import Transition, extrapolated, series, taylor_value, transition
-
-Array = NDArray[np.float64]
 
 _ROUNDING, _MATTERS = 1e-12, 1e-6
 """Part of the move by which a goal has moved, and by which one that is not reached is worth an event."""
@@ -48,8 +46,9 @@ def create_replanner_iosystem(
     min_horizon: float | None = None,
     limits: Mapping[int, ArrayLike] | None = None,
     derivatives: int | None = None,
-    suffix: str = "",
     offset: float = 0.0,
+    labels: Sequence[str] | str | None = None,
+    suffix: str = "",
     name: str = "replanner",
 ) -> ct.InterconnectedSystem:
     r"""Plan that is made again every period, from where the reference or the plant is.
@@ -72,9 +71,12 @@ def create_replanner_iosystem(
     drift. Between fits the output is the plan in continuous time. Runs in
     `ctrlplan.simulate` only.
 
-    Outputs: the jet of each axis, named as `create_source_iosystem` names them.
-    Inputs: with `goal_derivatives`, x_goal, x_goal_d1, ... of each axis; with
-    `measured`, x, x_d1, ....
+    States: start and end of the correction [s], lost (whether an input was not
+    finite), missed (whether the goal is out of reach), fits (their number),
+    ``goal[k]``, the goal at the last fit, and ``coefficient[k]``. Inputs: with
+    `goal_derivatives`, x_goal, x_goal_d1, ... of each axis x; with `measured`,
+    x, x_d1, .... Outputs: the jet of each axis, x, x_d1, ..., as
+    `create_source_iosystem` names it.
 
     Parameters
     ----------
@@ -112,22 +114,22 @@ def create_replanner_iosystem(
         taken: the last one is held. Costs milliseconds a fit.
     derivatives : int, optional
         Highest derivative put out; `order` unless given.
-    suffix : str, optional
-        Put behind each label of an output.
     offset : float, optional
         Time of the first fit after a run begins [s].
+    labels : sequence of str or str, optional
+        Names of the axes in the place of the plan's own.
+    suffix : str, optional
+        Appended to each label of an output.
     name : str, optional
         Name of the block.
 
     Returns
     -------
     control.InterconnectedSystem
-        Of the plan's source and the block that corrects it. States of that
-        block: start and end of the correction [s], whether values were lost,
-        whether the goal is out of reach, the number of fits, the goal at
-        the last, and coefficients. A run records as events when a value was not finite
-        (nan from a sensor: the last good plan is held), and when the goal could
-        not be reached within horizon and limits.
+        Of the plan's source and the block that corrects it. A run records as
+        events when an input was not finite (nan from a sensor: the last good
+        plan is held), and when the goal could not be reached within horizon and
+        limits.
 
     Raises
     ------
@@ -148,6 +150,7 @@ def create_replanner_iosystem(
     --------
     A goal that is moved at 4 s, met at 10 s all the same:
 
+    >>> import control as ct
     >>> import numpy as np
     >>> import ctrlplan as cp
     >>> plan = cp.PolySpline([cp.Waypoint(0, 0, 0, 0), cp.Waypoint(10, 1, 0, 0)], labels=["x"])
@@ -155,25 +158,26 @@ def create_replanner_iosystem(
     >>> replanner.input_labels, replanner.output_labels
     (['x_goal'], ['x', 'x_d1', 'x_d2'])
     >>> t = np.linspace(0, 12, 121)
-    >>> found = cp.simulate(replanner, t, cp.Step(1.5, 1.0, 4.0))
+    >>> goal = cp.create_source_iosystem(cp.Step(1.5, 1.0, 4.0), labels="x", suffix="_goal", name="goal")
+    >>> found = cp.simulate(ct.interconnect([goal, replanner], inputs=0, outputs=replanner.output_labels), t)
     >>> np.round(found.outputs[:, -1], 9).tolist()
     [1.5, 0.0, 0.0]
     """
-    if not isinstance(plan, Trajectory):
-        raise TypeError(f"plan must be a Trajectory, got {type(plan).__name__}")
+    check_kind(plan, "plan", Trajectory)
     order = checked_count(order, "order")
     put_out = order if derivatives is None else checked_count(derivatives, "derivatives")
     for label, value in (("measured", measured), ("goal_derivatives", goal_derivatives)):
         if value is not None and checked_count(value, label) > order:
             raise ValueError(f"{label} must be at most order, {order}, got {value}")
-    horizons = _Horizons(plan, checked_time(dt, "dt", positive=True), order, horizon, alpha, min_horizon)
+    horizons = _Horizons(plan, checked_finite(dt, "dt", above=0.0), order, horizon, alpha, min_horizon)
     trigger_over = _checked_trigger(trigger, threshold, measured, goal_derivatives)
     limited = _checked_limits(plan, limits)
-    signals = _Signals(plan.labels, max(put_out, order), put_out, goal_derivatives, measured, suffix)
+    axes = axis_signals(plan, labels, "")
+    signals = _Signals(axes, max(put_out, order), put_out, goal_derivatives, measured, suffix)
     core = _Correction(
-        plan, horizons, checked_seconds(offset, "offset", positive=False), signals, trigger_over, limited, name
+        plan, horizons, checked_finite(offset, "offset", minimum=0.0), signals, trigger_over, limited, name
     )
-    source = create_source_iosystem(plan, signals.planned, name=f"{name}_plan", suffix=signals.inside)
+    source = create_source_iosystem(plan, signals.planned, labels=axes, suffix=signals.inside, name=f"{name}_plan")
     return ct.interconnect(
         [source, core], inputs=signals.outer or 0, outputs=signals.outputs, name=name, warn_duplicate=False
     )
@@ -196,7 +200,7 @@ class _Horizons:
             raise ValueError(f'horizon must be a number of seconds or "shrinking", got {horizon!r}')
         if self.shrinking and not plan.duration:
             raise ValueError('horizon must be a number of seconds for a plan without duration, got "shrinking"')
-        whole = plan.duration if self.shrinking else checked_time(horizon, "horizon", positive=True)  # type: ignore[arg-type]
+        whole = plan.duration if self.shrinking else checked_finite(horizon, "horizon", above=0.0)
         if period > whole:
             what = "the plan's duration" if self.shrinking else "the horizon"
             raise ValueError(f"dt must be at most {what}, {whole:g} s, got {period:g} s")
@@ -475,7 +479,7 @@ def _least_horizon(given: float | None, period: float, whole: float) -> float:
     """Time to the end below which nothing is fitted."""
     if given is None:
         return max(period, min(5.0 * period, 0.5 * whole))
-    least = checked_time(given, "min_horizon", positive=True)
+    least = checked_finite(given, "min_horizon", above=0.0)
     if not period <= least <= whole:
         raise ValueError(
             f"min_horizon must lie between dt, {period:g} s, and the plan's duration, {whole:g} s, got {least:g} s"
@@ -498,20 +502,17 @@ def _checked_trigger(
         raise ValueError('measured must be given for trigger = "deviation", got None')
     if threshold is None:
         raise ValueError('threshold must be given for trigger = "deviation", got None')
-    return trigger, checked_time(threshold, "threshold", positive=True)
+    return trigger, checked_finite(threshold, "threshold", above=0.0)
 
 
 def _checked_limits(plan: Trajectory, limits: Mapping[int, ArrayLike] | None) -> tuple[tuple[int, Array], ...]:
     """Limits by order, one for each axis, which the plan itself keeps."""
-    if not isinstance(limits, Mapping | None):
-        raise TypeError(f"limits must be a mapping of orders to magnitudes, got {type(limits).__name__}")
+    if limits is not None:
+        check_kind(limits, "limits", Mapping, "a mapping of orders to magnitudes")
     found = []
     for key, value in (limits or {}).items():
         nu = checked_count(key, "orders of limits")
-        try:
-            limit = np.asarray(value, dtype=float)
-        except (TypeError, ValueError):
-            raise TypeError(f"limits[{nu}] must be numbers, got {value!r}") from None
+        limit = new_numbers(value, f"limits[{nu}]")
         if limit.shape not in ((), (plan.naxes,)) or not (limit > 0.0).all():
             raise ValueError(f"limits[{nu}] must be above 0, one number or {plan.naxes}, got {value!r}")
         limit = np.broadcast_to(limit, (plan.naxes,))

@@ -3,31 +3,38 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from typing import Any
 
 import control as ct
 import numpy as np
-from numpy.typing import NDArray
 
-from ctrlplan._types import EventName, Params, Value
+from ctrlplan._checks import checked_names, checked_number
+from ctrlplan._renamed import former_signature
+from ctrlplan._types import EventName
 from ctrlplan.traits import declare
 
-Array = NDArray[np.float64]
 
-
+@former_signature("inputs", "outputs", "name", renamed={"input": "inputs", "output": "outputs"})
 def create_saturation_iosystem(
-    low: float, high: float, input: str = "u_cmd", output: str = "u", name: str = "saturation"
+    low: float,
+    high: float,
+    *,
+    inputs: Sequence[str] | str | None = None,
+    outputs: Sequence[str] | str | None = None,
+    name: str = "saturation",
 ) -> ct.NonlinearIOSystem:
-    """Actuator that cannot go beyond its limits.
+    """Actuator limits: the output is the command within them.
 
-    No states. Input: what is asked for; output: the same within the limits. A
-    run by `ctrlplan.simulate` records when limits are reached and left.
+    No states. Inputs: the command u_cmd. Outputs: u. A run by
+    `ctrlplan.simulate` records as events when a limit is reached and left.
 
     Parameters
     ----------
     low, high : float
-        Least and greatest output; one may be infinite.
-    input, output : str, optional
-        Names of the signals.
+        Minimum and maximum of the output, in its unit; either may be infinite.
+    inputs, outputs : str, optional
+        Names of the signals: u_cmd and u unless given.
     name : str, optional
         Name of the block.
 
@@ -38,25 +45,34 @@ def create_saturation_iosystem(
 
     Raises
     ------
+    TypeError
+        If an argument is of a wrong kind.
     ValueError
-        If the limits do not increase or are nan.
+        If the limits do not increase or are nan, or names are not one of each.
 
     Examples
     --------
-    >>> create_saturation_iosystem(-1.0, 2.0).output(0.0, [], [5.0])
-    array([2.])
+    >>> import control as ct
+    >>> import ctrlplan as cp
+    >>> integrator = ct.ss([[0.0]], [[1.0]], [[1.0]], [[0.0]], inputs="u", outputs="y")
+    >>> limited = ct.interconnect([cp.create_saturation_iosystem(-1.0, 2.0), integrator], inputs="u_cmd", outputs="y")
+    >>> cp.simulate(limited, [0.0, 1.0, 2.0], 5.0).outputs.round(9).tolist()
+    [0.0, 2.0, 4.0]
     """
-    if not float(low) < float(high):
+    low, high = checked_number(low, "low"), checked_number(high, "high")
+    if not low < high:
         raise ValueError(f"high must be above low, got {low} and {high}")
+    command = checked_names("u_cmd" if inputs is None else inputs, "inputs", 1)
+    limited = checked_names("u" if outputs is None else outputs, "outputs", 1)
 
     def out(t: float, x: Value, u: Value, params: Params) -> Value:
         return np.array([np.fmin(np.fmax(u[0], low), high)])
 
-    block = ct.nlsys(None, out, inputs=[input], outputs=[output], dt=None, name=name)
+    block = ct.nlsys(None, out, inputs=command, outputs=limited, dt=None, name=name)
     if math.isfinite(low) or math.isfinite(high):
-        declare(block, watched={EventName(output, "was at its limit"): (_asked, low, high)})
+        declare(block, watched={EventName(limited[0], "was at its limit"): (_command, low, high)})
     return block
 
 
-def _asked(t: Value, x: Value, u: Value, params: Params) -> Value:
+def _command(t: Any, x: Any, u: Any, params: dict[str, Any]) -> Any:
     return u[0]

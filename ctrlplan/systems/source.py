@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import control as ct
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from ctrlplan._checks import checked_count
-from ctrlplan._types import Params
-from ctrlplan.traits import DeclaredTrait, declare
+from ctrlplan._checks import Array, check_kind, checked_count, checked_labels
+from ctrlplan._renamed import former_signature
+from ctrlplan.traits import Declared, declare
 from ctrlplan.trajectories import Trajectory
 from ctrlplan.trajectories.files import signal_names, signal_rows
-
-Array = NDArray[np.float64]
 
 
 class PlanSource(ct.NonlinearIOSystem):  # type: ignore[misc]
@@ -32,9 +33,9 @@ class PlanSource(ct.NonlinearIOSystem):  # type: ignore[misc]
     plan = DeclaredTrait[Trajectory]()
     derivatives = DeclaredTrait[int]()
 
-    def __init__(self, plan: Trajectory, derivatives: int, name: str, suffix: str) -> None:
-        labels = signal_names([label + suffix for label in plan.labels], derivatives)
-        super().__init__(None, self._output, inputs=0, outputs=labels, dt=None, name=name)
+    def __init__(self, plan: Trajectory, derivatives: int, name: str, axes: Sequence[str]) -> None:
+        outputs = signal_names(axes, derivatives)
+        super().__init__(None, self._output, inputs=0, outputs=outputs, dt=None, name=name)
         declare(self, plan=plan, derivatives=derivatives)
 
     @property
@@ -46,25 +47,34 @@ class PlanSource(ct.NonlinearIOSystem):  # type: ignore[misc]
         return self.plan.jet(t, self.derivatives).T.ravel()
 
 
+@former_signature("name")
 def create_source_iosystem(
-    plan: Trajectory, derivatives: int = 0, name: str = "plan", *, suffix: str = ""
+    plan: Trajectory,
+    derivatives: int = 0,
+    *,
+    labels: Sequence[str] | str | None = None,
+    suffix: str = "",
+    name: str = "plan",
 ) -> PlanSource:
-    """Plan as an input/output system without inputs or states.
+    """Plan as an input/output system.
 
-    Outputs are named axis by axis after the plan's labels: x, x_d1, x_d2, z,
-    z_d1, ...; `control.interconnect` joins them by these names.
+    No states. No inputs. Outputs: axis by axis the label, and its derivatives:
+    x, x_d1, x_d2, z, z_d1, ... for a plan with the labels x and z (y for one
+    without labels); `control.interconnect` connects them by these names.
 
     Parameters
     ----------
     plan : Trajectory
-        What is put out, at every time: held before its start and after its end.
+        Output at every time: held before its start and after its end.
     derivatives : int, optional
-        Highest derivative put out beside the position.
+        Highest derivative among the outputs, in the plan's unit over s^nu.
+    labels : sequence of str or str, optional
+        Names of the axes in the place of the plan's own.
+    suffix : str, optional
+        Appended to each label: ``suffix="_ref"`` gives x_ref, x_ref_d1, ...,
+        where the plant has outputs x and z of its own.
     name : str, optional
         Name of the block.
-    suffix : str, optional
-        Put behind each label: ``suffix="_ref"`` gives x_ref, x_ref_d1, ...,
-        where the plant has outputs x and z of its own.
 
     Returns
     -------
@@ -76,20 +86,27 @@ def create_source_iosystem(
     TypeError
         If `plan` is not a trajectory.
     ValueError
-        If `derivatives` is not a whole number from 0.
+        If `derivatives` is not a whole number from 0, or labels are not one for
+        each axis.
 
     Examples
     --------
     >>> import control as ct
     >>> import ctrlplan as cp
-    >>> plan = cp.PolySpline([cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1, 0, 0)], labels=["r"])
-    >>> driven = ct.interconnect(
-    ...     [cp.create_source_iosystem(plan), cp.plants.integrator_lag_loop(5)], inputs=0, outputs=["y"]
-    ... )
-    >>> driven.output_labels
-    ['y']
+    >>> plan = cp.PolySpline([cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1, 0, 0)])
+    >>> source = cp.create_source_iosystem(plan, labels="r")
+    >>> driven = ct.interconnect([source, cp.plants.integrator_lag_loop(5)], inputs=0, outputs=["y", "r"])
+    >>> cp.simulate(driven, [0.0, 0.5, 1.0]).outputs[1].tolist()
+    [0.0, 0.5, 1.0]
     """
-    return PlanSource(_checked_plan(plan), checked_count(derivatives, "derivatives"), name, suffix)
+    check_kind(plan, "plan", Trajectory)
+    return PlanSource(plan, checked_count(derivatives, "derivatives"), name, axis_signals(plan, labels, suffix))
+
+
+def axis_signals(plan: Trajectory, labels: Sequence[str] | str | None, suffix: str) -> tuple[str, ...]:
+    """Name of each axis in a block: its label, or the one given for it, with the suffix."""
+    own = plan.labels if labels is None else checked_labels(labels, plan.naxes)
+    return tuple(label + suffix for label in own)
 
 
 def source_samples(plan: Trajectory, timepts: ArrayLike, derivatives: int = 0) -> Array:
@@ -111,12 +128,7 @@ def source_samples(plan: Trajectory, timepts: ArrayLike, derivatives: int = 0) -
     -------
     ndarray, shape (ntime,) for a single signal, (nsignals, ntime) for more
     """
+    check_kind(plan, "plan", Trajectory)
     times = np.atleast_1d(np.asarray(timepts, dtype=float))
-    samples = signal_rows(_checked_plan(plan), times, checked_count(derivatives, "derivatives"))
+    samples = signal_rows(plan, times, checked_count(derivatives, "derivatives"))
     return samples[0] if len(samples) == 1 else samples
-
-
-def _checked_plan(plan: Trajectory) -> Trajectory:
-    if not isinstance(plan, Trajectory):
-        raise TypeError(f"plan must be a Trajectory, got {type(plan).__name__}")
-    return plan

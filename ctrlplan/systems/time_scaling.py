@@ -7,30 +7,37 @@ from collections.abc import Mapping, Sequence
 
 import control as ct
 import numpy as np
-from numpy.typing import NDArray
 
-from ctrlplan._checks import checked_count, checked_limits, checked_number, checked_pair, checked_time
-from ctrlplan._types import Params, Value
+from ctrlplan._checks import (
+    Array,
+    Range,
+    check_kind,
+    checked_count,
+    checked_finite,
+    checked_limits,
+    checked_number,
+    checked_pair,
+)
+from ctrlplan.systems.source import axis_signals
 from ctrlplan.traits import declare
 from ctrlplan.trajectories import Trajectory
 from ctrlplan.trajectories.combined import is_shaped
 from ctrlplan.trajectories.files import signal_names
 from ctrlplan.trajectories.retimed import composed
 
-Array = NDArray[np.float64]
-
 
 def create_time_scaling_iosystem(
     plan: Trajectory,
     derivatives: int = 2,
     *,
-    limits: Mapping[str, Sequence[float]] | None = None,
+    limits: Mapping[str, Range] | None = None,
     margin: float = 0.1,
     errors: Mapping[str, Sequence[float]] | None = None,
     bandwidth: float | None = None,
     slowest: float = 0.1,
     fastest: float = 1.1,
     catch_up: float | None = None,
+    labels: Sequence[str] | str | None = None,
     suffix: str = "",
     name: str = "time_scaling",
 ) -> ct.NonlinearIOSystem:
@@ -48,9 +55,10 @@ def create_time_scaling_iosystem(
     so that sigma is n times continuously differentiable, and so is the
     reference where the plan is. The path is the plan's own whatever the rate.
 
-    Outputs: the jet of each axis, as `create_source_iosystem` names them.
-    Inputs: the signals in `limits`, then those in `errors`. States: lag
-    t - sigma [s] and the lags of 1 - sigma'; the zero state follows the plan.
+    States: lag, which is t - sigma [s], and ``slow[1]``, ..., the lags of
+    1 - sigma'; the zero state follows the plan. Inputs: the signals in `limits`
+    (u for ``limits={"u": ...}``), then those in `errors`. Outputs: the jet of
+    each axis, x, x_d1, ..., as `create_source_iosystem` names it.
 
     Parameters
     ----------
@@ -58,8 +66,9 @@ def create_time_scaling_iosystem(
         What is followed.
     derivatives : int, optional
         Highest derivative put out: the order that the flat law needs.
-    limits : mapping of str to (float, float), optional
-        Least and greatest value of actuators, one of them may be infinite. A
+    limits : mapping of str to (float, float) or float, optional
+        Minimum and maximum of actuators, one of them may be infinite; a number
+        a for (-a, a). A
         clock that slows asks for force itself, and most of all where it has to
         brake: without damping this can make things worse. An actuator that
         rests near a limit keeps the clock slow.
@@ -67,7 +76,7 @@ def create_time_scaling_iosystem(
         Part of the range between limits, above 0 to 0.5, within which the rate
         falls; of the limit itself where the other is infinite.
     errors : mapping of str to (float, float), optional
-        For axes by their labels: distance of what is measured from the
+        For axes by their names in the block: distance of what is measured from the
         reference at which the rate begins to fall, and at which it is least.
         Later than limits, and gentler: which of the two is better hangs on the
         loop. Where a limit is known before the start, `retime` the plan.
@@ -79,8 +88,10 @@ def create_time_scaling_iosystem(
     catch_up : float, optional
         Time constant T [s] with which the lag is made up for; four times the
         delay n/w of the lags unless given.
+    labels : sequence of str or str, optional
+        Names of the axes in the place of the plan's own.
     suffix : str, optional
-        Put behind each label of an output.
+        Appended to each label of an output.
     name : str, optional
         Name of the block.
 
@@ -106,14 +117,28 @@ def create_time_scaling_iosystem(
 
     Examples
     --------
+    >>> import control as ct
+    >>> import numpy as np
     >>> import ctrlplan as cp
     >>> plan = cp.PolySpline([cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1, 0, 0)], labels=["x"])
     >>> block = cp.create_time_scaling_iosystem(plan, limits={"u": (-1.0, 1.0)}, suffix="_ref")
     >>> block.input_labels, block.output_labels, block.state_labels
     (['u'], ['x_ref', 'x_ref_d1', 'x_ref_d2'], ['lag', 'slow[1]', 'slow[2]'])
+
+    A PD law with the actuator's command as the signal that slows the plan:
+
+    >>> law = ct.ss([], [], [], [[20.0, 8.0, 1.0, -20.0, -8.0]], name="law", outputs="u",
+    ...             inputs=["x_ref", "x_ref_d1", "x_ref_d2", "x", "x_d1"])
+    >>> plant = cp.plants.integrator_chain(2)
+    >>> plant.set_inputs(["F"]), plant.set_outputs(["x", "x_d1"])
+    (None, None)
+    >>> actuator = cp.create_saturation_iosystem(-1.0, 1.0, inputs="u", outputs="F")
+    >>> loop = ct.interconnect([block, law, actuator, plant], inputs=0, outputs=["x", "F"])
+    >>> found = cp.simulate(loop, np.linspace(0.0, 20.0, 5))
+    >>> bool(abs(found.outputs[0, -1] - 1.0) < 1e-3)
+    True
     """
-    if not isinstance(plan, Trajectory):
-        raise TypeError(f"plan must be a Trajectory, got {type(plan).__name__}")
+    check_kind(plan, "plan", Trajectory)
     if is_shaped(plan):
         raise ValueError(
             f"a shaped plan must keep its duration of {plan.duration:g} s, got a clock that slows: the delays of the "
@@ -121,13 +146,13 @@ def create_time_scaling_iosystem(
         )
     highest = checked_count(derivatives, "derivatives")
     for label, value in (("limits", limits), ("errors", errors)):
-        if not isinstance(value, Mapping | None):
-            raise TypeError(f"{label} must be a mapping of signals to pairs of numbers, got {type(value).__name__}")
+        if value is not None:
+            check_kind(value, label, Mapping, "a mapping of signals to pairs of numbers")
     n = max(highest, 1)
     if bandwidth is None and not plan.duration:
         raise ValueError("bandwidth must be given for a plan without duration, got None")
-    w = 10.0 / plan.duration if bandwidth is None else checked_time(bandwidth, "bandwidth", positive=True)
-    horizon = 4.0 * n / w if catch_up is None else checked_time(catch_up, "catch_up", positive=True)
+    w = 10.0 / plan.duration if bandwidth is None else checked_finite(bandwidth, "bandwidth", above=0.0)
+    horizon = 4.0 * n / w if catch_up is None else checked_finite(catch_up, "catch_up", above=0.0)
     least, most, inner = (
         checked_number(value, label)
         for label, value in (("slowest", slowest), ("fastest", fastest), ("margin", margin))
@@ -145,15 +170,16 @@ def create_time_scaling_iosystem(
     if not 1.0 <= most < math.inf:
         raise ValueError(f"fastest must be finite and at least 1, got {fastest}")
     bounds = {label: _checked_limits(label, pair, inner) for label, pair in (limits or {}).items()}
-    bands = {label: _checked_band(label, pair, plan) for label, pair in (errors or {}).items()}
+    own = axis_signals(plan, labels, "")
+    bands = {label: _checked_band(label, pair, own) for label, pair in (errors or {}).items()}
     inputs = [*bounds, *bands]
-    outputs = signal_names([label + suffix for label in plan.labels], highest)
+    outputs = signal_names(axis_signals(plan, labels, suffix), highest)
     if not inputs:
         raise ValueError("limits or errors must name a signal that slows the clock, got none")
     both = [label for label in inputs if label in outputs or inputs.count(label) > 1]
     if both:
         raise ValueError(f"inputs and outputs must have names of their own, got {', '.join(both)} twice")
-    axes = [plan.labels.index(label) for label in bands]
+    axes = [own.index(label) for label in bands]
     weights = _rate_weights(n, w)
 
     def severity(t: Value, x: Value, u: Value) -> Value:
@@ -237,9 +263,9 @@ def _checked_limits(label: str, pair: Sequence[float], margin: float) -> tuple[f
     return low, high, margin * (2.0 * size if both else size)
 
 
-def _checked_band(label: str, pair: Sequence[float], plan: Trajectory) -> tuple[float, float]:
-    if label not in plan.labels:
-        raise ValueError(f"errors must name axes of the plan, {', '.join(plan.labels)}, got {label!r}")
+def _checked_band(label: str, pair: Any, axes: Sequence[str]) -> tuple[float, float]:
+    if label not in axes:
+        raise ValueError(f"errors must name axes of the plan, {', '.join(axes)}, got {label!r}")
     soft, hard = checked_pair(pair, f"errors of {label}")
     if not 0.0 <= soft < hard < math.inf:
         raise ValueError(f"errors of {label} must be finite and at least 0, got {soft:g} and {hard:g}")

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from ctrlplan._types import Params, Value
+from ctrlplan._checks import checked_finite
 from ctrlplan.flatness import FlatSystem
-from ctrlplan.systems.plants.parameters import check_parameters, overruled
+from ctrlplan.systems.plants.parameters import overruled
 
 
 def dc_motor(
@@ -65,7 +65,9 @@ def dc_motor(
         "motor_constant": motor_constant,
         "inertia": inertia,
     }
-    check_parameters(parameters, {"friction": friction})
+    for label, value in parameters.items():
+        checked_finite(value, label, above=0.0)
+    checked_finite(friction, "friction", minimum=0.0)
     R, L, K, J, b = resistance, inductance, motor_constant, inertia, friction
     own = {**parameters, "friction": friction}
 

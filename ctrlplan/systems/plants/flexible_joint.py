@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from ctrlplan._types import Params, Value
+from ctrlplan._checks import checked_finite
 from ctrlplan.flatness import FlatSystem
-from ctrlplan.systems.plants.parameters import check_parameters, overruled
+from ctrlplan.systems.plants.parameters import overruled
 
 
 def flexible_joint(
@@ -70,7 +70,9 @@ def flexible_joint(
         "mass": mass,
         "length": length,
     }
-    check_parameters(parameters, {"gravity": gravity})
+    for label, value in parameters.items():
+        checked_finite(value, label, above=0.0)
+    checked_finite(gravity, "gravity", minimum=0.0)
     I, J, k, weight = link_inertia, motor_inertia, stiffness, mass * gravity * length  # noqa: E741
 
     own = {**parameters, "gravity": gravity}

@@ -7,10 +7,9 @@ from functools import lru_cache
 
 import control as ct
 import numpy as np
-from control.statesp import LinearICSystem
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from ctrlplan._checks import Array, checked_finite
 
 
 def integrator_lag_loop(gain: float, outputs: Sequence[str] = ("y",)) -> ct.InterconnectedSystem:
@@ -82,9 +81,7 @@ def unity_feedback_loop(
 
 
 def _checked(gain: float, outputs: Sequence[str]) -> float:
-    gain = float(gain)
-    if not np.isfinite(gain):
-        raise ValueError(f"gain must be finite, got {gain}")
+    gain = checked_finite(gain, "gain")
     for output in outputs:
         if output not in ("y", "u", "e"):
             raise ValueError(f'outputs must be of "y", "u", "e", got {output!r}')
@@ -98,7 +95,7 @@ def _interconnected(
     wired = _wired(num, den, outputs)
     error, controller, plant = (ct.StateSpace(block, name=block.name) for block in wired.syslist)
     controller.D[0, 0] = gain
-    loop = LinearICSystem(wired, ct.StateSpace(*_closed(plant, gain, outputs), 0), wired.connection_type)
+    loop = ct.LinearICSystem(wired, ct.StateSpace(*_closed(plant, gain, outputs), 0), wired.connection_type)
     loop.syslist = [error, controller, plant]
     for name in ("connect_map", "input_map", "output_map"):
         setattr(loop, name, getattr(wired, name).copy())

@@ -11,51 +11,143 @@ from collections.abc import Mapping, Sequence
 import control as ct
 import numpy as np
 
-from ctrlplan._checks import Array
+from ctrlplan._checks import Array, checked_finite, checked_labels, checked_names
+from ctrlplan._renamed import former_signature
 from ctrlplan.systems.flat import hurwitz_coefficients
 from ctrlplan.systems.plants.crane.flatness import checked_formulas
 from ctrlplan.systems.plants.crane.parameters import CraneParameters
-from ctrlplan.systems.plants.parameters import check_parameters
 from ctrlplan.systems.series import Quantity
-from ctrlplan.trajectories import derivative_name
+from ctrlplan.trajectories.files import signal_names
 
 Params = Mapping[str, float]
 
 
-def create_still_iosystem(crane: CraneParameters, name: str = "setpoint") -> ct.NonlinearIOSystem:
-    """References of trolley and rope for a load at rest: the set-point law, for steps.
+@former_signature("name")
+def create_still_iosystem(
+    crane: CraneParameters,
+    *,
+    labels: Sequence[str] | None = None,
+    suffix: str = "_ref",
+    name: str = "setpoint",
+) -> ct.NonlinearIOSystem:
+    """Set-point law: references of trolley and rope for a load at rest.
 
-    Inputs x_ref and z_ref; outputs D_ref = x - b and R_ref = z.
+    No states. Inputs: x_ref and z_ref. Outputs: D_ref = x - b and R_ref = z [m].
+
+    Parameters
+    ----------
+    crane : Crane
+        The plant.
+    labels : sequence of str, optional
+        Names of the plan's axes: x and z unless given.
+    suffix : str, optional
+        Appended to each label in the names of the references.
+    name : str, optional
+        Name of the block.
+
+    Returns
+    -------
+    control.NonlinearIOSystem
+        Static, of any time base.
+
+    Raises
+    ------
+    ValueError
+        If labels are not two, or give a reference the name of another input.
+
+    Examples
+    --------
+    >>> import control as ct
+    >>> import ctrlplan as cp
+    >>> crane = cp.plants.Crane()
+    >>> step = cp.Step([1.0, 10.0], [0.0, 10.0], labels=["x", "z"])
+    >>> source = cp.create_source_iosystem(step, suffix="_ref")
+    >>> law = cp.plants.create_still_iosystem(crane)
+    >>> references = ct.interconnect([source, law], inputs=0, outputs=["D_ref", "R_ref"])
+    >>> cp.simulate(references, [0.0, 1.0]).outputs[:, -1].tolist()
+    [0.75, 10.0]
     """
     b = crane.drum_radius
 
     def out(t: float, state: Array, u: Array, params: Params) -> Array:
         return np.array([u[0] - b, u[1]])
 
-    return ct.nlsys(None, out, inputs=["x_ref", "z_ref"], outputs=["D_ref", "R_ref"], dt=None, name=name)
+    inputs = _input_names(0, labels, suffix)
+    return ct.nlsys(None, out, inputs=inputs, outputs=["D_ref", "R_ref"], dt=None, name=name)
 
 
-def create_generator_iosystem(crane: CraneParameters, name: str = "generator") -> ct.NonlinearIOSystem:
+@former_signature("name")
+def create_generator_iosystem(
+    crane: CraneParameters,
+    *,
+    labels: Sequence[str] | None = None,
+    suffix: str = "_ref",
+    name: str = "generator",
+) -> ct.NonlinearIOSystem:
     """Figure 3's generator of references, (15a,b) of the planned jets.
 
-    Inputs x_ref, x_ref_d1, x_ref_d2 and the same of z; outputs D_ref and R_ref.
-    Without feedback from the load, its sway is not damped.
+    No states. Inputs: x_ref, x_ref_d1, x_ref_d2 and the same of z_ref. Outputs:
+    D_ref and R_ref [m]. Without feedback from the load, its sway is not damped.
+
+    Parameters
+    ----------
+    crane : Crane
+        The plant.
+    labels : sequence of str, optional
+        Names of the plan's axes: x and z unless given.
+    suffix : str, optional
+        Appended to each label in the names of the references.
+    name : str, optional
+        Name of the block.
+
+    Returns
+    -------
+    control.NonlinearIOSystem
+        Static, of any time base.
+
+    Raises
+    ------
+    ValueError
+        If labels are not two, or give a reference the name of another input.
+
+    Examples
+    --------
+    >>> import control as ct
+    >>> import ctrlplan as cp
+    >>> crane = cp.plants.Crane()
+    >>> plan = cp.Step([0.0, 10.0], [0.0, 10.0], labels=["x", "z"])
+    >>> source = cp.create_source_iosystem(plan, 2, suffix="_ref")
+    >>> law = cp.plants.create_generator_iosystem(crane)
+    >>> references = ct.interconnect([source, law], inputs=0, outputs=["D_ref", "R_ref"])
+    >>> cp.simulate(references, [0.0, 1.0]).outputs[:, -1].tolist()
+    [-0.25, 10.0]
     """
 
     def out(t: float, state: Array, u: Array, params: Params) -> Array:
         return np.array(_held(crane, u[0], u[2], u[3], u[5]))
 
-    return ct.nlsys(None, out, inputs=_jet_names(2), outputs=["D_ref", "R_ref"], dt=None, name=name)
+    inputs = _input_names(2, labels, suffix)
+    return ct.nlsys(None, out, inputs=inputs, outputs=["D_ref", "R_ref"], dt=None, name=name)
 
 
+@former_signature("name")
 def create_load_feedback_iosystem(
-    crane: CraneParameters, bandwidth: float = 1.0, damping: float = 1.0, name: str = "load_feedback"
+    crane: CraneParameters,
+    bandwidth: float = 1.0,
+    damping: float = 1.0,
+    *,
+    labels: Sequence[str] | None = None,
+    suffix: str = "_ref",
+    name: str = "load_feedback",
 ) -> ct.NonlinearIOSystem:
     """Generator with feedback from the load's x, which damps the sway.
 
     In (15a,b) x is the measured one and x'' the law
     v = x_d'' - 2 zeta w (x' - x_d') - w^2 (x - x_d); z stays planned, because
     feeding it back as well leaves a double zero eigenvalue.
+
+    No states. Inputs: x_ref, x_ref_d1, x_ref_d2, the same of z_ref, and the
+    measured x and x_d1. Outputs: D_ref and R_ref [m].
 
     Parameters
     ----------
@@ -65,37 +157,63 @@ def create_load_feedback_iosystem(
         w [rad/s], above 0; stable with the study's PIDs from 0.1 to 3.
     damping : float, optional
         zeta, above 0; 0.7 to 1.
+    labels : sequence of str, optional
+        Names of the plan's axes: x and z unless given.
+    suffix : str, optional
+        Appended to each label in the names of the references.
     name : str, optional
         Name of the block.
 
     Returns
     -------
     control.NonlinearIOSystem
-        Inputs x_ref, x_ref_d1, x_ref_d2, the same of z, x and x_d1; outputs
-        D_ref and R_ref.
+        Static, of any time base.
 
     Raises
     ------
     ValueError
-        If `bandwidth` or `damping` is not above 0.
+        If `bandwidth` or `damping` is not above 0, or
+        labels are not two, or give a reference the name of another input.
+
+    Examples
+    --------
+    >>> import control as ct
+    >>> import ctrlplan as cp
+    >>> crane = cp.plants.Crane()
+    >>> plan = cp.Step([0.0, 10.0], [0.0, 10.0], labels=["x", "z"])
+    >>> source = cp.create_source_iosystem(plan, 2, suffix="_ref")
+    >>> law = cp.plants.create_load_feedback_iosystem(crane, 0.5)
+    >>> plant, pids = crane.iosystem(), [crane.trolley_pid(), crane.hoist_pid()]
+    >>> loop = ct.interconnect([source, law, *pids, plant], inputs=0, outputs=plant.output_labels)
+    >>> loop.nstates
+    10
     """
-    check_parameters({"bandwidth": bandwidth, "damping": damping}, {})
-    s0, s1 = bandwidth**2, 2.0 * damping * bandwidth
+    w, zeta = checked_finite(bandwidth, "bandwidth", above=0.0), checked_finite(damping, "damping", above=0.0)
+    s0, s1 = w**2, 2.0 * zeta * w
 
     def out(t: float, state: Array, u: Array, params: Params) -> Array:
         x2 = u[2] - s1 * (u[7] - u[1]) - s0 * (u[6] - u[0])
         return np.array(_held(crane, u[6], x2, u[3], u[5]))
 
-    return ct.nlsys(None, out, inputs=[*_jet_names(2), "x", "x_d1"], outputs=["D_ref", "R_ref"], dt=None, name=name)
+    inputs = _input_names(2, labels, suffix, ["x", "x_d1"])
+    return ct.nlsys(None, out, inputs=inputs, outputs=["D_ref", "R_ref"], dt=None, name=name)
 
 
+@former_signature("name")
 def create_dynamic_law_iosystem(
-    crane: CraneParameters, poles: Sequence[complex] = (-1.0, -1.2, -1.4, -1.6), name: str = "dynamic_law"
+    crane: CraneParameters,
+    poles: Sequence[complex] = (-1.0, -1.2, -1.4, -1.6),
+    *,
+    labels: Sequence[str] | None = None,
+    suffix: str = "_ref",
+    name: str = "dynamic_law",
 ) -> ct.NonlinearIOSystem:
     """The whole law (9)-(11), by dynamic extension: two chains of four integrators.
 
-    The tension and its rate are states of the controller, kept as offsets from
-    the weight of the load, so that the zero state is rest.
+    States: tension_offset [N], the tension as an offset from the weight of the
+    load, so that the zero state is equilibrium, and tension_rate [N/s]. Inputs:
+    x_ref, x_ref_d1, ... to order 4, the same of z_ref, then x, z, x_d1, z_d1, R,
+    theta, D_d1, R_d1, theta_d1 of the crane. Outputs: F [N] and C [N m].
 
     Parameters
     ----------
@@ -103,20 +221,36 @@ def create_dynamic_law_iosystem(
         The plant, of either model of the drum.
     poles : sequence of complex, optional
         Four poles [rad/s] of the error of x, and the same of z.
+    labels : sequence of str, optional
+        Names of the plan's axes: x and z unless given.
+    suffix : str, optional
+        Appended to each label in the names of the references.
     name : str, optional
         Name of the block.
 
     Returns
     -------
     control.NonlinearIOSystem
-        States tension_offset [N] and tension_rate [N/s]; inputs the jets of
-        order 4 of x_ref and z_ref, and x, z, x_d1, z_d1, R, theta, D_d1, R_d1,
-        theta_d1 of the crane; outputs F and C.
+        In continuous time.
 
     Raises
     ------
     ValueError
-        If the poles are not four, not conjugate pairs, or not stable.
+        If the poles are not four, not conjugate pairs, or not stable, or
+        labels are not two, or give a reference the name of another input.
+
+    Examples
+    --------
+    >>> import control as ct
+    >>> import ctrlplan as cp
+    >>> crane = cp.plants.Crane()
+    >>> plan = cp.Step([0.0, 10.0], [0.0, 10.0], labels=["x", "z"])
+    >>> source = cp.create_source_iosystem(plan, 4, suffix="_ref")
+    >>> law = cp.plants.create_dynamic_law_iosystem(crane)
+    >>> plant = crane.iosystem()
+    >>> loop = ct.interconnect([source, law, plant], inputs=0, outputs=plant.output_labels)
+    >>> loop.state_labels[:2]
+    ['dynamic_law_tension_offset', 'dynamic_law_tension_rate']
     """
     sigma = hurwitz_coefficients(poles, 4)
     m, g, b = crane.load_mass, crane.gravity, crane.drum_radius
@@ -153,17 +287,58 @@ def create_dynamic_law_iosystem(
         update,
         out,
         states=["tension_offset", "tension_rate"],
-        inputs=[*_jet_names(4), *measured],
+        inputs=_input_names(4, labels, suffix, measured),
         outputs=["F", "C"],
         name=name,
     )
 
 
-def create_crane_feedforward_iosystem(crane: CraneParameters, name: str = "feedforward") -> ct.NonlinearIOSystem:
+@former_signature("name")
+def create_crane_feedforward_iosystem(
+    crane: CraneParameters,
+    *,
+    labels: Sequence[str] | None = None,
+    suffix: str = "_ref",
+    name: str = "feedforward",
+) -> ct.NonlinearIOSystem:
     """Force and torque from the planned jets alone: the open-loop half of the law.
 
-    Inputs the jets of order 4 of x_ref and z_ref; outputs F and C, exact for
-    the model and without any correction.
+    No states. Inputs: x_ref, x_ref_d1, ... to order 4 and the same of z_ref.
+    Outputs: F [N] and C [N m], exact for the model and without any correction.
+
+    Parameters
+    ----------
+    crane : Crane
+        The plant.
+    labels : sequence of str, optional
+        Names of the plan's axes: x and z unless given.
+    suffix : str, optional
+        Appended to each label in the names of the references.
+    name : str, optional
+        Name of the block.
+
+    Returns
+    -------
+    control.NonlinearIOSystem
+        Static, of any time base.
+
+    Raises
+    ------
+    ValueError
+        If labels are not two, or give a reference the name of another input.
+
+    Examples
+    --------
+    >>> import control as ct
+    >>> import ctrlplan as cp
+    >>> crane = cp.plants.Crane()
+    >>> plan = cp.Step([0.0, 10.0], [0.0, 10.0], labels=["x", "z"])
+    >>> source = cp.create_source_iosystem(plan, 4, suffix="_ref")
+    >>> law = cp.plants.create_crane_feedforward_iosystem(crane)
+    >>> plant, start = crane.iosystem(), crane.equilibrium(0.0, 10.0)[0]
+    >>> loop = ct.interconnect([source, law, plant], inputs=0, outputs=[*plant.output_labels, "C"])
+    >>> cp.simulate(loop, [0.0, 1.0], initial_state=start).outputs[-1].tolist()
+    [-1226.25, -1226.25]
     """
 
     def out(t: float, state: Array, u: Array, params: Params) -> Array:
@@ -172,11 +347,13 @@ def create_crane_feedforward_iosystem(crane: CraneParameters, name: str = "feedf
         found = checked_formulas(crane.numbers(), crane.rope_wrap, jet)
         return np.array([found["F"], found["C"]])
 
-    return ct.nlsys(None, out, inputs=_jet_names(4), outputs=["F", "C"], dt=None, name=name)
+    return ct.nlsys(None, out, inputs=_input_names(4, labels, suffix), outputs=["F", "C"], dt=None, name=name)
 
 
-def _jet_names(order: int) -> list[str]:
-    return [derivative_name(axis, k) for axis in ("x_ref", "z_ref") for k in range(order + 1)]
+def _input_names(order: int, labels: Sequence[str] | None, suffix: str, measured: Sequence[str] = ()) -> list[str]:
+    """Names of the references axis by axis, then of what is measured."""
+    axes = [label + suffix for label in checked_labels(("x", "z") if labels is None else labels, 2)]
+    return checked_names([*signal_names(axes, order), *measured], "inputs")
 
 
 def _held(crane: CraneParameters, x: Quantity, x2: Quantity, z: Quantity, z2: Quantity) -> list[Quantity]:

@@ -9,11 +9,11 @@ from typing import ClassVar, Literal
 
 import control as ct
 
+from ctrlplan._checks import checked_finite
 from ctrlplan._renamed import warn_renamed
 from ctrlplan.systems.flat import hurwitz_coefficients
 from ctrlplan.systems.plants.crane import blocks
 from ctrlplan.systems.plants.crane.parameters import CraneParameters
-from ctrlplan.systems.plants.parameters import check_parameters
 
 LawName = Literal["setpoint", "generator", "load_feedback", "dynamic", "feedforward"]
 
@@ -145,7 +145,8 @@ class LoadFeedbackLaw(Law):
     damping: float = 1.0
 
     def __post_init__(self) -> None:
-        check_parameters({"load_bandwidth": self.load_bandwidth, "damping": self.damping}, {})
+        checked_finite(self.load_bandwidth, "load_bandwidth", above=0.0)
+        checked_finite(self.damping, "damping", above=0.0)
 
     def build(self, crane: CraneParameters) -> ct.NonlinearIOSystem:
         """Block from the jets of order 2 and the load's x to D_ref and R_ref."""

@@ -5,11 +5,9 @@ The tension is a disturbance in the models of trolley and hoist alone.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
-
 import control as ct
 
+from ctrlplan._checks import Range, checked_finite
 from ctrlplan.systems.pid import create_pid_iosystem
 from ctrlplan.systems.plants.crane.parameters import CraneParameters
 
@@ -35,8 +33,7 @@ def linear_coupled(crane: CraneParameters, rope_length: float, name: str = "cran
     An interconnection of the trolley and the pendulum; input F, outputs D
     and theta: D/F = (R s^2 + g)/(s [(M_c s + f1)(R s^2 + g) + m g s]).
     """
-    if not 0.0 < rope_length < math.inf:
-        raise ValueError(f"rope_length must be above 0 and finite, got {rope_length:g}")
+    rope_length = checked_finite(rope_length, "rope_length", above=0.0)
     g = crane.gravity
     trolley = ct.ss(
         [[0.0, 1.0], [0.0, -crane.trolley_friction / crane.trolley_mass]],
@@ -67,7 +64,7 @@ def trolley_pid(
     tf: float = 0.02,
     *,
     bias: float = 0.0,
-    limits: Sequence[float] | None = None,
+    limits: Range | None = None,
     tracking_time: float | None = None,
 ) -> ct.StateSpace | ct.NonlinearIOSystem:
     """PID on D with a triple pole at -bandwidth [rad/s] on the trolley alone; inputs D_ref and D, output F."""
@@ -78,7 +75,7 @@ def trolley_pid(
         limits=limits,
         tracking_time=tracking_time,
         inputs=("D_ref", "D"),
-        output="F",
+        outputs="F",
         name="trolley_pid",
     )
 
@@ -88,7 +85,7 @@ def hoist_pid(
     bandwidth: float = 5.0,
     tf: float = 0.02,
     *,
-    limits: Sequence[float] | None = None,
+    limits: Range | None = None,
     tracking_time: float | None = None,
 ) -> ct.StateSpace | ct.NonlinearIOSystem:
     """PID on R, the load's inertia included and its weight as the bias; inputs R_ref and R, output C."""
@@ -99,7 +96,7 @@ def hoist_pid(
         limits=limits,
         tracking_time=tracking_time,
         inputs=("R_ref", "R"),
-        output="C",
+        outputs="C",
         name="hoist_pid",
     )
 
@@ -112,7 +109,7 @@ def linear_trolley_loop(crane: CraneParameters, bandwidth: float = 5.0, tf: floa
 
 def linear_hoist_loop(crane: CraneParameters, bandwidth: float = 5.0, tf: float = 0.02) -> ct.InterconnectedSystem:
     """Drum and load with their PID, about the weight of the load: input R_ref, output R."""
-    pid = create_pid_iosystem(*_hoist_gains(crane, bandwidth), tf, inputs=("R_ref", "R"), output="C", name="hoist_pid")
+    pid = create_pid_iosystem(*_hoist_gains(crane, bandwidth), tf, inputs=("R_ref", "R"), outputs="C", name="hoist_pid")
     return ct.interconnect(
         [pid, linear_hoist(crane, with_load=True)], inputs=["R_ref"], outputs=["R"], name="hoist_loop"
     )
@@ -132,6 +129,5 @@ def _double(gain: float, damping: float, source: str, sink: str, name: str) -> c
 
 def _triple_pole(mass: float, friction: float, bandwidth: float) -> tuple[float, float, float]:
     """Kp, Ki, Kd that put three poles at -bandwidth on 1/(s (mass s + friction))."""
-    if not (math.isfinite(bandwidth) and bandwidth > 0.0):
-        raise ValueError(f"bandwidth must be finite and above 0, got {bandwidth:g}")
-    return 3.0 * mass * bandwidth**2, mass * bandwidth**3, 3.0 * mass * bandwidth - friction
+    w = checked_finite(bandwidth, "bandwidth", above=0.0)
+    return 3.0 * mass * w**2, mass * w**3, 3.0 * mass * w - friction

@@ -9,6 +9,7 @@ import control as ct
 import numpy as np
 from numpy.typing import NDArray
 
+from ctrlplan._checks import Range, check_kind, checked_range
 from ctrlplan.systems.plants.crane import linear, model
 from ctrlplan.systems.plants.crane.flatness import check
 from ctrlplan.systems.plants.crane.laws import Law, LawName, as_law
@@ -28,8 +29,8 @@ def crane_loop(
     poles: Sequence[complex] | None = None,
     bandwidth: float = 5.0,
     tf: float = 0.02,
-    force_limits: Sequence[float] | None = None,
-    torque_limits: Sequence[float] | None = None,
+    force_limits: Range | None = None,
+    torque_limits: Range | None = None,
     reference: Sequence[ct.InputOutputSystem] | None = None,
     wind: Trajectory | None = None,
     inputs: Sequence[str] = (),
@@ -56,8 +57,8 @@ def crane_loop(
         Triple pole of the PIDs [rad/s].
     tf : float, optional
         Their derivative filter [s].
-    force_limits, torque_limits : (float, float), optional
-        Limits of F [N] and C [N m], with anti-windup.
+    force_limits, torque_limits : (float, float) or float, optional
+        Limits of F [N] and C [N m], with anti-windup; a number a for (-a, a).
     reference : sequence of control systems, optional
         Blocks in the place of the plan's source: a replanner, a time scaling,
         a command filter, with the blocks that supply their inputs. (A governor,
@@ -103,6 +104,9 @@ def crane_loop(
     """
     chosen = _with_options(law, {"load_bandwidth": load_bandwidth, "damping": damping, "poles": poles})
     plan = _named(plan)
+    for label, limits in (("force_limits", force_limits), ("torque_limits", torque_limits)):
+        if limits is not None:
+            checked_range(limits, label)
     _check_smooth(plan, chosen)
     check(crane, plan)
     _check_signals(reference, wind, inputs)
@@ -200,8 +204,7 @@ def _start(block: ct.InputOutputSystem) -> NDArray[np.float64]:
 
 def _named(plan: Trajectory) -> Trajectory:
     """Plan of x and z: by name where its axes are called so, else in order."""
-    if not isinstance(plan, Trajectory):
-        raise TypeError(f"plan must be a Trajectory, got {type(plan).__name__}")
+    check_kind(plan, "plan", Trajectory)
     if plan.naxes != 2:
         raise ValueError(f"a plan of the load must have the axes x and z, got {plan.naxes} axes")
     if plan.labels == ("x", "z"):

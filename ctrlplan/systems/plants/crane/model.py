@@ -7,7 +7,6 @@ Formulas take numbers, arrays, Taylor series and the symbols of a tracer alike.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from functools import partial
 
@@ -15,7 +14,7 @@ import control as ct
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ctrlplan._checks import Array
+from ctrlplan._checks import Array, checked_finite
 from ctrlplan.systems.plants.crane.parameters import CraneParameters, Numbers
 from ctrlplan.systems.series import Quantity
 from ctrlplan.traits import declare
@@ -55,10 +54,7 @@ def equilibrium(crane: CraneParameters, x: float, z: float) -> tuple[Array, Arra
     ValueError
         If z is not above 0: the load hangs below the trolley.
     """
-    if not z > 0.0:
-        raise ValueError(f"z must be above 0 (down), got {z:g}")
-    if not math.isfinite(x + z):
-        raise ValueError(f"x and z must be finite, got {x:g} and {z:g}")
+    x, z = checked_finite(x, "x"), checked_finite(z, "z", above=0.0)
     state = np.array([x - crane.drum_radius, z, 0.0, 0.0, 0.0, 0.0])
     return state, np.array([0.0, -crane.drum_radius * crane.load_mass * crane.gravity])
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from ctrlplan.systems.plants.parameters import check_parameters, overruled
+from ctrlplan._checks import checked_finite
+from ctrlplan.systems.plants.parameters import overruled
 
 POSITIVE = ("load_mass", "trolley_mass", "drum_inertia", "drum_radius", "gravity")
 FRICTIONS = ("trolley_friction", "drum_friction")
@@ -31,8 +32,10 @@ class CraneParameters:
     def __post_init__(self) -> None:
         if not isinstance(self.rope_wrap, bool):
             raise TypeError(f"rope_wrap must be True or False, got {self.rope_wrap!r}")
-        positive, frictions = ({name: getattr(self, name) for name in names} for names in (POSITIVE, FRICTIONS))
-        check_parameters(positive, frictions)
+        for name in POSITIVE:
+            checked_finite(getattr(self, name), name, above=0.0)
+        for name in FRICTIONS:
+            checked_finite(getattr(self, name), name, minimum=0.0)
 
     def numbers(self, params: Mapping[str, float] | None = None) -> Numbers:
         """m, M_c, J, b, f1, f2, g, each overridden by the parameter of a run of its name."""
