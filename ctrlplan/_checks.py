@@ -107,7 +107,7 @@ def checked_limits(limits: object, name: str) -> tuple[float, float, float]:
 
 def checked_vector(values: ArrayLike, name: str, count: int) -> Array:
     """New array (count,) of finite numbers; one number stands for all."""
-    given = new_numbers(values, name)
+    given = real_array(values, name)
     if given.shape not in ((), (count,)) or not np.isfinite(given).all():
         raise ValueError(f"{name} must be a finite number or {count} of them, got {values!r:.80}")
     return np.broadcast_to(given, (count,)).copy()

@@ -12,7 +12,7 @@ import control as ct
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ctrlplan._checks import Array, check_kind, checked_count, checked_finite, new_numbers
+from ctrlplan._checks import Array, check_kind, checked_count, checked_finite, real_array
 from ctrlplan._types import EventName
 from ctrlplan.systems.hybrid import refuse_alone
 from ctrlplan.systems.source import axis_signals, create_source_iosystem
@@ -512,7 +512,7 @@ def _checked_limits(plan: Trajectory, limits: Mapping[int, ArrayLike] | None) ->
     found = []
     for key, value in (limits or {}).items():
         nu = checked_count(key, "orders of limits")
-        limit = new_numbers(value, f"limits[{nu}]")
+        limit = real_array(value, f"limits[{nu}]")
         if limit.shape not in ((), (plan.naxes,)) or not (limit > 0.0).all():
             raise ValueError(f"limits[{nu}] must be above 0, one number or {plan.naxes}, got {value!r}")
         limit = np.broadcast_to(limit, (plan.naxes,))
