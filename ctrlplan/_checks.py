@@ -8,9 +8,9 @@ from numbers import Real
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from ctrlplan._types import Array
 
 Range = float | Sequence[float]
 """Limits of a signal as `checked_range` reads them: (low, high), or a number a for (-a, a)."""

@@ -19,11 +19,9 @@ from typing import NamedTuple
 
 import control.flatsys as fs
 import numpy as np
-from numpy.typing import NDArray
 
-from ctrlplan._types import Value
+from ctrlplan._types import Array, Value
 
-Array = NDArray[np.float64]
 Matrix = list[list[Fraction]]
 
 _NOTHING = 1e-9

@@ -8,8 +8,8 @@ import control.flatsys as fs
 import numpy as np
 from numpy.typing import NDArray
 
-from ctrlplan._checks import Array
 from ctrlplan._renamed import warn_renamed
+from ctrlplan._types import Array
 from ctrlplan.flatness.system import FlatSystem
 from ctrlplan.flatness.verify import FlatPlant, check_maps, checked_plant, warn_of_output
 

@@ -8,7 +8,8 @@ import control.flatsys as fs
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ctrlplan._checks import Array, check_kind, checked_labels, checked_timepts, default_labels, real_array
+from ctrlplan._checks import check_kind, checked_labels, checked_timepts, default_labels, real_array
+from ctrlplan._types import Array
 from ctrlplan.trajectories import Trajectory
 
 Params = Mapping[str, float] | None

@@ -9,13 +9,13 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import control.flatsys as fs
 import numpy as np
 
-from ctrlplan._checks import Array, checked_labels, default_labels
+from ctrlplan._checks import checked_labels, default_labels
 from ctrlplan._renamed import outside_stacklevel
+from ctrlplan._types import Array, Params, System, Value
 from ctrlplan.flatness.linear import LinearMaps, is_linear, linear_maps
 from ctrlplan.trajectories import derivative_name
 
@@ -32,20 +32,20 @@ _MUST = "static feedback must linearise flat_system"
 class FlatPlant:
     """A flat system's maps at its own parameters."""
 
-    system: Any
+    system: System
     nstates: int
     ninputs: int
-    params: dict[str, Any]
+    params: Params
 
-    def forward(self, x: Any, u: Any) -> list[Any]:
+    def forward(self, x: Value, u: Value) -> list[Value]:
         """Flags of a state and an input."""
         return list(self.system.forward(x, u, self.params))
 
-    def reverse(self, flag: list[Any]) -> list[Any]:
+    def reverse(self, flag: list[Value]) -> list[Value]:
         """State and input of flags."""
         return [np.ravel(values) for values in self.system.reverse(flag, self.params)]
 
-    def rates(self, x: Array, u: Array) -> list[Any]:
+    def rates(self, x: Array, u: Array) -> list[Value]:
         """Rates of the states."""
         return [self.system.dynamics(0.0, x, u)]
 
@@ -70,14 +70,14 @@ class _LinearPlant(FlatPlant):
 
     maps: LinearMaps
 
-    def forward(self, x: Any, u: Any) -> list[Any]:
+    def forward(self, x: Value, u: Value) -> list[Value]:
         return self.maps.forward(x, u)
 
-    def reverse(self, flag: list[Any]) -> list[Any]:
+    def reverse(self, flag: list[Value]) -> list[Value]:
         return self.maps.reverse(flag)
 
 
-def checked_plant(flat_system: Any) -> FlatPlant:
+def checked_plant(flat_system: System) -> FlatPlant:
     """Maps of a flat system in continuous time, which has states and inputs."""
     if not isinstance(flat_system, fs.FlatSystem):
         raise TypeError(f"flat_system must be a control.flatsys.FlatSystem, got {type(flat_system).__name__}")
@@ -140,7 +140,7 @@ def warn_of_output(flat_system: fs.FlatSystem) -> None:
     )
 
 
-def finite_rows(function: Callable[..., Any], *args: Any) -> list[Array] | None:
+def finite_rows(function: Callable[..., Value], *args: Value) -> list[Array] | None:
     """What a map returns, row by row, or None outside of its domain."""
     with np.errstate(all="raise", under="ignore"):
         try:

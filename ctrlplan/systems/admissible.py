@@ -11,10 +11,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import linprog
 
-from ctrlplan._checks import Array, Range, checked_finite, checked_limits, checked_number
+from ctrlplan._checks import Range, checked_finite, checked_limits, checked_number
+from ctrlplan._types import Array, Frozen, System
 from ctrlplan.systems.output_cells import Problem, elevated, erosion, output_cells, seen_directions
 from ctrlplan.systems.polytope import Polytope, Rows
-from ctrlplan.trajectories.common import Frozen, readonly
+from ctrlplan.trajectories.common import readonly
 
 Limits: TypeAlias = Mapping[str, Range]
 

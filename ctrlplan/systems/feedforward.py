@@ -8,8 +8,9 @@ import control as ct
 import numpy as np
 from scipy.linalg import null_space
 
-from ctrlplan._checks import Array, checked_labels
+from ctrlplan._checks import checked_labels
 from ctrlplan._renamed import former_signature
+from ctrlplan._types import Array
 from ctrlplan.trajectories import derivative_name
 
 _SMALL = 1e-9

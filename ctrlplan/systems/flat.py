@@ -7,13 +7,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import control as ct
 import control.flatsys as fs
 import numpy as np
 
 from ctrlplan._renamed import former_signature
+from ctrlplan._types import Params, Value
 from ctrlplan.flatness.verify import (
     check_linearises,
     checked_plant,
@@ -29,7 +29,7 @@ from ctrlplan.trajectories import derivative_name
 @former_signature("name")
 def create_flat_iosystem(
     flat_system: fs.FlatSystem,
-    poles: Sequence[Any],
+    poles: Sequence[Value],
     *,
     labels: Sequence[str] | str | None = None,
     suffix: str = "_ref",

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, NoReturn, Protocol, runtime_checkable
+from typing import NoReturn, Protocol, runtime_checkable
 
 import control as ct
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ctrlplan._checks import Array, checked_finite, checked_names, checked_vector
-from ctrlplan._types import EventName
+from ctrlplan._checks import checked_finite, checked_names, checked_vector
+from ctrlplan._types import Array, EventName, Params, System, Value
 from ctrlplan.systems.admissible import AdmissibleSet, Limits
 from ctrlplan.systems.exposed import state_signals
 from ctrlplan.systems.hybrid import refuse_alone
-from ctrlplan.traits import Declared, declare
+from ctrlplan.traits import DeclaredTrait, declare
 
 
 @runtime_checkable

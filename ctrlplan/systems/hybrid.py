@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NoReturn
+from typing import NoReturn
 
 import control as ct
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ctrlplan._checks import Array, check_kind, checked_finite, checked_names, checked_vector
+from ctrlplan._checks import check_kind, checked_finite, checked_names, checked_vector
 from ctrlplan._renamed import former_signature
-from ctrlplan.traits import Declared, declare
+from ctrlplan._types import Array, Params, System, Value
+from ctrlplan.traits import DeclaredTrait, declare
 
 
 class SampleHold(ct.NonlinearIOSystem):  # type: ignore[misc]
@@ -30,7 +31,7 @@ class SampleHold(ct.NonlinearIOSystem):  # type: ignore[misc]
     offset = DeclaredTrait[float]()
 
     def __init__(
-        self, block: Any, period: float, offset: float, inputs: list[str], outputs: list[str], name: str
+        self, block: System, period: float, offset: float, inputs: list[str], outputs: list[str], name: str
     ) -> None:
         super().__init__(
             self._no_rates,
@@ -85,7 +86,7 @@ class Delay(ct.NonlinearIOSystem):  # type: ignore[misc]
 
 @former_signature("name")
 def sample_hold(
-    block: Any,
+    block: System,
     dt: float,
     offset: float = 0.0,
     *,

@@ -6,11 +6,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import expm, matrix_balance, solve_continuous_lyapunov
 from scipy.special import comb, factorial
 
-Array = NDArray[np.float64]
+from ctrlplan._types import Array
 
 _DEGREE = 8
 """Of the polynomials that outputs are over a cell of time."""

@@ -5,14 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import partial
-from typing import Any
 
 import control as ct
 import numpy as np
 
-from ctrlplan._checks import Array, Range, checked_finite, checked_names, checked_range
+from ctrlplan._checks import Range, checked_finite, checked_names, checked_range
 from ctrlplan._renamed import former_signature
-from ctrlplan._types import EventName
+from ctrlplan._types import Array, EventName, Params, Value
 from ctrlplan.traits import declare
 
 
@@ -91,7 +90,7 @@ def create_pid_iosystem(
         tracking_time = checked_finite(tracking_time, "tracking_time", above=0.0)
     measured = checked_names(("r", "y") if inputs is None else inputs, "inputs", 2)
     control = checked_names("u" if outputs is None else outputs, "outputs", 1)
-    names: dict[str, Any] = {"inputs": measured, "outputs": control, "states": ["integral", "filter"], "name": name}
+    names: dict[str, Value] = {"inputs": measured, "outputs": control, "states": ["integral", "filter"], "name": name}
     if limits is None and bias == 0.0:
         a = [[0.0, 0.0], [0.0, -1.0 / tf]]
         b = [[ki, -ki], [1.0 / tf, -1.0 / tf]]
@@ -104,7 +103,7 @@ def create_pid_iosystem(
     def limited(value: Value) -> Value:
         return value if limits is None else np.fmin(np.fmax(value, low), high)
 
-    def update(t: float, x: Any, u: Any, params: dict[str, Any]) -> Array:
+    def update(t: float, x: Value, u: Value, params: Params) -> Array:
         error, command = u[0] - u[1], total(x, u)
         return np.array([ki * error + back * (limited(command) - command), (error - x[1]) / tf])
 
@@ -119,13 +118,13 @@ def create_pid_iosystem(
     return block
 
 
-def _total(kp: float, kd: float, bias: float, x: Any, u: Any) -> Any:
+def _total(kp: float, kd: float, bias: float, x: Value, u: Value) -> Value:
     """Output before the limits; kd over the filter's time constant."""
     error = u[0] - u[1]
     return bias + kp * error + x[0] + kd * (error - x[1])
 
 
-def _command(kp: float, kd: float, bias: float, t: Any, x: Any, u: Any, params: dict[str, Any]) -> Any:
+def _command(kp: float, kd: float, bias: float, t: Value, x: Value, u: Value, params: Params) -> Value:
     return _total(kp, kd, bias, x, u)
 
 

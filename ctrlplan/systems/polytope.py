@@ -9,9 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
+from ctrlplan._types import Array
 from ctrlplan.systems.output_cells import Problem
-
-Array = NDArray[np.float64]
 
 _PROVEN = 1e-11
 """Relative error of a proof that a row follows from others."""

@@ -12,11 +12,11 @@ import control as ct
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ctrlplan._checks import Array, check_kind, checked_count, checked_finite, real_array
-from ctrlplan._types import EventName
+from ctrlplan._checks import check_kind, checked_count, checked_finite, real_array
+from ctrlplan._types import Array, EventName, Params, Value
 from ctrlplan.systems.hybrid import refuse_alone
 from ctrlplan.systems.source import axis_signals, create_source_iosystem
-from ctrlplan.traits import Declared, declare
+from ctrlplan.traits import DeclaredTrait, declare
 from ctrlplan.trajectories import Trajectory
 from ctrlplan.trajectories.extrema import stationary_times
 from ctrlplan.trajectories.files import signal_names

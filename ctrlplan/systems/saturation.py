@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import control as ct
 import numpy as np
 
 from ctrlplan._checks import checked_names, checked_number
 from ctrlplan._renamed import former_signature
-from ctrlplan._types import EventName
+from ctrlplan._types import EventName, Params, Value
 from ctrlplan.traits import declare
 
 
@@ -74,5 +73,5 @@ def create_saturation_iosystem(
     return block
 
 
-def _command(t: Any, x: Any, u: Any, params: dict[str, Any]) -> Any:
+def _command(t: Value, x: Value, u: Value, params: Params) -> Value:
     return u[0]

@@ -11,12 +11,9 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ctrlplan._types import Value
+from ctrlplan._types import Array, Value
 from ctrlplan.trajectories.common import FACTORIALS
-
-Array = NDArray[np.float64]
 
 Quantity = Value
 """What formulas of plants take: a number, an array, a Taylor series or a symbol of a tracer."""

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import control as ct
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ctrlplan._checks import Array, check_kind, checked_count, checked_labels
+from ctrlplan._checks import check_kind, checked_count, checked_labels
 from ctrlplan._renamed import former_signature
-from ctrlplan.traits import Declared, declare
+from ctrlplan._types import Array, Params
+from ctrlplan.traits import DeclaredTrait, declare
 from ctrlplan.trajectories import Trajectory
 from ctrlplan.trajectories.files import signal_names, signal_rows
 

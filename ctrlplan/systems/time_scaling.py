@@ -9,7 +9,6 @@ import control as ct
 import numpy as np
 
 from ctrlplan._checks import (
-    Array,
     Range,
     check_kind,
     checked_count,
@@ -18,6 +17,7 @@ from ctrlplan._checks import (
     checked_number,
     checked_pair,
 )
+from ctrlplan._types import Array, Params, Value
 from ctrlplan.systems.source import axis_signals
 from ctrlplan.traits import declare
 from ctrlplan.trajectories import Trajectory
@@ -263,7 +263,7 @@ def _checked_limits(label: str, pair: Sequence[float], margin: float) -> tuple[f
     return low, high, margin * (2.0 * size if both else size)
 
 
-def _checked_band(label: str, pair: Any, axes: Sequence[str]) -> tuple[float, float]:
+def _checked_band(label: str, pair: Sequence[float], axes: Sequence[str]) -> tuple[float, float]:
     if label not in axes:
         raise ValueError(f"errors must name axes of the plan, {', '.join(axes)}, got {label!r}")
     soft, hard = checked_pair(pair, f"errors of {label}")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ctrlplan._checks import checked_finite
+from ctrlplan._types import Params, Value
 from ctrlplan.flatness import FlatSystem
 from ctrlplan.systems.plants.parameters import overruled
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ctrlplan._checks import checked_count, default_labels
+from ctrlplan._types import Params, Value
 from ctrlplan.flatness import FlatSystem
 from ctrlplan.trajectories import derivative_name
 

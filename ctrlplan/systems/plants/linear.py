@@ -9,7 +9,8 @@ import control as ct
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ctrlplan._checks import Array, checked_finite
+from ctrlplan._checks import checked_finite
+from ctrlplan._types import Array
 
 
 def integrator_lag_loop(gain: float, outputs: Sequence[str] = ("y",)) -> ct.InterconnectedSystem:

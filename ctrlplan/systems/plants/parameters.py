@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from ctrlplan._types import Params, Value
 
 
-def overruled(own: Mapping[str, Any], params: Mapping[str, Any] | None) -> tuple[Any, ...]:
+def overruled(own: Params, params: Params | None) -> tuple[Value, ...]:
     """A plant's own parameters in order, each overruled by the parameter of a run of its name."""
     given = params or {}
     return tuple(given.get(name, value) for name, value in own.items())

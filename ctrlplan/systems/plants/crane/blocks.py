@@ -11,8 +11,9 @@ from collections.abc import Mapping, Sequence
 import control as ct
 import numpy as np
 
-from ctrlplan._checks import Array, checked_finite, checked_labels, checked_names
+from ctrlplan._checks import checked_finite, checked_labels, checked_names
 from ctrlplan._renamed import former_signature
+from ctrlplan._types import Array
 from ctrlplan.systems.flat import hurwitz_coefficients
 from ctrlplan.systems.plants.crane.flatness import checked_formulas
 from ctrlplan.systems.plants.crane.parameters import CraneParameters

@@ -12,7 +12,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ctrlplan._checks import Array
+from ctrlplan._types import Array
 from ctrlplan.flatness import FlatSystem
 from ctrlplan.systems import series
 from ctrlplan.systems.plants.crane import model

@@ -14,7 +14,8 @@ import control as ct
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ctrlplan._checks import Array, checked_finite
+from ctrlplan._checks import checked_finite
+from ctrlplan._types import Array
 from ctrlplan.systems.plants.crane.parameters import CraneParameters, Numbers
 from ctrlplan.systems.series import Quantity
 from ctrlplan.traits import declare

@@ -8,7 +8,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from ctrlplan._checks import Array
+from ctrlplan._types import Array
 from ctrlplan.systems.plants.crane.parameters import CraneParameters
 from ctrlplan.trajectories import Trajectory
 
