@@ -18,99 +18,8 @@ Range = float | Sequence[float]
 MOST = 100
 """Highest order of a derivative, and highest degree."""
 
-
-def one_number(value: object, name: str, rule: str = "a number") -> float:
-    """One number: no truth value, text, complex number, date, nor anything with a unit."""
-    if type(value) is float:
-        return value
-    given: Any = value
-    wrong = TypeError(f"{name} must be {rule}, got {value!r:.80}")
-    if isinstance(value, _NO_NUMBERS) or bool(getattr(given, "ndim", False)) or np.ma.is_masked(given):
-        raise wrong
-    if getattr(getattr(given, "dtype", None), "kind", "f") not in "iufO" or _has_unit(given):
-        raise wrong
-    try:
-        return float(given)
-    except OverflowError:
-        raise ValueError(f"{name} must be within floating point, got {value!r:.80}") from None
-    except (TypeError, ValueError):
-        raise wrong from None
-
-
-def checked_finite(value: object, name: str, *, above: float | None = None, minimum: float | None = None) -> float:
-    """Finite number, above a bound that is not allowed itself, or at least a minimum."""
-    number = one_number(value, name)
-    if math.isfinite(number) and (above is None or number > above) and (minimum is None or number >= minimum):
-        return number
-    bound = "" if above is None else f" and above {above:g}"
-    bound += "" if minimum is None else f" and at least {minimum:g}"
-    raise ValueError(f"{name} must be finite{bound}, got {number}")
-
-
-def checked_time(time: object, name: str, positive: bool = False) -> float:
-    """Finite number of seconds, above 0 where it is a duration."""
-    return checked_finite(time, name, above=0.0 if positive else None)
-
-
-def checked_number(value: object, name: str) -> float:
-    """Number that is not nan."""
-    if not isinstance(value, Real):
-        raise TypeError(f"{name} must be a number, got {value!r}")
-    number = one_number(value, name)
-    if math.isnan(number):
-        raise ValueError(f"{name} must be a number, got nan")
-    return number
-
-
-def checked_count(value: float | Real, name: str, least: int = 0) -> int:
-    """Whole number of some least value."""
-    if not isinstance(value, Real):
-        raise TypeError(f"{name} must be a whole number from {least}, got {value!r}")
-    number = one_number(value, name, f"a whole number from {least}")
-    if not math.isfinite(number) or number != int(number) or number < least:
-        raise ValueError(f"{name} must be a whole number from {least}, got {value}")
-    if number > MOST:
-        raise ValueError(f"{name} must be at most {MOST}, got {value}")
-    return int(number)
-
-
-def checked_pair(pair: object, name: str) -> tuple[float, float]:
-    """Two numbers that increase."""
-    if not isinstance(pair, Sequence | np.ndarray) or isinstance(pair, str) or len(pair) != 2:
-        raise ValueError(f"{name} must be two numbers, got {pair!r}")
-    low, high = checked_number(pair[0], name), checked_number(pair[1], name)
-    if not low < high:
-        raise ValueError(f"{name} must increase, got {low:g} and {high:g}")
-    return low, high
-
-
-def checked_range(limits: object, name: str) -> tuple[float, float]:
-    """Lower and upper limit, each of which may be infinite.
-
-    The only place that reads the short form: a number a above 0 means (-a, a).
-    """
-    if isinstance(limits, Real) or (isinstance(limits, np.ndarray) and not limits.ndim):
-        size = checked_finite(limits, name, above=0.0)
-        return -size, size
-    return checked_pair(limits, name)
-
-
-def checked_limits(limits: object, name: str) -> tuple[float, float, float]:
-    """Lower and upper limit of which one is finite; and half their distance, or the size of the only one."""
-    low, high = checked_range(limits, name)
-    if math.isinf(low) and math.isinf(high):
-        raise ValueError(f"{name} must hold a finite one, got {low:g} and {high:g}")
-    if math.isfinite(low) and math.isfinite(high):
-        return low, high, 0.5 * (high - low)
-    return low, high, abs(low if math.isfinite(low) else high) or 1.0
-
-
-def checked_vector(values: ArrayLike, name: str, count: int) -> Array:
-    """New array (count,) of finite numbers; one number stands for all."""
-    given = real_array(values, name)
-    if given.shape not in ((), (count,)) or not np.isfinite(given).all():
-        raise ValueError(f"{name} must be a finite number or {count} of them, got {values!r:.80}")
-    return np.broadcast_to(given, (count,)).copy()
+_NO_NUMBERS = (bool, np.bool_, str, bytes, complex, np.complexfloating, np.datetime64, np.timedelta64)
+"""Kinds that Python or numpy would convert to numbers without their being some."""
 
 
 def real_array(values: ArrayLike, name: str) -> Array:
@@ -162,26 +71,6 @@ def real_array(values: ArrayLike, name: str) -> Array:
     return array.astype(float, copy=False)
 
 
-def new_numbers(values: object, name: str) -> Array:
-    """Numbers as a new array of floats; None is nan. The kinds that `one_number` rejects are rejected here."""
-    _check_kinds(values, name)
-    try:
-        return np.array(values, dtype=float)
-    except (TypeError, ValueError, OverflowError):
-        raise ValueError(f"{name} must be numbers, got {values!r:.200}") from None
-
-
-def checked_timepts(t: ArrayLike) -> Array:
-    """Times as an array of any shape, without nan."""
-    times = real_array(t, "times")
-    if times is not t and np.asarray(t).dtype.kind == "b":
-        raise TypeError(f"times must be numbers, got truth values {t!r:.60}; index times by a mask before")
-    # One number tells: the minimum of times with a nan among them is nan.
-    if times.size and np.isnan(times.min()):
-        raise ValueError(f"times must not be nan, got nan at index {int(np.isnan(times).argmax())}")
-    return times
-
-
 def default_labels(naxes: int) -> tuple[str, ...]:
     """Names y, or y1, y2, ... for more than one axis."""
     return ("y",) if naxes == 1 else tuple(f"y{i + 1}" for i in range(naxes))
@@ -204,6 +93,131 @@ def checked_labels(labels: Sequence[str] | str | None, naxes: int) -> tuple[str,
     return names
 
 
+def checked_finite(value: object, name: str, *, above: float | None = None, minimum: float | None = None) -> float:
+    """Finite number, above a bound that is not allowed itself, or at least a minimum."""
+    number = one_number(value, name)
+    if math.isfinite(number) and (above is None or number > above) and (minimum is None or number >= minimum):
+        return number
+    bound = "" if above is None else f" and above {above:g}"
+    bound += "" if minimum is None else f" and at least {minimum:g}"
+    raise ValueError(f"{name} must be finite{bound}, got {number}")
+
+
+def checked_time(time: object, name: str, positive: bool = False) -> float:
+    """Finite number of seconds, above 0 where it is a duration."""
+    return checked_finite(time, name, above=0.0 if positive else None)
+
+
+def one_number(value: object, name: str, rule: str = "a number") -> float:
+    """One number: no truth value, text, complex number, date, nor anything with a unit."""
+    if type(value) is float:
+        return value
+    given: Any = value
+    wrong = TypeError(f"{name} must be {rule}, got {value!r:.80}")
+    if isinstance(value, _NO_NUMBERS) or bool(getattr(given, "ndim", False)) or np.ma.is_masked(given):
+        raise wrong
+    if getattr(getattr(given, "dtype", None), "kind", "f") not in "iufO" or _has_unit(given):
+        raise wrong
+    try:
+        return float(given)
+    except OverflowError:
+        raise ValueError(f"{name} must be within floating point, got {value!r:.80}") from None
+    except (TypeError, ValueError):
+        raise wrong from None
+
+
+def new_numbers(values: object, name: str) -> Array:
+    """Numbers as a new array of floats; None is nan. The kinds that `one_number` rejects are rejected here."""
+    _check_kinds(values, name)
+    try:
+        return np.array(values, dtype=float)
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError(f"{name} must be numbers, got {values!r:.200}") from None
+
+
+def checked_timepts(t: ArrayLike, name: str = "times") -> Array:
+    """Times as an array of any shape, without nan."""
+    times = real_array(t, name)
+    if times is not t and np.asarray(t).dtype.kind == "b":
+        raise TypeError(f"{name} must be numbers, got truth values {t!r:.60}; index times by a mask before")
+    # One number tells: the minimum of times with a nan among them is nan.
+    if times.size and np.isnan(times.min()):
+        raise ValueError(f"{name} must not be nan, got nan at index {int(np.isnan(times).argmax())}")
+    return times
+
+
+def checked_number(value: object, name: str) -> float:
+    """Number that is not nan."""
+    if not isinstance(value, Real):
+        raise TypeError(f"{name} must be a number, got {value!r}")
+    number = one_number(value, name)
+    if math.isnan(number):
+        raise ValueError(f"{name} must be a number, got nan")
+    return number
+
+
+def checked_pair(pair: object, name: str) -> tuple[float, float]:
+    """Two numbers that increase."""
+    if not isinstance(pair, Sequence | np.ndarray) or isinstance(pair, str) or len(pair) != 2:
+        raise ValueError(f"{name} must be two numbers, got {pair!r}")
+    low, high = checked_number(pair[0], name), checked_number(pair[1], name)
+    if not low < high:
+        raise ValueError(f"{name} must increase, got {low:g} and {high:g}")
+    return low, high
+
+
+def checked_range(limits: object, name: str) -> tuple[float, float]:
+    """Lower and upper limit, each of which may be infinite.
+
+    The only place that reads the short form: a number a above 0 means (-a, a).
+    """
+    if isinstance(limits, Real) or (isinstance(limits, np.ndarray) and not limits.ndim):
+        size = checked_finite(limits, name, above=0.0)
+        return -size, size
+    return checked_pair(limits, name)
+
+
+def checked_limits(limits: object, name: str) -> tuple[float, float, float]:
+    """Lower and upper limit of which one is finite; and half their distance, or the size of the only one."""
+    low, high = checked_range(limits, name)
+    if math.isinf(low) and math.isinf(high):
+        raise ValueError(f"{name} must hold a finite one, got {low:g} and {high:g}")
+    if math.isfinite(low) and math.isfinite(high):
+        return low, high, 0.5 * (high - low)
+    return low, high, abs(low if math.isfinite(low) else high) or 1.0
+
+
+def checked_count(value: float | Real, name: str, least: int = 0) -> int:
+    """Whole number of some least value."""
+    if not isinstance(value, Real):
+        raise TypeError(f"{name} must be a whole number from {least}, got {value!r}")
+    number = one_number(value, name, f"a whole number from {least}")
+    if not math.isfinite(number) or number != int(number) or number < least:
+        raise ValueError(f"{name} must be a whole number from {least}, got {value}")
+    if number > MOST:
+        raise ValueError(f"{name} must be at most {MOST}, got {value}")
+    return int(number)
+
+
+def finite_vector(values: ArrayLike, name: str, size: str, scalar: bool = False) -> Array:
+    """One or more finite numbers as a new array; `size` is the name of their number, `scalar` whether one may be."""
+    found = new_numbers(values, name)
+    if found.ndim > 1 or (found.ndim == 0 and not scalar) or not found.size:
+        forms = f"a scalar or of shape ({size},)" if scalar else f"of shape ({size},)"
+        raise ValueError(f"{name} must be {forms}, got shape {found.shape}")
+    if not np.isfinite(found).all():
+        raise ValueError(f"{name} must be finite, got {found.tolist()}")
+    return np.atleast_1d(found)
+
+
+def checked_vector(values: ArrayLike, name: str, count: int) -> Array:
+    """New array (count,) of finite numbers; one number stands for all."""
+    given = real_array(values, name)
+    if given.shape not in ((), (count,)) or not np.isfinite(given).all():
+        raise ValueError(f"{name} must be a finite number or {count} of them, got {values!r:.80}")
+    return np.broadcast_to(given, (count,)).copy()
+
+
 def checked_names(names: Sequence[str] | str, name: str, count: int | None = None) -> list[str]:
     """Names of signals: different strings, as many as a count; one string is one name."""
     given = [names] if isinstance(names, str) else list(names) if isinstance(names, Iterable) else [names]
@@ -224,28 +238,6 @@ def check_kind(value: object, name: str, kind: type, what: str = "") -> None:
 
 
 _NO_NUMBERS = (bool, np.bool_, str, bytes, complex, np.complexfloating, np.datetime64, np.timedelta64)
-
-
-def _has_unit(value: Any) -> bool:
-    unit = getattr(value, "units", None) or getattr(value, "unit", None)
-    return unit is not None and str(unit) not in ("", "dimensionless")
-
-
-def _check_kinds(values: Any, name: str) -> None:
-    """Reject what numpy would convert to numbers without being some."""
-    if type(values) in (float, int) or values is None:
-        return
-    if isinstance(values, list | tuple):
-        for value in values:
-            _check_kinds(value, name)
-        return
-    kind = getattr(getattr(values, "dtype", None), "kind", None)
-    if isinstance(values, bool | str | bytes | complex) or (kind is not None and kind in "bcSU"):
-        raise ValueError(f"{name} must be numbers, got {values!r:.80}")
-    if kind == "O" and isinstance(values, np.ndarray):
-        _check_kinds(values.tolist(), name)
-    elif type(values) is not np.ndarray or kind not in ("i", "u", "f"):
-        real_array(values, name)  # what has a unit, is a date, or is masked
 
 
 def _has_mask(values: Any) -> bool:

@@ -16,7 +16,7 @@ from scipy.optimize import minimize
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
-from ctrlplan._checks import checked_count, not_negative
+from ctrlplan._checks import checked_count, checked_finite
 from ctrlplan._renamed import warn_renamed
 from ctrlplan.planning.clearance import Clearance, Rope, checked_obstacles, checked_rope
 from ctrlplan.planning.clearance import clearance as certified_clearance
@@ -172,8 +172,8 @@ def avoid(
     task = _Task(
         _checked_plan(plan),
         checked_obstacles(obstacles),
-        not_negative(clearance, "clearance"),
-        not_negative(load, "load"),
+        checked_finite(clearance, "clearance", minimum=0.0),
+        checked_finite(load, "load", minimum=0.0),
         checked_rope(rope),
         checked_count(max_points, "max_points", 1),
     )

@@ -9,7 +9,7 @@ from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 
-from ctrlplan._checks import checked_number, not_negative
+from ctrlplan._checks import checked_finite, checked_number
 from ctrlplan.planning.obstacles import Obstacle
 from ctrlplan.trajectories import Trajectory
 from ctrlplan.trajectories.common import Array
@@ -133,7 +133,7 @@ def clearance(
     (True, 1.5, 'load')
     """
     things = checked_obstacles(obstacles)
-    radius = not_negative(load, "load")
+    radius = checked_finite(load, "load", minimum=0.0)
     goal = None if required is None else checked_number(required, "required")
     checked_rope(rope)
     if plan.naxes != 2:

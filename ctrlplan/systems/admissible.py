@@ -12,10 +12,11 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import linprog
 
 from ctrlplan._checks import Range, checked_finite, checked_limits, checked_number
-from ctrlplan._types import Array, Frozen, System
+from ctrlplan._types import Array, System
 from ctrlplan.systems.output_cells import Problem, elevated, erosion, output_cells, seen_directions
 from ctrlplan.systems.polytope import Polytope, Rows
 from ctrlplan.trajectories.common import readonly
+from ctrlplan.trajectories.fields import Fields
 
 Limits: TypeAlias = Mapping[str, Range]
 

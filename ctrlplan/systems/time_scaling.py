@@ -254,7 +254,7 @@ def _nearness(value: Value, low: float, high: float, reach: float) -> Value:
     return 1.0 - distance / reach
 
 
-def _checked_limits(label: str, pair: Sequence[float], margin: float) -> tuple[float, float, float]:
+def _checked_limits(label: str, pair: Range, margin: float) -> tuple[float, float, float]:
     """Limits, and the distance from them within which the rate falls."""
     low, high, size = checked_limits(pair, f"limits of {label}")
     both = math.isfinite(low) and math.isfinite(high)

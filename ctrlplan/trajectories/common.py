@@ -8,41 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ctrlplan._checks import (
-    MOST,
-    Array,
-    checked_count,
-    checked_labels,
-    checked_limits,
-    checked_number,
-    checked_pair,
-    checked_time,
-    checked_timepts,
-    default_labels,
-    new_numbers,
-    one_number,
-)
-
-__all__ = [
-    "FACTORIALS",
-    "MOST",
-    "Array",
-    "Frozen",
-    "checked_count",
-    "checked_labels",
-    "checked_limits",
-    "checked_number",
-    "checked_pair",
-    "checked_time",
-    "checked_timepts",
-    "default_labels",
-    "derivative_scale",
-    "mapped_time",
-    "new_numbers",
-    "one_number",
-    "readonly",
-    "times_powers",
-]
+Array = NDArray[np.float64]
 
 FACTORIALS: Array = np.array([float(math.factorial(k)) for k in range(171)])
 FACTORIALS.flags.writeable = False
