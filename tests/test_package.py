@@ -164,7 +164,7 @@ def test_names_of_the_design_are_there(name):
     ("name", "parameters"),
     [
         ("Waypoint", ["time", "position", "velocity", "acceleration", "jerk", "snap"]),
-        ("create_source_iosystem", ["plan", "derivatives", "name"]),
+        ("create_source_iosystem", ["plan", "derivatives"]),
         ("plants.integrator_lag_loop", ["gain"]),
         ("simulate", ["system", "timepts", "inputs", "initial_state"]),
         ("compare", ["loop", "plans", "timepts"]),

@@ -463,10 +463,10 @@ def test_every_law_of_the_crane_traces(law, rope_wrap):
 @pytest.mark.parametrize(
     "block",
     [
-        cp.create_saturation_iosystem(-1.0, 1.0, "r", "y"),
-        cp.create_saturation_iosystem(-math.inf, 1.0, "r", "y"),
-        cp.create_pid_iosystem(1.0, 2.0, 0.0, 0.1, limits=(-1.0, 1.0), inputs=("r", "d"), output="y"),
-        cp.create_pid_iosystem(1.0, 0.0, 0.5, 0.1, bias=0.3, inputs=("r", "d"), output="y"),
+        cp.create_saturation_iosystem(-1.0, 1.0, inputs="r", outputs="y"),
+        cp.create_saturation_iosystem(-math.inf, 1.0, inputs="r", outputs="y"),
+        cp.create_pid_iosystem(1.0, 2.0, 0.0, 0.1, limits=(-1.0, 1.0), inputs=("r", "d"), outputs="y"),
+        cp.create_pid_iosystem(1.0, 0.0, 0.5, 0.1, bias=0.3, inputs=("r", "d"), outputs="y"),
     ],
     ids=["saturation", "half a saturation", "limited", "biased"],
 )

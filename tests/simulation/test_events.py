@@ -315,7 +315,7 @@ def test_a_pid_without_limits_declares_nothing():
 
 @pytest.mark.parametrize("method", ["compiled", "python"])
 def test_one_limit_of_a_saturation(method):
-    block = cp.create_saturation_iosystem(-math.inf, 1.0, "r", "y")
+    block = cp.create_saturation_iosystem(-math.inf, 1.0, inputs="r", outputs="y")
     ramp = cp.PolySpline([cp.Waypoint(0, 0), cp.Waypoint(4, 2), cp.Waypoint(8, 0)])  # t - t^2/8
     found = cp.simulate(block, T, ramp, method=method)
     root = math.sqrt(8.0)

@@ -265,7 +265,7 @@ def test_what_the_peer_says_to_such_a_loop():
     loop = ct.interconnect([plant(), law], inputs=0, outputs="y")
     with pytest.raises(RuntimeError, match=r"block law, which takes samples, must be run by ctrlplan.simulate"):
         ct.input_output_response(loop, [0.0, 1.0], 0, [1.0, 0.0, 0.0])
-    late = ct.interconnect([plant(), cp.create_delay_iosystem(0.1, "y", "u")], inputs=0, outputs="y")
+    late = ct.interconnect([plant(), cp.create_delay_iosystem(0.1, inputs="y", outputs="u")], inputs=0, outputs="y")
     with pytest.raises(RuntimeError, match=r"block delay, which has a memory of its input, must be run by ctrlplan"):
         ct.input_output_response(late, [0.0, 1.0], 0, [1.0, 0.0])
 
@@ -284,14 +284,14 @@ HELD = ct.ss(0.5, 1.0, 1.0, 0.0, 0.1, name="held")
     ("arguments", "error", "match"),
     [
         ((3, 0.1), TypeError, "block must be a control system, got int"),
-        ((HELD, "0.1"), TypeError, "dt must be a number of seconds, got '0.1'"),
-        ((HELD, True), TypeError, "dt must be a number of seconds, got True"),
-        ((HELD, 0.0), ValueError, "dt must be finite and above 0 s, got 0"),
-        ((HELD, -0.1), ValueError, "dt must be finite and above 0 s, got -0.1"),
-        ((HELD, math.inf), ValueError, "dt must be finite and above 0 s, got inf"),
+        ((HELD, "0.1"), TypeError, "dt must be a number, got '0.1'"),
+        ((HELD, True), TypeError, "dt must be a number, got True"),
+        ((HELD, 0.0), ValueError, "dt must be finite and above 0, got 0"),
+        ((HELD, -0.1), ValueError, "dt must be finite and above 0, got -0.1"),
+        ((HELD, math.inf), ValueError, "dt must be finite and above 0, got inf"),
         ((HELD, 0.2), ValueError, "dt must be the period of the block, 0.1 s, got 0.2 s"),
-        ((HELD, 0.1, -1.0), ValueError, "offset must be finite and at least 0 s, got -1"),
-        ((HELD, 0.1, math.nan), ValueError, "offset must be finite and at least 0 s, got nan"),
+        ((HELD, 0.1, -1.0), ValueError, "offset must be finite and at least 0, got -1"),
+        ((HELD, 0.1, math.nan), ValueError, "offset must be finite and at least 0, got nan"),
         ((plant(), 0.1), ValueError, "block must be discrete, got plant with dt = 0: see control.sample_system"),
         ((ct.tf([1], [1, 1], name="lag"), 0.1), ValueError, "block must be discrete, got lag"),
     ],
@@ -304,10 +304,10 @@ def test_bad_sampled_blocks(arguments, error, match):
 @pytest.mark.parametrize(
     ("options", "error", "match"),
     [
-        ({"delay": 0.0}, ValueError, "delay must be finite and above 0 s, got 0"),
-        ({"delay": -1}, ValueError, "delay must be finite and above 0 s, got -1"),
+        ({"delay": 0.0}, ValueError, "delay must be finite and above 0, got 0"),
+        ({"delay": -1}, ValueError, "delay must be finite and above 0, got -1"),
         ({"delay": math.inf}, ValueError, "delay must be finite"),
-        ({"delay": "1"}, TypeError, "delay must be a number of seconds, got '1'"),
+        ({"delay": "1"}, TypeError, "delay must be a number, got '1'"),
         ({"delay": 1.0, "inputs": ["a", "b"]}, ValueError, "outputs must be as many as inputs, 2, got 1"),
         ({"delay": 1.0, "initial": [1.0, 2.0]}, ValueError, "initial must be a finite number or 1 of them"),
         ({"delay": 1.0, "initial": math.nan}, ValueError, "initial must be a finite number"),
@@ -326,7 +326,7 @@ def integrators(delays, weights, initial=0.0):
     """x' = the sum of weights times x some time ago."""
     names = [f"x{k}" for k in range(len(delays))]
     pasts = [
-        cp.create_delay_iosystem(d, "x", name, initial=initial, name=f"delay{k}")
+        cp.create_delay_iosystem(d, inputs="x", outputs=name, initial=initial, name=f"delay{k}")
         for k, (d, name) in enumerate(zip(delays, names, strict=True))
     ]
     moved = ct.ss(0.0, [weights], 1.0, np.zeros((1, len(weights))), inputs=names, outputs="x", name="integrator")
@@ -433,7 +433,7 @@ def test_a_bent_loop_with_two_delays(method):
         return 2.0 * u[0] / (1.0 + u[0] ** 6) - x + 0.5 * u[1]
 
     pasts = [
-        cp.create_delay_iosystem(d, "x", name, initial=0.5, name=f"delay_{name}")
+        cp.create_delay_iosystem(d, inputs="x", outputs=name, initial=0.5, name=f"delay_{name}")
         for d, name in zip(delays, "ab", strict=True)
     ]
     bent = ct.nlsys(rate, None, inputs=["a", "b"], outputs="x", states=1, name="bent")
@@ -447,7 +447,7 @@ def test_a_bent_loop_with_two_delays(method):
 @pytest.mark.parametrize("method", METHODS)
 def test_a_delay_in_a_saturated_loop(method):
     """x' = sat(2 (1 - x(t - 0.6))) within 0.8: bends inside of legs."""
-    late = cp.create_delay_iosystem(0.6, "x", "seen")
+    late = cp.create_delay_iosystem(0.6, inputs="x", outputs="seen")
     law = gain([2.0, -2.0], ["r", "seen"], "u_cmd", "law")
     integrator = ct.ss(0.0, 1.0, 1.0, 0.0, inputs="u", outputs="x", name="integrator")
     loop = ct.interconnect([late, law, cp.create_saturation_iosystem(-0.8, 0.8), integrator], inputs="r", outputs="x")
@@ -476,7 +476,7 @@ def test_a_delayed_plan_is_the_plan_later(delay, alpha, method):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_what_is_put_out_before_anything_has_come_through(method):
-    late = cp.create_delay_iosystem(0.7, ["a", "b"], ["c", "d"], initial=[3.0, -2.0])
+    late = cp.create_delay_iosystem(0.7, inputs=["a", "b"], outputs=["c", "d"], initial=[3.0, -2.0])
     times = np.array([0.0, 0.3, 0.7 - 1e-9, 0.7 + 1e-9, 1.0, 2.0])
     found = cp.simulate(late, times, {"a": 1.0, "b": cp.Step(5.0, time=0.2)}, method=method)
     assert np.abs(found.outputs - [[3, 3, 3, 1, 1, 1], [-2, -2, -2, 0, 5, 5]]).max() <= 1e-12
@@ -486,8 +486,8 @@ def test_what_is_put_out_before_anything_has_come_through(method):
 def test_a_jump_passes_at_its_time(method):
     """Through two delays in a row, 1.15 s after 0.3 s, and into an integrator: a ramp from 1.45 s on."""
     one, two = (
-        cp.create_delay_iosystem(0.8, "r", "w", name="one"),
-        cp.create_delay_iosystem(0.35, "w", "u", name="two"),
+        cp.create_delay_iosystem(0.8, inputs="r", outputs="w", name="one"),
+        cp.create_delay_iosystem(0.35, inputs="w", outputs="u", name="two"),
     )
     integrator = ct.ss(0.0, 1.0, 1.0, 0.0, inputs="u", outputs="y", name="integrator")
     loop = ct.interconnect([two, integrator, one], inputs="r", outputs=["u", "y"])
@@ -502,7 +502,7 @@ def test_a_jump_passes_at_its_time(method):
 @pytest.mark.parametrize("jump", [0.0, 0.1, 0.73])
 def test_jumps_that_go_round_for_ever(jump, method):
     """y = -y(t - 1)/2 + r has no state; the step is back at half its size every second."""
-    late = cp.create_delay_iosystem(1.0, "y", "past")
+    late = cp.create_delay_iosystem(1.0, inputs="y", outputs="past")
     adder = gain([1.0, -0.5], ["r", "past"], "y", "adder")
     loop = ct.interconnect([late, adder], inputs="r", outputs="y")
     times = np.linspace(0.0, 15.0, 311)
@@ -516,8 +516,8 @@ def test_two_rounds_without_a_common_measure():
     """y = y(t - 1)/2 - 0.3 y(t - sqrt(1/2)) + r: as many jumps as there are sums of the two delays."""
     root = math.sqrt(0.5)
     blocks = [
-        cp.create_delay_iosystem(1.0, "y", "one", name="d1"),
-        cp.create_delay_iosystem(root, "y", "two", name="d2"),
+        cp.create_delay_iosystem(1.0, inputs="y", outputs="one", name="d1"),
+        cp.create_delay_iosystem(root, inputs="y", outputs="two", name="d2"),
         gain([1.0, 0.5, -0.3], ["r", "one", "two"], "y", "adder"),
     ]
     times = np.linspace(0.0, 4.0, 81)
@@ -538,7 +538,7 @@ def test_two_rounds_without_a_common_measure():
 def test_a_sampled_law_whose_control_comes_late(method):
     """u = -x/2 taken every 0.5 s comes 0.2 s later: straight lines, their slopes one behind the other."""
     law = cp.sample_hold(gain(-0.5, "x", "asked", "law"), 0.5)
-    late = cp.create_delay_iosystem(0.2, "asked", "u")
+    late = cp.create_delay_iosystem(0.2, inputs="asked", outputs="u")
     integrator = ct.ss(0.0, 1.0, 1.0, 0.0, inputs="u", outputs="x", name="integrator")
     loop = ct.interconnect([integrator, late, law], inputs=0, outputs="x")
     times = np.round(0.1 * np.arange(51), 9)

@@ -60,7 +60,7 @@ def test_a_constant_out_of_a_plan_or_a_delay_is_exact(method):
     loop = ct.interconnect([source, gate(0.3)], inputs=0, outputs="y", warn_duplicate=False)
     found = cp.simulate(loop, t, method=method)
     assert np.abs(found.outputs[0] - lag_response(PLAN, t - 1.0)).max() < 1e-7
-    delay = cp.create_delay_iosystem(0.5, ["v", "r_now"], ["enable", "r"], initial=[0.3, 0.0])
+    delay = cp.create_delay_iosystem(0.5, inputs=["v", "r_now"], outputs=["enable", "r"], initial=[0.3, 0.0])
     loop = ct.interconnect([delay, gate(0.3)], inputs=["v", "r_now"], outputs="y")
     found = cp.simulate(loop, t, {"v": 0.3, "r_now": late}, method=method)
     assert np.abs(found.outputs - lag_response(PLAN, np.maximum(t - 1.5, 0.0))).max() < 1e-7
@@ -105,7 +105,7 @@ def test_a_plan_stays_within_its_range_where_a_block_is_undefined_beyond(plan, m
 def test_a_delayed_signal_stays_within_the_range_of_what_was_delayed(method):
     samples = np.clip(np.sin(7.0 * T), 0.0, 1.0)
     block = ct.nlsys(lambda t, x, u, params: [np.sqrt(u[0] * (1.0 - u[0]))], inputs="v", outputs="y", states="y")
-    late = cp.create_delay_iosystem(0.25, "r", "v")
+    late = cp.create_delay_iosystem(0.25, inputs="r", outputs="v")
     found = cp.simulate(ct.interconnect([late, block], inputs="r", outputs="y"), T, samples, method=method)
     assert np.isfinite(found.outputs).all()
 

@@ -35,7 +35,7 @@ def test_a_step_at_an_instant_is_seen_by_its_sample(instant, shift, method):
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize(("step", "delay"), [(0.1, 0.2), (0.3, 0.4), (0.7, 0.1), (0.2, 0.4), (0.1, 0.7)])
 def test_a_jump_that_arrives_at_an_instant_is_seen_by_its_sample(step, delay, method):
-    late = cp.create_delay_iosystem(delay, "v", "r")
+    late = cp.create_delay_iosystem(delay, inputs="v", outputs="r")
     loop = ct.interconnect([late, held(0.1)], inputs="v", outputs="y")
     t = np.linspace(0.0, 1.0, 11)
     assert first_seen(loop, t, cp.Step(1.0, time=step), method) == round(10 * (step + delay))

@@ -117,7 +117,7 @@ def test_a_new_method_has_plans_samples_and_events(with_rk4):
     loop = ct.interconnect(
         [
             ct.nlsys(lambda t, x, u, p: u - x, None, inputs="e", outputs="y", states="y", name="lag"),
-            cp.create_pid_iosystem(2.0, 1.0, 0.0, 0.1, inputs=["r", "y"], output="e", name="pid"),
+            cp.create_pid_iosystem(2.0, 1.0, 0.0, 0.1, inputs=["r", "y"], outputs="e", name="pid"),
         ],
         inputs="r",
         outputs="y",

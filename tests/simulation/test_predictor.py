@@ -209,7 +209,9 @@ def test_systems_that_a_state_does_not_predict():
     both = ct.interconnect([plan, ct.summing_junction(["r", "d"], "u"), lag], inputs="r", outputs="y", name="both")
     with pytest.raises(ValueError, match="must not depend on time, got the plan or breakpoints of the block plan"):
         cp.Predictor(both, limits, 5.0)
-    late = ct.interconnect([cp.create_delay_iosystem(0.5, "r", "u"), lag], inputs="r", outputs="y", name="late")
+    late = ct.interconnect(
+        [cp.create_delay_iosystem(0.5, inputs="r", outputs="u"), lag], inputs="r", outputs="y", name="late"
+    )
     with pytest.raises(ValueError, match="must say all by its state, got the delay of the block delay"):
         cp.Predictor(late, limits, 5.0)
     with pytest.raises(ValueError, match=r"must be continuous, got .* dt = 0.1"):

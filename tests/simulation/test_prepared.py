@@ -251,7 +251,7 @@ def test_maps_of_an_interconnection(how, method, through):
 
 def test_a_replaced_plan_and_a_replaced_delay(through):
     source = cp.create_source_iosystem(PLAN)
-    late = cp.create_delay_iosystem(0.25, "r", "y")
+    late = cp.create_delay_iosystem(0.25, inputs="r", outputs="y")
     loop = ct.interconnect([source, late], inputs=0, outputs="y")
     assert np.abs(through(loop).outputs.ravel() - PLAN.shift(0.25)(T)).max() <= 1e-9
     cp.declare(late, delay=0.5)

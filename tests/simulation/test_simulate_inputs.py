@@ -156,7 +156,7 @@ def test_many_samples_beside_a_plan_that_comes_to_rest(count, method):
     t = np.linspace(0.0, 6.0, count)
     move = [cp.Waypoint(0, 0, 0, 0), cp.Waypoint(4, 1, 0, 0)]
     source = cp.create_source_iosystem(cp.PolySpline(move, labels=["x"]), 2)
-    limit = cp.create_saturation_iosystem(-1.0, 1.0, input="a", output="u")
+    limit = cp.create_saturation_iosystem(-1.0, 1.0, inputs="a", outputs="u")
     plant = ct.ss(
         [[-1.0]], [[1.0, 0.1, 0.1, 0.1]], [[1.0]], 0, inputs=["u", "x", "x_d1", "x_d2"], outputs="y", name="p"
     )
@@ -199,7 +199,7 @@ def test_a_list_holds_what_each_input_takes():
 
 def test_none_is_the_stated_start_and_a_number_is_that_number():
     lag = ct.ss(-1.0, 1.0, 1.0, 0.0, inputs="u", outputs="y", name="lag")
-    follower = cp.create_command_filter_iosystem(2.0, 2, input="y", name="follower")
+    follower = cp.create_command_filter_iosystem(2.0, 2, inputs="y", name="follower")
     cp.declare(follower, initial_state=[3.0, -1.0, 0.5])
     loop = ct.interconnect([lag, follower], inputs="u", outputs=["y"], check_unused=False)
     t = [0.0, 1.0]

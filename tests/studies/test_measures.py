@@ -346,7 +346,7 @@ def test_an_event_keeps_its_words_whatever_it_is_called():
 
 
 def test_an_actuator_is_at_its_limit_and_does_not_leave_it():
-    limited = cp.create_saturation_iosystem(-1.0, 1.0, "v", "u", name="drive")
+    limited = cp.create_saturation_iosystem(-1.0, 1.0, inputs="v", outputs="u", name="drive")
     plant = ct.ss(-1.0, 1.0, 1.0, 0.0, inputs="u", outputs="y", name="plant")
     law = ct.ss([], [], [], [[4.0, -4.0]], inputs=["r", "y"], outputs="v", name="law")
     whole = ct.interconnect([law, limited, plant], inputs=["r"], outputs=["y", "u"], name="whole")

@@ -129,7 +129,7 @@ def test_a_delay_that_holds_what_goes_in_at_rest():
     plant = ct.ss(-1.0, 1.0, 1.0, 0.0, inputs="late", outputs="y", name="plant")
 
     def build(initial):
-        late = cp.create_delay_iosystem(0.2, "q", "late", initial=initial, name="pipe")
+        late = cp.create_delay_iosystem(0.2, inputs="q", outputs="late", initial=initial, name="pipe")
         return lambda name, p: joined(p, pi(0.5, 0.5), late, plant)
 
     assert rests(compared(build(10.0)), 10.0, 1e-8)
@@ -202,7 +202,7 @@ def test_what_only_python_control_runs_rests_too():
 
 def test_a_block_that_states_its_start_has_it_and_the_others_rest_with_it():
     """A filter that starts at 4 holds the lag behind it at 4, whatever the plan is."""
-    smooth = cp.create_command_filter_iosystem(2.0, 1, 2, initial=4.0, input="r", output="w")
+    smooth = cp.create_command_filter_iosystem(2.0, 1, 2, initial=4.0, inputs="r", outputs="w")
     lag = ct.nlsys(
         lambda t, x, u, p: u - np.sinh(x), lambda t, x, u, p: x, inputs="w", outputs="y", states=1, name="lag"
     )

@@ -10,7 +10,7 @@ from scipy.special import gammainc
 from scipy.stats import gamma
 
 import ctrlplan as cp
-from ctrlplan.systems import command_lead
+from ctrlplan.systems import command_filter_gains
 from ctrlplan.systems.plants import Crane, crane_loop
 
 CASES = [(0.7, 0, 1), (2.0, 0, 3), (3.0, 1, 2), (2.0, 2, 3), (5.0, 2, 5), (0.5, 3, 4), (10.0, 4, 5)]
@@ -59,7 +59,7 @@ def test_the_answer_to_a_step_is_the_gamma_distribution(w, derivatives, order):
 
 def test_outputs_are_derivatives_of_one_another_after_jumps_of_the_command():
     """Exactly: the integral of each by an integrator beside it, in one run over three steps."""
-    block = cp.create_command_filter_iosystem(3.0, 3, output="r")
+    block = cp.create_command_filter_iosystem(3.0, 3, outputs="r")
     chains = [ct.ss(0, 1, 1, 0, inputs=f"r_d{k}", outputs=f"i{k}", name=f"chain{k}") for k in (1, 2, 3)]
     names = ["r", "r_d1", "r_d2", "r_d3"]
     loop = ct.interconnect([block, *chains], inputs=["r_cmd"], outputs=[*names, "i1", "i2", "i3"])
@@ -90,7 +90,7 @@ def test_order_is_one_above_the_derivatives_unless_given():
 
 
 def test_names():
-    block = cp.create_command_filter_iosystem(1.0, 1, 3, input="x_ref", output="x")
+    block = cp.create_command_filter_iosystem(1.0, 1, 3, inputs="x_ref", outputs="x")
     assert block.input_labels == ["x_ref"]
     assert block.output_labels == ["x", "x_d1"]
     assert block.state_labels == ["x", "x_d1", "x_d2"]
@@ -118,7 +118,7 @@ def test_it_lags_by_n_over_w(kind):
 @pytest.mark.parametrize("order", [1, 2, 3, 5])
 @pytest.mark.parametrize("w", [0.3, 4.0])
 def test_the_lead_is_the_inverse_of_the_filter(w, order):
-    lead = command_lead(w, order)
+    lead = command_filter_gains(w, order)
     block = cp.create_command_filter_iosystem(w, 0, order)
     assert len(lead) == order + 1
     for s in w * np.exp(1j * np.linspace(-2.5, 2.5, 8)):
@@ -129,7 +129,7 @@ def led(plan, w, derivatives, order, outputs):
     """Source with all derivatives that the lead weighs, their sum, and the filter."""
     source = cp.create_source_iosystem(plan, order)
     names = source.output_labels
-    weighted = ct.ss([], [], [], [command_lead(w, order)], inputs=names, outputs=["r_cmd"], name="lead")
+    weighted = ct.ss([], [], [], [command_filter_gains(w, order)], inputs=names, outputs=["r_cmd"], name="lead")
     block = cp.create_command_filter_iosystem(w, derivatives, order)
     return ct.interconnect([source, weighted, block], inputs=0, outputs=outputs, name="led")
 
@@ -174,7 +174,7 @@ def commanded():
         [cp.Waypoint.from_jets(t, x=[x, 0, 0], z=[z, 0, 0]) for t, x, z in ((0, 1.0, 10.0), (6, 4.0, 9.0))]
     )
     filters = [
-        cp.create_command_filter_iosystem(w, 2, 3, input=f"{axis}_cmd", output=f"{axis}_ref")
+        cp.create_command_filter_iosystem(w, 2, 3, inputs=f"{axis}_cmd", outputs=f"{axis}_ref")
         for axis, w in (("x", 1.5), ("z", 2.0))
     ]
     cp.declare(filters[0], initial_state=[1.0, 0.0, 0.0])
@@ -213,7 +213,7 @@ def test_references_in_a_loop_are_what_the_filters_make_of_the_commands(commande
 
 def test_without_its_initial_state_a_filter_starts_at_0():
     plan = cp.PolySpline([cp.Waypoint.from_jets(t, x=[x, 0, 0], z=[10.0, 0, 0]) for t, x in ((0, 0.0), (6, 4.0))])
-    filters = [cp.create_command_filter_iosystem(1.0, 2, input=f"{a}_cmd", output=f"{a}_ref") for a in "xz"]
+    filters = [cp.create_command_filter_iosystem(1.0, 2, inputs=f"{a}_cmd", outputs=f"{a}_ref") for a in "xz"]
     loop = crane_loop(Crane(), plan, reference=filters, inputs=["x_cmd", "z_cmd"])
     assert np.all(loop.initial_state[:6] == 0.0)
 
@@ -250,4 +250,4 @@ def test_bad_input_of_the_filter(kind, message, given):
 )
 def test_bad_input_of_the_lead(kind, message, given):
     with pytest.raises(kind, match=message):
-        command_lead(*given)
+        command_filter_gains(*given)

@@ -513,13 +513,13 @@ def test_parameters_must_be_numbers(value):
 
 @pytest.mark.parametrize("z", [0.0, -3.0, math.nan])
 def test_the_load_rests_below_the_trolley(z):
-    with pytest.raises(ValueError, match="z must be above 0"):
+    with pytest.raises(ValueError, match="z must be finite and above 0"):
         Crane().equilibrium(0.0, z)
 
 
 @pytest.mark.parametrize("length", [0.0, -3.0, math.nan])
 def test_linear_model_needs_a_rope(length):
-    with pytest.raises(ValueError, match="rope_length must be above 0"):
+    with pytest.raises(ValueError, match="rope_length must be finite and above 0"):
         Crane().linear_coupled(length)
 
 

@@ -354,7 +354,7 @@ def test_a_wind_whose_axis_has_any_name_and_breakpoints_of_its_own():
 def test_the_plans_source_as_the_reference_is_the_plain_loop(law, method):
     plan = move(4)
     order = {"dynamic": 4, "feedforward": 4, "setpoint": 0}.get(law, 2)
-    own = crane_loop(Crane(), plan, law, reference=[cp.create_source_iosystem(plan, order, "mine", suffix="_ref")])
+    own = crane_loop(Crane(), plan, law, reference=[cp.create_source_iosystem(plan, order, suffix="_ref", name="mine")])
     plain = crane_loop(Crane(), plan, law)
     assert own.output_labels == plain.output_labels
     assert np.array_equal(own.initial_state, plain.initial_state)
@@ -394,7 +394,7 @@ def test_initial_states_in_the_order_of_the_blocks():
     """Reference blocks that start where they say, a wind without states, law and drives at 0, the crane at rest."""
     plan = move()
     first, second = (
-        cp.create_command_filter_iosystem(1.0, 2, input=f"{axis}_cmd", output=f"{axis}_ref") for axis in "xz"
+        cp.create_command_filter_iosystem(1.0, 2, inputs=f"{axis}_cmd", outputs=f"{axis}_ref") for axis in "xz"
     )
     cp.declare(first, initial_state=[1.0, 2.0, 3.0])
     cp.declare(second, initial_state=4.0)
@@ -449,7 +449,7 @@ def test_bad_input_of_the_loop(case):
 
 
 def test_an_initial_state_of_the_wrong_size_names_its_block():
-    other = cp.create_command_filter_iosystem(1.0, 2, input="z_cmd", output="z_ref")
+    other = cp.create_command_filter_iosystem(1.0, 2, inputs="z_cmd", outputs="z_ref")
     with pytest.raises(ValueError, match="initial_state of z_ref_filter must be a finite number or 3 of them"):
         cp.declare(other, initial_state=[10.0, 0.0])
 

@@ -51,7 +51,9 @@ SYSTEMS = {
     ),
     "sampled": lambda: loop(cp.sample_hold(discrete_law(), 0.1)),
     "delayed": lambda: ct.interconnect(
-        [cp.create_delay_iosystem(0.3, "y", "late"), discrete_free("late"), pendulum()], inputs="r", outputs=["y"]
+        [cp.create_delay_iosystem(0.3, inputs="y", outputs="late"), discrete_free("late"), pendulum()],
+        inputs="r",
+        outputs=["y"],
     ),
     "with a plan": lambda: ct.interconnect(
         [cp.create_source_iosystem(cp.Step(1.0, labels=["d"])), ct.summing_junction(["r", "d"], "u"), pendulum()],

@@ -358,7 +358,7 @@ def test_it_is_a_static_block_of_any_time_base():
     law = create_flat_iosystem(integrator_chain(2), [-1, -2])
     assert isinstance(law, ct.NonlinearIOSystem)
     assert (law.nstates, law.dt, law.name) == (0, None, "flat_law")
-    assert create_flat_iosystem(integrator_chain(1), [-1], "mine").name == "mine"
+    assert create_flat_iosystem(integrator_chain(1), [-1], name="mine").name == "mine"
 
 
 @pytest.mark.parametrize(("plant", "poles"), LOOPS.values(), ids=list(LOOPS))
@@ -418,7 +418,7 @@ def test_laws_side_by_side_share_nothing():
             inputs=[f"u_{axis}"],
             name=f"chain_{axis}",
         )
-        blocks += [chain, create_flat_iosystem(chain, poles, f"law_{axis}", labels=axis)]
+        blocks += [chain, create_flat_iosystem(chain, poles, labels=axis, name=f"law_{axis}")]
     plan = smooth(2, 2, labels=["x", "z"])
     loop = ct.interconnect(
         [cp.create_source_iosystem(plan, 2, suffix="_ref"), *blocks], inputs=0, outputs=["x", "x_d1", "z", "z_d1"]
@@ -683,7 +683,7 @@ def test_labels_are_refused():
     with pytest.raises(TypeError, match=r"^labels must be strings"):
         create_flat_iosystem(chain, [-1, -2], labels=[1])
     taken = double_integrator(states=["x", "x_ref_d1"])
-    with pytest.raises(ValueError, match=r"^labels must not make references of the names of states, got x_ref_d1"):
+    with pytest.raises(ValueError, match=r"^labels and suffix must not give references the names of states, got x_ref_d1"):
         create_flat_iosystem(taken, [-1, -2])
 
 

@@ -278,12 +278,12 @@ LIMITS = {"u": (-1.0, 1.0)}
 @pytest.mark.parametrize(
     ("given", "error", "message"),
     [
-        ({"dt": None}, ValueError, "dt and limits must be given beside a loop"),
-        ({"limits": None}, ValueError, "dt and limits must be given beside a loop"),
+        ({"dt": None}, ValueError, "dt and limits must be given with a loop"),
+        ({"limits": None}, ValueError, "dt and limits must be given with a loop"),
         ({"dt": -1.0}, ValueError, "dt must be finite and above 0, got -1.0"),
         ({"initial": math.nan}, ValueError, "initial must be a finite number or 1 of them, got nan"),
         ({"initial": [0.0, 1.0]}, ValueError, "initial must be a finite number or 1 of them"),
-        ({"offset": -0.1}, ValueError, "offset must be finite and at least 0 s, got -0.1"),
+        ({"offset": -0.1}, ValueError, "offset must be finite and at least 0, got -0.1"),
         ({"margin": 2.0}, ValueError, r"margin must lie in \(0, 1\)"),
         ({"loop": 3.0}, TypeError, "loop must be a linear control system or have references, .* got float"),
         ({"loop": Slowly()}, TypeError, "limits must go with a loop, got a Slowly, which has its own"),

@@ -149,7 +149,7 @@ def test_it_is_a_gain_of_any_time_base():
 
 def test_a_label_of_the_plans_own():
     loop, plan = cp.plants.integrator_lag_loop(5.0), plan_of(2, labels=["height"])
-    block = create_feedforward_iosystem(loop, "height", name="inverse")
+    block = create_feedforward_iosystem(loop, labels="height", suffix="", name="inverse")
     assert (block.name, block.input_labels) == ("inverse", ["height", "height_d1", "height_d2"])
     joined = ct.interconnect([cp.create_source_iosystem(plan, 2), block, loop], inputs=0, outputs=["y", "r"])
     found = cp.simulate(joined, T)
@@ -235,5 +235,5 @@ def test_other_loops_are_refused(loop, error, message):
 
 @pytest.mark.parametrize("label", ["r", "y"])
 def test_a_label_that_would_be_added_to_the_loops_own_signal_is_refused(label):
-    with pytest.raises(ValueError, match=f"^label must differ from the signals of the loop, .* got '{label}'$"):
-        create_feedforward_iosystem(cp.plants.integrator_lag_loop(5.0), label)
+    with pytest.raises(ValueError, match=f"^labels and suffix must not name a signal of the loop, .* got '{label}'$"):
+        create_feedforward_iosystem(cp.plants.integrator_lag_loop(5.0), labels=label, suffix="")

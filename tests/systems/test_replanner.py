@@ -1132,8 +1132,8 @@ BAD = [
         {"goal_derivatives": 0, "suffix": "_goal"},
         "suffix must tell outputs from inputs, got '_goal' and x_goal among both",
     ),
-    ({"offset": -0.1}, "offset must be finite and at least 0 s, got -0.1"),
-    ({"offset": math.inf}, "offset must be finite and at least 0 s, got inf"),
+    ({"offset": -0.1}, "offset must be finite and at least 0, got -0.1"),
+    ({"offset": math.inf}, "offset must be finite and at least 0, got inf"),
     ({"limits": {1: 0.0}}, "limits[1] must be above 0, one number or 1, got 0.0"),
     ({"limits": {1: math.nan}}, "limits[1] must be above 0, one number or 1, got nan"),
     ({"limits": {1: [1.0, 2.0]}}, "limits[1] must be above 0, one number or 1, got [1.0, 2.0]"),
@@ -1158,7 +1158,7 @@ def test_bad_values_get_one_line(options, message):
         ((PLAN, 0.5), {"order": "2"}, "order must be a whole number from 0, got '2'"),
         ((PLAN, 0.5), {"measured": True}, "measured must be a whole number from 0, got True"),
         ((PLAN, 0.5), {"limits": [1.0]}, "limits must be a mapping of orders to magnitudes, got list"),
-        ((PLAN, 0.5), {"limits": {1: "fast"}}, "limits[1] must be numbers, got 'fast'"),
+        ((PLAN, 0.5), {"limits": {1: "fast"}}, "limits[1] must be real numbers, got 'fast'"),
     ],
 )
 def test_wrong_kinds_get_one_line(arguments, options, message):

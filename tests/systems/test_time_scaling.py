@@ -513,7 +513,7 @@ LOOP_TIMES = np.linspace(0.0, 12.0, 241)
 
 def saturating(source, gains=GAINS, most=MOST, damping=DAMPING):
     """Unit mass under a PID whose force is limited; x_ref to x."""
-    pid = cp.create_pid_iosystem(*gains, limits=(-most, most), inputs=("x_ref", "x"), output="F", name="pid")
+    pid = cp.create_pid_iosystem(*gains, limits=(-most, most), inputs=("x_ref", "x"), outputs="F", name="pid")
     mass = ct.ss([[0, 1], [0, -damping]], [[0], [1]], [[1, 0]], 0, inputs=["F"], outputs=["x"], name="mass")
     return ct.interconnect([source, pid, mass], inputs=0, outputs=["x", "x_ref", "F"])
 
@@ -745,7 +745,7 @@ BAD = [
     (ValueError, "limits or errors must name a signal", {"limits": None}),
     (ValueError, "limits or errors must name a signal", {"limits": {}, "errors": {}}),
     *((ValueError, "limits of u must increase", {"limits": {"u": pair}}) for pair in ((1, -1), (1, 1))),
-    *((BOTH, "limits of u must be", {"limits": {"u": pair}}) for pair in ((math.nan, 1), (1,), 3, "ab", (1, 2, 3))),
+    *((BOTH, "limits of u must be", {"limits": {"u": pair}}) for pair in ((math.nan, 1), (1,), -3, "ab", (1, 2, 3))),
     *((ValueError, "limits of u must hold a finite one", {"limits": {"u": pair}}) for pair in ((-INF, INF), (0, INF))),
     (ValueError, "errors must name axes of the plan, x, got 'z'", {"errors": {"z": (0, 1)}}),
     *(
