@@ -120,20 +120,22 @@ def former_signature(
             extra = dict(zip(positional, args[count:], strict=False))
             if len(args) - count > len(positional) or extra.keys() & kwargs.keys():
                 return call(*args, **kwargs)  # too many arguments, or one of them twice: Python says which
+            given = extra | kwargs
+            for old, new in new_names.items():
+                if given.get(old) is not None and given.get(new) is not None:
+                    raise TypeError(f"{old}= is the old name of {new}=: only one of them may be given, got both")
             if extra:
                 keywords = [f"{new_names.get(name, name)}=" for name in extra]
                 keywords += [f"{k}={v!r}" for name in extra for k, v in also.get(name, {}).items()]
                 warn_renamed(f"{', '.join(extra)} by position in {function.__name__}", ", ".join(keywords))
-            given = extra | kwargs
             for old, new in new_names.items():
-                if given.get(old) is not None:
-                    if given.get(new) is not None:
-                        raise TypeError(f"{old}= is the old name of {new}=: only one of them may be given, got both")
-                    implied_now = dict(also.get(old, {}))
-                    if old not in extra:
-                        warn_renamed(f"{old}=", ", ".join([f"{new}=", *(f"{k}={v!r}" for k, v in implied_now.items())]))
-                    given = implied_now | given | {new: given[old]}
-                given.pop(old, None)
+                value = given.pop(old, None)
+                if value is None:
+                    continue
+                with_it = dict(also.get(old, {}))
+                if old not in extra:
+                    warn_renamed(f"{old}=", ", ".join([f"{new}=", *(f"{k}={v!r}" for k, v in with_it.items())]))
+                given = with_it | given | {new: value}
             return call(*args[:count], **given)
 
         return called

@@ -194,7 +194,8 @@ def optimize_waypoints(
 
     sides = np.where(np.isnan(table), found.sides / unit, table)  # prescribed entries to the last bit
     before, after = (
-        [Waypoint._of(t, jet.copy(), names) for t, jet in zip(times.tolist(), side, strict=True)] for side in sides
+        [Waypoint.from_array(t, jet.copy(), names) for t, jet in zip(times.tolist(), side, strict=True)]
+        for side in sides
     )
     parts = [after] if single else [list(pair) for pair in zip(after[:-1], before[1:], strict=True)]
     split = problem.split()
@@ -202,11 +203,11 @@ def optimize_waypoints(
     if single or split.any():
         # Of joined segments each is measured by its own ends alone, which says nothing of the whole.
         splines = [TrigSpline(p, alpha=alpha, warn=single) if alpha else PolySpline(p, warn=single) for p in parts]
-        plan = splines[0] if single else _joined(splines)
+        plan = splines[0] if single else Joined.as_they_are(splines)
     else:
         plan = PiecewiseSpline(after, alpha=alpha)
     shared = zip(times.tolist(), np.where(split, np.nan, sides[1]), strict=True)
-    chosen_points = tuple(Waypoint._of(t, jet.copy(), names) for t, jet in shared)
+    chosen_points = tuple(Waypoint.from_array(t, jet.copy(), names) for t, jet in shared)
     cost = float(found.cost @ factors) * duration ** (1 - 2 * derivative)
     return Optimum(chosen_points, plan, cost, found.unique, derivative)
 
@@ -474,10 +475,3 @@ def _checked_weights(weights: ArrayLike | None, naxes: int) -> Array:
     if factors.size != naxes:
         raise ValueError(f"weights must be one number an axis, {naxes}, got {factors.size}")
     return factors
-
-
-def _joined(legs: Sequence[Trajectory]) -> Joined:
-    """Legs one after the other, which need no shift that would round their times."""
-    plan = Joined.__new__(Joined)
-    plan._set(tuple(legs), legs[0].labels)
-    return plan

@@ -219,11 +219,12 @@ class Plot(ControlPlot):  # type: ignore[misc]
 
 def _set_below_title(figure: Figure | SubFigure, legend: Legend) -> None:
     """Move a legend outside the axes, and the axes, below the title of the figure: matplotlib puts both at the top."""
-    title = figure._suptitle  # type: ignore[union-attr]
+    words = figure.get_suptitle()
+    title = next((text for text in figure.texts if words and text.get_text() == words), None)
     engine = (
         figure.get_layout_engine() if isinstance(figure, Figure) else None
     )  # a part of a figure has none of its own
-    if title is not None and title.get_text() and isinstance(engine, ConstrainedLayoutEngine):
+    if title is not None and isinstance(engine, ConstrainedLayoutEngine):
         below = 1.0 - title.get_window_extent().height / figure.bbox.height
         legend.set_bbox_to_anchor((0.0, 0.0, 1.0, below - 0.005), transform=figure.transSubfigure)
         engine.set(rect=(0.0, 0.0, 1.0, below - 0.025))

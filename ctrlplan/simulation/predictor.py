@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ctrlplan._checks import checked_limits, checked_time
+from ctrlplan._checks import Range, checked_limits, checked_time
 from ctrlplan._types import Frozen, Params, System
 from ctrlplan.simulation import methods
 from ctrlplan.simulation.interpreted import LoopError, SolverError
@@ -53,8 +53,9 @@ class Predictor(Frozen):
         Continuous and not depending on time: without plans and delays. Blocks
         that take samples are predicted as at the start of a run: the
         governor's samples must fall on theirs.
-    limits : mapping of str to (float, float)
-        Least and greatest value of each limited output; one may be infinite.
+    limits : mapping of str to (float, float) or float
+        Minimum and maximum of each limited output, one of which may be
+        infinite; a number a for (-a, a).
     horizon : float
         How far ahead is looked [s], above 0.
     references : sequence of str, optional
@@ -122,7 +123,7 @@ class Predictor(Frozen):
     def __init__(
         self,
         system: System | Prepared,
-        limits: Mapping[str, Sequence[float]],
+        limits: Mapping[str, Range],
         horizon: float,
         *,
         references: Sequence[str] | None = None,

@@ -133,7 +133,7 @@ class PlanSignal:
 
     def analytic_at(self, moment: float, origin: float, s: Array) -> Array:
         """Values of the segment that holds at `moment`."""
-        jet = self.plan._jet_beside(moment, origin, s, self.derivatives)
+        jet = self.plan.segment_jet_at(moment, origin, s, self.derivatives)
         return jet.transpose(1, 0, 2).reshape(-1, s.size)
 
     def bounds(self, moment: float, left: float, right: float) -> tuple[Array, Array]:

@@ -132,7 +132,7 @@ def outputs_together(
 def _outputs(form: LinearForm, rows: list[int], plan: Trajectory, times: Array, initial: Array) -> Array:
     """Some of the outputs, shape (nloops, nrows, ntime), with a plan at the inputs."""
     with np.errstate(over="ignore", invalid="ignore"):
-        out = exact_states(form.a, form.b, plan._jet_beside, list(plan.breakpoints), times, initial, form.c[:, rows])
+        out = exact_states(form.a, form.b, plan.segment_jet_at, list(plan.breakpoints), times, initial, form.c[:, rows])
         for k, row in enumerate(rows):
             if form.d[:, row].any():
                 out[:, k] += form.d[:, row] @ plan.jet(times, 0)[0]

@@ -417,7 +417,7 @@ class _Correction(ct.NonlinearIOSystem):  # type: ignore[misc]
         for left, right in itertools.pairwise(edges[edges >= t].tolist()):
 
             def jet(s: Array, order: int, left: float = left, right: float = right) -> Array:
-                planned = self._plan._jet_beside(0.5 * (left + right), left, s, order)
+                planned = self._plan.segment_jet_at(0.5 * (left + right), left, s, order)
                 if right <= met:
                     return planned + found.jet(coefficients, s + (left - t), order)
                 kept = extrapolated(goal, left - t)

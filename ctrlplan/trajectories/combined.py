@@ -77,12 +77,12 @@ class _Combined(Trajectory):
         """Derivatives of a segment; as `Trajectory.segment_jet`."""
         origin, end = self.breakpoints[segment : segment + 2].tolist()
         moment = 0.5 * (origin + end)
-        return self._combine([part._jet_beside(moment, origin, s, order) for part in self.parts])
+        return self._combine([part.segment_jet_at(moment, origin, s, order) for part in self.parts])
 
     def segment_series(self, segment: int, s: Any, order: int) -> list[list[Any]]:
         """Taylor series of a segment; as `Trajectory.segment_series`."""
         origin, end = self.breakpoints[segment : segment + 2].tolist()
-        rows = [part._series_beside(0.5 * (origin + end), origin, s, order) for part in self.parts]
+        rows = [part.segment_series_at(0.5 * (origin + end), origin, s, order) for part in self.parts]
         found: list[list[Any]] = self._combine([_objects(row) for row in rows]).T.tolist()
         return found
 
@@ -238,6 +238,17 @@ class Joined(Trajectory):
             _check_join(before, after)
         self._set(tuple(members), members[0].labels)
 
+    @classmethod
+    def as_they_are(cls, parts: Sequence[Trajectory]) -> Self:
+        """Trajectories that follow each other already: no shift rounds their times."""
+        return cls._of(tuple(parts), parts[0].labels)
+
+    @classmethod
+    def _of(cls, parts: tuple[Trajectory, ...], labels: tuple[str, ...]) -> Self:
+        self = cls.__new__(cls)
+        self._set(parts, labels)
+        return self
+
     def _set(self, parts: tuple[Trajectory, ...], labels: tuple[str, ...]) -> None:
         times, segments = [parts[0].start], []
         waypoints = list(parts[0].waypoints)
@@ -264,18 +275,14 @@ class Joined(Trajectory):
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> Self:
         """Trajectory from the plain data of `to_dict`."""
-        self = cls.__new__(cls)
         parts = _checked_parts(trajectory_from_dict(part) for part in data["parts"])
         for before, after in pairwise(_same_axes(parts)):
             _check_join(before, after)
-        self._set(parts, tuple(data["labels"]))
-        return self
+        return cls._of(parts, tuple(data["labels"]))
 
     def map_time(self, origin: float, target: float, rate: float) -> Self:
         """Same path at other times; as `Trajectory.map_time`."""
-        self_ = type(self).__new__(type(self))
-        self_._set(tuple(part.map_time(origin, target, rate) for part in self.parts), self.labels)
-        return self_
+        return self._of(tuple(part.map_time(origin, target, rate) for part in self.parts), self.labels)
 
     def _sample(self, t: Array, low: int, high: int, left: bool) -> Array:
         out = super()._sample(t, low, high, left)

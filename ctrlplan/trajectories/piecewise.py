@@ -201,7 +201,7 @@ def _filled(points: tuple[Waypoint, ...], alpha: float) -> tuple[list[Waypoint],
                 decimals[where[0][:, None], where[1][:, None], axes] = found
             elif decimals is not None:
                 decimals[where[0][:, None], where[1][:, None], axes] = found
-    return [Waypoint._of(p.time, jet, None) for p, jet in zip(points, filled, strict=True)], decimals
+    return [Waypoint.from_array(p.time, jet, None) for p, jet in zip(points, filled, strict=True)], decimals
 
 
 def _resolve(legs: list[NewtonSpline], decimals: NDArray[np.object_]) -> None:

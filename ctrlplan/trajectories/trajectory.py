@@ -667,8 +667,24 @@ class Trajectory(Fields, ABC):
                 f"of {np.abs(self.segment_jet(segment, np.zeros(1), 0)).max():g}"
             )
 
-    def _jet_beside(self, moment: float, origin: float, s: Array, order: int) -> Array:
-        """Jet at origin + s of the analytic function that holds at `moment`, which is no breakpoint."""
+    def segment_jet_at(self, moment: float, origin: float, s: Array, order: int) -> Array:
+        """Jet at origin + s of the analytic function that holds at `moment`, which is no breakpoint.
+
+        Parameters
+        ----------
+        moment : float
+            Time [s] on the segment, or before the start or after the end.
+        origin : float
+            Time [s] from which s counts, so that no digits of it are lost.
+        s : ndarray, shape (ntime,)
+            Times [s] after the origin.
+        order : int
+            Highest derivative.
+
+        Returns
+        -------
+        ndarray, shape (order + 1, naxes, ntime)
+        """
         segment = int(np.searchsorted(self.breakpoints, moment)) - 1
         if 0 <= segment < self.breakpoints.size - 1:
             return self.segment_jet(segment, s + (origin - self.breakpoints[segment]), order)
@@ -676,8 +692,8 @@ class Trajectory(Fields, ABC):
         held[0] = (self.initial if segment < 0 else self.final)[:, None]
         return held
 
-    def _series_beside(self, moment: float, origin: float, s: Any, order: int) -> list[list[Any]]:
-        """The same as Taylor series, of numbers or of symbols."""
+    def segment_series_at(self, moment: float, origin: float, s: Any, order: int) -> list[list[Any]]:
+        """As `segment_jet_at`, the Taylor coefficients of each axis at one number or symbol s."""
         segment = int(np.searchsorted(self.breakpoints, moment)) - 1
         if 0 <= segment < self.breakpoints.size - 1:
             return self.segment_series(segment, s + (origin - float(self.breakpoints[segment])), order)

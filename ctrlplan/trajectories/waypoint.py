@@ -108,10 +108,26 @@ class Waypoint(Fields):
         table = np.full((max(1, *(c.size for c in columns.values())), len(columns)), np.nan)
         for axis, column in enumerate(columns.values()):
             table[: column.size, axis] = column
-        return cls._of(checked_time(time, "time"), table, tuple(columns))
+        return cls.from_array(checked_time(time, "time"), table, tuple(columns))
 
     @classmethod
-    def _of(cls, time: float, jet: Array, labels: tuple[str, ...] | None) -> Waypoint:
+    def from_array(cls, time: float, jet: Array, labels: tuple[str, ...] | None) -> Waypoint:
+        """Waypoint from a table of derivatives, which it keeps and makes read-only.
+
+        Parameters
+        ----------
+        time : float
+            Time [s], finite.
+        jet : ndarray, shape (order + 1, naxes)
+            Row k has the k-th derivatives, nan where they are free.
+        labels : tuple of str, or None
+            Names of the axes, where they are known.
+
+        Raises
+        ------
+        ValueError
+            If a value is infinite.
+        """
         self = cls.__new__(cls)
         self._set(time, jet, labels)
         return self
@@ -155,11 +171,11 @@ class Waypoint(Fields):
     def scaled(self, time: float, rate: float) -> Waypoint:
         """Same point at another time, passed `rate` times as fast."""
         moved = times_powers(self.jet, rate, np.arange(len(self.jet))[:, None])
-        return Waypoint._of(checked_time(time, "time"), moved, self.labels)
+        return Waypoint.from_array(checked_time(time, "time"), moved, self.labels)
 
     def truncated(self, order: int) -> Waypoint:
         """Same point with what it prescribes up to an order, and the rest left free."""
-        return Waypoint._of(self.time, self.jet[: order + 1], self.labels)
+        return Waypoint.from_array(self.time, self.jet[: order + 1], self.labels)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data: time, jet by order then axis (None where free)."""
@@ -179,7 +195,7 @@ class Waypoint(Fields):
         jet = new_numbers(rows, "jet")
         if jet.ndim != 2 or jet.size == 0 or (labels is not None and len(labels) != jet.shape[1]):
             raise ValueError(f"jet must be a table of entries by axes, got {data['jet']!r}")
-        return cls._of(checked_time(data["time"], "time"), jet, labels)
+        return cls.from_array(checked_time(data["time"], "time"), jet, labels)
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Waypoint):

@@ -55,7 +55,7 @@ def responses():
         form = linear_forms([build(gain) for gain in gains])
         rest = np.zeros(form.a.shape[:2])
         for plan in PLANS.values():
-            out = exact_states(form.a, form.b, plan._jet_beside, plan.breakpoints, TIMES, rest, form.c)
+            out = exact_states(form.a, form.b, plan.segment_jet_at, plan.breakpoints, TIMES, rest, form.c)
             out[:, 1] += form.d[:, 1] @ plan.jet(TIMES, 0)[0]
         found.append(out[:, 0, -1])
     return np.concatenate(found)

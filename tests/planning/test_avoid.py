@@ -291,7 +291,7 @@ def test_options_are_checked():
     plan, disc = cp.PolySpline(ACROSS), [Disc((10.0, 5.2), 2.0)]
     with pytest.raises(ValueError, match="clearance must be finite and at least 0, got -1"):
         avoid(plan, disc, clearance=-1.0)
-    with pytest.raises(ValueError, match="load must be a number, got nan"):
+    with pytest.raises(ValueError, match="load must be finite and at least 0, got nan"):
         avoid(plan, disc, load=math.nan)
     with pytest.raises(ValueError, match="max_points must be a whole number from 1, got 0"):
         avoid(plan, disc, max_points=0)

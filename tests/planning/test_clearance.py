@@ -207,7 +207,7 @@ def test_clearance_is_frozen():
     [
         (ACROSS, [], {}, "at least one obstacle, got none"),
         (ACROSS, [Disc((0, 0), 1)], {"load": -0.1}, "load must be finite and at least 0, got -0.1"),
-        (ACROSS, [Disc((0, 0), 1)], {"load": math.nan}, "load must be a number, got nan"),
+        (ACROSS, [Disc((0, 0), 1)], {"load": math.nan}, "load must be finite and at least 0, got nan"),
         (ACROSS, [Disc((0, 0), 1)], {"load": math.inf}, "load must be finite"),
         (ACROSS, [Disc((0, 0), 1)], {"required": math.nan}, "required must be a number, got nan"),
         (cp.Step([1.0, 2.0]), [Disc((0, 0), 1)], {}, "without duration .* got a step"),

@@ -25,7 +25,7 @@ def stacked(systems):
 def run(systems, plan, times, initial=None, **options):
     a, b, *_ = stacked(systems)
     state = np.zeros(a.shape[:2]) if initial is None else np.asarray(initial)
-    return exact_states(a, b, plan._jet_beside, plan.breakpoints, np.asarray(times), state, **options)
+    return exact_states(a, b, plan.segment_jet_at, plan.breakpoints, np.asarray(times), state, **options)
 
 
 def check(systems, plan, signals, times, initial=None, some=None, tolerance=SMALL):
@@ -100,7 +100,7 @@ def test_a_batch_finds_what_its_members_find():
         together = run(systems, plan, t)
         for i in range(len(systems)):
             a, b, *_ = (matrix[i] for matrix in stacked(systems))
-            alone = exact_states(a, b, plan._jet_beside, plan.breakpoints, t, np.zeros(2))
+            alone = exact_states(a, b, plan.segment_jet_at, plan.breakpoints, t, np.zeros(2))
             assert gap(together[i], alone) <= SMALL
 
 
@@ -118,7 +118,7 @@ def test_combinations_of_states_in_their_place():
 def test_systems_without_states():
     plan, _ = both(*REST, 1.0)
     found = exact_states(
-        np.zeros((3, 0, 0)), np.zeros((3, 0, 1)), plan._jet_beside, [], np.linspace(0, 1, 5), np.zeros((3, 0))
+        np.zeros((3, 0, 0)), np.zeros((3, 0, 1)), plan.segment_jet_at, [], np.linspace(0, 1, 5), np.zeros((3, 0))
     )
     assert found.shape == (3, 0, 5)
 

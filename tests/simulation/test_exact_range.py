@@ -33,7 +33,7 @@ STIFF = {
 def states_of(a, b, plan, times, initial=None):
     a, b = np.asarray(a, dtype=float), np.asarray(b, dtype=float)
     start = np.zeros(len(a)) if initial is None else np.asarray(initial, dtype=float)
-    return exact_states(a, b, plan._jet_beside, plan.breakpoints, np.asarray(times), start)
+    return exact_states(a, b, plan.segment_jet_at, plan.breakpoints, np.asarray(times), start)
 
 
 # Poles times duration far beyond 1e16
@@ -224,12 +224,12 @@ def test_a_batch_with_systems_that_outgrow_its_cells():
     a, b = np.stack(systems), np.ones((4, 2, 1))
     for t in (np.linspace(0.0, 10.0, 101), np.linspace(0.0, 10.0, 37) ** 1.1):
         initial = np.zeros((4, 2))
-        found = exact_states(a, b, cp.Step(1.0)._jet_beside, [], t, initial)
+        found = exact_states(a, b, cp.Step(1.0).segment_jet_at, [], t, initial)
         assert np.abs(found[:, 1] + np.expm1(-t)).max() <= 1e-13
         assert np.abs(found[1, 0] + np.expm1(-1e3 * t) / 1e3).max() <= 1e-16
         assert np.abs(found[3, 0] - t).max() <= 1e-13
         assert np.isposinf(found[[0, 2], 0, 1 + t.searchsorted(1.0) :]).all()
-        at_rest = exact_states(a, b, cp.Step(0.0)._jet_beside, [], t, initial)
+        at_rest = exact_states(a, b, cp.Step(0.0).segment_jet_at, [], t, initial)
         assert not at_rest.any()
 
 

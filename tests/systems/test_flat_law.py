@@ -683,7 +683,9 @@ def test_labels_are_refused():
     with pytest.raises(TypeError, match=r"^labels must be strings"):
         create_flat_iosystem(chain, [-1, -2], labels=[1])
     taken = double_integrator(states=["x", "x_ref_d1"])
-    with pytest.raises(ValueError, match=r"^labels and suffix must not give references the names of states, got x_ref_d1"):
+    with pytest.raises(
+        ValueError, match=r"^labels and suffix must not give references the names of states, got x_ref_d1"
+    ):
         create_flat_iosystem(taken, [-1, -2])
 
 

@@ -116,7 +116,7 @@ def test_filter_must_be_above_zero(tf):
 
 @pytest.mark.parametrize("limits", [(1.0, 1.0), (2.0, -2.0), (math.nan, 1.0), (0.0, math.nan)])
 def test_limits_must_increase(limits):
-    with pytest.raises(ValueError, match="limits must (increase|be a number, got nan)"):
+    with pytest.raises(ValueError, match=r"limits must (increase|be a number, got nan)"):
         create_pid_iosystem(*GAINS, limits=limits)
 
 

@@ -52,7 +52,7 @@ def _run(job: Job, form: LinearForm) -> Record:
     times = with_event_times(job.times, watched, lambda: form.a)
 
     def jet(moment: float, origin: float, s: Array, order: int) -> Array:
-        rows = [plan._jet_beside(moment, origin, s, order + high) for plan, high in plans]
+        rows = [plan.segment_jet_at(moment, origin, s, order + high) for plan, high in plans]
         signals = [_derivatives(row, high, order) for row, (_, high) in zip(rows, plans, strict=True)]
         return np.concatenate(signals, axis=1) if signals else np.zeros((order + 1, 0, s.size))
 
