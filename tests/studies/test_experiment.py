@@ -299,7 +299,7 @@ def test_roles_do_not_depend_on_names():
 
 def test_draws_see_the_events_that_blocks_declare():
     """As the nominal loop does: an actuator at its limit is an event of every draw."""
-    limited = cp.create_saturation_iosystem(-1.0, 1.0, "v", "u", name="drive")
+    limited = cp.create_saturation_iosystem(-1.0, 1.0, inputs="v", outputs="u", name="drive")
     plant = ct.nlsys(
         lambda t, x, u, p: [p["rate"] * (u[0] - x[0])], None, inputs=["u"], outputs=["y"], states=1,
         params={"rate": 1.0}, name="plant",
