@@ -149,36 +149,14 @@ def create_time_scaling_iosystem(
         if value is not None:
             check_kind(value, label, Mapping, "a mapping of signals to pairs of numbers")
     n = max(highest, 1)
-    if bandwidth is None and not plan.duration:
-        raise ValueError("bandwidth must be given for a plan without duration, got None")
-    w = 10.0 / plan.duration if bandwidth is None else checked_finite(bandwidth, "bandwidth", above=0.0)
-    horizon = 4.0 * n / w if catch_up is None else checked_finite(catch_up, "catch_up", above=0.0)
-    least, most, inner = (
-        checked_number(value, label)
-        for label, value in (("slowest", slowest), ("fastest", fastest), ("margin", margin))
-    )
-    poles = np.roots([*_lags(n, w), 1.0 / horizon])
-    if poles.real.max() >= 0.0:
-        raise ValueError(
-            f"catch_up must be long beside the lags, {n}/bandwidth = {n / w:g} s, got {horizon:g} s: the clock would "
-            f"swing with {abs(poles[poles.real.argmax()].imag):.3g} rad/s"
-        )
-    if not 0.0 < inner <= 0.5:
-        raise ValueError(f"margin must lie in (0, 0.5], got {margin}")
-    if not 0.0 <= least < 1.0:
-        raise ValueError(f"slowest must lie in [0, 1), got {slowest}")
-    if not 1.0 <= most < math.inf:
-        raise ValueError(f"fastest must be finite and at least 1, got {fastest}")
-    bounds = {label: _checked_limits(label, pair, inner) for label, pair in (limits or {}).items()}
+    w, horizon = _checked_times(plan, n, bandwidth, catch_up)
+    least, most, inner = _checked_shares(slowest, fastest, margin)
     own = axis_signals(plan, labels, "")
+    bounds = {label: _checked_limits(label, pair, inner) for label, pair in (limits or {}).items()}
     bands = {label: _checked_band(label, pair, own) for label, pair in (errors or {}).items()}
     inputs = [*bounds, *bands]
     outputs = signal_names(axis_signals(plan, labels, suffix), highest)
-    if not inputs:
-        raise ValueError("limits or errors must name a signal that slows the clock, got none")
-    both = [label for label in inputs if label in outputs or inputs.count(label) > 1]
-    if both:
-        raise ValueError(f"inputs and outputs must have names of their own, got {', '.join(both)} twice")
+    _check_signals(inputs, outputs)
     axes = [own.index(label) for label in bands]
     weights = _rate_weights(n, w)
 
@@ -218,6 +196,44 @@ def create_time_scaling_iosystem(
     )
     # Once behind, the plan moves out of rest at times that no breakpoint names.
     return declare(block, feedthrough=False, breakpoints=plan.breakpoints, longest=0.5 * _shortest_move(plan))
+
+
+def _checked_times(plan: Trajectory, n: int, bandwidth: float | None, catch_up: float | None) -> tuple[float, float]:
+    """Bandwidth [rad/s] of n lags and time constant [s] with which the lag is made up for."""
+    if bandwidth is None and not plan.duration:
+        raise ValueError("bandwidth must be given for a plan without duration, got None")
+    w = 10.0 / plan.duration if bandwidth is None else checked_finite(bandwidth, "bandwidth", above=0.0)
+    horizon = 4.0 * n / w if catch_up is None else checked_finite(catch_up, "catch_up", above=0.0)
+    poles = np.roots([*_lags(n, w), 1.0 / horizon])
+    if poles.real.max() >= 0.0:
+        raise ValueError(
+            f"catch_up must be long compared with the lags, {n}/bandwidth = {n / w:g} s, got {horizon:g} s: the time "
+            f"scaling would oscillate with {abs(poles[poles.real.argmax()].imag):.3g} rad/s"
+        )
+    return w, horizon
+
+
+def _checked_shares(slowest: float, fastest: float, margin: float) -> tuple[float, float, float]:
+    """Minimum and maximum rate, and the part of the limits' range within which the rate falls."""
+    least, most, inner = (
+        checked_number(value, label)
+        for label, value in (("slowest", slowest), ("fastest", fastest), ("margin", margin))
+    )
+    if not 0.0 < inner <= 0.5:
+        raise ValueError(f"margin must lie in (0, 0.5], got {margin}")
+    if not 0.0 <= least < 1.0:
+        raise ValueError(f"slowest must lie in [0, 1), got {slowest}")
+    if not 1.0 <= most < math.inf:
+        raise ValueError(f"fastest must be finite and at least 1, got {fastest}")
+    return least, most, inner
+
+
+def _check_signals(inputs: Sequence[str], outputs: Sequence[str]) -> None:
+    if not inputs:
+        raise ValueError("limits or errors must name a signal that slows the plan, got none")
+    both = [label for label in inputs if label in outputs or inputs.count(label) > 1]
+    if both:
+        raise ValueError(f"inputs and outputs must have names of their own, got {', '.join(both)} twice")
 
 
 def _series(plan: Trajectory, t: Value, order: int) -> list[list[Value]]:

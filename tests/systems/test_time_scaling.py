@@ -336,7 +336,7 @@ def test_a_catch_up_with_which_the_lag_would_swing_for_ever_is_refused(n):
     w = 10.0
     bound = 1.0 / (w * MARGINAL[n])
     with pytest.raises(
-        ValueError, match=r"catch_up must be long beside the lags, \d/bandwidth = 0\.\d s, got 0\.\d+ s"
+        ValueError, match=r"catch_up must be long compared with the lags, \d/bandwidth = 0\.\d s, got 0\.\d+ s"
     ):
         cp.create_time_scaling_iosystem(identity(30.0), n, limits=U, bandwidth=w, catch_up=0.99 * bound)
     options = {"bandwidth": w, "catch_up": 1.5 * bound, "fastest": 3.0, "slowest": 0.1}
