@@ -103,11 +103,6 @@ def checked_finite(value: object, name: str, *, above: float | None = None, mini
     raise ValueError(f"{name} must be finite{bound}, got {number}")
 
 
-def checked_time(time: object, name: str, positive: bool = False) -> float:
-    """Finite number of seconds, above 0 where it is a duration."""
-    return checked_finite(time, name, above=0.0 if positive else None)
-
-
 def one_number(value: object, name: str, rule: str = "a number") -> float:
     """One number: no truth value, text, complex number, date, nor anything with a unit."""
     if type(value) is float:

@@ -29,7 +29,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import blas, qr
 from scipy.optimize import minimize
 
-from ctrlplan._checks import checked_count, checked_labels, checked_time
+from ctrlplan._checks import checked_count, checked_finite, checked_labels
 from ctrlplan.trajectories import Joined, PiecewiseSpline, PolySpline, Trajectory, TrigSpline, Waypoint
 from ctrlplan.trajectories.common import FACTORIALS, Array, readonly
 from ctrlplan.trajectories.newton import NewtonSystem
@@ -174,7 +174,7 @@ def optimize_waypoints(
     factors = _checked_weights(weights, naxes)
 
     times = np.array([p.time for p in points])
-    start, duration = points[0].time, checked_time(points[-1].time - points[0].time, "duration", positive=True)
+    start, duration = points[0].time, checked_finite(points[-1].time - points[0].time, "duration", above=0.0)
     relative = (times - start) / duration
     table = np.full((len(points), order + 1, naxes), np.nan)
     given, _ = given_entries(points)
@@ -471,7 +471,7 @@ def _checked_weights(weights: ArrayLike | None, naxes: int) -> Array:
     """Factors of the axes, above 0."""
     if weights is None:
         return np.ones(naxes)
-    factors = np.array([checked_time(w, f"weights[{i}]", positive=True) for i, w in enumerate(np.ravel(weights))])
+    factors = np.array([checked_finite(w, f"weights[{i}]", above=0.0) for i, w in enumerate(np.ravel(weights))])
     if factors.size != naxes:
         raise ValueError(f"weights must be one number an axis, {naxes}, got {factors.size}")
     return factors

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ctrlplan._checks import Range, checked_limits, checked_time
+from ctrlplan._checks import Range, checked_finite, checked_limits
 from ctrlplan._types import Frozen, Params, System
 from ctrlplan.simulation import methods
 from ctrlplan.simulation.interpreted import LoopError, SolverError
@@ -142,7 +142,7 @@ class Predictor(Frozen):
         for label, value, most in (("margin", margin, 0.5), ("resolution", resolution, 1.0)):
             if not 0.0 < float(value) < most:
                 raise ValueError(f"{label} must lie in (0, {most:g}), got {value}")
-        seconds = checked_time(horizon, "horizon", positive=True)
+        seconds = checked_finite(horizon, "horizon", above=0.0)
         if isinstance(count, bool) or int(count) != count or not _COUNTS[0] <= count <= _COUNTS[1]:
             raise ValueError(f"count must be a whole number from {_COUNTS[0]} to {_COUNTS[1]}, got {count}")
         bounds = np.array([checked_limits(pair, f"limits of {label}") for label, pair in limits.items()])

@@ -9,7 +9,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from ctrlplan._checks import checked_labels, checked_time, default_labels
+from ctrlplan._checks import checked_finite, checked_labels, default_labels
 from ctrlplan.trajectories.common import Array, readonly
 from ctrlplan.trajectories.files import trajectory_from_dict
 from ctrlplan.trajectories.trajectory import Trajectory
@@ -189,7 +189,7 @@ class Scaled(_Combined):
     factor: float
 
     def __init__(self, part: Trajectory, factor: float) -> None:
-        self._set_fields(factor=checked_time(factor, "factor"))
+        self._set_fields(factor=checked_finite(factor, "factor"))
         self._set(_checked_parts([part]), part.labels)
 
     def to_dict(self) -> dict[str, Any]:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import comb
 
-from ctrlplan._checks import checked_count, checked_time, finite_vector, new_numbers
+from ctrlplan._checks import checked_count, checked_finite, finite_vector, new_numbers
 from ctrlplan.trajectories.combined import Sum
 from ctrlplan.trajectories.common import Array, readonly
 from ctrlplan.trajectories.fields import Fields
@@ -121,7 +121,7 @@ class Shaper(Fields):
         ValueError
             If one is out of range.
         """
-        omega = checked_time(frequency, "frequency", positive=True)
+        omega = checked_finite(frequency, "frequency", above=0.0)
         zeta, count = float(_checked_damping(damping)), checked_count(derivatives, "derivatives") + 1
         root = math.sqrt(1.0 - zeta**2)
         decay = math.exp(-zeta * math.pi / root)

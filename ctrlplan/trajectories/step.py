@@ -8,7 +8,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ctrlplan._checks import checked_labels, checked_time, finite_vector
+from ctrlplan._checks import checked_finite, checked_labels, finite_vector
 from ctrlplan.trajectories.common import Array, mapped_time, readonly
 from ctrlplan.trajectories.trajectory import Trajectory
 
@@ -62,7 +62,7 @@ class Step(Trajectory):
             initial=readonly(low),
             final=readonly(high),
             labels=checked_labels(labels, high.size),
-            breakpoints=readonly(np.array([checked_time(time, "time")])),
+            breakpoints=readonly(np.array([checked_finite(time, "time")])),
         )
 
     def to_dict(self) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ctrlplan._checks import checked_count, checked_number, checked_time, checked_timepts, one_number
+from ctrlplan._checks import checked_count, checked_finite, checked_number, checked_timepts, one_number
 from ctrlplan._renamed import warn_renamed
 from ctrlplan.trajectories import extrema as _extrema
 from ctrlplan.trajectories import sampling as _sampling
@@ -464,7 +464,7 @@ class Trajectory(Fields, ABC):
         """
         if not self.duration:
             raise ValueError("a trajectory without duration cannot be retimed, got a step")
-        wanted = checked_time(duration, "duration", positive=True)
+        wanted = checked_finite(duration, "duration", above=0.0)
         return self._moved(self.start, self.start, self.duration / wanted)
 
     def shift(self, dt: float) -> Self:
@@ -476,7 +476,7 @@ class Trajectory(Fields, ABC):
             If the rounding of so late a time changes an interval of the plan by
             more than 1e-3 of its length; above 1e-6 it warns.
         """
-        return self._moved(self.start, self.start + checked_time(dt, "dt"), 1.0)
+        return self._moved(self.start, self.start + checked_finite(dt, "dt"), 1.0)
 
     def then(self, other: Trajectory) -> Trajectory:
         """This trajectory, then the other from this one's end on.

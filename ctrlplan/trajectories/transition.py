@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ctrlplan._checks import checked_count, checked_time, real_array
+from ctrlplan._checks import checked_count, checked_finite, real_array
 from ctrlplan.trajectories.common import FACTORIALS, Array, derivative_scale
 from ctrlplan.trajectories.fields import Fields
 from ctrlplan.trajectories.newton import NewtonSystem, newton_series, pair_series
@@ -66,7 +66,7 @@ class Transition(Fields):
 
     def __init__(self, order: int, horizon: float, alpha: float = 0.0) -> None:
         order = checked_count(order, "order")
-        horizon = checked_time(horizon, "horizon", positive=True)
+        horizon = checked_finite(horizon, "horizon", above=0.0)
         alpha = checked_alpha(alpha)
         family = _family(order, alpha)
         with np.errstate(over="ignore", under="ignore"):
@@ -119,7 +119,7 @@ class Transition(Fields):
 
     def radius(self, period: float) -> float:
         """Spectral radius of replanning every `period` [s] and following the plan in between."""
-        found = self._led_to_rest(checked_time(period, "period", positive=True), self.order)
+        found = self._led_to_rest(checked_finite(period, "period", above=0.0), self.order)
         return float(np.abs(np.linalg.eigvals(found)).max())
 
     def _led_to_rest(self, s: float, order: int) -> Array:

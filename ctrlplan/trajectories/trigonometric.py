@@ -9,7 +9,7 @@ from typing import Any, Literal, Self
 
 import numpy as np
 
-from ctrlplan._checks import checked_time, one_number
+from ctrlplan._checks import checked_finite, one_number
 from ctrlplan.trajectories.common import Array
 from ctrlplan.trajectories.newton import NewtonSystem
 from ctrlplan.trajectories.newton_spline import NewtonSpline, Options, checked_degree
@@ -124,7 +124,7 @@ class TrigSpline(NewtonSpline):
             If the waypoints do not fit into one period; otherwise as `TrigSpline`.
         """
         points = checked_waypoints(waypoints, least=1)
-        duration = checked_time(period, "period", positive=True)
+        duration = checked_finite(period, "period", above=0.0)
         chosen = Options(
             labels, _checked_gamma(gamma, points[0].naxes), *checked_degree(degree, smooth), duration, warn
         )

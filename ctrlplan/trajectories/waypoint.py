@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ctrlplan._checks import checked_time, new_numbers
+from ctrlplan._checks import checked_finite, new_numbers
 from ctrlplan.trajectories.common import Array, readonly, times_powers
 from ctrlplan.trajectories.fields import Fields
 
@@ -72,7 +72,7 @@ class Waypoint(Fields):
         entries = [position, velocity, acceleration, jerk, snap]
         while len(entries) > 1 and entries[-1] is None:
             entries.pop()
-        self._set(checked_time(time, "time"), _jet(entries), None)
+        self._set(checked_finite(time, "time"), _jet(entries), None)
 
     @classmethod
     def from_jets(cls, time: float, /, **jets: Sequence[float | None]) -> Waypoint:
@@ -108,7 +108,7 @@ class Waypoint(Fields):
         table = np.full((max(1, *(c.size for c in columns.values())), len(columns)), np.nan)
         for axis, column in enumerate(columns.values()):
             table[: column.size, axis] = column
-        return cls.from_array(checked_time(time, "time"), table, tuple(columns))
+        return cls.from_array(checked_finite(time, "time"), table, tuple(columns))
 
     @classmethod
     def from_array(cls, time: float, jet: Array, labels: tuple[str, ...] | None) -> Waypoint:
@@ -171,7 +171,7 @@ class Waypoint(Fields):
     def scaled(self, time: float, rate: float) -> Waypoint:
         """Same point at another time, passed `rate` times as fast."""
         moved = times_powers(self.jet, rate, np.arange(len(self.jet))[:, None])
-        return Waypoint.from_array(checked_time(time, "time"), moved, self.labels)
+        return Waypoint.from_array(checked_finite(time, "time"), moved, self.labels)
 
     def truncated(self, order: int) -> Waypoint:
         """Same point with what it prescribes up to an order, and the rest left free."""
@@ -195,7 +195,7 @@ class Waypoint(Fields):
         jet = new_numbers(rows, "jet")
         if jet.ndim != 2 or jet.size == 0 or (labels is not None and len(labels) != jet.shape[1]):
             raise ValueError(f"jet must be a table of entries by axes, got {data['jet']!r}")
-        return cls.from_array(checked_time(data["time"], "time"), jet, labels)
+        return cls.from_array(checked_finite(data["time"], "time"), jet, labels)
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Waypoint):
