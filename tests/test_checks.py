@@ -1,8 +1,11 @@
 """Checks of what a user gives: what they accept, what they say, and that they take the value before its name."""
 
+import ast
 import inspect
 import math
+import re
 from fractions import Fraction
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,6 +25,18 @@ NAMELESS = {"checked_labels", "default_labels"}
 @pytest.mark.parametrize("check", [CHECKS[name] for name in sorted(set(CHECKS) - NAMELESS)])
 def test_every_check_takes_the_value_and_then_its_name(check):
     assert list(inspect.signature(check).parameters)[1] == "name"
+
+
+def test_so_does_every_check_of_one_module_alone():
+    """Also those of their own modules: no function that checks begins with what the value is called."""
+    wrong = [
+        f"{path.name}: {node.name}"
+        for path in Path(_checks.__file__).parent.rglob("*.py")
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.FunctionDef) and re.match(r"_?check(ed)?_", node.name)
+        if [a.arg for a in node.args.args if a.arg not in ("self", "cls")][:1] in (["name"], ["label"])
+    ]
+    assert wrong == []
 
 
 @pytest.mark.parametrize("value", [2, 2.0, np.float64(2.0), np.int8(2), np.array(2.0), Fraction(2)])

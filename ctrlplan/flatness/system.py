@@ -166,7 +166,7 @@ class FlatSystem(fs.FlatSystem):  # type: ignore[misc]
         x, u = self.reverse([jet[: r + 1, j] for j, r in enumerate(self.orders)], self.params)
         for labels, rows in ((self.state_labels, x), (self.input_labels, u)):
             for label, row in zip(labels, rows, strict=True):
-                self._check_regular(label, row, times)
+                self._check_regular(row, label, times)
         return np.asarray(x), np.asarray(u)
 
     def quantities(self, jet: ArrayLike) -> dict[str, Array]:
@@ -230,7 +230,7 @@ class FlatSystem(fs.FlatSystem):  # type: ignore[misc]
                     f"the times given, got one whose {what} jumps by {jump.size:.4g} at {jump.time:g} s"
                 )
 
-    def _check_regular(self, label: str, row: Array, times: Array) -> None:
+    def _check_regular(self, row: Array, label: str, times: Array) -> None:
         """Reject a signal that the plan does not determine."""
         wrong = np.broadcast_to(~np.isfinite(row), times.shape)
         if wrong.any():

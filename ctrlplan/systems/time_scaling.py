@@ -152,8 +152,8 @@ def create_time_scaling_iosystem(
     w, horizon = _checked_times(plan, n, bandwidth, catch_up)
     least, most, inner = _checked_shares(slowest, fastest, margin)
     own = axis_signals(plan, labels, "")
-    bounds = {label: _checked_limits(label, pair, inner) for label, pair in (limits or {}).items()}
-    bands = {label: _checked_band(label, pair, own) for label, pair in (errors or {}).items()}
+    bounds = {label: _checked_limits(pair, label, inner) for label, pair in (limits or {}).items()}
+    bands = {label: _checked_band(pair, label, own) for label, pair in (errors or {}).items()}
     inputs = [*bounds, *bands]
     outputs = signal_names(axis_signals(plan, labels, suffix), highest)
     _check_signals(inputs, outputs)
@@ -270,7 +270,7 @@ def _nearness(value: Value, low: float, high: float, reach: float) -> Value:
     return 1.0 - distance / reach
 
 
-def _checked_limits(label: str, pair: Range, margin: float) -> tuple[float, float, float]:
+def _checked_limits(pair: Range, label: str, margin: float) -> tuple[float, float, float]:
     """Limits, and the distance from them within which the rate falls."""
     low, high, size = checked_limits(pair, f"limits of {label}")
     both = math.isfinite(low) and math.isfinite(high)
@@ -279,7 +279,7 @@ def _checked_limits(label: str, pair: Range, margin: float) -> tuple[float, floa
     return low, high, margin * (2.0 * size if both else size)
 
 
-def _checked_band(label: str, pair: Sequence[float], axes: Sequence[str]) -> tuple[float, float]:
+def _checked_band(pair: Sequence[float], label: str, axes: Sequence[str]) -> tuple[float, float]:
     if label not in axes:
         raise ValueError(f"errors must name axes of the plan, {', '.join(axes)}, got {label!r}")
     soft, hard = checked_pair(pair, f"errors of {label}")
