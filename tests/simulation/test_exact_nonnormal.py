@@ -118,7 +118,7 @@ def test_no_more_digits_are_lost_than_half_an_ulp_of_the_matrix_costs(kind, dura
     plan = cp.Step(1.0)
 
     def planned(times):
-        return exact_states(a, b, plan._jet_beside, [], times, start)
+        return exact_states(a, b, plan.segment_jet_at, [], times, start)
 
     assert np.abs(sampled_states(a, b, np.ones((1, 33)), t, start) - exact).max() <= bound
     assert np.abs(planned(t) - exact).max() <= bound
@@ -138,7 +138,7 @@ def test_a_plan_through_a_matrix_far_from_normal(count):
     exact, bound = reference(a, b, QUINTIC, 1.0, 9, np.zeros(4))
     plan = cp.PolySpline([cp.Waypoint(0.0, 0, 0, 0), cp.Waypoint(1.0, 1, 0, 0)])
     t = np.linspace(0.0, 1.0, count)
-    found = exact_states(a, b, plan._jet_beside, plan.breakpoints, t, np.zeros(4))
+    found = exact_states(a, b, plan.segment_jet_at, plan.breakpoints, t, np.zeros(4))
     assert np.abs(found[:, :: (count - 1) // 8] - exact).max() <= bound
 
 
@@ -150,7 +150,7 @@ def test_a_member_of_a_batch_is_not_squared_as_often_as_the_stiffest(count):
     batch, t = np.stack([stiff, a, -np.eye(4)]), np.linspace(0.0, 4.0, count)
     exact, bound = reference(a, b, STEP, 4.0, 2, start)
     initial = np.tile(start, (3, 1))
-    found = exact_states(batch, np.stack([b] * 3), cp.Step(1.0)._jet_beside, [], t, initial)[..., [0, -1]]
+    found = exact_states(batch, np.stack([b] * 3), cp.Step(1.0).segment_jet_at, [], t, initial)[..., [0, -1]]
     assert np.abs(found[1] - exact).max() <= bound
     for member, rates in ((0, -np.diag(stiff)), (2, np.ones(4))):
         decay = np.exp(-rates * 4.0)
@@ -165,7 +165,7 @@ def test_inputs_of_very_different_size_keep_their_digits():
     for gains in ([1.0, 2.0**40], [2.0**40, 1.0]):
         small = gains.index(1.0)
         plan = cp.stack([cp.Step(float(k == small)) for k in range(2)], labels=["a", "b"])
-        found = exact_states(a, b * gains, plan._jet_beside, plan.breakpoints, np.array([0.0, 4.0]), np.zeros(4))
+        found = exact_states(a, b * gains, plan.segment_jet_at, plan.breakpoints, np.array([0.0, 4.0]), np.zeros(4))
         assert np.abs(found - exact).max() <= bound
 
 
