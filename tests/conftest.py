@@ -1,17 +1,14 @@
-"""One hypothesis profile for all tests: no deadline, for a loaded machine is no fault; what tests import; figures."""
+"""One hypothesis profile for all tests: no deadline, for a loaded machine is no fault; figures; order of tests."""
 
 import gc
 import os
 import sys
-from pathlib import Path
 
 import pytest
 from hypothesis import settings
 
 # Matrices are small here: more threads of BLAS only wait for each other, and tests run in several processes already.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-
-sys.path.insert(0, str(Path(__file__).parent / "support"))
 
 settings.register_profile("ctrlplan", deadline=None, derandomize=True, print_blob=True)
 settings.load_profile("ctrlplan")

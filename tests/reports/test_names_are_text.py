@@ -4,24 +4,19 @@ import base64
 import hashlib
 import json
 import re
-import sys
 import unicodedata
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
+from hostile import CONTROL, MARKUP, NOT_WRITTEN_SO, SHOWN, TEXTS, mixed, study
 
 import ctrlplan as cp
 from ctrlplan.reports import CraneAnimation, comparison_fragment, plot_plans, render_page, write_page
 from ctrlplan.reports.style import to_svg
 from ctrlplan.reports.words import unit_in
 from ctrlplan.studies import Study
-
-sys.path.insert(0, str(Path(__file__).parent))
-
-from hostile import CONTROL, MARKUP, NOT_WRITTEN_SO, SHOWN, TEXTS, mixed, study
 
 DIRECTIONS = set("\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069")
 

@@ -4,7 +4,7 @@ import control as ct
 import mpmath as mp
 import numpy as np
 import pytest
-from simulation_oracle import Signal, both, gap, lag_loop, response, step
+from simulation_oracle import both, gap, lag_loop, polygon, response, step
 
 import ctrlplan as cp
 from ctrlplan.simulation import exact
@@ -210,16 +210,6 @@ def test_one_loop_without_a_solution_among_others(bad):
 
 
 # An input between its samples
-
-
-def polygon(times, values):
-    """Signal that is linear between samples, by the oracle."""
-    t, u = [mp.mpf(float(x)) for x in times], [mp.mpf(float(x)) for x in values]
-    zero = mp.mpf(0)
-    pieces = [
-        {(0, zero, t[k]): u[k], (1, zero, t[k]): (u[k + 1] - u[k]) / (t[k + 1] - t[k])} for k in range(len(t) - 1)
-    ]
-    return Signal(t, [{(0, zero, t[0]): u[0]}, *pieces, {(0, zero, t[0]): u[-1]}])
 
 
 @pytest.mark.parametrize("seed", range(6))

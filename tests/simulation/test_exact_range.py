@@ -7,8 +7,7 @@ import mpmath as mp
 import numpy as np
 import pytest
 import simulation_oracle
-from simulation_oracle import both, constant, gap, response, step
-from test_exact_batch import polygon
+from simulation_oracle import both, constant, gap, polygon, response, step
 
 import ctrlplan as cp
 from ctrlplan.simulation import rest_state

@@ -147,6 +147,16 @@ def spline(times, jets, alpha=0.0):
     return Signal([t[0], t[-1]], [next(ends), leg, next(ends)])
 
 
+def polygon(times, values):
+    """Signal that is linear between samples."""
+    t, u = [mp.mpf(float(x)) for x in times], [mp.mpf(float(x)) for x in values]
+    zero = mp.mpf(0)
+    pieces = [
+        {(0, zero, t[k]): u[k], (1, zero, t[k]): (u[k + 1] - u[k]) / (t[k + 1] - t[k])} for k in range(len(t) - 1)
+    ]
+    return Signal(t, [{(0, zero, t[0]): u[0]}, *pieces, {(0, zero, t[0]): u[-1]}])
+
+
 def piecewise(times, jets, alpha=0.0):
     legs = [spline(times[i : i + 2], jets[i : i + 2], alpha) for i in range(len(times) - 1)]
     whole = legs[0]
