@@ -6,17 +6,12 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from linear_table import GAINS, printed
 
 from ctrlplan import metrics
 
-# Step of k/(s^2 + s) in unity feedback, from the equation of section 2 of the paper: percent and seconds.
-STEPS = [
-    (1, 16.3034, 8.07635),
-    (5, 48.6397, 7.56125),
-    (20, 70.2256, 7.82524),
-    (100, 85.4468, 7.60094),
-    (1000, 95.1535, 7.75851),
-]
+# Step of k/(s^2 + s) in unity feedback: percent and seconds.
+STEPS = [(gain, *printed(gain, "step")) for gain in GAINS]
 
 
 def step(gain, t):

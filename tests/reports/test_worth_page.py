@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from linear_table import printed
 
 import ctrlplan as cp
 from ctrlplan.reports import render_page, write_report
@@ -143,8 +144,8 @@ def test_all_rivals_are_in_the_table_of_the_section(study, page):
     for title, key in (("Settling time", "settling_time"), ("Peak of the control", "control_peak")):
         for text, values in zip(found[title], metrics.values(), strict=True):
             assert number(text) == pytest.approx(values[key], rel=5e-4)
-    # MATH.md, section 2, at k = 100.
-    assert [number(text) for text in found["Settling time"]][:2] == pytest.approx([3.42085, 7.60094], rel=3e-4)
+    settles = [printed(100, plan)[1] for plan in ("trigonometric", "step")]
+    assert [number(text) for text in found["Settling time"]][:2] == pytest.approx(settles, rel=3e-4)
 
 
 def test_needs_are_shown_with_the_limit_that_is_active_and_where(study, page):

@@ -2,18 +2,12 @@
 
 import numpy as np
 import pytest
+from linear_table import GAINS, TABLE, computed
+from linear_table import PLANS as NAMES
 
 import ctrlplan as cp
 from ctrlplan import metrics
 
-# k: step, trigonometric (alpha = 1), quintic, a move of 1 in 1 s; overshoot on the error [%] and settling time [s].
-TABLE = {
-    1: (("16.3034", "8.07635"), ("16.0211", "8.56714"), ("16.0148", "8.56693")),
-    5: (("48.6397", "7.56125"), ("44.5425", "8.02597"), ("44.4532", "8.02505")),
-    20: (("70.2256", "7.82524"), ("48.8553", "7.62643"), ("48.4222", "7.61252")),
-    100: (("85.4468", "7.60094"), ("11.4917", "3.42085"), ("10.7596", "3.39506")),
-    1000: (("95.1535", "7.75851"), ("0.634705", "0.847783"), ("0.646697", "0.850593")),
-}
 MOVE = [cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1, 0, 0)]
 PLANS = {
     "step": cp.Step(1.0),
@@ -25,6 +19,13 @@ T = np.linspace(0.0, 15.0, 30_001)
 
 def half_a_digit(printed):
     return 0.5000001 * 10.0 ** -len(printed.partition(".")[2])
+
+
+@pytest.mark.parametrize("plan", NAMES)
+@pytest.mark.parametrize("gain", GAINS)
+def test_the_table_is_the_closed_form_to_every_digit(gain, plan):
+    values = tuple(f"{value:.6g}" for value in computed(gain, plan))
+    assert values == TABLE[gain][NAMES.index(plan)]
 
 
 @pytest.mark.parametrize("plan", PLANS)

@@ -7,6 +7,7 @@ import math
 import control as ct
 import numpy as np
 import pytest
+from linear_table import printed
 from scipy.interpolate import make_interp_spline
 from scipy.optimize import brentq
 
@@ -27,18 +28,13 @@ VIA = [
 TIMES = np.linspace(0, 12, 1201)
 TABLES = {"alphas": (0.0, 1.0, 3.0), "factors": (1.0, 1.5)}
 NAMES = ["trigonometric", "step", "trapezoid", "S-curve", "shaped step", "shaped S-curve", "quintic (minimum jerk)"]
-# MATH.md, section 2: overshoot on the error [%] and settling time [s] at alpha = 1, T = 1.
-MATH = {
-    5.0: {
-        "step": (48.6397, 7.56125),
-        "trigonometric": (44.5425, 8.02597),
-        "quintic (minimum jerk)": (44.4532, 8.02505),
-    },
-    100.0: {
-        "step": (85.4468, 7.60094),
-        "trigonometric": (11.4917, 3.42085),
-        "quintic (minimum jerk)": (10.7596, 3.39506),
-    },
+PRINTED = {
+    gain: {
+        "step": printed(gain, "step"),
+        "trigonometric": printed(gain, "trigonometric"),
+        "quintic (minimum jerk)": printed(gain, "quintic"),
+    }
+    for gain in (5.0, 100.0)
 }
 SHAPER = Shaper.zvd(20.0, 0.1)
 
@@ -286,10 +282,10 @@ def test_no_plan_is_possible_where_limits_are_none_that_time_can_keep():
 # What the loop makes of each
 
 
-@pytest.mark.parametrize("gain", MATH)
+@pytest.mark.parametrize("gain", PRINTED)
 def test_figures_of_the_linear_loop(gain, soft, stiff):
     found = {5.0: soft, 100.0: stiff}[gain].comparison.metrics
-    for name, expected in MATH[gain].items():
+    for name, expected in PRINTED[gain].items():
         measured = (found[name]["overshoot_error"], found[name]["settling_time"])
         assert measured == pytest.approx(expected, rel=2e-5), name
 
@@ -312,7 +308,7 @@ def shaped_settling(gain):
     return brentq(lambda x: abs(error(np.array([x]))[0]) - 0.02, t[last], t[last + 1], xtol=1e-13)
 
 
-@pytest.mark.parametrize("gain", MATH)
+@pytest.mark.parametrize("gain", PRINTED)
 def test_the_shaped_step_is_made_for_the_loop_and_settles_before_the_plan(gain, soft, stiff):
     """The comparison can be lost: shaping wins in a lightly damped linear loop."""
     found = {5.0: soft, 100.0: stiff}[gain].comparison

@@ -2,6 +2,7 @@
 
 import re
 
+import linear_table
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -14,14 +15,8 @@ from ctrlplan.studies.linear import _shares, overshoot_peak
 MOVE = [cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1, 0, 0)]
 TIMES = np.linspace(0.0, 20.0, 8001)
 
-# MATH.md, section 2: overshoot on the error [%] and settling time [s] of the step, the trigonometric plan, the quintic.
-TABLE = {
-    1: (16.3034, 8.07635, 16.0211, 8.56714, 16.0148, 8.56693),
-    5: (48.6397, 7.56125, 44.5425, 8.02597, 44.4532, 8.02505),
-    20: (70.2256, 7.82524, 48.8553, 7.62643, 48.4222, 7.61252),
-    100: (85.4468, 7.60094, 11.4917, 3.42085, 10.7596, 3.39506),
-    1000: (95.1535, 7.75851, 0.634705, 0.847783, 0.646697, 0.850593),
-}
+# Overshoot on the error [%] and settling time [s] of the step, the trigonometric plan, the quintic.
+TABLE = {k: [v for plan in linear_table.PLANS for v in linear_table.printed(k, plan)] for k in linear_table.GAINS}
 FINEST = 0.02
 
 
@@ -101,7 +96,7 @@ def test_at_the_double_pole_the_step_has_its_own_form(study):
 
 
 def test_the_plan_settles_with_its_own_entry_into_the_band_as_the_gain_grows(study):
-    # 0.8619 s and 0.8647 s by MATH.md, section 2.
+    # No gain settles before the plan itself is in the band.
     for name, limit in (("trigonometric", 0.8619), ("polynomial", 0.8647)):
         plan = study.comparison.plans[name]
         assert brentq(lambda t, p=plan: float(p(t)) - 0.98, 0.5, 1.0) == pytest.approx(limit, abs=5e-5)
@@ -144,7 +139,7 @@ def test_notes_say_where_the_paper_differs_and_why(study):
 def test_notes_tell_what_the_numbers_say(study):
     gains, sweep = study.sweep.values, study.sweep.metrics
     (peak,) = (note for note in study.notes if "peaks at" in note)
-    assert "It peaks at 51.065 % at k = 12.50 " in peak  # MATH.md, section 6
+    assert "It peaks at 51.065 % at k = 12.50 " in peak  # located to the digits printed by the test below
     later = sweep["trigonometric"]["settling_time"] > sweep["step"]["settling_time"]
     (share,) = (note for note in study.notes if "sooner than the trigonometric plan" in note)
     assert f"at no gain above k = {gains[later].max():.3g}" in share
