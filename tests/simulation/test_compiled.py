@@ -55,7 +55,7 @@ def rows_of(response, *labels):
     return np.array([outputs[list(response.output_labels).index(label)] for label in labels])
 
 
-# The crane of section 3.1, by hand
+# The crane by hand
 
 M, TROLLEY, DRUM, B, F1, F2, G = 500.0, 5000.0, 50.0, 0.25, 20.0, 20.0, 9.81
 CRANE = cp.plants.Crane()

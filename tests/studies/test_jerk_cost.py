@@ -16,7 +16,7 @@ def test_the_unit_quintic_costs_720():
 
 @pytest.mark.parametrize(("alpha", "cost"), [(2.0, 781), (np.pi, 1521)])
 def test_trigonometric_moves_cost_what_is_printed(alpha, cost):
-    # MATH.md, section 1.4, printed to the whole number.
+    # With m = 3 and T = 1, to the whole number.
     assert jerk_cost(cp.TrigSpline(MOVE, alpha=alpha)) == pytest.approx(cost, abs=0.5)
 
 

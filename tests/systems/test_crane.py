@@ -299,7 +299,8 @@ def test_equilibrium_stays(wrap, x, z):
     assert out["T"] == pytest.approx(430.0 * 9.5, rel=1e-14)
 
 
-# Linear models of MATH.md 3.1
+# Linear models: D/F = 1/(s (M_c s + f1)), R/C = b/(s (J s + f2)), and coupled
+# D/F = (R s^2 + g)/(s ((M_c s + f1)(R s^2 + g) + m g s))
 
 FREQUENCIES = np.array([0.03, 0.4, 0.9, 1.3, 6.0, 70.0])
 
@@ -380,7 +381,7 @@ def test_trolley_loop_has_the_poles_of_the_study():
     assert (loop.input_labels, loop.output_labels) == (["D_ref"], ["D"])
     poles = ordered(loop.poles())
     np.testing.assert_allclose(poles, ordered(characteristic(5e3, 20, 5e3, 20)), rtol=1e-6)
-    # MATH.md 3.1: -3.12 +- 1.36j; its fast pair, -22 +- 7.4j, is the hoist's.
+    # Two decimals; a triple pole at -5 moves there by the filter of the PID, and its fast pair is near -22.
     np.testing.assert_allclose(poles[2:], [-3.12 - 1.36j, -3.12 + 1.36j], atol=0.006)
     np.testing.assert_allclose(poles[:2].real, -22.0, atol=0.5)
     slow = Crane().linear_trolley_loop(bandwidth=2.0, tf=1e-6).poles()

@@ -19,7 +19,7 @@ def c(alpha, u):
 
 
 def basis(alpha, nodes, u):
-    """The functions of MATH.md 1.3, one factor after another, phi_N included."""
+    """The functions of the confluent trigonometric Newton form, one factor after another, phi_N included."""
     found, product = [mp.mpf(1)], mp.mpf(1)
     for k, node in enumerate(nodes):
         # phi_(2j-1) has its cosine about the next node; phi_2j none.
