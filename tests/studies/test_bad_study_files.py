@@ -147,8 +147,8 @@ WRONG = {
     ),
     "gammas of other axes": (plan(family="trigonometric", alpha=1.0, gamma=[0.5, 0.5]), ["plans[0]", "gamma", "2"]),
     "gamma that is singular": (
-        # gamma adds a multiple of the function that has cos m(tau - gamma_mean) and vanishes at every constraint;
-        # where m (gamma_mean - gamma) is an odd multiple of pi/2 no multiple gives gamma. Here m = 3, mean in the middle.
+        # gamma adds a multiple of the function that has cos m(tau - gamma_mean) and vanishes at every constraint; where
+        # m (gamma_mean - gamma) is an odd multiple of pi/2 no multiple gives it. Here m = 3, the mean in the middle.
         plan(family="trigonometric", alpha=1.0, gamma=0.5 + math.pi / 6)
         | {"waypoints": [{"time": 0.0, "x": REST}, {"time": 16.0, "x": END}]},
         ["plans[0]", "gamma"],

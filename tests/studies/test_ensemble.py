@@ -391,7 +391,7 @@ CRANE = {"load_mass": [350.0, 500.0, 800.0], "trolley_friction": [20.0, 300.0, 6
 
 
 def crane_rate(plan, mass, friction):
-    """Crane (see crane_oracle.py) under two PIDs on D and R, which know of a load of 500 kg and a friction of 20 N s/m."""
+    """Crane of crane_oracle.py under two PIDs on D and R, which know of a load of 500 kg and a friction of 20 N s/m."""
     trolley, inertia, b, drum, g, w, tf = 5000.0, 50.0, 0.25, 20.0, 9.81, 5.0, 0.02
 
     def pid(own, damping, error, state, bias):
