@@ -199,7 +199,14 @@ class FeedforwardLaw(Law):
 
 
 LAWS: dict[str, Law] = {
-    law.name: law for law in (SetpointLaw(), GeneratorLaw(), LoadFeedbackLaw(), DynamicLaw(), FeedforwardLaw())
+    law.name: law
+    for law in (
+        SetpointLaw(),
+        GeneratorLaw(),
+        LoadFeedbackLaw(),
+        DynamicLaw(),
+        FeedforwardLaw(),
+    )
 }
 """Laws by name, with their default options: the short form of a law."""
 
