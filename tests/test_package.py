@@ -253,3 +253,19 @@ def test_it_carries_its_licence_its_types_and_its_templates():
 @pytest.mark.parametrize("path", sorted(ROOT.rglob("*.py")), ids=lambda p: str(p.relative_to(ROOT)))
 def test_every_file_says_what_it_is(path):
     assert ast.get_docstring(ast.parse(path.read_text(encoding="utf-8")))
+
+
+def test_documents_that_are_cited_are_in_the_repository():
+    """Whoever reads a file has the documents that it refers to."""
+    folders = [PROJECT / "ctrlplan", PROJECT / "tests", PROJECT / "notebooks"]
+    files = [
+        path for folder in folders for path in folder.rglob("*") if path.suffix in (".py", ".ipynb", ".toml", ".md")
+    ]
+    cited = {
+        (path.relative_to(PROJECT), name)
+        for path in [*files, PROJECT / "README.md", PROJECT / "pyproject.toml"]
+        for name in re.findall(r"\b[A-Z]{3,}\.md\b", path.read_text(encoding="utf-8"))
+    }
+    present = {path.name for path in [*PROJECT.glob("*.md"), *files]}
+    assert cited
+    assert not {(str(path), name) for path, name in cited if name not in present}

@@ -97,7 +97,8 @@ def made(order, horizon, alpha, period):
     return cp.create_replanner_iosystem(cp.Step(0.0), period, order=order, horizon=horizon, alpha=alpha)
 
 
-def test_the_pages_example_is_allowed_and_what_is_above_the_bound_is_refused_with_the_figure():
+def test_an_alpha_above_pi_may_be_stable_where_fits_are_sampled_and_an_error_has_the_radius():
+    """Continuous fits are stable below alpha = pi; a period moves that bound."""
     assert abs(radius(2, 1.0, 3.3, 0.1) - 0.961) < 5e-4
     made(2, 1.0, 3.3, 0.1)
     figure = radius(2, 2.0, 4.0, 0.1)
