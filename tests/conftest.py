@@ -10,6 +10,8 @@ from hypothesis import settings
 # Matrices are small here: more threads of BLAS only wait for each other, and tests run in several processes already.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+collect_ignore = ["support"]  # no tests: what they import, under one name and not again as tests.support.NAME
+
 settings.register_profile("ctrlplan", deadline=None, derandomize=True, print_blob=True)
 settings.load_profile("ctrlplan")
 
