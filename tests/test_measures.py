@@ -55,11 +55,20 @@ ignore_imports = ["ctrlplan.low -> ctrlplan.*"]
 """
 
 
-@pytest.fixture(scope="module")
-def printed(tmp_path_factory):
+CONTRACTS = {
+    "whole names": CONTRACT,
+    "in a container": CONTRACT.replace(
+        '["ctrlplan.high", "ctrlplan.low | ctrlplan.beside"]', '["high", "low | beside"]'
+    )
+    + 'containers = ["ctrlplan"]\n',
+}
+
+
+@pytest.fixture(scope="module", params=CONTRACTS)
+def printed(request, tmp_path_factory):
     folder = tmp_path_factory.mktemp("measured")
     (folder / "ctrlplan").mkdir()
-    (folder / "pyproject.toml").write_text(CONTRACT)
+    (folder / "pyproject.toml").write_text(CONTRACTS[request.param])
     for name, text in FILES.items():
         (folder / "ctrlplan" / name).write_text(text)
     command = [sys.executable, *WARNINGS, measures.__file__, str(folder), "--list"]
@@ -69,8 +78,9 @@ def printed(tmp_path_factory):
 @pytest.mark.parametrize(
     ("what", "number"),
     [
-        ("most parameters of a signature", 21),
-        ("signatures of more than 19", 1),
+        ("most parameters of a function", 4),
+        ("functions of more than 19", 0),
+        ("most fields of a dataclass", 21),
         ("signatures with untyped parameters (or `Any` alone)", 1),  # *rest
         ("signatures with `**`", 1),
         ("`Any`", 3),  # the import, *rest, what is returned

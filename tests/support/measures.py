@@ -117,7 +117,7 @@ def _fields(node):
 
 
 def signatures(modules):
-    """Each function and dataclass: number of parameters, place, name, untyped ones, and the name after ``**``.
+    """Each function and dataclass: number of parameters, place, name, untyped ones, name after ``**``, if a dataclass.
 
     A parameter is untyped without an annotation, or where it is `Any` itself.
     Nested functions and methods count; lambdas do not.
@@ -126,11 +126,11 @@ def signatures(modules):
         for node, name in module.nodes(Function):
             given = parameters(node)
             untyped = [p.arg for p in given if p.annotation is None or ast.unparse(p.annotation) == "Any"]
-            yield len(given), module.place(node), name, untyped, node.args.kwarg and node.args.kwarg.arg
+            yield len(given), module.place(node), name, untyped, node.args.kwarg and node.args.kwarg.arg, False
         for node, name in module.nodes(ast.ClassDef):
             if (given := _fields(node)) is not None:
                 untyped = [ast.unparse(n.target) for n in given if ast.unparse(n.annotation) == "Any"]
-                yield len(given), module.place(node), name, untyped, None
+                yield len(given), module.place(node), name, untyped, None, True
 
 
 # Imports upwards
@@ -160,8 +160,10 @@ def imports_upwards(root):
     """
     with open(root / "pyproject.toml", "rb") as file:
         linter = tomllib.load(file)["tool"]["importlinter"]
-    contract = next(c for c in linter["contracts"] if c["type"] == "layers" and "containers" not in c)
-    floors = [[member.strip() for member in re.split(r"[|:]", layer)] for layer in contract["layers"]]
+    layered = [c for c in linter["contracts"] if c["type"] == "layers"]
+    contract = next(c for c in layered if c.get("containers", [PACKAGE]) == [PACKAGE])
+    start = f"{PACKAGE}." if "containers" in contract else ""  # names are relative to a container
+    floors = [[start + member.strip(" ()") for member in re.split(r"[|:]", layer)] for layer in contract["layers"]]
     excluded = linter.get("exclude_type_checking_imports", False)
     sys.path.insert(0, str(root))
     graph = grimp.build_graph(PACKAGE, exclude_type_checking_imports=excluded, cache_dir=None)
@@ -336,6 +338,7 @@ def measured(root):
     """Rows of the table, (what, number), and the places behind each of them."""
     modules = package(root)
     given = sorted(signatures(modules), key=lambda row: -row[0])
+    functions, classes = ([row for row in given if row[5] is one] for one in (False, True))
     exempt, upwards = imports_upwards(root)
     found = list(switches(modules))
     kinds = Counter(switch.kind for switch in found)
@@ -345,15 +348,16 @@ def measured(root):
     many = [row for row in given if row[4]]
     anys = words(modules)
     return [
-        ("most parameters of a signature", given[0][0], _named(given[:12])),
-        (f"signatures of more than {MOST_PARAMETERS}", sum(row[0] > MOST_PARAMETERS for row in given), []),
+        ("most parameters of a function", functions[0][0], _named(functions[:12])),
+        (f"functions of more than {MOST_PARAMETERS}", sum(row[0] > MOST_PARAMETERS for row in functions), []),
+        ("most fields of a dataclass", classes[0][0], _named(classes[:8])),
         (
             "signatures with untyped parameters (or `Any` alone)",
             len(untyped),
-            [f"{place} {name}: {', '.join(names)}" for _, place, name, names, _ in untyped],
+            [f"{place} {name}: {', '.join(names)}" for _, place, name, names, *_ in untyped],
         ),
         ("of these, of 8 parameters or more", len(wide), _named(wide)),
-        ("signatures with `**`", len(many), [f"{place} {name}: **{star}" for _, place, name, _, star in many]),
+        ("signatures with `**`", len(many), [f"{place} {name}: **{star}" for _, place, name, _, star, _ in many]),
         ("`Any`", sum(anys.values()), [f"{path}: {n}" for path, n in sorted(anys.items(), key=lambda x: -x[1]) if n]),
         ("modules that import upwards", len({a for a, _ in upwards}), [f"{a} -> {b}" for a, b in upwards]),
         ("imports upwards", len(upwards), []),
