@@ -23,11 +23,12 @@ import ctrlplan
 class Recipe:
     """What is added to the package, and what is then to be seen.
 
-    `files` are new ones with their text, `lines` are (file, line after which,
-    line): the text of files in the package. `seen` runs in the copy, in a
-    folder of its own.
+    `says` is the recipe in the README's words, `files` are new ones with their
+    text, `lines` are (file, line after which, line) of files in the package.
+    `seen` runs in the copy, in a folder of its own.
     """
 
+    says: str
     files: dict = field(default_factory=dict)
     lines: tuple = ()
     seen: str = ""
@@ -77,6 +78,7 @@ def page(*command):
 RECIPES = {}
 
 RECIPES["metric"] = Recipe(
+    says="a metric: a function, its name in `metrics/__init__.py`, and one entry of `MEASURES`",
     files={
         "metrics/_last.py": '''
 """The error that a record ends with."""
@@ -112,6 +114,7 @@ assert "last_error" in results["study"]["plans"]["polynomial"]["metrics"]
 )
 
 RECIPES["objective"] = Recipe(
+    says="an objective: a function of a plan, one line in `OBJECTIVES`",
     lines=(
         (
             "planning/objectives.py",
@@ -139,6 +142,7 @@ assert abs(choice.value - float(choice.plan(0.5, 1))) < 1e-12
 )
 
 RECIPES["plant"] = Recipe(
+    says="a plant: one file, one export",
     files={
         "systems/plants/tank.py": '''
 """A tank that leaks."""
@@ -176,6 +180,7 @@ assert results["study"]["plans"]["polynomial"]["metrics"]["settling_time"] > 0
 )
 
 RECIPES["study"] = Recipe(
+    says="a study: one file, one line in `PAPER` or `ONLINE`",
     files={
         "studies/lag.py": '''
 """A lag behind a step and a plan."""
@@ -211,6 +216,7 @@ assert abs(results["lag"]["plans"]["step"]["metrics"]["settling_time"] - np.log(
 )
 
 RECIPES["figure"] = Recipe(
+    says="a figure: one function, one line in `FIGURES`",
     lines=(
         (
             "reports/figures.py",
@@ -278,6 +284,7 @@ class NaturalSpline(WaypointSpline):
 '''
 
 RECIPES["family"] = Recipe(
+    says="one file, its name in `trajectories/__init__.py` and in `_EXPORTS` of `ctrlplan/__init__.py`",
     files={"trajectories/natural.py": NATURAL},
     lines=(
         ("trajectories/__init__.py", "", "from ctrlplan.trajectories.natural import NaturalSpline"),
@@ -303,6 +310,7 @@ assert list(results["study"]["plans"]) == ["natural"]
 )
 
 RECIPES["method"] = Recipe(
+    says="a method: a class with `name`, `why_not(prepared)` and `run(job)`, one file, one line in `METHODS`",
     files={
         "simulation/methods/rk4.py": '''
 """Classical Runge-Kutta steps of at most 1/64 s."""
@@ -382,6 +390,7 @@ else:
 )
 
 RECIPES["law"] = Recipe(
+    says="one line in `LAWS` gives it a name",
     lines=(
         (
             "systems/plants/crane/laws.py",
@@ -498,6 +507,13 @@ def seen(tmp_path_factory):
     done = subprocess.run(command, input=given, capture_output=True, text=True, check=False, env=environment, cwd=root)
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout.splitlines()[-1])
+
+
+@pytest.mark.parametrize("name", RECIPES)
+def test_a_recipe_is_in_the_readme_word_for_word(name):
+    readme = Path(__file__).parents[1].joinpath("README.md").read_text(encoding="utf-8")
+    table = readme[readme.index("| to add one |") :].split("\n\n")[0]
+    assert RECIPES[name].says in table
 
 
 @pytest.mark.parametrize("name", RECIPES)
