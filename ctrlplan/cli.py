@@ -9,12 +9,13 @@ import sys
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import ctrlplan
 
 if TYPE_CHECKING:
     from ctrlplan.studies.files import StudyFile
+    from ctrlplan.studies.study import Study
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -74,7 +75,7 @@ def _online(options: argparse.Namespace) -> list[Path]:
     return _all_of(ONLINE, options.out, "On line: planning again, governing, and slowing the clock")
 
 
-def _all_of(studies: Mapping[str, Callable[..., Any]], folder: Path, title: str) -> list[Path]:
+def _all_of(studies: Mapping[str, Callable[..., Study]], folder: Path, title: str) -> list[Path]:
     from ctrlplan.reports import write_report
 
     found = []

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from functools import reduce
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +28,7 @@ _DEGREES = {1: "straight line", 3: "cubic", 5: "quintic", 7: "septic", 9: "nonic
 
 
 def baseline_plans(
-    waypoints: Sequence[Waypoint], limits: Mapping[str, Any] | None = None, shaper: Shaper | None = None
+    waypoints: Sequence[Waypoint], limits: Mapping[str, object] | None = None, shaper: Shaper | None = None
 ) -> dict[str, Trajectory]:
     """What a designer could send in the place of a trigonometric plan, in the same time.
 
@@ -143,7 +142,7 @@ def _at_rest(point: Waypoint, entries: int) -> Waypoint:
     return Waypoint.from_dict(point.to_dict() | {"jet": [point.position.tolist(), *[still] * (entries - 1)]})
 
 
-def needed_by(plan: Trajectory) -> dict[str, Any]:
+def needed_by(plan: Trajectory) -> dict[str, float]:
     """Velocity, acceleration and jerk that a plan needs, axis by axis."""
     peaks = {order: plan.peak(order) for order in (1, 2, 3)}
     names = [[label, f"{label}_d1", f"{label}_d2", f"{label}_d3"] for label in plan.labels]
@@ -159,7 +158,7 @@ Limits = tuple[Array, Array, Array]
 """Velocity, acceleration and jerk, axis by axis; inf where there is none."""
 
 
-def derivative_limits(plan: Trajectory, limits: Mapping[str, Any]) -> Limits:
+def derivative_limits(plan: Trajectory, limits: Mapping[str, object]) -> Limits:
     """Limits of velocity, acceleration and jerk among others, axis by axis."""
     found = np.full((3, plan.naxes), np.inf)
     known = {name: limit for name, limit in limits.items() if name in _names(plan)}

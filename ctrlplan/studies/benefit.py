@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ctrlplan._checks import real_array
 from ctrlplan.planning.limits import Limited
+from ctrlplan.planning.quantities import System as Quantified
 from ctrlplan.simulation import state_space
 from ctrlplan.studies.baselines import baseline_plans, derivative_limits, needed_by, profiles
 from ctrlplan.studies.comparison import Comparison, comparison_of, finite_or_none
@@ -58,7 +59,7 @@ class Benefit:
     """
 
     comparison: Comparison
-    limits: dict[str, Any]
+    limits: dict[str, object]
     needs: tuple[Need, ...]
     grids: tuple[Grid, ...]
     alpha: float = 0.0
@@ -69,7 +70,7 @@ class Benefit:
         """What was found, in sentences."""
         return (*([sentence_of(self.needs)] if self.needs else []), *(grid.verdict for grid in self.grids))
 
-    def results(self) -> dict[str, Any]:
+    def results(self) -> dict[str, object]:
         """Plain data for ``results.json``."""
         return {
             "plans": self.comparison.results()["plans"],
@@ -116,8 +117,8 @@ class Choices:
     """
 
     alpha: float | Literal["auto"] = 1.0
-    limits: Mapping[str, Any] | None = None
-    quantities: Any = None
+    limits: Mapping[str, object] | None = None
+    quantities: Quantified | None = None
     mode: tuple[float, float] | None = None
     alphas: Sequence[float] = ALPHAS
     factors: Sequence[float] = FACTORS
@@ -130,7 +131,7 @@ def benefit(
     comparison: Comparison,
     loop: System | Builder,
     *,
-    limits: Mapping[str, Any] | None = None,
+    limits: Mapping[str, object] | None = None,
     alphas: ArrayLike | None = None,
     durations: ArrayLike | None = None,
 ) -> Benefit:
@@ -222,7 +223,7 @@ def benefit_of(
     """
     points = experiment.waypoints
     reference = PolySpline(points, warn=False)
-    held = dict(choices.limits) if choices.limits is not None else needed_by(reference)
+    held: dict[str, object] = dict(needed_by(reference) if choices.limits is None else choices.limits)
     limited = Limited(reference, held, choices.quantities)
     setting = _Setting(experiment, loop, choices, held, _shaper(loop, reference, choices.mode), reference)
     planned = TrigSpline(points, alpha=choices.alpha)
@@ -255,7 +256,7 @@ class _Setting:
     experiment: Experiment
     loop: System | Builder
     choices: Choices
-    limits: Mapping[str, Any]
+    limits: Mapping[str, object]
     shaper: Shaper | None
     reference: PolySpline
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from functools import cache
-from typing import Any
 
 import control as ct
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from ctrlplan.planning import (
@@ -184,7 +184,7 @@ def _freer_paths(plan: Trajectory) -> dict[str, float]:
     }
     start = [plan.alpha, *plan.gamma] if isinstance(plan, TrigSpline) else []
 
-    def length(choice: Any) -> float:
+    def length(choice: NDArray[np.float64]) -> float:
         try:
             return path_length(TrigSpline(points, alpha=choice[0], gamma=choice[1:].tolist()))
         except ValueError:  # no such spline

@@ -8,12 +8,13 @@ import os
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from numpy.typing import ArrayLike
 
 from ctrlplan._files import write_text
 from ctrlplan._renamed import warn_renamed
+from ctrlplan._types import Params
 from ctrlplan.simulation import Event, SimulationResponse
 from ctrlplan.studies.experiment import Experiment, Measured
 from ctrlplan.studies.limits import limits_of
@@ -122,23 +123,25 @@ class Comparison:
 
         return pd.DataFrame(self.metrics).rename_axis(index="metric", columns="plan")
 
-    def results(self) -> dict[str, Any]:
+    def results(self) -> dict[str, object]:
         """Plain data for JSON: plans with their metrics, null where infinite or undefined."""
-        plans = {
-            plan: {"metrics": {name: finite_or_none(value) for name, value in found.items()}}
-            for plan, found in self.metrics.items()
-        }
-        failed = {"failures": dict(self.failures)} if self.failures else {}
-        benefit = {} if self.benefit is None else {"worth": self.benefit.results()}
-        return {"plans": plans} | failed | benefit
+        data: dict[str, object] = {"plans": self._plans()}
+        if self.failures:
+            data["failures"] = dict(self.failures)
+        return data if self.benefit is None else data | {"worth": self.benefit.results()}
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write metrics, plans and parameters as JSON, whole or not at all."""
-        data = self.results()
-        for name, plan in self.plans.items():
-            data["plans"][name]["trajectory"] = plan.to_dict()
-        data |= {"title": self.title, "parameters": {k: str(v) for k, v in self.parameters.items()}}
+        plans = {name: found | {"trajectory": self.plans[name].to_dict()} for name, found in self._plans().items()}
+        stated = {"title": self.title, "parameters": {k: str(v) for k, v in self.parameters.items()}}
+        data = self.results() | {"plans": plans} | stated
         write_text(path, json.dumps(data, indent=1, allow_nan=False) + "\n")
+
+    def _plans(self) -> dict[str, dict[str, object]]:
+        return {
+            plan: {"metrics": {name: finite_or_none(value) for name, value in found.items()}}
+            for plan, found in self.metrics.items()
+        }
 
     def marked(self, marks: Mapping[str, str]) -> Comparison:
         """Same comparison with further reservations about some plans."""
@@ -197,7 +200,7 @@ def compare(
     outputs: Sequence[str] | None = None,
     controls: Sequence[str] | None = None,
     initial_state: ArrayLike | None = None,
-    params: Mapping[str, Any] | None = None,
+    params: Params | None = None,
     events: Sequence[Event] | None = None,
     measures: Collection[str | Measure] | Mapping[str, Measure] | None = None,
     alpha: float = 1.0,

@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ctrlplan._types import System
 from ctrlplan.simulation import prepared_form
+from ctrlplan.simulation.network import Block, Network
 from ctrlplan.trajectories import Trajectory
 
 _LOOKS = np.array([0.0, 0.0312, 0.1234, 0.25, 0.3456, 0.5, 0.6543, 0.75, 0.8765, 1.0])
 """Where two plans are compared, as fractions of the duration of one."""
 
 
-def check_reached(system: Any, outputs: Sequence[str], plan: Trajectory | None = None) -> None:
+def check_reached(system: System, outputs: Sequence[str], plan: Trajectory | None = None) -> None:
     """Reject a loop in which a reference reaches nothing.
 
     What depends on what is read off the wiring and the matrices of linear
@@ -71,7 +72,7 @@ def check_reached(system: Any, outputs: Sequence[str], plan: Trajectory | None =
         raise _unconnected(system, network, what)
 
 
-def _check_derivatives(system: Any, network: Any) -> None:
+def _check_derivatives(system: System, network: Network) -> None:
     """Reject an input for a derivative of a reference that no source outputs: it would be 0."""
     known = {
         _plain(label) for block in network.blocks if block.plan is not None for label in block.system.output_labels
@@ -87,13 +88,13 @@ def _plain(label: str) -> str:
     return re.sub(r"_d[0-9]+$", "", label)
 
 
-def _unconnected(system: Any, network: Any, what: str) -> ValueError:
+def _unconnected(system: System, network: Network, what: str) -> ValueError:
     left = [f"{block}.{label}" for block, label in _open_inputs(network)]
     to_do = f"; inputs of blocks that nothing is connected to: {', '.join(left)}" if left else ""
     return ValueError(f"references must be connected in the loop {system.name}, got {what}{to_do}")
 
 
-def _open_inputs(network: Any) -> Iterator[tuple[str, str]]:
+def _open_inputs(network: Network) -> Iterator[tuple[str, str]]:
     """Inputs of blocks (block, label) that are connected to no signal, and so 0."""
     for block, place in zip(network.blocks, network.inputs, strict=True):
         for label, row in zip(block.system.input_labels or (), network.wire[place], strict=True):
@@ -101,7 +102,7 @@ def _open_inputs(network: Any) -> Iterator[tuple[str, str]]:
                 yield block.name, label
 
 
-def _reaching(network: Any, wanted: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _reaching(network: Network, wanted: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Which signals some others depend on, in time."""
     found = wanted.copy()
     depends = [_depends(block) for block in network.blocks]
@@ -114,7 +115,7 @@ def _reaching(network: Any, wanted: NDArray[np.bool_]) -> NDArray[np.bool_]:
             return found
 
 
-def _depends(block: Any) -> NDArray[np.bool_]:
+def _depends(block: Block) -> NDArray[np.bool_]:
     """Which outputs of a block depend on which inputs, directly or through states, (noutputs, ninputs)."""
     if block.delay is not None:  # signal by signal
         return np.eye(block.system.noutputs, dtype=bool)

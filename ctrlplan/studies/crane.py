@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import cache
-from typing import Any
 
 import control as ct
 import numpy as np
@@ -34,6 +33,7 @@ from ctrlplan.studies.crane_setup import (
     TORQUE_LIMITS,
     UNITS,
     WALL,
+    Drives,
     first_order_waypoints,
     marked_slack,
     nominal_waypoints,
@@ -42,16 +42,23 @@ from ctrlplan.studies.crane_setup import (
 from ctrlplan.studies.measures import Measure, Run, signals_of
 from ctrlplan.studies.study import Curves, Study
 from ctrlplan.systems.plants import LAWS, crane_loop
+from ctrlplan.systems.plants.crane.laws import LawName
 from ctrlplan.trajectories import PiecewiseSpline, PolySpline, Step, Trajectory, TrigSpline, Waypoint
 
 Array = NDArray[np.float64]
+
+
+class _Loop(Drives, total=False):
+    """Law of a `crane_loop`, and limits of its drives."""
+
+    law: LawName
 
 
 def crane_nominal_study(progress: bool = True) -> Study:
     """Simulation 1 (figure 4): a point-to-point move."""
     points = nominal_waypoints()
     smooth = PolySpline(nominal_waypoints(5))
-    plans: dict[str, tuple[Trajectory, dict[str, Any]]] = {
+    plans: dict[str, tuple[Trajectory, _Loop]] = {
         "step": (_step(points), _STEP),
         "polynomial": (PolySpline(points), {}),
         "trigonometric": (TrigSpline(points, alpha=1.0), {}),
@@ -100,7 +107,7 @@ def crane_nominal_study(progress: bool = True) -> Study:
 def crane_first_order_study(progress: bool = True) -> Study:
     """Simulation 2 (figure 5): only first-order data."""
     points = first_order_waypoints()
-    plans: dict[str, tuple[Trajectory, dict[str, Any]]] = {
+    plans: dict[str, tuple[Trajectory, _Loop]] = {
         "step": (_step(points), _STEP),
         "polynomial": (PolySpline(points), {}),
         "trigonometric": (TrigSpline(points, alpha=np.pi / 3, gamma=np.pi / 2), {}),
@@ -139,12 +146,12 @@ def crane_first_order_study(progress: bool = True) -> Study:
 def crane_obstacle_study(progress: bool = True) -> Study:
     """Simulation 3 (figure 6): over a wall through two via points."""
     points = obstacle_waypoints()
-    plans: dict[str, tuple[Trajectory, dict[str, Any]]] = {
+    plans: dict[str, tuple[Trajectory, _Loop]] = {
         "step": (_step(points), _STEP),
         "polynomial": (PolySpline(points), {}),
         "trigonometric": (TrigSpline(points, alpha=4.0), {}),
         "piecewise": (PiecewiseSpline(points), {}),
-        "via points chosen": (avoid(PolySpline([points[0], points[-1]]), WALLS, **_KEPT).plan, {}),
+        "via points chosen": (_kept_clear(PolySpline([points[0], points[-1]])), {}),
     }
     found = _compared(plans, points, 30.0, "Crane, obstacle (simulation 3)")
     rows = found.metrics
@@ -189,8 +196,12 @@ def _via_points(plan: Trajectory) -> str:
     return ", ".join(f"({w.position[0]:.3g}, {w.position[1]:.3g}) m at {w.time:.3g} s" for w in plan.waypoints[1:-1])
 
 
-_KEPT: dict[str, Any] = {"clearance": MARGIN, "load": LOAD_RADIUS, "rope": CRANE.rope()}
-_STEP: dict[str, Any] = {"law": "setpoint", "force_limits": FORCE_LIMITS, "torque_limits": TORQUE_LIMITS}
+_STEP: _Loop = {"law": "setpoint", "force_limits": FORCE_LIMITS, "torque_limits": TORQUE_LIMITS}
+
+
+def _kept_clear(plan: Trajectory) -> Trajectory:
+    """Plan through via points, with a margin between wall and load or rope."""
+    return avoid(plan, WALLS, clearance=MARGIN, load=LOAD_RADIUS, rope=CRANE.rope()).plan
 
 
 def _step(points: tuple[Waypoint, ...]) -> Step:
@@ -198,7 +209,7 @@ def _step(points: tuple[Waypoint, ...]) -> Step:
 
 
 def _compared(
-    plans: Mapping[str, tuple[Trajectory, dict[str, Any]]], points: tuple[Waypoint, ...], t_end: float, title: str
+    plans: Mapping[str, tuple[Trajectory, _Loop]], points: tuple[Waypoint, ...], t_end: float, title: str
 ) -> Comparison:
     timepts = np.union1d(np.linspace(0.0, t_end, int(100 * t_end) + 1), [w.time for w in points])
 
@@ -227,7 +238,7 @@ def _compared(
     return marked_slack(found)
 
 
-def _limited_error(plan: Trajectory, options: dict[str, Any], timepts: Array) -> float:
+def _limited_error(plan: Trajectory, options: _Loop, timepts: Array) -> float:
     """Greatest error of the load with force and torque limited as the step's are; nan where the rope goes slack."""
     loop = crane_loop(CRANE, plan, **options | {"force_limits": FORCE_LIMITS, "torque_limits": TORQUE_LIMITS})
     response = simulate(loop, timepts, events=(SLACK,))
@@ -269,7 +280,7 @@ def _parameters(t_end: float) -> dict[str, object]:
     }
 
 
-def _poles(loop: Any) -> str:
+def _poles(loop: ct.StateSpace) -> str:
     """Poles of a loop, pairs once."""
     poles = sorted((pole for pole in np.asarray(loop.poles()) if pole.imag >= 0.0), key=lambda pole: -pole.real)
     return ", ".join(f"{p.real:.3g}" + (f" ± {p.imag:.3g}j" if p.imag else "") for p in poles).replace("-", "−")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TypedDict
+
 import control as ct
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +18,15 @@ from ctrlplan.trajectories import Trajectory, Waypoint
 Array = NDArray[np.float64]
 
 CRANE = Crane()
+
+
+class Drives(TypedDict, total=False):
+    """Limits of the drives of a `crane_loop`."""
+
+    force_limits: tuple[float, float]
+    torque_limits: tuple[float, float]
+
+
 FORCE_LIMITS = (-30e3, 30e3)
 TORQUE_LIMITS = (-3e3, 1e3)
 WALL = ((7.0, 13.0), (6.5, 12.0))

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Protocol, TypeAlias
+from typing import Protocol, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 
@@ -14,7 +14,7 @@ Array = NDArray[np.float64]
 class Frozen(Protocol):
     """A frozen distribution of `scipy.stats`."""
 
-    def rvs(self, size: int, random_state: np.random.Generator) -> Any:
+    def rvs(self, size: int, random_state: np.random.Generator) -> ArrayLike:
         """Random values."""
 
 

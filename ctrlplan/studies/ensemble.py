@@ -6,7 +6,7 @@ import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -117,7 +117,7 @@ class Ensemble:
         columns |= {(plan, name): row for plan, rows in self.metrics.items() for name, row in rows.items()}
         return pd.DataFrame(columns).rename_axis(index="draw", columns=["plan", "metric"])
 
-    def results(self) -> dict[str, Any]:
+    def results(self) -> dict[str, object]:
         """Plain data for JSON: draws, metrics, failures; null where infinite or undefined."""
         return {
             "params": {name: values.tolist() for name, values in self.params.items()},

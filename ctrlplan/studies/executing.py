@@ -7,13 +7,14 @@ import pickle
 import signal
 import threading
 from asyncio import CancelledError
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 from functools import partial
 from numbers import Real
 from queue import Empty, SimpleQueue
+from types import FrameType
 from typing import Any, Generic, Protocol, TypeVar
 from uuid import uuid4
 
@@ -24,6 +25,7 @@ from ctrlplan.simulation.budget import time_limit
 
 T = TypeVar("T")
 R = TypeVar("R")
+R_co = TypeVar("R_co", covariant=True)
 
 _POLL = 0.02
 """Time between two looks at futures without callbacks [s]."""
@@ -35,11 +37,18 @@ _KEPT = 2
 """Shared values that a thread keeps."""
 
 
+class Future(Protocol[R_co]):
+    """Result of a call that is not there yet; what else a future has is used where it is found."""
+
+    def result(self) -> R_co:
+        """Result of the call, or what it raised."""
+
+
 class Executor(Protocol):
     """Where tasks run: `concurrent.futures.Executor` and whatever submits as it does."""
 
-    def submit(self, function: Callable[..., Any], /, *arguments: Any) -> Any:
-        """Future of a call: an object with ``result``."""
+    def submit(self, function: Callable[[T], R], argument: T, /) -> Future[R]:
+        """Future of a call."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +76,7 @@ class Failed:
         message = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
         return cls(message, error if isinstance(error, Exception) else RuntimeError(message), lost)
 
-    def __reduce__(self) -> tuple[Any, ...]:
+    def __reduce__(self) -> tuple[object, ...]:
         """Without an error that cannot be sent: it would bring down a whole pool."""
         error = self.error
         try:
@@ -142,7 +151,7 @@ def checked_executor(executor: Executor | None) -> Executor | None:
     raise TypeError(f"executor must be an object with submit, as those of concurrent.futures, got {given}")
 
 
-def checked_timeout(timeout: float | None) -> float | None:
+def checked_timeout(timeout: object) -> float | None:
     """Time limit of a run [s], or None.
 
     Raises
@@ -150,12 +159,11 @@ def checked_timeout(timeout: float | None) -> float | None:
     ValueError
         If it is not a finite number above 0.
     """
-    number: Any = timeout
-    if number is None:
+    if timeout is None:
         return None
-    if isinstance(number, bool) or not isinstance(number, Real) or not 0.0 < float(number) < math.inf:
+    if isinstance(timeout, bool) or not isinstance(timeout, Real) or not 0.0 < float(timeout) < math.inf:
         raise ValueError(f"timeout must be a finite number of seconds above 0, or None, got {timeout!r}")
-    return float(number)
+    return float(timeout)
 
 
 def tried(run: Callable[[T], R], task: T, timeout: float | None = None) -> R | Failed:
@@ -202,7 +210,7 @@ def gathered(
     return account
 
 
-def _ready(outcomes: Generator[tuple[int, Any], None, None]) -> Iterator[tuple[int, Any]]:
+def _ready(outcomes: Generator[tuple[int, R], None, None]) -> Iterator[tuple[int, R]]:
     """What a generator yields when it is interrupted; nothing if that is what ended it."""
     try:
         yield outcomes.throw(KeyboardInterrupt)
@@ -248,7 +256,7 @@ def executed(
         here = ((k, tried(run, task, timeout)) for k, task in enumerate(tasks))
         return gathered(here, len(tasks), label, progress)
     account: Account[R] = Account()
-    futures: dict[int, Any] = {}
+    futures: dict[int, Future[R | Failed]] = {}
     try:
         with _counting_interruptions() as pressed, _bar(len(tasks), label, progress) as advance:
             try:
@@ -289,7 +297,7 @@ class Shared(Generic[T]):
         # What stands in __main__ goes by its name in pickle, which another process may not know.
         self._data = b"" if b"__main__" in data else data
 
-    def __reduce__(self) -> tuple[Any, ...]:
+    def __reduce__(self) -> tuple[object, ...]:
         return _received, (self._key, self._data, None if self._data else self._value)
 
     def made(self, make: Callable[[T], R]) -> R:
@@ -300,8 +308,8 @@ class Shared(Generic[T]):
         return pickle.loads(self._data) if self._data else self._value  # noqa: S301 (its own)
 
 
-def _received(key: str, data: bytes, value: Any) -> Shared[Any]:
-    shared: Shared[Any] = object.__new__(Shared)
+def _received(key: str, data: bytes, value: T) -> Shared[T]:
+    shared: Shared[T] = object.__new__(Shared)
     shared._key, shared._data, shared._value = key, data, value
     return shared
 
@@ -333,7 +341,7 @@ def _counting_interruptions() -> Iterator[Sequence[int]]:
         yield pressed
         return
 
-    def remember(number: int, frame: Any) -> None:
+    def remember(number: int, frame: FrameType | None) -> None:
         pressed.append(number)
         signal.default_int_handler(number, frame)
 
@@ -352,7 +360,7 @@ def _raise_if_pressed() -> None:
 
 
 @contextmanager
-def _bar(count: int, label: str, progress: bool) -> Iterator[Callable[[], Any]]:
+def _bar(count: int, label: str, progress: bool) -> Iterator[Callable[[], object]]:
     bar = tqdm(total=count, desc=label, disable=not progress, leave=False)
     try:
         yield bar.update
@@ -361,7 +369,7 @@ def _bar(count: int, label: str, progress: bool) -> Iterator[Callable[[], Any]]:
 
 
 def _submit(
-    run: Callable[[T], Any], tasks: Sequence[T], executor: Executor, futures: dict[int, Any]
+    run: Callable[[T], R], tasks: Sequence[T], executor: Executor, futures: dict[int, Future[R]]
 ) -> dict[int, Failed]:
     """Hand out all tasks; those that the executor does not take, and why."""
     for k, task in enumerate(tasks):
@@ -372,7 +380,7 @@ def _submit(
     return {}
 
 
-def _completed(futures: dict[int, Any]) -> Iterator[tuple[int, Any]]:
+def _completed(futures: dict[int, Future[R]]) -> Iterator[tuple[int, R | Failed]]:
     """Outcomes as they complete; a future is dropped then, so that an executor need not keep its result."""
     done: SimpleQueue[int] = SimpleQueue()
     tells = all(hasattr(future, "add_done_callback") for future in futures.values())
@@ -381,8 +389,9 @@ def _completed(futures: dict[int, Any]) -> Iterator[tuple[int, Any]]:
             yield k, _outcome(futures[k])
             del futures[k]
         return
-    for k, future in futures.items() if tells else ():
-        future.add_done_callback(lambda _, k=k: done.put(k))
+    for k, future in futures.items():
+        if tells and hasattr(future, "add_done_callback"):
+            future.add_done_callback(lambda _, k=k: done.put(k))
     while futures:
         try:
             ready = [done.get(timeout=_POLL_BESIDE_CALLBACKS if tells else _POLL)]
@@ -395,7 +404,7 @@ def _completed(futures: dict[int, Any]) -> Iterator[tuple[int, Any]]:
                 del futures[k]
 
 
-def _outcome(future: Any) -> Any:
+def _outcome(future: Future[R]) -> R | Failed:
     """Result of a future, or why the executor has none."""
     try:
         return future.result()
@@ -404,22 +413,22 @@ def _outcome(future: Any) -> Any:
         return Failed.of(error.with_traceback(None), lost=True)  # which would keep the future
 
 
-def _results(futures: dict[int, Any]) -> dict[int, Any]:
+def _results(futures: dict[int, Future[R]]) -> dict[int, R]:
     """Results of futures that are done; what went wrong while all was interrupted is no failure of a task."""
     found = {}
     for k, future in futures.items():
         with suppress(Exception, CancelledError):
-            if future.exception() is None:
+            if hasattr(future, "exception") and future.exception() is None:
                 found[k] = future.result()
     return found
 
 
-def _cancel(futures: dict[int, Any]) -> None:
+def _cancel(futures: Mapping[int, Future[object]]) -> None:
     for future in futures.values():
         if not _is_done(future) and hasattr(future, "cancel"):
             with suppress(Exception):  # a task that cannot be cancelled must not keep the others
                 future.cancel()
 
 
-def _is_done(future: Any) -> bool:
+def _is_done(future: Future[object]) -> bool:
     return bool(future.done()) if hasattr(future, "done") else False

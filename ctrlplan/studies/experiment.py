@@ -6,12 +6,12 @@ import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ctrlplan._checks import real_array
+from ctrlplan._types import Params
 from ctrlplan.simulation import Event
 from ctrlplan.studies.alike import Linear, numbers_of, outputs_together
 from ctrlplan.studies.measures import (
@@ -136,7 +136,7 @@ class Experiment:
     outputs: tuple[str, ...] | None = None
     controls: tuple[str, ...] | None = None
     initial_state: ArrayLike | None = None
-    params: Mapping[str, Any] | None = None
+    params: Params | None = None
     events: tuple[Event, ...] | None = None
     measures: Chosen = None
 
@@ -151,7 +151,7 @@ class Experiment:
         outputs: Iterable[str] | None = None,
         controls: Iterable[str] | None = None,
         initial_state: ArrayLike | None = None,
-        params: Mapping[str, Any] | None = None,
+        params: Params | None = None,
         events: Iterable[Event] | None = None,
         measures: Collection[str | Measure] | Mapping[str, Measure] | None = None,
     ) -> None:
@@ -212,9 +212,7 @@ class Experiment:
         metrics = {name: values for name, (_, values) in found.items()}
         return Measured(metrics, {name: run for name, (run, _) in found.items()}, failures)
 
-    def run_plan(
-        self, loop: System | Builder, name: str, params: Mapping[str, Any] | None = None
-    ) -> tuple[Run, dict[str, float]]:
+    def run_plan(self, loop: System | Builder, name: str, params: Params | None = None) -> tuple[Run, dict[str, float]]:
         """Run one of the plans through a loop, and measure the response.
 
         Parameters
@@ -339,12 +337,12 @@ def _reason(error: Exception) -> str:
     return told if speaks else f"{type(error).__name__}: {told}".rstrip(": ")
 
 
-def _once(values: Any) -> Any:
+def _once(values: object) -> object:
     """Values of an iterator, which could be read once only; anything else as it is."""
     return values if values is None or isinstance(values, str) or not isinstance(values, Iterable) else tuple(values)
 
 
-def _check_start(start: Any, plans: Iterable[Trajectory], times: Array) -> None:
+def _check_start(start: float | None, plans: Iterable[Trajectory], times: Array) -> None:
     """Reject a start that is no finite time, or that leaves fewer than two sample times."""
     since = min(plan.start for plan in plans)
     if start is not None:
@@ -361,13 +359,13 @@ def _check_start(start: Any, plans: Iterable[Trajectory], times: Array) -> None:
         raise ValueError(f"start must leave two of timepts or more, which end at {end:g} s, got {start!r}")
 
 
-def _check_band(band: Any) -> None:
+def _check_band(band: float) -> None:
     """Reject a settling band that is none."""
     if not 0.0 < _number(band, "band") < math.inf:
         raise ValueError(f"band must be a finite number above 0, relative to the range of the plan, got {band!r}")
 
 
-def _number(value: Any, name: str) -> float:
+def _number(value: ArrayLike, name: str) -> float:
     """One real number, without a unit."""
     number = real_array(value, name)
     if number.ndim or isinstance(value, bool | np.bool_):

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
+from ctrlplan._types import System
 from ctrlplan.traits import traits_of
 
 
-def limits_of(loop: Any) -> dict[str, tuple[float, float]]:
+def limits_of(loop: System) -> dict[str, tuple[float, float]]:
     """Limits of a loop's outputs by their labels.
 
     Parameters

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Literal, get_args
+from typing import Any, Literal, TypeAlias, get_args
 
 import control as ct
 import numpy as np
@@ -20,6 +20,9 @@ Array = NDArray[np.float64]
 
 Kind = Literal["", "response", "control", "path", "run"]
 """What a measure is of."""
+
+Function: TypeAlias = Callable[..., Any]
+"""Function of a `Tracked`, `Acting`, `Path` or `Run`, as the kind of its measure says, to a value or several."""
 
 _TURNED = 1e-9
 """Net change, relative to the range of a plan, up to which the plan ends where it began."""
@@ -161,14 +164,11 @@ class Run:
     @cached_property
     def signals(self) -> dict[str, Array]:
         """Outputs of the loop (ntime,) by their labels."""
-        rows = np.asarray(self.response.outputs).reshape(-1, self.t.size)
-        return dict(zip(self.response.output_labels, rows, strict=True))
+        return signals_of(self.response)
 
     def rows(self, names: tuple[str, ...]) -> Array:
         """Some of the outputs, (nnames, ntime)."""
-        labels = list(self.response.output_labels)
-        signals = np.asarray(self.response.outputs).reshape(-1, self.t.size)
-        return signals[[labels.index(name) for name in names]]
+        return np.array([self.signals[name] for name in names]).reshape(-1, self.t.size)
 
 
 @dataclass(frozen=True)
@@ -209,7 +209,7 @@ class Measure:
     title: str
     unit: str = ""
     of: Kind = ""
-    function: Callable[[Any], Any] | None = None
+    function: Function | None = None
     name: str = ""
 
     def __post_init__(self) -> None:
@@ -222,7 +222,7 @@ class Measure:
             )
 
 
-def _smooth(function: Callable[[Path], Any]) -> Callable[[Path], Any]:
+def _smooth(function: Callable[[Path], float | Array]) -> Callable[[Path], float | Array]:
     """A metric of a path, nan of steps, which take none."""
     return lambda seen: np.nan if seen.steps else function(seen)
 
@@ -318,9 +318,10 @@ MEASURES = {
 """The metrics of a comparison by name, in the order in which they are shown: an entry is computed, listed and shown."""
 
 
-def signals_of(response: Any) -> dict[str, Array]:
+def signals_of(response: ct.TimeResponseData) -> dict[str, Array]:
     """Outputs (ntime,) of a response by their labels."""
-    return dict(zip(response.output_labels, np.asarray(response.outputs), strict=True))
+    rows = np.asarray(response.outputs).reshape(-1, np.size(response.time))
+    return dict(zip(response.output_labels, rows, strict=True))
 
 
 @dataclass(frozen=True)
@@ -372,7 +373,7 @@ def signal_metrics(
     """
     known = slice(int(np.searchsorted(record.t, start)), None)  # no copy of the rows
     t, y, u = record.t[known], record.y[..., known], record.u[..., known]
-    kinds: list[tuple[Kind, list[Any], tuple[str, ...]]] = [
+    kinds: list[tuple[Kind, Sequence[Tracked | Acting], tuple[str, ...]]] = [
         ("response", _tracked(t, y, plan, band, start), record.axes),
         ("control", [Acting(t, rows, start) for rows in _rows(u)], record.controls),
     ]
@@ -409,7 +410,7 @@ def _tracked(t: Array, y: Array, plan: Trajectory, band: float, start: float) ->
     return found
 
 
-def _table(function: Callable[[Any], Any], seen: list[Any], nloops: int) -> Array:
+def _table(function: Function, seen: Sequence[Tracked | Acting], nloops: int) -> Array:
     """Values (nloops, nsignals) of a measure."""
     values = [np.atleast_1d(np.asarray(function(one), dtype=float)) for one in seen]
     if nloops == 1:
@@ -560,7 +561,7 @@ def shown_measures(chosen: Chosen, found: Iterable[Mapping[str, float]]) -> dict
     return own | plain | MEASURES
 
 
-def checked_names(names: Any, known: Collection[str], what: str) -> tuple[str, ...]:
+def checked_names(names: Iterable[str], known: Collection[str], what: str) -> tuple[str, ...]:
     """Names given by a user, each among those known.
 
     Raises
@@ -573,7 +574,7 @@ def checked_names(names: Any, known: Collection[str], what: str) -> tuple[str, .
     listed = ", ".join(known) or "none"
     if isinstance(names, str):
         raise TypeError(f"{what} must be a collection of names, of {listed}, got the string {names!r}")
-    found: tuple[Any, ...] = tuple(names)
+    found = tuple(names)
     for name in found:
         if name not in known:
             raise ValueError(f"{what} must be among {listed}, got {name!r}")
@@ -583,7 +584,7 @@ def checked_names(names: Any, known: Collection[str], what: str) -> tuple[str, .
 _NONE = Measure("")
 
 
-def _functions(of: Kind, measures: Mapping[str, Measure]) -> list[tuple[str, Callable[[Any], Any]]]:
+def _functions(of: Kind, measures: Mapping[str, Measure]) -> list[tuple[str, Function]]:
     """Functions of the measures of one kind, by name."""
     return [
         (name, measure.function)

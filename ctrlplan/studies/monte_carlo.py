@@ -8,13 +8,14 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Protocol, TypeAlias, TypeGuard
+from typing import Protocol, TypeAlias, TypeGuard
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ctrlplan._checks import real_array
 from ctrlplan._renamed import outside_stacklevel
+from ctrlplan._types import Params
 from ctrlplan.simulation import Event, Prepared, SolverError, prepare
 from ctrlplan.simulation.learned import NotCompiledError
 from ctrlplan.simulation.methods.delegated import DELEGATED
@@ -56,7 +57,7 @@ def monte_carlo(
     outputs: Sequence[str] | None = None,
     controls: Sequence[str] | None = None,
     initial_state: ArrayLike | None = None,
-    params: Mapping[str, Any] | None = None,
+    params: Params | None = None,
     events: Sequence[Event] | None = None,
     measures: Collection[str | Measure] | Mapping[str, Measure] | None = None,
     units: Mapping[str, str] | None = None,
@@ -212,7 +213,7 @@ def _binds(signature: inspect.Signature, *arguments: object, **named: object) ->
 
 
 def _outcome(
-    forms: Callable[[str], System | Builder], experiment: Experiment, plans: Iterable[str], params: Any
+    forms: Callable[[str], System | Builder], experiment: Experiment, plans: Iterable[str], params: Params | None
 ) -> Outcome:
     """One draw, plan by plan: one may succeed where another fails."""
     wanted = experiment.timepts[kept_samples(experiment.timepts)]
@@ -301,7 +302,7 @@ class _Prepared:
     def of(cls, loop: System | Builder, experiment: Experiment, table: dict[str, Array]) -> _Prepared:
         """Prepare a loop, and check that its blocks read the parameters."""
         if is_builder(loop):
-            build: Any = loop
+            build = loop
             forms = tried(lambda _: {n: prepare(build(n, plan)) for n, plan in experiment.plans.items()}, None)
             if isinstance(forms, Failed):
                 raise forms.error
@@ -327,7 +328,7 @@ class _Prepared:
         for k in sorted({0, int(np.random.default_rng(0).integers(len(drawn)))}):
             tried(here, drawn[k], timeout)
         light = _light(self.forms, table)
-        sent: Any = self.forms if light is None else light
+        sent: Forms | Builder = self.forms if light is None else light
         if light is None and is_builder(self.loop):
             sent = self.loop
         run = partial(_of_forms, light or self.forms, experiment)
@@ -342,10 +343,10 @@ def _of_forms(forms: Forms, experiment: Experiment, params: dict[str, float]) ->
     return _outcome(lambda name: forms[name], experiment, experiment.plans, params)
 
 
-def _elsewhere(shared: Shared[Any], experiment: Experiment, params: dict[str, float]) -> Outcome:
+def _elsewhere(shared: Shared[Forms | Builder], experiment: Experiment, params: dict[str, float]) -> Outcome:
     """One draw, in another process or thread."""
 
-    def forms(given: Any) -> Forms:
+    def forms(given: Forms | Builder) -> Forms:
         if isinstance(given, Mapping):
             return given
         return {name: prepare(given(name, plan)) for name, plan in experiment.plans.items()}
@@ -418,7 +419,7 @@ def _by_python(
     return Account(found, again.interrupted)
 
 
-def _check_read(forms: Mapping[str, Prepared], table: dict[str, Array], start: Any) -> None:
+def _check_read(forms: Mapping[str, Prepared], table: dict[str, Array], start: ArrayLike | None) -> None:
     """Reject a parameter that no block has or reads."""
     for name, values in table.items():
 
@@ -446,5 +447,5 @@ def _light(forms: Mapping[str, Prepared], table: dict[str, Array]) -> dict[str, 
         return None
 
 
-def _of_solver(outcome: Any) -> bool:
+def _of_solver(outcome: object) -> bool:
     return isinstance(outcome, Failed) and isinstance(outcome.error, SolverError | NotCompiledError)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache
-from typing import Any
 
 import control as ct
 import numpy as np
@@ -15,7 +14,7 @@ from ctrlplan import metrics
 from ctrlplan.planning import fastest, margins
 from ctrlplan.simulation import simulate
 from ctrlplan.studies.comparison import Comparison, compare
-from ctrlplan.studies.crane_setup import CRANE, TORQUE_LIMITS, UNITS, nominal_waypoints
+from ctrlplan.studies.crane_setup import CRANE, TORQUE_LIMITS, UNITS, Drives, nominal_waypoints
 from ctrlplan.studies.measures import Measure, Run, signals_of
 from ctrlplan.studies.study import Study
 from ctrlplan.systems import (
@@ -27,7 +26,7 @@ from ctrlplan.systems import (
     create_time_scaling_iosystem,
     expose_states,
 )
-from ctrlplan.systems.plants import crane_loop
+from ctrlplan.systems.plants import LoadFeedbackLaw, crane_loop
 from ctrlplan.trajectories import PiecewiseSpline, PolySpline, Step, Trajectory, TrigSpline, Waypoint, stack
 
 Array = NDArray[np.float64]
@@ -47,7 +46,7 @@ ONLINE_MEASURES = {
 }
 
 START = nominal_waypoints(1)[0].position
-_LAW: dict[str, Any] = {"law": "load_feedback", "load_bandwidth": 0.5}
+_LAW = LoadFeedbackLaw(load_bandwidth=0.5)
 _FILTER, _LAGS = 0.8, 5
 """Bandwidth [rad/s] and order of the filter behind the governor: references of force that is continuous."""
 _PERIODS = {"replanned": 0.25, "governed": 0.5}
@@ -168,7 +167,7 @@ def online_saturated_study(progress: bool = True) -> Study:
     )
 
 
-def online_metrics(goal: Array, force: float, response: Any) -> dict[str, float]:
+def online_metrics(goal: Array, force: float, response: ct.TimeResponseData) -> dict[str, float]:
     """Metrics of a crane against the goal that it has in the end.
 
     Parameters
@@ -208,15 +207,15 @@ def online_metrics(goal: Array, force: float, response: Any) -> dict[str, float]
 # The five ways
 
 
-def _off_line(trouble: Trouble, **drives: Any) -> Any:
+def _off_line(trouble: Trouble, drives: Drives) -> ct.InterconnectedSystem:
     return crane_loop(CRANE, trouble.off_line, "generator", wind=trouble.wind, **drives)
 
 
-def _load_feedback(trouble: Trouble, **drives: Any) -> Any:
-    return crane_loop(CRANE, trouble.off_line, wind=trouble.wind, **_LAW, **drives)
+def _load_feedback(trouble: Trouble, drives: Drives) -> ct.InterconnectedSystem:
+    return crane_loop(CRANE, trouble.off_line, _LAW, wind=trouble.wind, **drives)
 
 
-def _replanned(trouble: Trouble, **drives: Any) -> Any:
+def _replanned(trouble: Trouble, drives: Drives) -> ct.InterconnectedSystem:
     """Generator, its plan made again: from the reference for a new goal, from the load where that is off."""
     period = _PERIODS["replanned"]
     if trouble.goal.start > trouble.plan.start:
@@ -239,9 +238,9 @@ def _replanned(trouble: Trouble, **drives: Any) -> Any:
     return crane_loop(CRANE, trouble.plan, "generator", reference=reference, wind=trouble.wind, **drives)
 
 
-def _governed(trouble: Trouble, **drives: Any) -> Any:
+def _governed(trouble: Trouble, drives: Drives) -> ct.InterconnectedSystem:
     """Goal itself through a governor and a filter: no plan."""
-    core = _filtered_loop(wind=trouble.wind, **drives)
+    core = _filtered_loop(trouble.wind, drives)
     governor = create_governor_iosystem(_admissible(trouble.force), initial=START[:1])
     goal = stack([trouble.goal], labels=["x_command_cmd", "z_command"])
     exposed = expose_states(core)
@@ -255,12 +254,12 @@ def _governed(trouble: Trouble, **drives: Any) -> Any:
     )
 
 
-def _slowed(trouble: Trouble, **drives: Any) -> Any:
+def _slowed(trouble: Trouble, drives: Drives) -> ct.InterconnectedSystem:
     clock = create_time_scaling_iosystem(trouble.off_line, errors={"x": (0.05, 0.5)}, suffix="_ref")
-    return crane_loop(CRANE, trouble.off_line, reference=[clock], wind=trouble.wind, **_LAW, **drives)
+    return crane_loop(CRANE, trouble.off_line, _LAW, reference=[clock], wind=trouble.wind, **drives)
 
 
-WAYS: dict[str, Callable[..., Any]] = {
+WAYS: dict[str, Callable[[Trouble, Drives], ct.InterconnectedSystem]] = {
     "off-line": _off_line,
     "load feedback": _load_feedback,
     "replanned": _replanned,
@@ -269,7 +268,7 @@ WAYS: dict[str, Callable[..., Any]] = {
 }
 
 
-def _filtered_loop(wind: Trajectory | None = None, **drives: Any) -> Any:
+def _filtered_loop(wind: Trajectory | None = None, drives: Drives | None = None) -> ct.InterconnectedSystem:
     """Crane with load feedback behind filters of commands x_command and z_command."""
     filters = [
         create_command_filter_iosystem(
@@ -278,7 +277,9 @@ def _filtered_loop(wind: Trajectory | None = None, **drives: Any) -> Any:
         for axis, start in zip(("x", "z"), START.tolist(), strict=True)
     ]
     inputs = ["x_command", "z_command"]
-    return crane_loop(CRANE, _still_at_start(), reference=filters, inputs=inputs, wind=wind, **_LAW, **drives)
+    return crane_loop(
+        CRANE, _still_at_start(), _LAW, reference=filters, inputs=inputs, wind=wind, **(drives or Drives())
+    )
 
 
 @cache
@@ -315,10 +316,10 @@ def _admissible(force: float) -> AdmissibleSet:
 
 def _compared(trouble: Trouble, title: str, what: str) -> Comparison:
     timepts = np.linspace(0.0, 50.0, 2501)
-    drives = {"force_limits": (-trouble.force, trouble.force), "torque_limits": TORQUE_LIMITS}
+    drives: Drives = {"force_limits": (-trouble.force, trouble.force), "torque_limits": TORQUE_LIMITS}
 
-    def build(name: str, plan: Trajectory) -> Any:
-        return WAYS[name](trouble, **drives)
+    def build(name: str, plan: Trajectory) -> ct.InterconnectedSystem:
+        return WAYS[name](trouble, drives)
 
     def measure(run: Run) -> Mapping[str, float]:
         return online_metrics(trouble.goal.final, trouble.force, run.response)
@@ -355,7 +356,7 @@ def _compared(trouble: Trouble, title: str, what: str) -> Comparison:
 def _in_time_note(limit: float) -> str:
     """What it is worth to know a limit before one starts."""
     seconds = float(np.ceil(10.0 * fastest(_move(), {"F": limit}, CRANE).duration)) / 10.0
-    loop = crane_loop(CRANE, _move().retime(seconds), force_limits=(-limit, limit), torque_limits=TORQUE_LIMITS, **_LAW)
+    loop = crane_loop(CRANE, _move().retime(seconds), _LAW, force_limits=(-limit, limit), torque_limits=TORQUE_LIMITS)
     found = online_metrics(_still().final, limit, simulate(loop, np.linspace(0.0, 50.0, 2501)))
     return (
         f"Who knows the limit before the start does best: in {seconds:.3g} s the same path asks for no more than "

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Any
-
-import numpy as np
 
 from ctrlplan.trajectories import PiecewiseSpline, PolySpline, Step, Trajectory, TrigSpline, Waypoint
 
 
-def waypoints_given(points: Any, name: str = "plans") -> tuple[Waypoint, ...]:
+def waypoints_given(points: object, name: str = "plans") -> tuple[Waypoint, ...]:
     """Waypoints, alone or in the place of plans.
 
     Raises
@@ -18,12 +15,13 @@ def waypoints_given(points: Any, name: str = "plans") -> tuple[Waypoint, ...]:
     TypeError
         If they are plans without names, or nothing of the kind.
     """
-    found = tuple(points) if np.iterable(points) else (points,)
     kinds = "Waypoints" if name == "waypoints" else "a mapping of names to trajectories, or waypoints"
-    for point in found:
+    found: list[Waypoint] = []
+    for point in points if isinstance(points, Iterable) else (points,):
         if not isinstance(point, Waypoint):
             raise TypeError(f"{name} must be {kinds}, got {type(point).__name__}")
-    return found
+        found.append(point)
+    return tuple(found)
 
 
 def standard_plans(waypoints: Iterable[Waypoint], alpha: float = 1.0) -> dict[str, Trajectory]:

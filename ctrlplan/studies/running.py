@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, TypeAlias, TypeGuard
+from collections.abc import Callable, Sequence
+from typing import TypeAlias, TypeGuard
 
 import control as ct
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ctrlplan._renamed import outside_stacklevel
+from ctrlplan._types import Params
 from ctrlplan.simulation import Event, Prepared, prepared_form, rest_at, simulate, state_space, unstable_poles
 from ctrlplan.studies.connections import check_reached
 from ctrlplan.studies.measures import Run, checked_names
@@ -34,7 +35,7 @@ def run_plan(
     outputs: Sequence[str] | None = None,
     controls: Sequence[str] | None = None,
     initial_state: ArrayLike | None = None,
-    params: Mapping[str, Any] | None = None,
+    params: Params | None = None,
     events: Sequence[Event] | None = None,
 ) -> Run:
     """Simulate a loop with a plan.

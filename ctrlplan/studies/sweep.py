@@ -6,13 +6,14 @@ import warnings
 from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ctrlplan._checks import real_array
 from ctrlplan._renamed import outside_stacklevel
+from ctrlplan._types import Params
 from ctrlplan.simulation import Event
 from ctrlplan.studies.alike import Linear
 from ctrlplan.studies.comparison import finite_or_none, shown_in_units
@@ -77,7 +78,7 @@ class Sweep:
             columns=["plan", "metric"]
         )
 
-    def results(self, names: Sequence[str]) -> dict[str, Any]:
+    def results(self, names: Sequence[str]) -> dict[str, object]:
         """Plain data for JSON: the values, and some metrics of each plan."""
         rows = {
             plan: {name: [finite_or_none(value) for value in found[name].tolist()] for name in names}
@@ -141,7 +142,7 @@ def sweep(
     outputs: Sequence[str] | None = None,
     controls: Sequence[str] | None = None,
     initial_state: ArrayLike | None = None,
-    params: Mapping[str, Any] | None = None,
+    params: Params | None = None,
     events: Sequence[Event] | None = None,
     measures: Collection[str | Measure] | Mapping[str, Measure] | None = None,
     units: Mapping[str, str] | None = None,

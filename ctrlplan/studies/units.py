@@ -5,10 +5,10 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
+from ctrlplan._types import System
 from ctrlplan.studies.measures import Measure, Run, checked_names
 from ctrlplan.trajectories import Trajectory
 
@@ -133,7 +133,9 @@ def in_units(unit: str, y: str, u: str) -> str:
     return re.sub(r"\{[yu]\}", lambda place: shown[place[0]], unit)
 
 
-def checked_units(units: Any, plans: Iterable[Trajectory], systems: Iterable[Any]) -> dict[str, str]:
+def checked_units(
+    units: Mapping[str, str] | None, plans: Iterable[Trajectory], systems: Iterable[System]
+) -> dict[str, str]:
     """Units by label, each of an axis of a plan, a derivative of one (y_d1), or a signal of a loop.
 
     Raises
@@ -156,7 +158,7 @@ def checked_units(units: Any, plans: Iterable[Trajectory], systems: Iterable[Any
     return dict(units)
 
 
-def _signals(system: Any) -> Iterator[str]:
+def _signals(system: System) -> Iterator[str]:
     """Names of the signals of a loop and of the blocks in it."""
     for labels in (system.output_labels, system.input_labels, system.state_labels):
         yield from labels or ()
