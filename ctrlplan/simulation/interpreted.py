@@ -93,7 +93,7 @@ class Interpreted:
         self._updates = [block.update(params) for block in network.blocks]
         self._samples = {i: network.blocks[i].sampled(params) for i in network.blocks_with("period")}
         self._trials, self.evaluations = trials, 0
-        self.feeds, doubtful = self._feeds(self._outputs)
+        self.feeds, doubtful = self._feeds()
         self._doubtful = [(i, can_remember(network.blocks[i].system)) for i in doubtful]
         self._for_rates = self._steps(self._outputs, network.signals_of_inputs(), self.feeds)
         self._for_all = self._steps(self._outputs, np.ones(network.nsignals, dtype=bool), self.feeds)
@@ -171,11 +171,9 @@ class Interpreted:
         needed = self.network.signals_of_inputs()
         for i in blocks:
             needed[self.network.outputs[i]] = True
-        return self._steps(outputs, needed, self._feeds(outputs, blocks)[0])
+        return self._steps(outputs, needed, self._feeds(blocks)[0])
 
-    def _feeds(
-        self, outputs: Sequence[BlockMap], sampled: Sequence[int] = ()
-    ) -> tuple[list[NDArray[np.bool_]], list[int]]:
+    def _feeds(self, sampled: Sequence[int] = ()) -> tuple[list[NDArray[np.bool_]], list[int]]:
         """Feedthrough of every block, and the blocks of which it was tried.
 
         It is assumed where nothing is known, and tried only where a loop seems to be.

@@ -225,7 +225,7 @@ def benefit_of(
     reference = PolySpline(points, warn=False)
     held: dict[str, object] = dict(needed_by(reference) if choices.limits is None else choices.limits)
     limited = Limited(reference, held, choices.quantities)
-    setting = _Setting(experiment, loop, choices, held, _shaper(loop, reference, choices.mode), reference)
+    setting = _Setting(experiment, loop, choices, held, _shaper(loop, choices.mode), reference)
     planned = TrigSpline(points, alpha=choices.alpha)
     plans: dict[str, Trajectory] = {PLANNED: planned} | setting.baselines(points)
     own, ran = setting.run(points, plans, experiment.measures)
@@ -363,7 +363,7 @@ def _scaled(points: Sequence[Waypoint], factor: float) -> tuple[Waypoint, ...]:
     return tuple(point.scaled(start + factor * (point.time - start), 1.0 / factor) for point in points)
 
 
-def _shaper(loop: System | Builder, plan: Trajectory, mode: tuple[float, float] | None) -> Shaper | None:
+def _shaper(loop: System | Builder, mode: tuple[float, float] | None) -> Shaper | None:
     """Shaper with two zeros at a mode: the one given, or the loop's own where it is linear."""
     if mode is None:
         if is_builder(loop) or not hasattr(loop, "poles"):

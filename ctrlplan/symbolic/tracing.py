@@ -108,7 +108,7 @@ def traced(block: Traceable, params: Params, t: float, x: Array, u: Array) -> Tr
     keeper = Keeper(callable_references([block], params))
     try:
         with untouched():
-            known = _known(block, list(_points(block, values, t, x, u)))
+            known = _known(block, list(_points(values, t, x, u)))
             trace = _agreed(block, values, known)
             changes = keeper.changes()
             if changes and not _is_log_only(block, values, trace, known, keeper):
@@ -201,7 +201,7 @@ def _agreed(block: Traceable, values: Params, known: list[tuple[Point, Answer]])
     )
 
 
-def _points(block: Traceable, values: Params, t: float, x: Array, u: Array) -> Iterator[Point]:
+def _points(values: Params, t: float, x: Array, u: Array) -> Iterator[Point]:
     """Times, states, inputs and parameters near the given ones and far from them."""
     rng = np.random.default_rng(0)
     for scale in (0.0, 1e-3, 0.1, 1.0):
