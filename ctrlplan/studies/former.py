@@ -2,146 +2,127 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import fields, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 from functools import wraps
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeAlias, TypeVar
 
 from ctrlplan._renamed import warn_renamed
 from ctrlplan.studies import comparison as _comparison
 from ctrlplan.studies import sweep as _sweep
-from ctrlplan.studies.benefit import Benefit, Choices, benefit_of
+from ctrlplan.studies.benefit import Choices, benefit_of
 from ctrlplan.studies.comparison import Comparison
-from ctrlplan.studies.measures import MEASURES, Measure, Run, checked_names
+from ctrlplan.studies.measures import MEASURES, Function, Measure, Run, checked_names
 from ctrlplan.studies.monte_carlo import monte_carlo
 from ctrlplan.studies.plans import standard_plans, waypoints_given
 from ctrlplan.trajectories import TrigSpline
 
 P = ParamSpec("P")
 R = TypeVar("R")
+Given: TypeAlias = dict[str, Any]
+"""Arguments by name."""
 
-_MEASURES = {
+_OF_COMPARE = {
     "only": "measures= with these names",
     "measure": 'measures= with a Measure(title, unit, "run", function), whose function is given a run',
+    "worth": "benefit(comparison, loop)",
 }
-_WORTH = {"worth": "benefit(comparison, loop)"}
-_OF_SWEEP = {
+_OF_SWEEP = _OF_COMPARE | {
     "alpha": "plans = ctrlplan.studies.standard_plans(waypoints, alpha)",
     "title": "report(path, title)",
     "parameters": "parameters= of compare",
 }
 
 
-def _compare(function: Callable[P, R]) -> Callable[P, R]:
-    """Comparison that takes the old arguments only, measure and worth as well."""
+def _former(
+    function: Callable[P, R], order: Sequence[str], notices: Mapping[str, str]
+) -> Callable[..., Callable[P, R]]:
+    """Decorator of what is made of all arguments by name, which shows the signature of a function."""
 
-    @wraps(function)
-    def called(*args: Any, **kwargs: Any) -> Any:
-        _notices("compare", _MEASURES | _WORTH, kwargs)
-        worth = kwargs.pop("worth", False)
-        if not isinstance(worth, bool | Mapping):
-            raise TypeError(f"worth must be True, False or a mapping of choices, got {worth!r}")
-        given = dict(kwargs)
-        kwargs = _with_measures(kwargs)
-        found: Any = function(*args, **kwargs)
-        if worth is False:
-            return found
-        loop = args[0] if args else kwargs["loop"]
-        return found.with_benefit(_benefit(found, loop, {} if worth is True else dict(worth), given))
+    def decorate(made: Callable[[Given], R]) -> Callable[P, R]:
+        @wraps(function)
+        def called(*args: P.args, **kwargs: P.kwargs) -> R:
+            given = dict(zip(order, args, strict=False))
+            if len(args) > len(order) or given.keys() & kwargs.keys():
+                return function(*args, **kwargs)  # which says what there is too much of
+            if "executor" in given:
+                warn_renamed("sweep with executor and progress by position", "executor= and progress=")
+            for name in notices:
+                if name in kwargs:
+                    warn_renamed(f"{name}= of {function.__name__}", notices[name])
+            return made(given | kwargs)
 
-    return called
+        return called
 
-
-def _benefit(found: Comparison, loop: Any, choices: dict[str, Any], given: Mapping[str, Any]) -> Benefit:
-    """Benefit as `compare` made it with `worth`, a mapping of choices and of options of its own."""
-    if not found.waypoints or found.experiment is None:
-        raise ValueError("worth needs waypoints, in the place of plans or as waypoints, got none")
-    own = {entry.name: choices.pop(entry.name) for entry in fields(Choices) if entry.name in choices}
-    if "alpha" not in own:
-        shapes = (plan.alpha for plan in found.plans.values() if isinstance(plan, TrigSpline))
-        own["alpha"] = next(shapes, given.get("alpha", 1.0))
-    texts = {name: choices.pop(name) for name in ("units", "title") if name in choices}
-    texts.setdefault("units", found.units)
-    measures = {name: given[name] for name in ("measure", "measures") if name in given}
-    last = "measure" in choices  # which was given the time of the last waypoint as well
-    measures |= {name: choices.pop(name) for name in ("only", "measure", "measures") if name in choices}
-    choices["measures"] = _with_measures(measures, last).get("measures")
-    return benefit_of(replace(found.experiment, **choices), loop, Choices(**own), **texts)
+    return decorate
 
 
-def _swept(function: Callable[P, R]) -> Callable[P, R]:
-    """Sweep that takes the old arguments params, only, measure, worth, alpha, title and parameters as well."""
-
-    @wraps(function)
-    def called(*args: Any, **kwargs: Any) -> Any:
-        if len(args) > 4:
-            warn_renamed("sweep with executor and progress by position", "executor= and progress=")
-            kwargs |= dict(zip(("executor", "progress"), args[4:], strict=False))
-            args = args[:4]
-        known = _MEASURES | _OF_SWEEP | _WORTH
-        table = kwargs.get("params")
-        drawn = "values" not in kwargs and (len(args) < 2 or args[1] is None)
-        if drawn and table is None:
-            raise TypeError("sweep() missing 1 required positional argument: 'values'; for draws use monte_carlo")
-        if drawn:
-            warn_renamed("sweep with params=", "monte_carlo(loop, draws, plans, timepts)")
-        _notices("sweep", known, kwargs)
-        worth = kwargs.pop("worth", False)
-        if worth is not False and not drawn:
-            raise (ValueError if isinstance(worth, bool | Mapping) else TypeError)(
-                "worth must be False in a sweep over values, which has no place for it, got "
-                f"{worth!r:.80}; give compare's result at the value of interest to benefit"
-            )
-        texts: dict[str, Any] = {name: kwargs.pop(name) for name in ("title", "parameters") if name in kwargs}
-        kwargs = _with_measures(_named(args, kwargs))
-        if "alpha" in kwargs:
-            kwargs |= _through(kwargs.get("plans", ()), kwargs.pop("alpha"))
-        if not drawn:
-            return function(**kwargs)  # type: ignore[call-arg]
-        return _drawn(kwargs, texts, worth)
-
-    return called
+@_former(_comparison.compare, ("loop", "plans", "timepts"), _OF_COMPARE)
+def compare(given: Given) -> Comparison:
+    """Comparison that takes `only`, `measure` and `worth` as well."""
+    choices = _choices(given.pop("worth", False))
+    return _with_worth(_comparison.compare(**_with_measures(given)), choices, given)
 
 
-def _named(args: tuple[Any, ...], kwargs: dict[str, Any]) -> dict[str, Any]:
-    """All arguments by name."""
-    named = dict(zip(("build", "values", "plans", "timepts"), args, strict=False))
-    for name in named:
-        if name in kwargs:
-            raise TypeError(f"sweep() got multiple values for argument {name!r}")
-    return named | kwargs
+@_former(_sweep.sweep, ("build", "values", "plans", "timepts", "executor", "progress"), _OF_SWEEP)
+def sweep(given: Given) -> Any:
+    """Sweep that takes `params` of draws, `only`, `measure`, `worth`, `alpha`, `title` and `parameters` as well."""
+    worth = given.pop("worth", False)
+    texts: Given = {name: given.pop(name) for name in ("title", "parameters") if name in given}
+    given = _with_measures(given)
+    alpha = given.pop("alpha", None)
+    if alpha is not None and not isinstance(given.get("plans", {}), Mapping):
+        points = waypoints_given(given["plans"])
+        given |= {"plans": standard_plans(points, alpha), "waypoints": points}
+    if given.get("values") is None:
+        return _drawn(given, texts, _choices(worth))
+    if worth is not False:
+        raise (ValueError if isinstance(worth, bool | Mapping) else TypeError)(
+            f"worth must be False in a sweep over values, which has no place for it, got {worth!r:.80}; give compare's "
+            "result at the value of interest to benefit"
+        )
+    return _sweep.sweep(**given)
 
 
-def _drawn(given: dict[str, Any], texts: Mapping[str, Any], worth: Any) -> Any:
+def _drawn(given: Given, texts: Given, choices: Given | None) -> Any:
     """Draws as `sweep` made them with `params`."""
-    given.pop("values", None)
-    given.pop("parameter", None)
-    loop, table = given.pop("build"), given.pop("params")
-    found = monte_carlo(loop, table, **given)
+    if given.get("params") is None:
+        raise TypeError("sweep() missing 1 required positional argument: 'values'; for draws use monte_carlo")
+    warn_renamed("sweep with params=", "monte_carlo(loop, draws, plans, timepts)")
+    rest = {name: value for name, value in given.items() if name not in ("build", "values", "params", "parameter")}
+    found = monte_carlo(given["build"], given["params"], **rest)
     nominal = found.nominal
     if texts:
         parameters = dict(texts.get("parameters") or {}) | nominal.parameters
         nominal = replace(nominal, title=texts.get("title", nominal.title), parameters=parameters)
-    if worth is not False:
-        nominal = nominal.with_benefit(_benefit(nominal, loop, {} if worth is True else dict(worth), given))
-    return replace(found, nominal=nominal)
+    return replace(found, nominal=_with_worth(nominal, choices, given | {"loop": given["build"]}))
 
 
-def _through(plans: Any, alpha: Any) -> dict[str, Any]:
-    """Plans through waypoints, with the shape that `sweep` was given."""
-    if isinstance(plans, Mapping):
-        return {"plans": plans}
-    points = waypoints_given(plans)
-    return {"plans": standard_plans(points, alpha), "waypoints": points}
+def _choices(worth: object) -> Given | None:
+    """Choices and options of `worth`; None where no benefit is wanted."""
+    if not isinstance(worth, bool | Mapping):
+        raise TypeError(f"worth must be True, False or a mapping of choices, got {worth!r}")
+    return None if worth is False else dict(worth) if isinstance(worth, Mapping) else {}
 
 
-def _notices(function: str, known: Mapping[str, str], given: Mapping[str, Any]) -> None:
-    for name in known:
-        if name in given:
-            warn_renamed(f"{name}= of {function}", known[name])
+def _with_worth(found: Comparison, choices: Given | None, given: Given) -> Comparison:
+    """Comparison with the benefit that was wanted, as `compare` made it with `worth`."""
+    if choices is None:
+        return found
+    if not found.waypoints or found.experiment is None:
+        raise ValueError("worth needs waypoints, in the place of plans or as waypoints, got none")
+    own = {entry.name: choices.pop(entry.name) for entry in fields(Choices) if entry.name in choices}
+    shapes = (plan.alpha for plan in found.plans.values() if isinstance(plan, TrigSpline))
+    own.setdefault("alpha", next(shapes, given.get("alpha", 1.0)))
+    texts = {"units": found.units} | {name: choices.pop(name) for name in ("units", "title") if name in choices}
+    measures: Given = {name: given[name] for name in ("measure", "measures") if name in given}
+    last = "measure" in choices  # which was given the time of the last waypoint as well
+    measures |= {name: choices.pop(name) for name in ("only", "measure", "measures") if name in choices}
+    choices["measures"] = _with_measures(measures, last).get("measures")
+    return found.with_benefit(benefit_of(replace(found.experiment, **choices), given["loop"], Choices(**own), **texts))
 
 
-def _with_measures(given: dict[str, Any], last: bool = False) -> dict[str, Any]:
+def _with_measures(given: Given, last: bool = False) -> Given:
     """Arguments with `only` and `measure` as `measures`."""
     if not {"only", "measure"} & set(given):
         return given
@@ -165,19 +146,15 @@ def _with_measures(given: dict[str, Any], last: bool = False) -> dict[str, Any]:
     return rest | {"measures": [*listed, *(name for name in names if name in MEASURES)]}
 
 
+@dataclass(frozen=True)
 class _Called:
     """Function of a run that calls one of a plan and a response."""
 
-    def __init__(self, function: Callable[..., Mapping[str, float]], last: bool) -> None:
-        self.function, self.last = function, last
+    function: Function
+    last: bool
 
     def __call__(self, run: Run) -> Mapping[str, float]:
-        more = (run.last,) if self.last else ()
-        found = self.function(run.plan, run.response, *more)
+        found = self.function(run.plan, run.response, *((run.last,) if self.last else ()))
         if not isinstance(found, Mapping):
             raise TypeError(f"measure must return a mapping of names to numbers, got {type(found).__name__}")
         return found
-
-
-compare = _compare(_comparison.compare)
-sweep = _swept(_sweep.sweep)
