@@ -17,7 +17,10 @@ System: TypeAlias = "ct.InputOutputSystem"
 """Any system of python-control, which has no types of its own."""
 
 Value: TypeAlias = Any
-"""Number, array or symbol, or a sequence of them: what the functions of a block take and return."""
+"""Number, array or symbol, or a sequence of them: what functions that are evaluated with symbols as well take."""
+
+Data: TypeAlias = dict[str, Any]
+"""A table of plain data, as of JSON or TOML: of what kind an entry is, is known once it is checked."""
 
 Params: TypeAlias = Mapping[str, Value]
 """Parameters of blocks by name, of any kind that a block can use."""

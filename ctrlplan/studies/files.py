@@ -15,14 +15,15 @@ from collections.abc import Collection
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
-from types import UnionType
-from typing import Any, Union, get_args, get_origin
+from types import ModuleType, UnionType
+from typing import Union, get_args, get_origin
 
 import control as ct
 import numpy as np
 from numpy.typing import NDArray
 
 from ctrlplan._renamed import warn_renamed
+from ctrlplan._types import Data
 from ctrlplan.simulation import Event
 from ctrlplan.studies.baselines import smoother_polynomials
 from ctrlplan.studies.benefit import Choices, benefit_of
@@ -98,10 +99,10 @@ class StudyFile:
     samples: int
     waypoints: tuple[Waypoint, ...]
     plans: dict[str, Trajectory]
-    loop: dict[str, Any]
+    loop: Data
     units: dict[str, str] = field(default_factory=dict)
     benefit: bool = False
-    experiment: dict[str, Any] = field(default_factory=dict)
+    experiment: Data = field(default_factory=dict)
 
     def run(self) -> Study:
         """Simulate and measure.
@@ -134,7 +135,7 @@ class StudyFile:
         figures = ("crane-plane", "plans", "crane-time", "crane-motion")
         return Study(self.name, self.title, marked_slack(comparison), notes=comparison.notes, figures=figures)
 
-    def _crane(self) -> tuple[dict[str, Any], Choices]:
+    def _crane(self) -> tuple[Data, Choices]:
         """Fields of the experiment with a crane, and how planning is judged: by sway, and against shaped references."""
         labels = self.waypoints[0].labels or ()
         if set(labels) != {"x", "z"}:
@@ -144,7 +145,7 @@ class StudyFile:
         measures = CRANE_MEASURES | {"load": LOAD}
         own = [replace(measure, name=name) for name, measure in measures.items()]
         stated = self.experiment.get("measures")
-        fields_of = {"controls": ("F", "C")} | self.experiment
+        fields_of: Data = {"controls": ("F", "C")} | self.experiment
         fields_of["events"] = (SLACK, *self.experiment.get("events", ()))
         fields_of["measures"] = measures if stated is None else [*own, *stated]
         return fields_of, Choices(
@@ -254,7 +255,7 @@ _LARGEST = 2**20
 """Bytes of a study file at most: it is written by hand."""
 
 
-def _parsed(source: Path) -> dict[str, Any]:
+def _parsed(source: Path) -> Data:
     """Data of a TOML file."""
     try:
         with source.open("rb") as file:
@@ -274,7 +275,7 @@ def _parsed(source: Path) -> dict[str, Any]:
         raise StudyError(f"{source}: must be valid TOML, got {error}") from None
 
 
-def build_loop(table: dict[str, Any], path: Path) -> System | Builder:
+def build_loop(table: Data, path: Path) -> System | Builder:
     """Loop that the table [loop] asks for.
 
     Raises
@@ -315,9 +316,9 @@ def _loop_of_module(kind: str, path: Path) -> System:
     return loop
 
 
-def _check_declared(function: Any) -> None:
+def _check_declared(function: object) -> None:
     """Raise where a callable is not a function that takes nothing and is declared to return a control system."""
-    if inspect.isclass(function) or not inspect.isfunction(inspect.unwrap(function)):
+    if not callable(function) or inspect.isclass(function) or not inspect.isfunction(inspect.unwrap(function)):
         raise TypeError(f"what is called must be a function of Python, got {type(function).__name__}")
     try:
         signature = inspect.signature(function, eval_str=True)
@@ -334,7 +335,7 @@ def _check_declared(function: Any) -> None:
         raise TypeError(f"its return annotation must be a class of control systems, got {got}")
 
 
-def _crane(table: dict[str, Any], path: Path) -> Builder:
+def _crane(table: Data, path: Path) -> Builder:
     """Loop of each plan: steps, shaped or not, go to the drives as at rest, every other plan through the law."""
     try:
         crane = Crane(**{key: value for key, value in table.items() if key in _CRANE_ENTRIES})
@@ -355,7 +356,7 @@ def _crane(table: dict[str, Any], path: Path) -> Builder:
     return build
 
 
-def _module(name: str, folder: Path) -> Any:
+def _module(name: str, folder: Path) -> ModuleType:
     """Module beside the study file, never one of the same name from elsewhere; or an installed one."""
     source = folder.joinpath(*name.split(".")).with_suffix(".py")
     spec = importlib.util.spec_from_file_location(name, source) if source.is_file() else None
@@ -405,12 +406,12 @@ class _Reader:
     def error(self, place: str, message: object) -> StudyError:
         return StudyError(f"{self.path}: {place}: {message}")
 
-    def known(self, table: dict[str, Any], names: Collection[str], place: str) -> None:
+    def known(self, table: Data, names: Collection[str], place: str) -> None:
         for key in table:
             if key not in names:
                 raise self.error(place, f"entries must be among {', '.join(names)}, got {key!r}")
 
-    def table(self, data: dict[str, Any], key: str, needed: bool = True) -> dict[str, Any]:
+    def table(self, data: Data, key: str, needed: bool = True) -> Data:
         found = data.get(key)
         if found is None and not needed:
             return {}
@@ -418,32 +419,32 @@ class _Reader:
             raise self.error(key, f"must be a table [{key}], got {'none' if found is None else _got(found)}")
         return found
 
-    def tables(self, data: dict[str, Any], key: str) -> list[dict[str, Any]]:
+    def tables(self, data: Data, key: str) -> list[Data]:
         found = data.get(key, [])
         if not isinstance(found, list) or not all(isinstance(t, dict) for t in found):
             raise self.error(key, f"must be tables [[{key}]], got {_got(found)}")
         return found
 
-    def number(self, table: dict[str, Any], key: str, place: str, default: float | None) -> float:
+    def number(self, table: Data, key: str, place: str, default: float | None) -> float:
         value = table.get(key, default)
         if value is None or not _is_number(value):
             raise self.error(place, f"must be a finite number, got {'none' if value is None else _got(value)}")
         return float(value)
 
-    def numbers(self, table: dict[str, Any], key: str, place: str, finite: bool = True) -> list[float]:
+    def numbers(self, table: Data, key: str, place: str, finite: bool = True) -> list[float]:
         value = table.get(key)
         if not isinstance(value, list) or not all(_is_number(v, finite) for v in value):
             kind = "finite numbers" if finite else "numbers"
             raise self.error(place, f"must be a list of {kind}, got {'none' if value is None else _got(value)}")
         return [float(v) for v in value]
 
-    def choice(self, table: dict[str, Any], key: str, place: str) -> Any:
+    def choice(self, table: Data, key: str, place: str) -> float | str | list[float]:
         """What a plan was asked for: a number, "auto", or a list with one entry an axis."""
         if table[key] == "auto":
             return "auto"
         return (self.numbers if isinstance(table[key], list) else partial(self.number, default=None))(table, key, place)
 
-    def waypoints(self, data: dict[str, Any]) -> tuple[Waypoint, ...]:
+    def waypoints(self, data: Data) -> tuple[Waypoint, ...]:
         loop = data.get("loop")
         # A crane is measured in x and z, in whatever order a file has them.
         first = ("x", "z") if isinstance(loop, dict) and loop.get("kind") == "crane" else ()
@@ -463,7 +464,7 @@ class _Reader:
         except ValueError as error:
             raise self.error("waypoints", error) from None
 
-    def benefit(self, data: dict[str, Any]) -> bool:
+    def benefit(self, data: Data) -> bool:
         """Whether planning is compared with its baselines; "worth" is the former name of the entry."""
         if "worth" in data and "benefit" in data:
             raise self.error("worth", "must not be given beside benefit, got both")
@@ -475,9 +476,7 @@ class _Reader:
             warn_renamed(f"{self.path}: worth =", "benefit =")
         return value
 
-    def experiment(
-        self, data: dict[str, Any], plans: dict[str, Trajectory], span: tuple[float, float]
-    ) -> dict[str, Any]:
+    def experiment(self, data: Data, plans: dict[str, Trajectory], span: tuple[float, float]) -> Data:
         """The table [experiment], checked as `Experiment` does."""
         found = dict(self.table(data, "experiment", needed=False))
         self.known(found, _EXPERIMENT, "experiment")
@@ -511,7 +510,7 @@ class _Reader:
         names = ", ".join([*sorted(known), "step", '"python:module:Class"'])
         raise self.error(place, f"must be one of {names}, got {_got(family)}")
 
-    def plans(self, data: dict[str, Any], waypoints: tuple[Waypoint, ...]) -> dict[str, Trajectory]:
+    def plans(self, data: Data, waypoints: tuple[Waypoint, ...]) -> dict[str, Trajectory]:
         plans: dict[str, Trajectory] = {}
         for i, table in enumerate(self.tables(data, "plans")):
             place = f"plans[{i}]"
@@ -554,9 +553,7 @@ def _kind_of_module(family: str, path: Path, place: str) -> type[FromWaypoints]:
     return kind
 
 
-def _made(
-    kind: type[FromWaypoints], waypoints: tuple[Waypoint, ...], family: str, chosen: dict[str, Any]
-) -> Trajectory:
+def _made(kind: type[FromWaypoints], waypoints: tuple[Waypoint, ...], family: str, chosen: Data) -> Trajectory:
     """Plan of a kind with the options chosen, of which none that it needs may be missing."""
     parameters = inspect.signature(kind).parameters
     for name in kind.options:
@@ -566,7 +563,7 @@ def _made(
     return kind.from_waypoints(waypoints, **chosen)
 
 
-def _checked_loop(loop: dict[str, Any], reader: _Reader) -> None:
+def _checked_loop(loop: Data, reader: _Reader) -> None:
     kind = loop.get("kind")
     if isinstance(kind, str) and kind.startswith("python:") and kind.count(":") == 2:
         reader.known(loop, ("kind",), "loop")

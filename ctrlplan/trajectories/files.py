@@ -11,18 +11,19 @@ import lzma
 import os
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import NoReturn
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ctrlplan._checks import checked_count, checked_timepts
 from ctrlplan._files import write_bytes, write_text
+from ctrlplan._types import Data
 from ctrlplan.trajectories.common import Array
 from ctrlplan.trajectories.trajectory import Trajectory
 
 
-def trajectory_from_dict(data: dict[str, Any]) -> Trajectory:
+def trajectory_from_dict(data: Data) -> Trajectory:
     """Trajectory from the plain data of its `to_dict`.
 
     Parameters

@@ -43,6 +43,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import blas
 
+from ctrlplan._types import Value
 from ctrlplan.trajectories.common import FACTORIALS, Array, readonly
 from ctrlplan.trajectories.digits import many_digits
 from ctrlplan.trajectories.fields import Fields
@@ -268,7 +269,7 @@ class NewtonSystem(Fields):
             out[self.size - 1] += self._fold * out[self.size]
         return out[: self.size]
 
-    def series(self, coefficients: Array, u: Any, order: int) -> list[list[Any]]:
+    def series(self, coefficients: Array, u: Value, order: int) -> list[list[Value]]:
         """Taylor series axis by axis of a plan at one normalised time, a number or a symbol."""
         factors = [
             pair_series(self.alpha, u - first, u - second, order)
@@ -345,11 +346,11 @@ def _taylor_scale(duration: float, orders: tuple[int, ...]) -> Array:
     return readonly(scale)
 
 
-Pair = tuple[list[Any], list[Any]]
+Pair = tuple[list[Value], list[Value]]
 """Taylor series of q q and of q c, the factors of one pair of nodes."""
 
 
-def pair_series(alpha: float, left: Any, right: Any, order: int) -> Pair:
+def pair_series(alpha: float, left: Value, right: Value, order: int) -> Pair:
     """Series of the factors of a pair about a point that lies `left` and `right` beyond its nodes."""
     alpha = _effective(alpha)
     if not alpha:
@@ -367,7 +368,7 @@ def pair_series(alpha: float, left: Any, right: Any, order: int) -> Pair:
     return qq, qc
 
 
-def newton_series(factors: Sequence[Pair], column: Sequence[Any], order: int) -> list[Any]:
+def newton_series(factors: Sequence[Pair], column: Sequence[Value], order: int) -> list[Value]:
     """Series of a combination of the basis functions, from the last pair of factors to the first."""
     orders = range(order + 1)
     last = 2 * len(factors)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctrlplan._checks import checked_count, checked_labels
+from ctrlplan._types import Data, Value
 from ctrlplan.trajectories.common import Array, derivative_scale, mapped_time, readonly
 from ctrlplan.trajectories.newton import NEARLY_CLOSED, NewtonSystem
 from ctrlplan.trajectories.swing import warn_of_swing
@@ -31,7 +32,7 @@ class Options(NamedTuple):
     period: float | None = None
     warn: bool = True
 
-    def given(self) -> dict[str, Any]:
+    def given(self) -> Data:
         """Those that make the plan what it is, where they differ from what is taken unless given."""
         return {k: v for k, v in self._asdict().items() if k != "warn" and v != self._field_defaults[k]}
 
@@ -214,9 +215,9 @@ class NewtonSpline(WaypointSpline):
             out[:, list(axes)] = values
         return out
 
-    def segment_series(self, segment: int, s: Any, order: int) -> list[list[Any]]:
+    def segment_series(self, segment: int, s: Value, order: int) -> list[list[Value]]:
         """Taylor series of a segment; as `Trajectory.segment_series`."""
-        found: list[list[Any]] = [[]] * self.naxes
+        found: list[list[Value]] = [[]] * self.naxes
         for axes, system, coefficients in self._parts:
             for axis, row in zip(axes, system.series(coefficients, s / self._duration, order), strict=True):
                 found[axis] = [value / self._duration**k for k, value in enumerate(row)]
@@ -224,7 +225,7 @@ class NewtonSpline(WaypointSpline):
 
     @classmethod
     @abstractmethod
-    def from_dict(cls, data: dict[str, Any]) -> Self:
+    def from_dict(cls, data: Data) -> Self:
         """Trajectory from the plain data of `to_dict`."""
 
     def _per_axis(self) -> list[tuple[NewtonSystem, Array]]:
@@ -232,9 +233,9 @@ class NewtonSpline(WaypointSpline):
         found = {a: (s, c[:, i]) for axes, s, c in self._parts for i, a in enumerate(axes)}
         return [found[a] for a in range(self.naxes)]
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> Data:
         """Plain data: type, waypoints, labels and whatever else was chosen."""
-        data: dict[str, Any] = {
+        data: Data = {
             "type": type(self).__name__,
             "waypoints": [w.to_dict() for w in self.waypoints],
             "labels": list(self.labels),

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctrlplan._checks import checked_labels
+from ctrlplan._types import Data, Value
 from ctrlplan.trajectories.common import FACTORIALS, Array, mapped_time, readonly, times_powers
 from ctrlplan.trajectories.conjugate_digits import Ends, conjugate_digits
 from ctrlplan.trajectories.newton import NEARLY_CLOSED, NewtonSystem
@@ -137,7 +138,7 @@ class PiecewiseSpline(WaypointSpline):
         plan._check_swing()
         return plan
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> Data:
         """Plain data that `trajectory_from_dict` reads."""
         return {
             "type": "PiecewiseSpline",
@@ -147,7 +148,7 @@ class PiecewiseSpline(WaypointSpline):
         }
 
     @classmethod
-    def from_dict(cls, data: dict[str, Any]) -> Self:
+    def from_dict(cls, data: Data) -> Self:
         """Trajectory from the plain data of `to_dict`."""
         points = [Waypoint.from_dict(w) for w in data["waypoints"]]
         plan = cls(points, alpha=data["alpha"], labels=data["labels"], warn=False)
@@ -178,7 +179,7 @@ class PiecewiseSpline(WaypointSpline):
         """Derivatives of a segment; as `Trajectory.segment_jet`."""
         return self.legs[segment].segment_jet(0, s, order)
 
-    def segment_series(self, segment: int, s: Any, order: int) -> list[list[Any]]:
+    def segment_series(self, segment: int, s: Value, order: int) -> list[list[Value]]:
         """Taylor series of a segment; as `Trajectory.segment_series`."""
         return self.legs[segment].segment_series(0, s, order)
 

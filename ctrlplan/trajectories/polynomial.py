@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import Any, Self
+from typing import Self
 
+from ctrlplan._types import Data
 from ctrlplan.trajectories.newton_spline import NewtonSpline, Options, checked_degree
 from ctrlplan.trajectories.waypoint import Waypoint
 from ctrlplan.trajectories.waypoint_spline import checked_waypoints
@@ -71,7 +72,7 @@ class PolySpline(NewtonSpline):
         self._check_swing()
 
     @classmethod
-    def from_dict(cls, data: dict[str, Any]) -> Self:
+    def from_dict(cls, data: Data) -> Self:
         """Trajectory from the plain data of `to_dict`."""
         points = [Waypoint.from_dict(w) for w in data["waypoints"]]
         return cls(points, warn=False, **{k: data[k] for k in ("labels", "degree", "smooth") if k in data})._loaded()

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ctrlplan._checks import new_numbers
+from ctrlplan._types import Data, Value
 from ctrlplan.trajectories.common import FACTORIALS, Array, mapped_time, readonly, times_powers
 from ctrlplan.trajectories.step import Step
 from ctrlplan.trajectories.trajectory import Trajectory
@@ -38,7 +39,7 @@ class _Profile(Trajectory, FromWaypoints):
     _names: ClassVar[tuple[str, ...]]
     _ramp: ClassVar[Array]  # the highest continuous derivative at both ends of each leg of the rise, to scale
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> Data:
         """Plain data that `trajectory_from_dict` reads."""
         return {
             "type": type(self).__name__,
@@ -50,7 +51,7 @@ class _Profile(Trajectory, FromWaypoints):
         }
 
     @classmethod
-    def from_dict(cls, data: dict[str, Any]) -> Self:
+    def from_dict(cls, data: Data) -> Self:
         """Trajectory from the plain data of `to_dict`."""
         ends = Step(data["final"], data["initial"], data["time"], data["labels"])
         return cls._of(ends, [data[name] for name in cls._names])
@@ -147,13 +148,13 @@ class _Profile(Trajectory, FromWaypoints):
         out[0] += anchor[:, None]
         return out
 
-    def segment_series(self, segment: int, s: Any, order: int) -> list[list[Any]]:
+    def segment_series(self, segment: int, s: Value, order: int) -> list[list[Value]]:
         """Taylor series of a segment; as `Trajectory.segment_series`."""
         anchor, (first, *rest) = self._law(segment, s, order)
         axes = zip(anchor.tolist(), self._change.tolist(), strict=True)
         return [[position + change * first, *(change * value for value in rest)] for position, change in axes]
 
-    def _law(self, segment: int, s: Any, order: int) -> tuple[Array, list[Any]]:
+    def _law(self, segment: int, s: Value, order: int) -> tuple[Array, list[Value]]:
         """Position that a segment counts from, and the Taylor series of the part of the line beyond it."""
         if segment < len(self._lasts) - self._nfall:
             return self.initial, _shifted(self._taylor[segment], s, order)
@@ -317,9 +318,9 @@ def _rise(lasts: Array, ramp: Array, order: int) -> tuple[Array, float]:
     return np.array(rows[::-1]).T / (velocity * FACTORIALS[: order + 1]), length / velocity
 
 
-def _shifted(taylor: list[float], s: Any, order: int) -> list[Any]:
+def _shifted(taylor: list[float], s: Value, order: int) -> list[Value]:
     """Coefficients of a polynomial about s, from those about 0."""
-    found: list[Any] = list(taylor)
+    found: list[Value] = list(taylor)
     for k in range(len(found) - 1):
         for m in range(len(found) - 2, k - 1, -1):
             found[m] = found[m] + s * found[m + 1]

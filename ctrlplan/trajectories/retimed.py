@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 from scipy.optimize import brentq
 
 from ctrlplan._checks import checked_labels
+from ctrlplan._types import Data, Value
 from ctrlplan.trajectories.combined import is_shaped, is_unit_rate
 from ctrlplan.trajectories.common import FACTORIALS, Array, readonly
 from ctrlplan.trajectories.files import trajectory_from_dict
@@ -84,7 +85,7 @@ class Retimed(Trajectory):
             _segments=list(zip(*segments, strict=True)),
         )
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> Data:
         """Plain data that `trajectory_from_dict` reads."""
         return {
             "type": "Retimed",
@@ -94,7 +95,7 @@ class Retimed(Trajectory):
         }
 
     @classmethod
-    def from_dict(cls, data: dict[str, Any]) -> Self:
+    def from_dict(cls, data: Data) -> Self:
         """Trajectory from the plain data of `to_dict`."""
         return cls(trajectory_from_dict(data["plan"]), trajectory_from_dict(data["law"]), data["labels"])
 
@@ -117,7 +118,7 @@ class Retimed(Trajectory):
         elapsed = inner[0, 0] - self.plan.breakpoints[of_plan]
         return _composed_jets(self.plan.segment_jet(of_plan, elapsed, order), inner)
 
-    def segment_series(self, segment: int, s: Any, order: int) -> list[list[Any]]:
+    def segment_series(self, segment: int, s: Value, order: int) -> list[list[Value]]:
         """Taylor series of a segment; as `Trajectory.segment_series`."""
         of_law, of_plan = self._segments[segment]
         ((time, *rates),) = self.law.segment_series(of_law, s + self._since(segment), order)
@@ -129,7 +130,7 @@ class Retimed(Trajectory):
         return float(self.breakpoints[segment] - self.law.breakpoints[self._segments[segment][0]])
 
 
-def composed(outer: Sequence[Any], inner: Sequence[Any]) -> list[Any]:
+def composed(outer: Sequence[Value], inner: Sequence[Value]) -> list[Value]:
     """Taylor series of a function of a function.
 
     Coefficients may be numbers, arrays that broadcast, or symbols.

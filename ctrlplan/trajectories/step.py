@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ctrlplan._checks import checked_finite, checked_labels, finite_vector
+from ctrlplan._types import Data
 from ctrlplan.trajectories.common import Array, mapped_time, readonly
 from ctrlplan.trajectories.trajectory import Trajectory
 
@@ -65,7 +66,7 @@ class Step(Trajectory):
             breakpoints=readonly(np.array([checked_finite(time, "time")])),
         )
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> Data:
         """Plain data that `trajectory_from_dict` reads."""
         return {
             "type": "Step",
@@ -76,7 +77,7 @@ class Step(Trajectory):
         }
 
     @classmethod
-    def from_dict(cls, data: dict[str, Any]) -> Self:
+    def from_dict(cls, data: Data) -> Self:
         """Trajectory from the plain data of `to_dict`."""
         return cls(data["final"], data["initial"], data["time"], data["labels"])
 

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ctrlplan._checks import checked_count, checked_finite, real_array
+from ctrlplan._types import Value
 from ctrlplan.trajectories.common import FACTORIALS, Array, derivative_scale
 from ctrlplan.trajectories.fields import Fields
 from ctrlplan.trajectories.newton import NewtonSystem, newton_series, pair_series
@@ -152,7 +153,7 @@ def transition(order: int, horizon: float, alpha: float) -> Transition:
     return Transition(order, horizon, alpha)
 
 
-def series(rate: float, columns: Sequence[Sequence[Any]], past: Any, ahead: Any, order: int) -> list[list[Any]]:
+def series(rate: float, columns: Sequence[Sequence[Value]], past: Value, ahead: Value, order: int) -> list[list[Value]]:
     """Taylor series, axis by axis, of transitions at one time; everything but the rate may be a symbol.
 
     Parameters
@@ -176,7 +177,7 @@ def extrapolated(jet: ArrayLike, time: float) -> Array:
     return np.array([taylor_value(values[k:], time) for k in range(len(values))]) if len(values) > 1 else values
 
 
-def taylor_value(jet: Any, s: Any) -> Any:
+def taylor_value(jet: Value, s: Value) -> Value:
     """Value of a Taylor polynomial s seconds on; derivatives and time may be symbols."""
     total = jet[-1]
     for k in range(len(jet) - 1, 0, -1):

@@ -10,6 +10,7 @@ from typing import Any, Literal, Self
 import numpy as np
 
 from ctrlplan._checks import checked_finite, one_number
+from ctrlplan._types import Data
 from ctrlplan.trajectories.common import Array
 from ctrlplan.trajectories.newton import NewtonSystem
 from ctrlplan.trajectories.newton_spline import NewtonSpline, Options, checked_degree
@@ -157,12 +158,12 @@ class TrigSpline(NewtonSpline):
             raise ValueError(f"alpha must be large enough for finite Fourier coefficients, got {self.alpha:g}")
         return found
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> Data:
         """Plain data that `trajectory_from_dict` reads."""
         return super().to_dict() | {"alpha": self.alpha}
 
     @classmethod
-    def from_dict(cls, data: dict[str, Any]) -> Self:
+    def from_dict(cls, data: Data) -> Self:
         """Trajectory from the plain data of `to_dict`."""
         points = [Waypoint.from_dict(w) for w in data["waypoints"]]
         chosen = {k: data[k] for k in ("gamma", "labels", "degree", "smooth") if k in data}

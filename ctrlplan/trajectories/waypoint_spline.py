@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from typing import Any, ClassVar, Self
 
+from ctrlplan._types import Data
 from ctrlplan.trajectories.common import mapped_time
 from ctrlplan.trajectories.trajectory import Trajectory
 from ctrlplan.trajectories.waypoint import Waypoint
@@ -150,7 +151,7 @@ class WaypointSpline(Trajectory, FromWaypoints):
         """Same path at other times; as `Trajectory.map_time`."""
         return self.through(w.scaled(mapped_time(w.time, origin, target, rate), rate) for w in self.waypoints)
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> Data:
         """Plain data: type, waypoints, labels and options."""
         return {
             "type": type(self).__name__,
@@ -160,7 +161,7 @@ class WaypointSpline(Trajectory, FromWaypoints):
         }
 
     @classmethod
-    def from_dict(cls, data: dict[str, Any]) -> Self:
+    def from_dict(cls, data: Data) -> Self:
         """Trajectory from the plain data of `to_dict`."""
         points = [Waypoint.from_dict(w) for w in data["waypoints"]]
         chosen = {name: data[name] for name in cls.options if name in data}
