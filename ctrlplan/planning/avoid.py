@@ -530,17 +530,8 @@ def _moved(task: _Task, build: Build, vias: _Vias, margin: float) -> _Vias:
     room = np.abs(t - task.times[:, None]).min(axis=0) / (0.05 * task.plan.duration)
     wanted = task.wanted + margin * np.minimum(1.0, room)
 
-    def decoded(x: Array) -> _Vias:
-        times = vias.times.copy()
-        for leg in np.unique(vias.legs):
-            here = vias.legs == leg
-            shares = np.exp(np.append(x[2 * count : 3 * count][here], 0.0))
-            begin, end = task.times[leg : leg + 2]
-            times[here] = begin + (end - begin) * np.cumsum(shares)[:-1] / shares.sum()
-        return _Vias(vias.legs, times, task.size * x[: 2 * count].reshape(2, count))
-
     def jets(x: Array) -> Array:
-        return _through(task, build, decoded(x)).jet(t, order)
+        return _through(task, build, _decoded(task, vias, x)).jet(t, order)
 
     def valued(jet: Array) -> Array:
         """Roughness, then the room in each window: shape (nvalues, ...) from jets (order + 1, 2, ..., ntime)."""
@@ -574,19 +565,31 @@ def _moved(task: _Task, build: Build, vias: _Vias, margin: float) -> _Vias:
     x0 = np.append(np.concatenate(start), 0.0)
     first = measured(x0.tobytes())
     x0[-1] = max(0.0, -float(first[1:].min()))
-    problem: dict[str, Any] = {
-        "fun": lambda x: measured(_key(x))[0] / first[0] + _PRICE * x[-1],
-        "jac": lambda x: np.append(slopes(_key(x))[0] / first[0], _PRICE),
-        "x0": x0,
-        "bounds": [(None, None)] * (2 * count) + [(-4.0, 4.0)] * count + [(0.0, None)],
-        "constraints": {
+    found = minimize(
+        lambda x: measured(_key(x))[0] / first[0] + _PRICE * x[-1],
+        x0,
+        jac=lambda x: np.append(slopes(_key(x))[0] / first[0], _PRICE),
+        method="SLSQP",
+        bounds=[(None, None)] * (2 * count) + [(-4.0, 4.0)] * count + [(0.0, None)],
+        constraints={
             "type": "ineq",
             "fun": lambda x: measured(_key(x))[1:] + x[-1],
             "jac": lambda x: np.column_stack([slopes(_key(x))[1:], np.ones(first.size - 1)]),
         },
-        "options": {"maxiter": 40, "ftol": 1e-5},
-    }
-    return decoded(minimize(method="SLSQP", **problem).x)
+        options={"maxiter": 40, "ftol": 1e-5},
+    )
+    return _decoded(task, vias, found.x)
+
+
+def _decoded(task: _Task, vias: _Vias, x: Array) -> _Vias:
+    """Via points of the unknowns of `_moved`."""
+    count, times = vias.legs.size, vias.times.copy()
+    for leg in np.unique(vias.legs):
+        here = vias.legs == leg
+        shares = np.exp(np.append(x[2 * count : 3 * count][here], 0.0))
+        begin, end = task.times[leg : leg + 2]
+        times[here] = begin + (end - begin) * np.cumsum(shares)[:-1] / shares.sum()
+    return _Vias(vias.legs, times, task.size * x[: 2 * count].reshape(2, count))
 
 
 def _logarithms(task: _Task, vias: _Vias, leg: int) -> Array:

@@ -290,30 +290,15 @@ def certified_bounds(
 ) -> Bounds:
     """Bounds by refining cells until a Lipschitz bound decides."""
     legs = _searchable_legs(plan)
-    try:
-        weights = np.broadcast_to(np.asarray(lipschitz, dtype=float), (order + 1, plan.naxes))[:, :, None]
-    except ValueError:
-        shape = f"({order + 1}, {plan.naxes})"
-        raise ValueError(f"lipschitz must broadcast to shape {shape}, got shape {np.shape(lipschitz)}") from None
-    if not (np.isfinite(weights).all() and np.all(weights >= 0.0)):
-        raise ValueError(f"lipschitz must be finite and at least 0, got {lipschitz!r}")
+    weights = _weights(lipschitz, order + 1, plan.naxes)
     if not rtol > 0.0:
         raise ValueError(f"rtol must be above 0, got {rtol}")
-
-    def evaluated(jet: Array) -> Array:
-        values = np.asarray(function(jet), dtype=float)
-        if values.shape != jet.shape[2:]:
-            raise ValueError(f"function must return one value a time, shape {jet.shape[2:]}, got {values.shape}")
-        if not np.isfinite(values).all():
-            raise ValueError("function must be finite over the plan, got nan or inf")
-        return values
-
     first, second = (np.stack([plan.peak(k + nu) for k in range(order + 1)])[:, :, None] for nu in (1, 2))
     found, lower, upper = _Candidates(), np.inf, -np.inf
     least, greatest = np.inf, -np.inf
     for leg, (_, duration) in enumerate(legs):
         s = np.linspace(0.0, duration, 129)
-        values = evaluated(plan.segment_jet(leg, s, order))
+        values = _evaluated(function, plan.segment_jet(leg, s, order))
         found.add(_placed(plan, leg, s)[0], values[None])
         least, greatest = min(least, float(values.min())), max(greatest, float(values.max()))
     for leg, (_, duration) in enumerate(legs):
@@ -324,7 +309,7 @@ def certified_bounds(
             if spent > max_cells:
                 raise ValueError(f"rtol = {rtol:g} must be reached within {max_cells} cells; raise either of them")
             jet = plan.segment_jet(leg, centres, order + 1)
-            values = evaluated(jet[:-1])
+            values = _evaluated(function, jet[:-1])
             # In its cell a derivative moves by no more than the next one's value at the centre and slope allow.
             slope = np.minimum(first, np.abs(jet[1:]) + radius * second)
             reach = radius * np.sum(weights * slope, axis=(0, 1))
@@ -347,6 +332,28 @@ def certified_bounds(
         upper + rounding,
         *(float(v[0]) for v in (best.minimum, best.maximum, best.time_min, best.time_max)),
     )
+
+
+def _weights(lipschitz: ArrayLike, norders: int, naxes: int) -> Array:
+    """Lipschitz constants (norders, naxes, 1) by derivative and axis."""
+    try:
+        weights = np.broadcast_to(np.asarray(lipschitz, dtype=float), (norders, naxes))[:, :, None]
+    except ValueError:
+        shape = f"({norders}, {naxes})"
+        raise ValueError(f"lipschitz must broadcast to shape {shape}, got shape {np.shape(lipschitz)}") from None
+    if not (np.isfinite(weights).all() and np.all(weights >= 0.0)):
+        raise ValueError(f"lipschitz must be finite and at least 0, got {lipschitz!r}")
+    return weights
+
+
+def _evaluated(function: Callable[[Array], Array], jet: Array) -> Array:
+    """Values (ntime,) of a function of the jet."""
+    values = np.asarray(function(jet), dtype=float)
+    if values.shape != jet.shape[2:]:
+        raise ValueError(f"function must return one value a time, shape {jet.shape[2:]}, got {values.shape}")
+    if not np.isfinite(values).all():
+        raise ValueError("function must be finite over the plan, got nan or inf")
+    return values
 
 
 _SHARES = readonly(np.append(points(_FIT, 0.0, 1.0), [0.0, 1.0]))
