@@ -10,6 +10,7 @@ from numbers import Real
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 from ctrlplan.planning.objectives import (
@@ -219,7 +220,7 @@ def _smoothest(
     search: Callable[[float], float],
     plan_of: Callable[[float], Trajectory],
     alphas: Array,
-    tied: Any,
+    tied: NDArray[np.intp],
     level: float,
 ) -> tuple[float, float]:
     """Of the alphas whose objective is at its least, that of the least integral of the squared jerk."""

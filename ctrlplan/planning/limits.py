@@ -382,11 +382,11 @@ class Limited:
 
     def margins(self, plan: Trajectory) -> Margins:
         """Margins over a whole plan."""
-        derived = [b for b in self.bounds if b.axis is not None]
-        extrema = {order: plan.extrema(order) for order in {b.order for b in derived}}
+        derived = [(b, b.axis) for b in self.bounds if b.axis is not None]
+        extrema = {order: plan.extrema(order) for order in {b.order for b, _ in derived}}
         rows = [
-            _margin(b, e.minimum[b.axis], e.maximum[b.axis], e.time_min[b.axis], e.time_max[b.axis])
-            for b in derived
+            _margin(b, e.minimum[axis], e.maximum[axis], e.time_min[axis], e.time_max[axis])
+            for b, axis in derived
             for e in [extrema[b.order]]
         ]
         others = [k for k, b in enumerate(self.bounds) if b.axis is None]
@@ -524,7 +524,7 @@ def _orders(quantities: Quantities, plan: Trajectory) -> dict[str, int]:
     return orders
 
 
-def _signal(name: str, values: Any, shape: tuple[int, ...]) -> Array:
+def _signal(name: str, values: Array, shape: tuple[int, ...]) -> Array:
     """Values of a quantity over time."""
     found = np.asarray(values, dtype=float)
     if found.shape != shape:
@@ -532,7 +532,7 @@ def _signal(name: str, values: Any, shape: tuple[int, ...]) -> Array:
     return found
 
 
-def _margin(bound: Bound, minimum: Any, maximum: Any, time_min: Any, time_max: Any) -> Margin:
+def _margin(bound: Bound, minimum: float, maximum: float, time_min: float, time_max: float) -> Margin:
     """The nearer of both sides."""
     low, high = ((side / bound.scale + bound.slack) for side in (minimum - bound.low, bound.high - maximum))
     value, time, fraction = (minimum, time_min, low) if low < high else (maximum, time_max, high)
