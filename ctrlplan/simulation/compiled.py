@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ctrlplan._lru import Lru
-from ctrlplan._types import Params, Value
+from ctrlplan._types import Array, Params, Value
 from ctrlplan.simulation.interpreted import SolverError
 from ctrlplan.simulation.network import Block, Network, Step, known_feedthrough
 from ctrlplan.simulation.scales import Scales, Tolerances
@@ -23,7 +23,6 @@ from ctrlplan.symbolic.comparison import Compared
 from ctrlplan.symbolic.switches import changes_of_side, switch_arguments
 from ctrlplan.symbolic.tracing import NotTraceableError, Trace, agrees
 
-Array = NDArray[np.float64]
 Stats = Mapping[str, float]
 """Statistics of an integrator, by name."""
 

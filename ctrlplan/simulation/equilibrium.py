@@ -12,14 +12,13 @@ from scipy.linalg import null_space
 from scipy.optimize import least_squares
 
 from ctrlplan._checks import real_array
-from ctrlplan._types import Params, System
+from ctrlplan._types import Array, Params, System
 from ctrlplan.simulation.interpreted import FeedthroughError, Interpreted
 from ctrlplan.simulation.linear import LinearForm, NotLinearError, in_right_half, linear_form
 from ctrlplan.simulation.prepared import Prepared, prepared_form
 from ctrlplan.simulation.signals import PlanSignal, TimeSignal, input_signals
 from ctrlplan.trajectories import Trajectory
 
-Array = NDArray[np.float64]
 Vector = Callable[[Array], Array]
 
 _AT_REST = 1e-9

@@ -12,9 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
-from ctrlplan._types import EventName
+from ctrlplan._types import Array, EventName
 
-Array = NDArray[np.float64]
 Signal = Callable[[Array, Array, Array, Array], Array]
 """(t, x, u, y) at many times, time last -> values (ntime,)."""
 Events: TypeAlias = Sequence["Event"] | None

@@ -29,9 +29,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import matrix_balance, pascal
 
+from ctrlplan._types import Array
 from ctrlplan.simulation.pairs import pair_product, pair_sum
-
-Array = NDArray[np.float64]
 
 _TERMS = 18
 """Taylor terms of the input in a cell."""

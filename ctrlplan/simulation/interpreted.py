@@ -15,7 +15,7 @@ import scipy
 from numpy.typing import NDArray
 from scipy.integrate import BDF, LSODA, RK45, OdeSolver
 
-from ctrlplan._types import BlockMap, Params
+from ctrlplan._types import Array, BlockMap, Params
 from ctrlplan.simulation.budget import check
 from ctrlplan.simulation.network import (
     Network,
@@ -29,8 +29,6 @@ from ctrlplan.simulation.signals import Series, within
 from ctrlplan.simulation.stalled import cause
 from ctrlplan.symbolic.isolation import untouched
 from ctrlplan.symbolic.trials import can_remember, trial_copy, values_of
-
-Array = NDArray[np.float64]
 
 Call = Callable[[float, Array, Array], None]
 """(t, state of the network, its signals): puts a block's outputs among the signals."""

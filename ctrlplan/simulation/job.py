@@ -7,9 +7,8 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ctrlplan._types import Params
+from ctrlplan._types import Array, Params
 from ctrlplan.simulation.events import Events, Snapshot, Watched, watched_events
 from ctrlplan.simulation.learned import NotCompiledError
 from ctrlplan.simulation.network import Network
@@ -17,8 +16,6 @@ from ctrlplan.simulation.prepared import Prepared
 from ctrlplan.simulation.signals import TimeSignal
 from ctrlplan.symbolic.trials import can_remember
 from ctrlplan.traits import BlockFunction
-
-Array = NDArray[np.float64]
 
 _EVENT_TIMES = 400, 20_000
 """Minimum and maximum number of times, in addition to the sample times, at which signals of events are evaluated."""

@@ -10,12 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctrlplan._checks import real_array
-from ctrlplan._types import System
+from ctrlplan._types import Array, System
 from ctrlplan.simulation.exact import largest_change, matrix_product, state_scale
 from ctrlplan.traits import traits_of
 from ctrlplan.trajectories import Trajectory
-
-Array = NDArray[np.float64]
 
 _TURNS, _GROWTH = 1e9, 20.0
 """Durations in units of the fastest pole, and of the fastest growth, up to which rounding stays below `_DOUBT`."""

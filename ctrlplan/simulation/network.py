@@ -22,13 +22,11 @@ from scipy.linalg import block_diag
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
-from ctrlplan._types import BlockMap, Params, System, Value
+from ctrlplan._types import Array, BlockMap, Params, System, Value
 from ctrlplan.symbolic.isolation import untouched
 from ctrlplan.symbolic.trials import can_remember, of_library, reads, trial_copy, values_of
 from ctrlplan.traits import BlockFunction, BlockTraits, traits_of
 from ctrlplan.trajectories import Trajectory
-
-Array = NDArray[np.float64]
 
 _TIME, _INPUT = 0, 2
 """Positions of time and input among the arguments (t, x, u, params) of a block's functions."""

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import trapezoid
 
+from ctrlplan._types import Array
 from ctrlplan.simulation.budget import TimeLimitError
 from ctrlplan.simulation.events import Snapshot, Watched
 from ctrlplan.simulation.interpreted import Interpreted, SolverError
@@ -21,8 +22,6 @@ from ctrlplan.simulation.scales import PASSES, Scales, Tolerances, doubt, effect
 from ctrlplan.simulation.segments import Run, Solver, integrate, known_before
 from ctrlplan.simulation.signals import TimeSignal, breakpoints_of, signal_values
 from ctrlplan.symbolic.isolation import untouched
-
-Array = NDArray[np.float64]
 
 VISITED = 12
 """Visited states at which equations must be defined; and of a comparison where evaluations were not counted."""

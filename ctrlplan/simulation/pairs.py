@@ -16,9 +16,9 @@ technique for extending the available precision, Numerische Mathematik 18
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from ctrlplan._types import Array
+
 Pair = tuple[Array, Array]
 
 

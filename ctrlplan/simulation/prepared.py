@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 
 import control as ct
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ctrlplan._lru import BUILDING, Lru
-from ctrlplan._types import Params, System, Value
+from ctrlplan._types import Array, Params, System, Value
 from ctrlplan.simulation.interpreted import Interpreted
 from ctrlplan.simulation.learned import BuiltForm, DisagreementError, Learned, NotCompiledError
 from ctrlplan.simulation.linear import LinearForm, NotLinearError, linear_form
@@ -27,8 +27,6 @@ from ctrlplan.traits import traits_of
 if TYPE_CHECKING:
     from ctrlplan.simulation.compiled import Compiled
     from ctrlplan.symbolic.tracing import Trace
-
-Array = NDArray[np.float64]
 
 _KEPT = 16
 """Systems that `simulate` keeps by itself."""

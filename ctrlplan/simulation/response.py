@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import control as ct
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ctrlplan._types import Array
 from ctrlplan.simulation.events import Occurrence
-
-Array = NDArray[np.float64]
 
 
 class SimulationResponse(ct.TimeResponseData):  # type: ignore[misc] # python-control has no types

@@ -23,7 +23,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from ctrlplan._types import Array
 
 RELATIVE = 1e-10
 """Absolute tolerance of a state in its own scale, unless a number is given."""

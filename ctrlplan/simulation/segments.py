@@ -13,6 +13,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from ctrlplan._types import Array
 from ctrlplan.simulation.budget import check
 from ctrlplan.simulation.interpreted import Interpreted, SolverError
 from ctrlplan.simulation.network import Network
@@ -25,8 +26,6 @@ from ctrlplan.simulation.signals import (
     chebyshev_times,
     resolved,
 )
-
-Array = NDArray[np.float64]
 
 _WIDTH = 24
 """Terms with which a signal that will be delayed is kept."""

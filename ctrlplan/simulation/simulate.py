@@ -11,11 +11,11 @@ from numbers import Real
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ctrlplan._checks import real_array
 from ctrlplan._renamed import outside_stacklevel
-from ctrlplan._types import System
+from ctrlplan._types import Array, System
 from ctrlplan.simulation import methods
 from ctrlplan.simulation.budget import begin_run
 from ctrlplan.simulation.events import Events, Occurrence, Watched, crossings
@@ -25,8 +25,6 @@ from ctrlplan.simulation.methods import Method
 from ctrlplan.simulation.prepared import Prepared, prepared_form
 from ctrlplan.simulation.response import SimulationResponse
 from ctrlplan.simulation.signals import Inputs, input_signals
-
-Array = NDArray[np.float64]
 
 MethodName = Literal["auto", "exact", "compiled", "python"]
 """Methods of the package, and the choice among them."""

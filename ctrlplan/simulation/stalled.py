@@ -5,14 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ctrlplan._types import Params
+from ctrlplan._types import Array, Params
 from ctrlplan.simulation.network import Block, Network
 from ctrlplan.symbolic.isolation import untouched
 from ctrlplan.symbolic.trials import can_remember, trial_copy, values_of
 
-Array = NDArray[np.float64]
 Values = Callable[[float, Array, Array], Array | None]
 """(t, state, input) of a block -> its outputs and rates; None outside of its domain."""
 

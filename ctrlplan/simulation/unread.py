@@ -6,9 +6,9 @@ from collections.abc import Callable, Iterator
 from functools import partial
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from ctrlplan._types import Params, System, Value
+from ctrlplan._types import Array, Params, System, Value
 from ctrlplan.simulation.interpreted import Interpreted
 from ctrlplan.simulation.network import Network
 from ctrlplan.symbolic.isolation import tried, untouched
@@ -16,8 +16,6 @@ from ctrlplan.symbolic.keeper import Keeper
 from ctrlplan.symbolic.references import References
 from ctrlplan.symbolic.trials import reads
 from ctrlplan.traits import traits_of
-
-Array = NDArray[np.float64]
 
 _PARAMS = 3
 """Position of the parameters among the arguments of a block's function."""

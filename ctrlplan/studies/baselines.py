@@ -7,8 +7,8 @@ from functools import reduce
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ctrlplan._types import Array
 from ctrlplan.planning import optimize_waypoints
 from ctrlplan.planning.limits import Limited
 from ctrlplan.trajectories import (
@@ -21,8 +21,6 @@ from ctrlplan.trajectories import (
     Trapezoid,
     Waypoint,
 )
-
-Array = NDArray[np.float64]
 
 _DEGREES = {1: "straight line", 3: "cubic", 5: "quintic", 7: "septic", 9: "nonic"}
 

@@ -7,9 +7,10 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ctrlplan._checks import real_array
+from ctrlplan._types import Array
 from ctrlplan.planning.limits import Limited
 from ctrlplan.planning.quantities import System as Quantified
 from ctrlplan.simulation import state_space
@@ -22,8 +23,6 @@ from ctrlplan.studies.needs import Need, need_of, sentence_of
 from ctrlplan.studies.roles import Role, role_of
 from ctrlplan.studies.running import Builder, System, is_builder
 from ctrlplan.trajectories import PolySpline, Shaper, Trajectory, TrigSpline, Waypoint
-
-Array = NDArray[np.float64]
 
 ALPHAS = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0)
 FACTORS = (0.75, 1.0, 1.5, 2.0)

@@ -6,16 +6,14 @@ from typing import TypedDict
 
 import control as ct
 import numpy as np
-from numpy.typing import NDArray
 
 from ctrlplan import metrics
+from ctrlplan._types import Array
 from ctrlplan.simulation import Event
 from ctrlplan.studies.comparison import Comparison
 from ctrlplan.studies.measures import Measure, signals_of
 from ctrlplan.systems.plants import Crane
 from ctrlplan.trajectories import Trajectory, Waypoint
-
-Array = NDArray[np.float64]
 
 CRANE = Crane()
 

@@ -8,10 +8,10 @@ from dataclasses import KW_ONLY, dataclass, field
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ctrlplan._checks import real_array
-from ctrlplan._types import Params
+from ctrlplan._types import Array, Params
 from ctrlplan.simulation import Event
 from ctrlplan.studies.alike import Linear, numbers_of, outputs_together
 from ctrlplan.studies.measures import (
@@ -29,7 +29,6 @@ from ctrlplan.studies.plans import references_of, waypoints_given
 from ctrlplan.studies.running import Builder, System, check_has_inputs, is_builder, run_plan
 from ctrlplan.trajectories import Trajectory, Waypoint
 
-Array = NDArray[np.float64]
 Metrics = dict[str, dict[str, float]]
 """Plan, metric, value."""
 

@@ -6,11 +6,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ctrlplan._types import Array
 from ctrlplan.studies.units import ROUNDING
-
-Array = NDArray[np.float64]
 
 SAME = 1e-3
 """Relative difference up to which values count as equal."""

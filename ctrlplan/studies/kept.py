@@ -8,10 +8,9 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from ctrlplan._types import Array
 from ctrlplan.studies.ensemble import LEVELS, Failure
 from ctrlplan.studies.executing import Failed
-
-Array = NDArray[np.float64]
 
 _SAMPLES = 1001
 """Times at which bands are kept, at most."""

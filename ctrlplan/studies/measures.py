@@ -12,11 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctrlplan import metrics
+from ctrlplan._types import Array
 from ctrlplan.planning import SquaredDerivative
 from ctrlplan.simulation import Occurrence, Prepared, SimulationResponse
 from ctrlplan.trajectories import Trajectory, Waypoint
-
-Array = NDArray[np.float64]
 
 Kind = Literal["", "response", "control", "path", "run"]
 """What a measure is of."""

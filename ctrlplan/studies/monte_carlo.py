@@ -11,11 +11,11 @@ from functools import partial
 from typing import Protocol, TypeAlias, TypeGuard
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ctrlplan._checks import real_array
 from ctrlplan._renamed import outside_stacklevel
-from ctrlplan._types import Params
+from ctrlplan._types import Array, Params
 from ctrlplan.simulation import Event, Prepared, SolverError, prepare
 from ctrlplan.simulation.learned import NotCompiledError
 from ctrlplan.simulation.methods.delegated import DELEGATED
@@ -37,7 +37,6 @@ from ctrlplan.studies.measures import Measure, shown_measures
 from ctrlplan.studies.running import Builder, System, check_has_inputs, is_builder
 from ctrlplan.trajectories import Trajectory, Waypoint
 
-Array = NDArray[np.float64]
 Forms: TypeAlias = Mapping[str, System]
 """The loop of each plan."""
 

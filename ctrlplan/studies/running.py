@@ -11,13 +11,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ctrlplan._renamed import outside_stacklevel
-from ctrlplan._types import Params
+from ctrlplan._types import Array, Params
 from ctrlplan.simulation import Event, Prepared, prepared_form, rest_at, simulate, state_space, unstable_poles
 from ctrlplan.studies.connections import check_reached
 from ctrlplan.studies.measures import Run, checked_names
 from ctrlplan.trajectories import Trajectory
 
-Array = NDArray[np.float64]
 System: TypeAlias = "ct.InputOutputSystem | Prepared"
 """A loop."""
 Builder: TypeAlias = Callable[[str, Trajectory], System]

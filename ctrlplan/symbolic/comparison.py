@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctrlplan._lru import BUILDING
-
-Array = NDArray[np.float64]
+from ctrlplan._types import Array
 
 _FEW = 4
 """Changes of each switch that come before the peaks of the signals."""

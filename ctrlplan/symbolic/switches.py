@@ -6,9 +6,8 @@ from collections.abc import Callable
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from ctrlplan._types import Array
 
 _GRID, _FINEST, _MOST = 4096, 2**17, 20_000
 """Intervals of the grid on which changes are looked for at first and at last, and changes at most."""

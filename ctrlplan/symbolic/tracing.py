@@ -14,14 +14,13 @@ import control as ct
 import numpy as np
 from numpy.typing import NDArray
 
-from ctrlplan._types import BlockMap, Params, Value
+from ctrlplan._types import Array, BlockMap, Params, Value
 from ctrlplan.symbolic.fingerprint import roots_of
 from ctrlplan.symbolic.isolation import same_answer, tried, untouched
 from ctrlplan.symbolic.keeper import Keeper
 from ctrlplan.symbolic.references import References
 from ctrlplan.symbolic.symbols import Symbol, column_of, symbol_array
 
-Array = NDArray[np.float64]
 Point = tuple[float, Array, Array, Params]
 """Time, state and input of a block, and parameters."""
 Answer = tuple[Array, Array]

@@ -24,13 +24,11 @@ from types import BuiltinFunctionType, CellType, CodeType, FunctionType, MethodT
 
 import control as ct
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from ctrlplan._types import System, Value
+from ctrlplan._types import Array, System, Value
 from ctrlplan.symbolic.isolation import tried
 from ctrlplan.traits import declare, traits_of
-
-Array = NDArray[np.float64]
 
 _DEPTH = 6
 """Functions that call functions are copied so many levels deep."""

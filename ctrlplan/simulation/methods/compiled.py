@@ -7,8 +7,8 @@ from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ctrlplan._types import Array
 from ctrlplan.simulation.interpreted import SolverError
 from ctrlplan.simulation.job import Job, Record, unused
 from ctrlplan.simulation.learned import DisagreementError
@@ -21,8 +21,6 @@ from ctrlplan.symbolic.comparison import telling_states
 
 if TYPE_CHECKING:
     from ctrlplan.simulation.compiled import CompiledSolver
-
-Array = NDArray[np.float64]
 
 _SHARE = 5
 """A compiled form is compared with Python at states a fifth as many as the run's evaluations of its equations."""

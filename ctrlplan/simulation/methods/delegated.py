@@ -7,16 +7,14 @@ import warnings
 
 import control as ct
 import numpy as np
-from numpy.typing import NDArray
 
 from ctrlplan._renamed import outside_stacklevel
+from ctrlplan._types import Array
 from ctrlplan.simulation.events import Snapshot
 from ctrlplan.simulation.job import Job, Record
 from ctrlplan.simulation.prepared import Prepared
 from ctrlplan.simulation.scales import RELATIVE
 from ctrlplan.simulation.signals import signal_values
-
-Array = NDArray[np.float64]
 
 DELEGATED = threading.RLock()
 """One run by python-control at a time: it keeps the parameters of a run in the system."""

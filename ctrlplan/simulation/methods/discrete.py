@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ctrlplan._types import Array
 from ctrlplan.simulation.budget import check
 from ctrlplan.simulation.events import Snapshot
 from ctrlplan.simulation.interpreted import Interpreted
 from ctrlplan.simulation.job import Job, Record
 from ctrlplan.simulation.prepared import Prepared
 from ctrlplan.simulation.signals import breakpoints_of, signal_values
-
-Array = NDArray[np.float64]
 
 _MOST_STEPS = 1e8
 """Maximum number of steps of a discrete system in a run."""
