@@ -6,17 +6,15 @@ import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ctrlplan._checks import Range, checked_finite, checked_limits
-from ctrlplan._types import Frozen, Params, System
+from ctrlplan._types import Array, Frozen, Params, System
 from ctrlplan.simulation import methods
 from ctrlplan.simulation.interpreted import LoopError, SolverError
 from ctrlplan.simulation.learned import NotApplicableError
 from ctrlplan.simulation.prepared import Prepared, prepare
 from ctrlplan.simulation.simulate import checked_job, response_to
-
-Array = NDArray[np.float64]
 
 _TOLERANCES = 1e-6, 1e-8
 """Of the solver: a prediction is not worth more than its margin."""

@@ -15,13 +15,12 @@ from functools import lru_cache
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ctrlplan._checks import real_array
+from ctrlplan._types import Array
 from ctrlplan.trajectories import Step, Trajectory, chebyshev
 from ctrlplan.trajectories.files import signal_rows
-
-Array = NDArray[np.float64]
 
 Inputs = Trajectory | ArrayLike | Mapping[str, Trajectory | ArrayLike] | None
 

@@ -9,13 +9,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ctrlplan._checks import real_array
+from ctrlplan._types import Array
 from ctrlplan.simulation import rest_state, state_space, stated_start
 from ctrlplan.simulation.exact import exact_states
 from ctrlplan.simulation.linear import LinearForm, in_right_half, linear_form
 from ctrlplan.studies.running import System, acting_outputs, tracked_outputs
 from ctrlplan.trajectories import Trajectory
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

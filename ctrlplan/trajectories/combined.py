@@ -10,6 +10,7 @@ from typing import Any, Self
 import numpy as np
 
 from ctrlplan._checks import checked_finite, checked_labels, default_labels
+from ctrlplan._types import Data, Value
 from ctrlplan.trajectories.common import Array, readonly
 from ctrlplan.trajectories.files import trajectory_from_dict
 from ctrlplan.trajectories.trajectory import Trajectory
@@ -22,7 +23,7 @@ class _Combined(Trajectory):
     initial: Array
     final: Array
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> Data:
         """Plain data that `trajectory_from_dict` reads."""
         return {
             "type": type(self).__name__,
@@ -31,7 +32,7 @@ class _Combined(Trajectory):
         }
 
     @classmethod
-    def from_dict(cls, data: dict[str, Any]) -> Self:
+    def from_dict(cls, data: Data) -> Self:
         """Trajectory from the plain data of `to_dict`."""
         parts = _checked_parts(trajectory_from_dict(part) for part in data["parts"])
         return cls._of(parts, tuple(data["labels"]))
@@ -79,11 +80,11 @@ class _Combined(Trajectory):
         moment = 0.5 * (origin + end)
         return self._combine([part.segment_jet_at(moment, origin, s, order) for part in self.parts])
 
-    def segment_series(self, segment: int, s: Any, order: int) -> list[list[Any]]:
+    def segment_series(self, segment: int, s: Value, order: int) -> list[list[Value]]:
         """Taylor series of a segment; as `Trajectory.segment_series`."""
         origin, end = self.breakpoints[segment : segment + 2].tolist()
         rows = [part.segment_series_at(0.5 * (origin + end), origin, s, order) for part in self.parts]
-        found: list[list[Any]] = self._combine([_objects(row) for row in rows]).T.tolist()
+        found: list[list[Value]] = self._combine([_objects(row) for row in rows]).T.tolist()
         return found
 
 
@@ -114,12 +115,12 @@ class Sum(_Combined):
         self._set_fields(shaped=shaped)
         self._set(terms, terms[0].labels)
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> Data:
         """Plain data that `trajectory_from_dict` reads."""
         return super().to_dict() | ({"shaped": True} if self.shaped else {})
 
     @classmethod
-    def from_dict(cls, data: dict[str, Any]) -> Self:
+    def from_dict(cls, data: Data) -> Self:
         """Trajectory from the plain data of `to_dict`."""
         return super().from_dict(data)._with_fields(shaped=bool(data.get("shaped", False)))
 
@@ -192,12 +193,12 @@ class Scaled(_Combined):
         self._set_fields(factor=checked_finite(factor, "factor"))
         self._set(_checked_parts([part]), part.labels)
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> Data:
         """Plain data that `trajectory_from_dict` reads."""
         return super().to_dict() | {"factor": self.factor}
 
     @classmethod
-    def from_dict(cls, data: dict[str, Any]) -> Self:
+    def from_dict(cls, data: Data) -> Self:
         """Trajectory from the plain data of `to_dict`."""
         return cls(trajectory_from_dict(data["parts"][0]), data["factor"])
 
@@ -267,13 +268,13 @@ class Joined(Trajectory):
             _segments=segments,
         )
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> Data:
         """Plain data that `trajectory_from_dict` reads."""
         parts = [part.to_dict() for part in self.parts]
         return {"type": "Joined", "parts": parts, "labels": list(self.labels)}
 
     @classmethod
-    def from_dict(cls, data: dict[str, Any]) -> Self:
+    def from_dict(cls, data: Data) -> Self:
         """Trajectory from the plain data of `to_dict`."""
         parts = _checked_parts(trajectory_from_dict(part) for part in data["parts"])
         for before, after in pairwise(_same_axes(parts)):
@@ -295,7 +296,7 @@ class Joined(Trajectory):
         part, own = self._segments[segment]
         return part.segment_jet(own, s, order)
 
-    def segment_series(self, segment: int, s: Any, order: int) -> list[list[Any]]:
+    def segment_series(self, segment: int, s: Value, order: int) -> list[list[Value]]:
         """Taylor series of a segment; as `Trajectory.segment_series`."""
         part, own = self._segments[segment]
         return part.segment_series(own, s, order)
@@ -334,7 +335,7 @@ def stack(plans: Iterable[Trajectory], labels: Sequence[str] | None = None) -> T
     return Stacked(plans, labels)
 
 
-def _objects(rows: list[list[Any]]) -> Any:
+def _objects(rows: list[list[Value]]) -> Any:
     """Table (order + 1, naxes) of numbers or symbols."""
     table = np.empty((len(rows[0]), len(rows)), dtype=object)
     for axis, row in enumerate(rows):

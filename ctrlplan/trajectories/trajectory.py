@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ctrlplan._checks import checked_count, checked_finite, checked_number, checked_timepts, one_number
 from ctrlplan._renamed import warn_renamed
+from ctrlplan._types import Data, Value
 from ctrlplan.trajectories import extrema as _extrema
 from ctrlplan.trajectories import sampling as _sampling
 from ctrlplan.trajectories.common import FACTORIALS, Array, readonly
@@ -149,15 +150,15 @@ class Trajectory(Fields, ABC):
         """
 
     @abstractmethod
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> Data:
         """Plain data (numbers, strings, lists, dicts) for `from_dict`; "type" is the name of the class."""
 
     @classmethod
     @abstractmethod
-    def from_dict(cls, data: dict[str, Any]) -> Trajectory:
+    def from_dict(cls, data: Data) -> Trajectory:
         """Trajectory from the plain data of `to_dict`, with equal values to every bit."""
 
-    def segment_series(self, segment: int, s: Any, order: int) -> list[list[Any]]:
+    def segment_series(self, segment: int, s: Value, order: int) -> list[list[Value]]:
         """Taylor series of a segment at a symbol of CasADi.
 
         Parameters
@@ -300,7 +301,7 @@ class Trajectory(Fields, ABC):
         values = self._sample(times.ravel(), 0, highest, left)
         return values.reshape(highest + 1, self.naxes, *times.shape)
 
-    def series(self, t: Any, order: int) -> list[list[Any]]:
+    def series(self, t: Value, order: int) -> list[list[Value]]:
         """Taylor series about one time, which may be a symbol of a tracer (CasADi's).
 
         Parameters
@@ -692,7 +693,7 @@ class Trajectory(Fields, ABC):
         held[0] = (self.initial if segment < 0 else self.final)[:, None]
         return held
 
-    def segment_series_at(self, moment: float, origin: float, s: Any, order: int) -> list[list[Any]]:
+    def segment_series_at(self, moment: float, origin: float, s: Value, order: int) -> list[list[Value]]:
         """As `segment_jet_at`, the Taylor coefficients of each axis at one number or symbol s."""
         segment = int(np.searchsorted(self.breakpoints, moment)) - 1
         if 0 <= segment < self.breakpoints.size - 1:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ctrlplan._checks import checked_finite, new_numbers
+from ctrlplan._types import Data
 from ctrlplan.trajectories.common import Array, readonly, times_powers
 from ctrlplan.trajectories.fields import Fields
 
@@ -177,16 +177,16 @@ class Waypoint(Fields):
         """Same point with what it prescribes up to an order, and the rest left free."""
         return Waypoint.from_array(self.time, self.jet[: order + 1], self.labels)
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> Data:
         """Plain data: time, jet by order then axis (None where free)."""
         jet = [[None if v != v else v for v in row] for row in self.jet.tolist()]
-        data: dict[str, Any] = {"time": self.time, "jet": jet}
+        data: Data = {"time": self.time, "jet": jet}
         if self.labels is not None:
             data["labels"] = list(self.labels)
         return data
 
     @classmethod
-    def from_dict(cls, data: dict[str, Any]) -> Waypoint:
+    def from_dict(cls, data: Data) -> Waypoint:
         """Waypoint from the plain data of `to_dict`."""
         labels = tuple(data["labels"]) if "labels" in data else None
         rows = [[np.nan if v is None else v for v in row] for row in data["jet"]]

@@ -5,17 +5,15 @@ from __future__ import annotations
 import warnings
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ctrlplan._renamed import outside_stacklevel
+from ctrlplan._types import Array
 from ctrlplan.simulation.events import Snapshot
 from ctrlplan.simulation.exact import exact_states, sampled_states
 from ctrlplan.simulation.job import Job, Record, with_event_times
 from ctrlplan.simulation.linear import LinearForm
 from ctrlplan.simulation.prepared import Prepared
 from ctrlplan.simulation.signals import PlanSignal, SampledSignal, signal_values
-
-Array = NDArray[np.float64]
 
 _UNCERTAIN = 1e-6
 """Part of an output's size from which on its uncertainty is reported."""
