@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import control as ct
 import numpy as np
@@ -138,12 +138,7 @@ def create_time_scaling_iosystem(
     >>> bool(abs(found.outputs[0, -1] - 1.0) < 1e-3)
     True
     """
-    check_kind(plan, "plan", Trajectory)
-    if is_shaped(plan):
-        raise ValueError(
-            f"a shaped plan must keep its duration of {plan.duration:g} s, got a clock that slows: the delays of the "
-            "shaper would change with it; take the plan before it is shaped"
-        )
+    _check_plan(plan)
     highest = checked_count(derivatives, "derivatives")
     for label, value in (("limits", limits), ("errors", errors)):
         if value is not None:
@@ -157,19 +152,8 @@ def create_time_scaling_iosystem(
     inputs = [*bounds, *bands]
     outputs = signal_names(axis_signals(plan, labels, suffix), highest)
     _check_signals(inputs, outputs)
-    axes = [own.index(label) for label in bands]
+    severity = _severity(plan, [*bounds.values()], [(own.index(label), band) for label, band in bands.items()])
     weights = _rate_weights(n, w)
-
-    def severity(t: Value, x: Value, u: Value) -> Value:
-        found = [_nearness(u[k], *bound) for k, bound in enumerate(bounds.values())]
-        if bands:
-            reference = _series(plan, t - x[0], 0)
-            for k, (axis, (soft, hard)) in enumerate(zip(axes, bands.values(), strict=True), len(bounds)):
-                found.append((np.fabs(u[k] - reference[axis][0]) - soft) / (hard - soft))
-        worst = found[0]
-        for value in found[1:]:
-            worst = np.fmax(worst, value)
-        return np.fmin(np.fmax(worst, 0.0), 1.0)
 
     def update(t: Value, x: Value, u: Value, params: Params) -> Array:
         free = np.fmin(np.fmax(1.0 + x[0] / horizon, least), most)
@@ -196,6 +180,38 @@ def create_time_scaling_iosystem(
     )
     # Once behind, the plan moves out of rest at times that no breakpoint names.
     return declare(block, feedthrough=False, breakpoints=plan.breakpoints, longest=0.5 * _shortest_move(plan))
+
+
+def _check_plan(plan: Trajectory) -> None:
+    check_kind(plan, "plan", Trajectory)
+    if is_shaped(plan):
+        raise ValueError(
+            f"a shaped plan must keep its duration of {plan.duration:g} s, got a clock that slows: the delays of the "
+            "shaper would change with it; take the plan before it is shaped"
+        )
+
+
+def _severity(
+    plan: Trajectory, bounds: list[tuple[float, float, float]], bands: list[tuple[int, tuple[float, float]]]
+) -> Callable[[Value, Value, Value], Value]:
+    """Function of (t, x, u): 0 where no signal is near its limits, 1 where one is at its limit.
+
+    The inputs are the signals of `bounds`, then those of `bands`, each the axis
+    of the plan with the errors between which the rate falls.
+    """
+
+    def severity(t: Value, x: Value, u: Value) -> Value:
+        found = [_nearness(u[k], *bound) for k, bound in enumerate(bounds)]
+        if bands:
+            reference = _series(plan, t - x[0], 0)
+            for k, (axis, (soft, hard)) in enumerate(bands, len(bounds)):
+                found.append((np.fabs(u[k] - reference[axis][0]) - soft) / (hard - soft))
+        worst = found[0]
+        for value in found[1:]:
+            worst = np.fmax(worst, value)
+        return np.fmin(np.fmax(worst, 0.0), 1.0)
+
+    return severity
 
 
 def _checked_times(plan: Trajectory, n: int, bandwidth: float | None, catch_up: float | None) -> tuple[float, float]:
