@@ -1,18 +1,50 @@
 """Tables, figures and pages: where results are shown."""
 
-from ctrlplan.reports.figures import FIGURES, plot_plane, plot_plans, plot_responses, plot_sweep, plot_trajectory
+from ctrlplan.reports.crane_figures import plot_motion, plot_online, plot_paths, plot_sketch, plot_step, plot_time
+from ctrlplan.reports.figures import (
+    plot_bands,
+    plot_blocks,
+    plot_curves,
+    plot_plane,
+    plot_plans,
+    plot_responses,
+    plot_sweep,
+    plot_trajectory,
+)
 from ctrlplan.reports.page import CraneAnimation, comparison_fragment, render_page, write_all, write_page, write_report
+from ctrlplan.reports.parts import Cell, Head, Items, MetricsTable, Part, Picture, Svg, Table, Text
+from ctrlplan.reports.planning_figures import plot_rivals
+from ctrlplan.reports.sections import draw
 from ctrlplan.reports.words import Verdict, summary, verdicts
 
 __all__ = [
-    "FIGURES",
+    "Cell",
     "CraneAnimation",
+    "Head",
+    "Items",
+    "MetricsTable",
+    "Part",
+    "Picture",
+    "Svg",
+    "Table",
+    "Text",
     "Verdict",
     "comparison_fragment",
+    "draw",
+    "plot_bands",
+    "plot_blocks",
+    "plot_curves",
+    "plot_motion",
+    "plot_online",
+    "plot_paths",
     "plot_plane",
     "plot_plans",
     "plot_responses",
+    "plot_rivals",
+    "plot_sketch",
+    "plot_step",
     "plot_sweep",
+    "plot_time",
     "plot_trajectory",
     "render_page",
     "summary",

@@ -1,4 +1,4 @@
-"""Figures of the crane: the paper's 2 to 6, its motion, and an animation that plays offline."""
+"""Figures of cranes: sketch, signals, paths, motion, and an animation that plays offline."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from control import ControlPlot
 from jinja2.utils import htmlsafe_json_dumps
 from markupsafe import Markup
 from matplotlib.axes import Axes
-from matplotlib.patches import Arc, Circle, FancyArrowPatch, FancyBboxPatch, Rectangle
+from matplotlib.patches import Arc, Circle, FancyArrowPatch, Rectangle
 from numpy.typing import NDArray
 
 from ctrlplan.reports.style import (
@@ -18,29 +18,25 @@ from ctrlplan.reports.style import (
     Drawing,
     add_title,
     as_text,
-    axis_styles,
     font_size,
     label_y,
-    legend_label,
     line_width,
     marker_size,
     plan_styles,
+    roles_of,
     shade,
 )
 from ctrlplan.studies.comparison import Comparison
-from ctrlplan.studies.crane_setup import CRANE, nominal_waypoints
 from ctrlplan.studies.measures import signals_of
-from ctrlplan.studies.study import Study
-from ctrlplan.systems.plants import crane_loop
-from ctrlplan.trajectories import PolySpline
+from ctrlplan.studies.roles import Role
+from ctrlplan.studies.sections import AnimatedCrane, Wall
+from ctrlplan.trajectories import TrigSpline
 
 Array = NDArray[np.float64]
 
-Wall = tuple[tuple[float, float], tuple[float, float]] | None
-
 
 def plot_sketch(*, ax: AxesLike | None = None) -> ControlPlot:
-    """Figure 2: the crane and its variables.
+    """A crane and its variables.
 
     Parameters
     ----------
@@ -93,68 +89,8 @@ def plot_sketch(*, ax: AxesLike | None = None) -> ControlPlot:
     return drawing.finish(legend=False)
 
 
-def plot_blocks(*, ax: AxesLike | None = None) -> ControlPlot:
-    """Figure 3: the controller, drawn from the blocks and connections of the model itself.
-
-    Parameters
-    ----------
-    ax : Axes, optional
-        Where to draw; None: an empty current figure, or a new one.
-
-    Returns
-    -------
-    control.ControlPlot
-        Of shape (1, 1).
-    """
-    loop = crane_loop(CRANE, PolySpline(nominal_waypoints()))
-    names = [block.name for block in loop.syslist]
-    place = {
-        names[0]: (0.0, 0.0),
-        names[1]: (2.6, 0.0),
-        names[2]: (5.2, 0.8),
-        names[3]: (5.2, -0.8),
-        names[4]: (7.8, 0.0),
-    }
-    titles = {"plan": "path generator", "generator": "flat law (15a,b)", "trolley_pid": "PID", "hoist_pid": "PID"}
-    joined: dict[tuple[str, str], list[str]] = {}
-    into = [(block, label) for block in loop.syslist for label in block.input_labels]
-    out = [(block, label) for block in loop.syslist for label in block.output_labels]
-    for row, column in np.argwhere(np.asarray(loop.connect_map) != 0.0):
-        source, signal = out[column]
-        joined.setdefault((source.name, into[row][0].name), []).append(signal)
-    drawing = Drawing(ax, (1, 1), (8.4, 3.2))
-    (axes,) = drawing.column
-    edge = shade(0.8)
-    axes.axis("off")
-    for name, (x, y) in place.items():
-        box = FancyBboxPatch((x - 0.75, y - 0.35), 1.5, 0.7, boxstyle="round,pad=0.02", fc=shade(0.045), ec=edge)
-        axes.add_patch(box)
-        axes.text(x, y, titles.get(name, name), ha="center", va="center", fontsize=font_size(9))
-    for (source, sink), signals in joined.items():
-        (x0, y0), (x1, y1) = place[source], place[sink]
-        text = ", ".join(signals) if len(signals) < 3 else f"{signals[0]} … {signals[-1]}"
-        if x1 > x0:
-            start, end, style = (
-                (x0 + 0.78, y0 + 0.15 * np.sign(y1 - y0)),
-                (x1 - 0.78, y1 + 0.15 * np.sign(y0 - y1)),
-                "arc3",
-            )
-            at = (0.5 * (start[0] + end[0]), 0.5 * (start[1] + end[1]) + 0.14)
-        else:  # what is measured comes back around the drives
-            side = 1.0 if y1 > 0.0 else -1.0
-            start, end, style = (x0, y0 + 0.38 * side), (x1, y1 + 0.38 * side), f"arc3,rad={0.5 * side}"
-            at = (0.5 * (x0 + x1), y1 + 0.98 * side)
-        axes.add_patch(
-            FancyArrowPatch(start, end, arrowstyle="-|>", mutation_scale=11, color=edge, connectionstyle=style)
-        )
-        axes.text(*at, text, ha="center", va="center", fontsize=font_size(8), color="#0072B2")
-    axes.set_xlim(-0.9, 8.7)
-    axes.set_ylim(-2.1, 2.1)
-    return drawing.finish(legend=False)
-
-
 def plot_time(comparison: Comparison, *, ax: AxesLike | None = None) -> ControlPlot:
-    """Load, error, sway and controls over time, as the paper's figures 4 and 5 lay them out.
+    """Load, error, sway and controls over time.
 
     Parameters
     ----------
@@ -173,7 +109,7 @@ def plot_time(comparison: Comparison, *, ax: AxesLike | None = None) -> ControlP
     labels = ("x [m]", "z [m]", "error [mm]", "sway [rad]", "F [kN]", "C [kN m]")
     drawing = Drawing(ax, (6, 1), (7.4, 9.4), rows=labels)
     rows = drawing.column
-    styles = plan_styles(comparison.plans, rows[0])
+    styles = plan_styles(comparison, rows[0])
     for name in names:
         signals = _signals(comparison, name)
         t = signals["t"]
@@ -221,7 +157,7 @@ def plot_step(comparison: Comparison, *, ax: AxesLike | None = None) -> ControlP
     signals = _signals(comparison, name)
     drawing = Drawing(ax, (4, 1), (7.0, 6.4), rows=("F", "C", "T", "sway"))
     rows = drawing.column
-    style = plan_styles(comparison.plans, rows[0])[name]
+    style = plan_styles(comparison, rows[0])[name]
     t, colour = signals["t"], style["color"]
     limits = comparison.limits.get(name, {}) | {"T": (0.0, np.inf)}
     drawn = "limit"
@@ -239,8 +175,8 @@ def plot_step(comparison: Comparison, *, ax: AxesLike | None = None) -> ControlP
     return drawing.finish()
 
 
-def plot_plane(comparison: Comparison, wall: Wall, *, ax: AxesLike | None = None) -> ControlPlot:
-    """Paths of the load in the plane, z down, with the obstacle (figure 6).
+def plot_paths(comparison: Comparison, wall: Wall = None, *, ax: AxesLike | None = None) -> ControlPlot:
+    """Paths of the load in the plane, z down, with the obstacle.
 
     Parameters
     ----------
@@ -258,7 +194,7 @@ def plot_plane(comparison: Comparison, wall: Wall, *, ax: AxesLike | None = None
     """
     drawing = Drawing(ax, (1, 1), (7.4, 4.6))
     (axes,) = drawing.column
-    styles = plan_styles(comparison.plans, axes)
+    styles = plan_styles(comparison, axes)
     if wall:
         (left, right), (top, ground) = wall
         axes.add_patch(Rectangle((left, top), right - left, ground - top, color=shade(0.267), zorder=0))
@@ -279,8 +215,10 @@ def plot_plane(comparison: Comparison, wall: Wall, *, ax: AxesLike | None = None
     return drawing.finish()
 
 
-def plot_motion(comparison: Comparison, wall: Wall, steps: int = 13, *, ax: AxesLike | None = None) -> ControlPlot:
-    """Trolley, rope and load at equal time steps along each plan.
+def plot_motion(
+    comparison: Comparison, wall: Wall = None, steps: int = 13, *, ax: AxesLike | None = None
+) -> ControlPlot:
+    """Trolley, rope and load at equal time steps, for the first two plans without jumps.
 
     Parameters
     ----------
@@ -299,8 +237,7 @@ def plot_motion(comparison: Comparison, wall: Wall, steps: int = 13, *, ax: Axes
     control.ControlPlot
         Of shape (nplans, 1).
     """
-    known = [n for n in ("polynomial", "trigonometric") if n in comparison.plans]
-    names = known or (_moving(comparison) or list(comparison.plans))[:2]
+    names = (_moving(comparison) or list(comparison.plans))[:2]
     drawing = Drawing(ax, (len(names), 1), (7.4, 3.4 * len(names)), rows=names)
     first, last = _ends(comparison)
     for name, axes in zip(names, drawing.column, strict=True):
@@ -309,7 +246,7 @@ def plot_motion(comparison: Comparison, wall: Wall, steps: int = 13, *, ax: Axes
             (left, right), (top, ground) = wall
             axes.add_patch(Rectangle((left, top), right - left, ground - top, color=shade(0.2), zorder=0))
         axes.axhline(0.0, color=shade(0.4), linewidth=line_width(1.25))
-        colour = plan_styles(comparison.plans, axes)[name]["color"]
+        colour = plan_styles(comparison, axes)[name]["color"]
         axes.plot(signals["x"], signals["z"], color=colour, linewidth=line_width(0.5))
         end = min(last, float(signals["t"][-1]))  # an event can have ended the run
         for t in np.linspace(first, end, steps):
@@ -334,39 +271,6 @@ def _crane_at(axes: Axes, signals: dict[str, Array], t: float, colour: str) -> N
     axes.plot(x, z, "o", color=colour, markersize=marker_size(4.5), zorder=4)
 
 
-def plot_curves(study: Study, *, ax: AxesLike | None = None) -> ControlPlot:
-    """The curves that a study computed for itself.
-
-    Parameters
-    ----------
-    study : Study
-        With curves, of which the first are drawn.
-    ax : Axes, optional
-        Where to draw; None: an empty current figure, or a new one.
-
-    Returns
-    -------
-    control.ControlPlot
-        Of shape (1, 1).
-    """
-    curves = study.curves[0]
-    drawing = Drawing(ax, (1, 1), (7.0, 3.8))
-    (axes,) = drawing.column
-    names = list(curves.rows)
-    # Curves of a logarithmic axis come in pairs: a colour a pair, and dashes for the second.
-    told = axis_styles(names[::2] if curves.log else names, axes)
-    colours = [style["color"] for style in told.values()]
-    for i, (name, row) in enumerate(curves.rows.items()):
-        style = "-" if i % 2 == 0 else (0, (5, 1.5))
-        colour = colours[i // 2 if curves.log else i]
-        axes.plot(curves.x, row, color=colour, linestyle=style, label=legend_label(name))
-    if curves.log:
-        axes.set_yscale("log")
-    drawing.label_x(as_text(curves.x_label))
-    label_y(axes, as_text(curves.y_label))
-    return drawing.finish()
-
-
 def plot_online(comparison: Comparison, *, ax: AxesLike | None = None) -> ControlPlot:
     """Load, reference in force, distance from the goal, sway and force of each way to run one plan.
 
@@ -386,7 +290,7 @@ def plot_online(comparison: Comparison, *, ax: AxesLike | None = None) -> Contro
     labels = ("x [m]", "distance from goal [m]", "sway [rad]", "F [kN]")
     drawing = Drawing(ax, (4, 1), (7.4, 8.2), rows=labels)
     rows = drawing.column
-    styles = plan_styles(comparison.plans, rows[0])
+    styles = plan_styles(comparison, rows[0])
     for name, plan in comparison.plans.items():
         signals = _signals(comparison, name)
         x, z = _across_and_down(comparison, plan.labels, plan.final)
@@ -407,12 +311,36 @@ _FRAMES = 20_000
 """Frames of an animation at most; longer runs have fewer a second."""
 
 
-def animation_data(comparison: Comparison, wall: Wall = None, rate: float = 12.0) -> Markup:
+def animation_data(comparison: Comparison, wall: Wall = None, shown: str = "", rate: float = 12.0) -> Markup:
     """JSON for the animation, safe inside HTML: each plan at equal time steps, up to where it is finite.
 
     Entries: plans {name: [D, R, theta]}, the radius b of the drum (by plan where
-    cranes differ), frames per second, wall, and the view: left, top, width, height.
+    cranes differ), frames per second, wall, the view: left, top, width, height,
+    and the number of the plan that is shown at first.
+
+    Parameters
+    ----------
+    comparison : Comparison
+        Of cranes.
+    wall : ((float, float), (float, float)) or None, optional
+        An obstacle to draw: its sides in x and in z [m].
+    shown : str, optional
+        The plan that is shown at first; unless given, the first trigonometric
+        one, or else the first that is no step.
+    rate : float, optional
+        Frames per second, fewer in runs of more than half an hour.
+
+    Raises
+    ------
+    ValueError
+        If the comparison is not of cranes, or has no plan `shown`.
     """
+    labels = [set(response.output_labels or ()) for response in comparison.responses.values()]
+    lacking = [label for label in AnimatedCrane.signals if not all(label in known for known in labels)]
+    if lacking:
+        raise ValueError(f"an animation must be of a comparison of cranes, got one without {', '.join(lacking)}")
+    if shown and shown not in comparison.plans:
+        raise ValueError(f"shown must be one of the plans ({', '.join(comparison.plans)}), got {shown!r}")
     plans: dict[str, list[list[float]]] = {}
     drums: dict[str, float] = {}
     corners = [] if not wall else [np.array(wall)]
@@ -420,7 +348,7 @@ def animation_data(comparison: Comparison, wall: Wall = None, rate: float = 12.0
     rate = min(rate, _FRAMES / max(longest, 1.0))
     for name in comparison.plans:
         signals = _signals(comparison, name)
-        sound = np.isfinite([signals[k] for k in ("x", "z", "D", "R", "theta")]).all(axis=0)
+        sound = np.isfinite([signals[k] for k in AnimatedCrane.signals]).all(axis=0)
         end = sound.size if sound.all() else int(np.argmin(sound))
         if not end:
             continue
@@ -432,7 +360,17 @@ def animation_data(comparison: Comparison, wall: Wall = None, rate: float = 12.0
     one = len(set(drums.values())) == 1
     drum = next(iter(drums.values())) if one else drums
     view = _view(comparison, corners)
-    return htmlsafe_json_dumps({"b": drum, "rate": rate, "plans": plans, "wall": wall, "view": view}, allow_nan=False)
+    trigonometric = [name for name, plan in comparison.plans.items() if isinstance(plan, TrigSpline)]
+    first = next((name for name in (shown, *trigonometric, *_moving(comparison)) if name in plans), None)
+    data = {
+        "b": drum,
+        "rate": rate,
+        "plans": plans,
+        "wall": wall,
+        "view": view,
+        "first": 0 if first is None else list(plans).index(first),
+    }
+    return htmlsafe_json_dumps(data, allow_nan=False)
 
 
 def _rounded(values: Array) -> list[float]:
@@ -464,12 +402,6 @@ def _view(comparison: Comparison, corners: list[Array]) -> list[float]:
     return _rounded(np.array([left, top, width, height]))
 
 
-def is_crane(comparison: Comparison) -> bool:
-    """Whether a comparison is of a crane, so that it can be drawn as one."""
-    first = next(iter(comparison.responses.values()))
-    return {"x", "z", "D", "R", "theta"} <= set(first.output_labels or ())
-
-
 def _signals(comparison: Comparison, name: str) -> dict[str, Array]:
     response = comparison.responses[name]
     return signals_of(response) | {"t": np.asarray(response.time)}
@@ -490,8 +422,8 @@ def _drum_radius(signals: dict[str, Array]) -> float:
 
 
 def _moving(comparison: Comparison) -> list[str]:
-    """Plans whose position does not jump."""
-    return [name for name, plan in comparison.plans.items() if not plan.jumps(0)]
+    """Plans that are no steps."""
+    return [name for name, role in roles_of(comparison).items() if role is not Role.STEP]
 
 
 def _ends(comparison: Comparison) -> tuple[float, float]:
@@ -530,38 +462,3 @@ def _letters_of(count: int) -> str:
     """A, B, ..., Z, AA, AB, ..."""
     head, last = divmod(count, 26)
     return (_letters_of(head - 1) if head else "") + chr(ord("A") + last)
-
-
-CRANE_FIGURES = {
-    "crane-sketch": (lambda study: plot_sketch(), "The crane and its variables (figure 2), z down."),
-    "crane-blocks": (
-        lambda study: plot_blocks(),
-        "Structure of the controller (figure 3), drawn from the blocks and connections of the model itself.",
-    ),
-    "crane-time": (
-        lambda study: plot_time(study.comparison),
-        "Load, error, sway and controls over time, the step left out. The error's axis is linear up to 1 mm, "
-        "logarithmic above.",
-    ),
-    "crane-step": (
-        lambda study: plot_step(study.comparison),
-        "The step: force and torque at their limits (dashed), up to the slack rope: where the tension comes to 0 the "
-        "model ends, and so does the run.",
-    ),
-    "crane-plane": (
-        lambda study: plot_plane(study.comparison, study.wall),
-        "Paths of the load in the plane (thin: planned), up to the time of the last waypoint; the step left out.",
-    ),
-    "crane-motion": (
-        lambda study: plot_motion(study.comparison, study.wall),
-        "Trolley, rope and load at equal time steps.",
-    ),
-    "crane-online": (
-        lambda study: plot_online(study.comparison),
-        "The load's x with the reference in force (thin), its distance from the goal (millimetres and less cut off), "
-        "sway and force.",
-    ),
-    "crane-sway": (plot_curves, "Sway after a push, with figure 3's generator and with feedback from the load."),
-    "crane-curves": (plot_curves, "Where the claim holds: the study's quantity over alpha."),
-}
-"""Figures of the crane's studies: how they are drawn, and their caption."""

@@ -2,24 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Collection, Iterable, Mapping, Sequence
 
+import control as ct
 import numpy as np
 from control import ControlPlot
 from matplotlib.axes import Axes
+from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
 from numpy.typing import NDArray
 
-from ctrlplan.reports.crane_figures import CRANE_FIGURES
 from ctrlplan.reports.style import (
     AxesLike,
     Drawing,
+    Style,
     add_title,
     as_text,
     axis_styles,
     font_size,
     given_axes,
     label_y,
+    legend_label,
     line_width,
     marker_size,
     plan_styles,
@@ -28,10 +30,9 @@ from ctrlplan.reports.style import (
 )
 from ctrlplan.studies.comparison import Comparison
 from ctrlplan.studies.ensemble import Ensemble
-from ctrlplan.studies.linear import STEP_LIMIT, jumps
 from ctrlplan.studies.measures import MEASURES
-from ctrlplan.studies.study import Study
-from ctrlplan.studies.sweep import Sweep
+from ctrlplan.studies.sections import Curves, Place
+from ctrlplan.studies.sweep import Sweep, settling_jumps
 from ctrlplan.studies.units import in_units
 from ctrlplan.trajectories import Trajectory
 
@@ -113,7 +114,7 @@ def plot_plans(comparison: Comparison, derivatives: int = 2, *, ax: AxesLike | N
     rows = derivatives + 1
     size = min(6.4 + 2.0 * (first.naxes - 1), 9.0), 1.4 + 1.6 * rows
     drawing = Drawing(ax, (rows, first.naxes), size, rows=map(_derivative_word, range(rows)))
-    styles = plan_styles(comparison.plans, drawing.column[0])
+    styles = plan_styles(comparison, drawing.column[0])
     start = min(p.start for p in comparison.plans.values())
     end = max(p.end for p in comparison.plans.values())
     t = np.unique(np.concatenate([_times(p, start, end) for p in comparison.plans.values()]))
@@ -153,7 +154,7 @@ def plot_responses(comparison: Comparison, *, ax: AxesLike | None = None) -> Con
     shown = [text for output in outputs for text in (output, f"error of {output}")] + list(controls)
     drawing = Drawing(ax, (len(shown), 1), (7.0, 1.4 + 1.9 * len(shown)), rows=shown)
     rows = drawing.column
-    styles = plan_styles(comparison.plans, rows[0])
+    styles = plan_styles(comparison, rows[0])
     for name, plan in comparison.plans.items():
         response = comparison.responses[name]
         t = np.asarray(response.time)
@@ -201,7 +202,7 @@ def plot_sweep(
     columns = 2 if len(names) > 1 else 1
     size = 4.0 * columns + 0.4, 0.8 + 2.5 * -(-len(names) // columns)
     drawing = Drawing(ax, (len(names), 1), size, rows=names, wrap=columns)
-    styles = plan_styles(sweep.metrics, drawing.column[0])
+    styles = plan_styles(sweep, drawing.column[0])
     for name, axes in zip(names, drawing.column, strict=True):
         for plan, rows in sweep.metrics.items():
             x, y = sweep.values, rows[name]
@@ -244,7 +245,7 @@ def plot_bands(ensemble: Ensemble, *, ax: AxesLike | None = None) -> ControlPlot
     titles = [f"error of {signal}" if error else signal for signal, error in shown]
     drawing = Drawing(ax, (len(shown), len(nominal.plans)), size, rows=titles)
     styles = {  # a column a plan: told apart from what that has
-        plan: plan_styles(nominal.plans, axes)[plan] for plan, axes in zip(nominal.plans, drawing.axes[0], strict=True)
+        plan: plan_styles(nominal, axes)[plan] for plan, axes in zip(nominal.plans, drawing.axes[0], strict=True)
     }
     for row, (signal, error) in zip(drawing.axes, shown, strict=True):
         _plot_bands_of(ensemble, row, signal, error, styles)
@@ -262,7 +263,7 @@ def plot_bands(ensemble: Ensemble, *, ax: AxesLike | None = None) -> ControlPlot
 
 
 def _plot_bands_of(
-    ensemble: Ensemble, row: NDArray[np.object_], signal: str, error: bool, styles: dict[str, dict[str, Any]]
+    ensemble: Ensemble, row: NDArray[np.object_], signal: str, error: bool, styles: dict[str, Style]
 ) -> None:
     """Bands of one signal, or of its error, an axes a plan."""
     nominal, t = ensemble.nominal, ensemble.timepts
@@ -289,12 +290,96 @@ def _plot_bands_of(
             axes.set_ylim(low - margin, high + margin)
 
 
-def plot_plane(sweep: Sweep, *, ax: AxesLike | None = None) -> ControlPlot:
-    """Figure 1: the settling-time/overshoot plane, each point a gain.
+def plot_plane(
+    sweep: Sweep,
+    *,
+    numbered: Mapping[str, Mapping[float, Place]] | None = None,
+    limit: tuple[float, float] | None = None,
+    limit_label: str = "limit",
+    ax: AxesLike | None = None,
+) -> ControlPlot:
+    """Settling time against overshoot on the error, a point for each value.
 
     Parameters
     ----------
     sweep : Sweep
+        With the metrics "settling_time" and "overshoot_error".
+    numbered : mapping of str to mapping of float to (float, float), optional
+        Plan, value of the parameter, place: values that are written beside
+        their points, so far to the right and up [pt].
+    limit : (float, float), optional
+        Settling time [s] and overshoot [%] of a point to be marked.
+    limit_label : str, optional
+        What that point is.
+    ax : Axes, optional
+        Where to draw; None: an empty current figure, or a new one.
+
+    Returns
+    -------
+    control.ControlPlot
+        Of shape (1, 1).
+
+    Raises
+    ------
+    ValueError
+        If a plan or a value to be numbered is not in the sweep.
+    """
+    drawing = Drawing(ax, (1, 1), (6.8, 5.2))
+    (axes,) = drawing.column
+    styles = plan_styles(sweep, axes)
+    for plan, rows in sweep.metrics.items():
+        ts, overshoot = rows["settling_time"], rows["overshoot_error"]
+        x, gap = _with_gaps(sweep.values, ts)
+        whole = styles[plan] | {"linestyle": "-", "linewidth": line_width(0.65)}
+        axes.plot(gap, np.interp(x, sweep.values, overshoot), **whole)
+        axes.plot(ts, overshoot, ".", color=styles[plan]["color"], markersize=marker_size(2.5))
+    for plan, places in (numbered or {}).items():
+        if plan not in sweep.metrics:
+            raise ValueError(f"numbered must be of plans of the sweep ({', '.join(sweep.metrics)}), got {plan!r}")
+        for value, place in places.items():
+            _number_point(axes, sweep, plan, value, place, styles[plan]["color"])
+    if limit is not None:
+        axes.plot(*limit, "*", label=limit_label, color=_LIMIT_POINT, markersize=marker_size(13), zorder=5)
+    if numbered:
+        add_title(axes, as_text(f"numbers at the circles: {sweep.parameter}"))
+    drawing.label_x(f"settling time ±{100.0 * sweep.band:g} % [s]")
+    label_y(axes, "overshoot on the error [%]")
+    axes.set_xlim(left=0.0)
+    axes.set_ylim(-4.0, 108.0)
+    return drawing.finish()
+
+
+_LIMIT_POINT = "#E69F00"
+
+
+def _number_point(axes: Axes, sweep: Sweep, plan: str, value: float, place: Place, colour: str) -> None:
+    """Circle at the point of a value, and the value beside it."""
+    at = int(np.argmin(np.abs(sweep.values - value)))
+    if not np.isclose(sweep.values[at], value, rtol=1e-9, atol=0.0):
+        raise ValueError(
+            f"numbered must be of values of the sweep, got {value:g} for {plan}, next to {sweep.values[at]:g}"
+        )
+    point = float(sweep.metrics[plan]["settling_time"][at]), float(sweep.metrics[plan]["overshoot_error"][at])
+    axes.plot(*point, "o", color=colour, mfc=axes.get_facecolor(), markersize=marker_size(5), zorder=4)
+    axes.annotate(
+        f"{value:.4g}",
+        point,
+        xytext=place,
+        textcoords="offset points",
+        fontsize=font_size(8),
+        color=colour,
+        ha="center",
+        va="center",
+        arrowprops={"arrowstyle": "-", "color": colour, "linewidth": 0.5, "shrinkA": 1, "shrinkB": 3},
+    )
+
+
+def plot_curves(curves: Curves, *, ax: AxesLike | None = None) -> ControlPlot:
+    """Curves over one variable.
+
+    Parameters
+    ----------
+    curves : Curves
         What is drawn.
     ax : Axes, optional
         Where to draw; None: an empty current figure, or a new one.
@@ -304,100 +389,100 @@ def plot_plane(sweep: Sweep, *, ax: AxesLike | None = None) -> ControlPlot:
     control.ControlPlot
         Of shape (1, 1).
     """
-    drawing = Drawing(ax, (1, 1), (6.8, 5.2))
+    drawing = Drawing(ax, (1, 1), (7.0, 3.8))
     (axes,) = drawing.column
-    styles = plan_styles(sweep.metrics, axes)
-    numbered = _NUMBERED if _of_the_paper(sweep) else {}
-    for plan, rows in sweep.metrics.items():
-        ts, overshoot = rows["settling_time"], rows["overshoot_error"]
-        x, gap = _with_gaps(sweep.values, ts)
-        colour = styles[plan]["color"]
-        whole = styles[plan] | {"linestyle": "-", "linewidth": line_width(0.65)}
-        axes.plot(gap, np.interp(x, sweep.values, overshoot), **whole)
-        axes.plot(ts, overshoot, ".", color=colour, markersize=marker_size(2.5))
-        # Only a few plans are numbered, or the numbers would overprint.
-        for gain, offset in numbered.get(plan, {}).items():
-            at = int(np.argmin(np.abs(sweep.values - gain)))
-            circle: dict[str, Any] = {"mfc": axes.get_facecolor(), "markersize": marker_size(5), "zorder": 4}
-            axes.plot(ts[at], overshoot[at], "o", color=colour, **circle)
-            axes.annotate(
-                f"{sweep.values[at]:.4g}",
-                (ts[at], overshoot[at]),
-                xytext=offset,
-                textcoords="offset points",
-                fontsize=font_size(8),
-                color=colour,
-                ha="center",
-                va="center",
-                arrowprops={"arrowstyle": "-", "color": colour, "linewidth": 0.5, "shrinkA": 1, "shrinkB": 3},
-            )
-    if numbered:
-        star: dict[str, Any] = {"color": "#E69F00", "markersize": marker_size(13), "zorder": 5}
-        axes.plot(*STEP_LIMIT, "*", label="limit of the step, k → ∞", **star)
-        add_title(axes, "numbers at the circles: gain k")
-    drawing.label_x("settling time ±2 % [s]")
-    label_y(axes, "overshoot on the error [%]")
-    axes.set_xlim(left=0.0)
-    axes.set_ylim(-4.0, 108.0)
+    names = list(curves.rows)
+    each = 2 if curves.paired else 1
+    colours = [style["color"] for style in axis_styles(names[::each], axes).values()]
+    for i, (name, row) in enumerate(curves.rows.items()):
+        style = "-" if i % 2 == 0 else (0, (5, 1.5))
+        axes.plot(curves.x, row, color=colours[i // each], linestyle=style, label=legend_label(name))
+    if curves.log:
+        axes.set_yscale("log")
+    drawing.label_x(as_text(curves.x_label))
+    label_y(axes, as_text(curves.y_label))
     return drawing.finish()
 
 
-def _of_the_paper(sweep: Sweep) -> bool:
-    """Whether a sweep is of the paper's loop, k/(s (s + 1)) in unity feedback, of which gains and limit are known."""
-    found = sweep.metrics.get("step", {}).get("overshoot_error")
-    swings = sweep.values > 0.25
-    if found is None or not swings.any():
-        return False
-    known = 100.0 * np.exp(-np.pi / np.sqrt(4.0 * sweep.values[swings] - 1.0))
-    return bool(np.all(np.abs(found[swings] - known) < 0.1))
+def plot_blocks(
+    loop: ct.InterconnectedSystem, titles: Mapping[str, str] | None = None, *, ax: AxesLike | None = None
+) -> ControlPlot:
+    """Blocks and connections of a loop: each block to the right of those that it follows.
+
+    Parameters
+    ----------
+    loop : control.InterconnectedSystem
+        Whose blocks are in the order of the signal path; a connection to an
+        earlier block is feedback, and is drawn around the others.
+    titles : mapping of str to str, optional
+        What is written in place of a block's name.
+    ax : Axes, optional
+        Where to draw; None: an empty current figure, or a new one.
+
+    Returns
+    -------
+    control.ControlPlot
+        Of shape (1, 1).
+    """
+    joined = _connections(loop)
+    place = _places([block.name for block in loop.syslist], list(joined))
+    drawing = Drawing(ax, (1, 1), (8.4, 3.2))
+    (axes,) = drawing.column
+    edge = shade(0.8)
+    axes.axis("off")
+    for name, (x, y) in place.items():
+        box = FancyBboxPatch((x - 0.75, y - 0.35), 1.5, 0.7, boxstyle="round,pad=0.02", fc=shade(0.045), ec=edge)
+        axes.add_patch(box)
+        axes.text(x, y, as_text((titles or {}).get(name, name)), ha="center", va="center", fontsize=font_size(9))
+    for (source, sink), signals in joined.items():
+        text = ", ".join(signals) if len(signals) < 3 else f"{signals[0]} … {signals[-1]}"
+        _arrow(axes, place[source], place[sink], as_text(text))
+    corners = np.array(list(place.values()))
+    axes.set_xlim(-0.9, corners[:, 0].max() + 0.9)
+    axes.set_ylim(corners[:, 1].min() - 1.3, corners[:, 1].max() + 1.3)
+    return drawing.finish(legend=False)
 
 
-# Where the gains of the table stand beside their circles, in points.
-_NUMBERED = {
-    "step": {1.0: (-26, -4), 5.0: (-34, 12), 20.0: (-34, 0), 100.0: (-34, 0), 1000.0: (-36, 2)},
-    "trigonometric": {1.0: (26, 4), 5.0: (30, 0), 20.0: (44, 22), 100.0: (-14, 12), 1000.0: (24, 9)},
-}
+def _connections(loop: ct.InterconnectedSystem) -> dict[tuple[str, str], list[str]]:
+    """Signals of a loop by the blocks that they connect."""
+    joined: dict[tuple[str, str], list[str]] = {}
+    into = [block for block in loop.syslist for _ in block.input_labels]
+    out = [(block, label) for block in loop.syslist for label in block.output_labels]
+    for row, column in np.argwhere(np.asarray(loop.connect_map) != 0.0):
+        source, signal = out[column]
+        joined.setdefault((source.name, into[row].name), []).append(signal)
+    return joined
 
 
-FIGURES: dict[str, tuple[Callable[[Study], ControlPlot], str]] = {
-    "plane": (
-        lambda study: plot_plane(_sweep(study)),
-        "Settling time against overshoot on the error as the gain runs from 0.25 to 1000 (figure 1 of the paper). "
-        "Curves are broken where the settling time jumps.",
-    ),
-    "gain": (
-        lambda study: plot_sweep(_sweep(study), ("settling_time", "overshoot_error", "control_peak", "control_effort")),
-        "The same over the gain, with what each reference asks of the control: its peak and its effort ∫u² dt.",
-    ),
-    "bands": (
-        lambda study: plot_bands(_ensemble(study)),
-        "Spread over the draws: the median, and the bands that hold half and nine tenths of them.",
-    ),
-    "plans": (
-        lambda study: plot_plans(study.comparison),
-        "The references and their derivatives; circles are prescribed values.",
-    ),
-    "responses": (
-        lambda study: plot_responses(study.comparison),
-        "What the loop does with each reference: output, error and control.",
-    ),
-}
-"""Figures that a study may ask for: how they are drawn, and their caption."""
+def _places(names: Sequence[str], joined: Collection[tuple[str, str]]) -> dict[str, tuple[float, float]]:
+    """Middles of blocks: a column further right than every earlier block that they are connected to."""
+    columns: dict[str, int] = {}
+    for name in names:
+        before = [columns[source] for source, sink in joined if sink == name and source in columns]
+        columns[name] = max(before, default=-1) + 1
+    place = {}
+    for column in sorted(set(columns.values())):
+        stacked = [name for name in names if columns[name] == column]
+        for row, name in enumerate(stacked):
+            place[name] = (2.6 * column, 0.8 * (len(stacked) - 1 - 2 * row))
+    return place
 
 
-FIGURES |= CRANE_FIGURES
-
-
-def _sweep(study: Study) -> Sweep:
-    if study.sweep is None:
-        raise ValueError(f"study {study.name} must have a sweep for this figure, got none")
-    return study.sweep
-
-
-def _ensemble(study: Study) -> Ensemble:
-    if study.ensemble is None:
-        raise ValueError(f"study {study.name} must have draws for this figure, got none")
-    return study.ensemble
+def _arrow(axes: Axes, source: tuple[float, float], sink: tuple[float, float], text: str) -> None:
+    """Arrow from block to block with its signals; feedback goes around the blocks between."""
+    (x0, y0), (x1, y1) = source, sink
+    if x1 > x0:
+        start, end = (x0 + 0.78, y0 + 0.15 * np.sign(y1 - y0)), (x1 - 0.78, y1 + 0.15 * np.sign(y0 - y1))
+        style, at = "arc3", (0.5 * (start[0] + end[0]), 0.5 * (start[1] + end[1]) + 0.14)
+    else:
+        side = 1.0 if y1 > 0.0 else -1.0
+        if source == sink:
+            x0, x1 = x0 + 0.5, x1 - 0.5
+        start, end, style = (x0, y0 + 0.38 * side), (x1, y1 + 0.38 * side), f"arc3,rad={0.5 * side}"
+        at = (0.5 * (x0 + x1), y1 + 0.98 * side)
+    edge = shade(0.8)
+    axes.add_patch(FancyArrowPatch(start, end, arrowstyle="-|>", mutation_scale=11, color=edge, connectionstyle=style))
+    axes.text(*at, text, ha="center", va="center", fontsize=font_size(8), color="#0072B2")
 
 
 def _times(plan: Trajectory, start: float | None = None, end: float | None = None) -> Array:
@@ -424,7 +509,7 @@ def _broken(t: Array, values: Array, plan: Trajectory) -> Array:
 
 def _with_gaps(x: Array, y: Array) -> tuple[Array, Array]:
     """Curve with a nan where a settling time jumps."""
-    where = np.flatnonzero(jumps(x, y)) + 1
+    where = np.flatnonzero(settling_jumps(x, y)) + 1
     return np.insert(x, where, 0.5 * (x[where - 1] + x[where])), np.insert(y, where, np.nan)
 
 
@@ -450,6 +535,6 @@ def _derivative_label(unit: str, order: int, name: str = "") -> str:
     return with_unit(label, in_units("{y}/", unit or "1", "").removesuffix("/"), suffix)
 
 
-def _common(units: Any) -> str:
+def _common(units: Iterable[str]) -> str:
     found = set(units)
     return found.pop() if len(found) == 1 else ""

@@ -6,32 +6,29 @@ import base64
 import contextlib
 import hashlib
 import json
-import math
 import os
 import platform
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cache
 from importlib import metadata
 from pathlib import Path
-from typing import Any
 
-import numpy as np
-from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
+from jinja2 import Environment, PackageLoader, StrictUndefined, Template, select_autoescape
 from markupsafe import Markup
 
 import ctrlplan
 from ctrlplan import _files
-from ctrlplan.planning import Fastest
-from ctrlplan.reports.crane_figures import Wall, animation_data, is_crane, plot_curves
-from ctrlplan.reports.figures import FIGURES
-from ctrlplan.reports.planning_figures import plot_rivals
-from ctrlplan.reports.style import line_styles, page_style, slug, to_svg
-from ctrlplan.reports.words import number, summary, unit_in, unit_of, verdicts
+from ctrlplan.reports.crane_figures import animation_data
+from ctrlplan.reports.parts import Animation, MetricsTable, Part, Picture, Svg
+from ctrlplan.reports.sections import draw
+from ctrlplan.reports.style import page_style, slug, to_svg
+from ctrlplan.reports.tables import metrics_of
+from ctrlplan.reports.words import summary, verdicts
 from ctrlplan.studies.benefit import Benefit
 from ctrlplan.studies.comparison import Comparison
-from ctrlplan.studies.ensemble import Ensemble
-from ctrlplan.studies.grids import SAME, Grid
+from ctrlplan.studies.sections import Section, Wall
 from ctrlplan.studies.study import Study
 
 
@@ -108,14 +105,16 @@ def write_all(texts: Mapping[Path, str]) -> list[Path]:
 
 def render_page(studies: Sequence[Study], title: str) -> str:
     """The page as text."""
+    shown: list[_Shown] = []
     with page_style():
-        sections = [_section(study, key) for study, key in zip(studies, _keys(studies), strict=True)]
+        for study in studies:
+            shown.append(_shown(study, [name for one in shown for name in one.ids]))
     script = _script("sort.js.html")
-    if any(section["animation"] for section in sections):
+    if any(isinstance(block, Animation) for one in shown for part in one.parts for block in part.blocks):
         script += _script("animation.js.html")
     return _template("page.html").render(
         title=title,
-        sections=sections,
+        studies=shown,
         versions=_versions(),
         script=script,
         policy=_policy(script),
@@ -131,33 +130,34 @@ class CraneAnimation:
         Of loops made by `crane_loop`.
     wall : ((float, float), (float, float)), optional
         An obstacle to draw: its sides in x and in z [m].
+    shown : str, optional
+        The plan that is shown at first; unless given, the first trigonometric
+        one, or else the first that is no step.
 
     Raises
     ------
     ValueError
-        If the comparison is not of a crane.
+        If the comparison is not of cranes, or has no plan `shown`.
     """
 
-    def __init__(self, comparison: Comparison, wall: Wall = None) -> None:
-        if not is_crane(comparison):
-            raise ValueError("an animation must be of a comparison of cranes, got one without D, R and theta")
-        self._data = animation_data(comparison, wall)
+    def __init__(self, comparison: Comparison, wall: Wall = None, shown: str = "") -> None:
+        self._data = animation_data(comparison, wall, shown)
         self._name = f"crane{abs(hash(self._data)):x}"
 
     def _repr_html_(self) -> str:
-        drawing = _template("animation.html").module.crane_animation(self._name, self._data)
+        caption = Animation(self._data).caption
+        drawing = _template("animation.html").render(name=self._name, data=self._data, caption=caption)
         return f"{drawing}<script>{_script('animation.js.html')}</script>"
 
 
 def comparison_fragment(comparison: Comparison) -> str:
     """Metrics table and verdict for a notebook cell."""
-    table = _table(comparison)
     return _template("fragment.html").render(
-        title=comparison.title, table=table, summary=summary(comparison), notes=comparison.notes
+        title=comparison.title, table=metrics_of(comparison), summary=summary(comparison), notes=comparison.notes
     )
 
 
-def _template(name: str) -> Any:
+def _template(name: str) -> Template:
     return _environment().get_template(name)
 
 
@@ -177,7 +177,7 @@ def _environment() -> Environment:
 _UNREADABLE = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udfff\ufffe\uffff]")
 
 
-def _readable(value: Any) -> Any:
+def _readable(value: object) -> object:
     """What is put into the page: of a text every character that can be seen and written."""
     return _UNREADABLE.sub("\N{REPLACEMENT CHARACTER}", value) if type(value) is str else value
 
@@ -198,175 +198,103 @@ def _policy(script: str) -> str:
     )
 
 
-def _keys(studies: Sequence[Study]) -> list[str]:
-    """Ids of the sections: the studies' names as far as an id can hold them; no id of the page stands twice."""
+@dataclass(frozen=True)
+class _Shown:
+    """A study as the page shows it.
+
+    Attributes
+    ----------
+    study : Study
+        What is shown.
+    id : str
+        Id of its section: the study's name as far as an id can hold it.
+    ids : tuple of str
+        Every id in it, its own included.
+    parts : tuple of Part
+        Its sections, and what planning gains where the comparison has that;
+        the figures as SVG elements, with their ids as keys.
+    """
+
+    study: Study
+    id: str
+    ids: tuple[str, ...]
+    parts: tuple[Part, ...]
+
+    @property
+    def above(self) -> list[Part]:
+        """Parts above the metrics."""
+        return [part for part in self.parts if not part.below]
+
+    @property
+    def below(self) -> list[Part]:
+        """Parts below the metrics."""
+        return [part for part in self.parts if part.below]
+
+    @property
+    def nominal(self) -> bool:
+        """Whether the metrics are those at nominal parameters."""
+        return any(part.nominal for part in self.parts)
+
+    @property
+    def summary(self) -> str:
+        """How often each plan is best and worst."""
+        return summary(self.study.comparison)
+
+    @property
+    def verdicts(self) -> list[str]:
+        """Best and worst plan of each metric, in sentences."""
+        return [verdict.sentence for verdict in verdicts(self.study.comparison)]
+
+    @property
+    def parameters(self) -> dict[str, str]:
+        """How the comparison was made."""
+        return {name: str(value) for name, value in self.study.comparison.parameters.items()}
+
+    @property
+    def table(self) -> MetricsTable:
+        """The metrics."""
+        return metrics_of(self.study.comparison)
+
+
+def _shown(study: Study, taken: Collection[str]) -> _Shown:
+    """A study with its figures drawn, under ids that no other on the page has."""
+    sections: list[Section | Benefit] = list(study.sections)
+    if study.comparison.benefit is not None:
+        sections.append(study.comparison.benefit)
+    parts = [draw(section, study) for section in sections]
     keys: list[str] = []
-    taken: set[str] = set()
-    for study in studies:
-        stem = key = slug(study.name)
-        count = 1
-        while not taken.isdisjoint(_ids(key, study)):
-            count += 1
-            key = f"{stem}-{count}"
-        keys.append(key)
-        taken.update(_ids(key, study))
-    return keys
-
-
-def _ids(name: str, study: Study) -> list[str]:
-    """Ids of a section, its own the first, and of the figures in it."""
-    return [name, *(f"{name}-{key}" for key in study.figures)]
-
-
-def _section(study: Study, name: str) -> dict[str, Any]:
-    comparison = study.comparison
-    figures = []
-    for key in study.figures:
-        draw, caption = FIGURES[key]
-        svg = to_svg(draw(study).figure, f"{name}.{key}")
-        if draw is plot_curves:
-            caption = study.curves[0].caption
-        figures.append({"key": key, "svg": Markup(svg), "caption": caption})  # noqa: S704 (our own drawing)
-    return {
-        "name": name,
-        "title": study.title,
-        "summary": study.summary,
-        "notes": study.notes,
-        "verdict": summary(comparison),
-        "verdicts": [v.sentence for v in verdicts(comparison)],
-        "table": _table(comparison),
-        "spread": _spread(study.ensemble),
-        "figures": figures,
-        "animation": animation_data(comparison, study.wall) if is_crane(comparison) else "",
-        "marks": comparison.marks,
-        "failures": comparison.failures,
-        "parameters": {k: str(v) for k, v in comparison.parameters.items()},
-        "worth": None if comparison.benefit is None else _worth(comparison.benefit, name),
-        "claim": study.claim,
-        "grids": [_grid(grid, grid.unit) for grid in study.grids],
-        "fastest": None if study.fastest is None else _fastest(study.fastest, study, name),
-    }
-
-
-def _fastest(found: Fastest, study: Study, name: str) -> dict[str, Any]:
-    """The section on a plan as fast as limits allow."""
-    units = study.comparison.units
-    return {
-        "duration": number(found.duration),
-        "limit": found.active.bound.name,
-        "time": number(found.active.time),
-        "rows": [
-            {
-                "name": row.bound.name,
-                "unit": units.get(row.bound.name, ""),
-                "range": row.bound.range,
-                "value": number(row.value),
-                "time": number(row.time),
-                "left": row.share,
-            }
-            for row in found.margins
-        ],
-        "svg": Markup(to_svg(found.plot(units).figure, f"{name}.fastest")),  # noqa: S704 (our own drawing)
-        "caption": "Every limited signal of the fastest plan, and where it comes nearest to its limits (dashed).",
-    }
-
-
-def _worth(worth: Benefit, name: str) -> dict[str, Any]:
-    """The section on whether planning is worth it."""
-    least = min((need.duration for need in worth.needs if math.isfinite(need.duration)), default=math.nan)
-    return {
-        "verdicts": worth.verdicts,
-        "alpha": f"{worth.alpha:.4g}",
-        "note": worth.note,
-        "svg": Markup(to_svg(plot_rivals(worth.comparison).figure, f"{name}.worth")),  # noqa: S704 (our own drawing)
-        "caption": "References through the same waypoints in the same time, what the loop makes of them, and what "
-        "that asks of its controls.",
-        "table": _table(worth.comparison),
-        "limits": "; ".join(f"{limit} {_limit_words(value)}" for limit, value in worth.limits.items()),
-        "needs": [
-            {
-                "name": need.name,
-                "text": number(need.duration),
-                "mark": "win" if need.duration <= least * (1.0 + SAME) else "",
-                "limit": need.limit,
-                "kept": need.kept,
-            }
-            for need in worth.needs
-        ],
-        "grids": [_grid(grid, unit_in(worth.comparison, grid.unit)) for grid in worth.grids],
-    }
-
-
-def _limit_words(value: Any) -> str:
-    """A limit as it was given, to four digits."""
-    if np.ndim(value):
-        low, high = ("any" if side is None else f"{side:.4g}" for side in value)
-        return f"from {low} to {high}"
-    return f"within ±{value:.4g}"
-
-
-def _grid(grid: Grid, unit: str) -> dict[str, Any]:
-    """Rows of a number over duration and alpha, the rivals behind it."""
-    rows = []
-    for i, (duration, marks) in enumerate(zip(grid.durations.tolist(), grid.marks(), strict=True)):
-        best, _ = grid.best(i)
-        own = zip(grid.values[i].tolist(), marks, strict=True)
-        cells = [{"text": number(value, unit), "mark": mark} for value, mark in own]
-        cells += [
-            {"text": number(float(values[i]), unit), "mark": "best" if name == best else ""}
-            for name, values in grid.rivals.items()
-        ]
-        rows.append({"duration": f"{duration:.4g}", "cells": cells})
-    heads = [f"alpha {a:.3g}" if a else "alpha 0 (polynomial)" for a in grid.alphas.tolist()]
-    return {"title": grid.title, "unit": unit, "heads": [*heads, *grid.rivals], "rows": rows}
-
-
-def _table(comparison: Comparison) -> dict[str, Any]:
-    """Rows of the metrics: cells with a number to sort by, a text, and whether it wins or loses."""
-    decided = {v.key: v for v in verdicts(comparison)}
-    rows = []
-    for key, measure in comparison.measures.items():
-        if not any(key in found for found in comparison.metrics.values()):
-            continue
-        verdict = decided.get(key)
-        cells = []
-        for plan, found in comparison.metrics.items():
-            value = found.get(key, math.nan)
-            mark = "" if verdict is None else "win" if plan in verdict.winners else ""
-            if verdict is not None and plan in verdict.losers:
-                mark = "lose"
-            order = "" if math.isnan(value) else "1e999" if math.isinf(value) else repr(value)
-            cells.append({"text": number(value, measure.unit), "order": order, "mark": mark})
-        rows.append({"title": measure.title, "unit": unit_of(comparison, key) or "", "cells": cells})
-    styles = line_styles(comparison.metrics)
-    plans = [
-        {"name": plan, "colour": styles[plan]["color"], "mark": "†" if plan in comparison.marks else ""}
-        for plan in comparison.metrics
+    for block in (block for part in parts for block in part.blocks if isinstance(block, _Keyed)):
+        keys.append(_numbered(slug(block.key), lambda key: key in keys))
+    name = _numbered(slug(study.name), lambda name: not {name, *(f"{name}-{key}" for key in keys)}.isdisjoint(taken))
+    left = iter(keys)
+    drawn = [
+        replace(
+            part,
+            blocks=[_drawn(block, name, next(left)) if isinstance(block, _Keyed) else block for block in part.blocks],
+        )
+        for part in parts
     ]
-    return {"plans": plans, "rows": rows}
+    return _Shown(study, name, (name, *(f"{name}-{key}" for key in keys)), tuple(drawn))
 
 
-def _spread(ensemble: Ensemble | None) -> dict[str, Any] | None:
-    """Rows of metrics over draws: the median, and where nine tenths of them lie."""
-    if ensemble is None:
-        return None
-    nominal, rows = ensemble.nominal, []
-    for key, measure in nominal.measures.items():
-        if not any(key in found for found in ensemble.metrics.values()):
-            continue
-        cells = []
-        for plan in nominal.metrics:
-            low, _, middle, _, high = ensemble.quantiles(key)[plan] if key in ensemble.metrics.get(plan, {}) else _NONE
-            text = f"{number(middle, measure.unit)} ({number(low, measure.unit)} to {number(high, measure.unit)})"
-            order = "" if math.isnan(middle) else "1e999" if math.isinf(middle) else repr(float(middle))
-            cells.append({"text": text, "order": order, "mark": ""})
-        rows.append({"title": measure.title, "unit": unit_of(nominal, key) or "", "cells": cells})
-    styles = line_styles(nominal.metrics)
-    plans = [{"name": plan, "colour": styles[plan]["color"], "mark": ""} for plan in nominal.metrics]
-    return {"plans": plans, "rows": rows}
+_Keyed = (Picture, Svg, Animation)
 
 
-_NONE = (math.nan,) * 5
+def _drawn(block: Picture | Svg | Animation, name: str, key: str) -> Svg | Animation:
+    """A figure with its id on the page for a key, a plot as an SVG element."""
+    if isinstance(block, Picture):
+        svg = Markup(to_svg(block.plot.figure, f"{name}.{key}"))  # noqa: S704 (our own drawing)
+        return Svg(f"{name}-{key}", svg, block.caption)
+    return replace(block, key=f"{name}-{key}")
+
+
+def _numbered(stem: str, taken: Callable[[str], bool]) -> str:
+    """A name, with the first number at which it is free where it is taken."""
+    name, count = stem, 1
+    while taken(name):
+        count += 1
+        name = f"{stem}-{count}"
+    return name
 
 
 def _versions() -> dict[str, str]:

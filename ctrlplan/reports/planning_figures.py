@@ -14,6 +14,7 @@ from ctrlplan.planning.limits import Limited
 from ctrlplan.reports.style import (
     AxesLike,
     Drawing,
+    Style,
     add_title,
     as_text,
     axis_styles,
@@ -21,10 +22,12 @@ from ctrlplan.reports.style import (
     line_width,
     marker_size,
     plan_styles,
+    roles_of,
     shade,
     with_unit,
 )
 from ctrlplan.studies.comparison import Comparison
+from ctrlplan.studies.roles import Role
 from ctrlplan.trajectories import Trajectory
 
 Array = NDArray[np.float64]
@@ -108,13 +111,17 @@ def plot_limits(
     return drawing.finish(legend=False)
 
 
-def plot_rivals(comparison: Comparison, *, ax: AxesLike | None = None) -> ControlPlot:
+def plot_rivals(
+    comparison: Comparison, *, known: Mapping[str, Style] | None = None, ax: AxesLike | None = None
+) -> ControlPlot:
     """References above the responses of the loop to them, an axis a column, and the controls below.
 
     Parameters
     ----------
     comparison : Comparison
         Of plans through the same waypoints.
+    known : mapping of str to dict, optional
+        Styles of plans that other figures of the page show, from `line_styles`.
     ax : array of Axes, shape (2 + ncontrols, noutputs), optional
         Where to draw; controls use the first column. None: an empty current
         figure, or a new one.
@@ -129,7 +136,7 @@ def plot_rivals(comparison: Comparison, *, ax: AxesLike | None = None) -> Contro
     size = min(6.4 + 2.4 * (columns - 1), 9.0), 1.4 + 2.0 * (2 + len(controls))
     drawing = Drawing(ax, (2 + len(controls), columns), size, rows=("references", "outputs", *controls))
     grid = drawing.axes
-    styles = plan_styles(comparison.plans, grid[0, 0])
+    styles = plan_styles(comparison, grid[0, 0], known)
     for name, plan in comparison.plans.items():
         response = comparison.responses[name]
         t = np.asarray(response.time)
@@ -155,12 +162,17 @@ def plot_rivals(comparison: Comparison, *, ax: AxesLike | None = None) -> Contro
 
 
 def _clip(axes: Axes, comparison: Comparison, control: str) -> None:
-    """Leave out what a step asks for where it is far beyond the others: they would be flat lines."""
+    """Leave out the control of a step where it is far beyond the others: they would be flat lines."""
     peaks = {
         name: float(np.abs(np.asarray(response.outputs)[list(response.output_labels).index(control)]).max())
         for name, response in comparison.responses.items()
     }
-    step, rest = peaks.pop("step", 0.0), max(peaks.values(), default=0.0)
+    steps = [name for name, role in roles_of(comparison).items() if role is Role.STEP]
+    if not steps:
+        return
+    highest = max(steps, key=lambda name: peaks[name])
+    step = peaks.pop(highest)
+    rest = max(peaks.values(), default=0.0)
     if rest and step > 4.0 * rest:
         axes.set_ylim(-1.3 * rest, 1.3 * rest)
-        add_title(axes, f"the step asks for {step:.3g}")
+        add_title(axes, as_text(f"the {highest} asks for {step:.3g}"))

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from functools import cache
@@ -30,16 +30,28 @@ from matplotlib.legend import Legend
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
+from ctrlplan.studies.comparison import Comparison
+from ctrlplan.studies.roles import Role, role_of
+from ctrlplan.studies.sweep import Sweep
+
 AxesLike: TypeAlias = Axes | Sequence[Axes] | NDArray[np.object_]
 """One axes, or several in a sequence or an array."""
 
-# Okabe and Ito's colours; a plan keeps its own in every figure.
-COLOURS = {"step": "#000000", "polynomial": "#0072B2", "trigonometric": "#D55E00", "piecewise": "#009E73"}
-_OTHERS = ("#CC79A7", "#E69F00", "#56B4E9")
-_PALETTE = ("#0072B2", "#D55E00", "#009E73", *_OTHERS, "#000000")
-DASHES = {"step": (0, (1, 1)), "polynomial": (0, (5, 1.5)), "trigonometric": "-", "piecewise": (0, (5, 1.5, 1, 1.5))}
+Style: TypeAlias = dict[str, Any]
+"""Keywords of ``Axes.plot`` for one curve: colour, line style, label and zorder."""
 
-_OTHER_DASHES = ((0, (3, 1, 1, 1)), (0, (7, 2)), (0, (2, 2)), (0, (9, 1.5, 1, 1.5, 1, 1.5)))
+Dashes: TypeAlias = str | tuple[int, tuple[float, ...]]
+
+# Okabe and Ito's colours.
+_STEP: tuple[str, Dashes] = ("#000000", (0, (1, 1)))
+_PLANS: tuple[tuple[str, Dashes], ...] = (
+    ("#0072B2", (0, (5, 1.5))),
+    ("#D55E00", "-"),
+    ("#009E73", (0, (5, 1.5, 1, 1.5))),
+)
+_OTHERS = ("#CC79A7", "#E69F00", "#56B4E9")
+_PALETTE = (*(colour for colour, _ in _PLANS), *_OTHERS, _STEP[0])
+_OTHER_DASHES: tuple[Dashes, ...] = ((0, (3, 1, 1, 1)), (0, (7, 2)), (0, (2, 2)), (0, (9, 1.5, 1, 1.5, 1, 1.5)))
 
 _RC: dict[Any, Any] = {
     "font.size": 9,
@@ -287,34 +299,56 @@ def _as_by_default(name: str) -> bool:
 # Colours and dashes
 
 
-def line_styles(names: Iterable[str]) -> dict[str, dict[str, Any]]:
-    """Colour and dashes of each plan where nothing is set by a user."""
-    names = list(names)
-    spare = cycle([*_OTHERS, *(colour for name, colour in COLOURS.items() if name not in names)])
-    dashed = cycle(_OTHER_DASHES)
-    styles: dict[str, dict[str, Any]] = {}
-    for name in names:
-        dashes = DASHES.get(name) or next(dashed)
+def line_styles(roles: Mapping[str, Role], known: Mapping[str, Style] | None = None) -> dict[str, Style]:
+    """Colour and dashes of each plan where nothing is set by a user.
+
+    The first step is black and dotted; planned references, then baselines, have
+    the colours of the palette in order.
+
+    Parameters
+    ----------
+    roles : mapping of str to Role
+        What each plan is.
+    known : mapping of str to dict, optional
+        Styles of plans that are drawn elsewhere on the page, which they keep.
+    """
+    main = {name: (style["color"], style["linestyle"]) for name, style in (known or {}).items() if name in roles}
+    free = [look for look in (_STEP, *_PLANS) if look[0] not in {colour for colour, _ in main.values()}]
+    for name, role in sorted(roles.items(), key=lambda entry: _RANKS[entry[1]]):
+        fit = [look for look in free if (look is _STEP) is (role is Role.STEP)]
+        if name not in main and fit:
+            main[name] = fit[0]
+            free.remove(fit[0])
+    spare, dashed = cycle([*_OTHERS, *(colour for colour, _ in free)]), cycle(_OTHER_DASHES)
+    styles: dict[str, Style] = {}
+    for name in roles:
+        colour, dashes = main[name] if name in main else (next(spare), next(dashed))
         # Dashes over solid lines: where curves coincide both are seen.
-        styles[name] = {
-            "color": COLOURS.get(name) or next(spare),
-            "linestyle": dashes,
-            "label": legend_label(name),
-            "zorder": 2.0 if dashes == "-" else 2.5,
-        }
+        zorder = 2.0 if dashes == "-" else 2.5
+        styles[name] = {"color": colour, "linestyle": dashes, "label": legend_label(name), "zorder": zorder}
     return styles
 
 
-def plan_styles(names: Iterable[str], axes: Axes) -> dict[str, dict[str, Any]]:
+_RANKS = {role: rank for rank, role in enumerate((Role.STEP, Role.PLANNED, Role.BASELINE))}
+
+
+def roles_of(shown: Comparison | Sweep) -> dict[str, Role]:
+    """What each plan is; one of which it is not known is planned, or a step where it jumps."""
+    if isinstance(shown, Sweep):
+        return {name: shown.roles.get(name, Role.PLANNED) for name in shown.metrics}
+    return {name: shown.roles.get(name) or role_of(plan) for name, plan in shown.plans.items()}
+
+
+def plan_styles(shown: Comparison | Sweep, axes: Axes, known: Mapping[str, Style] | None = None) -> dict[str, Style]:
     """Colour, dashes and label of each plan to be drawn in an axes.
 
     Those of `line_styles`; in the colours of the user's cycle where one is set,
     and unlike the curves that the axes have already.
     """
-    return _told_apart(line_styles(names), axes)
+    return _told_apart(line_styles(roles_of(shown), known), axes)
 
 
-def axis_styles(labels: Iterable[str], axes: Axes) -> dict[str, dict[str, Any]]:
+def axis_styles(labels: Iterable[str], axes: Axes) -> dict[str, Style]:
     """Colour, dashes and label of each axis of one plan to be drawn in an axes."""
     pairs = zip(labels, cycle(_PALETTE))
     return _told_apart(
@@ -322,7 +356,7 @@ def axis_styles(labels: Iterable[str], axes: Axes) -> dict[str, dict[str, Any]]:
     )
 
 
-def _told_apart(styles: dict[str, dict[str, Any]], axes: Axes) -> dict[str, dict[str, Any]]:
+def _told_apart(styles: dict[str, Style], axes: Axes) -> dict[str, Style]:
     """Styles with the user's colours and dashes, other than those of the curves that axes have."""
     drawn = [line for line in axes.lines if line.get_linestyle() != "None"]
     chosen = _users_cycle()
@@ -369,7 +403,7 @@ def _another(label: str, drawn: Sequence[Line2D]) -> str:
     return numbered
 
 
-def _users_cycle() -> list[dict[str, Any]]:
+def _users_cycle() -> list[Style]:
     """Properties of curves in turn, as the user has set them; empty where they are matplotlib's own."""
     chosen = mpl.rcParams["axes.prop_cycle"]
     return [] if chosen == mpl.rcParamsDefault["axes.prop_cycle"] else list(chosen)

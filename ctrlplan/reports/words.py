@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass
 
 from ctrlplan.studies.comparison import Comparison
@@ -97,7 +98,10 @@ def unit_in(comparison: Comparison, unit: str) -> str:
     first = next(iter(comparison.plans.values()))
     y = _shared([comparison.units.get(label, "") for label in first.labels])
     u = _shared([comparison.units.get(name, "") for name in comparison.controls])
-    return in_units(unit.replace("^2", "²").replace("^5", "⁵"), y, u)
+    return in_units(re.sub(r"\^(-?\d+)", lambda power: power[1].translate(_SUPERSCRIPTS), unit), y, u)
+
+
+_SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def number(value: float, unit: str = "") -> str:

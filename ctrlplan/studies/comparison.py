@@ -23,6 +23,7 @@ from ctrlplan.studies.notes import how_measured, mark_of, notes_of
 from ctrlplan.studies.plans import references_of, waypoints_given
 from ctrlplan.studies.roles import Role, Stability, role_of, stability_of
 from ctrlplan.studies.running import Builder, System
+from ctrlplan.studies.sections import AnimatedCrane, PlanCurves, Responses, Section
 from ctrlplan.studies.study import Study
 from ctrlplan.studies.units import Signals, checked_units, listed_measures, scales_of, signals_of_runs
 from ctrlplan.trajectories import Trajectory, Waypoint
@@ -171,6 +172,12 @@ class Comparison:
 
         return plot_responses(self, ax=ax)
 
+    def sections(self) -> tuple[Section, ...]:
+        """Sections of its page: plans and responses, and the animation where all loops are cranes."""
+        labels = [set(response.output_labels or ()) for response in self.responses.values()]
+        cranes = all(known >= set(AnimatedCrane.signals) for known in labels)
+        return (PlanCurves(), Responses(), *([AnimatedCrane()] if cranes else []))
+
     def report(self, path: str | os.PathLike[str]) -> Path:
         """Write one self-contained HTML page and return its path.
 
@@ -181,7 +188,8 @@ class Comparison:
         """
         from ctrlplan.reports import write_page
 
-        return write_page([Study("comparison", self.title, self, notes=self.notes)], path, title=self.title)
+        study = Study("comparison", self.title, self, notes=self.notes, sections=self.sections())
+        return write_page([study], path, title=self.title)
 
     def _repr_html_(self) -> str:
         from ctrlplan.reports import comparison_fragment

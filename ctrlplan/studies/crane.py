@@ -40,7 +40,19 @@ from ctrlplan.studies.crane_setup import (
     obstacle_waypoints,
 )
 from ctrlplan.studies.measures import Measure, Run, signals_of
-from ctrlplan.studies.study import Curves, Study
+from ctrlplan.studies.sections import (
+    AnimatedCrane,
+    ClaimTable,
+    CraneMotion,
+    CranePaths,
+    CraneSketch,
+    CraneStep,
+    CraneTime,
+    Curves,
+    FastestMove,
+    LoopBlocks,
+)
+from ctrlplan.studies.study import Study
 from ctrlplan.systems.plants import LAWS, crane_loop
 from ctrlplan.systems.plants.crane.laws import LawName
 from ctrlplan.trajectories import PiecewiseSpline, PolySpline, Step, Trajectory, TrigSpline, Waypoint
@@ -98,9 +110,24 @@ def crane_nominal_study(progress: bool = True) -> Study:
             "correct what is not nominal.",
             *fastest_notes(limited),
         ),
-        fastest=limited,
-        figures=("crane-sketch", "crane-blocks", "crane-time", "crane-step", "crane-motion", "crane-sway"),
-        curves=(_sway_curves(),),
+        sections=(
+            CraneSketch(caption="The crane and its variables (figure 2), z down."),
+            LoopBlocks(
+                crane_loop(CRANE, PolySpline(points)),
+                {"plan": "path generator", "generator": "flat law (15a,b)", "trolley_pid": "PID", "hoist_pid": "PID"},
+                caption="Structure of the controller (figure 3), drawn from the blocks and connections of the model "
+                "itself.",
+            ),
+            CraneTime(),
+            CraneStep(
+                caption="The step: force and torque at their limits (dashed), up to the slack rope: where the tension "
+                "comes to 0 the model ends, and so does the run."
+            ),
+            CraneMotion(),
+            _sway_curves(),
+            AnimatedCrane(),
+            FastestMove(limited),
+        ),
     )
 
 
@@ -138,8 +165,7 @@ def crane_first_order_study(progress: bool = True) -> Study:
             _step_note(found),
             _limits_note(found),
         ),
-        figures=("crane-time", "crane-curves", "crane-motion"),
-        curves=(_speed_curves(points),),
+        sections=(CraneTime(), _speed_curves(points), CraneMotion(), AnimatedCrane()),
     )
 
 
@@ -183,11 +209,14 @@ def crane_obstacle_study(progress: bool = True) -> Study:
             _step_note(found),
             _limits_note(found),
         ),
-        figures=("crane-plane", "crane-time", "crane-curves", "crane-motion"),
-        curves=(_length_curves(),),
-        wall=WALL,
-        claim=optimality_claim(grids),
-        grids=grids,
+        sections=(
+            CranePaths(WALL),
+            CraneTime(),
+            _length_curves(),
+            CraneMotion(WALL),
+            AnimatedCrane(WALL),
+            ClaimTable(optimality_claim(grids), grids),
+        ),
     )
 
 
@@ -328,7 +357,8 @@ def _sway_curves() -> Curves:
         state = np.zeros(system.nstates)
         state[system.nstates - 6 + 2] = 0.05
         rows[label] = np.asarray(simulate(system, t, initial_state=state).outputs).reshape(-1)
-    return Curves("time [s]", "sway [rad]", t, rows, "Sway after a push of 0.05 rad, loops linearised at R = 10 m.")
+    caption = "Sway after a push of 0.05 rad, loops linearised at R = 10 m."
+    return Curves("time [s]", "sway [rad]", t, rows, key="crane-sway", caption=caption)
 
 
 def _speed_curves(points: tuple[Waypoint, Waypoint]) -> Curves:
@@ -351,7 +381,8 @@ def _speed_curves(points: tuple[Waypoint, Waypoint]) -> Curves:
         "speed of the plan [m/s]",
         alphas,
         {name: np.array(row) for name, row in rows.items()},
-        "Speed at which the plan starts and ends over alpha: what is not 0 there, the load swings off.",
+        key="crane-curves",
+        caption="Speed at which the plan starts and ends over alpha: what is not 0 there, the load swings off.",
     )
 
 
@@ -382,6 +413,8 @@ def _length_curves() -> Curves:
         "path length [m]",
         alphas,
         rows,
-        "Length of the path over alpha for three end times; A and B stay at 6 and 11 s.",
         log=True,
+        paired=True,
+        key="crane-curves",
+        caption="Length of the path over alpha for three end times; A and B stay at 6 and 11 s.",
     )

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctrlplan.studies.comparison import Comparison, finite_or_none
+from ctrlplan.studies.sections import Bands, DrawTable, PlanCurves
 from ctrlplan.studies.study import Study
 from ctrlplan.studies.units import ROUNDING
 
@@ -162,7 +163,8 @@ class Ensemble:
         from ctrlplan.reports import write_page
 
         notes = (*self.nominal.notes, *self.notes())
-        study = Study("draws", title, self.nominal, notes=notes, figures=("bands", "responses"), ensemble=self)
+        shown = [section for section in self.nominal.sections() if not isinstance(section, PlanCurves)]
+        study = Study("draws", title, self.nominal, notes=notes, sections=(Bands(self), *shown, DrawTable(self)))
         return write_page([study], path, title=title)
 
     def notes(self) -> Iterator[str]:

@@ -32,6 +32,7 @@ from ctrlplan.studies.crane_setup import CRANE_MEASURES, LOAD, SLACK, marked_sla
 from ctrlplan.studies.experiment import Experiment
 from ctrlplan.studies.plans import standard_plans
 from ctrlplan.studies.running import Builder, System
+from ctrlplan.studies.sections import AnimatedCrane, CraneMotion, CranePaths, CraneTime, PlanCurves
 from ctrlplan.studies.study import Study
 from ctrlplan.systems.plants import LAWS, Crane, crane_loop, unity_feedback_loop
 from ctrlplan.systems.plants.crane.laws import as_law
@@ -132,8 +133,8 @@ class StudyFile:
             raise StudyError(f"{self.path}: loop: must run, got {type(error).__name__}: {error}") from error
         if self.loop["kind"] != "crane":
             return Study(self.name, self.title, comparison, notes=comparison.notes)
-        figures = ("crane-plane", "plans", "crane-time", "crane-motion")
-        return Study(self.name, self.title, marked_slack(comparison), notes=comparison.notes, figures=figures)
+        sections = (CranePaths(), PlanCurves(), CraneTime(), CraneMotion(), AnimatedCrane())
+        return Study(self.name, self.title, marked_slack(comparison), notes=comparison.notes, sections=sections)
 
     def _crane(self) -> tuple[Data, Choices]:
         """Fields of the experiment with a crane, and how planning is judged: by sway, and against shaped references."""

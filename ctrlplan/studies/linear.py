@@ -12,8 +12,9 @@ from scipy.optimize import minimize_scalar
 from ctrlplan.studies.benefit import benefit
 from ctrlplan.studies.comparison import Comparison, compare
 from ctrlplan.studies.running import Builder
+from ctrlplan.studies.sections import PlanCurves, Plane, Responses, SweepCurves
 from ctrlplan.studies.study import Study
-from ctrlplan.studies.sweep import Sweep, sweep
+from ctrlplan.studies.sweep import Sweep, settling_jumps, sweep
 from ctrlplan.systems import create_feedforward_iosystem, create_source_iosystem
 from ctrlplan.systems.plants import integrator_lag_loop
 from ctrlplan.trajectories import PolySpline, Step, Trajectory, TrigSpline, Waypoint
@@ -24,8 +25,11 @@ WAYPOINTS = (Waypoint(0.0, 0.0, 0.0, 0.0), Waypoint(1.0, 1.0, 0.0, 0.0))
 GAIN = 5.0
 GAINS = (0.25, 1000.0)
 TIMEPTS = np.linspace(0.0, 20.0, 8001)
-TABLE = (1.0, 5.0, 20.0, 100.0, 1000.0)
-"""Gains whose points figure 1 marks."""
+NUMBERED = {
+    "step": {1.0: (-26, -4), 5.0: (-34, 12), 20.0: (-34, 0), 100.0: (-34, 0), 1000.0: (-36, 2)},
+    "trigonometric": {1.0: (26, 4), 5.0: (30, 0), 20.0: (44, 22), 100.0: (-14, 12), 1000.0: (24, 9)},
+}
+"""Gains whose points figure 1 marks, and where their numbers stand beside them [pt]; of few plans, or they overlap."""
 SWEPT = ("settling_time", "overshoot_error", "control_peak", "control_effort")
 FED = "trigonometric, feedforward"
 STEP_LIMIT = (-np.log(0.02) / 0.5, 100.0)
@@ -88,25 +92,26 @@ def linear_study(progress: bool = True, count: int = 241, finest: float = 1e-3) 
             "tracking error, as the paper does; settling is the last entry into ±2 % of the change."
         ),
         notes=tuple(_notes(comparison, swept)),
-        sweep=swept,
-        figures=("plane", "gain", "plans", "responses"),
+        sections=(
+            Plane(
+                swept,
+                NUMBERED,
+                STEP_LIMIT,
+                "limit of the step, k → ∞",
+                caption=f"Settling time against overshoot on the error as the gain runs from {GAINS[0]:g} to "
+                f"{GAINS[1]:g} (figure 1 of the paper). Curves are broken where the settling time jumps.",
+            ),
+            SweepCurves(
+                swept,
+                ("settling_time", "overshoot_error", "control_peak", "control_effort"),
+                kept=(),  # the plane has them
+                caption="The same over the gain, with what each reference asks of the control: its peak and its "
+                "effort ∫u² dt.",
+            ),
+            PlanCurves(),
+            Responses(),
+        ),
     )
-
-
-def jumps(gains: Array, settling: Array, slope: float = 3.0) -> NDArray[np.bool_]:
-    """Between which neighbouring gains a settling time jumps: shape (ngains - 1,).
-
-    Between jumps it changes about as fast as the period of the oscillation,
-    with the power -1/2 of the gain; a jump is a change of more than 0.5 % with
-    a power of more than `slope`.
-    """
-    found = np.zeros(gains.size - 1, dtype=bool)
-    usable = np.isfinite(settling) & (settling > 0.0) & (gains > 0.0)
-    pairs = usable[1:] & usable[:-1]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        change, width = np.abs(np.diff(np.log(settling))), np.diff(np.log(gains))
-    found[pairs] = (change[pairs] > 0.005) & (change[pairs] > slope * width[pairs])
-    return found
 
 
 def _plain_loop(name: str, plan: Trajectory) -> ct.StateSpace:
@@ -136,9 +141,9 @@ def _refined_sweep(count: int, finest: float, progress: bool) -> Sweep:
         return found
 
     even = np.linspace(GAINS[0] ** 0.5, GAINS[1] ** 0.5, count)[1:-1] ** 2
-    found = swept(np.union1d(np.union1d(even, np.geomspace(*GAINS, count // 4)), TABLE))
+    found = swept(np.union1d(np.union1d(even, np.geomspace(*GAINS, count // 4)), list(NUMBERED["step"])))
     while True:
-        jump = np.any([jumps(found.values, r["settling_time"], 0.8) for r in found.metrics.values()], axis=0)
+        jump = np.any([settling_jumps(found.values, r["settling_time"], 0.8) for r in found.metrics.values()], axis=0)
         wide = found.values[1:] / found.values[:-1] > 1.0 + finest
         left = found.values[:-1][jump & wide]
         right = found.values[1:][jump & wide]

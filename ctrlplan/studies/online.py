@@ -16,6 +16,7 @@ from ctrlplan.simulation import simulate
 from ctrlplan.studies.comparison import Comparison, compare
 from ctrlplan.studies.crane_setup import CRANE, TORQUE_LIMITS, UNITS, Drives, nominal_waypoints
 from ctrlplan.studies.measures import Measure, Run, signals_of
+from ctrlplan.studies.sections import AnimatedCrane, CraneOnline
 from ctrlplan.studies.study import Study
 from ctrlplan.systems import (
     AdmissibleSet,
@@ -366,7 +367,7 @@ def _in_time_note(limit: float) -> str:
 
 
 def _study(name: str, found: Comparison, summary: str, *notes: str) -> Study:
-    return Study(name, found.title, found, summary, (*notes, *found.notes), figures=("crane-online",))
+    return Study(name, found.title, found, summary, (*notes, *found.notes), (CraneOnline(), AnimatedCrane()))
 
 
 def _move() -> TrigSpline:

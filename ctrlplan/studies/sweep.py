@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -30,6 +30,7 @@ from ctrlplan.studies.executing import (
 )
 from ctrlplan.studies.experiment import Experiment, Metrics
 from ctrlplan.studies.measures import Measure
+from ctrlplan.studies.roles import Role, role_of
 from ctrlplan.studies.running import Builder, System, is_builder
 from ctrlplan.trajectories import Trajectory, Waypoint
 
@@ -58,6 +59,10 @@ class Sweep:
         Values that could not be run, and why; `Failure.draw` is the value's index.
     interrupted : bool
         Whether Ctrl-C ended the sweep: values that it did not reach are then missing.
+    roles : dict of str to Role
+        What each plan is, where known.
+    band : float
+        Settling band, relative to the range of the plan.
     """
 
     parameter: str
@@ -65,6 +70,8 @@ class Sweep:
     metrics: dict[str, dict[str, Array]]
     failures: tuple[Failure, ...] = ()
     interrupted: bool = False
+    roles: dict[str, Role] = field(default_factory=dict)
+    band: float = 0.02
 
     def __repr__(self) -> str:
         return f"<Sweep of {', '.join(self.metrics)} over {self.values.size} values of {self.parameter}>"
@@ -102,7 +109,8 @@ class Sweep:
         moved = [replace(failure, draw=int(place[failure.draw])) for failure in self.failures]
         moved += [replace(failure, draw=int(place[failure.draw + self.values.size])) for failure in other.failures]
         failures = tuple(sorted(moved, key=lambda failure: failure.draw))
-        return Sweep(self.parameter, values[order], rows, failures, self.interrupted or other.interrupted)
+        interrupted = self.interrupted or other.interrupted
+        return Sweep(self.parameter, values[order], rows, failures, interrupted, self.roles | other.roles, self.band)
 
     def _column(self, plan: str, name: str) -> Array:
         return self.metrics.get(plan, {}).get(name, np.full(self.values.size, np.nan))
@@ -244,6 +252,8 @@ def sweep(
         account = executed(run, points.tolist(), executor, timeout, parameter, progress)
         account.raise_if_all_lost("build")
     found = _swept(parameter, points, account)
+    roles = {name: role_of(experiment.plans[name]) for name in found.metrics}
+    found = replace(found, roles=roles, band=experiment.band)
     if found.interrupted:
         kept = f"{found.values.size} of {points.size} values are kept"
         warnings.warn(f"the sweep was interrupted: {kept}", UserWarning, stacklevel=outside_stacklevel())
@@ -343,3 +353,19 @@ def _outcomes(
     except KeyboardInterrupt:  # what has been built is soon measured
         yield from together()
         raise
+
+
+def settling_jumps(values: Array, settling: Array, slope: float = 3.0) -> NDArray[np.bool_]:
+    """Between which neighbouring values of a gain a settling time jumps: shape (nvalues - 1,).
+
+    Between jumps it changes about as fast as the period of the oscillation,
+    with the power -1/2 of the gain; a jump is a change of more than 0.5 % with
+    a power of more than `slope`.
+    """
+    found = np.zeros(values.size - 1, dtype=bool)
+    usable = np.isfinite(settling) & (settling > 0.0) & (values > 0.0)
+    pairs = usable[1:] & usable[:-1]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        change, width = np.abs(np.diff(np.log(settling))), np.diff(np.log(values))
+    found[pairs] = (change[pairs] > 0.005) & (change[pairs] > slope * width[pairs])
+    return found

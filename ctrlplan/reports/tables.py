@@ -1,0 +1,109 @@
+"""Tables of a page: metrics, their spread over draws, and numbers over alpha and duration."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+from ctrlplan.reports.parts import Cell, Head, MetricRow, MetricsTable, Plan, Table
+from ctrlplan.reports.style import Style, line_styles, roles_of
+from ctrlplan.reports.words import number, unit_of, verdicts
+from ctrlplan.studies.comparison import Comparison
+from ctrlplan.studies.ensemble import Ensemble
+from ctrlplan.studies.grids import SAME, Grid
+from ctrlplan.studies.needs import Need
+
+_NONE = (math.nan,) * 5
+
+
+def metrics_of(comparison: Comparison, kind: str = "metrics", known: Mapping[str, Style] | None = None) -> MetricsTable:
+    """Metrics of a comparison, best and worst marked.
+
+    Parameters
+    ----------
+    comparison : Comparison
+        What is shown.
+    kind : str, optional
+        Class of the table in the page's style.
+    known : mapping of str to dict, optional
+        Styles of plans that other figures of the page show, from `line_styles`.
+    """
+    decided = {v.key: v for v in verdicts(comparison)}
+    rows = []
+    for key, measure in comparison.measures.items():
+        if not any(key in found for found in comparison.metrics.values()):
+            continue
+        verdict = decided.get(key)
+        winners, losers = ((), ()) if verdict is None else (verdict.winners, verdict.losers)
+        cells = []
+        for plan, found in comparison.metrics.items():
+            value = found.get(key, math.nan)
+            mark, meaning = ("lose", "worst") if plan in losers else ("win", "best") if plan in winners else ("", "")
+            cells.append(Cell(number(value, measure.unit), mark, meaning, _order(value)))
+        rows.append(MetricRow(measure.title, unit_of(comparison, key), cells))
+    styles = line_styles(roles_of(comparison), known)
+    plans = [Plan(plan, styles[plan]["color"], "†" if plan in comparison.marks else "") for plan in comparison.metrics]
+    return MetricsTable(plans, rows, kind)
+
+
+def spread_of(ensemble: Ensemble) -> MetricsTable:
+    """Metrics over draws: the median, and where nine tenths of them lie."""
+    nominal, rows = ensemble.nominal, []
+    for key, measure in nominal.measures.items():
+        if not any(key in found for found in ensemble.metrics.values()):
+            continue
+        cells = []
+        for plan in nominal.metrics:
+            low, _, middle, _, high = ensemble.quantiles(key)[plan] if key in ensemble.metrics.get(plan, {}) else _NONE
+            text = f"{number(middle, measure.unit)} ({number(low, measure.unit)} to {number(high, measure.unit)})"
+            cells.append(Cell(text, order=_order(float(middle))))
+        rows.append(MetricRow(measure.title, unit_of(nominal, key), cells))
+    styles = line_styles(roles_of(nominal))
+    return MetricsTable([Plan(plan, styles[plan]["color"]) for plan in nominal.metrics], rows)
+
+
+def grid_of(grid: Grid, unit: str) -> Table:
+    """A number over duration and alpha, the baselines behind it.
+
+    Parameters
+    ----------
+    grid : Grid
+        What is shown.
+    unit : str
+        Unit of the number.
+    """
+    rows = []
+    for i, (duration, marks) in enumerate(zip(grid.durations.tolist(), grid.marks(), strict=True)):
+        best, _ = grid.best(i)
+        own = zip(grid.values[i].tolist(), marks, strict=True)
+        cells = [Cell(number(value, unit), mark, _GRID_MARKS.get(mark, "")) for value, mark in own]
+        cells += [
+            Cell(number(float(values[i]), unit), "best" if name == best else "") for name, values in grid.rivals.items()
+        ]
+        rows.append([Cell(f"{duration:.4g}"), *cells])
+    shapes = [f"alpha {a:.3g}" if a else "alpha 0 (polynomial)" for a in grid.alphas.tolist()]
+    return Table(["takes [s]", *shapes, *grid.rivals], rows, "grid")
+
+
+_GRID_MARKS = {"win": "better than every rival", "lose": "worse than the best rival"}
+
+
+def needs_of(needs: Sequence[Need]) -> Table:
+    """Minimum durations of plans under the same limits."""
+    least = min((need.duration for need in needs if math.isfinite(need.duration)), default=math.nan)
+    rows = []
+    for need in needs:
+        mark, meaning = ("win", "best") if need.duration <= least * (1.0 + SAME) else ("", "")
+        rows.append([Cell(need.name), Cell(number(need.duration), mark, meaning), Cell(need.limit), Cell(need.kept)])
+    heads = [
+        Head("plan"),
+        Head("takes [s]"),
+        Head("limit that does not let it be shorter", words=True),
+        Head("limits in the time above", words=True),
+    ]
+    return Table(heads, rows, "needs")
+
+
+def _order(value: float) -> str:
+    """What a cell is sorted by."""
+    return "" if math.isnan(value) else "1e999" if math.isinf(value) else repr(value)

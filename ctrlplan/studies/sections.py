@@ -1,0 +1,318 @@
+"""Sections of a study: what its page shows around the metrics, as data.
+
+Each section is a small frozen class. `ctrlplan.reports.draw` draws it by its
+type; nothing here draws.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:  # comparisons and ensembles make studies of themselves for their pages
+    import control as ct
+
+    from ctrlplan.planning import Fastest
+    from ctrlplan.studies.ensemble import Ensemble
+    from ctrlplan.studies.grids import Grid
+    from ctrlplan.studies.sweep import Sweep
+
+Wall: TypeAlias = tuple[tuple[float, float], tuple[float, float]] | None
+"""An obstacle of a crane: its sides in x and in z (down) [m]; None for none."""
+
+Place: TypeAlias = tuple[float, float]
+"""Where a text stands relative to its point, right and up [pt]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Section:
+    """Section of a study: a new type is a subclass, and a function that draws it.
+
+    Attributes
+    ----------
+    caption : str
+        Caption of its figure, in place of the one that its type has.
+
+    Examples
+    --------
+    A section with a figure and a table of its own:
+
+    >>> from dataclasses import dataclass
+    >>> import ctrlplan as cp
+    >>> from ctrlplan.reports import Part, Picture, Table, draw
+    >>> from ctrlplan.studies import Study
+    >>> from ctrlplan.studies.sections import Section
+    >>> @dataclass(frozen=True)
+    ... class Durations(Section):
+    ...     longest: float
+    >>> @draw.register
+    ... def _(section: Durations, study: Study) -> Part:
+    ...     plan = next(iter(study.comparison.plans.values()))
+    ...     rows = [[name, f"{plan.duration:g}"] for name, plan in study.comparison.plans.items()]
+    ...     picture = Picture("plan", plan.plot(), section.caption or "The first plan.")
+    ...     table = Table(["plan", f"duration, at most {section.longest:g} [s]"], rows)
+    ...     return Part([picture, table], heading="Durations")
+
+    It stands in ``Study(..., sections=(Durations(2.0),))`` as any other.
+    """
+
+    caption: str = ""
+
+    def results(self) -> dict[str, Any]:
+        """Plain data for ``results.json``, by key: nothing, unless a type has data of its own."""
+        return {}
+
+
+# Comparisons
+
+
+@dataclass(frozen=True)
+class PlanCurves(Section):
+    """References of the comparison and their derivatives.
+
+    Attributes
+    ----------
+    derivatives : int
+        Highest derivative.
+    """
+
+    derivatives: int = 2
+
+
+@dataclass(frozen=True)
+class Responses(Section):
+    """Output, error and control of each plan of the comparison."""
+
+
+@dataclass(frozen=True)
+class Curves(Section):
+    """Curves over one variable.
+
+    Attributes
+    ----------
+    x_label, y_label : str
+        Names with units.
+    x : ndarray, shape (npoints,)
+        The variable.
+    rows : dict of str to ndarray
+        Curves by name.
+    log : bool
+        Whether the y axis is logarithmic.
+    paired : bool
+        Whether each two curves belong together, in one colour.
+    key : str
+        Id of the figure on the page.
+    """
+
+    x_label: str
+    y_label: str
+    x: NDArray[np.float64]
+    rows: Mapping[str, NDArray[np.float64]]
+    log: bool = False
+    paired: bool = False
+    key: str = "curves"
+
+
+# Sweeps and draws
+
+
+@dataclass(frozen=True)
+class Plane(Section):
+    """Settling time against overshoot on the error, a point for each value of a sweep.
+
+    Attributes
+    ----------
+    sweep : Sweep
+        With both metrics.
+    numbered : dict of str to dict of float to (float, float)
+        Plan, value of the parameter, place: values that are written beside
+        their points.
+    limit : (float, float) or None
+        Settling time [s] and overshoot [%] of a limit point to be marked.
+    limit_label : str
+        What the limit point is.
+    """
+
+    sweep: Sweep
+    numbered: Mapping[str, Mapping[float, Place]] = field(default_factory=dict)
+    limit: tuple[float, float] | None = None
+    limit_label: str = "limit"
+
+    def results(self) -> dict[str, Any]:
+        """The two metrics over the parameter."""
+        return {"sweep": self.sweep.results(("overshoot_error", "settling_time"))}
+
+
+@dataclass(frozen=True)
+class SweepCurves(Section):
+    """Metrics over the parameter of a sweep.
+
+    Attributes
+    ----------
+    sweep : Sweep
+        With these metrics.
+    metrics : tuple of str
+        Names of the metrics.
+    kept : tuple of str or None
+        Those that ``results.json`` has; all, unless given.
+    """
+
+    sweep: Sweep
+    metrics: tuple[str, ...] = ("settling_time", "overshoot_error")
+    kept: tuple[str, ...] | None = None
+
+    def results(self) -> dict[str, Any]:
+        """The metrics that are kept, over the parameter."""
+        kept = self.metrics if self.kept is None else self.kept
+        return {"sweep": self.sweep.results(kept)} if kept else {}
+
+
+@dataclass(frozen=True)
+class Bands(Section):
+    """Quantiles of signals over draws.
+
+    Attributes
+    ----------
+    ensemble : Ensemble
+        The draws.
+    """
+
+    ensemble: Ensemble
+
+
+@dataclass(frozen=True)
+class DrawTable(Section):
+    """Quantiles of metrics over draws, whose nominal loop is that of the study.
+
+    Attributes
+    ----------
+    ensemble : Ensemble
+        The draws.
+    """
+
+    ensemble: Ensemble
+
+    def results(self) -> dict[str, Any]:
+        """Draws, metrics and failures."""
+        return {"draws": self.ensemble.results()}
+
+
+# Planning
+
+
+@dataclass(frozen=True)
+class FastestMove(Section):
+    """A plan of minimum duration within limits.
+
+    Attributes
+    ----------
+    fastest : Fastest
+        The plan, and its margins.
+    """
+
+    fastest: Fastest
+
+
+@dataclass(frozen=True)
+class ClaimTable(Section):
+    """Whether the trigonometric path is optimal.
+
+    Attributes
+    ----------
+    claim : tuple of str
+        What was found, in sentences.
+    grids : tuple of Grid
+        The numbers over alpha and duration that show it.
+    """
+
+    claim: tuple[str, ...]
+    grids: tuple[Grid, ...]
+
+
+# Cranes and loops
+
+
+@dataclass(frozen=True)
+class CraneSketch(Section):
+    """A crane and its variables."""
+
+
+@dataclass(frozen=True)
+class LoopBlocks(Section):
+    """Blocks and connections of a loop.
+
+    Attributes
+    ----------
+    loop : control.InterconnectedSystem
+        The loop.
+    titles : dict of str to str
+        What is written in place of a block's name.
+    """
+
+    loop: ct.InterconnectedSystem
+    titles: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class CraneTime(Section):
+    """Load, error, sway and controls of cranes over time."""
+
+
+@dataclass(frozen=True)
+class CraneStep(Section):
+    """Controls, tension and sway of a crane for a step, with the limits of its loop."""
+
+
+@dataclass(frozen=True)
+class CraneOnline(Section):
+    """Load, distance from the goal, sway and force of cranes over time."""
+
+
+@dataclass(frozen=True)
+class CranePaths(Section):
+    """Paths of the load in the plane.
+
+    Attributes
+    ----------
+    wall : ((float, float), (float, float)) or None
+        An obstacle.
+    """
+
+    wall: Wall = None
+
+
+@dataclass(frozen=True)
+class CraneMotion(Section):
+    """Trolley, rope and load at equal time steps.
+
+    Attributes
+    ----------
+    wall : ((float, float), (float, float)) or None
+        An obstacle.
+    """
+
+    wall: Wall = None
+
+
+@dataclass(frozen=True)
+class AnimatedCrane(Section):
+    """Animation of trolley, rope and load.
+
+    Attributes
+    ----------
+    wall : ((float, float), (float, float)) or None
+        An obstacle.
+    shown : str
+        The plan that is shown at first; unless given, the first trigonometric
+        one, or else the first that is no step.
+    """
+
+    signals: ClassVar[tuple[str, ...]] = ("x", "z", "D", "R", "theta")
+    """Outputs that the loops must have: load, trolley, length and angle of the rope."""
+
+    wall: Wall = None
+    shown: str = ""
