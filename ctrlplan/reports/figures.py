@@ -356,9 +356,8 @@ def _number_point(axes: Axes, sweep: Sweep, plan: str, value: float, place: Plac
     """Circle at the point of a value, and the value beside it."""
     at = int(np.argmin(np.abs(sweep.values - value)))
     if not np.isclose(sweep.values[at], value, rtol=1e-9, atol=0.0):
-        raise ValueError(
-            f"numbered must be of values of the sweep, got {value:g} for {plan}, next to {sweep.values[at]:g}"
-        )
+        near = f"{sweep.values[at]:g} is the nearest"
+        raise ValueError(f"numbered must be of values of the sweep, got {value:g} for {plan}; {near}")
     point = float(sweep.metrics[plan]["settling_time"][at]), float(sweep.metrics[plan]["overshoot_error"][at])
     axes.plot(*point, "o", color=colour, mfc=axes.get_facecolor(), markersize=marker_size(5), zorder=4)
     axes.annotate(

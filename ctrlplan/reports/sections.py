@@ -78,9 +78,7 @@ def draw(section: Section | Benefit, study: Study) -> Part:
         If no function is registered for the type.
     """
     kind = type(section).__name__
-    raise TypeError(
-        f"sections must be of a type with a function that draws it, got {kind}; register one by draw.register"
-    )
+    raise TypeError(f"sections must be of a type that can be drawn, got {kind}; register a function by draw.register")
 
 
 # Comparisons

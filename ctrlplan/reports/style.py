@@ -302,8 +302,8 @@ def _as_by_default(name: str) -> bool:
 def line_styles(roles: Mapping[str, Role], known: Mapping[str, Style] | None = None) -> dict[str, Style]:
     """Colour and dashes of each plan where nothing is set by a user.
 
-    The first step is black and dotted; planned references, then baselines, have
-    the colours of the palette in order.
+    The first step is black and dotted, and the first planned references have
+    the main colours in order; baselines and all others have the other colours.
 
     Parameters
     ----------
@@ -313,13 +313,13 @@ def line_styles(roles: Mapping[str, Role], known: Mapping[str, Style] | None = N
         Styles of plans that are drawn elsewhere on the page, which they keep.
     """
     main = {name: (style["color"], style["linestyle"]) for name, style in (known or {}).items() if name in roles}
-    free = [look for look in (_STEP, *_PLANS) if look[0] not in {colour for colour, _ in main.values()}]
-    for name, role in sorted(roles.items(), key=lambda entry: _RANKS[entry[1]]):
-        fit = [look for look in free if (look is _STEP) is (role is Role.STEP)]
-        if name not in main and fit:
-            main[name] = fit[0]
-            free.remove(fit[0])
-    spare, dashed = cycle([*_OTHERS, *(colour for colour, _ in free)]), cycle(_OTHER_DASHES)
+    used = {colour for colour, _ in main.values()}
+    free = {Role.STEP: [_STEP], Role.PLANNED: [*_PLANS], Role.BASELINE: []}
+    free = {role: [look for look in looks if look[0] not in used] for role, looks in free.items()}
+    for name, role in roles.items():
+        if name not in main and free[role]:
+            main[name] = free[role].pop(0)
+    spare, dashed = cycle([*_OTHERS, *(colour for looks in free.values() for colour, _ in looks)]), cycle(_OTHER_DASHES)
     styles: dict[str, Style] = {}
     for name in roles:
         colour, dashes = main[name] if name in main else (next(spare), next(dashed))
@@ -327,9 +327,6 @@ def line_styles(roles: Mapping[str, Role], known: Mapping[str, Style] | None = N
         zorder = 2.0 if dashes == "-" else 2.5
         styles[name] = {"color": colour, "linestyle": dashes, "label": legend_label(name), "zorder": zorder}
     return styles
-
-
-_RANKS = {role: rank for rank, role in enumerate((Role.STEP, Role.PLANNED, Role.BASELINE))}
 
 
 def roles_of(shown: Comparison | Sweep) -> dict[str, Role]:

@@ -10,10 +10,11 @@ import pytest
 
 import ctrlplan as cp
 from ctrlplan.reports import render_page
-from ctrlplan.reports.figures import FIGURES, plot_bands
+from ctrlplan.reports.figures import plot_bands
 from ctrlplan.reports.style import page_style
 from ctrlplan.studies import Study
 from ctrlplan.studies.ensemble import LEVELS
+from ctrlplan.studies.sections import Bands, DrawTable
 
 TIMES = np.linspace(0.0, 6.0, 301)
 TAU = np.linspace(0.5, 1.5, 21)  # quantiles at 1, 5, 10, 15, 19
@@ -170,9 +171,9 @@ def test_figures_of_a_page_do_not_pile_up_in_pyplot(drawn):
     assert plt.get_fignums() == before
 
 
-def test_a_figure_of_bands_needs_draws(drawn):
-    with pytest.raises(ValueError, match="study it must have draws for this figure, got none"):
-        FIGURES["bands"][0](Study("it", "It", drawn.nominal))
+def test_a_figure_of_bands_needs_draws():
+    with pytest.raises(TypeError, match="missing 1 required positional argument: 'ensemble'"):
+        Bands()
 
 
 # The page
@@ -232,7 +233,7 @@ def test_the_page_says_what_was_drawn(page):
 
 @pytest.mark.slow
 def test_the_page_says_what_failed(failed, read):
-    study = Study("draws", "Draws", failed.nominal, notes=tuple(failed.notes()), ensemble=failed, figures=("bands",))
+    study = Study("draws", "Draws", failed.nominal, notes=tuple(failed.notes()), sections=(Bands(failed),))
     text = read(render_page([study], "Draws")).words()
     assert "1 draws failed; the first, with tau = 3: ValueError: tau is too long & <slow>" in text
 
@@ -258,7 +259,7 @@ def test_values_that_are_never_reached_are_words_that_sort_last(tmp_path, read):
 
 
 def test_results_of_a_study_hold_its_draws(drawn):
-    study = Study("draws", "Draws", drawn.nominal, ensemble=drawn)
+    study = Study("draws", "Draws", drawn.nominal, sections=(DrawTable(drawn),))
     assert study.results()["draws"] == drawn.results()
 
 

@@ -12,9 +12,9 @@ import pytest
 from strict import WARNINGS
 
 import ctrlplan as cp
-from ctrlplan.reports import FIGURES, CraneAnimation, render_page
-from ctrlplan.reports.crane_figures import animation_data, plot_motion, plot_plane, plot_step, plot_time
-from ctrlplan.studies import Study
+from ctrlplan.reports import CraneAnimation, draw, render_page
+from ctrlplan.reports.crane_figures import animation_data, plot_motion, plot_paths, plot_step, plot_time
+from ctrlplan.studies import Study, sections
 from ctrlplan.studies.files import load_study
 
 
@@ -144,7 +144,7 @@ def marked(drawn):
 def test_any_number_of_waypoints_is_named(inner):
     places = [(float(i), 10.0 - 0.1 * i) for i in range(inner + 2)]
     found = compared(points(*places, step=3.0), {"piecewise": cp.PiecewiseSpline(points(*places, step=3.0))})
-    names = marked(plot_plane(found, None))
+    names = marked(plot_paths(found, None))
     assert len(names) == inner + 2
     assert list(names)[:1] == ["start"]
     assert list(names)[-1:] == ["goal"]
@@ -156,14 +156,14 @@ def test_any_number_of_waypoints_is_named(inner):
 def test_waypoints_given_in_part_are_not_marked():
     free = [MOVE[0], cp.Waypoint.from_jets(3.0, x=[math.nan, 1.0], z=[7.0, math.nan]), *MOVE[1:]]
     found = compared(MOVE, {"polynomial": cp.PolySpline(free)})
-    names = marked(plot_plane(compared(MOVE), None)) | marked(plot_plane(found, None))
+    names = marked(plot_paths(compared(MOVE), None)) | marked(plot_paths(found, None))
     assert set(names) == {"start", "A", "goal"}
-    assert set(marked(plot_plane(replace(found, waypoints=tuple(free)), None))) == {"start", "B", "goal"}
+    assert set(marked(plot_paths(replace(found, waypoints=tuple(free)), None))) == {"start", "B", "goal"}
 
 
 def test_figures_need_no_waypoints():
     found = replace(compared(MOVE), waypoints=())
-    assert marked(plot_plane(found, None)) == {}
+    assert marked(plot_paths(found, None)) == {}
     for axes in plot_motion(found, None).axes.flat:
         assert len(ropes(axes)) == 13
     assert json.loads(animation_data(found))["view"][2] > 20.0
@@ -173,9 +173,9 @@ def test_axes_named_z_first_are_not_taken_for_x():
     """The same move, its labels the other way round: the same figures."""
     turned = points((0.0, 10.0), (8.0, 6.0), (20.0, 11.0), order=("z", "x"))
     one, other = compared(MOVE), compared(turned)
-    assert marked(plot_plane(one, None)) == marked(plot_plane(other, None))
-    for draw in (plot_time, lambda c: plot_plane(c, None), lambda c: plot_motion(c, None)):
-        for a, b in zip(draw(one).axes.flat, draw(other).axes.flat, strict=True):
+    assert marked(plot_paths(one, None)) == marked(plot_paths(other, None))
+    for plot in (plot_time, lambda c: plot_paths(c, None), lambda c: plot_motion(c, None)):
+        for a, b in zip(plot(one).axes.flat, plot(other).axes.flat, strict=True):
             for line, again in zip(a.lines, b.lines, strict=True):
                 np.testing.assert_allclose(line.get_xydata(), again.get_xydata(), rtol=0, atol=1e-6)
 
@@ -196,14 +196,15 @@ def test_a_move_that_starts_late_is_drawn_from_its_start():
 # Plans of any name
 
 
-@pytest.mark.parametrize("key", ["crane-plane", "crane-time", "crane-motion"])
+@pytest.mark.parametrize("kind", [sections.CranePaths, sections.CraneTime, sections.CraneMotion])
 @pytest.mark.parametrize("names", [("gentle",), ("a", "b", "c"), ("jump",), ("step",)])
-def test_plans_may_have_any_name(key, names):
+def test_plans_may_have_any_name(kind, names):
     plans = {
         name: cp.Step([20.0, 11.0], [0.0, 10.0], labels=["x", "z"]) if name in ("jump", "step") else cp.PolySpline(MOVE)
         for name in names
     }
-    drawn = FIGURES[key][0](Study("it", "It", compared(MOVE, plans)))
+    (picture,) = draw(kind(), Study("it", "It", compared(MOVE, plans))).blocks
+    drawn = picture.plot
     assert any(len(axes.lines) > 0 or axes.patches for axes in drawn.axes.flat) or names[0] in ("jump", "step")
 
 
@@ -337,7 +338,9 @@ return {view: root.querySelector("svg").getAttribute("viewBox").split(" ").map(N
 def test_the_animation_plays_the_crane_that_was_simulated(browser, tmp_path):
     found = compared(MOVE, crane=wide(1.5))
     path = tmp_path / "index.html"
-    path.write_text(render_page([Study("it", "It", found, figures=())], "It"), encoding="utf-8")
+    path.write_text(
+        render_page([Study("it", "It", found, sections=(sections.AnimatedCrane(),))], "It"), encoding="utf-8"
+    )
     browser.get("about:blank")
     browser.get_log("browser")
     browser.get(path.as_uri())

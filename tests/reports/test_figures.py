@@ -12,12 +12,20 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_hex
 
 import ctrlplan as cp
-from ctrlplan.reports import FIGURES, plot_plane, plot_plans, plot_responses, plot_sweep, plot_trajectory, render_page
-from ctrlplan.reports.style import line_styles, page_style, to_svg
-from ctrlplan.studies import MEASURES, Study
+from ctrlplan.reports import (
+    Picture,
+    draw,
+    plot_plane,
+    plot_plans,
+    plot_responses,
+    plot_sweep,
+    plot_trajectory,
+    render_page,
+)
+from ctrlplan.reports.style import line_styles, page_style, roles_of, to_svg
+from ctrlplan.studies import MEASURES, Role, Study, sections
 from ctrlplan.studies.crane import obstacle_waypoints
-from ctrlplan.studies.linear import STEP_LIMIT
-from ctrlplan.studies.study import Curves
+from ctrlplan.studies.linear import NUMBERED, STEP_LIMIT
 
 MOVE = [cp.Waypoint(0, 0, 0, 0), cp.Waypoint(6, 5), cp.Waypoint(10, 1, 0, 0)]
 TIMES = np.linspace(0, 20, 801)
@@ -59,8 +67,7 @@ def craned():
         return cp.plants.crane_loop(crane, plan, "setpoint" if name == "step" else "generator")
 
     found = cp.compare(loop, plans, np.linspace(0, 20, 401), waypoints=points)
-    curves = Curves("alpha [rad]", "length [m]", TIMES[1:], {"one": TIMES[1:], "two": TIMES[1:] ** 2}, "Two curves.")
-    return Study("crane", "Crane", found, curves=(curves,))
+    return Study("crane", "Crane", found)
 
 
 @pytest.fixture(scope="module")
@@ -82,12 +89,59 @@ def spread(compared):
     return cp.monte_carlo(loop, drawn, plans, TIMES, progress=False, units={"y": "m", "u": "N"})
 
 
+CURVES = {"one": TIMES[1:], "two": TIMES[1:] ** 2}
+# Every type of section with a figure: of a sweep, of draws, of a loop, or of a comparison alone.
+SECTIONS = {
+    "Plane": lambda swept, spread, crane: sections.Plane(swept, NUMBERED, STEP_LIMIT, "limit of the step"),
+    "SweepCurves": lambda swept, spread, crane: sections.SweepCurves(
+        swept, ("settling_time", "overshoot_error", "control_peak", "control_effort")
+    ),
+    "Bands": lambda swept, spread, crane: sections.Bands(spread),
+    "PlanCurves": lambda swept, spread, crane: sections.PlanCurves(),
+    "Responses": lambda swept, spread, crane: sections.Responses(),
+    "Curves": lambda swept, spread, crane: sections.Curves("alpha [rad]", "length [m]", TIMES[1:], CURVES),
+    "FastestMove": lambda swept, spread, crane: sections.FastestMove(
+        cp.fastest(cp.PolySpline(MOVE), {"y_d1": 2.0, "y_d2": 9.0})
+    ),
+    "CraneSketch": lambda swept, spread, crane: sections.CraneSketch(),
+    "LoopBlocks": lambda swept, spread, crane: sections.LoopBlocks(crane, {"plan": "path generator"}),
+    "CraneTime": lambda swept, spread, crane: sections.CraneTime(),
+    "CraneStep": lambda swept, spread, crane: sections.CraneStep(),
+    "CranePaths": lambda swept, spread, crane: sections.CranePaths(((7.0, 13.0), (6.5, 12.0))),
+    "CraneMotion": lambda swept, spread, crane: sections.CraneMotion(((7.0, 13.0), (6.5, 12.0))),
+    "CraneOnline": lambda swept, spread, crane: sections.CraneOnline(),
+}
+WITHOUT_FIGURE = {"AnimatedCrane", "ClaimTable", "DrawTable"}
+
+
+def test_every_type_of_section_is_drawn_here():
+    every = {
+        name
+        for name, value in vars(sections).items()
+        if isinstance(value, type) and issubclass(value, sections.Section) and value is not sections.Section
+    }
+    assert every == {*SECTIONS, *WITHOUT_FIGURE}
+
+
+@pytest.fixture(scope="module")
+def picture(compared, swept, craned, spread):
+    """Figure and caption of a type of section, on real data."""
+
+    def of(name):
+        crane = cp.plants.crane_loop(cp.plants.Crane(), craned.comparison.plans["polynomial"])
+        section = SECTIONS[name](swept, spread, crane)
+        study = craned if name.startswith("Crane") else Study("it", "It", compared)
+        (found,) = (block for block in draw(section, study).blocks if isinstance(block, Picture))
+        return found
+
+    return of
+
+
 @pytest.fixture(
-    scope="module", params=sorted([*FIGURES, "two axes: plans", "two axes: responses", "trajectory", "one metric"])
+    scope="module", params=sorted([*SECTIONS, "two axes: plans", "two axes: responses", "trajectory", "one metric"])
 )
-def figure(request, compared, two_axes, swept, craned, spread):
+def figure(request, two_axes, swept, picture):
     """Every kind of figure, on real data."""
-    study = craned if request.param.startswith("crane") else Study("it", "It", compared, sweep=swept, ensemble=spread)
     others = {
         "two axes: plans": lambda: plot_plans(two_axes),
         "two axes: responses": lambda: plot_responses(two_axes),
@@ -97,12 +151,13 @@ def figure(request, compared, two_axes, swept, craned, spread):
     if request.param in others:
         return others[request.param]().figure
     with page_style():
-        return FIGURES[request.param][0](study).figure
+        return picture(request.param).plot.figure
 
 
 def drawing(figure):
-    """Whether a figure shows a thing, not curves that a legend would tell apart."""
-    return all(not axes.axison or axes.get_title(loc="left").find("every") > 0 for axes in figure.axes)
+    """Whether a figure shows a thing, or one signal in each axes: no curves that a legend would tell apart."""
+    single = all(list(by_label(axes)) == [axes.get_ylabel()] for axes in figure.axes)
+    return single or all(not axes.axison or axes.get_title(loc="left").find("every") > 0 for axes in figure.axes)
 
 
 def visible(figure):
@@ -188,15 +243,16 @@ def test_every_axis_is_labelled(figure):
             assert axes.get_xlabel()
 
 
-@pytest.mark.parametrize("name", FIGURES)
-def test_every_figure_has_a_caption(name):
-    assert FIGURES[name][1].strip().endswith(".")
+@pytest.mark.parametrize("name", SECTIONS)
+def test_every_figure_has_a_caption(name, picture):
+    with page_style():
+        assert picture(name).caption.strip().endswith(".")
 
 
-@pytest.mark.parametrize("name", ["plane", "gain"])
-def test_a_figure_of_a_sweep_needs_one(name, compared):
-    with pytest.raises(ValueError, match="study it must have a sweep for this figure, got none"):
-        FIGURES[name][0](Study("it", "It", compared))
+@pytest.mark.parametrize("kind", [sections.Plane, sections.SweepCurves])
+def test_a_figure_of_a_sweep_needs_one(kind):
+    with pytest.raises(TypeError, match="missing 1 required positional argument: 'sweep'"):
+        kind()
 
 
 # Told apart
@@ -217,10 +273,15 @@ BLIND = {
 }
 
 
+def planned(*names):
+    """Roles of plans, of which those called step are steps."""
+    return {name: Role.STEP if name == "step" else Role.PLANNED for name in names}
+
+
 @pytest.mark.parametrize("names", [STANDARD, ("a", "b", "c", "d"), (*STANDARD, "mine", "yours")])
 @pytest.mark.parametrize("eyes", BLIND)
 def test_colours_are_told_apart_by_every_reader(names, eyes):
-    colours = [to_hex(style["color"]) for style in line_styles(names).values()]
+    colours = [to_hex(style["color"]) for style in line_styles(planned(*names)).values()]
     assert len(set(colours)) == len(names)
     seen = []
     for colour in colours:
@@ -232,22 +293,43 @@ def test_colours_are_told_apart_by_every_reader(names, eyes):
 
 
 def test_the_standard_plans_have_colours_of_okabe_and_ito():
-    assert {to_hex(style["color"]) for style in line_styles(STANDARD).values()} <= OKABE_ITO
+    assert {to_hex(style["color"]) for style in line_styles(planned(*STANDARD)).values()} <= OKABE_ITO
 
 
 @pytest.mark.parametrize("names", [STANDARD, ("a", "b", "c", "d"), (*STANDARD, "mine", "yours")])
 def test_dashes_tell_them_apart_without_colours(names):
-    dashes = [repr(style["linestyle"]) for style in line_styles(names).values()]
+    dashes = [repr(style["linestyle"]) for style in line_styles(planned(*names)).values()]
     assert len(set(dashes)) == len(names)
 
 
 def test_a_plan_looks_the_same_whoever_stands_beside_it():
-    alone, crowd = line_styles(["trigonometric"]), line_styles(["x", *STANDARD])
-    assert alone["trigonometric"] == crowd["trigonometric"]
+    """On one page: a figure with other plans keeps the looks of those that are known from the first."""
+    page = line_styles(planned(*STANDARD))
+    others = line_styles(planned("x", "trigonometric", "y", "step"), page)
+    assert {name: others[name] for name in ("trigonometric", "step")} == {
+        name: page[name] for name in ("trigonometric", "step")
+    }
+    colours = [style["color"] for style in others.values()]
+    assert len(set(colours)) == len(colours)
+
+
+def test_colours_are_by_role_and_order_and_not_by_name():
+    one = line_styles(planned(*STANDARD))
+    other = line_styles({"trigonometric": Role.STEP, "a": Role.PLANNED, "step": Role.PLANNED, "b": Role.PLANNED})
+    looks = [[(style["color"], style["linestyle"]) for style in styles.values()] for styles in (one, other)]
+    assert looks[0] == looks[1]
+
+
+def test_baselines_do_not_take_the_colours_of_planned_references():
+    roles = {"a": Role.BASELINE, "step": Role.STEP, "b": Role.BASELINE, "mine": Role.PLANNED, "again": Role.STEP}
+    styles = line_styles(roles)
+    alone = line_styles(planned("step", "mine"))
+    assert {name: styles[name] for name in alone} == alone
+    assert len({style["color"] for style in styles.values()}) == len(roles)
 
 
 def test_a_plan_keeps_its_colour_and_dashes_in_every_panel(compared):
-    styles = line_styles(compared.plans)
+    styles = line_styles(roles_of(compared))
     for drawn in (plot_plans(compared), plot_responses(compared)):
         for axes in axes_of(drawn):
             for line in curves(axes):
@@ -435,7 +517,7 @@ def test_every_measure_can_be_swept_and_drawn(swept):
 
 
 def test_figure_1_is_the_plane_of_settling_and_overshoot(swept):
-    (axes,) = axes_of(plot_plane(swept))
+    (axes,) = axes_of(plot_plane(swept, limit=STEP_LIMIT))
     assert axes.get_xlabel() == "settling time ±2 % [s]"
     assert axes.get_ylabel() == "overshoot on the error [%]"
     (star,) = (line for line in axes.lines if line.get_marker() == "*")
@@ -454,7 +536,7 @@ def test_figure_1_is_the_plane_of_settling_and_overshoot(swept):
 
 def test_gains_beside_the_circles_can_be_read(swept):
     with page_style():
-        figure = plot_plane(swept).figure
+        figure = plot_plane(swept, numbered=NUMBERED).figure
     _, _, renderer = boxes(figure)
     (axes,) = figure.axes
     written = {text: text.get_window_extent(renderer) for text in axes.texts}
@@ -468,13 +550,36 @@ def test_gains_beside_the_circles_can_be_read(swept):
 
 
 def test_circles_stand_at_the_gains_written_beside_them(swept):
-    (axes,) = axes_of(plot_plane(swept))
+    (axes,) = axes_of(plot_plane(swept, numbered=NUMBERED))
     circles = {tuple(line.get_xydata()[0]) for line in axes.lines if line.get_marker() == "o"}
     for text in axes.texts:
         assert tuple(text.xy) in circles
         gain = int(np.flatnonzero(swept.values == float(text.get_text()))[0])
         rows = [(r["settling_time"][gain], r["overshoot_error"][gain]) for r in swept.metrics.values()]
         assert tuple(text.xy) in rows
+
+
+@pytest.mark.parametrize(
+    ("numbered", "message"),
+    [
+        ({"mine": {1.0: (0, 9)}}, r"numbered must be of plans of the sweep \(step, .*\), got 'mine'"),
+        ({"step": {7.77: (0, 9)}}, "numbered must be of values of the sweep, got 7.77 for step; .* is the nearest"),
+    ],
+)
+def test_only_points_of_the_sweep_are_numbered(swept, numbered, message):
+    with pytest.raises(ValueError, match=message):
+        plot_plane(swept, numbered=numbered)
+
+
+def test_a_plane_of_any_loop_says_what_its_parameter_and_its_band_are():
+    """No gain of the paper, no figure 1 and no band of 2 %."""
+    found = cp.sweep(
+        cp.plants.integrator_lag_loop, [2.0, 4.0], MOVE, TIMES, parameter="stiffness", band=0.05, progress=False
+    )
+    (block,) = draw(sections.Plane(found), Study("it", "It", None)).blocks
+    assert block.caption.startswith("Settling time against overshoot on the error as stiffness runs from 2 to 4.")
+    assert block.plot.axes[0, 0].get_xlabel() == "settling time ±5 % [s]"
+    assert not [line for line in block.plot.lines[0, 0] if line.get_marker() in ("*", "o")]
 
 
 # Manners
@@ -497,7 +602,7 @@ def test_figures_of_a_page_do_not_pile_up_in_pyplot(compared, swept):
 def test_a_page_leaves_no_window_open(compared, swept, monkeypatch):
     monkeypatch.setattr(mpl, "get_backend", lambda: "QtAgg")  # where pyplot would manage them
     before = plt.get_fignums()
-    render_page([Study("it", "It", compared, sweep=swept, figures=("plane", "plans"))], "It")
+    render_page([Study("it", "It", compared, sections=(sections.Plane(swept), sections.PlanCurves()))], "It")
     assert plt.get_fignums() == before
 
 
@@ -518,7 +623,7 @@ def test_settings_of_the_user_are_left_alone(compared, swept):
 
 
 def test_settings_of_the_user_do_not_change_a_page(compared):
-    study = Study("it", "It", compared, figures=("responses",))
+    study = Study("it", "It", compared, sections=(sections.Responses(),))
     with plt.style.context("dark_background"):
         dark = render_page([study], "It")
     assert dark == render_page([study], "It")

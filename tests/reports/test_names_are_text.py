@@ -17,6 +17,7 @@ from ctrlplan.reports import CraneAnimation, comparison_fragment, plot_plans, re
 from ctrlplan.reports.style import to_svg
 from ctrlplan.reports.words import unit_in
 from ctrlplan.studies import Study
+from ctrlplan.studies.sections import PlanCurves
 
 DIRECTIONS = set("\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069")
 
@@ -76,7 +77,7 @@ def test_nor_where_figures_are_drawn(offset, plain, read):
 def test_ids_are_unique_and_plain_whatever_studies_are_called(names, read):
     move = [cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1, 0, 0)]
     found = cp.compare(cp.plants.integrator_lag_loop(5.0), move, np.linspace(0, 3, 31))
-    tree = read(render_page([Study(name, "it", found, figures=("plans",)) for name in names], "page"))
+    tree = read(render_page([Study(name, "it", found, sections=(PlanCurves(),)) for name in names], "page"))
     ids = [e.attributes["id"] for e in tree.all() if "id" in e.attributes]
     assert len(ids) == len(set(ids))
     assert all(re.fullmatch(r"[\w.-]+", i) for i in ids)

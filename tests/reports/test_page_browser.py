@@ -96,14 +96,14 @@ def test_nothing_overflows_the_page(window, written, width):
     assert outside == []
 
 
-@pytest.mark.parametrize("width", [1100, 390])
-def test_figures_are_seen(opened, width):
+@pytest.mark.parametrize(("width", "height"), [(1100, 200), (390, 120)])
+def test_figures_are_seen(opened, width, height):
     chrome = opened(width)
     drawings = chrome.execute_script(BOXES, "figure svg")
     assert len(drawings) == len(chrome.find_elements("css selector", "figure")) >= 2
     for box in drawings:
         assert box["width"] > 300
-        assert box["height"] > 200
+        assert box["height"] > height
         assert box["left"] >= 0
     for box in chrome.execute_script(BOXES, "figure .drawing"):
         assert box["left"] >= 0
@@ -113,26 +113,46 @@ def test_figures_are_seen(opened, width):
         assert sum(box["width"] > 100 and box["height"] > 20 for box in curves) >= 3
 
 
-def test_figures_are_inside_the_window_of_a_screen(opened):
-    for box in opened(1100).execute_script(BOXES, "figure svg"):
-        assert box["right"] <= 1100
+@pytest.mark.parametrize("width", [1280, 1100, 390])
+def test_figures_are_inside_the_window_of_a_screen(opened, width):
+    chrome = opened(width)
+    for box in chrome.execute_script(BOXES, "figure svg"):
+        assert box["right"] <= width
+    cut = chrome.execute_script(
+        "return Array.from(document.querySelectorAll('figure .drawing')).map(e => e.scrollWidth - e.clientWidth)"
+    )
+    assert max(cut) <= 1
+
+
+ENLARGED = """
+return Array.from(document.querySelectorAll("figure .drawing")).map(function (box) {
+  var svg = box.querySelector("svg"), small = svg.getBoundingClientRect().width;
+  box.focus();
+  box.scrollLeft = 1e6;
+  var large = svg.getBoundingClientRect();
+  return {text: 9 * large.width / svg.viewBox.baseVal.width, grown: large.width - small,
+    beyond: large.right - box.getBoundingClientRect().right, page: document.documentElement.scrollWidth};
+});
+"""
 
 
 def test_figures_wider_than_a_phone_scroll_to_their_end(opened):
+    """A figure that is touched is enlarged until its writing, of 9 points, can be read, and scrolls in its box."""
     chrome = opened(390)
-    reached = chrome.execute_script(
-        """
-        return Array.from(document.querySelectorAll("figure .drawing")).map(function (box) {
-          box.scrollLeft = 1e6;
-          return box.querySelector("svg").getBoundingClientRect().right - box.getBoundingClientRect().right;
-        });
-        """
-    )
-    assert reached
-    assert max(reached) <= 1.0
+    for figure in chrome.execute_script(ENLARGED):
+        assert figure["text"] >= 7.0
+        assert figure["grown"] > 100
+        assert figure["beyond"] <= 1.0
+        assert figure["page"] <= 390
 
 
-@pytest.mark.parametrize(("width", "least"), [(1100, 10.0), (390, 7.0)])
+def test_figures_of_a_screen_are_not_enlarged(opened):
+    chrome = opened(1100)
+    for figure in chrome.execute_script(ENLARGED):
+        assert figure["grown"] == 0
+
+
+@pytest.mark.parametrize(("width", "least"), [(1100, 10.0), (390, 5.0)])
 def test_writing_in_figures_can_be_read(opened, width, least):
     # Axes are labelled with 9 points; the drawing's own unit is the point.
     pixels = opened(width).execute_script(

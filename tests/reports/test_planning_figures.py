@@ -1,5 +1,7 @@
 """Figures of what was chosen draw what was chosen, with units and limits where they are near enough to be seen."""
 
+from dataclasses import replace
+
 import control as ct
 import matplotlib as mpl
 import numpy as np
@@ -182,6 +184,26 @@ def test_a_step_does_not_flatten_what_the_others_ask_for(compared):
     low, high = control.get_ylim()
     assert -low == high == pytest.approx(1.3 * others)
     assert control.get_title(loc="left") == "the step asks for 100"
+
+
+def test_a_step_is_found_by_its_role_and_not_by_its_name(compared):
+    """Names exchanged: the same curves in the same colours, and the control of the jump left out again."""
+    names = {name: f"plan {k}" for k, name in enumerate(compared.plans)} | {"step": "polynomial"}
+
+    def renamed(found):
+        return {names[name]: value for name, value in found.items()}
+
+    other = replace(
+        compared,
+        plans=renamed(compared.plans),
+        responses=renamed(compared.responses),
+        metrics=renamed(compared.metrics),
+        roles=renamed(compared.roles),
+    )
+    one, again = plot_rivals(compared), plot_rivals(other)
+    assert [line.get_color() for line in one.lines[0, 0]] == [line.get_color() for line in again.lines[0, 0]]
+    assert one.axes[2, 0].get_ylim() == again.axes[2, 0].get_ylim()
+    assert again.axes[2, 0].get_title(loc="left") == "the polynomial asks for 100"
 
 
 def test_rivals_of_two_axes_stand_side_by_side():

@@ -23,7 +23,7 @@ from ctrlplan.reports import crane_figures, figures, planning_figures, render_pa
 from ctrlplan.reports.style import as_text, page_style
 from ctrlplan.studies import Study
 from ctrlplan.studies.ensemble import Ensemble
-from ctrlplan.studies.study import Curves
+from ctrlplan.studies.sections import Curves, PlanCurves, Responses
 
 MOVE = [cp.Waypoint(0, 0, 0, 0), cp.Waypoint(2, 1, 0, 0)]
 ACROSS = [cp.Waypoint.from_jets(0, x=[0, 0, 0], z=[10, 0, 0]), cp.Waypoint.from_jets(2, x=[20, 0, 0], z=[11, 0, 0])]
@@ -79,7 +79,12 @@ def fastest():
 @cache
 def curved():
     rows = {name: T + k for k, name in enumerate("ab")}
-    return Study("it", "It", compared(), curves=(Curves("alpha [rad]", "length [m]", T, rows, "Two."),))
+    return Curves("alpha [rad]", "length [m]", T, rows)
+
+
+@cache
+def looped():
+    return cp.plants.crane_loop(cp.plants.Crane(), cp.PolySpline(ACROSS))
 
 
 PLOTS = {
@@ -94,17 +99,17 @@ PLOTS = {
     "plot_responses": (lambda **k: figures.plot_responses(compared(), **k), (3, 1)),
     "plot_sweep": (lambda **k: figures.plot_sweep(swept(), ("settling_time",), **k), (1, 1)),
     "plot_bands": (lambda **k: figures.plot_bands(spread(), **k), (3, 3)),
-    "figures.plot_plane": (lambda **k: figures.plot_plane(swept(), **k), (1, 1)),
+    "plot_plane": (lambda **k: figures.plot_plane(swept(), **k), (1, 1)),
+    "plot_curves": (lambda **k: figures.plot_curves(curved(), **k), (1, 1)),
+    "plot_blocks": (lambda **k: figures.plot_blocks(looped(), **k), (1, 1)),
     "plot_alpha_choice": (lambda **k: planning_figures.plot_alpha_choice(chosen(), **k), (1, 1)),
     "plot_limits": (lambda **k: planning_figures.plot_limits(PLAN, Limited(PLAN, LIMITS), **k), (2, 1)),
     "plot_rivals": (lambda **k: planning_figures.plot_rivals(compared(), **k), (3, 1)),
     "plot_sketch": (lambda **k: crane_figures.plot_sketch(**k), (1, 1)),
-    "plot_blocks": (lambda **k: crane_figures.plot_blocks(**k), (1, 1)),
     "plot_time": (lambda **k: crane_figures.plot_time(craned(), **k), (6, 1)),
     "plot_step": (lambda **k: crane_figures.plot_step(craned(), **k), (4, 1)),
-    "crane_figures.plot_plane": (lambda **k: crane_figures.plot_plane(craned(), None, **k), (1, 1)),
+    "plot_paths": (lambda **k: crane_figures.plot_paths(craned(), None, **k), (1, 1)),
     "plot_motion": (lambda **k: crane_figures.plot_motion(craned(), None, **k), (1, 1)),
-    "plot_curves": (lambda **k: crane_figures.plot_curves(curved(), **k), (1, 1)),
     "plot_online": (lambda **k: crane_figures.plot_online(craned(), **k), (4, 1)),
 }
 DRAWINGS = {"plot_sketch", "plot_blocks", "plot_motion"}  # of things: not curves in the user's colours
@@ -121,7 +126,8 @@ def test_every_plot_is_tested_here():
         for name, value in vars(module).items()
         if name.startswith("plot_") and value.__module__ == module.__name__
     }
-    assert functions == {name for name in PLOTS if "." not in name or "figures." in name}
+    assert not twice
+    assert functions == {name for name in PLOTS if "." not in name}
     modules = [module for name, module in sys.modules.items() if name.partition(".")[0] == "ctrlplan"]
     classes = {one for module in modules for one in vars(module).values() if inspect.isclass(one)}
     own = {one.plot.__qualname__ for one in classes if one.__module__.startswith("ctrlplan") and "plot" in vars(one)}
@@ -519,14 +525,14 @@ def test_a_figure_of_a_page_is_unknown_to_pyplot_and_in_its_own_style(name):
 def test_a_page_of_many_figures_warns_of_none(backend, windows):
     plt.switch_backend(backend)
     with mpl.rc_context({"figure.max_open_warning": 1}):
-        page = render_page([Study("it", "It", compared(), figures=("plans", "responses"))], "It")
+        page = render_page([Study("it", "It", compared(), sections=(PlanCurves(), Responses()))], "It")
     assert page.count("<svg") == 2
     assert plt.get_fignums() == []
 
 
 def test_a_page_does_not_draw_in_an_empty_figure_of_the_user():
     figure = plt.figure()
-    render_page([Study("it", "It", compared(), figures=("plans",))], "It")
+    render_page([Study("it", "It", compared(), sections=(PlanCurves(),))], "It")
     assert figure.axes == []
 
 

@@ -15,6 +15,7 @@ from ctrlplan.studies import Study
 from ctrlplan.studies.benefit import Benefit
 from ctrlplan.studies.grids import Grid
 from ctrlplan.studies.needs import Need
+from ctrlplan.studies.sections import ClaimTable, FastestMove
 
 MOVE = [cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1, 0, 0)]
 TIMES = np.linspace(0, 10, 501)
@@ -40,7 +41,7 @@ def study():
         beside=("bound",),
     )
     fast = cp.fastest(cp.PolySpline(MOVE), {"y_d1": 2.5, "y_d2": (-100.0, 200.0)})
-    return Study("mine", "Mine", compared, figures=(), claim=("The claim <fails>.",), grids=(grid,), fastest=fast)
+    return Study("mine", "Mine", compared, sections=(FastestMove(fast), ClaimTable(("The claim <fails>.",), (grid,))))
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +60,7 @@ def shown(read):
     """Words of a page with one comparison, and the page."""
 
     def of(comparison):
-        page = read(render_page([Study("mine", "Mine", comparison, figures=())], "Page"))
+        page = read(render_page([Study("mine", "Mine", comparison, sections=())], "Page"))
         return page.words(), page
 
     return of
@@ -199,7 +200,7 @@ def test_limits_of_every_form_and_the_note_are_said(study, shown):
 
 def test_tables_over_alpha_and_duration_are_those_of_the_grids(study, page):
     shown = tables(page, "grid")
-    grids = (*study.comparison.benefit.grids, *study.grids)
+    grids = (*study.sections[1].grids, *study.comparison.benefit.grids)
     assert len(shown) == len(grids) == 3
     for table, grid in zip(shown, grids, strict=True):
         alphas = [f"alpha {a:.3g}" if a else "alpha 0 (polynomial)" for a in grid.alphas]
@@ -248,7 +249,7 @@ def test_the_active_limit_and_the_margins_of_the_others(page):
 
 
 def test_marks_of_wins_losses_and_ties(page):
-    table = tables(page, "grid")[-1]
+    table = tables(page, "grid")[0]
     (body,) = table.all("tbody")
     marks = [[cell.attributes["class"] for cell in row.all("td")] for row in body.all("tr")]
     assert marks == [["lose", "win", "", "best", ""], ["lose", "", "", "best", ""]]

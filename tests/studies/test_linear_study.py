@@ -58,11 +58,11 @@ def test_the_study_is_the_one_of_the_paper(study):
 
 
 def test_the_sweep_runs_from_one_end_to_the_other(study):
-    gains = study.sweep.values
-    assert study.sweep.parameter == "gain"
+    gains = study.sections[0].sweep.values
+    assert study.sections[0].sweep.parameter == "gain"
     assert (gains[0], gains[-1]) == (0.25, 1000.0)
     assert np.all(np.diff(gains) > 0)
-    for rows in study.sweep.metrics.values():
+    for rows in study.sections[0].sweep.metrics.values():
         assert set(rows) >= {"settling_time", "overshoot_error", "control_peak", "control_effort"}
         assert all(row.shape == gains.shape and np.isfinite(row).all() for row in rows.values())
 
@@ -70,14 +70,17 @@ def test_the_sweep_runs_from_one_end_to_the_other(study):
 def test_the_gains_of_the_table_are_among_those_swept(study):
     # Figure 1 writes them beside its circles: a circle at another gain would show other numbers than the table.
     for gain, row in TABLE.items():
-        (at,) = np.flatnonzero(np.isclose(study.sweep.values, gain, rtol=1e-12, atol=0.0))
-        plans = [study.sweep.metrics[plan] for plan in ("step", "trigonometric", "polynomial")]
+        (at,) = np.flatnonzero(np.isclose(study.sections[0].sweep.values, gain, rtol=1e-12, atol=0.0))
+        plans = [study.sections[0].sweep.metrics[plan] for plan in ("step", "trigonometric", "polynomial")]
         found = [p[m][at] for p in plans for m in ("overshoot_error", "settling_time")]
         np.testing.assert_allclose(found, row, rtol=1e-5)
 
 
 def test_the_step_follows_its_closed_form_at_every_gain(study):
-    gains, step = study.sweep.values[1:], study.sweep.metrics["step"]  # at 0.25 the formula is 0/0
+    gains, step = (
+        study.sections[0].sweep.values[1:],
+        study.sections[0].sweep.metrics["step"],
+    )  # at 0.25 the formula is 0/0
     # Beside a jump the response touches the band: its settling time is as the square root of the response's error.
     np.testing.assert_allclose(step["settling_time"][1:], [step_settles(k) for k in gains], rtol=1e-5)
     np.testing.assert_allclose(
@@ -89,7 +92,7 @@ def test_the_step_follows_its_closed_form_at_every_gain(study):
 
 def test_at_the_double_pole_the_step_has_its_own_form(study):
     # k = 0.25: y = 1 - (1 + t/2) exp(-t/2), without overshoot.
-    step = {name: row[0] for name, row in study.sweep.metrics["step"].items()}
+    step = {name: row[0] for name, row in study.sections[0].sweep.metrics["step"].items()}
     settled = brentq(lambda t: (1 + t / 2) * np.exp(-t / 2) - 0.02, 5, 20, xtol=1e-14)
     assert step["settling_time"] == pytest.approx(settled, rel=1e-9)
     assert step["overshoot_error"] == pytest.approx(0.0, abs=1e-9)
@@ -106,10 +109,10 @@ def test_the_plan_settles_with_its_own_entry_into_the_band_as_the_gain_grows(stu
 
 def test_jumps_are_located_as_finely_as_stated(study):
     # Between jumps a settling time goes with the power -1/2 of the gain at most; three times that is a jump.
-    gains = study.sweep.values
+    gains = study.sections[0].sweep.values
     spacing = gains[1:] / gains[:-1] - 1.0
     found = 0
-    for rows in study.sweep.metrics.values():
+    for rows in study.sections[0].sweep.metrics.values():
         change = np.abs(np.diff(np.log(rows["settling_time"])))
         jump = (change > 0.005) & (change > 1.5 * np.diff(np.log(gains)))
         assert spacing[jump].max() <= FINEST * (1 + 1e-12)
@@ -118,7 +121,7 @@ def test_jumps_are_located_as_finely_as_stated(study):
 
 
 def test_gains_are_spent_on_jumps_only(study):
-    gains = study.sweep.values
+    gains = study.sections[0].sweep.values
     assert gains.size < 500
     assert np.min(gains[1:] / gains[:-1]) > 1.0 + FINEST / 4
 
@@ -137,7 +140,7 @@ def test_notes_say_where_the_paper_differs_and_why(study):
 
 
 def test_notes_tell_what_the_numbers_say(study):
-    gains, sweep = study.sweep.values, study.sweep.metrics
+    gains, sweep = study.sections[0].sweep.values, study.sections[0].sweep.metrics
     (peak,) = (note for note in study.notes if "peaks at" in note)
     assert "It peaks at 51.065 % at k = 12.50 " in peak  # located to the digits printed by the test below
     later = sweep["trigonometric"]["settling_time"] > sweep["step"]["settling_time"]

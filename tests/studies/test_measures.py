@@ -125,7 +125,7 @@ def test_signals_of_different_units_are_not_ranked_together():
         assert row["control_peak_M"] == pytest.approx(100.0, rel=1e-9)
         assert not math.isnan(row["settling_time"])  # seconds are seconds
         assert not math.isnan(row["overshoot_error"])
-    page = render_page([Study("mine", "Mine", found, figures=())], "Page")
+    page = render_page([Study("mine", "Mine", found, sections=())], "Page")
     assert "Peak of the control (F)" in page
     assert "Effort of the control (M)" in page
     assert unit_of(found, "control_effort_M") == "(N m)² s"

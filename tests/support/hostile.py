@@ -7,11 +7,10 @@ from types import SimpleNamespace
 import numpy as np
 
 import ctrlplan as cp
-from ctrlplan.studies import Measure, Study
+from ctrlplan.studies import Measure, Study, sections
 from ctrlplan.studies.benefit import Benefit
 from ctrlplan.studies.grids import Grid
 from ctrlplan.studies.needs import Need
-from ctrlplan.studies.study import Curves
 
 HIT = "window.hit=1"
 MARKUP = {
@@ -120,24 +119,34 @@ def study(text, drawn=True):
     worth = Benefit(found, {text("bounded"): 2.0}, needs, (grid,), 1.0, text("worth note"))
     speed = text("quantity")
     fast = cp.fastest(plans[0], {speed: 9.0}, lambda jet: {speed: np.hypot(jet[1, 0], jet[1, 1])}) if drawn else None
-    curves = Curves(
+    curves = sections.Curves(
         text("across"),
         text("up"),
         np.arange(3.0),
         {text("curve"): np.arange(3.0), text("bend"): np.ones(3)},
-        text("caption"),
+        caption=text("caption"),
     )
+    figures = (
+        sections.PlanCurves(),
+        sections.Responses(),
+        sections.CraneTime(),
+        sections.CranePaths(),
+        sections.CraneMotion(),
+        curves,
+    )
+    limited = () if fast is None else (sections.FastestMove(fast),)
     return Study(
         text("name"),
         text("heading"),
         replace(found, benefit=worth if drawn else None),
         summary=text("summary"),
         notes=(text("finding"),),
-        figures=("plans", "responses", "crane-time", "crane-plane", "crane-motion", "crane-sway") if drawn else (),
-        curves=(curves,),
-        claim=(text("claim"),),
-        grids=(grid,),
-        fastest=fast,
+        sections=(
+            *(figures if drawn else ()),
+            sections.AnimatedCrane(),
+            *limited,
+            sections.ClaimTable((text("claim"),), (grid,)),
+        ),
     )
 
 
