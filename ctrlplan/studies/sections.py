@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias
+from typing import TYPE_CHECKING, ClassVar, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,7 +62,7 @@ class Section:
 
     caption: str = ""
 
-    def results(self) -> dict[str, Any]:
+    def results(self) -> dict[str, object]:
         """Plain data for ``results.json``, by key: nothing, unless a type has data of its own."""
         return {}
 
@@ -142,7 +142,7 @@ class Plane(Section):
     limit: tuple[float, float] | None = None
     limit_label: str = "limit"
 
-    def results(self) -> dict[str, Any]:
+    def results(self) -> dict[str, object]:
         """The two metrics over the parameter."""
         return {"sweep": self.sweep.results(("overshoot_error", "settling_time"))}
 
@@ -165,7 +165,7 @@ class SweepCurves(Section):
     metrics: tuple[str, ...] = ("settling_time", "overshoot_error")
     kept: tuple[str, ...] | None = None
 
-    def results(self) -> dict[str, Any]:
+    def results(self) -> dict[str, object]:
         """The metrics that are kept, over the parameter."""
         kept = self.metrics if self.kept is None else self.kept
         return {"sweep": self.sweep.results(kept)} if kept else {}
@@ -196,7 +196,7 @@ class DrawTable(Section):
 
     ensemble: Ensemble
 
-    def results(self) -> dict[str, Any]:
+    def results(self) -> dict[str, object]:
         """Draws, metrics and failures."""
         return {"draws": self.ensemble.results()}
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from ctrlplan.studies.sections import PlanCurves, Responses, Section
 
@@ -51,7 +51,7 @@ class Study:
                 got = f"the class {section.__name__}" if isinstance(section, type) else type(section).__name__
                 raise TypeError(f"sections must be instances of subclasses of Section, got {got} as sections[{place}]")
 
-    def results(self) -> dict[str, Any]:
+    def results(self) -> dict[str, object]:
         """Plain data for ``results.json``.
 
         Raises
@@ -60,7 +60,7 @@ class Study:
             If two sections, or a section and the comparison, have data under
             one key.
         """
-        data = self.comparison.results()
+        data: dict[str, object] = {**self.comparison.results()}
         for place, section in enumerate(self.sections):
             found = section.results()
             twice = ", ".join(key for key in found if key in data)
