@@ -215,40 +215,57 @@ assert abs(results["lag"]["plans"]["step"]["metrics"]["settling_time"] - np.log(
 """,
 )
 
-RECIPES["figure"] = Recipe(
-    says="a figure: one function, one line in `FIGURES`",
+RECIPES["section"] = Recipe(
+    says="a frozen dataclass derived from `Section` in `studies/sections.py`, and a function under `@draw.register`",
     lines=(
         (
-            "reports/figures.py",
-            "FIGURES: dict[str, tuple[Callable[[Study], ControlPlot], str]] = {",
-            '    "phase": (lambda study: plot_phase(study.comparison), "Output and control, one over the other."),',
+            "studies/sections.py",
+            "# Cranes and loops",
+            '''
+@dataclass(frozen=True)
+class Phase(Section):
+    """One output against its reference, with the largest difference of each plan."""
+
+    output: str = "y"
+''',
         ),
         (
-            "reports/figures.py",
-            "Array = NDArray[np.float64]",
-            '''
+            "reports/sections.py",
+            "from ctrlplan.studies.study import Study",
+            "from ctrlplan.studies.sections import Phase",
+        ),
+        (
+            "reports/sections.py",
+            "# Cranes and loops",
+            """
+@draw.register
+def _(section: Phase, study: Study) -> Part:
+    from ctrlplan.reports.style import Drawing
 
-def plot_phase(comparison, *, ax=None):
-    """Output against reference, one axes."""
-    drawing = Drawing(ax, (1, 1), (5.0, 4.0))
-    for name, response in comparison.responses.items():
-        drawing.column[0].plot(comparison.plans[name](response.time), np.atleast_2d(response.outputs)[0], label=name)
+    drawing, rows = Drawing(None, (1, 1), (5.0, 4.0)), []
+    for name, response in study.comparison.responses.items():
+        reference = study.comparison.plans[name](response.time)
+        output = np.atleast_2d(response.outputs)[response.output_labels.index(section.output)]
+        drawing.column[0].plot(reference, output, label=name)
+        rows.append([name, number(float(np.abs(reference - output).max()))])
     drawing.label_x("reference")
-    return drawing.finish()
-
-''',
+    picture = Picture("phase", drawing.finish(), section.caption or "Output over reference.")
+    return Part([picture, Table(["plan", "largest difference"], rows)], heading="Output over reference")
+""",
         ),
     ),
     seen="""
-from ctrlplan.reports import write_page
-from ctrlplan.reports.figures import plot_phase
+from ctrlplan.reports import draw, write_page
 from ctrlplan.studies import Study
+from ctrlplan.studies.sections import Phase, PlanCurves
 found = cp.compare(cp.plants.integrator_lag_loop(5.0), {"mine": cp.PolySpline(MOVE)}, np.linspace(0, 5, 101))
-html = write_page([Study("own", "Own", found, figures=("plans", "phase"))], "own.html", "Own").read_text()
-assert "Output and control, one over the other." in html
-plot = plot_phase(found)
-assert isinstance(plot, ct.ControlPlot)
-assert len(plot.axes.ravel()[0].lines) == 1
+study = Study("own", "Own", found, sections=(PlanCurves(), Phase()))
+html = write_page([study], "own.html", "Own").read_text()
+assert '<figure id="own-phase"' in html and "largest difference" in html
+picture, table = draw(Phase(caption="Mine."), study).blocks
+assert isinstance(picture.plot, ct.ControlPlot) and picture.caption == "Mine."
+assert len(picture.plot.axes.ravel()[0].lines) == 1
+assert [row[0] for row in table.rows] == ["mine"]
 """,
 )
 
