@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctrlplan import metrics
-from ctrlplan.planning import avoid
+from ctrlplan.planning import Fastest, avoid
 from ctrlplan.simulation import simulate
 from ctrlplan.studies.choosing import (
     LOAD_RADIUS,
@@ -51,6 +51,7 @@ from ctrlplan.studies.sections import (
     Curves,
     FastestMove,
     LoopBlocks,
+    Section,
 )
 from ctrlplan.studies.study import Study
 from ctrlplan.systems.plants import LAWS, crane_loop
@@ -110,24 +111,29 @@ def crane_nominal_study(progress: bool = True) -> Study:
             "correct what is not nominal.",
             *fastest_notes(limited),
         ),
-        sections=(
-            CraneSketch(caption="The crane and its variables (figure 2), z down."),
-            LoopBlocks(
-                crane_loop(CRANE, PolySpline(points)),
-                {"plan": "path generator", "generator": "flat law (15a,b)", "trolley_pid": "PID", "hoist_pid": "PID"},
-                caption="Structure of the controller (figure 3), drawn from the blocks and connections of the model "
-                "itself.",
-            ),
-            CraneTime(),
-            CraneStep(
-                caption="The step: force and torque at their limits (dashed), up to the slack rope: where the tension "
-                "comes to 0 the model ends, and so does the run."
-            ),
-            CraneMotion(),
-            _sway_curves(),
-            AnimatedCrane(),
-            FastestMove(limited),
+        sections=_nominal_sections(points, limited),
+    )
+
+
+def _nominal_sections(points: tuple[Waypoint, Waypoint], limited: Fastest) -> tuple[Section, ...]:
+    """Sections of the first simulation: figures 2 to 4 of the paper, the sway, and the fastest move."""
+    return (
+        CraneSketch(caption="The crane and its variables (figure 2), z down."),
+        LoopBlocks(
+            crane_loop(CRANE, PolySpline(points)),
+            {"plan": "path generator", "generator": "flat law (15a,b)", "trolley_pid": "PID", "hoist_pid": "PID"},
+            caption="Structure of the controller (figure 3), drawn from the blocks and connections of the model "
+            "itself.",
         ),
+        CraneTime(),
+        CraneStep(
+            caption="The step: force and torque at their limits (dashed), up to the slack rope: where the tension "
+            "comes to 0 the model ends, and so does the run."
+        ),
+        CraneMotion(),
+        _sway_curves(),
+        AnimatedCrane(),
+        FastestMove(limited),
     )
 
 
