@@ -17,7 +17,8 @@ def shown(request):
 
 @pytest.fixture
 def window(browser):
-    """A page in the browser at a width, with the logs of before taken away."""
+    """A page in the browser at a width, whole, with the logs of before taken away."""
+    from selenium.webdriver.support.wait import WebDriverWait
 
     def at(written, width=1100, height=900):
         browser.execute_cdp_cmd(
@@ -28,6 +29,7 @@ def window(browser):
         browser.get_log("browser")
         browser.get_log("performance")
         browser.get((written.folder / "index.html").as_uri())
+        WebDriverWait(browser, 60).until(lambda page: page.execute_script("return document.readyState") == "complete")
         return browser
 
     yield at

@@ -242,7 +242,7 @@ def trace_of(system, params):
     from ctrlplan.symbolic import tracing as module
 
     block = Block(system, dict(system.params))
-    points = list(module._points(block, params, 0.0, np.ones(1), np.zeros(0)))
+    points = list(module._points(params, 0.0, np.ones(1), np.zeros(0)))
     return module._agreed(block, params, module._known(block, points))
 
 
