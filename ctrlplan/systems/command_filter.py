@@ -76,7 +76,7 @@ def create_command_filter_iosystem(
     >>> plant = cp.plants.integrator_lag_loop(5.0)
     >>> loop = ct.interconnect([block, plant], inputs=["r_cmd"], outputs=["y", *block.output_labels])
     >>> found = cp.simulate(loop, np.linspace(0.0, 30.0, 7), cp.Step(1.0))
-    >>> abs(found.outputs[:, -1] - [1.0, 1.0, 0.0, 0.0]).max() < 1e-5
+    >>> bool(abs(found.outputs[:, -1] - [1.0, 1.0, 0.0, 0.0]).max() < 1e-5)
     True
     """
     w = checked_finite(bandwidth, "bandwidth", above=0.0)
