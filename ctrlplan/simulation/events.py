@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import TypeAlias
+from typing import Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,6 +65,10 @@ class Event:
             object.__setattr__(self, "name", label)
 
 
+EventKind = Literal["below", "above", "inside"]
+"""How a signal crossed a limit of an event."""
+
+
 @dataclass(frozen=True)
 class Occurrence:
     """One crossing.
@@ -75,7 +79,7 @@ class Occurrence:
         When [s], to the accuracy of the run.
     name : str
         Of the event.
-    kind : str
+    kind : {"below", "above", "inside"}
         "below" or "above": the signal left its limits there, or began the run
         outside; "inside": it came back.
     stop : bool
@@ -84,7 +88,7 @@ class Occurrence:
 
     time: float
     name: str
-    kind: str
+    kind: EventKind
     stop: bool = False
 
     def __str__(self) -> str:
@@ -195,7 +199,7 @@ def watched_events(events: Sequence[Event], labels: Mapping[str, tuple[str, int]
     return found
 
 
-_KINDS = {-1: "below", 0: "inside", 1: "above"}
+_KINDS: dict[int, EventKind] = {-1: "below", 0: "inside", 1: "above"}
 
 
 def _value(signal: str | Signal, labels: Mapping[str, tuple[str, int]]) -> Callable[[Snapshot], Array]:

@@ -55,7 +55,7 @@ from ctrlplan.studies.sections import (
 )
 from ctrlplan.studies.study import Study
 from ctrlplan.systems.plants import LAWS, crane_loop
-from ctrlplan.systems.plants.crane.laws import LawName
+from ctrlplan.systems.plants.crane.laws import Law, LawName, as_law
 from ctrlplan.trajectories import PiecewiseSpline, PolySpline, Step, Trajectory, TrigSpline, Waypoint
 
 Array = NDArray[np.float64]
@@ -255,7 +255,7 @@ def _compared(
 
     def limited(run: Run) -> dict[str, float]:
         options = laws[id(run.plan)]
-        own = options.get("law", "generator") in ("dynamic", "feedforward")  # these command force and torque themselves
+        own = as_law(options.get("law", "generator")).outputs != Law.outputs  # it commands force and torque itself
         return {"error_limited": np.nan if own else _limited_error(run.plan, options, timepts)}
 
     found = compare(

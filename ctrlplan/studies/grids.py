@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -12,6 +13,9 @@ from ctrlplan.studies.units import ROUNDING
 
 SAME = 1e-3
 """Relative difference up to which values count as equal."""
+
+Mark = Literal["", "win", "lose"]
+"""Whether a plan is better than every baseline, worse than the best of them, or neither."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +58,7 @@ class Grid:
         name = min(found, key=lambda rival: found[rival], default="none")
         return name, found.get(name, math.nan)
 
-    def marks(self) -> list[list[str]]:
+    def marks(self) -> list[list[Mark]]:
         """Whether each trigonometric plan wins against its best rival, loses, or neither: "win", "lose", ""."""
         return [
             [_mark(value, self.best(row)[1], ROUNDING * self.scale) for value in values]
@@ -80,7 +84,7 @@ class Grid:
         return found + "."
 
 
-def _mark(value: float, rival: float, rounding: float = 0.0) -> str:
+def _mark(value: float, rival: float, rounding: float = 0.0) -> Mark:
     if math.isnan(value) or math.isnan(rival) or value == rival:
         return ""
     if math.isfinite(value - rival) and abs(value - rival) <= max(SAME * max(abs(value), abs(rival)), rounding):

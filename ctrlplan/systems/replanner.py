@@ -6,7 +6,7 @@ import itertools
 import math
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import Literal, NoReturn
+from typing import Literal, NoReturn, get_args
 
 import control as ct
 import numpy as np
@@ -26,7 +26,8 @@ from ctrlplan.trajectories.transition import Transition, extrapolated, series, t
 _ROUNDING, _MATTERS = 1e-12, 1e-6
 """Part of the move by which a goal has moved, and by which one that is not reached is worth an event."""
 
-TRIGGERS = ("period", "deviation", "goal")
+Trigger = Literal["period", "deviation", "goal"]
+"""When a replanner plans again."""
 
 _START, _END, _LOST, _MISSED, _FITS = range(5)
 """States of the correction before the goal's change and the coefficients."""
@@ -41,7 +42,7 @@ def create_replanner_iosystem(
     alpha: float | None = None,
     measured: int | None = None,
     goal_derivatives: int | None = None,
-    trigger: Literal["period", "deviation", "goal"] = "period",
+    trigger: Trigger = "period",
     threshold: float | None = None,
     min_horizon: float | None = None,
     limits: Mapping[int, ArrayLike] | None = None,
@@ -294,7 +295,7 @@ class _Correction(ct.NonlinearIOSystem):  # type: ignore[misc]
         horizons: _Horizons,
         offset: float,
         signals: _Signals,
-        trigger: tuple[str, float],
+        trigger: tuple[Trigger, float],
         limits: tuple[tuple[int, Array], ...],
         name: str,
     ) -> None:
@@ -372,10 +373,10 @@ class _Correction(ct.NonlinearIOSystem):  # type: ignore[misc]
         return after
 
     def _is_due(self, moved: bool, t: float, x: Array, begins: Array) -> bool:
-        kind, threshold = self._trigger
-        if moved or kind == "goal":
+        trigger, threshold = self._trigger
+        if moved or trigger == "goal":
             return moved
-        if kind == "deviation":
+        if trigger == "deviation":
             off = begins[0] - self._jets(t, x, 0)[0]
             return math.hypot(*off.tolist()) > threshold
         # From the reference to the same goal, on what is left of the plan, the same plan will do.
@@ -488,10 +489,10 @@ def _least_horizon(given: float | None, period: float, whole: float) -> float:
 
 
 def _checked_trigger(
-    trigger: str, threshold: float | None, measured: int | None, goal: int | None
-) -> tuple[str, float]:
-    if trigger not in TRIGGERS:
-        raise ValueError(f"trigger must be one of {', '.join(TRIGGERS)}, got {trigger!r}")
+    trigger: Trigger, threshold: float | None, measured: int | None, goal: int | None
+) -> tuple[Trigger, float]:
+    if trigger not in get_args(Trigger):
+        raise ValueError(f"trigger must be one of {', '.join(get_args(Trigger))}, got {trigger!r}")
     if trigger == "goal" and goal is None:
         raise ValueError('goal_derivatives must be given for trigger = "goal", got None')
     if trigger != "deviation":
