@@ -179,8 +179,8 @@ plan = cp.TrigSpline(obstacle_waypoints(), alpha=4.0)
 found = cp.simulate(cp.plants.crane_loop(CRANE, plan), np.linspace(0.0, 20.0, 41))
 assert found.method == "python" and "pip install ctrlplan[fast]" in found.reason, found.reason
 plans = {"trigonometric": plan}
-spread = cp.sweep(lambda n, p: cp.plants.crane_loop(CRANE, p), plans=plans, timepts=np.linspace(0.0, 2.0, 41),
-                  params={"load_mass": [400.0, 600.0]}, progress=False)
+spread = cp.monte_carlo(lambda n, p: cp.plants.crane_loop(CRANE, p), {"load_mass": [400.0, 600.0]},
+                        plans, np.linspace(0.0, 2.0, 41), progress=False)
 assert not spread.failures
 """
     subprocess.run([sys.executable, "-W", "error", "-c", program], check=True, timeout=120)
