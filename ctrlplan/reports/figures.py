@@ -30,7 +30,7 @@ from ctrlplan.reports.style import (
 )
 from ctrlplan.studies.comparison import Comparison
 from ctrlplan.studies.ensemble import Ensemble
-from ctrlplan.studies.measures import MEASURES
+from ctrlplan.studies.measures import MEASURES, SETTLING_TIMES
 from ctrlplan.studies.sections import Curves, Place
 from ctrlplan.studies.sweep import Sweep, settling_jumps
 from ctrlplan.studies.units import in_units
@@ -206,7 +206,7 @@ def plot_sweep(
     for name, axes in zip(names, drawing.column, strict=True):
         for plan, rows in sweep.metrics.items():
             x, y = sweep.values, rows[name]
-            if name.endswith("settling_time"):
+            if name in SETTLING_TIMES:
                 x, y = _with_gaps(x, y)
             axes.plot(x, y, **styles[plan])
         measure = MEASURES.get(name)

@@ -178,10 +178,10 @@ def checked_job(
         raise ValueError(f"timepts must be two or more finite times that increase strictly, got {timepts!r:.80}")
     if times[-1] - times[0] > _LONGEST:
         raise ValueError(f"timepts must span {_LONGEST:g} s at most, got {times[-1] - times[0]:g} s")
-    tolerances: tuple[tuple[str, object], ...] = (("rtol", rtol), ("atol", atol))
-    for label, value in tolerances:
-        if value is None and label == "atol":
-            continue
+    tolerances: dict[str, object] = {"rtol": rtol}
+    if atol is not None:
+        tolerances["atol"] = atol
+    for label, value in tolerances.items():
         if isinstance(value, bool) or not isinstance(value, Real) or not 0.0 < float(value) < math.inf:
             raise ValueError(f"{label} must be a finite number above 0, got {value!r}")
     prepared = prepared_form(system)

@@ -71,11 +71,10 @@ def cause(network: Network, params: Params, t: float, x: Array, w: Array, span: 
             state, fed = x[network.states[i]], network.fed[i](w)
             labels = ["t", *(block.system.state_labels or []), *(block.system.input_labels or [])]
             kinds = dict(zip(labels, _kinds(values, t, state, fed, span), strict=False))
-            for kind, words in (("jump", "jumps there with"), ("slope", "has an infinite slope there over")):
+            for kind, words, then in _WORDS:
                 at = next((label for label, found in kinds.items() if found == kind), None)
                 if at is not None:
-                    stays = ", and the solution stays at the jump: " if kind == "jump" else ": "
-                    return f"what block {block.name} returns {words} {at}{stays}{SMOOTHING}"
+                    return f"what block {block.name} returns {words} {at}{then}: {SMOOTHING}"
     return ""
 
 
@@ -122,6 +121,13 @@ def _kinds(values: Values, t: float, x: Array, u: Array, span: float) -> Iterato
         with np.errstate(all="ignore"):
             found = {_kind(np.abs(h - g), np.abs(h).max(initial=0.0)) for g, h in zip(low.T, high.T, strict=True)}
         yield next((kind for kind in ("jump", "slope") if kind in found), "")
+
+
+_WORDS = (
+    ("jump", "jumps there with", ", and the solution stays at the jump"),
+    ("slope", "has an infinite slope there over", ""),
+)
+"""Kinds of `_kind`, the first one found is named, and how."""
 
 
 def _kind(changes: Array, size: float) -> str:

@@ -280,7 +280,7 @@ def compare(
     >>> round(result.metrics["step"]["overshoot_error"], 1)
     85.4
     """
-    waypoints = waypoints_given(waypoints, "waypoints")
+    waypoints = waypoints_given(waypoints, "waypoints", "Waypoints")
     if not isinstance(plans, Mapping):
         waypoints = waypoints_given(plans)
         plans = references_of(waypoints, alpha)

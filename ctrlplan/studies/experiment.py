@@ -154,7 +154,7 @@ class Experiment:
         events: Iterable[Event] | None = None,
         measures: Collection[str | Measure] | Mapping[str, Measure] | None = None,
     ) -> None:
-        points = waypoints_given(waypoints, "waypoints")
+        points = waypoints_given(waypoints, "waypoints", "Waypoints")
         if not isinstance(plans, Mapping):
             plans = points = waypoints_given(plans)
         references = references_of(plans)

@@ -381,7 +381,7 @@ def signal_metrics(
         tables = {}
         for name, function in _functions(kind, measures) if labels else ():
             tables[name] = _table(function, seen, len(y))
-            if name in _NEVER_SETTLED:
+            if name in SETTLING_TIMES:
                 tables[name][record.unstable] = np.inf
         found |= {name: np.fmax.reduce(table, axis=1) for name, table in tables.items()}
         for name, table in tables.items() if len(labels) > 1 else ():
@@ -389,8 +389,8 @@ def signal_metrics(
     return found
 
 
-_NEVER_SETTLED = ("settling_time", "tracking_settling_time")
-"""Metrics that are infinite where the loop is unstable, however short the run."""
+SETTLING_TIMES = ("settling_time", "tracking_settling_time")
+"""Metrics that are infinite where the loop is unstable, however short the run, and that jump along a parameter."""
 
 
 def _rows(signals: Array) -> list[Array]:

@@ -7,15 +7,16 @@ from collections.abc import Iterable, Mapping
 from ctrlplan.trajectories import PiecewiseSpline, PolySpline, Step, Trajectory, TrigSpline, Waypoint
 
 
-def waypoints_given(points: object, name: str = "plans") -> tuple[Waypoint, ...]:
-    """Waypoints, alone or in the place of plans.
+def waypoints_given(
+    points: object, name: str = "plans", kinds: str = "a mapping of names to trajectories, or waypoints"
+) -> tuple[Waypoint, ...]:
+    """Waypoints, alone or in the place of plans; what they are called and must be, for messages.
 
     Raises
     ------
     TypeError
         If they are plans without names, or nothing of the kind.
     """
-    kinds = "Waypoints" if name == "waypoints" else "a mapping of names to trajectories, or waypoints"
     found: list[Waypoint] = []
     for point in points if isinstance(points, Iterable) else (points,):
         if not isinstance(point, Waypoint):
