@@ -137,11 +137,11 @@ def test_draws_beside_runs_by_hand(benchmark, capsys, tight):
     only = ("settling_time", "overshoot_error")
 
     def ours():
-        return cp.sweep(
+        return cp.monte_carlo(
             lambda name, plan: cp.plants.crane_loop(CRANE, plan),
-            plans={"trigonometric": PLAN},
-            timepts=T,
-            params=table,
+            table,
+            {"trigonometric": PLAN},
+            T,
             progress=False,
             outputs=("x", "z"),
             controls=("F", "C"),
