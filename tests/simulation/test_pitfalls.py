@@ -6,6 +6,7 @@ import sys
 import control as ct
 import numpy as np
 import pytest
+from strict import WARNINGS
 
 import ctrlplan as cp
 
@@ -183,4 +184,4 @@ spread = cp.monte_carlo(lambda n, p: cp.plants.crane_loop(CRANE, p), {"load_mass
                         plans, np.linspace(0.0, 2.0, 41), progress=False)
 assert not spread.failures
 """
-    subprocess.run([sys.executable, "-W", "error", "-c", program], check=True, timeout=120)
+    subprocess.run([sys.executable, *WARNINGS, "-c", program], check=True, timeout=120)
