@@ -231,7 +231,8 @@ def _problem(
     poles = np.linalg.eigvals(a)
     if poles.size and not poles.real.max() < -1e-9 * np.abs(poles).max():
         worst = poles[poles.real.argmax()]
-        raise ValueError(f"loop must be stable, got a pole of {loop.name} at {worst:.3g} 1/s")
+        shown = worst if np.imag(worst) else np.real(worst)
+        raise ValueError(f"loop must be stable, got a pole of {loop.name} at {shown:.3g} 1/s")
     found = np.array([checked_limits(pair, f"limits of {label}") for label, pair in limits.items()])
     pairs, scale = found[:, :2], found[:, 2]
     rows, columns = [outputs.index(label) for label in limits], [inputs.index(label) for label in governed]

@@ -308,7 +308,8 @@ def test_an_old_form_gives_the_same_block_with_a_warning(name, args, kwargs, new
         wanted = BLOCKS[name](*args[:count], **new)
     with pytest.warns(FutureWarning, match=message) as caught:
         found = BLOCKS[name](*args, **kwargs)
-    assert [warning.filename for warning in caught] == [__file__]
+    ours = [warning for warning in caught if warning.category is FutureWarning]  # others: control with numpy 2.5
+    assert [warning.filename for warning in ours] == [__file__]
     for labels in ("input_labels", "output_labels", "state_labels", "name"):
         assert getattr(found, labels) == getattr(wanted, labels)
     np.testing.assert_array_equal(outputs(found), outputs(wanted))
