@@ -190,7 +190,7 @@ def test_digits_that_a_matrix_far_from_normal_loses_are_said(gain, count):
     found, said, texts = simulated(a, b, np.linspace(0.0, 2.0, count))
     error = (np.abs(found[:, :: (count - 1) // 8] - exact).max(axis=1) / np.abs(exact).max(axis=1)).max()
     assert len(said) == 1
-    # One draw of signs has the size of the root of a sum of n^2 squares; rounding adds up to the sum, at most n times it.
+    # A draw of signs has the size of the root of a sum of n^2 squares; rounding that of the sum, at most n times more.
     assert said[0] >= 0.25 / 6.0 * min(error, 1.0)
     assert "closer to a normal one" in texts[0]
 
