@@ -332,7 +332,7 @@ def _made_through_waypoints(task: _Task) -> WaypointSpline:
 
 
 def _kinds(plan: WaypointSpline) -> Iterator[Build]:
-    """How plans through other waypoints are made: as the given one, then of minimum-jerk legs."""
+    """How plans through other waypoints are made: as the given one, then of minimum-jerk segments."""
     yield plan.quiet().through
     if not (isinstance(plan, PiecewiseSpline) and plan.alpha == 0.0):
         yield lambda points: PiecewiseSpline(points, labels=plan.labels, warn=False)
@@ -342,7 +342,7 @@ def _kinds(plan: WaypointSpline) -> Iterator[Build]:
 
 
 def _ways(task: _Task) -> list[list[Array]]:
-    """Shortest polyline of each class, leg by leg its corners (2, n), waypoints included; the shortest first."""
+    """Shortest polyline of each homotopy class as corners (2, n) by segment, with waypoints; the shortest first."""
     for margin in ((1.0 + 1e-3) * (task.load + task.wanted), 0.0):
         # Where there is no room for what is wanted, how near a plan comes is still worth knowing.
         nodes, edges = _visible(task, margin)
@@ -410,12 +410,12 @@ def _shortest(nodes: Array, edges: Pairs, npoints: int) -> list[Array]:
     graph = csr_array((lengths, tuple(edges.astype(np.int32))), shape=(nodes.shape[1],) * 2)
     far, before = dijkstra(graph, directed=False, indices=range(npoints - 1), return_predecessors=True)
     way = []
-    for leg in range(npoints - 1):
-        passed = [leg + 1]
-        while passed[-1] != leg:
-            if not np.isfinite(far[leg, leg + 1]):
+    for segment in range(npoints - 1):
+        passed = [segment + 1]
+        while passed[-1] != segment:
+            if not np.isfinite(far[segment, segment + 1]):
                 return []
-            passed.append(before[leg, passed[-1]])
+            passed.append(before[segment, passed[-1]])
         way.append(nodes[:, passed[::-1]])
     return way
 
@@ -425,16 +425,16 @@ def _shortest(nodes: Array, edges: Pairs, npoints: int) -> list[Array]:
 
 @dataclass(frozen=True)
 class _Vias:
-    """Via points in order: the leg of each, its time and position."""
+    """Via points in order: the segment of each, its time and position."""
 
-    legs: NDArray[np.intp]
+    segments: NDArray[np.intp]
     times: Array
     positions: Array
 
     def inserted(self, task: _Task, time: float, position: Array) -> _Vias:
-        at, leg = int(np.searchsorted(self.times, time)), int(np.searchsorted(task.times, time)) - 1
+        at, segment = int(np.searchsorted(self.times, time)), int(np.searchsorted(task.times, time)) - 1
         return _Vias(
-            np.insert(self.legs, at, leg),
+            np.insert(self.segments, at, segment),
             np.insert(self.times, at, time),
             np.insert(self.positions, at, position, axis=1),
         )
@@ -478,24 +478,24 @@ def _first(task: _Task, way: list[Array]) -> _Vias:
     lines = list(way)
     while True:
         bends: dict[tuple[int, int], float] = {}
-        for leg, line in enumerate(lines):
+        for segment, line in enumerate(lines):
             steps, chords = np.hypot(*np.diff(line)), np.hypot(*(line[:, 2:] - line[:, :-2]))
-            bends |= {(leg, k): bend for k, bend in enumerate((steps[1:] + steps[:-1] - chords).tolist(), 1)}
+            bends |= {(segment, k): bend for k, bend in enumerate((steps[1:] + steps[:-1] - chords).tolist(), 1)}
         least = min(bends.values(), default=0.0)
         if len(bends) < 2 or (len(bends) <= task.max_points and least > 0.01 * task.size):
             break
-        leg, k = min(bends, key=lambda corner: bends[corner])
-        lines[leg] = np.delete(lines[leg], k, axis=1)
-    for leg, k in bends:
-        run = np.cumsum(np.hypot(*np.diff(lines[leg])))
-        begin, end = task.times[leg : leg + 2]
+        segment, k = min(bends, key=lambda corner: bends[corner])
+        lines[segment] = np.delete(lines[segment], k, axis=1)
+    for segment, k in bends:
+        run = np.cumsum(np.hypot(*np.diff(lines[segment])))
+        begin, end = task.times[segment : segment + 2]
         time = _beside(task, vias, begin + (end - begin) * run[k - 1] / run[-1])
-        vias = vias.inserted(task, time, lines[leg][:, k])
+        vias = vias.inserted(task, time, lines[segment][:, k])
     if not bends:
         time = _beside(task, vias, task.given.time)
-        leg = int(np.searchsorted(task.times, time)) - 1
-        begin, end = task.times[leg : leg + 2]
-        vias = vias.inserted(task, time, lines[leg] @ np.array([end - time, time - begin]) / (end - begin))
+        segment = int(np.searchsorted(task.times, time)) - 1
+        begin, end = task.times[segment : segment + 2]
+        vias = vias.inserted(task, time, lines[segment] @ np.array([end - time, time - begin]) / (end - begin))
     return vias
 
 
@@ -519,10 +519,10 @@ def _moved(task: _Task, build: Build, vias: _Vias, margin: float) -> _Vias:
     """Via points where the plan is least rough among those clear at samples, or misses what is wanted by least.
 
     The unknowns are the positions in units of the size, the logarithms of the
-    shares of a leg's duration (the last one's is 0), and by how much the
+    shares of a segment's duration (the last one's is 0), and by how much the
     clearance may be missed: with it no step of the search is without a solution.
     """
-    count = vias.legs.size
+    count = vias.segments.size
     t = np.linspace(task.plan.start, task.plan.end, _SAMPLES)
     order = 3 if task.rope is None else max(3, task.rope.order)
     windows = np.arange(0, t.size, _WINDOW)
@@ -561,7 +561,8 @@ def _moved(task: _Task, build: Build, vias: _Vias, margin: float) -> _Vias:
             return np.zeros((measured(key).size, 3 * count))
         return (moved - measured(key)[:, None]) / _STEP
 
-    start = [vias.positions.ravel() / task.size, *[_logarithms(task, vias, leg) for leg in np.unique(vias.legs)]]
+    logarithms = [_logarithms(task, vias, segment) for segment in np.unique(vias.segments)]
+    start = [vias.positions.ravel() / task.size, *logarithms]
     x0 = np.append(np.concatenate(start), 0.0)
     first = measured(x0.tobytes())
     x0[-1] = max(0.0, -float(first[1:].min()))
@@ -583,18 +584,18 @@ def _moved(task: _Task, build: Build, vias: _Vias, margin: float) -> _Vias:
 
 def _decoded(task: _Task, vias: _Vias, x: Array) -> _Vias:
     """Via points of the unknowns of `_moved`."""
-    count, times = vias.legs.size, vias.times.copy()
-    for leg in np.unique(vias.legs):
-        here = vias.legs == leg
+    count, times = vias.segments.size, vias.times.copy()
+    for segment in np.unique(vias.segments):
+        here = vias.segments == segment
         shares = np.exp(np.append(x[2 * count : 3 * count][here], 0.0))
-        begin, end = task.times[leg : leg + 2]
+        begin, end = task.times[segment : segment + 2]
         times[here] = begin + (end - begin) * np.cumsum(shares)[:-1] / shares.sum()
-    return _Vias(vias.legs, times, task.size * x[: 2 * count].reshape(2, count))
+    return _Vias(vias.segments, times, task.size * x[: 2 * count].reshape(2, count))
 
 
-def _logarithms(task: _Task, vias: _Vias, leg: int) -> Array:
-    """Logarithms of the shares of a leg's duration, the last one's subtracted."""
-    shares = np.log(np.diff([task.times[leg], *vias.times[vias.legs == leg], task.times[leg + 1]]))
+def _logarithms(task: _Task, vias: _Vias, segment: int) -> Array:
+    """Logarithms of the shares of a segment's duration, the last one's subtracted."""
+    shares = np.log(np.diff([task.times[segment], *vias.times[vias.segments == segment], task.times[segment + 1]]))
     return shares[:-1] - shares[-1]
 
 

@@ -88,7 +88,7 @@ def clearance(
 ) -> Clearance:
     """Clearance of a plan in the plane, certified over its whole interval.
 
-    Cells of each leg are refined until a bound decides, not a sample. In a cell
+    Cells of each segment are refined until a bound decides, not a sample. In a cell
     of duration h the load leaves its chord by no more than h^2/8 times the
     bound of its acceleration; the rope's ends move by no more than h/2 times
     the bounds of their speeds. Both bounds come from the jet at the centre and

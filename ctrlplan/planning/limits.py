@@ -325,7 +325,7 @@ class Limited:
         self.bounds = tuple(self._slackened(plan))
 
     def sampled(self, plan: Trajectory) -> Array:
-        """Jet (order + 1, naxes, ntime) at samples of every leg, its ends included."""
+        """Jet (order + 1, naxes, ntime) at samples of every segment, its ends included."""
         edges, inside = plan.breakpoints, np.linspace(0.0, 1.0, _SAMPLES)[1:-1]
         times = (edges[:-1, None] + np.diff(edges)[:, None] * inside).ravel()
         return np.concatenate(

@@ -200,7 +200,7 @@ def checked_objective(objective: ObjectiveName | Objective) -> Objective:
 
 
 def _arc(plan: Trajectory, left: float, right: float) -> float:
-    """Length of one leg in panels; where the speed nearly vanishes, in ever smaller ones about its least value."""
+    """Length of one segment in panels; where the speed nearly vanishes, in ever smaller ones about its least value."""
     nodes, weights = gauss(16)
     edges = np.linspace(left, right, 13)
     squares = _squares(plan, edges[:-1], edges[1:])
@@ -220,7 +220,7 @@ def _arc(plan: Trajectory, left: float, right: float) -> float:
 
 
 def _variation(plan: Trajectory, left: float, right: float) -> float:
-    """Length of one leg of one axis: from turning point to turning point."""
+    """Length of one segment of one axis: from turning point to turning point."""
     t = left + (right - left) * gauss(128)[0]
     # Between points of inflection the slope is monotone: no two turning points can hide between samples.
     t = np.sort(np.concatenate([t, _crossings(plan, t, 2)]))
@@ -264,9 +264,9 @@ def _last_legendre(count: int) -> Array:
 
 
 def _peak(plan: Trajectory, left: float, right: float, nu: int, count: int) -> float:
-    """Greatest magnitude on one leg: samples, and the vertex of a parabola wherever the slope changes its sign."""
+    """Greatest magnitude on one segment: samples, and the vertex of a parabola wherever the slope changes its sign."""
     inside = np.linspace(left, right, count)
-    # The ends belong to this leg, not to what follows.
+    # The ends belong to this segment, not to what follows.
     inside[0], inside[-1] = np.nextafter(left, right), np.nextafter(right, left)
     value, slope, curve = plan.jet(inside, nu + 2)[nu:]
     best = float(np.abs(value).max())

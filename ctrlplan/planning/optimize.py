@@ -7,9 +7,9 @@ A plan is linear in its data, so its cost is a sum of squares of samples,
 
 with samples at the nodes of a Gauss-Legendre rule that is exact to rounding.
 Times are relative to the duration and derivatives scaled alike, so that no
-duration costs a digit. The cost of one leg of duration h in that unit is
-:math:`h^{1-2k} |R H d|^2` with the matrix R of the unit leg and H the powers of h
-that scale derivatives: legs share one factorised system.
+duration costs a digit. The cost of one segment of duration h in that unit is
+:math:`h^{1-2k} |R H d|^2` with the matrix R of the unit segment and H the powers of h
+that scale derivatives: segments share one factorised system.
 
 Times are chosen over the optimum at each of them. There the free entries are
 stationary, so that only the prescribed ones count in the slope of the cost.
@@ -53,10 +53,10 @@ class Optimum:
         Complete up to the order of the plan; nan where an entry was free on
         each side separately.
     plan : Trajectory
-        A spline where `single`; a `PiecewiseSpline` where legs share every
-        entry up to the order; otherwise legs joined.
+        A spline where `single`; a `PiecewiseSpline` where segments share every
+        entry up to the order; otherwise segments joined.
     cost : float
-        Weighted sum over the axes of int (y^(derivative))^2 dt within the legs.
+        Weighted sum over the axes of int (y^(derivative))^2 dt within the segments.
     unique : bool
         Whether the prescribed entries leave no function of zero cost free.
     derivative : int
@@ -113,17 +113,17 @@ def optimize_waypoints(
         Highest order of the entries; derivative - 1 unless given, or the
         continuity where that is higher. Prescribed entries above it raise it.
     single : bool, optional
-        One spline through all waypoints instead of one a leg.
+        One spline through all waypoints instead of one a segment.
     alpha : float, optional
-        Shape parameter in [0, 2 pi) [rad] of the spline or of every leg; 0 gives
+        Shape parameter in [0, 2 pi) [rad] of the spline or of every segment; 0 gives
         polynomials.
     continuity : int, optional
-        Highest derivative that legs share at inner waypoints, `order` unless
+        Highest derivative that segments share at inner waypoints, `order` unless
         given. Above it free entries are free on each side separately and may
         jump, which the cost does not count; prescribed ones hold on both sides.
     free_times : bool, optional
         Choose the times of inner waypoints too. Prescribed derivatives stay as
-        they are, and no leg becomes shorter than 1e-4 of the mean one or half
+        they are, and no segment becomes shorter than 1e-4 of the mean one or half
         the shortest given. The result is the best of several local minima,
         never worse than the given times.
     weights : array_like, shape (naxes,), optional
@@ -240,7 +240,7 @@ class _Solution(NamedTuple):
 
     sides: Array  # entries (2, nwaypoints, order + 1, naxes): left and right of each waypoint
     cost: Array  # (naxes,)
-    slope: Array  # of the cost along the durations, shape (nlegs, naxes)
+    slope: Array  # of the cost along the durations, shape (nsegments, naxes)
     unique: bool
     rounding: Array  # estimate of the error of the cost, shape (naxes,)
 
@@ -250,9 +250,9 @@ class _Problem:
 
     def __init__(self, table: Array, continuity: int, alpha: float, derivative: int, single: bool) -> None:
         self.table = table
-        self.family = _Whole if single else _Legs
+        self.family = _Whole if single else _Segments
         self.shape = (alpha, table.shape[1] - 1, derivative)
-        self.loose = np.zeros(table.shape[:2], dtype=bool)  # legs need not share it where it is free
+        self.loose = np.zeros(table.shape[:2], dtype=bool)  # segments need not share it where it is free
         self.loose[1:-1, continuity + 1 :] = not single
         known = ~np.isnan(table)
         patterns, which = np.unique(known.reshape(-1, table.shape[2]), axis=1, return_inverse=True)
@@ -283,11 +283,11 @@ class _Problem:
         return self.family(times, *self.shape).solve(known, entries, self.loose).cost
 
 
-class _Legs:
-    """One spline a leg."""
+class _Segments:
+    """One spline a segment."""
 
     def __init__(self, times: Array, alpha: float, order: int, derivative: int) -> None:
-        self.root = _leg_root(alpha, order, derivative)
+        self.root = _segment_root(alpha, order, derivative)
         self.derivative = derivative
         self.durations = np.diff(times)[:, None]
         self.orders = np.tile(np.arange(order + 1), 2)
@@ -363,7 +363,7 @@ class _Whole:
 
 
 @lru_cache(maxsize=256)
-def _leg_root(alpha: float, order: int, derivative: int) -> Array:
+def _segment_root(alpha: float, order: int, derivative: int) -> Array:
     """Matrix R with int_0^1 (y^(derivative))^2 = |R d|^2, d the jet at 0, then that at 1."""
     given = tuple(range(order + 1))
     system = NewtonSystem(alpha, np.array([0.0, 1.0]), (given, given))
@@ -420,11 +420,11 @@ def _best_times(problem: _Problem, given: Array, first: _Solution, weights: Arra
     floor = 1e-26 * float(problem.scale(given) @ weights)
     if first.cost @ weights <= floor:
         return given
-    legs = np.diff(given)
-    least = min(1e-4 / legs.size, 0.5 * float(legs.min()))
-    room = 1.0 - legs.size * least
+    segments = np.diff(given)
+    least = min(1e-4 / segments.size, 0.5 * float(segments.min()))
+    room = 1.0 - segments.size * least
     chord = np.sqrt(np.diff(first.sides[1, :, 0], axis=0) ** 2 @ weights)
-    chord = chord / chord.max() if chord.any() else np.ones(legs.size)
+    chord = chord / chord.max() if chord.any() else np.ones(segments.size)
 
     def durations(x: Array) -> tuple[Array, Array]:
         share = np.exp(x - x.max())
@@ -443,7 +443,7 @@ def _best_times(problem: _Problem, given: Array, first: _Solution, weights: Arra
         result = minimize(objective, x, jac=True, method="BFGS", options={"gtol": 1e-7})
         return float(result.fun), _times(durations(result.x)[0])
 
-    starts = [legs, *(chord**power for power in (1.0, 0.5, 1.0 / 3.0, 0.0))]
+    starts = [segments, *(chord**power for power in (1.0, 0.5, 1.0 / 3.0, 0.0))]
     return min(map(best_from, starts), key=lambda pair: pair[0])[1]
 
 
@@ -455,7 +455,7 @@ def _times(durations: Array) -> Array:
 def _checked_orders(
     points: tuple[Waypoint, ...], derivative: int, order: int | None, continuity: int | None, single: bool
 ) -> tuple[int, int]:
-    """Highest order of the entries, and that which legs share."""
+    """Highest order of the entries, and that which segments share."""
     if single and continuity is not None:
         raise ValueError(f"continuity must be left out for a single plan, which is smooth, got {continuity}")
     shared = 0 if continuity is None else checked_count(continuity, "continuity")

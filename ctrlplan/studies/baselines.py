@@ -61,7 +61,7 @@ def baseline_plans(
     ends = (0, len(points) - 1)
     freed = [point.truncated(2 if i in ends else 0) for i, point in enumerate(points)]
     jerk = optimize_waypoints(freed, 3, labels=legs.labels).plan
-    degree = max(max(leg.degree) for leg in legs.legs)
+    degree = max(max(leg.degree) for leg in legs.segments)
     name = f"{_DEGREES.get(degree, f'degree {degree}')}{' a leg' if len(points) > 2 else ''}"
     t = np.linspace(legs.start, legs.end, 101)
     if np.abs(jerk.jet(t, 0) - legs.jet(t, 0)).max() <= 1e-9 * np.abs(legs.jet(t, 0)).max():

@@ -77,10 +77,10 @@ def _jump(
     i, k = entry
     order = 2 * table.shape[1] - 1 - k
     unknown, known = dict[int, Decimal](), [Decimal(0)] * table.shape[2]
-    for leg, side in ((i - 1, 1), (i, 0)):
-        data = [(leg + end, given) for end in (0, 1) for given in ends[leg][end]]
-        for (waypoint, given), weight in zip(data, weights[leg][side][order], strict=True):
-            factor = weight * steps[leg] ** (given - order) * (1 - 2 * side)
+    for segment, side in ((i - 1, 1), (i, 0)):
+        data = [(segment + end, given) for end in (0, 1) for given in ends[segment][end]]
+        for (waypoint, given), weight in zip(data, weights[segment][side][order], strict=True):
+            factor = weight * steps[segment] ** (given - order) * (1 - 2 * side)
             n = place.get((waypoint, given))
             if n is None:
                 values = table[waypoint, given].tolist()

@@ -77,13 +77,13 @@ def derivative_extrema(plan: Trajectory, nu: int) -> Extrema:
     if nu == 0 or plan.breakpoints.size == 1:
         held = np.zeros((2, plan.naxes)) if nu else np.stack([plan.initial, plan.final])
         found.add(np.array([plan.start, plan.end]), held.T, (plan.start, plan.end))
-    for leg, (_, duration) in enumerate(_legs(plan)):
+    for segment, (_, duration) in enumerate(_segments(plan)):
 
-        def jet(t: Array, order: int, leg: int = leg) -> Array:
-            return plan.segment_jet(leg, t, order)
+        def jet(t: Array, order: int, segment: int = segment) -> Array:
+            return plan.segment_jet(segment, t, order)
 
         t = stationary_times(jet, duration, nu)
-        times, ends = _placed(plan, leg, t)
+        times, ends = _placed(plan, segment, t)
         found.add(times, jet(t, nu)[nu], ends)
     return found.extrema()
 
@@ -150,8 +150,8 @@ def function_extrema(
         If the function is not resolved with `_MAX_PIECES` pieces.
     """
     search = _Search(plan, function, order, np.asarray(scale, dtype=float))
-    for leg in range(len(search.legs)):
-        search.bisect(leg)
+    for segment in range(len(search.segments)):
+        search.bisect(segment)
     return search.found.extrema()
 
 
@@ -166,45 +166,45 @@ class _Search:
     """
 
     def __init__(self, plan: Trajectory, function: Callable[[Array], Array], order: int, scale: Array) -> None:
-        self.legs = _searchable_legs(plan)
+        self.segments = _searchable_segments(plan)
         self.found = _Candidates()
         self._plan, self._function, self._order, self._scale = plan, function, order, scale
         self._spent = 0
         self._samples: list[Array] = []
         self._best: dict[tuple[int, float], tuple[int, float, float]] = {}  # segment, time and value by row and sign
-        for leg, (_, duration) in enumerate(self.legs):
-            share = max(duration / plan.duration, 1.0 / len(self.legs))
+        for segment, (_, duration) in enumerate(self.segments):
+            share = max(duration / plan.duration, 1.0 / len(self.segments))
             count = 2 ** math.ceil(math.log2(max(_SAMPLES * share, 64)))
             parts = np.array_split(duration * _between(count), -(-count // 1024))  # small enough for a cache
             parts.append(np.array([0.0, duration]))
-            rows = np.concatenate([self._values(leg, t) for t in parts], axis=1)
+            rows = np.concatenate([self._values(segment, t) for t in parts], axis=1)
             self._samples.append(rows)
-            if leg == 0:
+            if segment == 0:
                 self._low, self._high = np.full(len(rows), np.inf), np.full(len(rows), -np.inf)
-            self._keep_best(leg, np.concatenate(parts), rows)
+            self._keep_best(segment, np.concatenate(parts), rows)
             self._low, self._high = np.minimum(self._low, rows.min(axis=1)), np.maximum(self._high, rows.max(axis=1))
 
-    def bisect(self, leg: int) -> None:
+    def bisect(self, segment: int) -> None:
         """Add to what was found the times at which a segment can hold an extremum."""
         index = np.zeros(1, dtype=np.int64)
         level = 0
         while index.size:
             self._spent += index.size
-            parts = [self._pieces(leg, level, index[k : k + _CHUNK]) for k in range(0, index.size, _CHUNK)]
+            parts = [self._pieces(segment, level, index[k : k + _CHUNK]) for k in range(0, index.size, _CHUNK)]
             again = np.concatenate([split for split, _ in parts])
             if again.size and self._spent + 2 * again.size > _MAX_PIECES:
-                self._give_up(leg, level, again, max(rest for _, rest in parts))
+                self._give_up(segment, level, again, max(rest for _, rest in parts))
             index = (2 * again[:, None] + np.arange(2)).ravel()
             level += 1
 
-    def _pieces(self, leg: int, level: int, index: NDArray[np.int64]) -> tuple[NDArray[np.int64], float]:
+    def _pieces(self, segment: int, level: int, index: NDArray[np.int64]) -> tuple[NDArray[np.int64], float]:
         """Those of the pieces of a level that must be bisected, and what is not resolved there at most."""
-        duration, samples = self.legs[leg][1], self._samples[leg][:, :-2]
+        duration, samples = self.segments[segment][1], self._samples[segment][:, :-2]
         width, count = math.ldexp(duration, -level), samples.shape[1] >> level
         own = _SHARES if count >= _CHECKS else np.append(_SHARES, _between(_CHECKS))
         times = np.minimum(width * (index[:, None] + own), duration)
-        found = self._values(leg, times.ravel())
-        self._keep_best(leg, times.ravel(), found)
+        found = self._values(segment, times.ravel())
+        self._keep_best(segment, times.ravel(), found)
         values = found.reshape(len(samples), *times.shape)
         series = transform(values[..., : _FIT + 1])
         missed = np.abs(series @ _ENDS - values[..., _FIT + 1 : _FIT + 3]).max(axis=2)
@@ -221,7 +221,7 @@ class _Search:
         high = np.maximum(values.max(axis=2), checks.max(axis=2))
         for (row, _), (place, instant, value) in self._best.items():  # pieces too short for a sample must not lose it
             k = int(np.searchsorted(index, math.floor(instant / width)))
-            if place == leg and k < index.size and 0.0 <= (part := instant / width - index[k]) <= 1.0:
+            if place == segment and k < index.size and 0.0 <= (part := instant / width - index[k]) <= 1.0:
                 miss = abs(float(chebyshev.chebval(2.0 * part - 1.0, series[row, k])) - value)
                 missed[row, k] = max(missed[row, k], miss)
                 low[row, k], high[row, k] = min(low[row, k], value), max(high[row, k], value)
@@ -242,36 +242,36 @@ class _Search:
             for row in np.flatnonzero(matters[:, piece]).tolist():
                 roots = real_roots(chebyshev.chebder(series[row, piece])) if smooth[row, piece] else 2.0 * own - 1.0
                 t.append(np.minimum(width * (index[piece] + 0.5 * (1.0 + roots)), duration))
-            self._add(leg, np.concatenate(t))
+            self._add(segment, np.concatenate(t))
         return index[split], float(rest[:, split].max(initial=0.0))
 
-    def _add(self, leg: int, t: Array) -> None:
-        times, ends = _placed(self._plan, leg, t)
-        self.found.add(times, self._values(leg, t), ends)
+    def _add(self, segment: int, t: Array) -> None:
+        times, ends = _placed(self._plan, segment, t)
+        self.found.add(times, self._values(segment, t), ends)
 
-    def _keep_best(self, leg: int, t: Array, values: Array) -> None:
+    def _keep_best(self, segment: int, t: Array, values: Array) -> None:
         """Make candidates of times at which a row exceeds all seen before: those near by may not reach it."""
         for sign, seen in ((-1.0, self._low), (1.0, self._high)):
             best = (sign * values).argmax(axis=1)
             for row in np.flatnonzero((sign * values).max(axis=1) > sign * seen).tolist():
                 at = best[row : row + 1]
-                self._best[row, sign] = (leg, float(t[at[0]]), float(values[row, at[0]]))
-                times, ends = _placed(self._plan, leg, t[at])
+                self._best[row, sign] = (segment, float(t[at[0]]), float(values[row, at[0]]))
+                times, ends = _placed(self._plan, segment, t[at])
                 self.found.add(times, values[:, at], ends)
 
-    def _values(self, leg: int, t: Array) -> Array:
+    def _values(self, segment: int, t: Array) -> Array:
         """Values (nrows, ntime) of the function at times from the beginning of a segment."""
-        values = np.atleast_2d(np.asarray(self._function(self._plan.segment_jet(leg, t, self._order)), dtype=float))
+        values = np.atleast_2d(np.asarray(self._function(self._plan.segment_jet(segment, t, self._order)), dtype=float))
         if values.ndim != 2 or values.shape[1] != t.size:
             raise ValueError(f"function must return values of shape (ntime,) or (m, ntime), got shape {values.shape}")
         if not np.isfinite(values).all():
-            (origin, duration), bad = self.legs[leg], t[~np.isfinite(values).all(axis=0)]
+            (origin, duration), bad = self.segments[segment], t[~np.isfinite(values).all(axis=0)]
             where = f"between {origin:g} and {origin + duration:g} s, such as at {origin + bad[0]:g} s"
             raise ValueError(f"function must be finite over the plan, got nan or inf {where}")
         return values
 
-    def _give_up(self, leg: int, level: int, index: NDArray[np.int64], rest: float) -> NoReturn:
-        origin, duration = self.legs[leg]
+    def _give_up(self, segment: int, level: int, index: NDArray[np.int64], rest: float) -> NoReturn:
+        origin, duration = self.segments[segment]
         left, right = (origin + math.ldexp(duration, -level) * (k + i) for i, k in enumerate((index[0], index[-1])))
         raise RuntimeError(
             f"function must be resolved to {TOLERANCE:g} of its largest magnitude, got {rest:.2g} "
@@ -289,31 +289,31 @@ def certified_bounds(
     max_cells: int,
 ) -> Bounds:
     """Bounds by refining cells until a Lipschitz bound decides."""
-    legs = _searchable_legs(plan)
+    segments = _searchable_segments(plan)
     weights = _weights(lipschitz, order + 1, plan.naxes)
     if not rtol > 0.0:
         raise ValueError(f"rtol must be above 0, got {rtol}")
     first, second = (np.stack([plan.peak(k + nu) for k in range(order + 1)])[:, :, None] for nu in (1, 2))
     found, lower, upper = _Candidates(), np.inf, -np.inf
     least, greatest = np.inf, -np.inf
-    for leg, (_, duration) in enumerate(legs):
+    for segment, (_, duration) in enumerate(segments):
         s = np.linspace(0.0, duration, 129)
-        values = _evaluated(function, plan.segment_jet(leg, s, order))
-        found.add(_placed(plan, leg, s)[0], values[None])
+        values = _evaluated(function, plan.segment_jet(segment, s, order))
+        found.add(_placed(plan, segment, s)[0], values[None])
         least, greatest = min(least, float(values.min())), max(greatest, float(values.max()))
-    for leg, (_, duration) in enumerate(legs):
+    for segment, (_, duration) in enumerate(segments):
         radius, spent = duration / 256, 0
         centres = duration * (np.arange(128) + 0.5) / 128
         while centres.size:
             spent += centres.size
             if spent > max_cells:
                 raise ValueError(f"rtol = {rtol:g} must be reached within {max_cells} cells; raise either of them")
-            jet = plan.segment_jet(leg, centres, order + 1)
+            jet = plan.segment_jet(segment, centres, order + 1)
             values = _evaluated(function, jet[:-1])
             # In its cell a derivative moves by no more than the next one's value at the centre and slope allow.
             slope = np.minimum(first, np.abs(jet[1:]) + radius * second)
             reach = radius * np.sum(weights * slope, axis=(0, 1))
-            found.add(_placed(plan, leg, centres)[0], values[None])
+            found.add(_placed(plan, segment, centres)[0], values[None])
             least, greatest = min(least, float(values.min())), max(greatest, float(values.max()))
             gap = rtol * (greatest - least)
             undecided = (values - reach < least - gap) | (values + reach > greatest + gap)
@@ -381,7 +381,7 @@ class _Candidates:
         self.ends: list[Array] = []
 
     def add(self, t: Array, values: Array, ends: tuple[float, float] = (np.nan, np.nan)) -> None:
-        """Values (naxes, ntime) at some times, of which those of the `ends` of a leg go first in a tie."""
+        """Values (naxes, ntime) at some times, of which those of the `ends` of a segment go first in a tie."""
         self.times.append(t)
         self.values.append(values)
         self.ends.append(np.where((t == ends[0]) | (t == ends[1]), 1.0, 0.0))
@@ -402,23 +402,23 @@ class _Candidates:
         return np.argmax(tied * (1.0 + ends), axis=1)
 
 
-def _legs(plan: Trajectory) -> list[tuple[float, float]]:
-    """Beginning and duration [s] of each leg."""
+def _segments(plan: Trajectory) -> list[tuple[float, float]]:
+    """Beginning and duration [s] of each segment."""
     return list(zip(plan.breakpoints[:-1].tolist(), np.diff(plan.breakpoints).tolist(), strict=True))
 
 
-def _placed(plan: Trajectory, leg: int, t: Array) -> tuple[Array, tuple[float, float]]:
+def _placed(plan: Trajectory, segment: int, t: Array) -> tuple[Array, tuple[float, float]]:
     """Times of a plan from those of a segment, and the ends of the segment, which rounding does not leave."""
-    left, right = plan.breakpoints[leg : leg + 2].tolist()
+    left, right = plan.breakpoints[segment : segment + 2].tolist()
     times = np.where(t < right - left, np.minimum(left + t, math.nextafter(right, left)), right)
     return times, (left, right)
 
 
-def _searchable_legs(plan: Trajectory) -> list[tuple[float, float]]:
-    legs = _legs(plan)
-    if not legs:
+def _searchable_segments(plan: Trajectory) -> list[tuple[float, float]]:
+    segments = _segments(plan)
+    if not segments:
         raise ValueError("a trajectory without duration has no interval to search, got a step")
-    return legs
+    return segments
 
 
 def _pieces(

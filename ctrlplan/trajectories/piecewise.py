@@ -1,4 +1,4 @@
-"""One spline a leg: the paper's first approach to via points."""
+"""One spline a segment: the paper's first approach to via points."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctrlplan._checks import checked_labels
+from ctrlplan._renamed import warn_renamed
 from ctrlplan._types import Data, Value
 from ctrlplan.trajectories.common import FACTORIALS, Array, mapped_time, readonly, times_powers
 from ctrlplan.trajectories.conjugate_digits import Ends, conjugate_digits
@@ -36,7 +37,7 @@ _WITHIN = np.linspace(0.0, 1.0, 13)
 
 
 class PiecewiseSpline(WaypointSpline):
-    """One spline for each leg between waypoints.
+    """One spline for each segment between waypoints.
 
     With K - 1 the highest order that an axis prescribes anywhere, an entry of
     order j < K left free at an inner waypoint is continuous there, and so is
@@ -44,14 +45,14 @@ class PiecewiseSpline(WaypointSpline):
     alpha = 0 that is the interpolant of least int (y^(K))^2: the cubic spline
     where velocities are free between given ones, the minimum-jerk spline where
     velocities and accelerations are. Entries left free at the ends lower the
-    degree of the first and last leg. What no waypoint prescribes may jump.
+    degree of the first and last segment. What no waypoint prescribes may jump.
 
     Parameters
     ----------
     waypoints : iterable of Waypoint
         Two or more, times increasing.
     alpha : float or "auto", optional
-        Shape parameter of every leg in [0, 2 pi) [rad]; 0 gives polynomials,
+        Shape parameter of every segment in [0, 2 pi) [rad]; 0 gives polynomials,
         "auto" the shortest path.
     labels : sequence of str, optional
         Names of the axes.
@@ -62,7 +63,7 @@ class PiecewiseSpline(WaypointSpline):
 
     Attributes
     ----------
-    legs : tuple of TrigSpline or PolySpline
+    segments : tuple of TrigSpline or PolySpline
         The splines, with the free entries of inner waypoints filled in.
 
     Raises
@@ -81,7 +82,7 @@ class PiecewiseSpline(WaypointSpline):
     options = ("alpha",)
 
     alpha: float
-    legs: tuple[NewtonSpline, ...]
+    segments: tuple[NewtonSpline, ...]
     _warn: bool
 
     def __init__(
@@ -96,23 +97,29 @@ class PiecewiseSpline(WaypointSpline):
         shape = chosen_alpha(alpha, points, type(self), labels=labels)
         names = checked_labels(labels or points[0].labels, points[0].naxes)
         filled, decimals = _filled(points, shape)
-        legs: list[NewtonSpline] = [
+        segments: list[NewtonSpline] = [
             TrigSpline(pair, alpha=shape, labels=names, warn=False)
             if shape
             else PolySpline(pair, labels=names, warn=False)
             for pair in itertools.pairwise(filled)
         ]
         if decimals is not None:
-            _resolve(legs, decimals)
+            _resolve(segments, decimals)
         self._set_fields(
             waypoints=points,
             alpha=shape,
             labels=names,
-            legs=tuple(legs),
+            segments=tuple(segments),
             breakpoints=readonly(np.array([p.time for p in points])),
             _warn=warn,
         )
         self._check_swing()
+
+    @property
+    def legs(self) -> tuple[NewtonSpline, ...]:
+        """Deprecated name of `segments`."""
+        warn_renamed("PiecewiseSpline.legs", "segments")
+        return self.segments
 
     def with_values(self, waypoints: Iterable[Waypoint]) -> Self:
         """Plan with the same times and shape through new values.
@@ -171,17 +178,17 @@ class PiecewiseSpline(WaypointSpline):
     def _check_swing(self) -> None:
         """Warn, where it was not declined, of a plan that swings far beyond its waypoints."""
         if self._warn:
-            values = [leg.segment_jet(0, leg.duration * _WITHIN, 0)[0] for leg in self.legs]
+            values = [segment.segment_jet(0, segment.duration * _WITHIN, 0)[0] for segment in self.segments]
             way_on = f"lower alpha from {self.alpha:.6g}" if self.alpha else "prescribe velocities at inner waypoints"
             warn_of_swing(np.concatenate(values, axis=1), self.waypoints, self.end, self.labels, way_on)
 
     def segment_jet(self, segment: int, s: Array, order: int) -> Array:
         """Derivatives of a segment; as `Trajectory.segment_jet`."""
-        return self.legs[segment].segment_jet(0, s, order)
+        return self.segments[segment].segment_jet(0, s, order)
 
     def segment_series(self, segment: int, s: Value, order: int) -> list[list[Value]]:
         """Taylor series of a segment; as `Trajectory.segment_series`."""
-        return self.legs[segment].segment_series(0, s, order)
+        return self.segments[segment].segment_series(0, s, order)
 
 
 def _filled(points: tuple[Waypoint, ...], alpha: float) -> tuple[list[Waypoint], NDArray[np.object_] | None]:
@@ -205,14 +212,14 @@ def _filled(points: tuple[Waypoint, ...], alpha: float) -> tuple[list[Waypoint],
     return [Waypoint.from_array(p.time, jet, None) for p, jet in zip(points, filled, strict=True)], decimals
 
 
-def _resolve(legs: list[NewtonSpline], decimals: NDArray[np.object_]) -> None:
+def _resolve(segments: list[NewtonSpline], decimals: NDArray[np.object_]) -> None:
     """Replace short segments, whose higher derivatives rounding of the entries at their ends would change."""
-    durations = [leg.duration for leg in legs]
+    durations = [segment.duration for segment in segments]
     longest = max(durations)
     for k, duration in enumerate(durations):
         if duration < _SHORT * longest:
             digits = math.ceil(2 * decimals.shape[1] * math.log10(longest / duration))
-            legs[k] = legs[k].resolved(decimals[k : k + 2], digits)
+            segments[k] = segments[k].resolved(decimals[k : k + 2], digits)
 
 
 def _conjugate(
@@ -226,10 +233,12 @@ def _conjugate(
     """Free entries (nfree, naxes) that leave no jump of the conjugate derivatives: floats, or decimals."""
     last = len(points) - 1
     ends: list[Ends] = []
-    for leg in range(last):
-        start, end = (pattern[i] if i in (0, last) else tuple(range(size)) for i in (leg, leg + 1))
+    for segment in range(last):
+        start, end = (pattern[i] if i in (0, last) else tuple(range(size)) for i in (segment, segment + 1))
         if not (start or end):
-            raise ValueError(f"waypoints must prescribe something on every leg, got none from {leg} to {leg + 1}")
+            raise ValueError(
+                f"waypoints must prescribe something on every segment, got none from {segment} to {segment + 1}"
+            )
         ends.append((start, end))
     times = np.array([p.time for p in points])
     unit = float(times[-1] - times[0]) / last
@@ -272,8 +281,8 @@ def _jumps(
 ) -> _Equations | None:
     """Jumps of the conjugate derivatives, scaled by rows; None where they are beyond floating point.
 
-    The legs are linear in their data, so each free entry is tried as an axis of
-    its own after those given; times are in units of the mean leg.
+    The segments are linear in their data, so each free entry is tried as an axis of
+    its own after those given; times are in units of the mean segment.
     """
     last, size, naxes = durations.size, table.shape[1], table.shape[2]
     columns = np.concatenate([np.nan_to_num(table), np.zeros((last + 1, size, len(free)))], axis=2)
@@ -281,18 +290,18 @@ def _jumps(
         columns[i, k, naxes + n] = 1.0
     jump = np.zeros((last + 1, 2 * size, columns.shape[2]))  # right limit minus left, at each waypoint
     amplification = 1.0
-    for leg, duration in enumerate(durations.tolist()):
-        system = NewtonSystem(alpha, np.array([0.0, 1.0]), ends[leg])
+    for segment, duration in enumerate(durations.tolist()):
+        system = NewtonSystem(alpha, np.array([0.0, 1.0]), ends[segment])
         amplification = max(amplification, system.amplification)
         orders = system.order_index
         with np.errstate(all="ignore"):
             scale = duration**orders / FACTORIALS[orders]
-            coefficients = system.coefficients(columns[leg + system.waypoint_index, orders] * scale[:, None])
+            coefficients = system.coefficients(columns[segment + system.waypoint_index, orders] * scale[:, None])
             taylor = system.taylor(np.array([0.0, 1.0]), 2 * size - 1)
             jets = np.einsum("mkt,ma->tka", taylor, coefficients)
             jets *= (FACTORIALS[: 2 * size] / duration ** np.arange(2 * size))[:, None]
-        jump[leg] += jets[0]
-        jump[leg + 1] -= jets[1]
+        jump[segment] += jets[0]
+        jump[segment + 1] -= jets[1]
     rows = np.array([jump[i, 2 * size - 1 - k] for i, k in free])
     if not np.isfinite(rows).all():
         return None

@@ -22,7 +22,7 @@ class _Profile(Trajectory, FromWaypoints):
     """Line initial + (final - initial) s(t) from rest to rest, s a rise of velocity, a cruise and the rise mirrored.
 
     The rise is counted from the start and the fall backwards from the end, so
-    that both positions are exact. Legs last as long as the clock says after
+    that both positions are exact. Segments last as long as the clock says after
     rounding, and s is made of those: however late the start, what should be
     continuous is, and no limit is exceeded, both to the last digits.
     """
@@ -37,7 +37,7 @@ class _Profile(Trajectory, FromWaypoints):
     _nfall: int
 
     _names: ClassVar[tuple[str, ...]]
-    _ramp: ClassVar[Array]  # the highest continuous derivative at both ends of each leg of the rise, to scale
+    _ramp: ClassVar[Array]  # the highest continuous derivative at both ends of each segment of the rise, to scale
 
     def to_dict(self) -> Data:
         """Plain data that `trajectory_from_dict` reads."""
@@ -106,9 +106,9 @@ class _Profile(Trajectory, FromWaypoints):
         with np.errstate(all="ignore"):
             durations = _fastest(*((limit[moves] / np.abs(change[moves])).min() for limit in given))
         if not np.isfinite(durations).all():
-            raise ValueError(f"limits must give legs of finite durations, got {durations.tolist()} s")
+            raise ValueError(f"limits must give segments of finite durations, got {durations.tolist()} s")
         least = 8.0 * np.finfo(float).eps * (abs(ends.start) + durations.sum())
-        kept = durations > least  # what is shorter is the rounding of a leg without duration
+        kept = durations > least  # what is shorter is the rounding of a segment without duration
         nrise = len(self._ramp)
         if not kept[:nrise].any():
             raise ValueError(
@@ -116,7 +116,7 @@ class _Profile(Trajectory, FromWaypoints):
                 f"got {durations[:nrise].sum():.3g} s"
             )
         times = [ends.start]
-        # Rounded down, or without the time of legs left out, the others would exceed their limits.
+        # Rounded down, or without the time of segments left out, the others would exceed their limits.
         for duration in (durations[kept] + durations[~kept].clip(min=0.0).sum()).tolist():
             time = times[-1] + duration
             times.append(time if time - times[-1] >= duration else math.nextafter(time, math.inf))
@@ -225,7 +225,7 @@ class Trapezoid(_Profile):
 class SCurve(_Profile):
     """Fastest rest-to-rest move with limits of its jerk.
 
-    Under limits of velocity, acceleration and jerk: seven legs of constant
+    Under limits of velocity, acceleration and jerk: seven segments of constant
     jerk, or fewer where the velocity or the acceleration limit is not reached.
     Several axes move together, on the straight line from `initial` to `final`,
     as fast as all limits allow. The jerk jumps at every breakpoint.
@@ -296,7 +296,7 @@ def _rest_to_rest(points: tuple[Waypoint, ...], kind: str) -> tuple[Waypoint, Wa
 
 
 def _fastest(velocity: float, acceleration: float, jerk: float = math.inf) -> Array:
-    """Durations of rise, cruise and fall of the fastest unit move; without a limit of jerk the rise is one leg."""
+    """Durations of rise, cruise and fall of the fastest unit move; without a limit of jerk the rise is one segment."""
     ramp = min(acceleration / jerk, np.sqrt(velocity / jerk), np.cbrt(0.5 / jerk))
     peak = acceleration if ramp == acceleration / jerk else jerk * ramp
     to_limit = velocity / peak + ramp
@@ -308,7 +308,7 @@ def _fastest(velocity: float, acceleration: float, jerk: float = math.inf) -> Ar
 
 
 def _rise(lasts: Array, ramp: Array, order: int) -> tuple[Array, float]:
-    """Rise to unit velocity: Taylor coefficients (nlegs, order + 1) about the beginning of each leg, and its length."""
+    """Rise to unit velocity: Taylor coefficients (nsegments, order + 1) at the start of each segment; its length."""
     rows, end = [(ramp[:, 1] - ramp[:, 0]) / lasts, ramp[:, 0]], [float(ramp[-1, 1])]
     for _ in range(order - 1):
         grown = np.cumsum(sum(row * lasts**k / FACTORIALS[k] for k, row in enumerate(reversed(rows), 1)))

@@ -179,8 +179,8 @@ def _checked_law(plan: Trajectory, law: Trajectory, slack: float) -> Array:
             f"law must have the rate 1 where the plan is shaped, got {rate.minimum[0]:g} to {rate.maximum[0]:g}: the "
             f"delays of the shaper would change with it; take the plan before it is shaped, then shape the result"
         )
-    for leg in np.flatnonzero(np.diff(values) <= 0.0).tolist():
-        raise ValueError(f"law must increase strictly, got {values[leg]:g} from {law.breakpoints[leg]:g} s on")
+    for segment in np.flatnonzero(np.diff(values) <= 0.0).tolist():
+        raise ValueError(f"law must increase strictly, got {values[segment]:g} from {law.breakpoints[segment]:g} s on")
     return values
 
 
@@ -190,11 +190,11 @@ def _passing(law: Trajectory, values: Array, target: float, slack: float) -> flo
     # Where the rate is 0 there, a root would be off by a root of the rounding.
     if abs(values[nearest] - target) <= slack:
         return float(law.breakpoints[nearest])
-    leg = int(np.searchsorted(values, target)) - 1
-    origin, end = law.breakpoints[leg : leg + 2].tolist()
+    segment = int(np.searchsorted(values, target)) - 1
+    origin, end = law.breakpoints[segment : segment + 2].tolist()
 
     def excess(s: float) -> float:
-        return float(law.segment_jet(leg, np.array([s]), 0)[0, 0, 0]) - target
+        return float(law.segment_jet(segment, np.array([s]), 0)[0, 0, 0]) - target
 
     eps = np.finfo(float).eps
     return origin + float(brentq(excess, 0.0, end - origin, xtol=eps * (end - origin), rtol=4.0 * eps))

@@ -32,9 +32,9 @@ def sample(jet: Callable[[Array, int], Array], duration: float, t: Array, low: i
     jet : callable
         Maps times (ntime,) and an order to (order + 1, naxes, ntime).
     duration : float
-        Length [s] of the leg, from 0, in which the function is analytic.
+        Length [s] of the segment, from 0, in which the function is analytic.
     t : ndarray, shape (ntime,)
-        Times [s] in that leg.
+        Times [s] in that segment.
     low, high : int
         Orders of the derivatives.
 
@@ -60,7 +60,7 @@ def sample(jet: Callable[[Array, int], Array], duration: float, t: Array, low: i
 
 
 def _is_uniform(t: Array, duration: float) -> bool:
-    """Whether the times are evenly spaced to rounding of the leg's own clock."""
+    """Whether the times are evenly spaced to rounding of the segment's own clock."""
     step = (t[-1] - t[0]) / (t.size - 1)
     slack = 4.0 * np.finfo(float).eps * duration
     if not step > 0.0 or abs(t[1] - t[0] - step) > slack:

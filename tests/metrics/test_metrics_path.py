@@ -13,10 +13,10 @@ SQUARE = np.array([[0.0, 1, 1, 0], [0, 0, 1, 1]])
 
 
 def polyline(points, count):
-    """Return times and samples of a polyline at one leg a second, `count` samples a leg."""
-    legs = points.shape[1] - 1
-    t = np.linspace(0, legs, legs * count + 1)
-    return t, np.stack([np.interp(t, np.arange(legs + 1), axis) for axis in points])
+    """Return times and samples of a polyline at one segment a second, `count` samples a segment."""
+    segments = points.shape[1] - 1
+    t = np.linspace(0, segments, segments * count + 1)
+    return t, np.stack([np.interp(t, np.arange(segments + 1), axis) for axis in points])
 
 
 def wave(t):

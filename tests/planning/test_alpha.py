@@ -33,7 +33,7 @@ def length(plan):
 
 
 def sampled(plan, nu, count=4001):
-    """Derivative (naxes, ntime) at samples of every leg, and the weights of Simpson's rule."""
+    """Derivative (naxes, ntime) at samples of every segment, and the weights of Simpson's rule."""
     values, weights = [], []
     for a, b in pairwise(plan.breakpoints):
         t = np.linspace(a, b, count)

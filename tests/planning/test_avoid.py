@@ -214,7 +214,7 @@ def test_options_of_the_plan_are_kept(plan):
     assert found.to_dict() == plan.to_dict() | {"waypoints": found.to_dict()["waypoints"]}
 
 
-def test_what_one_polynomial_cannot_do_is_left_to_legs():
+def test_what_one_polynomial_cannot_do_is_left_to_segments():
     """With its degree fixed there is no room for a via point: the answer is of another kind."""
     plan = cp.TrigSpline(ACROSS, alpha=2.0, gamma=[1.0, None], degree=3)
     found = avoid(plan, [Disc((10.0, 5.2), 2.0)], clearance=0.5).plan

@@ -183,13 +183,13 @@ def test_hold_says_whether_all_do():
 
 
 def test_both_limits_of_a_jump_count():
-    # Quintic legs: the jerk may jump at the inner waypoint, and comes to its peak there from the left.
+    # Quintic segments: the jerk may jump at the inner waypoint, and comes to its peak there from the left.
     points = [Waypoint(0, 0, 0, 0), Waypoint(1, 1, 0.5, 0), Waypoint(4, 0, 0, 0)]
     plan = cp.PiecewiseSpline(points)
     peaks = []
     for a, b in ((0, 1), (1, 4)):
-        leg = cp.PolySpline([p for p in points if p.time in (a, b)])
-        peaks.append(np.abs(leg(np.linspace(a, b, 10_001), 3)).max())
+        segment = cp.PolySpline([p for p in points if p.time in (a, b)])
+        peaks.append(np.abs(segment(np.linspace(a, b, 10_001), 3)).max())
     with pytest.raises(ValueError, match="y_d4 is limited, which needs a plan continuous up to derivative 3"):
         margins(plan, {"y_d4": 1e3})
     assert abs(margins(plan, {"y_d3": 1e3}).active.value) == pytest.approx(max(peaks), rel=1e-12)

@@ -43,13 +43,13 @@ NAMES = {
 
 
 def integral(plan, integrand):
-    """Integral over time of a function of one time, leg by leg, by adaptive quadrature."""
+    """Integral over time of a function of one time, segment by segment, by adaptive quadrature."""
     edges = plan.breakpoints.tolist()
     return sum(quad(integrand, a, b, epsabs=0, epsrel=1e-12, limit=400)[0] for a, b in pairwise(edges))
 
 
 def quintics():
-    """Quintic legs of the same data, by scipy."""
+    """Quintic segments of the same data, by scipy."""
     return PPoly.from_bernstein_basis(BPoly.from_derivatives(TIMES, JETS))
 
 
@@ -107,13 +107,13 @@ def test_peaks_of_the_minimum_jerk_move(nu, peak):
 
 
 @pytest.mark.parametrize("nu", range(6))
-def test_peaks_of_quintic_legs_by_their_roots(nu):
+def test_peaks_of_quintic_segments_by_their_roots(nu):
     peak = 0.0
     for axis in range(2):
         pieces = PPoly(quintics().c[:, :, axis], quintics().x)
         pieces = pieces.derivative(nu) if nu else pieces
-        for leg, (a, b) in enumerate(pairwise(TIMES)):
-            values = np.poly1d(pieces.c[:, leg])
+        for segment, (a, b) in enumerate(pairwise(TIMES)):
+            values = np.poly1d(pieces.c[:, segment])
             roots = [r.real for r in values.deriv().roots if abs(r.imag) < 1e-9 and 0 < r.real < b - a]
             peak = max(peak, *(abs(values(s)) for s in [0.0, b - a, *roots]))
     assert PeakDerivative(nu)(cp.PiecewiseSpline(POINTS)) == pytest.approx(peak, rel=1e-9)
@@ -134,13 +134,13 @@ def test_costs_of_the_minimum_jerk_move(nu, cost):
 
 
 @pytest.mark.parametrize("nu", [0, 1, 2, 3, 4])
-def test_costs_of_quintic_legs_are_exact(nu):
+def test_costs_of_quintic_segments_are_exact(nu):
     expected = 0.0
     for axis in range(2):
         pieces = PPoly(quintics().c[:, :, axis], quintics().x)
         pieces = pieces.derivative(nu) if nu else pieces
-        for leg, length in enumerate(np.diff(TIMES)):
-            squared = np.poly1d(pieces.c[:, leg]) ** 2
+        for segment, length in enumerate(np.diff(TIMES)):
+            squared = np.poly1d(pieces.c[:, segment]) ** 2
             expected += squared.integ()(length)
     assert SquaredDerivative(nu)(cp.PiecewiseSpline(POINTS)) == pytest.approx(expected, rel=1e-12)
 

@@ -45,7 +45,7 @@ def random_table(rng, n, size, naxes, ends=None):
 
 
 def energy(plan, k, weights=None):
-    """Integral of the squared k-th derivative, by many Gauss nodes a leg."""
+    """Integral of the squared k-th derivative, by many Gauss nodes a segment."""
     nodes, gauss = np.polynomial.legendre.leggauss(60)
     plan = plan.shift(-plan.start)
     total = np.zeros(plan.naxes)
@@ -56,7 +56,7 @@ def energy(plan, k, weights=None):
 
 
 class Quadratic:
-    """The same quadratic program in monomials of each leg, its KKT equations solved with 60 digits; one axis."""
+    """The same quadratic program in monomials of each segment, its KKT equations solved with 60 digits; one axis."""
 
     def __init__(self, times, table, k, order, continuity):
         with mp.workdps(60):
@@ -66,7 +66,7 @@ class Quadratic:
             unknowns = size * (n - 1)
             rows, right = [], []
             for i, j in itertools.product(range(n), range(order + 1)):
-                here = [self.row(leg, self.times[i], j) for leg in (i - 1, i) if 0 <= leg < n - 1]
+                here = [self.row(segment, self.times[i], j) for segment in (i - 1, i) if 0 <= segment < n - 1]
                 value = table[i][j] if j < len(table[i]) else FREE
                 if not math.isnan(value):
                     rows += here
@@ -76,11 +76,11 @@ class Quadratic:
                     right.append(mp.mpf(0))
             total = unknowns + len(rows)
             kkt, known = mp.zeros(total), mp.zeros(total, 1)
-            for leg in range(n - 1):
-                h = self.times[leg + 1] - self.times[leg]
+            for segment in range(n - 1):
+                h = self.times[segment + 1] - self.times[segment]
                 for a, b in itertools.product(range(k, size), repeat=2):
                     power = a + b - 2 * k + 1
-                    kkt[leg * size + a, leg * size + b] = mp.ff(a, k) * mp.ff(b, k) * h**power / power
+                    kkt[segment * size + a, segment * size + b] = mp.ff(a, k) * mp.ff(b, k) * h**power / power
             for r, (row, value) in enumerate(zip(rows, right, strict=True), unknowns):
                 known[r] = value
                 for c, v in enumerate(row):
@@ -90,16 +90,17 @@ class Quadratic:
             hessian, found = kkt[:unknowns, :unknowns], mp.matrix(self.coefficients)
             self.cost = float((found.T * hessian * found)[0])
 
-    def row(self, leg, t, j):
+    def row(self, segment, t, j):
         out = [mp.mpf(0)] * (self.size * (len(self.times) - 1))
         for m in range(j, self.size):
-            out[leg * self.size + m] = mp.ff(m, j) * (t - self.times[leg]) ** (m - j)
+            out[segment * self.size + m] = mp.ff(m, j) * (t - self.times[segment]) ** (m - j)
         return out
 
     def __call__(self, t, nu):
         with mp.workdps(60):
-            legs = np.clip(np.searchsorted([float(v) for v in self.times], t, side="right") - 1, 0, len(self.times) - 2)
-            rows = [self.row(int(leg), mp.mpf(float(v)), nu) for leg, v in zip(legs, t, strict=True)]
+            found = np.searchsorted([float(v) for v in self.times], t, side="right") - 1
+            segments = np.clip(found, 0, len(self.times) - 2)
+            rows = [self.row(int(segment), mp.mpf(float(v)), nu) for segment, v in zip(segments, t, strict=True)]
             return np.array([float(mp.fdot(row, self.coefficients)) for row in rows])
 
 
@@ -223,7 +224,7 @@ def test_quadratic_programs_are_solved(n, k, order, continuity):
 
 
 @pytest.mark.slow
-def test_minimum_snap_of_three_axes_and_uneven_legs():
+def test_minimum_snap_of_three_axes_and_uneven_segments():
     rng = np.random.default_rng(0)
     times = np.array([0.0, 1.0, 1.001, 3.0, 3.5])
     table = random_table(rng, 5, 4, 3)
@@ -234,7 +235,7 @@ def test_minimum_snap_of_three_axes_and_uneven_legs():
 
 
 @pytest.mark.parametrize(("k", "tolerance"), [(2, 1e-12), (3, 1e-11), (4, 1e-9)])
-def test_one_short_leg_costs_what_rounded_entries_cost(k, tolerance):
+def test_one_short_segment_costs_what_rounded_entries_cost(k, tolerance):
     times = np.array([0.0, 1.0, 1.0 + 2.0**-10, 3.0])
     table = random_table(np.random.default_rng(k), 4, k, 1)
     found = optimize_waypoints(points_of(times, table), k)
@@ -485,7 +486,7 @@ def test_discontinuity_may_leave_a_function_of_zero_cost():
     points = [Waypoint(0, 0, 0, 0), Waypoint(1, 1), Waypoint(2, 3)]
     assert optimize_waypoints(points, 3, continuity=1).unique
     loose = optimize_waypoints(points, 3, continuity=0)
-    assert not loose.unique  # a parabola in the last leg
+    assert not loose.unique  # a parabola in the last segment
 
 
 def test_an_order_too_low_for_the_derivative_costs_nothing():
@@ -602,7 +603,7 @@ def test_chosen_times_are_never_worse(seed, options):
     table = random_table(rng, n, 3, 2)
     table[1:-1, 1] = np.where(rng.random((max(n - 2, 0), 2)) < 0.3, rng.normal(size=(max(n - 2, 0), 2)), FREE)
     if n > 3:
-        table[2, 0] = table[1, 0]  # a leg without length
+        table[2, 0] = table[1, 0]  # a segment without length
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "the plan swings")  # one polynomial through random data
         warnings.filterwarnings("ignore", "the optimum is known to few digits only")

@@ -18,7 +18,7 @@ COUNT = 100_001
 HOIST = cp.PolySpline(nominal_waypoints(5))
 PLANS = {
     "obstacle": cp.TrigSpline(obstacle_waypoints(), alpha=4.0),
-    "legs": cp.PiecewiseSpline(obstacle_waypoints()),
+    "segments": cp.PiecewiseSpline(obstacle_waypoints()),
     "nominal": cp.TrigSpline(nominal_waypoints(), alpha=2.0),
     "there and back": cp.PolySpline([Waypoint(0, 0, 0, 0), Waypoint(1, 1, 0, 0)]).then(
         cp.PolySpline([Waypoint(1, 1, 0, 0), Waypoint(3, -1, 0, 0)])

@@ -20,7 +20,7 @@ from ctrlplan.trajectories import (
 T = np.linspace(-1.0, 6.0, 281)
 MOVE = PolySpline(waypoints([0.0, 1.0], [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]))
 WAVE = TrigSpline(waypoints([0.5, 2.0, 3.0], [[1.0, 2.0], [-1.0, 0.3], [0.5, -1.0]]), alpha=3.0)
-LEGS = PiecewiseSpline(waypoints([1.0, 2.0, 2.5], [[0.0, 1.0], [2.0, 0.0], [-1.0, 0.5]]), alpha=1.0)
+SEGMENTS = PiecewiseSpline(waypoints([1.0, 2.0, 2.5], [[0.0, 1.0], [2.0, 0.0], [-1.0, 0.5]]), alpha=1.0)
 
 
 def quintic(t):
@@ -37,7 +37,7 @@ def quintic(t):
 
 def test_held_outside_and_zero_derivatives():
     np.testing.assert_allclose(MOVE.jet(T, 3)[:, 0], quintic(T), rtol=0, atol=1e-13)
-    for plan in (MOVE, WAVE, LEGS):
+    for plan in (MOVE, WAVE, SEGMENTS):
         before, after = [-np.inf, -1e300, plan.start - 1e-9], [plan.end + 1e-9, 1e300, np.inf]
         for nu in range(1, 5):
             np.testing.assert_array_equal(plan(before + after, nu), 0)
@@ -58,12 +58,12 @@ def test_the_start_and_the_end_belong_to_the_plan():
 
 
 def test_an_inner_breakpoint_belongs_to_what_follows():
-    first, second = LEGS.legs
-    np.testing.assert_array_equal(LEGS.jet(2.0, 3), second.jet(2.0, 3))
-    np.testing.assert_array_equal(LEGS.jet(2.0, 3, left=True), first.jet(2.0, 3))
+    first, second = SEGMENTS.segments
+    np.testing.assert_array_equal(SEGMENTS.jet(2.0, 3), second.jet(2.0, 3))
+    np.testing.assert_array_equal(SEGMENTS.jet(2.0, 3, left=True), first.jet(2.0, 3))
     assert not np.allclose(first.jet(2.0, 3), second.jet(2.0, 3))
     inside = np.array([1.0 + 1e-9, 1.5, 2.2])
-    np.testing.assert_array_equal(LEGS.jet(inside, 3), LEGS.jet(inside, 3, left=True))
+    np.testing.assert_array_equal(SEGMENTS.jet(inside, 3), SEGMENTS.jet(inside, 3, left=True))
 
 
 def off_breakpoints(*plans):
@@ -72,31 +72,31 @@ def off_breakpoints(*plans):
 
 
 def test_sum_difference_and_multiple():
-    t = off_breakpoints(WAVE, LEGS)
-    a, b = WAVE.jet(t, 3), LEGS.jet(t, 3)
-    np.testing.assert_allclose((WAVE + LEGS).jet(t, 3), a + b, rtol=0, atol=1e-12)
-    np.testing.assert_allclose((WAVE - LEGS).jet(t, 3), a - b, rtol=0, atol=1e-12)
+    t = off_breakpoints(WAVE, SEGMENTS)
+    a, b = WAVE.jet(t, 3), SEGMENTS.jet(t, 3)
+    np.testing.assert_allclose((WAVE + SEGMENTS).jet(t, 3), a + b, rtol=0, atol=1e-12)
+    np.testing.assert_allclose((WAVE - SEGMENTS).jet(t, 3), a - b, rtol=0, atol=1e-12)
     np.testing.assert_array_equal((2 * WAVE).jet(t, 3), 2 * a)
     np.testing.assert_array_equal((WAVE * -0.5).jet(t, 3), -0.5 * a)
     np.testing.assert_array_equal((-WAVE).jet(t, 3), -a)
     np.testing.assert_array_equal((np.float64(2) * WAVE).jet(t, 3), 2 * a)
     np.testing.assert_array_equal(Sum([WAVE, WAVE, WAVE]).jet(t, 2), (3 * WAVE).jet(t, 2))
     np.testing.assert_array_equal((WAVE - WAVE).jet(T, 3), 0)
-    assert isinstance(WAVE + LEGS, Sum)
+    assert isinstance(WAVE + SEGMENTS, Sum)
     assert isinstance(2 * WAVE, Scaled)
 
 
 def test_a_sum_spans_its_parts():
-    total = WAVE + LEGS
+    total = WAVE + SEGMENTS
     assert (total.start, total.end) == (0.5, 3.0)
     np.testing.assert_array_equal(total.breakpoints, [0.5, 1.0, 2.0, 2.5, 3.0])
-    np.testing.assert_array_equal(total.initial, WAVE.initial + LEGS.initial)
-    np.testing.assert_array_equal(total.final, WAVE.final + LEGS.final)
+    np.testing.assert_array_equal(total.initial, WAVE.initial + SEGMENTS.initial)
+    np.testing.assert_array_equal(total.final, WAVE.final + SEGMENTS.final)
     for t in (1.0, 2.0, 2.5):  # right-continuous, the other limit on request
         right, left = total.jet(t + 1e-12, 1), total.jet(t - 1e-12, 1)
         np.testing.assert_allclose(total.jet(t, 1), right, rtol=0, atol=1e-9)
         np.testing.assert_allclose(total.jet(t, 1, left=True), left, rtol=0, atol=1e-9)
-    # LEGS ends at 2.5, inside the sum: what follows is its held position, of derivative 0.
+    # SEGMENTS ends at 2.5, inside the sum: what follows is its held position, of derivative 0.
     np.testing.assert_allclose(total.jet(2.5, 2)[1:], WAVE.jet(2.5, 2)[1:], rtol=1e-12)
 
 
@@ -105,21 +105,21 @@ def test_labels_of_combinations():
     assert stack([x, z]).labels == ("x", "z")
     assert stack([x, z], labels=["a", "b"]).labels == ("a", "b")
     assert stack([MOVE, WAVE]).labels == ("y1", "y2")
-    assert stack([stack([MOVE, WAVE]), LEGS]).labels == ("y1", "y2", "y3")
+    assert stack([stack([MOVE, WAVE]), SEGMENTS]).labels == ("y1", "y2", "y3")
     assert (x + MOVE).labels == ("x",)
     assert (3 * x).labels == ("x",)
     assert x.then(1.0 * Step(3.0, initial=1.0)).labels == ("x",)
 
 
 def test_stack_puts_axes_side_by_side():
-    t = off_breakpoints(MOVE, WAVE, LEGS)
-    both = stack([MOVE, WAVE, LEGS])
+    t = off_breakpoints(MOVE, WAVE, SEGMENTS)
+    both = stack([MOVE, WAVE, SEGMENTS])
     assert isinstance(both, Stacked)
     assert both.naxes == 3
     assert (both.start, both.end) == (0.0, 3.0)
-    np.testing.assert_allclose(both(t), [MOVE(t), WAVE(t), LEGS(t)], rtol=0, atol=1e-14)
-    np.testing.assert_allclose(both(t, 2), [MOVE(t, 2), WAVE(t, 2), LEGS(t, 2)], rtol=0, atol=1e-12)
-    np.testing.assert_array_equal(both.initial, [0.0, *WAVE.initial, *LEGS.initial])
+    np.testing.assert_allclose(both(t), [MOVE(t), WAVE(t), SEGMENTS(t)], rtol=0, atol=1e-14)
+    np.testing.assert_allclose(both(t, 2), [MOVE(t, 2), WAVE(t, 2), SEGMENTS(t, 2)], rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(both.initial, [0.0, *WAVE.initial, *SEGMENTS.initial])
 
 
 def test_then_shifts_the_other():
@@ -215,12 +215,12 @@ def test_a_step_between_two_moves():
 
 def test_a_step_inside_a_sum():
     """The step's instant is a breakpoint; the left limit is the value before it."""
-    plan = LEGS + Step(10.0, initial=1.0, time=1.7)
+    plan = SEGMENTS + Step(10.0, initial=1.0, time=1.7)
     np.testing.assert_array_equal(plan.breakpoints, [1.0, 1.7, 2.0, 2.5])
     t = np.array([1.2, 1.7, 2.3])
-    np.testing.assert_allclose(plan(t), LEGS(t) + np.array([1, 10, 10]), rtol=1e-14)
-    assert plan.jet(1.7, 0, left=True)[0, 0] == pytest.approx(LEGS(1.7) + 1, rel=1e-14)
-    np.testing.assert_allclose(plan(t, 1), LEGS(t, 1), rtol=1e-13)
+    np.testing.assert_allclose(plan(t), SEGMENTS(t) + np.array([1, 10, 10]), rtol=1e-14)
+    assert plan.jet(1.7, 0, left=True)[0, 0] == pytest.approx(SEGMENTS(1.7) + 1, rel=1e-14)
+    np.testing.assert_allclose(plan(t, 1), SEGMENTS(t, 1), rtol=1e-13)
 
 
 @pytest.mark.parametrize("time", [0.0, 1.0])
@@ -233,17 +233,17 @@ def test_a_step_at_an_end_of_a_sum(time):
 
 
 def nested():
-    """A shifted multiple and a step, stacked with legs joined to a retimed wave."""
+    """A shifted multiple and a step, stacked with segments joined to a retimed wave."""
     first = 2 * WAVE.shift(0.25) + Step(4.0, initial=1.0, time=2.0)
     rest = TrigSpline(waypoints([0.0, 1.0], [[-1.0, 0.5], [3.0, 0.0]]), alpha=2.0)
-    return stack([first, LEGS.then(rest.retime(2.0))])
+    return stack([first, SEGMENTS.then(rest.retime(2.0))])
 
 
 def naive(t):
     """What `nested` is, from its leaves."""
     rest = TrigSpline(waypoints([0.0, 1.0], [[-1.0, 0.5], [3.0, 0.0]]), alpha=2.0)
     step = np.where(t >= 2.0, 4.0, 1.0)
-    late = np.array([np.where(t >= 2.5, rest((t - 2.5) / 2, nu) / 2**nu, LEGS(t, nu)) for nu in range(3)])
+    late = np.array([np.where(t >= 2.5, rest((t - 2.5) / 2, nu) / 2**nu, SEGMENTS(t, nu)) for nu in range(3)])
     early = 2 * np.array([WAVE(t - 0.25, nu) for nu in range(3)])
     early[0] += step
     return np.stack([early, late], axis=1)
@@ -253,7 +253,7 @@ def test_nested_combinations():
     plan = nested()
     t = np.setdiff1d(T, plan.breakpoints)
     np.testing.assert_allclose(plan.jet(t, 2), naive(t), rtol=0, atol=1e-12)
-    # 0.75 and 3.25 of the wave; 1, 2, 2.5 and 4.5 of the legs; 2 of the step.
+    # 0.75 and 3.25 of the wave; 1, 2, 2.5 and 4.5 of the segments; 2 of the step.
     np.testing.assert_allclose(plan.breakpoints, [0.75, 1.0, 2.0, 2.5, 3.25, 4.5], rtol=1e-15)
 
 
@@ -269,7 +269,7 @@ def test_nested_combinations_move_as_one():
 
 
 def test_breakpoints_that_differ_by_rounding():
-    """0.1 + 0.2 is not 0.3: a leg of 5e-17 s is no trouble."""
+    """0.1 + 0.2 is not 0.3: a segment of 5e-17 s is no trouble."""
     a = PiecewiseSpline(waypoints([0.0, 0.3, 1.0], [[0.0, 0.0], [1.0, 2.0], [0.0, 0.0]]))
     b = PiecewiseSpline(waypoints([0.0, 0.1 + 0.2, 1.0], [[0.0, 0.0], [2.0, 0.0], [1.0, 0.0]]))
     total = a + b

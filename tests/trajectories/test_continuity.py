@@ -57,9 +57,9 @@ def test_a_join_jumps_by_the_difference_of_its_sides():
 def test_an_interior_waypoint_of_one_polynomial_is_no_jump():
     plan = cp.PolySpline([cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 2, 1), cp.Waypoint(3, 1, 0, 0)])
     assert {j.time for j in plan.jumps(5)} == {0.0, 3.0}
-    legs = cp.PiecewiseSpline([cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 2, 1, 0), cp.Waypoint(3, 1, 0, 0)])
-    assert legs.jumps(2) == ()
-    assert {j.time for j in legs.jumps(3)} == {0.0, 1.0, 3.0}
+    segments = cp.PiecewiseSpline([cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 2, 1, 0), cp.Waypoint(3, 1, 0, 0)])
+    assert segments.jumps(2) == ()
+    assert {j.time for j in segments.jumps(3)} == {0.0, 1.0, 3.0}
 
 
 @pytest.mark.parametrize("entries", [1, 2, 3, 4, 5])

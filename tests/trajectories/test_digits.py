@@ -193,9 +193,9 @@ def natural(alpha, times, positions):
 
         def add(value, *parts):
             row = [mp.mpf(0)] * size
-            for leg, u, k, sign in parts:
-                for j, v in enumerate(functions(mp.mpf(u), k, spans[leg])):
-                    row[6 * leg + j] = sign * v
+            for segment, u, k, sign in parts:
+                for j, v in enumerate(functions(mp.mpf(u), k, spans[segment])):
+                    row[6 * segment + j] = sign * v
             rows.append(row)
             known.append(mp.mpf(value))
 
@@ -210,9 +210,9 @@ def natural(alpha, times, positions):
         found = mp.lu_solve(mp.matrix(rows), mp.matrix(known))
 
         def value(t, k):
-            leg = min(int(np.searchsorted(times, t, side="right")) - 1, len(spans) - 1)
-            u = (mp.mpf(t) - mp.mpf(times[leg])) / spans[leg]
-            return float(mp.fdot(found[6 * leg : 6 * leg + 6], functions(u, k, spans[leg])))
+            segment = min(int(np.searchsorted(times, t, side="right")) - 1, len(spans) - 1)
+            u = (mp.mpf(t) - mp.mpf(times[segment])) / spans[segment]
+            return float(mp.fdot(found[6 * segment : 6 * segment + 6], functions(u, k, spans[segment])))
 
         t = np.linspace(times[0], times[-1], 13)
         return t, np.array([[value(x, k) for x in t] for k in range(4)])

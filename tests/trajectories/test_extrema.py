@@ -123,7 +123,7 @@ def test_many_extrema_of_forty_constraints():
 
 
 def test_both_limits_of_a_jump_count():
-    """Straight legs of slopes 1 and -3; quintic legs whose jerk jumps from 60 to 60 - 120."""
+    """Straight segments of slopes 1 and -3; quintic segments whose jerk jumps from 60 to 60 - 120."""
     lines = PiecewiseSpline(waypoints([0.0, 1.0, 2.0], [[0.0], [1.0], [-2.0]]))
     found = lines.extrema(1)
     assert (found.maximum[0], found.minimum[0]) == (pytest.approx(1, rel=1e-14), pytest.approx(-3, rel=1e-14))

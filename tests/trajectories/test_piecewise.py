@@ -1,4 +1,4 @@
-"""One spline a leg: what is prescribed, what is left free, and never a jump."""
+"""One spline a segment: what is prescribed, what is left free, and never a jump."""
 
 import itertools
 
@@ -19,9 +19,9 @@ JETS = [[0.0, 0.0, 0.0], [5.0, 1.0, 0.1], [15.0, 2.0, 0.1], [20.0, 0.0, 0.0]]
 
 
 @pytest.mark.parametrize("alpha", [0.0, 1e-4, 2.0, np.pi, 5.0])
-def test_three_legs_are_three_runs_of_a_single_leg(alpha):
+def test_three_segments_are_three_runs_of_a_single_segment(alpha):
     plan = PiecewiseSpline(waypoints(TIMES, JETS), alpha=alpha)
-    assert len(plan.legs) == 3
+    assert len(plan.segments) == 3
     np.testing.assert_array_equal(plan.breakpoints, TIMES)
     for k in range(3):
         pair, inside = slice(k, k + 2), np.linspace(TIMES[k], TIMES[k + 1], 30)[:-1]
@@ -74,8 +74,8 @@ def test_the_minimum_jerk_spline_costs_least():
     nodes, weights = np.polynomial.legendre.leggauss(6)
 
     def cost(p):
-        legs = itertools.pairwise(times)
-        return sum(0.5 * (b - a) * weights @ p(a + 0.5 * (b - a) * (nodes + 1), 3) ** 2 for a, b in legs)
+        segments = itertools.pairwise(times)
+        return sum(0.5 * (b - a) * weights @ p(a + 0.5 * (b - a) * (nodes + 1), 3) ** 2 for a, b in segments)
 
     chosen = plan.jet(times, 2)[:, 0].T
     assert cost(PiecewiseSpline(waypoints(times, chosen))) == pytest.approx(cost(plan), rel=1e-9)
@@ -133,12 +133,12 @@ def test_every_axis_has_its_own_free_entries():
     assert plan.jet(1.0, 1, left=True)[1, 2] == pytest.approx(1.0, rel=1e-14)
 
 
-def test_ends_that_prescribe_less_lower_the_degree_of_their_legs():
-    """Positions at the ends, a full jet inside: a cubic a leg (4 constraints)."""
+def test_ends_that_prescribe_less_lower_the_degree_of_their_segments():
+    """Positions at the ends, a full jet inside: a cubic a segment (4 constraints)."""
     plan = PiecewiseSpline(waypoints([0.0, 1.0, 2.0], [[0.0], [1.0, 2.0, 0.0], [5.0]]))
-    assert [leg.degree for leg in plan.legs] == [(3,), (3,)]
+    assert [segment.degree for segment in plan.segments] == [(3,), (3,)]
     assert miss(plan) <= 1e-14
-    assert [leg.degree for leg in PiecewiseSpline(waypoints(TIMES, JETS)).legs] == [(5,)] * 3
+    assert [segment.degree for segment in PiecewiseSpline(waypoints(TIMES, JETS)).segments] == [(5,)] * 3
 
 
 @settings(max_examples=60)
@@ -163,7 +163,7 @@ def test_never_a_jump(rows, alpha, decade):
     assert (jump <= 1e-11 * size[:, None]).all()
 
 
-def test_with_values_retime_and_one_leg():
+def test_with_values_retime_and_one_segment():
     plan = PiecewiseSpline(waypoints(TIMES, [JETS[0], [5.0], [15.0, 2.0], JETS[3]]), alpha=2.0)
     other = waypoints(TIMES, [[1.0, 0.0, 0.0], [2.0], [3.0, 1.0], [4.0, 0.0, 0.0]])
     t = np.linspace(0, 16, 60)
@@ -176,7 +176,7 @@ def test_with_values_retime_and_one_leg():
 
 @pytest.mark.parametrize("jets", [[[0.0], [None, 1.0], [1.0]], [[None, 0.0], [None, 1.0], [None, 0.0]], [[None]] * 3])
 def test_what_is_not_determined_is_refused(jets):
-    """A quadratic leg has no third derivative that could fix its end; nor have velocities a position."""
+    """A quadratic segment has no third derivative that could fix its end; nor have velocities a position."""
     with pytest.raises(ValueError, match="left free at inner waypoints must be determined by the others"):
         PiecewiseSpline(waypoints([0.0, 1.0, 2.0], jets))
 

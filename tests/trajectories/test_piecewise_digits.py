@@ -37,33 +37,40 @@ def reference(times, jets, size, alpha):
     """Jets (segment, order, position in WITHIN) up to 2 size - 1 of one axis whose ends have full jets."""
     last, m, moments, rows = len(times) - 1, 2 * size, [mpmath.mpf(t) for t in times], []
 
-    def side(i, leg):
-        return functions(mpmath.mpf(alpha), m, moments[leg + 1] - moments[leg], moments[i] - moments[leg], 2 * size - 1)
+    def side(i, segment):
+        start = moments[segment]
+        return functions(mpmath.mpf(alpha), m, moments[segment + 1] - start, moments[i] - start, 2 * size - 1)
 
     for i, jet in enumerate(jets):
-        legs = [leg for leg in (i - 1, i) if 0 <= leg < last]
+        segments = [segment for segment in (i - 1, i) if 0 <= segment < last]
         for k in range(size):
             if k < len(jet) and jet[k] is not None:
-                rows += [({leg: [f[k] for f in side(i, leg)]}, jet[k]) for leg in legs]
+                rows += [({segment: [f[k] for f in side(i, segment)]}, jet[k]) for segment in segments]
             else:
                 for order in (k, 2 * size - 1 - k):
                     rows.append(
-                        ({leg: [(2 * n - 1) * f[order] for f in side(i, leg)] for n, leg in enumerate(legs)}, 0)
+                        (
+                            {
+                                segment: [(2 * n - 1) * f[order] for f in side(i, segment)]
+                                for n, segment in enumerate(segments)
+                            },
+                            0,
+                        )
                     )
     matrix, right = mpmath.zeros(len(rows), last * m), mpmath.zeros(len(rows), 1)
     for r, (parts, value) in enumerate(rows):
         scale = max(abs(v) for part in parts.values() for v in part)
         right[r] = value / scale
-        for leg, part in parts.items():
+        for segment, part in parts.items():
             for j, v in enumerate(part):
-                matrix[r, leg * m + j] = v / scale
+                matrix[r, segment * m + j] = v / scale
     found = mpmath.lu_solve(matrix, right)
     out = np.empty((last, m, len(WITHIN)))
-    for leg, (q, u) in itertools.product(range(last), enumerate(WITHIN)):
-        h = moments[leg + 1] - moments[leg]
+    for segment, (q, u) in itertools.product(range(last), enumerate(WITHIN)):
+        h = moments[segment + 1] - moments[segment]
         values = functions(mpmath.mpf(alpha), m, h, mpmath.mpf(u) * h, m - 1)
         for k in range(m):
-            out[leg, k, q] = float(sum(found[leg * m + j] * values[j][k] for j in range(m)))
+            out[segment, k, q] = float(sum(found[segment * m + j] * values[j][k] for j in range(m)))
     return out
 
 
@@ -80,10 +87,10 @@ def check(times, rows, size, alpha, tolerance=1e-13):
     plan = PiecewiseSpline(points, alpha=alpha)
     with mpmath.workdps(80):
         wanted = np.array([reference(times, jets, size, alpha) for jets in rows])
-    for leg, h in enumerate(np.diff(times)):
-        got = plan.segment_jet(leg, h * np.array(WITHIN), 2 * size - 1)
+    for segment, h in enumerate(np.diff(times)):
+        got = plan.segment_jet(segment, h * np.array(WITHIN), 2 * size - 1)
         peak = np.abs(wanted).max(axis=(1, 3)).T[..., None]
-        assert (np.abs(got - wanted[:, leg].transpose(1, 0, 2)) <= tolerance * peak).all()
+        assert (np.abs(got - wanted[:, segment].transpose(1, 0, 2)) <= tolerance * peak).all()
     return plan
 
 

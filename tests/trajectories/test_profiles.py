@@ -42,7 +42,7 @@ def integrated(knots, top, t, times):
 
 
 @pytest.mark.parametrize(
-    ("d", "v", "a", "legs"),
+    ("d", "v", "a", "segments"),
     [
         (3.0, 1.0, 0.5, [2.0, 1.0, 2.0]),  # d/v + v/a
         (1.0, 9.0, 1.0, [1.0, 1.0]),  # 2 sqrt(d/a)
@@ -51,16 +51,16 @@ def integrated(knots, top, t, times):
         (8e6, 2e6, 1e6, [2.0, 2.0, 2.0]),
     ],
 )
-def test_legs_of_the_trapezoid(d, v, a, legs):
+def test_segments_of_the_trapezoid(d, v, a, segments):
     for final, initial in ((d, 0.0), (0.5 * d, -0.5 * d), (0.0, d)):
         plan = Trapezoid(final, initial, velocity=v, acceleration=a)
-        np.testing.assert_allclose(np.diff(plan.breakpoints), legs, rtol=1e-15)
+        np.testing.assert_allclose(np.diff(plan.breakpoints), segments, rtol=1e-15)
         assert plan.peak(1)[0] == pytest.approx(min(v, math.sqrt(d * a)), rel=1e-15)
         assert plan.peak(2)[0] == pytest.approx(a, rel=1e-15)
 
 
 @pytest.mark.parametrize(
-    ("d", "v", "a", "j", "legs"),
+    ("d", "v", "a", "j", "segments"),
     [
         (4.0, 1.0, 0.5, 0.5, [1, 1, 1, 1, 1, 1, 1]),  # d/v + v/a + a/j
         (4.0, 1.0, 9.0, 1.0, [1, 1, 2, 1, 1]),  # d/v + 2 sqrt(v/j)
@@ -74,11 +74,11 @@ def test_legs_of_the_trapezoid(d, v, a, legs):
         (2.0, 9.0, 1.0, 1.0, [1, 1, 1, 1]),
     ],
 )
-def test_legs_of_the_s_curve(d, v, a, j, legs):
+def test_segments_of_the_s_curve(d, v, a, j, segments):
     for size, speed in itertools.product((1e-6, 1.0, 1e6), (0.01, 1.0, 50.0)):
         limits = {"velocity": v * size * speed, "acceleration": a * size * speed**2, "jerk": j * size * speed**3}
         plan = SCurve(-d * size, **limits)
-        np.testing.assert_allclose(np.diff(plan.breakpoints), np.array(legs) / speed, rtol=4e-15)
+        np.testing.assert_allclose(np.diff(plan.breakpoints), np.array(segments) / speed, rtol=4e-15)
 
 
 @settings(max_examples=150)
@@ -92,8 +92,8 @@ def test_the_duration_is_that_of_the_cases(d, v, a, j):
 
 
 @pytest.mark.parametrize("off", [-1e-9, -3e-16, -1e-16, 0.0, 2e-16, 1e-9])
-def test_near_an_equality_no_leg_is_rounding(off):
-    """A leg that the limits just do not need has the length that they give it, or none."""
+def test_near_an_equality_no_segment_is_rounding(off):
+    """A segment that the limits just do not need has the length that they give it, or none."""
     plan = Trapezoid(1.0, velocity=1.0 + off, acceleration=1.0)
     assert len(plan.breakpoints) == (4 if off == -1e-9 else 3)
     plan = SCurve(2.0, velocity=1.0 + off, acceleration=1.0 + off, jerk=1.0)
@@ -134,7 +134,7 @@ def test_jets_are_those_of_the_integrated_acceleration(d, v, a):
 
 @settings(max_examples=50)
 @given(ENDS, SIZES, SIZES, SIZES, CLOCKS)
-@example((0.0, 30.0), 1.0, 1.0, 1.0 + 7e-14, -7.3)  # a leg that the clock does not resolve
+@example((0.0, 30.0), 1.0, 1.0, 1.0 + 7e-14, -7.3)  # a segment that the clock does not resolve
 @example((0.0, 2.0), 1.0 - 4e-15, 1.0, 1.0, -7.3)
 def test_limits_are_met_and_one_of_them_is_reached(ends, v, a, j, time):
     """Whatever the clock; and what should be continuous is, to rounding."""
@@ -147,7 +147,7 @@ def test_limits_are_met_and_one_of_them_is_reached(ends, v, a, j, time):
     ):
         used = [plan.peak(nu)[0] / limit for nu, limit in zip(range(1, highest + 1), (v, a, j), strict=False)]
         assert max(used) <= 1.0 + 2e-15
-        # Legs are lengthened to the next number of the clock, not more.
+        # Segments are lengthened to the next number of the clock, not more.
         tick = math.ulp(max(abs(plan.start), abs(plan.end)))
         assert max(used) >= 1.0 - 2e-15 - 8.0 * tick / np.diff(plan.breakpoints).min()
         assert plan.start == time
@@ -340,7 +340,7 @@ def wrong(kind=SCurve, final=1.0, initial=0.0, **changed):
         ({"labels": ["a", "b"]}, "labels must be as many as axes, 1, got 2"),
         ({"time": 1e17}, "limits must leave the rise of velocity more than 178 s at time = 1e[+]17 s, got"),
         ({"acceleration": 1e300}, "limits must leave the rise of velocity more than"),
-        ({"final": 1e300, "velocity": 1e-300}, "limits must give legs of finite durations, got"),
+        ({"final": 1e300, "velocity": 1e-300}, "limits must give segments of finite durations, got"),
     ],
 )
 def test_what_is_refused(kind, changed, message):

@@ -217,7 +217,7 @@ def test_breakpoints_against_roots_of_polynomials(path, clock):
     ) <= 1e-14 * max(1.0, knots[-1])
 
 
-def test_each_side_of_a_breakpoint_has_its_own_leg():
+def test_each_side_of_a_breakpoint_has_its_own_segment():
     """A path with corners: slopes 1, -2, 0.5 of sigma = t^2."""
     corners = PiecewiseSpline([Waypoint(1.0, 0.0), Waypoint(2.25, 1.25), Waypoint(3.0, -0.25), Waypoint(4.0, 0.25)])
     plan = Retimed(corners, SQUARE)

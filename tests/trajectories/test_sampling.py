@@ -120,12 +120,12 @@ def test_times_outside_are_mixed_in(alpha):
 
 
 @pytest.mark.parametrize("alpha", [0.0, 2.0])
-def test_several_legs(alpha):
+def test_several_segments(alpha):
     """Some with many samples, some with few; a join among the times."""
     times = [0.0, 1.0, 1.001, 4.0, 9.0]
     rng = np.random.default_rng(5)
-    legs = PiecewiseSpline(waypoints(times, rng.normal(size=(5, 3)).tolist()), alpha=alpha)
-    plan = stack([legs, legs.shift(0.3) + 2 * legs])
+    segments = PiecewiseSpline(waypoints(times, rng.normal(size=(5, 3)).tolist()), alpha=alpha)
+    plan = stack([segments, segments.shift(0.3) + 2 * segments])
     for count in (6000, 50_000):
         for name, t in orders_of(plan, count, rng).items():
             if name == "arbitrary":
@@ -186,12 +186,12 @@ def test_axes_that_vanish_or_stand_still():
 
 
 @pytest.mark.parametrize("name", ["uniform", "sorted", "arbitrary"])
-@pytest.mark.parametrize("legs", [1, 3])
-def test_memory_is_a_small_multiple_of_the_result(legs, name):
-    if legs == 1:
+@pytest.mark.parametrize("segments", [1, 3])
+def test_memory_is_a_small_multiple_of_the_result(segments, name):
+    if segments == 1:
         plan = random_plan(12, 1.0, naxes=2)
     else:
-        points = [Waypoint(float(i), *np.random.default_rng(i).normal(size=(3, 2))) for i in range(legs + 1)]
+        points = [Waypoint(float(i), *np.random.default_rng(i).normal(size=(3, 2))) for i in range(segments + 1)]
         plan = PiecewiseSpline(points, alpha=1.0)
     t = orders_of(plan, 1_000_000, np.random.default_rng(9))[name]
     plan.jet(t[:10_000], 2)

@@ -89,11 +89,11 @@ both = pytest.mark.parametrize("symbol", ["SX", "MX"])
 
 
 def moments(plan):
-    """Before, random ones in each leg, the start, every breakpoint, the end, after."""
+    """Before, random ones in each segment, the start, every breakpoint, the end, after."""
     rng = np.random.default_rng(7)
     edges, size = plan.breakpoints, plan.duration or 1.0
-    legs = [rng.uniform(a, b, 4) for a, b in pairwise(edges)]
-    return np.concatenate([edges[0] - size * rng.random(3), *legs, edges, edges[-1] + size * rng.random(3)])
+    segments = [rng.uniform(a, b, 4) for a, b in pairwise(edges)]
+    return np.concatenate([edges[0] - size * rng.random(3), *segments, edges, edges[-1] + size * rng.random(3)])
 
 
 def coefficients(plan, t, order):
@@ -139,7 +139,7 @@ def test_at_a_number_it_is_the_jet_over_factorials(name):
 
 @both
 @every
-def test_at_a_symbol_it_is_the_same_in_every_leg_before_and_after(name, symbol):
+def test_at_a_symbol_it_is_the_same_in_every_segment_before_and_after(name, symbol):
     """Breakpoints included: there it is what follows, at the end the plan's own."""
     plan = PLANS[name]
     function, size = traced(plan, ORDER, symbol), sizes(plan, ORDER)
@@ -189,23 +189,23 @@ def test_at_a_symbol_against_the_equations_of_the_paper_in_many_digits(alpha):
 
 
 def test_at_a_symbol_of_a_piecewise_plan_in_closed_form():
-    """Two minimum-jerk legs: 10 s^3 - 15 s^4 + 6 s^5 each, about any time by mpmath."""
+    """Two minimum-jerk segments: 10 s^3 - 15 s^4 + 6 s^5 each, about any time by mpmath."""
     plan = PiecewiseSpline([Waypoint(1.0, 0, 0, 0), Waypoint(3.0, 4, 0, 0), Waypoint(4.0, 3, 0, 0)])
     function = traced(plan, ORDER)
 
     def rise(s):
         return s**3 * (10 - 15 * s + 6 * s**2)
 
-    legs = [(1.0, 3.0, lambda t: 4 * rise((t - 1) / 2)), (3.0, 4.0, lambda t: 4 - rise(t - 3))]
-    for left, right, leg in legs:
+    segments = [(1.0, 3.0, lambda t: 4 * rise((t - 1) / 2)), (3.0, 4.0, lambda t: 4 - rise(t - 3))]
+    for left, right, segment in segments:
         for t in np.linspace(left, right, 9)[:-1]:
             with mp.workdps(30):
-                wanted = np.array([float(v) for v in mp.taylor(leg, mp.mpf(float(t)), ORDER)])
+                wanted = np.array([float(v) for v in mp.taylor(segment, mp.mpf(float(t)), ORDER)])
             assert np.abs(function(t)[0] - wanted).max() <= 1e-11
 
 
 def test_symbols_of_one_plan_in_an_expression_may_be_differentiated():
-    """The derivative that CasADi takes of coefficient k is (k + 1) times the next, inside each leg."""
+    """The derivative that CasADi takes of coefficient k is (k + 1) times the next, inside each segment."""
     plan, t = PLANS["Joined"], casadi.SX.sym("t")
     rows = plan.series(t, ORDER)
     column = casadi.vertcat(*[value for row in rows for value in row])
@@ -263,7 +263,7 @@ def foreign():
         def __init__(self):
             self._set_fields(labels=("y",), breakpoints=np.array([0.0, 1.0]))
 
-        def segment_jet(self, leg, s, order):
+        def segment_jet(self, segment, s, order):
             out = np.zeros((order + 1, 1, s.size))
             out[:2] = np.array([s, np.ones_like(s)])[: order + 1, None]
             return out

@@ -34,7 +34,7 @@ SPLINE = PolySpline([Waypoint(0.5, 1.0, 0.0), Waypoint(1.5, 2.0, 0.0)])
 def response(plan, omega, zeta, after=0.0):
     """State (y, y') of y'' + 2 zeta omega y' + omega^2 y = omega^2 plan from rest, some time after the end of the plan.
 
-    Exact: legs are polynomials of degree 3, of which a chain of integrators is the generator.
+    Exact: segments are polynomials of degree 3, of which a chain of integrators is the generator.
     """
     matrix = np.zeros((6, 6))
     matrix[0, 1] = matrix[2, 3] = matrix[3, 4] = matrix[4, 5] = 1.0

@@ -73,8 +73,8 @@ def test_values_given_later_are_checked_as_well():
         with pytest.warns(UserWarning, match="swings over 21") as caught:
             made(REST)
         assert caught[0].filename == __file__
-    legs = PiecewiseSpline(still.waypoints, alpha=5.0)
-    for made in (legs.with_values, legs.through):
+    segments = PiecewiseSpline(still.waypoints, alpha=5.0)
+    for made in (segments.with_values, segments.through):
         with pytest.warns(UserWarning, match="swings over 2") as caught:
             made(REST)
         assert caught[0].filename == __file__

@@ -66,7 +66,7 @@ def times(plan, count=41):
     return plan.start + np.linspace(-0.25, 1.25, count) * (plan.duration or 1.0)
 
 
-def legs(plan):
+def segments(plan):
     return list(zip(plan.breakpoints[:-1].tolist(), plan.breakpoints[1:].tolist(), strict=True))
 
 
@@ -142,8 +142,8 @@ def test_one_axis_squeezes(plan):
 
 @moving
 def test_jet_k_grows_by_the_integral_of_jet_k_plus_1(plan):
-    """Gauss-Legendre over part of every leg: no step size, no cancellation."""
-    for a, b in legs(plan):
+    """Gauss-Legendre over part of every segment: no step size, no cancellation."""
+    for a, b in segments(plan):
         a, b = a + 0.05 * (b - a), b - 0.1 * (b - a)
         increase = np.diff(plan.jet([a, b], 5), axis=2)[:-1, :, 0]
         integral = 0.5 * (b - a) * plan.jet(a + 0.5 * (b - a) * (NODES + 1), 5)[1:] @ WEIGHTS
