@@ -15,7 +15,7 @@ from ctrlplan._types import Array
 Range = float | Sequence[float]
 """Limits of a signal as `checked_range` reads them: (low, high), or a number a for (-a, a)."""
 
-MOST = 100
+MAXIMUM = 100
 """Highest order of a derivative, and highest degree."""
 
 _NO_NUMBERS = (bool, np.bool_, str, bytes, complex, np.complexfloating, np.datetime64, np.timedelta64)
@@ -182,15 +182,15 @@ def checked_limits(limits: object, name: str) -> tuple[float, float, float]:
     return low, high, abs(low if math.isfinite(low) else high) or 1.0
 
 
-def checked_count(value: float | Real, name: str, least: int = 0) -> int:
+def checked_count(value: float | Real, name: str, minimum: int = 0) -> int:
     """Whole number of some least value."""
     if not isinstance(value, Real):
-        raise TypeError(f"{name} must be a whole number from {least}, got {value!r}")
-    number = one_number(value, name, f"a whole number from {least}")
-    if not math.isfinite(number) or number != int(number) or number < least:
-        raise ValueError(f"{name} must be a whole number from {least}, got {value}")
-    if number > MOST:
-        raise ValueError(f"{name} must be at most {MOST}, got {value}")
+        raise TypeError(f"{name} must be a whole number from {minimum}, got {value!r}")
+    number = one_number(value, name, f"a whole number from {minimum}")
+    if not math.isfinite(number) or number != int(number) or number < minimum:
+        raise ValueError(f"{name} must be a whole number from {minimum}, got {value}")
+    if number > MAXIMUM:
+        raise ValueError(f"{name} must be at most {MAXIMUM}, got {value}")
     return int(number)
 
 

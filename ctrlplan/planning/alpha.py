@@ -55,7 +55,7 @@ class AlphaChoice:
         determine a plan.
     blow_up : float
         Alpha [rad] from which on the objective is above ten times the
-        least for good; 2 pi where it never is.
+        minimum for good; 2 pi where it never is.
     tied : bool
         Whether the objective does not depend on alpha near its least value, so
         that the integral of the squared jerk decided.

@@ -189,7 +189,7 @@ def avoid(
             reached, certificate = _search(task, build, way)
             if certificate.certified:
                 found.append(Avoidance(reached, certificate))
-            elif certificate.lower > best.least:  # certainly better: rounding is a tie, and the earlier plan stays
+            elif certificate.lower > best.minimum:  # certainly better: rounding is a tie, and the earlier plan stays
                 best = certificate
         if found:
             smoothest = min(found, key=lambda avoidance: task.roughness(avoidance.plan))
@@ -198,7 +198,7 @@ def avoid(
     x, z = best.position
     raise ValueError(
         f"no plan with {task.max_points} via points or fewer was found that keeps {task.wanted:g} from every obstacle: "
-        f"the best keeps {best.least:.4g}, the {best.part} from obstacles[{best.obstacle}] "
+        f"the best keeps {best.minimum:.4g}, the {best.part} from obstacles[{best.obstacle}] "
         f"with the load at ({x:.4g}, {z:.4g}) at {best.time:.4g} s; plans may exist that the search does not find: "
         f"give via waypoints, more of them by max_points, or another clearance"
     )
@@ -325,7 +325,7 @@ def _made_through_waypoints(task: _Task) -> WaypointSpline:
     if not isinstance(plan, WaypointSpline):
         raise TypeError(
             f"plan must be made through waypoints to be led round obstacles (a WaypointSpline, such as PolySpline), "
-            f"got a {type(plan).__name__} that keeps {given.least:.4g} from obstacles[{given.obstacle}] at "
+            f"got a {type(plan).__name__} that keeps {given.minimum:.4g} from obstacles[{given.obstacle}] at "
             f"{given.time:.4g} s; plan a spline through the same points, and shape or combine the result"
         )
     return plan
@@ -447,7 +447,7 @@ def _search(task: _Task, build: Build, way: list[Array]) -> tuple[Trajectory, Cl
     nearest = task.given
     while True:
         plan: Trajectory = task.plan
-        found, before = task.given, nearest.least
+        found, before = task.given, nearest.minimum
         margin = fine = 3e-4 * task.size
         for _ in range(_TRIES):
             vias = _moved(task, build, vias, margin)
@@ -458,14 +458,14 @@ def _search(task: _Task, build: Build, way: list[Array]) -> tuple[Trajectory, Cl
                 break
             if found.certified:
                 return plan, found
-            if found.least > nearest.least:
+            if found.minimum > nearest.minimum:
                 best, nearest = plan, found
-            missed = task.wanted - found.least
+            missed = task.wanted - found.minimum
             if missed > 3.0 * margin:  # more than what lies between samples
                 break
             margin += 1.5 * max(missed, 0.0)
         # One via point more that has brought nothing is followed by no other.
-        stuck = found is not task.given and vias.times.size > 1 and nearest.least < before + fine
+        stuck = found is not task.given and vias.times.size > 1 and nearest.minimum < before + fine
         if stuck or vias.times.size >= task.max_points:
             return best, nearest
         time = _beside(task, vias, found.time)
@@ -481,8 +481,8 @@ def _first(task: _Task, way: list[Array]) -> _Vias:
         for segment, line in enumerate(lines):
             steps, chords = np.hypot(*np.diff(line)), np.hypot(*(line[:, 2:] - line[:, :-2]))
             bends |= {(segment, k): bend for k, bend in enumerate((steps[1:] + steps[:-1] - chords).tolist(), 1)}
-        least = min(bends.values(), default=0.0)
-        if len(bends) < 2 or (len(bends) <= task.max_points and least > 0.01 * task.size):
+        minimum = min(bends.values(), default=0.0)
+        if len(bends) < 2 or (len(bends) <= task.max_points and minimum > 0.01 * task.size):
             break
         segment, k = min(bends, key=lambda corner: bends[corner])
         lines[segment] = np.delete(lines[segment], k, axis=1)

@@ -10,6 +10,7 @@ from typing import Literal, Protocol, runtime_checkable
 import numpy as np
 
 from ctrlplan._checks import checked_finite, checked_number
+from ctrlplan._renamed import warn_renamed
 from ctrlplan.planning.obstacles import Obstacle
 from ctrlplan.trajectories import Trajectory
 from ctrlplan.trajectories.common import Array
@@ -42,8 +43,8 @@ class Clearance:
     lower : float
         Everywhere on the whole interval the clearance is at least this, what
         rounds the coordinates subtracted.
-    least : float
-        Least clearance found: it is attained.
+    minimum : float
+        Minimum clearance, which is attained.
     time : float
         When [s].
     position : tuple of float
@@ -60,7 +61,7 @@ class Clearance:
     """
 
     lower: float
-    least: float
+    minimum: float
     time: float
     position: tuple[float, float]
     obstacle: int
@@ -68,11 +69,17 @@ class Clearance:
     required: float | None
     certified: bool | None
 
+    @property
+    def least(self) -> float:
+        """Deprecated name of `minimum`."""
+        warn_renamed("Clearance.least", "minimum")
+        return self.minimum
+
     def __str__(self) -> str:
         x, z = self.position
         asked = {True: f"; {self.required} is kept", False: f"; {self.required} is not kept", None: ""}[self.certified]
         return (
-            f"at least {self.lower:.6g} over the whole interval, {self.least:.6g} met by the {self.part} beside "
+            f"at least {self.lower:.6g} over the whole interval, {self.minimum:.6g} met by the {self.part} beside "
             f"obstacles[{self.obstacle}] at {self.time:.6g} s with the load at ({x:.4g}, {z:.4g}){asked}"
         )
 
@@ -93,7 +100,7 @@ def clearance(
     bound of its acceleration; the rope's ends move by no more than h/2 times
     the bounds of their speeds. Both bounds come from the jet at the centre and
     the plan's own peaks. What is asked for is `required`; without it, or where
-    it is missed, `lower` comes as near to `least` as 1e-6, relative where that is
+    it is missed, `lower` comes as near to `minimum` as 1e-6, relative where that is
     above 1, or as `max_cells` allow.
 
     Parameters
@@ -129,7 +136,7 @@ def clearance(
     >>> from ctrlplan.trajectories import PolySpline, Waypoint
     >>> plan = PolySpline([Waypoint(0, [0, 0], 0, 0), Waypoint(1, [4, 0], 0, 0)])
     >>> found = clearance(plan, [Disc((2.0, 3.0), 1.0)], load=0.5, required=1.4)
-    >>> found.certified, round(found.least, 6), found.part
+    >>> found.certified, round(found.minimum, 6), found.part
     (True, 1.5, 'load')
     """
     things = checked_obstacles(obstacles)
@@ -148,14 +155,14 @@ def clearance(
     while left.size:
         spent += left.size
         bound = cells.bound(left, right)
-        least = cells.least
-        target = least - _TIGHT * max(1.0, abs(least)) if goal is None or least < goal - slack else goal - slack
+        minimum = cells.minimum
+        target = minimum - _TIGHT * max(1.0, abs(minimum)) if goal is None or minimum < goal - slack else goal - slack
         open_ = bound < target
         if spent + 2 * np.count_nonzero(open_) > max_cells:
-            if goal is not None and least >= goal - slack:
+            if goal is not None and minimum >= goal - slack:
                 raise ValueError(
                     f"the clearance must be decided within {max_cells} cells, got a bound of {bound.min():.6g} and a "
-                    f"least value of {least:.6g} where {goal:g} is required; raise max_cells or lower what is required"
+                    f"minimum of {minimum:.6g} where {goal:g} is required; raise max_cells or lower what is required"
                 )
             open_[:] = False
         lower = min(lower, float(bound[~open_].min(initial=np.inf)))
@@ -192,7 +199,7 @@ class _Cells:
         self.plan, self.obstacles, self.load, self.rope = plan, obstacles, load, rope
         self.order = 2 if rope is None else max(2, rope.order + 1)
         self.peaks = np.stack([plan.peak(nu) for nu in range(self.order + 2)])[:, :, None]
-        self.least, self.where = np.inf, (0.0, 0, False)
+        self.minimum, self.where = np.inf, (0.0, 0, False)
         if rope is not None:
             slopes = np.asarray(rope.slopes(plan), dtype=float)
             if slopes.shape != (rope.order + 1, 2) or not (np.isfinite(slopes).all() and np.all(slopes >= 0.0)):
@@ -228,12 +235,14 @@ class _Cells:
         if not np.isfinite(values).all():
             raise ValueError("distances must be finite over the plan, got nan or inf")
         obstacle, at = np.unravel_index(np.argmin(values), values.shape)
-        if values[obstacle, at] < self.least:
-            self.least, self.where = float(values[obstacle, at]), (float(t[at]), int(obstacle), rope)
+        if values[obstacle, at] < self.minimum:
+            self.minimum, self.where = float(values[obstacle, at]), (float(t[at]), int(obstacle), rope)
 
     def result(self, lower: float, required: float | None, certified: bool | None) -> Clearance:
         time, obstacle, rope = self.where
         x, z = self.plan(time).tolist()
         # Coordinates and distances are rounded; a bound is not allowed to be so upwards.
-        safe = min(lower, self.least) - 32.0 * float(np.finfo(float).eps) * max(self.peaks[0].max(), abs(self.least))
-        return Clearance(safe, self.least, time, (x, z), obstacle, "rope" if rope else "load", required, certified)
+        safe = min(lower, self.minimum) - 32.0 * float(np.finfo(float).eps) * max(
+            self.peaks[0].max(), abs(self.minimum)
+        )
+        return Clearance(safe, self.minimum, time, (x, z), obstacle, "rope" if rope else "load", required, certified)

@@ -278,13 +278,13 @@ def fastest_within(plan: Trajectory, limited: Limited, span: tuple[float, float]
     """Shortest duration with the shape held, for limits that were made ready before."""
     scaled = _Scaled(plan, limited)
     _check_rest(plan, limited)
-    least = _closed_form(plan, limited)
+    minimum = _closed_form(plan, limited)
     if limited.derivatives_only and span is None:
-        if not least:
+        if not minimum:
             raise ValueError("limits must name a derivative that the plan has, got none that a shorter one would break")
-        found = _holding(limited, plan.retime, least)
+        found = _holding(limited, plan.retime, minimum)
         return Fastest(found, limited.margins(found), ((found.duration, math.inf),), "shape", limited)
-    return _searched(scaled, span or _span(scaled, plan.duration, least), "shape", endless=True)
+    return _searched(scaled, span or _span(scaled, plan.duration, minimum), "shape", endless=True)
 
 
 def _check_rest(plan: Trajectory, limited: Limited) -> None:
@@ -303,7 +303,7 @@ def _check_rest(plan: Trajectory, limited: Limited) -> None:
 
 def _closed_form(plan: Trajectory, limited: Limited) -> float:
     """Duration below which some derivative breaks its limits, T_0 max_k (peak_k/limit_k)^(1/k)."""
-    least = 0.0
+    minimum = 0.0
     for bound in limited.bounds:
         if bound.axis is not None and bound.order:
             extrema = plan.extrema(bound.order)
@@ -314,22 +314,22 @@ def _closed_form(plan: Trajectory, limited: Limited) -> float:
             rounding = 1e-12 * max(abs(value) for value, _, _ in sides)
             for value, side, time in sides:
                 if side > 0.0:
-                    least = max(least, plan.duration * (max(value, 0.0) / side) ** (1.0 / bound.order))
+                    minimum = max(minimum, plan.duration * (max(value, 0.0) / side) ** (1.0 / bound.order))
                 elif value > rounding:  # a sign that must not be, whatever the duration
                     raise ValueError(
                         f"limits must hold for some duration, got {bound.name} of both signs where it must stay "
                         f"{bound.range}: its sign at {time:.6g} s is the same at every duration"
                     )
-    return least
+    return minimum
 
 
 def _around(duration: float) -> tuple[float, float]:
     return duration / 64.0, 64.0 * duration
 
 
-def _span(scaled: _Scaled, duration: float, least: float) -> tuple[float, float]:
+def _span(scaled: _Scaled, duration: float, minimum: float) -> tuple[float, float]:
     """Durations between which is searched, from where limits are broken to where they hold."""
-    excess, high = scaled.excess, max(duration, least)
+    excess, high = scaled.excess, max(duration, minimum)
     for _ in range(60):
         if excess(high) <= 0.0 and scaled.limited.exact_excess(scaled.plan(1.01 * high)) <= 0.0:
             break
@@ -337,11 +337,11 @@ def _span(scaled: _Scaled, duration: float, least: float) -> tuple[float, float]
     else:
         raise ValueError(f"limits must hold for some duration, got none up to {high:.3g} s")
     low = high / 64.0
-    while low > least and excess(low) <= 0.0:
+    while low > minimum and excess(low) <= 0.0:
         low /= 64.0
         if low < 1e-12 * high:
             raise ValueError("limits must include one that a shorter plan would break, got none")
-    return max(low, 0.999 * least), 1.01 * high
+    return max(low, 0.999 * minimum), 1.01 * high
 
 
 def _searched(family: _Scaled | _Replanned, span: tuple[float, float], hold: Hold, endless: bool) -> Fastest:

@@ -211,9 +211,9 @@ def _arc(plan: Trajectory, left: float, right: float) -> float:
         return float(lengths.sum())
     slowest = np.clip(np.argmin(squares[rough], axis=1), 1, 14)[:, None] + np.array([-1, 0, 1])
     low, high = edges[:-1][rough], edges[1:][rough]
-    least = low + (high - low) * _vertex(nodes[slowest], np.take_along_axis(squares[rough], slowest, axis=1))
-    least = np.clip(least, low, high)
-    parts = np.concatenate([least + (end - least) * share for end in (low, high) for share in _GRADED])
+    minimum = low + (high - low) * _vertex(nodes[slowest], np.take_along_axis(squares[rough], slowest, axis=1))
+    minimum = np.clip(minimum, low, high)
+    parts = np.concatenate([minimum + (end - minimum) * share for end in (low, high) for share in _GRADED])
     begin, end = parts.reshape(2, len(_GRADED), -1)[:, :-1], parts.reshape(2, len(_GRADED), -1)[:, 1:]
     finer = np.sqrt(_squares(plan, begin.ravel(), end.ravel())) @ weights
     return float(lengths[~rough].sum() + np.abs(end - begin).ravel() @ finer)

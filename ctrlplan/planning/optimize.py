@@ -421,15 +421,15 @@ def _best_times(problem: _Problem, given: Array, first: _Solution, weights: Arra
     if first.cost @ weights <= floor:
         return given
     segments = np.diff(given)
-    least = min(1e-4 / segments.size, 0.5 * float(segments.min()))
-    room = 1.0 - segments.size * least
+    minimum = min(1e-4 / segments.size, 0.5 * float(segments.min()))
+    room = 1.0 - segments.size * minimum
     chord = np.sqrt(np.diff(first.sides[1, :, 0], axis=0) ** 2 @ weights)
     chord = chord / chord.max() if chord.any() else np.ones(segments.size)
 
     def durations(x: Array) -> tuple[Array, Array]:
         share = np.exp(x - x.max())
         share /= share.sum()
-        return least + room * share, share
+        return minimum + room * share, share
 
     def objective(x: Array) -> tuple[float, Array]:
         h, share = durations(x)
@@ -438,8 +438,8 @@ def _best_times(problem: _Problem, given: Array, first: _Solution, weights: Arra
         return math.log(cost), (slope - share * slope.sum()) / cost
 
     def best_from(start: Array) -> tuple[float, Array]:
-        h = np.maximum(start / start.sum(), 2.0 * least)
-        x = np.log(h / h.sum() - least)
+        h = np.maximum(start / start.sum(), 2.0 * minimum)
+        x = np.log(h / h.sum() - minimum)
         result = minimize(objective, x, jac=True, method="BFGS", options={"gtol": 1e-7})
         return float(result.fun), _times(durations(result.x)[0])
 

@@ -201,7 +201,7 @@ def clearance_note(plans: Mapping[str, Trajectory]) -> str:
         for name, plan in plans.items()
         if plan.duration
     }
-    parts = ", ".join(f"{name} {least.least:.2f} m ({least.part})" for name, least in found.items())
+    parts = ", ".join(f"{name} {least.minimum:.2f} m ({least.part})" for name, least in found.items())
     return f"Certified over the whole way, load and rope keep from the wall: {parts}."
 
 

@@ -36,7 +36,7 @@ from ctrlplan.symbolic.libraries import (
 )
 from ctrlplan.symbolic.logs import LOGS
 
-_MOST = 20_000
+_MAXIMUM = 20_000
 """Objects that a fingerprint covers."""
 
 _BYTES = 1 << 26
@@ -114,7 +114,7 @@ class References:
             self._add(root, where)
         while self._queue:
             self._visit(*self._queue.popleft())
-            if len(self.objects) > _MOST or self._bytes > _BYTES:
+            if len(self.objects) > _MAXIMUM or self._bytes > _BYTES:
                 self._hide("too large to be compared in every run", "objects and arrays")
                 return
             if not self._queue:

@@ -9,7 +9,7 @@ import numpy as np
 
 from ctrlplan._types import Array
 
-_GRID, _FINEST, _MOST = 4096, 2**17, 20_000
+_GRID, _FINEST, _MAXIMUM = 4096, 2**17, 20_000
 """Intervals of the grid on which changes are looked for at first and at last, and changes at most."""
 
 _HALVINGS = 60
@@ -78,11 +78,11 @@ def changes_of_side(sides: Callable[[Array], Array], first: float, last: float) 
         found = _apart(np.union1d(known, _located(sides, t)), 1e-12 * max(abs(first), abs(last), last - first))
         if found.size == known.size and count > _GRID:
             break
-        if found.size > _MOST or count >= _FINEST:
+        if found.size > _MAXIMUM or count >= _FINEST:
             break
         known, count = found, 2 * count
     inner = found[(found > first) & (found < last)]
-    return inner.tolist() if inner.size <= _MOST else []
+    return inner.tolist() if inner.size <= _MAXIMUM else []
 
 
 def _apart(times: Array, tolerance: float) -> Array:
@@ -94,7 +94,7 @@ def _located(sides: Callable[[Array], Array], t: Array) -> Array:
     """Times at which a sign changes between two of some times, by bisection of all at once."""
     signs = sides(t)
     switch, before = np.nonzero(signs[:, 1:] != signs[:, :-1])
-    if not switch.size or switch.size > _MOST:
+    if not switch.size or switch.size > _MAXIMUM:
         return np.empty(0)
     left, right, side = t[before], t[before + 1], signs[switch, before]
     for _ in range(_HALVINGS):

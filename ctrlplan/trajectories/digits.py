@@ -108,9 +108,9 @@ def _product(a: Series, b: Series) -> Series:
 def _sin_cos(x: Decimal) -> tuple[Decimal, Decimal]:
     """Sine and cosine by their series, of an angle of a turn at most."""
     digits = decimal.getcontext().prec
-    least = Decimal(10) ** -(digits + 5)
+    minimum = Decimal(10) ** -(digits + 5)
     sums, term, k = [Decimal(0), Decimal(1)], Decimal(1), 0
-    while abs(term) > least:
+    while abs(term) > minimum:
         k += 1
         term *= x / k
         sums[(k + 1) % 2] += term if k % 4 in (0, 1) else -term

@@ -295,12 +295,12 @@ def certified_bounds(
         raise ValueError(f"rtol must be above 0, got {rtol}")
     first, second = (np.stack([plan.peak(k + nu) for k in range(order + 1)])[:, :, None] for nu in (1, 2))
     found, lower, upper = _Candidates(), np.inf, -np.inf
-    least, greatest = np.inf, -np.inf
+    minimum, maximum = np.inf, -np.inf
     for segment, (_, duration) in enumerate(segments):
         s = np.linspace(0.0, duration, 129)
         values = _evaluated(function, plan.segment_jet(segment, s, order))
         found.add(_placed(plan, segment, s)[0], values[None])
-        least, greatest = min(least, float(values.min())), max(greatest, float(values.max()))
+        minimum, maximum = min(minimum, float(values.min())), max(maximum, float(values.max()))
     for segment, (_, duration) in enumerate(segments):
         radius, spent = duration / 256, 0
         centres = duration * (np.arange(128) + 0.5) / 128
@@ -314,9 +314,9 @@ def certified_bounds(
             slope = np.minimum(first, np.abs(jet[1:]) + radius * second)
             reach = radius * np.sum(weights * slope, axis=(0, 1))
             found.add(_placed(plan, segment, centres)[0], values[None])
-            least, greatest = min(least, float(values.min())), max(greatest, float(values.max()))
-            gap = rtol * (greatest - least)
-            undecided = (values - reach < least - gap) | (values + reach > greatest + gap)
+            minimum, maximum = min(minimum, float(values.min())), max(maximum, float(values.max()))
+            gap = rtol * (maximum - minimum)
+            undecided = (values - reach < minimum - gap) | (values + reach > maximum + gap)
             undecided &= reach > gap
             if not undecided.all():
                 lower = min(lower, float((values - reach)[~undecided].min()))
@@ -326,7 +326,7 @@ def certified_bounds(
     best = found.extrema()
     # What the function is made of is rounded, and can cancel in its values.
     terms = float(np.sum(weights[:, :, 0] * np.stack([plan.peak(k) for k in range(order + 1)])))
-    rounding = _ROUNDING * (max(abs(least), abs(greatest)) + terms)
+    rounding = _ROUNDING * (max(abs(minimum), abs(maximum)) + terms)
     return Bounds(
         lower - rounding,
         upper + rounding,

@@ -61,10 +61,10 @@ _KEPT = 1e-10
 _ACROSS = 1e-2
 """Way across the closed end [parts of a turn] below which products of alpha and times lose digits of their sine."""
 
-MOST_LOSS = 1e-6
+MAXIMUM_LOSS = 1e-6
 """The same where there are no more to take."""
 
-_MOST_DIGITS = 100
+_MAXIMUM_DIGITS = 100
 """Constraints up to which many digits take a fraction of a second."""
 
 NEARLY_CLOSED = 5.0
@@ -193,19 +193,19 @@ class NewtonSystem(Fields):
             If rounding could cost more than 1e-6 of the plan's range.
         """
         loss = self.loss(taylor_data)
-        if self._across(times, duration) < _ACROSS and self.hermite and len(values) <= _MOST_DIGITS:
+        if self._across(times, duration) < _ACROSS and self.hermite and len(values) <= _MAXIMUM_DIGITS:
             loss = 1.0  # the triangle itself is rounded
         if loss <= _KEPT:
             return self.coefficients(taylor_data)
-        if self.hermite and len(values) <= _MOST_DIGITS:
+        if self.hermite and len(values) <= _MAXIMUM_DIGITS:
             return self.resolved(values, times, duration)
-        if loss <= MOST_LOSS:
+        if loss <= MAXIMUM_LOSS:
             return self.coefficients(taylor_data)
         why = "waypoints so close together amplify rounding: move them apart, or use PiecewiseSpline"
         if self.alpha > NEARLY_CLOSED:
             why = "near alpha = 2 pi both ends are nearly one point: lower alpha, or use TrigSpline.cyclic"
         raise ValueError(
-            f"waypoints must determine the plan to {MOST_LOSS:g} of its range in floating point, got an estimated "
+            f"waypoints must determine the plan to {MAXIMUM_LOSS:g} of its range in floating point, got an estimated "
             f"loss of {loss:.1g}; {why}"
         )
 

@@ -273,9 +273,9 @@ def _size(alpha: float, count: int, degree: int | None) -> int | None:
     """Number of coefficients at a degree, None for as many as constraints."""
     if degree is None:
         return None
-    least = count // 2 if alpha else count - 1
-    if degree < least:
-        raise ValueError(f"degree must be at least {least} for {count} constraints an axis, got {degree}")
+    minimum = count // 2 if alpha else count - 1
+    if degree < minimum:
+        raise ValueError(f"degree must be at least {minimum} for {count} constraints an axis, got {degree}")
     return max(2 * degree if alpha else degree + 1, count)
 
 

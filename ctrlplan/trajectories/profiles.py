@@ -107,12 +107,12 @@ class _Profile(Trajectory, FromWaypoints):
             durations = _fastest(*((limit[moves] / np.abs(change[moves])).min() for limit in given))
         if not np.isfinite(durations).all():
             raise ValueError(f"limits must give segments of finite durations, got {durations.tolist()} s")
-        least = 8.0 * np.finfo(float).eps * (abs(ends.start) + durations.sum())
-        kept = durations > least  # what is shorter is the rounding of a segment without duration
+        minimum = 8.0 * np.finfo(float).eps * (abs(ends.start) + durations.sum())
+        kept = durations > minimum  # what is shorter is the rounding of a segment without duration
         nrise = len(self._ramp)
         if not kept[:nrise].any():
             raise ValueError(
-                f"limits must leave the rise of velocity more than {least:.3g} s at time = {ends.start:g} s, "
+                f"limits must leave the rise of velocity more than {minimum:.3g} s at time = {ends.start:g} s, "
                 f"got {durations[:nrise].sum():.3g} s"
             )
         times = [ends.start]

@@ -11,7 +11,7 @@ import numpy as np
 from ctrlplan.trajectories.common import FACTORIALS, Array
 from ctrlplan.trajectories.waypoint import Waypoint
 
-MOST_SWING = 3.0
+MAXIMUM_SWING = 3.0
 """Range of a plan, relative to that of its data, above which it warns.
 
 Rest-to-rest moves and those of the paper stay below 1.4 up to alpha = 4; from
@@ -39,14 +39,14 @@ def warn_of_swing(values: Array, points: Sequence[Waypoint], end: float, labels:
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         plan = values.max(axis=1) - values.min(axis=1)
         positions = np.array([p.jet[0] for p in points])
-        if (plan <= MOST_SWING * (positions.max(axis=0) - positions.min(axis=0))).all():
+        if (plan <= MAXIMUM_SWING * (positions.max(axis=0) - positions.min(axis=0))).all():
             return  # the common case, without regard to derivatives
         low, high = _data_range(points, end)
         # Relative to a range that is only rounding of the positions, rounding is large.
         counts = plan > 1e-9 * np.abs(values).max(axis=1)
         swing = np.where(counts, plan / (high - low), 0.0)
     axis = int(swing.argmax())
-    if swing[axis] > MOST_SWING:
+    if swing[axis] > MAXIMUM_SWING:
         warnings.warn(
             f"the plan swings over {swing[axis]:.3g} times the range of its waypoints: {labels[axis]} from "
             f"{values[axis].min():.6g} to {values[axis].max():.6g}, where positions and derivatives of the waypoints "

@@ -124,7 +124,7 @@ class TrigSpline(NewtonSpline):
         ValueError
             If the waypoints do not fit into one period; otherwise as `TrigSpline`.
         """
-        points = checked_waypoints(waypoints, least=1)
+        points = checked_waypoints(waypoints, minimum=1)
         duration = checked_finite(period, "period", above=0.0)
         chosen = Options(
             labels, _checked_gamma(gamma, points[0].naxes), *checked_degree(degree, smooth), duration, warn

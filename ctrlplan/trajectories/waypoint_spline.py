@@ -202,13 +202,13 @@ def family_name(kind: type[FromWaypoints]) -> str:
     return str(kind.__dict__.get("family", kind.__name__))
 
 
-def checked_waypoints(waypoints: Iterable[Waypoint], least: int = 2) -> tuple[Waypoint, ...]:
+def checked_waypoints(waypoints: Iterable[Waypoint], minimum: int = 2) -> tuple[Waypoint, ...]:
     """Waypoints as a tuple: enough of them, alike, at increasing times."""
     if not isinstance(waypoints, Iterable):
         raise TypeError(f"waypoints must be a sequence of Waypoint, got {type(waypoints).__name__}")
     points = tuple(waypoints)
-    if len(points) < least:
-        number = {1: "one waypoint", 2: "two waypoints"}[least]
+    if len(points) < minimum:
+        number = {1: "one waypoint", 2: "two waypoints"}[minimum]
         raise ValueError(f"a plan needs at least {number}, got {len(points)}")
     return increasing(points)
 

@@ -341,7 +341,7 @@ def test_a_plan_of_any_kind_that_keeps_clear_is_returned():
     found = avoid(plan, [Disc((10.0, 0.0), 2.0)], clearance=2.9)
     assert found.plan is plan
     assert found.clearance.certified
-    assert found.clearance.least == pytest.approx(3.0, abs=1e-9)  # the line passes 5 m above the centre
+    assert found.clearance.minimum == pytest.approx(3.0, abs=1e-9)  # the line passes 5 m above the centre
     shaped = cp.Shaper.zv(2.0)(plan)
     assert avoid(shaped, [Disc((10.0, 0.0), 2.0)], clearance=2.9).plan is shaped
 
@@ -387,7 +387,7 @@ def test_a_result_has_the_plan_and_its_clearance():
         lambda p: (-p)(3.0).tolist(),
         lambda p: cp.margins(p, {"velocity": 9.0}).active.value,
         lambda p: cp.fastest(p, {"velocity": 9.0}, hold="waypoints", durations=(8.0, 32.0)).duration,
-        lambda p: clearance(p, [Disc((10.0, 0.0), 1.0)]).least,
+        lambda p: clearance(p, [Disc((10.0, 0.0), 1.0)]).minimum,
         lambda p: avoid(p, [Disc((10.0, 0.0), 1.0)]).plan.to_dict(),
         lambda p: p.then(cp.Step([20.0, 5.0], [20.0, 5.0])).end,
         lambda p: cp.Retimed(p, cp.PolySpline([cp.Waypoint(0, 0), cp.Waypoint(8, 16)])).end,

@@ -58,7 +58,7 @@ def naive(thing, x, z):
 
 def test_a_straight_move_past_a_disc_keeps_what_geometry_says():
     found = clearance(ACROSS, [Disc((10.0, 9.0), 1.0), Disc((4.0, 0.0), 3.0)], load=0.5)
-    assert found.least == pytest.approx(1.5, abs=1e-6)
+    assert found.minimum == pytest.approx(1.5, abs=1e-6)
     assert 1.5 - 2e-6 <= found.lower <= 1.5
     assert (found.obstacle, found.part, found.required, found.certified) == (1, "load", None, None)
     assert found.position == pytest.approx((4.0, 5.0), abs=2e-3)
@@ -67,13 +67,13 @@ def test_a_straight_move_past_a_disc_keeps_what_geometry_says():
 
 def test_what_is_attained_at_an_end_is_attained_exactly():
     found = clearance(ACROSS, [Disc((23.0, 9.0), 1.0)])
-    assert (found.least, found.time, found.position) == (4.0, 10.0, (20.0, 5.0))
+    assert (found.minimum, found.time, found.position) == (4.0, 10.0, (20.0, 5.0))
     assert 4.0 - 4e-6 <= found.lower <= 4.0
 
 
 def test_a_parallel_wall_is_as_far_at_every_instant():
     found = clearance(ACROSS, [HalfPlane((0.0, 1.0), 7.0)], load=1.0)
-    assert found.least == pytest.approx(1.0, abs=1e-14)
+    assert found.minimum == pytest.approx(1.0, abs=1e-14)
     assert 1.0 - 1e-6 <= found.lower <= 1.0
 
 
@@ -88,11 +88,11 @@ def test_as_near_as_allowed_is_certified(required):
 def test_required_decides_and_spends_no_more():
     near = clearance(ACROSS, [Disc((10.0, 9.0), 1.0)], required=2.0, max_cells=100)
     assert near.certified
-    assert 2.0 <= near.lower <= near.least
+    assert 2.0 <= near.lower <= near.minimum
     missed = clearance(ACROSS, [Disc((10.0, 9.0), 1.0)], required=3.0 + 1e-6)
     assert not missed.certified
     assert missed.required == 3.0 + 1e-6
-    assert missed.least == pytest.approx(3.0, abs=1e-6)
+    assert missed.minimum == pytest.approx(3.0, abs=1e-6)
 
 
 @pytest.mark.parametrize("radius", [1e-4, 1e-6])
@@ -108,7 +108,7 @@ def test_a_spike_between_samples_is_not_missed(radius):
     found = clearance(plan, [spike], required=0.0)
     assert not found.certified
     assert found.lower <= -0.1 * radius
-    assert found.least == pytest.approx(-0.1 * radius, abs=1e-6)
+    assert found.minimum == pytest.approx(-0.1 * radius, abs=1e-6)
     past = Disc(tuple(plan(time) + 1.1 * radius * across), radius)
     assert clearance(plan, [past], required=0.0).certified
 
@@ -117,7 +117,7 @@ def test_a_corner_at_a_breakpoint_belongs_to_the_plan():
     plan = cp.PiecewiseSpline([cp.Waypoint(0, [0, 5]), cp.Waypoint(math.e, [10, 2]), cp.Waypoint(9, [20, 5])])
     found = clearance(plan, [Disc((10.0, -1.0), 1.0)], required=1.9)
     assert found.certified
-    assert found.least == 2.0
+    assert found.minimum == 2.0
     assert found.time == math.e
 
 
@@ -126,22 +126,20 @@ def test_a_rope_from_above_is_cut_by_what_the_load_passes_below():
     assert clearance(ACROSS, [disc], required=1.0).certified
     found = clearance(ACROSS, [disc], rope=Plumb(), required=0.0)
     assert (found.part, found.certified) == ("rope", False)
-    assert found.least == pytest.approx(-1.0, abs=2e-6)
+    assert found.minimum == pytest.approx(-1.0, abs=2e-6)
     above = clearance(ACROSS, [Disc((10.0, -3.0), 1.0)], rope=Plumb(), load=3.0)
-    assert above.least == pytest.approx(2.0, abs=2e-6)
+    assert above.minimum == pytest.approx(2.0, abs=2e-6)
     assert above.part == "rope"
 
 
 def test_a_load_without_size_hangs_where_its_rope_ends():
     found = clearance(ACROSS, [HalfPlane((0.0, 1.0), 7.0)], rope=Plumb())
-    assert found.least == pytest.approx(2.0, abs=1e-14)
+    assert found.minimum == pytest.approx(2.0, abs=1e-14)
     assert 2.0 - 1e-3 < found.lower <= 2.0
 
 
 def test_cells_that_do_not_suffice_are_said():
-    with pytest.raises(
-        ValueError, match=r"must be decided within 500 cells, got a bound of .* and a least value of 2 wh"
-    ):
+    with pytest.raises(ValueError, match=r"must be decided within 500 cells, got a bound of .* and a minimum of 2 wh"):
         clearance(ACROSS, [HalfPlane((0.0, 1.0), 7.0)], rope=Plumb(), required=2.0 - 1e-6, max_cells=500)
 
 
@@ -181,19 +179,19 @@ def test_no_sample_is_nearer_than_the_bound_and_the_bound_is_near(family, places
     crane = Crane() if roped and float(plan.extrema(2).maximum[1]) < 9.0 else None
     rope = crane and crane.rope()
     found = clearance(plan, obstacles, load=load, rope=rope)
-    least = sampled(plan, obstacles, load, crane, 20001 if crane is None else 2001)
-    assert found.lower <= least + 1e-12
-    assert found.lower <= found.least
+    minimum = sampled(plan, obstacles, load, crane, 20001 if crane is None else 2001)
+    assert found.lower <= minimum + 1e-12
+    assert found.lower <= found.minimum
     if crane is None:
-        assert least <= found.least + 1e-12 + 1e-3 * float(np.hypot(*plan.peak(1)))
-        assert found.lower >= found.least - 1e-6 * max(1.0, abs(found.least))
-        assert found.least <= least + 1e-6 * max(1.0, abs(least)) + 1e-12
+        assert minimum <= found.minimum + 1e-12 + 1e-3 * float(np.hypot(*plan.peak(1)))
+        assert found.lower >= found.minimum - 1e-6 * max(1.0, abs(found.minimum))
+        assert found.minimum <= minimum + 1e-6 * max(1.0, abs(minimum)) + 1e-12
     else:
-        assert found.least <= least + 0.05
-        assert found.lower >= found.least - 1e-2
-    required = found.least - 0.01
+        assert found.minimum <= minimum + 0.05
+        assert found.lower >= found.minimum - 1e-2
+    required = found.minimum - 0.01
     assert clearance(plan, obstacles, load=load, rope=rope, required=required).certified
-    assert not clearance(plan, obstacles, load=load, rope=rope, required=found.least + 1e-4).certified
+    assert not clearance(plan, obstacles, load=load, rope=rope, required=found.minimum + 1e-4).certified
 
 
 def test_clearance_is_frozen():

@@ -243,9 +243,9 @@ def test_what_the_plant_refuses_is_told():
     found = fastest(HOIST, {"T": (0, None)}, CRANE)
     # The crane can follow only below g - z'' = 0, which no limit says.
     fall = derivative(HOIST, 2)[1].max()
-    least = 15.0 * sqrt(fall / 9.81)
-    assert found.duration == pytest.approx(least, rel=1e-5)
-    assert found.duration >= least
+    minimum = 15.0 * sqrt(fall / 9.81)
+    assert found.duration == pytest.approx(minimum, rel=1e-5)
+    assert found.duration >= minimum
 
 
 def test_a_static_torque_beyond_the_limit():

@@ -139,8 +139,8 @@ def test_jets_are_those_of_the_integrated_acceleration(d, v, a):
 def test_limits_are_met_and_one_of_them_is_reached(ends, v, a, j, time):
     """Whatever the clock; and what should be continuous is, to rounding."""
     final, initial = ends
-    least = 1e-11 * (abs(time) + abs(final - initial) / v + v / a + a / j)
-    assume(min(v / a, a / j) > least)
+    minimum = 1e-11 * (abs(time) + abs(final - initial) / v + v / a + a / j)
+    assume(min(v / a, a / j) > minimum)
     for plan, highest in (
         (Trapezoid(final, initial, velocity=v, acceleration=a, time=time), 2),
         (SCurve(final, initial, velocity=v, acceleration=a, jerk=j, time=time), 3),

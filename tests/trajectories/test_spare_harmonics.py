@@ -20,7 +20,7 @@ DATA = {
 }
 
 
-def least(times, jets, degree, alpha, smooth):
+def minimum(times, jets, degree, alpha, smooth):
     """Naive, in 60 digits: the conditions of Lagrange for least int (y^(smooth))^2 under the constraints."""
     given = [(t, k, v) for t, jet in zip(times, jets, strict=True) for k, v in enumerate(jet) if v is not None]
     with mp.workdps(60):
@@ -92,7 +92,7 @@ def test_the_least_rough_of_all_that_meet_the_waypoints(data, alpha, smooth, ext
     points = waypoints(times, jets)
     options = {"degree": degree, "smooth": smooth}
     plan = TrigSpline(points, alpha=alpha, **options) if alpha else PolySpline(points, **options)
-    exact, smallest = least(times, jets, degree, alpha, smooth)
+    exact, smallest = minimum(times, jets, degree, alpha, smooth)
     assert plan.degree == (degree,)
     assert miss(plan) <= 1e-12
     assert cost(plan, smooth) == pytest.approx(smallest, rel=1e-13)
