@@ -63,6 +63,26 @@ def renamed_argument(old: str, old_value: Any, new: str, new_value: Any) -> Any:
     return old_value
 
 
+def renamed_members(module: str, renamed: Mapping[str, str]) -> Callable[[str], Any]:
+    """`__getattr__` of a module that still has its members' old names.
+
+    Parameters
+    ----------
+    module : str
+        Name of the module.
+    renamed : mapping of str to str
+        New name of each old one.
+    """
+
+    def member(name: str) -> Any:
+        if name not in renamed:
+            raise AttributeError(f"module {module!r} has no attribute {name!r}")
+        warn_renamed(f"{module}.{name}", f"{module}.{renamed[name]}")
+        return getattr(sys.modules[module], renamed[name])
+
+    return member
+
+
 def former_signature(
     *positional: str,
     renamed: Mapping[str, str] | None = None,

@@ -6,7 +6,12 @@ import warnings
 
 import pytest
 
+import ctrlplan as cp
+from ctrlplan import planning
 from ctrlplan._renamed import renamed_argument, warn_renamed
+
+MOVE = [cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1, 0, 0)]
+PLANE = cp.stack([cp.PolySpline(MOVE, labels=[name]) for name in "xz"])
 
 
 def package_function(depth):
@@ -39,3 +44,35 @@ def test_an_old_keyword_is_read_with_a_warning():
 def test_both_names_together_are_an_error():
     with pytest.raises(TypeError, match=re.escape("only= is the old name of measures=")):
         renamed_argument("only", ("a",), "measures", ("a",))
+
+
+OLD_NAMES = [
+    (lambda: cp.PiecewiseSpline(MOVE), "legs", "segments"),
+    (lambda: cp.clearance(PLANE, [cp.Disc((9.0, 0.0), 1.0)]), "least", "minimum"),
+    (lambda: cp.fastest(cp.PolySpline(MOVE), {"velocity": 1.0}), "refusal", "rejection"),
+    (lambda: cp.metrics, "wandering", "excess_length"),
+    (lambda: cp.metrics, "turning_points", "extra_reversals"),
+    (lambda: planning, "path_length", "plan_length"),
+    (lambda: planning, "wandering", "plan_excess_length"),
+]
+
+
+@pytest.mark.parametrize(("made", "old", "new"), OLD_NAMES, ids=[f"{old}-{new}" for _, old, new in OLD_NAMES])
+def test_an_old_name_of_a_member_gives_the_new_one_with_a_warning(made, old, new):
+    thing = made()
+    with pytest.warns(FutureWarning, match=rf"{old} is deprecated.*use .*{new}$"):
+        found = getattr(thing, old)
+    assert found is getattr(thing, new)
+    assert old not in getattr(thing, "__all__", ())
+
+
+def test_a_name_that_never_was_is_an_error():
+    with pytest.raises(AttributeError, match=r"module .ctrlplan\.metrics. has no attribute .wander."):
+        cp.metrics.wander  # noqa: B018
+
+
+def test_the_old_name_of_an_objective_chooses_the_same_alpha():
+    corner = [cp.Waypoint(0, [0, 0], 0), cp.Waypoint(1, [1, 0]), cp.Waypoint(2, [1, 1], 0)]
+    with pytest.warns(FutureWarning, match="wandering"):
+        old = cp.choose_alpha(corner, "wandering")
+    assert float(old) == float(cp.choose_alpha(corner, "excess_length"))

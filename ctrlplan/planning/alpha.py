@@ -115,7 +115,7 @@ def choose_alpha(
     waypoints : iterable of Waypoint
         What the plan meets.
     objective : str or callable, optional
-        What should be least: "path" (length), "wandering", "peak_velocity",
+        What should be least: "path" (length), "excess_length", "peak_velocity",
         "peak_acceleration", "peak_jerk", "peak_snap", "squared_velocity", ...,
         "squared_snap", an objective such as ``PeakDerivative(5)``, or any
         function of a plan that returns a number. Axes must share a unit.
@@ -157,7 +157,7 @@ def choose_alpha(
     alphas, values = scan(search, _grid(points))
     best = float(values.min())
     if math.isinf(best):
-        raise search.refusal or ValueError("objective must be finite for some alpha, got inf for all of [0, 2 pi)")
+        raise search.rejection or ValueError("objective must be finite for some alpha, got inf for all of [0, 2 pi)")
     declared = declared_size(goal)
     scale = abs(best) if declared is None else declared
     level = best + _TIE * scale
@@ -193,13 +193,13 @@ class _Search:
 
     def __init__(self, plan_of: Callable[[float], Trajectory], goal: Objective) -> None:
         self._plan_of, self._goal = plan_of, goal
-        self.refusal: ValueError | None = None
+        self.rejection: ValueError | None = None
 
     def __call__(self, alpha: float) -> float:
         try:
             plan = self._plan_of(float(alpha))
-        except ValueError as refusal:  # free entries can make single alphas singular
-            self.refusal = self.refusal or refusal
+        except ValueError as rejection:  # free entries can make single alphas singular
+            self.rejection = self.rejection or rejection
             return math.inf
         value: Any = self._goal(plan)
         if np.ndim(value) or not isinstance(value, Real | np.ndarray):

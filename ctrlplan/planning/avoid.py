@@ -20,7 +20,7 @@ from ctrlplan._checks import checked_count, checked_finite
 from ctrlplan._renamed import warn_renamed
 from ctrlplan.planning.clearance import Clearance, Rope, checked_obstacles, checked_rope
 from ctrlplan.planning.clearance import clearance as certified_clearance
-from ctrlplan.planning.objectives import path_length
+from ctrlplan.planning.objectives import plan_length
 from ctrlplan.planning.obstacles import Obstacle
 from ctrlplan.trajectories import PiecewiseSpline, Trajectory, Waypoint, WaypointSpline
 from ctrlplan.trajectories.common import Array
@@ -205,7 +205,7 @@ def avoid(
 
 
 def _check_length(plan: Trajectory, shortest: float) -> None:
-    length = path_length(plan)
+    length = plan_length(plan)
     if length > _LONG * shortest:
         warnings.warn(
             f"the path found is {length:.4g} long, {length / shortest:.2g} times the shortest way round the obstacles: "

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq
 
 from ctrlplan._checks import checked_pair
+from ctrlplan._renamed import warn_renamed
 from ctrlplan.planning.limits import Limited, Margin, Margins
 from ctrlplan.planning.quantities import System, system_given
 from ctrlplan.planning.scalar_search import bisected, scan
@@ -50,7 +51,7 @@ class Fastest:
         What was kept.
     limited : Limited
         The limits, to look at other plans with.
-    refusal : str
+    rejection : str
         What the plant says of shorter plans, where that holds the plan back and
         no limit does; else empty.
     searched : (float, float)
@@ -62,7 +63,7 @@ class Fastest:
     feasible: tuple[tuple[float, float], ...]
     hold: Hold
     limited: Limited
-    refusal: str = ""
+    rejection: str = ""
     searched: tuple[float, float] = (0.0, math.inf)
 
     @property
@@ -72,15 +73,21 @@ class Fastest:
 
     @property
     def active(self) -> Margin:
-        """The limit that comes nearest; it does not let the plan be shorter unless there is a refusal."""
+        """The active limit, which prevents a shorter plan unless `rejection` says what does."""
         return self.margins.active
 
+    @property
+    def refusal(self) -> str:
+        """Deprecated name of `rejection`."""
+        warn_renamed("Fastest.refusal", "rejection")
+        return self.rejection
+
     def __repr__(self) -> str:
-        note = f"\nshorter plans are refused: {self.refusal}" if self.refusal else ""
+        note = f"\nshorter plans are rejected: {self.rejection}" if self.rejection else ""
         return f"fastest with the {self.hold} held: {self.duration:.6g} s ({self._sets}){note}\n{self.margins!r}"
 
     def _repr_html_(self) -> str:
-        note = f" Shorter plans are refused: {escape(self.refusal)}." if self.refusal else ""
+        note = f" Shorter plans are rejected: {escape(self.rejection)}." if self.rejection else ""
         return (
             f"<p>Shortest duration with the {self.hold} held: <b>{self.duration:.6g} s</b> ({self._sets}).{note}</p>"
             f"{self.margins._repr_html_()}"
@@ -365,15 +372,15 @@ def _searched(family: _Scaled | _Replanned, span: tuple[float, float], hold: Hol
         ]
         feasible.append((ends[0], ends[1]))
     if not feasible:
-        _refuse(family, durations, excess)
+        _reject(family, durations, excess)
     if endless and feasible[-1][1] == durations[-1]:
         feasible[-1] = (feasible[-1][0], math.inf)
     plan = _holding(limited, family.plan, feasible[0][0])
     found = limited.margins(plan)
     # Where no limit is met, something else holds it back: a plant that cannot follow.
-    refusal = limited.refusal(family.plan(0.99 * plan.duration)) if found.active.fraction > 1e-6 else ""
+    rejection = limited.rejection(family.plan(0.99 * plan.duration)) if found.active.fraction > 1e-6 else ""
     searched = (span[0], math.inf if math.isinf(feasible[-1][1]) else span[1])
-    return Fastest(plan, found, tuple(feasible), hold, limited, refusal, searched)
+    return Fastest(plan, found, tuple(feasible), hold, limited, rejection, searched)
 
 
 def _runs(inside: NDArray[np.bool_]) -> list[tuple[int, int]]:
@@ -412,7 +419,7 @@ def _holding(limited: Limited, plan_of: Callable[[float], Trajectory], duration:
     raise ValueError(f"limits must hold near {duration:.6g} s, got {limited.margins(plan).active}")
 
 
-def _refuse(family: _Scaled | _Replanned, durations: Array, excess: Array) -> NoReturn:
+def _reject(family: _Scaled | _Replanned, durations: Array, excess: Array) -> NoReturn:
     span = f"from {durations[0]:.4g} to {durations[-1]:.4g} s"
     if math.isinf(excess.min()):
         raise ValueError(f"the plant must be able to follow for some duration {span}, got none")

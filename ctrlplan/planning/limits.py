@@ -360,17 +360,17 @@ class Limited:
         """Greatest excess over a sampled jet, inf where the plant cannot follow at all."""
         try:
             values = self.values(jet)
-        except ValueError:  # the plant refuses: a rope that would have to push
+        except ValueError:  # the plant cannot follow: a rope that would have to push
             return math.inf
         worst = max(float(b.excess(row).max()) for b, row in zip(self.bounds, values, strict=True))
         return math.inf if math.isnan(worst) else worst
 
-    def refusal(self, plan: Trajectory) -> str:
+    def rejection(self, plan: Trajectory) -> str:
         """Why the plant cannot follow a plan, empty where it can."""
         try:
             self.values(self.sampled(plan))
-        except ValueError as refusal:
-            return str(refusal)
+        except ValueError as rejection:
+            return str(rejection)
         return ""
 
     def exact_excess(self, plan: Trajectory) -> float:
@@ -504,13 +504,13 @@ def _orders(quantities: Quantities, plan: Trajectory) -> dict[str, int]:
     still = np.zeros((_HIGHEST + 1, plan.naxes, 1))
     still[0] = plan.initial[:, None]
     orders: dict[str, int] = {}
-    refusal: Exception | None = None
+    rejection: Exception | None = None
     for order in range(_HIGHEST + 1):
         try:
             with np.errstate(all="ignore"):
                 found = quantities(still[: order + 1])
         except (ValueError, IndexError, KeyError) as reason:  # it reads more than this
-            refusal = reason
+            rejection = reason
             continue
         if not isinstance(found, Mapping):
             raise TypeError(f"quantities must return a mapping of names to signals, got {type(found).__name__}")
@@ -519,7 +519,7 @@ def _orders(quantities: Quantities, plan: Trajectory) -> dict[str, int]:
     if not orders:
         raise ValueError(
             f"quantities must take jets (order + 1, {plan.naxes}, ntime) of up to {_HIGHEST} derivatives, got "
-            f"{type(refusal).__name__}: {refusal}"
+            f"{type(rejection).__name__}: {rejection}"
         )
     return orders
 

@@ -16,6 +16,7 @@ from typing import Literal, TypeVar
 import numpy as np
 
 from ctrlplan._checks import checked_count
+from ctrlplan._renamed import warn_renamed
 from ctrlplan.trajectories import Trajectory
 from ctrlplan.trajectories.common import Array
 from ctrlplan.trajectories.quadrature import gauss
@@ -26,7 +27,7 @@ Objective = Callable[[Trajectory], float]
 
 ObjectiveName = Literal[
     "path",
-    "wandering",
+    "excess_length",
     "peak_velocity",
     "peak_acceleration",
     "peak_jerk",
@@ -61,7 +62,7 @@ def declared_size(objective: Objective) -> float | None:
     return size
 
 
-def path_length(plan: Trajectory) -> float:
+def plan_length(plan: Trajectory) -> float:
     r"""Length of the path that a plan takes.
 
     .. math:: \int \Bigl(\sum_i \dot y_i(t)^2\Bigr)^{1/2} dt
@@ -82,8 +83,8 @@ def path_length(plan: Trajectory) -> float:
 
 
 @of_size(1.0)
-def wandering(plan: Trajectory) -> float:
-    """Length of a plan's path beyond the polyline of its waypoints, as a fraction of it.
+def plan_excess_length(plan: Trajectory) -> float:
+    """Path length over the length of the waypoint polyline, minus 1.
 
     Parameters
     ----------
@@ -97,7 +98,7 @@ def wandering(plan: Trajectory) -> float:
     """
     points = np.array([point.position for point in plan.waypoints]).reshape(-1, plan.naxes)
     shortest = float(np.sqrt(np.square(np.diff(points, axis=0)).sum(axis=1)).sum())
-    return path_length(plan) / shortest - 1.0 if shortest > 0.0 else math.nan
+    return plan_length(plan) / shortest - 1.0 if shortest > 0.0 else math.nan
 
 
 _GRADED = np.array([0.0, *0.1 ** np.arange(4.0)[::-1]])[:, None]
@@ -174,8 +175,8 @@ class SquaredDerivative:
 
 
 OBJECTIVES: dict[ObjectiveName, Objective] = {
-    "path": path_length,
-    "wandering": wandering,
+    "path": plan_length,
+    "excess_length": plan_excess_length,
     "peak_velocity": PeakDerivative(1),
     "peak_acceleration": PeakDerivative(2),
     "peak_jerk": PeakDerivative(3),
@@ -191,6 +192,9 @@ OBJECTIVES: dict[ObjectiveName, Objective] = {
 def checked_objective(objective: ObjectiveName | Objective) -> Objective:
     """Objective by its name, or the function itself."""
     if isinstance(objective, str):
+        if str(objective) == "wandering":
+            warn_renamed('objective "wandering"', '"excess_length"')
+            return plan_excess_length
         if objective not in OBJECTIVES:
             raise ValueError(f"objective must be one of {', '.join(OBJECTIVES)} or a function, got {objective!r}")
         return OBJECTIVES[objective]

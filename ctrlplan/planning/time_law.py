@@ -135,7 +135,7 @@ class _Law:
         series = np.stack(composed(list(outer), list(inner[1:].reshape(shape))))
         try:
             values = self._limited.values(series * FACTORIALS[: order + 1, None, None])
-        except ValueError:  # the plant refuses: far beyond every limit
+        except ValueError:  # the plant cannot follow: far beyond every limit
             return np.full((2 * len(self._bounds) * _SAMPLES, logs.shape[1]), -1e3)
         rows = [(b.high - row) / b.scale + b.slack for b, row in zip(self._bounds, values[self._moving], strict=True)]
         rows += [(row - b.low) / b.scale + b.slack for b, row in zip(self._bounds, values[self._moving], strict=True)]

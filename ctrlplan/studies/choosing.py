@@ -19,7 +19,7 @@ from ctrlplan.planning import (
     clearance,
     fastest,
     optimize_waypoints,
-    path_length,
+    plan_length,
 )
 from ctrlplan.studies.baselines import smoother_polynomials
 from ctrlplan.studies.benefit import PLANNED, Benefit, Choices, benefit_of
@@ -126,8 +126,8 @@ def optimality_grids() -> tuple[Grid, Grid]:
             "m",
             ends,
             alphas,
-            np.array([[path_length(plan) for plan in row] for row in shapes]),
-            {name: np.array([path_length(row[name]) for row in rivals]) for name in rivals[0]}
+            np.array([[plan_length(plan) for plan in row] for row in shapes]),
+            {name: np.array([plan_length(row[name]) for row in rivals]) for name in rivals[0]}
             | {_POLYLINE: np.array(polyline)},
             beside=(_POLYLINE,),
         ),
@@ -179,14 +179,14 @@ def _freer_paths(plan: Trajectory) -> dict[str, float]:
     """Lengths of trigonometric paths through the paper's waypoints with more freedom than alpha, by that freedom."""
     points = obstacle_waypoints()
     found = {
-        f"degree {degree} at alpha = {alpha:g}": path_length(TrigSpline(points, alpha=alpha, degree=degree))
+        f"degree {degree} at alpha = {alpha:g}": plan_length(TrigSpline(points, alpha=alpha, degree=degree))
         for degree, alpha in ((7, 4.0), (16, 5.0))
     }
     start = [plan.alpha, *plan.gamma] if isinstance(plan, TrigSpline) else []
 
     def length(choice: NDArray[np.float64]) -> float:
         try:
-            return path_length(TrigSpline(points, alpha=choice[0], gamma=choice[1:].tolist()))
+            return plan_length(TrigSpline(points, alpha=choice[0], gamma=choice[1:].tolist()))
         except ValueError:  # no such spline
             return math.inf
 

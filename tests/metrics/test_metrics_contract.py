@@ -50,8 +50,8 @@ def test_docstring_has_every_section(name):
 @pytest.mark.parametrize("name", NAMES)
 def test_one_record_gives_a_plain_number(name):
     value = call(name)
-    assert type(value) is (int if name == "turning_points" else float)
-    assert value >= 0 or name == "wandering"
+    assert type(value) is (int if name == "extra_reversals" else float)
+    assert value >= 0 or name == "excess_length"
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -72,7 +72,7 @@ def test_leading_axes_are_rows_of_their_own(name):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_nan_is_refused_by_name_and_place(name):
+def test_nan_is_rejected_by_name_and_place(name):
     given, signal = arguments(name)
     bad = RECORD.copy()
     bad[4] = np.nan
@@ -84,7 +84,7 @@ OTHERS = [(n, p) for n in NAMES for p in REST if p in inspect.signature(getattr(
 
 
 @pytest.mark.parametrize(("name", "other"), OTHERS)
-def test_nan_in_the_other_arguments_is_refused_by_name(name, other):
+def test_nan_in_the_other_arguments_is_rejected_by_name(name, other):
     bad = np.array(REST[other], dtype=float)
     bad[(-1,) * bad.ndim] = np.nan
     with pytest.raises(ValueError, match=rf"^{other} must hold no nan, got {other}"):
@@ -112,7 +112,7 @@ def test_levels_and_points_are_finite(name, other):
         (TIMES[:-1], r"must have 6 samples on its last axis, as timepts has, got shape \(7,\)"),
     ],
 )
-def test_wrong_times_are_refused(name, timepts, message):
+def test_wrong_times_are_rejected(name, timepts, message):
     with pytest.raises(ValueError, match=message):
         call(name, timepts=timepts)
 
@@ -130,7 +130,7 @@ def test_a_scalar_is_no_signal(name):
         call(name, signal=1.0)
 
 
-INFINITE = [n for n in NAMES if n not in ("lag", "saturation_time", "turning_points")]
+INFINITE = [n for n in NAMES if n not in ("lag", "saturation_time", "extra_reversals")]
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -79,7 +79,7 @@ def test_a_diverged_control_is_beyond_its_limit():
 
 
 @pytest.mark.parametrize(("lower", "upper"), [(1, 1), (2, -2), (np.inf, np.inf), (0, [1, -1])])
-def test_limits_in_the_wrong_order_are_refused(lower, upper):
+def test_limits_in_the_wrong_order_are_rejected(lower, upper):
     with pytest.raises(ValueError, match=r"^lower must be below upper, got lower = "):
         metrics.saturation_time([0, 1, 2], np.zeros((2, 3)), lower, upper)
 

@@ -153,13 +153,13 @@ def test_divergence_overshoots_on_its_own_side():
 
 
 @pytest.mark.parametrize("band", [0, -0.02, np.inf, np.nan, [0.02, 0.05]])
-def test_a_wrong_band_is_refused(band):
+def test_a_wrong_band_is_rejected(band):
     with pytest.raises(ValueError, match=r"^band must"):
         metrics.settling_time([0, 1, 2], [0, 1, 1], 1, 0, band=band)
 
 
 @pytest.mark.parametrize("start", [2.5, np.inf, np.nan, [0.0, 1.0]])
-def test_a_wrong_start_is_refused(start):
+def test_a_wrong_start_is_rejected(start):
     with pytest.raises(ValueError, match=r"^start must"):
         metrics.settling_time([0, 1, 2], [0, 1, 1], 1, 0, start=start)
     with pytest.raises(ValueError, match=r"^start must"):

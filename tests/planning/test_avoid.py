@@ -274,12 +274,12 @@ def test_a_rope_has_no_way_under_what_reaches_above_the_trolley():
         (HalfPlane((0.0, 1.0), 4.0), r"waypoints\[0\] that lies 1 inside obstacles\[1\]"),
     ],
 )
-def test_a_waypoint_too_near_is_refused(obstacle, message):
+def test_a_waypoint_too_near_is_rejected(obstacle, message):
     with pytest.raises(ValueError, match="the load must keep 0.4 from every obstacle at each waypoint, got " + message):
         avoid(cp.PolySpline(ACROSS), [Disc((10.0, 0.0), 1.0), obstacle], clearance=0.4, load=0.3)
 
 
-def test_a_rope_that_hangs_too_near_at_rest_is_refused():
+def test_a_rope_that_hangs_too_near_at_rest_is_rejected():
     message = (
         r"the rope must keep 0.4 from every obstacle at each waypoint, got 0.25 from obstacles\[0\] at waypoints\[1\]"
     )
@@ -301,7 +301,7 @@ def test_options_are_checked():
         avoid(plan, [(10.0, 5.2, 2.0)])
 
 
-def test_plans_of_another_kind_are_refused():
+def test_plans_of_another_kind_are_rejected():
     disc = [Disc((10.0, 5.2), 2.0)]
     with pytest.raises(TypeError, match="plan must have a duration, made through waypoints, got a Step"):
         avoid(cp.Step([1.0, 2.0]), disc)

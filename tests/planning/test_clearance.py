@@ -1,4 +1,4 @@
-"""Certified clearance: closed forms, dense independent sampling, what samples would miss, and refusals."""
+"""Certified clearance: closed forms, dense independent sampling, what samples would miss, and rejections."""
 
 import dataclasses
 import math
@@ -218,12 +218,12 @@ def test_clearance_is_frozen():
         ),
     ],
 )
-def test_bad_values_are_refused(plan, obstacles, options, message):
+def test_bad_values_are_rejected(plan, obstacles, options, message):
     with pytest.raises(ValueError, match=message):
         clearance(plan, obstacles, **options)
 
 
-def test_what_is_no_obstacle_is_refused():
+def test_what_is_no_obstacle_is_rejected():
     with pytest.raises(TypeError, match=r"obstacles\[1\] must be an obstacle, got \(1, 2\)"):
         clearance(ACROSS, [Disc((0, 0), 1), (1, 2)])
     with pytest.raises(TypeError, match=r"must be a sequence of obstacles, got Disc"):
@@ -232,7 +232,7 @@ def test_what_is_no_obstacle_is_refused():
         clearance(ACROSS, [Disc((0, 0), 1)], load=None)
 
 
-def test_a_rope_with_wrong_slopes_is_refused():
+def test_a_rope_with_wrong_slopes_is_rejected():
     class Wrong(Plumb):
         def slopes(self, plan):
             return np.array([1.0, -1.0])
@@ -241,7 +241,7 @@ def test_a_rope_with_wrong_slopes_is_refused():
         clearance(ACROSS, [Disc((0, 0), 1)], rope=Wrong())
 
 
-def test_distances_that_are_no_numbers_are_refused():
+def test_distances_that_are_no_numbers_are_rejected():
     class Hole(Disc):
         def distance(self, points):
             return np.full(np.shape(points)[1:], np.nan)

@@ -504,7 +504,7 @@ def test_durations_that_are_none(durations, message, hold):
         fastest(MOVE, {"y_d1": 1.0}, durations=durations, hold=hold)
 
 
-# What is refused
+# What is rejected
 
 
 @pytest.mark.parametrize("hold", ["time", "", None])

@@ -298,7 +298,7 @@ def test_margins_as_tables():
     assert "y_d1" in html
 
 
-# What is refused
+# What is rejected
 
 
 @pytest.mark.parametrize("limit", [0.0, -1.0, inf, np.nan, -0.0])

@@ -13,7 +13,7 @@ from scipy.interpolate import BPoly, PPoly
 
 import ctrlplan as cp
 from ctrlplan import Waypoint
-from ctrlplan.planning import OBJECTIVES, PeakDerivative, SquaredDerivative, path_length, wandering
+from ctrlplan.planning import OBJECTIVES, PeakDerivative, SquaredDerivative, plan_excess_length, plan_length
 from ctrlplan.planning.objectives import ObjectiveName, declared_size, of_size
 
 REST = [Waypoint(0, 0, 0, 0), Waypoint(1, 1, 0, 0)]
@@ -32,8 +32,8 @@ PLANS = {
     ),
 }
 NAMES = {
-    "path": path_length,
-    "wandering": wandering,
+    "path": plan_length,
+    "excess_length": plan_excess_length,
     **{f"peak_{name}": PeakDerivative(k) for k, name in enumerate(["velocity", "acceleration", "jerk", "snap"], 1)},
     **{
         f"squared_{name}": SquaredDerivative(k)
@@ -58,30 +58,30 @@ def test_names_lead_to_the_objectives():
 
 
 @pytest.mark.parametrize("name", PLANS)
-def test_path_length_is_the_integral_of_the_speed(name):
+def test_plan_length_is_the_integral_of_the_speed(name):
     plan = PLANS[name]
     expected = integral(plan, lambda t: float(np.linalg.norm(plan.jet(t, 1)[1])))
     # These plans turn round, and nearly stop there.
-    assert path_length(plan) == pytest.approx(expected, rel=1e-7)
+    assert plan_length(plan) == pytest.approx(expected, rel=1e-7)
 
 
-def test_path_length_of_a_half_circle():
+def test_plan_length_of_a_half_circle():
     points = [Waypoint(t, [2 * cos(t), 2 * sin(t)]) for t in (0.0, pi / 2, pi)]
-    assert path_length(cp.TrigSpline(points, alpha=pi)) == pytest.approx(2 * pi, rel=1e-14)
+    assert plan_length(cp.TrigSpline(points, alpha=pi)) == pytest.approx(2 * pi, rel=1e-14)
 
 
-def test_path_length_of_a_parabola():
+def test_plan_length_of_a_parabola():
     parabola = cp.PolySpline([Waypoint(t, [t, t * t]) for t in (0.0, 1.0, 3.0)])
-    assert path_length(parabola) == pytest.approx((6 * sqrt(37) + asinh(6)) / 4, rel=1e-14)
+    assert plan_length(parabola) == pytest.approx((6 * sqrt(37) + asinh(6)) / 4, rel=1e-14)
 
 
-def test_path_length_counts_the_way_there_and_back():
+def test_plan_length_counts_the_way_there_and_back():
     there_and_back = MOVE.then(cp.PolySpline([Waypoint(1, 1, 0, 0), Waypoint(3, -2, 0, 0)]))
-    assert path_length(there_and_back) == pytest.approx(4.0, rel=1e-14)
+    assert plan_length(there_and_back) == pytest.approx(4.0, rel=1e-14)
 
 
 @pytest.mark.parametrize("miss", [1e-2, 1e-4, 0.0])
-def test_path_length_where_the_path_nearly_stops(miss):
+def test_plan_length_where_the_path_nearly_stops(miss):
     # x = t^2, z = miss t through t = 0: the speed hypot(2 t, miss) has its minimum inside a panel.
     a, b = -0.7, 1.3
     plan = cp.PolySpline([Waypoint(t, [t * t, miss * t]) for t in (a, 0.4, b)])
@@ -90,13 +90,13 @@ def test_path_length_where_the_path_nearly_stops(miss):
         return t * sqrt(t * t + miss**2 / 4) + (miss**2 / 4 * asinh(2 * t / miss) if miss else 0.0)
 
     expected = primitive(b) - primitive(a) if miss else a * a + b * b
-    assert path_length(plan) == pytest.approx(expected, rel=1e-7)
+    assert plan_length(plan) == pytest.approx(expected, rel=1e-7)
 
 
-def test_path_length_of_one_axis_is_the_way_between_its_turns():
+def test_plan_length_of_one_axis_is_the_way_between_its_turns():
     cubic = cp.PolySpline([Waypoint(t, t**3 - t) for t in (-1.5, -0.6, 0.7, 2.0)])
     turn = 2 / (3 * sqrt(3))  # height of the turns at -+1/sqrt 3
-    assert path_length(cubic) == pytest.approx((turn + 1.875) + 2 * turn + (turn + 6.0), rel=1e-7)
+    assert plan_length(cubic) == pytest.approx((turn + 1.875) + 2 * turn + (turn + 6.0), rel=1e-7)
 
 
 @pytest.mark.parametrize(
@@ -153,26 +153,28 @@ def test_costs_are_integrals(name, nu):
     assert SquaredDerivative(nu)(plan) == pytest.approx(expected, rel=1e-10)
 
 
-def test_wandering_is_the_path_beyond_the_polyline():
+def test_excess_length_is_the_path_beyond_the_polyline():
     plan = PLANS["trigonometric"]
     polyline = sum(np.linalg.norm(b - a) for a, b in zip(JETS[:, 0], JETS[1:, 0], strict=False))
     path = integral(plan, lambda t: float(np.linalg.norm(plan.jet(t, 1)[1])))
-    assert wandering(plan) == pytest.approx(path / polyline - 1, rel=1e-7)
+    assert plan_excess_length(plan) == pytest.approx(path / polyline - 1, rel=1e-7)
 
 
 def test_a_straight_move_does_not_wander():
-    assert wandering(cp.PolySpline([Waypoint(0, [0, 3], 0, 0), Waypoint(2, [3, -1], 0, 0)])) == pytest.approx(
+    assert plan_excess_length(cp.PolySpline([Waypoint(0, [0, 3], 0, 0), Waypoint(2, [3, -1], 0, 0)])) == pytest.approx(
         0.0, abs=1e-14
     )
 
 
-def test_wandering_is_undefined_without_a_polyline():
+def test_excess_length_is_undefined_without_a_polyline():
     still = cp.PolySpline([Waypoint(0, 1, 0), Waypoint(1, 1, 0)])
-    assert np.isnan(wandering(still))
-    assert np.isnan(wandering(cp.TrigSpline([Waypoint(0, 1, 0), Waypoint(0.7, None, 2), Waypoint(2, 3, 0)], alpha=1.0)))
+    assert np.isnan(plan_excess_length(still))
+    assert np.isnan(
+        plan_excess_length(cp.TrigSpline([Waypoint(0, 1, 0), Waypoint(0.7, None, 2), Waypoint(2, 3, 0)], alpha=1.0))
+    )
 
 
-@pytest.mark.parametrize("objective", [path_length, PeakDerivative(1), SquaredDerivative(3)])
+@pytest.mark.parametrize("objective", [plan_length, PeakDerivative(1), SquaredDerivative(3)])
 def test_a_step_takes_no_path(objective):
     assert objective(cp.Step(2.0)) == 0.0
 
@@ -204,7 +206,7 @@ def test_scales_of_amplitude_and_time(factor, duration, shift, name):
     plan = PLANS[name]
     other = (factor * plan).retime(duration).shift(shift)
     rate = plan.duration / duration
-    assert path_length(other) == pytest.approx(factor * path_length(plan), rel=1e-8)
+    assert plan_length(other) == pytest.approx(factor * plan_length(plan), rel=1e-8)
     for nu in (1, 3):
         # The clock of a plan that starts late is known to a rounding of that start.
         slack = 1e-9 + 1e-13 * abs(shift) / duration
@@ -220,8 +222,8 @@ def test_a_turned_path_is_as_long(angle):
     turned = cp.TrigSpline(
         [Waypoint(t, *(jet @ turn.T)) for t, jet in zip(TIMES, JETS, strict=True)], alpha=4.0, warn=False
     )
-    assert path_length(turned) == pytest.approx(path_length(PLANS["trigonometric"]), rel=1e-8)
-    assert wandering(turned) == pytest.approx(wandering(PLANS["trigonometric"]), rel=1e-8)
+    assert plan_length(turned) == pytest.approx(plan_length(PLANS["trigonometric"]), rel=1e-8)
+    assert plan_excess_length(turned) == pytest.approx(plan_excess_length(PLANS["trigonometric"]), rel=1e-8)
     assert SquaredDerivative(3)(turned) == pytest.approx(SquaredDerivative(3)(PLANS["trigonometric"]), rel=1e-10)
 
 
@@ -234,10 +236,10 @@ def test_an_objective_of_a_users_own_may_declare_its_size():
 
     @of_size(1.0)
     def excess(plan):
-        return OBJECTIVES["wandering"](plan)
+        return OBJECTIVES["excess_length"](plan)
 
     points = [cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1, 0, 0)]
-    own, known = (cp.choose_alpha(points, objective) for objective in (excess, "wandering"))
+    own, known = (cp.choose_alpha(points, objective) for objective in (excess, "excess_length"))
     assert (own.alpha, own.tied, own.blow_up) == (known.alpha, known.tied, known.blow_up)
     assert own.tied
     assert declared_size(excess) == 1.0

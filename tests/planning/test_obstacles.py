@@ -1,4 +1,4 @@
-"""Obstacles: their distances against naive geometry, what the Protocol promises, and refusals."""
+"""Obstacles: their distances against naive geometry, what the Protocol promises, and rejections."""
 
 import dataclasses
 import math
@@ -198,12 +198,12 @@ def test_obstacles_are_frozen_and_hashable(thing):
         (lambda: HalfPlane((0.0, 1.0), INF), "offset must be finite, got inf"),
     ],
 )
-def test_bad_values_are_refused(make, message):
+def test_bad_values_are_rejected(make, message):
     with pytest.raises(ValueError, match=message):
         make()
 
 
-def test_what_is_no_number_is_refused():
+def test_what_is_no_number_is_rejected():
     with pytest.raises(TypeError, match="radius must be a number, got 'wide'"):
         Disc((0.0, 0.0), "wide")
     with pytest.raises(TypeError, match="x must be a number, got 'left'"):

@@ -651,7 +651,7 @@ GOOD = [Waypoint(0, [0, 0], 0), Waypoint(1, [1, 1]), Waypoint(2, [0, 0], 0)]
         ({"waypoints": [Waypoint(0, [0, FREE]), Waypoint(1, [1, FREE])]}, "every axis must have a prescribed entry"),
     ],
 )
-def test_bad_values_are_refused(arguments, message):
+def test_bad_values_are_rejected(arguments, message):
     with pytest.raises(ValueError, match=message):
         optimize_waypoints(**({"waypoints": GOOD} | arguments))
 
@@ -664,7 +664,7 @@ def test_bad_values_are_refused(arguments, message):
         ({"waypoints": [1, 2]}, r"waypoints\[0\] must be a Waypoint, got int"),
     ],
 )
-def test_bad_kinds_are_refused(arguments, message):
+def test_bad_kinds_are_rejected(arguments, message):
     with pytest.raises(TypeError, match=message):
         optimize_waypoints(**({"waypoints": GOOD} | arguments))
 

@@ -167,7 +167,7 @@ def test_a_plan_that_returns_to_zero_can_be_continued(alpha):
         assert joined(2.0) == 1.0
 
 
-def test_positions_that_differ_are_refused():
+def test_positions_that_differ_are_rejected():
     with pytest.raises(
         ValueError, match=r"positions must agree where trajectories join, got \[0.0\] after \[1.0\] at 1 s"
     ):

@@ -86,7 +86,7 @@ def places(data, path=()):
         yield from places(value, (*path, key))
 
 
-def loaded_or_refused(data):
+def loaded_or_rejected(data):
     """A plan that works, or a ValueError; nothing else, and no warning."""
     try:
         plan = trajectory_from_dict(data)
@@ -116,7 +116,7 @@ def test_one_entry_replaced_or_lost(data):
             inner[where[-1]] = copy.deepcopy(data.draw(st.sampled_from(HOSTILE)))
         if not list(places(damaged)):
             break
-    loaded_or_refused(damaged)
+    loaded_or_rejected(damaged)
 
 
 json_like = st.recursive(
@@ -131,8 +131,8 @@ json_like = st.recursive(
 def test_any_json_in_any_place(saved, value, data):
     damaged = copy.deepcopy(saved)
     damaged[data.draw(st.sampled_from(sorted(damaged)))] = value
-    loaded_or_refused(damaged)
-    loaded_or_refused(value)
+    loaded_or_rejected(damaged)
+    loaded_or_rejected(value)
 
 
 @settings(max_examples=200, deadline=None)
@@ -146,7 +146,7 @@ def test_bytes_lost_or_changed(saved, data):
         else:
             del text[at : at + data.draw(st.integers(1, 40))]
     with contextlib.suppress(UnicodeDecodeError, json.JSONDecodeError):
-        loaded_or_refused(json.loads(bytes(text).decode()))
+        loaded_or_rejected(json.loads(bytes(text).decode()))
 
 
 def nested(kind, depth):

@@ -167,7 +167,7 @@ def test_where_no_digits_can_be_kept_their_loss_is_stated():
 @pytest.mark.parametrize("free", [0, 1])
 @pytest.mark.parametrize("gap", [0.1, 0.02, 0.005, 1e-3, 1e-4])
 def test_what_is_returned_is_right(gap, free):
-    """With free entries either the digits are there or the plan is refused."""
+    """With free entries either the digits are there or the plan is rejected."""
     jets = [[0, 0, 0], [1, 0, 0], [1, 0, 0], [0, 0, 0]]
     jets[1][1 + free] = jets[2][1 + free] = None
     times = [0, 0.5, 0.5 + gap, 1]

@@ -56,7 +56,7 @@ def attempt(make):
 
 @pytest.mark.parametrize("name", PLANS)
 @pytest.mark.parametrize("exponent", [-300, -160, -150, -100, -20, 20, 100, 150, 160, 300])
-def test_any_duration_is_right_or_refused(name, exponent):
+def test_any_duration_is_right_or_rejected(name, exponent):
     """The path at the same part of the duration, and its first derivative, by the chain rule."""
     plan, duration = PLANS[name], 10.0**exponent
     moved, said = attempt(lambda: plan.retime(duration))
@@ -76,7 +76,7 @@ def test_any_duration_is_right_or_refused(name, exponent):
 @pytest.mark.parametrize("name", PLANS)
 @pytest.mark.parametrize("dt", [1e300, -1e300, 1e17, 3e15, 1e13, 1e11, 1e9 / 3])
 @pytest.mark.filterwarnings("ignore:times must keep the intervals")
-def test_any_shift_is_right_or_refused(name, dt):
+def test_any_shift_is_right_or_rejected(name, dt):
     """To what the clock resolves there, as long as that is below 1e-3 of an interval."""
     plan = PLANS[name]
     moved, said = attempt(lambda: plan.shift(dt))

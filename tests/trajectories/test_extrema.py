@@ -434,7 +434,7 @@ def test_bounds_are_not_rounded_inwards(seed):
     assert found.lower <= min(start, end) <= max(start, end) <= found.upper
 
 
-def test_bounds_that_cannot_be_reached_are_refused():
+def test_bounds_that_cannot_be_reached_are_rejected():
     with pytest.raises(ValueError, match="rtol = 1e-12 must be reached within 200 cells"):
         MOVE.bounds(lambda jet: jet[0, 0], 0, 1.0, rtol=1e-12, max_cells=200)
 

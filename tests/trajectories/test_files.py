@@ -1,4 +1,4 @@
-"""Trajectories as JSON and CSV: numbers to the last bit, and what is not a trajectory is refused in one line."""
+"""Trajectories as JSON and CSV: numbers to the last bit, and what is not a trajectory is rejected in one line."""
 
 import errno
 import json
@@ -159,7 +159,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("name", BAD)
-def test_what_is_not_a_trajectory_is_refused(name, tmp_path):
+def test_what_is_not_a_trajectory_is_rejected(name, tmp_path):
     """From plain data as ValueError; from a file with its name in front."""
     data, message = BAD[name]
     with pytest.raises(ValueError, match=message):

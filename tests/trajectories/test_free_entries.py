@@ -97,7 +97,7 @@ def test_units_do_not_decide_what_is_singular():
     ],
     ids=["paper", "shifted", "odd about the middle", "no position", "velocities"],
 )
-def test_singular_free_entries_are_refused(times, jets):
+def test_singular_free_entries_are_rejected(times, jets):
     with pytest.raises(ValueError, match=r"must not make the system singular.* got a relative singular value"):
         PolySpline(waypoints(times, jets))
 

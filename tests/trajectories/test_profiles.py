@@ -309,7 +309,7 @@ def test_series_at_a_symbol(kind):
         assert np.abs(np.array(function(moment)).reshape(2, 6).T - wanted).max() <= 2e-15
 
 
-# What is refused
+# What is rejected
 
 
 def wrong(kind=SCurve, final=1.0, initial=0.0, **changed):
@@ -343,7 +343,7 @@ def wrong(kind=SCurve, final=1.0, initial=0.0, **changed):
         ({"final": 1e300, "velocity": 1e-300}, "limits must give segments of finite durations, got"),
     ],
 )
-def test_what_is_refused(kind, changed, message):
+def test_what_is_rejected(kind, changed, message):
     if kind is SCurve and changed.get("acceleration") == 1e300:
         changed = changed | {"jerk": 1e300}
     with pytest.raises(ValueError, match=message):
@@ -362,7 +362,7 @@ def test_limits_are_given_by_name():
         Trapezoid(1.0, 0.0, 1.0)
 
 
-def test_a_file_that_lacks_a_limit_is_refused():
+def test_a_file_that_lacks_a_limit_is_rejected():
     data = wrong().to_dict()
     del data["jerk"]
     with pytest.raises(ValueError, match="a SCurve needs the entry 'jerk'"):

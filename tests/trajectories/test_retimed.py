@@ -345,7 +345,7 @@ def test_it_cannot_be_changed():
     assert not plan.breakpoints.flags.writeable
 
 
-# What is refused
+# What is rejected
 
 
 @pytest.mark.parametrize(
@@ -371,12 +371,12 @@ def test_it_cannot_be_changed():
         (Step(4.0, 1.0), "law must be continuous, got a jump by 3 at 0 s"),
     ],
 )
-def test_laws_that_are_refused(law, message):
+def test_laws_that_are_rejected(law, message):
     with pytest.raises(ValueError, match=message):
         Retimed(PLANS["piecewise"], law)
 
 
-def test_other_arguments_that_are_refused():
+def test_other_arguments_that_are_rejected():
     with pytest.raises(ValueError, match="plan must have a duration, got a step"):
         Retimed(Step(1.0, time=1.0), SQUARE)
     with pytest.raises(TypeError, match="plan must be a Trajectory, got float"):

@@ -222,14 +222,14 @@ def test_numbers_of_other_types(number):
     assert POLY.series(number, 2) == POLY.series(float(number), 2)
 
 
-# What is refused
+# What is rejected
 
 
 @pytest.mark.parametrize(
     "t", ["0.5", None, 0.5 + 0j, [0.1, 0.2], (0.1,), np.array([0.1, 0.2]), np.array(["a"])], ids=repr
 )
 @pytest.mark.parametrize("name", ["PolySpline", "Step", "Sum", "Joined"])
-def test_what_is_no_time_is_refused_by_name(name, t):
+def test_what_is_no_time_is_rejected_by_name(name, t):
     with pytest.raises(TypeError, match="t must be one number or a symbol, got"):
         PLANS[name].series(t, 2)
 
@@ -248,7 +248,7 @@ def test_nan_is_no_time(name):
 
 @pytest.mark.parametrize("at", ["number", "symbol"])
 @pytest.mark.parametrize("name", ["PolySpline", "Step", "Stacked", "Joined"])
-def test_an_order_that_is_none_is_refused(name, at):
+def test_an_order_that_is_none_is_rejected(name, at):
     t = 0.3 if at == "number" else casadi.SX.sym("t")
     for order, kind in [(-1, ValueError), (1.5, ValueError), ("2", TypeError), (None, TypeError), (101, ValueError)]:
         with pytest.raises(kind, match="order must be"):

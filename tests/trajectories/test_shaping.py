@@ -265,7 +265,7 @@ def test_it_cannot_be_changed():
         (["a"], [1.0], "delays must be numbers"),
     ],
 )
-def test_impulses_that_are_refused(delays, weights, message):
+def test_impulses_that_are_rejected(delays, weights, message):
     with pytest.raises(ValueError, match=message):
         Shaper(delays, weights)
 
@@ -281,13 +281,13 @@ def test_impulses_that_are_refused(delays, weights, message):
         ((1.0, math.nan), r"damping must lie in \[0, 1\), got nan"),
     ],
 )
-def test_modes_that_are_refused(arguments, message):
+def test_modes_that_are_rejected(arguments, message):
     for make in (Shaper.zv, Shaper.zvd):
         with pytest.raises(ValueError, match=message):
             make(*arguments)
 
 
-def test_other_arguments_that_are_refused():
+def test_other_arguments_that_are_rejected():
     shaper = Shaper.zv(1.0)
     with pytest.raises(ValueError, match="derivatives must be a whole number from 0, got -1"):
         Shaper.zvd(1.0, 0.0, -1)
