@@ -233,7 +233,7 @@ class _Equations:
         network = prepared.network.for_trials()
         sampled, unknown = [], []
         for i, (block, place) in enumerate(zip(network.blocks, network.states, strict=True)):
-            linear = block.linear or block.driven or isinstance(block.traits.block, ct.StateSpace)
+            linear = block.linear or block.is_time_function or isinstance(block.traits.block, ct.StateSpace)
             if not linear and (self.discrete or block.period is not None):
                 unknown.append(block.name)
                 self.fixed[place] = True

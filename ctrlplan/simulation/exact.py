@@ -126,11 +126,11 @@ def sampled_states(a: Array, b: Array, samples: Array, timepts: Array, initial: 
     even = _spacing(timepts - timepts[0], float(timepts[-1] - timepts[0]))
     if even:  # spacings that differ by rounding alone share an exponential
         steps[:] = even
-    drive = np.concatenate([samples[:, :-1], np.diff(samples)]).T  # Taylor terms in the time of each interval
-    part = max(1, _NUMBERS // max(1, scale.size * (scale.size + drive.shape[1])))
+    terms = np.concatenate([samples[:, :-1], np.diff(samples)]).T  # Taylor terms in the time of each interval
+    part = max(1, _NUMBERS // max(1, scale.size * (scale.size + terms.shape[1])))
     with np.errstate(all="ignore"):
         if even and scale.size > _FEWEST:
-            out[:] = _marched(state, _changes(even * a, even * b, 2), drive.T.reshape(2, len(samples), -1))[0].T
+            out[:] = _marched(state, _changes(even * a, even * b, 2), terms.T.reshape(2, len(samples), -1))[0].T
             return (out * scale).T
         for begin in range(0, steps.size if scale.size else 0, part):
             these = slice(begin, begin + part)
@@ -138,11 +138,11 @@ def sampled_states(a: Array, b: Array, samples: Array, timepts: Array, initial: 
             h = spacings[:, None, None]
             changes = _changes(h * a, h * b, 2)
             change = changes[-1][which]
-            forced = change[:, :, scale.size :] @ drive[these, :, None]
+            forced = change[:, :, scale.size :] @ terms[these, :, None]
             found = out[begin + 1 : these.stop + 1]
             found[:] = _recurrence(change[:, :, : scale.size], forced, out[begin])
             for k in range(_first_overflow(found.T), len(found)):
-                series, own = drive[begin + k].reshape(2, -1, 1), [level[which[k]] for level in changes]
+                series, own = terms[begin + k].reshape(2, -1, 1), [level[which[k]] for level in changes]
                 found[k] = _carried(out[begin + k][:, None], series, own)[:, 0]
     return (out * scale).T
 

@@ -78,7 +78,9 @@ class Block:
     def changes_unseen(self) -> bool:
         """Whether the equations may switch at times that nobody has named, if they depend on time."""
         named = self.traits.breakpoints is not None or self.period is not None
-        functions = (self.system.outfcn, self.system.updfcn) if not (self.linear or self.driven or named) else ()
+        functions = (
+            (self.system.outfcn, self.system.updfcn) if not (self.linear or self.is_time_function or named) else ()
+        )
         return any(function is not None and not of_library(function) for function in functions)
 
     @property
@@ -93,7 +95,7 @@ class Block:
         return inner if inner is not None and inner.noutputs == self.system.noutputs else None
 
     @property
-    def driven(self) -> bool:
+    def is_time_function(self) -> bool:
         """Whether the outputs are, over a segment, functions of time alone."""
         return self.plan is not None or self.delay is not None
 
@@ -265,13 +267,13 @@ class Network:
         return self.wire.shape[1]
 
     @cached_property
-    def driven(self) -> NDArray[np.intp]:
+    def time_rows(self) -> NDArray[np.intp]:
         """Signals that are functions of time alone over a segment: inputs, plans, delayed signals."""
         rows = [np.arange(self.ninputs)]
         rows += [
             np.arange(place.start, place.stop)
             for block, place in zip(self.blocks, self.outputs, strict=True)
-            if block.driven
+            if block.is_time_function
         ]
         return np.concatenate(rows)
 
@@ -296,7 +298,7 @@ class Network:
             at once are one step.
         """
         known = np.zeros(self.nsignals, dtype=bool)
-        known[self.driven] = True
+        known[self.time_rows] = True
         feeds_on = _dependencies(self, feeds)
         wanted = _reached(feeds_on, needed)
         steps: list[Step] = []
@@ -348,7 +350,7 @@ def known_feedthrough(block: Block) -> NDArray[np.bool_] | None:
     shape = (block.system.noutputs, block.system.ninputs or 0)
     if block.linear:
         return np.asarray(block.system.D) != 0.0
-    if block.driven or block.system.outfcn is None:
+    if block.is_time_function or block.system.outfcn is None:
         return np.zeros(shape, dtype=bool)
     declared = block.traits.feedthrough
     if declared is None:

@@ -62,10 +62,10 @@ class NumericalSolver(Solver, Protocol):
     def instants(self, first: float, last: float, values: Callable[[Array], Array]) -> list[float]:
         """Times of a run at which the equations switch, where functions of time (n,) -> (nsignals, n) alone decide."""
 
-    def rates(self, times: Array, states: Array, driven: Array) -> Array:
+    def rates(self, times: Array, states: Array, time_values: Array) -> Array:
         """Rates (nstates, ntime) of the states."""
 
-    def slopes(self, times: Array, states: Array, driven: Array) -> Array:
+    def slopes(self, times: Array, states: Array, time_values: Array) -> Array:
         """Derivatives of the rates by the states, (ntime, nstates, nstates)."""
 
 
@@ -223,8 +223,8 @@ class Attempt(Generic[S]):
         found = self.effects * error > allowed[:, None]
         if found.any() and self.job.blocks.blocks_with("period"):
             # What feeds back from sample to sample is in no slope: only what others depend on absolutely counts.
-            t, x, driven = self.visited()
-            size, rates = np.abs(states - scales.shift[:, None]).max(axis=1), self.solver.rates(t, x, driven)
+            t, x, time_values = self.visited()
+            size, rates = np.abs(states - scales.shift[:, None]).max(axis=1), self.solver.rates(t, x, time_values)
             found &= np.abs(self._slopes[: t.size]).max(axis=0) * size > _STEEP * np.abs(rates).max(
                 axis=1, keepdims=True
             )
@@ -238,11 +238,15 @@ class Attempt(Generic[S]):
     @cached_property
     def _slopes(self) -> Array:
         """Derivatives of the rates by the states, (nplaces, nstates, nstates), first at the visited times."""
-        t, x, driven = self.visited()
+        t, x, time_values = self.visited()
         some = slice(None, None, VISITED // _ASTRAY)
         # Samples that are a turn of an angle apart see one slope of its sine, which may be 0.
         astray = x[:, some] * (1.0 + _JITTER * np.random.default_rng(0).uniform(-1.0, 1.0, x[:, some].shape))
-        places = np.append(t, t[some]), np.append(x, astray, axis=1), np.append(driven, driven[:, some], axis=1)
+        places = (
+            np.append(t, t[some]),
+            np.append(x, astray, axis=1),
+            np.append(time_values, time_values[:, some], axis=1),
+        )
         return self.on_trial(self.solver.slopes, *places, (-1, len(x), len(x)))
 
     def on_trial(
@@ -250,7 +254,7 @@ class Attempt(Generic[S]):
         function: Callable[[Array, Array, Array], Array],
         t: Array,
         x: Array,
-        driven: Array,
+        time_values: Array,
         shape: tuple[int, ...],
     ) -> Array:
         """What a function of many times finds at states that a run need not have reached; nan where blocks raise.
@@ -258,12 +262,12 @@ class Attempt(Generic[S]):
         Its result has a shape, in which -1 stands for the times.
         """
         if not self.solver.calls_blocks:
-            return function(t, x, driven)
+            return function(t, x, time_values)
         axis, empty = shape.index(-1), np.full([abs(size) for size in shape], np.nan)
 
         def at(some: slice) -> Array | None:
             try:
-                return function(t[some], x[:, some], driven[:, some])
+                return function(t[some], x[:, some], time_values[:, some])
             except (KeyboardInterrupt, TimeLimitError):
                 raise
             except BaseException:  # outside of a block's domain, which a made-up argument may leave
@@ -302,12 +306,12 @@ class Attempt(Generic[S]):
 
     def noise(self) -> Array:
         """Rounding noise of the rates along the run, times its duration."""
-        t, x, driven = self.visited()
+        t, x, time_values = self.visited()
         rng = np.random.default_rng(0)
-        plain, found = self.on_trial(self.solver.rates, t, x, driven, (len(x), -1)), np.zeros(len(x))
+        plain, found = self.on_trial(self.solver.rates, t, x, time_values, (len(x), -1)), np.zeros(len(x))
         for _ in range(3):
             near = x * (1.0 + np.finfo(float).eps * rng.choice([-1.0, 1.0], x.shape))
-            apart = np.abs(self.on_trial(self.solver.rates, t, near, driven, (len(x), -1)) - plain)
+            apart = np.abs(self.on_trial(self.solver.rates, t, near, time_values, (len(x), -1)) - plain)
             found = np.maximum(found, np.where(np.isfinite(apart), apart, 0.0).max(axis=1, initial=0.0))
         return found * float(self.run.times[-1] - self.run.times[0])
 
@@ -318,9 +322,11 @@ class Attempt(Generic[S]):
         return t, self.run.states[:, some], signal_values(self.time_signals, t)
 
     def _see(self, t: Array, x: Array) -> Snapshot:
-        driven = signal_values(self.time_signals, t)
-        y = self.solver.outputs(t, x, driven)
-        return Snapshot(t, x, driven[: self.job.prepared.ninputs], y, lambda: self.solver.signals(t, x, driven))
+        time_values = signal_values(self.time_signals, t)
+        y = self.solver.outputs(t, x, time_values)
+        return Snapshot(
+            t, x, time_values[: self.job.prepared.ninputs], y, lambda: self.solver.signals(t, x, time_values)
+        )
 
     def _carry(self, k: int, t: float) -> Array:
         start = float(self.run.times[k])
@@ -335,8 +341,8 @@ class Attempt(Generic[S]):
         equations, job = self.equations, self.job
         if equations is None:
             return np.zeros((0, 0))
-        driven = signal_values(self.time_signals, job.times[:1])[:, 0]
-        return _slope(lambda x: equations.rates(job.first, x, driven), job.state)
+        time_values = signal_values(self.time_signals, job.times[:1])[:, 0]
+        return _slope(lambda x: equations.rates(job.first, x, time_values), job.state)
 
 
 def equations_of(job: Job, network: Network) -> Interpreted | None:
@@ -351,10 +357,12 @@ def _in_doubt(attempt: Attempt[S]) -> str:
     t, x = run.times[some], run.states[:, some]
     if not x.size or not np.isfinite(x).all():
         return ""
-    driven = signal_values(attempt.time_signals, t)
+    time_values = signal_values(attempt.time_signals, t)
     own = scales.uncertainty(run.states, job.rtol) * attempt.growth / attempt.tighter
     uncertainty, count = own + attempt.drift, len(job.prepared.output_labels)
-    worst, ranges = doubt(lambda near: attempt.on_trial(solver.outputs, t, near, driven, (count, -1)), x, uncertainty)
+    worst, ranges = doubt(
+        lambda near: attempt.on_trial(solver.outputs, t, near, time_values, (count, -1)), x, uncertainty
+    )
     allowed = max(_DOUBTED, 100.0 * job.rtol) * ranges
     lost = (ranges > 0.0) & (worst > allowed)
     if not lost.any():

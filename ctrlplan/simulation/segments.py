@@ -61,10 +61,10 @@ class Solver(Protocol):
     def advance(self, series: Series, left: float, grid: Array, state: Array) -> Array:
         """States (nstates, ngrid) at times of a segment, of which the last is its end."""
 
-    def signals(self, times: Array, states: Array, driven: Array) -> Array:
+    def signals(self, times: Array, states: Array, time_values: Array) -> Array:
         """All signals (nsignals, ntime)."""
 
-    def outputs(self, times: Array, states: Array, driven: Array) -> Array:
+    def outputs(self, times: Array, states: Array, time_values: Array) -> Array:
         """Outputs (noutputs, ntime) of the whole."""
 
 
@@ -256,7 +256,7 @@ class _Memory:
         blocks = network.blocks_with("delay")
         self._time_signals = [signal for signal in time_signals if isinstance(signal, DelayedSignal)]
         self._fed = [network.fed[i] for i in blocks]
-        self._wires, self._driven = [network.wire[network.inputs[i]] for i in blocks], network.driven
+        self._wires, self._time_rows = [network.wire[network.inputs[i]] for i in blocks], network.time_rows
         self._solver, self._resolution = solver, resolution
         self.delays = [signal.delay for signal in self._time_signals]
 
@@ -274,7 +274,7 @@ class _Memory:
         if right - left > _SHORTEST * min(self.delays) and any(_unresolved(p, self._resolution) for p in pieces):
             return False
         for signal, piece, wire in zip(self._time_signals, pieces, self._wires, strict=True):
-            signal.record(Series(left, right, piece, *_combined_bounds(wire, self._driven, series)))
+            signal.record(Series(left, right, piece, *_combined_bounds(wire, self._time_rows, series)))
         return True
 
 
@@ -372,11 +372,11 @@ def _bounds(time_signals: Sequence[TimeSignal], moment: float, left: float, righ
     return tuple(np.concatenate([np.zeros(0), *(pair[side] for pair in found)]) for side in (0, 1))  # type: ignore[return-value]
 
 
-def _combined_bounds(wire: Array, driven: NDArray[np.intp], series: Series) -> tuple[Array, Array]:
+def _combined_bounds(wire: Array, time_rows: NDArray[np.intp], series: Series) -> tuple[Array, Array]:
     """Bounds of sums of signals, where only functions of time are summed."""
-    others = np.delete(wire, driven, axis=1)
+    others = np.delete(wire, time_rows, axis=1)
     known = ~np.any(others != 0.0, axis=1)
-    weights = wire[:, driven]
+    weights = wire[:, time_rows]
     ends = [
         np.where(weights != 0.0, weights, 0.0) * np.where(weights != 0.0, end, 0.0) for end in (series.low, series.high)
     ]

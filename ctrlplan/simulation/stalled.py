@@ -81,7 +81,7 @@ def cause(network: Network, params: Params, t: float, x: Array, w: Array, span: 
 def _continuous(network: Network, params: Params) -> Iterator[tuple[int, Block, Values]]:
     """Nonlinear continuous blocks, and their values on copies of what they remember."""
     for i, block in enumerate(network.blocks):
-        if block.linear or block.driven or block.period is not None:
+        if block.linear or block.is_time_function or block.period is not None:
             continue
         own = Block(trial_copy(block.system), block.params) if can_remember(block.system) else block
         yield i, block, _values(own, params)
