@@ -243,7 +243,7 @@ def _even_segment(
 ) -> Array:
     """Same, for evenly spaced samples, a power of two of them, `per`, in each cell of length h."""
     (count, n), m = state.shape, b.shape[-1]
-    whole, rest = divmod(samples.size, per)
+    whole, remainder = divmod(samples.size, per)
     last = int(duration // h)  # the cell in which the segment ends
     cells = series(h * np.arange(max(last, whole) + 1, dtype=float), h)
     chain = cells.reshape(-1, cells.shape[2])
@@ -265,12 +265,12 @@ def _even_segment(
     rows[:, :, :n] += read[..., None]
     main = out[:, :, : whole * per].reshape(*out.shape[:2], whole, per)
     np.matmul(known[:, None, :whole], rows, out=main)
-    out[:, :, whole * per :] = (known[:, None, whole : whole + 1] @ rows[..., :rest])[:, :, 0]
+    out[:, :, whole * per :] = (known[:, None, whole : whole + 1] @ rows[..., :remainder])[:, :, 0]
     for i in np.flatnonzero(~np.isfinite(out).all(axis=(1, 2))):
         main[i] = matrix_product(known[i, :whole], rows[i])
-        out[i, :, whole * per :] = matrix_product(known[i, whole : whole + 1], rows[i, ..., :rest])[:, 0]
+        out[i, :, whole * per :] = matrix_product(known[i, whole : whole + 1], rows[i, ..., :remainder])[:, 0]
     if samples[-1] == duration:
-        ending, last = table[:, :, rest - 1], whole if rest else whole - 1
+        ending, last = table[:, :, remainder - 1], whole if remainder else whole - 1
     else:
         ending = _part(a, b, nterms, h, duration / h - last)
     return known[:, last, :n] + matrix_product(ending, known[:, last, :, None])[:, :, 0]
@@ -452,23 +452,23 @@ def _doubled_precisely(both: Array, least: NDArray[np.intp], nterms: int, levels
     while len(products) < orders.size:
         products.append(pair_product((both[..., :n], np.zeros_like(both[..., :n])), products[-1]))
     series = [np.stack(half, axis=-1) for half in zip(*products, strict=True)]
-    change, rest = (np.zeros((len(least), n, powers.size)) for _ in range(2))
+    change, errors = (np.zeros((len(least), n, powers.size)) for _ in range(2))
     found: list[Array] = []
     for level in range(levels, -1, -1):
         squared = least > level
         if squared.any():
-            old = change[squared], rest[squared]
+            old = change[squared], errors[squared]
             new = pair_sum(old, old, pair_product((old[0][..., :n], old[1][..., :n]), old))
             if m:
                 more = pair_product((old[0][..., n:], old[1][..., n:]), (shift, np.zeros_like(shift)), m)
                 forced = pair_sum((new[0][..., n:], new[1][..., n:]), more)
                 new[0][..., n:], new[1][..., n:] = forced
-            change[squared], rest[squared] = new[0] * powers, new[1] * powers
+            change[squared], errors[squared] = new[0] * powers, new[1] * powers
         if not squared.all():
             part = 0.5 ** (level - least[~squared, None, None, None])
             terms, small = ((half[~squared] * part**orders).reshape(-1, orders.size) for half in series)
-            sums = pair_product((terms, small), (_WEIGHTS[:nterms].T, _WEIGHTS_REST[:nterms].T))
-            change[~squared], rest[~squared] = (_arranged(half, n, m) for half in sums)
+            sums = pair_product((terms, small), (_WEIGHTS[:nterms].T, _WEIGHTS_ERROR[:nterms].T))
+            change[~squared], errors[~squared] = (_arranged(half, n, m) for half in sums)
         found.append(change.copy())
     return found
 
@@ -628,5 +628,5 @@ _PASCAL: Array = np.triu(pascal(_TERMS, kind="upper")).astype(float)
 _RATIOS = [[Fraction(factorial(j), factorial(i + j + 1)) for i in range(_TERMS + 1)] for j in range(_TERMS)]
 _WEIGHTS: Array = np.array(_RATIOS, dtype=float)
 """j!/(i + j + 1)!: what a^i b, in units of time, adds to the change of states by the input's Taylor term j."""
-_WEIGHTS_REST: Array = np.array([[ratio - Fraction(float(ratio)) for ratio in row] for row in _RATIOS], dtype=float)
+_WEIGHTS_ERROR: Array = np.array([[ratio - Fraction(float(ratio)) for ratio in row] for row in _RATIOS], dtype=float)
 """What rounding cuts off them."""

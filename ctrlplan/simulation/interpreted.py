@@ -132,15 +132,15 @@ class Interpreted:
     def sampled(self, blocks: tuple[int, ...], t: float, x: Array, time_values: Array) -> Array:
         """State after some discrete blocks have taken a sample, each seeing the others' new outputs.
 
-        Blocks that declare `samples_first` go before the rest and see
+        Blocks that declare `samples_first` go before the others and see
         their own outputs as they were, which may come back to them at once.
         """
         first = tuple(i for i in blocks if self.network.blocks[i].traits.samples_first)
-        rest = tuple(i for i in blocks if i not in first)
+        others = tuple(i for i in blocks if i not in first)
         if first:
-            w = self._seen(rest, t, x, time_values) if rest else self.signals(t, x, time_values)
+            w = self._seen(others, t, x, time_values) if others else self.signals(t, x, time_values)
             x = self._after(first, t, x, w)
-        return self._after(rest, t, x, self._seen(rest, t, x, time_values)) if rest else x
+        return self._after(others, t, x, self._seen(others, t, x, time_values)) if others else x
 
     def _after(self, blocks: tuple[int, ...], t: float, x: Array, w: Array) -> Array:
         """State after some blocks have taken a sample of some signals."""
@@ -489,45 +489,45 @@ def _passed_on(image: Callable[[Array], Array], start: Array, times: int) -> Arr
     return None
 
 
-def _root(left_over: Callable[[Array], Array], guess: Array, names: str, t: float) -> Array:
+def _root(residual_of: Callable[[Array], Array], guess: Array, names: str, t: float) -> Array:
     """Solution of an algebraic loop by Newton's iteration, in one step where it is linear."""
     z = guess.copy()
-    rest = left_over(z)
+    residual = residual_of(z)
 
-    def trial_rest(z: Array) -> Array:
+    def trial_residual(z: Array) -> Array:
         try:
-            return left_over(z)
+            return residual_of(z)
         except Exception:  # outside of a block's domain
             return np.full(z.size, np.nan)
 
     for _ in range(50):
         size = 1.0 + np.abs(z)
-        if np.all(np.abs(rest) <= 1e-13 * size):
+        if np.all(np.abs(residual) <= 1e-13 * size):
             return z
         slope = np.empty((z.size, z.size))
         for j in range(z.size):
             step = np.zeros(z.size)
             step[j] = 1e-7 * size[j]
-            slope[:, j] = (trial_rest(z + step) - rest) / step[j]
+            slope[:, j] = (trial_residual(z + step) - residual) / step[j]
             if not np.isfinite(slope[:, j]).all():
-                slope[:, j] = (rest - trial_rest(z - step)) / step[j]
+                slope[:, j] = (residual - trial_residual(z - step)) / step[j]
         if not np.isfinite(slope).all():
             break
-        change = np.linalg.lstsq(slope, -rest, rcond=1e-14)[0]
-        before = np.abs(rest).max()
+        change = np.linalg.lstsq(slope, -residual, rcond=1e-14)[0]
+        before = np.abs(residual).max()
         for _ in range(30):
-            following = trial_rest(z + change)
+            following = trial_residual(z + change)
             if np.abs(following).max() < before:
                 break
             change = 0.5 * change
         else:
             break
-        z, rest = z + change, following
-    if np.all(np.abs(rest) <= 1e-9 * (1.0 + np.abs(z))):
+        z, residual = z + change, following
+    if np.all(np.abs(residual) <= 1e-9 * (1.0 + np.abs(z))):
         return z
     raise LoopError(
         f"the algebraic loop of the blocks {names} must have a solution that Newton's iteration finds, "
-        f"got a rest of {np.abs(rest).max():.3g} at {t:g} s"
+        f"got a residual of {np.abs(residual).max():.3g} at {t:g} s"
     )
 
 

@@ -22,7 +22,7 @@ _TOLERANCES = 1e-6, 1e-8
 _SHORTEST = 2.0**-20
 """Fractions below are taken for 0."""
 
-_REST = 0.8
+_SETTLED = 0.8
 """Part of the horizon after which the loop must be at rest."""
 
 _COUNTS = 20, 100_000
@@ -110,7 +110,7 @@ class Predictor(Frozen):
     horizon: float
     _prepared: Prepared
     _times: Array
-    _resting: int
+    _settled: int
     _rows: list[int]
     _low: Array
     _high: Array
@@ -153,7 +153,7 @@ class Predictor(Frozen):
             horizon=seconds,
             _prepared=prepared,
             _times=times,
-            _resting=int(np.searchsorted(times, _REST * seconds)),
+            _settled=int(np.searchsorted(times, _SETTLED * seconds)),
             _rows=[prepared.output_labels.index(label) for label in limits],
             _low=bounds[:, 0] + inset,
             _high=bounds[:, 1] - inset,
@@ -215,7 +215,7 @@ class Predictor(Frozen):
         if outputs is None:
             return False
         low, high, inset = self._low, self._high, self._inset
-        last = outputs[:, self._resting :]
+        last = outputs[:, self._settled :]
         least, greatest = last.min(axis=1), last.max(axis=1)
         return bool(
             (-_peaks(-outputs) >= low).all()

@@ -133,7 +133,7 @@ class AdmissibleSet(Fields):
             raise ValueError(f"margin must lie in (0, 1), got {margin}")
         problem = _problem(loop, limits, references, dict(disturbances or {}))
         rows, last = _determined(problem, share)
-        of_reference = rows.reference - rows.state @ problem.rest
+        of_reference = rows.reference - rows.state @ problem.equilibrium
         bounds = rows.bound + _shift(rows.state, of_reference, origin)
         self._set_fields(
             references=problem.references,
@@ -241,15 +241,15 @@ def _problem(
         [checked_finite(most, f"disturbances of {label}", minimum=0.0) for label, most in disturbances.items()]
     )
     c, d = c[rows] / scale[:, None], d[rows] / scale[:, None]
-    rest = np.asarray(-np.linalg.solve(a, b[:, columns]), dtype=float)
+    equilibrium = np.asarray(-np.linalg.solve(a, b[:, columns]), dtype=float)
     low, high = pairs.T / scale
     return Problem(
         a,
         c,
         b[:, shaken] * sizes,
         d[:, shaken] * sizes,
-        rest,
-        c @ rest + d[:, columns],
+        equilibrium,
+        c @ equilibrium + d[:, columns],
         np.where(np.isfinite(low), low, high - _FAR),
         np.where(np.isfinite(high), high, low + _FAR),
         np.where(np.isfinite(low + high), 0.5 * (low + high), np.where(np.isfinite(low), low, high)),
@@ -300,10 +300,10 @@ def _determined(problem: Problem, margin: float) -> tuple[Rows, float]:
     cells = output_cells(problem, seen, margin)
     lost, in_all = erosion(problem, cells)
     high, low = problem.high - _INSIDE, problem.low + _INSIDE
-    at_rest = (low + margin + in_all)[:, None], (high - margin - in_all)[:, None]
-    _check_rest(problem, *at_rest)
+    steady = (low + margin + in_all)[:, None], (high - margin - in_all)[:, None]
+    _check_equilibrium(problem, *steady)
     polytope = Polytope(problem, seen, _SPARED * margin)
-    polytope.take(np.zeros((len(high), 1, len(problem.a))), *at_rest, np.zeros(1))
+    polytope.take(np.zeros((len(high), 1, len(problem.a))), *steady, np.zeros(1))
     rows = elevated(cells.rows[: cells.needed])
     count, p, each, n = rows.shape
     rows, lost = rows.swapaxes(0, 1).reshape(p, count * each, n), lost[:count].swapaxes(0, 1).reshape(p, -1)
@@ -323,7 +323,7 @@ def _by_halving(count: int) -> Iterator[NDArray[np.intp]]:
         yield np.arange(stride, count, 2 * stride)
 
 
-def _check_rest(problem: Problem, low: Array, high: Array) -> None:
+def _check_equilibrium(problem: Problem, low: Array, high: Array) -> None:
     """Refuse limits between which the loop cannot rest."""
     p, m = problem.gain.shape
     both = np.vstack([problem.gain, -problem.gain])

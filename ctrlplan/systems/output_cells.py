@@ -32,7 +32,7 @@ class Problem:
     c: Array
     e: Array
     f: Array
-    rest: Array  # state at rest, by the reference
+    equilibrium: Array  # state at rest, by the reference
     gain: Array  # outputs at rest
     low: Array
     high: Array

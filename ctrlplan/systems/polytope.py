@@ -51,10 +51,10 @@ class Polytope:
     def __init__(self, problem: Problem, seen: Array, spare: float) -> None:
         self._gain, self._seen, self._spare = problem.gain, seen, spare
         u, s, _ = np.linalg.svd(problem.gain, full_matrices=False)
-        self._rest = u[:, s > 1e-12 * s.max(initial=0.0)]  # outputs at rest, by as many coordinates as they have
+        self._steady = u[:, s > 1e-12 * s.max(initial=0.0)]  # outputs at rest, by as many coordinates as they have
         # Bounds are taken from the middle between limits, as near to it as outputs at rest come.
-        self._centre = self._rest @ (self._rest.T @ problem.middle)
-        self._columns = np.zeros((seen.shape[1] + self._rest.shape[1] + 1, 0))
+        self._centre = self._steady @ (self._steady.T @ problem.middle)
+        self._columns = np.zeros((seen.shape[1] + self._steady.shape[1] + 1, 0))
         self._columns = self._column(np.zeros((1, len(seen))), np.zeros((1, len(self._gain))), np.ones(1))
         self._kept: list[tuple[Array, Array, float, float]] = []
         self._proofs: list[_Proof] = []
@@ -103,7 +103,7 @@ class Polytope:
 
     def _column(self, state: Array, output: Array, bound: Array) -> Array:
         """Rows as columns (coordinates and bound) of length 1."""
-        found = np.vstack([(state @ self._seen).T, (output @ self._rest).T, bound - output @ self._centre])
+        found = np.vstack([(state @ self._seen).T, (output @ self._steady).T, bound - output @ self._centre])
         return np.asarray(found / np.linalg.norm(found, axis=0))
 
     def _proof(self, column: Array) -> _Proof | None:
@@ -117,13 +117,13 @@ class Polytope:
             new = np.argpartition(gain, -_NEAR)[-_NEAR:] if gain.size > _NEAR else np.arange(gain.size)
             near = np.union1d(near, new)
             try:
-                factors, rest = nnls(every[:, near], column)
+                factors, residual = nnls(every[:, near], column)
             except RuntimeError:
                 return None
             used = factors > 0.0
             near, generators = near[used], every[:, near[used]]
             missed = column - generators @ factors[used]
-            if rest <= _PROVEN:
+            if residual <= _PROVEN:
                 return generators, np.linalg.pinv(generators)
         return None  # nothing is proven: the row is kept
 
