@@ -35,7 +35,7 @@ from ctrlplan.simulation.pairs import pair_product, pair_sum
 _TERMS = 18
 """Taylor terms of the input in a cell."""
 
-_FEWEST = 8
+_CROSSOVER = 8
 """Samples in a cell from which on a table for all cells is quicker than a series in each; and states up to which
 products of their matrices are quicker than steps one by one."""
 
@@ -129,7 +129,7 @@ def sampled_states(a: Array, b: Array, samples: Array, timepts: Array, initial: 
     terms = np.concatenate([samples[:, :-1], np.diff(samples)]).T  # Taylor terms in the time of each interval
     part = max(1, _NUMBERS // max(1, scale.size * (scale.size + terms.shape[1])))
     with np.errstate(all="ignore"):
-        if even and scale.size > _FEWEST:
+        if even and scale.size > _CROSSOVER:
             out[:] = _marched(state, _changes(even * a, even * b, 2), terms.T.reshape(2, len(samples), -1))[0].T
             return (out * scale).T
         for begin in range(0, steps.size if scale.size else 0, part):
@@ -214,9 +214,9 @@ def _segment(
     if per:
         h = per * float(samples[-1] - samples[0]) / (samples.size - 1)
         changes = _changes(h * a, h * b, nterms, halvings=per.bit_length() - 1)
-        while per >= _FEWEST and not np.isfinite(changes[-1]).all():  # an unstable system outgrows a cell
+        while per >= _CROSSOVER and not np.isfinite(changes[-1]).all():  # an unstable system outgrows a cell
             changes, per, h = changes[:-1], per // 2, 0.5 * h
-        if per >= _FEWEST:
+        if per >= _CROSSOVER:
             return _even_segment(a, b, series, duration, nterms, per, h, changes, samples, state, read, out)
     h = duration / ncells
     terms = series(h * np.arange(ncells, dtype=float), h)
@@ -338,8 +338,8 @@ def _samples_per_cell(samples: Array, duration: float, longest: float) -> int:
     if not step or max(samples[0], duration - samples[-1]) > step:
         return 0
     # Longer cells than the square root and the table costs more than the march.
-    most = min(longest / step - 1.0, 2.0 * samples.size**0.5)
-    return 2 ** int(np.log2(most)) if most >= _FEWEST else 0
+    maximum = min(longest / step - 1.0, 2.0 * samples.size**0.5)
+    return 2 ** int(np.log2(maximum)) if maximum >= _CROSSOVER else 0
 
 
 def _spacing(samples: Array, duration: float) -> float:
@@ -362,9 +362,9 @@ def _changes(a: Array, b: Array, nterms: int, halvings: int = 0) -> list[Array]:
     """
     if a.ndim == 2:
         return [change[0] for change in _changes(a[None], b[None], nterms, halvings)]
-    products, least = _products(a, b)
-    levels = max(halvings, int(least.max()))
-    found = _doubled(products, least, nterms, levels)
+    products, minimum = _products(a, b)
+    levels = max(halvings, int(minimum.max()))
+    found = _doubled(products, minimum, nterms, levels)
     n = a.shape[1]
     own = np.array([change[..., :n] for change in found])
     lost = np.any(_cancelling(own[:-1], own[:-1], own[1:]), axis=0, out=np.zeros(len(a), dtype=bool))
@@ -373,7 +373,7 @@ def _changes(a: Array, b: Array, nterms: int, halvings: int = 0) -> list[Array]:
         powers = np.moveaxis(products[large, :, :n], -1, 0)
         lost[large] |= np.any(_cancelling(powers[:1], powers[:-1], powers[1:]), axis=0)
     if lost.any():
-        precise = _doubled_precisely(products[lost, :, :, 0], least[lost], nterms, levels)
+        precise = _doubled_precisely(products[lost, :, :, 0], minimum[lost], nterms, levels)
         for change, better in zip(found, precise, strict=True):
             change[lost] = np.where(np.isfinite(better).all(axis=(1, 2), keepdims=True), better, change[lost])
     return found
@@ -411,21 +411,21 @@ def _products(a: Array, b: Array) -> tuple[Array, NDArray[np.intp]]:
     return np.stack(products, axis=-1), halvings.astype(np.intp)
 
 
-def _doubled(products: Array, least: NDArray[np.intp], nterms: int, levels: int) -> list[Array]:
+def _doubled(products: Array, minimum: NDArray[np.intp], nterms: int, levels: int) -> list[Array]:
     """Changes over 2^-levels, ..., 1/2, 1 units of time: by the series up to 2^-least, then by squaring."""
     n, m = products.shape[1], products.shape[2] - products.shape[1]
     shift, powers = _shift(nterms, m, 1.0), np.repeat(0.5 ** np.arange(nterms), m)
     orders = np.arange(1.0, products.shape[3] + 1.0)
     found: list[Array] = []
     for level in range(levels, -1, -1):
-        change, squared = np.empty((len(least), n, n + nterms * m)), least > level
+        change, squared = np.empty((len(minimum), n, n + nterms * m)), minimum > level
         if squared.any():
             before = found[-1][squared]
             after = _followed(before[:, :, None, :], before, shift)[:, :, 0]
             after[..., n:] *= powers
             change[squared] = after
         if not squared.all():
-            terms, shorter = (products, least) if not squared.any() else (products[~squared], least[~squared])
+            terms, shorter = (products, minimum) if not squared.any() else (products[~squared], minimum[~squared])
             if (shorter < level).any():
                 terms = terms * (0.5 ** (level - shorter[:, None, None, None])) ** orders
             # By einsum, equal rows have equal sums, which a product of matrices does not promise.
@@ -443,7 +443,7 @@ def _cancelling(left: Array, right: Array, result: Array) -> NDArray[np.bool_]:
     return found
 
 
-def _doubled_precisely(both: Array, least: NDArray[np.intp], nterms: int, levels: int) -> list[Array]:
+def _doubled_precisely(both: Array, minimum: NDArray[np.intp], nterms: int, levels: int) -> list[Array]:
     """Same as `_doubled` in twice the digits, from [a, b] in a time of 2^-least."""
     n, m = both.shape[1], both.shape[2] - both.shape[1]
     powers = np.concatenate([np.ones(n), np.repeat(0.5 ** np.arange(nterms), m)])
@@ -452,10 +452,10 @@ def _doubled_precisely(both: Array, least: NDArray[np.intp], nterms: int, levels
     while len(products) < orders.size:
         products.append(pair_product((both[..., :n], np.zeros_like(both[..., :n])), products[-1]))
     series = [np.stack(half, axis=-1) for half in zip(*products, strict=True)]
-    change, errors = (np.zeros((len(least), n, powers.size)) for _ in range(2))
+    change, errors = (np.zeros((len(minimum), n, powers.size)) for _ in range(2))
     found: list[Array] = []
     for level in range(levels, -1, -1):
-        squared = least > level
+        squared = minimum > level
         if squared.any():
             old = change[squared], errors[squared]
             new = pair_sum(old, old, pair_product((old[0][..., :n], old[1][..., :n]), old))
@@ -465,7 +465,7 @@ def _doubled_precisely(both: Array, least: NDArray[np.intp], nterms: int, levels
                 new[0][..., n:], new[1][..., n:] = forced
             change[squared], errors[squared] = new[0] * powers, new[1] * powers
         if not squared.all():
-            part = 0.5 ** (level - least[~squared, None, None, None])
+            part = 0.5 ** (level - minimum[~squared, None, None, None])
             terms, small = ((half[~squared] * part**orders).reshape(-1, orders.size) for half in series)
             sums = pair_product((terms, small), (_WEIGHTS[:nterms].T, _WEIGHTS_ERROR[:nterms].T))
             change[~squared], errors[~squared] = (_arranged(half, n, m) for half in sums)
@@ -560,7 +560,7 @@ def _recurrence(change: Array, forced: Array, state: Array) -> Array:
     side by side from a state still unknown, then that state from block to block.
     """
     nsteps, n = change.shape[:2]
-    if n > _FEWEST:
+    if n > _CROSSOVER:
         return _one_by_one(change, forced, state)
     per = int(np.ceil(nsteps**0.5))
     steps = np.zeros((per * -(-nsteps // per), n, n + 1))

@@ -33,7 +33,7 @@ from ctrlplan.symbolic.trials import can_remember, trial_copy, values_of
 Call = Callable[[float, Array, Array], None]
 """(t, state of the network, its signals): puts a block's outputs among the signals."""
 
-_LEAST = 2.3e-14
+_MIN_RTOL = 2.3e-14
 """Smallest relative tolerance of scipy's solvers."""
 
 _SHARED = tuple(int(part) for part in scipy.__version__.split(".")[:2]) < (1, 17)
@@ -288,7 +288,7 @@ class InterpretedSolver:
 
     def __init__(self, equations: Interpreted, tolerances: Tolerances, scales: Scales) -> None:
         self._equations, self._scales = equations, scales
-        self._rtol, self._atol = max(tolerances.rtol, _LEAST), tolerances.atol
+        self._rtol, self._atol = max(tolerances.rtol, _MIN_RTOL), tolerances.atol
         self._bounded = any(b.changes_unseen and b.depends_on_time for b in equations.network.blocks)
         self._segments, self._next = 0, 0
         self.switches: list[float] = []

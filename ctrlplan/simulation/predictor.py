@@ -137,9 +137,9 @@ class Predictor(Frozen):
         governed = tuple(prepared.input_labels if references is None else references)
         _check_known(governed, prepared.input_labels, "references", "inputs")
         _check_known(tuple(limits), prepared.output_labels, "limits", "outputs")
-        for label, value, most in (("margin", margin, 0.5), ("resolution", resolution, 1.0)):
-            if not 0.0 < float(value) < most:
-                raise ValueError(f"{label} must lie in (0, {most:g}), got {value}")
+        for label, value, maximum in (("margin", margin, 0.5), ("resolution", resolution, 1.0)):
+            if not 0.0 < float(value) < maximum:
+                raise ValueError(f"{label} must lie in (0, {maximum:g}), got {value}")
         seconds = checked_finite(horizon, "horizon", above=0.0)
         if isinstance(count, bool) or int(count) != count or not _COUNTS[0] <= count <= _COUNTS[1]:
             raise ValueError(f"count must be a whole number from {_COUNTS[0]} to {_COUNTS[1]}, got {count}")
@@ -216,13 +216,13 @@ class Predictor(Frozen):
             return False
         low, high, inset = self._low, self._high, self._inset
         last = outputs[:, self._settled :]
-        least, greatest = last.min(axis=1), last.max(axis=1)
+        minimum, maximum = last.min(axis=1), last.max(axis=1)
         return bool(
             (-_peaks(-outputs) >= low).all()
             and (_peaks(outputs) <= high).all()
-            and (least >= low + inset).all()
-            and (greatest <= high - inset).all()
-            and (greatest - least <= inset).all()
+            and (minimum >= low + inset).all()
+            and (maximum <= high - inset).all()
+            and (maximum - minimum <= inset).all()
         )
 
     def _predicted(self, state: Array, reference: Array) -> Array | None:

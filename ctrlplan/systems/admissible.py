@@ -190,11 +190,11 @@ class AdmissibleSet(Fields):
         after = room - rise
         if after.min(initial=0.0) >= 0.0:
             return 1.0
-        least = room.min()
-        if least >= 0.0:
+        minimum = room.min()
+        if minimum >= 0.0:
             over = after < 0.0
             return float((room[over] / rise[over]).min())
-        return _inside(room, rise, 0.0 if least >= -self._margin else math.nan)
+        return _inside(room, rise, 0.0 if minimum >= -self._margin else math.nan)
 
 
 def _problem(
@@ -238,7 +238,10 @@ def _problem(
     rows, columns = [outputs.index(label) for label in limits], [inputs.index(label) for label in governed]
     shaken = [inputs.index(label) for label in disturbances]
     sizes = np.array(
-        [checked_finite(most, f"disturbances of {label}", minimum=0.0) for label, most in disturbances.items()]
+        [
+            checked_finite(magnitude, f"disturbances of {label}", minimum=0.0)
+            for label, magnitude in disturbances.items()
+        ]
     )
     c, d = c[rows] / scale[:, None], d[rows] / scale[:, None]
     equilibrium = np.asarray(-np.linalg.solve(a, b[:, columns]), dtype=float)
@@ -277,10 +280,10 @@ def _inside(room: Array, rise: Array, otherwise: float) -> float:
     short = room < 0.0
     if (rise[short] >= 0.0).any():
         return otherwise
-    least = (room[short] / rise[short]).max()
+    lower = (room[short] / rise[short]).max()
     over = ~short & (rise > room)
-    most = min(1.0, (room[over] / rise[over]).min(initial=1.0))
-    return float(most) if least <= most else otherwise
+    upper = min(1.0, (room[over] / rise[over]).min(initial=1.0))
+    return float(upper) if lower <= upper else otherwise
 
 
 def _shift(state: Array, reference: Array, origin: tuple[ArrayLike, ArrayLike] | None) -> Array | float:

@@ -213,7 +213,7 @@ class _Horizons:
         self.step: Array | None = None  # from coefficients to jets a period later, where that is always the same map
         self._start, self._end = plan.start, plan.end
         if self.shrinking:
-            self._least = _least_horizon(min_horizon, period, whole)
+            self._minimum = _minimum_horizon(min_horizon, period, whole)
             return
         if min_horizon is not None:
             raise ValueError(f'min_horizon must go with horizon = "shrinking", got {min_horizon} with {whole:g} s')
@@ -227,7 +227,7 @@ class _Horizons:
 
     def late(self, t: float) -> bool:
         """Whether what is left of the plan is too short for a fit."""
-        return self.shrinking and self._end - t < self._least * (1.0 - 1e-9)
+        return self.shrinking and self._end - t < self._minimum * (1.0 - 1e-9)
 
     def end(self, t: float) -> float:
         """Where a fit at a time ends."""
@@ -476,16 +476,16 @@ def _state(row: int, t: Value, x: Value, u: Value, params: Params) -> Value:
     return x[row]
 
 
-def _least_horizon(given: float | None, period: float, whole: float) -> float:
+def _minimum_horizon(given: float | None, period: float, whole: float) -> float:
     """Time to the end below which nothing is fitted."""
     if given is None:
         return max(period, min(5.0 * period, 0.5 * whole))
-    least = checked_finite(given, "min_horizon", above=0.0)
-    if not period <= least <= whole:
+    minimum = checked_finite(given, "min_horizon", above=0.0)
+    if not period <= minimum <= whole:
         raise ValueError(
-            f"min_horizon must lie between dt, {period:g} s, and the plan's duration, {whole:g} s, got {least:g} s"
+            f"min_horizon must lie between dt, {period:g} s, and the plan's duration, {whole:g} s, got {minimum:g} s"
         )
-    return least
+    return minimum
 
 
 def _checked_trigger(

@@ -12,7 +12,7 @@ from ctrlplan.simulation.job import Job, Record
 from ctrlplan.simulation.prepared import Prepared
 from ctrlplan.simulation.signals import breakpoints_of, signal_values
 
-_MOST_STEPS = 1e8
+_MAX_STEPS = 1e8
 """Maximum number of steps of a discrete system in a run."""
 
 _OFF_CLOCK = 1e-5
@@ -77,8 +77,8 @@ def _clock(times: Array, dt: float | bool) -> Array:
     if not rounding < 0.1 * period < np.inf:
         raise ValueError(f"timepts must tell instants {period:g} s apart, got times up to {np.abs(times).max():g} s")
     steps = (times - times[0]) / period
-    if steps[-1] > _MOST_STEPS:
-        raise ValueError(f"timepts must span {_MOST_STEPS:g} periods of a discrete system at most, got {steps[-1]:.3g}")
+    if steps[-1] > _MAX_STEPS:
+        raise ValueError(f"timepts must span {_MAX_STEPS:g} periods of a discrete system at most, got {steps[-1]:.3g}")
     wanted = np.round(steps)
     off = np.abs(steps - wanted)
     if off.max() > _OFF_CLOCK + rounding / period:
