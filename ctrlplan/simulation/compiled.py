@@ -26,7 +26,7 @@ from ctrlplan.symbolic.tracing import NotTraceableError, Trace, agrees
 Stats = Mapping[str, float]
 """Statistics of an integrator, by name."""
 
-_KEPT = 64
+_CACHE_SIZE = 64
 """Integrators kept, one for each pattern of output times; and functions, one for each number of times."""
 
 _FEW = 64
@@ -100,8 +100,8 @@ class Compiled:
             trace is not None and block.changes_unseen and trace.depends_on_time()
             for block, trace in zip(network.blocks, traces, strict=True)
         )
-        self._integrators: Lru[tuple[object, ...], ca.Function] = Lru(_KEPT)
-        self._maps: Lru[tuple[str, int], ca.Function] = Lru(_KEPT)
+        self._integrators: Lru[tuple[object, ...], ca.Function] = Lru(_CACHE_SIZE)
+        self._maps: Lru[tuple[str, int], ca.Function] = Lru(_CACHE_SIZE)
         self._equations: dict[int, dict[str, ca.SX]] = {}
 
     def __getstate__(self) -> dict[str, object]:
@@ -401,8 +401,8 @@ def _called(
     out = np.zeros((function.numel_out(0) // nrows if nrows else 0, nrows))
     given: tuple[Value, Callable[[], None]] = function.buffer()  # with a signature that CasADi's stubs do not have
     buffer, evaluate = given
-    kept = [np.ravel(values, order="F").astype(float) for values in arguments]
-    for k, values in enumerate(kept):
+    columns = [np.ravel(values, order="F").astype(float) for values in arguments]
+    for k, values in enumerate(columns):
         if values.size:
             buffer.set_arg(k, values.data)
     buffer.set_res(0, out.data)

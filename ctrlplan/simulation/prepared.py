@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from ctrlplan.simulation.compiled import Compiled
     from ctrlplan.symbolic.tracing import Trace
 
-_KEPT = 16
+_CACHE_SIZE = 16
 """Systems that `simulate` keeps by itself."""
 
 
@@ -334,4 +334,4 @@ def _checked_system(system: System) -> System:
     return system
 
 
-_FORMS: Lru[tuple[object, ...], Prepared] = Lru(_KEPT)
+_FORMS: Lru[tuple[object, ...], Prepared] = Lru(_CACHE_SIZE)

@@ -398,11 +398,11 @@ def _fixed(marks: Sequence[float], first: float, last: float, delays: list[float
 
 def apart(times: list[float]) -> list[float]:
     """Increasing times without those that are the same but for rounding; first and last stay."""
-    kept = [times[0]]
+    distinct = [times[0]]
     for t in times[1:-1]:
-        if t - kept[-1] > 1e-14 * max(abs(t), times[-1] - times[0]) < times[-1] - t:
-            kept.append(t)
-    return [*kept, times[-1]]
+        if t - distinct[-1] > 1e-14 * max(abs(t), times[-1] - times[0]) < times[-1] - t:
+            distinct.append(t)
+    return [*distinct, times[-1]]
 
 
 def _unresolved(coefficients: Array, resolution: float) -> bool:

@@ -306,14 +306,14 @@ def _determined(problem: Problem, margin: float) -> tuple[Rows, float]:
     steady = (low + margin + in_all)[:, None], (high - margin - in_all)[:, None]
     _check_equilibrium(problem, *steady)
     polytope = Polytope(problem, seen, _SPARED * margin)
-    polytope.take(np.zeros((len(high), 1, len(problem.a))), *steady, np.zeros(1))
+    polytope.add(np.zeros((len(high), 1, len(problem.a))), *steady, np.zeros(1))
     rows = elevated(cells.rows[: cells.needed])
     count, p, each, n = rows.shape
     rows, lost = rows.swapaxes(0, 1).reshape(p, count * each, n), lost[:count].swapaxes(0, 1).reshape(p, -1)
     ends = np.repeat(cells.ends[:count], each)
     # Coarse in time first: between two rows that are kept others follow sooner than after one.
     for places in _by_halving(ends.size):
-        polytope.take(rows[:, places], low[:, None] + lost[:, places], high[:, None] - lost[:, places], ends[places])
+        polytope.add(rows[:, places], low[:, None] + lost[:, places], high[:, None] - lost[:, places], ends[places])
     return polytope.reduced()
 
 

@@ -55,7 +55,7 @@ def create_replanner_iosystem(
     r"""Plan that is made again every period, from where the reference or the plant is.
 
     Every `dt` seconds a spline is fitted from the present jet to the goal's.
-    It is kept as a correction to `plan`: the transition of the same family and
+    It is applied as a correction to `plan`: the transition of the same family and
     angular frequency from the present deviation to the change of the goal.
     Nothing being in the way the correction is 0, and every plan is followed as
     it was made, whatever its kind. A polynomial between two jets plus its
@@ -299,9 +299,9 @@ class _Correction(ct.NonlinearIOSystem):  # type: ignore[misc]
         limits: tuple[tuple[int, Array], ...],
         name: str,
     ) -> None:
-        naxes, order, kept = plan.naxes, horizons.order, signals.goal_rows.stop - signals.goal_rows.start
+        naxes, order, ngoals = plan.naxes, horizons.order, signals.goal_rows.stop - signals.goal_rows.start
         states = ["start", "end", "lost", "missed", "fits"]
-        states += [f"goal[{k}]" for k in range(kept)]
+        states += [f"goal[{k}]" for k in range(ngoals)]
         states += [f"coefficient[{k}]" for k in range(naxes * 2 * (order + 1))]
         super().__init__(
             self._no_rates,
@@ -333,7 +333,7 @@ class _Correction(ct.NonlinearIOSystem):  # type: ignore[misc]
         )
         self._passed, self._naxes, self._order = signals.passed, naxes, order
         self._final = plan.final.tolist()
-        self._goal, self._fitted = slice(5, 5 + kept), slice(5 + kept, len(states))
+        self._goal, self._fitted = slice(5, 5 + ngoals), slice(5 + ngoals, len(states))
         extrema = plan.extrema()
         self._range = float((extrema.maximum - extrema.minimum).max())
         self._scales = [horizons.whole.horizon**k for k in range(order + 1)]
@@ -421,10 +421,10 @@ class _Correction(ct.NonlinearIOSystem):  # type: ignore[misc]
                 planned = self._plan.segment_jet_at(0.5 * (left + right), left, s, order)
                 if right <= met:
                     return planned + found.jet(coefficients, s + (left - t), order)
-                kept = extrapolated(goal, left - t)
-                kept = np.concatenate([kept, np.zeros((order + 1, self._naxes))])[: order + 1]
-                kept[0] -= self._plan.final if len(goal) else 0.0
-                return planned + np.stack([extrapolated(kept, value) for value in s.tolist()], axis=2)
+                after_end = extrapolated(goal, left - t)
+                after_end = np.concatenate([after_end, np.zeros((order + 1, self._naxes))])[: order + 1]
+                after_end[0] -= self._plan.final if len(goal) else 0.0
+                return planned + np.stack([extrapolated(after_end, value) for value in s.tolist()], axis=2)
 
             for nu, limit in self._limits:
                 times = stationary_times(jet, right - left, nu)
@@ -455,10 +455,10 @@ class _Correction(ct.NonlinearIOSystem):  # type: ignore[misc]
         changed = (x[_FITS] > 0.5) * (1.0 - live)
         found = []
         for row, goal, final in zip(rows, goals, self._final, strict=True):
-            kept = [row[0] * (1.0 - live) if not goal else changed * -final, *[0.0] * order]
+            after_end = [row[0] * (1.0 - live) if not goal else changed * -final, *[0.0] * order]
             for k in range(min(order + 1, len(goal))):
-                kept[k] = kept[k] + changed * taylor_value(goal[k:], t - x[_START])
-            found.append([value * live * math.factorial(k) + kept[k] for k, value in enumerate(row)])
+                after_end[k] = after_end[k] + changed * taylor_value(goal[k:], t - x[_START])
+            found.append([value * live * math.factorial(k) + after_end[k] for k, value in enumerate(row)])
         return found
 
     def _no_rates(self, t: float, x: Value, u: Value, params: Params) -> NoReturn:
