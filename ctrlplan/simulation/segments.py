@@ -175,23 +175,23 @@ def integrate(
     endless = equations is not None and network.delays_feed_delays(equations.feeds)
     hops = _MARKS if endless else _HOPS
     marks = [*breakpoints_of(time_signals), *network.breakpoints, *marks]
-    clock = _Clock(network, time_signals, _fixed(marks, first, last, memory.delays, hops), first, last)
+    schedule = _Schedule(network, time_signals, _fixed(marks, first, last, memory.delays, hops), first, last)
     longest = _longest(network, memory.delays, last - first)
     if pause is not None:
         longest = min(longest, (last - first) / 64.0)
     shortest = 1e-9 * (last - first) if pause is not None else np.inf
-    rounding = _rounding(time_signals, np.union1d(np.linspace(first, last, 257), clock.marks))
+    rounding = _rounding(time_signals, np.union1d(np.linspace(first, last, 257), schedule.marks))
     known: list[tuple[Array, Array]] = []  # times and states of each segment, its end left to the next
     segments: list[tuple[float, Series]] = []
     span: list[Series] = []
     left, reach = first, longest
-    x = clock.sample(equations, first, state)
+    x = schedule.sample(equations, first, state)
     while left < last:
         check(left)  # CVODES is not stopped within a segment, whose steps are bounded
-        right = clock.following(left)
-        right = clock.on(times, right) if right - left <= reach * (1.0 + 1e-9) else left + reach
+        right = schedule.following(left)
+        right = schedule.on(times, right) if right - left <= reach * (1.0 + 1e-9) else left + reach
         if memory.delays or not (span and span[-1].right >= right):
-            until = right if memory.delays else clock.fixed_after(left)
+            until = right if memory.delays else schedule.fixed_after(left)
             accuracy = resolution if memory.delays else RESOLVED
             span = _resolved(time_signals, 0.5 * (left + right), left, until, accuracy, rounding)
         series = next(s for s in span if left < s.right)
@@ -213,7 +213,7 @@ def integrate(
         segments.append((left, series))
         wanted = np.isin(grid, inside)
         known.append((np.append(left, grid[wanted]), np.column_stack([x, found[:, wanted]])))
-        before, x = x, clock.sample(equations, right, found[:, -1])
+        before, x = x, schedule.sample(equations, right, found[:, -1])
         left, reach = right, min(longest, 2.0 * reach)
         if pause is not None and pause(np.append(segments[-1][0], grid), np.column_stack([before, found])):
             break
@@ -278,7 +278,7 @@ class _Memory:
         return True
 
 
-class _Clock:
+class _Schedule:
     """Instants at which a segment must end: breakpoints, and samples of discrete blocks.
 
     Sample instants are multiples of a common tick, offset + k period as whole

@@ -162,11 +162,11 @@ def create_time_scaling_iosystem(
         return np.array([x[n], *(w * (slow[k] - slow[k + 1]) for k in range(n))])
 
     def out(t: Value, x: Value, u: Value, params: Params) -> Array:
-        clock = [sum(weight * x[k + 1] for k, weight in enumerate(row)) for row in weights[:highest]]
-        if clock:
-            clock[0] = 1.0 + clock[0]
-        clock = [value / math.factorial(k) for k, value in enumerate(clock, 1)]
-        rows = [composed(row, clock) for row in _series(plan, t - x[0], highest)]
+        scaling = [sum(weight * x[k + 1] for k, weight in enumerate(row)) for row in weights[:highest]]
+        if scaling:
+            scaling[0] = 1.0 + scaling[0]
+        scaling = [value / math.factorial(k) for k, value in enumerate(scaling, 1)]
+        rows = [composed(row, scaling) for row in _series(plan, t - x[0], highest)]
         return np.array([value * math.factorial(k) for row in rows for k, value in enumerate(row)])
 
     block = ct.nlsys(
