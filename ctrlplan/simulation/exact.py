@@ -156,10 +156,12 @@ def matrix_product(left: Array, right: Array) -> Array:
         product: Array = left @ right
         if np.isfinite(product).all():
             return product
-        lost, gone = ~np.isfinite(left), ~np.isfinite(right)
-        product = np.where(lost, 0.0, left) @ np.where(gone, 0.0, right)
-    votes = np.where(lost, np.sign(left), 0.0) @ np.sign(right) + np.sign(left) @ np.where(gone, np.sign(right), 0.0)
-    touched = lost.astype(float) @ (right != 0.0) + (left != 0.0) @ gone.astype(float) > 0.0
+        left_infinite, right_infinite = ~np.isfinite(left), ~np.isfinite(right)
+        product = np.where(left_infinite, 0.0, left) @ np.where(right_infinite, 0.0, right)
+    votes = np.where(left_infinite, np.sign(left), 0.0) @ np.sign(right) + np.sign(left) @ np.where(
+        right_infinite, np.sign(right), 0.0
+    )
+    touched = left_infinite.astype(float) @ (right != 0.0) + (left != 0.0) @ right_infinite.astype(float) > 0.0
     product[touched] = np.copysign(np.inf, votes[touched])
     product[np.isnan(product)] = np.inf
     return product
@@ -367,15 +369,15 @@ def _changes(a: Array, b: Array, nterms: int, halvings: int = 0) -> list[Array]:
     found = _doubled(products, minimum, nterms, levels)
     n = a.shape[1]
     own = np.array([change[..., :n] for change in found])
-    lost = np.any(_cancelling(own[:-1], own[:-1], own[1:]), axis=0, out=np.zeros(len(a), dtype=bool))
+    cancelled = np.any(_cancelling(own[:-1], own[:-1], own[1:]), axis=0, out=np.zeros(len(a), dtype=bool))
     large = np.abs(products[:, :, :n, 0]).sum(axis=1).max(axis=1) > 0.25 * _CANCELLED
     if large.any():
         powers = np.moveaxis(products[large, :, :n], -1, 0)
-        lost[large] |= np.any(_cancelling(powers[:1], powers[:-1], powers[1:]), axis=0)
-    if lost.any():
-        precise = _doubled_precisely(products[lost, :, :, 0], minimum[lost], nterms, levels)
+        cancelled[large] |= np.any(_cancelling(powers[:1], powers[:-1], powers[1:]), axis=0)
+    if cancelled.any():
+        precise = _doubled_precisely(products[cancelled, :, :, 0], minimum[cancelled], nterms, levels)
         for change, better in zip(found, precise, strict=True):
-            change[lost] = np.where(np.isfinite(better).all(axis=(1, 2), keepdims=True), better, change[lost])
+            change[cancelled] = np.where(np.isfinite(better).all(axis=(1, 2), keepdims=True), better, change[cancelled])
     return found
 
 
@@ -520,8 +522,8 @@ def _marched(state: Array, changes: list[Array], series: Array) -> Array:
 
 def _first_overflow(states: Array) -> int:
     """Index of the first time at which a state is not finite; their number where all are."""
-    lost = ~np.isfinite(states).all(axis=0)
-    return int(lost.argmax()) if lost.any() else lost.size
+    overflowed = ~np.isfinite(states).all(axis=0)
+    return int(overflowed.argmax()) if overflowed.any() else overflowed.size
 
 
 def _carried(states: Array, series: Array, changes: list[Array]) -> Array:

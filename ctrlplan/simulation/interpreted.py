@@ -558,13 +558,13 @@ class _Watched:
 
     def begin(self, calls: int) -> None:
         """Count anew, with so many calls about one instant."""
-        self._calls, self._about, self._asked = calls, -math.inf, 0
+        self._calls, self._about, self._count = calls, -math.inf, 0
 
     def __call__(self, t: float, z: Array) -> Array:
-        self._asked += 1
+        self._count += 1
         if abs(t - self._about) > _INSTANT * (self.right - self.left):
-            self._about, self._asked = t, 0
-        elif self._asked > self._calls:
+            self._about, self._count = t, 0
+        elif self._count > self._calls:
             raise _StalledError("the solution ends there")
         self._solver.review(self, t, z)
         inside = min(max(t, self._within[0]), self._within[1])

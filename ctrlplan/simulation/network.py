@@ -135,9 +135,9 @@ class Block:
             )
         if sample is None:
             raise TypeError(f"block {self.name} must declare a function that takes its samples")
-        taken = _once(lambda t, x, u: sample(t, x, u, own))
+        sampled_once = _once(lambda t, x, u: sample(t, x, u, own))
         output = self.output(params)
-        return (lambda t, x, u: output(t, taken(t, x, u), u)), taken
+        return (lambda t, x, u: output(t, sampled_once(t, x, u), u)), sampled_once
 
 
 @dataclass(frozen=True)
@@ -393,14 +393,14 @@ def _once(sample: BlockMap) -> BlockMap:
     """States after a sample, taken once though a run asks for them and for the outputs that follow from them."""
     last: tuple[object, Array] = (None, np.empty(0))
 
-    def taken(t: float, x: Array, u: Array) -> Array:
+    def sampled_once(t: float, x: Array, u: Array) -> Array:
         nonlocal last
-        asked = t, x.tobytes(), u.tobytes()
-        if asked != last[0]:
-            last = asked, np.ravel(sample(t, x, u))
+        arguments = t, x.tobytes(), u.tobytes()
+        if arguments != last[0]:
+            last = arguments, np.ravel(sample(t, x, u))
         return last[1].copy()
 
-    return taken
+    return sampled_once
 
 
 @dataclass(frozen=True)
@@ -432,13 +432,13 @@ def _flattened(system: System, above: Params) -> _Part:
     if wires.size and np.linalg.matrix_rank(wires) < len(wires):  # numpy 1.26 has no rank of an empty matrix
         raise ValueError(f"wires must not feed themselves, got such a one in {system.name}")
     v_y, v_r = np.linalg.solve(wires, connect @ read), np.linalg.solve(wires, external)
-    put_out = from_out @ through + from_in
+    passed = from_out @ through + from_in
     return _Part(
         [block for part in parts for block in part.blocks],
         inner + outer @ v_y,
         outer @ v_r,
-        from_out @ read + put_out @ v_y,
-        put_out @ v_r,
+        from_out @ read + passed @ v_y,
+        passed @ v_r,
     )
 
 
@@ -478,11 +478,11 @@ def _product(matrix: Array) -> Callable[[Array], Array]:
     """Product with a matrix in which 0 times nan is 0: a signal that is lost is lost only where it goes."""
     rows, columns = np.nonzero(matrix)
     if np.array_equal(rows, np.arange(len(matrix))) and np.all(matrix[rows, columns] == 1.0):
-        return partial(_taken, columns)
+        return partial(_selected, columns)
     return partial(_multiplied, csr_array(matrix))
 
 
-def _taken(rows: NDArray[np.intp], signals: Array) -> Array:
+def _selected(rows: NDArray[np.intp], signals: Array) -> Array:
     return signals[rows]
 
 

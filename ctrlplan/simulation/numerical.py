@@ -364,11 +364,11 @@ def _in_doubt(attempt: Attempt[S]) -> str:
         lambda near: attempt.on_trial(solver.outputs, t, near, time_values, (count, -1)), x, uncertainty
     )
     allowed = max(_DOUBTED, 100.0 * job.rtol) * ranges
-    lost = (ranges > 0.0) & (worst > allowed)
-    if not lost.any():
+    uncertain = (ranges > 0.0) & (worst > allowed)
+    if not uncertain.any():
         return ""
-    part = np.where(lost, worst / np.where(lost, ranges, 1.0), 0.0)
-    names = ", ".join(np.array(job.prepared.output_labels)[lost])
+    part = np.where(uncertain, worst / np.where(uncertain, ranges, 1.0), 0.0)
+    names = ", ".join(np.array(job.prepared.output_labels)[uncertain])
     needed = job.rtol * _DOUBTED / float(part.max())
     what = "are differences of larger terms" if attempt.growth <= _GROWTH else "grow apart from their neighbours"
     if np.any(attempt.drift > own):

@@ -195,16 +195,16 @@ class Predictor(Frozen):
             admissible: within `resolution`, or within a factor of 2 where it is
             smaller; 1 where r is admissible; nan where neither r nor v is.
         """
-        state, held, asked = self._checked(x, v, r)
-        if self._admissible(state, asked):
+        state, held, command = self._checked(x, v, r)
+        if self._admissible(state, command):
             return 1.0
-        if np.array_equal(held, asked) or not self._admissible(state, held):
+        if np.array_equal(held, command) or not self._admissible(state, held):
             return math.nan
         low, high = 0.0, 1.0
         # A first step must be found however short, or a far reference would be waited for for ever.
         while high - low > (self._resolution if low else _SHORTEST):
             middle = 0.5 * (low + high)
-            if self._admissible(state, held + middle * (asked - held)):
+            if self._admissible(state, held + middle * (command - held)):
                 low = middle
             else:
                 high = middle

@@ -301,7 +301,7 @@ def _determined(problem: Problem, margin: float) -> tuple[Rows, float]:
     """Rows that determine the set, and the time [s] up to which they look."""
     seen = seen_directions(problem)
     cells = output_cells(problem, seen, margin)
-    lost, in_all = erosion(problem, cells)
+    eroded, in_all = erosion(problem, cells)
     high, low = problem.high - _INSIDE, problem.low + _INSIDE
     steady = (low + margin + in_all)[:, None], (high - margin - in_all)[:, None]
     _check_equilibrium(problem, *steady)
@@ -309,11 +309,11 @@ def _determined(problem: Problem, margin: float) -> tuple[Rows, float]:
     polytope.add(np.zeros((len(high), 1, len(problem.a))), *steady, np.zeros(1))
     rows = elevated(cells.rows[: cells.needed])
     count, p, each, n = rows.shape
-    rows, lost = rows.swapaxes(0, 1).reshape(p, count * each, n), lost[:count].swapaxes(0, 1).reshape(p, -1)
+    rows, eroded = rows.swapaxes(0, 1).reshape(p, count * each, n), eroded[:count].swapaxes(0, 1).reshape(p, -1)
     ends = np.repeat(cells.ends[:count], each)
     # Coarse in time first: between two rows that are kept others follow sooner than after one.
     for places in _by_halving(ends.size):
-        polytope.add(rows[:, places], low[:, None] + lost[:, places], high[:, None] - lost[:, places], ends[places])
+        polytope.add(rows[:, places], low[:, None] + eroded[:, places], high[:, None] - eroded[:, places], ends[places])
     return polytope.reduced()
 
 

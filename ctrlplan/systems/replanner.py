@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ctrlplan._checks import check_kind, checked_count, checked_finite, real_array
 from ctrlplan._types import Array, EventName, Params, Value
-from ctrlplan.systems.hybrid import refuse_alone
+from ctrlplan.systems.hybrid import raise_not_standalone
 from ctrlplan.systems.source import axis_signals, create_source_iosystem
 from ctrlplan.traits import DeclaredTrait, declare
 from ctrlplan.trajectories import Trajectory
@@ -29,7 +29,7 @@ _ROUNDING, _MATTERS = 1e-12, 1e-6
 Trigger = Literal["period", "deviation", "goal"]
 """When a replanner plans again."""
 
-_START, _END, _LOST, _MISSED, _FITS = range(5)
+_START, _END, _NAN_INPUT, _UNREACHABLE, _FITS = range(5)
 """States of the correction before the goal's change and the coefficients."""
 
 
@@ -72,8 +72,8 @@ def create_replanner_iosystem(
     drift. Between fits the output is the plan in continuous time. Runs in
     `ctrlplan.simulate` only.
 
-    States: start and end of the correction [s], lost (whether an input was not
-    finite), missed (whether the goal is out of reach), fits (their number),
+    States: start and end of the correction [s], nan_input (whether an input was not
+    finite), unreachable (whether the goal is out of reach), fits (their number),
     ``goal[k]``, the goal at the last fit, and ``coefficient[k]``. Inputs: with
     `goal_derivatives`, x_goal, x_goal_d1, ... of each axis x; with `measured`,
     x, x_d1, .... Outputs: the jet of each axis, x, x_d1, ..., as
@@ -166,7 +166,7 @@ def create_replanner_iosystem(
     """
     check_kind(plan, "plan", Trajectory)
     order = checked_count(order, "order")
-    put_out = order if derivatives is None else checked_count(derivatives, "derivatives")
+    output_order = order if derivatives is None else checked_count(derivatives, "derivatives")
     for label, value in (("measured", measured), ("goal_derivatives", goal_derivatives)):
         if value is not None and checked_count(value, label) > order:
             raise ValueError(f"{label} must be at most order, {order}, got {value}")
@@ -174,7 +174,7 @@ def create_replanner_iosystem(
     trigger_over = _checked_trigger(trigger, threshold, measured, goal_derivatives)
     limited = _checked_limits(plan, limits)
     axes = axis_signals(plan, labels, "")
-    signals = _Signals(axes, max(put_out, order), put_out, goal_derivatives, measured, suffix)
+    signals = _Signals(axes, max(output_order, order), output_order, goal_derivatives, measured, suffix)
     core = _Correction(
         plan, horizons, checked_finite(offset, "offset", minimum=0.0), signals, trigger_over, limited, name
     )
@@ -249,16 +249,16 @@ class _Signals:
         self,
         labels: tuple[str, ...],
         planned: int,
-        put_out: int,
+        output_order: int,
         goal: int | None,
         measured: int | None,
         suffix: str,
     ) -> None:
         goals = [] if goal is None else signal_names([f"{label}_goal" for label in labels], goal)
         seen = [] if measured is None else signal_names(list(labels), measured)
-        self.planned, self.put_out, self.goal, self.measured = planned, put_out, goal, measured
+        self.planned, self.output_order, self.goal, self.measured = planned, output_order, goal, measured
         self.outer = [*goals, *seen]
-        self.outputs = signal_names([label + suffix for label in labels], put_out)
+        self.outputs = signal_names([label + suffix for label in labels], output_order)
         self.inside = "_planned"
         while {*self.outer, *self.outputs} & {*signal_names([label + self.inside for label in labels], planned)}:
             self.inside += "_"
@@ -280,7 +280,7 @@ class _Signals:
     def passed(self) -> list[int]:
         """Which inputs the outputs pass on."""
         each, naxes = self.planned + 1, len(self.inner) // (self.planned + 1)
-        return [axis * each + k for axis in range(naxes) for k in range(self.put_out + 1)]
+        return [axis * each + k for axis in range(naxes) for k in range(self.output_order + 1)]
 
 
 class _Correction(ct.NonlinearIOSystem):  # type: ignore[misc]
@@ -300,12 +300,12 @@ class _Correction(ct.NonlinearIOSystem):  # type: ignore[misc]
         name: str,
     ) -> None:
         naxes, order, ngoals = plan.naxes, horizons.order, signals.goal_rows.stop - signals.goal_rows.start
-        states = ["start", "end", "lost", "missed", "fits"]
+        states = ["start", "end", "nan_input", "unreachable", "fits"]
         states += [f"goal[{k}]" for k in range(ngoals)]
         states += [f"coefficient[{k}]" for k in range(naxes * 2 * (order + 1))]
         super().__init__(
             self._no_rates,
-            self._put_out,
+            self._output,
             inputs=[*signals.inner, *signals.outer],
             outputs=signals.outputs,
             states=states,
@@ -320,8 +320,8 @@ class _Correction(ct.NonlinearIOSystem):  # type: ignore[misc]
             samples_first=True,  # what is measured may follow the reference directly
             feedthrough=signals.feedthrough,
             watched={
-                EventName(f"{name}: input lost"): (partial(_state, _LOST), -math.inf, 0.5),
-                EventName(f"{name}: goal out of reach"): (partial(_state, _MISSED), -math.inf, 0.5),
+                EventName(f"{name}: nan at the input"): (partial(_state, _NAN_INPUT), -math.inf, 0.5),
+                EventName(f"{name}: goal out of reach"): (partial(_state, _UNREACHABLE), -math.inf, 0.5),
             },
         )
         self._plan, self._horizons, self._signals, self._trigger, self._limits = (
@@ -346,14 +346,14 @@ class _Correction(ct.NonlinearIOSystem):  # type: ignore[misc]
     def sample(self, t: float, x: Array, u: Array, params: Params) -> Array:
         """States after a fit, or where none is due the same."""
         after = x.copy()
-        after[_LOST] = 0.0 if math.isfinite(sum(u.tolist())) else 1.0
-        if after[_LOST]:
+        after[_NAN_INPUT] = 0.0 if math.isfinite(sum(u.tolist())) else 1.0
+        if after[_NAN_INPUT]:
             return after
         goal = u[self._signals.goal_rows].reshape(self._naxes, -1).T
         miss = self._miss(t, x, goal)
         moved = miss > _ROUNDING
         begins = self._deviation(t, x, u)
-        after[_MISSED] = float(miss > _MATTERS and self._horizons.late(t))
+        after[_UNREACHABLE] = float(miss > _MATTERS and self._horizons.late(t))
         found = self._horizons.at(t) if self._is_due(moved, t, x, begins) else None
         if found is None:
             return after
@@ -364,9 +364,9 @@ class _Correction(ct.NonlinearIOSystem):  # type: ignore[misc]
             jets[last] = extrapolated(goal, found.horizon) - self._arrival[: len(goal)]
         coefficients = found.coefficients(jets)
         if self._limits and not self._within_limits(t, found, coefficients, goal):
-            after[_MISSED] = 1.0
+            after[_UNREACHABLE] = 1.0
             return after
-        after[_START], after[_END], after[_MISSED] = t, self._horizons.end(t), 0.0
+        after[_START], after[_END], after[_UNREACHABLE] = t, self._horizons.end(t), 0.0
         after[_FITS] += 1.0
         after[self._goal] = goal.ravel()
         after[self._fitted] = coefficients.ravel()
@@ -432,8 +432,8 @@ class _Correction(ct.NonlinearIOSystem):  # type: ignore[misc]
                     return False
         return True
 
-    def _put_out(self, t: Value, x: Value, u: Value, params: Params) -> Array:
-        added = itertools.chain.from_iterable(self._corrections(t, x, self._signals.put_out))
+    def _output(self, t: Value, x: Value, u: Value, params: Params) -> Array:
+        added = itertools.chain.from_iterable(self._corrections(t, x, self._signals.output_order))
         return np.array([u[row] + value for row, value in zip(self._passed, added, strict=True)])
 
     def _jets(self, t: float, x: Array, order: int) -> Array:
@@ -462,7 +462,7 @@ class _Correction(ct.NonlinearIOSystem):  # type: ignore[misc]
         return found
 
     def _no_rates(self, t: float, x: Value, u: Value, params: Params) -> NoReturn:
-        refuse_alone(self.name, "plans again every period")
+        raise_not_standalone(self.name, "plans again every period")
 
 
 def _without_rounding(jet: Array, scale: Array, size: float) -> Array:
