@@ -156,11 +156,11 @@ class Compiled:
         self, name: str, switches: ca.Function, network: Network, argument: int
     ) -> tuple[str, ca.Function | None]:
         """Those of some switches that depend on time (0) or functions of time (2), and on no state; None without."""
-        late = np.zeros(network.nsignals, dtype=bool)
+        delayed = np.zeros(network.nsignals, dtype=bool)
         for i in network.blocks_with("delay"):
-            late[network.outputs[i]] = True
+            delayed[network.outputs[i]] = True
         depends = {k: np.asarray(ca.DM(switches.jac_sparsity(0, k)).full(), dtype=bool) for k in (0, 1, 2)}
-        undecided = depends[1].any(axis=1) | depends[2][:, late[network.time_rows]].any(axis=1)
+        undecided = depends[1].any(axis=1) | depends[2][:, delayed[network.time_rows]].any(axis=1)
         rows = depends[argument].any(axis=1) & ~undecided
         if not rows.any():
             return name, None
@@ -290,7 +290,7 @@ class CompiledSolver:
         """Rates (nstates, ntime) of the states."""
         return self.form.rates(times, states, time_values, self._p)
 
-    def at_edge(self, times: Array, states: Array, time_values: Array) -> bool:
+    def near_undefined(self, times: Array, states: Array, time_values: Array) -> bool:
         """Whether equations are undefined within the tolerances of states found.
 
         There CVODES may stay for ever on a solution that has ended: a Newton

@@ -143,7 +143,7 @@ def sampled_states(a: Array, b: Array, samples: Array, timepts: Array, initial: 
             found[:] = _recurrence(change[:, :, : scale.size], forced, out[begin])
             for k in range(_first_overflow(found.T), len(found)):
                 series, own = terms[begin + k].reshape(2, -1, 1), [level[which[k]] for level in changes]
-                found[k] = _carried(out[begin + k][:, None], series, own)[:, 0]
+                found[k] = _propagated(out[begin + k][:, None], series, own)[:, 0]
     return (out * scale).T
 
 
@@ -302,7 +302,7 @@ def _any_segment(a: Array, b: Array, series: Array, samples: Array, state: Array
             break
         h *= 0.5
         first, second = _halved(series)
-        middle = _carried(states, first, changes[: level + 1])
+        middle = _propagated(states, first, changes[: level + 1])
         states = np.stack([states, middle], axis=2).reshape(n, -1)
         series = np.stack([first, second], axis=3).reshape(*first.shape[:2], 2 * first.shape[2])
         later = sigma >= 0.5  # doubling and this difference are exact, until nothing is left of any sample
@@ -516,7 +516,7 @@ def _marched(state: Array, changes: list[Array], series: Array) -> Array:
         for k in range(_first_overflow(found), ncells + 1):
             if k:
                 before, terms = found[:, k - 1, None], series[:, :, k - 1, None]
-                found[:, k] = _carried(before, terms, [change[i] for change in changes])[:, 0]
+                found[:, k] = _propagated(before, terms, [change[i] for change in changes])[:, 0]
     return states
 
 
@@ -526,7 +526,7 @@ def _first_overflow(states: Array) -> int:
     return int(overflowed.argmax()) if overflowed.any() else overflowed.size
 
 
-def _carried(states: Array, series: Array, changes: list[Array]) -> Array:
+def _propagated(states: Array, series: Array, changes: list[Array]) -> Array:
     """States (n, ncells) after the last of some changes, of one system with the input's terms in each cell.
 
     Where that change is beyond the range of numbers, by shorter ones: what is
@@ -546,10 +546,10 @@ def _carried(states: Array, series: Array, changes: list[Array]) -> Array:
     last, grown, series = len(changes) - 1, grown[:, cells], series[:, :, cells]
     level = max(0, bisect_left(range(last), True, key=lambda k: not np.isfinite(changes[k]).all()) - 1)
     halves = 0.5 ** np.arange(len(series))[:, None, None]
-    now = _carried(states[:, cells], series * halves ** (last - level), changes[: level + 1])
+    now = _propagated(states[:, cells], series * halves ** (last - level), changes[: level + 1])
     while level < last and np.isfinite(now[grown]).any():
         _, second = _halved(series * halves ** (last - level - 1))
-        now = _carried(now, second, changes[: level + 1])
+        now = _propagated(now, second, changes[: level + 1])
         level += 1
     after[:, cells] = now if level == last else np.where(grown, now, after[:, cells])
     return after

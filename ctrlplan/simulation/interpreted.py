@@ -39,7 +39,7 @@ _MIN_RTOL = 2.3e-14
 _SHARED = tuple(int(part) for part in scipy.__version__.split(".")[:2]) < (1, 17)
 """Whether all threads share the state of scipy's LSODA, which was Fortran before."""
 
-_ALONE = threading.Lock()
+_LSODA_LOCK = threading.Lock()
 """Held by the run that uses LSODA where its state is shared."""
 
 _CALLS, _INSTANT = 2000, 1e-9
@@ -428,11 +428,11 @@ def _implicit() -> Iterator[type[OdeSolver]]:
     """LSODA, or BDF while another run, in a thread or inside a block, holds an LSODA whose state is shared."""
     if not _SHARED:
         yield LSODA
-    elif _ALONE.acquire(blocking=False):
+    elif _LSODA_LOCK.acquire(blocking=False):
         try:
             yield LSODA
         finally:
-            _ALONE.release()
+            _LSODA_LOCK.release()
     else:
         yield BDF
 

@@ -212,10 +212,10 @@ def create_delay_iosystem(
     """
     seconds = checked_finite(delay, "delay", above=0.0)
     given = checked_names("u" if inputs is None else inputs, "inputs")
-    late = checked_names("y" if outputs is None else outputs, "outputs")
-    if len(given) != len(late) or not given:
-        raise ValueError(f"outputs must be as many as inputs, {len(given)}, got {len(late)}")
-    return Delay(seconds, checked_vector(initial, "initial", len(given)), given, late, name)
+    delayed = checked_names("y" if outputs is None else outputs, "outputs")
+    if len(given) != len(delayed) or not given:
+        raise ValueError(f"outputs must be as many as inputs, {len(given)}, got {len(delayed)}")
+    return Delay(seconds, checked_vector(initial, "initial", len(given)), given, delayed, name)
 
 
 def raise_not_standalone(name: str, why: str) -> NoReturn:

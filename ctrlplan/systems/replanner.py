@@ -225,7 +225,7 @@ class _Horizons:
                 f"got {radius:.4g} with dt = {period:g} s, horizon = {whole:g} s and alpha = {alpha:g}"
             )
 
-    def late(self, t: float) -> bool:
+    def too_short(self, t: float) -> bool:
         """Whether what is left of the plan is too short for a fit."""
         return self.shrinking and self._end - t < self._minimum * (1.0 - 1e-9)
 
@@ -237,7 +237,7 @@ class _Horizons:
         """Transition to fit at a time, None where it is too early or too late for one."""
         if not self.shrinking:
             return self.whole
-        if t < self._start or self.late(t):
+        if t < self._start or self.too_short(t):
             return None
         return transition(self.order, self._end - t, self.rate * (self._end - t))
 
@@ -353,7 +353,7 @@ class _Correction(ct.NonlinearIOSystem):  # type: ignore[misc]
         miss = self._miss(t, x, goal)
         moved = miss > _ROUNDING
         begins = self._deviation(t, x, u)
-        after[_UNREACHABLE] = float(miss > _MATTERS and self._horizons.late(t))
+        after[_UNREACHABLE] = float(miss > _MATTERS and self._horizons.too_short(t))
         found = self._horizons.at(t) if self._is_due(moved, t, x, begins) else None
         if found is None:
             return after

@@ -75,7 +75,9 @@ def test_limits_hold_and_the_same_goals_are_taken_as_by_the_peer(seed, horizon):
     wanted = peer(coarse)
     assert np.abs(found.outputs[:, ::20] - wanted).max() <= 1e-9
     changes = [
-        (t, m) for (t, m), (_, before) in zip(peer.unreachable[1:], peer.unreachable, strict=False) if m != before and t <= 13
+        (t, m)
+        for (t, m), (_, before) in zip(peer.unreachable[1:], peer.unreachable, strict=False)
+        if m != before and t <= 13
     ]
     assert happened(found, UNREACHABLE) == [(round(t, 9), "above" if m else "inside") for t, m in changes]
 

@@ -72,7 +72,7 @@ class CompiledMethod:
     def check(self, attempt: Attempt[CompiledSolver]) -> None:
         """Compare with Python, at states of the run."""
         solver, job = attempt.solver, attempt.job
-        if solver.at_edge(*attempt.visited()):
+        if solver.near_undefined(*attempt.visited()):
             raise SolverError(
                 f"the solver must reach {job.times[-1]:g} s, got to the edge of where equations are defined"
             )
