@@ -12,8 +12,8 @@ import control as ct
 import numpy as np
 
 from ctrlplan._checks import checked_finite, checked_labels, checked_names
-from ctrlplan._renamed import former_signature
-from ctrlplan._types import Array
+from ctrlplan._renamed import former_signature, warn_renamed
+from ctrlplan._types import Array, Value
 from ctrlplan.systems.flat import hurwitz_coefficients
 from ctrlplan.systems.plants.crane.flatness import checked_formulas
 from ctrlplan.systems.plants.crane.parameters import CraneParameters
@@ -24,7 +24,7 @@ Params = Mapping[str, float]
 
 
 @former_signature("name")
-def create_still_iosystem(
+def create_setpoint_iosystem(
     crane: CraneParameters,
     *,
     labels: Sequence[str] | None = None,
@@ -63,7 +63,7 @@ def create_still_iosystem(
     >>> crane = cp.plants.Crane()
     >>> step = cp.Step([1.0, 10.0], [0.0, 10.0], labels=["x", "z"])
     >>> source = cp.create_source_iosystem(step, suffix="_ref")
-    >>> law = cp.plants.create_still_iosystem(crane)
+    >>> law = cp.plants.create_setpoint_iosystem(crane)
     >>> references = ct.interconnect([source, law], inputs=0, outputs=["D_ref", "R_ref"])
     >>> cp.simulate(references, [0.0, 1.0]).outputs[:, -1].tolist()
     [0.75, 10.0]
@@ -75,6 +75,18 @@ def create_still_iosystem(
 
     inputs = _input_names(0, labels, suffix)
     return ct.nlsys(None, out, inputs=inputs, outputs=["D_ref", "R_ref"], dt=None, name=name)
+
+
+def create_still_iosystem(crane: CraneParameters, *args: str, **options: Value) -> ct.NonlinearIOSystem:
+    """Old name of `create_setpoint_iosystem`.
+
+    Warns
+    -----
+    FutureWarning
+        Always.
+    """
+    warn_renamed("create_still_iosystem", "create_setpoint_iosystem")
+    return create_setpoint_iosystem(crane, *args, **options)
 
 
 @former_signature("name")
