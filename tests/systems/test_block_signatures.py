@@ -33,7 +33,7 @@ ARGUMENTS = {
     "crane": cp.plants.Crane(),
     "delay": 0.5,
     "dt": 0.1,
-    "flat_system": cp.plants.integrator_chain(2),
+    "flat": cp.plants.integrator_chain(2),
     "high": 2.0,
     "kd": 0.5,
     "ki": 2.0,
@@ -274,7 +274,7 @@ def test_limits_that_are_none(limits, kind, message):
 
 CRANE = ARGUMENTS["crane"]
 LOOP = ARGUMENTS["loop"]
-CHAIN = ARGUMENTS["flat_system"]
+CHAIN = ARGUMENTS["flat"]
 BLOCK = ARGUMENTS["block"]
 OLD = [
     ("create_pid_iosystem", (3.0, 1.0, 2.0, 0.1, 0.5, (-1, 1), 0.2, "p"), {},
@@ -291,6 +291,8 @@ OLD = [
     ("create_command_filter_iosystem", (2.0,), {"output": "q"}, {"outputs": "q"}, "output= is deprecated"),
     ("create_source_iosystem", (PLAN, 2, "mine"), {}, {"name": "mine"}, "name by position in create_source_iosystem"),
     ("create_flat_iosystem", (CHAIN, [-1.0, -2.0], "mine"), {}, {"name": "mine"}, "name by position"),
+    ("create_flat_iosystem", (), {"flat_system": CHAIN, "poles": [-1.0, -2.0]}, {"flat": CHAIN, "poles": [-1.0, -2.0]},
+     "flat_system= is deprecated.*use flat="),
     ("create_feedforward_iosystem", (LOOP, "q", "mine"), {}, {"labels": "q", "suffix": "", "name": "mine"},
      "label, name by position in create_feedforward_iosystem.*use labels=, name=, suffix=''"),
     ("create_feedforward_iosystem", (LOOP,), {"label": "q"}, {"labels": "q", "suffix": ""},
@@ -300,6 +302,8 @@ OLD = [
     ("create_setpoint_iosystem", (CRANE, "mine"), {}, {"name": "mine"}, "name by position in create_setpoint_iosystem"),
     ("create_generator_iosystem", (CRANE, "mine"), {}, {"name": "mine"}, "name by position"),
     ("create_load_feedback_iosystem", (CRANE, 1.0, 0.8, "mine"), {}, {"name": "mine"}, "name by position"),
+    ("create_load_feedback_iosystem", (CRANE,), {"bandwidth": 0.5}, {"load_bandwidth": 0.5},
+     "bandwidth= is deprecated.*use load_bandwidth="),
     ("create_dynamic_law_iosystem", (CRANE, [-1, -2, -3, -4], "mine"), {}, {"name": "mine"}, "name by position"),
     ("create_crane_feedforward_iosystem", (CRANE, "mine"), {}, {"name": "mine"}, "name by position"),
 ]  # fmt: skip

@@ -140,7 +140,7 @@ def test_poles_must_be_four_stable_and_in_pairs(poles):
 
 
 @pytest.mark.parametrize("value", [0.0, -1.0, math.nan, math.inf])
-@pytest.mark.parametrize("name", ["bandwidth", "damping"])
+@pytest.mark.parametrize("name", ["load_bandwidth", "damping"])
 def test_load_feedback_needs_positive_numbers(name, value):
     with pytest.raises(ValueError, match=f"{name} must be finite and above 0"):
         create_load_feedback_iosystem(CRANE, **{name: value})

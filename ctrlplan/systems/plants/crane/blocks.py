@@ -143,10 +143,10 @@ def create_generator_iosystem(
     return ct.nlsys(None, out, inputs=inputs, outputs=["D_ref", "R_ref"], dt=None, name=name)
 
 
-@former_signature("name")
+@former_signature("name", renamed={"bandwidth": "load_bandwidth"})
 def create_load_feedback_iosystem(
     crane: CraneParameters,
-    bandwidth: float = 1.0,
+    load_bandwidth: float = 1.0,
     damping: float = 1.0,
     *,
     labels: Sequence[str] | None = None,
@@ -166,7 +166,7 @@ def create_load_feedback_iosystem(
     ----------
     crane : Crane
         The plant.
-    bandwidth : float, optional
+    load_bandwidth : float, optional
         w [rad/s], above 0; stable with the study's PIDs from 0.1 to 3.
     damping : float, optional
         zeta, above 0; 0.7 to 1.
@@ -185,7 +185,7 @@ def create_load_feedback_iosystem(
     Raises
     ------
     ValueError
-        If `bandwidth` or `damping` is not above 0, or
+        If `load_bandwidth` or `damping` is not above 0, or
         labels are not two, or give a reference the name of another input.
 
     Examples
@@ -201,7 +201,7 @@ def create_load_feedback_iosystem(
     >>> loop.nstates
     10
     """
-    w, zeta = checked_finite(bandwidth, "bandwidth", above=0.0), checked_finite(damping, "damping", above=0.0)
+    w, zeta = checked_finite(load_bandwidth, "load_bandwidth", above=0.0), checked_finite(damping, "damping", above=0.0)
     s0, s1 = w**2, 2.0 * zeta * w
 
     def out(t: float, state: Array, u: Array, params: Params) -> Array:
