@@ -25,7 +25,7 @@ _PROBES = 8
 _SAME = 1e-6
 """Relative difference up to which numbers count as equal, and singular values as 0."""
 
-_MUST = "static feedback must linearise flat_system"
+_MUST = "flat must be linearisable by static feedback"
 
 
 @dataclass(frozen=True)
@@ -77,15 +77,15 @@ class _LinearPlant(FlatPlant):
         return self.maps.reverse(flag)
 
 
-def checked_plant(flat_system: System) -> FlatPlant:
+def checked_plant(flat_system: System, label: str = "flat_system") -> FlatPlant:
     """Maps of a flat system in continuous time, which has states and inputs."""
     if not isinstance(flat_system, fs.FlatSystem):
-        raise TypeError(f"flat_system must be a control.flatsys.FlatSystem, got {type(flat_system).__name__}")
+        raise TypeError(f"{label} must be a control.flatsys.FlatSystem, got {type(flat_system).__name__}")
     if flat_system.dt not in (None, 0):
-        raise ValueError(f"flat_system must be in continuous time, got dt = {flat_system.dt}")
+        raise ValueError(f"{label} must be in continuous time, got dt = {flat_system.dt}")
     n, m = flat_system.nstates or 0, flat_system.ninputs or 0
     if not (n and m):
-        raise ValueError(f"flat_system must have states and inputs, got {n} and {m}")
+        raise ValueError(f"{label} must have states and inputs, got {n} and {m}")
     if is_linear(flat_system):
         return _LinearPlant(flat_system, n, m, {}, linear_maps(flat_system))
     return FlatPlant(flat_system, n, m, dict(flat_system.params))

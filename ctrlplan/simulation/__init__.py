@@ -1,6 +1,6 @@
 """Responses of loops: exact where they are linear, compiled where they can be, otherwise by Python."""
 
-from ctrlplan.simulation.equilibrium import rest_at, rest_state, unstable_poles
+from ctrlplan.simulation.equilibrium import equilibrium_at, equilibrium_state, unstable_poles
 from ctrlplan.simulation.events import Event, Occurrence, what_happened
 from ctrlplan.simulation.interpreted import SolverError
 from ctrlplan.simulation.predictor import Predictor
@@ -15,10 +15,10 @@ __all__ = [
     "Prepared",
     "SimulationResponse",
     "SolverError",
+    "equilibrium_at",
+    "equilibrium_state",
     "prepare",
     "prepared_form",
-    "rest_at",
-    "rest_state",
     "simulate",
     "state_space",
     "stated_start",

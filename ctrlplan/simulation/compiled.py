@@ -26,7 +26,7 @@ from ctrlplan.symbolic.tracing import NotTraceableError, Trace, agrees
 Stats = Mapping[str, float]
 """Statistics of an integrator, by name."""
 
-_KEPT = 64
+_CACHE_SIZE = 64
 """Integrators kept, one for each pattern of output times; and functions, one for each number of times."""
 
 _FEW = 64
@@ -57,14 +57,14 @@ _SIGNALS = tuple(map(int, signal.valid_signals()))
 
 
 class Compiled:
-    """Equations of a network as CasADi functions of (t, x, driven, p).
+    """Equations of a network as CasADi functions of (t, x, time_values, p).
 
     Parameters
     ----------
     network : Network
         What is run.
     traces : list of Trace or None
-        Of every block but the linear and the driven ones.
+        Of every block that is neither linear nor a function of time.
 
     Raises
     ------
@@ -78,7 +78,7 @@ class Compiled:
         self._places = [(i, key) for i, trace in enumerate(traces) if trace is not None for key in trace.symbols]
         self.symbols = frozenset(key for _, key in self._places)
         self._defaults = [(key, network.blocks[i].params.get(key)) for i, key in self._places]
-        n, nd = network.nstates, network.driven.size
+        n, nd = network.nstates, network.time_rows.size
         t, x, d, p = (ca.SX.sym(name, size) for name, size in (("t", 1), ("x", n), ("d", nd), ("p", len(self._places))))
         own = self._own_parameters(p)
         every = np.ones(network.nsignals, dtype=bool)
@@ -100,8 +100,8 @@ class Compiled:
             trace is not None and block.changes_unseen and trace.depends_on_time()
             for block, trace in zip(network.blocks, traces, strict=True)
         )
-        self._integrators: Lru[tuple[object, ...], ca.Function] = Lru(_KEPT)
-        self._maps: Lru[tuple[str, int], ca.Function] = Lru(_KEPT)
+        self._integrators: Lru[tuple[object, ...], ca.Function] = Lru(_CACHE_SIZE)
+        self._maps: Lru[tuple[str, int], ca.Function] = Lru(_CACHE_SIZE)
         self._equations: dict[int, dict[str, ca.SX]] = {}
 
     def __getstate__(self) -> dict[str, object]:
@@ -112,31 +112,31 @@ class Compiled:
         """Entries of p for a run."""
         return np.array([float(params.get(key, default)) for key, default in self._defaults])
 
-    def outputs(self, t: Array, x: Array, driven: Array, p: Array) -> Array:
+    def outputs(self, t: Array, x: Array, time_values: Array, p: Array) -> Array:
         """Outputs of the whole at many times, (noutputs, ntime)."""
-        return self._at_many("outputs", t, x, driven, p)
+        return self._at_many("outputs", t, x, time_values, p)
 
-    def rates(self, t: Array, x: Array, driven: Array, p: Array) -> Array:
+    def rates(self, t: Array, x: Array, time_values: Array, p: Array) -> Array:
         """Rates of all states at many times, (nstates, ntime)."""
-        return self._at_many("rates", t, x, driven, p)
+        return self._at_many("rates", t, x, time_values, p)
 
-    def slopes(self, t: Array, x: Array, driven: Array, p: Array) -> Array:
+    def slopes(self, t: Array, x: Array, time_values: Array, p: Array) -> Array:
         """Derivatives of the rates by the states at many times, column after column, (nstates**2, ntime)."""
-        return self._at_many("jacobian", t, x, driven, p)
+        return self._at_many("jacobian", t, x, time_values, p)
 
-    def signals(self, t: Array, x: Array, driven: Array, p: Array) -> Array:
+    def signals(self, t: Array, x: Array, time_values: Array, p: Array) -> Array:
         """All signals at many times, (nsignals, ntime)."""
-        return self._at_many("signals", t, x, driven, p)
+        return self._at_many("signals", t, x, time_values, p)
 
-    def instants(self, first: float, last: float, driven: Callable[[Array], Array], p: Array) -> list[float]:
+    def instants(self, first: float, last: float, time_values: Callable[[Array], Array], p: Array) -> list[float]:
         """Times of a run at which the equations switch, where time and functions of time alone decide.
 
         Parameters
         ----------
         first, last : float
             Beginning and end of the run [s].
-        driven : callable
-            Maps times (n,) to the functions of time (ndriven, n).
+        time_values : callable
+            Maps times (n,) to the functions of time (nd, n).
         p : ndarray
             Parameters of the run.
         """
@@ -145,7 +145,9 @@ class Compiled:
             if function is not None:
 
                 def sides(t: Array, name: str = name) -> Array:
-                    return np.sign(self._at_many(name, t, np.zeros((self._rates.numel_in(1), t.size)), driven(t), p))
+                    return np.sign(
+                        self._at_many(name, t, np.zeros((self._rates.numel_in(1), t.size)), time_values(t), p)
+                    )
 
                 found += changes_of_side(sides, first, last)
         return sorted(set(found))
@@ -154,11 +156,11 @@ class Compiled:
         self, name: str, switches: ca.Function, network: Network, argument: int
     ) -> tuple[str, ca.Function | None]:
         """Those of some switches that depend on time (0) or functions of time (2), and on no state; None without."""
-        late = np.zeros(network.nsignals, dtype=bool)
+        delayed = np.zeros(network.nsignals, dtype=bool)
         for i in network.blocks_with("delay"):
-            late[network.outputs[i]] = True
+            delayed[network.outputs[i]] = True
         depends = {k: np.asarray(ca.DM(switches.jac_sparsity(0, k)).full(), dtype=bool) for k in (0, 1, 2)}
-        undecided = depends[1].any(axis=1) | depends[2][:, late[network.driven]].any(axis=1)
+        undecided = depends[1].any(axis=1) | depends[2][:, delayed[network.time_rows]].any(axis=1)
         rows = depends[argument].any(axis=1) & ~undecided
         if not rows.any():
             return name, None
@@ -167,9 +169,9 @@ class Compiled:
         self._functions[f"timed {name}"] = ca.Function("timed", inputs, [ca.densify(chosen)])
         return f"timed {name}", self._functions[f"timed {name}"]
 
-    def sides(self, t: Array, x: Array, driven: Array, p: Array) -> Array:
+    def sides(self, t: Array, x: Array, time_values: Array, p: Array) -> Array:
         """On which side of its switches the form is at many times, (nswitches, ntime): -1, 0 or 1."""
-        return np.sign(self._at_many("switches", t, x, driven, p))
+        return np.sign(self._at_many("switches", t, x, time_values, p))
 
     def disagreement(self, network: Network, params: Params, t: Array, x: Array, w: Array) -> str:
         """What is wrong with a trace at visited times, states and signals; empty where nothing."""
@@ -180,9 +182,9 @@ class Compiled:
                     return f"block {block.name} cannot be traced ({wrong})"
         return ""
 
-    def fastest_decay(self, t: float, x: Array, driven: Array, p: Array) -> float:
+    def fastest_decay(self, t: float, x: Array, time_values: Array, p: Array) -> float:
         """Greatest rate [1/s] at which a motion about a state dies out."""
-        jacobian = _called(self._jacobian, (np.array([t]), x, driven, p), x.size)
+        jacobian = _called(self._jacobian, (np.array([t]), x, time_values, p), x.size)
         return float(-np.linalg.eigvals(jacobian).real.min()) if np.isfinite(jacobian).all() else np.inf
 
     def integrator(
@@ -207,12 +209,12 @@ class Compiled:
 
         return self._integrators.get(key, made)
 
-    def _at_many(self, name: str, t: Array, x: Array, driven: Array, p: Array) -> Array:
+    def _at_many(self, name: str, t: Array, x: Array, time_values: Array, p: Array) -> Array:
         function = self._functions[name]
         if not function.numel_out(0):  # a system without inputs and outputs has no signals
             return np.zeros((0, t.size))
         at_all = self._maps.get((name, t.size), lambda: function.map(t.size))
-        return _called(at_all, (t, x, driven, np.repeat(p[:, None], t.size, axis=1)), function.numel_out(0))
+        return _called(at_all, (t, x, time_values, np.repeat(p[:, None], t.size, axis=1)), function.numel_out(0))
 
     def _segment_equations(self, width: int) -> dict[str, ca.SX]:
         """Equations of scaled states in s from 0 to 1, the functions of time as Chebyshev series of some width."""
@@ -223,15 +225,15 @@ class Compiled:
             s, z, p, c, bounds, span, shift, scale = (ca.SX.sym(name, *shape) for name, shape in shapes.items())
             left, length, first, last, earliest, latest = (span[k] for k in range(6))
             t = ca.fmin(ca.fmax(left + s * length, earliest), latest)
-            driven = _series(c, (2.0 * t - first - last) / (last - first))
+            time_values = _series(c, (2.0 * t - first - last) / (last - first))
             if width > 1:  # a signal that is nan stays nan
-                driven = ca.if_else(driven < bounds[:, 0], bounds[:, 0], driven)
-                driven = ca.if_else(driven > bounds[:, 1], bounds[:, 1], driven)
+                time_values = ca.if_else(time_values < bounds[:, 0], bounds[:, 0], time_values)
+                time_values = ca.if_else(time_values > bounds[:, 1], bounds[:, 1], time_values)
             self._equations[width] = {
                 "t": s,
                 "x": z,
                 "p": ca.vertcat(p, ca.vec(c), ca.vec(bounds), span, shift, scale),
-                "ode": length * self._rates(t, shift + scale * z, driven, p) / scale,
+                "ode": length * self._rates(t, shift + scale * z, time_values, p) / scale,
             }
         return self._equations[width]
 
@@ -271,24 +273,24 @@ class CompiledSolver:
         self.switches: list[float] = []
         self._report = self._count if equations.compared.is_expected else None
 
-    def signals(self, times: Array, states: Array, driven: Array) -> Array:
+    def signals(self, times: Array, states: Array, time_values: Array) -> Array:
         """All signals (nsignals, ntime) of the network."""
-        return self.form.signals(times, states, driven, self._p)
+        return self.form.signals(times, states, time_values, self._p)
 
-    def outputs(self, times: Array, states: Array, driven: Array) -> Array:
+    def outputs(self, times: Array, states: Array, time_values: Array) -> Array:
         """Outputs (noutputs, ntime) of the whole."""
-        return self.form.outputs(times, states, driven, self._p)
+        return self.form.outputs(times, states, time_values, self._p)
 
-    def slopes(self, times: Array, states: Array, driven: Array) -> Array:
+    def slopes(self, times: Array, states: Array, time_values: Array) -> Array:
         """Derivatives of the rates by the states, (ntime, nstates, nstates)."""
         n = len(states)
-        return self.form.slopes(times, states, driven, self._p).reshape(n, n, times.size).transpose(2, 1, 0)
+        return self.form.slopes(times, states, time_values, self._p).reshape(n, n, times.size).transpose(2, 1, 0)
 
-    def rates(self, times: Array, states: Array, driven: Array) -> Array:
+    def rates(self, times: Array, states: Array, time_values: Array) -> Array:
         """Rates (nstates, ntime) of the states."""
-        return self.form.rates(times, states, driven, self._p)
+        return self.form.rates(times, states, time_values, self._p)
 
-    def at_edge(self, times: Array, states: Array, driven: Array) -> bool:
+    def near_undefined(self, times: Array, states: Array, time_values: Array) -> bool:
         """Whether equations are undefined within the tolerances of states found.
 
         There CVODES may stay for ever on a solution that has ended: a Newton
@@ -297,13 +299,13 @@ class CompiledSolver:
         rtol, atol = self._tolerances
         reach = (rtol * np.abs(states) + (atol * self._scales.scale)[:, None]) * _EDGE
         return not all(
-            np.isfinite(self.form.rates(times, near, driven, self._p)).all()
+            np.isfinite(self.form.rates(times, near, time_values, self._p)).all()
             for near in (states - reach, states, states + reach)
         )
 
-    def instants(self, first: float, last: float, driven: Callable[[Array], Array]) -> list[float]:
+    def instants(self, first: float, last: float, time_values: Callable[[Array], Array]) -> list[float]:
         """Times of a run at which the equations switch, where functions of time alone decide."""
-        return self.form.instants(first, last, driven, self._p)
+        return self.form.instants(first, last, time_values, self._p)
 
     def advance(self, series: Series, left: float, grid: Array, state: Array) -> Array:
         """States (nstates, ngrid) at times of a segment, of which the last is its end."""
@@ -399,8 +401,8 @@ def _called(
     out = np.zeros((function.numel_out(0) // nrows if nrows else 0, nrows))
     given: tuple[Value, Callable[[], None]] = function.buffer()  # with a signature that CasADi's stubs do not have
     buffer, evaluate = given
-    kept = [np.ravel(values, order="F").astype(float) for values in arguments]
-    for k, values in enumerate(kept):
+    columns = [np.ravel(values, order="F").astype(float) for values in arguments]
+    for k, values in enumerate(columns):
         if values.size:
             buffer.set_arg(k, values.data)
     buffer.set_res(0, out.data)
@@ -418,12 +420,18 @@ def _feedthrough(block: Block, trace: Trace | None) -> NDArray[np.bool_]:
 
 
 def _signals(
-    network: Network, traces: list[Trace | None], own: list[ca.SX], steps: list[Step], t: ca.SX, x: ca.SX, driven: ca.SX
+    network: Network,
+    traces: list[Trace | None],
+    own: list[ca.SX],
+    steps: list[Step],
+    t: ca.SX,
+    x: ca.SX,
+    time_values: ca.SX,
 ) -> ca.SX:
     """Column of all signals."""
     known = [ca.SX(0)] * network.nsignals
-    for k, row in enumerate(network.driven):
-        known[row] = driven[k]
+    for k, row in enumerate(network.time_rows):
+        known[row] = time_values[k]
     for step in steps:
         if step.unknown is None:
             _evaluate(network, traces, own, step.blocks[0], t, x, known)

@@ -21,20 +21,20 @@ from ctrlplan.trajectories import Trajectory
 
 Vector = Callable[[Array], Array]
 
-_AT_REST = 1e-9
+_LINEAR_RESIDUAL = 1e-9
 """Rate of a state at equilibrium, relative to the terms it is the sum of, in a linear loop."""
 
-_FOUND = 1e-8
+_RESIDUAL = 1e-8
 """The same in a loop whose equilibrium was found by iteration."""
 
 _EVALUATIONS = 10_000
 """Evaluations of the rates after which no further guess is tried."""
 
-_TURNS = 40
+_ITERATIONS = 40
 """Steps of Newton's iteration."""
 
 
-def rest_at(
+def equilibrium_at(
     system: System | Prepared, plan: Trajectory, time: float, outputs: Sequence[int], params: Params | None = None
 ) -> tuple[Array, str]:
     """State in which a loop is at equilibrium at the first position of a plan.
@@ -77,7 +77,7 @@ def rest_at(
     held = np.concatenate([np.zeros(0), *(_held(signal, time) for signal in prepared.time_signals(given, time))])
     if prepared.linear is not None:
         form = prepared.linear
-        state = _linear_rest(form.a, form.b @ held, form.c[rows], form.d[rows] @ held, target, start, free)
+        state = _linear_equilibrium(form.a, form.b @ held, form.c[rows], form.d[rows] @ held, target, start, free)
         return (start, "it has none") if state is None else (state, "")
     try:
         try:
@@ -89,7 +89,7 @@ def rest_at(
         return start, f"its equations cannot be evaluated ({type(error).__name__}: {error})"
 
 
-def rest_state(system: System | Prepared, position: ArrayLike) -> Array:
+def equilibrium_state(system: System | Prepared, position: ArrayLike) -> Array:
     """State at which a linear loop rests when its inputs are held.
 
     Parameters
@@ -114,7 +114,7 @@ def rest_state(system: System | Prepared, position: ArrayLike) -> Array:
     if form.b.shape[1] != held.size or not held.any():
         return np.zeros(len(form.a))
     c, d, free = form.c[: held.size], form.d[: held.size], np.ones(len(form.a), dtype=bool)
-    state = _linear_rest(form.a, form.b @ held, c, d @ held, held, np.zeros(len(form.a)), free)
+    state = _linear_equilibrium(form.a, form.b @ held, c, d @ held, held, np.zeros(len(form.a)), free)
     return np.zeros(len(form.a)) if state is None else state
 
 
@@ -144,7 +144,7 @@ def _held(signal: TimeSignal, time: float) -> Array:
     return jet.ravel()
 
 
-def _linear_rest(
+def _linear_equilibrium(
     a: Array, supplied: Array, c: Array, passed: Array, target: Array, start: Array, free: NDArray[np.bool_]
 ) -> Array | None:
     """State at which the free rows of A x + supplied vanish; None where there is none.
@@ -155,7 +155,7 @@ def _linear_rest(
     inner = a[np.ix_(free, free)]
     wanted = -(supplied + a @ state)[free]
     found, left = _scaled_solution(inner, wanted)
-    if left > _AT_REST:
+    if left > _LINEAR_RESIDUAL:
         return None
     idle = null_space(inner)
     if idle.size and len(c) == target.size:
@@ -197,7 +197,7 @@ class _Equations:
         self.discrete, self._trials = prepared.is_discrete, trials
         self.unknown: tuple[str, ...] = ()
         self.fixed = np.zeros(prepared.nstates, dtype=bool)
-        self.late: Callable[[Array], str] = lambda x: ""
+        self.delay_mismatch: Callable[[Array], str] = lambda x: ""
         self._rates: Vector
         self._outputs: Vector
         self._gaps: Vector = lambda x: np.zeros(0)
@@ -233,7 +233,7 @@ class _Equations:
         network = prepared.network.for_trials()
         sampled, unknown = [], []
         for i, (block, place) in enumerate(zip(network.blocks, network.states, strict=True)):
-            linear = block.linear or block.driven or isinstance(block.traits.block, ct.StateSpace)
+            linear = block.linear or block.is_time_function or isinstance(block.traits.block, ct.StateSpace)
             if not linear and (self.discrete or block.period is not None):
                 unknown.append(block.name)
                 self.fixed[place] = True
@@ -250,11 +250,11 @@ class _Equations:
                 moved[place] = equations.sampled((i,), time, x, held)[place] - x[place]
             return moved
 
-        def late(x: Array) -> str:
+        def delay_mismatch(x: Array) -> str:
             signals = equations.signals(time, x, held)
             for i in network.blocks_with("delay"):
                 before, now = signals[network.outputs[i]], network.fed[i](signals)
-                if np.any(np.abs(now - before) > _FOUND * max(np.abs(held).max(), np.abs(before).max())):
+                if np.any(np.abs(now - before) > _RESIDUAL * max(np.abs(held).max(), np.abs(before).max())):
                     start = (
                         f"the output of the delay {network.blocks[i].name} starts at {_listed(before)}, its initial="
                     )
@@ -266,7 +266,7 @@ class _Equations:
             found = [network.fed[i](signals) - signals[network.outputs[i]] for i in network.blocks_with("delay")]
             return np.concatenate([np.zeros(0), *found])
 
-        self._rates, self.late, self._gaps = rates, late, gaps
+        self._rates, self.delay_mismatch, self._gaps = rates, delay_mismatch, gaps
         self._outputs = lambda x: network.to_outputs(equations.signals(time, x, held))
 
     def rates(self, x: Array) -> Array:
@@ -317,7 +317,7 @@ def _found(
 
     size = float(np.abs(target).max(initial=0.0)) or 1.0
     if not rates(start[free]).any() and not missing(start[free]).any():
-        return start, equations.late(start)
+        return start, equations.delay_mismatch(start)
     guesses = [guess for guess in _guesses(start[free], target) if _finite(rates(guess)) and _finite(missing(guess))]
     moves = np.max([np.abs(rates(guess)) for guess in guesses], axis=0, initial=0.0) if guesses else np.zeros(0)
     nearest: tuple[float, Array] | None = None
@@ -330,14 +330,16 @@ def _found(
         distance = float(np.abs(missing(z)).max(initial=0.0))
         if nearest is None or distance < nearest[0]:
             nearest = distance, z
-        if distance <= _FOUND * size:
+        if distance <= _RESIDUAL * size:
             break
     if nearest is None:
-        return start, _of_samples(equations) if equations.unknown else equations.late(start) or "none was found"
+        return start, _of_samples(equations) if equations.unknown else equations.delay_mismatch(
+            start
+        ) or "none was found"
     state = whole(nearest[1])
-    if equations.unknown and nearest[0] > _FOUND * size:
+    if equations.unknown and nearest[0] > _RESIDUAL * size:
         return state, _of_samples(equations)
-    return state, equations.late(state)
+    return state, equations.delay_mismatch(state)
 
 
 def _of_samples(equations: _Equations) -> str:
@@ -360,7 +362,7 @@ def _guesses(start: Array, target: Array) -> Iterator[Array]:
 def _equilibrium(rates: Vector, missing: Vector, guess: Array, moves: Array, size: float) -> Array | None:
     """State from a guess at which all rates vanish; None where none is found."""
     z = guess
-    if z.size and (not _still(rates, z, moves) or np.abs(missing(z)).max(initial=0.0) > _FOUND * size):
+    if z.size and (not _is_equilibrium(rates, z, moves) or np.abs(missing(z)).max(initial=0.0) > _RESIDUAL * size):
         weight = 1.0 / np.where(moves > 0.0, moves, 1.0)
         near = least_squares(
             lambda v: np.concatenate([weight * rates(v), missing(v) / size]),
@@ -372,13 +374,13 @@ def _equilibrium(rates: Vector, missing: Vector, guess: Array, moves: Array, siz
             max_nfev=max(10, min(200, _EVALUATIONS // (z.size + 1))),
         )
         z = _newton(rates, near.x)
-    return z if _still(rates, z, moves) else None
+    return z if _is_equilibrium(rates, z, moves) else None
 
 
 def _newton(rates: Vector, z: Array) -> Array:
     """Newton's iteration on the rates alone, by steps of minimum norm."""
     f = rates(z)
-    for _ in range(_TURNS):
+    for _ in range(_ITERATIONS):
         if not _finite(f) or not f.any():
             break
         slope = _jacobian(rates, z, f)
@@ -396,7 +398,7 @@ def _newton(rates: Vector, z: Array) -> Array:
     return z
 
 
-def _still(rates: Vector, z: Array, moves: Array) -> bool:
+def _is_equilibrium(rates: Vector, z: Array, moves: Array) -> bool:
     """Whether the rates are rounding compared with the terms that they sum, or with rates at other states."""
     f = rates(z)
     if not _finite(f):
@@ -404,7 +406,7 @@ def _still(rates: Vector, z: Array, moves: Array) -> bool:
     if not f.any():
         return True
     terms = np.abs(_jacobian(rates, z, f)) @ np.abs(z)
-    return bool(np.all(np.abs(f) <= _FOUND * np.fmax(terms, moves)))
+    return bool(np.all(np.abs(f) <= _RESIDUAL * np.fmax(terms, moves)))
 
 
 def _jacobian(rates: Vector, z: Array, f: Array) -> Array:

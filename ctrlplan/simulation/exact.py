@@ -35,7 +35,7 @@ from ctrlplan.simulation.pairs import pair_product, pair_sum
 _TERMS = 18
 """Taylor terms of the input in a cell."""
 
-_FEWEST = 8
+_CROSSOVER = 8
 """Samples in a cell from which on a table for all cells is quicker than a series in each; and states up to which
 products of their matrices are quicker than steps one by one."""
 
@@ -126,11 +126,11 @@ def sampled_states(a: Array, b: Array, samples: Array, timepts: Array, initial: 
     even = _spacing(timepts - timepts[0], float(timepts[-1] - timepts[0]))
     if even:  # spacings that differ by rounding alone share an exponential
         steps[:] = even
-    drive = np.concatenate([samples[:, :-1], np.diff(samples)]).T  # Taylor terms in the time of each interval
-    part = max(1, _NUMBERS // max(1, scale.size * (scale.size + drive.shape[1])))
+    terms = np.concatenate([samples[:, :-1], np.diff(samples)]).T  # Taylor terms in the time of each interval
+    part = max(1, _NUMBERS // max(1, scale.size * (scale.size + terms.shape[1])))
     with np.errstate(all="ignore"):
-        if even and scale.size > _FEWEST:
-            out[:] = _marched(state, _changes(even * a, even * b, 2), drive.T.reshape(2, len(samples), -1))[0].T
+        if even and scale.size > _CROSSOVER:
+            out[:] = _marched(state, _changes(even * a, even * b, 2), terms.T.reshape(2, len(samples), -1))[0].T
             return (out * scale).T
         for begin in range(0, steps.size if scale.size else 0, part):
             these = slice(begin, begin + part)
@@ -138,12 +138,12 @@ def sampled_states(a: Array, b: Array, samples: Array, timepts: Array, initial: 
             h = spacings[:, None, None]
             changes = _changes(h * a, h * b, 2)
             change = changes[-1][which]
-            forced = change[:, :, scale.size :] @ drive[these, :, None]
+            forced = change[:, :, scale.size :] @ terms[these, :, None]
             found = out[begin + 1 : these.stop + 1]
             found[:] = _recurrence(change[:, :, : scale.size], forced, out[begin])
             for k in range(_first_overflow(found.T), len(found)):
-                series, own = drive[begin + k].reshape(2, -1, 1), [level[which[k]] for level in changes]
-                found[k] = _carried(out[begin + k][:, None], series, own)[:, 0]
+                series, own = terms[begin + k].reshape(2, -1, 1), [level[which[k]] for level in changes]
+                found[k] = _propagated(out[begin + k][:, None], series, own)[:, 0]
     return (out * scale).T
 
 
@@ -156,10 +156,12 @@ def matrix_product(left: Array, right: Array) -> Array:
         product: Array = left @ right
         if np.isfinite(product).all():
             return product
-        lost, gone = ~np.isfinite(left), ~np.isfinite(right)
-        product = np.where(lost, 0.0, left) @ np.where(gone, 0.0, right)
-    votes = np.where(lost, np.sign(left), 0.0) @ np.sign(right) + np.sign(left) @ np.where(gone, np.sign(right), 0.0)
-    touched = lost.astype(float) @ (right != 0.0) + (left != 0.0) @ gone.astype(float) > 0.0
+        left_infinite, right_infinite = ~np.isfinite(left), ~np.isfinite(right)
+        product = np.where(left_infinite, 0.0, left) @ np.where(right_infinite, 0.0, right)
+    votes = np.where(left_infinite, np.sign(left), 0.0) @ np.sign(right) + np.sign(left) @ np.where(
+        right_infinite, np.sign(right), 0.0
+    )
+    touched = left_infinite.astype(float) @ (right != 0.0) + (left != 0.0) @ right_infinite.astype(float) > 0.0
     product[touched] = np.copysign(np.inf, votes[touched])
     product[np.isnan(product)] = np.inf
     return product
@@ -214,9 +216,9 @@ def _segment(
     if per:
         h = per * float(samples[-1] - samples[0]) / (samples.size - 1)
         changes = _changes(h * a, h * b, nterms, halvings=per.bit_length() - 1)
-        while per >= _FEWEST and not np.isfinite(changes[-1]).all():  # an unstable system outgrows a cell
+        while per >= _CROSSOVER and not np.isfinite(changes[-1]).all():  # an unstable system outgrows a cell
             changes, per, h = changes[:-1], per // 2, 0.5 * h
-        if per >= _FEWEST:
+        if per >= _CROSSOVER:
             return _even_segment(a, b, series, duration, nterms, per, h, changes, samples, state, read, out)
     h = duration / ncells
     terms = series(h * np.arange(ncells, dtype=float), h)
@@ -243,7 +245,7 @@ def _even_segment(
 ) -> Array:
     """Same, for evenly spaced samples, a power of two of them, `per`, in each cell of length h."""
     (count, n), m = state.shape, b.shape[-1]
-    whole, rest = divmod(samples.size, per)
+    whole, remainder = divmod(samples.size, per)
     last = int(duration // h)  # the cell in which the segment ends
     cells = series(h * np.arange(max(last, whole) + 1, dtype=float), h)
     chain = cells.reshape(-1, cells.shape[2])
@@ -265,12 +267,12 @@ def _even_segment(
     rows[:, :, :n] += read[..., None]
     main = out[:, :, : whole * per].reshape(*out.shape[:2], whole, per)
     np.matmul(known[:, None, :whole], rows, out=main)
-    out[:, :, whole * per :] = (known[:, None, whole : whole + 1] @ rows[..., :rest])[:, :, 0]
+    out[:, :, whole * per :] = (known[:, None, whole : whole + 1] @ rows[..., :remainder])[:, :, 0]
     for i in np.flatnonzero(~np.isfinite(out).all(axis=(1, 2))):
         main[i] = matrix_product(known[i, :whole], rows[i])
-        out[i, :, whole * per :] = matrix_product(known[i, whole : whole + 1], rows[i, ..., :rest])[:, 0]
+        out[i, :, whole * per :] = matrix_product(known[i, whole : whole + 1], rows[i, ..., :remainder])[:, 0]
     if samples[-1] == duration:
-        ending, last = table[:, :, rest - 1], whole if rest else whole - 1
+        ending, last = table[:, :, remainder - 1], whole if remainder else whole - 1
     else:
         ending = _part(a, b, nterms, h, duration / h - last)
     return known[:, last, :n] + matrix_product(ending, known[:, last, :, None])[:, :, 0]
@@ -300,7 +302,7 @@ def _any_segment(a: Array, b: Array, series: Array, samples: Array, state: Array
             break
         h *= 0.5
         first, second = _halved(series)
-        middle = _carried(states, first, changes[: level + 1])
+        middle = _propagated(states, first, changes[: level + 1])
         states = np.stack([states, middle], axis=2).reshape(n, -1)
         series = np.stack([first, second], axis=3).reshape(*first.shape[:2], 2 * first.shape[2])
         later = sigma >= 0.5  # doubling and this difference are exact, until nothing is left of any sample
@@ -338,8 +340,8 @@ def _samples_per_cell(samples: Array, duration: float, longest: float) -> int:
     if not step or max(samples[0], duration - samples[-1]) > step:
         return 0
     # Longer cells than the square root and the table costs more than the march.
-    most = min(longest / step - 1.0, 2.0 * samples.size**0.5)
-    return 2 ** int(np.log2(most)) if most >= _FEWEST else 0
+    maximum = min(longest / step - 1.0, 2.0 * samples.size**0.5)
+    return 2 ** int(np.log2(maximum)) if maximum >= _CROSSOVER else 0
 
 
 def _spacing(samples: Array, duration: float) -> float:
@@ -362,20 +364,20 @@ def _changes(a: Array, b: Array, nterms: int, halvings: int = 0) -> list[Array]:
     """
     if a.ndim == 2:
         return [change[0] for change in _changes(a[None], b[None], nterms, halvings)]
-    products, least = _products(a, b)
-    levels = max(halvings, int(least.max()))
-    found = _doubled(products, least, nterms, levels)
+    products, minimum = _products(a, b)
+    levels = max(halvings, int(minimum.max()))
+    found = _doubled(products, minimum, nterms, levels)
     n = a.shape[1]
     own = np.array([change[..., :n] for change in found])
-    lost = np.any(_cancelling(own[:-1], own[:-1], own[1:]), axis=0, out=np.zeros(len(a), dtype=bool))
+    cancelled = np.any(_cancelling(own[:-1], own[:-1], own[1:]), axis=0, out=np.zeros(len(a), dtype=bool))
     large = np.abs(products[:, :, :n, 0]).sum(axis=1).max(axis=1) > 0.25 * _CANCELLED
     if large.any():
         powers = np.moveaxis(products[large, :, :n], -1, 0)
-        lost[large] |= np.any(_cancelling(powers[:1], powers[:-1], powers[1:]), axis=0)
-    if lost.any():
-        precise = _doubled_precisely(products[lost, :, :, 0], least[lost], nterms, levels)
+        cancelled[large] |= np.any(_cancelling(powers[:1], powers[:-1], powers[1:]), axis=0)
+    if cancelled.any():
+        precise = _doubled_precisely(products[cancelled, :, :, 0], minimum[cancelled], nterms, levels)
         for change, better in zip(found, precise, strict=True):
-            change[lost] = np.where(np.isfinite(better).all(axis=(1, 2), keepdims=True), better, change[lost])
+            change[cancelled] = np.where(np.isfinite(better).all(axis=(1, 2), keepdims=True), better, change[cancelled])
     return found
 
 
@@ -411,21 +413,21 @@ def _products(a: Array, b: Array) -> tuple[Array, NDArray[np.intp]]:
     return np.stack(products, axis=-1), halvings.astype(np.intp)
 
 
-def _doubled(products: Array, least: NDArray[np.intp], nterms: int, levels: int) -> list[Array]:
+def _doubled(products: Array, minimum: NDArray[np.intp], nterms: int, levels: int) -> list[Array]:
     """Changes over 2^-levels, ..., 1/2, 1 units of time: by the series up to 2^-least, then by squaring."""
     n, m = products.shape[1], products.shape[2] - products.shape[1]
     shift, powers = _shift(nterms, m, 1.0), np.repeat(0.5 ** np.arange(nterms), m)
     orders = np.arange(1.0, products.shape[3] + 1.0)
     found: list[Array] = []
     for level in range(levels, -1, -1):
-        change, squared = np.empty((len(least), n, n + nterms * m)), least > level
+        change, squared = np.empty((len(minimum), n, n + nterms * m)), minimum > level
         if squared.any():
             before = found[-1][squared]
             after = _followed(before[:, :, None, :], before, shift)[:, :, 0]
             after[..., n:] *= powers
             change[squared] = after
         if not squared.all():
-            terms, shorter = (products, least) if not squared.any() else (products[~squared], least[~squared])
+            terms, shorter = (products, minimum) if not squared.any() else (products[~squared], minimum[~squared])
             if (shorter < level).any():
                 terms = terms * (0.5 ** (level - shorter[:, None, None, None])) ** orders
             # By einsum, equal rows have equal sums, which a product of matrices does not promise.
@@ -443,7 +445,7 @@ def _cancelling(left: Array, right: Array, result: Array) -> NDArray[np.bool_]:
     return found
 
 
-def _doubled_precisely(both: Array, least: NDArray[np.intp], nterms: int, levels: int) -> list[Array]:
+def _doubled_precisely(both: Array, minimum: NDArray[np.intp], nterms: int, levels: int) -> list[Array]:
     """Same as `_doubled` in twice the digits, from [a, b] in a time of 2^-least."""
     n, m = both.shape[1], both.shape[2] - both.shape[1]
     powers = np.concatenate([np.ones(n), np.repeat(0.5 ** np.arange(nterms), m)])
@@ -452,23 +454,23 @@ def _doubled_precisely(both: Array, least: NDArray[np.intp], nterms: int, levels
     while len(products) < orders.size:
         products.append(pair_product((both[..., :n], np.zeros_like(both[..., :n])), products[-1]))
     series = [np.stack(half, axis=-1) for half in zip(*products, strict=True)]
-    change, rest = (np.zeros((len(least), n, powers.size)) for _ in range(2))
+    change, errors = (np.zeros((len(minimum), n, powers.size)) for _ in range(2))
     found: list[Array] = []
     for level in range(levels, -1, -1):
-        squared = least > level
+        squared = minimum > level
         if squared.any():
-            old = change[squared], rest[squared]
+            old = change[squared], errors[squared]
             new = pair_sum(old, old, pair_product((old[0][..., :n], old[1][..., :n]), old))
             if m:
                 more = pair_product((old[0][..., n:], old[1][..., n:]), (shift, np.zeros_like(shift)), m)
                 forced = pair_sum((new[0][..., n:], new[1][..., n:]), more)
                 new[0][..., n:], new[1][..., n:] = forced
-            change[squared], rest[squared] = new[0] * powers, new[1] * powers
+            change[squared], errors[squared] = new[0] * powers, new[1] * powers
         if not squared.all():
-            part = 0.5 ** (level - least[~squared, None, None, None])
+            part = 0.5 ** (level - minimum[~squared, None, None, None])
             terms, small = ((half[~squared] * part**orders).reshape(-1, orders.size) for half in series)
-            sums = pair_product((terms, small), (_WEIGHTS[:nterms].T, _WEIGHTS_REST[:nterms].T))
-            change[~squared], rest[~squared] = (_arranged(half, n, m) for half in sums)
+            sums = pair_product((terms, small), (_WEIGHTS[:nterms].T, _WEIGHTS_ERROR[:nterms].T))
+            change[~squared], errors[~squared] = (_arranged(half, n, m) for half in sums)
         found.append(change.copy())
     return found
 
@@ -514,17 +516,17 @@ def _marched(state: Array, changes: list[Array], series: Array) -> Array:
         for k in range(_first_overflow(found), ncells + 1):
             if k:
                 before, terms = found[:, k - 1, None], series[:, :, k - 1, None]
-                found[:, k] = _carried(before, terms, [change[i] for change in changes])[:, 0]
+                found[:, k] = _propagated(before, terms, [change[i] for change in changes])[:, 0]
     return states
 
 
 def _first_overflow(states: Array) -> int:
     """Index of the first time at which a state is not finite; their number where all are."""
-    lost = ~np.isfinite(states).all(axis=0)
-    return int(lost.argmax()) if lost.any() else lost.size
+    overflowed = ~np.isfinite(states).all(axis=0)
+    return int(overflowed.argmax()) if overflowed.any() else overflowed.size
 
 
-def _carried(states: Array, series: Array, changes: list[Array]) -> Array:
+def _propagated(states: Array, series: Array, changes: list[Array]) -> Array:
     """States (n, ncells) after the last of some changes, of one system with the input's terms in each cell.
 
     Where that change is beyond the range of numbers, by shorter ones: what is
@@ -544,10 +546,10 @@ def _carried(states: Array, series: Array, changes: list[Array]) -> Array:
     last, grown, series = len(changes) - 1, grown[:, cells], series[:, :, cells]
     level = max(0, bisect_left(range(last), True, key=lambda k: not np.isfinite(changes[k]).all()) - 1)
     halves = 0.5 ** np.arange(len(series))[:, None, None]
-    now = _carried(states[:, cells], series * halves ** (last - level), changes[: level + 1])
+    now = _propagated(states[:, cells], series * halves ** (last - level), changes[: level + 1])
     while level < last and np.isfinite(now[grown]).any():
         _, second = _halved(series * halves ** (last - level - 1))
-        now = _carried(now, second, changes[: level + 1])
+        now = _propagated(now, second, changes[: level + 1])
         level += 1
     after[:, cells] = now if level == last else np.where(grown, now, after[:, cells])
     return after
@@ -560,7 +562,7 @@ def _recurrence(change: Array, forced: Array, state: Array) -> Array:
     side by side from a state still unknown, then that state from block to block.
     """
     nsteps, n = change.shape[:2]
-    if n > _FEWEST:
+    if n > _CROSSOVER:
         return _one_by_one(change, forced, state)
     per = int(np.ceil(nsteps**0.5))
     steps = np.zeros((per * -(-nsteps // per), n, n + 1))
@@ -628,5 +630,5 @@ _PASCAL: Array = np.triu(pascal(_TERMS, kind="upper")).astype(float)
 _RATIOS = [[Fraction(factorial(j), factorial(i + j + 1)) for i in range(_TERMS + 1)] for j in range(_TERMS)]
 _WEIGHTS: Array = np.array(_RATIOS, dtype=float)
 """j!/(i + j + 1)!: what a^i b, in units of time, adds to the change of states by the input's Taylor term j."""
-_WEIGHTS_REST: Array = np.array([[ratio - Fraction(float(ratio)) for ratio in row] for row in _RATIOS], dtype=float)
+_WEIGHTS_ERROR: Array = np.array([[ratio - Fraction(float(ratio)) for ratio in row] for row in _RATIOS], dtype=float)
 """What rounding cuts off them."""

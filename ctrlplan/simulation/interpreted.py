@@ -33,13 +33,13 @@ from ctrlplan.symbolic.trials import can_remember, trial_copy, values_of
 Call = Callable[[float, Array, Array], None]
 """(t, state of the network, its signals): puts a block's outputs among the signals."""
 
-_LEAST = 2.3e-14
+_MIN_RTOL = 2.3e-14
 """Smallest relative tolerance of scipy's solvers."""
 
 _SHARED = tuple(int(part) for part in scipy.__version__.split(".")[:2]) < (1, 17)
 """Whether all threads share the state of scipy's LSODA, which was Fortran before."""
 
-_ALONE = threading.Lock()
+_LSODA_LOCK = threading.Lock()
 """Held by the run that uses LSODA where its state is shared."""
 
 _CALLS, _INSTANT = 2000, 1e-9
@@ -96,18 +96,18 @@ class Interpreted:
         self._for_rates = self._steps(self._outputs, network.signals_of_inputs(), self.feeds)
         self._for_all = self._steps(self._outputs, np.ones(network.nsignals, dtype=bool), self.feeds)
         self._for_samples: dict[tuple[int, ...], list[Call]] = {}
-        self._a, self._b, self._driving, self._moving = _merged_linear(network)
+        self._a, self._b, self._linear_columns, self._moving = _merged_linear(network)
 
-    def rates(self, t: float, x: Array, driven: Array) -> Array:
+    def rates(self, t: float, x: Array, time_values: Array) -> Array:
         """Derivatives of all states, given the signals that are functions of time."""
         check(t)
         self.evaluations += 1
-        w = self._signals(self._for_all if self._doubtful else self._for_rates, t, x, driven)
+        w = self._signals(self._for_all if self._doubtful else self._for_rates, t, x, time_values)
         return self.rates_of(t, x, w)
 
     def rates_of(self, t: float, x: Array, w: Array) -> Array:
         """The same, given all signals; the next states of a discrete system."""
-        dx = self._a @ x + self._b @ w[self._driving]
+        dx = self._a @ x + self._b @ w[self._linear_columns]
         for i in self._moving:
             place = self.network.states[i]
             with _named(self.network.blocks[i].name, t):
@@ -120,27 +120,27 @@ class Interpreted:
             dx[place] = found
         return dx
 
-    def signals(self, t: float, x: Array, driven: Array) -> Array:
+    def signals(self, t: float, x: Array, time_values: Array) -> Array:
         """All signals of the network."""
-        return self._signals(self._for_all, t, x, driven)
+        return self._signals(self._for_all, t, x, time_values)
 
-    def all_signals(self, times: Array, states: Array, driven: Array) -> Array:
+    def all_signals(self, times: Array, states: Array, time_values: Array) -> Array:
         """All signals (nsignals, ntime) at many times."""
-        rows = [self.signals(t, states[:, k], driven[:, k]) for k, t in enumerate(times.tolist())]
+        rows = [self.signals(t, states[:, k], time_values[:, k]) for k, t in enumerate(times.tolist())]
         return np.array(rows).T.reshape(-1, times.size)
 
-    def sampled(self, blocks: tuple[int, ...], t: float, x: Array, driven: Array) -> Array:
+    def sampled(self, blocks: tuple[int, ...], t: float, x: Array, time_values: Array) -> Array:
         """State after some discrete blocks have taken a sample, each seeing the others' new outputs.
 
-        Blocks that declare `samples_first` go before the rest and see
+        Blocks that declare `samples_first` go before the others and see
         their own outputs as they were, which may come back to them at once.
         """
         first = tuple(i for i in blocks if self.network.blocks[i].traits.samples_first)
-        rest = tuple(i for i in blocks if i not in first)
+        others = tuple(i for i in blocks if i not in first)
         if first:
-            w = self._seen(rest, t, x, driven) if rest else self.signals(t, x, driven)
+            w = self._seen(others, t, x, time_values) if others else self.signals(t, x, time_values)
             x = self._after(first, t, x, w)
-        return self._after(rest, t, x, self._seen(rest, t, x, driven)) if rest else x
+        return self._after(others, t, x, self._seen(others, t, x, time_values)) if others else x
 
     def _after(self, blocks: tuple[int, ...], t: float, x: Array, w: Array) -> Array:
         """State after some blocks have taken a sample of some signals."""
@@ -154,11 +154,11 @@ class Interpreted:
             after[place] = following
         return after
 
-    def _seen(self, blocks: tuple[int, ...], t: float, x: Array, driven: Array) -> Array:
+    def _seen(self, blocks: tuple[int, ...], t: float, x: Array, time_values: Array) -> Array:
         """Signals at an instant, the outputs of some blocks being those after a sample."""
         if blocks not in self._for_samples:
             self._for_samples[blocks] = self._sampling(blocks)
-        return self._signals(self._for_samples[blocks], t, x, driven)
+        return self._signals(self._for_samples[blocks], t, x, time_values)
 
     def _sampling(self, blocks: tuple[int, ...]) -> list[Call]:
         """Steps to all signals at the instant of a sample."""
@@ -208,9 +208,9 @@ class Interpreted:
             if found is not None and not np.allclose(found, w[outs], rtol=1e-9, atol=1e-9 * size, equal_nan=True):
                 raise FeedthroughError(f"outputs of {block.name} at {t:g} s depend on more inputs than at the start")
 
-    def _signals(self, steps: list[Call], t: float, x: Array, driven: Array) -> Array:
+    def _signals(self, steps: list[Call], t: float, x: Array, time_values: Array) -> Array:
         w = np.zeros(self.network.nsignals)
-        w[self.network.driven] = driven
+        w[self.network.time_rows] = time_values
         for step in steps:
             step(t, x, w)
         if self._doubtful and steps is self._for_all:
@@ -264,10 +264,10 @@ class Interpreted:
         block, count = network.blocks[i], outs.stop - outs.start
         if block.linear and output is self._outputs[i]:
             c = np.asarray(block.system.C, dtype=float)
-            d, driving = _used(np.asarray(block.system.D, dtype=float) @ network.wire[network.inputs[i]])
+            d, columns = _used(np.asarray(block.system.D, dtype=float) @ network.wire[network.inputs[i]])
 
             def linear(t: float, x: Array, w: Array) -> None:
-                w[outs] = c @ x[states] + d @ w[driving]
+                w[outs] = c @ x[states] + d @ w[columns]
 
             return linear
 
@@ -288,7 +288,7 @@ class InterpretedSolver:
 
     def __init__(self, equations: Interpreted, tolerances: Tolerances, scales: Scales) -> None:
         self._equations, self._scales = equations, scales
-        self._rtol, self._atol = max(tolerances.rtol, _LEAST), tolerances.atol
+        self._rtol, self._atol = max(tolerances.rtol, _MIN_RTOL), tolerances.atol
         self._bounded = any(b.changes_unseen and b.depends_on_time for b in equations.network.blocks)
         self._segments, self._next = 0, 0
         self.switches: list[float] = []
@@ -301,34 +301,34 @@ class InterpretedSolver:
     def count(self) -> None:
         """Evaluations are counted as it is."""
 
-    def scaled_rates(self, t: float, z: Array, driven: Array) -> Array:
+    def scaled_rates(self, t: float, z: Array, time_values: Array) -> Array:
         """Rates of the states in their scales."""
         scales = self._scales
-        return np.asarray(self._equations.rates(t, scales.shift + scales.scale * z, driven) / scales.scale)
+        return np.asarray(self._equations.rates(t, scales.shift + scales.scale * z, time_values) / scales.scale)
 
-    def signals(self, times: Array, states: Array, driven: Array) -> Array:
+    def signals(self, times: Array, states: Array, time_values: Array) -> Array:
         """All signals (nsignals, ntime) of the network."""
-        return self._equations.all_signals(times, states, driven)
+        return self._equations.all_signals(times, states, time_values)
 
-    def outputs(self, times: Array, states: Array, driven: Array) -> Array:
+    def outputs(self, times: Array, states: Array, time_values: Array) -> Array:
         """Outputs (noutputs, ntime) of the whole."""
-        return self._equations.network.to_outputs(self.signals(times, states, driven))
+        return self._equations.network.to_outputs(self.signals(times, states, time_values))
 
-    def slopes(self, times: Array, states: Array, driven: Array) -> Array:
+    def slopes(self, times: Array, states: Array, time_values: Array) -> Array:
         """Derivatives of the rates by the states, by differences, (ntime, nstates, nstates)."""
         n = len(states)
         steps = 1e-7 * np.maximum(self._scales.scale, np.abs(states).max(axis=1, initial=0.0))
-        plain = self.rates(times, states, driven)
+        plain = self.rates(times, states, time_values)
         found = np.empty((times.size, n, n))
         for j in range(n):
             near = states.copy()
             near[j] += steps[j]
-            found[:, :, j] = ((self.rates(times, near, driven) - plain) / steps[j]).T
+            found[:, :, j] = ((self.rates(times, near, time_values) - plain) / steps[j]).T
         return found
 
-    def rates(self, times: Array, states: Array, driven: Array) -> Array:
+    def rates(self, times: Array, states: Array, time_values: Array) -> Array:
         """Rates (nstates, ntime) of the states."""
-        rows = [self._equations.rates(t, states[:, k], driven[:, k]) for k, t in enumerate(times.tolist())]
+        rows = [self._equations.rates(t, states[:, k], time_values[:, k]) for k, t in enumerate(times.tolist())]
         return np.array(rows).T.reshape(-1, times.size)
 
     def advance(self, series: Series, left: float, grid: Array, state: Array) -> Array:
@@ -354,7 +354,7 @@ class InterpretedSolver:
                 t = passed
         raise self._ended(rates, t, z, why)
 
-    def instants(self, first: float, last: float, driven: Callable[[Array], Array]) -> list[float]:
+    def instants(self, first: float, last: float, time_values: Callable[[Array], Array]) -> list[float]:
         """Times at which equations switch: of functions in Python none are known but those declared."""
         return []
 
@@ -409,9 +409,9 @@ class InterpretedSolver:
 
     def _cause(self, rates: _Watched, t: float, z: Array) -> str:
         equations, x = self._equations, self._scales.shift + self._scales.scale * z
-        driven = rates.series(t)
+        time_values = rates.series(t)
         try:
-            w = equations.signals(t, x, driven)
+            w = equations.signals(t, x, time_values)
         except Exception:  # outside of a block's domain, and no help
             return ""
         return cause(equations.network, equations.params, t, x, w, rates.right - rates.left)
@@ -428,11 +428,11 @@ def _implicit() -> Iterator[type[OdeSolver]]:
     """LSODA, or BDF while another run, in a thread or inside a block, holds an LSODA whose state is shared."""
     if not _SHARED:
         yield LSODA
-    elif _ALONE.acquire(blocking=False):
+    elif _LSODA_LOCK.acquire(blocking=False):
         try:
             yield LSODA
         finally:
-            _ALONE.release()
+            _LSODA_LOCK.release()
     else:
         yield BDF
 
@@ -489,45 +489,45 @@ def _passed_on(image: Callable[[Array], Array], start: Array, times: int) -> Arr
     return None
 
 
-def _root(left_over: Callable[[Array], Array], guess: Array, names: str, t: float) -> Array:
+def _root(residual_of: Callable[[Array], Array], guess: Array, names: str, t: float) -> Array:
     """Solution of an algebraic loop by Newton's iteration, in one step where it is linear."""
     z = guess.copy()
-    rest = left_over(z)
+    residual = residual_of(z)
 
-    def trial_rest(z: Array) -> Array:
+    def trial_residual(z: Array) -> Array:
         try:
-            return left_over(z)
+            return residual_of(z)
         except Exception:  # outside of a block's domain
             return np.full(z.size, np.nan)
 
     for _ in range(50):
         size = 1.0 + np.abs(z)
-        if np.all(np.abs(rest) <= 1e-13 * size):
+        if np.all(np.abs(residual) <= 1e-13 * size):
             return z
         slope = np.empty((z.size, z.size))
         for j in range(z.size):
             step = np.zeros(z.size)
             step[j] = 1e-7 * size[j]
-            slope[:, j] = (trial_rest(z + step) - rest) / step[j]
+            slope[:, j] = (trial_residual(z + step) - residual) / step[j]
             if not np.isfinite(slope[:, j]).all():
-                slope[:, j] = (rest - trial_rest(z - step)) / step[j]
+                slope[:, j] = (residual - trial_residual(z - step)) / step[j]
         if not np.isfinite(slope).all():
             break
-        change = np.linalg.lstsq(slope, -rest, rcond=1e-14)[0]
-        before = np.abs(rest).max()
+        change = np.linalg.lstsq(slope, -residual, rcond=1e-14)[0]
+        before = np.abs(residual).max()
         for _ in range(30):
-            following = trial_rest(z + change)
+            following = trial_residual(z + change)
             if np.abs(following).max() < before:
                 break
             change = 0.5 * change
         else:
             break
-        z, rest = z + change, following
-    if np.all(np.abs(rest) <= 1e-9 * (1.0 + np.abs(z))):
+        z, residual = z + change, following
+    if np.all(np.abs(residual) <= 1e-9 * (1.0 + np.abs(z))):
         return z
     raise LoopError(
         f"the algebraic loop of the blocks {names} must have a solution that Newton's iteration finds, "
-        f"got a rest of {np.abs(rest).max():.3g} at {t:g} s"
+        f"got a residual of {np.abs(residual).max():.3g} at {t:g} s"
     )
 
 
@@ -558,13 +558,13 @@ class _Watched:
 
     def begin(self, calls: int) -> None:
         """Count anew, with so many calls about one instant."""
-        self._calls, self._about, self._asked = calls, -math.inf, 0
+        self._calls, self._about, self._count = calls, -math.inf, 0
 
     def __call__(self, t: float, z: Array) -> Array:
-        self._asked += 1
+        self._count += 1
         if abs(t - self._about) > _INSTANT * (self.right - self.left):
-            self._about, self._asked = t, 0
-        elif self._asked > self._calls:
+            self._about, self._count = t, 0
+        elif self._count > self._calls:
             raise _StalledError("the solution ends there")
         self._solver.review(self, t, z)
         inside = min(max(t, self._within[0]), self._within[1])

@@ -15,7 +15,7 @@ from ctrlplan.symbolic.fingerprint import value_token
 if TYPE_CHECKING:
     from ctrlplan.simulation.compiled import Compiled
 
-_KEPT = 8
+_CACHE_SIZE = 8
 """Maximum number of compiled forms of a system."""
 
 
@@ -86,7 +86,7 @@ class Learned:
                 found = self._known(params)
                 if found is None:
                     found = build()
-                    self.forms = (*self.forms[1 - _KEPT :], found)
+                    self.forms = (*self.forms[1 - _CACHE_SIZE :], found)
         if isinstance(found.form, NotCompiledError):
             raise NotCompiledError(str(found.form))
         return found.form
@@ -94,15 +94,15 @@ class Learned:
     def distrust(self, form: Compiled, why: str) -> DisagreementError:
         """Drop a form that was found wrong: the first time it may be built again, as its functions may have changed."""
         with BUILDING:
-            kept = []
+            retained = []
             for entry in self.forms:
                 if entry.form is not form:
-                    kept.append(entry)
+                    retained.append(entry)
                 elif any(entry.names == e.names and entry.constants == e.constants for e in self._rebuilt):
-                    kept.append(replace(entry, form=NotCompiledError(why)))
+                    retained.append(replace(entry, form=NotCompiledError(why)))
                 else:
-                    self._rebuilt = (*self._rebuilt[1 - _KEPT :], replace(entry, form=NotCompiledError(why)))
-            self.forms = tuple(kept)
+                    self._rebuilt = (*self._rebuilt[1 - _CACHE_SIZE :], replace(entry, form=NotCompiledError(why)))
+            self.forms = tuple(retained)
         return DisagreementError(why)
 
     def reads(self, name: str, find: Callable[[], bool]) -> bool:

@@ -15,10 +15,10 @@ from ctrlplan.simulation.exact import largest_change, matrix_product, state_scal
 from ctrlplan.traits import traits_of
 from ctrlplan.trajectories import Trajectory
 
-_TURNS, _GROWTH = 1e9, 20.0
-"""Durations in units of the fastest pole, and of the fastest growth, up to which rounding stays below `_DOUBT`."""
+_FAST, _GROWING = 1e9, 20.0
+"""Durations in units of the fastest pole, and of the fastest growth, up to which rounding stays below `_UNCERTAIN`."""
 
-_DOUBT = 1e-6
+_UNCERTAIN = 1e-6
 
 
 class NotLinearError(ValueError):
@@ -60,7 +60,7 @@ class LinearForm:
         if not self.a.size:
             return False, False, False
         poles = np.linalg.eigvals(self.a)
-        growing, fast = duration * poles.real.max() > _GROWTH, duration * np.abs(poles).max() > _TURNS
+        growing, fast = duration * poles.real.max() > _GROWING, duration * np.abs(poles).max() > _FAST
         if growing or fast:
             return bool(growing), bool(fast), False
         scale = state_scale(self.a)
@@ -68,7 +68,7 @@ class LinearForm:
         rounding = np.finfo(float).eps * np.abs(a).sum(axis=0).max()
         # norm(exp(a)) <= exp(greatest eigenvalue of the symmetric part), which most often is enough.
         bound = np.exp(np.clip(np.linalg.eigvalsh(a + a.T).max(), 0.0, 700.0))
-        nonnormal = rounding * bound > _DOUBT and rounding * largest_change(a, 1.0) ** 2 > _DOUBT
+        nonnormal = rounding * bound > _UNCERTAIN and rounding * largest_change(a, 1.0) ** 2 > _UNCERTAIN
         return False, False, bool(nonnormal)
 
     def rounding(self, states: Array, inputs: Array) -> Array:

@@ -78,7 +78,9 @@ class Block:
     def changes_unseen(self) -> bool:
         """Whether the equations may switch at times that nobody has named, if they depend on time."""
         named = self.traits.breakpoints is not None or self.period is not None
-        functions = (self.system.outfcn, self.system.updfcn) if not (self.linear or self.driven or named) else ()
+        functions = (
+            (self.system.outfcn, self.system.updfcn) if not (self.linear or self.is_time_function or named) else ()
+        )
         return any(function is not None and not of_library(function) for function in functions)
 
     @property
@@ -93,7 +95,7 @@ class Block:
         return inner if inner is not None and inner.noutputs == self.system.noutputs else None
 
     @property
-    def driven(self) -> bool:
+    def is_time_function(self) -> bool:
         """Whether the outputs are, over a segment, functions of time alone."""
         return self.plan is not None or self.delay is not None
 
@@ -133,9 +135,9 @@ class Block:
             )
         if sample is None:
             raise TypeError(f"block {self.name} must declare a function that takes its samples")
-        taken = _once(lambda t, x, u: sample(t, x, u, own))
+        sampled_once = _once(lambda t, x, u: sample(t, x, u, own))
         output = self.output(params)
-        return (lambda t, x, u: output(t, taken(t, x, u), u)), taken
+        return (lambda t, x, u: output(t, sampled_once(t, x, u), u)), sampled_once
 
 
 @dataclass(frozen=True)
@@ -265,13 +267,13 @@ class Network:
         return self.wire.shape[1]
 
     @cached_property
-    def driven(self) -> NDArray[np.intp]:
+    def time_rows(self) -> NDArray[np.intp]:
         """Signals that are functions of time alone over a segment: inputs, plans, delayed signals."""
         rows = [np.arange(self.ninputs)]
         rows += [
             np.arange(place.start, place.stop)
             for block, place in zip(self.blocks, self.outputs, strict=True)
-            if block.driven
+            if block.is_time_function
         ]
         return np.concatenate(rows)
 
@@ -296,7 +298,7 @@ class Network:
             at once are one step.
         """
         known = np.zeros(self.nsignals, dtype=bool)
-        known[self.driven] = True
+        known[self.time_rows] = True
         feeds_on = _dependencies(self, feeds)
         wanted = _reached(feeds_on, needed)
         steps: list[Step] = []
@@ -348,7 +350,7 @@ def known_feedthrough(block: Block) -> NDArray[np.bool_] | None:
     shape = (block.system.noutputs, block.system.ninputs or 0)
     if block.linear:
         return np.asarray(block.system.D) != 0.0
-    if block.driven or block.system.outfcn is None:
+    if block.is_time_function or block.system.outfcn is None:
         return np.zeros(shape, dtype=bool)
     declared = block.traits.feedthrough
     if declared is None:
@@ -391,14 +393,14 @@ def _once(sample: BlockMap) -> BlockMap:
     """States after a sample, taken once though a run asks for them and for the outputs that follow from them."""
     last: tuple[object, Array] = (None, np.empty(0))
 
-    def taken(t: float, x: Array, u: Array) -> Array:
+    def sampled_once(t: float, x: Array, u: Array) -> Array:
         nonlocal last
-        asked = t, x.tobytes(), u.tobytes()
-        if asked != last[0]:
-            last = asked, np.ravel(sample(t, x, u))
+        arguments = t, x.tobytes(), u.tobytes()
+        if arguments != last[0]:
+            last = arguments, np.ravel(sample(t, x, u))
         return last[1].copy()
 
-    return taken
+    return sampled_once
 
 
 @dataclass(frozen=True)
@@ -430,13 +432,13 @@ def _flattened(system: System, above: Params) -> _Part:
     if wires.size and np.linalg.matrix_rank(wires) < len(wires):  # numpy 1.26 has no rank of an empty matrix
         raise ValueError(f"wires must not feed themselves, got such a one in {system.name}")
     v_y, v_r = np.linalg.solve(wires, connect @ read), np.linalg.solve(wires, external)
-    put_out = from_out @ through + from_in
+    passed = from_out @ through + from_in
     return _Part(
         [block for part in parts for block in part.blocks],
         inner + outer @ v_y,
         outer @ v_r,
-        from_out @ read + put_out @ v_y,
-        put_out @ v_r,
+        from_out @ read + passed @ v_y,
+        passed @ v_r,
     )
 
 
@@ -476,11 +478,11 @@ def _product(matrix: Array) -> Callable[[Array], Array]:
     """Product with a matrix in which 0 times nan is 0: a signal that is lost is lost only where it goes."""
     rows, columns = np.nonzero(matrix)
     if np.array_equal(rows, np.arange(len(matrix))) and np.all(matrix[rows, columns] == 1.0):
-        return partial(_taken, columns)
+        return partial(_selected, columns)
     return partial(_multiplied, csr_array(matrix))
 
 
-def _taken(rows: NDArray[np.intp], signals: Array) -> Array:
+def _selected(rows: NDArray[np.intp], signals: Array) -> Array:
     return signals[rows]
 
 

@@ -18,7 +18,7 @@ from ctrlplan.simulation.events import Snapshot, Watched
 from ctrlplan.simulation.interpreted import Interpreted, SolverError
 from ctrlplan.simulation.job import Job, Record, unused, with_event_times
 from ctrlplan.simulation.network import Network
-from ctrlplan.simulation.scales import PASSES, Scales, Tolerances, doubt, effects, remaining
+from ctrlplan.simulation.scales import PASSES, Scales, Tolerances, effects, output_uncertainty, remaining
 from ctrlplan.simulation.segments import Run, Solver, integrate, known_before
 from ctrlplan.simulation.signals import TimeSignal, breakpoints_of, signal_values
 from ctrlplan.symbolic.isolation import untouched
@@ -26,10 +26,10 @@ from ctrlplan.symbolic.isolation import untouched
 VISITED = 12
 """Visited states at which equations must be defined; and of a comparison where evaluations were not counted."""
 
-_ASIDE = 1e-6
+_PERTURBATION = 1e-6
 """Distance, in the scales of the states, at which a neighbouring run starts."""
 
-_ASTRAY, _JITTER = 4, 1e-3
+_DISPLACED, _JITTER = 4, 1e-3
 """Visited states that are displaced at random to see slopes elsewhere, and by which part of their size."""
 
 _STEEP = 30.0
@@ -38,7 +38,7 @@ _STEEP = 30.0
 _GROWTH, _TIGHTEST = 30.0, 1e4
 """Growth of a distance along a run above which steps are made with smaller tolerances, and how much smaller at most."""
 
-_DOUBTED = 1e-6
+_UNCERTAIN = 1e-6
 """Uncertainty of an output, relative to its range, above which the response says so."""
 
 
@@ -62,10 +62,10 @@ class NumericalSolver(Solver, Protocol):
     def instants(self, first: float, last: float, values: Callable[[Array], Array]) -> list[float]:
         """Times of a run at which the equations switch, where functions of time (n,) -> (nsignals, n) alone decide."""
 
-    def rates(self, times: Array, states: Array, driven: Array) -> Array:
+    def rates(self, times: Array, states: Array, time_values: Array) -> Array:
         """Rates (nstates, ntime) of the states."""
 
-    def slopes(self, times: Array, states: Array, driven: Array) -> Array:
+    def slopes(self, times: Array, states: Array, time_values: Array) -> Array:
         """Derivatives of the rates by the states, (ntime, nstates, nstates)."""
 
 
@@ -104,22 +104,22 @@ def numerical(job: Job, method: NumericalMethod[S]) -> Record:
     if job.atol is None and attempt.expands():
         attempt = _tightened(attempt, spare)
     if attempt.tighter == 1.0:
-        attempt = _firmer(attempt, spare)
+        attempt = _with_closer_states(attempt, spare)
     return attempt.record()
 
 
 def _tightened(attempt: Attempt[S], spare: Job) -> Attempt[S]:
     """Run whose errors of steps grow: measured by a run from beside, and made again with smaller ones."""
-    scales, aside = attempt.scales, _ASIDE * attempt.scales.scale
-    aside = aside * np.where(np.arange(aside.size) % 2, -1.0, 1.0)
+    scales, perturbation = attempt.scales, _PERTURBATION * attempt.scales.scale
+    perturbation = perturbation * np.where(np.arange(perturbation.size) % 2, -1.0, 1.0)
     try:
-        near = Attempt(replace(spare, state=spare.state + aside), attempt.method, scales)
+        near = Attempt(replace(spare, state=spare.state + perturbation), attempt.method, scales)
         near.go()
     except SolverError:
         return attempt
     common, mine, others = np.intersect1d(attempt.run.times, near.run.times, return_indices=True)
     apart = np.abs(attempt.run.states[:, mine] - near.run.states[:, others]).max(axis=1, initial=0.0)
-    growth = float((apart / np.abs(aside)).max(initial=1.0)) if common.size else 1.0
+    growth = float((apart / np.abs(perturbation)).max(initial=1.0)) if common.size else 1.0
     attempt.growth = growth
     if growth <= _GROWTH:
         return attempt
@@ -133,13 +133,15 @@ def _tightened(attempt: Attempt[S], spare: Job) -> Attempt[S]:
     return again
 
 
-def _firmer(attempt: Attempt[S], spare: Job) -> Attempt[S]:
+def _with_closer_states(attempt: Attempt[S], spare: Job) -> Attempt[S]:
     """Run again, with large states integrated more closely where others depend on them absolutely, as on an angle."""
     loose = attempt.loose()
     if not loose.any():
         return attempt
     try:
-        again = Attempt(spare, attempt.method, attempt.scales.firmer(attempt.run.states, loose, attempt.noise()))
+        again = Attempt(
+            spare, attempt.method, attempt.scales.with_closer_states(attempt.run.states, loose, attempt.noise())
+        )
         again.solver.count()
         again.go()
     except SolverError:
@@ -219,12 +221,12 @@ class Attempt(Generic[S]):
         if len(states) < 2 or not np.isfinite(states).all():
             return np.zeros(len(states), dtype=bool)
         error = scales.uncertainty(states, self.job.rtol)
-        allowed = max(_DOUBTED, 100.0 * self.job.rtol) * np.ptp(states, axis=1) + 10.0 * scales.atol * scales.scale
+        allowed = max(_UNCERTAIN, 100.0 * self.job.rtol) * np.ptp(states, axis=1) + 10.0 * scales.atol * scales.scale
         found = self.effects * error > allowed[:, None]
         if found.any() and self.job.blocks.blocks_with("period"):
             # What feeds back from sample to sample is in no slope: only what others depend on absolutely counts.
-            t, x, driven = self.visited()
-            size, rates = np.abs(states - scales.shift[:, None]).max(axis=1), self.solver.rates(t, x, driven)
+            t, x, time_values = self.visited()
+            size, rates = np.abs(states - scales.shift[:, None]).max(axis=1), self.solver.rates(t, x, time_values)
             found &= np.abs(self._slopes[: t.size]).max(axis=0) * size > _STEEP * np.abs(rates).max(
                 axis=1, keepdims=True
             )
@@ -238,11 +240,15 @@ class Attempt(Generic[S]):
     @cached_property
     def _slopes(self) -> Array:
         """Derivatives of the rates by the states, (nplaces, nstates, nstates), first at the visited times."""
-        t, x, driven = self.visited()
-        some = slice(None, None, VISITED // _ASTRAY)
+        t, x, time_values = self.visited()
+        some = slice(None, None, VISITED // _DISPLACED)
         # Samples that are a turn of an angle apart see one slope of its sine, which may be 0.
-        astray = x[:, some] * (1.0 + _JITTER * np.random.default_rng(0).uniform(-1.0, 1.0, x[:, some].shape))
-        places = np.append(t, t[some]), np.append(x, astray, axis=1), np.append(driven, driven[:, some], axis=1)
+        displaced = x[:, some] * (1.0 + _JITTER * np.random.default_rng(0).uniform(-1.0, 1.0, x[:, some].shape))
+        places = (
+            np.append(t, t[some]),
+            np.append(x, displaced, axis=1),
+            np.append(time_values, time_values[:, some], axis=1),
+        )
         return self.on_trial(self.solver.slopes, *places, (-1, len(x), len(x)))
 
     def on_trial(
@@ -250,7 +256,7 @@ class Attempt(Generic[S]):
         function: Callable[[Array, Array, Array], Array],
         t: Array,
         x: Array,
-        driven: Array,
+        time_values: Array,
         shape: tuple[int, ...],
     ) -> Array:
         """What a function of many times finds at states that a run need not have reached; nan where blocks raise.
@@ -258,12 +264,12 @@ class Attempt(Generic[S]):
         Its result has a shape, in which -1 stands for the times.
         """
         if not self.solver.calls_blocks:
-            return function(t, x, driven)
+            return function(t, x, time_values)
         axis, empty = shape.index(-1), np.full([abs(size) for size in shape], np.nan)
 
         def at(some: slice) -> Array | None:
             try:
-                return function(t[some], x[:, some], driven[:, some])
+                return function(t[some], x[:, some], time_values[:, some])
             except (KeyboardInterrupt, TimeLimitError):
                 raise
             except BaseException:  # outside of a block's domain, which a made-up argument may leave
@@ -278,9 +284,11 @@ class Attempt(Generic[S]):
 
     def record(self) -> Record:
         """What the run left, and how accurate it is where that is worse than usual."""
-        said = _in_doubt(self)
+        said = _accuracy_note(self)
         reason = f"{self.job.reason}; {said}" if said else self.job.reason
-        return Record(self.run.times, self.run.states, self._see, self._carry, self.watched, self.method.name, reason)
+        return Record(
+            self.run.times, self.run.states, self._snapshot, self._state_at, self.watched, self.method.name, reason
+        )
 
     def expands(self) -> bool:
         """Whether neighbouring solutions may part, by the fastest growing motion along the run."""
@@ -302,12 +310,12 @@ class Attempt(Generic[S]):
 
     def noise(self) -> Array:
         """Rounding noise of the rates along the run, times its duration."""
-        t, x, driven = self.visited()
+        t, x, time_values = self.visited()
         rng = np.random.default_rng(0)
-        plain, found = self.on_trial(self.solver.rates, t, x, driven, (len(x), -1)), np.zeros(len(x))
+        plain, found = self.on_trial(self.solver.rates, t, x, time_values, (len(x), -1)), np.zeros(len(x))
         for _ in range(3):
             near = x * (1.0 + np.finfo(float).eps * rng.choice([-1.0, 1.0], x.shape))
-            apart = np.abs(self.on_trial(self.solver.rates, t, near, driven, (len(x), -1)) - plain)
+            apart = np.abs(self.on_trial(self.solver.rates, t, near, time_values, (len(x), -1)) - plain)
             found = np.maximum(found, np.where(np.isfinite(apart), apart, 0.0).max(axis=1, initial=0.0))
         return found * float(self.run.times[-1] - self.run.times[0])
 
@@ -317,26 +325,28 @@ class Attempt(Generic[S]):
         t = self.run.times[some]
         return t, self.run.states[:, some], signal_values(self.time_signals, t)
 
-    def _see(self, t: Array, x: Array) -> Snapshot:
-        driven = signal_values(self.time_signals, t)
-        y = self.solver.outputs(t, x, driven)
-        return Snapshot(t, x, driven[: self.job.prepared.ninputs], y, lambda: self.solver.signals(t, x, driven))
+    def _snapshot(self, t: Array, x: Array) -> Snapshot:
+        time_values = signal_values(self.time_signals, t)
+        y = self.solver.outputs(t, x, time_values)
+        return Snapshot(
+            t, x, time_values[: self.job.prepared.ninputs], y, lambda: self.solver.signals(t, x, time_values)
+        )
 
-    def _carry(self, k: int, t: float) -> Array:
+    def _state_at(self, k: int, t: float) -> Array:
         start = float(self.run.times[k])
         found: Array = self.solver.advance(self.run.series(start), start, np.array([t]), self.run.states[:, k])
         return found[:, -1]
 
     def _pause(self, t: Array, x: Array) -> bool:
-        seen = self._see(t, x)
+        seen = self._snapshot(t, x)
         return any(entry.side(entry.value(seen)).any() for entry in self.watched if entry.stop)
 
     def _slope(self) -> Array:
         equations, job = self.equations, self.job
         if equations is None:
             return np.zeros((0, 0))
-        driven = signal_values(self.time_signals, job.times[:1])[:, 0]
-        return _slope(lambda x: equations.rates(job.first, x, driven), job.state)
+        time_values = signal_values(self.time_signals, job.times[:1])[:, 0]
+        return _slope(lambda x: equations.rates(job.first, x, time_values), job.state)
 
 
 def equations_of(job: Job, network: Network) -> Interpreted | None:
@@ -344,24 +354,26 @@ def equations_of(job: Job, network: Network) -> Interpreted | None:
     return Interpreted(network, job.params, (job.first, job.state), job.trials) if network.blocks else None
 
 
-def _in_doubt(attempt: Attempt[S]) -> str:
+def _accuracy_note(attempt: Attempt[S]) -> str:
     """What is uncertain in the outputs, and the tolerance that would do, in words; empty where nothing is."""
     job, run, solver, scales = attempt.job, attempt.run, attempt.solver, attempt.scales
     some = np.unique(np.linspace(0, run.times.size - 1, VISITED).astype(int))
     t, x = run.times[some], run.states[:, some]
     if not x.size or not np.isfinite(x).all():
         return ""
-    driven = signal_values(attempt.time_signals, t)
+    time_values = signal_values(attempt.time_signals, t)
     own = scales.uncertainty(run.states, job.rtol) * attempt.growth / attempt.tighter
     uncertainty, count = own + attempt.drift, len(job.prepared.output_labels)
-    worst, ranges = doubt(lambda near: attempt.on_trial(solver.outputs, t, near, driven, (count, -1)), x, uncertainty)
-    allowed = max(_DOUBTED, 100.0 * job.rtol) * ranges
-    lost = (ranges > 0.0) & (worst > allowed)
-    if not lost.any():
+    worst, ranges = output_uncertainty(
+        lambda near: attempt.on_trial(solver.outputs, t, near, time_values, (count, -1)), x, uncertainty
+    )
+    allowed = max(_UNCERTAIN, 100.0 * job.rtol) * ranges
+    uncertain = (ranges > 0.0) & (worst > allowed)
+    if not uncertain.any():
         return ""
-    part = np.where(lost, worst / np.where(lost, ranges, 1.0), 0.0)
-    names = ", ".join(np.array(job.prepared.output_labels)[lost])
-    needed = job.rtol * _DOUBTED / float(part.max())
+    part = np.where(uncertain, worst / np.where(uncertain, ranges, 1.0), 0.0)
+    names = ", ".join(np.array(job.prepared.output_labels)[uncertain])
+    needed = job.rtol * _UNCERTAIN / float(part.max())
     what = "are differences of larger terms" if attempt.growth <= _GROWTH else "grow apart from their neighbours"
     if np.any(attempt.drift > own):
         what = "depend on small parts of large states"

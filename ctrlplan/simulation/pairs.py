@@ -24,13 +24,13 @@ Pair = tuple[Array, Array]
 
 def pair_sum(*pairs: Pair) -> Pair:
     """Sum of pairs of one shape."""
-    total, rest = pairs[0]
+    total, error = pairs[0]
     for value, more in pairs[1:]:
         before, total = total, total + value
         part = total - before
-        rest = rest + more + ((before - (total - part)) + (value - part))
-    found = total + rest
-    return found, rest - (found - total)
+        error = error + more + ((before - (total - part)) + (value - part))
+    found = total + error
+    return found, error - (found - total)
 
 
 def pair_product(left: Pair, right: Pair, groups: int = 1) -> Pair:
@@ -61,6 +61,6 @@ def _split(values: Pair, size: Array, digits: int) -> tuple[Array, Array, Array]
     """Binary digits of values, so many below the first one of a size, as many again, and the rest."""
     unit = np.ldexp(1.5, np.frexp(size)[1] + 52 - digits)
     first = (values[0] + unit) - unit
-    rest, unit = values[0] - first, np.ldexp(unit, -digits)
-    second = (rest + unit) - unit
-    return first, second, (rest - second) + values[1]
+    error, unit = values[0] - first, np.ldexp(unit, -digits)
+    second = (error + unit) - unit
+    return first, second, (error - second) + values[1]

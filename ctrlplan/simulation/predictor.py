@@ -22,7 +22,7 @@ _TOLERANCES = 1e-6, 1e-8
 _SHORTEST = 2.0**-20
 """Fractions below are taken for 0."""
 
-_REST = 0.8
+_SETTLED = 0.8
 """Part of the horizon after which the loop must be at rest."""
 
 _COUNTS = 20, 100_000
@@ -110,7 +110,7 @@ class Predictor(Frozen):
     horizon: float
     _prepared: Prepared
     _times: Array
-    _resting: int
+    _settled: int
     _rows: list[int]
     _low: Array
     _high: Array
@@ -137,9 +137,9 @@ class Predictor(Frozen):
         governed = tuple(prepared.input_labels if references is None else references)
         _check_known(governed, prepared.input_labels, "references", "inputs")
         _check_known(tuple(limits), prepared.output_labels, "limits", "outputs")
-        for label, value, most in (("margin", margin, 0.5), ("resolution", resolution, 1.0)):
-            if not 0.0 < float(value) < most:
-                raise ValueError(f"{label} must lie in (0, {most:g}), got {value}")
+        for label, value, maximum in (("margin", margin, 0.5), ("resolution", resolution, 1.0)):
+            if not 0.0 < float(value) < maximum:
+                raise ValueError(f"{label} must lie in (0, {maximum:g}), got {value}")
         seconds = checked_finite(horizon, "horizon", above=0.0)
         if isinstance(count, bool) or int(count) != count or not _COUNTS[0] <= count <= _COUNTS[1]:
             raise ValueError(f"count must be a whole number from {_COUNTS[0]} to {_COUNTS[1]}, got {count}")
@@ -153,7 +153,7 @@ class Predictor(Frozen):
             horizon=seconds,
             _prepared=prepared,
             _times=times,
-            _resting=int(np.searchsorted(times, _REST * seconds)),
+            _settled=int(np.searchsorted(times, _SETTLED * seconds)),
             _rows=[prepared.output_labels.index(label) for label in limits],
             _low=bounds[:, 0] + inset,
             _high=bounds[:, 1] - inset,
@@ -195,16 +195,16 @@ class Predictor(Frozen):
             admissible: within `resolution`, or within a factor of 2 where it is
             smaller; 1 where r is admissible; nan where neither r nor v is.
         """
-        state, held, asked = self._checked(x, v, r)
-        if self._admissible(state, asked):
+        state, held, command = self._checked(x, v, r)
+        if self._admissible(state, command):
             return 1.0
-        if np.array_equal(held, asked) or not self._admissible(state, held):
+        if np.array_equal(held, command) or not self._admissible(state, held):
             return math.nan
         low, high = 0.0, 1.0
         # A first step must be found however short, or a far reference would be waited for for ever.
         while high - low > (self._resolution if low else _SHORTEST):
             middle = 0.5 * (low + high)
-            if self._admissible(state, held + middle * (asked - held)):
+            if self._admissible(state, held + middle * (command - held)):
                 low = middle
             else:
                 high = middle
@@ -215,14 +215,14 @@ class Predictor(Frozen):
         if outputs is None:
             return False
         low, high, inset = self._low, self._high, self._inset
-        last = outputs[:, self._resting :]
-        least, greatest = last.min(axis=1), last.max(axis=1)
+        last = outputs[:, self._settled :]
+        minimum, maximum = last.min(axis=1), last.max(axis=1)
         return bool(
             (-_peaks(-outputs) >= low).all()
             and (_peaks(outputs) <= high).all()
-            and (least >= low + inset).all()
-            and (greatest <= high - inset).all()
-            and (greatest - least <= inset).all()
+            and (minimum >= low + inset).all()
+            and (maximum <= high - inset).all()
+            and (maximum - minimum <= inset).all()
         )
 
     def _predicted(self, state: Array, reference: Array) -> Array | None:

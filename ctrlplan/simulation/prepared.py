@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from ctrlplan.simulation.compiled import Compiled
     from ctrlplan.symbolic.tracing import Trace
 
-_KEPT = 16
+_CACHE_SIZE = 16
 """Systems that `simulate` keeps by itself."""
 
 
@@ -191,7 +191,7 @@ class Prepared:
         try:
             w = self._signals_at_start(network, params, time_signals, first, state, trials)
             for block, states, fed in zip(network.blocks, network.states, network.fed, strict=True):
-                if block.linear or block.driven:
+                if block.linear or block.is_time_function:
                     traces.append(None)
                     continue
                 trace = traced(block, params, first, state[states], fed(w))
@@ -215,7 +215,7 @@ class Prepared:
         """Signals at the start of a run, by calls that leave nothing behind."""
         from ctrlplan.symbolic.tracing import callable_references
 
-        others = [block for block in network.blocks if not (block.linear or block.driven)]
+        others = [block for block in network.blocks if not (block.linear or block.is_time_function)]
         keeper = Keeper(callable_references(others, params))
         try:
             equations = Interpreted(network.for_trials(), params, (first, state), trials)
@@ -334,4 +334,4 @@ def _checked_system(system: System) -> System:
     return system
 
 
-_FORMS: Lru[tuple[object, ...], Prepared] = Lru(_KEPT)
+_FORMS: Lru[tuple[object, ...], Prepared] = Lru(_CACHE_SIZE)

@@ -43,7 +43,7 @@ _NOISE = 1e11
 _ADDED = 0.3
 """Error of a state at the end of a run, relative to the tolerance of the run, as errors of steps add up."""
 
-_FIRM = 1e-3
+_CLOSER = 1e-3
 """Part of the relative tolerance with which large states are integrated that others depend on absolutely."""
 
 _OWN = 0.1
@@ -123,7 +123,7 @@ class Scales:
         size = np.abs(states - self.shift[:, None]).max(axis=1, initial=0.0)
         return _ADDED * (rtol * self.relative * size + self.atol * self.scale)
 
-    def firmer(self, states: Array, loose: NDArray[np.bool_], noise: Array) -> Scales:
+    def with_closer_states(self, states: Array, loose: NDArray[np.bool_], noise: Array) -> Scales:
         """Scales with which large states that others depend on absolutely are integrated more closely.
 
         Parameters
@@ -138,10 +138,10 @@ class Scales:
         size = np.abs(states - self.shift[:, None]).max(axis=1, initial=0.0)
         close = np.where(loose & (size > 0.0), np.maximum(_OWN * size, _NOISE * noise), np.inf)
         scale = np.minimum(self.scale, close)
-        return replace(self, scale=scale, relative=_FIRM)
+        return replace(self, scale=scale, relative=_CLOSER)
 
 
-def doubt(outputs: Callable[[Array], Array], states: Array, uncertainty: Array) -> tuple[Array, Array]:
+def output_uncertainty(outputs: Callable[[Array], Array], states: Array, uncertainty: Array) -> tuple[Array, Array]:
     """Uncertainty of outputs from that of the states, and the outputs' ranges, shapes (noutputs,).
 
     Parameters

@@ -61,10 +61,10 @@ class Solver(Protocol):
     def advance(self, series: Series, left: float, grid: Array, state: Array) -> Array:
         """States (nstates, ngrid) at times of a segment, of which the last is its end."""
 
-    def signals(self, times: Array, states: Array, driven: Array) -> Array:
+    def signals(self, times: Array, states: Array, time_values: Array) -> Array:
         """All signals (nsignals, ntime)."""
 
-    def outputs(self, times: Array, states: Array, driven: Array) -> Array:
+    def outputs(self, times: Array, states: Array, time_values: Array) -> Array:
         """Outputs (noutputs, ntime) of the whole."""
 
 
@@ -175,23 +175,23 @@ def integrate(
     endless = equations is not None and network.delays_feed_delays(equations.feeds)
     hops = _MARKS if endless else _HOPS
     marks = [*breakpoints_of(time_signals), *network.breakpoints, *marks]
-    clock = _Clock(network, time_signals, _fixed(marks, first, last, memory.delays, hops), first, last)
+    schedule = _Schedule(network, time_signals, _fixed(marks, first, last, memory.delays, hops), first, last)
     longest = _longest(network, memory.delays, last - first)
     if pause is not None:
         longest = min(longest, (last - first) / 64.0)
     shortest = 1e-9 * (last - first) if pause is not None else np.inf
-    rounding = _rounding(time_signals, np.union1d(np.linspace(first, last, 257), clock.marks))
+    rounding = _rounding(time_signals, np.union1d(np.linspace(first, last, 257), schedule.marks))
     known: list[tuple[Array, Array]] = []  # times and states of each segment, its end left to the next
     segments: list[tuple[float, Series]] = []
     span: list[Series] = []
     left, reach = first, longest
-    x = clock.sample(equations, first, state)
+    x = schedule.sample(equations, first, state)
     while left < last:
         check(left)  # CVODES is not stopped within a segment, whose steps are bounded
-        right = clock.following(left)
-        right = clock.on(times, right) if right - left <= reach * (1.0 + 1e-9) else left + reach
+        right = schedule.following(left)
+        right = schedule.on(times, right) if right - left <= reach * (1.0 + 1e-9) else left + reach
         if memory.delays or not (span and span[-1].right >= right):
-            until = right if memory.delays else clock.fixed_after(left)
+            until = right if memory.delays else schedule.fixed_after(left)
             accuracy = resolution if memory.delays else RESOLVED
             span = _resolved(time_signals, 0.5 * (left + right), left, until, accuracy, rounding)
         series = next(s for s in span if left < s.right)
@@ -213,7 +213,7 @@ def integrate(
         segments.append((left, series))
         wanted = np.isin(grid, inside)
         known.append((np.append(left, grid[wanted]), np.column_stack([x, found[:, wanted]])))
-        before, x = x, clock.sample(equations, right, found[:, -1])
+        before, x = x, schedule.sample(equations, right, found[:, -1])
         left, reach = right, min(longest, 2.0 * reach)
         if pause is not None and pause(np.append(segments[-1][0], grid), np.column_stack([before, found])):
             break
@@ -256,7 +256,7 @@ class _Memory:
         blocks = network.blocks_with("delay")
         self._time_signals = [signal for signal in time_signals if isinstance(signal, DelayedSignal)]
         self._fed = [network.fed[i] for i in blocks]
-        self._wires, self._driven = [network.wire[network.inputs[i]] for i in blocks], network.driven
+        self._wires, self._time_rows = [network.wire[network.inputs[i]] for i in blocks], network.time_rows
         self._solver, self._resolution = solver, resolution
         self.delays = [signal.delay for signal in self._time_signals]
 
@@ -274,11 +274,11 @@ class _Memory:
         if right - left > _SHORTEST * min(self.delays) and any(_unresolved(p, self._resolution) for p in pieces):
             return False
         for signal, piece, wire in zip(self._time_signals, pieces, self._wires, strict=True):
-            signal.record(Series(left, right, piece, *_combined_bounds(wire, self._driven, series)))
+            signal.record(Series(left, right, piece, *_combined_bounds(wire, self._time_rows, series)))
         return True
 
 
-class _Clock:
+class _Schedule:
     """Instants at which a segment must end: breakpoints, and samples of discrete blocks.
 
     Sample instants are multiples of a common tick, offset + k period as whole
@@ -372,11 +372,11 @@ def _bounds(time_signals: Sequence[TimeSignal], moment: float, left: float, righ
     return tuple(np.concatenate([np.zeros(0), *(pair[side] for pair in found)]) for side in (0, 1))  # type: ignore[return-value]
 
 
-def _combined_bounds(wire: Array, driven: NDArray[np.intp], series: Series) -> tuple[Array, Array]:
+def _combined_bounds(wire: Array, time_rows: NDArray[np.intp], series: Series) -> tuple[Array, Array]:
     """Bounds of sums of signals, where only functions of time are summed."""
-    others = np.delete(wire, driven, axis=1)
+    others = np.delete(wire, time_rows, axis=1)
     known = ~np.any(others != 0.0, axis=1)
-    weights = wire[:, driven]
+    weights = wire[:, time_rows]
     ends = [
         np.where(weights != 0.0, weights, 0.0) * np.where(weights != 0.0, end, 0.0) for end in (series.low, series.high)
     ]
@@ -398,11 +398,11 @@ def _fixed(marks: Sequence[float], first: float, last: float, delays: list[float
 
 def apart(times: list[float]) -> list[float]:
     """Increasing times without those that are the same but for rounding; first and last stay."""
-    kept = [times[0]]
+    distinct = [times[0]]
     for t in times[1:-1]:
-        if t - kept[-1] > 1e-14 * max(abs(t), times[-1] - times[0]) < times[-1] - t:
-            kept.append(t)
-    return [*kept, times[-1]]
+        if t - distinct[-1] > 1e-14 * max(abs(t), times[-1] - times[0]) < times[-1] - t:
+            distinct.append(t)
+    return [*distinct, times[-1]]
 
 
 def _unresolved(coefficients: Array, resolution: float) -> bool:

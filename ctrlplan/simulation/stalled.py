@@ -81,7 +81,7 @@ def cause(network: Network, params: Params, t: float, x: Array, w: Array, span: 
 def _continuous(network: Network, params: Params) -> Iterator[tuple[int, Block, Values]]:
     """Nonlinear continuous blocks, and their values on copies of what they remember."""
     for i, block in enumerate(network.blocks):
-        if block.linear or block.driven or block.period is not None:
+        if block.linear or block.is_time_function or block.period is not None:
             continue
         own = Block(trial_copy(block.system), block.params) if can_remember(block.system) else block
         yield i, block, _values(own, params)
@@ -139,10 +139,10 @@ def _kind(changes: Array, size: float) -> str:
     ratios = np.divide(changes[1:], changes[:-1], out=np.full(changes.size - 1, np.nan), where=both)
     last = ratios[-_LAST:][both[-_LAST:]]
     # From one distance to the next nothing is left of a change: the jump lies between.
-    gone = np.append(changes[1:] <= np.maximum(_DROP * changes[:-1], _ROUNDING * size), False) & real
+    vanished = np.append(changes[1:] <= np.maximum(_DROP * changes[:-1], _ROUNDING * size), False) & real
     stays = np.array([bool(np.all(changes[k + 1 :] <= _DROP * changes[k])) for k in range(changes.size)])
     flat = np.append(False, ratios > 0.5 * _JUMP)
-    if bool((gone & stays & flat)[_CLOSE:].any()):
+    if bool((vanished & stays & flat)[_CLOSE:].any()):
         return "jump"
     if last.size < 2 or np.median(last) <= _STEEP:
         return ""

@@ -37,7 +37,7 @@ def is_read(network: Network, name: str, value: Value, start: Array, at_start: C
     at_start : callable
         Returns the values of the signals that are functions of time.
     """
-    blocks = [i for i, block in enumerate(network.blocks) if not (block.linear or block.driven)]
+    blocks = [i for i, block in enumerate(network.blocks) if not (block.linear or block.is_time_function)]
     functions = {i: [*_functions(network.blocks[i].system)] for i in blocks}
     # A call may take minutes, as that of an estimator which runs an optimiser: only what can tell is called.
     tellers = {i: [f for f in functions[i] if reads(f, _PARAMS)] for i in blocks}

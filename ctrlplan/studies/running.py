@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ctrlplan._renamed import outside_stacklevel
 from ctrlplan._types import Array, Params
-from ctrlplan.simulation import Event, Prepared, prepared_form, rest_at, simulate, state_space, unstable_poles
+from ctrlplan.simulation import Event, Prepared, equilibrium_at, prepared_form, simulate, state_space, unstable_poles
 from ctrlplan.studies.connections import check_reached
 from ctrlplan.studies.measures import Run, checked_names
 from ctrlplan.trajectories import Trajectory
@@ -65,7 +65,7 @@ def run_plan(
     state, doubt = initial_state, ""
     if state is None and times.ndim == 1 and times.size and np.isfinite(times).all():  # otherwise simulate says so
         rows = [system.output_labels.index(label) for label in tracked]
-        state, why = rest_at(system, plan, float(times[0]), rows, params)
+        state, why = equilibrium_at(system, plan, float(times[0]), rows, params)
         doubt = f"With {name}, {_doubt(plan, times, state, why)}." if why else ""
     inputs, start = (plan if system.ninputs else None), (0.0 if state is None else state)
     try:

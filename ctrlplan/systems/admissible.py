@@ -133,7 +133,7 @@ class AdmissibleSet(Fields):
             raise ValueError(f"margin must lie in (0, 1), got {margin}")
         problem = _problem(loop, limits, references, dict(disturbances or {}))
         rows, last = _determined(problem, share)
-        of_reference = rows.reference - rows.state @ problem.rest
+        of_reference = rows.reference - rows.state @ problem.equilibrium
         bounds = rows.bound + _shift(rows.state, of_reference, origin)
         self._set_fields(
             references=problem.references,
@@ -190,11 +190,11 @@ class AdmissibleSet(Fields):
         after = room - rise
         if after.min(initial=0.0) >= 0.0:
             return 1.0
-        least = room.min()
-        if least >= 0.0:
+        minimum = room.min()
+        if minimum >= 0.0:
             over = after < 0.0
             return float((room[over] / rise[over]).min())
-        return _inside(room, rise, 0.0 if least >= -self._margin else math.nan)
+        return _inside(room, rise, 0.0 if minimum >= -self._margin else math.nan)
 
 
 def _problem(
@@ -238,18 +238,21 @@ def _problem(
     rows, columns = [outputs.index(label) for label in limits], [inputs.index(label) for label in governed]
     shaken = [inputs.index(label) for label in disturbances]
     sizes = np.array(
-        [checked_finite(most, f"disturbances of {label}", minimum=0.0) for label, most in disturbances.items()]
+        [
+            checked_finite(magnitude, f"disturbances of {label}", minimum=0.0)
+            for label, magnitude in disturbances.items()
+        ]
     )
     c, d = c[rows] / scale[:, None], d[rows] / scale[:, None]
-    rest = np.asarray(-np.linalg.solve(a, b[:, columns]), dtype=float)
+    equilibrium = np.asarray(-np.linalg.solve(a, b[:, columns]), dtype=float)
     low, high = pairs.T / scale
     return Problem(
         a,
         c,
         b[:, shaken] * sizes,
         d[:, shaken] * sizes,
-        rest,
-        c @ rest + d[:, columns],
+        equilibrium,
+        c @ equilibrium + d[:, columns],
         np.where(np.isfinite(low), low, high - _FAR),
         np.where(np.isfinite(high), high, low + _FAR),
         np.where(np.isfinite(low + high), 0.5 * (low + high), np.where(np.isfinite(low), low, high)),
@@ -277,10 +280,10 @@ def _inside(room: Array, rise: Array, otherwise: float) -> float:
     short = room < 0.0
     if (rise[short] >= 0.0).any():
         return otherwise
-    least = (room[short] / rise[short]).max()
+    lower = (room[short] / rise[short]).max()
     over = ~short & (rise > room)
-    most = min(1.0, (room[over] / rise[over]).min(initial=1.0))
-    return float(most) if least <= most else otherwise
+    upper = min(1.0, (room[over] / rise[over]).min(initial=1.0))
+    return float(upper) if lower <= upper else otherwise
 
 
 def _shift(state: Array, reference: Array, origin: tuple[ArrayLike, ArrayLike] | None) -> Array | float:
@@ -298,19 +301,19 @@ def _determined(problem: Problem, margin: float) -> tuple[Rows, float]:
     """Rows that determine the set, and the time [s] up to which they look."""
     seen = seen_directions(problem)
     cells = output_cells(problem, seen, margin)
-    lost, in_all = erosion(problem, cells)
+    eroded, in_all = erosion(problem, cells)
     high, low = problem.high - _INSIDE, problem.low + _INSIDE
-    at_rest = (low + margin + in_all)[:, None], (high - margin - in_all)[:, None]
-    _check_rest(problem, *at_rest)
+    steady = (low + margin + in_all)[:, None], (high - margin - in_all)[:, None]
+    _check_equilibrium(problem, *steady)
     polytope = Polytope(problem, seen, _SPARED * margin)
-    polytope.take(np.zeros((len(high), 1, len(problem.a))), *at_rest, np.zeros(1))
+    polytope.add(np.zeros((len(high), 1, len(problem.a))), *steady, np.zeros(1))
     rows = elevated(cells.rows[: cells.needed])
     count, p, each, n = rows.shape
-    rows, lost = rows.swapaxes(0, 1).reshape(p, count * each, n), lost[:count].swapaxes(0, 1).reshape(p, -1)
+    rows, eroded = rows.swapaxes(0, 1).reshape(p, count * each, n), eroded[:count].swapaxes(0, 1).reshape(p, -1)
     ends = np.repeat(cells.ends[:count], each)
     # Coarse in time first: between two rows that are kept others follow sooner than after one.
     for places in _by_halving(ends.size):
-        polytope.take(rows[:, places], low[:, None] + lost[:, places], high[:, None] - lost[:, places], ends[places])
+        polytope.add(rows[:, places], low[:, None] + eroded[:, places], high[:, None] - eroded[:, places], ends[places])
     return polytope.reduced()
 
 
@@ -323,7 +326,7 @@ def _by_halving(count: int) -> Iterator[NDArray[np.intp]]:
         yield np.arange(stride, count, 2 * stride)
 
 
-def _check_rest(problem: Problem, low: Array, high: Array) -> None:
+def _check_equilibrium(problem: Problem, low: Array, high: Array) -> None:
     """Refuse limits between which the loop cannot rest."""
     p, m = problem.gain.shape
     both = np.vstack([problem.gain, -problem.gain])

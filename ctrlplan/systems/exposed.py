@@ -135,19 +135,19 @@ def _block(system: ct.NonlinearIOSystem, names: Sequence[str]) -> ct.NonlinearIO
 
 def _interconnection(system: ct.InterconnectedSystem, names: Sequence[str]) -> ct.InterconnectedSystem:
     blocks: list[System] = []
-    kept: list[int] = []
+    own_rows: list[int] = []
     states: list[int] = []
     first = 0
     for block in system.syslist:
         own = state_signals(block.state_labels)
         blocks.append(_exposed(block, [_free(name, block.output_labels) for name in own]))
-        kept += range(first, first + block.noutputs)
+        own_rows += range(first, first + block.noutputs)
         states += range(first + block.noutputs, first + block.noutputs + block.nstates)
         first += block.noutputs + block.nstates
     connect = np.zeros((system.connect_map.shape[0], first))
-    connect[:, kept] = system.connect_map
-    own_outputs = np.hstack([np.zeros((system.noutputs, first)), system.output_map[:, len(kept) :]])
-    own_outputs[:, kept] = system.output_map[:, : len(kept)]
+    connect[:, own_rows] = system.connect_map
+    own_outputs = np.hstack([np.zeros((system.noutputs, first)), system.output_map[:, len(own_rows) :]])
+    own_outputs[:, own_rows] = system.output_map[:, : len(own_rows)]
     state_outputs = np.eye(own_outputs.shape[1])[states]
     found = ct.InterconnectedSystem(
         blocks,

@@ -26,9 +26,9 @@ from ctrlplan.flatness.verify import (
 from ctrlplan.trajectories import derivative_name
 
 
-@former_signature("name")
+@former_signature("name", renamed={"flat_system": "flat"})
 def create_flat_iosystem(
-    flat_system: fs.FlatSystem,
+    flat: fs.FlatSystem,
     poles: Sequence[Value],
     *,
     labels: Sequence[str] | str | None = None,
@@ -42,7 +42,7 @@ def create_flat_iosystem(
     .. math:: v_j = y_{d,j}^{(r_j)} - \sum_{k=0}^{r_j - 1} \sigma_{j,k}\,(y_j^{(k)} - y_{d,j}^{(k)}),
         \qquad s^{r_j} + \sum_k \sigma_{j,k} s^k = \prod_k (s - p_{j,k}),
 
-    and u is what `flat_system.reverse` gives for the flag with v_j in the place
+    and u is what `flat.reverse` gives for the flag with v_j in the place
     of y_j^(r_j). Plant and law together are chains of r_j integrators, on which
     the errors obey the linear equation with the poles p_j.
 
@@ -53,7 +53,7 @@ def create_flat_iosystem(
 
     Parameters
     ----------
-    flat_system : control.flatsys.FlatSystem
+    flat : control.flatsys.FlatSystem
         Plant that static feedback linearises, in continuous time. The flag of
         flat output j has r_j + 1 entries, of which y_j, ..., y_j^(r_j - 1) are
         functions of the state alone, and the r_j add up to the number of states.
@@ -76,10 +76,10 @@ def create_flat_iosystem(
     Raises
     ------
     TypeError
-        If `flat_system` is no `control.flatsys.FlatSystem`, or poles or labels are of
+        If `flat` is no `control.flatsys.FlatSystem`, or poles or labels are of
         a wrong kind.
     ValueError
-        If static feedback does not linearise `flat_system`: a derivative below
+        If static feedback does not linearise `flat`: a derivative below
         the last depends on an input (the message says which), the decoupling
         matrix is singular, or the flags are too short; if `forward`, `reverse`
         and the plant's equations do not belong together; or if poles or labels
@@ -88,7 +88,7 @@ def create_flat_iosystem(
     Warns
     -----
     UserWarning
-        If `flat_system` is a `LinearFlatSystem` whose output is not its flat output,
+        If `flat` is a `LinearFlatSystem` whose output is not its flat output,
         which python-control chose, and `labels` does not name it: a multiple of it,
         or, where the plant has zeros, a sum of its derivatives.
 
@@ -103,7 +103,7 @@ def create_flat_iosystem(
     `LinearFlatSystem` is chosen by python-control and need not be its output; its
     maps are computed here from its matrices, without rounding.
 
-    The law keeps the parameters `flat_system` has now: a loop simulated with
+    The law keeps the parameters `flat` has now: a loop simulated with
     others shows what an inexact model does.
 
     Examples
@@ -123,9 +123,9 @@ def create_flat_iosystem(
     >>> bool(abs(found.outputs - plan(found.time)).max() < 1e-7)
     True
     """
-    plant = checked_plant(flat_system)
+    plant = checked_plant(flat, "flat")
     if labels is None:
-        warn_of_output(flat_system)
+        warn_of_output(flat)
     probes = random_probes(plant)
     names = flat_labels(plant, probes, labels)
     check_linearises(plant, probes, names)

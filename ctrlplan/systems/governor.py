@@ -14,7 +14,7 @@ from ctrlplan._checks import checked_finite, checked_names, checked_vector
 from ctrlplan._types import Array, EventName, Params, System, Value
 from ctrlplan.systems.admissible import AdmissibleSet, Limits
 from ctrlplan.systems.exposed import state_signals
-from ctrlplan.systems.hybrid import refuse_alone
+from ctrlplan.systems.hybrid import raise_not_standalone
 from ctrlplan.traits import DeclaredTrait, declare
 
 
@@ -73,7 +73,7 @@ class Governor(ct.NonlinearIOSystem):  # type: ignore[misc]
             self._held,
             inputs=inputs,
             outputs=outputs,
-            states=[*(f"{label}_offset" for label in outputs), "fraction", "refused", "unread"],
+            states=[*(f"{label}_offset" for label in outputs), "fraction", "infeasible", "nan_input"],
             dt=0,
             name=name,
         )
@@ -85,8 +85,8 @@ class Governor(ct.NonlinearIOSystem):  # type: ignore[misc]
             sample=self.sample,
             feedthrough=False,  # between samples
             watched={
-                EventName(f"{name}: nothing admissible, reference held"): (_refused, -math.inf, 0.5),
-                EventName(f"{name}: input lost, reference held"): (_unread, -math.inf, 0.5),
+                EventName(f"{name}: no admissible reference, previous one held"): (_infeasible, -math.inf, 0.5),
+                EventName(f"{name}: nan at the input, reference held"): (_nan_input, -math.inf, 0.5),
             },
         )
         self._count = len(outputs)
@@ -108,7 +108,7 @@ class Governor(ct.NonlinearIOSystem):  # type: ignore[misc]
         return np.array([x[k] + value for k, value in enumerate(self.initial.tolist())])
 
     def _no_rates(self, t: float, x: Value, u: Value, params: Params) -> NoReturn:
-        refuse_alone(self.name, "takes samples")
+        raise_not_standalone(self.name, "takes samples")
 
 
 def create_governor_iosystem(
@@ -139,7 +139,7 @@ def create_governor_iosystem(
     `create_command_filter_iosystem` after the governor.
 
     States: the references as offsets from `initial`, ``<reference>_offset``;
-    fraction, the last kappa, 0 where v was held; refused and unread, 1 while
+    fraction, the last kappa, 0 where v was held; infeasible and nan_input, 1 while
     nothing is admissible or an input is not finite. Inputs: the commands,
     ``<reference>_cmd``, then the states of the loop as `expose_states` names
     them, ``<state>_state``. Outputs: the references, by the loop's names, held
@@ -256,9 +256,9 @@ def _admission(loop: System, dt: float | None, limits: Limits | None, options: d
     return loop
 
 
-def _refused(t: Value, x: Value, u: Value, params: Params) -> Value:
+def _infeasible(t: Value, x: Value, u: Value, params: Params) -> Value:
     return x[-2]
 
 
-def _unread(t: Value, x: Value, u: Value, params: Params) -> Value:
+def _nan_input(t: Value, x: Value, u: Value, params: Params) -> Value:
     return x[-1]

@@ -59,7 +59,7 @@ class SampleHold(ct.NonlinearIOSystem):  # type: ignore[misc]
         return x[self._inner :]
 
     def _no_rates(self, t: float, x: Value, u: Value, params: Params) -> NoReturn:
-        refuse_alone(self.name, "takes samples")
+        raise_not_standalone(self.name, "takes samples")
 
 
 class Delay(ct.NonlinearIOSystem):  # type: ignore[misc]
@@ -81,7 +81,7 @@ class Delay(ct.NonlinearIOSystem):  # type: ignore[misc]
         declare(self, delay=delay, initial=initial)
 
     def _past(self, t: float, x: Value, u: Value, params: Params) -> NoReturn:
-        refuse_alone(self.name, "has a memory of its input")
+        raise_not_standalone(self.name, "has a memory of its input")
 
 
 @former_signature("name")
@@ -212,12 +212,12 @@ def create_delay_iosystem(
     """
     seconds = checked_finite(delay, "delay", above=0.0)
     given = checked_names("u" if inputs is None else inputs, "inputs")
-    late = checked_names("y" if outputs is None else outputs, "outputs")
-    if len(given) != len(late) or not given:
-        raise ValueError(f"outputs must be as many as inputs, {len(given)}, got {len(late)}")
-    return Delay(seconds, checked_vector(initial, "initial", len(given)), given, late, name)
+    delayed = checked_names("y" if outputs is None else outputs, "outputs")
+    if len(given) != len(delayed) or not given:
+        raise ValueError(f"outputs must be as many as inputs, {len(given)}, got {len(delayed)}")
+    return Delay(seconds, checked_vector(initial, "initial", len(given)), given, delayed, name)
 
 
-def refuse_alone(name: str, why: str) -> NoReturn:
+def raise_not_standalone(name: str, why: str) -> NoReturn:
     """Say who runs a block that python-control cannot run by itself."""
     raise RuntimeError(f"a loop with the block {name}, which {why}, must be run by ctrlplan.simulate")

@@ -32,7 +32,7 @@ class Problem:
     c: Array
     e: Array
     f: Array
-    rest: Array  # state at rest, by the reference
+    equilibrium: Array  # state at rest, by the reference
     gain: Array  # outputs at rest
     low: Array
     high: Array
@@ -117,8 +117,8 @@ def output_cells(problem: Problem, seen: Array, margin: float) -> Cells:
         ends.append(t)
         left = _norm(problem.c @ moved @ seen)
         if not needed:
-            kept = 1.0 - np.linalg.norm(back @ moved @ seen, 2) ** 2 if seen.size else 1.0
-            if kept > 0.0 and left * math.sqrt(t * float(widths @ widths) / kept) <= margin:
+            decrease = 1.0 - np.linalg.norm(back @ moved @ seen, 2) ** 2 if seen.size else 1.0
+            if decrease > 0.0 and left * math.sqrt(t * float(widths @ widths) / decrease) <= margin:
                 needed = len(ends)
         # Disturbances add up until nothing moves.
         if needed and (left <= _REMAINDER * first or not problem.e.any()):

@@ -51,15 +51,15 @@ class Polytope:
     def __init__(self, problem: Problem, seen: Array, spare: float) -> None:
         self._gain, self._seen, self._spare = problem.gain, seen, spare
         u, s, _ = np.linalg.svd(problem.gain, full_matrices=False)
-        self._rest = u[:, s > 1e-12 * s.max(initial=0.0)]  # outputs at rest, by as many coordinates as they have
+        self._steady = u[:, s > 1e-12 * s.max(initial=0.0)]  # outputs at rest, by as many coordinates as they have
         # Bounds are taken from the middle between limits, as near to it as outputs at rest come.
-        self._centre = self._rest @ (self._rest.T @ problem.middle)
-        self._columns = np.zeros((seen.shape[1] + self._rest.shape[1] + 1, 0))
+        self._centre = self._steady @ (self._steady.T @ problem.middle)
+        self._columns = np.zeros((seen.shape[1] + self._steady.shape[1] + 1, 0))
         self._columns = self._column(np.zeros((1, len(seen))), np.zeros((1, len(self._gain))), np.ones(1))
-        self._kept: list[tuple[Array, Array, float, float]] = []
+        self._rows: list[tuple[Array, Array, float, float]] = []
         self._proofs: list[_Proof] = []
 
-    def take(self, rows: Array, low: Array, high: Array, ends: Array) -> None:
+    def add(self, rows: Array, low: Array, high: Array, ends: Array) -> None:
         """Keep what does not follow of low <= rows @ z + gain @ v <= high.
 
         Rows (noutputs, ntime, nstates), limits (noutputs, ntime), and the times
@@ -70,7 +70,7 @@ class Polytope:
         state = np.concatenate([rows, -rows]).reshape(2 * p * count, n)
         output, bound = np.concatenate([outputs, -outputs]), np.concatenate([high, -low]).ravel()
         spared = bound - np.tile(np.where(ends > 0.0, self._spare, 0.0), 2 * p)
-        columns, kept = self._column(state, output, bound), self._column(state, output, spared)
+        columns, tightened = self._column(state, output, bound), self._column(state, output, spared)
         left = np.arange(bound.size)
         for known in self._proofs:
             left = left[_unproven(known, columns[:, left])]
@@ -84,13 +84,13 @@ class Polytope:
                 near, far = left[:_NEIGHBOURS], left[_NEIGHBOURS:]
                 left = np.concatenate([near[_unproven(proof, columns[:, near])], far])
                 continue
-            self._kept.append((state[k], output[k], float(spared[k]), float(ends[k % count])))
-            self._columns = np.hstack([self._columns, kept[:, [k]]])
+            self._rows.append((state[k], output[k], float(spared[k]), float(ends[k % count])))
+            self._columns = np.hstack([self._columns, tightened[:, [k]]])
 
     def reduced(self) -> tuple[Rows, float]:
         """Rows that do not follow from the rest of them, and the time [s] up to which they look."""
         needed = []
-        for k, row in enumerate(self._kept):
+        for k, row in enumerate(self._rows):
             column = self._columns[:, k + 1].copy()
             self._columns[:, k + 1] = 0.0
             if self._proof(column) is None:
@@ -103,7 +103,7 @@ class Polytope:
 
     def _column(self, state: Array, output: Array, bound: Array) -> Array:
         """Rows as columns (coordinates and bound) of length 1."""
-        found = np.vstack([(state @ self._seen).T, (output @ self._rest).T, bound - output @ self._centre])
+        found = np.vstack([(state @ self._seen).T, (output @ self._steady).T, bound - output @ self._centre])
         return np.asarray(found / np.linalg.norm(found, axis=0))
 
     def _proof(self, column: Array) -> _Proof | None:
@@ -117,13 +117,13 @@ class Polytope:
             new = np.argpartition(gain, -_NEAR)[-_NEAR:] if gain.size > _NEAR else np.arange(gain.size)
             near = np.union1d(near, new)
             try:
-                factors, rest = nnls(every[:, near], column)
+                factors, residual = nnls(every[:, near], column)
             except RuntimeError:
                 return None
             used = factors > 0.0
             near, generators = near[used], every[:, near[used]]
             missed = column - generators @ factors[used]
-            if rest <= _PROVEN:
+            if residual <= _PROVEN:
                 return generators, np.linalg.pinv(generators)
         return None  # nothing is proven: the row is kept
 

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ctrlplan._checks import check_kind, checked_count, checked_finite, real_array
 from ctrlplan._types import Array, EventName, Params, Value
-from ctrlplan.systems.hybrid import refuse_alone
+from ctrlplan.systems.hybrid import raise_not_standalone
 from ctrlplan.systems.source import axis_signals, create_source_iosystem
 from ctrlplan.traits import DeclaredTrait, declare
 from ctrlplan.trajectories import Trajectory
@@ -29,7 +29,7 @@ _ROUNDING, _MATTERS = 1e-12, 1e-6
 Trigger = Literal["period", "deviation", "goal"]
 """When a replanner plans again."""
 
-_START, _END, _LOST, _MISSED, _FITS = range(5)
+_START, _END, _NAN_INPUT, _UNREACHABLE, _FITS = range(5)
 """States of the correction before the goal's change and the coefficients."""
 
 
@@ -55,7 +55,7 @@ def create_replanner_iosystem(
     r"""Plan that is made again every period, from where the reference or the plant is.
 
     Every `dt` seconds a spline is fitted from the present jet to the goal's.
-    It is kept as a correction to `plan`: the transition of the same family and
+    It is applied as a correction to `plan`: the transition of the same family and
     angular frequency from the present deviation to the change of the goal.
     Nothing being in the way the correction is 0, and every plan is followed as
     it was made, whatever its kind. A polynomial between two jets plus its
@@ -72,8 +72,8 @@ def create_replanner_iosystem(
     drift. Between fits the output is the plan in continuous time. Runs in
     `ctrlplan.simulate` only.
 
-    States: start and end of the correction [s], lost (whether an input was not
-    finite), missed (whether the goal is out of reach), fits (their number),
+    States: start and end of the correction [s], nan_input (whether an input was not
+    finite), unreachable (whether the goal is out of reach), fits (their number),
     ``goal[k]``, the goal at the last fit, and ``coefficient[k]``. Inputs: with
     `goal_derivatives`, x_goal, x_goal_d1, ... of each axis x; with `measured`,
     x, x_d1, .... Outputs: the jet of each axis, x, x_d1, ..., as
@@ -166,7 +166,7 @@ def create_replanner_iosystem(
     """
     check_kind(plan, "plan", Trajectory)
     order = checked_count(order, "order")
-    put_out = order if derivatives is None else checked_count(derivatives, "derivatives")
+    output_order = order if derivatives is None else checked_count(derivatives, "derivatives")
     for label, value in (("measured", measured), ("goal_derivatives", goal_derivatives)):
         if value is not None and checked_count(value, label) > order:
             raise ValueError(f"{label} must be at most order, {order}, got {value}")
@@ -174,7 +174,7 @@ def create_replanner_iosystem(
     trigger_over = _checked_trigger(trigger, threshold, measured, goal_derivatives)
     limited = _checked_limits(plan, limits)
     axes = axis_signals(plan, labels, "")
-    signals = _Signals(axes, max(put_out, order), put_out, goal_derivatives, measured, suffix)
+    signals = _Signals(axes, max(output_order, order), output_order, goal_derivatives, measured, suffix)
     core = _Correction(
         plan, horizons, checked_finite(offset, "offset", minimum=0.0), signals, trigger_over, limited, name
     )
@@ -213,7 +213,7 @@ class _Horizons:
         self.step: Array | None = None  # from coefficients to jets a period later, where that is always the same map
         self._start, self._end = plan.start, plan.end
         if self.shrinking:
-            self._least = _least_horizon(min_horizon, period, whole)
+            self._minimum = _minimum_horizon(min_horizon, period, whole)
             return
         if min_horizon is not None:
             raise ValueError(f'min_horizon must go with horizon = "shrinking", got {min_horizon} with {whole:g} s')
@@ -225,9 +225,9 @@ class _Horizons:
                 f"got {radius:.4g} with dt = {period:g} s, horizon = {whole:g} s and alpha = {alpha:g}"
             )
 
-    def late(self, t: float) -> bool:
+    def too_short(self, t: float) -> bool:
         """Whether what is left of the plan is too short for a fit."""
-        return self.shrinking and self._end - t < self._least * (1.0 - 1e-9)
+        return self.shrinking and self._end - t < self._minimum * (1.0 - 1e-9)
 
     def end(self, t: float) -> float:
         """Where a fit at a time ends."""
@@ -237,7 +237,7 @@ class _Horizons:
         """Transition to fit at a time, None where it is too early or too late for one."""
         if not self.shrinking:
             return self.whole
-        if t < self._start or self.late(t):
+        if t < self._start or self.too_short(t):
             return None
         return transition(self.order, self._end - t, self.rate * (self._end - t))
 
@@ -249,16 +249,16 @@ class _Signals:
         self,
         labels: tuple[str, ...],
         planned: int,
-        put_out: int,
+        output_order: int,
         goal: int | None,
         measured: int | None,
         suffix: str,
     ) -> None:
         goals = [] if goal is None else signal_names([f"{label}_goal" for label in labels], goal)
         seen = [] if measured is None else signal_names(list(labels), measured)
-        self.planned, self.put_out, self.goal, self.measured = planned, put_out, goal, measured
+        self.planned, self.output_order, self.goal, self.measured = planned, output_order, goal, measured
         self.outer = [*goals, *seen]
-        self.outputs = signal_names([label + suffix for label in labels], put_out)
+        self.outputs = signal_names([label + suffix for label in labels], output_order)
         self.inside = "_planned"
         while {*self.outer, *self.outputs} & {*signal_names([label + self.inside for label in labels], planned)}:
             self.inside += "_"
@@ -280,7 +280,7 @@ class _Signals:
     def passed(self) -> list[int]:
         """Which inputs the outputs pass on."""
         each, naxes = self.planned + 1, len(self.inner) // (self.planned + 1)
-        return [axis * each + k for axis in range(naxes) for k in range(self.put_out + 1)]
+        return [axis * each + k for axis in range(naxes) for k in range(self.output_order + 1)]
 
 
 class _Correction(ct.NonlinearIOSystem):  # type: ignore[misc]
@@ -299,13 +299,13 @@ class _Correction(ct.NonlinearIOSystem):  # type: ignore[misc]
         limits: tuple[tuple[int, Array], ...],
         name: str,
     ) -> None:
-        naxes, order, kept = plan.naxes, horizons.order, signals.goal_rows.stop - signals.goal_rows.start
-        states = ["start", "end", "lost", "missed", "fits"]
-        states += [f"goal[{k}]" for k in range(kept)]
+        naxes, order, ngoals = plan.naxes, horizons.order, signals.goal_rows.stop - signals.goal_rows.start
+        states = ["start", "end", "nan_input", "unreachable", "fits"]
+        states += [f"goal[{k}]" for k in range(ngoals)]
         states += [f"coefficient[{k}]" for k in range(naxes * 2 * (order + 1))]
         super().__init__(
             self._no_rates,
-            self._put_out,
+            self._output,
             inputs=[*signals.inner, *signals.outer],
             outputs=signals.outputs,
             states=states,
@@ -320,8 +320,8 @@ class _Correction(ct.NonlinearIOSystem):  # type: ignore[misc]
             samples_first=True,  # what is measured may follow the reference directly
             feedthrough=signals.feedthrough,
             watched={
-                EventName(f"{name}: input lost"): (partial(_state, _LOST), -math.inf, 0.5),
-                EventName(f"{name}: goal out of reach"): (partial(_state, _MISSED), -math.inf, 0.5),
+                EventName(f"{name}: nan at the input"): (partial(_state, _NAN_INPUT), -math.inf, 0.5),
+                EventName(f"{name}: goal out of reach"): (partial(_state, _UNREACHABLE), -math.inf, 0.5),
             },
         )
         self._plan, self._horizons, self._signals, self._trigger, self._limits = (
@@ -333,7 +333,7 @@ class _Correction(ct.NonlinearIOSystem):  # type: ignore[misc]
         )
         self._passed, self._naxes, self._order = signals.passed, naxes, order
         self._final = plan.final.tolist()
-        self._goal, self._fitted = slice(5, 5 + kept), slice(5 + kept, len(states))
+        self._goal, self._fitted = slice(5, 5 + ngoals), slice(5 + ngoals, len(states))
         extrema = plan.extrema()
         self._range = float((extrema.maximum - extrema.minimum).max())
         self._scales = [horizons.whole.horizon**k for k in range(order + 1)]
@@ -346,14 +346,14 @@ class _Correction(ct.NonlinearIOSystem):  # type: ignore[misc]
     def sample(self, t: float, x: Array, u: Array, params: Params) -> Array:
         """States after a fit, or where none is due the same."""
         after = x.copy()
-        after[_LOST] = 0.0 if math.isfinite(sum(u.tolist())) else 1.0
-        if after[_LOST]:
+        after[_NAN_INPUT] = 0.0 if math.isfinite(sum(u.tolist())) else 1.0
+        if after[_NAN_INPUT]:
             return after
         goal = u[self._signals.goal_rows].reshape(self._naxes, -1).T
         miss = self._miss(t, x, goal)
         moved = miss > _ROUNDING
         begins = self._deviation(t, x, u)
-        after[_MISSED] = float(miss > _MATTERS and self._horizons.late(t))
+        after[_UNREACHABLE] = float(miss > _MATTERS and self._horizons.too_short(t))
         found = self._horizons.at(t) if self._is_due(moved, t, x, begins) else None
         if found is None:
             return after
@@ -364,9 +364,9 @@ class _Correction(ct.NonlinearIOSystem):  # type: ignore[misc]
             jets[last] = extrapolated(goal, found.horizon) - self._arrival[: len(goal)]
         coefficients = found.coefficients(jets)
         if self._limits and not self._within_limits(t, found, coefficients, goal):
-            after[_MISSED] = 1.0
+            after[_UNREACHABLE] = 1.0
             return after
-        after[_START], after[_END], after[_MISSED] = t, self._horizons.end(t), 0.0
+        after[_START], after[_END], after[_UNREACHABLE] = t, self._horizons.end(t), 0.0
         after[_FITS] += 1.0
         after[self._goal] = goal.ravel()
         after[self._fitted] = coefficients.ravel()
@@ -421,10 +421,10 @@ class _Correction(ct.NonlinearIOSystem):  # type: ignore[misc]
                 planned = self._plan.segment_jet_at(0.5 * (left + right), left, s, order)
                 if right <= met:
                     return planned + found.jet(coefficients, s + (left - t), order)
-                kept = extrapolated(goal, left - t)
-                kept = np.concatenate([kept, np.zeros((order + 1, self._naxes))])[: order + 1]
-                kept[0] -= self._plan.final if len(goal) else 0.0
-                return planned + np.stack([extrapolated(kept, value) for value in s.tolist()], axis=2)
+                after_end = extrapolated(goal, left - t)
+                after_end = np.concatenate([after_end, np.zeros((order + 1, self._naxes))])[: order + 1]
+                after_end[0] -= self._plan.final if len(goal) else 0.0
+                return planned + np.stack([extrapolated(after_end, value) for value in s.tolist()], axis=2)
 
             for nu, limit in self._limits:
                 times = stationary_times(jet, right - left, nu)
@@ -432,8 +432,8 @@ class _Correction(ct.NonlinearIOSystem):  # type: ignore[misc]
                     return False
         return True
 
-    def _put_out(self, t: Value, x: Value, u: Value, params: Params) -> Array:
-        added = itertools.chain.from_iterable(self._corrections(t, x, self._signals.put_out))
+    def _output(self, t: Value, x: Value, u: Value, params: Params) -> Array:
+        added = itertools.chain.from_iterable(self._corrections(t, x, self._signals.output_order))
         return np.array([u[row] + value for row, value in zip(self._passed, added, strict=True)])
 
     def _jets(self, t: float, x: Array, order: int) -> Array:
@@ -455,14 +455,14 @@ class _Correction(ct.NonlinearIOSystem):  # type: ignore[misc]
         changed = (x[_FITS] > 0.5) * (1.0 - live)
         found = []
         for row, goal, final in zip(rows, goals, self._final, strict=True):
-            kept = [row[0] * (1.0 - live) if not goal else changed * -final, *[0.0] * order]
+            after_end = [row[0] * (1.0 - live) if not goal else changed * -final, *[0.0] * order]
             for k in range(min(order + 1, len(goal))):
-                kept[k] = kept[k] + changed * taylor_value(goal[k:], t - x[_START])
-            found.append([value * live * math.factorial(k) + kept[k] for k, value in enumerate(row)])
+                after_end[k] = after_end[k] + changed * taylor_value(goal[k:], t - x[_START])
+            found.append([value * live * math.factorial(k) + after_end[k] for k, value in enumerate(row)])
         return found
 
     def _no_rates(self, t: float, x: Value, u: Value, params: Params) -> NoReturn:
-        refuse_alone(self.name, "plans again every period")
+        raise_not_standalone(self.name, "plans again every period")
 
 
 def _without_rounding(jet: Array, scale: Array, size: float) -> Array:
@@ -476,16 +476,16 @@ def _state(row: int, t: Value, x: Value, u: Value, params: Params) -> Value:
     return x[row]
 
 
-def _least_horizon(given: float | None, period: float, whole: float) -> float:
+def _minimum_horizon(given: float | None, period: float, whole: float) -> float:
     """Time to the end below which nothing is fitted."""
     if given is None:
         return max(period, min(5.0 * period, 0.5 * whole))
-    least = checked_finite(given, "min_horizon", above=0.0)
-    if not period <= least <= whole:
+    minimum = checked_finite(given, "min_horizon", above=0.0)
+    if not period <= minimum <= whole:
         raise ValueError(
-            f"min_horizon must lie between dt, {period:g} s, and the plan's duration, {whole:g} s, got {least:g} s"
+            f"min_horizon must lie between dt, {period:g} s, and the plan's duration, {whole:g} s, got {minimum:g} s"
         )
-    return least
+    return minimum
 
 
 def _checked_trigger(

@@ -154,8 +154,8 @@ Operand = Taylor | float | Array
 
 def _total(terms: Iterable[Value]) -> Value:
     """Sum, 0 of none; no term is added to 0, which would copy it."""
-    rest = iter(terms)
-    return sum(rest, next(rest, 0.0))
+    remaining = iter(terms)
+    return sum(remaining, next(remaining, 0.0))
 
 
 def _stacked(terms: list[Value]) -> Array:

@@ -95,8 +95,8 @@ def create_source_iosystem(
     >>> import ctrlplan as cp
     >>> plan = cp.PolySpline([cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1, 0, 0)])
     >>> source = cp.create_source_iosystem(plan, labels="r")
-    >>> driven = ct.interconnect([source, cp.plants.integrator_lag_loop(5)], inputs=0, outputs=["y", "r"])
-    >>> cp.simulate(driven, [0.0, 0.5, 1.0]).outputs[1].tolist()
+    >>> loop = ct.interconnect([source, cp.plants.integrator_lag_loop(5)], inputs=0, outputs=["y", "r"])
+    >>> cp.simulate(loop, [0.0, 0.5, 1.0]).outputs[1].tolist()
     [0.0, 0.5, 1.0]
     """
     check_kind(plan, "plan", Trajectory)

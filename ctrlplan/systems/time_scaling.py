@@ -145,7 +145,7 @@ def create_time_scaling_iosystem(
             check_kind(value, label, Mapping, "a mapping of signals to pairs of numbers")
     n = max(highest, 1)
     w, horizon = _checked_times(plan, n, bandwidth, catch_up)
-    least, most, inner = _checked_shares(slowest, fastest, margin)
+    minimum, maximum, inner = _checked_shares(slowest, fastest, margin)
     own = axis_signals(plan, labels, "")
     bounds = {label: _checked_limits(pair, label, inner) for label, pair in (limits or {}).items()}
     bands = {label: _checked_band(pair, label, own) for label, pair in (errors or {}).items()}
@@ -156,17 +156,17 @@ def create_time_scaling_iosystem(
     weights = _rate_weights(n, w)
 
     def update(t: Value, x: Value, u: Value, params: Params) -> Array:
-        free = np.fmin(np.fmax(1.0 + x[0] / horizon, least), most)
-        wanted = least + (1.0 - severity(t, x, u)) * (free - least)
+        free = np.fmin(np.fmax(1.0 + x[0] / horizon, minimum), maximum)
+        wanted = minimum + (1.0 - severity(t, x, u)) * (free - minimum)
         slow = [1.0 - wanted, *(x[k] for k in range(1, n + 1))]
         return np.array([x[n], *(w * (slow[k] - slow[k + 1]) for k in range(n))])
 
     def out(t: Value, x: Value, u: Value, params: Params) -> Array:
-        clock = [sum(weight * x[k + 1] for k, weight in enumerate(row)) for row in weights[:highest]]
-        if clock:
-            clock[0] = 1.0 + clock[0]
-        clock = [value / math.factorial(k) for k, value in enumerate(clock, 1)]
-        rows = [composed(row, clock) for row in _series(plan, t - x[0], highest)]
+        scaling = [sum(weight * x[k + 1] for k, weight in enumerate(row)) for row in weights[:highest]]
+        if scaling:
+            scaling[0] = 1.0 + scaling[0]
+        scaling = [value / math.factorial(k) for k, value in enumerate(scaling, 1)]
+        rows = [composed(row, scaling) for row in _series(plan, t - x[0], highest)]
         return np.array([value * math.factorial(k) for row in rows for k, value in enumerate(row)])
 
     block = ct.nlsys(
@@ -231,17 +231,17 @@ def _checked_times(plan: Trajectory, n: int, bandwidth: float | None, catch_up: 
 
 def _checked_shares(slowest: float, fastest: float, margin: float) -> tuple[float, float, float]:
     """Minimum and maximum rate, and the part of the limits' range within which the rate falls."""
-    least, most, inner = (
+    minimum, maximum, inner = (
         checked_number(value, label)
         for label, value in (("slowest", slowest), ("fastest", fastest), ("margin", margin))
     )
     if not 0.0 < inner <= 0.5:
         raise ValueError(f"margin must lie in (0, 0.5], got {margin}")
-    if not 0.0 <= least < 1.0:
+    if not 0.0 <= minimum < 1.0:
         raise ValueError(f"slowest must lie in [0, 1), got {slowest}")
-    if not 1.0 <= most < math.inf:
+    if not 1.0 <= maximum < math.inf:
         raise ValueError(f"fastest must be finite and at least 1, got {fastest}")
-    return least, most, inner
+    return minimum, maximum, inner
 
 
 def _check_signals(inputs: Sequence[str], outputs: Sequence[str]) -> None:
@@ -261,14 +261,14 @@ def _series(plan: Trajectory, t: Value, order: int) -> list[list[Value]]:
 
 def _shortest_move(plan: Trajectory) -> float:
     """Shortest time [s] for which the plan moves between two in which it dwells."""
-    durations, least, lasted = np.diff(plan.breakpoints), math.inf, 0.0
+    durations, shortest, lasted = np.diff(plan.breakpoints), math.inf, 0.0
     inside = plan.breakpoints[:-1, None] + durations[:, None] * np.array([0.13, 0.37, 0.61, 0.89])
     moving = np.append(plan.jet(inside, 2)[1:].any(axis=(0, 1, 3)), False)
     for moves, duration in zip(moving.tolist(), np.append(durations, 0.0).tolist(), strict=True):
         lasted += duration if moves else 0.0
         if not moves and lasted:
-            least, lasted = min(least, lasted), 0.0
-    return least
+            shortest, lasted = min(shortest, lasted), 0.0
+    return shortest
 
 
 def _rate_weights(n: int, w: float) -> list[list[float]]:

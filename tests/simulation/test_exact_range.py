@@ -10,7 +10,7 @@ import simulation_oracle
 from simulation_oracle import both, constant, gap, polygon, response, step
 
 import ctrlplan as cp
-from ctrlplan.simulation import rest_state
+from ctrlplan.simulation import equilibrium_state
 from ctrlplan.simulation.exact import exact_states, matrix_product, sampled_states
 
 SMALL = 1e-11
@@ -128,10 +128,10 @@ def test_what_is_beyond_the_range_says_so():
 
 def test_a_stiff_loop_rests_where_its_slow_states_do():
     # By hand, x1 = x2 = 1; beside 1e18 a rate of 1 is no integrator.
-    assert np.abs(rest_state(ct.ss([[-1e18, 0], [1, -1]], [[1e18], [0]], [[0, 1]], 0), 1.0) - 1.0).max() <= 1e-12
+    assert np.abs(equilibrium_state(ct.ss([[-1e18, 0], [1, -1]], [[1e18], [0]], [[0, 1]], 0), 1.0) - 1.0).max() <= 1e-12
     # A slow integrator behind them that is not at rest at 1: there is no rest.
     loop = ct.ss([[-1e18, 0, 0], [1, -1, 0], [0, 1e-9, 0]], [[1e18], [0], [0]], [[0, 0, 1]], 0)
-    assert rest_state(loop, 1.0).tolist() == [0.0, 0.0, 0.0]
+    assert equilibrium_state(loop, 1.0).tolist() == [0.0, 0.0, 0.0]
 
 
 # Growth beyond the range of numbers

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import ctrlplan as cp
-from ctrlplan.simulation import rest_at
+from ctrlplan.simulation import equilibrium_at
 
 BEFORE = np.linspace(-3.0, 12.0, 301)  # the plan begins at 0: until then a loop at rest does not move
 
@@ -323,7 +323,7 @@ def test_the_search_for_an_equilibrium_ends():
         return u - x + rng.standard_normal(3)
 
     noisy = ct.nlsys(rates, lambda t, x, u, p: x[:1], inputs="r", outputs="y", states=3, name="noisy")
-    _, doubt = rest_at(noisy, move(), 0.0, [0])
+    _, doubt = equilibrium_at(noisy, move(), 0.0, [0])
     assert doubt == "none was found"
     assert len(calls) < 20_000
 
@@ -337,7 +337,7 @@ def test_a_discrete_block_that_remembers_is_not_called():
         return 0.5 * x + 0.5 * u
 
     block = ct.nlsys(update, lambda t, x, u, p: x, inputs="r", outputs="y", states=1, dt=0.5, name="counting")
-    _, doubt = rest_at(block, move(), 0.0, [0])
+    _, doubt = equilibrium_at(block, move(), 0.0, [0])
     assert calls == []
     assert "counting" in doubt
 

@@ -15,7 +15,7 @@ METHODS = ("compiled", "python")
 TIGHT = {"rtol": 1e-11, "atol": 1e-13}
 REST = [Waypoint(0, 0, 0, 0), Waypoint(10, 1, 0, 0)]
 PLAN = cp.PolySpline(REST, labels=["x"])
-LOST, MISSED = cp.traits_of(cp.create_replanner_iosystem(PLAN, 0.5).syslist[1]).watched
+NAN_INPUT, UNREACHABLE = cp.traits_of(cp.create_replanner_iosystem(PLAN, 0.5).syslist[1]).watched
 """What the block calls its events: a value was not finite; the goal is out of reach."""
 
 
@@ -51,7 +51,7 @@ class Peer:
     def __init__(self, plan, goal, dt, order=2, horizon=None, least=None, limits=None, begin=0.0):
         self.plan, self.goal, self.order, self.limits = plan, goal, order, limits or {}
         self.pieces = []
-        self.fits, self.missed, known = 0, [], None
+        self.fits, self.unreachable, known = 0, [], None
         least = max(dt, min(5 * dt, 0.5 * plan.duration)) if least is None else least
         for k in itertools.count():
             t = begin + k * dt
@@ -60,15 +60,15 @@ class Peer:
             found = goal(t)
             new = known is None or not np.allclose(found, self.ahead(*known, t)[:, :, 0], rtol=1e-10, atol=1e-10)
             late = horizon is None and plan.end - t < least - 1e-9
-            missed = new and late
+            unreachable = new and late
             if not late and t >= plan.start and (horizon is not None or new):
                 end = plan.end if horizon is None else t + horizon
                 piece = self.fitted(t, end, found)
-                missed = not self.kept(t, end, piece)
-                if not missed:
+                unreachable = not self.within_limits(t, end, piece)
+                if not unreachable:
                     self.pieces.append((t, piece))
                     self.fits, known = self.fits + 1, (found, t)
-            self.missed.append((t, missed))
+            self.unreachable.append((t, unreachable))
 
     @staticmethod
     def ahead(goal, then, t):
@@ -96,7 +96,7 @@ class Peer:
 
         return piece
 
-    def kept(self, t, end, piece):
+    def within_limits(self, t, end, piece):
         grid = np.linspace(t, max(end, self.plan.end), 4001)
         whole = np.abs(self.plan.jet(grid, self.order) + piece(grid)).max(axis=(1, 2))
         shares = [whole[nu] / limit for nu, limit in self.limits.items()]
@@ -200,7 +200,7 @@ def signals(plan, replanner, t, goal=None, off=0.0):
     return np.array([values[label] for label in core.input_labels])
 
 
-def put_out(plan, replanner, t, x, **options):
+def block_outputs(plan, replanner, t, x, **options):
     core = replanner.syslist[1]
     return np.asarray(core.outfcn(t, x, signals(plan, replanner, t, **options), {}), dtype=float)
 

@@ -174,7 +174,7 @@ def test_copies_are_whole(again):
 
 
 def test_static_feedback_is_still_rejected_with_the_reason():
-    with pytest.raises(ValueError, match="static feedback must linearise flat_system"):
+    with pytest.raises(ValueError, match="flat must be linearisable by static feedback"):
         cp.create_flat_iosystem(Crane().flat_system(), [[-1, -2, -3, -4]] * 2)
 
 

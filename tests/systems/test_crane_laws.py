@@ -13,12 +13,12 @@ from ctrlplan.systems.plants import (
     create_dynamic_law_iosystem,
     create_generator_iosystem,
     create_load_feedback_iosystem,
-    create_still_iosystem,
+    create_setpoint_iosystem,
 )
 
 CRANE = Crane(load_mass=430.0, trolley_mass=3100.0, drum_inertia=70.0, drum_radius=0.5, gravity=9.5)
 MAKERS = [
-    create_still_iosystem,
+    create_setpoint_iosystem,
     create_generator_iosystem,
     create_load_feedback_iosystem,
     create_dynamic_law_iosystem,
@@ -33,7 +33,7 @@ def names(order):
 @pytest.mark.parametrize(
     ("make", "inputs", "outputs"),
     [
-        (create_still_iosystem, ["x_ref", "z_ref"], ["D_ref", "R_ref"]),
+        (create_setpoint_iosystem, ["x_ref", "z_ref"], ["D_ref", "R_ref"]),
         (create_generator_iosystem, names(2), ["D_ref", "R_ref"]),
         (create_load_feedback_iosystem, [*names(2), "x", "x_d1"], ["D_ref", "R_ref"]),
         (
@@ -104,7 +104,7 @@ def test_load_feedback_on_plan_is_the_generator():
 
 def test_still_is_rest():
     state, _ = CRANE.equilibrium(3.0, 8.0)
-    np.testing.assert_array_equal(create_still_iosystem(CRANE).output(0.0, [], [3.0, 8.0]), state[:2])
+    np.testing.assert_array_equal(create_setpoint_iosystem(CRANE).output(0.0, [], [3.0, 8.0]), state[:2])
 
 
 @pytest.mark.parametrize("wrap", [False, True])
@@ -140,7 +140,7 @@ def test_poles_must_be_four_stable_and_in_pairs(poles):
 
 
 @pytest.mark.parametrize("value", [0.0, -1.0, math.nan, math.inf])
-@pytest.mark.parametrize("name", ["bandwidth", "damping"])
+@pytest.mark.parametrize("name", ["load_bandwidth", "damping"])
 def test_load_feedback_needs_positive_numbers(name, value):
     with pytest.raises(ValueError, match=f"{name} must be finite and above 0"):
         create_load_feedback_iosystem(CRANE, **{name: value})

@@ -553,7 +553,7 @@ REFUSED = {
 @pytest.mark.parametrize(("plant", "reason"), REFUSED.values(), ids=list(REFUSED))
 def test_other_plants_are_refused_with_the_reason(plant, reason):
     orders = [len(row) - 1 for row in plant.forward(np.ones(plant.nstates), np.ones(plant.ninputs), {})]
-    with pytest.raises(ValueError, match=f"^static feedback must linearise flat_system: .*{reason}"):
+    with pytest.raises(ValueError, match=f"^flat must be linearisable by static feedback: .*{reason}"):
         create_flat_iosystem(plant, [[-1.0] * r for r in orders])
 
 
@@ -665,12 +665,12 @@ def test_a_plant_of_limited_domain_will_do():
 
 
 def test_kinds_are_refused():
-    with pytest.raises(TypeError, match=r"^flat_system must be a control.flatsys.FlatSystem, got StateSpace"):
+    with pytest.raises(TypeError, match=r"^flat must be a control.flatsys.FlatSystem, got StateSpace"):
         create_flat_iosystem(ct.rss(2, 1, 1), [-1, -2])
-    with pytest.raises(ValueError, match=r"^flat_system must be in continuous time, got dt = 0.1"):
+    with pytest.raises(ValueError, match=r"^flat must be in continuous time, got dt = 0.1"):
         create_flat_iosystem(double_integrator(dt=0.1), [-1, -2])
     bare = fs.flatsys(lambda x, u, params: [x], lambda flag, params: (flag[0], flag[0]))
-    with pytest.raises(ValueError, match=r"^flat_system must have states and inputs, got 0 and 0"):
+    with pytest.raises(ValueError, match=r"^flat must have states and inputs, got 0 and 0"):
         create_flat_iosystem(bare, [-1, -2])
 
 

@@ -173,8 +173,8 @@ def test_a_sensor_that_fails_and_comes_back():
     assert np.abs(found.outputs[1] - expected).max() <= 1e-12
     seen = [(event.name, event.kind, round(event.time, 6)) for event in found.events]
     assert seen == [
-        ("governor: input lost, reference held", "above", 0.5),
-        ("governor: input lost, reference held", "inside", 1.0),
+        ("governor: nan at the input, reference held", "above", 0.5),
+        ("governor: nan at the input, reference held", "inside", 1.0),
     ]
 
 
@@ -183,8 +183,8 @@ def test_a_state_from_which_nothing_is_admissible():
     start = [0.0, 0.0, 0.0, 0.0, -0.4, 0.5]  # u = -2.5 there
     found = cp.simulate(lag_loop(), np.linspace(0.0, 6.0, 1201), 0.0, start)
     assert [(e.name, e.kind) for e in found.events] == [
-        ("governor: nothing admissible, reference held", "above"),
-        ("governor: nothing admissible, reference held", "inside"),
+        ("governor: no admissible reference, previous one held", "above"),
+        ("governor: no admissible reference, previous one held", "inside"),
     ]
     assert found.events[0].time == 0.0
     refused = found.states[2, ::10] == 1.0

@@ -5,7 +5,7 @@ import math
 import control as ct
 import numpy as np
 import pytest
-from replanner_oracle import METHODS, MISSED, PLAN, REST, happened, put_out, signals, state_of, steps
+from replanner_oracle import METHODS, PLAN, REST, UNREACHABLE, block_outputs, happened, signals, state_of, steps
 from scipy.interpolate import BPoly
 
 import ctrlplan as cp
@@ -179,7 +179,7 @@ def test_a_run_begins_before_or_within_or_after_the_plan(begin):
         assert found.events == []
     else:  # too late for it
         assert np.abs(found.outputs[0] - PLAN(t)).max() <= 1e-12
-        assert happened(found, MISSED) == [(round(begin + 0.15, 9), "above")]
+        assert happened(found, UNREACHABLE) == [(round(begin + 0.15, 9), "above")]
 
 
 def test_a_plant_is_not_brought_onto_a_plan_that_has_not_begun():
@@ -278,7 +278,7 @@ def test_two_replanners_in_one_loop():
     alone = cp.simulate(blocks[1], t, cp.Step(0.0, 1.0, 3.1))
     assert np.abs(found.outputs[2:] - alone.outputs).max() <= 1e-10
     late = cp.simulate(loop, t, {"a_goal": cp.Step(2.0, 1.0, 9.8), "b_goal": 1.0})
-    assert [e.name for e in late.events] == [MISSED.replace("replanner", "first")]
+    assert [e.name for e in late.events] == [UNREACHABLE.replace("replanner", "first")]
 
 
 def test_python_controls_own_simulation_is_refused():
@@ -339,7 +339,7 @@ def test_a_plan_that_ends_in_motion_meets_its_goal_at_every_fit_time():
         aim = [[5.5 - 0.8 * (7.3 - t)], [0.8]]
         x = core.sample(t, np.zeros(core.nstates), signals(IN_MOTION, replanner, t, goal=aim), {})
         assert x[4] == 1
-        assert np.abs(put_out(IN_MOTION, replanner, 7.3, x) - [5.5, 0.8, 0.0]).max() <= 1e-9
+        assert np.abs(block_outputs(IN_MOTION, replanner, 7.3, x) - [5.5, 0.8, 0.0]).max() <= 1e-9
 
 
 def test_limits_do_not_count_the_arrival_twice():

@@ -5,14 +5,14 @@ import numpy as np
 import pytest
 from replanner_oracle import (
     METHODS,
-    MISSED,
     PLAN,
     PLANS,
     REST,
+    UNREACHABLE,
+    block_outputs,
     conveyor,
     happened,
     ideal,
-    put_out,
     signals,
     state_of,
     steps,
@@ -151,7 +151,7 @@ def test_shrinking_stops_and_a_goal_moved_too_late_is_an_event():
         fits = state_of(found, "fits")
         moved = np.flatnonzero(np.diff(fits)) + 1
         assert t[moved].tolist() == pytest.approx([8.0])
-        assert happened(found, MISSED) == [(9.0, "above"), (11.0, "inside")]
+        assert happened(found, UNREACHABLE) == [(9.0, "above"), (11.0, "inside")]
         assert len(found.events) == 2
         peer = BPoly.from_derivatives([8.0, 10.0], [PLAN.jet(8.0, 2)[:, 0], [1.2, 0, 0]])
         held = (t >= 8.0) & (t <= 10.0)
@@ -226,7 +226,7 @@ def test_deviation_heeds_a_new_goal_as_well():
     assert x[4] == 0
     x = core.sample(1.5, x, signals(PLAN, replanner, 1.5, goal=[[1.1]]), {})
     assert x[4] == 1
-    lifted = float(put_out(PLAN, replanner, 2.0, x)[0] - PLAN(2.0))
+    lifted = float(block_outputs(PLAN, replanner, 2.0, x)[0] - PLAN(2.0))
     x = core.sample(2.0, x, signals(PLAN, replanner, 2.0, goal=[[1.1]], off=lifted), {})
     assert x[4] == 1
     x = core.sample(2.5, x, signals(PLAN, replanner, 2.5, goal=[[1.1]], off=0.6), {})

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.polynomial import chebyshev
-from replanner_oracle import PLAN, TWO, Peer, between, put_out, signals, state_of, steps
+from replanner_oracle import PLAN, TWO, Peer, between, block_outputs, signals, state_of, steps
 from scipy.interpolate import BPoly
 
 import ctrlplan as cp
@@ -40,7 +40,7 @@ def test_after_a_goal_and_a_deviation_it_is_the_plan_and_a_spline_between_two_je
         s = np.linspace(0.0, left * (1 - 1e-12), 5)
         added = between(off[: order + 1, 0], last, left, alpha / 5.0 * left, s, order + 1)
         wanted = added + plan.jet(now + s, order + 1)[:, 0]
-        found = np.array([put_out(plan, replanner, now + v, x) for v in s.tolist()]).T
+        found = np.array([block_outputs(plan, replanner, now + v, x) for v in s.tolist()]).T
         size = np.abs(wanted).max(axis=1, keepdims=True) + np.abs(added).max(axis=1, keepdims=True)
         assert (np.abs(found - wanted) <= 1e-9 * size).all()
 
@@ -149,11 +149,11 @@ def test_no_jump_at_any_fit_whatever_the_goals(order, alpha, moves, seed):
     x, size, jumps = np.zeros(core.nstates), np.zeros(2 * (order + 1)), []
     for t in np.arange(0.0, 12.0, 0.5).tolist():
         aim = [plan.final + sum(value for time, value in moves if time <= t)]
-        before = put_out(plan, replanner, t, x, goal=aim)
+        before = block_outputs(plan, replanner, t, x, goal=aim)
         x = core.sample(t, x, signals(plan, replanner, t, goal=aim), {})
-        after = put_out(plan, replanner, t, x, goal=aim)
+        after = block_outputs(plan, replanner, t, x, goal=aim)
         jumps.append(np.abs(after - before))
-        middle = [put_out(plan, replanner, t + s, x, goal=aim) for s in (0.0, 0.2, 0.4)]
+        middle = [block_outputs(plan, replanner, t + s, x, goal=aim) for s in (0.0, 0.2, 0.4)]
         size = np.maximum(size, np.abs(middle).max(axis=0))
     assert (np.max(jumps, axis=0) <= 1e-9 * size).all()
 
@@ -163,6 +163,6 @@ def test_a_derivative_above_the_order_does_jump():
     replanner = cp.create_replanner_iosystem(PLAN, 0.5, goal_derivatives=0, derivatives=3)
     core = replanner.syslist[1]
     x = core.sample(4.0, np.zeros(core.nstates), signals(PLAN, replanner, 4.0, goal=[[2.0]]), {})
-    jump = put_out(PLAN, replanner, 4.0, x) - PLAN.jet(4.0, 3)[:, 0]
+    jump = block_outputs(PLAN, replanner, 4.0, x) - PLAN.jet(4.0, 3)[:, 0]
     assert np.abs(jump[:3]).max() <= 1e-12
     assert abs(jump[3] - 60.0 / 6.0**3) <= 1e-10  # minimum jerk over 6 s: 60 x move/H^3

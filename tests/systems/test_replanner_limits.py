@@ -5,7 +5,19 @@ import math
 import control as ct
 import numpy as np
 import pytest
-from replanner_oracle import LOST, METHODS, MISSED, PLAN, PLANS, Peer, conveyor, happened, signals, state_of, steps
+from replanner_oracle import (
+    METHODS,
+    NAN_INPUT,
+    PLAN,
+    PLANS,
+    UNREACHABLE,
+    Peer,
+    conveyor,
+    happened,
+    signals,
+    state_of,
+    steps,
+)
 from scipy.interpolate import BPoly
 
 import ctrlplan as cp
@@ -29,7 +41,7 @@ def test_a_goal_out_of_reach_is_not_taken_and_one_within_is_taken_up_again(metho
     found = cp.simulate(replanner, FINE, steps((2.2, 1.3), (4.2, 4.0), (6.1, 1.5)), method=method)
     fits = np.flatnonzero(np.diff(state_of(found, "fits"))) + 1
     assert FINE[fits].tolist() == pytest.approx([2.5, 6.5])
-    assert happened(found, MISSED) == [(4.5, "above"), (6.5, "inside")]
+    assert happened(found, UNREACHABLE) == [(4.5, "above"), (6.5, "inside")]
     assert len(found.events) == 2
     peer = BPoly.from_derivatives([2.5, 10.0], [PLAN.jet(2.5, 2)[:, 0], [1.3, 0, 0]])
     beyond = BPoly.from_derivatives(
@@ -58,14 +70,16 @@ def test_limits_hold_and_the_same_goals_are_taken_as_by_the_peer(seed, horizon):
         return np.array([[targets[np.searchsorted(times, t, side="right")]]])
 
     peer = Peer(PLAN, goal, 0.5, horizon=None if horizon == "shrinking" else horizon, limits=limits)
-    assert any(missed for _, missed in peer.missed)
+    assert any(unreachable for _, unreachable in peer.unreachable)
     coarse = np.linspace(0, 13, 131)
     wanted = peer(coarse)
     assert np.abs(found.outputs[:, ::20] - wanted).max() <= 1e-9
     changes = [
-        (t, m) for (t, m), (_, before) in zip(peer.missed[1:], peer.missed, strict=False) if m != before and t <= 13
+        (t, m)
+        for (t, m), (_, before) in zip(peer.unreachable[1:], peer.unreachable, strict=False)
+        if m != before and t <= 13
     ]
-    assert happened(found, MISSED) == [(round(t, 9), "above" if m else "inside") for t, m in changes]
+    assert happened(found, UNREACHABLE) == [(round(t, 9), "above" if m else "inside") for t, m in changes]
 
 
 @pytest.mark.parametrize("name", ["trigonometric, inner waypoints, alpha 4", "piecewise", "joined"])
@@ -79,7 +93,7 @@ def test_limits_hold_on_plans_with_joins_and_for_each_axis_its_own(name):
     found = cp.simulate(replanner, FINE, steps(*moves))
     assert np.abs(found.outputs[1]).max() <= limit * (1 + 1e-9)
     assert 0 < state_of(found, "fits")[-1] < 9
-    assert happened(found, MISSED)
+    assert happened(found, UNREACHABLE)
 
 
 def test_each_axis_has_its_limit():
@@ -101,7 +115,7 @@ def test_limits_hold_where_the_correction_ends_before_the_plan(trigger):
     )
     found = cp.simulate(replanner, FINE, steps((1.1, 1.5)))
     assert np.abs(found.outputs[0]).max() <= 1.2
-    assert happened(found, MISSED)[0] == (1.5, "above")
+    assert happened(found, UNREACHABLE)[0] == (1.5, "above")
     found = cp.simulate(replanner, FINE, steps((1.1, 1.15)))
     assert np.abs(found.outputs[0]).max() == pytest.approx(1.15, abs=1e-3)
     assert found.events == []
@@ -112,7 +126,7 @@ def test_limits_on_the_speed_of_a_plan_and_a_conveyor_together():
     replanner = cp.create_replanner_iosystem(PLAN, 0.5, horizon=1.0, goal_derivatives=1, limits={1: 0.3})
     found = cp.simulate(replanner, FINE, conveyor(1.0, 0.15, at=0.0))
     assert np.abs(found.outputs[1]).max() <= 0.3 * (1 + 1e-9)
-    assert happened(found, MISSED)[0] == (0.0, "above")
+    assert happened(found, UNREACHABLE)[0] == (0.0, "above")
 
 
 def test_what_is_measured_beyond_the_limits_is_not_begun_from():
@@ -166,7 +180,7 @@ def test_a_sensor_that_fails_for_a_while(method):
     assert np.isfinite(found.outputs[[0, 1, 2, 4]]).all()
     assert np.isfinite(found.states).all()
     assert np.isnan(found.outputs[3, (t > 3.31) & (t < 5.19)]).all()
-    assert happened(found, LOST) == [(3.5, "above"), (5.5, "inside")]
+    assert happened(found, NAN_INPUT) == [(3.5, "above"), (5.5, "inside")]
     assert len(found.events) == 2
     fits = np.flatnonzero(np.diff(state_of(found, "fits"), prepend=0.0))
     assert np.allclose(t[fits], [0, 0.5, 1, 1.5, 2, 2.5, 3, 5.5, 6, 6.5, 7, 7.5, 8, 8.5, 9])
@@ -190,7 +204,7 @@ def test_a_goal_that_is_lost_for_a_while(method):
     t = np.linspace(0.0, 12.0, 121)
     found = cp.simulate(loop, t, steps((2.2, 1.2), (4.0, 0.5)), method=method)
     assert np.isfinite(found.outputs).all()
-    assert happened(found, LOST) == [(3.5, "above"), (5.5, "inside")]
+    assert happened(found, NAN_INPUT) == [(3.5, "above"), (5.5, "inside")]
     first = BPoly.from_derivatives([2.5, 10.0], [PLAN.jet(2.5, 2)[:, 0], [1.2, 0, 0]])
     jet = [first.derivative(k)(5.5) if k else first(5.5) for k in range(3)]
     second = BPoly.from_derivatives([5.5, 10.0], [jet, [0.5, 0, 0]])

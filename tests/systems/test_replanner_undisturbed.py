@@ -3,7 +3,7 @@
 import control as ct
 import numpy as np
 import pytest
-from replanner_oracle import METHODS, PLAN, PLANS, TIGHT, ideal, put_out, signals, state_of
+from replanner_oracle import METHODS, PLAN, PLANS, TIGHT, block_outputs, ideal, signals, state_of
 
 import ctrlplan as cp
 from ctrlplan import Waypoint
@@ -34,7 +34,7 @@ def test_undisturbed_every_plan_is_followed_as_it_was_made(name, trigger):
         for s in (t, t + 0.13, t + 0.39):
             if s <= plan.end:
                 wanted = plan.jet(s, 2).T.ravel()
-                assert (np.abs(put_out(plan, replanner, s, x) - wanted) <= 1e-10 * size).all()
+                assert (np.abs(block_outputs(plan, replanner, s, x) - wanted) <= 1e-10 * size).all()
     assert x[3] == 0.0
     if trigger in ("measured", "position measured", "measured, goal"):
         assert fits[-1] == 23  # at 0, 0.4, ..., 8.8

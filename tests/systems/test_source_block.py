@@ -18,7 +18,7 @@ SINGLE = cp.PolySpline([cp.Waypoint(0.5, 0, 0, 0), cp.Waypoint(1.5, 1, 0, 0)], l
 T = np.linspace(0.0, 6.0, 61)
 
 
-def put_out(block, t):
+def block_outputs(block, t):
     return block.output(t, np.zeros(0), np.zeros(0))
 
 
@@ -55,7 +55,7 @@ def test_it_is_a_system_of_python_control_without_inputs_or_states():
 @pytest.mark.parametrize("t", [-3.0, 0.0, 0.5, 0.7, 1.5, 2.999, 3.0, 3.1, 100.0])
 @pytest.mark.parametrize("derivatives", [0, 1, 3])
 def test_values_are_the_jet(derivatives, t):
-    found = put_out(cp.create_source_iosystem(PLAN, derivatives), t)
+    found = block_outputs(cp.create_source_iosystem(PLAN, derivatives), t)
     assert found.shape == (2 * (derivatives + 1),)
     jet = PLAN.jet(t, derivatives)
     assert found.tolist() == [jet[nu, axis] for axis in range(2) for nu in range(derivatives + 1)]
@@ -67,19 +67,19 @@ def test_values_are_the_jet(derivatives, t):
 def test_values_where_they_are_prescribed():
     block = cp.create_source_iosystem(PLAN, derivatives=1)
     for i, t in enumerate(TIMES):
-        assert np.abs(put_out(block, t) - [*JETS["x"][i][:2], *JETS["z"][i][:2]]).max() <= 1e-12
+        assert np.abs(block_outputs(block, t) - [*JETS["x"][i][:2], *JETS["z"][i][:2]]).max() <= 1e-12
 
 
 def test_the_plan_is_held_outside_its_interval():
     block = cp.create_source_iosystem(PLAN, derivatives=2)
-    assert np.abs(put_out(block, -1.0) - [0, 0, 0, 10, 0, 0]).max() <= 1e-13
-    assert np.abs(put_out(block, 9.0) - [3, 0, 0, 11, 0, 0]).max() <= 1e-13
+    assert np.abs(block_outputs(block, -1.0) - [0, 0, 0, 10, 0, 0]).max() <= 1e-13
+    assert np.abs(block_outputs(block, 9.0) - [3, 0, 0, 11, 0, 0]).max() <= 1e-13
 
 
 def test_a_step_jumps_at_its_time():
     block = cp.create_source_iosystem(cp.Step([1.0, 2.0], initial=-1.0, time=2.0, labels=["a", "b"]), derivatives=1)
-    assert put_out(block, np.nextafter(2.0, 0.0)).tolist() == [-1, 0, -1, 0]
-    assert put_out(block, 2.0).tolist() == [1, 0, 2, 0]
+    assert block_outputs(block, np.nextafter(2.0, 0.0)).tolist() == [-1, 0, -1, 0]
+    assert block_outputs(block, 2.0).tolist() == [1, 0, 2, 0]
 
 
 def test_a_whole_number_of_any_kind_counts_derivatives():
@@ -170,7 +170,7 @@ def test_a_block_can_be_used_twice():
     assert isinstance(copied, PlanSource)
     assert copied.plan is SINGLE
     assert copied.name == "again"
-    assert put_out(copied, 1.1) == put_out(block, 1.1)
+    assert block_outputs(copied, 1.1) == block_outputs(block, 1.1)
 
 
 def test_two_plans_in_one_loop():

@@ -66,13 +66,13 @@ class CompiledMethod:
         known = equations_of(job, attempt.copies)
         if known is not None:  # an algebraic loop without a solution has a better name here
             known.signals(job.first, job.state, signal_values(attempt.time_signals, job.times[:1])[:, 0])
-        most = _STEPS_WITH_STOPS if attempt.stops else _STEPS
-        return CompiledSolver(form, job.params, attempt.tolerances, attempt.scales, max_steps=most)
+        max_steps = _STEPS_WITH_STOPS if attempt.stops else _STEPS
+        return CompiledSolver(form, job.params, attempt.tolerances, attempt.scales, max_steps=max_steps)
 
     def check(self, attempt: Attempt[CompiledSolver]) -> None:
         """Compare with Python, at states of the run."""
         solver, job = attempt.solver, attempt.job
-        if solver.at_edge(*attempt.visited()):
+        if solver.near_undefined(*attempt.visited()):
             raise SolverError(
                 f"the solver must reach {job.times[-1]:g} s, got to the edge of where equations are defined"
             )
@@ -88,11 +88,11 @@ def _disagreement(attempt: Attempt[CompiledSolver], solver: CompiledSolver) -> s
     values = signal_values(attempt.time_signals, run.times)
     if not form.compared.is_due(form.sides(run.times, run.states, values, p)):
         return ""
-    most = max(1, solver.evaluations // _SHARE) if solver.evaluations else VISITED
+    count = max(1, solver.evaluations // _SHARE) if solver.evaluations else VISITED
     t, x = _closer(run, solver)
     values = signal_values(attempt.time_signals, t)
     w, sides = form.signals(t, x, values, p), form.sides(t, x, values, p)
-    places = telling_states(sides, np.concatenate([w, x]), most)
+    places = telling_states(sides, np.concatenate([w, x]), count)
     # Blocks are compared at the inputs that the form computes: where each agrees, the whole does.
     return form.disagreement(attempt.copies, job.params, t[places], x[:, places], w[:, places])
 

@@ -12,10 +12,10 @@ from ctrlplan.simulation.job import Job, Record
 from ctrlplan.simulation.prepared import Prepared
 from ctrlplan.simulation.signals import breakpoints_of, signal_values
 
-_MOST_STEPS = 1e8
+_MAX_STEPS = 1e8
 """Maximum number of steps of a discrete system in a run."""
 
-_OFF_CLOCK = 1e-5
+_OFF_INSTANT = 1e-5
 """Part of a sampling time by which a time may miss an instant, besides rounding of the times."""
 
 
@@ -38,36 +38,36 @@ class Discrete:
     def run(self, job: Job) -> Record:
         """States at every sample of a job."""
         prepared, network = job.prepared, job.blocks
-        clock = _clock(job.times, prepared.dt)
+        instants = _sampling_instants(job.times, prepared.dt)
         time_signals = prepared.time_signals(job.inputs, job.first)
         equations = Interpreted(network, job.params, (job.first, job.state), job.trials)
         breakpoints = np.array(sorted(breakpoints_of(time_signals)))
-        values = signal_values(time_signals, _on_breakpoints(clock, breakpoints))
-        states = np.empty((job.state.size, clock.size))
-        signals = np.empty((network.nsignals, clock.size))
+        values = signal_values(time_signals, _on_breakpoints(instants, breakpoints))
+        states = np.empty((job.state.size, instants.size))
+        signals = np.empty((network.nsignals, instants.size))
         states[:, 0] = job.state
-        for k, t in enumerate(clock.tolist()):
+        for k, t in enumerate(instants.tolist()):
             check(t)
             signals[:, k] = equations.signals(t, states[:, k], values[:, k])
             following = equations.rates_of(t, states[:, k], signals[:, k])
-            if k + 1 < clock.size:
+            if k + 1 < instants.size:
                 states[:, k + 1] = following
 
         def snapshot(t: Array, x: Array) -> Snapshot:
             now = signal_values(time_signals, _on_breakpoints(t, breakpoints))
-            w = signals[:, np.searchsorted(clock, t, side="right") - 1]
+            w = signals[:, np.searchsorted(instants, t, side="right") - 1]
             return Snapshot(t, x, now[: prepared.ninputs], network.to_outputs(w), lambda: w)
 
         # Between samples nothing happens: what crosses a limit does so at the later one.
-        return Record(clock, states, snapshot, lambda k, t: states[:, k], job.watched(), self.name, job.reason)
+        return Record(instants, states, snapshot, lambda k, t: states[:, k], job.watched(), self.name, job.reason)
 
 
-def _clock(times: Array, dt: float | bool) -> Array:
+def _sampling_instants(times: Array, dt: float | bool) -> Array:
     """Sampling instants of a discrete system from the first time to the last, the times themselves among them."""
     rounding = 4.0 * np.finfo(float).eps * np.abs(times).max()
     if isinstance(dt, bool):
         spacing = np.diff(times)
-        if np.ptp(spacing) > _OFF_CLOCK * spacing.mean() + rounding:
+        if np.ptp(spacing) > _OFF_INSTANT * spacing.mean() + rounding:
             raise ValueError(
                 "timepts must be evenly spaced for a system with unspecified sampling time (dt = True), "
                 f"got spacings from {spacing.min():g} to {spacing.max():g} s"
@@ -77,11 +77,11 @@ def _clock(times: Array, dt: float | bool) -> Array:
     if not rounding < 0.1 * period < np.inf:
         raise ValueError(f"timepts must tell instants {period:g} s apart, got times up to {np.abs(times).max():g} s")
     steps = (times - times[0]) / period
-    if steps[-1] > _MOST_STEPS:
-        raise ValueError(f"timepts must span {_MOST_STEPS:g} periods of a discrete system at most, got {steps[-1]:.3g}")
+    if steps[-1] > _MAX_STEPS:
+        raise ValueError(f"timepts must span {_MAX_STEPS:g} periods of a discrete system at most, got {steps[-1]:.3g}")
     wanted = np.round(steps)
     off = np.abs(steps - wanted)
-    if off.max() > _OFF_CLOCK + rounding / period:
+    if off.max() > _OFF_INSTANT + rounding / period:
         at = float(times[off.argmax()])
         raise ValueError(
             f"timepts must be whole periods of {period:g} s apart in a discrete system, got {at:g} s, "
@@ -89,9 +89,9 @@ def _clock(times: Array, dt: float | bool) -> Array:
         )
     if np.any(np.diff(wanted) < 1.0):
         raise ValueError(f"timepts must be at least a period of {period:g} s apart in a discrete system, got less")
-    clock: Array = times[0] + period * np.arange(wanted[-1] + 1.0)
-    clock[wanted.astype(int)] = times
-    return clock
+    instants: Array = times[0] + period * np.arange(wanted[-1] + 1.0)
+    instants[wanted.astype(int)] = times
+    return instants
 
 
 def _on_breakpoints(times: Array, breakpoints: Array) -> Array:

@@ -108,8 +108,8 @@ def _warn_of_undefined(job: Job, form: LinearForm, times: Array, states: Array) 
         return
     up, down = (states == np.inf).astype(float), (states == -np.inf).astype(float)
     added = (form.c > 0.0) @ up + (form.c < 0.0) @ down > 0.0
-    taken = (form.c > 0.0) @ down + (form.c < 0.0) @ up > 0.0
-    undefined = added & taken
+    subtracted = (form.c > 0.0) @ down + (form.c < 0.0) @ up > 0.0
+    undefined = added & subtracted
     if undefined.any():
         names = ", ".join(np.array(job.prepared.output_labels)[undefined.any(axis=1)])
         begin = times[undefined.any(axis=0).argmax()]

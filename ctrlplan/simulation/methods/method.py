@@ -91,5 +91,5 @@ def recorded(job: Job, methods: Sequence[Method]) -> Record:
             job = spare
         reasons.setdefault(method.name, reason)
         why = job.reason or reason
-    needs = "must be given a system that it applies to"
-    raise NotApplicableError("; ".join(f'method "{name}" {needs}, but {why}' for name, why in reasons.items()))
+    requirement = "must be given a system that it applies to"
+    raise NotApplicableError("; ".join(f'method "{name}" {requirement}, but {why}' for name, why in reasons.items()))

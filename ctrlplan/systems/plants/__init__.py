@@ -14,6 +14,7 @@ from ctrlplan.systems.plants.crane import (
     create_dynamic_law_iosystem,
     create_generator_iosystem,
     create_load_feedback_iosystem,
+    create_setpoint_iosystem,
     create_still_iosystem,
 )
 from ctrlplan.systems.plants.dc_motor import dc_motor
@@ -35,6 +36,7 @@ __all__ = [
     "create_dynamic_law_iosystem",
     "create_generator_iosystem",
     "create_load_feedback_iosystem",
+    "create_setpoint_iosystem",
     "create_still_iosystem",
     "dc_motor",
     "flexible_joint",

@@ -7,7 +7,7 @@ import numpy as np
 from ctrlplan._checks import checked_finite
 from ctrlplan._types import Params, Value
 from ctrlplan.flatness import FlatSystem
-from ctrlplan.systems.plants.parameters import overruled
+from ctrlplan.systems.plants.parameters import overridden
 
 
 def dc_motor(
@@ -73,7 +73,7 @@ def dc_motor(
     own = {**parameters, "friction": friction}
 
     def update(t: float, x: Value, u: Value, params: Params) -> Value:
-        R, L, K, J, b = overruled(own, params)
+        R, L, K, J, b = overridden(own, params)
         return np.array([x[1], (K * x[2] - b * x[1]) / J, (u[0] - R * x[2] - K * x[1]) / L])
 
     def forward(x: Value, u: Value, params: Params | None = None) -> list[Value]:

@@ -7,7 +7,7 @@ import numpy as np
 from ctrlplan._checks import checked_finite
 from ctrlplan._types import Params, Value
 from ctrlplan.flatness import FlatSystem
-from ctrlplan.systems.plants.parameters import overruled
+from ctrlplan.systems.plants.parameters import overridden
 
 
 def flexible_joint(
@@ -79,7 +79,7 @@ def flexible_joint(
     own = {**parameters, "gravity": gravity}
 
     def update(t: float, x: Value, u: Value, params: Params) -> Value:
-        I, J, k, m, l, g = overruled(own, params)  # noqa: E741
+        I, J, k, m, l, g = overridden(own, params)  # noqa: E741
         weight = m * g * l
         spring = k * (x[1] - x[0])
         return np.array([x[2], x[3], (spring - weight * np.sin(x[0])) / I, (u[0] - spring) / J])

@@ -5,6 +5,7 @@ from ctrlplan.systems.plants.crane.blocks import (
     create_dynamic_law_iosystem,
     create_generator_iosystem,
     create_load_feedback_iosystem,
+    create_setpoint_iosystem,
     create_still_iosystem,
 )
 from ctrlplan.systems.plants.crane.crane import Crane
@@ -35,5 +36,6 @@ __all__ = [
     "create_dynamic_law_iosystem",
     "create_generator_iosystem",
     "create_load_feedback_iosystem",
+    "create_setpoint_iosystem",
     "create_still_iosystem",
 ]

@@ -12,8 +12,8 @@ import control as ct
 import numpy as np
 
 from ctrlplan._checks import checked_finite, checked_labels, checked_names
-from ctrlplan._renamed import former_signature
-from ctrlplan._types import Array
+from ctrlplan._renamed import former_signature, warn_renamed
+from ctrlplan._types import Array, Value
 from ctrlplan.systems.flat import hurwitz_coefficients
 from ctrlplan.systems.plants.crane.flatness import checked_formulas
 from ctrlplan.systems.plants.crane.parameters import CraneParameters
@@ -24,7 +24,7 @@ Params = Mapping[str, float]
 
 
 @former_signature("name")
-def create_still_iosystem(
+def create_setpoint_iosystem(
     crane: CraneParameters,
     *,
     labels: Sequence[str] | None = None,
@@ -63,7 +63,7 @@ def create_still_iosystem(
     >>> crane = cp.plants.Crane()
     >>> step = cp.Step([1.0, 10.0], [0.0, 10.0], labels=["x", "z"])
     >>> source = cp.create_source_iosystem(step, suffix="_ref")
-    >>> law = cp.plants.create_still_iosystem(crane)
+    >>> law = cp.plants.create_setpoint_iosystem(crane)
     >>> references = ct.interconnect([source, law], inputs=0, outputs=["D_ref", "R_ref"])
     >>> cp.simulate(references, [0.0, 1.0]).outputs[:, -1].tolist()
     [0.75, 10.0]
@@ -75,6 +75,18 @@ def create_still_iosystem(
 
     inputs = _input_names(0, labels, suffix)
     return ct.nlsys(None, out, inputs=inputs, outputs=["D_ref", "R_ref"], dt=None, name=name)
+
+
+def create_still_iosystem(crane: CraneParameters, *args: str, **options: Value) -> ct.NonlinearIOSystem:
+    """Old name of `create_setpoint_iosystem`.
+
+    Warns
+    -----
+    FutureWarning
+        Always.
+    """
+    warn_renamed("create_still_iosystem", "create_setpoint_iosystem")
+    return create_setpoint_iosystem(crane, *args, **options)
 
 
 @former_signature("name")
@@ -131,10 +143,10 @@ def create_generator_iosystem(
     return ct.nlsys(None, out, inputs=inputs, outputs=["D_ref", "R_ref"], dt=None, name=name)
 
 
-@former_signature("name")
+@former_signature("name", renamed={"bandwidth": "load_bandwidth"})
 def create_load_feedback_iosystem(
     crane: CraneParameters,
-    bandwidth: float = 1.0,
+    load_bandwidth: float = 1.0,
     damping: float = 1.0,
     *,
     labels: Sequence[str] | None = None,
@@ -154,7 +166,7 @@ def create_load_feedback_iosystem(
     ----------
     crane : Crane
         The plant.
-    bandwidth : float, optional
+    load_bandwidth : float, optional
         w [rad/s], above 0; stable with the study's PIDs from 0.1 to 3.
     damping : float, optional
         zeta, above 0; 0.7 to 1.
@@ -173,7 +185,7 @@ def create_load_feedback_iosystem(
     Raises
     ------
     ValueError
-        If `bandwidth` or `damping` is not above 0, or
+        If `load_bandwidth` or `damping` is not above 0, or
         labels are not two, or give a reference the name of another input.
 
     Examples
@@ -189,7 +201,7 @@ def create_load_feedback_iosystem(
     >>> loop.nstates
     10
     """
-    w, zeta = checked_finite(bandwidth, "bandwidth", above=0.0), checked_finite(damping, "damping", above=0.0)
+    w, zeta = checked_finite(load_bandwidth, "load_bandwidth", above=0.0), checked_finite(damping, "damping", above=0.0)
     s0, s1 = w**2, 2.0 * zeta * w
 
     def out(t: float, state: Array, u: Array, params: Params) -> Array:

@@ -93,7 +93,7 @@ class Law(ABC):
 
 @dataclass(frozen=True)
 class SetpointLaw(Law):
-    """References of a load at rest, for steps; block `create_still_iosystem`."""
+    """References of a load at rest, for steps; block `create_setpoint_iosystem`."""
 
     name = "setpoint"
     order = 0
@@ -101,7 +101,7 @@ class SetpointLaw(Law):
 
     def build(self, crane: CraneParameters) -> ct.NonlinearIOSystem:
         """Block from x_ref and z_ref to D_ref and R_ref."""
-        return blocks.create_still_iosystem(crane)
+        return blocks.create_setpoint_iosystem(crane)
 
 
 @dataclass(frozen=True)

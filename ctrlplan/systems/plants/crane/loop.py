@@ -123,10 +123,10 @@ def crane_loop(
     _check_fed(reference or (), blocks, inputs)
     outputs = [*model.OUTPUTS, "F", "C", "x_ref", "z_ref"]
     loop = ct.interconnect(blocks, inputs=list(inputs) or 0, outputs=outputs, name=name)
-    rest = model.equilibrium(crane, float(plan.initial[0]), float(plan.initial[1]))[0]
+    equilibrium = model.equilibrium(crane, float(plan.initial[0]), float(plan.initial[1]))[0]
     # The crane comes last; the states of law and PIDs are 0 at rest.
     before = [_start(block) for block in blocks[:-1]]
-    loop.initial_state = np.concatenate([*before, rest])
+    loop.initial_state = np.concatenate([*before, equilibrium])
     return declare(loop, initial_state=loop.initial_state)
 
 

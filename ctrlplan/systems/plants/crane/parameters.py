@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from ctrlplan._checks import checked_finite
-from ctrlplan.systems.plants.parameters import overruled
+from ctrlplan.systems.plants.parameters import overridden
 
 POSITIVE = ("load_mass", "trolley_mass", "drum_inertia", "drum_radius", "gravity")
 FRICTIONS = ("trolley_friction", "drum_friction")
@@ -39,5 +39,5 @@ class CraneParameters:
 
     def numbers(self, params: Mapping[str, float] | None = None) -> Numbers:
         """m, M_c, J, b, f1, f2, g, each overridden by the parameter of a run of its name."""
-        m, trolley, inertia, b, f1, f2, g = overruled({name: getattr(self, name) for name in NUMBERS}, params)
+        m, trolley, inertia, b, f1, f2, g = overridden({name: getattr(self, name) for name in NUMBERS}, params)
         return m, trolley, inertia, b, f1, f2, g

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import ctrlplan as cp
-from ctrlplan.simulation import rest_state, simulate, unstable_poles
+from ctrlplan.simulation import equilibrium_state, simulate, unstable_poles
 
 T = np.linspace(0.0, 10.0, 21)
 
@@ -21,21 +21,21 @@ def rests(system, position, state):
 @pytest.mark.parametrize("gain", [0.1, 0.25, 5.0, 1e3, 1e6])
 def test_the_lag_loop_rests_where_it_is_asked_to(gain, position):
     # y' = 0 and y = r, whatever the gain.
-    state = rest_state(cp.plants.integrator_lag_loop(gain), position)
+    state = equilibrium_state(cp.plants.integrator_lag_loop(gain), position)
     assert np.abs(state - [0.0, position]).max() <= 1e-9 * max(abs(position), 1e-9)
 
 
 @pytest.mark.parametrize("outputs", [["y"], ["u"], ["e", "y"], ["y", "u", "e"]])
 def test_the_order_of_outputs_does_not_move_the_rest(outputs):
     # A x + B w = 0 has one solution here; u and e are 0 in it, and cannot be 1.
-    assert np.abs(rest_state(cp.plants.integrator_lag_loop(5.0, outputs), 1.0) - [0.0, 1.0]).max() <= 1e-9
+    assert np.abs(equilibrium_state(cp.plants.integrator_lag_loop(5.0, outputs), 1.0) - [0.0, 1.0]).max() <= 1e-9
 
 
 @pytest.mark.parametrize("gain", [1.0, 4.0, 99.0])
 def test_a_loop_with_an_offset(gain):
     # gain/(s + 1) in unity feedback holds gain/(1 + gain), not 1: the rest it has is that one.
     system = cp.plants.unity_feedback_loop([1.0], [1.0, 1.0], gain)
-    state = rest_state(system, 1.0)
+    state = equilibrium_state(system, 1.0)
     assert np.abs(state - gain / (1 + gain)).max() <= 1e-9
     assert rests(system, 1.0, state)
 
@@ -43,7 +43,7 @@ def test_a_loop_with_an_offset(gain):
 def test_of_many_rests_the_one_where_outputs_are_the_inputs():
     # Two open integrators rest anywhere while nothing drives them: x' = 0 w; y = x.
     system = ct.ss(np.zeros((2, 2)), np.zeros((2, 2)), np.eye(2), np.zeros((2, 2)))
-    assert np.abs(rest_state(system, [2.0, -3.0]) - [2.0, -3.0]).max() <= 1e-12
+    assert np.abs(equilibrium_state(system, [2.0, -3.0]) - [2.0, -3.0]).max() <= 1e-12
 
 
 def test_two_axes():
@@ -52,7 +52,7 @@ def test_two_axes():
     c = rng.normal(size=(2, 4))
     gain = np.linalg.inv(c @ -np.linalg.solve(a, b))  # so that outputs rest at the inputs
     system = ct.ss(a, b @ gain, c, np.zeros((2, 2)))
-    state = rest_state(system, [1.5, -0.5])
+    state = equilibrium_state(system, [1.5, -0.5])
     assert np.abs(state + np.linalg.solve(a, b @ gain @ [1.5, -0.5])).max() <= 1e-9
     assert np.abs(c @ state - [1.5, -0.5]).max() <= 1e-9
     assert rests(system, [1.5, -0.5], state)
@@ -60,18 +60,18 @@ def test_two_axes():
 
 def test_where_there_is_no_rest_the_state_is_zero():
     # x' = w never rests while w is held at 1.
-    assert rest_state(ct.ss(0.0, 1.0, 1.0, 0.0), 1.0).tolist() == [0.0]
+    assert equilibrium_state(ct.ss(0.0, 1.0, 1.0, 0.0), 1.0).tolist() == [0.0]
 
 
 def test_a_nonlinear_system_gives_the_zero_state():
     bent = ct.nlsys(lambda t, x, u, p: -(x**3) + u, None, inputs=1, outputs=1, states=1, name="bent")
-    assert rest_state(bent, 1.0).tolist() == [0.0]
-    assert rest_state(ct.ss(0.5, 1.0, 1.0, 0.0, 0.1), 1.0).tolist() == [0.0]
+    assert equilibrium_state(bent, 1.0).tolist() == [0.0]
+    assert equilibrium_state(ct.ss(0.5, 1.0, 1.0, 0.0, 0.1), 1.0).tolist() == [0.0]
 
 
 def test_the_zero_position_needs_no_state():
-    assert rest_state(cp.plants.integrator_lag_loop(5.0), 0.0).tolist() == [0.0, 0.0]
-    assert rest_state(cp.plants.integrator_lag_loop(5.0), [0.0]).tolist() == [0.0, 0.0]
+    assert equilibrium_state(cp.plants.integrator_lag_loop(5.0), 0.0).tolist() == [0.0, 0.0]
+    assert equilibrium_state(cp.plants.integrator_lag_loop(5.0), [0.0]).tolist() == [0.0, 0.0]
 
 
 @pytest.mark.parametrize(
