@@ -83,6 +83,47 @@ def renamed_members(module: str, renamed: Mapping[str, str]) -> Callable[[str], 
     return member
 
 
+class FormerAttribute:
+    """Attribute of a class under its former name, which warns.
+
+    Parameters
+    ----------
+    new : str
+        Its present name.
+
+    Warns
+    -----
+    FutureWarning
+        Where it is read.
+
+    Examples
+    --------
+    >>> class Result:
+    ...     duration = 2.0
+    ...     takes = FormerAttribute("duration")
+    >>> import warnings
+    >>> with warnings.catch_warnings(record=True) as caught:
+    ...     warnings.simplefilter("always")
+    ...     Result().takes
+    2.0
+    >>> print(caught[0].message)
+    Result.takes is deprecated and will be removed in the next release; use Result.duration
+    """
+
+    def __init__(self, new: str) -> None:
+        self._new = new
+        self.__doc__ = f"Former name of `{new}`."
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self._old = name
+
+    def __get__(self, instance: object, owner: type) -> Any:
+        if instance is None:
+            return self
+        warn_renamed(f"{owner.__name__}.{self._old}", f"{owner.__name__}.{self._new}")
+        return getattr(instance, self._new)
+
+
 def former_signature(
     *positional: str,
     renamed: Mapping[str, str] | None = None,

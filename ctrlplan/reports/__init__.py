@@ -1,5 +1,8 @@
 """Tables, figures and pages: where results are shown."""
 
+from typing import Any
+
+from ctrlplan._renamed import warn_renamed
 from ctrlplan.reports.crane_figures import plot_motion, plot_online, plot_paths, plot_sketch, plot_step, plot_time
 from ctrlplan.reports.figures import (
     plot_bands,
@@ -13,9 +16,17 @@ from ctrlplan.reports.figures import (
 )
 from ctrlplan.reports.page import CraneAnimation, comparison_fragment, render_page, write_all, write_page, write_report
 from ctrlplan.reports.parts import Cell, Head, Items, MetricsTable, Part, Picture, Svg, Table, Text
-from ctrlplan.reports.planning_figures import plot_rivals
+from ctrlplan.reports.planning_figures import plot_baselines
 from ctrlplan.reports.sections import draw
 from ctrlplan.reports.words import Verdict, summary, verdicts
+
+
+def __getattr__(name: str) -> Any:
+    if name != "plot_rivals":
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    warn_renamed("plot_rivals", "plot_baselines")
+    return plot_baselines
+
 
 __all__ = [
     "Cell",
@@ -32,6 +43,7 @@ __all__ = [
     "comparison_fragment",
     "draw",
     "plot_bands",
+    "plot_baselines",
     "plot_blocks",
     "plot_curves",
     "plot_motion",
@@ -40,7 +52,6 @@ __all__ = [
     "plot_plane",
     "plot_plans",
     "plot_responses",
-    "plot_rivals",
     "plot_sketch",
     "plot_step",
     "plot_sweep",

@@ -129,7 +129,7 @@ class Cell:
     ----------
     text : str
         What stands in it.
-    mark : {"", "win", "lose", "best"}
+    mark : {"", "better", "worse", "reference"}
         Whether it is better or worse than the others, or the one that the
         others are compared with.
     meaning : str

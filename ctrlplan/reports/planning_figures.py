@@ -111,7 +111,7 @@ def plot_limits(
     return drawing.finish(legend=False)
 
 
-def plot_rivals(
+def plot_baselines(
     comparison: Comparison, *, known: Mapping[str, Style] | None = None, ax: AxesLike | None = None
 ) -> ControlPlot:
     """References above the responses of the loop to them, an axis a column, and the controls below.
@@ -172,7 +172,7 @@ def _clip(axes: Axes, comparison: Comparison, control: str) -> None:
         return
     highest = max(steps, key=lambda name: peaks[name])
     step = peaks.pop(highest)
-    rest = max(peaks.values(), default=0.0)
-    if rest and step > 4.0 * rest:
-        axes.set_ylim(-1.3 * rest, 1.3 * rest)
+    others = max(peaks.values(), default=0.0)
+    if others and step > 4.0 * others:
+        axes.set_ylim(-1.3 * others, 1.3 * others)
         add_title(axes, as_text(f"the {highest} asks for {step:.3g}"))

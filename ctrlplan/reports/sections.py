@@ -25,9 +25,9 @@ from ctrlplan.reports.figures import (
     plot_sweep,
 )
 from ctrlplan.reports.parts import Animation, Block, Head, Items, Part, Picture, Table, Text
-from ctrlplan.reports.planning_figures import plot_rivals
+from ctrlplan.reports.planning_figures import plot_baselines
 from ctrlplan.reports.style import line_styles, roles_of
-from ctrlplan.reports.tables import grid_of, metrics_of, needs_of, spread_of
+from ctrlplan.reports.tables import durations_of, grid_of, metrics_of, spread_of
 from ctrlplan.reports.words import number, unit_in
 from ctrlplan.studies.benefit import Benefit
 from ctrlplan.studies.comparison import Comparison
@@ -163,7 +163,7 @@ def _(section: FastestMove, study: Study) -> Part:
         f"{number(found.duration)} s is the shortest duration; {name} is at its limit at {time} s. Limits hold over "
         "the whole interval, not at samples."
     )
-    blocks: list[Block] = [Text(words), Table(heads, rows, "needs"), Picture("fastest", found.plot(units), caption)]
+    blocks: list[Block] = [Text(words), Table(heads, rows, "margins"), Picture("fastest", found.plot(units), caption)]
     return Part(blocks, heading="As fast as limits allow", below=True)
 
 
@@ -191,11 +191,11 @@ def _(section: Benefit, study: Study) -> Part:
     blocks: list[Block] = [
         Text(f"{words} {section.note}" if section.note else words),
         Items(section.verdicts),
-        Picture("worth", plot_rivals(compared, known=known), caption),
+        Picture("worth", plot_baselines(compared, known=known), caption),
         Text("In the same time:", hint=True),
-        metrics_of(compared, "rivals", known),
+        metrics_of(compared, "baselines", known),
         Text(f"Under the same limits ({limits}), the shortest duration of each:", hint=True),
-        needs_of(section.needs),
+        durations_of(section.required_durations),
         Text(over, hint=True),
         *_grids([(grid, unit_in(compared, grid.unit)) for grid in section.grids]),
     ]

@@ -11,7 +11,7 @@ from ctrlplan.reports.words import number, unit_of, verdicts
 from ctrlplan.studies.comparison import Comparison
 from ctrlplan.studies.ensemble import Ensemble
 from ctrlplan.studies.grids import SAME, Grid
-from ctrlplan.studies.needs import Need
+from ctrlplan.studies.required_durations import RequiredDuration
 
 _NONE = (math.nan,) * 5
 
@@ -34,11 +34,11 @@ def metrics_of(comparison: Comparison, kind: str = "metrics", known: Mapping[str
         if not any(key in found for found in comparison.metrics.values()):
             continue
         verdict = decided.get(key)
-        winners, losers = ((), ()) if verdict is None else (verdict.winners, verdict.losers)
+        best, worst = ((), ()) if verdict is None else (verdict.best, verdict.worst)
         cells = []
         for plan, found in comparison.metrics.items():
             value = found.get(key, math.nan)
-            mark, meaning = ("lose", "worst") if plan in losers else ("win", "best") if plan in winners else ("", "")
+            mark, meaning = ("worse", "worst") if plan in worst else ("better", "best") if plan in best else ("", "")
             cells.append(Cell(number(value, measure.unit), mark, meaning, _order(value)))
         rows.append(MetricRow(measure.title, unit_of(comparison, key), cells))
     styles = line_styles(roles_of(comparison), known)
@@ -78,30 +78,31 @@ def grid_of(grid: Grid, unit: str) -> Table:
         own = zip(grid.values[i].tolist(), marks, strict=True)
         cells = [Cell(number(value, unit), mark, _GRID_MARKS.get(mark, "")) for value, mark in own]
         cells += [
-            Cell(number(float(values[i]), unit), "best" if name == best else "") for name, values in grid.rivals.items()
+            Cell(number(float(values[i]), unit), "reference" if name == best else "")
+            for name, values in grid.baselines.items()
         ]
         rows.append([Cell(f"{duration:.4g}"), *cells])
     shapes = [f"alpha {a:.3g}" if a else "alpha 0 (polynomial)" for a in grid.alphas.tolist()]
-    return Table(["takes [s]", *shapes, *grid.rivals], rows, "grid")
+    return Table(["takes [s]", *shapes, *grid.baselines], rows, "grid")
 
 
-_GRID_MARKS = {"win": "better than every rival", "lose": "worse than the best rival"}
+_GRID_MARKS = {"better": "better than every baseline", "worse": "worse than the best baseline"}
 
 
-def needs_of(needs: Sequence[Need]) -> Table:
+def durations_of(required: Sequence[RequiredDuration]) -> Table:
     """Minimum durations of plans under the same limits."""
-    least = min((need.duration for need in needs if math.isfinite(need.duration)), default=math.nan)
+    minimum = min((one.duration for one in required if math.isfinite(one.duration)), default=math.nan)
     rows = []
-    for need in needs:
-        mark, meaning = ("win", "best") if need.duration <= least * (1.0 + SAME) else ("", "")
-        rows.append([Cell(need.name), Cell(number(need.duration), mark, meaning), Cell(need.limit), Cell(need.kept)])
+    for one in required:
+        mark, meaning = ("better", "best") if one.duration <= minimum * (1.0 + SAME) else ("", "")
+        rows.append([Cell(one.name), Cell(number(one.duration), mark, meaning), Cell(one.limit), Cell(one.satisfied)])
     heads = [
         Head("plan"),
         Head("takes [s]"),
         Head("limit that does not let it be shorter", words=True),
         Head("limits in the time above", words=True),
     ]
-    return Table(heads, rows, "needs")
+    return Table(heads, rows, "durations")
 
 
 def _order(value: float) -> str:

@@ -6,6 +6,7 @@ import math
 import re
 from dataclasses import dataclass
 
+from ctrlplan._renamed import FormerAttribute
 from ctrlplan.studies.comparison import Comparison
 from ctrlplan.studies.roles import Stability
 from ctrlplan.studies.units import ROUNDING, in_units
@@ -25,10 +26,10 @@ class Verdict:
     ----------
     key, title, unit : str
         The metric.
-    winners, losers : tuple of str
-        Plans with the least and the greatest value, ties included; both empty
+    best, worst : tuple of str
+        Plans with the minimum and the maximum value, ties included; both empty
         where all are equal.
-    least, greatest : float
+    minimum, maximum : float
         Their values.
     sentence : str
         The same in words.
@@ -37,11 +38,14 @@ class Verdict:
     key: str
     title: str
     unit: str
-    winners: tuple[str, ...]
-    losers: tuple[str, ...]
-    least: float
-    greatest: float
+    best: tuple[str, ...]
+    worst: tuple[str, ...]
+    minimum: float
+    maximum: float
     sentence: str
+
+    winners, losers = FormerAttribute("best"), FormerAttribute("worst")
+    least, greatest = FormerAttribute("minimum"), FormerAttribute("maximum")
 
 
 def verdicts(comparison: Comparison) -> list[Verdict]:
@@ -63,7 +67,7 @@ def summary(comparison: Comparison) -> str:
     """How often each plan wins and loses, in one paragraph."""
     if is_unstable(comparison):
         return comparison.notes[0]
-    decided = [v for v in verdicts(comparison) if v.winners]
+    decided = [v for v in verdicts(comparison) if v.best]
     ended = (
         f" Not ranked, since its run was ended early: {', '.join(comparison.stopped)}." if comparison.stopped else ""
     )
@@ -73,9 +77,9 @@ def summary(comparison: Comparison) -> str:
     for plan in comparison.plans:
         if plan in comparison.stopped:
             continue
-        wins = sum(plan in v.winners for v in decided)
-        losses = sum(plan in v.losers for v in decided)
-        parts.append(f"{plan} is best in {wins} and worst in {losses}")
+        best = sum(plan in v.best for v in decided)
+        worst = sum(plan in v.worst for v in decided)
+        parts.append(f"{plan} is best in {best} and worst in {worst}")
     sentence = "; ".join(parts)
     return (
         f"Of {len(decided)} metrics that tell the plans apart, {sentence}. Values within 0.1 %, or within "
@@ -122,22 +126,22 @@ def number(value: float, unit: str = "") -> str:
 
 
 def _verdict(key: str, title: str, unit: str, values: dict[str, float], rounding: float) -> Verdict:
-    least, greatest = min(values.values()), max(values.values())
-    if _equal(least, greatest, rounding):
-        apart = greatest - least if least < greatest else 0.0
+    minimum, maximum = min(values.values()), max(values.values())
+    if _equal(minimum, maximum, rounding):
+        apart = maximum - minimum if minimum < maximum else 0.0
         within = f", within {apart:.2g}{f' {unit}' if unit else ''}" if apart else ""
         sentence = f"{title}: no difference between {_listed(tuple(values))}{within}."
-        return Verdict(key, title, unit, (), (), least, greatest, sentence)
-    winners = tuple(plan for plan, value in values.items() if _equal(value, least, rounding))
-    losers = tuple(plan for plan, value in values.items() if _equal(value, greatest, rounding))
+        return Verdict(key, title, unit, (), (), minimum, maximum, sentence)
+    best = tuple(plan for plan, value in values.items() if _equal(value, minimum, rounding))
+    worst = tuple(plan for plan, value in values.items() if _equal(value, maximum, rounding))
     with_unit = f" {unit}" if unit else ""
-    verb, lose = ("wins" if len(winners) == 1 else "win"), ("loses" if len(losers) == 1 else "lose")
-    worst = number(greatest, unit) + (with_unit if math.isfinite(greatest) else "")
-    best = number(least) + with_unit
-    sentence = f"{title}: {_listed(winners)} {verb} with {best}, {_listed(losers)} {lose} with {worst}"
-    if least > rounding and math.isfinite(greatest) and 1.05 <= greatest / least < 1e4:
-        sentence += f" ({greatest / least:.3g} times)"
-    return Verdict(key, title, unit, winners, losers, least, greatest, sentence + ".")
+    verb, lose = ("wins" if len(best) == 1 else "win"), ("loses" if len(worst) == 1 else "lose")
+    high = number(maximum, unit) + (with_unit if math.isfinite(maximum) else "")
+    low = number(minimum) + with_unit
+    sentence = f"{title}: {_listed(best)} {verb} with {low}, {_listed(worst)} {lose} with {high}"
+    if minimum > rounding and math.isfinite(maximum) and 1.05 <= maximum / minimum < 1e4:
+        sentence += f" ({maximum / minimum:.3g} times)"
+    return Verdict(key, title, unit, best, worst, minimum, maximum, sentence + ".")
 
 
 def _equal(one: float, other: float, rounding: float) -> bool:

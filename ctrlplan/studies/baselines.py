@@ -49,24 +49,24 @@ def baseline_plans(
         (through the positions); one under both names where they are equal.
     """
     points = tuple(waypoints)
-    legs = PiecewiseSpline(points)
-    bounds = derivative_limits(legs, limits if limits is not None else needed_by(PolySpline(points, warn=False)))
+    spline = PiecewiseSpline(points)
+    bounds = derivative_limits(spline, limits if limits is not None else peak_limits(PolySpline(points, warn=False)))
     plans: dict[str, Trajectory] = {
-        "step": Step(legs.final, legs.initial, legs.start, legs.labels),
+        "step": Step(spline.final, spline.initial, spline.start, spline.labels),
     }
-    timed = profiles(points, legs.labels, bounds, shaper)
+    timed = profiles(points, spline.labels, bounds, shaper)
     shaped = {} if shaper is None else {"shaped step": shaper(plans["step"])}
     plans |= {name: timed.pop(name) for name in ("trapezoid", "S-curve")} | shaped | timed
     # Entries above the acceleration leave minimum jerk nothing to choose.
     ends = (0, len(points) - 1)
     freed = [point.truncated(2 if i in ends else 0) for i, point in enumerate(points)]
-    jerk = optimize_waypoints(freed, 3, labels=legs.labels).plan
-    degree = max(max(leg.degree) for leg in legs.segments)
+    jerk = optimize_waypoints(freed, 3, labels=spline.labels).plan
+    degree = max(max(piece.degree) for piece in spline.segments)
     name = f"{_DEGREES.get(degree, f'degree {degree}')}{' a leg' if len(points) > 2 else ''}"
-    t = np.linspace(legs.start, legs.end, 101)
-    if np.abs(jerk.jet(t, 0) - legs.jet(t, 0)).max() <= 1e-9 * np.abs(legs.jet(t, 0)).max():
-        return plans | {f"{name} (minimum jerk)": legs}
-    return plans | {name: legs, "minimum jerk": jerk}
+    t = np.linspace(spline.start, spline.end, 101)
+    if np.abs(jerk.jet(t, 0) - spline.jet(t, 0)).max() <= 1e-9 * np.abs(spline.jet(t, 0)).max():
+        return plans | {f"{name} (minimum jerk)": spline}
+    return plans | {name: spline, "minimum jerk": jerk}
 
 
 def profiles(
@@ -136,11 +136,11 @@ def smoother_polynomials(waypoints: Sequence[Waypoint]) -> dict[str, Trajectory]
 
 def _at_rest(point: Waypoint, entries: int) -> Waypoint:
     """Same position, with so many entries, the derivatives 0."""
-    still = [0.0] * point.naxes
-    return Waypoint.from_dict(point.to_dict() | {"jet": [point.position.tolist(), *[still] * (entries - 1)]})
+    zero = [0.0] * point.naxes
+    return Waypoint.from_dict(point.to_dict() | {"jet": [point.position.tolist(), *[zero] * (entries - 1)]})
 
 
-def needed_by(plan: Trajectory) -> dict[str, float]:
+def peak_limits(plan: Trajectory) -> dict[str, float]:
     """Velocity, acceleration and jerk that a plan needs, axis by axis."""
     peaks = {order: plan.peak(order) for order in (1, 2, 3)}
     names = [[label, f"{label}_d1", f"{label}_d2", f"{label}_d3"] for label in plan.labels]
@@ -183,14 +183,14 @@ def _profile(
     """Profiles from rest to rest, one after the other: each in the time of its leg, or as fast as it can be."""
     parts: list[Trajectory] = []
     for first, last in pairwise(points):
-        duration, way = last.time - first.time, np.abs(last.position - first.position)
-        if not way.any():
+        duration, distance = last.time - first.time, np.abs(last.position - first.position)
+        if not distance.any():
             parts.append(PolySpline([Waypoint(p.time, p.position, 0, 0) for p in (first, last)], labels=labels))
             continue
-        way = np.maximum(way, 1e-9 * way.max())
+        distance = np.maximum(distance, 1e-9 * distance.max())
         # Where there is no limit, that of a move in equal thirds.
         velocity, acceleration, jerk = (
-            np.where(np.isfinite(limit), limit, usual * way / duration**order)
+            np.where(np.isfinite(limit), limit, usual * distance / duration**order)
             for order, usual, limit in zip((1, 2, 3), (1.5, 4.5, 27.0), limits, strict=True)
         )
         more = {"jerk": jerk} if kind is SCurve else {}

@@ -10,16 +10,17 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ctrlplan._checks import real_array
+from ctrlplan._renamed import FormerAttribute
 from ctrlplan._types import Array
 from ctrlplan.planning.limits import Limited
 from ctrlplan.planning.quantities import System as Quantified
 from ctrlplan.simulation import state_space
-from ctrlplan.studies.baselines import baseline_plans, derivative_limits, needed_by, profiles
+from ctrlplan.studies.baselines import baseline_plans, derivative_limits, peak_limits, profiles
 from ctrlplan.studies.comparison import Comparison, comparison_of, finite_or_none
 from ctrlplan.studies.experiment import Experiment, Measured
 from ctrlplan.studies.grids import Grid
 from ctrlplan.studies.measures import MEASURES, Chosen, Measure
-from ctrlplan.studies.needs import Need, need_of, sentence_of
+from ctrlplan.studies.required_durations import RequiredDuration, required_duration, sentence_of
 from ctrlplan.studies.roles import Role, role_of
 from ctrlplan.studies.running import Builder, System, is_builder
 from ctrlplan.trajectories import PolySpline, Shaper, Trajectory, TrigSpline, Waypoint
@@ -47,7 +48,7 @@ class Benefit:
         Of all plans, through the same waypoints in the same time.
     limits : dict of str to object
         Limits that all must satisfy.
-    needs : tuple of Need
+    required_durations : tuple of RequiredDuration
         Minimum duration of each under these limits.
     grids : tuple of Grid
         Metrics of trigonometric plans and baselines over alpha and duration.
@@ -59,28 +60,33 @@ class Benefit:
 
     comparison: Comparison
     limits: dict[str, object]
-    needs: tuple[Need, ...]
+    required_durations: tuple[RequiredDuration, ...]
     grids: tuple[Grid, ...]
     alpha: float = 0.0
     note: str = ""
 
+    needs = FormerAttribute("required_durations")
+
     @property
     def verdicts(self) -> tuple[str, ...]:
         """What was found, in sentences."""
-        return (*([sentence_of(self.needs)] if self.needs else []), *(grid.verdict for grid in self.grids))
+        return (
+            *([sentence_of(self.required_durations)] if self.required_durations else []),
+            *(grid.verdict for grid in self.grids),
+        )
 
     def results(self) -> dict[str, object]:
         """Plain data for ``results.json``."""
         return {
             "plans": self.comparison.results()["plans"],
-            "needs": {need.name: finite_or_none(need.duration) for need in self.needs},
+            "needs": {one.name: finite_or_none(one.duration) for one in self.required_durations},
             "grids": [
                 {
                     "title": grid.title,
                     "durations": grid.durations.tolist(),
                     "alphas": grid.alphas.tolist(),
                     "values": [[finite_or_none(v) for v in row] for row in grid.values.tolist()],
-                    "rivals": {name: [finite_or_none(v) for v in row.tolist()] for name, row in grid.rivals.items()},
+                    "rivals": {name: [finite_or_none(v) for v in row.tolist()] for name, row in grid.baselines.items()},
                 }
                 for grid in self.grids
             ],
@@ -222,7 +228,7 @@ def benefit_of(
     """
     points = experiment.waypoints
     reference = PolySpline(points, warn=False)
-    held: dict[str, object] = dict(needed_by(reference) if choices.limits is None else choices.limits)
+    held: dict[str, object] = dict(peak_limits(reference) if choices.limits is None else choices.limits)
     limited = Limited(reference, held, choices.quantities)
     setting = _Setting(experiment, loop, choices, held, _shaper(loop, choices.mode), reference)
     planned = TrigSpline(points, alpha=choices.alpha)
@@ -233,7 +239,7 @@ def benefit_of(
     found = replace(found, roles={name: Role.PLANNED if name == PLANNED else role for name, role in roles.items()})
     grids = _grids(setting, found, _decisive(choices.decisive, found))
     note = choices.note if choices.limits is not None else " ".join(filter(None, (choices.note, OWN_LIMITS)))
-    return Benefit(found, held, _needs(setting, plans, planned, limited), grids, planned.alpha, note)
+    return Benefit(found, held, _required_durations(setting, plans, planned, limited), grids, planned.alpha, note)
 
 
 @dataclass(frozen=True)
@@ -287,19 +293,19 @@ class _Setting:
         """
         scaled = _scaled(self.experiment.waypoints, factor)
         shapes: dict[str, Trajectory] = {f"{a:g}": TrigSpline(scaled, alpha=a, warn=False) for a in self.choices.alphas}
-        rivals = self.baselines(scaled)
-        _, ran = self.run(scaled, shapes | rivals, _only(self.experiment.measures, decisive))
+        baselines = self.baselines(scaled)
+        _, ran = self.run(scaled, shapes | baselines, _only(self.experiment.measures, decisive))
         worst, none = dict.fromkeys(decisive, np.inf), dict.fromkeys(decisive, np.nan)
-        rows = {name: worst | ran.metrics.get(name, {}) for name in (*shapes, *rivals)}
+        rows = {name: worst | ran.metrics.get(name, {}) for name in (*shapes, *baselines)}
         stopped = [name for name, run in ran.runs.items() if run.stop is not None]
-        return rows | {name: worst if name in shapes else none for name in stopped}, list(rivals)
+        return rows | {name: worst if name in shapes else none for name in stopped}, list(baselines)
 
 
 def _grids(setting: _Setting, found: Comparison, decisive: Sequence[str]) -> tuple[Grid, ...]:
     """Tables over alpha and duration, one for each decisive metric."""
     alphas, factors = setting.choices.alphas, setting.choices.factors
     tables = [setting.rows(factor, decisive) for factor in factors] if decisive else []
-    names = dict.fromkeys(name for _, rivals in tables for name in rivals)  # a move can be too short to be shaped
+    names = dict.fromkeys(name for _, baselines in tables for name in baselines)  # a move can be too short to be shaped
     steps = [name for name, role in found.roles.items() if role is Role.STEP]
     steps += [name for name, plan in setting.baselines(setting.experiment.waypoints).items() if _is_step(plan)]
     return tuple(
@@ -310,8 +316,8 @@ def _grids(setting: _Setting, found: Comparison, decisive: Sequence[str]) -> tup
             durations=setting.reference.duration * np.array(factors),
             alphas=np.array(alphas, dtype=float),
             values=np.array([[rows[f"{a:g}"][key] for a in alphas] for rows, _ in tables]),
-            rivals={name: np.array([rows.get(name, {}).get(key, np.nan) for rows, _ in tables]) for name in names},
-            beside=tuple(name for name in names if name in steps),
+            baselines={name: np.array([rows.get(name, {}).get(key, np.nan) for rows, _ in tables]) for name in names},
+            not_ranked=tuple(name for name in names if name in steps),
         )
         for key in decisive
     )
@@ -334,8 +340,8 @@ def _decisive(wanted: Sequence[str] | None, found: Comparison) -> list[str]:
 def _only(chosen: Chosen, decisive: Sequence[str]) -> Chosen:
     """Of the metrics wanted, those of the tables, and those that a measure of runs returns."""
     own = [one for one in chosen or () if isinstance(one, Measure)]
-    kept = [one for one in own if one.of in ("", "run") or one.name in decisive]
-    return (*kept, *(name for name in decisive if name in MEASURES))
+    wanted = [one for one in own if one.of in ("", "run") or one.name in decisive]
+    return (*wanted, *(name for name in decisive if name in MEASURES))
 
 
 def _followable(loop: System | Builder, plans: dict[str, Trajectory]) -> dict[str, Trajectory]:
@@ -387,9 +393,11 @@ def _numbers(values: ArrayLike, name: str) -> Array:
     return numbers
 
 
-def _needs(setting: _Setting, timed: dict[str, Trajectory], planned: Trajectory, limited: Limited) -> tuple[Need, ...]:
+def _required_durations(
+    setting: _Setting, timed: dict[str, Trajectory], planned: Trajectory, limited: Limited
+) -> tuple[RequiredDuration, ...]:
     """Minimum duration, under the same limits, of plans that take the time of the waypoints."""
     bounds = derivative_limits(planned, setting.limits)
     # Profiles are as fast as they can be, each segment by itself; shaping adds its own time to each.
     fast = profiles(setting.experiment.waypoints, planned.labels, bounds, setting.shaper, timed=False)
-    return tuple(need_of(name, plan, fast.get(name, plan), limited) for name, plan in timed.items())
+    return tuple(required_duration(name, plan, fast.get(name, plan), limited) for name, plan in timed.items())

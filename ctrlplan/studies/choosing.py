@@ -107,11 +107,11 @@ def fastest_notes(found: Fastest) -> tuple[str, ...]:
 def optimality_grids() -> tuple[Grid, Grid]:
     """Length and squared jerk of one trigonometric spline through the paper's waypoints, over alpha and end time."""
     ends, alphas = np.array([14.0, 15.0, 16.0, 17.0, 18.0, 20.0]), np.array([0.0, 1.0, 2.0, 3.0, 4.0, 4.5, 5.0])
-    shapes, rivals = [], []
+    shapes, baselines = [], []
     for end in ends.tolist():
         points = obstacle_waypoints(end)
         shapes.append([TrigSpline(points, alpha=a, warn=False) for a in alphas.tolist()])
-        rivals.append(
+        baselines.append(
             {
                 "quintic a leg (minimum jerk)": PiecewiseSpline(points),
                 "minimum jerk through the positions": _freed(points),
@@ -127,9 +127,9 @@ def optimality_grids() -> tuple[Grid, Grid]:
             ends,
             alphas,
             np.array([[plan_length(plan) for plan in row] for row in shapes]),
-            {name: np.array([plan_length(row[name]) for row in rivals]) for name in rivals[0]}
+            {name: np.array([plan_length(row[name]) for row in baselines]) for name in baselines[0]}
             | {_POLYLINE: np.array(polyline)},
-            beside=(_POLYLINE,),
+            not_ranked=(_POLYLINE,),
         ),
         Grid(
             "Integral of the squared jerk",
@@ -137,7 +137,7 @@ def optimality_grids() -> tuple[Grid, Grid]:
             ends,
             alphas,
             np.array([[jerk(plan) for plan in row] for row in shapes]),
-            {name: np.array([jerk(row[name]) for row in rivals]) for name in rivals[0]},
+            {name: np.array([jerk(row[name]) for row in baselines]) for name in baselines[0]},
         ),
     )
 
@@ -147,29 +147,29 @@ def optimality_claim(grids: tuple[Grid, Grid]) -> tuple[str, ...]:
     length, jerk = grids
     row = int(np.flatnonzero(length.durations == 16.0)[0])
     best = choose_alpha(obstacle_waypoints())
-    rival, shortest = length.best(row)
-    bound = float(length.rivals[_POLYLINE][row])
-    wins = sum(marks[1:].count("win") for grid in grids for marks in grid.marks())
+    baseline, shortest = length.best(row)
+    bound = float(length.baselines[_POLYLINE][row])
+    better = sum(marks[1:].count("better") for grid in grids for marks in grid.marks())
     cells = sum(grid.values[:, 1:].size for grid in grids)
     polynomial = int((length.values[:, 1:] < length.values[:, :1] * (1.0 - 1e-3)).sum())
-    rest = choose_alpha(nominal_waypoints())
+    straight = choose_alpha(nominal_waypoints())
     freer = ", ".join(f"{length:.2f} m with {freedom}" for freedom, length in _freer_paths(best.plan).items())
-    fails = "fails" if not wins else f"holds in {wins} of {cells} cases, and fails in the others"
+    fails = "fails" if not better else f"holds in {better} of {cells} cases, and fails in the others"
     return (
         f"The paper calls its trigonometric path optimal. Over {cells // 2} pairs of alpha and end time, against "
         f"minimum jerk and the shortest plan known through the same waypoints, the claim {fails}.",
         f"Length: with 16 s, of the trigonometric paths of lowest degree and mean gamma the shortest has alpha = "
         f"{best.alpha:.4g} and {best.value:.4g} m. Alpha alone was searched for that; other freedoms give shorter "
-        f"ones: {freer}. {rival[0].upper()}{rival[1:]} has {shortest:.4g} m, and no path is shorter than the "
+        f"ones: {freer}. {baseline[0].upper()}{baseline[1:]} has {shortest:.4g} m, and no path is shorter than the "
         f"polyline's {bound:.4g} m. "
         f"Against the one polynomial through all of them it is shorter in {polynomial} of {length.values[:, 1:].size} "
         "cases: that is what the paper compared with.",
         "Jerk: one quintic a leg has the least squared jerk of all plans through these entries, which is a theorem; "
-        f"at 16 s it has {jerk.rivals['quintic a leg (minimum jerk)'][row]:.3g} m²/s⁵, the best trigonometric plan of "
-        f"the table {jerk.values[row, 1:].min():.3g}.",
-        f"From rest to rest, as in simulation 1, the path is a straight line of {rest.value:.4g} m whatever the alpha "
-        f"below pi: it is the shortest, and so is every other; the least squared jerk is the polynomial's "
-        f"(alpha = {rest.alpha:g}).",
+        f"at 16 s it has {jerk.baselines['quintic a leg (minimum jerk)'][row]:.3g} m²/s⁵, the best trigonometric plan "
+        f"of the table {jerk.values[row, 1:].min():.3g}.",
+        f"From rest to rest, as in simulation 1, the path is a straight line of {straight.value:.4g} m whatever the "
+        f"alpha below pi: it is the shortest, and so is every other; the least squared jerk is the polynomial's "
+        f"(alpha = {straight.alpha:g}).",
         length.verdict,
         jerk.verdict,
     )

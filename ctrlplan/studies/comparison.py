@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from numpy.typing import ArrayLike
 
 from ctrlplan._files import write_text
-from ctrlplan._renamed import warn_renamed
+from ctrlplan._renamed import FormerAttribute
 from ctrlplan._types import Params
 from ctrlplan.simulation import Event, SimulationResponse
 from ctrlplan.studies.experiment import Experiment, Measured
@@ -108,11 +108,7 @@ class Comparison:
     stability: Stability = Stability.UNKNOWN
     experiment: Experiment | None = None
 
-    @property
-    def worth(self) -> Benefit | None:
-        """Former name of `benefit`."""
-        warn_renamed("Comparison.worth", "Comparison.benefit")
-        return self.benefit
+    worth = FormerAttribute("benefit")
 
     def __repr__(self) -> str:
         failed = f" ({', '.join(self.failures)} failed)" if self.failures else ""

@@ -33,7 +33,7 @@ from ctrlplan.studies.crane_setup import (
     TORQUE_LIMITS,
     UNITS,
     WALL,
-    Drives,
+    DriveLimits,
     first_order_waypoints,
     marked_slack,
     nominal_waypoints,
@@ -61,7 +61,7 @@ from ctrlplan.trajectories import PiecewiseSpline, PolySpline, Step, Trajectory,
 Array = NDArray[np.float64]
 
 
-class _Loop(Drives, total=False):
+class _Loop(DriveLimits, total=False):
     """Law of a `crane_loop`, and limits of its drives."""
 
     law: LawName
@@ -183,7 +183,7 @@ def crane_obstacle_study(progress: bool = True) -> Study:
         "polynomial": (PolySpline(points), {}),
         "trigonometric": (TrigSpline(points, alpha=4.0), {}),
         "piecewise": (PiecewiseSpline(points), {}),
-        "via points chosen": (_kept_clear(PolySpline([points[0], points[-1]])), {}),
+        "via points chosen": (_avoiding(PolySpline([points[0], points[-1]])), {}),
     }
     found = _compared(plans, points, 30.0, "Crane, obstacle (simulation 3)")
     rows = found.metrics
@@ -207,7 +207,7 @@ def crane_obstacle_study(progress: bool = True) -> Study:
             "Does not hold in general: over alpha and duration the trigonometric path can be far longer than the "
             "polynomial's (alpha above 5), and at 20 s both wander. The figure shows where the claim is true.",
             f"The paper's other approach, one quintic a leg, takes {lengths['piecewise']:.2f} m and "
-            f"{_verdict_on_legs()} What it costs is a jump of the jerk at A and B; the load follows it within "
+            f"{_piecewise_lengths()} What it costs is a jump of the jerk at A and B; the load follows it within "
             f"{1e3 * rows['piecewise']['error_travel']:.2g} mm.",
             f"The paper gives A and B. Without them, a load of {LOAD_RADIUS:g} m radius, its rope, and {MARGIN:g} m of "
             f"clearance, the via points are found: {_via_points(found.plans['via points chosen'])}; the path has "
@@ -234,7 +234,7 @@ def _via_points(plan: Trajectory) -> str:
 _STEP: _Loop = {"law": "setpoint", "force_limits": FORCE_LIMITS, "torque_limits": TORQUE_LIMITS}
 
 
-def _kept_clear(plan: Trajectory) -> Trajectory:
+def _avoiding(plan: Trajectory) -> Trajectory:
     """Plan through via points, with a margin between wall and load or rope."""
     return avoid(plan, WALLS, clearance=MARGIN, load=LOAD_RADIUS, rope=CRANE.rope()).plan
 
@@ -286,14 +286,14 @@ def _limited_error(plan: Trajectory, options: _Loop, timepts: Array) -> float:
 def _limits_note(found: Comparison) -> str:
     """What the plans ask of drives that have the step's limits, and what that costs."""
     names = ("polynomial", "trigonometric", "piecewise")
-    asked = ", ".join(f"{name} {1e-3 * found.metrics[name]['force_peak']:.3g} kN" for name in names)
+    peaks = ", ".join(f"{name} {1e-3 * found.metrics[name]['force_peak']:.3g} kN" for name in names)
     limited = {name: found.metrics[name]["error_limited"] for name in names}
     errors = ", ".join(
         f"{name} {'none, since the rope goes slack' if np.isnan(error) else f'{error:.2g} m'}"
         for name, error in limited.items()
     )
     return (
-        f"Only the step runs with limited drives above; the plans ask for a force of up to {asked}, much of it where "
+        f"Only the step runs with limited drives above; the plans ask for a force of up to {peaks}, much of it where "
         f"their acceleration or speed begins and ends with a jump. With the step's limits (30 kN) their greatest "
         f"errors are: {errors}."
     )
@@ -339,8 +339,8 @@ def _step_note(found: Comparison) -> str:
 
 def _linear_loop(law: str) -> ct.StateSpace:
     """Closed loop linearised about rest at R = 10 m, with the sway as output."""
-    rest = Step([0.0, 10.0], [0.0, 10.0], labels=["x", "z"])
-    loop = crane_loop(CRANE, rest, LAWS[law])
+    start = Step([0.0, 10.0], [0.0, 10.0], labels=["x", "z"])
+    loop = crane_loop(CRANE, start, LAWS[law])
     linear = ct.linearize(loop, loop.initial_state, 0)
     row = loop.output_labels.index("theta")
     a = np.asarray(linear.A)
@@ -392,13 +392,13 @@ def _speed_curves(points: tuple[Waypoint, Waypoint]) -> Curves:
     )
 
 
-def _verdict_on_legs() -> str:
+def _piecewise_lengths() -> str:
     """Whether one quintic a leg is the shortest path at every alpha and end time drawn."""
     rows = _length_curves().rows
     pairs = [(rows[name], rows[name.replace("one plan", "one quintic a leg")]) for name in rows if "one plan" in name]
-    if all(np.all(legs <= whole) for whole, legs in pairs):
+    if all(np.all(segments <= whole) for whole, segments in pairs):
         return "is the shortest at every alpha and end time drawn."
-    share = np.mean([np.mean(legs <= whole) for whole, legs in pairs])
+    share = np.mean([np.mean(segments <= whole) for whole, segments in pairs])
     return f"is the shorter one at {100 * share:.0f} % of the alphas and end times drawn."
 
 
@@ -412,8 +412,8 @@ def _length_curves() -> Curves:
         t = np.linspace(0.0, duration, 2001)
         lengths = [float(metrics.path_length(t, TrigSpline(points, alpha=a, warn=False)(t))) for a in alphas.tolist()]
         rows[f"one plan, {duration:g} s"] = np.array(lengths)
-        legs = float(metrics.path_length(t, PiecewiseSpline(points)(t)))
-        rows[f"one quintic a leg, {duration:g} s"] = np.full(alphas.size, legs)
+        segments = float(metrics.path_length(t, PiecewiseSpline(points)(t)))
+        rows[f"one quintic a leg, {duration:g} s"] = np.full(alphas.size, segments)
     return Curves(
         "alpha [rad] (0: polynomial)",
         "path length [m]",

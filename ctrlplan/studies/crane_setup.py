@@ -18,7 +18,7 @@ from ctrlplan.trajectories import Trajectory, Waypoint
 CRANE = Crane()
 
 
-class Drives(TypedDict, total=False):
+class DriveLimits(TypedDict, total=False):
     """Limits of the drives of a `crane_loop`."""
 
     force_limits: tuple[float, float]
@@ -46,12 +46,12 @@ CRANE_MEASURES = {
 UNITS = {"x": "m", "z": "m", "F": "N", "C": "N m", "theta": "rad", "T": "N", "R": "m"}
 
 
-def nominal_waypoints(rest: int = 3) -> tuple[Waypoint, Waypoint]:
-    """First simulation: 20 m across and 1 m down in 15 s, `rest` entries prescribed at both ends."""
-    still = [0.0] * (rest - 1)
+def nominal_waypoints(prescribed: int = 3) -> tuple[Waypoint, Waypoint]:
+    """First simulation: 20 m across and 1 m down in 15 s, `prescribed` entries prescribed at both ends."""
+    zeros = [0.0] * (prescribed - 1)
     return (
-        Waypoint.from_jets(0.0, x=[0.0, *still], z=[10.0, *still]),
-        Waypoint.from_jets(15.0, x=[20.0, *still], z=[11.0, *still]),
+        Waypoint.from_jets(0.0, x=[0.0, *zeros], z=[10.0, *zeros]),
+        Waypoint.from_jets(15.0, x=[20.0, *zeros], z=[11.0, *zeros]),
     )
 
 

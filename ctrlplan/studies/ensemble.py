@@ -181,7 +181,7 @@ class Ensemble:
             count = len({failure.draw for failure in self.failures})
             yield f"{count} draws failed; the first, with {where}{with_plan}: {first.message}"
             yield "A draw that failed is in no band and no quantile."
-        yield from self._wins()
+        yield from self._best_shares()
 
     def best(self, name: str) -> dict[str, float]:
         """Share of the draws in which a plan has the smallest value of a metric, of those in which one has it.
@@ -197,7 +197,7 @@ class Ensemble:
         known = ~np.isnan(smallest)
         return {plan: float(row[known].mean()) if known.any() else np.nan for plan, row in zip(rows, best, strict=True)}
 
-    def _wins(self) -> Iterator[str]:
+    def _best_shares(self) -> Iterator[str]:
         plans = list(self.metrics)
         names = dict.fromkeys(name for found in self.metrics.values() for name in found)
         if len(plans) < 2:

@@ -33,7 +33,7 @@ _POLL = 0.02
 _POLL_BESIDE_CALLBACKS = 0.5
 """The same where callbacks tell of what is done: they may be lost with a connection."""
 
-_KEPT = 2
+_CACHED = 2
 """Shared values that a thread keeps."""
 
 
@@ -302,7 +302,7 @@ class Shared(Generic[T]):
 
     def made(self, make: Callable[[T], R]) -> R:
         """What is made of the value, in this thread: kept, so that no two threads share it."""
-        return _kept().get(self._key, lambda: make(self._own()))
+        return _cache().get(self._key, lambda: make(self._own()))
 
     def _own(self) -> T:
         return pickle.loads(self._data) if self._data else self._value  # noqa: S301 (its own)
@@ -317,12 +317,12 @@ def _received(key: str, data: bytes, value: T) -> Shared[T]:
 _HERE = threading.local()
 
 
-def _kept() -> Lru[str, Any]:
+def _cache() -> Lru[str, Any]:
     """What this thread has made of shared values."""
-    if not hasattr(_HERE, "kept"):
-        _HERE.kept = Lru(_KEPT)
-    kept: Lru[str, Any] = _HERE.kept
-    return kept
+    if not hasattr(_HERE, "cache"):
+        _HERE.cache = Lru(_CACHED)
+    cache: Lru[str, Any] = _HERE.cache
+    return cache
 
 
 _PRESSED: ContextVar[Sequence[int]] = ContextVar("pressed", default=())

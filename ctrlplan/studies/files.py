@@ -180,13 +180,13 @@ def load_study(path: str | os.PathLike[str]) -> StudyFile:
 _MEMORY = 2.0**30
 """Bytes that a run and its page may take, as far as the number of samples decides."""
 
-_BESIDE, _EACH, _RIVALS = 750, 450, 8
+_ONCE, _EACH, _BASELINES = 750, 450, 8
 """Bytes a sample, as measured with a crane: once, and for each plan; and how many plans a benefit report adds."""
 
 
 def _check_memory(samples: float, plans: int, benefit: bool, place: str) -> None:
     """Raise where the samples of all plans would take more memory than a study may."""
-    each = _BESIDE + _EACH * (plans + _RIVALS * benefit)
+    each = _ONCE + _EACH * (plans + _BASELINES * benefit)
     if samples * each > _MEMORY:
         raise StudyError(
             f"{place} must be at most {int(_MEMORY / each)} with {plans} plans, for about {_MEMORY / 1e9:.2g} GB of "

@@ -104,7 +104,7 @@ def linear_study(progress: bool = True, count: int = 241, finest: float = 1e-3) 
             SweepCurves(
                 swept,
                 ("settling_time", "overshoot_error", "control_peak", "control_effort"),
-                kept=(),  # the plane has them
+                in_results=(),  # the plane has them
                 caption="The same over the gain, with what each reference asks of the control: its peak and its "
                 "effort ∫u² dt.",
             ),

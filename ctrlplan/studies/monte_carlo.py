@@ -20,6 +20,7 @@ from ctrlplan.simulation import Event, Prepared, SolverError, prepare
 from ctrlplan.simulation.learned import NotCompiledError
 from ctrlplan.simulation.methods.delegated import DELEGATED
 from ctrlplan.studies.comparison import Comparison, comparison_of
+from ctrlplan.studies.draw_results import DrawResults, Outcome, band_samples
 from ctrlplan.studies.ensemble import Ensemble
 from ctrlplan.studies.executing import (
     Account,
@@ -32,7 +33,6 @@ from ctrlplan.studies.executing import (
     tried,
 )
 from ctrlplan.studies.experiment import Experiment
-from ctrlplan.studies.kept import Kept, Outcome, kept_samples
 from ctrlplan.studies.measures import Measure, shown_measures
 from ctrlplan.studies.running import Builder, System, check_has_inputs, is_builder
 from ctrlplan.trajectories import Trajectory, Waypoint
@@ -145,20 +145,20 @@ def monte_carlo(
     nominal, nominal_draw = _nominal(drawn_loop, experiment, table, units, timeout)
     account = drawn_loop.account(experiment, table, executor, timeout, progress)
     shown = shown_measures(experiment.measures, list(nominal.metrics.values()))
-    kept = Kept(_count(table), experiment.timepts, shown.keys() - nominal.measures.keys())
+    results = DrawResults(_count(table), experiment.timepts, shown.keys() - nominal.measures.keys())
     for k, outcome in account.in_order().items():
-        kept.add(k, _draw(table, k), outcome)
+        results.add(k, _draw(table, k), outcome)
     if account.interrupted:
-        text = f"monte_carlo was interrupted: {kept.finished} of {_count(table)} draws are kept"
+        text = f"monte_carlo was interrupted: {results.finished} of {_count(table)} draws are kept"
         warnings.warn(text, UserWarning, stacklevel=outside_stacklevel())
     return Ensemble(
         nominal,
         table,
-        kept.metrics,
-        kept.timepts,
-        kept.bands(),
-        failures=tuple(kept.failures),
-        finished=kept.finished,
+        results.metrics,
+        results.timepts,
+        results.bands(),
+        failures=tuple(results.failures),
+        finished=results.finished,
         nominal_draw=nominal_draw,
         interrupted=account.interrupted,
     )
@@ -215,15 +215,15 @@ def _outcome(
     forms: Callable[[str], System | Builder], experiment: Experiment, plans: Iterable[str], params: Params | None
 ) -> Outcome:
     """One draw, plan by plan: one may succeed where another fails."""
-    wanted = experiment.timepts[kept_samples(experiment.timepts)]
+    wanted = experiment.timepts[band_samples(experiment.timepts)]
 
     def measured(plan: str) -> tuple[dict[str, float], dict[str, Array]]:
         form = forms(plan)
         with DELEGATED if isinstance(form, Prepared) and form.network is None else nullcontext():
             run, metrics = experiment.run_plan(form, plan, params)
-        kept = np.isin(run.t, wanted)
+        stored = np.isin(run.t, wanted)
         names = dict.fromkeys((*run.outputs, *run.controls))
-        return metrics, {name: run.signals[name][kept] for name in names}
+        return metrics, {name: run.signals[name][stored] for name in names}
 
     return {plan: tried(measured, plan) for plan in plans}
 

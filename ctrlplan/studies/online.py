@@ -14,7 +14,7 @@ from ctrlplan import metrics
 from ctrlplan.planning import fastest, margins
 from ctrlplan.simulation import simulate
 from ctrlplan.studies.comparison import Comparison, compare
-from ctrlplan.studies.crane_setup import CRANE, TORQUE_LIMITS, UNITS, Drives, nominal_waypoints
+from ctrlplan.studies.crane_setup import CRANE, TORQUE_LIMITS, UNITS, DriveLimits, nominal_waypoints
 from ctrlplan.studies.measures import Measure, Run, signals_of
 from ctrlplan.studies.sections import AnimatedCrane, CraneOnline
 from ctrlplan.studies.study import Study
@@ -54,7 +54,7 @@ _PERIODS = {"replanned": 0.25, "governed": 0.5}
 
 
 @dataclass(frozen=True)
-class Trouble:
+class Scenario:
     """What happens to the crane on its way.
 
     Attributes
@@ -62,7 +62,7 @@ class Trouble:
     goal : Trajectory
         Where the load is to go, over time.
     off_line : Trajectory
-        What is planned without knowing of the trouble.
+        What is planned without knowing of the scenario.
     force : float
         Greatest force of the trolley [N].
     wind : Trajectory or None
@@ -88,7 +88,9 @@ def online_gust_study(progress: bool = True) -> Study:
     gust = PiecewiseSpline(
         [Waypoint(5.0, 0.0, 0.0), Waypoint(6.0, 300.0, 0.0), Waypoint(8.0, 300.0, 0.0), Waypoint(9.0, 0.0, 0.0)]
     )
-    found = _compared(Trouble(_still(), _move(), wind=gust), "On line: a gust on the load", "0 to 300 N, 5 to 9 s")
+    found = _compared(
+        Scenario(_fixed_goal(), _move(), wind=gust), "On line: a gust on the load", "0 to 300 N, 5 to 9 s"
+    )
     blind, law, again, governed, slowed = (found.metrics[name] for name in WAYS)
     return _study(
         "online-gust",
@@ -109,7 +111,7 @@ def online_gust_study(progress: bool = True) -> Study:
 def online_payload_study(progress: bool = True) -> Study:
     """A load twice as heavy as modelled."""
     found = _compared(
-        Trouble(_still(), _move(), params={"load_mass": 2.0 * CRANE.load_mass}),
+        Scenario(_fixed_goal(), _move(), params={"load_mass": 2.0 * CRANE.load_mass}),
         "On line: a load twice as heavy as modelled",
         f"m = {2.0 * CRANE.load_mass:g} kg, modelled as {CRANE.load_mass:g} kg",
     )
@@ -131,7 +133,7 @@ def online_goal_study(progress: bool = True) -> Study:
     further = Waypoint(rest.time + late, [24.0, 11.0], 0, 0, 0, 0)
     second = PolySpline([Waypoint(rest.time, [20.0, 11.0], 0, 0, 0, 0), further], labels=["x", "z"])
     found = _compared(
-        Trouble(goal, _move().then(second)),
+        Scenario(goal, _move().then(second)),
         "On line: the goal moved at half way",
         f"from x = 20 to 24 m at 7.5 s; off line a second move of {late:g} s follows the first",
     )
@@ -151,14 +153,16 @@ def online_goal_study(progress: bool = True) -> Study:
 def online_saturated_study(progress: bool = True) -> Study:
     """Trolley with less force than the plan asks for."""
     limit = 2e3
-    asked = f"{limit / 1e3:g} kN where the plan asks for {_asked_force() / 1e3:.3g} kN"
-    found = _compared(Trouble(_still(), _move(), force=limit), "On line: saturated actuators", f"|F| at most {asked}")
+    force = f"{limit / 1e3:g} kN where the plan asks for {_peak_force() / 1e3:.3g} kN"
+    found = _compared(
+        Scenario(_fixed_goal(), _move(), force=limit), "On line: saturated actuators", f"|F| at most {force}"
+    )
     past = {name: f"{values['overshoot_goal']:.2g} m past the goal" for name, values in found.metrics.items()}
     arrivals = {name: f"{values['arrival']:.3g} s" for name, values in found.metrics.items()}
     return _study(
         "online-saturated",
         found,
-        f"The trolley has {asked}.",
+        f"The trolley has {force}.",
         f"Off line the trolley falls behind and runs {past['off-line']}, anti-windup or not. With feedback of the load "
         f"it is {past['load feedback']}, but the sway goes on growing: feedback asks for more, which is not there.",
         f"A clock that slows as the error grows arrives after {arrivals['slowed']}, {past['slowed']}; the governor, "
@@ -208,25 +212,25 @@ def online_metrics(goal: Array, force: float, response: ct.TimeResponseData) -> 
 # The five ways
 
 
-def _off_line(trouble: Trouble, drives: Drives) -> ct.InterconnectedSystem:
-    return crane_loop(CRANE, trouble.off_line, "generator", wind=trouble.wind, **drives)
+def _off_line(scenario: Scenario, limits: DriveLimits) -> ct.InterconnectedSystem:
+    return crane_loop(CRANE, scenario.off_line, "generator", wind=scenario.wind, **limits)
 
 
-def _load_feedback(trouble: Trouble, drives: Drives) -> ct.InterconnectedSystem:
-    return crane_loop(CRANE, trouble.off_line, _LAW, wind=trouble.wind, **drives)
+def _load_feedback(scenario: Scenario, limits: DriveLimits) -> ct.InterconnectedSystem:
+    return crane_loop(CRANE, scenario.off_line, _LAW, wind=scenario.wind, **limits)
 
 
-def _replanned(trouble: Trouble, drives: Drives) -> ct.InterconnectedSystem:
+def _replanned(scenario: Scenario, limits: DriveLimits) -> ct.InterconnectedSystem:
     """Generator, its plan made again: from the reference for a new goal, from the load where that is off."""
     period = _PERIODS["replanned"]
-    if trouble.goal.start > trouble.plan.start:
+    if scenario.goal.start > scenario.plan.start:
         replanner = create_replanner_iosystem(
-            trouble.plan, period, order=4, derivatives=2, goal_derivatives=0, trigger="goal", suffix="_ref"
+            scenario.plan, period, order=4, derivatives=2, goal_derivatives=0, trigger="goal", suffix="_ref"
         )
-        reference = [replanner, create_source_iosystem(trouble.goal, name="goal", suffix="_goal")]
+        reference = [replanner, create_source_iosystem(scenario.goal, name="goal", suffix="_goal")]
     else:
         replanner = create_replanner_iosystem(
-            trouble.plan,
+            scenario.plan,
             period,
             horizon=6.0,
             alpha=1.0,
@@ -236,14 +240,14 @@ def _replanned(trouble: Trouble, drives: Drives) -> ct.InterconnectedSystem:
             suffix="_ref",
         )
         reference = [replanner]
-    return crane_loop(CRANE, trouble.plan, "generator", reference=reference, wind=trouble.wind, **drives)
+    return crane_loop(CRANE, scenario.plan, "generator", reference=reference, wind=scenario.wind, **limits)
 
 
-def _governed(trouble: Trouble, drives: Drives) -> ct.InterconnectedSystem:
+def _governed(scenario: Scenario, limits: DriveLimits) -> ct.InterconnectedSystem:
     """Goal itself through a governor and a filter: no plan."""
-    core = _filtered_loop(trouble.wind, drives)
-    governor = create_governor_iosystem(_admissible(trouble.force), initial=START[:1])
-    goal = stack([trouble.goal], labels=["x_command_cmd", "z_command"])
+    core = _filtered_loop(scenario.wind, limits)
+    governor = create_governor_iosystem(_admissible(scenario.force), initial=START[:1])
+    goal = stack([scenario.goal], labels=["x_command_cmd", "z_command"])
     exposed = expose_states(core)
     unread = set(exposed.output_labels) - {*governor.input_labels, *core.output_labels}
     return ct.interconnect(
@@ -255,12 +259,12 @@ def _governed(trouble: Trouble, drives: Drives) -> ct.InterconnectedSystem:
     )
 
 
-def _slowed(trouble: Trouble, drives: Drives) -> ct.InterconnectedSystem:
-    clock = create_time_scaling_iosystem(trouble.off_line, errors={"x": (0.05, 0.5)}, suffix="_ref")
-    return crane_loop(CRANE, trouble.off_line, _LAW, reference=[clock], wind=trouble.wind, **drives)
+def _slowed(scenario: Scenario, limits: DriveLimits) -> ct.InterconnectedSystem:
+    scaling = create_time_scaling_iosystem(scenario.off_line, errors={"x": (0.05, 0.5)}, suffix="_ref")
+    return crane_loop(CRANE, scenario.off_line, _LAW, reference=[scaling], wind=scenario.wind, **limits)
 
 
-WAYS: dict[str, Callable[[Trouble, Drives], ct.InterconnectedSystem]] = {
+WAYS: dict[str, Callable[[Scenario, DriveLimits], ct.InterconnectedSystem]] = {
     "off-line": _off_line,
     "load feedback": _load_feedback,
     "replanned": _replanned,
@@ -269,7 +273,7 @@ WAYS: dict[str, Callable[[Trouble, Drives], ct.InterconnectedSystem]] = {
 }
 
 
-def _filtered_loop(wind: Trajectory | None = None, drives: Drives | None = None) -> ct.InterconnectedSystem:
+def _filtered_loop(wind: Trajectory | None = None, limits: DriveLimits | None = None) -> ct.InterconnectedSystem:
     """Crane with load feedback behind filters of commands x_command and z_command."""
     filters = [
         create_command_filter_iosystem(
@@ -279,7 +283,7 @@ def _filtered_loop(wind: Trajectory | None = None, drives: Drives | None = None)
     ]
     inputs = ["x_command", "z_command"]
     return crane_loop(
-        CRANE, _still_at_start(), _LAW, reference=filters, inputs=inputs, wind=wind, **(drives or Drives())
+        CRANE, _constant_start(), _LAW, reference=filters, inputs=inputs, wind=wind, **(limits or DriveLimits())
     )
 
 
@@ -315,23 +319,23 @@ def _admissible(force: float) -> AdmissibleSet:
     )
 
 
-def _compared(trouble: Trouble, title: str, what: str) -> Comparison:
+def _compared(scenario: Scenario, title: str, what: str) -> Comparison:
     timepts = np.linspace(0.0, 50.0, 2501)
-    drives: Drives = {"force_limits": (-trouble.force, trouble.force), "torque_limits": TORQUE_LIMITS}
+    limits: DriveLimits = {"force_limits": (-scenario.force, scenario.force), "torque_limits": TORQUE_LIMITS}
 
     def build(name: str, plan: Trajectory) -> ct.InterconnectedSystem:
-        return WAYS[name](trouble, drives)
+        return WAYS[name](scenario, limits)
 
     def measure(run: Run) -> Mapping[str, float]:
-        return online_metrics(trouble.goal.final, trouble.force, run.response)
+        return online_metrics(scenario.goal.final, scenario.force, run.response)
 
     return compare(
         build,
-        dict.fromkeys(WAYS, trouble.off_line),
+        dict.fromkeys(WAYS, scenario.off_line),
         timepts,
         outputs=("x", "z"),
         controls=("F", "C"),
-        params=trouble.params,
+        params=scenario.params,
         measures=[
             *(replace(one, name=name) for name, one in ONLINE_MEASURES.items()),
             Measure("Crane against its goal", of="run", function=measure),
@@ -339,9 +343,9 @@ def _compared(trouble: Trouble, title: str, what: str) -> Comparison:
         units=UNITS,
         title=title,
         parameters={
-            "trouble": what,
+            "scenario": what,
             "move": "20 m across and 1 m down in 15 s, trigonometric, alpha = 1, ten constraints an axis",
-            "limits": f"|F| ≤ {trouble.force / 1e3:g} kN, C from −3 to 1 kN m, with anti-windup",
+            "limits": f"|F| ≤ {scenario.force / 1e3:g} kN, C from −3 to 1 kN m, with anti-windup",
             "off-line": "the plan through figure 3's generator, which does not see the load",
             "load feedback": "the plan through the law with feedback of the load's x, 0.5 rad/s",
             "replanned": "figure 3's generator; for a new goal from the reference, joined to the fourth derivative; "
@@ -358,7 +362,7 @@ def _in_time_note(limit: float) -> str:
     """What it is worth to know a limit before one starts."""
     seconds = float(np.ceil(10.0 * fastest(_move(), {"F": limit}, CRANE).duration)) / 10.0
     loop = crane_loop(CRANE, _move().retime(seconds), _LAW, force_limits=(-limit, limit), torque_limits=TORQUE_LIMITS)
-    found = online_metrics(_still().final, limit, simulate(loop, np.linspace(0.0, 50.0, 2501)))
+    found = online_metrics(_fixed_goal().final, limit, simulate(loop, np.linspace(0.0, 50.0, 2501)))
     return (
         f"Who knows the limit before the start does best: in {seconds:.3g} s the same path asks for no more than "
         f"{limit / 1e3:g} kN, and the load arrives after {found['arrival']:.3g} s, "
@@ -375,16 +379,16 @@ def _move() -> TrigSpline:
     return TrigSpline(nominal_waypoints(5), alpha=1.0)
 
 
-def _still() -> Step:
+def _fixed_goal() -> Step:
     """A goal that is there from the start."""
     first, last = nominal_waypoints(1)
     return Step(last.position, first.position, labels=["x", "z"])
 
 
-def _still_at_start() -> Step:
+def _constant_start() -> Step:
     return Step(START, START, labels=["x", "z"])
 
 
-def _asked_force() -> float:
+def _peak_force() -> float:
     """Greatest force that the move asks of the trolley [N]."""
     return abs(margins(_move(), {"F": 1.0}, CRANE).active.value)

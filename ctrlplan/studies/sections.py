@@ -157,18 +157,18 @@ class SweepCurves(Section):
         With these metrics.
     metrics : tuple of str
         Names of the metrics.
-    kept : tuple of str or None
+    in_results : tuple of str or None
         Those that ``results.json`` has; all, unless given.
     """
 
     sweep: Sweep
     metrics: tuple[str, ...] = ("settling_time", "overshoot_error")
-    kept: tuple[str, ...] | None = None
+    in_results: tuple[str, ...] | None = None
 
     def results(self) -> dict[str, object]:
         """The metrics that are kept, over the parameter."""
-        kept = self.metrics if self.kept is None else self.kept
-        return {"sweep": self.sweep.results(kept)} if kept else {}
+        names = self.metrics if self.in_results is None else self.in_results
+        return {"sweep": self.sweep.results(names)} if names else {}
 
 
 @dataclass(frozen=True)

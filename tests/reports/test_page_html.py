@@ -229,17 +229,17 @@ def test_the_summary_counts_wins_and_losses(page):
                 assert f"{plan} is best" not in box.words()
                 continue
             cells = [list(row.all("td"))[1 + column] for row in table.all("tr") if list(row.all("td"))]
-            wins, losses = (sum(mark in c.attributes["class"].split() for c in cells) for mark in ("win", "lose"))
+            wins, losses = (sum(mark in c.attributes["class"].split() for c in cells) for mark in ("better", "worse"))
             assert f"{plan} is best in {wins} and worst in {losses}" in box.words()
 
 
 def test_best_and_worst_are_told_by_more_than_colour(page):
-    for mark, sign in (("win", "▲"), ("lose", "▽")):
+    for mark, sign in (("better", "▲"), ("worse", "▽")):
         cells = list(page.all("td", class_=mark))
         assert bool(cells) != all(map(unstable, page.all("section")))
         assert all(sign in cell.words() for cell in cells)
         labels = [next(cell.all("span")).attributes["aria-label"] for cell in cells]
-        assert set(labels) <= {"best", "worst", "better than every rival", "worse than the best rival"}
+        assert set(labels) <= {"best", "worst", "better than every baseline", "worse than the best baseline"}
 
 
 def test_versions_are_on_the_page(page):

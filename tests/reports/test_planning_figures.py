@@ -10,7 +10,7 @@ from matplotlib.colors import to_hex
 
 import ctrlplan as cp
 from ctrlplan.planning.limits import Limited
-from ctrlplan.reports.planning_figures import plot_alpha_choice, plot_limits, plot_rivals
+from ctrlplan.reports.planning_figures import plot_alpha_choice, plot_baselines, plot_limits
 from ctrlplan.reports.style import page_style, to_svg
 from ctrlplan.studies.baselines import baseline_plans
 
@@ -153,8 +153,8 @@ def compared():
 
 
 @pytest.mark.slow
-def test_rivals_are_drawn_with_what_the_loop_makes_of_them(compared):
-    drawn = plot_rivals(compared)
+def test_baselines_are_drawn_with_what_the_loop_makes_of_them(compared):
+    drawn = plot_baselines(compared)
     reference, output, control = (axes for axes in drawn.axes.flat if axes.get_visible())
     shown = (reference.get_ylabel(), output.get_ylabel(), control.get_ylabel())
     assert shown == ("reference of y [m]", "y [m]", "u [N]")
@@ -170,14 +170,14 @@ def test_rivals_are_drawn_with_what_the_loop_makes_of_them(compared):
 
 
 def test_the_legend_names_all_and_no_two_look_alike(compared):
-    drawn = plot_rivals(compared)
+    drawn = plot_baselines(compared)
     assert labels(drawn) == list(compared.plans)
     looks = {(to_hex(line.get_color()), str(line._unscaled_dash_pattern)) for line in drawn.axes[0, 0].lines}
     assert len(looks) == len(compared.plans)
 
 
 def test_a_step_does_not_flatten_what_the_others_ask_for(compared):
-    control = [axes for axes in plot_rivals(compared).axes.flat if axes.get_visible()][-1]
+    control = [axes for axes in plot_baselines(compared).axes.flat if axes.get_visible()][-1]
     others = max(np.abs(r.outputs[1]).max() for name, r in compared.responses.items() if name != "step")
     step = np.abs(compared.responses["step"].outputs[1]).max()
     assert step > 4 * others
@@ -200,18 +200,18 @@ def test_a_step_is_found_by_its_role_and_not_by_its_name(compared):
         metrics=renamed(compared.metrics),
         roles=renamed(compared.roles),
     )
-    one, again = plot_rivals(compared), plot_rivals(other)
+    one, again = plot_baselines(compared), plot_baselines(other)
     assert [line.get_color() for line in one.lines[0, 0]] == [line.get_color() for line in again.lines[0, 0]]
     assert one.axes[2, 0].get_ylim() == again.axes[2, 0].get_ylim()
     assert again.axes[2, 0].get_title(loc="left") == "the polynomial asks for 100"
 
 
-def test_rivals_of_two_axes_stand_side_by_side():
+def test_baselines_of_two_axes_stand_side_by_side():
     loops = [ct.ss(cp.plants.integrator_lag_loop(k)) for k in (50.0, 200.0)]
     side = ct.append(*loops)
     both = ct.ss(side.A, side.B, side.C, side.D, inputs=["rx", "rz"], outputs=["x", "z"])
     found = cp.compare(both, baseline_plans(PATH), np.linspace(0, 5, 201), waypoints=PATH, units={"x": "m", "z": "mm"})
-    drawn = plot_rivals(found)
+    drawn = plot_baselines(found)
     assert [axes.get_ylabel() for axes in drawn.axes.flat] == [
         "reference of x [m]",
         "reference of z [mm]",

@@ -104,7 +104,7 @@ PLOTS = {
     "plot_blocks": (lambda **k: figures.plot_blocks(looped(), **k), (1, 1)),
     "plot_alpha_choice": (lambda **k: planning_figures.plot_alpha_choice(chosen(), **k), (1, 1)),
     "plot_limits": (lambda **k: planning_figures.plot_limits(PLAN, Limited(PLAN, LIMITS), **k), (2, 1)),
-    "plot_rivals": (lambda **k: planning_figures.plot_rivals(compared(), **k), (3, 1)),
+    "plot_baselines": (lambda **k: planning_figures.plot_baselines(compared(), **k), (3, 1)),
     "plot_sketch": (lambda **k: crane_figures.plot_sketch(**k), (1, 1)),
     "plot_time": (lambda **k: crane_figures.plot_time(craned(), **k), (6, 1)),
     "plot_step": (lambda **k: crane_figures.plot_step(craned(), **k), (4, 1)),

@@ -45,7 +45,7 @@ def _(section: Durations, study: Study) -> Part:
     rows = [
         [
             name,
-            Cell(f"{plan.duration:g}", "win" if plan.duration <= section.longest else "lose", "as wanted"),
+            Cell(f"{plan.duration:g}", "better" if plan.duration <= section.longest else "worse", "as wanted"),
             "s & <s>",
         ]
         for name, plan in plans.items()
@@ -184,7 +184,7 @@ def test_each_key_of_the_results_is_given_once(compared, swept):
         ValueError, match=r"keys of their own in results.json, got sweep again from sections\[1\], Swee"
     ):
         twice.results()
-    once = Study("it", "It", compared, sections=(Plane(swept), SweepCurves(swept, kept=())))
+    once = Study("it", "It", compared, sections=(Plane(swept), SweepCurves(swept, in_results=())))
     assert once.results()["sweep"] == swept.results(("overshoot_error", "settling_time"))
     alone = Study("it", "It", compared, sections=(SweepCurves(swept, ("iae",)),))
     assert alone.results()["sweep"] == swept.results(("iae",))

@@ -29,31 +29,31 @@ def verdict(*arguments, **values):
 
 def test_the_least_wins_and_the_greatest_loses():
     found = verdict(a=2.0, b=1.0, c=3.0)
-    assert (found.winners, found.losers, found.least, found.greatest) == (("b",), ("c",), 1.0, 3.0)
+    assert (found.best, found.worst, found.minimum, found.maximum) == (("b",), ("c",), 1.0, 3.0)
     assert found.sentence == "Settling time: b wins with 1.000 s, c loses with 3.000 s (3 times)."
 
 
 def test_several_may_win_or_lose():
     found = verdict(a=1.0, b=1.0, c=3.0)
-    assert found.winners == ("a", "b")
+    assert found.best == ("a", "b")
     assert "a and b win with 1.000 s, c loses" in found.sentence
     found = verdict(a=1.0, b=3.0, c=3.0, d=3.0)
-    assert found.losers == ("b", "c", "d")
+    assert found.worst == ("b", "c", "d")
     assert "a wins with 1.000 s, b, c and d lose with 3.000 s" in found.sentence
 
 
 @pytest.mark.parametrize(("factor", "tied"), [(1 + 0.9 * TIE, True), (1 + 1.1 * TIE, False)])
 def test_values_within_a_thousandth_are_equal(factor, tied):
     found = verdict(a=1.0, b=factor)
-    assert (found.winners == found.losers == ()) is tied
+    assert (found.best == found.worst == ()) is tied
     assert ("no difference between a and b" in found.sentence) is tied
     found = verdict(a=1.0, b=factor, c=2.0)
-    assert found.winners == (("a", "b") if tied else ("a",))
+    assert found.best == (("a", "b") if tied else ("a",))
 
 
 def test_what_is_undefined_takes_no_part():
     found = verdict(a=NAN, b=1.0, c=2.0)
-    assert (found.winners, found.losers) == (("b",), ("c",))
+    assert (found.best, found.worst) == (("b",), ("c",))
     assert verdicts(comparison(a=NAN, b=1.0)) == []
     assert verdicts(comparison(a=NAN, b=NAN)) == []
     assert verdicts(comparison(a=1.0)) == []
@@ -61,10 +61,10 @@ def test_what_is_undefined_takes_no_part():
 
 def test_what_is_infinite_loses_and_all_infinite_are_equal():
     found = verdict(a=INF, b=1.0)
-    assert (found.winners, found.losers) == (("b",), ("a",))
+    assert (found.best, found.worst) == (("b",), ("a",))
     assert found.sentence == "Settling time: b wins with 1.000 s, a loses with never."
     found = verdict(a=INF, b=INF)
-    assert found.winners == found.losers == ()
+    assert found.best == found.worst == ()
     assert "no difference" in found.sentence
 
 
@@ -72,12 +72,12 @@ def test_nothing_at_all_wins_and_is_not_divided_by():
     found = verdict("overshoot_error", a=0.0, b=5.0)
     assert found.sentence == "Overshoot on the error: a wins with 0 %, b loses with 5.000 %."
     found = verdict("overshoot_error", a=1e-13, b=3e-12)
-    assert found.winners == ()
+    assert found.best == ()
 
 
 def test_a_metric_may_be_negative():
     found = verdict("wandering", a=-0.2, b=0.1)
-    assert (found.winners, found.losers) == (("a",), ("b",))
+    assert (found.best, found.worst) == (("a",), ("b",))
     assert "a wins with −0.2000, b loses with 0.1000." in found.sentence
 
 

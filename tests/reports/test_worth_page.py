@@ -14,7 +14,7 @@ from ctrlplan.reports import render_page, write_report
 from ctrlplan.studies import Study
 from ctrlplan.studies.benefit import Benefit
 from ctrlplan.studies.grids import Grid
-from ctrlplan.studies.needs import Need
+from ctrlplan.studies.required_durations import RequiredDuration
 from ctrlplan.studies.sections import ClaimTable, FastestMove
 
 MOVE = [cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1, 0, 0)]
@@ -38,7 +38,7 @@ def study():
         np.array([0.0, 1.0, 2.5]),
         np.array([[3.0, 1.0, math.nan], [math.inf, 2.0, 2.001]]),
         {"minimum jerk": np.array([2.0, 2.0]), "bound": np.array([0.5, 0.5])},
-        beside=("bound",),
+        not_ranked=("bound",),
     )
     fast = cp.fastest(cp.PolySpline(MOVE), {"y_d1": 2.5, "y_d2": (-100.0, 200.0)})
     return Study("mine", "Mine", compared, sections=(FastestMove(fast), ClaimTable(("The claim <fails>.",), (grid,))))
@@ -113,7 +113,10 @@ def test_nothing_is_left_to_fill_in_and_nothing_is_undefined(html, page):
     assert not re.search(r"\{\w*\}|\{\{|\{%|\bnan\b|\bNone\b|\binf\b", words)
     assert "{u}" not in html
     for cell in [
-        cell for kind in ("needs", "grid", "metrics", "rivals") for t in tables(page, kind) for cell in t.all("td")
+        cell
+        for kind in ("durations", "margins", "grid", "metrics", "baselines")
+        for t in tables(page, kind)
+        for cell in t.all("td")
     ]:
         assert cell.words() or "unit" in cell.attributes.get("class", "")
 
@@ -135,8 +138,8 @@ def test_without_units_there_are_no_brackets(shown, study):
 # Is it worth it?
 
 
-def test_all_rivals_are_in_the_table_of_the_section(study, page):
-    (beside,) = tables(page, "rivals")
+def test_all_baselines_are_in_the_table_of_the_section(study, page):
+    (beside,) = tables(page, "baselines")
     assert titles(beside) == ["metric", "unit", *study.comparison.benefit.comparison.plans]
     expected = {"step", "trapezoid", "S-curve", "shaped step", "quintic (minimum jerk)"}
     assert expected <= set(titles(beside))
@@ -150,7 +153,7 @@ def test_all_rivals_are_in_the_table_of_the_section(study, page):
 
 
 def test_needs_are_shown_with_the_limit_that_is_active_and_where(study, page):
-    _, table = tables(page, "needs")
+    (table,) = tables(page, "durations")
     assert titles(table) == [
         "plan",
         "takes [s]",
@@ -158,12 +161,12 @@ def test_needs_are_shown_with_the_limit_that_is_active_and_where(study, page):
         "limits in the time above",
     ]
     shown = rows(table)
-    for (name, text, why, kept), need in zip(shown, study.comparison.benefit.needs, strict=True):
-        assert (name, why, kept) == (need.name, need.limit, need.kept)
-        if math.isnan(need.duration):
+    for (name, text, why, kept), one in zip(shown, study.comparison.benefit.required_durations, strict=True):
+        assert (name, why, kept) == (one.name, one.limit, one.satisfied)
+        if math.isnan(one.duration):
             assert text == "–"
         else:
-            assert number(text) == pytest.approx(need.duration, rel=5e-4)
+            assert number(text) == pytest.approx(one.duration, rel=5e-4)
     takes = {name: text for name, text, *_ in shown}
     kept = {name: words for name, _, _, words in shown}
     assert kept["quintic (minimum jerk)"] == kept["S-curve"] == "all kept"
@@ -173,7 +176,7 @@ def test_needs_are_shown_with_the_limit_that_is_active_and_where(study, page):
     assert kept["trigonometric"] == f"y_d2 {100 * beyond:.3g} % beyond"
     assert takes["quintic (minimum jerk)"] == "1.000"
     assert takes["S-curve"] == "0.9543 ▲"
-    winners = [row.children[0].words() for row in table.all("tr") if list(row.all("td", class_="win"))]
+    winners = [row.children[0].words() for row in table.all("tr") if list(row.all("td", class_="better"))]
     assert winners == ["S-curve"]
 
 
@@ -204,10 +207,10 @@ def test_tables_over_alpha_and_duration_are_those_of_the_grids(study, page):
     assert len(shown) == len(grids) == 3
     for table, grid in zip(shown, grids, strict=True):
         alphas = [f"alpha {a:.3g}" if a else "alpha 0 (polynomial)" for a in grid.alphas]
-        assert titles(table) == ["takes [s]", *alphas, *grid.rivals]
+        assert titles(table) == ["takes [s]", *alphas, *grid.baselines]
         for row, duration, values, k in zip(rows(table), grid.durations, grid.values, range(9), strict=False):
             assert float(row[0]) == pytest.approx(duration, rel=1e-3)
-            expected = [*values, *(rival[k] for rival in grid.rivals.values())]
+            expected = [*values, *(baseline[k] for baseline in grid.baselines.values())]
             for text, value in zip(row[1:], expected, strict=True):
                 if math.isfinite(value):
                     assert number(text) == pytest.approx(value, rel=5e-4)
@@ -220,7 +223,7 @@ def test_units_are_in_the_headings_of_the_tables(page):
         assert f"{heading} over duration and alpha:" in page.words()
 
 
-def test_the_figure_of_the_rivals_names_all(html, study):
+def test_the_figure_of_the_baselines_names_all(html, study):
     comments = re.findall(r"<!-- (.*?) -->", html)
     for plan in study.comparison.benefit.comparison.plans:
         assert plan in comments
@@ -233,7 +236,7 @@ def test_the_figure_of_the_rivals_names_all(html, study):
 
 def test_the_active_limit_and_the_margins_of_the_others(page):
     """15/8 of 1 m at 2.5 m/s takes 0.75 s; the acceleration then comes to 10/sqrt 3/0.75^2."""
-    table, _ = tables(page, "needs")
+    (table,) = tables(page, "margins")
     assert "0.7500 s is the shortest duration; y_d1 is at its limit at 0.3750 s." in page.words()
     assert titles(table) == ["limit", "unit", "must stay", "comes to", "at [s]", "left"]
     peak = 10 / 3**0.5 / 0.75**2
@@ -252,13 +255,13 @@ def test_marks_of_wins_losses_and_ties(page):
     table = tables(page, "grid")[0]
     (body,) = table.all("tbody")
     marks = [[cell.attributes["class"] for cell in row.all("td")] for row in body.all("tr")]
-    assert marks == [["lose", "win", "", "best", ""], ["lose", "", "", "best", ""]]
+    assert marks == [["worse", "better", "", "reference", ""], ["worse", "", "", "reference", ""]]
     assert rows(table) == [
         ["14", "3.000 ▽", "1.000 ▲", "–", "2.000", "0.5000"],
         ["16", "∞ ▽", "2.000", "2.001", "2.000", "0.5000"],
     ]
     symbols = [span.attributes["aria-label"] for span in table.all("span")]
-    assert symbols == ["worse than the best rival", "better than every rival", "worse than the best rival"]
+    assert symbols == ["worse than the best baseline", "better than every baseline", "worse than the best baseline"]
 
 
 # Odd cases
@@ -268,8 +271,8 @@ def test_marks_of_wins_losses_and_ties(page):
 def test_a_table_where_nothing_is_defined_has_a_page(study, shown):
     """Such as of settling, for a move there and back."""
     one, _ = study.comparison.benefit.grids
-    rivals = dict.fromkeys(one.rivals, np.full(2, math.nan))
-    bare = replace(one, values=np.full((2, 3), math.nan), rivals=rivals)
+    baselines = dict.fromkeys(one.baselines, np.full(2, math.nan))
+    bare = replace(one, values=np.full((2, 3), math.nan), baselines=baselines)
     words, page = shown(replace(study.comparison, benefit=replace(study.comparison.benefit, grids=(bare,))))
     assert not re.search(r"\bnan\b", words)
     (table,) = tables(page, "grid")
@@ -278,12 +281,16 @@ def test_a_table_where_nothing_is_defined_has_a_page(study, shown):
 
 @pytest.mark.slow
 def test_limits_that_no_plan_can_keep_have_a_page(study, shown):
-    needs = tuple(Need(need.name, math.nan, "never") for need in study.comparison.benefit.needs)
-    words, page = shown(replace(study.comparison, benefit=replace(study.comparison.benefit, needs=needs)))
+    required = tuple(
+        RequiredDuration(one.name, math.nan, "never") for one in study.comparison.benefit.required_durations
+    )
+    words, page = shown(
+        replace(study.comparison, benefit=replace(study.comparison.benefit, required_durations=required))
+    )
     assert "Under these limits no plan is possible." in words
-    (table,) = tables(page, "needs")
+    (table,) = tables(page, "durations")
     assert {row[1] for row in rows(table)} == {"–"}
-    assert not list(table.all("td", class_="win"))
+    assert not list(table.all("td", class_="better"))
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""Is it worth it: rivals that meet the same waypoints, in the same time; who wins and who loses is counted by hand."""
+"""The benefit of planning: baselines through the same waypoints in the same time; marks are counted by hand."""
 
 import dataclasses
 import json
@@ -15,7 +15,7 @@ import ctrlplan as cp
 from ctrlplan.studies.baselines import baseline_plans, smoother_polynomials
 from ctrlplan.studies.benefit import Benefit, Choices, benefit_of
 from ctrlplan.studies.grids import Grid
-from ctrlplan.studies.needs import Need
+from ctrlplan.studies.required_durations import RequiredDuration
 from ctrlplan.trajectories import SCurve, Shaper, Trapezoid
 
 MOVE = [cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1, 0, 0)]
@@ -61,41 +61,41 @@ def soft():
 
 
 @pytest.fixture(scope="module")
-def rivals():
+def baselines():
     return baseline_plans(VIA, None, SHAPER)
 
 
-# The rivals
+# The baselines
 
 
 @pytest.mark.parametrize("name", ["trapezoid", "S-curve", "shaped S-curve", "quintic a leg", "minimum jerk"])
-def test_rivals_pass_every_waypoint_in_its_time(name, rivals):
-    plan = rivals[name]
+def test_baselines_pass_every_waypoint_in_its_time(name, baselines):
+    plan = baselines[name]
     times = np.array([w.time for w in VIA])
     np.testing.assert_allclose(plan(times), np.transpose([w.position for w in VIA]), rtol=0, atol=1e-9)
     assert (plan.start, plan.end) == pytest.approx((1.0, 7.0), abs=1e-12)
     assert plan.labels == ("x", "z")
 
 
-def test_there_is_one_rival_of_each_kind(rivals):
+def test_there_is_one_baseline_of_each_kind(baselines):
     steps = ["step", "shaped step"]
     profiles = ["trapezoid", "S-curve", "shaped S-curve"]
-    assert sorted(rivals) == sorted([*steps, *profiles, "quintic a leg", "minimum jerk"])
+    assert sorted(baselines) == sorted([*steps, *profiles, "quintic a leg", "minimum jerk"])
 
 
 @pytest.mark.parametrize(("name", "order"), [("trapezoid", 1), ("S-curve", 2)])
-def test_profiles_rest_at_every_waypoint(name, order, rivals):
+def test_profiles_rest_at_every_waypoint(name, order, baselines):
     times = [w.time for w in VIA]
     for left in (True, False):
-        jet = rivals[name].jet(times, order, left=left)
+        jet = baselines[name].jet(times, order, left=left)
         np.testing.assert_allclose(jet[1:], 0.0, rtol=0, atol=1e-9)
-    assert not rivals[name].jumps(order)
+    assert not baselines[name].jumps(order)
 
 
-def test_an_axis_that_stands_still_on_a_leg_stays_where_it_is(rivals):
+def test_an_axis_that_stands_still_on_a_leg_stays_where_it_is(baselines):
     t = np.linspace(3, 4, 101)
     for name in ("trapezoid", "S-curve"):
-        np.testing.assert_allclose(rivals[name](t)[1], 7.0, rtol=0, atol=1e-8)
+        np.testing.assert_allclose(baselines[name](t)[1], 7.0, rtol=0, atol=1e-8)
 
 
 def test_a_leg_on_which_nothing_moves_waits():
@@ -106,9 +106,9 @@ def test_a_leg_on_which_nothing_moves_waits():
         np.testing.assert_allclose(plan([0.0, 1.0, 2.0, 3.0]), [0, 1, 1, 4], rtol=0, atol=1e-9)
 
 
-def test_steps_go_to_the_goal_at_once(rivals):
-    np.testing.assert_array_equal(rivals["step"]([0.999, 1.0, 5.0]), [[0, 2, 2], [10, 11, 11]])
-    parts = rivals["shaped step"]
+def test_steps_go_to_the_goal_at_once(baselines):
+    np.testing.assert_array_equal(baselines["step"]([0.999, 1.0, 5.0]), [[0, 2, 2], [10, 11, 11]])
+    parts = baselines["shaped step"]
     half = np.pi / (20.0 * np.sqrt(1 - 0.01))
     decay = np.exp(-0.1 * np.pi / np.sqrt(1 - 0.01))
     weights = np.array([1.0, 2 * decay, decay**2]) / (1 + decay) ** 2
@@ -149,18 +149,18 @@ def test_without_limits_profiles_are_those_of_what_the_polynomial_needs(kind):
     np.testing.assert_allclose(found[name](t), expected(t), rtol=0, atol=1e-9)
 
 
-def test_minimum_jerk_is_the_clamped_quintic_spline_of_scipy(rivals):
+def test_minimum_jerk_is_the_clamped_quintic_spline_of_scipy(baselines):
     times = np.array([w.time for w in VIA])
     rest = [(1, [0.0, 0.0]), (2, [0.0, 0.0])]
     spline = make_interp_spline(times, [w.position for w in VIA], k=5, bc_type=(rest, rest))
     t = np.linspace(1, 7, 301)
     for nu in range(3):
-        np.testing.assert_allclose(rivals["minimum jerk"](t, nu), spline(t, nu).T, rtol=0, atol=1e-8)
+        np.testing.assert_allclose(baselines["minimum jerk"](t, nu), spline(t, nu).T, rtol=0, atol=1e-8)
 
 
-def test_a_quintic_a_leg_meets_every_entry(rivals):
+def test_a_quintic_a_leg_meets_every_entry(baselines):
     for w in VIA:
-        np.testing.assert_allclose(rivals["quintic a leg"].jet(w.time, 2), w.jet, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(baselines["quintic a leg"].jet(w.time, 2), w.jet, rtol=0, atol=1e-9)
 
 
 def test_where_velocities_alone_are_given_minimum_jerk_chooses_accelerations():
@@ -181,7 +181,7 @@ def test_where_velocities_alone_are_given_minimum_jerk_chooses_accelerations():
         (5, ["nonic", "minimum jerk"]),
     ],
 )
-def test_rivals_are_called_what_they_are(rest, names):
+def test_baselines_are_called_what_they_are(rest, names):
     still = [0.0] * (rest - 1)
     found = baseline_plans([cp.Waypoint(0, 0, *still), cp.Waypoint(2, 1, *still)])
     assert [name for name in found if name not in ("step", "trapezoid", "S-curve")] == names
@@ -212,19 +212,19 @@ def test_an_axis_that_does_not_move_has_no_limit():
 # How long each takes under the same limits
 
 
-def needs(found):
-    return {need.name: need for need in found.needs}
+def required(found):
+    return {one.name: one for one in found.required_durations}
 
 
 def test_the_quintic_takes_exactly_its_own_time(stiff):
-    assert needs(stiff)["quintic (minimum jerk)"].duration == pytest.approx(1.0, abs=1e-12)
+    assert required(stiff)["quintic (minimum jerk)"].duration == pytest.approx(1.0, abs=1e-12)
 
 
 def test_the_s_curve_takes_its_closed_form(stiff):
     """Every limit is reached: d/v + v/a + a/j."""
     v, a, j = 15 / 8, 10 / 3**0.5, 60.0
     assert v * (v / a + a / j) < 1 > a**2 / j / v
-    assert needs(stiff)["S-curve"].duration == pytest.approx(1 / v + v / a + a / j, rel=1e-12)
+    assert required(stiff)["S-curve"].duration == pytest.approx(1 / v + v / a + a / j, rel=1e-12)
 
 
 def test_the_trigonometric_plan_takes_what_its_peaks_need(stiff):
@@ -232,13 +232,13 @@ def test_the_trigonometric_plan_takes_what_its_peaks_need(stiff):
     jet = np.abs(cp.TrigSpline(MOVE, alpha=1.0).jet(t, 3)[1:, 0]).max(axis=1)
     limits = np.array([15 / 8, 10 / 3**0.5, 60.0])
     expected = ((jet / limits) ** (1.0 / np.arange(1, 4))).max()
-    need = needs(stiff)["trigonometric"]
-    assert need.duration == pytest.approx(expected, rel=1e-9)
-    assert need.limit.startswith("y_d1 within ±1.875, at 0.508 s")
+    one = required(stiff)["trigonometric"]
+    assert one.duration == pytest.approx(expected, rel=1e-9)
+    assert one.limit.startswith("y_d1 within ±1.875, at 0.508 s")
 
 
 def test_what_jumps_keeps_no_limit_and_says_why(stiff):
-    found = needs(stiff)
+    found = required(stiff)
     assert math.isnan(found["step"].duration)
     assert found["step"].limit == "jumps: no limit on a derivative holds"
     assert math.isnan(found["trapezoid"].duration)
@@ -258,23 +258,23 @@ def test_limits_given_hold_all():
     few = {"alphas": (1.0,), "factors": (1.0,), "decisive": ("settling_time",)}
     found = worth(loop(5.0), MOVE, TIMES, alpha=0.0, limits=limits, **few)
     assert found.limits == limits
-    assert needs(found)["trapezoid"].duration == pytest.approx(1.25, rel=1e-12)
-    assert needs(found)["quintic (minimum jerk)"].duration == pytest.approx(15 / 8, rel=1e-12)
-    assert needs(found)["trigonometric"].duration == pytest.approx(15 / 8, rel=1e-12)
+    assert required(found)["trapezoid"].duration == pytest.approx(1.25, rel=1e-12)
+    assert required(found)["quintic (minimum jerk)"].duration == pytest.approx(15 / 8, rel=1e-12)
+    assert required(found)["trigonometric"].duration == pytest.approx(15 / 8, rel=1e-12)
     assert found.verdicts[0].startswith("Under the same limits trapezoid is the fastest with 1.25 s")
     found = worth(loop(5.0), MOVE, TIMES, alpha=0.0, limits={"velocity": (None, 1.0)}, **few)
-    assert needs(found)["quintic (minimum jerk)"].duration == pytest.approx(15 / 8, rel=1e-12)
+    assert required(found)["quintic (minimum jerk)"].duration == pytest.approx(15 / 8, rel=1e-12)
 
 
 def test_a_sign_may_be_a_limit():
     """Never backwards, at most 2 m/s: what `fastest` takes as a limit."""
     few = {"alphas": (1.0,), "factors": (1.0,), "decisive": ("settling_time",)}
     found = worth(loop(5.0), MOVE, TIMES, alpha=0.0, limits={"y_d1": (0.0, 2.0)}, **few)
-    assert needs(found)["quintic (minimum jerk)"].duration == pytest.approx(15 / 16, rel=1e-6)
+    assert required(found)["quintic (minimum jerk)"].duration == pytest.approx(15 / 16, rel=1e-6)
 
 
 def test_no_plan_is_possible_where_limits_are_none_that_time_can_keep():
-    lone = (Need("step", math.nan, "jumps"), Need("quintic", math.nan, "no"))
+    lone = (RequiredDuration("step", math.nan, "jumps"), RequiredDuration("quintic", math.nan, "no"))
     found = Benefit(None, {}, lone, (), 1.0)
     assert found.verdicts == ("Under these limits no plan is possible.",)
 
@@ -367,8 +367,8 @@ def test_there_is_a_table_for_settling_and_one_for_the_control(stiff):
         np.testing.assert_array_equal(grid.durations, [1.0, 1.5])
         np.testing.assert_array_equal(grid.alphas, [0.0, 1.0, 3.0])
         assert grid.values.shape == (2, 3)
-        assert list(grid.rivals) == NAMES[1:]
-        assert grid.beside == ("step", "shaped step")
+        assert list(grid.baselines) == NAMES[1:]
+        assert grid.not_ranked == ("step", "shaped step")
 
 
 def test_values_are_those_of_runs_of_their_own(stiff):
@@ -385,16 +385,16 @@ def test_values_are_those_of_runs_of_their_own(stiff):
 
 def test_alpha_zero_is_the_quintic_and_rows_of_the_move_itself_are_the_comparison(stiff):
     for grid, key in zip(stiff.grids, ("settling_time", "control_peak"), strict=True):
-        np.testing.assert_allclose(grid.values[:, 0], grid.rivals["quintic (minimum jerk)"], rtol=1e-9)
+        np.testing.assert_allclose(grid.values[:, 0], grid.baselines["quintic (minimum jerk)"], rtol=1e-9)
         assert grid.values[0, 1] == stiff.comparison.metrics["trigonometric"][key]
-        for name, values in grid.rivals.items():
+        for name, values in grid.baselines.items():
             assert values[0] == stiff.comparison.metrics[name][key]
 
 
 def test_steps_do_not_depend_on_the_duration(stiff):
     for grid in stiff.grids:
         for name in ("step", "shaped step"):
-            assert grid.rivals[name][1] == pytest.approx(grid.rivals[name][0], rel=1e-9)
+            assert grid.baselines[name][1] == pytest.approx(grid.baselines[name][0], rel=1e-9)
 
 
 @pytest.mark.slow
@@ -417,7 +417,7 @@ def test_a_shaper_too_slow_for_some_of_the_durations(factors):
     """Period 1.41 s: a move of 2 s leaves room for it, one of 0.75 s does not."""
     found = worth(loop(20.0), MOVE, TIMES, alpha=1.0, alphas=(1.0,), factors=factors, decisive=("settling_time",))
     (grid,) = found.grids
-    shaped = dict(zip(factors, grid.rivals["shaped S-curve"].tolist(), strict=True))
+    shaped = dict(zip(factors, grid.baselines["shaped S-curve"].tolist(), strict=True))
     assert math.isnan(shaped[0.75])
     assert math.isfinite(shaped[2.0])
     json.dumps(found.results(), allow_nan=False)
@@ -433,7 +433,7 @@ def test_a_move_there_and_back_is_settled_relative_to_its_range():
     points = [cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1), cp.Waypoint(2, 0, 0, 0)]
     found = worth(loop(100.0), points, TIMES, alpha=1.0, alphas=(0.0, 1.0), factors=(1.0,))
     assert np.isfinite(found.grids[0].values).all()
-    assert np.isnan(found.grids[0].rivals["step"]).all()
+    assert np.isnan(found.grids[0].baselines["step"]).all()
     assert "nan" not in " ".join(found.verdicts)
     plan = found.comparison.plans["trigonometric"]
     y = cp.simulate(loop(100.0), t := np.linspace(0, 12, 120_001), plan).outputs[0]
@@ -448,13 +448,13 @@ def test_a_run_that_is_ended_loses():
     (table,) = worth(loop(100.0), MOVE, TIMES, alpha=1.0, events=ends, **few).grids
     assert table.values[0, 2] == math.inf
     assert np.isfinite(table.values[1]).all()
-    assert table.marks()[0][2] == "lose"
+    assert table.marks()[0][2] == "worse"
 
 
 # Wins and losses, counted by hand
 
 
-def grid(values, beside=(), **rivals):
+def grid(values, not_ranked=(), **baselines):
     values = np.array(values, dtype=float)
     return Grid(
         "Length",
@@ -462,71 +462,74 @@ def grid(values, beside=(), **rivals):
         np.arange(1.0, len(values) + 1),
         np.arange(values.shape[1]) * 1.0,
         values,
-        {name: np.array(row, dtype=float) for name, row in rivals.items()},
-        beside,
+        {name: np.array(row, dtype=float) for name, row in baselines.items()},
+        not_ranked,
     )
 
 
-def test_marks_are_against_the_best_rival_of_each_row():
+def test_marks_are_against_the_best_baseline_of_each_row():
     found = grid([[5, 3, 1], [5, 3, 1]], one=[4, 2], two=[2, 6])
     assert [found.best(0), found.best(1)] == [("two", 2.0), ("one", 2.0)]
-    assert found.marks() == [["lose", "lose", "win"], ["lose", "lose", "win"]]
+    assert found.marks() == [["worse", "worse", "better"], ["worse", "worse", "better"]]
     assert found.verdict == (
-        "Length: of 4 trigonometric plans 2 win and 2 lose against the best rival (two, one); "
-        "they win at alpha = 2 in 1 s, 2 s."
+        "Length: of 4 trigonometric plans, 2 are better and 2 are worse than the best baseline of the same duration "
+        "(two, one); the better ones have alpha = 2 and durations of 1 s, 2 s."
     )
 
 
-def test_rivals_that_stand_beside_do_not_count():
-    found = grid([[5, 3]], one=[4], step=[1], beside=("step",))
+def test_baselines_that_stand_beside_do_not_count():
+    found = grid([[5, 3]], one=[4], step=[1], not_ranked=("step",))
     assert found.best(0) == ("one", 4.0)
-    assert found.marks() == [["lose", "win"]]
+    assert found.marks() == [["worse", "better"]]
 
 
 @pytest.mark.parametrize(
-    ("value", "rival", "mark"),
+    ("value", "baseline", "mark"),
     [
         (1.0, 1.0, ""),
         (1.0009, 1.0, ""),
         (0.9991, 1.0, ""),
-        (1.002, 1.0, "lose"),
-        (0.998, 1.0, "win"),
+        (1.002, 1.0, "worse"),
+        (0.998, 1.0, "better"),
         (0.0, 0.0, ""),
-        (0.0, 1e-30, "win"),
-        (math.inf, 1.0, "lose"),
-        (1.0, math.inf, "win"),
+        (0.0, 1e-30, "better"),
+        (math.inf, 1.0, "worse"),
+        (1.0, math.inf, "better"),
         (math.inf, math.inf, ""),
         (math.nan, 1.0, ""),
         (math.nan, math.inf, ""),
     ],
 )
-def test_marks_of_ties_and_of_what_is_infinite_or_undefined(value, rival, mark):
-    assert grid([[value]], one=[rival]).marks() == [[mark]]
+def test_marks_of_ties_and_of_what_is_infinite_or_undefined(value, baseline, mark):
+    assert grid([[value]], one=[baseline]).marks() == [[mark]]
 
 
-def test_an_undefined_rival_does_not_count_where_it_is_undefined():
+def test_an_undefined_baseline_does_not_count_where_it_is_undefined():
     found = grid([[2], [2]], one=[math.nan, 1], two=[3, math.nan])
-    assert found.marks() == [["win"], ["lose"]]
+    assert found.marks() == [["better"], ["worse"]]
     assert [found.best(i)[0] for i in (0, 1)] == ["two", "one"]
 
 
-def test_no_one_wins_where_every_rival_is_undefined():
+def test_no_one_wins_where_every_baseline_is_undefined():
     found = grid([[2.0, 2.0], [2.0, 3.0]], one=[math.nan, 2.5])
-    assert found.marks() == [["", ""], ["win", "lose"]]
+    assert found.marks() == [["", ""], ["better", "worse"]]
     assert "nan" not in found.verdict
 
 
-def test_a_plan_wins_where_every_rival_never_arrives():
+def test_a_plan_wins_where_every_baseline_never_arrives():
     found = grid([[math.inf, 2.0]], one=[math.inf])
-    assert found.marks() == [["", "win"]]
-    assert "of 1 trigonometric plans 1 win and 0 lose" in found.verdict
+    assert found.marks() == [["", "better"]]
+    assert "of 1 trigonometric plans, 1 are better and 0 are worse" in found.verdict
 
 
 def test_the_polynomial_is_no_trigonometric_plan():
     """Alpha 0 is shown and marked, and not counted."""
     found = grid([[1, 3], [1, 3]], one=[2, 2])
-    assert found.marks() == [["win", "lose"], ["win", "lose"]]
-    assert found.verdict == "Length: of 2 trigonometric plans 0 win and 2 lose against the best rival (one)."
+    assert found.marks() == [["better", "worse"], ["better", "worse"]]
+    assert found.verdict == (
+        "Length: of 2 trigonometric plans, 0 are better and 2 are worse than the best baseline of the same duration "
+        "(one)."
+    )
 
 
 # As data
@@ -548,7 +551,7 @@ def test_what_is_infinite_or_undefined_is_null():
     lone = Benefit(
         cp.compare(loop(5.0), {"step": cp.Step(1.0)}, TIMES),
         {},
-        (Need("step", math.nan, "jumps"),),
+        (RequiredDuration("step", math.nan, "jumps"),),
         (grid([[math.inf, 1.0]], one=[math.nan]),),
         1.0,
     )
@@ -673,8 +676,8 @@ def test_further_baselines_are_compared_and_count():
     few = {"alphas": (1.0,), "factors": (1.0,), "decisive": ("settling_time",)}
     found = worth(loop(100.0), MOVE, TIMES, alpha=1.0, baselines=smoother_polynomials, **few)
     assert {"septic", "nonic"} <= set(found.comparison.plans)
-    assert {"septic", "nonic"} <= set(found.grids[0].rivals)
-    assert {"septic", "nonic"} <= {need.name for need in found.needs}
+    assert {"septic", "nonic"} <= set(found.grids[0].baselines)
+    assert {"septic", "nonic"} <= {one.name for one in found.required_durations}
 
 
 def test_own_limits_are_said_to_be_so_and_given_ones_are_not():
@@ -689,4 +692,4 @@ def test_rounding_beside_the_scale_is_no_defeat():
     tied = Grid("Overshoot", "%", np.ones(1), np.ones(1), np.array([[3e-7]]), {"one": np.zeros(1)}, scale=100.0)
     assert tied.marks() == [[""]]
     lost = Grid("Overshoot", "%", np.ones(1), np.ones(1), np.array([[3e-3]]), {"one": np.zeros(1)}, scale=100.0)
-    assert lost.marks() == [["lose"]]
+    assert lost.marks() == [["worse"]]

@@ -83,9 +83,9 @@ def test_grids_are_of_length_and_squared_jerk(grids):
         assert grid.values.shape == (grid.durations.size, grid.alphas.size)
         assert {14.0, 16.0, 20.0} <= set(grid.durations)
         assert {0.0, 4.0, 5.0} <= set(grid.alphas)
-    assert list(grids[0].rivals) == [QUINTIC, FREED, LEGS, POLYLINE]
-    assert list(grids[1].rivals) == [QUINTIC, FREED, LEGS]
-    assert (grids[0].beside, grids[1].beside) == ((POLYLINE,), ())
+    assert list(grids[0].baselines) == [QUINTIC, FREED, LEGS, POLYLINE]
+    assert list(grids[1].baselines) == [QUINTIC, FREED, LEGS]
+    assert (grids[0].not_ranked, grids[1].not_ranked) == ((POLYLINE,), ())
 
 
 @pytest.mark.parametrize(
@@ -105,25 +105,25 @@ def test_cells_against_quadrature(grids, end, alpha):
 
 
 @pytest.mark.parametrize("end", [14.0, 16.0, 20.0])
-def test_rivals_against_splines_of_scipy(grids, end):
+def test_baselines_against_splines_of_scipy(grids, end):
     (row,) = np.flatnonzero(grids[0].durations == end)
     for name, spline in ((QUINTIC, quintics(end)), (FREED, clamped(end))):
-        assert grids[0].rivals[name][row] == pytest.approx(length(spline.derivative(), end), rel=1e-8)
-        assert grids[1].rivals[name][row] == pytest.approx(jerk(spline.derivative(3), end), rel=1e-8)
+        assert grids[0].baselines[name][row] == pytest.approx(length(spline.derivative(), end), rel=1e-8)
+        assert grids[1].baselines[name][row] == pytest.approx(jerk(spline.derivative(3), end), rel=1e-8)
 
 
 def test_the_polyline_and_how_near_one_quintic_a_leg_comes_to_it(grids):
-    rivals = dict(grids[0].rivals)
-    np.testing.assert_allclose(rivals.pop(POLYLINE), L0, rtol=1e-12)
+    baselines = dict(grids[0].baselines)
+    np.testing.assert_allclose(baselines.pop(POLYLINE), L0, rtol=1e-12)
     assert f"{L0:.1f}" == "24.9"
-    assert all((values > L0).all() for values in rivals.values())
+    assert all((values > L0).all() for values in baselines.values())
     assert (grids[0].values > L0).all()
-    of_end = dict(zip(grids[0].durations, rivals[QUINTIC] / L0, strict=True))
+    of_end = dict(zip(grids[0].durations, baselines[QUINTIC] / L0, strict=True))
     assert (f"{of_end[16.0]:.2f}", f"{of_end[20.0]:.2f}") == ("1.03", "1.06")
 
 
 def test_no_trigonometric_spline_a_leg_is_shorter_than_that_of_the_table(grids):
-    for end, found in zip(grids[0].durations, grids[0].rivals[LEGS], strict=True):
+    for end, found in zip(grids[0].durations, grids[0].baselines[LEGS], strict=True):
         t = np.linspace(0, end, 2001)
         alphas = np.linspace(0, 5.5, 23)
         ways = [
@@ -135,7 +135,7 @@ def test_no_trigonometric_spline_a_leg_is_shorter_than_that_of_the_table(grids):
 
 
 def test_one_quintic_a_leg_has_the_least_jerk_through_its_entries_and_freed_ones_less(grids):
-    least = grids[1].rivals
+    least = grids[1].baselines
     assert (grids[1].values > least[QUINTIC][:, None]).all()
     assert (least[LEGS] >= least[QUINTIC] * (1 - 1e-9)).all()
     assert (least[FREED] < least[QUINTIC]).all()
@@ -147,7 +147,7 @@ def test_one_quintic_a_leg_has_the_least_jerk_through_its_entries_and_freed_ones
 def test_the_claim_fails_and_says_how(grids):
     claim = optimality_claim(grids)
     text = " ".join(claim)
-    assert all(mark == "lose" for grid in grids for row in grid.marks() for mark in row)
+    assert all(mark == "worse" for grid in grids for row in grid.marks() for mark in row)
     assert "Over 36 pairs of alpha and end time" in claim[0]
     assert claim[0].endswith("the claim fails.")
     assert claim[-2:] == (grids[0].verdict, grids[1].verdict)
@@ -172,7 +172,7 @@ def test_the_shortest_path_of_the_claim_is_the_shortest_of_a_scan(grids):
 
 
 def test_the_claim_would_hold_where_it_held(grids):
-    """The words follow the numbers: a plan that is shorter than all rivals is counted."""
+    """The words follow the numbers: a plan that is shorter than all baselines is counted."""
     values = grids[0].values.copy()
     values[2, 4] = values[0, 1] = 24.9
     won = optimality_claim((replace(grids[0], values=values), grids[1]))
@@ -288,7 +288,7 @@ def test_clearance_is_that_of_dense_samples():
         assert said == f"{least:.2f} m ({part})"
 
 
-# The nominal move beside its rivals
+# The nominal move beside its baselines
 
 
 @pytest.fixture(scope="module")
@@ -297,29 +297,29 @@ def beside():
 
 
 @pytest.mark.slow
-def test_the_nominal_move_beside_its_rivals(beside):
+def test_the_nominal_move_beside_its_baselines(beside):
     names = ["trigonometric", "step", "trapezoid", "S-curve", "shaped step", "shaped S-curve", "quintic (minimum jerk)"]
     assert list(beside.comparison.plans) == [*names, "septic", "nonic"]
     half = np.pi * np.sqrt(10.5 / G)
     np.testing.assert_allclose(beside.comparison.plans["shaped step"].breakpoints, [0, half, 2 * half], rtol=1e-12)
-    needs = {need.name: need for need in beside.needs}
+    required = {one.name: one for one in beside.required_durations}
     # 15/8 of 20 m in 15 s is the limit of 2.5 m/s itself.
-    assert needs["quintic (minimum jerk)"].duration == pytest.approx(15.0, rel=1e-9)
+    assert required["quintic (minimum jerk)"].duration == pytest.approx(15.0, rel=1e-9)
     t = np.linspace(0, 1, 100_001)
     unit = cp.TrigSpline([cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1, 0, 0)], alpha=1.0)
-    assert needs["trigonometric"].duration == pytest.approx(20 / 2.5 * unit(t, 1).max(), rel=1e-8)
-    assert np.isnan(needs["step"].duration)
+    assert required["trigonometric"].duration == pytest.approx(20 / 2.5 * unit(t, 1).max(), rel=1e-8)
+    assert np.isnan(required["step"].duration)
 
 
 @pytest.mark.slow
 def test_the_s_curve_of_the_needs_sways_as_far_as_is_allowed(beside):
     """A jerk limit of 0.4 alone would take 20/2.5 + 2.5/0.6 + 0.6/0.4 s: it is retimed to 0.06 rad of sway."""
     alone = 20 / 2.5 + 2.5 / 0.6 + 0.6 / 0.4
-    (need,) = (need for need in beside.needs if need.name == "S-curve")
-    stretch = need.duration / alone
+    (one,) = (one for one in beside.required_durations if one.name == "S-curve")
+    stretch = one.duration / alone
     across, fall = 0.6 / stretch**2, 0.03 / stretch**2
     assert np.arctan2(across, G - fall) == pytest.approx(0.06, rel=1e-6)
-    assert "theta" in need.limit
+    assert "theta" in one.limit
 
 
 @pytest.mark.slow
@@ -335,7 +335,7 @@ def test_values_of_the_crane_are_those_of_runs_of_their_own(beside):
         out = cp.simulate(made, t, initial_state=made.initial_state)
         rows = dict(zip(out.output_labels, np.asarray(out.outputs), strict=True))
         swayed, pushed = np.abs(rows["theta"][t >= 15]).max(), np.abs(rows["F"]).max()
-        found = [g.values[1, 3] if column is None else g.rivals[column][1] for g in (sway, force)]
+        found = [g.values[1, 3] if column is None else g.baselines[column][1] for g in (sway, force)]
         assert found == pytest.approx([swayed, pushed], rel=5e-3)
     assert (np.diff(settling.values[:, :4], axis=1) < 0).all()  # it wins over the polynomial where alpha is below pi
 
@@ -350,7 +350,7 @@ def test_what_jumps_takes_no_path_and_the_others_the_straight_line(beside):
 @pytest.mark.slow
 def test_limited_drives_are_never_asked_for_more_than_they_have(beside):
     force = beside.grids[2]
-    peaks = [np.nanmax(rows) for rows in force.rivals.values() if not np.isnan(rows).all()]
+    peaks = [np.nanmax(rows) for rows in force.baselines.values() if not np.isnan(rows).all()]
     assert max(force.values.max(), *peaks) <= 30e3 * (1 + 1e-9)
 
 
@@ -374,7 +374,7 @@ def test_every_smooth_baseline_goes_through_the_flat_map(beside):
         assert (rows[name]["sway_after"], rows[name]["force_peak"]) == pytest.approx(SMOOTH[name], rel=1e-3)
     sway, force = beside.grids[1:]
     assert (sway.values[1, 3], force.values[1, 3]) == pytest.approx(SMOOTH["alpha = 3"], rel=5e-3)
-    assert {row[3] for row in sway.marks()} == {"lose"}  # alpha = 3 is not the best in sway at any duration
+    assert {row[3] for row in sway.marks()} == {"worse"}  # alpha = 3 is not the best in sway at any duration
     s = np.linspace(0, 1, 101)
     for name, curve in (
         ("septic", s**4 * (35 - 84 * s + 70 * s**2 - 20 * s**3)),
@@ -389,5 +389,5 @@ def test_a_step_is_valid_up_to_the_slack_rope_and_is_not_ranked(beside):
     assert found.stopped["step"] == pytest.approx(SLACK, abs=1e-3)
     assert str(SLACK) in found.marks["step"]
     assert found.responses["step"].time[-1] == found.stopped["step"]
-    assert not any("step" in (*verdict.winners, *verdict.losers) for verdict in verdicts(found))
-    assert all(np.isnan(grid.rivals["step"]).all() for grid in beside.grids)
+    assert not any("step" in (*verdict.best, *verdict.worst) for verdict in verdicts(found))
+    assert all(np.isnan(grid.baselines["step"]).all() for grid in beside.grids)

@@ -411,18 +411,18 @@ def test_where_the_planned_reference_loses_the_verdict_says_so(standard):
     # At this gain the step settles first (7.56125 s against 8.02597 s, see linear_table.py).
     found = {v.key: v for v in verdicts(standard)}
     verdict = found["settling_time"]
-    assert verdict.winners == ("step",)
-    assert set(verdict.losers) == {"polynomial", "trigonometric", "piecewise"}
+    assert verdict.best == ("step",)
+    assert set(verdict.worst) == {"polynomial", "trigonometric", "piecewise"}
     assert "step wins with 7.561 s" in verdict.sentence
     assert "lose with 8.026 s" in verdict.sentence
-    assert found["overshoot_error"].losers == ("step",)
+    assert found["overshoot_error"].worst == ("step",)
 
 
 def test_a_plan_that_takes_its_time_loses_and_is_reported_so(tmp_path):
     slow = cp.TrigSpline([cp.Waypoint(0, 0, 0, 0), cp.Waypoint(15, 1, 0, 0)], alpha=1.0)
     found = cp.compare(loop(1000.0), {"step": cp.Step(1.0), "planned": slow}, np.linspace(0, 30, 6001))
     verdict = next(v for v in verdicts(found) if v.key == "settling_time")
-    assert (verdict.winners, verdict.losers) == (("step",), ("planned",))
+    assert (verdict.best, verdict.worst) == (("step",), ("planned",))
     assert verdict.sentence in found.report(tmp_path).read_text(encoding="utf-8")
 
 

@@ -156,7 +156,7 @@ def test_what_a_step_did_outside_the_model_is_not_reported(nominal):
     assert row["error_limited"] is None
     assert "slack" in nominal.marks["step"]
     assert any("the run was ended at 5.866 s, and is measured up to then" in note for note in nominal.notes)
-    assert all("step" not in (*v.winners, *v.losers) for v in verdicts(nominal))
+    assert all("step" not in (*v.best, *v.worst) for v in verdicts(nominal))
     note = studies._step_note(nominal)
     assert "slack at 5.87 s" in note
     assert "nan" not in note

@@ -5,7 +5,9 @@ import pytest
 from study_text import to_toml, valid
 
 import ctrlplan as cp
+from ctrlplan import reports
 from ctrlplan.cli import main
+from ctrlplan.reports import verdicts
 from ctrlplan.studies.files import StudyError, load_study
 
 MOVE = [cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1, 0, 0)]
@@ -56,7 +58,7 @@ def test_worth_is_the_benefit():
     new = cp.benefit(compared, LOOP, alphas=[1.0], durations=[1.0])
     assert found.benefit.alpha == new.alpha == 2.0
     assert found.benefit.comparison.metrics == new.comparison.metrics
-    assert [need.name for need in found.benefit.needs] == [need.name for need in new.needs]
+    assert [one.name for one in found.benefit.required_durations] == [one.name for one in new.required_durations]
     with pytest.warns(FutureWarning, match="use Comparison.benefit"):
         assert found.worth is found.benefit
     with pytest.warns(FutureWarning):
@@ -147,3 +149,26 @@ def test_a_study_file_may_say_worth(tmp_path, capsys):
     path.write_text(to_toml(valid(worth=1)))
     with pytest.raises(StudyError, match="worth: must be true or false, got 1"):
         load_study(path)
+
+
+def test_former_attributes_of_a_benefit_and_a_verdict_warn():
+    found = cp.benefit(cp.compare(LOOP, MOVE, TIMES), LOOP, alphas=(1.0,), durations=(1.0,))
+    grid, verdict = found.grids[0], verdicts(found.comparison)[0]
+    renamed = [
+        (found, "needs", "required_durations"),
+        (grid, "rivals", "baselines"),
+        (grid, "beside", "not_ranked"),
+        (verdict, "winners", "best"),
+        (verdict, "losers", "worst"),
+        (verdict, "least", "minimum"),
+        (verdict, "greatest", "maximum"),
+    ]
+    for value, old, new in renamed:
+        kind = type(value).__name__
+        with pytest.warns(FutureWarning, match=rf"{kind}\.{old} is deprecated.*use {kind}\.{new}"):
+            assert getattr(value, old) is getattr(value, new)
+
+
+def test_the_figure_of_baselines_has_a_former_name():
+    with pytest.warns(FutureWarning, match="plot_rivals is deprecated.*use plot_baselines"):
+        assert reports.plot_rivals is reports.plot_baselines

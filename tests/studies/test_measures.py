@@ -167,10 +167,10 @@ def named(metric, a, b, **more):
 def test_rounding_is_a_tie_and_says_within_how_much(metric, scale):
     """The plan is 1 long, the run 8 s: a difference of a millionth of the scale is rounding, of ten is not."""
     tie = named(metric, 0.0, 0.5e-6 * scale)
-    assert (tie.winners, tie.losers) == ((), ())
+    assert (tie.best, tie.worst) == ((), ())
     assert f"no difference between a and b, within {0.5e-6 * scale:.2g}" in tie.sentence
     real = named(metric, 0.0, 1e-5 * scale)
-    assert (real.winners, real.losers) == (("a",), ("b",))
+    assert (real.best, real.worst) == (("a",), ("b",))
 
 
 def test_what_is_rounding_depends_on_the_size_of_the_signals():
@@ -178,8 +178,8 @@ def test_what_is_rounding_depends_on_the_size_of_the_signals():
     small = [cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1e-6, 0, 0)]
     found = cp.compare(loop(100.0), {"a": cp.PolySpline(small), "b": cp.Step(1e-6)}, T)
     (verdict,) = (v for v in verdicts(found) if v.key == "iae")
-    assert verdict.winners == ("a",)
-    assert named("iae", 1e-9, 2e-9).winners == ()
+    assert verdict.best == ("a",)
+    assert named("iae", 1e-9, 2e-9).best == ()
 
 
 def test_two_exact_loops_tie_though_their_rounding_differs():
@@ -194,7 +194,7 @@ def test_two_exact_loops_tie_though_their_rounding_differs():
     found = cp.compare(build, plans, T)
     tied = {v.key: v for v in verdicts(found)}
     for metric in ("overshoot_error", "lag_error", "iae", "ise", "itae"):
-        assert tied[metric].winners == ()
+        assert tied[metric].best == ()
     assert "a millionth of the scale" in summary(found)
 
 
@@ -214,7 +214,7 @@ def test_a_run_that_is_ended_is_measured_up_to_then_and_says_so():
     assert "measured up to then, and not ranked" in found.marks["step"]
     (note,) = (note for note in found.notes if note.startswith("With step"))
     assert f"the run was ended at {t[-1]:.4g} s, and is measured up to then" in note
-    assert all("step" not in (*v.winners, *v.losers) for v in verdicts(found))
+    assert all("step" not in (*v.best, *v.worst) for v in verdicts(found))
     assert "not ranked" in summary(found).lower()
 
 

@@ -56,7 +56,7 @@ def test_a_load_that_goes_past_its_goal_and_stays_away():
 def test_the_move_asks_for_the_force_of_the_flat_map():
     plan = studies._move()
     forces = studies.CRANE.quantities(plan.jet(np.linspace(0.0, 15.0, 30001), 4))["F"]
-    assert studies._asked_force() == pytest.approx(np.abs(forces).max(), rel=1e-6)
+    assert studies._peak_force() == pytest.approx(np.abs(forces).max(), rel=1e-6)
     retimed = [
         np.abs(studies.CRANE.quantities(plan.retime(t).jet(np.linspace(0.0, t, 30001), 4))["F"]) for t in (21.6, 21.5)
     ]
@@ -118,9 +118,7 @@ class TestWhole:
         assert saturated["slowed"]["overshoot_goal"] < 0.5 * saturated["load feedback"]["overshoot_goal"]
 
     def test_no_way_wins_everything(self, found):
-        winners = {
-            next(v.winners for v in verdicts(study.comparison) if v.key == "arrival") for study in found.values()
-        }
+        winners = {next(v.best for v in verdicts(study.comparison) if v.key == "arrival") for study in found.values()}
         assert len(winners) > 1
 
     def test_the_reference_of_a_moved_goal_does_not_jump(self, found):

@@ -10,7 +10,7 @@ import ctrlplan as cp
 from ctrlplan.studies import Measure, Study, sections
 from ctrlplan.studies.benefit import Benefit
 from ctrlplan.studies.grids import Grid
-from ctrlplan.studies.needs import Need
+from ctrlplan.studies.required_durations import RequiredDuration
 
 HIT = "window.hit=1"
 MARKUP = {
@@ -115,8 +115,8 @@ def study(text, drawn=True):
         np.array([[1.0, 2.0], [3.0, 0.5]]),
         {text("rival"): np.array([1.5, 2.5])},
     )
-    needs = (Need(text("need"), 1.0, text("limit of it"), text("kept")),)
-    worth = Benefit(found, {text("bounded"): 2.0}, needs, (grid,), 1.0, text("worth note"))
+    required = (RequiredDuration(text("need"), 1.0, text("limit of it"), text("kept")),)
+    worth = Benefit(found, {text("bounded"): 2.0}, required, (grid,), 1.0, text("worth note"))
     speed = text("quantity")
     fast = cp.fastest(plans[0], {speed: 9.0}, lambda jet: {speed: np.hypot(jet[1, 0], jet[1, 1])}) if drawn else None
     curves = sections.Curves(

@@ -19,7 +19,7 @@ Outcome: TypeAlias = dict[str, tuple[dict[str, float], dict[str, Array]] | Faile
 """By plan: metrics, and signals at the times of the bands; or what went wrong."""
 
 
-class Kept:
+class DrawResults:
     """What of all draws is kept.
 
     Parameters
@@ -34,7 +34,7 @@ class Kept:
 
     def __init__(self, count: int, times: Array, mixed: Collection[str]) -> None:
         self._mixed = mixed
-        self.timepts = times[kept_samples(times)]
+        self.timepts = times[band_samples(times)]
         self.metrics: dict[str, dict[str, Array]] = {}
         self.failures: list[Failure] = []
         self.finished = 0
@@ -82,6 +82,6 @@ def _quantiles(rows: Array) -> Array:
     return out
 
 
-def kept_samples(times: Array) -> NDArray[np.intp]:
+def band_samples(times: Array) -> NDArray[np.intp]:
     """Samples at which bands are kept."""
     return np.unique(np.linspace(0, times.size - 1, min(times.size, _SAMPLES)).round().astype(np.intp))

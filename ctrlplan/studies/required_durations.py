@@ -13,7 +13,7 @@ from ctrlplan.trajectories import Trajectory
 
 
 @dataclass(frozen=True)
-class Need:
+class RequiredDuration:
     """Minimum duration of a plan under the same limits.
 
     Attributes
@@ -24,17 +24,17 @@ class Need:
         Minimum duration [s], nan where there is none.
     limit : str
         Active limit, or why there is no duration.
-    kept : str
+    satisfied : str
         Whether it satisfies the limits in the time of the waypoints.
     """
 
     name: str
     duration: float
     limit: str
-    kept: str = ""
+    satisfied: str = ""
 
 
-def need_of(name: str, plan: Trajectory, fast: Trajectory, limited: Limited) -> Need:
+def required_duration(name: str, plan: Trajectory, fast: Trajectory, limited: Limited) -> RequiredDuration:
     """Minimum duration of a plan under limits.
 
     Parameters
@@ -49,29 +49,31 @@ def need_of(name: str, plan: Trajectory, fast: Trajectory, limited: Limited) -> 
         The limits.
     """
     if plan.jumps(0):
-        return Need(name, math.nan, "jumps: no limit on a derivative holds", "broken")
+        return RequiredDuration(name, math.nan, "jumps: no limit on a derivative holds", "broken")
     try:
         limited.check_smooth(plan)
         worst = limited.margins(plan).active
-        kept = "all kept" if worst.fraction >= -SAME else f"{worst.bound.name} {worst.share} beyond"
+        satisfied = "all kept" if worst.fraction >= -SAME else f"{worst.bound.name} {worst.share} beyond"
         shortest = limited.margins(fast)
         duration = fast.duration
         if fast is plan or not shortest.hold:
             found = fastest_within(fast, limited)
             duration, shortest = found.duration, found.margins
     except ValueError as refusal:
-        return Need(name, math.nan, str(refusal), "broken")
+        return RequiredDuration(name, math.nan, str(refusal), "broken")
     active = shortest.active
-    return Need(name, duration, f"{active.bound.name} {active.bound.range}, at {active.time:.3g} s", kept)
+    return RequiredDuration(
+        name, duration, f"{active.bound.name} {active.bound.range}, at {active.time:.3g} s", satisfied
+    )
 
 
-def sentence_of(needs: Sequence[Need]) -> str:
+def sentence_of(required: Sequence[RequiredDuration]) -> str:
     """The plan with the minimum duration, and the others, in a sentence."""
-    possible = [need for need in needs if not math.isnan(need.duration)]
+    possible = [one for one in required if not math.isnan(one.duration)]
     if not possible:
         return "Under these limits no plan is possible."
-    first = min(possible, key=lambda need: need.duration)
-    others = ", ".join(f"{need.name} {need.duration:.4g} s" for need in possible if need is not first)
-    never = [need.name for need in needs if math.isnan(need.duration)]
+    first = min(possible, key=lambda one: one.duration)
+    others = ", ".join(f"{one.name} {one.duration:.4g} s" for one in possible if one is not first)
+    never = [one.name for one in required if math.isnan(one.duration)]
     without = f"; {', '.join(never)} cannot keep them at any" if never else ""
     return f"Under the same limits {first.name} is the fastest with {first.duration:.4g} s ({others}{without})."
