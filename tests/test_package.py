@@ -59,7 +59,7 @@ FIXED = (
     "metrics.ise",
     "metrics.itae",
     "metrics.effort",
-    "metrics.excess_length",
+    "metrics.wandering",
 )
 
 

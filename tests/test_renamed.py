@@ -7,7 +7,7 @@ import warnings
 import pytest
 
 import ctrlplan as cp
-from ctrlplan import planning
+from ctrlplan import planning, reports
 from ctrlplan._renamed import renamed_argument, warn_renamed
 
 MOVE = [cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1, 0, 0)]
@@ -50,8 +50,7 @@ OLD_NAMES = [
     (lambda: cp.PiecewiseSpline(MOVE), "legs", "segments"),
     (lambda: cp.clearance(PLANE, [cp.Disc((9.0, 0.0), 1.0)]), "least", "minimum"),
     (lambda: cp.fastest(cp.PolySpline(MOVE), {"velocity": 1.0}), "refusal", "rejection"),
-    (lambda: cp.metrics, "wandering", "excess_length"),
-    (lambda: cp.metrics, "turning_points", "extra_reversals"),
+    (lambda: reports, "plot_rivals", "plot_baselines"),
     (lambda: planning, "path_length", "plan_length"),
     (lambda: planning, "wandering", "plan_excess_length"),
 ]
@@ -67,12 +66,5 @@ def test_an_old_name_of_a_member_gives_the_new_one_with_a_warning(made, old, new
 
 
 def test_a_name_that_never_was_is_an_error():
-    with pytest.raises(AttributeError, match=r"module .ctrlplan\.metrics. has no attribute .wander."):
-        cp.metrics.wander  # noqa: B018
-
-
-def test_the_old_name_of_an_objective_chooses_the_same_alpha():
-    corner = [cp.Waypoint(0, [0, 0], 0), cp.Waypoint(1, [1, 0]), cp.Waypoint(2, [1, 1], 0)]
-    with pytest.warns(FutureWarning, match="wandering"):
-        old = cp.choose_alpha(corner, "wandering")
-    assert float(old) == float(cp.choose_alpha(corner, "excess_length"))
+    with pytest.raises(AttributeError, match=r"module .ctrlplan\.planning. has no attribute .wander."):
+        planning.wander  # noqa: B018

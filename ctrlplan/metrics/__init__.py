@@ -5,17 +5,14 @@ last. Where leading axes are allowed, (..., ntime), a single record gives a floa
 samples a signal is taken for a cubic, so that a smooth signal's metrics are of fourth order in the sample spacing.
 """
 
-from ctrlplan import _renamed
 from ctrlplan.metrics._control import effort, peak, saturation_time, total_variation
 from ctrlplan.metrics._error import iae, ise, itae
-from ctrlplan.metrics._path import excess_length, excess_variation, extra_reversals, jerk_cost, outside_box, path_length
+from ctrlplan.metrics._path import excess_variation, jerk_cost, outside_box, path_length, turning_points, wandering
 from ctrlplan.metrics._response import lag, overshoot, settling_time, tracking_settling_time
 
 __all__ = [
     "effort",
-    "excess_length",
     "excess_variation",
-    "extra_reversals",
     "iae",
     "ise",
     "itae",
@@ -29,6 +26,6 @@ __all__ = [
     "settling_time",
     "total_variation",
     "tracking_settling_time",
+    "turning_points",
+    "wandering",
 ]
-
-__getattr__ = _renamed.renamed_members(__name__, {"turning_points": "extra_reversals", "wandering": "excess_length"})

@@ -52,7 +52,7 @@ def path_length(timepts: ArrayLike, path: ArrayLike) -> float:
     return float(each(lambda p: _length(t, p), (), positions))
 
 
-def excess_length(timepts: ArrayLike, path: ArrayLike, points: ArrayLike) -> float:
+def wandering(timepts: ArrayLike, path: ArrayLike, points: ArrayLike) -> float:
     r"""Length of a path beyond that of its waypoints' polyline.
 
     .. math:: L / L_0 - 1, \qquad L_0 = \sum_j |w_{j+1} - w_j|
@@ -82,9 +82,9 @@ def excess_length(timepts: ArrayLike, path: ArrayLike, points: ArrayLike) -> flo
     Examples
     --------
     >>> import numpy as np
-    >>> from ctrlplan.metrics import excess_length
+    >>> from ctrlplan.metrics import wandering
     >>> t = np.linspace(0, np.pi, 101)
-    >>> round(excess_length(t, [np.cos(t), np.sin(t)], [[1, -1], [0, 0]]), 6)
+    >>> round(wandering(t, [np.cos(t), np.sin(t)], [[1, -1], [0, 0]]), 6)
     0.570796
     """
     t = times(timepts)
@@ -123,7 +123,7 @@ def excess_variation(timepts: ArrayLike, path: ArrayLike, points: ArrayLike) -> 
     Raises
     ------
     ValueError
-        As `excess_length`.
+        As `wandering`.
     TypeError
         If an argument is not made of real numbers.
 
@@ -147,7 +147,7 @@ def excess_variation(timepts: ArrayLike, path: ArrayLike, points: ArrayLike) -> 
     return float(each(excess, (), positions))
 
 
-def extra_reversals(timepts: ArrayLike, path: ArrayLike, points: ArrayLike) -> int:
+def turning_points(timepts: ArrayLike, path: ArrayLike, points: ArrayLike) -> int:
     """Count the turns of a path that its waypoints do not force.
 
     A turn is a change of direction of one axis. Each axis's turns beyond those of its waypoints are counted, and
@@ -171,16 +171,16 @@ def extra_reversals(timepts: ArrayLike, path: ArrayLike, points: ArrayLike) -> i
     Raises
     ------
     ValueError
-        As `excess_length`.
+        As `wandering`.
     TypeError
         If an argument is not made of real numbers.
 
     Examples
     --------
     >>> import numpy as np
-    >>> from ctrlplan.metrics import extra_reversals
+    >>> from ctrlplan.metrics import turning_points
     >>> t = np.linspace(0, 10, 101)
-    >>> extra_reversals(t, np.sin(t), [0, 1, np.sin(10)])
+    >>> turning_points(t, np.sin(t), [0, 1, np.sin(10)])
     2
     """
     t = times(timepts)
@@ -216,7 +216,7 @@ def outside_box(timepts: ArrayLike, path: ArrayLike, points: ArrayLike) -> float
     Raises
     ------
     ValueError
-        As `excess_length`.
+        As `wandering`.
     TypeError
         If an argument is not made of real numbers.
 

@@ -115,7 +115,7 @@ def choose_alpha(
     waypoints : iterable of Waypoint
         What the plan meets.
     objective : str or callable, optional
-        What should be least: "path" (length), "excess_length", "peak_velocity",
+        What should be least: "path" (length), "wandering", "peak_velocity",
         "peak_acceleration", "peak_jerk", "peak_snap", "squared_velocity", ...,
         "squared_snap", an objective such as ``PeakDerivative(5)``, or any
         function of a plan that returns a number. Axes must share a unit.

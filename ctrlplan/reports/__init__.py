@@ -1,8 +1,6 @@
 """Tables, figures and pages: where results are shown."""
 
-from typing import Any
-
-from ctrlplan._renamed import warn_renamed
+from ctrlplan import _renamed
 from ctrlplan.reports.crane_figures import plot_motion, plot_online, plot_paths, plot_sketch, plot_step, plot_time
 from ctrlplan.reports.figures import (
     plot_bands,
@@ -19,14 +17,6 @@ from ctrlplan.reports.parts import Cell, Head, Items, MetricsTable, Part, Pictur
 from ctrlplan.reports.planning_figures import plot_baselines
 from ctrlplan.reports.sections import draw
 from ctrlplan.reports.words import Verdict, summary, verdicts
-
-
-def __getattr__(name: str) -> Any:
-    if name != "plot_rivals":
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    warn_renamed("plot_rivals", "plot_baselines")
-    return plot_baselines
-
 
 __all__ = [
     "Cell",
@@ -64,3 +54,5 @@ __all__ = [
     "write_page",
     "write_report",
 ]
+
+__getattr__ = _renamed.renamed_members(__name__, {"plot_rivals": "plot_baselines"})

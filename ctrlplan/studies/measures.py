@@ -290,7 +290,7 @@ MEASURES = {
         "Path length beyond the waypoints' polyline",
         "",
         "path",
-        _smooth(lambda seen: metrics.excess_length(seen.t, seen.path, seen.points)),
+        _smooth(lambda seen: metrics.wandering(seen.t, seen.path, seen.points)),
     ),
     "excess_variation": Measure(
         "Variation beyond what the waypoints force",
@@ -302,7 +302,7 @@ MEASURES = {
         "Turning points beyond those forced",
         "",
         "path",
-        _smooth(lambda seen: metrics.extra_reversals(seen.t, seen.path, seen.points)),
+        _smooth(lambda seen: metrics.turning_points(seen.t, seen.path, seen.points)),
     ),
     "outside_box": Measure(
         "Distance outside the waypoints' box",

@@ -47,7 +47,7 @@ def beside(benchmark, capsys, request):
 
 
 @pytest.mark.benchmark(group="alpha")
-@pytest.mark.parametrize("name", ["path", "excess_length", "peak_velocity", "peak_jerk", "squared_jerk"])
+@pytest.mark.parametrize("name", ["path", "wandering", "peak_velocity", "peak_jerk", "squared_jerk"])
 def test_choose_alpha(beside, name):
     """Peer: bounded minimisation of the same objective from 32 parts of the range."""
     goal = OBJECTIVES[name]

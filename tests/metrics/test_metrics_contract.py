@@ -50,8 +50,8 @@ def test_docstring_has_every_section(name):
 @pytest.mark.parametrize("name", NAMES)
 def test_one_record_gives_a_plain_number(name):
     value = call(name)
-    assert type(value) is (int if name == "extra_reversals" else float)
-    assert value >= 0 or name == "excess_length"
+    assert type(value) is (int if name == "turning_points" else float)
+    assert value >= 0 or name == "wandering"
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -130,7 +130,7 @@ def test_a_scalar_is_no_signal(name):
         call(name, signal=1.0)
 
 
-INFINITE = [n for n in NAMES if n not in ("lag", "saturation_time", "extra_reversals")]
+INFINITE = [n for n in NAMES if n not in ("lag", "saturation_time", "turning_points")]
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -78,8 +78,8 @@ CASES = {
         lambda t: metrics.path_length(t, [3 * np.cos(t), 4 * np.cos(t)]),
         lambda a, b: 5 * (area(b) - area(a)),
     ),
-    "excess_length": (
-        lambda t: metrics.excess_length(t, [np.cos(t), np.sin(t)], [[0, 3], [0, 4]]),
+    "wandering": (
+        lambda t: metrics.wandering(t, [np.cos(t), np.sin(t)], [[0, 3], [0, 4]]),
         lambda a, b: (b - a) / 5 - 1,
     ),
     "excess_variation": (

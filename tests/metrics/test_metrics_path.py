@@ -30,9 +30,9 @@ def test_a_polyline_does_not_exceed_itself(count):
     t, path = polyline(points, count)
     length = 5 + 2 + 5 + 3
     assert metrics.path_length(t, path) == pytest.approx(length, rel=1e-12)
-    assert metrics.excess_length(t, path, points) == pytest.approx(0, abs=1e-12)
+    assert metrics.wandering(t, path, points) == pytest.approx(0, abs=1e-12)
     assert metrics.excess_variation(t, path, points) == pytest.approx(0, abs=1e-12)
-    assert metrics.extra_reversals(t, path, points) == 0
+    assert metrics.turning_points(t, path, points) == 0
 
 
 def test_closed_forms_on_the_half_circle():
@@ -40,9 +40,9 @@ def test_closed_forms_on_the_half_circle():
     path = np.array([2 * np.cos(t), 2 * np.sin(t)])
     ends = [[2, -2], [0, 0]]
     assert metrics.path_length(t, path) == pytest.approx(2 * pi, rel=1e-9)
-    assert metrics.excess_length(t, path, ends) == pytest.approx(pi / 2 - 1, rel=1e-8)
+    assert metrics.wandering(t, path, ends) == pytest.approx(pi / 2 - 1, rel=1e-8)
     assert metrics.excess_variation(t, path, ends) == pytest.approx(1, rel=1e-9)
-    assert metrics.extra_reversals(t, path, ends) == 1
+    assert metrics.turning_points(t, path, ends) == 1
     assert metrics.outside_box(t, path, ends) == pytest.approx(2, rel=1e-9)
     assert metrics.outside_box(t, path, [[2, -2], [0, 0.5]]) == pytest.approx(1.5, rel=1e-9)
 
@@ -67,7 +67,7 @@ def test_the_polynomial_through_the_obstacle_wanders():
     points = np.array([[x[0] for _, x, _ in jets], [z[0] for _, _, z in jets]])
     straight = hypot(5, 5) + 10 + hypot(5, 6)
     assert metrics.path_length(t, path) == pytest.approx(33.02, abs=0.005)
-    assert metrics.excess_length(t, path, points) == pytest.approx(33.02 / straight - 1, abs=3e-4)
+    assert metrics.wandering(t, path, points) == pytest.approx(33.02 / straight - 1, abs=3e-4)
     assert metrics.path_length(t[::20], path[:, ::20]) == pytest.approx(metrics.path_length(t, path), rel=1e-4)
 
 
@@ -86,23 +86,23 @@ def test_turning_points_that_waypoints_force_are_free():
     t = np.linspace(0, 10, 1001)
     wiggle = np.sin(2 * pi * t / 2.5)
     corners = [0, 1, -1, 1, -1, 1, -1, 1, -1, 0]
-    assert metrics.extra_reversals(t, wiggle, corners) == 0
-    assert metrics.extra_reversals(t, wiggle, [0, 1, 0]) == 7
-    assert metrics.extra_reversals(t, wiggle, [0, 1, 2]) == 8
-    assert metrics.extra_reversals(t, [wiggle, t], [corners, np.arange(10)]) == 0
-    assert metrics.extra_reversals(t, [wiggle, t], [np.arange(10), corners]) == 8
-    assert metrics.extra_reversals(t, t, corners) == 0
+    assert metrics.turning_points(t, wiggle, corners) == 0
+    assert metrics.turning_points(t, wiggle, [0, 1, 0]) == 7
+    assert metrics.turning_points(t, wiggle, [0, 1, 2]) == 8
+    assert metrics.turning_points(t, [wiggle, t], [corners, np.arange(10)]) == 0
+    assert metrics.turning_points(t, [wiggle, t], [np.arange(10), corners]) == 8
+    assert metrics.turning_points(t, t, corners) == 0
 
 
 def test_rounding_and_rests_are_no_turns():
     t = np.linspace(0, 10, 1001)
     rough = np.clip(t, 2, 6) + 1e-9 * (-1) ** np.arange(1001)
-    assert metrics.extra_reversals(t, rough, [2, 6]) == 0
+    assert metrics.turning_points(t, rough, [2, 6]) == 0
     there_and_back = np.minimum(np.clip(t, 2, 6), 12 - np.clip(t, 6, 10))
-    assert metrics.extra_reversals(t, there_and_back, [2, 6]) == 1
-    assert metrics.extra_reversals(t, np.zeros(1001), [0, 0]) == 0
+    assert metrics.turning_points(t, there_and_back, [2, 6]) == 1
+    assert metrics.turning_points(t, np.zeros(1001), [0, 0]) == 0
     small = 1e-9 * np.clip(2 * np.sin(t), -1, 1) + 1e-16 * (-1) ** np.arange(1001)
-    assert metrics.extra_reversals(t, small, [0, 0]) == 3
+    assert metrics.turning_points(t, small, [0, 0]) == 3
 
 
 def test_a_corner_of_the_box_is_far_by_the_diagonal():
@@ -124,7 +124,7 @@ def test_a_box_is_left_between_samples():
 def test_points_without_extent_leave_nothing_to_normalise_by():
     t = np.linspace(0, 1, 11)
     for points in ([[0.0], [0.0]], [[1.0, 1.0], [2.0, 2.0]]):
-        assert np.isnan(metrics.excess_length(t, [t, t], points))
+        assert np.isnan(metrics.wandering(t, [t, t], points))
         assert np.isnan(metrics.excess_variation(t, [t, t], points))
     assert metrics.outside_box(t, [t, t], [[0.0], [0.0]]) == pytest.approx(sqrt(2), rel=1e-12)
 
@@ -132,7 +132,7 @@ def test_points_without_extent_leave_nothing_to_normalise_by():
 def test_one_axis_is_a_path_too():
     t = np.linspace(0, 10, 501)
     p = np.sin(t)
-    for metric in (metrics.excess_length, metrics.excess_variation, metrics.extra_reversals, metrics.outside_box):
+    for metric in (metrics.wandering, metrics.excess_variation, metrics.turning_points, metrics.outside_box):
         assert metric(t, p, [0, 1, 0.5]) == metric(t, [p], [[0, 1, 0.5]])
     assert metrics.path_length(t, p) == metrics.path_length(t, [p])
 
@@ -140,7 +140,7 @@ def test_one_axis_is_a_path_too():
 @pytest.mark.parametrize("points", [[[0, 1]], [0, 1], np.zeros((2, 0)), np.zeros((2, 2, 2)), np.zeros((3, 2))])
 def test_points_of_other_axes_are_rejected(points):
     t = np.linspace(0, 1, 11)
-    for metric in (metrics.excess_length, metrics.excess_variation, metrics.extra_reversals, metrics.outside_box):
+    for metric in (metrics.wandering, metrics.excess_variation, metrics.turning_points, metrics.outside_box):
         with pytest.raises(ValueError, match=r"^points must have shape \(2, npoints\)"):
             metric(t, [t, t], points)
 
@@ -154,14 +154,14 @@ def test_a_path_has_two_array_axes_at_most():
 
 
 @given(st.floats(0, 2 * pi), st.floats(-5, 5), st.floats(-5, 5))
-def test_length_and_excess_length_do_not_mind_where_the_axes_point(angle, right, up):
+def test_length_and_wandering_do_not_mind_where_the_axes_point(angle, right, up):
     t = np.linspace(0, 8, 801)
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     shift = np.array([[right], [up]])
     moved = turn @ wave(t) + shift
     assert metrics.path_length(t, moved) == pytest.approx(metrics.path_length(t, wave(t)), rel=1e-7)
-    excess_length = metrics.excess_length(t, wave(t), SQUARE)
-    assert metrics.excess_length(t, moved, turn @ SQUARE + shift) == pytest.approx(excess_length, rel=1e-7)
+    wandering = metrics.wandering(t, wave(t), SQUARE)
+    assert metrics.wandering(t, moved, turn @ SQUARE + shift) == pytest.approx(wandering, rel=1e-7)
 
 
 @given(st.floats(0.01, 100), st.floats(0.01, 100), st.integers(0, 3))
@@ -170,7 +170,7 @@ def test_scale_pace_and_quarter_turns(size, pace, quarters):
     turn = np.linalg.matrix_power(np.array([[0.0, -1], [1, 0]]), quarters)
     path, points = size * turn @ wave(t), size * turn @ SQUARE
     assert metrics.path_length(pace * t, path) == pytest.approx(size * metrics.path_length(t, wave(t)), rel=1e-6)
-    for metric in (metrics.excess_length, metrics.excess_variation, metrics.extra_reversals):
+    for metric in (metrics.wandering, metrics.excess_variation, metrics.turning_points):
         assert metric(pace * t, path, points) == pytest.approx(metric(t, wave(t), SQUARE), rel=1e-6)
     outside = metrics.outside_box(t, wave(t), SQUARE)
     assert metrics.outside_box(pace * t, path, points) == pytest.approx(size * outside, rel=1e-6)
@@ -182,5 +182,5 @@ def test_the_polyline_itself_is_the_shortest_way(corners, count):
     t, path = polyline(points, count)
     length = np.hypot(*np.diff(points)).sum()
     assert metrics.path_length(t, path) == pytest.approx(length, rel=1e-9, abs=1e-9)
-    assert metrics.extra_reversals(t, path, points) == 0
+    assert metrics.turning_points(t, path, points) == 0
     assert metrics.outside_box(t, path, points) <= 1e-9

@@ -116,8 +116,8 @@ def test_crane_path_is_least_to_a_millionth_of_its_length():
     assert not found.tied
 
 
-def test_crane_excess_length_is_the_same_choice():
-    path, wander = cp.choose_alpha(OBSTACLE, "path"), cp.choose_alpha(OBSTACLE, "excess_length")
+def test_crane_wandering_is_the_same_choice():
+    path, wander = cp.choose_alpha(OBSTACLE, "path"), cp.choose_alpha(OBSTACLE, "wandering")
     assert wander.alpha == pytest.approx(path.alpha, abs=1e-6)
     assert wander.value == pytest.approx(path.value / POLYLINE - 1, abs=1e-9)
     assert wander.blow_up > path.alpha
@@ -171,7 +171,7 @@ def test_many_random_waypoints_have_no_better_alpha(seed, name):
     check_global(seed, cp.PiecewiseSpline if seed % 3 == 0 else cp.TrigSpline, name, 600)
 
 
-@pytest.mark.parametrize("name", ["path", "excess_length"])
+@pytest.mark.parametrize("name", ["path", "wandering"])
 def test_straight_moves_tie_and_take_the_least_jerk(name):
     straight = [Waypoint(0, [0, 0], 0, 0), Waypoint(2, [3, 4], 0, 0)]
     found = cp.choose_alpha(straight, name)
@@ -273,7 +273,7 @@ def brute_peak(nu):
 
 @pytest.mark.parametrize("name", ["speed", "", "Path"])
 def test_names_that_are_no_objectives(name):
-    with pytest.raises(ValueError, match=f"objective must be one of path, excess_length.*or a function, got '{name}'"):
+    with pytest.raises(ValueError, match=f"objective must be one of path, wandering.*or a function, got '{name}'"):
         cp.choose_alpha(REST, name)
 
 
@@ -287,7 +287,7 @@ def test_nan_is_rejected():
     with pytest.raises(ValueError, match=r"objective must return a number.* got nan at alpha = 2\.\d+"):
         cp.choose_alpha(REST, lambda plan: np.nan if plan.alpha > 2.0 else 1.0)
     with pytest.raises(ValueError, match=r"objective must return a number.* got nan at alpha = 0"):
-        cp.choose_alpha([Waypoint(0, 1, 0), Waypoint(1, 1, 0)], "excess_length")
+        cp.choose_alpha([Waypoint(0, 1, 0), Waypoint(1, 1, 0)], "wandering")
 
 
 @pytest.mark.parametrize("value", [None, "high", np.ones(2)])

@@ -33,7 +33,7 @@ PLANS = {
 }
 NAMES = {
     "path": plan_length,
-    "excess_length": plan_excess_length,
+    "wandering": plan_excess_length,
     **{f"peak_{name}": PeakDerivative(k) for k, name in enumerate(["velocity", "acceleration", "jerk", "snap"], 1)},
     **{
         f"squared_{name}": SquaredDerivative(k)
@@ -153,7 +153,7 @@ def test_costs_are_integrals(name, nu):
     assert SquaredDerivative(nu)(plan) == pytest.approx(expected, rel=1e-10)
 
 
-def test_excess_length_is_the_path_beyond_the_polyline():
+def test_wandering_is_the_path_beyond_the_polyline():
     plan = PLANS["trigonometric"]
     polyline = sum(np.linalg.norm(b - a) for a, b in zip(JETS[:, 0], JETS[1:, 0], strict=False))
     path = integral(plan, lambda t: float(np.linalg.norm(plan.jet(t, 1)[1])))
@@ -166,7 +166,7 @@ def test_a_straight_move_does_not_wander():
     )
 
 
-def test_excess_length_is_undefined_without_a_polyline():
+def test_wandering_is_undefined_without_a_polyline():
     still = cp.PolySpline([Waypoint(0, 1, 0), Waypoint(1, 1, 0)])
     assert np.isnan(plan_excess_length(still))
     assert np.isnan(
@@ -236,10 +236,10 @@ def test_an_objective_of_a_users_own_may_declare_its_size():
 
     @of_size(1.0)
     def excess(plan):
-        return OBJECTIVES["excess_length"](plan)
+        return OBJECTIVES["wandering"](plan)
 
     points = [cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1, 0, 0)]
-    own, known = (cp.choose_alpha(points, objective) for objective in (excess, "excess_length"))
+    own, known = (cp.choose_alpha(points, objective) for objective in (excess, "wandering"))
     assert (own.alpha, own.tied, own.blow_up) == (known.alpha, known.tied, known.blow_up)
     assert own.tied
     assert declared_size(excess) == 1.0
