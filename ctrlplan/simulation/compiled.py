@@ -255,7 +255,7 @@ class CompiledSolver:
         Evaluations of the right-hand side so far, counted where a comparison with Python is expected.
     """
 
-    calls_blocks = False
+    calls_blocks = relative_by_state = False
 
     def __init__(
         self,
@@ -267,7 +267,7 @@ class CompiledSolver:
     ) -> None:
         self.form, self._p = equations, equations.parameters(params)
         self._scales, self._max_steps = scales, max_steps
-        self._tolerances = tolerances
+        self._tolerances = float(tolerances.rtol.min(initial=1.0)), tolerances.atol
         self._longest, self._stiff = 0.0, False
         self.evaluations = 0
         self.switches: list[float] = []

@@ -284,11 +284,11 @@ class Interpreted:
 class InterpretedSolver:
     """LSODA on a network's equations, segment by segment."""
 
-    calls_blocks = True
+    calls_blocks = relative_by_state = True
 
     def __init__(self, equations: Interpreted, tolerances: Tolerances, scales: Scales) -> None:
         self._equations, self._scales = equations, scales
-        self._rtol, self._atol = max(tolerances.rtol, _MIN_RTOL), tolerances.atol
+        self._rtol, self._atol = np.maximum(tolerances.rtol, _MIN_RTOL), tolerances.atol
         self._bounded = any(b.changes_unseen and b.depends_on_time for b in equations.network.blocks)
         self._segments, self._next = 0, 0
         self.switches: list[float] = []

@@ -56,6 +56,10 @@ class NumericalSolver(Solver, Protocol):
     def calls_blocks(self) -> bool:
         """Whether the blocks' own functions are called, which may raise outside of their domain."""
 
+    @property
+    def relative_by_state(self) -> bool:
+        """Whether each state has a relative tolerance of its own."""
+
     def count(self) -> None:
         """Count evaluations from now on."""
 
@@ -139,9 +143,10 @@ def _with_closer_states(attempt: Attempt[S], spare: Job) -> Attempt[S]:
     if not loose.any():
         return attempt
     try:
-        again = Attempt(
-            spare, attempt.method, attempt.scales.with_closer_states(attempt.run.states, loose, attempt.noise())
+        scales = attempt.scales.with_closer_states(
+            attempt.run.states, loose, attempt.noise(), attempt.solver.relative_by_state
         )
+        again = Attempt(spare, attempt.method, scales)
         again.solver.count()
         again.go()
     except SolverError:
@@ -377,7 +382,7 @@ def _accuracy_note(attempt: Attempt[S]) -> str:
     what = "are differences of larger terms" if attempt.growth <= _GROWTH else "grow apart from their neighbours"
     if np.any(attempt.drift > own):
         what = "depend on small parts of large states"
-    advice = f"rtol = {needed:.0e} would do" if needed > 1e-12 / scales.relative else "no tolerance would do"
+    advice = f"rtol = {needed:.0e} would do" if needed > 1e-12 / scales.relative.min() else "no tolerance would do"
     return f"outputs {names} {what} and are uncertain by about {float(part.max()):.1g} of their range: {advice}"
 
 

@@ -11,7 +11,8 @@ An angle of thousands of turns is accurate to a small part of itself, and a
 position that depends on its sine is then not. Where the slopes of the rates at
 some states of a run show that the tolerated error of one state displaces
 another by more than is tolerated there, the run is repeated with a thousandth
-of the relative tolerance; how far the two runs are apart tells the error.
+of the relative tolerance, of that state alone where the solver has tolerances
+by state; how far the two runs are apart tells the error.
 """
 
 from __future__ import annotations
@@ -57,16 +58,16 @@ _A_STEP, _A_SEGMENT = 100.0, 4.0
 
 
 class Tolerances(NamedTuple):
-    """Tolerances of a step, relative and in the scales of the states."""
+    """Tolerances of a step: relative, shape (nstates,), and in the scales of the states."""
 
-    rtol: float
+    rtol: Array
     atol: float
 
     @classmethod
     def of_run(cls, rtol: float, scales: Scales, nsegments: int, tighter: float = 1.0) -> Tolerances:
         """Of a run that restarts at every segment: the errors of all add up."""
         divisor = tighter * max(_A_STEP, _A_SEGMENT * nsegments)
-        return cls(max(rtol * scales.relative / divisor, min(rtol, 1e-13)), scales.atol / divisor)
+        return cls(np.maximum(rtol * scales.relative / divisor, min(rtol, 1e-13)), scales.atol / divisor)
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,19 +80,19 @@ class Scales:
         In the units of the states.
     atol : float
         Absolute tolerance in units of the scales.
-    relative : float
+    relative : ndarray, shape (nstates,)
         Part of the relative tolerance that is used.
     """
 
     shift: Array
     scale: Array
     atol: float
-    relative: float = 1.0
+    relative: Array
 
     @classmethod
     def plain(cls, nstates: int, atol: float | None) -> Scales:
         """The states as they are, with a tolerance in their own units."""
-        return cls(np.zeros(nstates), np.ones(nstates), RELATIVE if atol is None else atol)
+        return cls(np.zeros(nstates), np.ones(nstates), RELATIVE if atol is None else atol, np.ones(nstates))
 
     def renewed(self, states: Array, noise: Callable[[], Array]) -> Scales | None:
         """Scales that fit the states of a run; None where these do.
@@ -116,14 +117,14 @@ class Scales:
         shift = np.where(about, states[:, 0], self.shift)
         if np.all(scale >= _SMALL * self.scale) and np.array_equal(shift, self.shift):
             return None
-        return Scales(shift, np.minimum(scale, np.where(small, self.scale, np.inf)), self.atol)
+        return replace(self, shift=shift, scale=np.minimum(scale, np.where(small, self.scale, np.inf)))
 
     def uncertainty(self, states: Array, rtol: float) -> Array:
         """Error that the states of a run are taken to have (nstates,), where errors of steps do not grow."""
         size = np.abs(states - self.shift[:, None]).max(axis=1, initial=0.0)
         return _ADDED * (rtol * self.relative * size + self.atol * self.scale)
 
-    def with_closer_states(self, states: Array, loose: NDArray[np.bool_], noise: Array) -> Scales:
+    def with_closer_states(self, states: Array, loose: NDArray[np.bool_], noise: Array, by_state: bool) -> Scales:
         """Scales with which large states that others depend on absolutely are integrated more closely.
 
         Parameters
@@ -134,11 +135,13 @@ class Scales:
             States whose relative tolerance was too large for others.
         noise : ndarray, shape (nstates,)
             Rounding noise of each rate times the duration.
+        by_state : bool
+            Whether the solver has relative tolerances by state; otherwise all get the smaller one.
         """
         size = np.abs(states - self.shift[:, None]).max(axis=1, initial=0.0)
         close = np.where(loose & (size > 0.0), np.maximum(_OWN * size, _NOISE * noise), np.inf)
         scale = np.minimum(self.scale, close)
-        return replace(self, scale=scale, relative=_CLOSER)
+        return replace(self, scale=scale, relative=np.where(loose | (not by_state), _CLOSER, self.relative))
 
 
 def output_uncertainty(outputs: Callable[[Array], Array], states: Array, uncertainty: Array) -> tuple[Array, Array]:

@@ -295,3 +295,27 @@ def test_a_plant_that_is_fed_by_the_phase_of_an_oscillator():
     found = cp.simulate(block, t, None, [0.0, start], method="compiled")
     assert np.abs(found.outputs - expected).max() < ALLOWED * np.ptp(expected)
     assert "uncertain" not in found.reason
+
+
+def calls_of_a_car_with_a_noisy_signal(size):
+    """Calls of its equations; its angle is huge, and nothing depends on the signal, which has some size."""
+    calls = 0
+
+    def rates(t, x, u, params):
+        nonlocal calls
+        calls += 1
+        noise = 1e-9 * np.sin(1e17 * t)
+        return [100.0 * np.cos(x[2]), 100.0 * np.sin(x[2]), 100.0, size * (np.cos(t) + noise)]
+
+    car = ct.nlsys(rates, inputs=0, outputs=4, states=4, name="car")
+    t, start = np.linspace(0.0, 2.5, 101), 2e4
+    angle = start + 100.0 * t
+    expected = np.array([np.sin(angle) - np.sin(start), np.cos(start) - np.cos(angle), angle, size * np.sin(t)])
+    found = cp.simulate(car, t, None, [0.0, 0.0, start, 0.0], method="python")
+    assert np.all(np.abs(found.outputs - expected).max(axis=1) < ALLOWED * np.ptp(expected, axis=1))
+    return calls
+
+
+def test_a_large_state_that_nothing_depends_on_is_not_integrated_more_closely():
+    small, large = (calls_of_a_car_with_a_noisy_signal(size) for size in (1.0, 1e8))
+    assert large < 2 * small
