@@ -16,7 +16,6 @@ from typing import Literal, TypeVar
 import numpy as np
 
 from ctrlplan._checks import checked_count
-from ctrlplan._renamed import warn_renamed
 from ctrlplan.trajectories import Trajectory
 from ctrlplan.trajectories.common import Array
 from ctrlplan.trajectories.quadrature import gauss
@@ -192,9 +191,6 @@ OBJECTIVES: dict[ObjectiveName, Objective] = {
 def checked_objective(objective: ObjectiveName | Objective) -> Objective:
     """Objective by its name, or the function itself."""
     if isinstance(objective, str):
-        if str(objective) == "wandering":
-            warn_renamed('objective "wandering"', '"excess_length"')
-            return plan_excess_length
         if objective not in OBJECTIVES:
             raise ValueError(f"objective must be one of {', '.join(OBJECTIVES)} or a function, got {objective!r}")
         return OBJECTIVES[objective]
