@@ -1,4 +1,4 @@
-"""Functions of time with exact derivatives: what a loop is asked to follow."""
+"""Functions of time with exact derivatives: the references of a control loop."""
 
 from ctrlplan.trajectories.combined import Joined, Scaled, Selected, Stacked, Sum, stack
 from ctrlplan.trajectories.continuity import Jump

@@ -1,4 +1,4 @@
-"""Chebyshev polynomials that stand for an analytic function to rounding."""
+"""Chebyshev interpolants of analytic functions, accurate to rounding."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ _DEGREES = (16, 32, 64, 128)
 def chebyshev_proxy(
     jet: Callable[[Array, int], Array], interval: tuple[float, float], low: int, high: int
 ) -> Array | None:
-    """Coefficients of derivatives low to high, each fitted to its own exact values.
+    """Chebyshev coefficients of derivatives low to high, each from exact values.
 
     Returns
     -------
     ndarray, shape (high - low + 1, naxes, size), or None
-        None where 128 degrees do not resolve the function.
+        None where degree 128 does not resolve the function.
     """
     for degree in _DEGREES:
         values = jet(points(degree, *interval), high)[low:]
@@ -34,10 +34,11 @@ def chebyshev_proxy(
 
 
 def resolved_size(coefficients: Array, rtol: float = 3e-14) -> int | None:
-    """Number of leading coefficients that matter, None where the last ones still do.
+    """Number of significant leading coefficients; None if not resolved.
 
-    The last quarter of a resolved series lies below `rtol` of its largest: it
-    is the rounding of the values, and so is whatever else is no larger.
+    A series is resolved if its last quarter lies below `rtol` of its largest
+    coefficient. That quarter is the rounding of the values, and so are all
+    coefficients of the same size.
     """
     size = np.abs(coefficients).reshape(-1, coefficients.shape[-1])
     scale = size.max(axis=1, keepdims=True)
@@ -55,7 +56,7 @@ def fit(function: Callable[[Array], Array], interval: tuple[float, float], degre
 
 
 def real_roots(coefficients: Array) -> Array:
-    """Roots of a Chebyshev series in [-1, 1], pairs that rounding split included."""
+    """Roots of a Chebyshev series in [-1, 1], including double roots split by rounding."""
     size = np.abs(coefficients)
     matters = np.flatnonzero(size > 1e-15 * size.max()) if size.max() > 0 else np.array([], dtype=int)
     if not matters.size or matters[-1] == 0:

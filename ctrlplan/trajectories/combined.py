@@ -1,4 +1,4 @@
-"""Trajectories made of others: sums, multiples, axes side by side, one after the other."""
+"""Combinations of trajectories: sums, multiples, stacked axes, sequences."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from ctrlplan.trajectories.trajectory import Trajectory
 
 
 class _Combined(Trajectory):
-    """Trajectory of several parts; a new kind says how their jets combine."""
+    """Trajectory of several parts; a subclass defines how their jets combine."""
 
     parts: tuple[Trajectory, ...]
     initial: Array
@@ -61,7 +61,7 @@ class _Combined(Trajectory):
 
     @abstractmethod
     def _combine(self, values: list[Array]) -> Array:
-        """Jets, or held positions, of the whole from those of the parts (axes second to last)."""
+        """Jets, or constant positions, of the combination from those of the parts (axes second to last)."""
 
     def map_time(self, origin: float, target: float, rate: float) -> Self:
         """Same path at other times; as `Trajectory.map_time`."""
@@ -70,7 +70,7 @@ class _Combined(Trajectory):
     def _sample(self, t: Array, low: int, high: int, left: bool) -> Array:
         out = super()._sample(t, low, high, left)
         at_end = t == self.end
-        if not left and at_end.any():  # the end belongs to the parts, each by its own rule
+        if not left and at_end.any():  # each part defines its own value at the end
             out[:, :, at_end] = self._combine([part._sample(t[at_end], low, high, left) for part in self.parts])
         return out
 
@@ -96,11 +96,11 @@ class Sum(_Combined):
     Parameters
     ----------
     parts : iterable of Trajectory
-        One or more. Each holds its ends outside its own interval.
+        One or more. Each is constant outside its own interval.
     shaped : bool, optional
-        Whether the parts are delayed by the times of a shaper (`Shaper`), which
-        another duration would change: `retime`, alone or inside of a
-        combination, then raises a ValueError.
+        Whether the parts are the delayed parts of an input shaper (`Shaper`).
+        Another duration would change the delays: `retime`, of the sum or of a
+        combination that contains it, then raises a ValueError.
 
     Raises
     ------
@@ -141,7 +141,7 @@ class Sum(_Combined):
 
 
 class Stacked(_Combined):
-    """Axes of several trajectories side by side; made by `stack`."""
+    """Stacked axes of several trajectories; returned by `stack`."""
 
     def __init__(self, parts: Iterable[Trajectory], labels: Sequence[str] | None = None) -> None:
         members = _checked_parts(parts)
@@ -157,7 +157,7 @@ class Stacked(_Combined):
 
 
 class Selected(_Combined):
-    """Some axes of a trajectory; made by `select`."""
+    """Some axes of a trajectory; returned by `select`."""
 
     _axes: list[int]
 
@@ -182,9 +182,9 @@ class Scaled(_Combined):
     Parameters
     ----------
     part : Trajectory
-        What is multiplied.
+        Trajectory to be multiplied.
     factor : float
-        By what, finite.
+        Factor, finite.
     """
 
     factor: float
@@ -211,25 +211,25 @@ class Scaled(_Combined):
 
 
 class Joined(Trajectory):
-    """Trajectories one after the other; made by `then`.
+    """Sequence of trajectories; returned by `then`.
 
     Parameters
     ----------
     parts : iterable of Trajectory
-        Each is shifted to begin where the one before it ends.
+        Each is shifted in time to begin where the previous one ends.
 
     Raises
     ------
     ValueError
-        If the axes differ in number, or a first position differs from the last
-        one before it by more than 1e-9 of the range of either trajectory and the
-        rounding of positions.
+        If the numbers of axes differ, or if an initial position differs from the
+        previous final position by more than 1e-9 of the range of either
+        trajectory plus the rounding of positions.
     """
 
     parts: tuple[Trajectory, ...]
     initial: Array
     final: Array
-    _segments: list[tuple[Trajectory, int]]  # for each segment a part and one of its own
+    _segments: list[tuple[Trajectory, int]]  # for each segment the part and the part's segment number
 
     def __init__(self, parts: Iterable[Trajectory]) -> None:
         members = list(_checked_parts(parts))
@@ -240,8 +240,8 @@ class Joined(Trajectory):
         self._set(tuple(members), members[0].labels)
 
     @classmethod
-    def as_they_are(cls, parts: Sequence[Trajectory]) -> Self:
-        """Trajectories that follow each other already: no shift rounds their times."""
+    def without_shift(cls, parts: Sequence[Trajectory]) -> Self:
+        """Sequence of trajectories at their own times, without a shift that would round them."""
         return cls._of(tuple(parts), parts[0].labels)
 
     @classmethod
@@ -303,25 +303,25 @@ class Joined(Trajectory):
 
 
 def is_unit_rate(rate: float) -> bool:
-    """Whether a rate leaves the delays of a shaper as they are, to what rounding of a duration costs."""
+    """Whether a rate is 1, so that it preserves the delays of a shaper, up to the rounding of a duration."""
     return abs(rate - 1.0) <= 1e-9
 
 
 def is_shaped(plan: Trajectory) -> bool:
-    """Whether a plan, or one that it is made of, is shaped."""
+    """Whether a plan or one of its parts is shaped."""
     made_of = getattr(plan, "parts", (getattr(plan, "plan", None),))
     return bool(getattr(plan, "shaped", False)) or any(is_shaped(p) for p in made_of if isinstance(p, Trajectory))
 
 
 def stack(plans: Iterable[Trajectory], labels: Sequence[str] | None = None) -> Trajectory:
-    """Axes of several trajectories side by side.
+    """Trajectory with the axes of several trajectories.
 
     Parameters
     ----------
     plans : iterable of Trajectory
-        One or more, of any intervals: each holds its ends outside its own.
+        One or more, on any intervals: each is constant outside its own.
     labels : sequence of str, optional
-        Names of all axes; needed where those of the plans collide.
+        Names of all axes; required if names of the plans coincide.
 
     Returns
     -------
@@ -363,7 +363,7 @@ def _same_axes(parts: tuple[Trajectory, ...]) -> tuple[Trajectory, ...]:
 
 
 def _check_join(before: Trajectory, after: Trajectory) -> None:
-    """Refuse a jump of position, or a gap in time beyond the clock's rounding."""
+    """Raise for a jump of position, or for a gap in time beyond the rounding of times."""
     if abs(after.start - before.end) > 1e-9 * (before.duration + after.duration):
         raise ValueError(f"parts must follow one another in time, got {after.start} s after {before.end} s")
     last, first = before.final, after.initial
@@ -375,7 +375,7 @@ def _check_join(before: Trajectory, after: Trajectory) -> None:
 
 
 def _slack(*parts: Trajectory) -> Array:
-    """Difference of positions (naxes,) that counts as none: part of a range, so that a far origin hides no jump."""
+    """Tolerance (naxes,) of position differences, relative to the range, so that a distant origin hides no jump."""
     extrema = [part.extrema() for part in parts]
     ranges = np.max([e.maximum - e.minimum for e in extrema], axis=0)
     size = np.max([np.maximum(np.abs(e.minimum), np.abs(e.maximum)) for e in extrema], axis=0)

@@ -1,4 +1,4 @@
-"""What every module of this folder uses."""
+"""Helpers shared by the modules of this package."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ FACTORIALS.flags.writeable = False
 
 
 def readonly(values: Array) -> Array:
-    """Same array, which can no longer be written to."""
+    """Same array, made read-only."""
     values.flags.writeable = False
     return values
 
 
 def times_powers(values: Array, base: float, orders: NDArray[np.integer[Any]]) -> Array:
-    """Derivatives (order, ...) times powers of a time or rate: exact 0 stays 0, and nothing leaves floating point."""
+    """Derivatives (order, ...) times powers of a time or rate; exact zeros remain, overflow raises."""
     with np.errstate(all="ignore"):
         found = np.where(values == 0.0, 0.0, values * base**orders)
         size = np.abs(found)
-        shrunk = (size < _TINY) & (np.abs(values) > 1e-290)  # what was nearly 0 may become it
+        shrunk = (size < _TINY) & (np.abs(values) > 1e-290)  # only subnormal values may underflow to 0
         lost = (values != 0.0) & np.isfinite(values) & (shrunk | ~(size < np.inf))
     if lost.any():
         place = tuple(np.argwhere(lost)[0])
@@ -37,7 +37,7 @@ def times_powers(values: Array, base: float, orders: NDArray[np.integer[Any]]) -
 
 
 def derivative_scale(duration: float, order: int) -> Array:
-    """Factors (order + 1,) that make derivatives of Taylor coefficients in parts of a duration; inf beyond floats."""
+    """Factors (order + 1,) from Taylor coefficients in normalised time to derivatives; inf on overflow."""
     with np.errstate(over="ignore", divide="ignore", under="ignore"):
         scale: Array = FACTORIALS[: order + 1] / duration ** np.arange(order + 1)
     return scale

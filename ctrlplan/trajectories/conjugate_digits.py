@@ -1,8 +1,8 @@
-"""Free entries of a piecewise spline in as many digits as their data need.
+"""Free entries of a piecewise spline in multiple-precision arithmetic.
 
 Where segments are of very different durations, the equations of the free
-entries hold powers of those durations, and floating point loses their digits.
-The same equations are made and solved here in decimal arithmetic.
+entries contain powers of those durations and are ill-conditioned in floating
+point. Here the same equations are set up and solved in decimal arithmetic.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _Row = tuple[dict[int, Decimal], list[Decimal]]
 def conjugate_digits(
     alpha: float, times: Sequence[float], ends: Sequence[Ends], free: Sequence[tuple[int, int]], table: Array
 ) -> NDArray[np.object_] | None:
-    """Free entries that leave no jump of their conjugate derivatives, correct to rounding.
+    """Free entries for continuous conjugate derivatives, correct to rounding.
 
     Parameters
     ----------
@@ -39,11 +39,11 @@ def conjugate_digits(
     times : sequence of float
         Times of the waypoints [s].
     ends : sequence of Ends, of length nsegments
-        What determines each segment, free entries included.
+        Orders that determine each segment, free entries included.
     free : sequence of (int, int)
-        Waypoint and order of each free entry, by waypoints.
+        Waypoint and order of each free entry, sorted by waypoint.
     table : ndarray, shape (nwaypoints, size, naxes)
-        Prescribed derivatives; what is free does not count.
+        Prescribed derivatives; values of free entries are ignored.
 
     Returns
     -------
@@ -52,8 +52,8 @@ def conjugate_digits(
     """
     size = table.shape[1]
     durations = np.diff(times)
-    # Each equation holds powers of the durations up to 2 size - 1, elimination the products of two of them; ends that
-    # are nearly one point on the circle divide by powers of their distance.
+    # Equations contain powers of the durations up to 2 size - 1, elimination the products of two of them; ends that
+    # nearly coincide on the circle lead to divisions by powers of their distance.
     spread = max(float(durations.max() / durations.min()), 10.0)
     digits = 40 + math.ceil(2 * size * (2.0 * math.log10(spread) + math.log10(2.0 * math.pi / (2.0 * math.pi - alpha))))
     with decimal.localcontext(decimal.Context(digits, Emin=decimal.MIN_EMIN, Emax=decimal.MAX_EMAX)):
@@ -73,7 +73,7 @@ def _jump(
     ends: Sequence[Ends],
     table: Array,
 ) -> _Row:
-    """Equation of a free entry: the derivative conjugate to it does not jump."""
+    """Equation of a free entry: continuity of its conjugate derivative."""
     i, k = entry
     order = 2 * table.shape[1] - 1 - k
     unknown, known = dict[int, Decimal](), [Decimal(0)] * table.shape[2]
@@ -92,7 +92,7 @@ def _jump(
 
 @lru_cache(maxsize=64)
 def _derivatives(alpha: float, ends: Ends, size: int, digits: int) -> list[list[list[Decimal]]]:
-    """Derivatives 0, ..., 2 size - 1 at the start and at the end of the unit segment, by its data."""
+    """Derivatives 0, ..., 2 size - 1 at both ends of the unit segment, as weights of its prescribed entries."""
     with decimal.localcontext(decimal.Context(digits, Emin=decimal.MIN_EMIN, Emax=decimal.MAX_EMAX)):
         nodes = [Decimal(end) for end in (0, 1) for _ in ends[end]]
         taylor = [basis_series(Decimal(alpha), Decimal(end), nodes, 2 * size - 1, Decimal(0)) for end in (0, 1)]
@@ -103,7 +103,7 @@ def _derivatives(alpha: float, ends: Ends, size: int, digits: int) -> list[list[
             rows.append((dict(enumerate(values[end][k])), unit))
         inverse = _solved(rows)
         if inverse is None:
-            raise ValueError("the entries given at the ends of a segment must determine it, got a singular system")
+            raise ValueError("the entries prescribed at the ends of a segment must determine it, got a singular system")
         columns = list(zip(*inverse, strict=True))
         return [
             [[sum(map(operator.mul, row, column), Decimal(0)) for column in columns] for row in side] for side in values
@@ -111,12 +111,12 @@ def _derivatives(alpha: float, ends: Ends, size: int, digits: int) -> list[list[
 
 
 def _solved(rows: list[_Row]) -> list[list[Decimal]] | None:
-    """Solution of equations by elimination with pivots; None where they are singular."""
+    """Solution by Gaussian elimination with pivoting; None if the equations are singular."""
     left = []
     for coefficients, right in rows:
         size = max(map(abs, coefficients.values()), default=Decimal(0)) or Decimal(1)
         left.append(({n: v / size for n, v in coefficients.items() if v}, [v / size for v in right]))
-    # Rows come by waypoints. `first`: lowest unknown of a row and of all after it, so that few rows are searched.
+    # Rows are sorted by waypoint. `first`: lowest unknown of a row and of all later rows, which limits the search.
     starts = [min(coefficients, default=0) for coefficients, _ in left]
     first = list(itertools.accumulate(starts[::-1], min))[::-1]
     pivots: list[_Row] = []

@@ -1,4 +1,4 @@
-"""Where a derivative of a trajectory jumps."""
+"""Jumps of the derivatives of a trajectory."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ class Jump:
     order : int
         Order of the derivative, 0 the position.
     time : float
-        When [s].
+        Time of the jump [s].
     label : str
         Name of the axis.
     size : float
-        Value after less value before.
+        Value after the jump minus value before.
     """
 
     order: int
@@ -36,8 +36,8 @@ class Jump:
 def find_jumps(plan: Trajectory, order: int) -> tuple[Jump, ...]:
     """Jumps of the derivatives up to an order, lowest order first, then in time.
 
-    Rest before the start and after the end counts: a plan that starts at
-    speed jumps there. Differences below 1e-9 of a derivative's peak, or of the
+    The plan is at rest before its start and after its end: a plan that starts
+    at nonzero velocity jumps there. Differences below 1e-9 of a derivative's peak, or of the
     range of the position, are rounding.
     """
     before = plan.jet(plan.breakpoints, order, left=True)
@@ -46,7 +46,7 @@ def find_jumps(plan: Trajectory, order: int) -> tuple[Jump, ...]:
     after[0, :, -1] = plan.final
     size = after - before
     position, eps = plan.extrema(), float(np.finfo(float).eps)
-    # A far origin of the positions hides no jump.
+    # Relative to the range: a distant origin of the positions hides no jump.
     farthest = np.maximum(np.abs(position.minimum), np.abs(position.maximum))
     slack = [1e-9 * (position.maximum - position.minimum) + 8.0 * eps * farthest]
     slack += [1e-9 * plan.peak(k) for k in range(1, order + 1)]

@@ -1,9 +1,9 @@
-"""Coefficients of the Newton form in as many digits as their data need.
+"""Coefficients of the Newton form in multiple-precision arithmetic.
 
-Waypoints that nearly coincide, as both ends do near alpha = 2 pi, divide the
-rounding of floating point by high powers of their distance. Where that costs
-digits that matter, the same triangular system is made and solved here in
-decimal arithmetic, from the times and entries as they were given.
+Where waypoints nearly coincide, as both ends do near alpha = 2 pi, rounding
+errors are divided by high powers of their distance. If the loss of accuracy
+is significant, the same triangular system is set up and solved here in
+decimal arithmetic, from the given times and entries.
 """
 
 from __future__ import annotations
@@ -46,9 +46,9 @@ def many_digits(
     values : ndarray of float or Decimal, shape (nconstraints, naxes)
         Prescribed derivatives.
     fold : float
-        Part of the function after the last one that is added to it.
+        Weight of the next function that is added to the last one.
     digits : int
-        Decimal digits that rounding may take.
+        Number of decimal digits lost to rounding.
 
     Returns
     -------
@@ -79,13 +79,13 @@ def basis_series(alpha: Decimal, u: Decimal, nodes: list[Decimal], order: int, f
         found += [_product(found[-1], one), _product(found[-1], both)]
     if fold:
         found[-2] = [a + fold * b for a, b in zip(found[-2], found[-1], strict=True)]
-    if len(nodes) % 2:  # the last node stands alone: its function vanishes at those before
+    if len(nodes) % 2:  # unpaired last node: its function vanishes at all previous nodes
         return found
     return found[: len(nodes)]
 
 
 def _pair(alpha: Decimal, left: Decimal, right: Decimal, order: int) -> tuple[Series, Series]:
-    """Series of q q and of q c, `left` and `right` beyond a pair of nodes."""
+    """Series of q q and of q c at distances `left` and `right` from a pair of nodes."""
     rest = [Decimal(0)] * order
     if not alpha:
         return [left * right, left + right, Decimal(1), *rest][: order + 1], [left, Decimal(1), *rest][: order + 1]
@@ -106,7 +106,7 @@ def _product(a: Series, b: Series) -> Series:
 
 
 def _sin_cos(x: Decimal) -> tuple[Decimal, Decimal]:
-    """Sine and cosine by their series, of an angle of a turn at most."""
+    """Sine and cosine by their series, for angles up to 2 pi."""
     digits = decimal.getcontext().prec
     minimum = Decimal(10) ** -(digits + 5)
     sums, term, k = [Decimal(0), Decimal(1)], Decimal(1), 0

@@ -1,4 +1,4 @@
-"""Extrema and bounds that are facts about an interval, not about samples of it."""
+"""Extrema and certified bounds over whole intervals."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ if TYPE_CHECKING:
 TOLERANCE = 1e-9
 """Error of an extremum of a function of the jet, relative to the function's largest magnitude."""
 
-_SAMPLES = 8192  # times of a plan at which such a function is evaluated, however smooth it seems
+_SAMPLES = 8192  # minimum number of times at which such a function is evaluated
 
 _MAX_PIECES = 20_000
 _CHUNK = 256  # pieces that are evaluated together
 _FIT = 32  # degree of an interpolant
-_CHECKS = 8  # times in a piece, at least, that its interpolant was not made from
+_CHECKS = 8  # minimum number of check points of a piece, none of them a node of its interpolant
 _ROUNDING = 8.0 * float(np.finfo(float).eps)
 _TINY = float(np.finfo(float).tiny)
 
 
 @dataclass(frozen=True)
 class Extrema:
-    """Least and greatest values and where they are attained.
+    """Minimum and maximum values and the times of both.
 
     Attributes
     ----------
@@ -56,11 +56,11 @@ class Bounds:
     Attributes
     ----------
     lower, upper : float
-        Every value over the whole interval lies between them.
+        Bounds of every value over the whole interval.
     minimum, maximum : float
-        Values that are attained.
+        Attained values, within the bounds.
     time_min, time_max : float
-        Where [s].
+        Times [s] of `minimum` and `maximum`.
     """
 
     lower: float
@@ -89,7 +89,7 @@ def derivative_extrema(plan: Trajectory, nu: int) -> Extrema:
 
 
 def stationary_times(jet: Callable[[Array, int], Array], duration: float, nu: int) -> Array:
-    """Times in [0, duration] at which the nu-th derivative of an analytic function can be greatest or least.
+    """Candidate times in [0, duration] for extrema of a derivative of an analytic function.
 
     Parameters
     ----------
@@ -110,7 +110,7 @@ def stationary_times(jet: Callable[[Array, int], Array], duration: float, nu: in
         times += [0.5 * (left + right) + 0.5 * (right - left) * real_roots(series) for series in slopes]
     t = np.concatenate(times)
     t = np.concatenate([t, _polished(jet, t, nu, duration)])
-    # What rounding moved off an end belongs to it.
+    # Candidates within rounding of an end are that end.
     t[t < 1e-12 * duration] = 0.0
     t[t > (1.0 - 1e-12) * duration] = duration
     return np.unique(t)
@@ -121,20 +121,20 @@ def function_extrema(
 ) -> Extrema:
     """Extrema of a function of the jet, to `TOLERANCE` of its largest magnitude or of a scale.
 
-    The function is evaluated at 8192 times of the plan, of each of n segments at
-    8192/n and at 64 at least; what shows at none of them, such as a shorter
+    The function is evaluated at 8192 times of the plan: 8192/n, and at least 64,
+    for each of n segments. A feature between these times, such as a shorter
     pulse, is missed.
 
     Parameters
     ----------
     plan : Trajectory
-        With a duration.
+        A plan with a duration.
     function : callable
         Maps a jet (order + 1, naxes, ntime) to (ntime,) or (m, ntime).
     order : int
-        Highest derivative that it needs.
+        Highest derivative that `function` uses.
     scale : array_like, broadcasts to (m,), optional
-        What counts as a magnitude where the function itself is smaller.
+        Minimum scale of the relative tolerance.
 
     Returns
     -------
@@ -156,13 +156,13 @@ def function_extrema(
 
 
 class _Search:
-    """Bisection of segments until a function of the jet is resolved wherever an extremum can be.
+    """Bisection of segments until a function of the jet is resolved near its extrema.
 
     A piece is resolved where the Chebyshev interpolant agrees with the function
-    at points that it was not made from; where the function varies by less than
-    the tolerance (about a kink); or where the clock resolves nothing shorter
-    (at a jump). A piece whose values stay farther from the extrema seen so far
-    than they are apart is left alone.
+    at check points; where the function varies by less than the tolerance (about a
+    kink); or at the resolution of floating-point times (at a jump). A piece is
+    skipped if its values differ from the extrema found so far by more than
+    their own range.
     """
 
     def __init__(self, plan: Trajectory, function: Callable[[Array], Array], order: int, scale: Array) -> None:
@@ -175,7 +175,7 @@ class _Search:
         for segment, (_, duration) in enumerate(self.segments):
             share = max(duration / plan.duration, 1.0 / len(self.segments))
             count = 2 ** math.ceil(math.log2(max(_SAMPLES * share, 64)))
-            parts = np.array_split(duration * _between(count), -(-count // 1024))  # small enough for a cache
+            parts = np.array_split(duration * _between(count), -(-count // 1024))  # fit into the cache
             parts.append(np.array([0.0, duration]))
             rows = np.concatenate([self._values(segment, t) for t in parts], axis=1)
             self._samples.append(rows)
@@ -185,7 +185,7 @@ class _Search:
             self._low, self._high = np.minimum(self._low, rows.min(axis=1)), np.maximum(self._high, rows.max(axis=1))
 
     def bisect(self, segment: int) -> None:
-        """Add to what was found the times at which a segment can hold an extremum."""
+        """Add the candidate times of a segment to the results."""
         index = np.zeros(1, dtype=np.int64)
         level = 0
         while index.size:
@@ -193,12 +193,12 @@ class _Search:
             parts = [self._pieces(segment, level, index[k : k + _CHUNK]) for k in range(0, index.size, _CHUNK)]
             again = np.concatenate([split for split, _ in parts])
             if again.size and self._spent + 2 * again.size > _MAX_PIECES:
-                self._give_up(segment, level, again, max(rest for _, rest in parts))
+                self._raise_unresolved(segment, level, again, max(rest for _, rest in parts))
             index = (2 * again[:, None] + np.arange(2)).ravel()
             level += 1
 
     def _pieces(self, segment: int, level: int, index: NDArray[np.int64]) -> tuple[NDArray[np.int64], float]:
-        """Those of the pieces of a level that must be bisected, and what is not resolved there at most."""
+        """Pieces of a level that must be bisected, and the maximum unresolved error."""
         duration, samples = self.segments[segment][1], self._samples[segment][:, :-2]
         width, count = math.ldexp(duration, -level), samples.shape[1] >> level
         own = _SHARES if count >= _CHECKS else np.append(_SHARES, _between(_CHECKS))
@@ -212,14 +212,14 @@ class _Search:
         checks = values[..., _SHARES.size :]
         if checks.size:
             missed = np.maximum(missed, np.abs(series @ _basis(_CHECKS) - checks).max(axis=2))
-        if count:  # samples of the piece, which may have met what its own times have not
+        if count:  # samples of the piece, which may show features that its check points miss
             seen = samples.reshape(len(samples), -1, count)[:, index]
             missed = np.maximum(missed, np.abs(series @ _basis(count) - seen).max(axis=2))
             checks = np.concatenate([checks, seen], axis=2)
 
         low = np.minimum(values.min(axis=2), checks.min(axis=2))
         high = np.maximum(values.max(axis=2), checks.max(axis=2))
-        for (row, _), (place, instant, value) in self._best.items():  # pieces too short for a sample must not lose it
+        for (row, _), (place, instant, value) in self._best.items():  # a piece too short for a sample
             k = int(np.searchsorted(index, math.floor(instant / width)))
             if place == segment and k < index.size and 0.0 <= (part := instant / width - index[k]) <= 1.0:
                 miss = abs(float(chebyshev.chebval(2.0 * part - 1.0, series[row, k])) - value)
@@ -231,7 +231,7 @@ class _Search:
         reach = high - low + 4.0 * missed + _ROUNDING * scale
         matters = (high + reach >= self._high[:, None]) | (low - reach <= self._low[:, None])
 
-        # Where the function is smooth, its value at a root of the interpolant's slope is off by the square of this.
+        # For a smooth function the error of its value at a root of the interpolant's slope is the square of this.
         rest = missed / scale
         smooth = rest <= 0.1 * TOLERANCE
         flat = high - low <= 0.1 * TOLERANCE * scale
@@ -250,7 +250,7 @@ class _Search:
         self.found.add(times, self._values(segment, t), ends)
 
     def _keep_best(self, segment: int, t: Array, values: Array) -> None:
-        """Make candidates of times at which a row exceeds all seen before: those near by may not reach it."""
+        """Add times at which a row exceeds all previous values as candidates: the roots nearby may not reach it."""
         for sign, seen in ((-1.0, self._low), (1.0, self._high)):
             best = (sign * values).argmax(axis=1)
             for row in np.flatnonzero((sign * values).max(axis=1) > sign * seen).tolist():
@@ -270,13 +270,13 @@ class _Search:
             raise ValueError(f"function must be finite over the plan, got nan or inf {where}")
         return values
 
-    def _give_up(self, segment: int, level: int, index: NDArray[np.int64], rest: float) -> NoReturn:
+    def _raise_unresolved(self, segment: int, level: int, index: NDArray[np.int64], rest: float) -> NoReturn:
         origin, duration = self.segments[segment]
         left, right = (origin + math.ldexp(duration, -level) * (k + i) for i, k in enumerate((index[0], index[-1])))
         raise RuntimeError(
             f"function must be resolved to {TOLERANCE:g} of its largest magnitude, got {rest:.2g} "
             f"between {left:g} and {right:g} s after {_MAX_PIECES} pieces: it is noisy or oscillates there; "
-            f"smooth it, or take `bounds`, which needs a Lipschitz constant"
+            f"smooth it, or use `bounds`, which requires a Lipschitz constant"
         )
 
 
@@ -288,7 +288,7 @@ def certified_bounds(
     rtol: float,
     max_cells: int,
 ) -> Bounds:
-    """Bounds by refining cells until a Lipschitz bound decides."""
+    """Bounds by refinement of cells until the Lipschitz bound reaches the tolerance."""
     segments = _searchable_segments(plan)
     weights = _weights(lipschitz, order + 1, plan.naxes)
     if not rtol > 0.0:
@@ -310,7 +310,7 @@ def certified_bounds(
                 raise ValueError(f"rtol = {rtol:g} must be reached within {max_cells} cells; raise either of them")
             jet = plan.segment_jet(segment, centres, order + 1)
             values = _evaluated(function, jet[:-1])
-            # In its cell a derivative moves by no more than the next one's value at the centre and slope allow.
+            # Within a cell the change of a derivative is bounded by the next one's value at the centre and its slope.
             slope = np.minimum(first, np.abs(jet[1:]) + radius * second)
             reach = radius * np.sum(weights * slope, axis=(0, 1))
             found.add(_placed(plan, segment, centres)[0], values[None])
@@ -324,7 +324,7 @@ def certified_bounds(
             radius *= 0.5
             centres = (centres[undecided, None] + np.array([-radius, radius])).ravel()
     best = found.extrema()
-    # What the function is made of is rounded, and can cancel in its values.
+    # The terms of the function are rounded, and may cancel in its values.
     terms = float(np.sum(weights[:, :, 0] * np.stack([plan.peak(k) for k in range(order + 1)])))
     rounding = _ROUNDING * (max(abs(minimum), abs(maximum)) + terms)
     return Bounds(
@@ -350,7 +350,7 @@ def _evaluated(function: Callable[[Array], Array], jet: Array) -> Array:
     """Values (ntime,) of a function of the jet."""
     values = np.asarray(function(jet), dtype=float)
     if values.shape != jet.shape[2:]:
-        raise ValueError(f"function must return one value a time, shape {jet.shape[2:]}, got {values.shape}")
+        raise ValueError(f"function must return one value per time, shape {jet.shape[2:]}, got {values.shape}")
     if not np.isfinite(values).all():
         raise ValueError("function must be finite over the plan, got nan or inf")
     return values
@@ -362,18 +362,18 @@ _ENDS = chebyshev.chebvander(np.array([-1.0, 1.0]), _FIT).T
 
 @lru_cache(maxsize=16)
 def _between(count: int) -> Array:
-    """Parts of an interval, evenly spaced but in step with no other grid."""
+    """Relative positions in an interval: even spacing that coincides with no other grid."""
     return readonly(np.asarray((np.arange(count) + 0.5 * (math.sqrt(5.0) - 1.0)) / count))
 
 
 @lru_cache(maxsize=16)
 def _basis(count: int) -> Array:
-    """Chebyshev polynomials (degree + 1, ntime) there."""
+    """Chebyshev polynomials (degree + 1, ntime) at the points of `_between`."""
     return readonly(np.asarray(chebyshev.chebvander(2.0 * _between(count) - 1.0, _FIT).T, dtype=float))
 
 
 class _Candidates:
-    """Least and greatest of the values seen, one row an axis."""
+    """Minimum and maximum of the values so far, one row per axis."""
 
     def __init__(self) -> None:
         self.times: list[Array] = []
@@ -381,7 +381,7 @@ class _Candidates:
         self.ends: list[Array] = []
 
     def add(self, t: Array, values: Array, ends: tuple[float, float] = (np.nan, np.nan)) -> None:
-        """Values (naxes, ntime) at some times, of which those of the `ends` of a segment go first in a tie."""
+        """Add values (naxes, ntime); the `ends` of a segment take precedence in a tie."""
         self.times.append(t)
         self.values.append(values)
         self.ends.append(np.where((t == ends[0]) | (t == ends[1]), 1.0, 0.0))
@@ -396,19 +396,19 @@ class _Candidates:
 
     @staticmethod
     def _first(values: Array, ends: Array) -> NDArray[np.intp]:
-        """Where each row is least: to rounding, at an end if it can be, and as early as it can be."""
+        """Index of the minimum of each row, up to rounding: preferably an end, then the earliest."""
         slack = _ROUNDING * np.abs(values).max(axis=1, keepdims=True)
         tied = values <= values.min(axis=1, keepdims=True) + slack
         return np.argmax(tied * (1.0 + ends), axis=1)
 
 
 def _segments(plan: Trajectory) -> list[tuple[float, float]]:
-    """Beginning and duration [s] of each segment."""
+    """Start and duration [s] of each segment."""
     return list(zip(plan.breakpoints[:-1].tolist(), np.diff(plan.breakpoints).tolist(), strict=True))
 
 
 def _placed(plan: Trajectory, segment: int, t: Array) -> tuple[Array, tuple[float, float]]:
-    """Times of a plan from those of a segment, and the ends of the segment, which rounding does not leave."""
+    """Times of a plan from those of a segment, clipped to the ends of the segment, and these ends."""
     left, right = plan.breakpoints[segment : segment + 2].tolist()
     times = np.where(t < right - left, np.minimum(left + t, math.nextafter(right, left)), right)
     return times, (left, right)
@@ -417,7 +417,7 @@ def _placed(plan: Trajectory, segment: int, t: Array) -> tuple[Array, tuple[floa
 def _searchable_segments(plan: Trajectory) -> list[tuple[float, float]]:
     segments = _segments(plan)
     if not segments:
-        raise ValueError("a trajectory without duration has no interval to search, got a step")
+        raise ValueError("a trajectory must have a duration to be searched for extrema, got a step")
     return segments
 
 
@@ -428,14 +428,14 @@ def _pieces(
     proxy = chebyshev_proxy(jet, (a, b), nu, nu)
     if proxy is not None:
         return [(a, b, proxy[0])]
-    if not depth:  # what is not resolved by now is rounding
+    if not depth:  # at this depth the remaining error is rounding
         return [(a, b, fit(lambda t: jet(t, nu)[nu], (a, b), 32))]
     middle = 0.5 * (a + b)
     return _pieces(jet, a, middle, nu, depth - 1) + _pieces(jet, middle, b, nu, depth - 1)
 
 
 def _polished(jet: Callable[[Array, int], Array], t: Array, nu: int, duration: float) -> Array:
-    """One Newton step on y^(nu + 1) for every axis from every candidate, kept if it stays near."""
+    """One Newton step on y^(nu + 1) for every axis from every candidate, accepted if it is small."""
     slope, curve = jet(t, nu + 2)[nu + 1 :]
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         moved = t - slope / curve

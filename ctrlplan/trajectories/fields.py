@@ -1,4 +1,4 @@
-"""Objects whose fields are declared at the top of the class and set once."""
+"""Immutable objects whose fields are declared at the top of the class."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ class Fields(Frozen):
     """Immutable object; its fields are the annotated names of its classes."""
 
     def _set_fields(self, **values: Any) -> None:
-        """Set fields, each once; arrays are stored read-only, as copies where they were not.
+        """Set fields, each once; arrays are stored read-only, and copied if they are writable.
 
         Raises
         ------
@@ -39,11 +39,11 @@ class Fields(Frozen):
         self.__dict__.update(values)
 
     def _with_fields(self, **values: Any) -> Self:
-        """The same object with some fields changed; what was cached is computed again."""
+        """Copy with some fields changed and without cached values."""
         declared = _declared(type(self).__mro__)
-        kept = {name: value for name, value in self.__dict__.items() if name in declared}
+        fields = {name: value for name, value in self.__dict__.items() if name in declared}
         found = type(self).__new__(type(self))
-        found._set_fields(**(kept | values))
+        found._set_fields(**(fields | values))
         return found
 
 

@@ -29,12 +29,12 @@ def trajectory_from_dict(data: Data) -> Trajectory:
     Parameters
     ----------
     data : dict
-        With the key "type" and what that kind needs.
+        With the key "type" and the entries of that kind.
 
     Returns
     -------
     Trajectory
-        Equal to the one saved in every bit of its values.
+        Equal to the saved one in every bit of its values.
 
     Raises
     ------
@@ -47,15 +47,15 @@ def trajectory_from_dict(data: Data) -> Trajectory:
     try:
         return Trajectory.kinds[kind].from_dict(data)
     except KeyError as missing:
-        raise ValueError(f"a {kind} needs the entry {missing}, got {', '.join(map(str, data))}") from None
+        raise ValueError(f"a {kind} must have the entry {missing}, got {', '.join(map(str, data))}") from None
     except RecursionError:
-        raise ValueError("type must not be nested so deep that Python's stack overflows") from None
+        raise ValueError("data must not be nested so deeply that Python's stack overflows") from None
     except (TypeError, AttributeError, IndexError, ArithmeticError) as error:
         raise ValueError(f"a {kind} must have entries of the kinds that to_dict writes: {error}") from None
 
 
 def save_trajectory(plan: Trajectory, path: str | os.PathLike[str]) -> None:
-    """Write a trajectory as JSON; numbers are written so that every bit returns."""
+    """Write a trajectory as JSON; numbers are restored to every bit."""
     text = json.dumps(plan.to_dict(), indent=1, allow_nan=False)
     write_text(path, text + "\n")
 
@@ -77,19 +77,19 @@ def load_trajectory(path: str | os.PathLike[str]) -> Trajectory:
     OSError
         If the file cannot be read.
     ValueError
-        If it does not hold a trajectory.
+        If it does not contain a trajectory.
     """
     try:
         text = Path(path).read_text(encoding="utf-8")
         return trajectory_from_dict(json.loads(text, parse_constant=_no_number))
     except RecursionError:
-        raise ValueError(f"{os.fspath(path)} must hold a saved trajectory: it is nested too deep") from None
+        raise ValueError(f"{os.fspath(path)} must contain a saved trajectory: it is nested too deeply") from None
     except (ValueError, TypeError) as error:
-        raise ValueError(f"{os.fspath(path)} must hold a saved trajectory: {error}") from None
+        raise ValueError(f"{os.fspath(path)} must contain a saved trajectory: {error}") from None
 
 
 def _no_number(name: str) -> NoReturn:
-    """Reject what JSON does not have and `save` never writes."""
+    """Raise for nan and inf, which are not JSON and which `save` does not write."""
     raise ValueError(f"numbers must be finite, got {name}")
 
 
@@ -99,28 +99,28 @@ def write_csv(plan: Trajectory, path: str | os.PathLike[str], timepts: ArrayLike
     Parameters
     ----------
     plan : Trajectory
-        What is sampled.
+        Plan to be sampled.
     path : str or path
-        The file.
+        File to be written.
     timepts : array_like, shape (ntime,), optional
-        Times [s]; 1001 from start to end unless given.
+        Times [s]; default: 1001 from start to end.
     order : int, optional
         Highest derivative; columns are x, x_d1, x_d2, ...
 
     Raises
     ------
     ValueError
-        If `timepts` is no sequence of times (a sampling period is none), one is
-        nan, or the order is negative.
+        If `timepts` is not a sequence of times (but a sampling period), if a
+        time is nan, or if the order is negative.
     OSError
-        If the file cannot be written: one of this name is as it was.
+        If the file cannot be written; an existing file is then unchanged.
     """
     times = np.linspace(plan.start, plan.end, 1001) if timepts is None else checked_timepts(timepts)
     if times.ndim != 1:
         got = f"the scalar {times:g}" if times.ndim == 0 else f"shape {times.shape}"
         step = f"{times:g}" if times.ndim == 0 else "dt"
         raise ValueError(
-            f"timepts must be sample times of shape (ntime,), got {got}; for a row every {step} s give "
+            f"timepts must be sample times of shape (ntime,), got {got}; for one row every {step} s pass "
             f"np.arange(plan.start, plan.end, {step})"
         )
     highest = checked_count(order, "order")
@@ -129,18 +129,18 @@ def write_csv(plan: Trajectory, path: str | os.PathLike[str], timepts: ArrayLike
     np.savetxt(
         table, columns.T, fmt="%.17g", delimiter=",", header=csv_header(column_names(plan, highest)), comments=""
     )
-    # As numpy's own writing to a path of these endings.
+    # As numpy does for paths with these suffixes.
     packers: dict[str, Callable[[bytes], bytes]] = {".gz": gzip.compress, ".bz2": bz2.compress, ".xz": lzma.compress}
     write_bytes(path, packers.get(Path(path).suffix, bytes)(table.getvalue().encode("utf-8")))
 
 
 def csv_header(names: list[str]) -> str:
-    """First line of a table: names quoted where they need it, each of them once."""
+    """Header line of a table, with names quoted where necessary; duplicate names raise."""
     for name in names:
         if names.count(name) > 1:
-            raise ValueError(f"columns must have names of their own, got {name!r} twice; rename an axis")
+            raise ValueError(f"columns must have different names, got {name!r} twice; rename an axis")
     line = io.StringIO(newline="")
-    csv.writer(line, lineterminator="\r\n").writerow(names)  # names with any of both are quoted then
+    csv.writer(line, lineterminator="\r\n").writerow(names)  # csv then quotes names that contain either character
     return line.getvalue()[:-2]
 
 

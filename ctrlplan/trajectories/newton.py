@@ -50,39 +50,40 @@ from ctrlplan.trajectories.fields import Fields
 from ctrlplan.trajectories.quadrature import gauss
 
 _MEET = 0.25
-"""Ends meet where they are nearer to each other, on the circle, than this part of all neighbours."""
+"""The ends coincide if their distance on the circle is below this fraction of that to all neighbours."""
 
 _SUSPECT = 1e5
-"""Amplification of rounding errors above which the digits lost are estimated."""
+"""Amplification of rounding errors above which the loss of accuracy is estimated."""
 
 _KEPT = 1e-10
-"""Part of a plan's range up to which rounding may cost it before more digits are taken."""
+"""Error relative to a plan's range above which decimal arithmetic is used."""
 
 _ACROSS = 1e-2
-"""Way across the closed end [parts of a turn] below which products of alpha and times lose digits of their sine."""
+"""Distance across the closed end [fraction of a turn] below which sines of alpha times t lose digits."""
 
 MAXIMUM_LOSS = 1e-6
-"""The same where there are no more to take."""
+"""Maximum error relative to a plan's range; a larger one raises."""
 
 _MAXIMUM_DIGITS = 100
-"""Constraints up to which many digits take a fraction of a second."""
+"""Maximum number of constraints for decimal arithmetic, which then takes a fraction of a second."""
 
 NEARLY_CLOSED = 5.0
-"""Alpha [rad] from which on both ends may count as one point."""
+"""Alpha [rad] above which both ends may coincide."""
 
 
 class NewtonSystem(Fields):
-    """Factorised collocation for one pattern of times and given entries.
+    """Factorised collocation for one pattern of times and prescribed entries.
 
-    It depends on alpha, the relative times and which entries are given, not on
-    their values: new values and other durations reuse it.
+    It depends on alpha, on the relative times and on which entries are
+    prescribed, but not on their values or on the duration, and is reused for
+    others.
 
     Parameters
     ----------
     alpha : float
         Shape parameter [rad] over the normalised interval; 0 is the polynomial.
     times : ndarray, shape (nwaypoints,)
-        Relative times, increasing, of which the first is 0.
+        Relative times, increasing from 0.
     given : tuple of tuple of int
         For each waypoint the derivative orders prescribed there, increasing.
     gamma : float or None
@@ -93,17 +94,17 @@ class NewtonSystem(Fields):
     smooth : int
         That derivative order.
     meet : bool
-        Whether the data of both ends agree, so that they may be one node near
-        alpha = 2 pi.
+        Whether the data of both ends agree, so that the ends may be one node
+        near alpha = 2 pi.
     apart : ndarray, shape (nwaypoints, nwaypoints), or None
-        Differences of the relative times, where they are known to more digits
-        than the times themselves have: waypoints close together need them.
+        Differences of the relative times, if they are known more accurately than
+        the times themselves, as for waypoints close together.
 
     Raises
     ------
     ValueError
-        If the constraints do not determine the plan: free entries that make
-        the (Birkhoff) system singular, or a gamma that does.
+        If free entries or gamma make the (Birkhoff) system singular, so that the
+        constraints do not determine the plan.
     """
 
     alpha: float
@@ -113,7 +114,7 @@ class NewtonSystem(Fields):
     order_index: NDArray[np.intp]
     hermite: bool  # no gaps between the orders at any waypoint
     _orders: tuple[int, ...]  # `order_index` as a key
-    _positions: Array  # 1 where a position is prescribed, else 0
+    _positions: Array  # 1 for a prescribed position, else 0
     _anchor: int
     _triangle: Array
     _spread: Array | None
@@ -134,7 +135,7 @@ class NewtonSystem(Fields):
     ) -> None:
         count = sum(map(len, given))
         if count == 0:
-            raise ValueError("an axis needs at least one prescribed entry, got none")
+            raise ValueError("an axis must have at least one prescribed entry, got none")
         size = count if size is None else size
         waypoints, orders, lead = _constraints(_effective(alpha), times, given, meet)
         nodes = times[waypoints]
@@ -168,33 +169,33 @@ class NewtonSystem(Fields):
         self._set_fields(_triangle=triangle, _spread=spread)
 
         if not self._triangle.diagonal().all():
-            raise ValueError("the constraints do not determine the plan: the system is singular")
+            raise ValueError("the constraints must determine the plan, got a singular system")
 
     def taylor_scale(self, duration: float) -> Array:
-        """Column that turns prescribed derivatives into normalised Taylor data."""
+        """Factors from prescribed derivatives to normalised Taylor data, as a column."""
         return _taylor_scale(duration, self._orders)
 
     def coefficients(self, taylor_data: Array) -> Array:
         """Coefficients (size, naxes) from Taylor data (nconstraints, naxes)."""
-        # Positions from the first one: what they have in common costs no digit of their differences.
+        # Positions relative to the first one: a common offset costs no digits of their differences.
         offset = taylor_data[self._anchor] * self._positions[self._anchor]
-        # Not LAPACK's dtrtrs, which waits for its threads however small the system.
+        # Not LAPACK's dtrtrs, whose threads are slow for small systems.
         solved = blas.dtrsm(1.0, self._triangle, taylor_data - self._positions * offset, lower=1)
         found = solved if self._spread is None else self._spread @ solved
         found[0] += offset
         return found
 
     def fitted(self, values: Array, times: Sequence[float], duration: float, taylor_data: Array) -> Array:
-        """Coefficients from prescribed derivatives at the times [s], which no rounding has spoilt.
+        """Coefficients from prescribed derivatives at times [s], with an error below `MAXIMUM_LOSS`.
 
         Raises
         ------
         ValueError
-            If rounding could cost more than 1e-6 of the plan's range.
+            If rounding could change the plan by more than 1e-6 of its range.
         """
         loss = self.loss(taylor_data)
         if self._across(times, duration) < _ACROSS and self.hermite and len(values) <= _MAXIMUM_DIGITS:
-            loss = 1.0  # the triangle itself is rounded
+            loss = 1.0  # the triangle itself is inaccurate
         if loss <= _KEPT:
             return self.coefficients(taylor_data)
         if self.hermite and len(values) <= _MAXIMUM_DIGITS:
@@ -203,16 +204,16 @@ class NewtonSystem(Fields):
             return self.coefficients(taylor_data)
         why = "waypoints so close together amplify rounding: move them apart, or use PiecewiseSpline"
         if self.alpha > NEARLY_CLOSED:
-            why = "near alpha = 2 pi both ends are nearly one point: lower alpha, or use TrigSpline.cyclic"
+            why = "near alpha = 2 pi both ends nearly coincide: lower alpha, or use TrigSpline.cyclic"
         raise ValueError(
             f"waypoints must determine the plan to {MAXIMUM_LOSS:g} of its range in floating point, got an estimated "
             f"loss of {loss:.1g}; {why}"
         )
 
     def resolved(self, values: NDArray[Any], times: Sequence[float], duration: float, digits: int = 0) -> Array:
-        """The same in decimal arithmetic, where the triangle is that of the Newton form; values may be decimals.
+        """Coefficients in decimal arithmetic, for the triangle of the Newton form; values may be decimals.
 
-        `digits` are those that the caller expects to lose beyond those that the nodes cost.
+        `digits` is the expected loss of decimal digits in addition to that of the nodes.
         """
         digits += math.ceil(math.log10(min(self.amplification, 1e300)))
         constraints = self.waypoint_index, self.order_index
@@ -236,7 +237,7 @@ class NewtonSystem(Fields):
         return self._taylor(u - self._first[:, None], u - self._second[:, None], order)
 
     def _taylor(self, first: Array, second: Array, order: int) -> Array:
-        """The same from the distances (npairs, ntime) beyond the nodes of each pair."""
+        """Taylor coefficients from the distances (npairs, ntime) to the nodes of each pair."""
         alpha = _effective(self.alpha)
         half = 0.5 * alpha
         npairs, ntime = len(second), second.shape[1]
@@ -270,7 +271,7 @@ class NewtonSystem(Fields):
         return out[: self.size]
 
     def series(self, coefficients: Array, u: Value, order: int) -> list[list[Value]]:
-        """Taylor series axis by axis of a plan at one normalised time, a number or a symbol."""
+        """Taylor series of each axis at one normalised time, a number or a symbol."""
         factors = [
             pair_series(self.alpha, u - first, u - second, order)
             for first, second in zip(self._first.tolist(), self._second.tolist(), strict=True)
@@ -281,7 +282,7 @@ class NewtonSystem(Fields):
         return [newton_series(factors, column, order) for column in columns]
 
     def _across(self, times: Sequence[float], duration: float) -> float:
-        """Shortest way on the circle from a waypoint near the end to one near the start, both ends excepted."""
+        """Minimum distance on the circle from a waypoint near the end to one near the start, without the two ends."""
         if self.alpha <= NEARLY_CLOSED:
             return 1.0
         used = [times[i] for i in sorted(set(self.waypoint_index.tolist()))]
@@ -289,10 +290,10 @@ class NewtonSystem(Fields):
         return math.sin(0.5 * self.alpha * min(apart / duration, 1.0))
 
     def loss(self, taylor_data: Array) -> float:
-        """Bound of what rounding costs the plan through the data, relative to its range.
+        """Bound of the rounding error of the plan through the data, relative to its range.
 
-        The rounding of each product in the triangular solution, through the
-        inverse to the plan: Skeel's componentwise bound, to first order.
+        Skeel's componentwise bound to first order: the rounding of each product of
+        the triangular solution is propagated to the plan by the inverse.
         """
         if self.amplification < _SUSPECT:
             return 0.0
@@ -301,25 +302,25 @@ class NewtonSystem(Fields):
         rounding = np.finfo(float).eps * (np.abs(self._triangle) @ np.abs(solved))
         functions, cardinal = self._samples
         plan, lost = (np.abs(values).max(axis=1) for values in (functions @ solved, np.abs(cardinal) @ rounding))
-        # Derivatives are of Taylor's scale: some are 0 but for rounding.
+        # Derivatives are scaled as Taylor coefficients: some differ from 0 by rounding only.
         size = np.maximum(plan, plan[0])
         return float((lost / np.where(size > 0.0, size, 1.0)).max())
 
     @cached_property
     def functions(self) -> Array:
-        """Values (size, ntime) of the basis functions at times between which a plan cannot hide much."""
+        """Values (size, ntime) of the basis functions on a grid that resolves any plan."""
         return self.taylor(np.linspace(0.0, 1.0, 2 * self.size + 1), 0)[:, 0]
 
     @cached_property
     def amplification(self) -> float:
-        """By how much rounding errors can grow in the solution, at most."""
+        """Maximum amplification of rounding errors by the solution."""
         scaled = self._triangle / np.abs(self._triangle).max(axis=0)
         inverse: Array = blas.dtrsm(1.0, scaled, np.eye(len(scaled)), lower=1)
         return float((np.abs(inverse) @ np.abs(scaled)).max())
 
     @cached_property
     def _samples(self) -> tuple[Array, Array]:
-        """Taylor coefficients (order + 1, ntime, nconstraints) by solution, and by data."""
+        """Taylor coefficients (order + 1, ntime, nconstraints) as functions of the solution, and of the data."""
         u = np.linspace(0.0, 1.0, 2 * self.size + 1)
         functions = self.taylor(u, int(self.order_index.max())).transpose(1, 2, 0)
         functions = functions if self._spread is None else functions @ self._spread
@@ -351,7 +352,7 @@ Pair = tuple[list[Value], list[Value]]
 
 
 def pair_series(alpha: float, left: Value, right: Value, order: int) -> Pair:
-    """Series of the factors of a pair about a point that lies `left` and `right` beyond its nodes."""
+    """Series of the factors of a pair about a point at distances `left` and `right` from its nodes."""
     alpha = _effective(alpha)
     if not alpha:
         rest = [0.0] * order
@@ -369,7 +370,7 @@ def pair_series(alpha: float, left: Value, right: Value, order: int) -> Pair:
 
 
 def newton_series(factors: Sequence[Pair], column: Sequence[Value], order: int) -> list[Value]:
-    """Series of a combination of the basis functions, from the last pair of factors to the first."""
+    """Series of a linear combination of the basis functions, evaluated from the last pair of factors to the first."""
     orders = range(order + 1)
     last = 2 * len(factors)
     found = [column[last] if len(column) > last else 0.0, *[0.0] * order]
@@ -382,7 +383,7 @@ def newton_series(factors: Sequence[Pair], column: Sequence[Value], order: int) 
 
 @lru_cache(maxsize=256)
 def _kernel_weights(alpha: float, order: int) -> tuple[float, ...]:
-    """Coefficients 1, 2, ... of S(h) where odd, of V(h) where even."""
+    """Coefficients 1, 2, ...: odd ones of S(h), even ones of V(h)."""
     return tuple(
         (-1.0) ** (k // 2) * (alpha ** (k - 1) if k % 2 else -2.0 * alpha ** (k - 2)) / math.factorial(k)
         for k in range(1, order + 1)
@@ -390,19 +391,20 @@ def _kernel_weights(alpha: float, order: int) -> tuple[float, ...]:
 
 
 def _effective(alpha: float) -> float:
-    """Alpha for the formulas: so near 0 that they would underflow, the family is its limit to every digit."""
+    """Alpha of the formulas: 0 where they would underflow, which is the limit to full precision."""
     return alpha if alpha > 1e-100 else 0.0
 
 
 def _constraints(
     alpha: float, times: Array, given: tuple[tuple[int, ...], ...], meet: bool
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], int]:
-    """Waypoint and order of each constraint, in the order in which the Newton form takes them.
+    """Waypoint and order of each constraint, in the order of the Newton form.
 
-    Waypoints in Leja order: each next one farthest, in product, from those
-    before. Ends that meet on the circle come first with all their entries, whose
-    number is returned: their data agree, so the divided differences between them
-    are exactly 0 or small, and no others are divided by their distance.
+    Waypoints are in Leja order: each maximises the product of its distances to
+    the previous ones. Ends that coincide on the circle come first with all their
+    entries, whose number is returned: as their data agree, the divided
+    differences between them are 0 or small, and no others are divided by their
+    distance.
     """
     used = [i for i, g in enumerate(given) if g]
     u = times[used]
@@ -413,7 +415,7 @@ def _constraints(
     chosen = [0, len(used) - 1] if meet else [0]
     product = distance[chosen].prod(axis=0)
     while len(chosen) < len(used):
-        # Rescaled, so that many waypoints do not underflow to a tie.
+        # Rescaled, so that the products do not underflow for many waypoints.
         farthest = int(product.argmax())
         product = product * (distance[farthest] / product[farthest])
         chosen.append(farthest)
@@ -425,14 +427,14 @@ def _constraints(
 
 
 def _sequence(waypoints: list[int], given: tuple[tuple[int, ...], ...]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Constraints in rounds through the waypoints, each waypoint's spread evenly over all rounds.
+    """Constraints in rounds through the waypoints, those of each waypoint distributed evenly over all rounds.
 
-    Orders rise at each waypoint, as the triangle needs, and the nodes so far
-    are spread at every stage like all of them: waypoints with few entries
-    before long jets elsewhere would cost four digits.
+    Orders increase at each waypoint, as the triangle requires, and at every stage
+    the nodes are distributed like all of them. Otherwise waypoints with few
+    entries before long jets elsewhere cost four digits.
     """
     lengths = set(map(len, given))
-    if len(lengths) == 1:  # the same order, sooner
+    if len(lengths) == 1:  # the same order, computed faster
         rows = [(i, given[i][turn]) for turn in range(lengths.pop()) for i in waypoints]
         table = np.array(rows, dtype=np.intp)
         return table[:, 0], table[:, 1]
@@ -446,17 +448,17 @@ def _sequence(waypoints: list[int], given: tuple[tuple[int, ...], ...]) -> tuple
 
 
 def _spare_nodes(mean: float, count: int) -> Array:
-    """Nodes for spare functions, symmetric about the mean so that gamma stays."""
+    """Nodes of additional functions, symmetric about the mean, which preserves gamma."""
     reach = min(mean, 1.0 - mean)
     return mean + reach * np.cos(np.pi * (np.arange(count) + 0.5) / count)
 
 
 def _top_harmonic(alpha: float, size: int, mean: float, gamma: float | None) -> tuple[float | None, float]:
-    """Phase of the top harmonic, if there is one, and what turns it to a given gamma."""
+    """Phase of the top harmonic, if there is one, and the fold weight for a given gamma."""
     if size % 2 or not alpha:
         if gamma is not None:
             why = f"{size} coefficients" if size % 2 else "alpha = 0"
-            raise ValueError(f"gamma needs an even number of coefficients and alpha > 0, got {why}")
+            raise ValueError(f"gamma requires an even number of coefficients and alpha > 0, got {why}")
         return None, 0.0
     if gamma is None:
         return alpha * mean, 0.0
@@ -464,10 +466,10 @@ def _top_harmonic(alpha: float, size: int, mean: float, gamma: float | None) -> 
 
 
 def _fold(alpha: float, size: int, offset: float) -> float:
-    """Weight of phi_M in the last function that turns the top harmonic to a given gamma.
+    """Weight of phi_M in the last function for a given phase gamma of the top harmonic.
 
     The leading parts of phi_M and phi_{M-1} are cos and sin of m(tau - mean) in
-    the ratio 2/alpha : -1, M = 2m; the sum must have no part along cos m(tau - gamma).
+    the ratio 2/alpha : -1, M = 2m; the sum must have no component cos m(tau - gamma).
     """
     angle = 0.5 * size * offset
     if abs(math.cos(angle)) < 1e-9:
@@ -481,22 +483,22 @@ def _fold(alpha: float, size: int, offset: float) -> float:
 def _factor(collocation: Array, hermite: bool, roughness: Array | None, lead: int) -> tuple[Array, Array | None]:
     """Lower triangle T and matrix B such that coefficients = B T^-1 data.
 
-    The first `lead` constraints are left as they are where they are triangular.
+    The order of the first `lead` constraints is preserved where they are triangular.
     """
     count, size = collocation.shape
-    if hermite:  # spare functions vanish at every constraint
+    if hermite:  # additional functions vanish at every constraint
         triangle, basis = collocation[:, :count], np.eye(size)
     else:
         lead = lead if not np.triu(collocation[:lead], 1).any() else 0
         rest = collocation[lead:, lead:]
-        # Columns and rows scaled: neither the size of the basis functions nor the units of the entries must count.
+        # Columns and rows are scaled, so that basis functions and units of the entries do not matter.
         size_of = np.abs(rest).max(axis=0)
         weight = 1.0 / np.where(size_of > 0.0, size_of, 1.0)
         scaled = rest * weight
         singular = np.linalg.svd(scaled / np.linalg.norm(scaled, axis=1, keepdims=True), compute_uv=False)
         if singular[-1] < 1e-13 * singular[0]:
             raise ValueError(
-                "the entries left free must not make the system singular: the prescribed entries conflict or leave "
+                "free entries must not make the system singular: the prescribed entries conflict or leave "
                 f"the plan undetermined, got a relative singular value of {singular[-1] / singular[0]:.1g}"
             )
         mixed, upper = np.linalg.qr(scaled.T, mode="complete")
@@ -510,8 +512,8 @@ def _factor(collocation: Array, hermite: bool, roughness: Array | None, lead: in
         free, _, rank, _ = np.linalg.lstsq(cost[:, count:], -cost[:, :count], rcond=None)
         if rank < size - count:
             raise ValueError(
-                "the constraints must leave no function of zero cost free; prescribe more entries or lower "
-                f"the order of smooth, got {count} constraints for {size} coefficients"
+                "the constraints must determine every function of zero cost; prescribe more entries or lower "
+                f"smooth, got {count} constraints for {size} coefficients"
             )
         spread = spread + basis[:, count:] @ free
     return np.asfortranarray(triangle), spread

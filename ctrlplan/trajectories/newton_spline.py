@@ -1,4 +1,4 @@
-"""A plan through all its waypoints at once, in Newton form."""
+"""Splines with one function through all waypoints, in Newton form."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from ctrlplan.trajectories.waypoint_spline import WaypointSpline, checked_waypoi
 
 Given = tuple[tuple[int, ...], ...]
 Kind = tuple[Given, float | None, bool]
-"""Entries given at each waypoint, gamma, and whether the ends meet."""
+"""Entries prescribed at each waypoint, gamma, and whether the ends coincide."""
 
 
 class Options(NamedTuple):
-    """What a spline was asked for beside its waypoints and alpha."""
+    """Options of a spline in addition to its waypoints and alpha."""
 
     labels: Sequence[str] | None = None
     gamma: float | list[float | None] | None = None
@@ -33,19 +33,19 @@ class Options(NamedTuple):
     warn: bool = True
 
     def given(self) -> Data:
-        """Those that make the plan what it is, where they differ from what is taken unless given."""
+        """Options that determine the plan and differ from their defaults."""
         return {k: v for k, v in self._asdict().items() if k != "warn" and v != self._field_defaults[k]}
 
 
 class NewtonSpline(WaypointSpline):
-    """What the trigonometric and the polynomial spline share.
+    """Base class of the trigonometric and the polynomial spline.
 
     Attributes
     ----------
     waypoints : tuple of Waypoint
-        What the plan meets.
+        Prescribed positions and derivatives.
     alpha : float
-        Shape parameter [rad]: the plan takes this much of a turn; 0 is the polynomial.
+        Shape parameter [rad], the angle of the plan on the circle; 0 is the polynomial.
     """
 
     alpha: float
@@ -60,8 +60,8 @@ class NewtonSpline(WaypointSpline):
     def with_values(self, waypoints: Iterable[Waypoint]) -> Self:
         """Plan with the same times and shape through new values.
 
-        The factorised system is reused: this is the fast path for many plans
-        of one pattern.
+        The factorised system is reused, which is fast for many plans of one
+        pattern.
 
         Parameters
         ----------
@@ -92,7 +92,7 @@ class NewtonSpline(WaypointSpline):
 
     @property
     def degree(self) -> tuple[int, ...]:
-        """Degree axis by axis: m, or that of the polynomial where alpha is 0."""
+        """Degree of each axis: m, or that of the polynomial if alpha is 0."""
         return tuple(s.size // 2 if self.alpha else s.size - 1 for s, _ in self._per_axis())
 
     def _fit(
@@ -102,7 +102,7 @@ class NewtonSpline(WaypointSpline):
         options: Options,
         donor: NewtonSpline | None = None,
     ) -> None:
-        """Set every attribute; a donor of the same pattern lends its factorised systems."""
+        """Set all attributes; the factorised systems of a `donor` of the same pattern are reused."""
         times = [w.time for w in waypoints]
         start, period = times[0], options.period
         duration = times[-1] - start if period is None else period
@@ -154,13 +154,13 @@ class NewtonSpline(WaypointSpline):
         )
 
     def _again(self, waypoints: tuple[Waypoint, ...], options: Options) -> Self:
-        """Plan of this kind through other waypoints, with what can be reused of this one."""
+        """Plan of this kind through other waypoints; reuses the factorised systems."""
         plan = type(self).__new__(type(self))
         plan._fit(increasing(waypoints), self.alpha, options, self)
         return plan
 
     def _check_swing(self) -> None:
-        """Warn, where it was not declined, of a plan that swings far beyond its waypoints."""
+        """Warn, unless disabled, if the plan swings far beyond its waypoints."""
         if self._options.warn:
             values = np.empty((self.naxes, 2 * max([s.size for _, s, _ in self._parts]) + 1))
             for axes, system, coefficients in self._parts:
@@ -170,13 +170,13 @@ class NewtonSpline(WaypointSpline):
                 else:
                     values[list(axes), : found.shape[1]] = found
                     values[list(axes), found.shape[1] :] = found[:, :1]
-            way_on = "use PiecewiseSpline, one polynomial a segment"
+            remedy = "use PiecewiseSpline, one polynomial per segment"
             if self.alpha:
-                way_on = f"lower alpha from {self.alpha:.6g} (choose_alpha finds the best one) or {way_on}"
-            warn_of_swing(values, self.waypoints, self.end, self.labels, way_on)
+                remedy = f"lower alpha from {self.alpha:.6g} (choose_alpha finds the best one) or {remedy}"
+            warn_of_swing(values, self.waypoints, self.end, self.labels, remedy)
 
     def resolved(self, table: NDArray[Any], digits: int) -> Self:
-        """The same plan with coefficients from decimals (nwaypoints, order + 1, naxes), where they can be had."""
+        """The same plan with coefficients from decimals (nwaypoints, order + 1, naxes), where possible."""
         parts = []
         for axes, system, coefficients in self._parts:
             values = table[system.waypoint_index, system.order_index][:, list(axes)]
@@ -186,11 +186,11 @@ class NewtonSpline(WaypointSpline):
         return self._with_fields(_parts=parts)
 
     def quiet(self) -> Self:
-        """The same plan, which no longer warns where `through` or `with_values` swings."""
+        """The same plan, with warnings of `through` and `with_values` disabled."""
         return self._again(self.waypoints, self._options._replace(warn=False))
 
     def _loaded(self) -> Self:
-        """The plan as it was saved: it was warned of when it was made, and its `through` warns."""
+        """The plan as it was saved: loading does not warn, `through` does."""
         return self._with_fields(_options=self._options._replace(warn=True))
 
     def map_time(self, origin: float, target: float, rate: float) -> Self:
@@ -229,12 +229,12 @@ class NewtonSpline(WaypointSpline):
         """Trajectory from the plain data of `to_dict`."""
 
     def _per_axis(self) -> list[tuple[NewtonSystem, Array]]:
-        """System and coefficients (size,) of each axis in order."""
+        """System and coefficients (size,) of each axis."""
         found = {a: (s, c[:, i]) for axes, s, c in self._parts for i, a in enumerate(axes)}
         return [found[a] for a in range(self.naxes)]
 
     def to_dict(self) -> Data:
-        """Plain data: type, waypoints, labels and whatever else was chosen."""
+        """Plain data: type, waypoints, labels and options."""
         data: Data = {
             "type": type(self).__name__,
             "waypoints": [w.to_dict() for w in self.waypoints],
@@ -249,38 +249,38 @@ def _solved(system: NewtonSystem, data: Array, times: list[float], duration: flo
         found = system.fitted(data, times, duration, data * system.taylor_scale(duration))
     if not np.isfinite(found).all():
         raise ValueError(
-            "what waypoints prescribe must leave a plan within floating point, got coefficients beyond it from "
-            f"entries of up to {np.abs(data).max():g} over {duration:g} s"
+            "coefficients must stay within floating point, got an overflow from "
+            f"waypoint entries of up to {np.abs(data).max():g} over {duration:g} s"
         )
     return found
 
 
 def _apart(times: list[float], relative: Array, duration: float) -> Array | None:
-    """Differences of the times in parts of the duration, where those of the rounded parts would lose digits."""
+    """Differences of the normalised times, if those of the rounded times would lose digits."""
     if np.diff(relative).min(initial=1.0) > 1e-4:
         return None
     return np.subtract.outer(times, times) / duration
 
 
 def _same_pattern(donor: NewtonSpline, relative: Array, apart: Array | None) -> bool:
-    """Whether the systems of another plan fit these times."""
+    """Whether the systems of another plan are valid for these times."""
     if not np.array_equal(donor._relative, relative):
         return False
     return apart is None or (donor._apart is not None and np.array_equal(donor._apart, apart))
 
 
 def _size(alpha: float, count: int, degree: int | None) -> int | None:
-    """Number of coefficients at a degree, None for as many as constraints."""
+    """Number of coefficients at a degree; None for the number of constraints."""
     if degree is None:
         return None
     minimum = count // 2 if alpha else count - 1
     if degree < minimum:
-        raise ValueError(f"degree must be at least {minimum} for {count} constraints an axis, got {degree}")
+        raise ValueError(f"degree must be at least {minimum} for {count} constraints per axis, got {degree}")
     return max(2 * degree if alpha else degree + 1, count)
 
 
 def given_entries(waypoints: Sequence[Waypoint]) -> tuple[Array, list[Given]]:
-    """Entries (waypoint, order, axis), and for each axis the orders given at each waypoint."""
+    """Entries (waypoint, order, axis), and the orders prescribed at each waypoint for each axis."""
     jets = [w.jet for w in waypoints]
     sizes = [len(j) for j in jets]
     if min(sizes) == max(sizes) and all([w.complete for w in waypoints]):
@@ -294,7 +294,7 @@ def given_entries(waypoints: Sequence[Waypoint]) -> tuple[Array, list[Given]]:
 
 
 def _meeting(table: Array, alpha: float) -> list[bool]:
-    """Whether the first and last positions agree, axis by axis; only near alpha = 2 pi, where ends can meet."""
+    """Whether the first and last position of each axis agree; only near alpha = 2 pi, where ends may coincide."""
     if alpha < NEARLY_CLOSED:
         return [False] * table.shape[2]
     found = []
@@ -307,7 +307,7 @@ def _meeting(table: Array, alpha: float) -> list[bool]:
 def _groups(
     patterns: list[Given], gamma: float | list[float | None] | None, meeting: list[bool]
 ) -> dict[Kind, tuple[int, ...]]:
-    """Axes that share a pattern of given entries, a gamma, and whether their ends meet."""
+    """Axes with the same pattern of prescribed entries, gamma and coinciding ends."""
     if gamma is None and patterns.count(patterns[0]) == len(patterns) and len(set(meeting)) == 1:
         return {(patterns[0], None, meeting[0]): tuple(range(len(patterns)))}
     gammas = gamma if isinstance(gamma, list) else [gamma] * len(patterns)
@@ -318,5 +318,5 @@ def _groups(
 
 
 def checked_degree(degree: int | None, smooth: int) -> tuple[int | None, int]:
-    """Degree and order of smoothness as whole numbers from 1."""
+    """Degree and order of smoothness as integers of at least 1."""
     return None if degree is None else checked_count(degree, "degree", 1), checked_count(smooth, "smooth", 1)

@@ -1,4 +1,4 @@
-"""One spline a segment: the paper's first approach to via points."""
+"""Splines with one function per segment: the paper's first approach to via points."""
 
 from __future__ import annotations
 
@@ -23,29 +23,29 @@ from ctrlplan.trajectories.trigonometric import TrigSpline, chosen_alpha
 from ctrlplan.trajectories.waypoint import Waypoint
 from ctrlplan.trajectories.waypoint_spline import WaypointSpline, checked_waypoints, same_axes, same_times
 
-_KEPT = 1e-12
-"""Relative error of the free entries, as estimated, up to which floating point solves for them."""
+_ACCURATE = 1e-12
+"""Estimated relative error of the free entries above which decimal arithmetic is used."""
 
 _SINGULAR = 1e13
-"""Condition of their equations, with segments of one duration, from which they are not determined."""
+"""Condition number of their equations, for equal durations, above which they are not determined."""
 
 _SHORT = 0.02
-"""Part of the longest segment below which a segment needs its entries in more digits than floating point has."""
+"""Duration relative to the longest segment below which entries are computed in decimal arithmetic."""
 
 _WITHIN = np.linspace(0.0, 1.0, 13)
-"""Parts of a segment at which its swing is measured."""
+"""Relative times in a segment at which its range is measured."""
 
 
 class PiecewiseSpline(WaypointSpline):
-    """One spline for each segment between waypoints.
+    """Piecewise spline, one function per segment between waypoints.
 
-    With K - 1 the highest order that an axis prescribes anywhere, an entry of
-    order j < K left free at an inner waypoint is continuous there, and so is
-    its conjugate, the derivative of order 2K - 1 - j, which determines it. With
-    alpha = 0 that is the interpolant of least int (y^(K))^2: the cubic spline
-    where velocities are free between given ones, the minimum-jerk spline where
-    velocities and accelerations are. Entries left free at the ends lower the
-    degree of the first and last segment. What no waypoint prescribes may jump.
+    Let K - 1 be the highest order that is prescribed for an axis. An entry of
+    order j < K that is free at an inner waypoint is determined by continuity of
+    its conjugate, the derivative of order 2K - 1 - j. For alpha = 0 this is the
+    interpolant that minimises int (y^(K))^2: the cubic spline if velocities are
+    free between prescribed ones, the minimum-jerk spline if velocities and
+    accelerations are. Free entries at the ends lower the degree of the first and
+    last segment. Derivatives that no waypoint prescribes may jump.
 
     Parameters
     ----------
@@ -57,9 +57,9 @@ class PiecewiseSpline(WaypointSpline):
     labels : sequence of str, optional
         Names of the axes.
     warn : bool, optional
-        Whether to warn where the plan swings over more than 3 times the range
-        of its waypoints (their positions, and where their derivatives lead
-        within half a segment), on any axis.
+        Whether to warn if the range of the plan on any axis exceeds 3 times that
+        of its waypoints (their positions, and the extrapolation of their
+        derivatives over half a segment).
 
     Attributes
     ----------
@@ -70,7 +70,7 @@ class PiecewiseSpline(WaypointSpline):
     ------
     ValueError
         If alpha is outside [0, 2 pi), times do not increase, axes differ, or
-        the entries left free are not determined.
+        free entries are not determined.
 
     Warns
     -----
@@ -159,7 +159,7 @@ class PiecewiseSpline(WaypointSpline):
         """Trajectory from the plain data of `to_dict`."""
         points = [Waypoint.from_dict(w) for w in data["waypoints"]]
         plan = cls(points, alpha=data["alpha"], labels=data["labels"], warn=False)
-        return plan._with_fields(_warn=True)  # of what is made from it
+        return plan._with_fields(_warn=True)  # for plans that are derived from it
 
     def map_time(self, origin: float, target: float, rate: float) -> Self:
         """Same path at other times; as `Trajectory.map_time`."""
@@ -167,20 +167,20 @@ class PiecewiseSpline(WaypointSpline):
         return self._again(moved, self._warn)
 
     def _again(self, points: Iterable[Waypoint], warn: bool) -> Self:
-        """Plan of the same shape through other waypoints, without a warning now."""
+        """Plan of the same shape through other waypoints, without a warning."""
         plan = type(self)(points, alpha=self.alpha, labels=self.labels, warn=False)
         return plan._with_fields(_warn=warn)
 
     def quiet(self) -> Self:
-        """The same plan, which no longer warns where `through` or `with_values` swings."""
+        """The same plan, with warnings of `through` and `with_values` disabled."""
         return self._again(self.waypoints, False)
 
     def _check_swing(self) -> None:
-        """Warn, where it was not declined, of a plan that swings far beyond its waypoints."""
+        """Warn, unless disabled, if the plan swings far beyond its waypoints."""
         if self._warn:
             values = [segment.segment_jet(0, segment.duration * _WITHIN, 0)[0] for segment in self.segments]
-            way_on = f"lower alpha from {self.alpha:.6g}" if self.alpha else "prescribe velocities at inner waypoints"
-            warn_of_swing(np.concatenate(values, axis=1), self.waypoints, self.end, self.labels, way_on)
+            remedy = f"lower alpha from {self.alpha:.6g}" if self.alpha else "prescribe velocities at inner waypoints"
+            warn_of_swing(np.concatenate(values, axis=1), self.waypoints, self.end, self.labels, remedy)
 
     def segment_jet(self, segment: int, s: Array, order: int) -> Array:
         """Derivatives of a segment; as `Trajectory.segment_jet`."""
@@ -192,7 +192,7 @@ class PiecewiseSpline(WaypointSpline):
 
 
 def _filled(points: tuple[Waypoint, ...], alpha: float) -> tuple[list[Waypoint], NDArray[np.object_] | None]:
-    """Waypoints whose inner ones have no free entry below the axis's highest order; and as decimals, where needed."""
+    """Waypoints with all free entries of inner ones filled in; and as decimals, where needed."""
     table, patterns = given_entries(points)
     filled = table.copy()
     decimals: NDArray[np.object_] | None = None
@@ -213,7 +213,7 @@ def _filled(points: tuple[Waypoint, ...], alpha: float) -> tuple[list[Waypoint],
 
 
 def _resolve(segments: list[NewtonSpline], decimals: NDArray[np.object_]) -> None:
-    """Replace short segments, whose higher derivatives rounding of the entries at their ends would change."""
+    """Replace short segments, whose higher derivatives are sensitive to rounding of the entries at their ends."""
     durations = [segment.duration for segment in segments]
     longest = max(durations)
     for k, duration in enumerate(durations):
@@ -230,14 +230,14 @@ def _conjugate(
     table: Array,
     alpha: float,
 ) -> NDArray[Any]:
-    """Free entries (nfree, naxes) that leave no jump of the conjugate derivatives: floats, or decimals."""
+    """Free entries (nfree, naxes) for continuous conjugate derivatives: floats, or decimals."""
     last = len(points) - 1
     ends: list[Ends] = []
     for segment in range(last):
         start, end = (pattern[i] if i in (0, last) else tuple(range(size)) for i in (segment, segment + 1))
         if not (start or end):
             raise ValueError(
-                f"waypoints must prescribe something on every segment, got none from {segment} to {segment + 1}"
+                f"waypoints must prescribe an entry of every segment, got none from {segment} to {segment + 1}"
             )
         ends.append((start, end))
     times = np.array([p.time for p in points])
@@ -247,28 +247,28 @@ def _conjugate(
     equations = None
     if durations.min() >= _SHORT * durations.max():
         equations = _jumps(durations / unit, ends, free, times_powers(table, unit, np.arange(size)[:, None]), alpha)
-    if equations is not None and equations.loss <= _KEPT:
+    if equations is not None and equations.loss <= _ACCURATE:
         entries: NDArray[Any] = np.linalg.solve(equations.matrix, -equations.known)
         return times_powers(entries, 1.0 / unit, orders[:, None])
-    # Whether the data determine the entries does not depend on the times, which may be far from even.
+    # Whether the data determine the entries does not depend on the times, which may be uneven.
     even = _jumps(np.ones(last), ends, free, table, alpha)
     solution = None
     if even is None or even.condition <= _SINGULAR or alpha > NEARLY_CLOSED:
         solution = conjugate_digits(alpha, times.tolist(), ends, free, table)
     if solution is None:
-        raise ValueError("the entries left free at inner waypoints must be determined by the others; prescribe more")
+        raise ValueError("free entries at inner waypoints must be determined by the prescribed ones; prescribe more")
     finite = np.isfinite(solution.astype(float))
     if not finite.all():
         i, k = free[int(np.argwhere(~finite)[0, 0])]
         raise ValueError(
-            f"derivatives at inner waypoints must stay within floating point, got a larger derivative {k} at "
-            f"waypoints[{i}]; move waypoints apart that are so near in time"
+            f"derivatives at inner waypoints must stay within floating point, got an overflow of derivative {k} at "
+            f"waypoints[{i}]; increase the time between neighbouring waypoints"
         )
     return solution
 
 
 class _Equations(NamedTuple):
-    """Equations of the free entries, matrix (nfree, nfree) by known sides (nfree, naxes)."""
+    """Equations of the free entries: matrix (nfree, nfree), right-hand sides (nfree, naxes)."""
 
     matrix: Array
     known: Array
@@ -279,10 +279,10 @@ class _Equations(NamedTuple):
 def _jumps(
     durations: Array, ends: list[Ends], free: list[tuple[int, int]], table: Array, alpha: float
 ) -> _Equations | None:
-    """Jumps of the conjugate derivatives, scaled by rows; None where they are beyond floating point.
+    """Jumps of the conjugate derivatives, scaled by rows; None on overflow.
 
-    The segments are linear in their data, so each free entry is tried as an axis of
-    its own after those given; times are in units of the mean segment.
+    The segments are linear in their data: each free entry is an additional axis
+    with a unit value. Times are in units of the mean segment.
     """
     last, size, naxes = durations.size, table.shape[1], table.shape[2]
     columns = np.concatenate([np.nan_to_num(table), np.zeros((last + 1, size, len(free)))], axis=2)
@@ -308,7 +308,7 @@ def _jumps(
     size_of = np.abs(rows[:, naxes:]).max(axis=1, keepdims=True)
     rows /= np.where(size_of > 0.0, size_of, 1.0)
     matrix = rows[:, naxes:]
-    # Columns scaled, so that the units of the entries do not count.
+    # Columns are scaled, so that the units of the entries do not matter.
     size_of = size_of[:, 0] * np.abs(matrix).max(axis=0)
     condition = float(np.linalg.cond(matrix / np.abs(matrix).max(axis=0))) if size_of.min() > 0.0 else np.inf
     return _Equations(matrix, rows[:, :naxes], condition, np.finfo(float).eps * condition * amplification)

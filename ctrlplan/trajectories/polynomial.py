@@ -12,34 +12,34 @@ from ctrlplan.trajectories.waypoint_spline import checked_waypoints
 
 
 class PolySpline(NewtonSpline):
-    """Polynomial of least degree through waypoints.
+    """Polynomial of minimum degree through waypoints.
 
-    Equation (12), for any number of waypoints: the member alpha = 0 of the
+    Equation (12) for any number of waypoints: the limit alpha = 0 of the
     trigonometric family, computed in the same Newton form.
 
     Parameters
     ----------
     waypoints : iterable of Waypoint
-        Two or more, times increasing; each axis may leave its own entries free.
+        Two or more, times increasing; the free entries may differ between axes.
     labels : sequence of str, optional
         Names of the axes.
     degree : int, optional
-        Degree where it should be higher than the constraints need; the spare
-        coefficients minimise the integral of the squared derivative of order
-        `smooth`.
+        Degree, at least the default, the number of constraints minus 1. The
+        additional coefficients minimise the integral of the squared derivative
+        of order `smooth`.
     smooth : int, optional
-        That order, 3 (jerk) unless given.
+        Order of that derivative; default 3 (jerk).
     warn : bool, optional
-        Whether to warn where the plan swings over more than 3 times the range
-        of its waypoints (their positions, and where their derivatives lead
-        within half a segment), on any axis.
+        Whether to warn if the range of the plan on any axis exceeds 3 times that
+        of its waypoints (their positions, and the extrapolation of their
+        derivatives over half a segment).
 
     Raises
     ------
     ValueError
         If times do not increase, axes differ, the free entries make the system
-        singular, or the degree is too low; if rounding could cost more than 1e-6
-        of the plan's range.
+        singular, or the degree is too low; if rounding could change the plan by
+        more than 1e-6 of its range.
 
     Warns
     -----

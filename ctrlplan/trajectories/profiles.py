@@ -1,4 +1,4 @@
-"""Moves from rest to rest that are as fast as limits allow."""
+"""Time-optimal rest-to-rest moves: trapezoidal and S-curve profiles."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from ctrlplan.trajectories.waypoint_spline import FromWaypoints, checked_waypoin
 
 
 class _Profile(Trajectory, FromWaypoints):
-    """Line initial + (final - initial) s(t) from rest to rest, s a rise of velocity, a cruise and the rise mirrored.
+    """Line initial + (final - initial) s(t) from rest to rest, with acceleration, cruise and mirrored deceleration.
 
-    The rise is counted from the start and the fall backwards from the end, so
-    that both positions are exact. Segments last as long as the clock says after
-    rounding, and s is made of those: however late the start, what should be
-    continuous is, and no limit is exceeded, both to the last digits.
+    The acceleration phase is evaluated from the start, the deceleration phase
+    backwards from the end, so that both positions are exact. s is computed from
+    the differences of the rounded breakpoints: for any start time continuity
+    and limits hold to the last digits.
     """
 
     velocity: Array
@@ -37,7 +37,7 @@ class _Profile(Trajectory, FromWaypoints):
     _nfall: int
 
     _names: ClassVar[tuple[str, ...]]
-    _ramp: ClassVar[Array]  # the highest continuous derivative at both ends of each segment of the rise, to scale
+    _ramp: ClassVar[Array]  # relative highest continuous derivative at both ends of each segment of the rise
 
     def to_dict(self) -> Data:
         """Plain data that `trajectory_from_dict` reads."""
@@ -58,17 +58,18 @@ class _Profile(Trajectory, FromWaypoints):
 
     @classmethod
     def from_waypoints(cls, waypoints: Iterable[Waypoint], **options: Any) -> Self:
-        """Move from the first of two waypoints, at rest, to the second, which it reaches in time.
+        """Time-optimal move between two waypoints at rest.
 
-        It starts at the time of the first and rests from its end on; what jumps
-        there (the acceleration of a trapezoid) has its other limit at rest.
+        It starts at the time of the first waypoint and is at rest from its end
+        on, which is not after the second. At both ends the derivatives that
+        jump, such as the acceleration of a trapezoid, are 0 outside.
 
         Raises
         ------
         ValueError
-            If there are more than two waypoints, one leaves a position free or
-            prescribes motion, or the limits do not allow the move in the time
-            between them.
+            If there are more than two waypoints, a position is free, a derivative
+            is not 0, or the limits do not allow the move in the time between
+            them.
         """
         start, end = _rest_to_rest(checked_waypoints(waypoints), cls.__name__)
         found = cls._of(
@@ -98,7 +99,7 @@ class _Profile(Trajectory, FromWaypoints):
             change = ends.final - ends.initial
         if not (np.isfinite(change).all() and change.any()):
             raise ValueError(
-                "final must differ from initial, by a finite length, "
+                "final must differ from initial by a finite length, "
                 f"got {ends.final.tolist()} after {ends.initial.tolist()}"
             )
         given = [_checked_limit(*pair, ends.labels) for pair in zip(limits, self._names, strict=True)]
@@ -108,22 +109,22 @@ class _Profile(Trajectory, FromWaypoints):
         if not np.isfinite(durations).all():
             raise ValueError(f"limits must give segments of finite durations, got {durations.tolist()} s")
         minimum = 8.0 * np.finfo(float).eps * (abs(ends.start) + durations.sum())
-        kept = durations > minimum  # what is shorter is the rounding of a segment without duration
+        present = durations > minimum  # shorter ones are the rounding of a segment of zero duration
         nrise = len(self._ramp)
-        if not kept[:nrise].any():
+        if not present[:nrise].any():
             raise ValueError(
-                f"limits must leave the rise of velocity more than {minimum:.3g} s at time = {ends.start:g} s, "
+                f"limits must give an acceleration phase of more than {minimum:.3g} s at time = {ends.start:g} s, "
                 f"got {durations[:nrise].sum():.3g} s"
             )
         times = [ends.start]
-        # Rounded down, or without the time of segments left out, the others would exceed their limits.
-        for duration in (durations[kept] + durations[~kept].clip(min=0.0).sum()).tolist():
+        # If durations were rounded down, or omitted segments not compensated, the others would exceed their limits.
+        for duration in (durations[present] + durations[~present].clip(min=0.0).sum()).tolist():
             time = times[-1] + duration
             times.append(time if time - times[-1] >= duration else math.nextafter(time, math.inf))
-        lasts, ramp = np.diff(times), self._ramp[kept[:nrise]]
+        lasts, ramp = np.diff(times), self._ramp[present[:nrise]]
         rise, before = _rise(lasts[: len(ramp)], ramp, len(given))
         fall, after = _rise(lasts[::-1][: len(ramp)], ramp, len(given))
-        cruise = np.zeros((int(kept[nrise]), rise.shape[1]))
+        cruise = np.zeros((int(present[nrise]), rise.shape[1]))
         cruise[:, :2] = before, 1.0
         if not np.isfinite(cruise).all():
             raise ValueError(f"limits must give segments within floating point, got durations {durations.tolist()} s")
@@ -155,7 +156,7 @@ class _Profile(Trajectory, FromWaypoints):
         return [[position + change * first, *(change * value for value in rest)] for position, change in axes]
 
     def _law(self, segment: int, s: Value, order: int) -> tuple[Array, list[Value]]:
-        """Position that a segment counts from, and the Taylor series of the part of the line beyond it."""
+        """Reference position of a segment, and the Taylor series of s relative to it."""
         if segment < len(self._lasts) - self._nfall:
             return self.initial, _shifted(self._taylor[segment], s, order)
         mirrored = _shifted(self._taylor[segment], self._lasts[segment] - s, order)
@@ -163,12 +164,13 @@ class _Profile(Trajectory, FromWaypoints):
 
 
 class Trapezoid(_Profile):
-    """Fastest rest-to-rest move with limits of its acceleration.
+    """Time-optimal rest-to-rest move with limited acceleration.
 
-    Under limits of velocity and acceleration: the velocity is a trapezoid, or a
-    triangle where the way is too short for its limit. Several axes move
-    together, on the straight line from `initial` to `final`, as fast as all
-    limits allow. The acceleration jumps at every breakpoint.
+    With limits on velocity and acceleration the velocity profile is a trapezoid,
+    or a triangle if the distance is too short to reach the velocity limit.
+    Several axes are synchronised on the straight line from `initial` to `final`
+    in the minimum time under all limits. The acceleration jumps at every
+    breakpoint.
 
     Parameters
     ----------
@@ -177,7 +179,7 @@ class Trapezoid(_Profile):
     initial : array_like, optional
         Position at the start.
     velocity, acceleration : array_like, scalar or shape (naxes,)
-        Greatest magnitudes, above 0 [unit of the axis per s, per s^2].
+        Maximum magnitudes, above 0 [unit of the axis per s, per s^2].
     time : float, optional
         Start [s].
     labels : sequence of str, optional
@@ -192,11 +194,12 @@ class Trapezoid(_Profile):
     ------
     ValueError
         If a limit is not above 0 and finite, no axis moves, a position is not
-        finite, shapes differ, or the clock does not resolve the rise.
+        finite, shapes differ, or floating-point times do not resolve the
+        acceleration phase.
 
     Examples
     --------
-    The duration is d/v + v/a where v^2/a < d, and else 2 sqrt(d/a):
+    The duration is d/v + v/a if v^2/a < d, otherwise 2 sqrt(d/a):
 
     >>> Trapezoid(3.0, velocity=1.0, acceleration=0.5).duration
     5.0
@@ -223,12 +226,12 @@ class Trapezoid(_Profile):
 
 
 class SCurve(_Profile):
-    """Fastest rest-to-rest move with limits of its jerk.
+    """Time-optimal rest-to-rest move with limited jerk.
 
-    Under limits of velocity, acceleration and jerk: seven segments of constant
-    jerk, or fewer where the velocity or the acceleration limit is not reached.
-    Several axes move together, on the straight line from `initial` to `final`,
-    as fast as all limits allow. The jerk jumps at every breakpoint.
+    With limits on velocity, acceleration and jerk the move has seven segments of
+    constant jerk, or fewer if the velocity or acceleration limit is not reached.
+    Several axes are synchronised on the straight line from `initial` to `final`
+    in the minimum time under all limits. The jerk jumps at every breakpoint.
 
     Parameters
     ----------
@@ -237,7 +240,7 @@ class SCurve(_Profile):
     initial : array_like, optional
         Position at the start.
     velocity, acceleration, jerk : array_like, scalar or shape (naxes,)
-        Greatest magnitudes, above 0 [unit of the axis per s, per s^2, per s^3].
+        Maximum magnitudes, above 0 [unit of the axis per s, per s^2, per s^3].
     time : float, optional
         Start [s].
     labels : sequence of str, optional
@@ -252,11 +255,12 @@ class SCurve(_Profile):
     ------
     ValueError
         If a limit is not above 0 and finite, no axis moves, a position is not
-        finite, shapes differ, or the clock does not resolve the rise.
+        finite, shapes differ, or floating-point times do not resolve the
+        acceleration phase.
 
     Examples
     --------
-    With every limit reached the duration is d/v + v/a + a/j:
+    If every limit is reached, the duration is d/v + v/a + a/j:
 
     >>> SCurve(4.0, velocity=1.0, acceleration=0.5, jerk=0.5).duration
     7.0
@@ -284,9 +288,9 @@ class SCurve(_Profile):
 
 
 def _rest_to_rest(points: tuple[Waypoint, ...], kind: str) -> tuple[Waypoint, Waypoint]:
-    """Two waypoints at rest, between which a profile can move."""
+    """Start and end of a rest-to-rest move, checked."""
     if len(points) != 2:
-        raise ValueError(f"a {kind} must lead from one waypoint to one other, got {len(points)} waypoints")
+        raise ValueError(f"a {kind} must have exactly two waypoints, got {len(points)} waypoints")
     for i, point in enumerate(points):
         if np.isnan(point.position).any():
             raise ValueError(f"a {kind} must have its positions prescribed, got waypoints[{i}] = {point}")
@@ -296,11 +300,11 @@ def _rest_to_rest(points: tuple[Waypoint, ...], kind: str) -> tuple[Waypoint, Wa
 
 
 def _fastest(velocity: float, acceleration: float, jerk: float = math.inf) -> Array:
-    """Durations of rise, cruise and fall of the fastest unit move; without a limit of jerk the rise is one segment."""
+    """Segment durations of the time-optimal unit move; without a jerk limit the acceleration phase is one segment."""
     ramp = min(acceleration / jerk, np.sqrt(velocity / jerk), np.cbrt(0.5 / jerk))
     peak = acceleration if ramp == acceleration / jerk else jerk * ramp
     to_limit = velocity / peak + ramp
-    halfway = 0.5 * (ramp + np.hypot(ramp, 2.0 / np.sqrt(peak)))  # a rise that covers half of the way
+    halfway = 0.5 * (ramp + np.hypot(ramp, 2.0 / np.sqrt(peak)))  # acceleration over half of the distance
     rises = min(to_limit, halfway)
     cruise = 1.0 / velocity - to_limit if to_limit < halfway else 0.0
     rise = [rises] if jerk == math.inf else [ramp, rises - 2.0 * ramp, ramp]
@@ -308,7 +312,7 @@ def _fastest(velocity: float, acceleration: float, jerk: float = math.inf) -> Ar
 
 
 def _rise(lasts: Array, ramp: Array, order: int) -> tuple[Array, float]:
-    """Rise to unit velocity: Taylor coefficients (nsegments, order + 1) at the start of each segment; its length."""
+    """Acceleration to unit velocity: Taylor coefficients (nsegments, order + 1) by segment; distance."""
     rows, end = [(ramp[:, 1] - ramp[:, 0]) / lasts, ramp[:, 0]], [float(ramp[-1, 1])]
     for _ in range(order - 1):
         grown = np.cumsum(sum(row * lasts**k / FACTORIALS[k] for k, row in enumerate(reversed(rows), 1)))
@@ -328,7 +332,7 @@ def _shifted(taylor: list[float], s: Value, order: int) -> list[Value]:
 
 
 def _checked_limit(limit: ArrayLike, name: str, labels: tuple[str, ...]) -> Array:
-    """Limit of each axis."""
+    """Limit of each axis, checked."""
     values = new_numbers(limit, name)
     if values.shape not in ((), (len(labels),)):
         raise ValueError(f"{name} must be a scalar or of shape ({len(labels)},), got shape {values.shape}")

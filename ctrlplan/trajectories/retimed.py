@@ -1,4 +1,4 @@
-"""A plan on another clock."""
+"""Time reparametrisation of a plan."""
 
 from __future__ import annotations
 
@@ -16,39 +16,39 @@ from ctrlplan.trajectories.files import trajectory_from_dict
 from ctrlplan.trajectories.trajectory import Trajectory
 
 _ROUNDING = 1e-12
-"""Part of a clock, or of a rate, that rounding may cost."""
+"""Relative rounding error allowed in times and rates."""
 
 
 class Retimed(Trajectory):
-    """Path of a plan on another clock: plan(law(t)).
+    """Plan with another time law: plan(law(t)).
 
     Parameters
     ----------
     plan : Trajectory
-        The path, with a duration.
+        Plan to be reparametrised, with a duration.
     law : Trajectory
-        Time of the plan [s] over time [s]: one axis, continuous and strictly
-        increasing, from the plan's start to its end.
+        Time law: time of the plan [s] as a function of time [s], on one axis,
+        continuous and strictly increasing from the plan's start to its end.
     labels : sequence of str, optional
-        Names of the axes; the plan's unless given.
+        Names of the axes; default: those of the plan.
 
     Attributes
     ----------
     plan, law
-        As given.
+        The arguments.
 
     Raises
     ------
     TypeError
-        If one is not a trajectory.
+        If an argument is not a trajectory.
     ValueError
-        If the plan has no duration, or the law has several axes, other ends, a
-        jump, or does not increase; if the plan is shaped (`Shaper`) and the
-        rate of the law is not 1, which would change the delays of the shaper.
+        If the plan has no duration, or the time law has several axes, other
+        ends, a jump, or does not increase; if the plan is shaped (`Shaper`) and
+        the rate of the law is not 1, which would change the delays of the shaper.
 
     Examples
     --------
-    A straight line, sped up and slowed down as a trapezoid:
+    A straight line with a trapezoidal velocity profile:
 
     >>> from ctrlplan.trajectories import PolySpline, Trapezoid, Waypoint
     >>> line = PolySpline([Waypoint(0, 0), Waypoint(4, 8)])
@@ -106,7 +106,7 @@ class Retimed(Trajectory):
     def _sample(self, t: Array, low: int, high: int, left: bool) -> Array:
         out = super()._sample(t, low, high, left)
         at_end = t == self.end
-        if not left and at_end.any():  # the end belongs to the plan, by its own rule
+        if not left and at_end.any():  # the plan defines its own value at the end
             jets = self.plan.jet([self.plan.end], high), self.law.jet([self.end], high)
             out[:, :, at_end] = _composed_jets(*jets)[low:]
         return out
@@ -126,12 +126,12 @@ class Retimed(Trajectory):
         return [composed(row, rates) for row in self.plan.segment_series(of_plan, elapsed, order)]
 
     def _since(self, segment: int) -> float:
-        """Time [s] from the beginning of the law's segment to that of one of the whole."""
+        """Time [s] from the start of the law's segment to the start of a segment of this plan."""
         return float(self.breakpoints[segment] - self.law.breakpoints[self._segments[segment][0]])
 
 
 def composed(outer: Sequence[Value], inner: Sequence[Value]) -> list[Value]:
-    """Taylor series of a function of a function.
+    """Taylor series of a composition of functions.
 
     Coefficients may be numbers, arrays that broadcast, or symbols.
 
@@ -140,7 +140,7 @@ def composed(outer: Sequence[Value], inner: Sequence[Value]) -> list[Value]:
     outer : sequence of length order + 1
         Coefficients of the outer function about the value of the inner one.
     inner : sequence of length order
-        Coefficients 1, 2, ... of the inner function: its value is left out.
+        Coefficients 1, 2, ... of the inner function, without its value.
 
     Returns
     -------
@@ -153,14 +153,14 @@ def composed(outer: Sequence[Value], inner: Sequence[Value]) -> list[Value]:
 
 
 def _composed_jets(outer: Array, inner: Array) -> Array:
-    """Jet of a function (order + 1, naxes, ntime) of a law (order + 1, 1, ntime)."""
+    """Jet of the composition of a plan (order + 1, naxes, ntime) with a time law (order + 1, 1, ntime)."""
     factorials = FACTORIALS[: len(outer), None, None]
     rows = composed(list(outer / factorials), list(inner / factorials)[1:])
     return np.array(rows) * factorials
 
 
 def _checked_law(plan: Trajectory, law: Trajectory, slack: float) -> Array:
-    """Values of the law at its breakpoints, once it is found to lead through the plan."""
+    """Values of a time law at its breakpoints, after a check that it runs through the plan."""
     if not plan.duration:
         raise ValueError("plan must have a duration, got a step")
     if law.naxes != 1:
@@ -168,7 +168,9 @@ def _checked_law(plan: Trajectory, law: Trajectory, slack: float) -> Array:
     values = law(law.breakpoints)
     first, last = float(law.initial[0]), float(law.final[0])
     if max(abs(first - plan.start), abs(last - plan.end)) > slack:
-        raise ValueError(f"law must lead from {plan.start} s to {plan.end} s, where the plan is, got {first} to {last}")
+        raise ValueError(
+            f"law must lead from the plan's start {plan.start} s to its end {plan.end} s, got {first} to {last}"
+        )
     for jump in law.jumps(0):
         raise ValueError(f"law must be continuous, got a jump by {jump.size:g} at {jump.time:g} s")
     rate = law.extrema(1)
@@ -177,7 +179,7 @@ def _checked_law(plan: Trajectory, law: Trajectory, slack: float) -> Array:
     if is_shaped(plan) and not (is_unit_rate(float(rate.minimum[0])) and is_unit_rate(float(rate.maximum[0]))):
         raise ValueError(
             f"law must have the rate 1 where the plan is shaped, got {rate.minimum[0]:g} to {rate.maximum[0]:g}: the "
-            f"delays of the shaper would change with it; take the plan before it is shaped, then shape the result"
+            f"delays of the shaper would change with it; retime the plan before it is shaped, then shape the result"
         )
     for segment in np.flatnonzero(np.diff(values) <= 0.0).tolist():
         raise ValueError(f"law must increase strictly, got {values[segment]:g} from {law.breakpoints[segment]:g} s on")
@@ -185,9 +187,9 @@ def _checked_law(plan: Trajectory, law: Trajectory, slack: float) -> Array:
 
 
 def _passing(law: Trajectory, values: Array, target: float, slack: float) -> float:
-    """Instant at which an increasing law, of some values at its breakpoints, reaches a target."""
+    """Time at which an increasing law, with given values at its breakpoints, reaches a target."""
     nearest = int(np.abs(values - target).argmin())
-    # Where the rate is 0 there, a root would be off by a root of the rounding.
+    # At a rate of 0 the error of a root would be the square root of the rounding.
     if abs(values[nearest] - target) <= slack:
         return float(law.breakpoints[nearest])
     segment = int(np.searchsorted(values, target)) - 1

@@ -1,10 +1,10 @@
-"""Many times of an analytic function from exact jets at few.
+"""Evaluation of analytic functions at many times from exact jets at few.
 
-Times in order are cut into cells; exact jets at the cells' centres go to the
-times around them by their Taylor series: one matrix product for all cells where
-the times are evenly spaced, one a cell where they are not. Times in no order
-take a Chebyshev proxy of each derivative, built from exact jets. All are as
-accurate as the jets: terms are kept until they fall below rounding.
+Sorted times are divided into cells. In each cell the Taylor series about its
+centre, from the exact jet there, gives the values: by one matrix product for
+all cells if the times are evenly spaced, otherwise by one per cell. For unsorted
+times a Chebyshev interpolant of each derivative is built from exact jets. All
+are as accurate as the jets: series are truncated below rounding.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from ctrlplan.trajectories.chebyshev import chebyshev_proxy
 from ctrlplan.trajectories.common import FACTORIALS, Array
 
 FEW = 4096
-"""Number of times up to which the jets themselves are taken."""
+"""Number of times up to which the jets themselves are evaluated."""
 
 _MAX_TERMS = 24
-_PRODUCT = 2**18  # multiplications up to which a matrix product stays in one thread
-_CHUNK = 4104  # not a power of two: rows that far apart would share cache lines
+_PRODUCT = 2**18  # maximum multiplications of a matrix product in one thread
+_CHUNK = 4104  # not a power of two, to avoid cache conflicts between rows
 
 
 def sample(jet: Callable[[Array, int], Array], duration: float, t: Array, low: int, high: int) -> Array:
@@ -60,7 +60,7 @@ def sample(jet: Callable[[Array, int], Array], duration: float, t: Array, low: i
 
 
 def _is_uniform(t: Array, duration: float) -> bool:
-    """Whether the times are evenly spaced to rounding of the segment's own clock."""
+    """Whether the times are evenly spaced up to rounding of times within the segment."""
     step = (t[-1] - t[0]) / (t.size - 1)
     slack = 4.0 * np.finfo(float).eps * duration
     if not step > 0.0 or abs(t[1] - t[0] - step) > slack:
@@ -77,11 +77,11 @@ def _is_uniform(t: Array, duration: float) -> bool:
 
 
 def _taylor_terms(size: Array, radius: float, low: int, high: int) -> int | None:
-    """Terms after which the series have died, from the size (order, naxes) of the derivatives."""
+    """Number of significant terms of the series, from the magnitudes (order, naxes) of the derivatives."""
     powers = radius ** np.arange(_MAX_TERMS + 3) / FACTORIALS[: _MAX_TERMS + 3]
     tails = np.stack([size[nu : nu + _MAX_TERMS + 3] * powers[:, None] for nu in range(low, high + 1)])
     small = tails <= 0.25 * np.finfo(float).eps * tails.max(axis=1, keepdims=True)
-    # Larger terms than the value would cancel, and cost digits.
+    # Terms larger than the value would cancel and lose digits.
     if np.any(tails.sum(axis=1) > 4.0 * tails[:, 0]):
         return None
     # Two terms in a row, so that an odd or even function does not end its series early.
@@ -152,7 +152,7 @@ def _sample_proxy(coefficients: Array, duration: float, t: Array) -> Array:
         x = (t[first : first + _CHUNK] - middle) / radius
         terms = basis[:, : x.size]
         terms[1] = x
-        top = 1  # T_{top + k} = 2 T_top T_k - T_{top - k}: twice as many at each turn
+        top = 1  # T_{top + k} = 2 T_top T_k - T_{top - k}: doubles the number in each pass
         while top < size - 1:
             more = min(top, size - 1 - top)
             block = terms[top + 1 : top + more + 1]

@@ -1,4 +1,4 @@
-"""Input shaping: a reference split into delayed parts whose vibrations cancel."""
+"""Input shaping: delayed copies of a reference whose residual vibrations cancel."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from ctrlplan.trajectories.trajectory import Trajectory
 
 
 class Shaper(Fields):
-    r"""Impulses that any reference is convolved with.
+    r"""Input shaper, a sequence of impulses.
 
-    The shaped reference is :math:`\sum_i w_i\,r(t - t_i)`. A mode whose response
-    to the impulses dies with the last of them is left without vibration by
-    every reference, and the end is where it was.
+    The shaped reference is :math:`\sum_i w_i\,r(t - t_i)`. If the response of a
+    mode to the impulses is zero after the last impulse, no shaped reference
+    leaves residual vibration of that mode. The final position is unchanged.
 
     Parameters
     ----------
@@ -34,13 +34,14 @@ class Shaper(Fields):
     Attributes
     ----------
     delays, weights : ndarray, shape (nimpulses,)
-        As given; the sum of the weights is 1 to rounding.
+        The arguments; the sum of the weights is 1 up to rounding.
 
     Raises
     ------
     ValueError
-        If the delays do not increase from 0 or later, the weights do not sum to
-        1 within 1e-12, one is not finite, or the numbers of them differ.
+        If a delay is below 0, delays do not increase strictly, the weights do not
+        sum to 1 within 1e-12, a value is not finite, or the numbers of delays
+        and weights differ.
 
     References
     ----------
@@ -49,7 +50,7 @@ class Shaper(Fields):
 
     Examples
     --------
-    A load that swings with 2 rad/s, moved in two halves:
+    A ZV shaper for a load with a sway frequency of 2 rad/s:
 
     >>> import numpy as np
     >>> from ctrlplan.trajectories import Step
@@ -80,10 +81,11 @@ class Shaper(Fields):
 
     @classmethod
     def zv(cls, frequency: float, damping: float = 0.0) -> Self:
-        r"""Two impulses that leave no vibration of one mode.
+        r"""Zero-vibration (ZV) shaper of two impulses for one mode.
 
-        Half a period :math:`\pi/(\omega\sqrt{1 - \zeta^2})` apart, of weights in
-        the ratio :math:`K = e^{-\zeta\pi/\sqrt{1 - \zeta^2}}` to the first.
+        The second impulse comes half a period :math:`\pi/(\omega\sqrt{1 - \zeta^2})`
+        after the first, with :math:`K = e^{-\zeta\pi/\sqrt{1 - \zeta^2}}` times
+        its weight.
 
         Parameters
         ----------
@@ -95,17 +97,17 @@ class Shaper(Fields):
         Raises
         ------
         ValueError
-            If one is out of range.
+            If an argument is out of range.
         """
         return cls.zvd(frequency, damping, 0)
 
     @classmethod
     def zvd(cls, frequency: float, damping: float = 0.0, derivatives: int = 1) -> Self:
-        """Impulses that leave little vibration where the frequency is not quite known.
+        """Zero-vibration-and-derivative (ZVD) shaper, robust to frequency errors.
 
         The residual vibration and its derivatives with respect to frequency and
-        damping up to an order are 0: `zv` convolved with itself, weights by the
-        binomial theorem. Each order takes another half period.
+        damping up to an order are 0. The shaper is `zv` convolved with itself,
+        with binomial weights. Each order adds half a period to the duration.
 
         Parameters
         ----------
@@ -119,7 +121,7 @@ class Shaper(Fields):
         Raises
         ------
         ValueError
-            If one is out of range.
+            If an argument is out of range.
         """
         omega = checked_finite(frequency, "frequency", above=0.0)
         zeta, count = float(_checked_damping(damping)), checked_count(derivatives, "derivatives") + 1
@@ -131,7 +133,7 @@ class Shaper(Fields):
 
     @property
     def duration(self) -> float:
-        """Time [s] by which a shaped reference ends later."""
+        """Delay [s] of the last impulse, added to the duration of a reference."""
         return float(self.delays[-1])
 
     def __call__(self, plan: Trajectory) -> Trajectory:
@@ -140,26 +142,27 @@ class Shaper(Fields):
         Parameters
         ----------
         plan : Trajectory
-            Any reference, a `Step` too.
+            Any reference, including a `Step`.
 
         Returns
         -------
         Trajectory
-            From the plan's start and initial position to its final one,
-            `duration` after its end. It can be shifted, not retimed: the
-            delays are times of the mode, which another duration would change.
+            From the plan's start and initial position to its final position,
+            which it reaches `duration` after the plan's end. It can be shifted
+            but not retimed, which would change the delays.
 
         Raises
         ------
         TypeError
             If `plan` is not a trajectory.
         ValueError
-            If times so far from 0 round the delays by more than 1e-3 of the duration.
+            If rounding of times far from 0 changes the delays by more than 1e-3 of
+            the duration.
 
         Warns
         -----
         UserWarning
-            If they round them by more than 1e-6 of it.
+            If rounding changes the delays by more than 1e-6 of the duration.
         """
         if not isinstance(plan, Trajectory):
             raise TypeError(f"plan must be a Trajectory, got {type(plan).__name__}")
@@ -168,8 +171,8 @@ class Shaper(Fields):
         loss = float((np.abs(delayed - self.delays) / (self.duration or 1.0)).max())
         if loss > 1e-6:
             said = (
-                f"delays must be kept by the clock, got a loss of {loss:.1g} of the shaper's duration by rounding of "
-                f"times near {plan.start:.17g} s; count time from an origin nearer to the plan"
+                f"delays must be representable, got an error of {loss:.1g} of the shaper's duration by rounding of "
+                f"times near {plan.start:.17g} s; use a time origin nearer to the plan"
             )
             if loss > 1e-3:
                 raise ValueError(said)
@@ -177,24 +180,25 @@ class Shaper(Fields):
         return Sum((weight * part for part, weight in zip(parts, self.weights.tolist(), strict=True)), shaped=True)
 
     def then(self, other: Shaper) -> Shaper:
-        """Both shapers one after the other, for two modes: every impulse split again."""
+        """Convolution of two shapers, for two modes."""
         if not isinstance(other, Shaper):
             raise TypeError(f"other must be a Shaper, got {type(other).__name__}")
         delays = np.add.outer(self.delays, other.delays).ravel()
         order = np.argsort(delays, kind="stable")
         delays, weights = delays[order], np.outer(self.weights, other.weights).ravel()[order]
-        # What differs by the rounding of the sums is one impulse.
+        # Delays that differ by the rounding of sums are one impulse.
         first = np.flatnonzero(np.diff(delays, prepend=-1.0) > 8.0 * np.finfo(float).eps * delays[-1])
         return Shaper(delays[first], np.add.reduceat(weights, first))
 
     def residual(self, frequency: ArrayLike, damping: ArrayLike = 0.0) -> Array:
-        r"""Part of the vibration of a mode that is left.
+        r"""Residual vibration of a mode, relative to that of one impulse.
 
         .. math:: V = e^{-\zeta\omega t_n}
             \left|\sum_i w_i\,e^{(\zeta + i\sqrt{1 - \zeta^2})\,\omega t_i}\right|
 
-        The amplitude at the last impulse t_n, relative to that of one impulse of
-        weight 1 when it comes: over frequencies this is the sensitivity curve.
+        The amplitude after the last impulse t_n, relative to the initial amplitude
+        after one impulse of weight 1. As a function of frequency this is the
+        sensitivity curve.
 
         Parameters
         ----------
@@ -206,12 +210,12 @@ class Shaper(Fields):
         Returns
         -------
         ndarray, of the shape that both broadcast to
-            1 is the vibration without a shaper, 0 none.
+            Residual vibration: 1 is that of an undamped mode without a shaper.
 
         Raises
         ------
         ValueError
-            If one is out of range.
+            If an argument is out of range.
         """
         omega, zeta = new_numbers(frequency, "frequency"), _checked_damping(damping)
         if not np.all((omega >= 0.0) & (omega < math.inf)):
@@ -225,7 +229,7 @@ class Shaper(Fields):
 
 
 def _checked_damping(damping: ArrayLike) -> Array:
-    """Damping ratios below the critical one."""
+    """Damping ratios in [0, 1), checked."""
     zeta = new_numbers(damping, "damping")
     if not np.all((zeta >= 0.0) & (zeta < 1.0)):
         raise ValueError(f"damping must lie in [0, 1), got {damping!r}")

@@ -1,4 +1,4 @@
-"""The step: what a plan is compared with."""
+"""The step reference."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from ctrlplan.trajectories.trajectory import Trajectory
 
 
 class Step(Trajectory):
-    """Jump from one position to another.
+    """Step from one position to another.
 
     Parameters
     ----------
     final : array_like, scalar or shape (naxes,)
-        Position from `time` on.
+        Position from `time` onward.
     initial : array_like, optional
-        Position before.
+        Position before `time`; default 0.
     time : float, optional
-        Instant of the jump [s]: start and end of this trajectory.
+        Time of the step [s]: start and end of this trajectory.
     labels : sequence of str, optional
         Names of the axes.
 

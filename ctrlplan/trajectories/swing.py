@@ -1,4 +1,4 @@
-"""Plans that swing far beyond what they must meet."""
+"""Warning for plans that swing far beyond their waypoints."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ctrlplan.trajectories.common import FACTORIALS, Array
 from ctrlplan.trajectories.waypoint import Waypoint
 
 MAXIMUM_SWING = 3.0
-"""Range of a plan, relative to that of its data, above which it warns.
+"""Range of a plan relative to that of its data above which a warning is issued.
 
 Rest-to-rest moves and those of the paper stay below 1.4 up to alpha = 4; from
 alpha = 4.5 on, and between many waypoints, one polynomial or trigonometric
@@ -20,29 +20,29 @@ spline swings by powers of ten.
 """
 
 
-def warn_of_swing(values: Array, points: Sequence[Waypoint], end: float, labels: Sequence[str], way_on: str) -> None:
-    """Warn of the axis that swings most, where the method that calls was called.
+def warn_of_swing(values: Array, points: Sequence[Waypoint], end: float, labels: Sequence[str], remedy: str) -> None:
+    """Warn of the axis with the largest relative range, at the line of the caller's caller.
 
     Parameters
     ----------
     values : ndarray, shape (naxes, ntime)
-        Positions of the plan at times between which it cannot hide much.
+        Positions of the plan on a grid that resolves it.
     points : sequence of Waypoint
-        What it meets.
+        Waypoints of the plan.
     end : float
         End of the plan [s], which may lie beyond the last waypoint.
     labels : sequence of str
         Names of the axes.
-    way_on : str
-        What to do instead.
+    remedy : str
+        Advice at the end of the message.
     """
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         plan = values.max(axis=1) - values.min(axis=1)
         positions = np.array([p.jet[0] for p in points])
         if (plan <= MAXIMUM_SWING * (positions.max(axis=0) - positions.min(axis=0))).all():
-            return  # the common case, without regard to derivatives
+            return  # the common case, before derivatives are evaluated
         low, high = _data_range(points, end)
-        # Relative to a range that is only rounding of the positions, rounding is large.
+        # If the range is only rounding of the positions, the ratio has no meaning.
         counts = plan > 1e-9 * np.abs(values).max(axis=1)
         swing = np.where(counts, plan / (high - low), 0.0)
     axis = int(swing.argmax())
@@ -50,13 +50,13 @@ def warn_of_swing(values: Array, points: Sequence[Waypoint], end: float, labels:
         warnings.warn(
             f"the plan swings over {swing[axis]:.3g} times the range of its waypoints: {labels[axis]} from "
             f"{values[axis].min():.6g} to {values[axis].max():.6g}, where positions and derivatives of the waypoints "
-            f"stay from {low[axis]:.6g} to {high[axis]:.6g}; {way_on}, or pass warn=False if this is intended",
+            f"stay from {low[axis]:.6g} to {high[axis]:.6g}; {remedy}, or pass warn=False if this is intended",
             stacklevel=4,
         )
 
 
 def _data_range(points: Sequence[Waypoint], end: float) -> tuple[Array, Array]:
-    """Minimum and maximum (naxes,) of positions, and of where derivatives lead within half a segment."""
+    """Minimum and maximum (naxes,) of positions and of the extrapolated derivatives over half a segment."""
     gaps = np.diff([p.time for p in points], append=max(end, points[-1].time))
     if not gaps[-1]:
         gaps = gaps[:-1]
@@ -73,5 +73,5 @@ def _data_range(points: Sequence[Waypoint], end: float) -> tuple[Array, Array]:
     known = ~np.isnan(table[:, 0])
     low = np.where(known, table[:, 0] - away, math.inf).min(axis=0)
     high = np.where(known, table[:, 0] + away, -math.inf).max(axis=0)
-    free = np.where(known, 0.0, away).sum(axis=0)  # derivatives at no stated position
+    free = np.where(known, 0.0, away).sum(axis=0)  # derivatives where the position is free
     return low - free, high + free

@@ -1,4 +1,4 @@
-"""The interface of every planned reference."""
+"""The interface of all trajectories."""
 
 from __future__ import annotations
 
@@ -34,34 +34,34 @@ if TYPE_CHECKING:
 class Trajectory(Fields, ABC):
     """Function of time with exact derivatives.
 
-    Between breakpoints it is analytic. Before the start it holds its first
-    position, after the end its last, with every derivative zero there. At a
-    breakpoint it takes the value and derivatives of what follows, at the end
-    its own.
+    A trajectory is analytic between breakpoints. Before its start it is constant
+    at the initial position, after its end at the final one, with zero
+    derivatives. At a breakpoint the value and derivatives are those of the
+    following segment, at the end those of the last segment.
 
     A new kind of trajectory must define
 
     - its fields, annotated at the top of the class, and a constructor that sets
-      them by ``self._set_fields(...)``: each once, and with them `labels` (tuple
+      each of them once by ``self._set_fields(...)``, including `labels` (tuple
       of str) and `breakpoints` (ndarray, increasing);
     - `segment_jet`, the derivatives between two breakpoints;
-    - `map_time`, the same path at other times: `retime` and `shift`;
-    - `to_dict` and `from_dict`, plain data: `save` and `load_trajectory`.
+    - `map_time`, the same path at other times, for `retime` and `shift`;
+    - `to_dict` and `from_dict`, plain data, for `save` and `load_trajectory`.
 
-    `segment_series` is needed only where the time is a symbol of CasADi, as under
-    a time scaling in a compiled simulation. A kind that is made through
-    waypoints derives from `WaypointSpline`. Everything else is derived here.
+    `segment_series` is required only if the time is a CasADi symbol, as with
+    time scaling in a compiled simulation. A trajectory through waypoints
+    derives from `WaypointSpline`. All other methods are inherited.
 
     Attributes
     ----------
     labels : tuple of str
-        Names of the axes: y, or y1, y2, ... unless given.
+        Names of the axes; default y, or y1, y2, ...
     breakpoints : ndarray, shape (nsegments + 1,)
-        Times [s] of the start, of every join, and of the end.
+        Times [s] of the start, of the ends of inner segments, and of the end.
 
     Examples
     --------
-    A sine, whose nth derivative is A w^n sin(w s + n pi/2):
+    A sine, with the nth derivative A w^n sin(w s + n pi/2):
 
     >>> import numpy as np
     >>> class Sine(Trajectory):
@@ -98,7 +98,7 @@ class Trajectory(Fields, ABC):
 
     kinds: ClassVar[dict[str, type[Trajectory]]] = {}
 
-    __array_ufunc__ = None  # numpy's numbers leave products to this class, and its arrays are no factors
+    __array_ufunc__ = None  # products with numpy scalars are those of this class; arrays are not factors
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
@@ -106,21 +106,21 @@ class Trajectory(Fields, ABC):
         if cls.__name__.startswith("_") or any(abstract):
             return
         former = Trajectory.kinds.setdefault(cls.__name__, cls)
-        # A class that is defined again, in a cell or by a reload, replaces itself.
+        # A class that is defined again, in a notebook cell or by a reload, replaces the previous one.
         if (former.__module__, former.__qualname__) != (cls.__module__, cls.__qualname__):
             raise ValueError(
-                f"kinds of trajectories must have names of their own, by which they are saved, got {cls.__name__} "
+                f"classes of trajectories must have different names, by which they are saved, got {cls.__name__} "
                 f"in {cls.__module__} after that in {former.__module__}; rename the class, or begin its name with _"
             )
         Trajectory.kinds[cls.__name__] = cls
 
     @abstractmethod
     def segment_jet(self, segment: int, s: Array, order: int) -> Array:
-        """Derivatives of the analytic function that a segment is a part of.
+        """Derivatives of the analytic function of a segment.
 
-        Times are counted from the beginning of the segment: what a start long
-        after 0 costs by rounding is lost once, in the subtraction. They may lie a
-        little outside of it.
+        Times are relative to the start of the segment, so that a large start time
+        causes rounding only in the subtraction. They may lie slightly outside of
+        the segment.
 
         Parameters
         ----------
@@ -128,7 +128,7 @@ class Trajectory(Fields, ABC):
             Number of the segment, from 0: between ``breakpoints[segment]`` and
             ``breakpoints[segment + 1]``.
         s : ndarray, shape (ntime,)
-            Times [s] since the beginning of the segment, in any order.
+            Times [s] since the start of the segment, in any order.
         order : int
             Highest derivative.
 
@@ -144,29 +144,32 @@ class Trajectory(Fields, ABC):
         Parameters
         ----------
         origin, target : float
-            A time [s], and where it is moved.
+            A time [s], and the time to which it is moved.
         rate : float
-            Factor of the speed, above 0: the nth derivative is multiplied by rate^n.
+            Speed factor, above 0: the nth derivative is multiplied by rate^n.
         """
 
     @abstractmethod
     def to_dict(self) -> Data:
-        """Plain data (numbers, strings, lists, dicts) for `from_dict`; "type" is the name of the class."""
+        """Plain data (numbers, strings, lists, dicts) for `from_dict`.
+
+        The entry "type" is the name of the class.
+        """
 
     @classmethod
     @abstractmethod
     def from_dict(cls, data: Data) -> Trajectory:
-        """Trajectory from the plain data of `to_dict`, with equal values to every bit."""
+        """Trajectory from the plain data of `to_dict`, equal in every bit."""
 
     def segment_series(self, segment: int, s: Value, order: int) -> list[list[Value]]:
-        """Taylor series of a segment at a symbol of CasADi.
+        """Taylor series of a segment at a CasADi symbol.
 
         Parameters
         ----------
         segment : int
             Number of the segment.
         s : symbol
-            Time [s] since its beginning.
+            Time [s] since the start of the segment.
         order : int
             Highest coefficient.
 
@@ -178,21 +181,21 @@ class Trajectory(Fields, ABC):
         Raises
         ------
         TypeError
-            If this kind does not define it.
+            If the class does not define it.
         """
         raise TypeError(
-            f"the time of a {type(self).__name__} must be a number, got {type(s).__name__}: this kind of trajectory "
+            f"the time of a {type(self).__name__} must be a number, got {type(s).__name__}: this class "
             "does not define segment_series"
         )
 
     @property
     def start(self) -> float:
-        """Time of the first waypoint [s]."""
+        """Time of the first breakpoint [s]."""
         return float(self.breakpoints[0])
 
     @property
     def end(self) -> float:
-        """Time of the last waypoint [s]."""
+        """Time of the last breakpoint [s]."""
         return float(self.breakpoints[-1])
 
     @property
@@ -207,20 +210,20 @@ class Trajectory(Fields, ABC):
 
     @cached_property
     def initial(self) -> Array:
-        """Position held before the start, shape (naxes,)."""
+        """Position up to the start, shape (naxes,)."""
         return readonly(self.segment_jet(0, np.zeros(1), 0)[0, :, 0].copy())
 
     @cached_property
     def final(self) -> Array:
-        """Position held after the end, shape (naxes,)."""
+        """Position from the end on, shape (naxes,)."""
         last = self.breakpoints.size - 2
         return readonly(self.segment_jet(last, np.diff(self.breakpoints[last:]), 0)[0, :, 0].copy())
 
     def breakpoints_between(self, t0: float, t1: float) -> Array:
         """Breakpoints in the half-open interval [t0, t1).
 
-        Intervals that follow one another have every breakpoint in exactly one
-        of them, as an inner breakpoint belongs to what follows it.
+        Of consecutive intervals exactly one contains a given breakpoint, which
+        belongs to the segment that follows it.
 
         Parameters
         ----------
@@ -230,7 +233,7 @@ class Trajectory(Fields, ABC):
         Returns
         -------
         ndarray, shape (nbreakpoints,)
-            Increasing; the breakpoint at t0 is among them, that at t1 is not.
+            Increasing, with a breakpoint at t0 and without one at t1.
 
         Raises
         ------
@@ -250,7 +253,7 @@ class Trajectory(Fields, ABC):
         return self.breakpoints[begin:end].copy()
 
     def __call__(self, t: ArrayLike, nu: int = 0) -> Array:
-        """Value, or the nu-th derivative.
+        """Value or nu-th derivative.
 
         Parameters
         ----------
@@ -284,8 +287,8 @@ class Trajectory(Fields, ABC):
         order : int
             Highest derivative.
         left : bool, optional
-            Take the limit from the left at breakpoints (an integrator that
-            arrives at one needs it).
+            Return the limit from the left at breakpoints, as required at the end
+            of an integration interval.
 
         Returns
         -------
@@ -302,7 +305,7 @@ class Trajectory(Fields, ABC):
         return values.reshape(highest + 1, self.naxes, *times.shape)
 
     def series(self, t: Value, order: int) -> list[list[Value]]:
-        """Taylor series about one time, which may be a symbol of a tracer (CasADi's).
+        """Taylor series about one time, a number or a CasADi symbol.
 
         Parameters
         ----------
@@ -319,14 +322,14 @@ class Trajectory(Fields, ABC):
         Raises
         ------
         TypeError
-            If `t` is neither.
+            If `t` is neither a number nor a symbol.
         """
         order = checked_count(order, "order")
         if isinstance(t, Real):
             return (self.jet(np.asarray(t), order).T / FACTORIALS[: order + 1]).tolist()
         if t is None or isinstance(t, str | complex | list | tuple | np.ndarray | np.datetime64 | np.bool_):
             raise TypeError(f"t must be one number or a symbol, got {t!r:.80}")
-        # Each segment counts where it holds; elsewhere it is taken at its ends, where it is finite.
+        # Each segment is weighted by 1 in its interval; elsewhere it is evaluated at its ends, where it is finite.
         found = [[value * (t < self.start), *[0.0] * order] for value in self.initial.tolist()]
         for segment, (left, right) in enumerate(itertools.pairwise(self.breakpoints.tolist())):
             holds = (t >= left) * (t < right)
@@ -338,9 +341,9 @@ class Trajectory(Fields, ABC):
         return [[a + (t == self.end) * b for a, b in zip(*pair, strict=True)] for pair in zip(found, last, strict=True)]
 
     def extrema(self, nu: int = 0) -> _extrema.Extrema:
-        """Least and greatest value of the nu-th derivative, true over the whole interval.
+        """Minimum and maximum of the nu-th derivative over the whole plan.
 
-        Where a derivative jumps at a join, both of its limits count.
+        If a derivative jumps at a breakpoint, both limits are included.
 
         Parameters
         ----------
@@ -350,39 +353,41 @@ class Trajectory(Fields, ABC):
         Returns
         -------
         Extrema
-            minimum, maximum, time_min, time_max, each of shape (naxes,).
+            With the attributes minimum, maximum, time_min and time_max, each of
+            shape (naxes,).
         """
         return _extrema.derivative_extrema(self, checked_count(nu, "nu"))
 
     def peak(self, nu: int = 0) -> Array:
-        """Greatest magnitude of the nu-th derivative, shape (naxes,)."""
+        """Maximum magnitude of the nu-th derivative, shape (naxes,)."""
         found = self.extrema(nu)
         return np.maximum(np.abs(found.minimum), np.abs(found.maximum))
 
     def extrema_of(self, function: Callable[[Array], Array], order: int) -> _extrema.Extrema:
         """Minimum and maximum of a function of the jet.
 
-        Both are right to 1e-9 of the largest magnitude of the function. Between
-        breakpoints the function is interpolated by Chebyshev polynomials, whose
-        stationary points are solved for. Pieces are bisected until interpolant
-        and function agree at times that the interpolant was not made from;
-        kinks and jumps are enclosed. The function is evaluated at 8192 times
-        spread over the plan (of each of n segments at 8192/n and at 64 at least)
-        before it is taken for smooth: what shows at none of them, such as a pulse shorter than their
-        distance, is missed. `bounds` proves its result.
+        Both have an error below 1e-9 of the maximum magnitude of the function.
+        Between breakpoints the function is interpolated by Chebyshev
+        polynomials, of which the stationary points are computed. Pieces are
+        bisected until interpolant and function agree at check points; kinks and
+        jumps are enclosed. The function is evaluated at 8192 times of the plan or
+        more: 8192/n, and at least 64, for each of n segments. A feature between
+        these times, such as a shorter pulse, is missed. `bounds` certifies its
+        result.
 
         Parameters
         ----------
         function : callable
             Maps a jet (order + 1, naxes, ntime) to (ntime,) or (m, ntime).
         order : int
-            Highest derivative that it needs.
+            Highest derivative that `function` uses.
 
         Returns
         -------
         Extrema
-            Each entry of shape (m,), m = 1 for a function with one value. The
-            limits from both sides of a jump count.
+            With the attributes minimum, maximum, time_min and time_max, each of
+            shape (m,), m = 1 for a function with one value. At a jump the limits
+            from both sides are included.
 
         Raises
         ------
@@ -390,9 +395,9 @@ class Trajectory(Fields, ABC):
             If the function is not finite over the plan, or does not return one
             value for each time; if the plan has no duration.
         RuntimeError
-            If the function is not resolved to 1e-9 within 20,000 pieces: it is
-            noisy, or oscillates too fast. The message gives the size of what
-            is left, and where.
+            If the function is not resolved to 1e-9 within 20,000 pieces, because
+            it is noisy or oscillates too fast. The message states the remaining
+            error and the interval.
         """
         return _extrema.function_extrema(self, function, checked_count(order, "order"))
 
@@ -406,28 +411,29 @@ class Trajectory(Fields, ABC):
     ) -> _extrema.Bounds:
         """Certified bounds of a function of the jet.
 
-        Cells of the interval are refined until the value at their centre minus
-        a Lipschitz bound from the jet's own peaks decides: between `lower` and
-        `upper` lies every value, not only every sample.
+        Cells of the interval are refined until a Lipschitz bound, from the value at
+        the centre of a cell and the peaks of the jet, reaches the tolerance. All
+        values, not only samples, lie between `lower` and `upper`.
 
         Parameters
         ----------
         function : callable
             Maps a jet (order + 1, naxes, ntime) to (ntime,).
         order : int
-            Highest derivative that it needs.
+            Highest derivative that `function` uses.
         lipschitz : array_like, broadcasts to (order + 1, naxes)
-            Bounds of its partial derivatives over the jets of this plan.
+            Bounds of the partial derivatives of `function` over the jets of this plan.
         rtol : float, optional
-            Gap allowed between a bound and an attained value, relative to the
+            Maximum gap between a bound and an attained value, relative to the
             range of the function.
         max_cells : int, optional
-            Cells at most.
+            Maximum number of cells.
 
         Returns
         -------
         Bounds
-            lower, upper, and the attained minimum, maximum with their times.
+            With the attributes lower and upper, and the attained minimum and
+            maximum with their times time_min and time_max.
 
         Raises
         ------
@@ -437,34 +443,40 @@ class Trajectory(Fields, ABC):
         return _extrema.certified_bounds(self, function, checked_count(order, "order"), lipschitz, rtol, max_cells)
 
     def jumps(self, order: int) -> tuple[Jump, ...]:
-        """Where derivatives up to an order jump, the ends at rest included.
+        """Jumps of the derivatives up to an order, both ends included.
 
         Parameters
         ----------
         order : int
-            Highest derivative looked at.
+            Highest derivative considered.
 
         Returns
         -------
         tuple of Jump
-            Each with order, time, label and size; lowest order first.
+            Each with the attributes order, time, label and size; lowest order
+            first.
         """
         return find_jumps(self, checked_count(order, "order"))
 
     def retime(self, duration: float) -> Self:
-        """Same path from the same start, in another duration [s].
+        """Same path from the same start with another duration [s].
 
         The nu-th derivative is multiplied by (old duration/new)^nu.
 
         Raises
         ------
         ValueError
-            If the duration is not above 0, a derivative leaves floating point,
-            or rounding changes an interval of the plan by more than 1e-3 of its
-            length; above 1e-6 it warns.
+            If the duration is not above 0, a derivative overflows, or rounding
+            changes an interval of the plan by more than 1e-3 of its length.
+
+        Warns
+        -----
+        UserWarning
+            If rounding changes an interval of the plan by more than 1e-6 of its
+            length.
         """
         if not self.duration:
-            raise ValueError("a trajectory without duration cannot be retimed, got a step")
+            raise ValueError("a trajectory must have a duration to be retimed, got a step")
         wanted = checked_finite(duration, "duration", above=0.0)
         return self._moved(self.start, self.start, self.duration / wanted)
 
@@ -474,38 +486,45 @@ class Trajectory(Fields, ABC):
         Raises
         ------
         ValueError
-            If the rounding of so late a time changes an interval of the plan by
-            more than 1e-3 of its length; above 1e-6 it warns.
+            If rounding at the new times changes an interval of the plan by more
+            than 1e-3 of its length.
+
+        Warns
+        -----
+        UserWarning
+            If rounding changes an interval of the plan by more than 1e-6 of its
+            length.
         """
         return self._moved(self.start, self.start + checked_finite(dt, "dt"), 1.0)
 
     def then(self, other: Trajectory) -> Trajectory:
-        """This trajectory, then the other from this one's end on.
+        """This trajectory followed by another, shifted to start at its end.
 
         Raises
         ------
         ValueError
-            If the other's first position differs from this one's last by more
-            than 1e-9 of their range, or the axes differ in number.
+            If the initial position of the other differs from the final position
+            of this one by more than 1e-9 of their range, or if the numbers of
+            axes differ.
         """
         from ctrlplan.trajectories.combined import Joined
 
         return Joined((self, other))
 
     def select(self, labels: Sequence[str]) -> Trajectory:
-        """Some axes by name, in the order given."""
+        """Trajectory of some axes by name, in the given order."""
         from ctrlplan.trajectories.combined import Selected
 
         return Selected(self, (labels,) if isinstance(labels, str) else labels)
 
     def to_csv(self, path: str | os.PathLike[str], timepts: ArrayLike | None = None, order: int = 2) -> None:
-        """Write times and jets as a table with one line of names."""
+        """Write times and jets as a CSV table with a header line."""
         from ctrlplan.trajectories.files import write_csv
 
         write_csv(self, path, timepts, order)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write as JSON, from which `load_trajectory` restores every bit."""
+        """Write to a JSON file that `load_trajectory` reads, exact to every bit."""
         from ctrlplan.trajectories.files import save_trajectory
 
         save_trajectory(self, path)
@@ -518,23 +537,24 @@ class Trajectory(Fields, ABC):
         units: Sequence[str] | None = None,
         order: int | None = None,
     ) -> ControlPlot:
-        """Position and derivatives stacked, waypoints marked.
+        """Plot position and derivatives over time, with waypoints.
 
-        The figure is registered with pyplot, so that ``plt.show()`` shows it and
-        ``plt.savefig`` writes it, and obeys the user's rcParams. To compare plans,
-        draw the second in the axes of the first.
+        The figure is registered with pyplot, as ``plt.show()`` and
+        ``plt.savefig`` require, and uses the current rcParams. To compare plans,
+        pass the axes of the first plot to the second.
 
         Parameters
         ----------
         derivatives : int, optional
-            Highest derivative drawn.
+            Highest derivative plotted.
         ax : Axes or array of Axes, optional
-            Where to draw: an array of n axes gets the derivatives 0 to n - 1, one
-            axes the position only. None: an empty current figure, or a new one.
+            Axes to plot in: an array of n axes for the derivatives 0 to n - 1, one
+            Axes for the position only. Default: the current figure if it is
+            empty, otherwise a new one.
         units : sequence of str, optional
             Units of the plan's axes.
         order : int, optional
-            Old name of `derivatives`.
+            Deprecated name of `derivatives`.
 
         Returns
         -------
@@ -546,15 +566,15 @@ class Trajectory(Fields, ABC):
         TypeError
             If `ax` is neither axes nor an array of them.
         ValueError
-            If `ax` has not one axes for each of the `derivatives` stated.
+            If the number of axes differs from that of the derivatives.
 
         Examples
         --------
         >>> import ctrlplan as cp
         >>> move = [cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1, 0, 0)]
-        >>> drawn = cp.PolySpline(move).plot(1)
-        >>> both = cp.TrigSpline(move, alpha=3.0).plot(ax=drawn.axes)
-        >>> both.figure is drawn.figure, both.axes.shape
+        >>> first = cp.PolySpline(move).plot(1)
+        >>> both = cp.TrigSpline(move, alpha=3.0).plot(ax=first.axes)
+        >>> both.figure is first.figure, both.axes.shape
         (True, (2, 1))
         """
         from ctrlplan.reports.figures import plot_trajectory
@@ -591,7 +611,7 @@ class Trajectory(Fields, ABC):
         return f"<{type(self).__name__} of {axes} {when}>"
 
     def _moved(self, origin: float, target: float, rate: float) -> Self:
-        """As `map_time`, with what the rounding of times costs the intervals between them stated."""
+        """As `map_time`, with a check of the rounding of the intervals between times."""
         try:
             with np.errstate(over="raise", invalid="raise"):
                 moved = self.map_time(origin, target, rate)
@@ -600,13 +620,13 @@ class Trajectory(Fields, ABC):
         before, after = (np.union1d(p.breakpoints, [w.time for w in p.waypoints]) for p in (self, moved))
         if before.size < 2:
             return moved
-        if before.size != after.size:  # a profile leaves out segments shorter than its clock resolves
+        if before.size != after.size:  # a profile omits segments below the resolution of times
             before, after = before[[0, -1]], after[[0, -1]]
         loss = float(np.abs(np.diff(after) * rate / np.diff(before) - 1.0).max())
         if loss > 1e-6:
             said = (
-                f"times must keep the intervals of the plan, got a loss of {loss:.1g} of an interval by rounding "
-                f"between {after[0]:.17g} s and {after[-1]:.17g} s; count time from an origin nearer to the plan"
+                f"intervals of the plan must be representable, got an error of {loss:.1g} of an interval by rounding "
+                f"between {after[0]:.17g} s and {after[-1]:.17g} s; use a time origin nearer to the plan"
             )
             if loss > 1e-3:
                 raise ValueError(said)
@@ -654,7 +674,7 @@ class Trajectory(Fields, ABC):
         return found
 
     def _extreme_jet(self, segment: int, s: Array, low: int, high: int) -> Array:
-        """Derivatives low to high of a segment whose duration, to the power of their order, leaves floating point."""
+        """Derivatives low to high of a segment whose duration to the power of their order overflows."""
         with np.errstate(over="ignore", invalid="ignore"):
             found = self.segment_jet(segment, s, high)[low:]
         self._check_finite(found, segment, high)
@@ -669,14 +689,15 @@ class Trajectory(Fields, ABC):
             )
 
     def segment_jet_at(self, moment: float, origin: float, s: Array, order: int) -> Array:
-        """Jet at origin + s of the analytic function that holds at `moment`, which is no breakpoint.
+        """Jet at origin + s of the analytic function of the segment at `moment`.
 
         Parameters
         ----------
         moment : float
-            Time [s] on the segment, or before the start or after the end.
+            Time [s] within a segment, before the start or after the end; not a
+            breakpoint.
         origin : float
-            Time [s] from which s counts, so that no digits of it are lost.
+            Reference time [s] of s, so that s has full precision.
         s : ndarray, shape (ntime,)
             Times [s] after the origin.
         order : int
@@ -694,7 +715,7 @@ class Trajectory(Fields, ABC):
         return held
 
     def segment_series_at(self, moment: float, origin: float, s: Value, order: int) -> list[list[Value]]:
-        """As `segment_jet_at`, the Taylor coefficients of each axis at one number or symbol s."""
+        """Taylor series of each axis at one number or symbol s; as `segment_jet_at`."""
         segment = int(np.searchsorted(self.breakpoints, moment)) - 1
         if 0 <= segment < self.breakpoints.size - 1:
             return self.segment_series(segment, s + (origin - float(self.breakpoints[segment])), order)
@@ -702,5 +723,5 @@ class Trajectory(Fields, ABC):
 
 
 def _is_factor(value: object) -> bool:
-    """Whether a plan may be multiplied by a value: numpy counts a time difference among the real numbers."""
+    """Whether a value is a real factor; numpy time differences are Real but are not."""
     return isinstance(value, Real) and not isinstance(value, bool | np.timedelta64)

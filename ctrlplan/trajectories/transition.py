@@ -1,4 +1,4 @@
-"""From one jet to another in a given time: what is planned again while a loop runs."""
+"""Transitions between jets over a fixed horizon, for on-line replanning."""
 
 from __future__ import annotations
 
@@ -18,19 +18,21 @@ from ctrlplan.trajectories.trigonometric import checked_alpha
 
 
 class Transition(Fields):
-    r"""Splines from jet to jet in one horizon, factorised once.
+    r"""Splines between two jets over a fixed horizon.
 
-    Replanning every instant towards 0 with the horizon kept is the constant law
+    The linear system of the coefficients is factorised once. Continuous
+    replanning towards 0 with a constant horizon is the linear feedback law
 
     .. math:: y^{(b+1)} = -\sum_{j=0}^{b} k_j\,y^{(j)}, \qquad
         k_b = (b + 1)^2\,\tfrac{\alpha}{2}\cot\tfrac{\alpha}{2}\,/\,H
 
-    of `gains`; replanning every period it is the map of `radius`.
+    with the gains of `gains`; periodic replanning has the spectral radius of
+    `radius`.
 
     Parameters
     ----------
     order : int
-        Highest derivative b that is joined at both ends.
+        Highest derivative b that is prescribed at both ends.
     horizon : float
         Duration H [s], above 0.
     alpha : float, optional
@@ -39,7 +41,7 @@ class Transition(Fields):
     Attributes
     ----------
     order, horizon, alpha
-        As given.
+        The arguments.
     rate : float
         Angular frequency alpha/H [rad/s].
 
@@ -50,7 +52,7 @@ class Transition(Fields):
 
     Examples
     --------
-    The minimum-jerk law of horizon 1 s:
+    The feedback gains of minimum-jerk replanning with a horizon of 1 s:
 
     >>> Transition(2, 1.0).gains().round(9).tolist()
     [60.0, 36.0, 9.0]
@@ -88,12 +90,12 @@ class Transition(Fields):
         )
 
     def coefficients(self, jets: Array) -> Array:
-        """Coefficients of the Newton form in time [s], which `series` reads.
+        """Coefficients of the Newton form in time [s], for `jet` and `series`.
 
         Parameters
         ----------
         jets : ndarray, shape (2 (order + 1), naxes)
-            Derivatives 0 to `order` at the beginning, then those at the end.
+            Derivatives 0 to `order` at the start, then those at the end.
 
         Returns
         -------
@@ -104,43 +106,43 @@ class Transition(Fields):
         return found * self._time_scale
 
     def jet(self, coefficients: Array, s: Array, order: int) -> Array:
-        """Jet (order + 1, naxes, ntime) at times s [s] after the beginning."""
+        """Jet (order + 1, naxes, ntime) at times s [s] after the start."""
         taylor = self._system.taylor(np.asarray(s, dtype=float) / self.horizon, order)
         values = np.einsum("mkt,ma->kat", taylor, coefficients / self._time_scale)
         return values * derivative_scale(self.horizon, order)[:, None, None]
 
     def evaluation(self, s: float, order: int) -> Array:
-        """Matrix (order + 1, 2 (self.order + 1)) from coefficients to derivatives s seconds after the beginning."""
+        """Matrix (order + 1, 2 (self.order + 1)) from coefficients to derivatives s seconds after the start."""
         rows = series(self.rate, np.eye(2 * self.order + 2).tolist(), s, s - self.horizon, order)
         return np.array(rows).T * FACTORIALS[: order + 1, None]
 
     def gains(self) -> Array:
-        """Gains k_0, ..., k_b [1/s^(b + 1 - j)] of replanning at every instant, shape (order + 1,)."""
+        """Gains k_0, ..., k_b [1/s^(b + 1 - j)] of continuous replanning, shape (order + 1,)."""
         return -self._led_to_rest(0.0, self.order + 1)[-1]
 
     def radius(self, period: float) -> float:
-        """Spectral radius of replanning every `period` [s] and following the plan in between."""
+        """Spectral radius of replanning every `period` [s]."""
         found = self._led_to_rest(checked_finite(period, "period", above=0.0), self.order)
         return float(np.abs(np.linalg.eigvals(found)).max())
 
-    def _led_to_rest(self, s: float, order: int) -> Array:
-        """Derivatives (order + 1, self.order + 1) after s seconds of plans that lead unit derivatives to rest."""
+    def _from_units_to_zero(self, s: float, order: int) -> Array:
+        """Derivatives (order + 1, self.order + 1) after s seconds of plans from unit derivatives to 0."""
         first = np.eye(self.order + 1)
         return self.evaluation(s, order) @ self.coefficients(np.concatenate([first, np.zeros_like(first)]))
 
 
 class _Family(NamedTuple):
-    """What transitions of one order and alpha share, whatever the horizon."""
+    """Data of the transitions of one order and alpha, independent of the horizon."""
 
     system: NewtonSystem
-    rows: NDArray[np.intp]  # of the jets at both ends, in the system's order
+    rows: NDArray[np.intp]  # of the jets at both ends, in the order of the system
     exponents: Array
     inverse: Array  # of the factorials
 
 
 @lru_cache(maxsize=4096)
 def _family(order: int, alpha: float) -> _Family:
-    """Factorised collocation in normalised time: of polynomials one for every horizon."""
+    """Factorised collocation in normalised time, independent of the horizon for polynomials."""
     given = tuple(range(order + 1))
     system = NewtonSystem(alpha, np.array([0.0, 1.0]), (given, given))
     rows = system.waypoint_index * (order + 1) + system.order_index
@@ -149,12 +151,12 @@ def _family(order: int, alpha: float) -> _Family:
 
 @lru_cache(maxsize=4096)
 def transition(order: int, horizon: float, alpha: float) -> Transition:
-    """Transition made before, or a new one: a clock that ticks evenly meets the same horizons again."""
+    """Cached transition: with a constant period the same horizons recur."""
     return Transition(order, horizon, alpha)
 
 
 def series(rate: float, columns: Sequence[Sequence[Value]], past: Value, ahead: Value, order: int) -> list[list[Value]]:
-    """Taylor series, axis by axis, of transitions at one time; everything but the rate may be a symbol.
+    """Taylor series of each axis of transitions at one time; all arguments but the rate may be symbols.
 
     Parameters
     ----------
@@ -163,7 +165,7 @@ def series(rate: float, columns: Sequence[Sequence[Value]], past: Value, ahead: 
     columns : sequence of sequence
         Coefficients of each axis.
     past, ahead : float
-        Time since the beginning, and since the end [s].
+        Time since the start, and since the end [s].
     order : int
         Highest coefficient; coefficient k is the k-th derivative / k!.
     """
@@ -172,13 +174,13 @@ def series(rate: float, columns: Sequence[Sequence[Value]], past: Value, ahead: 
 
 
 def extrapolated(jet: ArrayLike, time: float) -> Array:
-    """Jet (order + 1, naxes) `time` seconds later, along its Taylor polynomial."""
+    """Jet (order + 1, naxes) of the Taylor polynomial after `time` seconds."""
     values = real_array(jet, "jet")
     return np.array([taylor_value(values[k:], time) for k in range(len(values))]) if len(values) > 1 else values
 
 
 def taylor_value(jet: Value, s: Value) -> Value:
-    """Value of a Taylor polynomial s seconds on; derivatives and time may be symbols."""
+    """Value of a Taylor polynomial after s seconds; derivatives and time may be symbols."""
     total = jet[-1]
     for k in range(len(jet) - 1, 0, -1):
         total = jet[k - 1] + total * s / k

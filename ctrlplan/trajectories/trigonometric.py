@@ -25,7 +25,7 @@ class TrigSpline(NewtonSpline):
         y = a_0 + \sum_{k=1}^{m-1} (a_k \cos k\tau + b_k \sin k\tau)
             + a_m \sin m(\tau - \gamma), \quad \tau = \alpha (t - t_1)/(t_n - t_1)
 
-    Equation (2) for an even number 2m of constraints an axis, with gamma the
+    Equation (2) for an even number 2m of constraints per axis, with gamma the
     mean of their abscissae; for an odd number 2m + 1 the full trigonometric
     polynomial of degree m. It is computed in the Newton form of
     `ctrlplan.trajectories.newton`, not by solving (3).
@@ -33,33 +33,33 @@ class TrigSpline(NewtonSpline):
     Parameters
     ----------
     waypoints : iterable of Waypoint
-        Two or more, times increasing; each axis may leave its own entries free.
+        Two or more, times increasing; the free entries may differ between axes.
     alpha : float or "auto"
-        Shape parameter in [0, 2 pi) [rad]; 0 is the polynomial spline, "auto"
-        that of the shortest path (`ctrlplan.choose_alpha` has other objectives).
+        Shape parameter in [0, 2 pi) [rad]; 0 gives the polynomial spline, "auto"
+        the shortest path (see `ctrlplan.choose_alpha` for other objectives).
     gamma : float or sequence of float or None, optional
-        Phase of the top harmonic [rad of tau], one for all axes or one an axis
-        (None for the mean). Needs an even number of coefficients.
+        Phase of the top harmonic [rad of tau], for all axes or one per axis
+        (None for the mean). Requires an even number of coefficients.
     labels : sequence of str, optional
         Names of the axes.
     degree : int, optional
-        Degree m where it should be higher than the constraints need; the spare
-        coefficients minimise the integral of the squared derivative of order
-        `smooth`.
+        Degree m, at least the default that the constraints require. The
+        additional coefficients minimise the integral of the squared derivative
+        of order `smooth`.
     smooth : int, optional
-        That order, 3 (jerk) unless given.
+        Order of that derivative; default 3 (jerk).
     warn : bool, optional
-        Whether to warn where the plan swings over more than 3 times the range
-        of its waypoints (their positions, and where their derivatives lead
-        within half a segment), on any axis.
+        Whether to warn if the range of the plan on any axis exceeds 3 times that
+        of its waypoints (their positions, and the extrapolation of their
+        derivatives over half a segment).
 
     Raises
     ------
     ValueError
         If alpha is outside [0, 2 pi), times do not increase, axes differ, the
         free entries or gamma make the system singular, or the degree is too low;
-        if rounding could cost more than 1e-6 of the plan's range: near alpha =
-        2 pi both ends are nearly one point.
+        if rounding could change the plan by more than 1e-6 of its range, as near
+        alpha = 2 pi, where both ends nearly coincide on the circle.
 
     Warns
     -----
@@ -104,18 +104,18 @@ class TrigSpline(NewtonSpline):
         smooth: int = 3,
         warn: bool = True,
     ) -> Self:
-        """Closed plan that repeats, alpha = 2 pi (remark 2 of the paper).
+        """Periodic plan with alpha = 2 pi (remark 2 of the paper).
 
-        The plan runs from the first waypoint for one period and ends as it
-        began, every derivative included; `then` appends further rounds.
+        The plan starts at the first waypoint, lasts one period and ends with the
+        initial position and derivatives of all orders. `then` appends further
+        periods.
 
         Parameters
         ----------
         waypoints : iterable of Waypoint
-            One or more, all within one period: the return to the first is not
-            stated.
+            One or more, all within one period, without the return to the first.
         period : float
-            Duration of a round [s].
+            Period [s].
         gamma, labels, degree, smooth, warn
             As for `TrigSpline`.
 
@@ -136,19 +136,19 @@ class TrigSpline(NewtonSpline):
 
     @property
     def gamma(self) -> tuple[float | None, ...]:
-        """Phase of the top harmonic [rad of tau], axis by axis; None where it has none."""
+        """Phase of the top harmonic [rad of tau] of each axis; None if there is none."""
         return tuple(s.gamma for s, _ in self._per_axis())
 
     def fourier(self) -> FourierCoefficients:
         """Coefficients a0, a_k, b_k, a_m of equation (2).
 
-        For readers of the paper: at small alpha they are huge and cancel, so
-        the plan itself is never evaluated through them.
+        For comparison with the paper. At small alpha the coefficients are large
+        and cancel, so the plan itself is not evaluated from them.
 
         Raises
         ------
         ValueError
-            If alpha is 0: a polynomial has none; or so small that they overflow.
+            If alpha is 0, as a polynomial has none, or so small that they overflow.
         """
         if not self.alpha:
             raise ValueError("alpha must be above 0 for Fourier coefficients, got 0 (a polynomial)")
@@ -178,24 +178,24 @@ AxisCoefficients = tuple[float, Array, Array, float, int, float]
 
 @dataclass(frozen=True)
 class FourierCoefficients:
-    """Coefficients of equation (2), axis first.
+    """Fourier coefficients of equation (2), axis first.
 
-    Indexing by an axis gives that axis alone, with scalars for a0 and am.
+    Indexing by an axis gives the coefficients of that axis, a0 and am as scalars.
 
     Attributes
     ----------
     a0 : ndarray, shape (naxes,)
         Constant.
     a, b : ndarray, shape (naxes, nharmonics)
-        Cosine and sine coefficients of harmonics 1, 2, ...; up to m - 1 where
+        Cosine and sine coefficients of harmonics 1, 2, ...: up to m - 1 if
         the top one is sin m(tau - gamma), up to m for an odd number of
-        constraints. Zero where an axis has fewer.
+        constraints. Padded with zeros for axes with fewer.
     am : ndarray, shape (naxes,)
-        Coefficient of sin m(tau - gamma), 0 where there is none.
+        Coefficient of sin m(tau - gamma), 0 if there is none.
     m : ndarray of int, shape (naxes,)
         Degree.
     gamma : ndarray, shape (naxes,)
-        Phase [rad of tau], nan where there is none.
+        Phase [rad of tau], nan if there is none.
     """
 
     a0: Array
@@ -226,7 +226,7 @@ class FourierCoefficients:
 
 
 def chosen_alpha(alpha: float | str, points: tuple[Waypoint, ...], family: Callable[..., Any], **options: Any) -> float:
-    """Shape parameter in [0, 2 pi): the one given, or for "auto" that of the shortest path."""
+    """Shape parameter in [0, 2 pi); "auto" is that of the shortest path."""
     if not isinstance(alpha, str):
         return checked_alpha(alpha)
     if alpha != "auto":
@@ -247,25 +247,25 @@ def checked_alpha(alpha: float | str) -> float:
 
 
 def _checked_gamma(gamma: float | Sequence[float | None] | None, naxes: int) -> float | list[float | None] | None:
-    """One phase for all axes, or one an axis, as plain numbers."""
+    """One phase for all axes, or one per axis, as floats."""
     if gamma is None:
         return None
     if np.ma.is_masked(gamma):
-        raise TypeError(f"gamma must be a number, or one an axis, got {gamma!r:.80}")
+        raise TypeError(f"gamma must be a number, or one per axis, got {gamma!r:.80}")
     given: Any = np.asarray(gamma, dtype=object)
-    values = [None if v is None else one_number(v, "gamma", "a number, or one an axis") for v in given.ravel()]
+    values = [None if v is None else one_number(v, "gamma", "a number, or one per axis") for v in given.ravel()]
     for value in values:
         if value is not None and not math.isfinite(value):
             raise ValueError(f"gamma must be finite, got {value}")
     if not given.ndim:
         return values[0]
     if len(values) != naxes:
-        raise ValueError(f"gamma must be one number or as many as axes, {naxes}, got {len(values)}")
+        raise ValueError(f"gamma must be one number or one per axis, {naxes}, got {len(values)}")
     return values
 
 
 def _fourier(alpha: float, system: NewtonSystem, coefficients: Array) -> AxisCoefficients:
-    """Exact values at equal steps of a whole turn, through the discrete Fourier transform."""
+    """Fourier coefficients by the discrete transform of exact values over one turn."""
     m = system.size // 2
     count = 2 * m + 2
     turn = 2.0 * np.pi * np.arange(count) / count

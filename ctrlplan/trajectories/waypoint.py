@@ -1,4 +1,4 @@
-"""A point in time with prescribed value and derivatives."""
+"""Waypoints: prescribed positions and derivatives at one time."""
 
 from __future__ import annotations
 
@@ -16,35 +16,35 @@ ENTRIES = ("position", "velocity", "acceleration", "jerk", "snap")
 
 
 class Waypoint(Fields):
-    """What a plan must meet at one instant.
+    """Prescribed position and derivatives at one time.
 
     Parameters
     ----------
     time : float
         Time [s], finite.
     position : array_like, scalar or shape (naxes,)
-        Value of every axis. An entry that is nan is left free.
+        Value of every axis; nan is a free entry.
     velocity, acceleration, jerk, snap : array_like or None, optional
         Derivatives 1 to 4 in units of the position per s, s^2, ...; scalar
-        for one axis, shape (naxes,) for more. A scalar 0 holds for every
-        axis; None, or nan for one axis, leaves the entry free.
+        for one axis, shape (naxes,) for more. A scalar 0 applies to every
+        axis; None is free on all axes, nan on one.
 
     Attributes
     ----------
     jet : ndarray, shape (nentries, naxes)
-        The prescribed derivatives from order 0, nan where free.
+        The prescribed derivatives from order 0, nan if free.
     labels : tuple of str or None
-        Names of the axes, given by `from_jets` only.
+        Names of the axes; None unless made by `from_jets`.
     naxes : int
         Number of axes.
     complete : bool
-        Whether no entry of the jet is free.
+        Whether all entries of the jet are prescribed.
 
     Raises
     ------
     ValueError
-        If the time is not finite, an entry is infinite, or the entries
-        disagree in their number of axes.
+        If the time is not finite, an entry is infinite, or the numbers of axes
+        of the entries differ.
 
     Examples
     --------
@@ -76,15 +76,15 @@ class Waypoint(Fields):
 
     @classmethod
     def from_jets(cls, time: float, /, **jets: Sequence[float | None]) -> Waypoint:
-        """Waypoint axis by axis, which names the axes.
+        """Waypoint with named axes from the jet of each.
 
         Parameters
         ----------
         time : float
             Time [s], finite.
         **jets : sequence of float or None
-            For each axis its position, velocity, ...: as many as are
-            prescribed, of any order; None or nan leaves one free.
+            Position, velocity, ... of each axis, up to any order; None or nan is
+            a free entry.
 
         Raises
         ------
@@ -98,7 +98,7 @@ class Waypoint(Fields):
         ('x', 'z')
         """
         if not jets:
-            raise ValueError("from_jets needs at least one axis, such as x=[0.0, 0.0], got none")
+            raise ValueError("from_jets requires at least one axis, such as x=[0.0, 0.0], got none")
         columns = {}
         for label, jet in jets.items():
             column = new_numbers(jet, f"jet of axis {label}")
@@ -112,16 +112,16 @@ class Waypoint(Fields):
 
     @classmethod
     def from_array(cls, time: float, jet: Array, labels: tuple[str, ...] | None) -> Waypoint:
-        """Waypoint from a table of derivatives, which it keeps and makes read-only.
+        """Waypoint from an array of derivatives, which is made read-only.
 
         Parameters
         ----------
         time : float
             Time [s], finite.
         jet : ndarray, shape (order + 1, naxes)
-            Row k has the k-th derivatives, nan where they are free.
+            Row k contains the k-th derivatives; nan is a free entry.
         labels : tuple of str, or None
-            Names of the axes, where they are known.
+            Names of the axes, if known.
 
         Raises
         ------
@@ -142,43 +142,43 @@ class Waypoint(Fields):
 
     @property
     def position(self) -> Array:
-        """Value of every axis, shape (naxes,), nan where free."""
+        """Value of every axis, shape (naxes,), nan if free."""
         return self._entry(0)
 
     @property
     def velocity(self) -> Array:
-        """First derivative of every axis, shape (naxes,), nan where free."""
+        """First derivative of every axis, shape (naxes,), nan if free."""
         return self._entry(1)
 
     @property
     def acceleration(self) -> Array:
-        """Second derivative of every axis, shape (naxes,), nan where free."""
+        """Second derivative of every axis, shape (naxes,), nan if free."""
         return self._entry(2)
 
     @property
     def jerk(self) -> Array:
-        """Third derivative of every axis, shape (naxes,), nan where free."""
+        """Third derivative of every axis, shape (naxes,), nan if free."""
         return self._entry(3)
 
     @property
     def snap(self) -> Array:
-        """Fourth derivative of every axis, shape (naxes,), nan where free."""
+        """Fourth derivative of every axis, shape (naxes,), nan if free."""
         return self._entry(4)
 
     def _entry(self, order: int) -> Array:
         return self.jet[order] if order < len(self.jet) else np.full(self.naxes, np.nan)
 
     def scaled(self, time: float, rate: float) -> Waypoint:
-        """Same point at another time, passed `rate` times as fast."""
+        """Same point at another time with derivatives scaled by a speed factor."""
         moved = times_powers(self.jet, rate, np.arange(len(self.jet))[:, None])
         return Waypoint.from_array(checked_finite(time, "time"), moved, self.labels)
 
     def truncated(self, order: int) -> Waypoint:
-        """Same point with what it prescribes up to an order, and the rest left free."""
+        """Same point without the entries above an order."""
         return Waypoint.from_array(self.time, self.jet[: order + 1], self.labels)
 
     def to_dict(self) -> Data:
-        """Plain data: time, jet by order then axis (None where free)."""
+        """Plain data: time, and jet by order and axis (None if free)."""
         jet = [[None if v != v else v for v in row] for row in self.jet.tolist()]
         data: Data = {"time": self.time, "jet": jet}
         if self.labels is not None:
@@ -191,10 +191,10 @@ class Waypoint(Fields):
         labels = tuple(data["labels"]) if "labels" in data else None
         rows = [[np.nan if v is None else v for v in row] for row in data["jet"]]
         if len({len(row) for row in rows}) > 1:
-            raise ValueError(f"jet must have rows of one length, got {data['jet']!r}")
+            raise ValueError(f"jet must have rows of equal length, got {data['jet']!r}")
         jet = new_numbers(rows, "jet")
         if jet.ndim != 2 or jet.size == 0 or (labels is not None and len(labels) != jet.shape[1]):
-            raise ValueError(f"jet must be a table of entries by axes, got {data['jet']!r}")
+            raise ValueError(f"jet must be a table of entries by order and axis, got {data['jet']!r}")
         return cls.from_array(checked_finite(data["time"], "time"), jet, labels)
 
     def __eq__(self, other: object) -> bool:
@@ -216,11 +216,11 @@ class Waypoint(Fields):
 
 
 def _jet(entries: list[ArrayLike | None]) -> Array:
-    """Table (order, axis) of the entries, scalars that mean every axis spread."""
+    """Table (order, axis) of the entries; scalars that apply to every axis are repeated."""
     try:
-        table = new_numbers(entries, "position")  # the common case: alike shapes and no gaps
+        table = new_numbers(entries, "position")  # the common case: equal shapes and no free entries
     except (TypeError, ValueError):
-        table = np.empty(())  # says below which entry is wrong
+        table = np.empty(())  # the wrong entry is found below
     if table.ndim == 2 and table.shape[1]:
         return table
     if table.ndim == 1:
@@ -232,7 +232,7 @@ def _jet(entries: list[ArrayLike | None]) -> Array:
         spread = row.ndim == 0 and (naxes == 1 or row == 0 or np.isnan(row))
         if not spread and row.shape != (naxes,):
             given = f"scalar {row:g}" if row.ndim == 0 else f"shape {row.shape}"
-            raise ValueError(f"{ENTRIES[k]} must have shape ({naxes},) as the other entries (or be 0), got {given}")
+            raise ValueError(f"{ENTRIES[k]} must have shape ({naxes},) as the other entries, or be 0, got {given}")
         out[k] = row
     if naxes == 0:
         raise ValueError("position must have at least one axis, got none")

@@ -1,4 +1,4 @@
-"""Trajectories that are made through waypoints, and the families that waypoints alone can choose."""
+"""Interface of trajectories through waypoints, and their families."""
 
 from __future__ import annotations
 
@@ -13,17 +13,16 @@ from ctrlplan.trajectories.waypoint import Waypoint
 
 
 class FromWaypoints(ABC):
-    """Capability of a kind of trajectory to be made from waypoints.
+    """Interface of trajectory classes with a constructor from waypoints.
 
-    Study files name such a kind by its family.
+    Study files refer to such a class by its family.
 
     Attributes
     ----------
     family : str, class variable
-        Name of the family; the name of the class where it is not stated in the
-        class itself.
+        Name of the family; default: the name of the class.
     options : tuple of str, class variable
-        Keyword arguments that a study file may state.
+        Keyword arguments that are allowed in a study file.
     """
 
     family: ClassVar[str] = ""
@@ -32,49 +31,49 @@ class FromWaypoints(ABC):
     @classmethod
     @abstractmethod
     def from_waypoints(cls, waypoints: Iterable[Waypoint], **options: Any) -> Trajectory:
-        """Trajectory of this kind through waypoints.
+        """Trajectory of this class through waypoints.
 
         Parameters
         ----------
         waypoints : iterable of Waypoint
             Two or more, times increasing.
         **options
-            Of those named in `options`.
+            Arguments named in `options`.
 
         Raises
         ------
         ValueError
-            If this kind does not lead through such waypoints, or an option is wrong.
+            If the class does not support such waypoints, or an option is wrong.
         """
 
 
 class WaypointSpline(Trajectory, FromWaypoints):
-    """Trajectory that can be made again through other waypoints.
+    """Spline through waypoints that can be rebuilt through others.
 
-    `avoid`, ``fastest(hold="waypoints")``, `choose_alpha` and study files take
-    every trajectory of this kind, whatever its class.
+    `avoid`, ``fastest(hold="waypoints")``, `choose_alpha` and study files accept
+    every subclass.
 
-    A new kind must define
+    A new subclass must define
 
     - a constructor ``(waypoints, *, labels=None, ...)`` that sets the fields
-      `waypoints`, `labels`, `breakpoints` and those of its own
-      (`Trajectory`), by ``self._set_fields(...)``;
+      `waypoints`, `labels`, `breakpoints` and its own fields by
+      ``self._set_fields(...)`` (see `Trajectory`);
     - `segment_jet`, the derivatives between two breakpoints;
-    - `options`, the names of further arguments of the constructor, each stored
-      in a field of that name, if there are any.
+    - `options`, the names of further constructor arguments, each stored in a
+      field of that name, if there are any.
 
-    `through`, `with_values`, `map_time`, `to_dict` and `from_dict` follow from
-    these. `map_time` makes the spline again through waypoints at other times: a
-    kind of which that is another path must define its own.
+    `through`, `with_values`, `map_time`, `to_dict` and `from_dict` are inherited.
+    `map_time` rebuilds the spline through waypoints at other times. A subclass for
+    which that changes the path must override it.
 
     Attributes
     ----------
     waypoints : tuple of Waypoint
-        What the plan meets, two or more.
+        Prescribed positions and derivatives, two or more.
 
     Examples
     --------
-    The natural cubic spline of scipy, through positions only:
+    The natural cubic spline of scipy, through positions:
 
     >>> import numpy as np
     >>> from scipy.interpolate import CubicSpline
@@ -96,10 +95,10 @@ class WaypointSpline(Trajectory, FromWaypoints):
     ...             rows.append(sum(c[-1 - k][:, None] * s**k for k in range(len(c))) + 0.0 * s)
     ...             c = c[:-1] * np.arange(len(c) - 1, 0, -1)[:, None] if len(c) > 1 else 0.0 * c
     ...         return np.array(rows)
-    >>> way = Natural([cp.Waypoint(0, [0, 0]), cp.Waypoint(2, [5, 1]), cp.Waypoint(4, [10, 0])])
-    >>> cp.avoid(way, [cp.Disc((2.0, 0.0), 0.5)], clearance=0.5).clearance.certified
+    >>> plan = Natural([cp.Waypoint(0, [0, 0]), cp.Waypoint(2, [5, 1]), cp.Waypoint(4, [10, 0])])
+    >>> cp.avoid(plan, [cp.Disc((2.0, 0.0), 0.5)], clearance=0.5).clearance.certified
     True
-    >>> round(cp.fastest(way, {"y1_d1": 5.0}, hold="waypoints").duration, 9)
+    >>> round(cp.fastest(plan, {"y1_d1": 5.0}, hold="waypoints").duration, 9)
     2.0
     """
 
@@ -107,13 +106,13 @@ class WaypointSpline(Trajectory, FromWaypoints):
 
     @classmethod
     def from_waypoints(cls, waypoints: Iterable[Waypoint], **options: Any) -> Self:
-        """Spline of this kind through waypoints, by its constructor."""
-        kind: Any = cls  # whose constructor is that of the subclass
+        """Spline of this class through waypoints."""
+        kind: Any = cls  # with the constructor of the subclass
         found: Self = kind(waypoints, **options)
         return found
 
     def through(self, waypoints: Iterable[Waypoint]) -> Self:
-        """Spline of the same kind and options through other waypoints.
+        """Spline of the same class and options through other waypoints.
 
         Parameters
         ----------
@@ -129,7 +128,7 @@ class WaypointSpline(Trajectory, FromWaypoints):
         return type(self).from_waypoints(points, labels=self.labels, **self._own_options())
 
     def with_values(self, waypoints: Iterable[Waypoint]) -> Self:
-        """Spline of the same kind and times through other values.
+        """Spline of the same class and times through other values.
 
         Parameters
         ----------
@@ -144,7 +143,7 @@ class WaypointSpline(Trajectory, FromWaypoints):
         return self.through(same_times(waypoints, self.waypoints))
 
     def quiet(self) -> Self:
-        """The same spline, of which `through` and `with_values` do not warn."""
+        """The same spline, with warnings of `through` and `with_values` disabled."""
         return self
 
     def map_time(self, origin: float, target: float, rate: float) -> Self:
@@ -172,17 +171,17 @@ class WaypointSpline(Trajectory, FromWaypoints):
 
 
 def families() -> dict[str, type[FromWaypoints]]:
-    """Kinds of trajectories that can be made from waypoints, by family.
+    """Trajectory classes with a constructor from waypoints, by family.
 
     Returns
     -------
     dict of str to type
-        Those of this package and every other that has been imported.
+        Classes of this package and all others that have been imported.
 
     Raises
     ------
     ValueError
-        If two kinds have a family in common.
+        If two classes have the same family.
     """
     found: dict[str, type[FromWaypoints]] = {}
     for kind in Trajectory.kinds.values():
@@ -190,7 +189,7 @@ def families() -> dict[str, type[FromWaypoints]]:
             name = family_name(kind)
             if name in found:
                 raise ValueError(
-                    f"families of trajectories must have names of their own, got {name!r} of {found[name].__name__} "
+                    f"families of trajectories must have different names, got {name!r} of {found[name].__name__} "
                     f"and of {kind.__name__}"
                 )
             found[name] = kind
@@ -198,23 +197,23 @@ def families() -> dict[str, type[FromWaypoints]]:
 
 
 def family_name(kind: type[FromWaypoints]) -> str:
-    """Name of a family: the one that the class itself states, or the name of the class."""
+    """Name of a family: that defined in the class itself, or the name of the class."""
     return str(kind.__dict__.get("family", kind.__name__))
 
 
 def checked_waypoints(waypoints: Iterable[Waypoint], minimum: int = 2) -> tuple[Waypoint, ...]:
-    """Waypoints as a tuple: enough of them, alike, at increasing times."""
+    """Waypoints as a tuple: a minimum number, with equal axes, at increasing times."""
     if not isinstance(waypoints, Iterable):
         raise TypeError(f"waypoints must be a sequence of Waypoint, got {type(waypoints).__name__}")
     points = tuple(waypoints)
     if len(points) < minimum:
         number = {1: "one waypoint", 2: "two waypoints"}[minimum]
-        raise ValueError(f"a plan needs at least {number}, got {len(points)}")
+        raise ValueError(f"a plan must have at least {number}, got {len(points)}")
     return increasing(points)
 
 
 def increasing(points: tuple[Waypoint, ...]) -> tuple[Waypoint, ...]:
-    """Waypoints that are alike, at increasing times."""
+    """Waypoints, checked for equal axes and increasing times."""
     before: Waypoint | None = None
     for i, point in enumerate(points):
         if not isinstance(point, Waypoint):
@@ -239,7 +238,7 @@ def _axes(point: Waypoint) -> str:
 
 
 def same_times(waypoints: Iterable[Waypoint], before: tuple[Waypoint, ...]) -> tuple[Waypoint, ...]:
-    """Waypoints at the same times and of as many axes as others before them."""
+    """Waypoints, checked for the times and the number of axes of others."""
     points = tuple(waypoints)
     for i, point in enumerate(points):
         if not isinstance(point, Waypoint):
@@ -251,7 +250,7 @@ def same_times(waypoints: Iterable[Waypoint], before: tuple[Waypoint, ...]) -> t
 
 
 def same_axes(points: tuple[Waypoint, ...], naxes: int) -> tuple[Waypoint, ...]:
-    """Waypoints of a number of axes."""
+    """Waypoints, checked for a number of axes."""
     if points[0].naxes != naxes:
         raise ValueError(f"waypoints must keep the number of axes, {naxes}, got {points[0].naxes}")
     return points
