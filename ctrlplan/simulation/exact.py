@@ -349,8 +349,8 @@ def _spacing(samples: Array, duration: float) -> float:
     if samples.size < 2:
         return 0.0
     step = float(samples[-1] - samples[0]) / (samples.size - 1)
-    beside = np.abs(samples - (samples[0] + step * np.arange(samples.size)))
-    return step if beside.max() <= 4.0 * np.finfo(float).eps * duration else 0.0
+    deviation = np.abs(samples - (samples[0] + step * np.arange(samples.size)))
+    return step if deviation.max() <= 4.0 * np.finfo(float).eps * duration else 0.0
 
 
 def _changes(a: Array, b: Array, nterms: int, halvings: int = 0) -> list[Array]:
@@ -403,9 +403,9 @@ def _products(a: Array, b: Array) -> tuple[Array, NDArray[np.intp]]:
         roots = sizes ** (1.0 / np.arange(1.0, _POWERS + 2.0)[:, None])
         root = np.maximum(roots[:-1], roots[1:]).min(axis=0)
         # The bounds keep the products, and what rounding leaves of them, within the range of numbers.
-        spare = np.floor(-np.log2(np.clip(root, 2.0**-50, 1.0))) * (np.abs(b).max(axis=(1, 2), initial=0.0) < 1e200)
-        spare = np.minimum(spare, halvings)
-        halvings, factor = halvings - spare, 2.0 ** spare[:, None, None]
+        saved = np.floor(-np.log2(np.clip(root, 2.0**-50, 1.0))) * (np.abs(b).max(axis=(1, 2), initial=0.0) < 1e200)
+        saved = np.minimum(saved, halvings)
+        halvings, factor = halvings - saved, 2.0 ** saved[:, None, None]
         products = [product * factor ** (k + 1.0) for k, product in enumerate(products)]
         both = products[0]
     while len(products) <= _TERMS:

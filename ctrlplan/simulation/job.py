@@ -9,8 +9,8 @@ from functools import partial
 import numpy as np
 
 from ctrlplan._types import Array, Params
+from ctrlplan.simulation.built_forms import NotCompiledError
 from ctrlplan.simulation.events import Events, Snapshot, Watched, watched_events
-from ctrlplan.simulation.learned import NotCompiledError
 from ctrlplan.simulation.network import Network
 from ctrlplan.simulation.prepared import Prepared
 from ctrlplan.simulation.signals import TimeSignal
@@ -142,7 +142,7 @@ def _of_block(
     return np.asarray(function(seen.t, seen.x[states], fed(seen.w), params))
 
 
-def unused(job: Job) -> Job:
+def fresh_job(job: Job) -> Job:
     """Same job for another attempt, its sampled blocks with the memory that they have now."""
     network = job.network
     if network is None or not any(can_remember(network.blocks[i].system) for i in network.blocks_with("period")):

@@ -220,9 +220,9 @@ def _singular_loop(closing: Array) -> NDArray[np.intp]:
     for _ in range(size.bit_length()):
         reach = reach @ reach
     group = reach & reach.swapaxes(1, 2)  # [system, signal, signals in one loop with it]
-    alone = np.argwhere((closing[:, range(size), range(size)] == 0.0) & (group.sum(axis=2) == 1))
-    if alone.size:
-        return alone[0, 1:]
+    isolated = np.argwhere((closing[:, range(size), range(size)] == 0.0) & (group.sum(axis=2) == 1))
+    if isolated.size:
+        return isolated[0, 1:]
     for system, signal in np.argwhere((group.sum(axis=2) > 1) & (group.argmax(axis=2) == np.arange(size))):
         members = np.flatnonzero(group[system, signal])
         block = closing[system][np.ix_(members, members)]

@@ -16,7 +16,7 @@ from ctrlplan._types import Array
 from ctrlplan.simulation.budget import TimeLimitError
 from ctrlplan.simulation.events import Snapshot, Watched
 from ctrlplan.simulation.interpreted import Interpreted, SolverError
-from ctrlplan.simulation.job import Job, Record, unused, with_event_times
+from ctrlplan.simulation.job import Job, Record, fresh_job, with_event_times
 from ctrlplan.simulation.network import Network
 from ctrlplan.simulation.scales import PASSES, Scales, Tolerances, effects, output_uncertainty, remaining
 from ctrlplan.simulation.segments import Run, Solver, integrate, known_before
@@ -92,32 +92,32 @@ class NumericalMethod(Protocol[S]):
 
 def numerical(job: Job, method: NumericalMethod[S]) -> Record:
     """Run from segment to segment, repeated where the scales of the states were not known."""
-    scales, spare = Scales.plain(job.state.size, job.atol), unused(job)
+    scales, fresh = Scales.plain(job.state.size, job.atol), fresh_job(job)
     attempt = Attempt(job, method, scales)
     attempt.go()
     for _ in range(PASSES - 1 if job.atol is None else 0):
         found = scales.renewed(attempt.run.states, attempt.noise)
         if found is None:
             break
-        following = Attempt(spare, method, found)
+        following = Attempt(fresh, method, found)
         try:
             following.go()
         except SolverError:  # the run before stands, with what is said of its accuracy
             break
         scales, attempt = found, following
     if job.atol is None and attempt.expands():
-        attempt = _tightened(attempt, spare)
+        attempt = _tightened(attempt, fresh)
     if attempt.tighter == 1.0:
-        attempt = _with_closer_states(attempt, spare)
+        attempt = _with_closer_states(attempt, fresh)
     return attempt.record()
 
 
-def _tightened(attempt: Attempt[S], spare: Job) -> Attempt[S]:
+def _tightened(attempt: Attempt[S], fresh: Job) -> Attempt[S]:
     """Run whose errors of steps grow: measured by a run from beside, and made again with smaller ones."""
     scales, perturbation = attempt.scales, _PERTURBATION * attempt.scales.scale
     perturbation = perturbation * np.where(np.arange(perturbation.size) % 2, -1.0, 1.0)
     try:
-        near = Attempt(replace(spare, state=spare.state + perturbation), attempt.method, scales)
+        near = Attempt(replace(fresh, state=fresh.state + perturbation), attempt.method, scales)
         near.go()
     except SolverError:
         return attempt
@@ -129,7 +129,7 @@ def _tightened(attempt: Attempt[S], spare: Job) -> Attempt[S]:
         return attempt
     tighter = min(growth / _GROWTH, _TIGHTEST)
     try:
-        again = Attempt(spare, attempt.method, scales, tighter)
+        again = Attempt(fresh, attempt.method, scales, tighter)
         again.go()
     except SolverError:
         return attempt
@@ -137,7 +137,7 @@ def _tightened(attempt: Attempt[S], spare: Job) -> Attempt[S]:
     return again
 
 
-def _with_closer_states(attempt: Attempt[S], spare: Job) -> Attempt[S]:
+def _with_closer_states(attempt: Attempt[S], fresh: Job) -> Attempt[S]:
     """Run again, with large states integrated more closely where others depend on them absolutely, as on an angle."""
     loose = attempt.loose()
     if not loose.any():
@@ -146,7 +146,7 @@ def _with_closer_states(attempt: Attempt[S], spare: Job) -> Attempt[S]:
         scales = attempt.scales.with_closer_states(
             attempt.run.states, loose, attempt.noise(), attempt.solver.relative_by_state
         )
-        again = Attempt(spare, attempt.method, scales)
+        again = Attempt(fresh, attempt.method, scales)
         again.solver.count()
         again.go()
     except SolverError:
@@ -216,7 +216,7 @@ class Attempt(Generic[S]):
             job.state,
             resolution=10.0 * job.rtol,
             marks=marks,
-            pause=self._pause if self.stops else None,
+            stops_after=self._stops_after if self.stops else None,
         )
         self.method.check(self)
 
@@ -342,7 +342,7 @@ class Attempt(Generic[S]):
         found: Array = self.solver.advance(self.run.series(start), start, np.array([t]), self.run.states[:, k])
         return found[:, -1]
 
-    def _pause(self, t: Array, x: Array) -> bool:
+    def _stops_after(self, t: Array, x: Array) -> bool:
         seen = self._snapshot(t, x)
         return any(entry.side(entry.value(seen)).any() for entry in self.watched if entry.stop)
 

@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike
 from ctrlplan._checks import Range, checked_finite, checked_limits
 from ctrlplan._types import Array, Frozen, Params, System
 from ctrlplan.simulation import methods
+from ctrlplan.simulation.built_forms import NotApplicableError
 from ctrlplan.simulation.interpreted import LoopError, SolverError
-from ctrlplan.simulation.learned import NotApplicableError
 from ctrlplan.simulation.prepared import Prepared, prepare
 from ctrlplan.simulation.simulate import checked_job, response_to
 

@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike
 
 from ctrlplan._lru import BUILDING, Lru
 from ctrlplan._types import Array, Params, System, Value
+from ctrlplan.simulation.built_forms import BuiltForm, BuiltForms, DisagreementError, NotCompiledError
 from ctrlplan.simulation.interpreted import Interpreted
-from ctrlplan.simulation.learned import BuiltForm, DisagreementError, Learned, NotCompiledError
 from ctrlplan.simulation.linear import LinearForm, NotLinearError, linear_form
 from ctrlplan.simulation.network import Block, Network, UnsupportedError
 from ctrlplan.simulation.segments import DelayedSignal
@@ -74,7 +74,7 @@ class Prepared:
                 what = "puts out the past" if block.delay is not None else "takes samples"
                 self.not_linear = f"block {block.name} {what}"
         self._sources = [PlanSignal(b.plan, b.traits.derivatives) for b in self._blocks() if b.plan is not None]
-        self._learned = Learned()
+        self._built_forms = BuiltForms()
 
     def __repr__(self) -> str:
         return f"<Prepared form of {self.name}: {self.nstates} states>"
@@ -133,11 +133,11 @@ class Prepared:
                 _FORMS.get(self.fingerprint, lambda: self)
             return built
 
-        return self._learned.form(params, build)
+        return self._built_forms.form(params, build)
 
-    def distrust(self, form: Compiled, why: str) -> DisagreementError:
+    def discard(self, form: Compiled, why: str) -> DisagreementError:
         """Drop a compiled form that was found wrong; the error to raise."""
-        return self._learned.distrust(form, why)
+        return self._built_forms.discard(form, why)
 
     def detached(self, names: Iterable[str] = ()) -> Prepared:
         """Same form without python-control's blocks, for other processes and for many runs with some parameters.
@@ -153,8 +153,8 @@ class Prepared:
         other = object.__new__(Prepared)
         other.__dict__.update(self.__getstate__())
         if self.linear is None:
-            other._learned = other._learned.for_any(names)
-            if not other._learned.forms:
+            other._built_forms = other._built_forms.for_any(names)
+            if not other._built_forms.forms:
                 raise TypeError(f"{self.name} is not compiled for any values of {', '.join(names) or 'no parameters'}")
         return other
 
@@ -169,7 +169,7 @@ class Prepared:
         def at_start() -> Array:
             return signal_values(self.time_signals([], 0.0), np.zeros(1))[:, 0]
 
-        return self._learned.reads(name, partial(is_read, network, name, value, start, at_start))
+        return self._built_forms.reads(name, partial(is_read, network, name, value, start, at_start))
 
     def _build(
         self, params: Params, time_signals: list[TimeSignal], first: float, state: Array, trials: bool
@@ -228,7 +228,7 @@ class Prepared:
 
     def __getstate__(self) -> dict[str, object]:
         """Without python-control's objects, whose functions cannot be sent to another process."""
-        usable = self._learned.usable()
+        usable = self._built_forms.usable()
         if self.linear is None:
             special = any(block.delay is not None or block.period is not None for block in self._blocks())
             if not usable.forms or special:
@@ -244,7 +244,7 @@ class Prepared:
             "system": None,
             "fingerprint": None,
             "network": network,
-            "_learned": usable,
+            "_built_forms": usable,
             "_stated": self.stated,
         }
 

@@ -143,7 +143,7 @@ def integrate(
     state: Array,
     resolution: float,
     marks: Sequence[float] = (),
-    pause: Callable[[Array, Array], bool] | None = None,
+    stops_after: Callable[[Array, Array], bool] | None = None,
 ) -> Run:
     """Run a network over increasing times.
 
@@ -177,9 +177,9 @@ def integrate(
     marks = [*breakpoints_of(time_signals), *network.breakpoints, *marks]
     schedule = _Schedule(network, time_signals, _fixed(marks, first, last, memory.delays, hops), first, last)
     longest = _longest(network, memory.delays, last - first)
-    if pause is not None:
+    if stops_after is not None:
         longest = min(longest, (last - first) / 64.0)
-    shortest = 1e-9 * (last - first) if pause is not None else np.inf
+    shortest = 1e-9 * (last - first) if stops_after is not None else np.inf
     rounding = _rounding(time_signals, np.union1d(np.linspace(first, last, 257), schedule.marks))
     known: list[tuple[Array, Array]] = []  # times and states of each segment, its end left to the next
     segments: list[tuple[float, Series]] = []
@@ -215,7 +215,7 @@ def integrate(
         known.append((np.append(left, grid[wanted]), np.column_stack([x, found[:, wanted]])))
         before, x = x, schedule.sample(equations, right, found[:, -1])
         left, reach = right, min(longest, 2.0 * reach)
-        if pause is not None and pause(np.append(segments[-1][0], grid), np.column_stack([before, found])):
+        if stops_after is not None and stops_after(np.append(segments[-1][0], grid), np.column_stack([before, found])):
             break
     known.append((np.array([left]), x[:, None]))
     return Run(np.concatenate([t for t, _ in known]), np.concatenate([s for _, s in known], axis=1), segments)

@@ -20,7 +20,7 @@ from ctrlplan.simulation import methods
 from ctrlplan.simulation.budget import begin_run
 from ctrlplan.simulation.events import Events, Occurrence, Watched, crossings
 from ctrlplan.simulation.interpreted import FeedthroughError
-from ctrlplan.simulation.job import Job, Record, unused
+from ctrlplan.simulation.job import Job, Record, fresh_job
 from ctrlplan.simulation.methods import Method
 from ctrlplan.simulation.prepared import Prepared, prepared_form
 from ctrlplan.simulation.response import SimulationResponse
@@ -192,11 +192,11 @@ def checked_job(
 
 def response_to(job: Job, chosen: Sequence[Method]) -> SimulationResponse:
     """Response by the first of some methods that applies."""
-    spare = unused(job)
+    fresh = fresh_job(job)
     try:
         return _response(job, methods.recorded(job, chosen))
     except FeedthroughError:  # no algebraic loop at the start, but later: solved as one from the start on
-        return _response(spare, methods.recorded(replace(spare, trials=False), chosen))
+        return _response(fresh, methods.recorded(replace(fresh, trials=False), chosen))
 
 
 def _warn_of_unread(job: Job) -> None:

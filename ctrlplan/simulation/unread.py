@@ -56,14 +56,14 @@ def is_read(network: Network, name: str, value: Value, start: Array, at_start: C
     with untouched():
         w = tried(signals, np.zeros(network.nsignals))
         for i in blocks:
-            noticing = _Noticing({**network.blocks[i].params, name: value}, read)
+            recorder = _ReadRecorder({**network.blocks[i].params, name: value}, read)
             for scale in (0.0, 0.1, 1.0):
                 x, u = start[network.states[i]], network.fed[i](w)
                 x, u = (v + scale * rng.standard_normal(v.size) * (1.0 + np.abs(v)) for v in (x, u))
                 for function in tellers[i]:
-                    tried(partial(function, 10.0 * scale, x.copy(), u.copy(), noticing), None)
+                    tried(partial(function, 10.0 * scale, x.copy(), u.copy(), recorder), None)
     keeper.restore()
-    return name in read or _Noticing.ALL in read
+    return name in read or _ReadRecorder.ALL in read
 
 
 def _functions(system: System) -> Iterator[Callable[..., ArrayLike]]:
@@ -71,7 +71,7 @@ def _functions(system: System) -> Iterator[Callable[..., ArrayLike]]:
     return filter(None, (system.outfcn, system.updfcn, traits_of(system).sample))
 
 
-class _Noticing(dict[str, Value]):
+class _ReadRecorder(dict[str, Value]):
     """Parameters that notice which of them are read."""
 
     ALL = ""

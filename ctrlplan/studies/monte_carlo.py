@@ -17,7 +17,7 @@ from ctrlplan._checks import real_array
 from ctrlplan._renamed import outside_stacklevel
 from ctrlplan._types import Array, Params
 from ctrlplan.simulation import Event, Prepared, SolverError, prepare
-from ctrlplan.simulation.learned import NotCompiledError
+from ctrlplan.simulation.built_forms import NotCompiledError
 from ctrlplan.simulation.methods.delegated import DELEGATED
 from ctrlplan.studies.comparison import Comparison, comparison_of
 from ctrlplan.studies.draw_results import DrawResults, Outcome, band_samples

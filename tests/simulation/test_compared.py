@@ -56,7 +56,7 @@ WRONG = [beyond_a_switch, beyond_a_limit, beyond_a_clip, at_the_peak, at_a_whole
 
 
 @pytest.mark.parametrize("force", WRONG, ids=lambda force: force.__name__)
-def test_a_wrong_trace_shows_between_the_times_asked_for(force):
+def test_a_wrong_trace_shows_between_the_times_of_the_run(force):
     """At the times themselves x is near 0, and no trial state is beyond 9."""
     found = cp.simulate(oscillator(force), OSCILLATION, None, [0.0, 10.0])
     assert found.method == "python"
@@ -134,10 +134,10 @@ def test_both_sides_of_every_switch_come_first():
     assert np.all(np.diff(places) > 0)
 
 
-@pytest.mark.parametrize("most", [1, 3, 50])
-def test_without_switches_places_are_spread(most):
-    places = telling_states(np.ones((0, 7)), np.sin(np.arange(7.0))[None], most)
-    assert 1 <= places.size <= min(most, 7)
+@pytest.mark.parametrize("maximum", [1, 3, 50])
+def test_without_switches_places_are_spread(maximum):
+    places = telling_states(np.ones((0, 7)), np.sin(np.arange(7.0))[None], maximum)
+    assert 1 <= places.size <= min(maximum, 7)
     assert np.unique(places).size == places.size
 
 

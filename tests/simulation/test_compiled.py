@@ -94,10 +94,10 @@ def gains(mass, friction, w=5.0):
 def pid_by_hand(error, state, given, bias=0.0, limits=(-math.inf, math.inf), tf=0.02):
     """Output and rates of (integral, filter)."""
     kp, ki, kd = given
-    asked = bias + kp * error + state[0] + kd / tf * (error - state[1])
-    out = min(max(asked, limits[0]), limits[1])
+    requested = bias + kp * error + state[0] + kd / tf * (error - state[1])
+    out = min(max(requested, limits[0]), limits[1])
     back = math.sqrt(ki / kd) if math.isfinite(limits[0]) else 0.0
-    return out, [ki * error + back * (out - asked), (error - state[1]) / tf]
+    return out, [ki * error + back * (out - requested), (error - state[1]) / tf]
 
 
 def driven_crane(law, force_limits=(-math.inf, math.inf), mass=M):
@@ -109,8 +109,8 @@ def driven_crane(law, force_limits=(-math.inf, math.inf), mass=M):
         jet = planned(t, 2)
         if law == "load_feedback":
             px, _, px1, _ = load_of(plant)
-            asked = jet[2, 0] - 2.0 * (px1 - jet[1, 0]) - (px - jet[0, 0])
-            d_ref, r_ref = generated(px, asked, jet[0, 1], jet[2, 1])
+            requested = jet[2, 0] - 2.0 * (px1 - jet[1, 0]) - (px - jet[0, 0])
+            d_ref, r_ref = generated(px, requested, jet[0, 1], jet[2, 1])
         else:
             d_ref, r_ref = generated(jet[0, 0], jet[2, 0], jet[0, 1], jet[2, 1])
         force, rates = pid_by_hand(d_ref - plant[0], x[:2], trolley, limits=force_limits)
@@ -339,10 +339,10 @@ def test_a_saturated_loop(method):
         return min(max(4 * (quintic(t, 0.5, 1.5, 3.0) - x[0]) - 2 * x[1], -0.5), 2.0)
 
     states = tight(lambda t, x: [x[1], -x[1] + control(t, x)], T, [0.0, 0.0], (0.5, 1.5))
-    asked = np.array([control(t, x) for t, x in zip(T, states.T, strict=True)])
-    assert (asked.min(), asked.max()) == (-0.5, 2.0)
+    requested = np.array([control(t, x) for t, x in zip(T, states.T, strict=True)])
+    assert (requested.min(), requested.max()) == (-0.5, 2.0)
     assert found.method == method
-    assert gap(found.outputs, [states[0], asked]) <= 1e-7
+    assert gap(found.outputs, [states[0], requested]) <= 1e-7
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -358,9 +358,9 @@ def test_a_limited_pid_with_its_anti_windup(method, tracking_time):
 
     def both(t, x):
         error = (3.0 if t >= 1.0 else 0.0) - x[2]
-        asked = 0.2 + kp * error + x[0] + kd / tf * (error - x[1])
-        out = min(max(asked, limits[0]), limits[1])
-        return [ki * error + back * (out - asked), (error - x[1]) / tf, x[3] - x[2], out - x[3]], out
+        requested = 0.2 + kp * error + x[0] + kd / tf * (error - x[1])
+        out = min(max(requested, limits[0]), limits[1])
+        return [ki * error + back * (out - requested), (error - x[1]) / tf, x[3] - x[2], out - x[3]], out
 
     states = tight(lambda t, x: both(t, x)[0], T, np.zeros(4), (1.0,))
     assert found.method == method

@@ -42,7 +42,7 @@ def test_one_compiled_form_for_all_values(monkeypatch):
             assert found.method == "compiled"
             assert np.abs(found.states[0] - start / np.sqrt(1 + 2 * k * start**2 * T)).max() <= 1e-6
     assert calls == ["cubic"]
-    assert len(ready._learned.forms) == 1
+    assert len(ready._built_forms.forms) == 1
 
 
 def test_one_compiled_form_for_all_plans_and_times(monkeypatch):

@@ -189,7 +189,7 @@ def test_a_random_number_is_no_constant():
         cp.simulate(block, T, None, 1.0, method="compiled")
 
 
-def test_a_block_that_remembers_what_it_was_asked():
+def test_a_block_that_remembers_its_arguments():
     """A memory that only saves work must not hand a symbol to a run, nor a number of another state."""
     known = {}
 

@@ -270,8 +270,8 @@ def test_a_saturation_says_when_it_acts(method):
     assert told(found) == [("u", "above"), ("u", "inside"), ("u", "below")]
     assert np.abs(times_of(found) - [0.0, math.log(4 / 3), math.log(4.0)]).max() <= 1e-8
     assert np.array_equal(found.time, times)
-    asked = 2 * np.exp(-times) - 1
-    assert np.abs(found.outputs - np.clip(asked, -0.5, 0.5)).max() <= 1e-8
+    requested = 2 * np.exp(-times) - 1
+    assert np.abs(found.outputs - np.clip(requested, -0.5, 0.5)).max() <= 1e-8
     assert cp.simulate(loop, times, {"one": 1.0}, 1.0, method=method, events=()).events == []
     both = cp.simulate(loop, times, {"one": 1.0}, 1.0, method=method, events=[Event("u", high=0.2, name="mine")])
     assert {o.name for o in both.events} == {"u", "mine"}
@@ -288,17 +288,17 @@ def test_limits_of_a_pid(method):
     found = cp.simulate(loop, T, cp.Step(1.0, time=1.0), method=method, rtol=1e-10, atol=1e-12)
     back = math.sqrt(ki / kd)
 
-    def asked(x):
+    def requested(x):
         error = 1.0 - x[2]
         return kp * error + x[0] + kd / tf * (error - x[1])
 
     def rate(t, x):
-        out = min(max(asked(x), -1.0), high)
+        out = min(max(requested(x), -1.0), high)
         error = 1.0 - x[2]
-        return [ki * error + back * (out - asked(x)), (error - x[1]) / tf, x[3] - x[2], out - 2 * x[3]]
+        return [ki * error + back * (out - requested(x)), (error - x[1]) / tf, x[3] - x[2], out - 2 * x[3]]
 
     def at_limit(t, x):
-        return asked(x) - high
+        return requested(x) - high
 
     run = solve_ivp(rate, (0.0, 9.0), np.zeros(4), "DOP853", rtol=1e-12, atol=1e-12, events=at_limit, max_step=0.01)
     exact = [1.0, *(1.0 + run.t_events[0])]

@@ -397,12 +397,12 @@ def method_of_steps(rate, delays, initial, end, times):
     for t in marks[1:]:
         if t - kept[-1] > 1e-9:
             kept.append(t)
-    legs, x = [], initial
+    segments, x = [], initial
 
     def past(t):
         if t <= 0.0:
             return initial
-        for right, run in legs:
+        for right, run in segments:
             if t <= right:
                 return float(run(t)[0])
         return x
@@ -418,7 +418,7 @@ def method_of_steps(rate, delays, initial, end, times):
             dense_output=True,
             max_step=0.1,
         )
-        legs.append((right, run.sol))
+        segments.append((right, run.sol))
         x = run.y[0, -1]
     return np.array([past(t) for t in times])
 
@@ -542,12 +542,12 @@ def test_a_sampled_law_whose_control_comes_late(method):
     integrator = ct.ss(0.0, 1.0, 1.0, 0.0, inputs="u", outputs="x", name="integrator")
     loop = ct.interconnect([integrator, late, law], inputs=0, outputs="x")
     times = np.round(0.1 * np.arange(51), 9)
-    x, slope, asked, rows = 1.0, 0.0, 0.0, []
+    x, slope, requested, rows = 1.0, 0.0, 0.0, []
     for k in range(51):
         if k % 5 == 0:
-            asked = -0.5 * x
+            requested = -0.5 * x
         if k % 5 == 2:
-            slope = asked
+            slope = requested
         rows.append(x)
         x += 0.1 * slope
     found = cp.simulate(loop, times, None, [1.0, 0.0], method=method, **TIGHT)

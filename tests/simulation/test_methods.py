@@ -14,8 +14,8 @@ import pytest
 
 import ctrlplan as cp
 from ctrlplan.simulation import methods
+from ctrlplan.simulation.built_forms import NotApplicableError
 from ctrlplan.simulation.interpreted import InterpretedSolver, SolverError
-from ctrlplan.simulation.learned import NotApplicableError
 from ctrlplan.simulation.numerical import numerical
 from ctrlplan.simulation.simulate import MethodName
 

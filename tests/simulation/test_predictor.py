@@ -37,10 +37,10 @@ def highest_torque(x, r):
 
 def by_bisection(x, high):
     """Greatest step from 0 whose torque stays below a limit, by runs made here."""
-    low, most = 0.0, 3.0
-    while most - low > 1e-4:
-        middle = 0.5 * (low + most)
-        low, most = (middle, most) if highest_torque(x, middle) < high else (low, middle)
+    low, maximum = 0.0, 3.0
+    while maximum - low > 1e-4:
+        middle = 0.5 * (low + maximum)
+        low, maximum = (middle, maximum) if highest_torque(x, middle) < high else (low, middle)
     return low
 
 
@@ -197,7 +197,7 @@ GOOD = {"limits": {"torque": (-1.0, 1.0)}, "horizon": 5.0}
         ({"count": 20.5}, "count must be a whole number"),
     ],
 )
-def test_what_is_refused(given, message):
+def test_what_is_rejected(given, message):
     with pytest.raises(ValueError, match=message):
         cp.Predictor(pendulum(), **{**GOOD, **given})
 
@@ -264,8 +264,8 @@ def test_a_crane_whose_law_feeds_the_load_back():
     limits = {"theta": (-0.06, 0.06), "F": (-6000.0, 6000.0)}
     governor = cp.create_governor_iosystem(cp.Predictor(loop, limits, 40.0), 0.5, initial=[0.0, 10.0])
     outputs = [*plant.output_labels, "F", "C", "x_set", "z_set"]
-    asked = ["x_set_cmd", "z_set_cmd"]
-    whole = ct.interconnect([governor, cp.expose_states(loop)], inputs=asked, outputs=outputs)
+    requested = ["x_set_cmd", "z_set_cmd"]
+    whole = ct.interconnect([governor, cp.expose_states(loop)], inputs=requested, outputs=outputs)
     start = np.concatenate([np.zeros(5), rest])
     found = cp.simulate(whole, np.linspace(0.0, 60.0, 12001), {"x_set_cmd": 4.0, "z_set_cmd": 10.0}, start)
     y = dict(zip(outputs, found.outputs, strict=True))

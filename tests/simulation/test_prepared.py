@@ -284,18 +284,18 @@ def test_the_forms_that_are_kept_do_not_grow_without_bound():
     systems = [decay(k) for k in np.linspace(1.0, 2.0, 40)]
     for system in systems:
         simulate(system, T[:2], None, 1.0)
-    assert len(prepared_module._FORMS) <= prepared_module._KEPT
+    assert len(prepared_module._FORMS) <= prepared_module._CACHE_SIZE
     changed = decay()
     for k in np.linspace(1.0, 2.0, 40):
         changed.params["k"] = k
         simulate(changed, T[:2], None, 1.0)
-    assert len(prepared_module._FORMS) <= prepared_module._KEPT
+    assert len(prepared_module._FORMS) <= prepared_module._CACHE_SIZE
     ready = prepare(driven())
     for k in range(20):
         with pytest.warns(UserWarning, match=f"params 'p{k}' is read by no block"):
             simulate(ready, T[:2], 1.0, params={f"p{k}": 1.0})
-    assert len(ready._learned.forms) <= 8
-    form = ready._learned.forms[-1].form
+    assert len(ready._built_forms.forms) <= 8
+    form = ready._built_forms.forms[-1].form
     for n in range(2, 150):
         with pytest.warns(UserWarning, match="params 'p19' is read by no block"):
             simulate(ready, np.linspace(0.0, 1.0 + 0.01 * n, n), 1.0, params={"p19": 1.0})

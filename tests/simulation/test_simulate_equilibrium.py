@@ -19,7 +19,7 @@ def rests(system, position, state):
 
 @pytest.mark.parametrize("position", [0.0, 1.0, -2.5, 1e3, 1e-6])
 @pytest.mark.parametrize("gain", [0.1, 0.25, 5.0, 1e3, 1e6])
-def test_the_lag_loop_rests_where_it_is_asked_to(gain, position):
+def test_the_equilibrium_of_the_lag_loop_is_the_reference(gain, position):
     # y' = 0 and y = r, whatever the gain.
     state = equilibrium_state(cp.plants.integrator_lag_loop(gain), position)
     assert np.abs(state - [0.0, position]).max() <= 1e-9 * max(abs(position), 1e-9)

@@ -92,21 +92,21 @@ def kinds(alpha):
     move, (m,) = both(*MOVE, alpha)
     rest, (r,) = both(*REST, alpha)
     speed, (s,) = both(*SPEED, alpha)
-    legs, (p,) = both(*FULL, alpha, each_leg=True)
+    segments, (p,) = both(*FULL, alpha, each_segment=True)
     back, (b,) = both(*BACK, alpha)
     late = r.shift(3.25)
     return {
         "late": (rest.shift(3.25), [late]),
         "ends at speed": (speed, [s]),
-        "piecewise": (legs, [p]),
+        "piecewise": (segments, [p]),
         "retimed": (cp.trajectory_from_dict(rest.to_dict()).retime(2.6), both([0.4, 3.0], REST[1], alpha)[1]),
         "sum": (move + rest, [m + r]),
         "sum with a step": (speed + cp.Step(-0.5, 0.25, time=1.3), [s + step(-0.5, 0.25, 1.3)]),
         "difference of a multiple": (move - 0.75 * speed, [m + (-0.75) * s]),
         "join": (move.then(rest).then(back), [m.then(r).then(b)]),
-        "joined legs": (legs.then(back.shift(7.0)), [p.then(b)]),
-        "sum of joins": (move.then(rest) + legs.then(back), [m.then(r) + p.then(b)]),
-        "stack": (cp.stack([move, legs, speed], labels=["a", "b", "c"]), [m, p, s]),
+        "joined legs": (segments.then(back.shift(7.0)), [p.then(b)]),
+        "sum of joins": (move.then(rest) + segments.then(back), [m.then(r) + p.then(b)]),
+        "stack": (cp.stack([move, segments, speed], labels=["a", "b", "c"]), [m, p, s]),
         "stack with a step": (cp.stack([rest, cp.Step(1.0, time=0.77)], ["a", "b"]), [r, step(1.0, 0.0, 0.77)]),
     }  # fmt: skip
 

@@ -54,7 +54,7 @@ def test_a_plan_with_derivatives_inside_a_nested_loop(alpha):
 
 def test_a_plan_whose_derivatives_jump_inside_the_loop():
     # The acceleration jumps at 0.5, 2 and 3 s, and samples fall there: a jump belongs to what follows, but at the end.
-    plan, (r,) = both([0.5, 2.0, 3.0], [[[0.0, 0.0], [1.0, -0.4], [0.3, 0.0]]], 1.0, each_leg=True)
+    plan, (r,) = both([0.5, 2.0, 3.0], [[[0.0, 0.0], [1.0, -0.4], [0.3, 0.0]]], 1.0, each_segment=True)
     r1 = r.derivative()
     found = cp.simulate(follower(plan), T, None, [0.3, -1.0], method="exact")
     a, b = [[0.0, 1.0], [-KP, -KD]], [[0.0] * 3, [KP, KD, 1.0]]
@@ -190,7 +190,7 @@ def test_an_algebraic_loop_with_a_solution_is_solved():
 
 
 @pytest.mark.parametrize("method", ["auto", "exact"])
-def test_an_algebraic_loop_without_a_solution_is_refused(method):
+def test_an_algebraic_loop_without_a_solution_is_rejected(method):
     # y = x - u and u = r - y leave u undetermined.
     loop = algebraic(both(*MOVE, 1.0)[0], -1.0)
     with pytest.raises(ValueError, match="algebraic loop"):

@@ -68,19 +68,19 @@ def saturated():
 
 
 @cache
-def of_linear_loop(each_leg, alpha):
-    _, signals = both(*(FULL if each_leg else MOVE), alpha, each_leg=each_leg)
+def of_linear_loop(each_segment, alpha):
+    _, signals = both(*(FULL if each_segment else MOVE), alpha, each_segment=each_segment)
     return response(*lag_loop(5.0), signals, T, [0.3, -0.2])
 
 
 @pytest.mark.parametrize(("rtol", "allowed"), [(1e-8, 2e-7), (1e-11, 3e-10)])
 @pytest.mark.parametrize("alpha", [0.0, 1e-9, 1.0, 5.0])
-@pytest.mark.parametrize("each_leg", [False, True], ids=["one spline", "one a leg"])
-def test_a_linear_loop(each_leg, alpha, rtol, allowed):
-    plan, _ = both(*(FULL if each_leg else MOVE), alpha, each_leg=each_leg)
+@pytest.mark.parametrize("each_segment", [False, True], ids=["one spline", "one a segment"])
+def test_a_linear_loop(each_segment, alpha, rtol, allowed):
+    plan, _ = both(*(FULL if each_segment else MOVE), alpha, each_segment=each_segment)
     loop = cp.plants.integrator_lag_loop(5.0, ["y", "u", "e"])
     found = cp.simulate(loop, T, plan, [0.3, -0.2], method="python", rtol=rtol, atol=1e-2 * rtol)
-    outputs, states = of_linear_loop(each_leg, alpha)
+    outputs, states = of_linear_loop(each_segment, alpha)
     assert found.method == "python"
     assert gap(found.states, states) <= allowed
     assert gap(found.outputs, outputs) <= allowed
@@ -256,10 +256,10 @@ def test_the_reason_names_what_ran_and_why():
     loop = cp.plants.integrator_lag_loop(5.0)
     plan = both(*MOVE, 1.0)[0]
     assert cp.simulate(loop, T, plan).method == "exact"
-    asked = cp.simulate(loop, T, plan, method="python")
-    assert (asked.method, asked.reason) == ("python", 'method "python" was requested')
+    requested = cp.simulate(loop, T, plan, method="python")
+    assert (requested.method, requested.reason) == ("python", 'method "python" was requested')
     assert cp.simulate(loop, T, np.sin(T)).method == "exact"
     bent = cp.simulate(saturated(), T, plan)
     assert bent.method == "compiled"
     assert "valve" in bent.reason
-    assert asked.events == []
+    assert requested.events == []

@@ -370,8 +370,8 @@ def by_a_plan_of_a_user_inside_another():
     class _Level(cp.PolySpline):
         levels = [1.0]  # noqa: RUF012
 
-        def segment_jet(self, leg, s, order):
-            return super().segment_jet(leg, s, order) * self.levels[0]
+        def segment_jet(self, segment, s, order):
+            return super().segment_jet(segment, s, order) * self.levels[0]
 
     stacked = cp.stack([_Level([cp.Waypoint(0, 0, 0), cp.Waypoint(1, 1, 0)])])
     return (lambda t, x, u, p: decay(2.0 * float(stacked(0.5)), x)), lambda k: _Level.levels.__setitem__(0, k)

@@ -273,7 +273,7 @@ def test_threads_share_a_prepared_form():
     with ThreadPoolExecutor(8) as executor:
         runs = executor.map(lambda n: (n, cp.simulate(ready, np.linspace(0.0, 3.0, n), PLAN).outputs), counts * 8)
         assert all(np.array_equal(found, alone[n]) for n, found in runs)
-    assert len(ready._learned.forms) == 1
+    assert len(ready._built_forms.forms) == 1
 
 
 def test_a_sweep_in_threads_leaves_casadi_as_it_was():

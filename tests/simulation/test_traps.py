@@ -145,7 +145,7 @@ def test_samples_lose_digits_that_plans_keep():
         assert np.abs(found.outputs.ravel() - plan(times)).max() <= allowed
 
 
-def test_a_callable_input_is_refused_with_a_reason():
+def test_a_callable_input_is_rejected_with_a_reason():
     lag = ct.ss(-1.0, 1.0, 1.0, 0.0)
     with pytest.raises(TypeError):
         ct.input_output_response(lag, [0.0, 1.0], np.sin)
@@ -185,7 +185,7 @@ def test_a_static_block_defaults_to_continuous_time():
         assert np.abs(found.outputs - 4 * (1 - 0.5 ** np.arange(6))).max() <= 1e-14
 
 
-def test_discrete_with_continuous_is_refused_by_the_peer_and_run_here():
+def test_discrete_with_continuous_is_rejected_by_the_peer_and_run_here():
     """x' = u, u = -x held for 0.5 s: x halves at every sample, straight in between."""
     plant = ct.ss(0.0, 1.0, 1.0, 0.0, inputs="u", outputs="y", name="plant")
     law = ct.ss([], [], [], [[-1.0]], 0.5, inputs="y", outputs="u", name="law")

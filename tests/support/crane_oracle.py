@@ -55,7 +55,7 @@ def load_of(q):
     )
 
 
-def drives(x, x2, z, z2):
+def actuator_references(x, x2, z, z2):
     """(15a,b)."""
     pull = math.hypot(x2, G - z2)
     return x - (B * pull - z * x2) / (G - z2), (z * pull - B * x2) / (G - z2)
@@ -63,9 +63,9 @@ def drives(x, x2, z, z2):
 
 def pid(mass, friction, error, state, bias, limits, w=5.0, tf=0.02):
     kp, ki, kd = 3 * mass * w**2, mass * w**3, 3 * mass * w - friction
-    asked = bias + kp * error + state[0] + kd * (error - state[1]) / tf
-    sent = min(max(asked, limits[0]), limits[1])
-    back = math.sqrt(ki / kd) * (sent - asked)
+    requested = bias + kp * error + state[0] + kd * (error - state[1]) / tf
+    sent = min(max(requested, limits[0]), limits[1])
+    back = math.sqrt(ki / kd) * (sent - requested)
     return sent, [ki * error + back, (error - state[1]) / tf]
 
 
@@ -75,16 +75,16 @@ FREE = (-math.inf, math.inf)
 def hand_rate(jet, law, wrap, force_limits=FREE, torque_limits=FREE):
     """Right-hand side over (controller states, crane states)."""
 
-    def driven(t, y):
+    def with_pids(t, y):
         q, (x, _, x1, _) = y[4:], load_of(y[4:])
         p = jet(t)
         if law == "setpoint":
             d_ref, r_ref = p[0, 0] - B, p[0, 1]
         elif law == "generator":
-            d_ref, r_ref = drives(p[0, 0], p[2, 0], p[0, 1], p[2, 1])
+            d_ref, r_ref = actuator_references(p[0, 0], p[2, 0], p[0, 1], p[2, 1])
         else:
-            asked = p[2, 0] - 2 * (x1 - p[1, 0]) - (x - p[0, 0])
-            d_ref, r_ref = drives(x, asked, p[0, 1], p[2, 1])
+            requested = p[2, 0] - 2 * (x1 - p[1, 0]) - (x - p[0, 0])
+            d_ref, r_ref = actuator_references(x, requested, p[0, 1], p[2, 1])
         force, moved = pid(MC, F1, d_ref - q[0], y[:2], 0.0, force_limits)
         torque, wound = pid(J / B + M * B, F2 / B, r_ref - q[1], y[2:4], -B * M * G, torque_limits)
         return np.array([*moved, *wound, *q[3:], *acceleration(wrap, q, force, torque)[:3]])
@@ -114,7 +114,7 @@ def hand_rate(jet, law, wrap, force_limits=FREE, torque_limits=FREE):
         force, torque = MC * d2 + F1 * d1 - tension * s, J * drum2 + F2 * drum1 - B * tension
         return np.array([rate, tension2, *q[3:], *acceleration(wrap, q, force, torque)[:3]])
 
-    return dynamic if law == "dynamic" else driven
+    return dynamic if law == "dynamic" else with_pids
 
 
 def by_hand(plan, law, wrap, state, t, **limits):
@@ -131,17 +131,17 @@ def by_hand(plan, law, wrap, state, t, **limits):
             return p
 
         inside = (t >= left) & (t <= right)
-        asked = np.union1d(t[inside], [left, right])
+        requested = np.union1d(t[inside], [left, right])
         found = solve_ivp(
             hand_rate(jet, law, wrap, **limits),
             (left, right),
             state,
             method="LSODA",
-            t_eval=asked,
+            t_eval=requested,
             rtol=1e-10,
             atol=1e-12,
         )
         assert found.success
-        out[:, inside] = found.y[:, np.searchsorted(asked, t[inside])]
+        out[:, inside] = found.y[:, np.searchsorted(requested, t[inside])]
         state = found.y[:, -1]
     return out

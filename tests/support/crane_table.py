@@ -9,7 +9,22 @@ is in it. The crane starts at rest at the first waypoint, D = x - b, R = z.
 import math
 
 import numpy as np
-from crane_oracle import F1, F2, FREE, MC, B, G, J, M, acceleration, by_hand, drives, hand_rate, load_of, pid
+from crane_oracle import (
+    F1,
+    F2,
+    FREE,
+    MC,
+    B,
+    G,
+    J,
+    M,
+    acceleration,
+    actuator_references,
+    by_hand,
+    hand_rate,
+    load_of,
+    pid,
+)
 from scipy.integrate import solve_ivp
 from trajectory_oracle import Direct
 
@@ -136,7 +151,7 @@ def computed_smooth(name):
     forces = []
     for moment, y in zip(t, states.T, strict=True):
         p = plan.jet(moment) if moment <= plan.end else np.vstack([plan.final, np.zeros((4, 2))])
-        d_ref = drives(p[0, 0], p[2, 0], p[0, 1], p[2, 1])[0]
+        d_ref = actuator_references(p[0, 0], p[2, 0], p[0, 1], p[2, 1])[0]
         forces.append(pid(MC, F1, d_ref - y[4], y[:2], 0.0, FREE)[0])
     return np.abs(states[6][t >= plan.end]).max(), np.abs(forces).max()
 

@@ -48,18 +48,18 @@ def between(first, last, horizon, alpha, s, highest):
 class Peer:
     """A replanner of polynomials: the plan and BPoly.from_derivatives on top, limits looked at on a fine grid."""
 
-    def __init__(self, plan, goal, dt, order=2, horizon=None, least=None, limits=None, begin=0.0):
+    def __init__(self, plan, goal, dt, order=2, horizon=None, minimum=None, limits=None, begin=0.0):
         self.plan, self.goal, self.order, self.limits = plan, goal, order, limits or {}
         self.pieces = []
         self.fits, self.unreachable, known = 0, [], None
-        least = max(dt, min(5 * dt, 0.5 * plan.duration)) if least is None else least
+        minimum = max(dt, min(5 * dt, 0.5 * plan.duration)) if minimum is None else minimum
         for k in itertools.count():
             t = begin + k * dt
             if t > plan.end + 5.0:
                 break
             found = goal(t)
             new = known is None or not np.allclose(found, self.ahead(*known, t)[:, :, 0], rtol=1e-10, atol=1e-10)
-            late = horizon is None and plan.end - t < least - 1e-9
+            late = horizon is None and plan.end - t < minimum - 1e-9
             unreachable = new and late
             if not late and t >= plan.start and (horizon is not None or new):
                 end = plan.end if horizon is None else t + horizon
@@ -118,11 +118,11 @@ class Peer:
 # Small helpers
 
 
-def chain(order, drive, label="x", name="plant"):
+def chain(order, signal, label="x", name="plant"):
     """Integrators from the order-th + 1 derivative to the position, all of them measured."""
     n = order + 1
     outputs = [label, *(f"{label}_d{k}" for k in range(1, n))]
-    return ct.ss(np.diag(np.ones(order), 1), np.eye(n)[:, -1:], np.eye(n), 0, inputs=drive, outputs=outputs, name=name)
+    return ct.ss(np.diag(np.ones(order), 1), np.eye(n)[:, -1:], np.eye(n), 0, inputs=signal, outputs=outputs, name=name)
 
 
 def ideal(plan, dt, order=2, method="auto", times=None, disturbance=None, **options):
@@ -130,8 +130,10 @@ def ideal(plan, dt, order=2, method="auto", times=None, disturbance=None, **opti
     replanner = cp.create_replanner_iosystem(
         plan, dt, order=order, measured=order, derivatives=order + 1, suffix="_r", **options
     )
-    drives = [f"{label}_r_d{order + 1}" for label in plan.labels]
-    plants = [chain(order, drive, label, f"plant_{label}") for drive, label in zip(drives, plan.labels, strict=True)]
+    accelerations = [f"{label}_r_d{order + 1}" for label in plan.labels]
+    plants = [
+        chain(order, signal, label, f"plant_{label}") for signal, label in zip(accelerations, plan.labels, strict=True)
+    ]
     outputs = [*replanner.output_labels, *(label for p in plants for label in p.output_labels)]
     goals = [label for label in replanner.input_labels if "_goal" in label]
     loop = ct.interconnect([replanner, *plants], inputs=goals or 0, outputs=outputs, name="loop")

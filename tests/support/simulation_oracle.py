@@ -142,9 +142,9 @@ def spline(times, jets, alpha=0.0):
         orders.append([differentiated(f) for f in orders[-1]])
     matrix = mp.matrix([[mp.re(value(f, x)) for f in orders[nu]] for x, nu, _ in given])
     found = mp.lu_solve(matrix, mp.matrix([v for _, _, v in given]))
-    leg = added(*zip(found, basis, strict=True))
-    ends = (held(mp.re(value(leg, x))) for x in (t[0], t[-1]))
-    return Signal([t[0], t[-1]], [next(ends), leg, next(ends)])
+    segment = added(*zip(found, basis, strict=True))
+    ends = (held(mp.re(value(segment, x))) for x in (t[0], t[-1]))
+    return Signal([t[0], t[-1]], [next(ends), segment, next(ends)])
 
 
 def polygon(times, values):
@@ -158,21 +158,21 @@ def polygon(times, values):
 
 
 def piecewise(times, jets, alpha=0.0):
-    legs = [spline(times[i : i + 2], jets[i : i + 2], alpha) for i in range(len(times) - 1)]
-    whole = legs[0]
-    for leg in legs[1:]:
-        whole = whole.then(leg)
+    segments = [spline(times[i : i + 2], jets[i : i + 2], alpha) for i in range(len(times) - 1)]
+    whole = segments[0]
+    for segment in segments[1:]:
+        whole = whole.then(segment)
     return whole
 
 
-def both(times, axes, alpha=0.0, each_leg=False, labels=None):
+def both(times, axes, alpha=0.0, each_segment=False, labels=None):
     """Plan of the library and the same in closed form, axis by axis; axes[a][i] is the jet at times[i]."""
     names = labels or [f"axis{a}" for a in range(len(axes))]
     points = [
         cp.Waypoint.from_jets(float(t), **{name: list(axis[i]) for name, axis in zip(names, axes, strict=True)})
         for i, t in enumerate(times)
     ]
-    if each_leg:
+    if each_segment:
         return cp.PiecewiseSpline(points, alpha=alpha, warn=False), [piecewise(times, axis, alpha) for axis in axes]
     plan = cp.TrigSpline(points, alpha=alpha, warn=False) if alpha else cp.PolySpline(points, warn=False)
     return plan, [spline(times, axis, alpha) for axis in axes]

@@ -181,9 +181,9 @@ def test_every_later_time_follows():
         output = np.hstack([moved, loop.D + (loop.C - moved) @ rest])
         for row, (low, high) in zip(output, limits.values(), strict=True):
             for sign, limit in ((1.0, high), (-1.0, -low)):
-                most = linprog(-sign * row, A_ub=rows, b_ub=found.bounds, bounds=(None, None))
-                assert most.status == 0
-                assert -most.fun <= limit + 1e-6
+                maximum = linprog(-sign * row, A_ub=rows, b_ub=found.bounds, bounds=(None, None))
+                assert maximum.status == 0
+                assert -maximum.fun <= limit + 1e-6
 
 
 def test_no_row_is_superfluous():
@@ -191,8 +191,8 @@ def test_no_row_is_superfluous():
     rows = np.hstack([found.state_matrix, found.reference_matrix])
     for k, row in enumerate(rows):
         others = np.arange(len(rows)) != k
-        most = linprog(-row, A_ub=rows[others], b_ub=found.bounds[others], bounds=(None, None))
-        assert most.status == 3 or -most.fun > found.bounds[k] - 1e-6
+        maximum = linprog(-row, A_ub=rows[others], b_ub=found.bounds[others], bounds=(None, None))
+        assert maximum.status == 3 or -maximum.fun > found.bounds[k] - 1e-6
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -233,7 +233,7 @@ def shaken(zeta=0.3):
     )
 
 
-def worst(t, most):
+def worst(t, maximum):
     """Sup of y at t over |w| <= most from 0: what w = sign c e^(a (t - s)) b makes, and w passed on."""
     loop, h = shaken(), 0.004
     step = expm(loop.A * h)
@@ -242,23 +242,23 @@ def worst(t, most):
         following = step @ swing
         size += 0.5 * h * (abs(swing[0]) + abs(following[0]))
         swing = following
-    return most * (size + 0.2)
+    return maximum * (size + 0.2)
 
 
 def test_disturbances_take_their_worst_from_the_limits_at_rest():
-    most = 0.2
-    found = cp.AdmissibleSet(shaken(), {"y": (-1.0, 1.0)}, 0.05, disturbances={"w": most})
+    maximum = 0.2
+    found = cp.AdmissibleSet(shaken(), {"y": (-1.0, 1.0)}, 0.05, disturbances={"w": maximum})
     assert found.references == ("r",)
-    room = 1.0 - MARGIN - worst(30.0, most)
+    room = 1.0 - MARGIN - worst(30.0, maximum)
     assert found.contains([0.998 * room, 0.0], [0.998 * room])
     assert not found.contains([1.002 * room, 0.0], [1.002 * room])
 
 
 def test_no_bang_bang_disturbance_breaks_a_limit_and_one_does_just_outside():
-    most, loop = 0.2, shaken()
-    found = cp.AdmissibleSet(loop, {"y": (-1.0, 1.0)}, 0.05, disturbances={"w": most})
+    maximum, loop = 0.2, shaken()
+    found = cp.AdmissibleSet(loop, {"y": (-1.0, 1.0)}, 0.05, disturbances={"w": maximum})
     times = np.linspace(0.0, 4.0, 41)
-    lost = np.array([worst(t, most) for t in times])
+    lost = np.array([worst(t, maximum) for t in times])
     moved = np.array([(loop.C @ expm(loop.A * t))[0] for t in times])
     rng, broken = np.random.default_rng(5), 0
     for _ in range(20):
@@ -338,7 +338,7 @@ GOOD = {"limits": {"u": (-1.0, 1.0)}, "dt": 0.1}
         ({"disturbances": {"r": 1.0}, "references": ["r"]}, "disturbances must be of no signal, got 'r'"),
     ],
 )
-def test_what_is_refused(given, message):
+def test_what_is_rejected(given, message):
     with pytest.raises(ValueError, match=message):
         cp.AdmissibleSet(first_order(), **{**GOOD, **given})
 

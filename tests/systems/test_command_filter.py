@@ -181,8 +181,8 @@ def commanded():
     cp.declare(filters[1], initial_state=[10.0, 0.0, 0.0])
     loop = crane_loop(Crane(), plan, reference=filters, inputs=["x_cmd", "z_cmd"])
     t = np.linspace(0, 12, 121)
-    asked = {"x_cmd": cp.Step(4.0, 1.0, 1.0), "z_cmd": cp.Step(9.0, 10.0, 1.0)}
-    return loop, t, cp.simulate(loop, t, asked)
+    requested = {"x_cmd": cp.Step(4.0, 1.0, 1.0), "z_cmd": cp.Step(9.0, 10.0, 1.0)}
+    return loop, t, cp.simulate(loop, t, requested)
 
 
 def test_a_loop_starts_its_filters_where_they_say(commanded):

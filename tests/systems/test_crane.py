@@ -408,7 +408,7 @@ def test_drive_loops_have_unit_gain_at_rest():
 # Plans the crane cannot follow
 
 
-def leg(duration, first, last, at=0.0):
+def segment(duration, first, last, at=0.0):
     """Quintic from rest to rest."""
     points = [(at, first), (at + duration, last)]
     return cp.PolySpline([cp.Waypoint.from_jets(t, x=[x, 0, 0], z=[z, 0, 0]) for t, (x, z) in points])
@@ -430,8 +430,8 @@ def numbers_in(error):
     return float(value.split()[0]), float(rest.split()[0])
 
 
-def test_a_plan_that_would_push_the_rope_is_refused_with_value_and_time():
-    plan = leg(1.5, (0, 5), (0, 10))
+def test_a_plan_that_would_push_the_rope_is_rejected_with_value_and_time():
+    plan = segment(1.5, (0, 5), (0, 10))
     with pytest.raises(ValueError, match=r"g - z'' must be above 0.*tension T <= 0") as error:
         Crane().check(plan)
     value, moment = worst(plan, lambda jet: 9.81 - jet[2, 1])
@@ -440,8 +440,8 @@ def test_a_plan_that_would_push_the_rope_is_refused_with_value_and_time():
     assert value == pytest.approx(9.81 - 10 / math.sqrt(3) * 5 / 1.5**2, rel=1e-6)
 
 
-def test_a_plan_that_would_wind_up_the_rope_is_refused_with_value_and_time():
-    plan = leg(6, (0, 5), (0, -1))
+def test_a_plan_that_would_wind_up_the_rope_is_rejected_with_value_and_time():
+    plan = segment(6, (0, 5), (0, -1))
     with pytest.raises(ValueError, match="rope length R must be above 0") as error:
         Crane().check(plan)
     value, moment = worst(plan, length_of)
@@ -449,16 +449,16 @@ def test_a_plan_that_would_wind_up_the_rope_is_refused_with_value_and_time():
 
 
 def test_plans_next_to_the_limits_pass():
-    Crane().check(leg(math.sqrt(10 / math.sqrt(3) * 5 / 9.8), (0, 5), (0, 10)))
-    Crane().check(leg(6, (0, 5), (0, 0.01)))
+    Crane().check(segment(math.sqrt(10 / math.sqrt(3) * 5 / 9.8), (0, 5), (0, 10)))
+    Crane().check(segment(6, (0, 5), (0, 0.01)))
 
 
 @pytest.mark.parametrize("width", [1e-2, 1e-4])
 def test_a_narrow_violation_between_samples_is_found(width):
     """One leg of many, far narrower than any sampling of the whole."""
     twitch = 15.0 * width**2 / (10 / math.sqrt(3))  # peak acceleration 15 m/s^2
-    falling = leg(5, (0, 5), (1, 5)).then(leg(width, (1, 5), (1, 5 + twitch), 5)).then(
-        leg(5, (1, 5 + twitch), (2, 5), 5 + width)
+    falling = segment(5, (0, 5), (1, 5)).then(segment(width, (1, 5), (1, 5 + twitch), 5)).then(
+        segment(5, (1, 5 + twitch), (2, 5), 5 + width)
     )  # fmt: skip
     with pytest.raises(ValueError, match="tension T <= 0") as error:
         Crane().check(falling)
@@ -466,8 +466,8 @@ def test_a_narrow_violation_between_samples_is_found(width):
     assert value == pytest.approx(9.81 - 15.0, abs=1e-3)
     assert moment == pytest.approx(5.0, abs=1.1 * width)
     # With z below b, the rope winds up where the load accelerates to the right hard enough.
-    rushing = leg(5, (0, 0.2), (1, 0.2)).then(leg(width, (1, 0.2), (1 + twitch, 0.2), 5)).then(
-        leg(5, (1 + twitch, 0.2), (2, 0.2), 5 + width)
+    rushing = segment(5, (0, 0.2), (1, 0.2)).then(segment(width, (1, 0.2), (1 + twitch, 0.2), 5)).then(
+        segment(5, (1 + twitch, 0.2), (2, 0.2), 5 + width)
     )  # fmt: skip
     with pytest.raises(ValueError, match="rope length R") as error:
         Crane().check(rushing)
@@ -482,7 +482,7 @@ def test_a_step_is_checked_by_its_positions():
         Crane().check(cp.Step([20, -1], [0, 10], 2.0))
 
 
-def test_a_plan_of_one_axis_is_refused():
+def test_a_plan_of_one_axis_is_rejected():
     with pytest.raises(ValueError, match="axes x and z, got 1"):
         Crane().check(cp.PolySpline([cp.Waypoint(0, 0), cp.Waypoint(1, 1)]))
 

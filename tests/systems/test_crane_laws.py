@@ -88,10 +88,10 @@ def test_generator_puts_the_drives_where_the_load_hangs_as_planned(u):
 def test_load_feedback_asks_for_the_acceleration_of_the_law(u, dx, dv, w, zeta):
     block = create_load_feedback_iosystem(CRANE, w, zeta)
     found = block.output(0.0, [], [*u, u[0] + dx, u[1] + dv])
-    asked = u[2] - 2 * zeta * w * dv - w**2 * dx
-    scale = 1 + abs(asked)
+    requested = u[2] - 2 * zeta * w * dv - w**2 * dx
+    scale = 1 + abs(requested)
     d, r = found
-    angle = math.atan2(-asked, CRANE.gravity - u[5])
+    angle = math.atan2(-requested, CRANE.gravity - u[5])
     np.testing.assert_allclose(r * math.sin(angle) + d + 0.5 * math.cos(angle), u[0] + dx, atol=1e-10 * scale)
     np.testing.assert_allclose(r * math.cos(angle) - 0.5 * math.sin(angle), u[3], atol=1e-10 * scale)
 

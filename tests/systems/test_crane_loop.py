@@ -215,7 +215,7 @@ STEP = cp.Step([20, 11], [0, 10], 1.5, labels=["x", "z"])
 @pytest.mark.parametrize(
     ("law", "smooth"), [("generator", 0), ("load_feedback", 0), ("dynamic", 3), ("feedforward", 3)]
 )
-def test_a_step_is_refused_where_derivatives_are_needed(law, smooth):
+def test_a_step_is_rejected_where_derivatives_are_needed(law, smooth):
     text = f"law '{law}' .* continuous up to derivative {smooth}, got one whose position of x jumps by 20 at 1.5 s"
     with pytest.raises(ValueError, match=text):
         crane_loop(Crane(), STEP, law)
@@ -227,7 +227,7 @@ def test_a_step_may_be_sent_at_rest_references():
 
 @pytest.mark.parametrize("law", ["dynamic", "feedforward"])
 @pytest.mark.parametrize("entries", [1, 2, 3])
-def test_a_plan_too_rough_for_the_law_is_refused_with_derivative_and_time(law, entries):
+def test_a_plan_too_rough_for_the_law_is_rejected_with_derivative_and_time(law, entries):
     plan = plan_of(entries).shift(2.0)
     jump = plan.jet(2.0, entries)[entries, 0]
     text = f"up to derivative 3, got one whose derivative {entries} of x jumps by {jump:.4g} at 2 s"
@@ -235,7 +235,7 @@ def test_a_plan_too_rough_for_the_law_is_refused_with_derivative_and_time(law, e
         crane_loop(Crane(), plan, law)
 
 
-def test_a_jump_amid_the_plan_is_refused_with_its_time():
+def test_a_jump_amid_the_plan_is_rejected_with_its_time():
     rest = [0.0] * 4
     first = cp.PolySpline(
         [
@@ -254,7 +254,7 @@ def test_a_jump_amid_the_plan_is_refused_with_its_time():
 
 
 @pytest.mark.parametrize("law", LAWS)
-def test_a_plan_the_rope_cannot_follow_is_refused(law):
+def test_a_plan_the_rope_cannot_follow_is_rejected(law):
     plunge = plan_of(5, ((0, 0, 5), (1, 0, 12)))
     with pytest.raises(ValueError, match=r"g - z'' must be above 0, got -.* m/s\^2 at 0\..* s"):
         crane_loop(Crane(), plunge, law)
@@ -263,7 +263,7 @@ def test_a_plan_the_rope_cannot_follow_is_refused(law):
         crane_loop(Crane(), above, law)
 
 
-def test_what_does_not_go_together_is_refused():
+def test_what_does_not_go_together_is_rejected():
     with pytest.raises(ValueError, match="law must be one of setpoint, generator"):
         crane_loop(Crane(), plan_of(3), "pid")
     with pytest.raises(ValueError, match="limits must go with a law that uses the PIDs"):
@@ -294,6 +294,6 @@ def test_axes_called_x_and_z_are_taken_by_name():
 @pytest.mark.parametrize(
     ("law", "option"), [("generator", "poles"), ("load_feedback", "dampning"), ("feedforward", "poles")]
 )
-def test_options_that_the_law_does_not_have_are_refused(law, option):
+def test_options_that_the_law_does_not_have_are_rejected(law, option):
     with pytest.raises((TypeError, ValueError), match=option):
         crane_loop(Crane(), plan_of(5), law, **{option: 1.0})

@@ -239,12 +239,12 @@ def loop_by_hand(wrap, law):
                 p = plan.jet(6.0, 2, left=True)
             x, x1 = r * s + d + B * c, r1 * s + r * th1 * c + d1 - B * th1 * s
             # The feedback puts the measured x in the place of the planned one.
-            where, asked = p[0, 0], p[2, 0]
+            where, requested = p[0, 0], p[2, 0]
             if law == "load_feedback":
-                where, asked = x, asked - 2 * (x1 - p[1, 0]) - (x - p[0, 0])
-            pull = math.hypot(asked, G - p[2, 1])
-            d_ref = where - (B * pull - p[0, 1] * asked) / (G - p[2, 1])
-            r_ref = (p[0, 1] * pull - B * asked) / (G - p[2, 1])
+                where, requested = x, requested - 2 * (x1 - p[1, 0]) - (x - p[0, 0])
+            pull = math.hypot(requested, G - p[2, 1])
+            d_ref = where - (B * pull - p[0, 1] * requested) / (G - p[2, 1])
+            r_ref = (p[0, 1] * pull - B * requested) / (G - p[2, 1])
             force, moved = pid_by_hand(MC, F1, d_ref - d, y[:2], 0.0)
             torque, wound = pid_by_hand(J / B + M * B, F2 / B, r_ref - r, y[2:4], -B * M * G)
             wind = gust_by_hand(t, left)
@@ -258,8 +258,8 @@ def loop_by_hand(wrap, law):
             return [*moved, *wound, d1, r1, th1, *np.linalg.solve(matrix, right_side)[:3]]
 
         inside = TIMES[np.logical_and(np.greater(TIMES, left - 1e-12), np.less(TIMES, right - 1e-12))]
-        asked_times = np.append(inside, right)
-        run = solve_ivp(rate, (left, right), state, method="LSODA", t_eval=asked_times, rtol=1e-10, atol=1e-11)
+        requested_times = np.append(inside, right)
+        run = solve_ivp(rate, (left, right), state, method="LSODA", t_eval=requested_times, rtol=1e-10, atol=1e-11)
         assert run.success
         rows.append(run.y[:, : inside.size])
         state = run.y[:, -1]

@@ -344,8 +344,8 @@ def test_the_last_derivative_is_what_the_law_asks_for(x, reference):
     u = law.output(0.0, np.zeros(0), np.concatenate([reference, x]))
     (flag,) = plant.forward(np.array(x), u)
     sigma = polynomial.polyfromroots(POLES).real[:-1]
-    asked = reference[4] - sigma @ (flag[:4] - reference[:4])
-    assert abs(flag[4] - asked) < 1e-10 * (np.abs(sigma) @ np.abs(flag[:4]) + 100)
+    requested = reference[4] - sigma @ (flag[:4] - reference[:4])
+    assert abs(flag[4] - requested) < 1e-10 * (np.abs(sigma) @ np.abs(flag[:4]) + 100)
 
 
 LAW_OF_JOINT = create_flat_iosystem(flexible_joint(), POLES)
@@ -508,12 +508,12 @@ BAD_POLES = [
 
 
 @pytest.mark.parametrize(("poles", "error", "message"), BAD_POLES)
-def test_poles_are_refused(poles, error, message):
+def test_poles_are_rejected(poles, error, message):
     with pytest.raises(error, match=f"^{message}"):
         create_flat_iosystem(dc_motor(), poles)
 
 
-def test_poles_of_several_flat_outputs_are_refused_with_their_place():
+def test_poles_of_several_flat_outputs_are_rejected_with_their_place():
     chains = integrator_chain(2, axes=2)
     with pytest.raises(ValueError, match=r"^poles must be one sequence for each of 2 flat outputs, got 3$"):
         create_flat_iosystem(chains, [[-1, -2]] * 3)
@@ -526,7 +526,7 @@ def test_poles_of_several_flat_outputs_are_refused_with_their_place():
 # What static feedback does not linearise
 
 
-REFUSED = {
+REJECTED = {
     "car": (car(3), r"got derivative 1 of flat output y1 \(the last is 2\), which depends on v$"),
     "car, flags cut": (
         car(2),
@@ -550,8 +550,8 @@ REFUSED = {
 }
 
 
-@pytest.mark.parametrize(("plant", "reason"), REFUSED.values(), ids=list(REFUSED))
-def test_other_plants_are_refused_with_the_reason(plant, reason):
+@pytest.mark.parametrize(("plant", "reason"), REJECTED.values(), ids=list(REJECTED))
+def test_other_plants_are_rejected_with_the_reason(plant, reason):
     orders = [len(row) - 1 for row in plant.forward(np.ones(plant.nstates), np.ones(plant.ninputs), {})]
     with pytest.raises(ValueError, match=f"^flat must be linearisable by static feedback: .*{reason}"):
         create_flat_iosystem(plant, [[-1.0] * r for r in orders])
@@ -579,7 +579,7 @@ def double_integrator(forward=None, reverse=None, **options):
     )
 
 
-def test_maps_that_do_not_belong_to_the_motion_are_refused():
+def test_maps_that_do_not_belong_to_the_motion_are_rejected():
     # Invertible, but the flag is not made of derivatives: the approximate flat output of the ball and beam.
     with pytest.raises(ValueError, match=r"^forward must return derivatives along the motion .* derivative 2 of .* y "):
         create_flat_iosystem(ball_and_beam(approximate=True), [-1] * 4)
@@ -589,7 +589,7 @@ def test_maps_that_do_not_belong_to_the_motion_are_refused():
         create_flat_iosystem(double_integrator(lambda x, u, params: [array(x[0], 2 * x[1], u[0])]), [-1, -2])
 
 
-def test_a_reverse_that_does_not_undo_forward_is_refused():
+def test_a_reverse_that_does_not_undo_forward_is_rejected():
     for reverse in (
         lambda flag, params: (array(flag[0][0], 0.0), flag[0][2:]),
         lambda flag, params: (flag[0][:2], flag[0][2:] + 0.01 * flag[0][1]),
@@ -614,7 +614,7 @@ def test_a_reverse_that_does_not_undo_forward_is_refused():
     ],
     ids=["too short", "too many", "of varying length", "not a number"],
 )
-def test_flags_are_refused(forward, message):
+def test_flags_are_rejected(forward, message):
     with pytest.raises(ValueError, match=f"^forward must .*{message}"):
         create_flat_iosystem(double_integrator(forward), [-1, -2])
 
@@ -664,7 +664,7 @@ def test_a_plant_of_limited_domain_will_do():
     assert np.abs(found.outputs - plan(t)).max() < 1e-10
 
 
-def test_kinds_are_refused():
+def test_kinds_are_rejected():
     with pytest.raises(TypeError, match=r"^flat must be a control.flatsys.FlatSystem, got StateSpace"):
         create_flat_iosystem(ct.rss(2, 1, 1), [-1, -2])
     with pytest.raises(ValueError, match=r"^flat must be in continuous time, got dt = 0.1"):
@@ -674,7 +674,7 @@ def test_kinds_are_refused():
         create_flat_iosystem(bare, [-1, -2])
 
 
-def test_labels_are_refused():
+def test_labels_are_rejected():
     chain, chains = integrator_chain(2), integrator_chain(2, axes=2)
     with pytest.raises(ValueError, match=r"^labels must be as many as axes, 2, got 1"):
         create_flat_iosystem(chains, [[-1, -2]] * 2, labels=["x"])

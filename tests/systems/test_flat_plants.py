@@ -282,19 +282,19 @@ def test_equations_and_maps_can_be_traced(plant):
 
 @pytest.mark.parametrize(("factory", "good"), [(dc_motor, MOTOR), (flexible_joint, JOINT)])
 @pytest.mark.parametrize("value", [-1.0, 0.0, np.nan, np.inf])
-def test_parameters_are_refused_by_name(factory, good, value):
+def test_parameters_are_rejected_by_name(factory, good, value):
     for name in good:
         may_be_zero = name in ("friction", "gravity")
         if value == 0.0 and may_be_zero:
             assert factory(**good | {name: value}).nstates
             continue
-        least = "at least 0" if may_be_zero else "above 0"
-        with pytest.raises(ValueError, match=f"^{name} must be finite and {least}, got {value}$"):
+        minimum = "at least 0" if may_be_zero else "above 0"
+        with pytest.raises(ValueError, match=f"^{name} must be finite and {minimum}, got {value}$"):
             factory(**good | {name: value})
 
 
 @pytest.mark.parametrize("value", [0, -1, 1.5, np.nan])
-def test_counts_are_refused_by_name(value):
+def test_counts_are_rejected_by_name(value):
     with pytest.raises(ValueError, match=r"^order must be a whole number from 1, got"):
         integrator_chain(value)
     with pytest.raises(ValueError, match=r"^axes must be a whole number from 1, got"):

@@ -31,8 +31,8 @@ def random_governed(rng):
     limits = {"y": (-rng.uniform(0.5, 2.0), rng.uniform(0.5, 2.0)), "u": (-1.0, rng.uniform(0.5, 2.0))}
     found = cp.AdmissibleSet(loop, limits, rng.uniform(0.02, 0.3))
     governor = cp.create_governor_iosystem(found)
-    asked = [f"r{i}_cmd" for i in range(m)]
-    whole = ct.interconnect([governor, cp.expose_states(loop)], inputs=asked, outputs=["y", "u", *names["inputs"]])
+    requested = [f"r{i}_cmd" for i in range(m)]
+    whole = ct.interconnect([governor, cp.expose_states(loop)], inputs=requested, outputs=["y", "u", *names["inputs"]])
     return loop, limits, found, whole
 
 
@@ -93,14 +93,14 @@ def test_every_sample_takes_the_largest_fraction(seed):
     times = dt * np.arange(40)
     change = expm(np.block([[loop.A, loop.B], [np.zeros((m, n + m))]]) * dt)
     x, v, expected = np.zeros(n), np.zeros(m), []
-    for asked in r:
+    for requested in r:
         low, high = 0.0, 1.0
-        if found.contains(x, asked):
+        if found.contains(x, requested):
             low = 1.0
         while high - low > 1e-13:
             middle = 0.5 * (low + high)
-            low, high = (middle, high) if found.contains(x, v + middle * (asked - v)) else (low, middle)
-        v = v + low * (asked - v)
+            low, high = (middle, high) if found.contains(x, v + middle * (requested - v)) else (low, middle)
+        v = v + low * (requested - v)
         expected.append(v)
         x = (change @ np.concatenate([x, v]))[:n]
     fine = np.repeat(times, 2)[1:]
@@ -187,10 +187,10 @@ def test_a_state_from_which_nothing_is_admissible():
         ("governor: no admissible reference, previous one held", "inside"),
     ]
     assert found.events[0].time == 0.0
-    refused = found.states[2, ::10] == 1.0
+    rejected = found.states[2, ::10] == 1.0
     to_come = np.maximum.accumulate(np.abs(found.outputs[1])[::-1])[::-1][::10]
-    assert to_come[refused].min() > 1.0
-    assert to_come[~refused].max() <= 1.01  # outside by no more than the margin
+    assert to_come[rejected].min() > 1.0
+    assert to_come[~rejected].max() <= 1.01  # outside by no more than the margin
 
 
 def test_two_references_move_on_a_line():
@@ -291,7 +291,7 @@ LIMITS = {"u": (-1.0, 1.0)}
         ({"loop": Slowly(), "limits": None, "dt": None}, ValueError, "dt must be given, the period in s"),
     ],
 )
-def test_what_is_refused(given, error, message):
+def test_what_is_rejected(given, error, message):
     loop = cp.plants.integrator_lag_loop(5.0, outputs=("u",))
     with pytest.raises(error, match=message):
         cp.create_governor_iosystem(**{"loop": loop, "dt": 0.05, "limits": LIMITS, **given})

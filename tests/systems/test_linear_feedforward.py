@@ -173,7 +173,7 @@ def test_a_label_of_the_plans_own():
         (ct.ss([[-1, 0], [0, -2]], [[1], [0]], [[1, 1]], 0), "-2"),
     ],
 )
-def test_finite_zeros_are_refused_and_told(loop, zeros):
+def test_finite_zeros_are_rejected_and_told(loop, zeros):
     with pytest.raises(ValueError, match=f"^loop must have no finite zeros .*, got {zeros}$"):
         create_feedforward_iosystem(loop)
 
@@ -228,12 +228,12 @@ def test_no_zero_is_missed(seed):
         (5.0, TypeError, "loop must be linear, .* got float"),
     ],
 )
-def test_other_loops_are_refused(loop, error, message):
+def test_other_loops_are_rejected(loop, error, message):
     with pytest.raises(error, match=f"^{message}"):
         create_feedforward_iosystem(loop)
 
 
 @pytest.mark.parametrize("label", ["r", "y"])
-def test_a_label_that_would_be_added_to_the_loops_own_signal_is_refused(label):
+def test_a_label_that_would_be_added_to_the_loops_own_signal_is_rejected(label):
     with pytest.raises(ValueError, match=f"^labels and suffix must not name a signal of the loop, .* got '{label}'$"):
         create_feedforward_iosystem(cp.plants.integrator_lag_loop(5.0), labels=label, suffix="")

@@ -82,7 +82,7 @@ def test_it_is_an_interconnection():
 
 
 @pytest.mark.parametrize("outputs", [["y"], ["u", "y"], ("e", "u", "y"), "y"])
-def test_outputs_in_the_order_asked_for(outputs):
+def test_outputs_in_the_requested_order(outputs):
     loop = plants.integrator_lag_loop(5.0, outputs)
     assert loop.output_labels == list(outputs)
     # At the state y' = 0, y = 1/2 with r = 2: e = 3/2, u = 15/2.

@@ -56,12 +56,12 @@ def test_several_flat_outputs_and_linear_systems():
 
 
 @pytest.mark.parametrize("wrong", [None, "motor", cp.plants.integrator_lag_loop(1.0)])
-def test_what_is_no_flat_system_is_refused(wrong):
+def test_what_is_no_flat_system_is_rejected(wrong):
     with pytest.raises(TypeError, match=r"flat_system must be a control\.flatsys\.FlatSystem, got"):
         quantities_of_flat_system(wrong)
 
 
-def test_discrete_systems_are_refused():
+def test_discrete_systems_are_rejected():
     chain = integrator_chain(1)
     discrete = fs.FlatSystem(chain.forward, chain.reverse, inputs=1, outputs=1, states=1, dt=0.1)
     with pytest.raises(ValueError, match=r"continuous time, got dt = 0\.1"):
@@ -249,7 +249,7 @@ MOVING = cp.PolySpline([cp.Waypoint(0, [0, 0], [1, 0], 0), cp.Waypoint(10, [20, 
 @pytest.mark.parametrize(
     "limits", [{"delta": 0.5}, {"theta": (0.0, 1.0)}, {"v": 3.0, "delta": 0.5}, {"delta": (0, None)}]
 )
-def test_what_is_singular_at_rest_is_refused_with_the_reason(steering, limits):
+def test_what_is_singular_at_rest_is_rejected_with_the_reason(steering, limits):
     """Not 214 % beyond, which is a quotient of rounding errors."""
     for call in (cp.margins, cp.fastest):
         with pytest.raises(ValueError, match=r"(delta|theta) must be determined by the plan, got nan where"):

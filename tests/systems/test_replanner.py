@@ -281,7 +281,7 @@ def test_two_replanners_in_one_loop():
     assert [e.name for e in late.events] == [UNREACHABLE.replace("replanner", "first")]
 
 
-def test_python_controls_own_simulation_is_refused():
+def test_python_controls_own_simulation_is_rejected():
     replanner = cp.create_replanner_iosystem(PLAN, 0.5, goal_derivatives=0)
     with pytest.raises(RuntimeError, match=r"plans again every period, must be run by ctrlplan\.simulate"):
         ct.input_output_response(replanner, np.linspace(0, 10, 11), np.ones(11))
@@ -347,11 +347,11 @@ def test_limits_do_not_count_the_arrival_twice():
     limit = 1.2 * float(IN_MOTION.peak(1)[0])
     replanner = cp.create_replanner_iosystem(IN_MOTION, 0.1, goal_derivatives=1, limits={1: limit})
     core = replanner.syslist[1]
-    refused = 0
+    rejected = 0
     for t in random_times():
         aim = [[5.01 - (7.3 - t)], [1.0]]
         added = BPoly.from_derivatives([t, 7.3], [[0, 0, 0], [0.01, 0, 0]])
         s = np.linspace(t, 7.3, 99)
         assert np.abs(IN_MOTION(s, 1) + added.derivative()(s)).max() < limit
-        refused += core.sample(t, np.zeros(core.nstates), signals(IN_MOTION, replanner, t, goal=aim), {})[3]
-    assert refused == 0
+        rejected += core.sample(t, np.zeros(core.nstates), signals(IN_MOTION, replanner, t, goal=aim), {})[3]
+    assert rejected == 0

@@ -159,7 +159,7 @@ def test_shrinking_stops_and_a_goal_moved_too_late_is_an_event():
         assert np.abs(found.outputs[0, t >= 10.0] - 1.2).max() <= 1e-10
 
 
-def test_the_least_horizon_is_five_periods_and_half_the_plan_at_most():
+def test_the_minimum_horizon_is_five_periods_and_half_the_plan_at_most():
     """The last fit of a plant that is measured, by its count."""
     t = np.array([0.0, 10.0])
     assert state_of(ideal(PLAN, 0.5, times=t), "fits")[-1] == 16  # 0, ..., 7.5

@@ -84,7 +84,7 @@ def test_runs_are_those_of_a_replanner_of_the_peers_polynomials(seed, horizon):
 NODES = 22
 
 
-def legs(edges, nodes=NODES):
+def segments(edges, nodes=NODES):
     """Chebyshev times inside each leg, none at its ends."""
     cosines = np.cos(np.pi * (np.arange(nodes)[::-1] + 0.5) / nodes)
     return np.array([0.5 * (a + b) + 0.5 * (b - a) * cosines for a, b in itertools.pairwise(edges)])
@@ -105,7 +105,7 @@ def test_no_derivative_jumps_and_each_is_that_of_the_one_before(order, alpha, ho
         *[(float(t), float(v)) for t, v in zip(np.sort(rng.uniform(0, 3, 4)), rng.normal(size=4), strict=True)]
     )
     edges = np.append(0.25 * np.arange(17), [4.25, 4.5])
-    times = legs(edges)
+    times = segments(edges)
     flat = np.union1d(times.ravel(), edges)
     found = cp.simulate(replanner, flat, goal)
     outputs = found.outputs.reshape(order + 1, -1)

@@ -54,12 +54,12 @@ def clock_by_hand(severity, n, w, t, slowest=0.1, fastest=1.1, horizon=None):
     edges = [t[0], *jumps, t[-1]]
     for value, (left, right) in zip(values, pairwise(edges), strict=True):
         inside = t[(t >= left) & ((t < right) | (right == t[-1]))]
-        asked = np.union1d(inside, [left, right])
+        requested = np.union1d(inside, [left, right])
         run = solve_ivp(
-            rate, (left, right), state, method="DOP853", t_eval=asked, rtol=1e-12, atol=1e-13, args=(value,)
+            rate, (left, right), state, method="DOP853", t_eval=requested, rtol=1e-12, atol=1e-13, args=(value,)
         )
         assert run.success
-        out.append(run.y[:, np.isin(asked, inside)])
+        out.append(run.y[:, np.isin(requested, inside)])
         state = run.y[:, -1]
     return np.hstack(out)
 
@@ -157,14 +157,14 @@ def test_with_nothing_wrong_a_run_puts_out_the_plan_at_rate_1(method):
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 4])
-def test_at_the_greatest_severity_the_rate_falls_as_equal_lags_do(n):
+def test_at_the_largest_severity_the_rate_falls_as_equal_lags_do(n):
     """1 - sigma' is (1 - slowest) times the incomplete gamma function of w t; severity 1 does not catch up."""
-    w, least, t = 2.0, 0.25, np.linspace(0, 4, 41)
-    found = alone(identity(), n, t, 1.0, bandwidth=w, slowest=least)
-    fallen = (1 - least) * gammainc(n, w * t)
+    w, minimum, t = 2.0, 0.25, np.linspace(0, 4, 41)
+    found = alone(identity(), n, t, 1.0, bandwidth=w, slowest=minimum)
+    fallen = (1 - minimum) * gammainc(n, w * t)
     assert np.abs(found.rate - (1 - fallen)).max() <= 1e-9
     # Of the integral of the incomplete gamma function: t P(n, wt) - (n/w) P(n + 1, wt).
-    lost = (1 - least) * (t * gammainc(n, w * t) - n / w * gammainc(n + 1, w * t))
+    lost = (1 - minimum) * (t * gammainc(n, w * t) - n / w * gammainc(n + 1, w * t))
     assert np.abs(found.lag - lost).max() <= 1e-9
     assert np.abs(found.jets[0, 0] - (t - lost)).max() <= 1e-9
     assert np.abs(found.jets[0, 1] - (1 - fallen)).max() <= 1e-9
@@ -309,11 +309,11 @@ def test_the_rate_stays_between_slowest_and_fastest(n, seed):
     """Whatever the input does: 40 random severities, default catching up."""
     rng = np.random.default_rng(seed)
     t, values = np.arange(0.0, 20.01, 0.05), rng.choice([0.0, 0.6, 0.8, 1.0, 3.0, -2.0], 41)
-    least, most = rng.uniform(0.0, 0.5), rng.uniform(1.0, 2.5)
+    minimum, maximum = rng.uniform(0.0, 0.5), rng.uniform(1.0, 2.5)
     steps = [(0.5 * i, float(b - a)) for i, (a, b) in enumerate(pairwise(np.append(0.0, values)))]
-    found = alone(identity(30.0), n, t, pulses(*steps), bandwidth=4.0, slowest=least, fastest=most)
-    assert found.rate.min() >= least - 1e-9
-    assert found.rate.max() <= most + 1e-9
+    found = alone(identity(30.0), n, t, pulses(*steps), bandwidth=4.0, slowest=minimum, fastest=maximum)
+    assert found.rate.min() >= minimum - 1e-9
+    assert found.rate.max() <= maximum + 1e-9
     assert np.all(np.diff(found.sigma) >= -1e-9)
     assert found.lag.min() >= -1e-9
     assert found.rate.min() < 0.8  # slowed at all
@@ -324,7 +324,7 @@ MARGINAL = {2: 2.0, 3: 8.0 / 9.0}
 
 
 @pytest.mark.parametrize("n", MARGINAL)
-def test_a_catch_up_with_which_the_lag_would_swing_for_ever_is_refused(n):
+def test_a_catch_up_with_which_the_lag_would_swing_for_ever_is_rejected(n):
     """At the bound by Routh's criterion: just below it is refused, just above it the lag settles above `slowest`."""
     w = 10.0
     bound = 1.0 / (w * MARGINAL[n])
@@ -469,7 +469,7 @@ def test_no_move_behind_a_slowed_clock_is_skipped(case, fastest, method):
     assert abs(p[-1] - plan.final[0]) <= 1e-6
 
 
-def test_a_short_leg_in_a_long_run_costs_no_hundred_thousand_legs():
+def test_a_short_segment_in_a_long_run_costs_no_hundred_thousand_segments():
     """The step that a clock allows its solver is that of whole moves: here of 1 s and 59 s, a millisecond between."""
     points = [cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1, 0, 0), cp.Waypoint(1.001, 1, 0, 0), cp.Waypoint(60, 2, 0, 0)]
     clock = cp.create_time_scaling_iosystem(cp.PiecewiseSpline(points), 2, limits=U)
@@ -548,7 +548,7 @@ def _name(case):
 
 
 @pytest.mark.parametrize(("kind", "message", "given"), BAD, ids=map(_name, BAD))
-def test_bad_input_is_refused_by_name(kind, message, given):
+def test_bad_input_is_rejected_by_name(kind, message, given):
     options = {"plan": ONE, "derivatives": 2, "limits": U, "suffix": "_ref"} | given
     with pytest.raises(kind, match=re.escape(message)):
         cp.create_time_scaling_iosystem(**options)

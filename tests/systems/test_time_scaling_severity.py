@@ -60,7 +60,7 @@ def test_an_error_may_begin_to_count_at_once():
         assert abs(severity_of(block, [error]) - wanted) <= 1e-14
 
 
-def test_the_greatest_severity_counts():
+def test_the_largest_severity_counts():
     """Two actuators and two axes; each in turn is the worst, and none adds to another. Inputs in the order named."""
     plan = cp.stack([ONE, rest((0, 3.0), (1, 5.0), labels=["z"])])
     block = cp.create_time_scaling_iosystem(
@@ -121,23 +121,23 @@ def test_a_sensor_that_is_lost_for_a_while_does_not_end_the_run(method, cause):
 
 PLAN = cp.PolySpline([cp.Waypoint(0.5, 0, 0, 0), cp.Waypoint(3.0, 4.0, 0, 0)], labels=["x"])
 """4 m in 2.5 s from rest to rest: at 3 m/s at the most."""
-DAMPING, MOST = 4.0, 9.0
+DAMPING, MAXIMUM = 4.0, 9.0
 """At 3 m/s the damping alone takes 12 N."""
 GAINS = (64.0, 32.0, 16.0, 0.02)
 LOOP_TIMES = np.linspace(0.0, 12.0, 241)
 
 
-def saturating(source, gains=GAINS, most=MOST, damping=DAMPING):
+def saturating(source, gains=GAINS, maximum=MAXIMUM, damping=DAMPING):
     """Unit mass under a PID whose force is limited; x_ref to x."""
-    pid = cp.create_pid_iosystem(*gains, limits=(-most, most), inputs=("x_ref", "x"), outputs="F", name="pid")
+    pid = cp.create_pid_iosystem(*gains, limits=(-maximum, maximum), inputs=("x_ref", "x"), outputs="F", name="pid")
     mass = ct.ss([[0, 1], [0, -damping]], [[0], [1]], [[1, 0]], 0, inputs=["F"], outputs=["x"], name="mass")
     return ct.interconnect([source, pid, mass], inputs=0, outputs=["x", "x_ref", "F"])
 
 
 CLOCKS = {
     "errors": {"errors": {"x": (0.02, 0.2)}, "bandwidth": 8.0},
-    "limits": {"limits": {"F": (-MOST, MOST)}, "margin": 0.2, "bandwidth": 8.0},
-    "both": {"errors": {"x": (0.02, 0.2)}, "limits": {"F": (-MOST, MOST)}, "bandwidth": 8.0},
+    "limits": {"limits": {"F": (-MAXIMUM, MAXIMUM)}, "margin": 0.2, "bandwidth": 8.0},
+    "both": {"errors": {"x": (0.02, 0.2)}, "limits": {"F": (-MAXIMUM, MAXIMUM)}, "bandwidth": 8.0},
 }
 
 
@@ -152,22 +152,22 @@ def by_hand(name, t):
     def signals(moment, y):
         lag, _, integral, filtered, x, _ = y
         ref = 4.0 * rise(min(max((moment - lag - 0.5) / 2.5, 0.0), 1.0))
-        asked = kp * (ref - x) + integral + kd * (ref - x - filtered) / tf
-        return ref, asked, min(max(asked, -MOST), MOST)
+        requested = kp * (ref - x) + integral + kd * (ref - x - filtered) / tf
+        return ref, requested, min(max(requested, -MAXIMUM), MAXIMUM)
 
     def rate(moment, y):
         lag, slow, _, filtered, x, v = y
-        ref, asked, force = signals(moment, y)
+        ref, requested, force = signals(moment, y)
         severity = 0.0
         if "errors" in chosen:
             severity = max(severity, (abs(x - ref) - 0.02) / 0.18)
         if "limits" in chosen:
-            severity = max(severity, 1 - (MOST - abs(force)) / (chosen.get("margin", 0.1) * 2 * MOST))
+            severity = max(severity, 1 - (MAXIMUM - abs(force)) / (chosen.get("margin", 0.1) * 2 * MAXIMUM))
         rho = 0.1 + (1 - min(severity, 1.0)) * (min(1.1, 1 + lag / horizon) - 0.1)
         return [
             slow,
             w * (1 - rho - slow),
-            ki * (ref - x) + back * (force - asked),
+            ki * (ref - x) + back * (force - requested),
             (ref - x - filtered) / tf,
             v,
             force - DAMPING * v,
@@ -207,7 +207,7 @@ def test_a_saturating_loop_against_its_equations_by_hand(saturated, name, method
 @pytest.mark.parametrize("name", CLOCKS)
 def test_a_slowed_clock_spares_a_saturating_loop_most_of_its_tracking_error(saturated, name):
     plain, found = (np.asarray(saturated[key].outputs) for key in ("plain", (name, "compiled")))
-    assert np.abs(plain[2]).max() == pytest.approx(MOST, abs=1e-9)  # the plan asks for too much
+    assert np.abs(plain[2]).max() == pytest.approx(MAXIMUM, abs=1e-9)  # the plan asks for too much
     assert np.abs(plain[1] - plain[0]).max() > 0.5
     assert np.abs(found[1] - found[0]).max() < 0.2 * np.abs(plain[1] - plain[0]).max()
     assert abs(found[0, -1] - 4.0) <= 1e-3
@@ -215,7 +215,7 @@ def test_a_slowed_clock_spares_a_saturating_loop_most_of_its_tracking_error(satu
 
 def test_a_free_mass_that_saturates_in_braking_is_spared_error_and_overshoot():
     """Acceleration of 10/sqrt 3 times 4/2.5^2 = 3.7 m/s^2 at 2.5 N; the clock slows for errors, default bandwidth."""
-    free = {"gains": (16.0, 8.0, 8.0, 0.02), "most": 2.5, "damping": 0.0}
+    free = {"gains": (16.0, 8.0, 8.0, 0.02), "maximum": 2.5, "damping": 0.0}
     clock = cp.create_time_scaling_iosystem(PLAN, 0, errors={"x": (0.02, 0.2)}, suffix="_ref")
     sources = (cp.create_source_iosystem(PLAN, suffix="_ref"), clock)
     plain, found = (np.asarray(cp.simulate(saturating(s, **free), LOOP_TIMES).outputs) for s in sources)

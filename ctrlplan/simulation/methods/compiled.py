@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ctrlplan._types import Array
+from ctrlplan.simulation.built_forms import DisagreementError
 from ctrlplan.simulation.interpreted import SolverError
-from ctrlplan.simulation.job import Job, Record, unused
-from ctrlplan.simulation.learned import DisagreementError
+from ctrlplan.simulation.job import Job, Record, fresh_job
 from ctrlplan.simulation.numerical import VISITED, Attempt, equations_of, numerical
 from ctrlplan.simulation.prepared import Prepared
 from ctrlplan.simulation.segments import Run
@@ -51,11 +51,11 @@ class CompiledMethod:
         NotCompiledError
             If a block cannot be traced at these parameters, or disagrees with Python.
         """
-        spare = unused(job)
+        fresh = fresh_job(job)
         try:
             return numerical(job, self)
         except DisagreementError:  # what a function refers to may have changed since it was traced
-            return numerical(spare, self)
+            return numerical(fresh, self)
 
     def solver(self, attempt: Attempt[CompiledSolver]) -> CompiledSolver:
         """CVODES on the compiled form."""
@@ -78,7 +78,7 @@ class CompiledMethod:
             )
         wrong = _disagreement(attempt, solver) if attempt.copies.blocks else ""
         if wrong:
-            raise job.prepared.distrust(solver.form, wrong)
+            raise job.prepared.discard(solver.form, wrong)
 
 
 def _disagreement(attempt: Attempt[CompiledSolver], solver: CompiledSolver) -> str:

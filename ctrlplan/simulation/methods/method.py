@@ -6,9 +6,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Protocol
 
+from ctrlplan.simulation.built_forms import NotApplicableError
 from ctrlplan.simulation.interpreted import SolverError
-from ctrlplan.simulation.job import Job, Record, unused
-from ctrlplan.simulation.learned import NotApplicableError
+from ctrlplan.simulation.job import Job, Record, fresh_job
 from ctrlplan.simulation.prepared import Prepared
 
 
@@ -79,7 +79,7 @@ def recorded(job: Job, methods: Sequence[Method]) -> Record:
     for place, method in enumerate(methods):
         reason = method.why_not(job.prepared)
         if not reason:
-            spare = unused(job)
+            fresh = fresh_job(job)
             try:
                 return method.run(replace(job, reason=why))
             except NotApplicableError as error:
@@ -88,7 +88,7 @@ def recorded(job: Job, methods: Sequence[Method]) -> Record:
                 if not any(applicable(methods[place + 1 :], job.prepared)):
                     raise
                 reason = f'method "{method.name}" failed: {error}'
-            job = spare
+            job = fresh
         reasons.setdefault(method.name, reason)
         why = job.reason or reason
     requirement = "must be given a system that it applies to"

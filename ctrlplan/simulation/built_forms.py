@@ -60,7 +60,7 @@ class BuiltForm:
         )
 
 
-class Learned:
+class BuiltForms:
     """Forms and findings of one system; safe in threads.
 
     A form is built once, and so is a finding made: the same call gets the same
@@ -91,7 +91,7 @@ class Learned:
             raise NotCompiledError(str(found.form))
         return found.form
 
-    def distrust(self, form: Compiled, why: str) -> DisagreementError:
+    def discard(self, form: Compiled, why: str) -> DisagreementError:
         """Drop a form that was found wrong: the first time it may be built again, as its functions may have changed."""
         with BUILDING:
             retained = []
@@ -112,14 +112,14 @@ class Learned:
                 self._read[name] = find()
             return self._read[name]
 
-    def usable(self) -> Learned:
+    def usable(self) -> BuiltForms:
         """Forms that another process can use."""
-        return Learned(entry for entry in self.forms if not isinstance(entry.form, NotCompiledError))
+        return BuiltForms(entry for entry in self.forms if not isinstance(entry.form, NotCompiledError))
 
-    def for_any(self, names: Iterable[str]) -> Learned:
+    def for_any(self, names: Iterable[str]) -> BuiltForms:
         """Forms that hold for any values of some parameters."""
         wanted = frozenset(names)
-        return Learned(entry for entry in self.forms if entry.names == wanted and not entry.constants)
+        return BuiltForms(entry for entry in self.forms if entry.names == wanted and not entry.constants)
 
     def _known(self, params: Params) -> BuiltForm | None:
         return next((entry for entry in self.forms if entry.fits(params)), None)
