@@ -7,7 +7,7 @@ import inspect
 import sys
 import warnings
 from collections.abc import Callable, Mapping
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, ParamSpec
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -61,22 +61,6 @@ def renamed_argument(old: str, old_value: Any, new: str, new_value: Any) -> Any:
         raise TypeError(f"{old}= is the old name of {new}=: only one of them may be given, got both")
     warn_renamed(f"{old}=", f"{new}=")
     return old_value
-
-
-def renamed_choice(value: T, renamed: Mapping[str, T]) -> T:
-    """Value of an argument that chooses by a name; an old name warns and gives the new one.
-
-    Parameters
-    ----------
-    value : object
-        What was given; anything but a string is returned as it is.
-    renamed : mapping of str to str
-        New name of each old one.
-    """
-    if not isinstance(value, str) or value not in renamed:
-        return value
-    warn_renamed(f'"{value}"', f'"{renamed[value]}"')
-    return renamed[value]
 
 
 def renamed_members(module: str, renamed: Mapping[str, str]) -> Callable[[str], Any]:

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
-from ctrlplan._renamed import renamed_choice
 from ctrlplan.planning.objectives import (
     Objective,
     ObjectiveName,
@@ -144,7 +143,6 @@ def choose_alpha(
     (1.98, 39.39)
     """
     points = checked_waypoints(waypoints)
-    objective = renamed_choice(objective, {"wandering": "excess_length"})
     goal = checked_objective(objective)
     if not callable(family):
         raise TypeError(f"family must be TrigSpline, PiecewiseSpline or a function like them, got {family!r}")

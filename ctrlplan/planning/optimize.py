@@ -203,7 +203,7 @@ def optimize_waypoints(
     if single or split.any():
         # Of joined segments each is measured by its own ends alone, which says nothing of the whole.
         splines = [TrigSpline(p, alpha=alpha, warn=single) if alpha else PolySpline(p, warn=single) for p in parts]
-        plan = splines[0] if single else Joined.as_they_are(splines)
+        plan = splines[0] if single else Joined.without_shift(splines)
     else:
         plan = PiecewiseSpline(after, alpha=alpha)
     shared = zip(times.tolist(), np.where(split, np.nan, sides[1]), strict=True)

@@ -118,11 +118,11 @@ class Transition(Fields):
 
     def gains(self) -> Array:
         """Gains k_0, ..., k_b [1/s^(b + 1 - j)] of continuous replanning, shape (order + 1,)."""
-        return -self._led_to_rest(0.0, self.order + 1)[-1]
+        return -self._from_units_to_zero(0.0, self.order + 1)[-1]
 
     def radius(self, period: float) -> float:
         """Spectral radius of replanning every `period` [s]."""
-        found = self._led_to_rest(checked_finite(period, "period", above=0.0), self.order)
+        found = self._from_units_to_zero(checked_finite(period, "period", above=0.0), self.order)
         return float(np.abs(np.linalg.eigvals(found)).max())
 
     def _from_units_to_zero(self, s: float, order: int) -> Array:
