@@ -205,7 +205,7 @@ def _problem(
     if not isinstance(loop, ct.StateSpace):
         raise TypeError(
             f"loop must be a control.StateSpace or TransferFunction, got {type(loop).__name__}; "
-            "of others ctrlplan.Predictor says what is admissible"
+            "use ctrlplan.Predictor for nonlinear loops"
         )
     if loop.dt not in (None, 0):
         raise ValueError(f"loop must be continuous, got {loop.name} with dt = {loop.dt}")
@@ -214,7 +214,7 @@ def _problem(
         tuple(label for label in inputs if label not in disturbances) if references is None else tuple(references)
     )
     if not governed:
-        raise ValueError(f"references must name an input of {loop.name} at least, got none")
+        raise ValueError(f"references must name at least one input of {loop.name}, got none")
     for name, given, known in (
         ("references", governed, inputs),
         ("disturbances", tuple(disturbances), [label for label in inputs if label not in governed]),
@@ -222,11 +222,11 @@ def _problem(
     ):
         for label in given:
             if label not in known:
-                raise ValueError(f"{name} must be of {', '.join(known) or 'no signal'}, got {label!r}")
+                raise ValueError(f"{name} must be among {', '.join(known) or 'no signals'}, got {label!r}")
     if len(set(governed)) < len(governed):
         raise ValueError(f"references must not name an input twice, got {', '.join(governed)}")
     if not limits:
-        raise ValueError("limits must name an output at least, got none")
+        raise ValueError("limits must name at least one output, got none")
     a, b, c, d = _matrices(loop)
     poles = np.linalg.eigvals(a)
     if poles.size and not poles.real.max() < -1e-9 * np.abs(poles).max():
@@ -340,6 +340,6 @@ def _check_equilibrium(problem: Problem, low: Array, high: Array) -> None:
     room = float(found.x[-1])
     if room <= 0.0:
         raise ValueError(
-            f"limits of {', '.join(problem.labels)} must leave a reference at which the loop rests inside them by the "
-            f"margin, whatever the disturbances, got {abs(room):.3g} of half their distance too little"
+            f"limits of {', '.join(problem.labels)} must allow a steady state inside them by the margin under all "
+            f"disturbances, got limits too narrow by {abs(room):.3g} of half their distance"
         )

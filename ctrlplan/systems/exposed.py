@@ -54,7 +54,7 @@ def expose_states(system: System, name: str | None = None) -> System:
     names = state_signals(getattr(system, "state_labels", None) or ())
     twice = set(names) & set(getattr(system, "output_labels", None) or ())
     if twice:
-        raise ValueError(f"outputs of {system.name} must not be named as its states are put out, got {min(twice)!r}")
+        raise ValueError(f"outputs of {system.name} must not have the name of a state output, got {min(twice)!r}")
     found = _exposed(system, names)
     if found is system:
         found = copy.copy(system)
@@ -121,7 +121,7 @@ def _block(system: ct.NonlinearIOSystem, names: Sequence[str]) -> ct.NonlinearIO
     """Copy of a block, all that it says of itself included, with longer outputs."""
     if any(getattr(type(system), name) is not getattr(ct.NonlinearIOSystem, name) for name in ("_rhs", "_out")):
         raise TypeError(
-            f"block {system.name} must have updfcn and outfcn, got a {type(system).__name__} of its own kind"
+            f"block {system.name} must have updfcn and outfcn, got a {type(system).__name__} that overrides them"
         )
     block = copy.copy(system)
     block.outfcn = partial(_with_states, system.outfcn)

@@ -86,7 +86,7 @@ def create_feedforward_iosystem(
     label = checked_labels([reached] if labels is None else labels, 1)[0] + suffix
     if label in (given, reached):
         raise ValueError(
-            f"labels and suffix must not name a signal of the loop, which would be added to it, got {label!r}"
+            f"labels and suffix must not name a signal of the loop, to which it would be added, got {label!r}"
         )
     gains = _inverse(*(np.asarray(m, dtype=float) for m in (system.A, system.B, system.C, system.D)))
     names = [derivative_name(label, k) for k in range(gains.size)]
@@ -124,7 +124,7 @@ def _inverse(a: Array, b: Array, c: Array, d: Array) -> Array:
     sizes = [0.0, *(float(np.linalg.norm(row) * np.linalg.norm(b)) for row in rows[:-1])]
     seen = [abs(value) > _SMALL * size for value, size in zip(markov, sizes, strict=True)]
     if not any(seen):
-        raise ValueError("loop must bring its input to its output, got gain 0")
+        raise ValueError("the transfer function of loop must not be 0, got 0")
     order = seen.index(True)
     gain, last = markov[order], rows[order]
     norms = np.array([np.linalg.norm(row) for row in rows[:order]])

@@ -108,7 +108,7 @@ class Governor(ct.NonlinearIOSystem):  # type: ignore[misc]
         return np.array([x[k] + value for k, value in enumerate(self.initial.tolist())])
 
     def _no_rates(self, t: float, x: Value, u: Value, params: Params) -> NoReturn:
-        raise_not_standalone(self.name, "takes samples")
+        raise_not_standalone(self.name, "is sampled")
 
 
 def create_governor_iosystem(
@@ -252,7 +252,9 @@ def _admission(loop: System, dt: float | None, limits: Limits | None, options: d
         )
     if limits is not None or options:
         given = ", ".join(["limits"] * (limits is not None) + sorted(options))
-        raise TypeError(f"{given} must go with a loop, got a {type(loop).__name__}, which has its own")
+        raise TypeError(
+            f"{given} must be given with a linear loop only, got a {type(loop).__name__}, which has its own"
+        )
     return loop
 
 

@@ -59,7 +59,7 @@ class SampleHold(ct.NonlinearIOSystem):  # type: ignore[misc]
         return x[self._inner :]
 
     def _no_rates(self, t: float, x: Value, u: Value, params: Params) -> NoReturn:
-        raise_not_standalone(self.name, "takes samples")
+        raise_not_standalone(self.name, "is sampled")
 
 
 class Delay(ct.NonlinearIOSystem):  # type: ignore[misc]
@@ -81,7 +81,7 @@ class Delay(ct.NonlinearIOSystem):  # type: ignore[misc]
         declare(self, delay=delay, initial=initial)
 
     def _past(self, t: float, x: Value, u: Value, params: Params) -> NoReturn:
-        raise_not_standalone(self.name, "has a memory of its input")
+        raise_not_standalone(self.name, "is a delay")
 
 
 @former_signature("name")

@@ -105,8 +105,8 @@ def output_cells(problem: Problem, seen: Array, margin: float) -> Cells:
     while True:
         if len(ends) == _CELLS:
             raise ValueError(
-                f"loop must come to rest sooner beside its fastest motion, got motion after {t:.3g} s that takes more "
-                f"than {_CELLS} cells of time"
+                "time constants of the loop must not be too far apart, got a free response that has not settled after "
+                f"{_CELLS} intervals of the fastest, {t:.3g} s"
             )
         bend = _norm(problem.c @ powers[-1] @ moved @ seen)
         h = (_REMAINDER * first * factorial(_DEGREE + 1) / bend) ** (1.0 / (_DEGREE + 1)) if bend else math.inf

@@ -265,7 +265,9 @@ class _Signals:
         self.inner = signal_names([label + self.inside for label in labels], planned)
         both = [name for name in self.outputs if name in self.outer]
         if both:
-            raise ValueError(f"suffix must tell outputs from inputs, got {suffix!r} and {', '.join(both)} among both")
+            raise ValueError(
+                f"suffix must make outputs differ from inputs, got {suffix!r} and {', '.join(both)} in both"
+            )
         n = len(self.inner)
         self.goal_rows, self.seen_rows = slice(n, n + len(goals)), slice(n + len(goals), n + len(self.outer))
 
@@ -462,7 +464,7 @@ class _Correction(ct.NonlinearIOSystem):  # type: ignore[misc]
         return found
 
     def _no_rates(self, t: float, x: Value, u: Value, params: Params) -> NoReturn:
-        raise_not_standalone(self.name, "plans again every period")
+        raise_not_standalone(self.name, "is sampled")
 
 
 def _without_rounding(jet: Array, scale: Array, size: float) -> Array:
@@ -520,10 +522,12 @@ def _checked_limits(plan: Trajectory, limits: Mapping[int, ArrayLike] | None) ->
         extrema = plan.extrema(nu)
         for axis, label in enumerate(plan.labels):
             low, high = float(extrema.minimum[axis]), float(extrema.maximum[axis])
-            worst, time = (high, extrema.time_max[axis]) if high >= -low else (low, extrema.time_min[axis])
+            worst, time = (
+                (high, float(extrema.time_max[axis])) if high >= -low else (low, float(extrema.time_min[axis]))
+            )
             if abs(worst) > limit[axis] * (1.0 + 1e-9):
                 raise ValueError(
-                    f"plan must keep limits[{nu}] = {limit[axis]:g}, got {worst:.6g} of {label} at {float(time):.6g} s"
+                    f"plan must satisfy limits[{nu}] = {limit[axis]:g}, got {worst:.6g} of {label} at {time:.6g} s"
                 )
         found.append((nu, limit))
     return tuple(found)
