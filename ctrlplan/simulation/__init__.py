@@ -1,4 +1,4 @@
-"""Responses of loops: exact where they are linear, compiled where they can be, otherwise by Python."""
+"""Simulation of loops: exact for linear ones, compiled where possible, otherwise by Python."""
 
 from ctrlplan.simulation.equilibrium import equilibrium_at, equilibrium_state, unstable_poles
 from ctrlplan.simulation.events import Event, Occurrence, what_happened

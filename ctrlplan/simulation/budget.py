@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 
 _LIMIT: ContextVar[tuple[float, float] | None] = ContextVar("limit", default=None)
-"""Deadline on the monotonic clock, and the seconds that were allowed; of this thread or task alone."""
+"""Deadline on the monotonic clock and the limit [s], of the present thread or task."""
 
 
 class TimeLimitError(RuntimeError):
@@ -17,20 +17,21 @@ class TimeLimitError(RuntimeError):
 
 @contextmanager
 def time_limit(seconds: float | None) -> Iterator[None]:
-    """Context in which `check` raises once a run has taken some time.
+    """Context with a time limit for each run.
 
-    The time counts from here, and again from each call of `begin_run`.
+    `check` raises once the limit is exceeded. The time is counted from entry,
+    and again from each call of `begin_run`.
 
     Parameters
     ----------
     seconds : float or None
-        Time allowed for a run [s], by the computer's clock; None for what
-        holds outside.
+        Wall-clock time for a run [s]; None: the limit of the enclosing context
+        stays in force.
 
     Notes
     -----
-    The limit holds in the thread that entered the context; others have their
-    own. Nothing is interrupted: code that never calls `check` is not stopped.
+    The limit applies to the thread that entered the context. Nothing is
+    interrupted: code that never calls `check` is not stopped.
     """
     if seconds is None:
         yield
@@ -43,26 +44,26 @@ def time_limit(seconds: float | None) -> Iterator[None]:
 
 
 def begin_run() -> None:
-    """Allow a run that begins the whole time, whatever the one before it took."""
+    """Restart the time limit of the present context, at the start of a run."""
     limit = _LIMIT.get()
     if limit is not None:
         _LIMIT.set((time.monotonic() + limit[1], limit[1]))
 
 
 def check(t: float | None = None) -> None:
-    """Raise where the time limit of the present context is over.
+    """Raise if the time limit of the present context is exceeded.
 
     Parameters
     ----------
     t : float, optional
-        Time that the simulation has reached [s], for the message.
+        Time reached by the simulation [s], for the message.
 
     Raises
     ------
     TimeLimitError
-        If the limit is over.
+        If the limit is exceeded.
     """
     limit = _LIMIT.get()
     if limit is not None and time.monotonic() > limit[0]:
-        reached = "" if t is None else f" at t = {t:g} s"
-        raise TimeLimitError(f"a run must end within timeout = {limit[1]:g} s, got no further{reached}")
+        reached = ", got a longer one" if t is None else f", got to t = {t:g} s in that time"
+        raise TimeLimitError(f"a run must end within timeout = {limit[1]:g} s{reached}")

@@ -38,12 +38,12 @@ _FEW_STEPS = 2_000
 _CLOSE = 129
 """Output times of the second."""
 
-_TOO_MANY = "it needs too many steps"
+_TOO_MANY = "too many steps are required"
 _FAILURES = {
     "CV_TOO_MUCH_WORK": _TOO_MANY,
-    "CV_ERR_FAILURE": "no step is small enough",
-    "CV_CONV_FAILURE": "no step is small enough",
-    "CV_FIRST_RHSFUNC_ERR": "rates are not finite at the beginning",
+    "CV_ERR_FAILURE": "the error test fails at the minimum step size",
+    "CV_CONV_FAILURE": "the nonlinear iteration does not converge at the minimum step size",
+    "CV_FIRST_RHSFUNC_ERR": "the derivatives of the states are not finite at its start",
 }
 
 _STIFF = 3000.0
@@ -338,10 +338,10 @@ class CompiledSolver:
                 return scales.shift[:, None] + scales.scale[:, None] * wanted
             except RuntimeError as error:
                 code = re.search(r"CV_\w+", str(error))
-                why = _FAILURES.get(code.group() if code else "", "its equations could not be evaluated")
+                why = _FAILURES.get(code.group() if code else "", "the equations could not be evaluated")
                 if why != _TOO_MANY or allowed == max_steps:
                     break
-        raise SolverError(f"the solver must reach {right:g} s from {left:g} s, got to where {why}")
+        raise SolverError(f"the solver must reach {right:g} s from {left:g} s, but the segment fails: {why}")
 
     def count(self) -> None:
         """Count evaluations from now on."""

@@ -78,7 +78,7 @@ def equilibrium_at(
     if prepared.linear is not None:
         form = prepared.linear
         state = _linear_equilibrium(form.a, form.b @ held, form.c[rows], form.d[rows] @ held, target, start, free)
-        return (start, "it has none") if state is None else (state, "")
+        return (start, "the loop has none") if state is None else (state, "")
     try:
         try:
             return _found(_Equations(prepared, held, time, params or {}, start), rows, target, start, free)
@@ -86,7 +86,7 @@ def equilibrium_at(
             again = _Equations(prepared, held, time, params or {}, start, trials=False)
             return _found(again, rows, target, start, free)
     except Exception as error:  # whatever a block does outside its domain; a run that fails there says so itself
-        return start, f"its equations cannot be evaluated ({type(error).__name__}: {error})"
+        return start, f"the equations cannot be evaluated ({type(error).__name__}: {error})"
 
 
 def equilibrium_state(system: System | Prepared, position: ArrayLike) -> Array:
@@ -255,10 +255,8 @@ class _Equations:
             for i in network.blocks_with("delay"):
                 before, now = signals[network.outputs[i]], network.fed[i](signals)
                 if np.any(np.abs(now - before) > _RESIDUAL * max(np.abs(held).max(), np.abs(before).max())):
-                    start = (
-                        f"the output of the delay {network.blocks[i].name} starts at {_listed(before)}, its initial="
-                    )
-                    return f"{start}, and its input at {_listed(now)}"
+                    start = f"the output of the delay {network.blocks[i].name} starts at initial = {_listed(before)}"
+                    return f"{start}, but its input starts at {_listed(now)}"
             return ""
 
         def gaps(x: Array) -> Array:
@@ -335,7 +333,7 @@ def _found(
     if nearest is None:
         return start, _of_samples(equations) if equations.unknown else equations.delay_mismatch(
             start
-        ) or "none was found"
+        ) or "none was found by iteration"
     state = whole(nearest[1])
     if equations.unknown and nearest[0] > _RESIDUAL * size:
         return state, _of_samples(equations)
@@ -343,7 +341,7 @@ def _found(
 
 
 def _of_samples(equations: _Equations) -> str:
-    return f"the states of {', '.join(equations.unknown)}, which takes samples, are not known"
+    return f"the states of {', '.join(equations.unknown)}, a sampled block, cannot be computed"
 
 
 def _guesses(start: Array, target: Array) -> Iterator[Array]:

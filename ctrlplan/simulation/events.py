@@ -1,4 +1,4 @@
-"""Instants at which a signal crosses its limits."""
+"""Events: times at which a signal crosses its limits."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from ctrlplan._types import Array, EventName
 Signal = Callable[[Array, Array, Array, Array], Array]
 """(t, x, u, y) at many times, time last -> values (ntime,)."""
 Events: TypeAlias = Sequence["Event"] | None
-"""Events of a run. None: the limits that blocks declare; some: these in addition; an empty sequence: none at all."""
+"""Events of a run. None: the limits that blocks declare; a sequence: these in addition; empty: none at all."""
 
 
 @dataclass(frozen=True)
 class Event:
-    """Limits of a signal, the crossings of which a run records.
+    """Limits of a signal whose crossings are recorded in a run.
 
     Parameters
     ----------
@@ -34,7 +34,7 @@ class Event:
     stop : bool, optional
         End the run where the signal leaves its limits.
     name : str, optional
-        What the crossings are called; the signal's label unless given.
+        Name of the crossings; the signal's label unless given.
 
     Raises
     ------
@@ -71,19 +71,19 @@ EventKind = Literal["below", "above", "inside"]
 
 @dataclass(frozen=True)
 class Occurrence:
-    """One crossing.
+    """Crossing of a limit of an event.
 
     Attributes
     ----------
     time : float
-        When [s], to the accuracy of the run.
+        Time of the crossing [s], to the accuracy of the run.
     name : str
-        Of the event.
+        Name of the event.
     kind : {"below", "above", "inside"}
-        "below" or "above": the signal left its limits there, or began the run
-        outside; "inside": it came back.
+        "below" or "above": the signal left its limits, or was outside at the
+        start of the run; "inside": it returned within them.
     stop : bool
-        Whether the run ended there.
+        Whether the event ended the run.
     """
 
     time: float
@@ -92,16 +92,16 @@ class Occurrence:
     stop: bool = False
 
     def __str__(self) -> str:
-        """In words."""
+        """Time, name and kind in words."""
         end = ", where the run ends" if self.stop else ""
         if isinstance(self.name, EventName) and (self.kind != "inside" or not self.name.words):
-            return f"{self.time:.6g} s: {what_happened(self.name)}{', over' if self.kind == 'inside' else ''}{end}"
+            return f"{self.time:.6g} s: {what_happened(self.name)}{' (end)' if self.kind == 'inside' else ''}{end}"
         where = "within its limits" if self.kind == "inside" else f"{self.kind} its limit"
         return f"{self.time:.6g} s: {self.name} {where}{end}"
 
 
 def what_happened(name: str) -> str:
-    """What an event is, in words: what its block says of it, or that the signal left its limits."""
+    """Event in words: as its block declares it, or that the signal left its limits."""
     if isinstance(name, EventName):
         return f"{name} {name.words}" if name.words else str(name)
     return f"{name} left its limits"
@@ -109,7 +109,7 @@ def what_happened(name: str) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Snapshot:
-    """Times, states, inputs and outputs of a run, time last; and of a network all signals, where they are asked for."""
+    """Times, states, inputs and outputs of a run, time last; all signals of a network on demand."""
 
     t: Array
     x: Array
@@ -121,13 +121,13 @@ class Snapshot:
     def w(self) -> Array:
         """All signals of the network, (nsignals, ntime)."""
         if self.signals is None:
-            raise ValueError("a run without a network has no signals inside")
+            raise ValueError("internal signals must come from a network, got a run by python-control")
         return self.signals()
 
 
 @dataclass(frozen=True, eq=False)
 class Watched:
-    """A signal of a run and its limits: an event with its label looked up."""
+    """Signal of a run and its limits: an event with its label resolved."""
 
     name: str
     value: Callable[[Snapshot], Array]
@@ -140,29 +140,29 @@ class Watched:
         return (values > self.high).astype(int) - (values < self.low).astype(int)
 
     def limit(self, side: int, other: int) -> float:
-        """The limit between two sides next to each other."""
+        """Limit that separates two adjacent sides."""
         return self.high if max(side, other) > 0 else self.low
 
 
 def crossings(
     watched: Watched, times: Array, values: Array, value_at: Callable[[int, float], float]
 ) -> list[Occurrence]:
-    """Every crossing of a record, located by root finding.
+    """Crossings of limits in a record, located by root finding.
 
     Parameters
     ----------
     watched : Watched
-        The signal and its limits.
+        Signal and limits.
     times, values : ndarray, shape (ntime,)
         The record.
     value_at : callable
-        Maps k and a time after times[k] and before the next to the signal.
+        Maps k and a time between times[k] and times[k + 1] to the signal.
     """
     sides = watched.side(values)
     found = [Occurrence(float(times[0]), watched.name, _KINDS[int(sides[0])], watched.stop)] if sides[0] else []
     for k in np.flatnonzero(np.diff(sides)).tolist():
         before, after = int(sides[k]), int(sides[k + 1])
-        # From below to above both limits are crossed.
+        # Between below and above, both limits are crossed.
         stages = [(before, 0), (0, after)] if before * after < 0 else [(before, after)]
         for left, right in stages:
             level = watched.limit(left, right)
@@ -173,24 +173,24 @@ def crossings(
                 float(values[k]) - level,
                 float(values[k + 1]) - level,
             )
-            if left != before:  # through both limits at once, a rounding error apart
+            if left != before:  # both limits within a rounding error of time
                 time = max(time, found[-1].time)
             found.append(Occurrence(time, watched.name, _KINDS[right], watched.stop and right != 0))
     return found
 
 
 def watched_events(events: Sequence[Event], labels: Mapping[str, tuple[str, int]]) -> list[Watched]:
-    """Events with their labels looked up.
+    """Events with their labels resolved.
 
     Parameters
     ----------
     events : sequence of Event
-        As the user gave them.
+        Events given by the user.
     labels : mapping of str to (kind, int)
         "x", "u" or "y", and the row, of every label.
     """
     if isinstance(events, Event):
-        raise TypeError("events must be a sequence of Event, got one alone")
+        raise TypeError("events must be a sequence of Event, got a single Event")
     found = []
     for event in events:
         if not isinstance(event, Event):
@@ -228,7 +228,7 @@ def _row(kind: str, row: int, seen: Snapshot) -> Array:
 
 
 def _root(function: Callable[[float], float], left: float, right: float, at_left: float, at_right: float) -> float:
-    """Earliest time found at which the signal is on the side where it is at `right`."""
+    """Root of a function, rounded to the side on which it is at `right`."""
     if at_left == 0.0 or at_left * at_right >= 0.0:
         return left if at_left == 0.0 else right
     crossed = [right]

@@ -321,8 +321,8 @@ def _cells(jet: Callable[[Array, int], Array], duration: float) -> tuple[int, in
     size = np.abs(jet(np.linspace(0.0, duration, 9), order)).max(axis=2)  # (order + 1, ninputs)
     if not np.isfinite(size[:_TERMS]).all():
         raise ValueError(
-            f"inputs must have derivatives within the range of numbers up to order {_TERMS - 1}, got a segment of "
-            f"{duration:g} s on which they have not; state times, or values, in another unit"
+            f"derivatives of inputs up to order {_TERMS - 1} must not overflow, got an overflow on a segment of "
+            f"{duration:g} s; use other units for times or values"
         )
     ncells = 1
     while ncells < 4096:
@@ -392,7 +392,7 @@ def _products(a: Array, b: Array) -> tuple[Array, NDArray[np.intp]]:
     """
     norm = np.abs(a).sum(axis=1).max(axis=1)
     if not (np.isfinite(norm).all() and np.isfinite(b).all()):
-        raise ValueError("rates and input gains of the system times the duration must be below 1e308, got more")
+        raise ValueError("the system matrices A and B times the duration must be below 1e308, got an overflow")
     halvings = np.ceil(np.log2(np.maximum(norm, 1.0)))
     both = np.concatenate([a, b], axis=2) * 0.5 ** halvings[:, None, None]
     n, products = a.shape[1], [both]

@@ -114,8 +114,8 @@ class Interpreted:
                 found = np.ravel(self._updates[i](t, x[place], self.network.fed[i](w)))
             if found.size != place.stop - place.start:
                 raise ValueError(
-                    f"block {self.network.blocks[i].name} must return {place.stop - place.start} rates, "
-                    f"got {found.size}"
+                    f"block {self.network.blocks[i].name} must return the derivatives of "
+                    f"{place.stop - place.start} states, got {found.size}"
                 )
             dx[place] = found
         return dx
@@ -206,7 +206,7 @@ class Interpreted:
                 found = values_of(block.output(self.params), t, x[place], fed)
             size = np.abs(w).max(initial=0.0, where=np.isfinite(w))
             if found is not None and not np.allclose(found, w[outs], rtol=1e-9, atol=1e-9 * size, equal_nan=True):
-                raise FeedthroughError(f"outputs of {block.name} at {t:g} s depend on more inputs than at the start")
+                raise FeedthroughError(f"the direct feedthrough of block {block.name} has changed at {t:g} s")
 
     def _signals(self, steps: list[Call], t: float, x: Array, time_values: Array) -> Array:
         w = np.zeros(self.network.nsignals)
@@ -396,9 +396,9 @@ class InterpretedSolver:
             except _StalledError as stalled:
                 return before, z, str(stalled)
             if solver.status == "failed":
-                return before, z, f"{why} Equations that jump, as by floor or sign, may chatter there"
+                return before, z, f"{why} Discontinuous equations, as with floor or sign, may chatter there"
             if not np.isfinite(solver.y).all():
-                return before, z, "a state is infinite beyond"
+                return before, z, "a state is not finite after that"
             now = float(solver.t)
             inside = slice(*np.searchsorted(grid, [before, now], side="right"))
             if inside.stop > inside.start:
@@ -565,7 +565,7 @@ class _Watched:
         if abs(t - self._about) > _INSTANT * (self.right - self.left):
             self._about, self._count = t, 0
         elif self._count > self._calls:
-            raise _StalledError("the solution ends there")
+            raise _StalledError("the solution cannot be continued")
         self._solver.review(self, t, z)
         inside = min(max(t, self._within[0]), self._within[1])
         rates = self._solver.scaled_rates(inside, z, self.series(inside))

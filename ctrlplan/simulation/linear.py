@@ -154,7 +154,9 @@ def _kind(system: System) -> type:
 
 
 def _unlike(systems: Sequence[System]) -> ValueError:
-    return ValueError(f"systems must differ in numbers alone, got other blocks or wires in one named {systems[0].name}")
+    return ValueError(
+        f"systems must differ only in numerical values, got other blocks or connections in one named {systems[0].name}"
+    )
 
 
 def _interconnections(systems: Sequence[System]) -> LinearForm:
@@ -194,7 +196,7 @@ def _interconnections(systems: Sequence[System]) -> LinearForm:
             tuple(source for form in forms for source in form.sources),
         )
     if not all(np.isfinite(matrix).all() for matrix in (form.a, form.b, form.c, form.d)):
-        raise ValueError(f"gains of the blocks in {first.name} must have finite products, got some beyond 1e308")
+        raise ValueError(f"gains of the blocks in {first.name} must have finite products, got an overflow")
     return form
 
 

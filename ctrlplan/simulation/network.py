@@ -134,7 +134,7 @@ class Block:
                 lambda t, x, u: np.ravel(inner.dynamics(t, x[:count], u, given)) if count else np.empty(0),
             )
         if sample is None:
-            raise TypeError(f"block {self.name} must declare a function that takes its samples")
+            raise TypeError(f"block {self.name} must declare sample, the function evaluated at its sample times")
         sampled_once = _once(lambda t, x, u: sample(t, x, u, own))
         output = self.output(params)
         return (lambda t, x, u: output(t, sampled_once(t, x, u), u)), sampled_once
@@ -430,7 +430,7 @@ def _flattened(system: System, above: Params) -> _Part:
     # Parts take v = connect @ (read @ y + through @ v) + external @ r.
     wires = np.eye(len(connect)) - connect @ through
     if wires.size and np.linalg.matrix_rank(wires) < len(wires):  # numpy 1.26 has no rank of an empty matrix
-        raise ValueError(f"wires must not feed themselves, got such a one in {system.name}")
+        raise ValueError(f"connections must not form a loop without a block, got one in {system.name}")
     v_y, v_r = np.linalg.solve(wires, connect @ read), np.linalg.solve(wires, external)
     passed = from_out @ through + from_in
     return _Part(
@@ -449,7 +449,7 @@ def _innermost(system: System, above: Params) -> _Part:
         getattr(type(system), name) is getattr(ct.NonlinearIOSystem, name) for name in ("_rhs", "_out")
     )
     if not (plain or isinstance(system, ct.StateSpace)):
-        raise UnsupportedError(f"block {system.name} ({type(system).__name__}) has equations of a kind of its own")
+        raise UnsupportedError(f"block {system.name} ({type(system).__name__}) overrides the equations of its class")
     nin, nout = system.ninputs or 0, system.noutputs
     block = Block(system, {**system.params, **above})
     return _Part([block], np.zeros((nin, nout)), np.eye(nin), np.eye(nout), np.zeros((nout, nin)))
@@ -468,7 +468,7 @@ def _warn_of_shared_parameters(system: System) -> None:
                 warnings.warn(
                     f"blocks {name} and {block.name} both have a parameter {key!r}, {before!r} and {value!r}: "
                     f"inside {system.name} python-control gives both {system.params.get(key, value)!r}; "
-                    "use keys of their own",
+                    "use different keys",
                     UserWarning,
                     stacklevel=2,
                 )
@@ -522,7 +522,7 @@ def _first_loop(depends: NDArray[np.bool_], open_: NDArray[np.bool_]) -> NDArray
         members = group == k
         if not among[np.ix_(members, ~members)].any():
             return rows[members]
-    raise AssertionError("of the groups of a finite graph one depends on no other")
+    raise AssertionError("a finite graph has a strongly connected component that depends on no other")
 
 
 def _can_be_sent(what: object) -> bool:

@@ -379,10 +379,10 @@ def _accuracy_note(attempt: Attempt[S]) -> str:
     part = np.where(uncertain, worst / np.where(uncertain, ranges, 1.0), 0.0)
     names = ", ".join(np.array(job.prepared.output_labels)[uncertain])
     needed = job.rtol * _UNCERTAIN / float(part.max())
-    what = "are differences of larger terms" if attempt.growth <= _GROWTH else "grow apart from their neighbours"
+    what = "are differences of larger terms" if attempt.growth <= _GROWTH else "diverge from neighbouring solutions"
     if np.any(attempt.drift > own):
-        what = "depend on small parts of large states"
-    advice = f"rtol = {needed:.0e} would do" if needed > 1e-12 / scales.relative.min() else "no tolerance would do"
+        what = "depend on small fractions of large states"
+    advice = f"rtol = {needed:.0e} suffices" if needed > 1e-12 / scales.relative.min() else "no tolerance suffices"
     return f"outputs {names} {what} and are uncertain by about {float(part.max()):.1g} of their range: {advice}"
 
 

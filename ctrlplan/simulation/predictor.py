@@ -1,4 +1,4 @@
-"""How far the reference of a nonlinear loop may go, by predictions."""
+"""Admissible references of a nonlinear loop, by predictive simulation."""
 
 from __future__ import annotations
 
@@ -17,52 +17,54 @@ from ctrlplan.simulation.prepared import Prepared, prepare
 from ctrlplan.simulation.simulate import checked_job, response_to
 
 _TOLERANCES = 1e-6, 1e-8
-"""Of the solver: a prediction is not worth more than its margin."""
+"""Relative and absolute tolerance of the solver, far below any margin."""
 
 _SHORTEST = 2.0**-20
-"""Fractions below are taken for 0."""
+"""Fractions below this one count as 0."""
 
 _SETTLED = 0.8
-"""Part of the horizon after which the loop must be at rest."""
+"""Fraction of the horizon after which the loop must be in steady state."""
 
 _COUNTS = 20, 100_000
-"""Least and greatest number of times at which a prediction is looked at."""
+"""Minimum and maximum number of times at which a prediction is evaluated."""
 
 
 class Predictor(Frozen):
-    """Says by simulation how far the reference of a loop may go.
+    """Admissible references of a nonlinear loop, by simulation.
 
-    For loops that are not linear; `create_governor_iosystem` takes it in the
-    loop's place. A reference is admissible at a state if the loop, run from
-    there over the horizon with the reference held,
+    `create_governor_iosystem` accepts it in place of a linear loop. A reference
+    is admissible at a state if, in a simulation from that state over the
+    horizon with the reference held constant,
 
-    - keeps every limited output inside its limits by the margin, and
-    - is at rest over the last fifth of the horizon: limited outputs are inside
-      by twice the margin, and none moves by more than the margin.
+    - every limited output stays inside its limits by the margin, and
+    - the loop is in steady state over the last fifth of the horizon: limited
+      outputs are inside by twice the margin, and none moves by more than the
+      margin.
 
-    A run that fails or leaves the range of numbers is not. Outputs are looked
-    at at `count` times, closer together after the start, and their peaks
-    between these by parabolas. What the horizon does not show is not seen: it
-    must be long beside the slowest motion of the loop.
+    A reference for which the simulation fails or overflows is not admissible.
+    Outputs are evaluated at `count` times, closer together after the start;
+    peaks in between are estimated by parabolas. Violations beyond the horizon
+    are not detected: it must be long compared with the slowest time constant.
 
     Parameters
     ----------
     system : control system or Prepared
-        Continuous and not depending on time: without plans and delays. Blocks
-        that take samples are predicted as at the start of a run: the
-        governor's samples must fall on theirs.
+        Continuous and time-invariant, without plans and delays. Sampled blocks
+        are predicted as at the start of a run: the sample times of the governor
+        must be sample times of these blocks.
     limits : mapping of str to (float, float) or float
         Minimum and maximum of each limited output, one of which may be
         infinite; a number a for (-a, a).
     horizon : float
-        How far ahead is looked [s], above 0.
+        Prediction horizon [s], above 0.
     references : sequence of str, optional
-        Inputs that are governed: all unless given. The others are 0.
+        Inputs that are governed, by default all. The others are 0.
     margin : float, optional
-        Distance from the limits, relative to half the distance between two,
-        to the size of one alone (to 1 where that is 0); in (0, 1/2).
+        Distance from the limits, relative to half the distance between them;
+        with a single limit relative to its magnitude (to 1 if that is 0). In
+        (0, 1/2).
     count : int, optional
-        Times at which a prediction is looked at, from 20.
+        Number of times at which a prediction is evaluated, at least 20.
     resolution : float, optional
         Accuracy of the fraction, in (0, 1).
     params : mapping, optional
@@ -73,15 +75,15 @@ class Predictor(Frozen):
     references, states : tuple of str
         Labels of the governed inputs, and of the states.
     horizon : float
-        How far ahead is looked [s].
+        Prediction horizon [s].
 
     Raises
     ------
     TypeError
-        If `system` is no system.
+        If `system` is not a control system.
     ValueError
-        If it is discrete or depends on time, a label is unknown, limits do not
-        increase, or a number is out of range.
+        If the system is discrete or depends on time, a label is unknown, limits
+        do not increase, or a number is out of range.
 
     References
     ----------
@@ -90,7 +92,7 @@ class Predictor(Frozen):
 
     Examples
     --------
-    A pendulum, held by a spring of the law at the angle asked for, with little torque:
+    Position control of a pendulum with limited torque:
 
     >>> import control as ct
     >>> import numpy as np
@@ -145,7 +147,7 @@ class Predictor(Frozen):
             raise ValueError(f"count must be a whole number from {_COUNTS[0]} to {_COUNTS[1]}, got {count}")
         bounds = np.array([checked_limits(pair, f"limits of {label}") for label, pair in limits.items()])
         inset = float(margin) * bounds[:, 2]
-        # Even steps of the root of time: a new reference sets off the fastest motion at the start.
+        # Evenly spaced in the square root of time: the fastest motion follows the change of the reference.
         times = seconds * np.linspace(0.0, 1.0, int(count)) ** 2
         self.__dict__.update(
             references=governed,
@@ -166,7 +168,7 @@ class Predictor(Frozen):
         return f"<Predictor of {self._prepared.name} over {self.horizon:g} s>"
 
     def contains(self, x: ArrayLike, v: ArrayLike) -> bool:
-        """Whether a reference, held from a state on, is admissible.
+        """Whether a reference, held constant from a state, is admissible.
 
         Parameters
         ----------
@@ -179,21 +181,21 @@ class Predictor(Frozen):
         return self._admissible(state, held)
 
     def fraction(self, x: ArrayLike, v: ArrayLike, r: ArrayLike) -> float:
-        """Part of the way from v to r that is admissible from a state on.
+        """Largest admissible fraction of the way from v to r.
 
         Parameters
         ----------
         x : array_like, shape (nstates,)
             State.
         v, r : array_like, shape (nreferences,)
-            Reference that is held, and the one asked for.
+            Present reference and commanded reference.
 
         Returns
         -------
         float
-            Greatest kappa in [0, 1] found by halving, itself predicted to be
-            admissible: within `resolution`, or within a factor of 2 where it is
-            smaller; 1 where r is admissible; nan where neither r nor v is.
+            Largest kappa in [0, 1] found by bisection for which v + kappa (r - v)
+            is admissible: within `resolution`, or within a factor of 2 if it is
+            smaller; 1 if r is admissible; nan if neither r nor v is.
         """
         state, held, command = self._checked(x, v, r)
         if self._admissible(state, command):
@@ -201,7 +203,7 @@ class Predictor(Frozen):
         if np.array_equal(held, command) or not self._admissible(state, held):
             return math.nan
         low, high = 0.0, 1.0
-        # A first step must be found however short, or a far reference would be waited for for ever.
+        # An arbitrarily short first step must be found, otherwise a distant reference is never reached.
         while high - low > (self._resolution if low else _SHORTEST):
             middle = 0.5 * (low + high)
             if self._admissible(state, held + middle * (command - held)):
@@ -226,7 +228,7 @@ class Predictor(Frozen):
         )
 
     def _predicted(self, state: Array, reference: Array) -> Array | None:
-        """Limited outputs (nlimits, count) of a run, or None where it fails."""
+        """Limited outputs (nlimits, count) of a simulation, or None if it fails."""
         inputs = dict(zip(self.references, reference.tolist(), strict=True))
         with np.errstate(all="ignore"):
             for method in methods.applicable(methods.METHODS, self._prepared):
@@ -235,11 +237,11 @@ class Predictor(Frozen):
                     found = response_to(job, [method])
                 except (SolverError, LoopError):
                     return None
-                except NotApplicableError:  # what cannot be compiled is run by Python
+                except NotApplicableError:  # not compilable: the next method
                     continue
                 outputs = np.atleast_2d(found.y[self._rows, ...].reshape(len(self._rows), -1))
                 return outputs if np.isfinite(outputs).all() else None
-        raise AssertionError("Python runs every system that the constructor accepts")
+        raise AssertionError("the method python applies to every system that the constructor accepts")
 
     def _checked(self, x: ArrayLike, *references: ArrayLike) -> list[Array]:
         found = [np.asarray(x, dtype=float), *(np.atleast_1d(np.asarray(v, dtype=float)) for v in references)]
@@ -251,7 +253,7 @@ class Predictor(Frozen):
 
 
 def _peaks(values: Array) -> Array:
-    """Greatest values (nsignals,) of signals (nsignals, ntime), between samples by parabolas through three of them."""
+    """Maxima (nsignals,) of signals (nsignals, ntime), interpolated between samples by parabolas."""
     before, middle, after = values[:, :-2], values[:, 1:-1], values[:, 2:]
     bend = 2.0 * middle - before - after
     inner = (middle >= before) & (middle >= after) & (bend > 0.0)
@@ -260,7 +262,7 @@ def _peaks(values: Array) -> Array:
 
 
 def _check_autonomous(prepared: Prepared) -> None:
-    """Refuse what a run from a state and constant inputs does not predict."""
+    """Raise for a system that its state and constant inputs do not determine."""
     if prepared.is_discrete:
         raise ValueError(f"system must be continuous, got {prepared.name} with dt = {prepared.dt}")
     if prepared.network is None:
@@ -269,7 +271,7 @@ def _check_autonomous(prepared: Prepared) -> None:
         if block.plan is not None or block.traits.breakpoints:
             raise ValueError(f"system must not depend on time, got the plan or breakpoints of the block {block.name}")
         if block.delay is not None:
-            raise ValueError(f"system must say all by its state, got the delay of the block {block.name}")
+            raise ValueError(f"system must have a finite number of states, got the delay of the block {block.name}")
 
 
 def _check_known(given: tuple[str, ...], known: list[str], name: str, what: str) -> None:

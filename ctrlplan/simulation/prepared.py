@@ -1,4 +1,4 @@
-"""The built form of a system, kept for many runs."""
+"""Internal form of a system, reused for many runs."""
 
 from __future__ import annotations
 
@@ -29,18 +29,18 @@ if TYPE_CHECKING:
     from ctrlplan.symbolic.tracing import Trace
 
 _CACHE_SIZE = 16
-"""Systems that `simulate` keeps by itself."""
+"""Number of systems whose forms `simulate` caches."""
 
 
 class Prepared:
-    """Built form of a system; made by `prepare`.
+    """System prepared for simulation; returned by `prepare`.
 
     Attributes
     ----------
     name : str
-        Of the system.
+        Name of the system.
     input_labels, output_labels, state_labels : list of str
-        Its signals, in python-control's order.
+        Labels of its signals, in the order of python-control.
     nstates : int
         Number of states.
     """
@@ -71,7 +71,7 @@ class Prepared:
             self.unsupported = str(error)
         for block in self._blocks():
             if block.delay is not None or block.period is not None:
-                what = "puts out the past" if block.delay is not None else "takes samples"
+                what = "is a delay" if block.delay is not None else "is sampled"
                 self.not_linear = f"block {block.name} {what}"
         self._sources = [PlanSignal(b.plan, b.traits.derivatives) for b in self._blocks() if b.plan is not None]
         self._built_forms = BuiltForms()
@@ -86,7 +86,7 @@ class Prepared:
 
     @property
     def stated(self) -> Array | None:
-        """States at which the system or its blocks say that they start, nan for the others; None where none does."""
+        """Initial states that the system or its blocks declare, nan for the others; None if none is declared."""
         return self._stated if self.system is None else stated_states(self.system)
 
     @property
@@ -101,11 +101,11 @@ class Prepared:
 
     @property
     def has_blocks(self) -> bool:
-        """Whether python-control's blocks are at hand: not in a form from another process."""
+        """Whether the blocks of python-control are available: not in a form from another process."""
         return self.network is not None and bool(self.network.blocks)
 
     def time_signals(self, inputs: list[TimeSignal], first: float) -> list[TimeSignal]:
-        """Signals at the inputs, then the outputs of blocks that are functions of time, in order."""
+        """Input signals, then the outputs of blocks that are functions of time, in order."""
         sources, found = iter(self._sources), list(inputs)
         for block in self._blocks():
             if block.plan is not None:
@@ -118,17 +118,17 @@ class Prepared:
     def compiled(
         self, params: Params, time_signals: list[TimeSignal], first: float, state: Array, trials: bool = True
     ) -> Compiled:
-        """Compiled form for some parameters, built once for all their values.
+        """Compiled form for given parameters, built once for all their values.
 
         Raises
         ------
         NotCompiledError
-            If CasADi is missing, or a block cannot be traced; it is named.
+            If CasADi is missing, or a block cannot be traced; the message names it.
         """
 
         def build() -> BuiltForm:
             built = self._build(params, time_signals, first, state, trials)
-            if self.original is not None:  # what blocks only write has turned out meanwhile
+            if self.original is not None:  # the trace has shown which objects the blocks only write
                 self.fingerprint = fingerprint(self.original)
                 _FORMS.get(self.fingerprint, lambda: self)
             return built
@@ -136,18 +136,18 @@ class Prepared:
         return self._built_forms.form(params, build)
 
     def discard(self, form: Compiled, why: str) -> DisagreementError:
-        """Drop a compiled form that was found wrong; the error to raise."""
+        """Discard a compiled form that disagrees with Python; returns the error to raise."""
         return self._built_forms.discard(form, why)
 
     def detached(self, names: Iterable[str] = ()) -> Prepared:
-        """Same form without python-control's blocks, for other processes and for many runs with some parameters.
+        """Same form without the blocks of python-control, for other processes and for many runs.
 
-        Nothing is compared with Python any more.
+        The compiled form is no longer compared with Python.
 
         Raises
         ------
         TypeError
-            If it is neither linear nor compiled for any values of these
+            If it is neither linear nor compiled for all values of these
             parameters, or has delays or discrete blocks.
         """
         other = object.__new__(Prepared)
@@ -159,7 +159,7 @@ class Prepared:
         return other
 
     def reads(self, name: str, value: Value, initial_state: ArrayLike | None = None) -> bool:
-        """Whether a block has a parameter, or reads one of that name where a run begins or near it."""
+        """Whether a block has a parameter, or reads one of that name near the initial state."""
         network = self.network
         if network is None or not network.blocks or any(name in block.params for block in network.blocks):
             return True
@@ -174,7 +174,7 @@ class Prepared:
     def _build(
         self, params: Params, time_signals: list[TimeSignal], first: float, state: Array, trials: bool
     ) -> BuiltForm:
-        """Compiled form of all blocks, or why there is none."""
+        """Compiled form of all blocks, or the reason why there is none."""
         names, network = frozenset(params), self.network
         if missing := missing_casadi():
             return BuiltForm(names, {}, NotCompiledError(missing))
@@ -184,7 +184,7 @@ class Prepared:
         if network is None:
             return BuiltForm(names, {}, NotCompiledError(self.unsupported))
         if not network.blocks:
-            why = f"{self.name} is without its blocks, compiled for other parameters"
+            why = f"{self.name} has come without its blocks, compiled for other parameters"
             return BuiltForm(names, {}, NotCompiledError(why))
         traces: list[Trace | None] = []
         constants: dict[str, tuple[object, ...]] = {}
@@ -196,7 +196,7 @@ class Prepared:
                     continue
                 trace = traced(block, params, first, state[states], fed(w))
                 traces.append(trace)
-                # What is a constant in the trace must be so in every run of it.
+                # A parameter that is a constant in the trace must have this value in every run of it.
                 constants |= {key: value_token(params[key]) for key in params if key not in trace.symbols}
             return BuiltForm(names, constants, Compiled(network, traces))
         except NotTraceableError as error:
@@ -212,7 +212,7 @@ class Prepared:
         state: Array,
         trials: bool,
     ) -> Array:
-        """Signals at the start of a run, by calls that leave nothing behind."""
+        """Signals at the start of a run, by trial calls without side effects."""
         from ctrlplan.symbolic.tracing import callable_references
 
         others = [block for block in network.blocks if not (block.linear or block.is_time_function)]
@@ -227,7 +227,7 @@ class Prepared:
         return self.network.blocks if self.network is not None else ()
 
     def __getstate__(self) -> dict[str, object]:
-        """Without python-control's objects, whose functions cannot be sent to another process."""
+        """State without the objects of python-control, whose functions cannot be pickled."""
         usable = self._built_forms.usable()
         if self.linear is None:
             special = any(block.delay is not None or block.period is not None for block in self._blocks())
@@ -250,11 +250,10 @@ class Prepared:
 
 
 def prepare(system: System | Prepared) -> Prepared:
-    """Built form of a system, for many runs.
+    """System prepared for many simulations.
 
-    `simulate` takes it in the system's place; what it builds on the way
-    (the linear form, the compiled one) is built once, whatever the values of
-    parameters, plans on inputs and initial states.
+    `simulate` accepts it in place of the system. Its linear or compiled form is
+    built once, for all values of parameters, plans at inputs and initial states.
 
     Parameters
     ----------
@@ -264,6 +263,15 @@ def prepare(system: System | Prepared) -> Prepared:
     Returns
     -------
     Prepared
+        With the attributes ``name``, ``input_labels``, ``output_labels``,
+        ``state_labels``, ``nstates`` and ``initial_state``, the declared one.
+
+    Raises
+    ------
+    TypeError
+        If `system` is not a control system.
+    ValueError
+        If it has no number of states, inputs or outputs.
 
     Examples
     --------
@@ -278,10 +286,10 @@ def prepare(system: System | Prepared) -> Prepared:
 
 
 def prepared_form(system: System | Prepared) -> Prepared:
-    """Form built before of the same system, or a new one where its maps, parameters or blocks have changed."""
+    """Cached form of a system, or a new one if its connections, parameters or blocks have changed."""
     if isinstance(system, Prepared) and system.original is None:
         return system
-    with BUILDING:  # no other thread is calling a block on trial
+    with BUILDING:  # no other thread makes trial calls of a block
         if isinstance(system, Prepared):
             if fingerprint(system.original) == system.fingerprint:
                 return system
@@ -291,12 +299,12 @@ def prepared_form(system: System | Prepared) -> Prepared:
 
 
 def stated_start(system: System | Prepared) -> Array | None:
-    """State at which a system says that it starts, or its blocks do, the rest of them at 0; None where none does."""
+    """Initial state that a system or its blocks declare, 0 for other blocks; None if none is declared."""
     return _filled(stated_states(system))
 
 
 def stated_states(system: System | Prepared) -> Array | None:
-    """State at which a system or its blocks declare that they start, nan for those of other blocks."""
+    """Initial state that a system or its blocks declare, nan for other blocks; None if none is declared."""
     if isinstance(system, Prepared):
         return system.stated
     own = traits_of(system).initial_state
@@ -311,14 +319,14 @@ def stated_states(system: System | Prepared) -> Array | None:
 
 
 def state_space(system: System) -> System:
-    """Same system with states, where it is a transfer function."""
+    """State-space form of a transfer function; other systems unchanged."""
     if not isinstance(system, ct.TransferFunction):
         return system
     return ct.ss(system, name=system.name, inputs=system.input_labels, outputs=system.output_labels)
 
 
 def _filled(stated: Array | None) -> Array | None:
-    """A stated start with 0 where nothing is stated."""
+    """Declared initial state with 0 where none is declared."""
     return None if stated is None else np.where(np.isnan(stated), 0.0, stated)
 
 
@@ -330,7 +338,9 @@ def _checked_system(system: System) -> System:
     unknown = [name for name, size in sizes.items() if size is None]
     if unknown:
         numbers = ", ".join(f"{name}=..." for name in unknown)
-        raise ValueError(f"system must have a number of {unknown[0]}, got {system.name} without; give it {numbers}")
+        raise ValueError(
+            f"system must declare its number of {unknown[0]}, got {system.name} without; construct it with {numbers}"
+        )
     return system
 
 

@@ -1,4 +1,4 @@
-"""What a simulation returns."""
+"""Result of a simulation."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from ctrlplan.simulation.events import Occurrence
 
 
 class SimulationResponse(ct.TimeResponseData):  # type: ignore[misc] # python-control has no types
-    """Response of a system, with the method that computed it and its events.
+    """Time response of a system, with the method used and its events.
 
-    A `control.TimeResponseData` in all else: its signals, labels, indexing,
-    ``plot()`` and ``to_pandas()`` are python-control's.
+    A `control.TimeResponseData`: signals, labels, indexing, ``plot()`` and
+    ``to_pandas()`` are those of python-control.
 
     Parameters
     ----------
@@ -26,12 +26,12 @@ class SimulationResponse(ct.TimeResponseData):  # type: ignore[misc] # python-co
     states, inputs : array_like, shapes (nstates, ntime) and (ninputs, ntime), optional
         Its states and inputs.
     method : str, optional
-        Name of the method that ran: "exact", "compiled", "python".
+        Name of the method used: "exact", "compiled" or "python".
     reason : str, optional
-        Why that method was chosen, in words; and where an output is uncertain,
-        the estimated error and the tolerance that suffices.
+        Why that method was chosen; where an output is uncertain, also the
+        estimated error and the tolerance that suffices.
     events : sequence of Occurrence, optional
-        Crossings of the limits that were watched, in order of time.
+        Crossings of the limits of events, in order of time.
     **labels
         Further arguments of `control.TimeResponseData`.
 
@@ -41,10 +41,12 @@ class SimulationResponse(ct.TimeResponseData):  # type: ignore[misc] # python-co
         Times [s].
     y, x, u : ndarray, shapes (noutputs, ntime), (nstates, ntime) and (ninputs, ntime)
         Outputs, states and inputs, never squeezed.
-    method, reason : str
-        As above.
+    method : str
+        Name of the method used.
+    reason : str
+        Why it was chosen, and where an output is uncertain the estimated error.
     events : list of Occurrence
-        As above.
+        Crossings of the limits of events, in order of time.
 
     Examples
     --------

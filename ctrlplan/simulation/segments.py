@@ -206,7 +206,7 @@ def integrate(
             reach = 0.5 * (right - left)
             continue
         if not np.isfinite(found).all():
-            raise SolverError(f"the solver must reach {last:g} s, got to {left:g} s: a state is infinite beyond")
+            raise SolverError(f"the solver must reach {last:g} s, got to {left:g} s: a state is not finite after that")
         if not memory.record(left, right, series, grid, found):
             reach = 0.5 * (right - left)
             continue
@@ -302,7 +302,7 @@ class _Schedule:
             traits = network.blocks[i].traits
             if float(traits.period or 0.0) < 4.0 * self._tolerance:
                 raise ValueError(
-                    f"the period of {network.blocks[i].name} must be told from 0 in times up to {latest:g} s, "
+                    f"the period of {network.blocks[i].name} must exceed the rounding of times up to {latest:g} s, "
                     f"got {traits.period:g} s"
                 )
             self._periods[i] = _fraction(traits.period or 0.0)

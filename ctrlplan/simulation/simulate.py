@@ -1,4 +1,4 @@
-"""One function that runs any loop."""
+"""Simulation of a system: checks, choice of the method, response."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ from ctrlplan.simulation.response import SimulationResponse
 from ctrlplan.simulation.signals import Inputs, input_signals
 
 MethodName = Literal["auto", "exact", "compiled", "python"]
-"""Methods of the package, and the choice among them."""
+"""Names of the methods; "auto" chooses among them."""
 
 _LONGEST = 1e15
-"""Seconds after which a double cannot tell one microsecond from the next, by far."""
+"""Longest run [s]: far beyond the times at which doubles resolve a microsecond."""
 
 _NO_TIMEBASE = (
     "{} has states and no timebase (dt = None): it is simulated as continuous-time, as by "
@@ -50,106 +50,107 @@ def simulate(
     params: Mapping[str, object] | None = None,
     events: Events = None,
 ) -> SimulationResponse:
-    """Response of a system to plans.
+    """Time response of a system to plans and other inputs.
 
     A continuous linear system, interconnections and plan sources included, is
-    solved exactly: the error is that of rounding whatever the sample spacing.
-    Others are flattened, each block called once a step, and integrated from
-    breakpoint to breakpoint, so that no plan is skipped: compiled by CasADi
-    under CVODES where every block can be traced, by Python and LSODA otherwise.
+    solved exactly: the error is rounding, whatever the sample spacing. Other
+    systems are flattened, with one call of each block per step, and integrated
+    from breakpoint to breakpoint: compiled by CasADi and solved by CVODES
+    where every block can be traced, otherwise by Python and LSODA.
 
     Parameters
     ----------
     system : control system or Prepared
-        With whatever inputs; unmodified python-control objects, or what
-        `prepare` made of one. The built form is kept, and rebuilt where maps,
-        parameters, blocks or what their functions refer to have changed. A system with states and without a
-        timebase (dt = None) is simulated as continuous-time, with a warning.
+        Any python-control system, unmodified, or the result of `prepare`. Its
+        internal form is cached, and rebuilt when connections, parameters,
+        blocks or the objects that their functions refer to have changed. A
+        system with states and without a timebase (dt = None) is simulated as
+        continuous-time, with a warning.
     timepts : array_like, shape (ntime,)
-        Sample times [s], strictly increasing, two or more. Of a discrete system
-        multiples of its sampling time from the first on; where that is
-        unspecified (dt = True), evenly spaced, one step of the system each.
+        Sample times [s], two or more, strictly increasing. For a discrete
+        system: whole sampling periods apart; with unspecified sampling time
+        (dt = True) evenly spaced, one step of the system each.
     inputs : Trajectory, array_like, mapping or None, optional
         For all inputs in order: a trajectory with as many axes, a number, an
-        array (ninputs, ntime) of samples taken for linear in between, or a list
-        of one of these for each input; or by name, ``{"r": plan, "d": 0.1}``,
-        each for one input, 0 where unnamed.
+        array (ninputs, ntime) of samples, linear in between, or a list with one
+        of these for each input. By name: ``{"r": plan, "d": 0.1}``; inputs
+        without an entry are 0.
     initial_state : array_like, shape (nstates,), float or None, optional
         State at the first sample time, a number for all states. None: the
         initial state that the system or its blocks declare (see `declare`; as
         `crane_loop` does), and 0 where none does.
     method : {"auto", "exact", "compiled", "python"}, optional
-        "auto" takes the first of the others that applies; these raise where
-        they do not apply.
+        "auto" uses the first of the others that applies. The others raise an
+        error if they do not apply.
     rtol : float, optional
-        Relative tolerance of a numerical solver; "exact" needs none.
+        Relative tolerance of the numerical solvers; not used by "exact".
     atol : float, optional
-        Absolute tolerance for all states. None, the default, is 1e-10 of each
-        state's own scale, its largest displacement from its start: a run in
-        which a state moves less than 1e-3, or less than a hundredth of its
-        size, is repeated in the scales that it found (four runs at most). A
-        run is also repeated, with a thousandth of `rtol`, where other states
-        depend on the sine of a huge angle, or on the like.
+        Absolute tolerance of all states. None, the default: 1e-10 of each
+        state's scale, which is its largest displacement from its initial value.
+        A run in which a state moves by less than 1e-3, or by less than 1 % of
+        its size, is repeated with the scales found (at most four runs). A run
+        is also repeated, with a thousandth of `rtol`, where small relative
+        errors of a large state matter, as with the sine of a large angle.
     params : mapping, optional
         Parameters of the blocks.
     events : sequence of Event or None, optional
-        Limits of signals whose crossings are recorded, and may end the run, in
+        Limits of signals whose crossings are recorded and may end the run, in
         addition to those that blocks declare, as a PID does. None, the default:
-        the declared ones alone. An empty sequence: none at all, not even those.
-        Signals are evaluated at the sample times and at sixteen instants in a
-        period of the loop's fastest oscillation: closer crossings need closer
-        sample times.
+        the declared ones only. An empty sequence: no events, declared ones
+        included. Signals are evaluated at the sample times and sixteen times
+        per period of the loop's fastest oscillation; crossings closer together
+        require closer sample times.
 
     Returns
     -------
     SimulationResponse
-        A `control.TimeResponseData` with the fields ``method`` and ``reason``,
-        what ran and why, and ``events``, a list of `Occurrence` in order of
-        time. Where an event ended the run its time is the last. Where an output
-        is not accurate to 1e-6 of its range, ``reason`` gives the estimate and
-        the tolerance that suffices.
+        A `control.TimeResponseData` with three further attributes: ``method``,
+        the method used; ``reason``, why it was chosen; ``events``, a list of
+        `Occurrence` in order of time. If an event ends the run, its time is the
+        last. If an output is not accurate to 1e-6 of its range, ``reason``
+        gives the estimated error and the tolerance that suffices.
 
     Raises
     ------
     TypeError
-        If `system` is no system, or times, inputs or states are no real
-        numbers: strings, complex numbers, dates, values with units.
+        If `system` is not a control system, or times, inputs or states are not
+        real numbers (strings, complex numbers, dates, values with units).
     ValueError
-        If times do not increase or are no sampling instants of a discrete
-        system, inputs do not fit, values are masked, or a method is asked for
-        that the system does not allow; the reason is in the message.
+        If times do not increase or are not sample times of a discrete system,
+        inputs do not fit, values are masked, or the requested method does not
+        apply; the message gives the reason.
     RuntimeError
-        If an integrator fails, or an algebraic loop has no solution that is
-        found; time and block are in the message.
+        If the integrator fails, or no solution of an algebraic loop is found;
+        the message gives time and block.
 
     Warns
     -----
     UserWarning
         If a parameter is read by no block; if a system with states has no
-        timebase; if a linear response depends on digits that rounding takes
-        from the system's matrices; or if a block has equations of a kind that
-        only python-control runs: its `control.input_output_response` is then
-        used, with the same tolerances.
+        timebase; if rounding errors of the system matrices change a linear
+        response noticeably; or if a block overrides the equations of its class:
+        `control.input_output_response` is then used, with the same tolerances.
 
     Notes
     -----
-    Inputs reach the blocks exactly: constants to the bit, samples and plans
+    Constant inputs reach the blocks to the last bit; samples and plans stay
     within their own range.
 
-    Switches in t: breakpoints that a block declares are stopped at. In compiled
-    blocks undeclared ones are found in the equations. A block that is run by
-    Python and reads t is evaluated at least once between two sample times: a
-    pulse that is shorter than the sample spacing must be declared.
+    Equations that switch with time: the integrator stops at breakpoints that a
+    block declares. In compiled blocks undeclared ones are found in the
+    equations. A block run by Python that reads t is evaluated at least once
+    between two sample times: a pulse shorter than the sample spacing must be
+    declared.
 
     Discrete blocks are evaluated in the order of the signal flow, first the
-    outputs, then the updates, each once a sample, so that they may have a
-    memory besides their states. The functions of a continuous block must return
-    equal values for equal arguments.
+    outputs, then the updates, each once per sample; they may therefore have
+    memory other than their states. The functions of a continuous block must
+    return equal values for equal arguments.
 
     A run by Python that makes no progress ends with an error: after 2,000
-    evaluations of the equations about one instant, and where 60,000 evaluations
-    (and 300 for each segment between breakpoints and samples) have been spent
-    and a block jumps, has an infinite slope or is random at that time.
+    evaluations of the equations about one time, or when 60,000 evaluations
+    (plus 300 for each segment between breakpoints and samples) are exceeded
+    and a block is discontinuous, has an infinite slope or is random there.
     """
     job = checked_job(system, timepts, inputs, initial_state, rtol, atol, params, events)
     chosen = methods.named(methods.METHODS, method)
@@ -171,13 +172,13 @@ def checked_job(
     params: Mapping[str, object] | None = None,
     events: Events = None,
 ) -> Job:
-    """Arguments of `simulate`, checked."""
+    """Job from the arguments of `simulate`, which are checked."""
     begin_run()
     times = real_array(timepts, "timepts")
     if times.ndim != 1 or times.size < 2 or not np.isfinite(times).all() or not np.all(np.diff(times) > 0):
         raise ValueError(f"timepts must be two or more finite times that increase strictly, got {timepts!r:.80}")
     if times[-1] - times[0] > _LONGEST:
-        raise ValueError(f"timepts must span {_LONGEST:g} s at most, got {times[-1] - times[0]:g} s")
+        raise ValueError(f"timepts must span at most {_LONGEST:g} s, got {times[-1] - times[0]:g} s")
     tolerances: dict[str, object] = {"rtol": rtol}
     if atol is not None:
         tolerances["atol"] = atol
@@ -191,16 +192,16 @@ def checked_job(
 
 
 def response_to(job: Job, chosen: Sequence[Method]) -> SimulationResponse:
-    """Response by the first of some methods that applies."""
+    """Response by the first method that applies."""
     fresh = fresh_job(job)
     try:
         return _response(job, methods.recorded(job, chosen))
-    except FeedthroughError:  # no algebraic loop at the start, but later: solved as one from the start on
+    except FeedthroughError:  # no algebraic loop at the start, but later: repeat with the loop solved from the start
         return _response(fresh, methods.recorded(replace(fresh, trials=False), chosen))
 
 
 def _warn_of_unread(job: Job) -> None:
-    """Warn of parameters that no block reads: they are misspelt."""
+    """Warn of parameters that no block reads, probably misspelt."""
     for name, value in job.params.items():
         if np.ndim(value) == 0 and not job.prepared.reads(name, value):
             warnings.warn(
@@ -211,7 +212,7 @@ def _warn_of_unread(job: Job) -> None:
 
 
 def _response(job: Job, record: Record) -> SimulationResponse:
-    """Response at the times asked for, up to the event that ends it."""
+    """Response at the times of a job, up to the event that ends it."""
     prepared = job.prepared
     found = _occurrences(record)
     places = np.searchsorted(record.times, job.times[job.times <= record.times[-1]])
@@ -242,7 +243,7 @@ def _response(job: Job, record: Record) -> SimulationResponse:
 
 
 def _occurrences(record: Record) -> list[Occurrence]:
-    """Every crossing of what was watched, in order of time."""
+    """Crossings of the limits of events, in order of time."""
     if not record.watched:
         return []
     seen, found = record.snapshot(record.times, record.states), []
@@ -252,7 +253,7 @@ def _occurrences(record: Record) -> list[Occurrence]:
 
 
 def _value_at(record: Record, entry: Watched, k: int, t: float) -> float:
-    """Watched signal at a time from times[k] of a record to the next."""
+    """Signal of an event at a time between times[k] and times[k + 1] of a record."""
     return float(entry.value(record.snapshot(np.array([t]), record.state_at(k, t)[:, None]))[0])
 
 

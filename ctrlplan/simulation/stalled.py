@@ -28,7 +28,7 @@ _ROUNDING = 1e-13
 """Change of values, relative to their size, below which it is taken for rounding."""
 
 SMOOTHING = (
-    "replace it by a steep but continuous function, such as np.tanh(s/width) for np.sign(s) and "
+    "replace it with a steep continuous function, such as np.tanh(s/width) for np.sign(s) and "
     "np.clip(s/width, 0, 1) for s > 0, or give the block a fixed step by cp.sample_hold"
 )
 
@@ -52,8 +52,9 @@ def unrepeatable(network: Network, params: Params, t: float, x: Array, w: Array)
             first, second = values(t, state, fed), values(t, state, fed)
             if first is not None and second is not None and not np.array_equal(first, second, equal_nan=True):
                 return (
-                    f"block {block.name} returns different values for equal arguments: it is random, or remembers its "
-                    "calls. Give random values as samples of an input, and a memory as states or by cp.sample_hold"
+                    f"block {block.name} returns different values for equal arguments: it is random or depends on "
+                    "earlier calls; give random values as samples of an input, and a memory as states or by "
+                    "cp.sample_hold"
                 )
     return ""
 
@@ -74,7 +75,7 @@ def cause(network: Network, params: Params, t: float, x: Array, w: Array, span: 
             for kind, words, then in _WORDS:
                 at = next((label for label, found in kinds.items() if found == kind), None)
                 if at is not None:
-                    return f"what block {block.name} returns {words} {at}{then}: {SMOOTHING}"
+                    return f"block {block.name} {words} {at}{then}: {SMOOTHING}"
     return ""
 
 
@@ -124,8 +125,8 @@ def _kinds(values: Values, t: float, x: Array, u: Array, span: float) -> Iterato
 
 
 _WORDS = (
-    ("jump", "jumps there with", ", and the solution stays at the jump"),
-    ("slope", "has an infinite slope there over", ""),
+    ("jump", "is discontinuous there in", ", and the solution stays at the discontinuity"),
+    ("slope", "has an infinite slope there in", ""),
 )
 """Kinds of `_kind`, the first one found is named, and how."""
 

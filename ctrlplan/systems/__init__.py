@@ -1,4 +1,4 @@
-"""Blocks that python-control interconnects: plans, laws and plants."""
+"""Blocks for python-control interconnections: sources, controllers and plants."""
 
 from ctrlplan.flatness.quantities import flat_quantities
 from ctrlplan.systems import plants

@@ -1,4 +1,4 @@
-"""States and references from which a linear loop keeps its limits for ever."""
+"""States and references from which a linear loop satisfies its limits for all future times."""
 
 from __future__ import annotations
 
@@ -21,72 +21,74 @@ from ctrlplan.trajectories.fields import Fields
 Limits: TypeAlias = Mapping[str, Range]
 
 _SPARED = 0.1
-"""Part of the margin that is given away so that rows which hardly matter can be left out."""
+"""Fraction of the margin given up so that nearly redundant rows can be omitted."""
 
 _INSIDE = 1e-8
-"""Distance that is kept from limits for the rounding of a run, relative to half their distance."""
+"""Distance from the limits for rounding errors of a run, relative to half their distance."""
 
 _FAR = 1e6
-"""Where an output has one limit, the other is so many times its size away: of unbounded sets rows have no end."""
+"""Distance of the other limit of an output with one limit, relative to its size: unbounded sets need no finite rows."""
 
 
 class AdmissibleSet(Fields):
     r"""Maximal output admissible set of a linear loop.
 
     The pairs of a state x and a constant reference v from which every limited
-    output stays within its limits at all times, between samples too, as
+    output satisfies its limits for all future times, also between samples, as
     finitely many inequalities
 
     .. math:: G x + F v \le h.
 
-    Over a cell of time an output is a polynomial to rounding, and lies between
-    its least and greatest Bernstein coefficient, which are linear in x and v.
-    At rest outputs keep a margin from the limits; then what they do beyond some
-    time cannot matter. A row is left out where the others imply it; a tenth
-    of the margin is given away for that.
+    Over a short time interval an output is a polynomial to rounding accuracy and
+    lies between its minimum and maximum Bernstein coefficients, which are linear
+    in x and v. In steady state outputs have a margin from the limits, so that
+    a finite time interval suffices. Redundant rows are omitted; a tenth of the
+    margin is given up for that.
 
     Parameters
     ----------
     loop : control.StateSpace or control.TransferFunction
-        Continuous and stable, linear interconnections included.
+        Continuous-time and stable; linear interconnections are accepted.
     limits : mapping of str to (float, float) or float
         Minimum and maximum of each limited output; a number a for (-a, a). One
-        of them may be infinite; it then stands for a million times the other
-        (or 1) away from it.
+        of them may be infinite: it is placed at a distance of 1e6 times the
+        magnitude of the other (or 1e6 if that is 0).
     dt : float
         Period of the governor [s], above 0.
     references : sequence of str, optional
-        Inputs that are governed: all but the disturbances unless given. What
-        is neither is 0.
+        Inputs that are governed, by default all but the disturbances. Other
+        inputs are 0.
     margin : float, optional
-        Distance from the limits at rest, relative to half the distance between
-        two, to the size of one alone (to 1 where that is 0); in (0, 1).
+        Distance from the limits in steady state, relative to half the distance
+        between them; with a single limit relative to its magnitude (to 1 if
+        that is 0). In (0, 1).
     disturbances : mapping of str to float, optional
-        Greatest magnitude of inputs that may do as they like: the set holds
-        whatever they do.
+        Bounds on the magnitude of unknown disturbance inputs; the set is robust
+        to all disturbances within them.
     origin : (array_like, array_like), optional
-        State and reference at which a loop that was linearised has its zeros;
-        limits are of what its outputs differ by from those there.
+        State and reference at the operating point of a linearised loop; limits
+        then apply to deviations of the outputs from their values there.
 
     Attributes
     ----------
     references, states : tuple of str
-        Labels of v and x.
+        Labels of the references v and the states x.
     dt : float
-        Period [s].
+        Period of the governor [s].
     state_matrix, reference_matrix, bounds : ndarray, shapes (nrows, nstates), (nrows, nreferences), (nrows,)
-        G, F and h, in units of half the distance between limits, or of the size of one.
+        G, F and h, scaled by half the distance between the limits, or by the
+        magnitude of a single limit.
     periods : int
-        After how many periods no inequality is needed.
+        Number of periods after which no further inequality is required.
 
     Raises
     ------
     TypeError
-        If `loop` is no linear system.
+        If `loop` is not a linear system.
     ValueError
-        If it is discrete, not stable or without reference, a label is unknown,
-        limits do not increase, a number is out of range, or nothing is
-        admissible.
+        If the loop is discrete, not stable or has no reference, a label is
+        unknown, limits do not increase, a number is out of range, or the set is
+        empty.
 
     References
     ----------
@@ -163,23 +165,23 @@ class AdmissibleSet(Fields):
         return bool((self._rows @ np.concatenate([x, v], dtype=float) <= self.bounds).all())
 
     def fraction(self, x: ArrayLike, v: ArrayLike, r: ArrayLike) -> float:
-        """Part of the way from v to r that is admissible at a state.
+        """Largest admissible fraction of the way from v to r.
 
         Parameters
         ----------
         x : array_like, shape (nstates,)
             State.
         v, r : array_like, shape (nreferences,)
-            Reference that is held, and the one asked for.
+            Present reference and commanded reference.
 
         Returns
         -------
         float
             Largest kappa in [0, 1] for which x and v + kappa (r - v) are in the
-            set, 1 exactly where x and r are. Where there is none: 0 if x and v
-            are outside by no more than the margin, as after a period they may
-            be by rounding and by what was given away; nan if they are farther
-            outside or not finite.
+            set; exactly 1 if x and r are. If there is none: 0 if x and v are
+            outside by at most the margin, which rounding and the omitted rows
+            can cause after a period; nan if they are farther outside or not
+            finite.
         """
         point = np.concatenate([x, v, r], dtype=float)
         if not np.isfinite(point).all():
@@ -205,7 +207,7 @@ def _problem(
     if not isinstance(loop, ct.StateSpace):
         raise TypeError(
             f"loop must be a control.StateSpace or TransferFunction, got {type(loop).__name__}; "
-            "of others ctrlplan.Predictor says what is admissible"
+            "use ctrlplan.Predictor for nonlinear loops"
         )
     if loop.dt not in (None, 0):
         raise ValueError(f"loop must be continuous, got {loop.name} with dt = {loop.dt}")
@@ -214,7 +216,7 @@ def _problem(
         tuple(label for label in inputs if label not in disturbances) if references is None else tuple(references)
     )
     if not governed:
-        raise ValueError(f"references must name an input of {loop.name} at least, got none")
+        raise ValueError(f"references must name at least one input of {loop.name}, got none")
     for name, given, known in (
         ("references", governed, inputs),
         ("disturbances", tuple(disturbances), [label for label in inputs if label not in governed]),
@@ -222,11 +224,11 @@ def _problem(
     ):
         for label in given:
             if label not in known:
-                raise ValueError(f"{name} must be of {', '.join(known) or 'no signal'}, got {label!r}")
+                raise ValueError(f"{name} must be among {', '.join(known) or 'no signals'}, got {label!r}")
     if len(set(governed)) < len(governed):
         raise ValueError(f"references must not name an input twice, got {', '.join(governed)}")
     if not limits:
-        raise ValueError("limits must name an output at least, got none")
+        raise ValueError("limits must name at least one output, got none")
     a, b, c, d = _matrices(loop)
     poles = np.linalg.eigvals(a)
     if poles.size and not poles.real.max() < -1e-9 * np.abs(poles).max():
@@ -263,7 +265,7 @@ def _problem(
 
 
 def _matrices(loop: ct.StateSpace) -> tuple[Array, Array, Array, Array]:
-    """Matrices of a linear system: those that python-control keeps of an interconnection come by differences."""
+    """Matrices of a linear system; python-control computes those of an interconnection by finite differences."""
     if not isinstance(loop, ct.InterconnectedSystem):
         a, b, c, d = (np.asarray(m, dtype=float) for m in (loop.A, loop.B, loop.C, loop.D))
         return a, b, c, d
@@ -276,7 +278,7 @@ def _matrices(loop: ct.StateSpace) -> tuple[Array, Array, Array, Array]:
 
 
 def _inside(room: Array, rise: Array, otherwise: float) -> float:
-    """Largest kappa in [0, 1] with room - kappa rise >= 0, where some room is below 0."""
+    """Largest kappa in [0, 1] with room - kappa rise >= 0, if some entries of room are negative."""
     short = room < 0.0
     if (rise[short] >= 0.0).any():
         return otherwise
@@ -287,7 +289,7 @@ def _inside(room: Array, rise: Array, otherwise: float) -> float:
 
 
 def _shift(state: Array, reference: Array, origin: tuple[ArrayLike, ArrayLike] | None) -> Array | float:
-    """What an origin adds to the bounds of rows."""
+    """Shift of the bounds of rows by an operating point."""
     if origin is None:
         return 0.0
     given = [np.atleast_1d(np.asarray(values, dtype=float)) for values in origin]
@@ -298,7 +300,7 @@ def _shift(state: Array, reference: Array, origin: tuple[ArrayLike, ArrayLike] |
 
 
 def _determined(problem: Problem, margin: float) -> tuple[Rows, float]:
-    """Rows that determine the set, and the time [s] up to which they look."""
+    """Irredundant rows of the set, and the last time [s] that they constrain."""
     seen = seen_directions(problem)
     cells = output_cells(problem, seen, margin)
     eroded, in_all = erosion(problem, cells)
@@ -311,14 +313,14 @@ def _determined(problem: Problem, margin: float) -> tuple[Rows, float]:
     count, p, each, n = rows.shape
     rows, eroded = rows.swapaxes(0, 1).reshape(p, count * each, n), eroded[:count].swapaxes(0, 1).reshape(p, -1)
     ends = np.repeat(cells.ends[:count], each)
-    # Coarse in time first: between two rows that are kept others follow sooner than after one.
+    # Coarse in time first: rows between two known ones are more often redundant.
     for places in _by_halving(ends.size):
         polytope.add(rows[:, places], low[:, None] + eroded[:, places], high[:, None] - eroded[:, places], ends[places])
     return polytope.reduced()
 
 
 def _by_halving(count: int) -> Iterator[NDArray[np.intp]]:
-    """Numbers below a count: multiples of a power of 2, then of half of it that are new, and so on to all."""
+    """Indices below a count in bit-reversed blocks: multiples of a power of 2, then of half of it, and so on."""
     stride = 1 << max(count - 1, 0).bit_length()
     yield np.arange(0, count, stride)
     while stride > 1:
@@ -327,10 +329,10 @@ def _by_halving(count: int) -> Iterator[NDArray[np.intp]]:
 
 
 def _check_equilibrium(problem: Problem, low: Array, high: Array) -> None:
-    """Refuse limits between which the loop cannot rest."""
+    """Raise if no steady state satisfies the limits with their margin."""
     p, m = problem.gain.shape
     both = np.vstack([problem.gain, -problem.gain])
-    # Any reference, and a room of at most 1 that it leaves on all sides: there always is one, if negative.
+    # Maximise the distance from all limits (at most 1, negative if infeasible) over the references.
     found: Any = linprog(
         [*[0.0] * m, -1.0],
         np.column_stack([both, np.ones(2 * p)]),
@@ -340,6 +342,6 @@ def _check_equilibrium(problem: Problem, low: Array, high: Array) -> None:
     room = float(found.x[-1])
     if room <= 0.0:
         raise ValueError(
-            f"limits of {', '.join(problem.labels)} must leave a reference at which the loop rests inside them by the "
-            f"margin, whatever the disturbances, got {abs(room):.3g} of half their distance too little"
+            f"limits of {', '.join(problem.labels)} must allow a steady state inside them by the margin under all "
+            f"disturbances, got limits too narrow by {abs(room):.3g} of half their distance"
         )

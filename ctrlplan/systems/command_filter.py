@@ -1,4 +1,4 @@
-"""From a command that jumps to a reference with its derivatives."""
+"""Command filter: a reference and its derivatives from a discontinuous command."""
 
 from __future__ import annotations
 
@@ -27,9 +27,10 @@ def create_command_filter_iosystem(
 ) -> ct.StateSpace:
     """Command filter 1/(s/w + 1)^n with derivative outputs.
 
-    For a law that reads derivatives of a reference that comes in steps, as from
-    a governor. The output of a plan lags by n/w, unless the command is the sum
-    of its derivatives weighted by `command_filter_gains`.
+    For a controller that requires derivatives of a piecewise constant reference,
+    as from a governor. The output lags the command by n/w, unless the command
+    is the sum of the derivatives of the plan weighted by
+    `command_filter_gains`.
 
     States: r and its derivatives r_d1, ... up to n - 1. Inputs: the command
     r_cmd. Outputs: r, r_d1, ... up to `derivatives`.
@@ -41,17 +42,18 @@ def create_command_filter_iosystem(
     derivatives : int, optional
         Highest derivative among the outputs.
     order : int, optional
-        n, at least ``derivatives + 1``, which is the default: the derivative n
-        jumps with the command.
+        n, at least ``derivatives + 1`` (default). Derivative n is discontinuous
+        where the command is.
     initial : float, optional
-        Reference at the start of a run, in equilibrium; the declared initial state.
+        Reference at the start of a run, in equilibrium: declared as the initial
+        state.
     inputs : str, optional
-        Name of the command: r_cmd unless given.
+        Name of the command, by default r_cmd.
     outputs : str or sequence of str, optional
-        Name of the reference, r unless given, which its derivatives are named
-        after; or a name for each output.
+        Name of the reference, by default r, from which the names of its
+        derivatives are formed; or a name for each output.
     name : str, optional
-        Name of the block: that of the first output with ``_filter`` unless given.
+        Name of the block, by default that of the first output with ``_filter``.
 
     Returns
     -------
@@ -61,9 +63,10 @@ def create_command_filter_iosystem(
     Raises
     ------
     TypeError
-        If an argument is of a wrong kind.
+        If an argument has the wrong type.
     ValueError
-        If an argument is out of range, or names are not as many as signals.
+        If an argument is out of range, or the number of names differs from the
+        number of signals.
 
     Examples
     --------
@@ -105,9 +108,10 @@ def create_command_filter_iosystem(
 
 
 def command_filter_gains(bandwidth: float, order: int) -> tuple[float, ...]:
-    """Gains of a plan's derivatives in the command of a filter.
+    """Gains of a plan's derivatives that cancel the lag of a command filter.
 
-    With this command the output of `create_command_filter_iosystem` is the plan.
+    With the weighted sum of the derivatives as the command, the output of
+    `create_command_filter_iosystem` is the plan.
 
     Parameters
     ----------

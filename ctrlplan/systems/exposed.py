@@ -1,4 +1,4 @@
-"""Systems that put out their states as well."""
+"""Systems with their states among their outputs."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from ctrlplan.traits import declare, traits_of
 
 
 def expose_states(system: System, name: str | None = None) -> System:
-    """Same system with its states among its outputs.
+    """System with its states as additional outputs.
 
-    Interconnections are made anew around blocks that put out their states, so
-    that `ctrlplan.simulate` sees every block as before, sampled ones included.
+    Interconnections are rebuilt from blocks with state outputs, so that
+    `ctrlplan.simulate` still has access to every block, sampled ones included.
 
     States and inputs: those of `system`. Outputs: its own, then its states,
-    named by `state_signals`.
+    with names by `state_signals`.
 
     Parameters
     ----------
@@ -29,19 +29,20 @@ def expose_states(system: System, name: str | None = None) -> System:
         A `control.StateSpace`, `control.TransferFunction`,
         `control.NonlinearIOSystem` or `control.InterconnectedSystem`.
     name : str, optional
-        Name of the system that is returned: that of `system` unless given.
+        Name of the new system, by default that of `system`.
 
     Returns
     -------
     control system
-        Of the kind of `system`, of a transfer function a `control.StateSpace`.
+        Of the type of `system`; a `control.StateSpace` for a transfer function.
 
     Raises
     ------
     TypeError
-        If `system` is of another kind, or a block has equations of a kind of its own.
+        If `system` has another type, or a block overrides the equations of its
+        class.
     ValueError
-        If an output is named as a state would be: the states are put out already.
+        If an output already has the name of a state output.
 
     Examples
     --------
@@ -54,7 +55,7 @@ def expose_states(system: System, name: str | None = None) -> System:
     names = state_signals(getattr(system, "state_labels", None) or ())
     twice = set(names) & set(getattr(system, "output_labels", None) or ())
     if twice:
-        raise ValueError(f"outputs of {system.name} must not be named as its states are put out, got {min(twice)!r}")
+        raise ValueError(f"outputs of {system.name} must not have the name of a state output, got {min(twice)!r}")
     found = _exposed(system, names)
     if found is system:
         found = copy.copy(system)
@@ -63,10 +64,10 @@ def expose_states(system: System, name: str | None = None) -> System:
 
 
 def state_signals(labels: Sequence[str]) -> list[str]:
-    """Names of the outputs by which `expose_states` puts out states.
+    """Names of the state outputs of `expose_states`.
 
-    Letters, digits and underlines of the state's label, and ``_state``, so that
-    nothing joins by name what was not meant to be joined.
+    Letters, digits and underscores of the state label, followed by ``_state``,
+    so that `control.interconnect` connects no signal unintentionally.
 
     Parameters
     ----------
@@ -76,7 +77,7 @@ def state_signals(labels: Sequence[str]) -> list[str]:
     Returns
     -------
     list of str
-        As many names, no two the same.
+        As many names, all different.
 
     Examples
     --------
@@ -91,7 +92,7 @@ def state_signals(labels: Sequence[str]) -> list[str]:
 
 
 def _exposed(system: System, names: Sequence[str]) -> System:
-    """System with its states put out under some names; the same object where it has none."""
+    """System with state outputs of given names; the same object if it has no states."""
     if not isinstance(system, ct.StateSpace | ct.NonlinearIOSystem):
         raise TypeError(f"system must be a control system with states, got {type(system).__name__}")
     if not names:
@@ -118,10 +119,10 @@ def _state_space(system: ct.StateSpace, names: Sequence[str]) -> ct.StateSpace:
 
 
 def _block(system: ct.NonlinearIOSystem, names: Sequence[str]) -> ct.NonlinearIOSystem:
-    """Copy of a block, all that it says of itself included, with longer outputs."""
+    """Copy of a block with its declared traits and additional outputs."""
     if any(getattr(type(system), name) is not getattr(ct.NonlinearIOSystem, name) for name in ("_rhs", "_out")):
         raise TypeError(
-            f"block {system.name} must have updfcn and outfcn, got a {type(system).__name__} of its own kind"
+            f"block {system.name} must have updfcn and outfcn, got a {type(system).__name__} that overrides them"
         )
     block = copy.copy(system)
     block.outfcn = partial(_with_states, system.outfcn)
@@ -163,13 +164,13 @@ def _interconnection(system: ct.InterconnectedSystem, names: Sequence[str]) -> c
     found.set_connect_map(connect)
     found.set_input_map(np.array(system.input_map))
     found.set_output_map(np.vstack([own_outputs, state_outputs]))
-    if isinstance(system, ct.StateSpace):  # of linear blocks python-control keeps the matrices as well
+    if isinstance(system, ct.StateSpace):  # a linear interconnection of python-control stores its matrices as well
         found = ct.LinearICSystem(found, _state_space(system, names), system.connection_type)
     return declare(found, initial_state=traits_of(system).initial_state)
 
 
 def _with_states(outputs: Value, t: Value, x: Value, u: Value, params: Params) -> Value:
-    """Outputs of a block, then its states: of numbers or of symbols."""
+    """Outputs of a block, then its states; numeric or symbolic."""
     own = x if outputs is None else outputs(t, x, u, params)
     if isinstance(own, np.ndarray) and isinstance(x, np.ndarray):
         return np.concatenate([own.ravel(), x])
@@ -177,13 +178,13 @@ def _with_states(outputs: Value, t: Value, x: Value, u: Value, params: Params) -
 
 
 def _entries(values: Value) -> list[Value]:
-    """Entries of a column: a list, an array, or a symbol of CasADi, which counts them by a method."""
+    """Entries of a list, an array or a column of CasADi symbols."""
     count = getattr(values, "numel", None)
     return [values[k] for k in range(count())] if count is not None else list(np.ravel(values))
 
 
 def _free(name: str, taken: Collection[str]) -> str:
-    """Name, lengthened until it is not taken."""
+    """Name with underscores appended until it is unused."""
     while name in taken:
         name += "_"
     return name

@@ -1,4 +1,4 @@
-"""Feedforward of a linear loop: the command under which it follows its plan exactly."""
+"""Feedforward of a linear loop: the command for exact tracking of a plan."""
 
 from __future__ import annotations
 
@@ -27,25 +27,26 @@ def create_feedforward_iosystem(
 ) -> ct.StateSpace:
     r"""Exact inverse of a linear loop without finite zeros.
 
-    The output y of such a loop is flat: with the transfer function
-    g/(s^n + a_(n-1) s^(n-1) + ... + a_0) from its input to y the command
+    The output y of such a loop is flat. With the transfer function
+    g/(s^n + a_(n-1) s^(n-1) + ... + a_0) from its input to y, the command
 
     .. math:: r = \frac1g \Bigl(y_d^{(n)} + \sum_{k=0}^{n-1} a_k\, y_d^{(k)}\Bigr)
 
-    makes y = y_d, from a start on the plan; for k/(s^2 + s) in unity feedback
-    it is y_d + (y_d'' + y_d')/k. The loop's own poles say how errors decay.
+    gives y = y_d if the loop starts on the plan; for k/(s^2 + s) in unity
+    feedback it is y_d + (y_d'' + y_d')/k. Errors decay with the poles of the
+    loop.
 
-    No states. Inputs: y_ref, y_ref_d1, ... up to order n, y the output of the
-    loop, as `create_source_iosystem` names its outputs with ``suffix="_ref"``.
-    Outputs: the input r of the loop, by the loop's names.
+    No states. Inputs: y_ref, y_ref_d1, ... up to order n, with y the output of
+    the loop, as `create_source_iosystem` names its outputs with
+    ``suffix="_ref"``. Outputs: the input r of the loop, under its name.
 
     Parameters
     ----------
     loop : control.StateSpace or control.TransferFunction
-        Linear and continuous, with one input and one output; interconnections
-        of linear blocks are.
+        Linear and continuous-time, with one input and one output;
+        interconnections of linear blocks are accepted.
     labels : sequence of str or str, optional
-        Name of the plan's axis: that of the output of the loop unless given.
+        Name of the plan's axis, by default that of the output of the loop.
     suffix : str, optional
         Appended to the label.
     name : str, optional
@@ -54,17 +55,17 @@ def create_feedforward_iosystem(
     Returns
     -------
     control.StateSpace
-        A gain of n + 1 inputs and one output, of any time base.
+        Static gain with n + 1 inputs and one output, of any time base.
 
     Raises
     ------
     TypeError
         If the loop is not linear.
     ValueError
-        If it is discrete, has more than one input or output, does not bring its
-        input to its output, or has finite zeros (its inverse is then no sum of
-        derivatives; they are in the message); or if the label with the suffix is a
-        signal of the loop.
+        If it is discrete, has more than one input or output, a transfer function
+        of 0, or finite zeros (the message lists them; the inverse is then not a
+        sum of derivatives); or if the label with the suffix is a signal of the
+        loop.
 
     Examples
     --------
@@ -86,7 +87,7 @@ def create_feedforward_iosystem(
     label = checked_labels([reached] if labels is None else labels, 1)[0] + suffix
     if label in (given, reached):
         raise ValueError(
-            f"labels and suffix must not name a signal of the loop, which would be added to it, got {label!r}"
+            f"labels and suffix must not name a signal of the loop, to which it would be added, got {label!r}"
         )
     gains = _inverse(*(np.asarray(m, dtype=float) for m in (system.A, system.B, system.C, system.D)))
     names = [derivative_name(label, k) for k in range(gains.size)]
@@ -110,12 +111,12 @@ def _checked_loop(loop: ct.StateSpace | ct.TransferFunction) -> ct.StateSpace:
 
 
 def _inverse(a: Array, b: Array, c: Array, d: Array) -> Array:
-    """Gains of y, y', ..., y^(n) whose sum is the input.
+    """Gains of y, y', ..., y^(n) whose weighted sum is the input.
 
     y^(k) = c A^k x until the input appears, y^(n) = c A^n x + g r. The zeros are
-    the motions left where y and its first n - 1 derivatives are 0: they cannot
-    be seen in the input, and there are none, where c A^n is a sum of the rows
-    before it.
+    the eigenvalues of the motion with y and its first n - 1 derivatives equal
+    to 0; they do not affect the input, or there are none, if c A^n is a linear
+    combination of the rows before it.
     """
     rows = [c[0]]
     for _ in range(len(a)):
@@ -124,7 +125,7 @@ def _inverse(a: Array, b: Array, c: Array, d: Array) -> Array:
     sizes = [0.0, *(float(np.linalg.norm(row) * np.linalg.norm(b)) for row in rows[:-1])]
     seen = [abs(value) > _SMALL * size for value, size in zip(markov, sizes, strict=True)]
     if not any(seen):
-        raise ValueError("loop must bring its input to its output, got gain 0")
+        raise ValueError("the transfer function of loop must not be 0, got 0")
     order = seen.index(True)
     gain, last = markov[order], rows[order]
     norms = np.array([np.linalg.norm(row) for row in rows[:order]])

@@ -1,4 +1,4 @@
-"""Tracking law of flat plants: linearise by the flat output's flag, then place the poles of the error.
+"""Tracking control of flat plants: linearisation by the flag of the flat output, then pole placement.
 
 Equations (9)-(11) of the paper, (11) corrected: the sum starts at 0 and is subtracted.
 """
@@ -35,34 +35,34 @@ def create_flat_iosystem(
     suffix: str = "_ref",
     name: str = "flat_law",
 ) -> ct.NonlinearIOSystem:
-    r"""Law under which flat outputs follow their plan, (9)-(11) corrected.
+    r"""Tracking controller of a flat plant, (9)-(11) corrected.
 
     With y_1, ..., y_1^(r_1), y_2, ... the flag of the flat outputs,
 
     .. math:: v_j = y_{d,j}^{(r_j)} - \sum_{k=0}^{r_j - 1} \sigma_{j,k}\,(y_j^{(k)} - y_{d,j}^{(k)}),
         \qquad s^{r_j} + \sum_k \sigma_{j,k} s^k = \prod_k (s - p_{j,k}),
 
-    and u is what `flat.reverse` gives for the flag with v_j in the place
-    of y_j^(r_j). Plant and law together are chains of r_j integrators, on which
-    the errors obey the linear equation with the poles p_j.
+    and u is computed by `flat.reverse` from the flag with v_j in place of
+    y_j^(r_j). The closed loop consists of chains of r_j integrators, in which
+    the tracking errors satisfy the linear equation with the poles p_j.
 
-    No states. Inputs: of each flat output in turn the references, y_ref,
-    y_ref_d1, ... up to order r_j for one called y, as `create_source_iosystem`
-    names its outputs with ``suffix="_ref"``; then the plant's states by name.
-    Outputs: the plant's inputs by name, u of a plant whose input is u.
+    No states. Inputs: for each flat output its references, y_ref, y_ref_d1, ...
+    up to order r_j for one called y, as `create_source_iosystem` names its
+    outputs with ``suffix="_ref"``; then the states of the plant by name.
+    Outputs: the inputs of the plant by name, such as u.
 
     Parameters
     ----------
     flat : control.flatsys.FlatSystem
-        Plant that static feedback linearises, in continuous time. The flag of
+        Continuous-time plant that is linearisable by static feedback. The flag of
         flat output j has r_j + 1 entries, of which y_j, ..., y_j^(r_j - 1) are
-        functions of the state alone, and the r_j add up to the number of states.
+        functions of the state only; the sum of all r_j is the number of states.
     poles : sequence of sequences of complex
-        For each flat output r_j poles [rad/s], closed under conjugation and
-        with negative real parts; one flat sequence where there is one flat output.
+        r_j poles [rad/s] for each flat output, closed under conjugation, with
+        negative real parts; a single sequence for a single flat output.
     labels : sequence of str or str, optional
-        Names of the flat outputs: unless given, those of the plant's outputs
-        where these are the flat outputs and are named, else y, or y1, y2, ...
+        Names of the flat outputs. Default: the names of the plant's outputs if
+        these are the flat outputs and have names, otherwise y, or y1, y2, ...
     suffix : str, optional
         Appended to each label in the names of the references.
     name : str, optional
@@ -71,40 +71,41 @@ def create_flat_iosystem(
     Returns
     -------
     control.NonlinearIOSystem
-        Without states and of any time base.
+        Static, of any time base.
 
     Raises
     ------
     TypeError
-        If `flat` is no `control.flatsys.FlatSystem`, or poles or labels are of
-        a wrong kind.
+        If `flat` is not a `control.flatsys.FlatSystem`, or poles or labels have
+        the wrong type.
     ValueError
-        If static feedback does not linearise `flat`: a derivative below
-        the last depends on an input (the message says which), the decoupling
-        matrix is singular, or the flags are too short; if `forward`, `reverse`
-        and the plant's equations do not belong together; or if poles or labels
-        are wrong.
+        If `flat` is not linearisable by static feedback: a derivative below the
+        last depends on an input (the message says which), the decoupling matrix
+        is singular, or the flags are too short; if `forward`, `reverse` and the
+        equations of the plant are inconsistent; or if poles or labels are
+        wrong.
 
     Warns
     -----
     UserWarning
-        If `flat` is a `LinearFlatSystem` whose output is not its flat output,
-        which python-control chose, and `labels` does not name it: a multiple of it,
-        or, where the plant has zeros, a sum of its derivatives.
+        If `flat` is a `LinearFlatSystem` whose output is not the flat output that
+        python-control has chosen, but a multiple of it, or a sum of its
+        derivatives if the plant has zeros, and `labels` is not given.
 
     Notes
     -----
-    The plant's maps are looked at in a few states, drawn at random from a fixed
-    seed and from `reverse`, and in the zero state where it is not singular: a
-    plant is refused for what is seen there, and otherwise taken at its word.
+    The maps are checked at a few states (random ones from a fixed seed, some
+    from `reverse`, and the zero state unless it is singular); flatness elsewhere
+    is not verified.
 
-    The plant of the loop must put out its states by their names, as those of
-    `ctrlplan.plants` do. References are of the flat outputs: that of a
-    `LinearFlatSystem` is chosen by python-control and need not be its output; its
-    maps are computed here from its matrices, without rounding.
+    The plant in the loop must have its states as outputs under their names, as
+    the plants of `ctrlplan.plants` have. References belong to the flat outputs:
+    the flat output of a `LinearFlatSystem` is chosen by python-control and need
+    not be its output; its maps are computed here from its matrices in exact
+    arithmetic.
 
-    The law keeps the parameters `flat` has now: a loop simulated with
-    others shows what an inexact model does.
+    The controller uses the parameters that `flat` has when it is constructed; a
+    simulation of the loop with other parameters shows the effect of model errors.
 
     Examples
     --------
@@ -142,7 +143,7 @@ def create_flat_iosystem(
     idle = np.zeros(plant.ninputs)
 
     def law(t: float, x: Value, u: Value, params: Params) -> Value:
-        # Below the last derivative the flag does not depend on the input.
+        # Entries of the flag below the last derivative do not depend on the input.
         measured = plant.forward(u[len(references) :], idle)
         flag, first = [], 0
         for row, sigma in zip(measured, gains, strict=True):
@@ -156,8 +157,8 @@ def create_flat_iosystem(
     regular = np.concatenate([*planned[0].flag, planned[0].x])
 
     def law_off_zero(t: float, x: Value, u: Value, params: Params) -> Value:
-        # Blocks are first evaluated with all inputs zero, where this plant is singular: there the law is taken
-        # elsewhere, and is 0. Without a condition, so that it can be traced.
+        # Blocks are first evaluated with all inputs zero, where this plant is singular: the law is evaluated
+        # at a regular state instead and multiplied by 0. Without a branch, so that it can be traced.
         idles = math.prod(value == 0.0 for value in u)
         moved = np.empty(regular.size, dtype=u.dtype)
         for i, at in enumerate(regular.tolist()):
@@ -183,9 +184,9 @@ def hurwitz_coefficients(poles: Sequence[complex], count: int, where: str = "") 
     poles : sequence of complex
         Roots [rad/s], closed under conjugation, with negative real parts.
     count : int
-        How many there must be.
+        Required number of poles.
     where : str, optional
-        Put behind what was given in an error's message: `` in poles[1]``.
+        Place of the poles, appended to error messages: `` in poles[1]``.
 
     Returns
     -------
@@ -197,8 +198,8 @@ def hurwitz_coefficients(poles: Sequence[complex], count: int, where: str = "") 
     TypeError
         If poles are not numbers.
     ValueError
-        If they are not `count`, not closed under conjugation, not finite, or
-        not stable.
+        If their number is not `count`, or they are not closed under conjugation,
+        not finite or not stable.
 
     Examples
     --------

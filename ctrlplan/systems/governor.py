@@ -1,4 +1,4 @@
-"""Reference governor: it lets through as much of what is asked for as keeps every limit."""
+"""Reference governor: modifies the command so that the loop satisfies its limits."""
 
 from __future__ import annotations
 
@@ -20,7 +20,9 @@ from ctrlplan.traits import DeclaredTrait, declare
 
 @runtime_checkable
 class Admission(Protocol):
-    """What a governor asks: an `AdmissibleSet`, a `ctrlplan.Predictor`, or an object of the user's.
+    """Interface of admissible references, as a governor calls it.
+
+    `AdmissibleSet` and `ctrlplan.Predictor` implement it, and so can other classes.
 
     Attributes
     ----------
@@ -48,9 +50,9 @@ class Governor(ct.NonlinearIOSystem):  # type: ignore[misc]
     Attributes
     ----------
     admission : Admission
-        What says how far a reference may go.
+        Admissible references of the loop.
     period, offset : float
-        Samples are taken at offset, offset + period, ... [s] after the run begins.
+        Sample times are offset, offset + period, ... [s] after the start of a run.
     initial : ndarray, shape (nreferences,)
         Reference before the first sample.
     """
@@ -92,7 +94,7 @@ class Governor(ct.NonlinearIOSystem):  # type: ignore[misc]
         self._count = len(outputs)
 
     def sample(self, t: float, x: Array, u: Array, params: Params) -> Array:
-        """States after a sample: the reference moved as far as is admissible."""
+        """States after a sample: the reference moved by the admissible fraction."""
         n = self._count
         if not np.isfinite(u).all():
             return np.array([*x[:n], 0.0, 0.0, 1.0])
@@ -100,7 +102,7 @@ class Governor(ct.NonlinearIOSystem):  # type: ignore[misc]
         kappa = float(self.admission.fraction(u[n:], held, command))
         if math.isnan(kappa):
             return np.array([*x[:n], 0.0, 1.0, 0.0])
-        # The whole way is the command itself, without a rounding error.
+        # With kappa = 1 the reference is the command itself, without rounding.
         moved = command if kappa == 1.0 else held + kappa * (command - held)
         return np.array([*(moved - self.initial), kappa, 0.0, 0.0])
 
@@ -108,7 +110,7 @@ class Governor(ct.NonlinearIOSystem):  # type: ignore[misc]
         return np.array([x[k] + value for k, value in enumerate(self.initial.tolist())])
 
     def _no_rates(self, t: float, x: Value, u: Value, params: Params) -> NoReturn:
-        raise_not_standalone(self.name, "takes samples")
+        raise_not_standalone(self.name, "is sampled")
 
 
 def create_governor_iosystem(
@@ -151,20 +153,21 @@ def create_governor_iosystem(
         A linear loop; or an `AdmissibleSet`, a `ctrlplan.Predictor` for
         nonlinear loops, or any object with `references`, `states` and `fraction`.
     dt : float, optional
-        Period [s], above 0: that of the admissible set unless given.
+        Period [s], above 0; by default that of the admissible set.
     limits : mapping of str to (float, float) or float, optional
         Minimum and maximum of each limited output of a linear loop; a number a
         for (-a, a).
     initial : array_like, optional
-        Reference before the first sample, one for all or one each; it must be admissible where the run begins.
+        Reference before the first sample, a number for all or one for each; it
+        must be admissible at the start of a run.
     offset : float, optional
-        Time of the first sample after a run begins [s], from 0.
+        Time of the first sample after the start of a run [s], at least 0.
     references, margin, disturbances, origin : optional
-        Of the `AdmissibleSet` of a linear loop, with its defaults.
+        Arguments of the `AdmissibleSet` of a linear loop, with its defaults.
     inputs : sequence of str or str, optional
         Names of the commands, or of all inputs.
     outputs : sequence of str or str, optional
-        Names of the references: those of the loop unless given.
+        Names of the references, by default those of the loop.
     name : str, optional
         Name of the block.
 
@@ -176,11 +179,11 @@ def create_governor_iosystem(
     Raises
     ------
     TypeError
-        If `loop` is none of these, or what belongs to an `AdmissibleSet` is
-        given with an object that is one already.
+        If `loop` is none of these, or arguments of an `AdmissibleSet` are given
+        with an object that is one already.
     ValueError
-        If `dt` is missing or is not that of the set, `initial` or names do not
-        fit, or the `AdmissibleSet` raises; the reason is in the message.
+        If `dt` is missing or differs from that of the set, `initial` or names do
+        not fit, or the `AdmissibleSet` raises; the message gives the reason.
 
     References
     ----------
@@ -252,7 +255,9 @@ def _admission(loop: System, dt: float | None, limits: Limits | None, options: d
         )
     if limits is not None or options:
         given = ", ".join(["limits"] * (limits is not None) + sorted(options))
-        raise TypeError(f"{given} must go with a loop, got a {type(loop).__name__}, which has its own")
+        raise TypeError(
+            f"{given} must be given with a linear loop only, got a {type(loop).__name__}, which has its own"
+        )
     return loop
 
 

@@ -1,4 +1,4 @@
-"""Blocks that only `ctrlplan.simulate` runs: discrete ones in a continuous loop, and pure delays."""
+"""Blocks for `ctrlplan.simulate` only: discrete blocks in a continuous loop, and delays."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ class SampleHold(ct.NonlinearIOSystem):  # type: ignore[misc]
     Attributes
     ----------
     block : control system
-        What takes the samples.
+        The discrete system.
     period, offset : float
-        It takes them at offset, offset + period, ... [s] after the run begins.
+        Sample times are offset, offset + period, ... [s] after the start of a run.
     """
 
     block = DeclaredTrait[ct.InputOutputSystem]()
@@ -48,7 +48,7 @@ class SampleHold(ct.NonlinearIOSystem):  # type: ignore[misc]
         self._inner = block.nstates or 0
 
     def sample(self, t: float, x: Array, u: Array, params: Params) -> Array:
-        """States after a sample: the block's next ones, and the outputs that are held."""
+        """States after a sample: the next states of the block, and the held outputs."""
         own = None if isinstance(self.block, ct.StateSpace) else params
         state = x[: self._inner]
         outputs = np.ravel(self.block.output(t, state, u, own))
@@ -59,18 +59,18 @@ class SampleHold(ct.NonlinearIOSystem):  # type: ignore[misc]
         return x[self._inner :]
 
     def _no_rates(self, t: float, x: Value, u: Value, params: Params) -> NoReturn:
-        raise_not_standalone(self.name, "takes samples")
+        raise_not_standalone(self.name, "is sampled")
 
 
 class Delay(ct.NonlinearIOSystem):  # type: ignore[misc]
-    """Block that puts out later what goes in; made by `create_delay_iosystem`.
+    """Transport delay; made by `create_delay_iosystem`.
 
     Attributes
     ----------
     delay : float
-        How much later [s].
+        Delay [s].
     initial : ndarray, shape (ninputs,)
-        What it puts out before anything has come through.
+        Outputs until the first input has passed.
     """
 
     delay = DeclaredTrait[float]()
@@ -81,7 +81,7 @@ class Delay(ct.NonlinearIOSystem):  # type: ignore[misc]
         declare(self, delay=delay, initial=initial)
 
     def _past(self, t: float, x: Value, u: Value, params: Params) -> NoReturn:
-        raise_not_standalone(self.name, "has a memory of its input")
+        raise_not_standalone(self.name, "is a delay")
 
 
 @former_signature("name")
@@ -96,9 +96,9 @@ def sample_hold(
 ) -> SampleHold:
     """Discrete-time block for a continuous loop, its outputs held between samples.
 
-    python-control does not connect the two kinds; it connects the block that is
-    returned, and `ctrlplan.simulate` runs the loop from sample to sample.
-    Blocks that take a sample at the same instant see each other's new outputs
+    python-control does not connect discrete and continuous systems. It connects
+    the block that is returned, and `ctrlplan.simulate` runs the loop from sample
+    to sample. Blocks sampled at the same time read each other's new outputs
     where these have direct feedthrough.
 
     States: those of the block, then the held outputs, ``<output>_held``.
@@ -107,15 +107,16 @@ def sample_hold(
     Parameters
     ----------
     block : control system
-        Discrete, or without states.
+        Discrete-time or static.
     dt : float
-        Period [s], above 0; that of the block, where it has one.
+        Period [s], above 0; it must be that of the block if the block has one.
     offset : float, optional
-        Time of the first sample after a run begins [s], from 0; outputs are 0 until then.
+        Time of the first sample after the start of a run [s], at least 0;
+        outputs are 0 until then.
     inputs, outputs : sequence of str or str, optional
-        Names of the signals: those of `block` unless given.
+        Names of the signals, by default those of `block`.
     name : str, optional
-        Name of the block: that of `block` unless given.
+        Name of the block, by default that of `block`.
 
     Returns
     -------
@@ -125,10 +126,10 @@ def sample_hold(
     Raises
     ------
     TypeError
-        If `block` is no control system, or another argument is of a wrong kind.
+        If `block` is not a control system, or another argument has the wrong type.
     ValueError
-        If it is continuous with states, has another period, a time is out of
-        range, or names are not as many as signals.
+        If it is continuous with states or has another period, a time is out of
+        range, or the number of names differs from the number of signals.
 
     Examples
     --------
@@ -170,19 +171,19 @@ def create_delay_iosystem(
 ) -> Delay:
     """Transport delay: y(t) = u(t - delay).
 
-    No states that python-control knows: `ctrlplan.simulate` keeps the past
-    input as series and stops where a jump arrives, without a rational
-    approximation. Inputs: u. Outputs: y.
+    No states for python-control: `ctrlplan.simulate` stores the past input as
+    Chebyshev series and stops the integrator where a jump arrives, without a
+    rational approximation. Inputs: u. Outputs: y.
 
     Parameters
     ----------
     delay : float
         Delay [s], above 0.
     initial : array_like, optional
-        Outputs until the first input has passed, one number for all or one
-        each, in the inputs' unit.
+        Outputs until the first input has passed, a number for all or one for
+        each, in the unit of the inputs.
     inputs, outputs : sequence of str or str, optional
-        Names of the signals, as many of each: u and y unless given.
+        Names of the signals, equally many of each; by default u and y.
     name : str, optional
         Name of the block.
 
@@ -194,7 +195,7 @@ def create_delay_iosystem(
     Raises
     ------
     TypeError
-        If an argument is of a wrong kind.
+        If an argument has the wrong type.
     ValueError
         If the delay is not above 0, or inputs, outputs and initial do not fit.
 
@@ -219,5 +220,5 @@ def create_delay_iosystem(
 
 
 def raise_not_standalone(name: str, why: str) -> NoReturn:
-    """Say who runs a block that python-control cannot run by itself."""
+    """Raise for a block that python-control cannot simulate."""
     raise RuntimeError(f"a loop with the block {name}, which {why}, must be run by ctrlplan.simulate")

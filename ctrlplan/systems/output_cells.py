@@ -1,4 +1,4 @@
-"""Outputs of a linear loop over cells of time, as polynomials with bounded remainders."""
+"""Outputs of a linear loop over short time intervals (cells), as polynomials with bounded remainders."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from scipy.special import comb, factorial
 from ctrlplan._types import Array
 
 _DEGREE = 8
-"""Of the polynomials that outputs are over a cell of time."""
+"""Degree of the polynomial of an output over a cell."""
 
 _REMAINDER = 1e-10
-"""What such a polynomial leaves, relative to the motion at the start."""
+"""Remainder of such a polynomial, relative to the response at the start."""
 
 _CELLS = 3000
-"""Cells after which a loop must have come to rest."""
+"""Maximum number of cells until a loop has settled."""
 
 _SEEN = 1e-7
-"""Relative size of what limited outputs show of a direction of the state, from which on it counts."""
+"""Relative size of a state direction in the limited outputs above which it is observable."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,33 +32,34 @@ class Problem:
     c: Array
     e: Array
     f: Array
-    equilibrium: Array  # state at rest, by the reference
-    gain: Array  # outputs at rest
+    equilibrium: Array  # steady state per unit reference
+    gain: Array  # outputs in steady state
     low: Array
     high: Array
-    middle: Array  # between limits, or near the only one
+    middle: Array  # midpoint of the limits, or the only finite one
     labels: tuple[str, ...]
     references: tuple[str, ...]
     states: tuple[str, ...]
 
     @property
     def slowest(self) -> float:
-        """Rate [1/s] at which the slowest motion dies out."""
+        """Decay rate [1/s] of the slowest mode."""
         return float(-np.linalg.eigvals(self.a).real.max()) if self.a.size else 1.0
 
 
 @dataclass(frozen=True, eq=False)
 class Cells:
-    """Cells of time, and over each the outputs as polynomials.
+    """Cells, and the outputs over each as polynomials.
 
     Attributes
     ----------
     ends : ndarray, shape (ncells,)
-        Where they end [s].
+        End times [s].
     rows : ndarray, shape (ncells, noutputs, degree + 1, nstates)
         Bernstein coefficients of c exp(a t).
     needed : int
-        Those after which outputs that have kept their limits keep them for ever.
+        Number of cells after which outputs that have satisfied their limits do so
+        for all future times.
     """
 
     ends: Array
@@ -67,10 +68,10 @@ class Cells:
 
 
 def seen_directions(problem: Problem) -> Array:
-    """Directions (nstates, nseen) of the state that the limited outputs show, as long as they show as much.
+    """Observable directions (nstates, nseen) of the state, scaled by the observability Gramian.
 
-    They are coordinates in which the norm of a state is what the outputs' free
-    motion from there amounts to, the integral of its square: it never grows.
+    In these coordinates the squared norm of a state is the integral of the
+    squared free response of the outputs: it never increases.
     """
     if not problem.a.size:
         return np.zeros((0, 0))
@@ -83,20 +84,20 @@ def seen_directions(problem: Problem) -> Array:
 
 
 def output_cells(problem: Problem, seen: Array, margin: float) -> Cells:
-    """Cells up to where the loop is at rest, or nearly.
+    """Cells up to the time at which the loop has settled, or nearly.
 
-    In the coordinates `seen` no free motion grows: a derivative of an output is
-    nowhere later larger than it may be at the beginning of a cell, which bounds
-    what its Taylor polynomial leaves. The square of a state's size is what it
-    loses until t, no more than limits are wide, and what is left then: that
-    bounds the size.
+    In the coordinates `seen` the norm of a free response never increases: the
+    bound of an output's derivative at the start of a cell holds for all later
+    times, which bounds the remainder of its Taylor polynomial. The squared norm
+    of a state is its decrease until t, which the width of the limits bounds,
+    plus the squared norm at t: that bounds the norm.
     """
     a, n, widths = problem.a, len(problem.a), problem.high - problem.low
     powers = [np.eye(n)]
     for _ in range(_DEGREE + 1):
         powers.append(powers[-1] @ a)
     orders = np.arange(_DEGREE + 1)
-    # From powers of s in [0, 1] to Bernstein's polynomials, divided by factorials.
+    # From powers of s in [0, 1] to the Bernstein basis, divided by factorials.
     basis = np.tril(comb(orders[:, None], orders) / comb(_DEGREE, orders)) / factorial(orders)
     moved, back, t, needed = np.eye(n), np.linalg.pinv(seen), 0.0, 0
     first = _norm(problem.c @ seen)
@@ -105,8 +106,8 @@ def output_cells(problem: Problem, seen: Array, margin: float) -> Cells:
     while True:
         if len(ends) == _CELLS:
             raise ValueError(
-                f"loop must come to rest sooner beside its fastest motion, got motion after {t:.3g} s that takes more "
-                f"than {_CELLS} cells of time"
+                "time constants of the loop must not be too far apart, got a free response that has not settled after "
+                f"{_CELLS} intervals of the fastest, {t:.3g} s"
             )
         bend = _norm(problem.c @ powers[-1] @ moved @ seen)
         h = (_REMAINDER * first * factorial(_DEGREE + 1) / bend) ** (1.0 / (_DEGREE + 1)) if bend else math.inf
@@ -120,7 +121,7 @@ def output_cells(problem: Problem, seen: Array, margin: float) -> Cells:
             decrease = 1.0 - np.linalg.norm(back @ moved @ seen, 2) ** 2 if seen.size else 1.0
             if decrease > 0.0 and left * math.sqrt(t * float(widths @ widths) / decrease) <= margin:
                 needed = len(ends)
-        # Disturbances add up until nothing moves.
+        # The effect of disturbances accumulates until the response has settled.
         if needed and (left <= _REMAINDER * first or not problem.e.any()):
             return Cells(np.array(ends), np.array(found), needed)
 
@@ -130,18 +131,18 @@ def _norm(rows: Array) -> float:
 
 
 def elevated(rows: Array) -> Array:
-    """Bernstein coefficients, along the last axis but one, of the same polynomials at a degree one higher."""
+    """Degree elevation: Bernstein coefficients, along axis -2, of the same polynomials at one degree higher."""
     part = (np.arange(1, rows.shape[2]) / rows.shape[2])[:, None]
     inner = part * rows[:, :, :-1] + (1.0 - part) * rows[:, :, 1:]
     return np.concatenate([rows[:, :, :1], inner, rows[:, :, -1:]], axis=2)
 
 
 def erosion(problem: Problem, cells: Cells) -> tuple[Array, Array]:
-    """What disturbances can make of each output: over each cell, (ncells, noutputs, degree + 2), and in all.
+    """Largest effect of disturbances on each output: over each cell (ncells, noutputs, degree + 2), and in total.
 
-    It is the integral of the size of c exp(a t) e. A polynomial is nowhere
-    larger than the one whose Bernstein coefficients are the sizes of its own,
-    and these add up to the coefficients of the integral.
+    It is the integral of |c exp(a t) e|. The polynomial with the magnitudes of
+    the Bernstein coefficients bounds the magnitude of a polynomial; their
+    cumulative sums are the coefficients of the integral.
     """
     size = np.abs(cells.rows @ problem.e).sum(axis=3)
     lengths = np.diff(cells.ends, prepend=0.0)[:, None, None] / size.shape[2]

@@ -32,13 +32,15 @@ def create_pid_iosystem(
     """PID on the error r - y: Kp + Ki/s + Kd s/(Tf s + 1).
 
     States: integral (of Ki times the error) and filter (of the error). Inputs:
-    r and y. Outputs: u. Without bias and limits it is a `control.StateSpace`.
+    r and y. Outputs: u. The block is a `control.StateSpace` if bias and limits
+    are not given. With limits, `ctrlplan.simulate` records as events when the
+    output reaches and leaves a limit.
 
     Parameters
     ----------
     kp, ki, kd : float
-        Gains, finite; `ki` and `kd` may be 0. Units: that of u over that of y,
-        over seconds for `ki`, times seconds for `kd`.
+        Gains, finite; `ki` and `kd` may be 0. Unit of `kp`: that of u over that
+        of y; of `ki` that per second, of `kd` that times seconds.
     tf : float
         Time constant of the derivative filter [s], above 0.
     bias : float, optional
@@ -46,12 +48,12 @@ def create_pid_iosystem(
     limits : (float, float) or float, optional
         Minimum and maximum of the output, bias included; a number a for (-a, a).
     tracking_time : float, optional
-        Time constant [s] of the anti-windup, with which the integral tracks the
-        limited output: sqrt(kd/ki), or kp/ki where kd is 0, unless given.
+        Time constant [s] of anti-windup by back-calculation; by default
+        sqrt(kd/ki), or kp/ki if kd is 0.
     inputs : sequence of str, optional
-        Names of reference and measurement: r and y unless given.
+        Names of reference and measurement, by default r and y.
     outputs : str, optional
-        Name of the control: u unless given.
+        Name of the control signal, by default u.
     name : str, optional
         Name of the block.
 
@@ -63,10 +65,10 @@ def create_pid_iosystem(
     Raises
     ------
     TypeError
-        If a number or a name is of a wrong kind.
+        If a number or a name has the wrong type.
     ValueError
         If a gain is not finite, `tf` or `tracking_time` is not above 0, the
-        limits do not increase, or names are not two and one.
+        limits do not increase, or the number of names is wrong.
 
     Examples
     --------
@@ -112,14 +114,14 @@ def create_pid_iosystem(
 
     block = ct.nlsys(update, out, **names)
     if limits is not None:
-        # What `ctrlplan.simulate` records the crossings of.
+        # `ctrlplan.simulate` records the crossings of these limits.
         command = partial(_command, kp, kd / tf, bias)
         declare(block, watched={EventName(control[0], "was at its limit"): (command, low, high)})
     return block
 
 
 def _total(kp: float, kd: float, bias: float, x: Value, u: Value) -> Value:
-    """Output before the limits; kd over the filter's time constant."""
+    """Output before limiting; kd is divided by the time constant of the filter."""
     error = u[0] - u[1]
     return bias + kp * error + x[0] + kd * (error - x[1])
 
@@ -129,7 +131,7 @@ def _command(kp: float, kd: float, bias: float, t: Value, x: Value, u: Value, pa
 
 
 def _tracking_rate(kp: float, ki: float, kd: float, tracking_time: float | None) -> float:
-    """Inverse of the tracking time, 0 where there is no integral to lead back."""
+    """Inverse of the tracking time; 0 without integral action."""
     if tracking_time is None:
         if ki == 0.0:
             return 0.0

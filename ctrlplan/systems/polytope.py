@@ -1,4 +1,4 @@
-"""Inequalities that matter, of many of which most follow from others."""
+"""Irredundant inequalities among many."""
 
 from __future__ import annotations
 
@@ -13,27 +13,27 @@ from ctrlplan._types import Array
 from ctrlplan.systems.output_cells import Problem
 
 _PROVEN = 1e-11
-"""Relative error of a proof that a row follows from others."""
+"""Relative residual of a proof that a row is redundant."""
 
 _NEAR = 24
-"""Rows that are added to a proof at a time."""
+"""Rows added to a proof per iteration."""
 
 _ATTEMPTS = 50
-"""Times that this is done."""
+"""Maximum number of iterations of a proof."""
 
 _PROOFS = 24
-"""Proofs that are kept to be tried on other rows."""
+"""Number of stored proofs that are tried on other rows."""
 
 _NEIGHBOURS = 64
-"""Rows on which a new proof is tried."""
+"""Number of following rows on which a new proof is tried."""
 
 _Proof: TypeAlias = tuple[NDArray[np.float64], NDArray[np.float64]]
-"""Rows of which others are sums, and the inverse that finds the factors."""
+"""Rows whose nonnegative combinations prove others redundant, and the pseudoinverse that gives the factors."""
 
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """Inequalities state @ z + reference @ v <= bound in the distance z of the state from rest."""
+    """Inequalities state @ z + reference @ v <= bound in the deviation z of the state from steady state."""
 
     state: Array
     reference: Array
@@ -41,18 +41,18 @@ class Rows:
 
 
 class Polytope:
-    """Rows that are kept, each with a bound on z and v; and proofs that others follow from them.
+    """Irredundant rows, each with a bound on z and v; and proofs that other rows are redundant.
 
-    A row follows if it is a sum of kept ones with factors of at least 0, which
-    are found by nonnegative least squares: some twenty times faster than a
-    linear program of this size.
+    A row is redundant if it is a nonnegative combination of the irredundant
+    ones (Farkas' lemma). The factors are found by nonnegative least squares,
+    about twenty times faster than by a linear program of this size.
     """
 
     def __init__(self, problem: Problem, seen: Array, spare: float) -> None:
         self._gain, self._seen, self._spare = problem.gain, seen, spare
         u, s, _ = np.linalg.svd(problem.gain, full_matrices=False)
-        self._steady = u[:, s > 1e-12 * s.max(initial=0.0)]  # outputs at rest, by as many coordinates as they have
-        # Bounds are taken from the middle between limits, as near to it as outputs at rest come.
+        self._steady = u[:, s > 1e-12 * s.max(initial=0.0)]  # basis of the steady-state outputs
+        # Bounds are measured from the steady-state outputs closest to the midpoint of the limits.
         self._centre = self._steady @ (self._steady.T @ problem.middle)
         self._columns = np.zeros((seen.shape[1] + self._steady.shape[1] + 1, 0))
         self._columns = self._column(np.zeros((1, len(seen))), np.zeros((1, len(self._gain))), np.ones(1))
@@ -60,10 +60,10 @@ class Polytope:
         self._proofs: list[_Proof] = []
 
     def add(self, rows: Array, low: Array, high: Array, ends: Array) -> None:
-        """Keep what does not follow of low <= rows @ z + gain @ v <= high.
+        """Add the irredundant inequalities of low <= rows @ z + gain @ v <= high.
 
-        Rows (noutputs, ntime, nstates), limits (noutputs, ntime), and the times
-        of the ends of their cells; of time 0 nothing is given away.
+        Rows have shape (noutputs, ntime, nstates), limits (noutputs, ntime);
+        `ends` are the end times of their cells. Rows of time 0 are not tightened.
         """
         p, count, n = rows.shape
         outputs = np.repeat(np.eye(p), count, axis=0)
@@ -80,7 +80,7 @@ class Polytope:
             proof = self._proof(columns[:, k])
             if proof is not None:
                 self._proofs = [proof, *self._proofs[: _PROOFS - 1]]
-                # What stands next is of the same output and of nearly the same time.
+                # The next rows belong to the same output and nearly the same time.
                 near, far = left[:_NEIGHBOURS], left[_NEIGHBOURS:]
                 left = np.concatenate([near[_unproven(proof, columns[:, near])], far])
                 continue
@@ -88,7 +88,7 @@ class Polytope:
             self._columns = np.hstack([self._columns, tightened[:, [k]]])
 
     def reduced(self) -> tuple[Rows, float]:
-        """Rows that do not follow from the rest of them, and the time [s] up to which they look."""
+        """Irredundant rows, and the last time [s] that they constrain."""
         needed = []
         for k, row in enumerate(self._rows):
             column = self._columns[:, k + 1].copy()
@@ -102,12 +102,12 @@ class Polytope:
         return Rows(state, output @ self._gain, bound), max([row[3] for row in needed], default=0.0)
 
     def _column(self, state: Array, output: Array, bound: Array) -> Array:
-        """Rows as columns (coordinates and bound) of length 1."""
+        """Rows as columns (coordinates and bound) of unit norm."""
         found = np.vstack([(state @ self._seen).T, (output @ self._steady).T, bound - output @ self._centre])
         return np.asarray(found / np.linalg.norm(found, axis=0))
 
     def _proof(self, column: Array) -> _Proof | None:
-        """Kept columns of which a column is a sum: of a few near it, and more as they are missed."""
+        """Stored columns of which a column is a nonnegative combination; near ones first, more as required."""
         every, missed = self._columns, column
         near = np.empty(0, dtype=np.intp)
         for _ in range(_ATTEMPTS):
@@ -125,11 +125,11 @@ class Polytope:
             missed = column - generators @ factors[used]
             if residual <= _PROVEN:
                 return generators, np.linalg.pinv(generators)
-        return None  # nothing is proven: the row is kept
+        return None  # not proven: the row counts as irredundant
 
 
 def _unproven(proof: _Proof, columns: Array) -> NDArray[np.bool_]:
-    """Which columns are no sum of those of a proof."""
+    """Columns that are not a nonnegative combination of those of a proof."""
     generators, inverse = proof
     missed = columns - generators @ np.maximum(inverse @ columns, 0.0)
     return np.einsum("ij,ij->j", missed, missed) > _PROVEN**2

@@ -1,4 +1,4 @@
-"""A plan that is made again while the loop runs, as a block."""
+"""Replanner: a plan that is refitted online, as a block."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from ctrlplan.trajectories.newton_spline import NewtonSpline
 from ctrlplan.trajectories.transition import Transition, extrapolated, series, taylor_value, transition
 
 _ROUNDING, _MATTERS = 1e-12, 1e-6
-"""Part of the move by which a goal has moved, and by which one that is not reached is worth an event."""
+"""Relative distances, in units of the move, above which a goal is new, and above which a missed one is an event."""
 
 Trigger = Literal["period", "deviation", "goal"]
-"""When a replanner plans again."""
+"""Condition on which a replanner makes a new fit."""
 
 _START, _END, _NAN_INPUT, _UNREACHABLE, _FITS = range(5)
-"""States of the correction before the goal's change and the coefficients."""
+"""Indices of the first states of the correction; goal and coefficients follow."""
 
 
 def create_replanner_iosystem(
@@ -52,73 +52,75 @@ def create_replanner_iosystem(
     suffix: str = "",
     name: str = "replanner",
 ) -> ct.InterconnectedSystem:
-    r"""Plan that is made again every period, from where the reference or the plant is.
+    r"""Plan that is refitted online every period.
 
-    Every `dt` seconds a spline is fitted from the present jet to the goal's.
-    It is applied as a correction to `plan`: the transition of the same family and
-    angular frequency from the present deviation to the change of the goal.
-    Nothing being in the way the correction is 0, and every plan is followed as
-    it was made, whatever its kind. A polynomial between two jets plus its
-    correction is that polynomial fitted again. A trigonometric one is, but for
-    the phase of the correction's top harmonic, which is the middle of what is
-    left: with the plan's own gamma fits would be singular at some instants.
+    Every `dt` seconds a spline is fitted from the present jet to the jet of the
+    goal. It is applied as a correction to `plan`: the transition of the same
+    family and angular frequency from the present deviation to the change of the
+    goal. Without deviation and change of the goal the correction is 0, and the
+    plan, of any kind, is followed unchanged. A polynomial between two jets plus
+    its correction is that polynomial refitted. For a trigonometric spline this
+    holds except for the phase of the top harmonic of the correction, which
+    refers to the middle of the remaining time: with the plan's own gamma fits
+    would be singular at some times.
 
-    Without `measured` the fit begins at the reference itself, so that no
-    derivative up to `order` jumps. With it the fit begins at what is measured:
-    feedback, and the reference jumps to the plant, so that a controller of the
-    error sees none. It is stable where the loop follows the plan between fits:
-    the period not below the time that the loop takes to follow, or a law that
-    reads the derivatives; a PID refitted faster than it acts lets the load
-    drift. Between fits the output is the plan in continuous time. Runs in
+    Without `measured` the fit starts at the reference, so that no derivative up
+    to `order` jumps. With `measured` it starts at the measurement. This is
+    feedback: the reference jumps to the measured state, and the error of a
+    controller is reset. It is stable if the loop follows the plan between fits:
+    with a period not below the response time of the loop, or with a controller
+    that uses the derivatives. With a PID and a shorter period the load drifts.
+    Between fits the output is the plan in continuous time. The block runs in
     `ctrlplan.simulate` only.
 
-    States: start and end of the correction [s], nan_input (whether an input was not
-    finite), unreachable (whether the goal is out of reach), fits (their number),
-    ``goal[k]``, the goal at the last fit, and ``coefficient[k]``. Inputs: with
+    States: start and end of the correction [s]; nan_input, 1 if an input was not
+    finite; unreachable, 1 if the goal is out of reach; fits, their number;
+    ``goal[k]``, the goal at the last fit; ``coefficient[k]``. Inputs: with
     `goal_derivatives`, x_goal, x_goal_d1, ... of each axis x; with `measured`,
-    x, x_d1, .... Outputs: the jet of each axis, x, x_d1, ..., as
-    `create_source_iosystem` names it.
+    x, x_d1, .... Outputs: x, x_d1, ... of each axis, as `create_source_iosystem`
+    names them.
 
     Parameters
     ----------
     plan : Trajectory
-        What is followed as long as nothing happens. Its end is the goal unless
-        the goal is an input.
+        Nominal plan. Its end is the goal unless the goal is an input.
     dt : float
-        Period [s], not above the horizon.
+        Period of the fits [s], at most the horizon.
     order : int, optional
-        Highest derivative that is joined.
+        Highest derivative that is continuous at a fit.
     horizon : float or "shrinking", optional
-        Time from every fit [s] after which deviations are gone and a change of
-        the goal is made; or what is left of the plan.
+        Time from a fit [s] to the end of its correction; "shrinking": the
+        remaining time of the plan.
     alpha : float, optional
-        Shape parameter [rad] of a transition over the horizon, or for
-        "shrinking" over the whole plan, whose angular frequency is kept. Unless
-        given, that of a `TrigSpline` for "shrinking", and 0 (polynomials) else.
+        Shape parameter [rad] of a transition over the horizon, or with
+        "shrinking" over the whole plan, whose angular frequency is kept. By
+        default that of a `TrigSpline` with "shrinking", otherwise 0
+        (polynomials).
     measured : int, optional
-        Highest derivative that is measured; those above are the reference's.
+        Highest measured derivative; higher ones are those of the reference.
     goal_derivatives : int, optional
-        Highest derivative of the goal that comes in. The goal is taken to go on
-        along its Taylor polynomial until it is met, and afterwards.
+        Highest derivative of the goal among the inputs. The goal is extrapolated
+        by its Taylor polynomial.
     trigger : {"period", "deviation", "goal"}, optional
-        Fit every period; where what is measured lies more than `threshold` off
-        the reference; or only for a new goal, which the others heed as well.
+        Fit every period; if the measurement deviates from the reference by more
+        than `threshold`; or only for a new goal. The first two also fit for a
+        new goal.
     threshold : float, optional
-        Distance over all axes, in their unit.
+        Euclidean distance over all axes, in their unit.
     min_horizon : float, optional
-        With "shrinking", time to the end [s] below which the plan is left as it
-        is: the gains grow as its power -(order + 1). About five time constants
-        of the loop that follows; five periods unless given, half the plan at most.
+        With "shrinking": remaining time [s] below which no fit is made, since the
+        gains grow with its power -(order + 1). About five time constants of the
+        tracking loop; by default five periods, at most half the plan.
     limits : mapping of int to array_like, optional
-        Greatest magnitude of a derivative by its order, for all axes or one
-        each, until both plan and correction end. A fit beyond them is not
-        taken: the last one is held. Costs milliseconds a fit.
+        Maximum magnitude of a derivative by its order, for all axes or one for
+        each, until both plan and correction end. A fit that violates a limit is
+        rejected: the last one stays in force. Requires milliseconds per fit.
     derivatives : int, optional
-        Highest derivative put out; `order` unless given.
+        Highest derivative among the outputs, by default `order`.
     offset : float, optional
-        Time of the first fit after a run begins [s].
+        Time of the first fit after the start of a run [s].
     labels : sequence of str or str, optional
-        Names of the axes in the place of the plan's own.
+        Names of the axes in place of those of the plan.
     suffix : str, optional
         Appended to each label of an output.
     name : str, optional
@@ -127,10 +129,10 @@ def create_replanner_iosystem(
     Returns
     -------
     control.InterconnectedSystem
-        Of the plan's source and the block that corrects it. A run records as
-        events when an input was not finite (nan from a sensor: the last good
-        plan is held), and when the goal could not be reached within horizon and
-        limits.
+        The source of the plan and the block with the correction. A run records as
+        events when an input is not finite (nan from a sensor: the last valid
+        plan stays in force), and when the goal cannot be reached within horizon
+        and limits.
 
     Raises
     ------
@@ -138,18 +140,18 @@ def create_replanner_iosystem(
         If `plan` is not a trajectory.
     ValueError
         If an argument is out of range; the period is above the horizon; the
-        sampled map from fit to fit has a spectral radius of 1 or more; the plan
-        itself breaks a limit; or outputs and inputs would have the same name.
-        The spectral radius is that of a loop that follows at once.
+        sampled map from fit to fit has a spectral radius of 1 or more (for a
+        loop that tracks without delay); the plan itself violates a limit; or an
+        output has the name of an input.
 
     References
     ----------
     The paper's conclusion; `ctrlplan.trajectories.transition.Transition` for the
-    law that this tends to as the period goes to 0, and for the radius.
+    limit as the period tends to 0, and for the spectral radius.
 
     Examples
     --------
-    A goal that is moved at 4 s, met at 10 s all the same:
+    A goal that changes at 4 s and is reached at 10 s:
 
     >>> import control as ct
     >>> import numpy as np
@@ -185,7 +187,7 @@ def create_replanner_iosystem(
 
 
 class _Horizons:
-    """What a fit at some time goes through."""
+    """Horizon and transition of a fit at a given time."""
 
     def __init__(
         self,
@@ -210,7 +212,7 @@ class _Horizons:
             alpha = own if own < 2.0 * math.pi else 0.0
         self.whole = Transition(order, whole, alpha)
         self.period, self.order, self.rate = period, order, self.whole.rate
-        self.step: Array | None = None  # from coefficients to jets a period later, where that is always the same map
+        self.step: Array | None = None  # map from coefficients to jets one period later, if it is constant
         self._start, self._end = plan.start, plan.end
         if self.shrinking:
             self._minimum = _minimum_horizon(min_horizon, period, whole)
@@ -226,15 +228,15 @@ class _Horizons:
             )
 
     def too_short(self, t: float) -> bool:
-        """Whether what is left of the plan is too short for a fit."""
+        """Whether the remaining time of the plan is too short for a fit."""
         return self.shrinking and self._end - t < self._minimum * (1.0 - 1e-9)
 
     def end(self, t: float) -> float:
-        """Where a fit at a time ends."""
+        """End time of a fit [s]."""
         return self._end if self.shrinking else t + self.whole.horizon
 
     def at(self, t: float) -> Transition | None:
-        """Transition to fit at a time, None where it is too early or too late for one."""
+        """Transition of a fit at a time; None before the plan or too close to its end."""
         if not self.shrinking:
             return self.whole
         if t < self._start or self.too_short(t):
@@ -243,7 +245,7 @@ class _Horizons:
 
 
 class _Signals:
-    """Names of what comes in and goes out, and where it stands."""
+    """Names and indices of inputs and outputs."""
 
     def __init__(
         self,
@@ -265,26 +267,28 @@ class _Signals:
         self.inner = signal_names([label + self.inside for label in labels], planned)
         both = [name for name in self.outputs if name in self.outer]
         if both:
-            raise ValueError(f"suffix must tell outputs from inputs, got {suffix!r} and {', '.join(both)} among both")
+            raise ValueError(
+                f"suffix must make outputs differ from inputs, got {suffix!r} and {', '.join(both)} in both"
+            )
         n = len(self.inner)
         self.goal_rows, self.seen_rows = slice(n, n + len(goals)), slice(n + len(goals), n + len(self.outer))
 
     @property
     def feedthrough(self) -> NDArray[np.bool_]:
-        """An output passes its own entry of the plan on; everything else waits for a fit."""
+        """Direct feedthrough: from each entry of the plan to its output only."""
         found = np.zeros((len(self.outputs), len(self.inner) + len(self.outer)), dtype=bool)
         found[np.arange(len(self.outputs)), self.passed] = True
         return found
 
     @property
     def passed(self) -> list[int]:
-        """Which inputs the outputs pass on."""
+        """Index of the planned input of each output."""
         each, naxes = self.planned + 1, len(self.inner) // (self.planned + 1)
         return [axis * each + k for axis in range(naxes) for k in range(self.output_order + 1)]
 
 
 class _Correction(ct.NonlinearIOSystem):  # type: ignore[misc]
-    """Jets of a plan plus those of the transition last fitted."""
+    """Jets of a plan plus those of the last fitted transition."""
 
     period = DeclaredTrait[float]()
     offset = DeclaredTrait[float]()
@@ -317,7 +321,7 @@ class _Correction(ct.NonlinearIOSystem):  # type: ignore[misc]
             period=horizons.period,
             offset=offset,
             sample=self.sample,
-            samples_first=True,  # what is measured may follow the reference directly
+            samples_first=True,  # the measurement may have direct feedthrough from the reference
             feedthrough=signals.feedthrough,
             watched={
                 EventName(f"{name}: nan at the input"): (partial(_state, _NAN_INPUT), -math.inf, 0.5),
@@ -337,14 +341,14 @@ class _Correction(ct.NonlinearIOSystem):  # type: ignore[misc]
         extrema = plan.extrema()
         self._range = float((extrema.maximum - extrema.minimum).max())
         self._scales = [horizons.whole.horizon**k for k in range(order + 1)]
-        # The goal is reached where the plan ends, with the plan's own derivatives, or else rests there.
+        # The goal is the end of the plan, with the plan's derivatives if shrinking, otherwise with zero derivatives.
         self._arrival = np.zeros((order + 1, naxes))
         self._arrival[0] = plan.final
         if horizons.shrinking:
             self._arrival = _without_rounding(plan.jet(plan.end, order), np.array(self._scales)[:, None], self._range)
 
     def sample(self, t: float, x: Array, u: Array, params: Params) -> Array:
-        """States after a fit, or where none is due the same."""
+        """States after a fit; unchanged if none is due."""
         after = x.copy()
         after[_NAN_INPUT] = 0.0 if math.isfinite(sum(u.tolist())) else 1.0
         if after[_NAN_INPUT]:
@@ -379,17 +383,17 @@ class _Correction(ct.NonlinearIOSystem):  # type: ignore[misc]
         if trigger == "deviation":
             off = begins[0] - self._jets(t, x, 0)[0]
             return math.hypot(*off.tolist()) > threshold
-        # From the reference to the same goal, on what is left of the plan, the same plan will do.
+        # From the reference to the same goal over the remaining time the fit would be the same plan.
         return self._signals.measured is not None or not self._horizons.shrinking
 
     def _miss(self, t: float, x: Array, goal: Array) -> float:
-        """How far the goal is from where the last fit, or the plan, took it to be by now, relative to the move."""
+        """Distance of the goal from its extrapolation by the last fit or the plan, relative to the move."""
         if not len(goal):
             return 0.0
         if x[_FITS] > 0.5:
             expected = extrapolated(x[self._goal].reshape(goal.shape), t - x[_START])
         elif self._arrival[1 : len(goal)].any():
-            return math.inf  # after its end the plan rests, which a fit sees to
+            return math.inf  # after its end the plan has zero derivatives, which requires a fit
         else:
             expected = self._arrival[: len(goal)]
         rows = list(zip(goal.tolist(), expected.tolist(), strict=True))
@@ -402,7 +406,7 @@ class _Correction(ct.NonlinearIOSystem):  # type: ignore[misc]
         return max(far) / size if size else math.inf if any(far) else 0.0
 
     def _deviation(self, t: float, x: Array, u: Array) -> Array:
-        """Jet (order + 1, naxes) from which a fit begins, less the plan's."""
+        """Jet (order + 1, naxes) at the start of a fit, minus that of the plan."""
         highest = self._signals.measured
         if highest is None:
             return self._jets(t, x, self._order)
@@ -411,7 +415,7 @@ class _Correction(ct.NonlinearIOSystem):  # type: ignore[misc]
         return seen if highest == self._order else np.concatenate([seen, self._jets(t, x, self._order)[highest + 1 :]])
 
     def _within_limits(self, t: float, found: Transition, coefficients: Array, goal: Array) -> bool:
-        """Whether the plan with a correction keeps its limits from now to the end of both."""
+        """Whether the plan with a correction satisfies the limits until the end of both."""
         met = self._horizons.end(t)
         end = max(met, self._plan.end)
         edges = np.unique([t, met, end, *self._plan.breakpoints.tolist()])
@@ -444,7 +448,7 @@ class _Correction(ct.NonlinearIOSystem):  # type: ignore[misc]
         return np.array(self._corrections(t, x.tolist(), order)).T
 
     def _corrections(self, t: Value, x: Value, order: int) -> list[list[Value]]:
-        """Jets of the correction axis by axis, of numbers or of symbols."""
+        """Jets of the correction axis by axis, numeric or symbolic."""
         live = t <= x[_END]
         now = (t if live else x[_END]) if isinstance(live, bool) else np.fmin(t, x[_END])
         columns, goals = (
@@ -462,11 +466,11 @@ class _Correction(ct.NonlinearIOSystem):  # type: ignore[misc]
         return found
 
     def _no_rates(self, t: float, x: Value, u: Value, params: Params) -> NoReturn:
-        raise_not_standalone(self.name, "plans again every period")
+        raise_not_standalone(self.name, "is sampled")
 
 
 def _without_rounding(jet: Array, scale: Array, size: float) -> Array:
-    """Jet with 0 where derivatives are the rounding of a plan of some size."""
+    """Jet with derivatives of the size of rounding errors replaced by 0."""
     small = np.abs(jet * scale) <= 1e-9 * max(size, float(np.abs(jet[0]).max()))
     small[0] = False
     return np.where(small, 0.0, jet)
@@ -477,7 +481,7 @@ def _state(row: int, t: Value, x: Value, u: Value, params: Params) -> Value:
 
 
 def _minimum_horizon(given: float | None, period: float, whole: float) -> float:
-    """Time to the end below which nothing is fitted."""
+    """Remaining time [s] below which no fit is made."""
     if given is None:
         return max(period, min(5.0 * period, 0.5 * whole))
     minimum = checked_finite(given, "min_horizon", above=0.0)
@@ -507,7 +511,7 @@ def _checked_trigger(
 
 
 def _checked_limits(plan: Trajectory, limits: Mapping[int, ArrayLike] | None) -> tuple[tuple[int, Array], ...]:
-    """Limits by order, one for each axis, which the plan itself keeps."""
+    """Limits by order, one for each axis, which the plan itself must satisfy."""
     if limits is not None:
         check_kind(limits, "limits", Mapping, "a mapping of orders to magnitudes")
     found = []
@@ -520,10 +524,12 @@ def _checked_limits(plan: Trajectory, limits: Mapping[int, ArrayLike] | None) ->
         extrema = plan.extrema(nu)
         for axis, label in enumerate(plan.labels):
             low, high = float(extrema.minimum[axis]), float(extrema.maximum[axis])
-            worst, time = (high, extrema.time_max[axis]) if high >= -low else (low, extrema.time_min[axis])
+            worst, time = (
+                (high, float(extrema.time_max[axis])) if high >= -low else (low, float(extrema.time_min[axis]))
+            )
             if abs(worst) > limit[axis] * (1.0 + 1e-9):
                 raise ValueError(
-                    f"plan must keep limits[{nu}] = {limit[axis]:g}, got {worst:.6g} of {label} at {float(time):.6g} s"
+                    f"plan must satisfy limits[{nu}] = {limit[axis]:g}, got {worst:.6g} of {label} at {time:.6g} s"
                 )
         found.append((nu, limit))
     return tuple(found)

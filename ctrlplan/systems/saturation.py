@@ -1,4 +1,4 @@
-"""Limits of an actuator as a block."""
+"""Saturation of an actuator as a block."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ def create_saturation_iosystem(
     outputs: Sequence[str] | str | None = None,
     name: str = "saturation",
 ) -> ct.NonlinearIOSystem:
-    """Actuator limits: the output is the command within them.
+    """Actuator saturation: the output is the limited command.
 
-    No states. Inputs: the command u_cmd. Outputs: u. A run by
-    `ctrlplan.simulate` records as events when a limit is reached and left.
+    No states. Inputs: the command u_cmd. Outputs: u. `ctrlplan.simulate` records
+    as events when the command reaches and leaves a limit.
 
     Parameters
     ----------
     low, high : float
         Minimum and maximum of the output, in its unit; either may be infinite.
     inputs, outputs : str, optional
-        Names of the signals: u_cmd and u unless given.
+        Names of the signals, by default u_cmd and u.
     name : str, optional
         Name of the block.
 
@@ -45,9 +45,9 @@ def create_saturation_iosystem(
     Raises
     ------
     TypeError
-        If an argument is of a wrong kind.
+        If an argument has the wrong type.
     ValueError
-        If the limits do not increase or are nan, or names are not one of each.
+        If the limits do not increase or are nan, or more than one name is given.
 
     Examples
     --------

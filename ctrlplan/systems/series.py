@@ -1,9 +1,9 @@
 """Arithmetic of truncated Taylor series: derivatives of a formula from derivatives of its arguments.
 
 A series is an array (order + 1, ...) whose entry k is the k-th derivative
-over k!. The flat maps of plants are formulas in derivatives of flat outputs;
-with these few operations their own derivatives cost no derivation by hand.
-Entries may be arrays, numbers, or the symbols of a tracer.
+over k!. The flat maps of plants are formulas in the derivatives of flat outputs;
+these operations give the derivatives of the maps without derivation by hand.
+Entries may be arrays, numbers or symbols.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from ctrlplan._types import Array, Value
 from ctrlplan.trajectories.common import FACTORIALS
 
 Quantity = Value
-"""What formulas of plants take: a number, an array, a Taylor series or a symbol of a tracer."""
+"""Argument of the formulas of plants: a number, an array, a Taylor series or a symbol."""
 
 
 def from_jet(jet: Array) -> Array:
@@ -36,13 +36,13 @@ def derivative(series: Array, nu: int = 1) -> Array:
 
 
 def multiply(a: Array, b: Array) -> Array:
-    """Product, as long as the shorter factor."""
+    """Product, with the order of the shorter factor."""
     n = min(len(a), len(b))
     return _stacked([_total(a[i] * b[k - i] for i in range(k + 1)) for k in range(n)])
 
 
 def divide(a: Array, b: Array) -> Array:
-    """Quotient, as long as the shorter of both; b must not be 0."""
+    """Quotient, with the order of the shorter operand; b must not be 0."""
     out: list[Array] = []
     for k in range(min(len(a), len(b))):
         out.append((a[k] - _total(out[i] * b[k - i] for i in range(k))) / b[0])
@@ -59,7 +59,7 @@ def sqrt(a: Array) -> Array:
 
 
 def arctan2(y: Array, x: Array, squares: Array | None = None) -> Array:
-    """Angle of (x, y), by integrating (y' x - y x')/(x^2 + y^2); `squares` is x^2 + y^2 where it is known."""
+    """Angle of (x, y), by integrating (y' x - y x')/(x^2 + y^2); `squares` is x^2 + y^2 if known."""
     n = min(len(x), len(y))
     x, y = x[:n], y[:n]
     first = _stacked([np.arctan2(y[0], x[0])])
@@ -82,11 +82,11 @@ def sincos(a: Array) -> tuple[Array, Array]:
 
 
 class Taylor:
-    """Truncated Taylor series in arithmetic written for numbers.
+    """Truncated Taylor series with arithmetic operators.
 
-    Operators with numbers, arrays and other series, and `numpy.sin` and
-    `numpy.cos`, so that the equations of a plant, written once, also give the
-    derivatives of what they compute. A result is as long as its shorter argument.
+    Supports numbers, arrays and other series as operands, and `numpy.sin` and
+    `numpy.cos`, so that the equations of a plant also give derivatives of their
+    results. A result has the order of its shorter argument.
 
     Attributes
     ----------
@@ -94,14 +94,14 @@ class Taylor:
         Derivatives over k!.
     """
 
-    __array_priority__ = 1000.0  # of arrays on the left: they leave the operation to this class
+    __array_priority__ = 1000.0  # with an array on the left, this class performs the operation
 
     def __init__(self, terms: Array) -> None:
         self.terms = terms
 
     @classmethod
     def integral(cls, start: Array, rate: Taylor) -> Taylor:
-        """Series of the function with a value at 0 and a rate."""
+        """Series of the integral of a rate, with its initial value."""
         counts = np.arange(1, len(rate.terms) + 1).reshape(-1, *[1] * (rate.terms.ndim - 1))
         return cls(np.concatenate([np.broadcast_to(start, rate.terms.shape[1:])[None], rate.terms / counts]))
 
@@ -153,7 +153,7 @@ Operand = Taylor | float | Array
 
 
 def _total(terms: Iterable[Value]) -> Value:
-    """Sum, 0 of none; no term is added to 0, which would copy it."""
+    """Sum of terms; 0 without terms. A single term is not copied."""
     remaining = iter(terms)
     return sum(remaining, next(remaining, 0.0))
 

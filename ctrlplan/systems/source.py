@@ -1,4 +1,4 @@
-"""A plan as a block of a python-control loop."""
+"""Plan as a block of a python-control interconnection."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from ctrlplan.trajectories.files import signal_names, signal_rows
 
 
 class PlanSource(ct.NonlinearIOSystem):  # type: ignore[misc]
-    """Block that puts out a plan and its derivatives; made by `create_source_iosystem`.
+    """Source of a plan and its derivatives; made by `create_source_iosystem`.
 
     Attributes
     ----------
     plan : Trajectory
-        What is put out.
+        The plan.
     derivatives : int
-        Highest derivative put out.
+        Highest derivative among the outputs.
     breakpoints : ndarray
-        Times [s] at which the output or a derivative of it may jump: an
-        integrator should stop there.
+        Times [s] at which an output or one of its derivatives may jump, where an
+        integrator should stop.
     """
 
     plan = DeclaredTrait[Trajectory]()
@@ -56,23 +56,24 @@ def create_source_iosystem(
     suffix: str = "",
     name: str = "plan",
 ) -> PlanSource:
-    """Plan as an input/output system.
+    """Source of a plan and its derivatives.
 
-    No states. No inputs. Outputs: axis by axis the label, and its derivatives:
-    x, x_d1, x_d2, z, z_d1, ... for a plan with the labels x and z (y for one
-    without labels); `control.interconnect` connects them by these names.
+    No states. No inputs. Outputs: the position of each axis and its
+    derivatives, x, x_d1, x_d2, z, z_d1, ... for a plan with the labels x and z
+    (y for a plan without labels). `control.interconnect` connects them by name.
 
     Parameters
     ----------
     plan : Trajectory
-        Output at every time: held before its start and after its end.
+        The plan; constant before its start and after its end.
     derivatives : int, optional
-        Highest derivative among the outputs, in the plan's unit over s^nu.
+        Highest derivative among the outputs; derivative nu has the unit of the
+        plan over s^nu.
     labels : sequence of str or str, optional
-        Names of the axes in the place of the plan's own.
+        Names of the axes in place of those of the plan.
     suffix : str, optional
-        Appended to each label: ``suffix="_ref"`` gives x_ref, x_ref_d1, ...,
-        where the plant has outputs x and z of its own.
+        Appended to each label: ``suffix="_ref"`` gives x_ref, x_ref_d1, ..., for
+        a plant with outputs x and z.
     name : str, optional
         Name of the block.
 
@@ -86,8 +87,8 @@ def create_source_iosystem(
     TypeError
         If `plan` is not a trajectory.
     ValueError
-        If `derivatives` is not a whole number from 0, or labels are not one for
-        each axis.
+        If `derivatives` is not a non-negative integer, or the number of labels
+        differs from the number of axes.
 
     Examples
     --------
@@ -104,29 +105,29 @@ def create_source_iosystem(
 
 
 def axis_signals(plan: Trajectory, labels: Sequence[str] | str | None, suffix: str) -> tuple[str, ...]:
-    """Name of each axis in a block: its label, or the one given for it, with the suffix."""
+    """Signal name of each axis: its label, or the one given instead, with the suffix."""
     own = plan.labels if labels is None else checked_labels(labels, plan.naxes)
     return tuple(label + suffix for label in own)
 
 
 def source_samples(plan: Trajectory, timepts: ArrayLike, derivatives: int = 0) -> Array:
-    """Samples of a plan in the order of its source block's outputs.
+    """Samples of a plan in the order of the outputs of its source.
 
-    The input signal for `control.forced_response`, which takes it for linear
-    between samples.
+    They can be used as input of `control.forced_response`, which interpolates
+    linearly between samples.
 
     Parameters
     ----------
     plan : Trajectory
-        What is sampled.
+        The plan.
     timepts : array_like, shape (ntime,)
         Times [s].
     derivatives : int, optional
-        Highest derivative beside the position.
+        Highest derivative in addition to the position.
 
     Returns
     -------
-    ndarray, shape (ntime,) for a single signal, (nsignals, ntime) for more
+    ndarray, shape (ntime,) for a single signal, otherwise (nsignals, ntime)
     """
     check_kind(plan, "plan", Trajectory)
     times = np.atleast_1d(np.asarray(timepts, dtype=float))

@@ -186,8 +186,8 @@ def _check_plan(plan: Trajectory) -> None:
     check_kind(plan, "plan", Trajectory)
     if is_shaped(plan):
         raise ValueError(
-            f"a shaped plan must keep its duration of {plan.duration:g} s, got a clock that slows: the delays of the "
-            "shaper would change with it; take the plan before it is shaped"
+            f"plan must not be shaped, got a shaped plan of {plan.duration:g} s: a time scaling would change the "
+            "delays of the shaper; give the plan before it is shaped"
         )
 
 
@@ -249,7 +249,7 @@ def _check_signals(inputs: Sequence[str], outputs: Sequence[str]) -> None:
         raise ValueError("limits or errors must name a signal that slows the plan, got none")
     both = [label for label in inputs if label in outputs or inputs.count(label) > 1]
     if both:
-        raise ValueError(f"inputs and outputs must have names of their own, got {', '.join(both)} twice")
+        raise ValueError(f"inputs and outputs must have different names, got {', '.join(both)} twice")
 
 
 def _series(plan: Trajectory, t: Value, order: int) -> list[list[Value]]:
@@ -291,7 +291,7 @@ def _checked_limits(pair: Range, label: str, margin: float) -> tuple[float, floa
     low, high, size = checked_limits(pair, f"limits of {label}")
     both = math.isfinite(low) and math.isfinite(high)
     if not both and 0.0 in (low, high):
-        raise ValueError(f"limits of {label} must hold a finite one that is not 0, got {low:g} and {high:g}")
+        raise ValueError(f"limits of {label} must contain a finite one that is not 0, got {low:g} and {high:g}")
     return low, high, margin * (2.0 * size if both else size)
 
 

@@ -66,7 +66,7 @@ def response(function, system, options, times=None):
     state, params = _initial_state(function, system, options), options.get("params")
     try:
         ours = cp.simulate(system, timepts, signals, state, params=params)
-        stated = re.search(r"rtol = (\S+) would do", ours.reason)
+        stated = re.search(r"rtol = (\S+) suffices", ours.reason)
         if stated:  # an output is not accurate to 1e-6 of its range, and the response says what to do
             ours = cp.simulate(system, timepts, signals, state, params=params, rtol=float(stated[1]))
     except cp.SolverError as error:

@@ -180,7 +180,7 @@ def test_loops_flattened_together_are_those_flattened_alone():
     ids=["matrices", "fraction", "order", "outputs", "blocks"],
 )
 def test_systems_that_differ_in_more_than_numbers(other):
-    with pytest.raises(ValueError, match="systems must differ in numbers alone"):
+    with pytest.raises(ValueError, match="systems must differ only in numerical values"):
         linear_forms([cp.plants.integrator_lag_loop(5.0), other])
 
 

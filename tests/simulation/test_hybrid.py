@@ -263,17 +263,17 @@ def test_events_and_stops_in_a_sampled_loop():
 def test_what_the_peer_says_to_such_a_loop():
     law = cp.sample_hold(gain(-1.0, "y", "u", "law"), 0.5)
     loop = ct.interconnect([plant(), law], inputs=0, outputs="y")
-    with pytest.raises(RuntimeError, match=r"block law, which takes samples, must be run by ctrlplan.simulate"):
+    with pytest.raises(RuntimeError, match=r"block law, which is sampled, must be run by ctrlplan.simulate"):
         ct.input_output_response(loop, [0.0, 1.0], 0, [1.0, 0.0, 0.0])
     late = ct.interconnect([plant(), cp.create_delay_iosystem(0.1, inputs="y", outputs="u")], inputs=0, outputs="y")
-    with pytest.raises(RuntimeError, match=r"block delay, which has a memory of its input, must be run by ctrlplan"):
+    with pytest.raises(RuntimeError, match=r"block delay, which is a delay, must be run by ctrlplan"):
         ct.input_output_response(late, [0.0, 1.0], 0, [1.0, 0.0])
 
 
 @pytest.mark.parametrize("system", ["sampled", "delayed"])
 def test_the_exact_method_refuses_them(system):
     block = cp.sample_hold(gain(1.0, "r", "y", "b"), 0.5) if system == "sampled" else cp.create_delay_iosystem(0.5)
-    with pytest.raises(ValueError, match=r'method "exact".*block (b takes samples|delay puts out the past)'):
+    with pytest.raises(ValueError, match=r'method "exact".*block (b is sampled|delay is a delay)'):
         cp.simulate(block, [0.0, 1.0], 1.0, method="exact")
 
 

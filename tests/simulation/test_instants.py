@@ -85,7 +85,7 @@ def test_a_run_that_starts_late_keeps_its_instants(first):
 
 
 def test_a_period_below_the_resolution_of_time_is_rejected():
-    with pytest.raises(ValueError, match="the period of hold must be told from 0 in times up to 1e"):
+    with pytest.raises(ValueError, match="the period of hold must exceed the rounding of times up to 1e"):
         cp.simulate(held(1e-9), 1e9 + np.array([0.0, 1.0]), 1.0)
 
 

@@ -212,7 +212,7 @@ def test_systems_that_a_state_does_not_predict():
     late = ct.interconnect(
         [cp.create_delay_iosystem(0.5, inputs="r", outputs="u"), lag], inputs="r", outputs="y", name="late"
     )
-    with pytest.raises(ValueError, match="must say all by its state, got the delay of the block delay"):
+    with pytest.raises(ValueError, match="must have a finite number of states, got the delay of the block delay"):
         cp.Predictor(late, limits, 5.0)
     with pytest.raises(ValueError, match=r"must be continuous, got .* dt = 0.1"):
         cp.Predictor(ct.ss([[0.5]], [[1]], [[1]], 0, 0.1, inputs="r", outputs="y"), limits, 5.0)

@@ -110,7 +110,9 @@ def test_a_system_without_stated_sizes_is_named_with_what_to_give(missing):
     sizes = {"states": 1, "inputs": 1, "outputs": 1}
     del sizes[missing]
     system = ct.nlsys(lambda t, x, u, p: -x + u, lambda t, x, u, p: x, name="lag", **sizes)
-    with pytest.raises(ValueError, match=rf"system must have a number of {missing}, got lag .* give it {missing}="):
+    with pytest.raises(
+        ValueError, match=rf"system must declare its number of {missing}, got lag .* construct it with {missing}="
+    ):
         cp.simulate(system, [0.0, 1.0], 1.0, 0.0)
 
 

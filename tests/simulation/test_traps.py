@@ -105,7 +105,7 @@ def test_blocks_that_share_a_name_of_a_parameter(method):
     with pytest.warns(UserWarning, match=r"first and second both have a parameter 'k', 2\.0 and 5\.0.*gives both 5\.0"):
         found = cp.simulate(sharing(), times, 1.0, method=method)
     assert np.abs(found.outputs + 25.0 * np.expm1(-times)).max() <= 1e-6
-    with pytest.warns(UserWarning, match="use keys of their own"):
+    with pytest.warns(UserWarning, match="use different keys"):
         given = cp.simulate(sharing(), times, 1.0, method=method, params={"k": 3.0})
     assert np.abs(given.outputs + 9.0 * np.expm1(-times)).max() <= 1e-6
 

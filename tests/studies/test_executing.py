@@ -360,7 +360,7 @@ def test_a_run_that_takes_too_long_is_the_failure_of_its_value(executor, clock):
     found = swept(trembling, [0.5, 1.0, 300.0], pool, timeout=4000.0, initial_state=[0.0, 1.0, 0.0])
     (failure,) = found.failures
     assert (failure.draw, failure.params) == (2, {"value": 300.0})
-    assert failure.message.startswith("TimeLimitError: a run must end within timeout = 4000 s, got no further at t = ")
+    assert failure.message.startswith("TimeLimitError: a run must end within timeout = 4000 s, got to t = ")
     np.testing.assert_allclose(found.metrics["step"]["settling_time"][:2], np.log(50.0), rtol=1e-5)
 
 

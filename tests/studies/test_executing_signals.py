@@ -353,7 +353,7 @@ def test_one_run_without_an_end_stops_no_sweep(tmp_path):
         assert [found["settling"][k] for k in (0, 2)] == settling([1, 3])
         ((k, message),) = found["failures"]
         assert k == 1
-        assert message.startswith("TimeLimitError: a run must end within timeout = 0.5 s, got no further at t = ")
+        assert message.startswith("TimeLimitError: a run must end within timeout = 0.5 s, got to t = ")
 
 
 DASK = """

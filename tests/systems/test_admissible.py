@@ -282,7 +282,9 @@ def test_no_bang_bang_disturbance_breaks_a_limit_and_one_does_just_outside():
 
 def test_disturbances_that_leave_nothing():
     short = worst(30.0, 2.0) + MARGIN - 1.0
-    with pytest.raises(ValueError, match=rf"must leave a reference .* got {short:.3g} of half their distance too"):
+    with pytest.raises(
+        ValueError, match=rf"must allow a steady state .* got limits too narrow by {short:.3g} of half their"
+    ):
         cp.AdmissibleSet(shaken(), {"y": (-1.0, 1.0)}, 0.05, disturbances={"w": 2.0})
 
 
@@ -320,22 +322,22 @@ GOOD = {"limits": {"u": (-1.0, 1.0)}, "dt": 0.1}
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"limits": {"z": (-1, 1)}}, "limits must be of u, y, got 'z'"),
-        ({"limits": {}}, "limits must name an output"),
+        ({"limits": {"z": (-1, 1)}}, "limits must be among u, y, got 'z'"),
+        ({"limits": {}}, "limits must name at least one output"),
         ({"limits": {"u": (1, 1)}}, "limits of u must increase, got 1 and 1"),
         ({"limits": {"u": (math.nan, 1)}}, "limits of u must be a number, got nan"),
         ({"limits": {"u": (-math.inf, math.inf)}}, "must hold a finite one"),
         ({"limits": {"u": (1, 2, 3)}}, "limits of u must be two numbers"),
-        ({"limits": {"u": (1, 2)}}, "must leave a reference .* got 2.01 of half"),  # u rests at 0
+        ({"limits": {"u": (1, 2)}}, "must allow a steady state .* too narrow by 2.01 of half"),  # u rests at 0
         ({"dt": 0.0}, "dt must be finite and above 0, got 0.0"),
         ({"dt": math.nan}, "dt must be finite"),
         ({"margin": 0.0}, r"margin must lie in \(0, 1\), got 0.0"),
         ({"margin": 1.0}, r"margin must lie in \(0, 1\), got 1.0"),
-        ({"references": ["q"]}, "references must be of r, got 'q'"),
+        ({"references": ["q"]}, "references must be among r, got 'q'"),
         ({"references": ["r", "r"]}, "references must not name an input twice"),
-        ({"references": []}, "references must name an input"),
-        ({"disturbances": {"r": 1.0}}, "references must name an input of .* got none"),
-        ({"disturbances": {"r": 1.0}, "references": ["r"]}, "disturbances must be of no signal, got 'r'"),
+        ({"references": []}, "references must name at least one input"),
+        ({"disturbances": {"r": 1.0}}, "references must name at least one input of .* got none"),
+        ({"disturbances": {"r": 1.0}, "references": ["r"]}, "disturbances must be among no signals, got 'r'"),
     ],
 )
 def test_what_is_rejected(given, message):
@@ -363,5 +365,5 @@ def test_loops_of_other_kinds():
 @pytest.mark.slow
 def test_a_loop_that_swings_on_and_on():
     slow = ct.ss([[-1e-7, 300.0], [-300.0, -1.0]], [[1], [1]], [[1, 0]], 0, inputs="r", outputs="u")
-    with pytest.raises(ValueError, match="loop must come to rest sooner beside its fastest motion"):
+    with pytest.raises(ValueError, match="time constants of the loop must not be too far apart"):
         cp.AdmissibleSet(slow, **GOOD)

@@ -87,7 +87,7 @@ def test_no_two_instants_are_farther_apart_than_slopes_times_peaks():
 def test_a_rope_cannot_push():
     rope = Crane().rope()
     falls = cp.PolySpline([cp.Waypoint(0, [0, 0], 0, 0), cp.Waypoint(1, [0, 10], 0, 0)])
-    with pytest.raises(ValueError, match=r"g - z'' must be above 0, got -47.93 m/s\^2 at 0.2113 s"):
+    with pytest.raises(ValueError, match=r"g - z'' must be above 0 for a taut rope, got -47.93 m/s\^2 at 0.2113 s"):
         rope.slopes(falls)
     with pytest.raises(ValueError, match=r"g - z'' must be above 0 for a taut rope, got -47.93"):
         rope.top(falls.jet([0.0, 0.5 - np.sqrt(3) / 6], 2))

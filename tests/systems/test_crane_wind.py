@@ -429,7 +429,7 @@ BAD = {
     "wind twice": (EITHER, "wind must be .*, got wind among inputs", {"wind": GUST, "inputs": ["wind"]}),
     "a string for inputs": (TypeError, "inputs must be a sequence", {"inputs": "wind"}),
     "a block for the reference": (TypeError, "reference must be a sequence", {"reference": SOURCE}),
-    "a plan in the reference": (TypeError, "reference must hold control systems", {"reference": [move()]}),
+    "a plan in the reference": (TypeError, "reference must contain control systems", {"reference": [move()]}),
     "inputs twice": (ValueError, "inputs", {"inputs": ["wind", "wind"]}),
     "an unknown input": (ValueError, "wnd", {"inputs": ["wnd"]}),
     "no reference": (ValueError, "x_ref", {"reference": []}),

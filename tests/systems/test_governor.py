@@ -256,7 +256,7 @@ def test_a_nonlinear_loop_behind_a_predictor():
 
 
 def test_only_simulate_runs_it():
-    with pytest.raises(RuntimeError, match=r"block governor, which takes samples, must be run by ctrlplan.simulate"):
+    with pytest.raises(RuntimeError, match=r"block governor, which is sampled, must be run by ctrlplan.simulate"):
         ct.input_output_response(lag_loop(), [0.0, 1.0], [0.0, 0.0])
 
 
@@ -286,8 +286,12 @@ LIMITS = {"u": (-1.0, 1.0)}
         ({"offset": -0.1}, ValueError, "offset must be finite and at least 0, got -0.1"),
         ({"margin": 2.0}, ValueError, r"margin must lie in \(0, 1\)"),
         ({"loop": 3.0}, TypeError, "loop must be a linear control system or have references, .* got float"),
-        ({"loop": Slowly()}, TypeError, "limits must go with a loop, got a Slowly, which has its own"),
-        ({"loop": Slowly(), "limits": None, "margin": 1}, TypeError, "margin must go with a loop"),
+        (
+            {"loop": Slowly()},
+            TypeError,
+            "limits must be given with a linear loop only, got a Slowly, which has its own",
+        ),
+        ({"loop": Slowly(), "limits": None, "margin": 1}, TypeError, "margin must be given with a linear loop only"),
         ({"loop": Slowly(), "limits": None, "dt": None}, ValueError, "dt must be given, the period in s"),
     ],
 )

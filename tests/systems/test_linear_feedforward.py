@@ -202,8 +202,8 @@ def test_no_zero_is_missed(seed):
 @pytest.mark.parametrize(
     ("loop", "error", "message"),
     [
-        (named([0.0], [1, 1]), ValueError, "loop must bring its input to its output, got gain 0"),
-        (ct.ss([[-1.0]], [[0.0]], [[1.0]], 0), ValueError, "loop must bring its input to its output, got gain 0"),
+        (named([0.0], [1, 1]), ValueError, "the transfer function of loop must not be 0, got 0"),
+        (ct.ss([[-1.0]], [[0.0]], [[1.0]], 0), ValueError, "the transfer function of loop must not be 0, got 0"),
         (ct.tf([1], [1, 0.5], 0.1), ValueError, "loop must be in continuous time, got dt = 0.1"),
         (ct.tf([1], [1, 0.5], True), ValueError, "loop must be in continuous time, got dt = True"),
         (

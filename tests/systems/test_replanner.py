@@ -97,10 +97,10 @@ BAD = [
     ({"derivatives": -1}, "derivatives must be a whole number from 0, got -1"),
     ({"alpha": 6.5}, "alpha must lie in [0, 2 pi), got 6.5"),
     ({"alpha": -0.5}, "alpha must lie in [0, 2 pi), got -0.5"),
-    ({"measured": 1}, "suffix must tell outputs from inputs, got '' and x, x_d1 among both"),
+    ({"measured": 1}, "suffix must make outputs differ from inputs, got '' and x, x_d1 in both"),
     (
         {"goal_derivatives": 0, "suffix": "_goal"},
-        "suffix must tell outputs from inputs, got '_goal' and x_goal among both",
+        "suffix must make outputs differ from inputs, got '_goal' and x_goal in both",
     ),
     ({"offset": -0.1}, "offset must be finite and at least 0, got -0.1"),
     ({"offset": math.inf}, "offset must be finite and at least 0, got inf"),
@@ -283,7 +283,7 @@ def test_two_replanners_in_one_loop():
 
 def test_python_controls_own_simulation_is_rejected():
     replanner = cp.create_replanner_iosystem(PLAN, 0.5, goal_derivatives=0)
-    with pytest.raises(RuntimeError, match=r"plans again every period, must be run by ctrlplan\.simulate"):
+    with pytest.raises(RuntimeError, match=r"is sampled, must be run by ctrlplan\.simulate"):
         ct.input_output_response(replanner, np.linspace(0, 10, 11), np.ones(11))
 
 

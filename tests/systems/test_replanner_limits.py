@@ -141,7 +141,7 @@ def test_what_is_measured_beyond_the_limits_is_not_begun_from():
 
 def test_a_plan_that_breaks_its_limits_says_which_by_how_much_and_when():
     peak, time = 15 / 8 / 10, 5.0
-    message = f"plan must keep limits\\[1\\] = 0.18, got {peak:.6g} of x at {time:g} s"
+    message = f"plan must satisfy limits\\[1\\] = 0.18, got {peak:.6g} of x at {time:g} s"
     with pytest.raises(ValueError, match=message):
         cp.create_replanner_iosystem(PLAN, 0.5, limits={1: 0.18})
     cp.create_replanner_iosystem(PLAN, 0.5, limits={1: peak})

@@ -74,7 +74,7 @@ class CompiledMethod:
         solver, job = attempt.solver, attempt.job
         if solver.near_undefined(*attempt.visited()):
             raise SolverError(
-                f"the solver must reach {job.times[-1]:g} s, got to the edge of where equations are defined"
+                f"the solver must reach {job.times[-1]:g} s, got to a state at which the equations are undefined"
             )
         wrong = _disagreement(attempt, solver) if attempt.copies.blocks else ""
         if wrong:

@@ -75,10 +75,12 @@ def _sampling_instants(times: Array, dt: float | bool) -> Array:
         return times
     period = float(dt)
     if not rounding < 0.1 * period < np.inf:
-        raise ValueError(f"timepts must tell instants {period:g} s apart, got times up to {np.abs(times).max():g} s")
+        raise ValueError(
+            f"timepts must resolve sample times {period:g} s apart, got times up to {np.abs(times).max():g} s"
+        )
     steps = (times - times[0]) / period
     if steps[-1] > _MAX_STEPS:
-        raise ValueError(f"timepts must span {_MAX_STEPS:g} periods of a discrete system at most, got {steps[-1]:.3g}")
+        raise ValueError(f"timepts must span at most {_MAX_STEPS:g} periods of a discrete system, got {steps[-1]:.3g}")
     wanted = np.round(steps)
     off = np.abs(steps - wanted)
     if off.max() > _OFF_INSTANT + rounding / period:

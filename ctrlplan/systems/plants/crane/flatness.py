@@ -169,7 +169,7 @@ def check(crane: CraneParameters, plan: Trajectory) -> None:
     fall = plan.extrema(2)
     if not g - fall.maximum[1] > 0.0:
         raise ValueError(
-            f"the rope can only pull: g - z'' must be above 0, got {g - fall.maximum[1]:.4g} m/s^2 "
+            f"g - z'' must be above 0 for a taut rope, got {g - fall.maximum[1]:.4g} m/s^2 "
             f"at {fall.time_max[1]:.4g} s (tension T <= 0)"
         )
     if not plan.duration:

@@ -176,7 +176,7 @@ def _check_signals(
         raise ValueError(f"inputs must not name a signal twice, got {', '.join(inputs)}")
     for block in reference or ():
         if not isinstance(block, ct.InputOutputSystem):
-            raise TypeError(f"reference must hold control systems, got {type(block).__name__}")
+            raise TypeError(f"reference must contain control systems, got {type(block).__name__}")
     if wind is not None and not (isinstance(wind, Trajectory) and wind.naxes == 1 and "wind" not in inputs):
         got = "wind among inputs as well" if "wind" in inputs else repr(wind)
         raise ValueError(f"wind must be a trajectory of one axis, or one of inputs, got {got:.60}")

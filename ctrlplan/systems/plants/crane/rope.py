@@ -82,7 +82,7 @@ class CraneRope:
         low = self.gravity - float(fall.maximum[1])
         if not low > 0.0:
             raise ValueError(
-                f"the rope can only pull: g - z'' must be above 0, got {low:.4g} m/s^2 "
+                f"g - z'' must be above 0 for a taut rope, got {low:.4g} m/s^2 "
                 f"at {fall.time_max[1]:.4g} s (tension T <= 0)"
             )
         depth, across = float(plan.peak()[1]), float(max(-fall.minimum[0], fall.maximum[0]))
