@@ -1,4 +1,4 @@
-"""What a section becomes on a page: figures, sentences and tables, in order."""
+"""Contents of a section on the page: figures, text and tables, in order."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ class Animation:
 
     macro: ClassVar[str] = "animation"
     data: Markup
-    caption: str = "The crane along each plan, at three times its speed."
+    caption: str = "Animation of the crane for each plan, at three times real speed."
     key: str = "animation"
 
 

@@ -1,4 +1,4 @@
-"""How each type of section is drawn."""
+"""Drawing of each type of section."""
 
 from __future__ import annotations
 
@@ -63,10 +63,10 @@ def draw(section: Section | Benefit, study: Study) -> Part:
     Parameters
     ----------
     section : Section
-        What is drawn. A new type is registered with a function of the same
+        The section. A new type is registered with a function of the same
         arguments: ``@draw.register``, see `ctrlplan.studies.sections.Section`.
     study : Study
-        Whose section it is; sections of a comparison are of ``study.comparison``.
+        The study that contains it; comparisons are taken from ``study.comparison``.
 
     Returns
     -------
@@ -86,19 +86,19 @@ def draw(section: Section | Benefit, study: Study) -> Part:
 
 @draw.register
 def _(section: PlanCurves, study: Study) -> Part:
-    caption = section.caption or "The references and their derivatives; circles are prescribed values."
+    caption = section.caption or "References and their derivatives. Circles: prescribed values."
     return Part([Picture("plans", plot_plans(study.comparison, section.derivatives), caption)])
 
 
 @draw.register
 def _(section: Responses, study: Study) -> Part:
-    caption = section.caption or "What the loop does with each reference: output, error and control."
+    caption = section.caption or "Closed-loop response to each reference: output, tracking error and control."
     return Part([Picture("responses", plot_responses(study.comparison), caption)])
 
 
 @draw.register
 def _(section: Curves, study: Study) -> Part:
-    caption = section.caption or f"{section.y_label} over {section.x_label}."
+    caption = section.caption or f"{section.y_label} versus {section.x_label}."
     return Part([Picture(section.key, plot_curves(section), caption)])
 
 
@@ -109,8 +109,8 @@ def _(section: Curves, study: Study) -> Part:
 def _(section: Plane, study: Study) -> Part:
     sweep = section.sweep
     caption = section.caption or (
-        f"Settling time against overshoot on the error as {sweep.parameter} runs from {sweep.values[0]:g} to "
-        f"{sweep.values[-1]:g}. Curves are broken where the settling time jumps."
+        f"Settling time versus overshoot on the tracking error for {sweep.parameter} from {sweep.values[0]:g} to "
+        f"{sweep.values[-1]:g}. Curves are interrupted where the settling time is discontinuous."
     )
     plot = plot_plane(sweep, numbered=section.numbered, limit=section.limit, limit_label=section.limit_label)
     return Part([Picture("plane", plot, caption)])
@@ -118,21 +118,19 @@ def _(section: Plane, study: Study) -> Part:
 
 @draw.register
 def _(section: SweepCurves, study: Study) -> Part:
-    caption = section.caption or f"Metrics over {section.sweep.parameter}."
+    caption = section.caption or f"Metrics versus {section.sweep.parameter}."
     return Part([Picture("gain", plot_sweep(section.sweep, section.metrics), caption)])
 
 
 @draw.register
 def _(section: Bands, study: Study) -> Part:
-    caption = (
-        section.caption or "Spread over the draws: the median, and the bands that hold half and nine tenths of them."
-    )
+    caption = section.caption or "Median over the draws (line), and the central 50 % and 90 % of the draws (bands)."
     return Part([Picture("bands", plot_bands(section.ensemble), caption)])
 
 
 @draw.register
 def _(section: DrawTable, study: Study) -> Part:
-    hint = "The median, and in brackets where nine tenths of the draws lie; less is better in every row."
+    hint = "Median over the draws, with the 5 % and 95 % quantiles in parentheses; smaller is better in every row."
     table = spread_of(section.ensemble)
     return Part([Text(hint, hint=True), table], heading="Metrics over the draws", nominal=True)
 
@@ -147,29 +145,29 @@ def _(section: FastestMove, study: Study) -> Part:
     heads = [
         Head("limit"),
         Head("unit", unit=True),
-        Head("must stay", words=True),
-        Head("comes to"),
-        Head("at [s]"),
-        Head("left"),
+        Head("permitted range", words=True),
+        Head("value nearest to the limit"),
+        Head("time [s]"),
+        Head("margin"),
     ]
     rows = []
     for row in found.margins:
         unit = units.get(row.bound.name, "")
         rows.append([row.bound.name, unit, row.bound.range, number(row.value), number(row.time), row.share])
     caption = section.caption or (
-        "Every limited signal of the fastest plan, and where it comes nearest to its limits (dashed)."
+        "Limited signals of the fastest plan, their limits (dashed), and the point nearest to a limit (marker)."
     )
     words = (
-        f"{number(found.duration)} s is the shortest duration; {name} is at its limit at {time} s. Limits hold over "
-        "the whole interval, not at samples."
+        f"The minimum duration is {number(found.duration)} s. The active limit is {name}, reached at {time} s. The "
+        "limits are satisfied over the whole interval, not only at samples."
     )
     blocks: list[Block] = [Text(words), Table(heads, rows, "margins"), Picture("fastest", found.plot(units), caption)]
-    return Part(blocks, heading="As fast as limits allow", below=True)
+    return Part(blocks, heading="Minimum duration within limits", below=True)
 
 
 @draw.register
 def _(section: ClaimTable, study: Study) -> Part:
-    hint = Text("▲ better than every rival that counts, ▽ worse than the best of them (underlined).", hint=True)
+    hint = Text("▲ better than every ranked baseline, ▽ worse than the best ranked baseline (underlined).", hint=True)
     blocks: list[Block] = [Items(section.claim), hint, *_grids([(grid, grid.unit) for grid in section.grids])]
     return Part(blocks, heading="Is the trigonometric path optimal?", below=True)
 
@@ -178,32 +176,33 @@ def _(section: ClaimTable, study: Study) -> Part:
 def _(section: Benefit, study: Study) -> Part:
     compared, known = section.comparison, line_styles(roles_of(study.comparison))
     words = (
-        f"A trigonometric plan (alpha = {section.alpha:.4g} rad) beside what else could be sent through the same "
-        "waypoints in the same time. Profiles stop at every waypoint; the step goes to the goal at once. Steps, shaped "
-        "or not, keep no limit and do not count as rivals in the tables over alpha and duration."
+        f"A trigonometric plan (alpha = {section.alpha:.4g} rad) is compared with other references through the same "
+        "waypoints in the same time. Trapezoid and S-curve stop at every waypoint; the step jumps to the final "
+        "position. Steps, shaped or not, violate every limit on a derivative and are not ranked in the tables over "
+        "alpha and duration."
     )
-    caption = (
-        "References through the same waypoints in the same time, what the loop makes of them, and what that asks of "
-        "its controls."
-    )
+    caption = "References through the same waypoints in the same time, with the outputs and controls of the loop."
     limits = "; ".join(f"{limit} {_limit_words(value)}" for limit, value in section.limits.items())
-    over = "Over duration and alpha: ▲ better than every rival that counts, ▽ worse than the best of them (underlined)."
+    over = (
+        "Metrics over duration and alpha: ▲ better than every ranked baseline, ▽ worse than the best ranked baseline "
+        "(underlined)."
+    )
     blocks: list[Block] = [
         Text(f"{words} {section.note}" if section.note else words),
         Items(section.verdicts),
-        Picture("worth", plot_baselines(compared, known=known), caption),
-        Text("In the same time:", hint=True),
+        Picture("benefit", plot_baselines(compared, known=known), caption),
+        Text("Metrics at the same duration:", hint=True),
         metrics_of(compared, "baselines", known),
-        Text(f"Under the same limits ({limits}), the shortest duration of each:", hint=True),
+        Text(f"Minimum duration of each plan under the same limits ({limits}):", hint=True),
         durations_of(section.required_durations),
         Text(over, hint=True),
         *_grids([(grid, unit_in(compared, grid.unit)) for grid in section.grids]),
     ]
-    return Part(blocks, heading="Is it worth it?", below=True)
+    return Part(blocks, heading="Benefit of planning", below=True)
 
 
 def _grids(grids: list[tuple[Grid, str]]) -> list[Block]:
-    """Tables over alpha and duration, each with what it shows."""
+    """Tables over alpha and duration, each under its title."""
     blocks: list[Block] = []
     for grid, unit in grids:
         title = f"{grid.title} [{unit}]" if unit else grid.title
@@ -213,7 +212,7 @@ def _grids(grids: list[tuple[Grid, str]]) -> list[Block]:
 
 def _limit_words(value: object) -> str:
     """A limit as it was given, to four digits."""
-    sides = ["any" if side is None else f"{side:.4g}" for side in np.array(value, dtype=object).reshape(-1)]
+    sides = ["unlimited" if side is None else f"{side:.4g}" for side in np.array(value, dtype=object).reshape(-1)]
     return f"within ±{sides[0]}" if len(sides) == 1 else f"from {sides[0]} to {sides[1]}"
 
 
@@ -227,29 +226,29 @@ def _(section: CraneSketch, study: Study) -> Part:
 
 @draw.register
 def _(section: LoopBlocks, study: Study) -> Part:
-    caption = section.caption or "Structure of the loop, drawn from the blocks and connections of the model itself."
+    caption = section.caption or "Structure of the loop, drawn from the blocks and connections of the model."
     return Part([Picture("crane-blocks", plot_blocks(section.loop, section.titles), caption)])
 
 
 @draw.register
 def _(section: CraneTime, study: Study) -> Part:
     caption = section.caption or (
-        f"Load, error, sway and controls over time{_without_steps(study.comparison, ', ')}. The error's axis is linear "
-        "up to 1 mm, logarithmic above."
+        f"Load, tracking error, sway and controls versus time{_without_steps(study.comparison, '; ')}. The error axis "
+        "is linear up to 1 mm and logarithmic above."
     )
     return Part([Picture("crane-time", plot_time(study.comparison), caption)])
 
 
 @draw.register
 def _(section: CraneStep, study: Study) -> Part:
-    caption = section.caption or "The step: force, torque, tension of the rope and sway, with their limits (dashed)."
+    caption = section.caption or "Step: force, torque, rope tension and sway, with limits (dashed)."
     return Part([Picture("crane-step", plot_step(study.comparison), caption)])
 
 
 @draw.register
 def _(section: CranePaths, study: Study) -> Part:
     caption = section.caption or (
-        "Paths of the load in the plane (thin: planned), up to the time of the last waypoint"
+        "Paths of the load in the plane (thin: planned) up to the last waypoint"
         f"{_without_steps(study.comparison, '; ')}."
     )
     return Part([Picture("crane-plane", plot_paths(study.comparison, section.wall), caption)])
@@ -257,15 +256,15 @@ def _(section: CranePaths, study: Study) -> Part:
 
 @draw.register
 def _(section: CraneMotion, study: Study) -> Part:
-    caption = section.caption or "Trolley, rope and load at equal time steps."
+    caption = section.caption or "Trolley, rope and load at equal time intervals."
     return Part([Picture("crane-motion", plot_motion(study.comparison, section.wall), caption)])
 
 
 @draw.register
 def _(section: CraneOnline, study: Study) -> Part:
     caption = section.caption or (
-        "The load's x with the reference in force (thin), its distance from the goal (millimetres and less cut off), "
-        "sway and force."
+        "Load position x and its reference (thin), distance of the load from the goal (values below 1 mm are not "
+        "shown), sway and force."
     )
     return Part([Picture("crane-online", plot_online(study.comparison), caption)])
 
@@ -277,8 +276,8 @@ def _(section: AnimatedCrane, study: Study) -> Part:
 
 
 def _without_steps(comparison: Comparison, joint: str) -> str:
-    """That steps are not drawn, where there are any beside other plans."""
+    """Note that steps are omitted, if there are steps and other plans."""
     steps = [name for name, role in roles_of(comparison).items() if role is Role.STEP]
     if not steps or len(steps) == len(comparison.plans):
         return ""
-    return f"{joint}the step left out" if len(steps) == 1 else f"{joint}steps left out"
+    return f"{joint}the step is omitted" if len(steps) == 1 else f"{joint}steps are omitted"

@@ -1,4 +1,4 @@
-"""Tables of a page: metrics, their spread over draws, and numbers over alpha and duration."""
+"""Tables of a page: metrics, their quantiles over draws, and metrics over alpha and duration."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _NONE = (math.nan,) * 5
 
 
 def metrics_of(comparison: Comparison, kind: str = "metrics", known: Mapping[str, Style] | None = None) -> MetricsTable:
-    """Metrics of a comparison, best and worst marked.
+    """Metrics of a comparison, with marks on the best and the worst.
 
     Parameters
     ----------
@@ -47,7 +47,7 @@ def metrics_of(comparison: Comparison, kind: str = "metrics", known: Mapping[str
 
 
 def spread_of(ensemble: Ensemble) -> MetricsTable:
-    """Metrics over draws: the median, and where nine tenths of them lie."""
+    """Metrics over draws: median, 5 % and 95 % quantile."""
     nominal, rows = ensemble.nominal, []
     for key, measure in nominal.measures.items():
         if not any(key in found for found in ensemble.metrics.values()):
@@ -63,14 +63,14 @@ def spread_of(ensemble: Ensemble) -> MetricsTable:
 
 
 def grid_of(grid: Grid, unit: str) -> Table:
-    """A number over duration and alpha, the baselines behind it.
+    """A metric over duration and alpha, followed by the baselines.
 
     Parameters
     ----------
     grid : Grid
-        What is shown.
+        The metric.
     unit : str
-        Unit of the number.
+        Unit of the metric.
     """
     rows = []
     for i, (duration, marks) in enumerate(zip(grid.durations.tolist(), grid.marks(), strict=True)):
@@ -83,7 +83,7 @@ def grid_of(grid: Grid, unit: str) -> Table:
         ]
         rows.append([Cell(f"{duration:.4g}"), *cells])
     shapes = [f"alpha {a:.3g}" if a else "alpha 0 (polynomial)" for a in grid.alphas.tolist()]
-    return Table(["takes [s]", *shapes, *grid.baselines], rows, "grid")
+    return Table(["duration [s]", *shapes, *grid.baselines], rows, "grid")
 
 
 _GRID_MARKS = {"better": "better than every baseline", "worse": "worse than the best baseline"}
@@ -98,13 +98,13 @@ def durations_of(required: Sequence[RequiredDuration]) -> Table:
         rows.append([Cell(one.name), Cell(number(one.duration), mark, meaning), Cell(one.limit), Cell(one.satisfied)])
     heads = [
         Head("plan"),
-        Head("takes [s]"),
-        Head("limit that does not let it be shorter", words=True),
-        Head("limits in the time above", words=True),
+        Head("minimum duration [s]"),
+        Head("active limit", words=True),
+        Head("limits at the given duration", words=True),
     ]
     return Table(heads, rows, "durations")
 
 
 def _order(value: float) -> str:
-    """What a cell is sorted by."""
+    """Sort key of a cell."""
     return "" if math.isnan(value) else "1e999" if math.isinf(value) else repr(value)

@@ -1,4 +1,4 @@
-"""Verdicts: which plan wins and which loses, metric by metric, in words."""
+"""Best and worst plans by metric, and numbers, in words."""
 
 from __future__ import annotations
 
@@ -14,13 +14,19 @@ from ctrlplan.studies.units import ROUNDING, in_units
 TIE = 1e-3
 """Relative difference below which two values count as equal."""
 
-_NOTHING = 1e-7
-"""Difference that is the rounding of a solver, in a metric of which no scale is known."""
+_ROUNDING = 1e-7
+"""Difference that counts as rounding in a metric whose scale is unknown."""
+
+_ZERO = 1e-9
+"""Magnitude below which a value is printed as 0."""
+
+_INFINITE = {"s": "never"}
+"""Words for an infinite value by its unit."""
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """Winner and loser in one metric.
+    """Best and worst plans in one metric.
 
     Attributes
     ----------
@@ -28,11 +34,11 @@ class Verdict:
         The metric.
     best, worst : tuple of str
         Plans with the minimum and the maximum value, ties included; both empty
-        where all are equal.
+        if all values are equal.
     minimum, maximum : float
-        Their values.
+        These values.
     sentence : str
-        The same in words.
+        The result in words.
     """
 
     key: str
@@ -49,30 +55,33 @@ class Verdict:
 
 
 def verdicts(comparison: Comparison) -> list[Verdict]:
-    """Winner and loser of every metric that at least two plans define; runs that were ended early are not ranked."""
+    """Best and worst plans of each metric that two or more plans have.
+
+    Runs that an event ended are not ranked.
+    """
     found: list[Verdict] = []
     if is_unstable(comparison):
-        return found  # nothing is won where nothing settles
+        return found  # no plan settles
     for key, measure in comparison.measures.items():
         whole = {plan: rows for plan, rows in comparison.metrics.items() if plan not in comparison.stopped}
         values = {plan: rows[key] for plan, rows in whole.items() if key in rows and not math.isnan(rows[key])}
         if len(values) > 1:
             scale = comparison.scales.get(key, 100.0 if measure.unit == "%" else math.nan)
-            rounding = _NOTHING if math.isnan(scale) else ROUNDING * scale
+            rounding = _ROUNDING if math.isnan(scale) else ROUNDING * scale
             found.append(_verdict(key, measure.title, unit_of(comparison, key), values, rounding))
     return found
 
 
 def summary(comparison: Comparison) -> str:
-    """How often each plan wins and loses, in one paragraph."""
+    """Number of metrics in which each plan is best and worst, in one paragraph."""
     if is_unstable(comparison):
         return comparison.notes[0]
     decided = [v for v in verdicts(comparison) if v.best]
     ended = (
-        f" Not ranked, since its run was ended early: {', '.join(comparison.stopped)}." if comparison.stopped else ""
+        f" Not ranked, because an event ended the run: {', '.join(comparison.stopped)}." if comparison.stopped else ""
     )
     if not decided:
-        return f"No metric tells the plans apart.{ended}"
+        return f"No metric differs between the plans.{ended}"
     parts = []
     for plan in comparison.plans:
         if plan in comparison.stopped:
@@ -82,8 +91,8 @@ def summary(comparison: Comparison) -> str:
         parts.append(f"{plan} is best in {best} and worst in {worst}")
     sentence = "; ".join(parts)
     return (
-        f"Of {len(decided)} metrics that tell the plans apart, {sentence}. Values within 0.1 %, or within "
-        f"a millionth of the scale of the metric, count as equal.{ended}"
+        f"Of {len(decided)} metrics that differ between the plans, {sentence}. Values that differ by less than 0.1 %, "
+        f"or by less than 10⁻⁶ of the scale of the metric, count as equal.{ended}"
     )
 
 
@@ -93,54 +102,59 @@ def is_unstable(comparison: Comparison) -> bool:
 
 
 def unit_of(comparison: Comparison, key: str) -> str:
-    """Unit of a metric in the units of a comparison; empty where it has none."""
+    """Unit of a metric in the units of a comparison; empty if there is none."""
     return unit_in(comparison, comparison.measures[key].unit)
 
 
 def unit_in(comparison: Comparison, unit: str) -> str:
-    """A measure's unit in the units of a comparison."""
+    """Unit of a measure in the units of a comparison."""
     first = next(iter(comparison.plans.values()))
     y = _shared([comparison.units.get(label, "") for label in first.labels])
     u = _shared([comparison.units.get(name, "") for name in comparison.controls])
-    return in_units(re.sub(r"\^(-?\d+)", lambda power: power[1].translate(_SUPERSCRIPTS), unit), y, u)
+    return in_units(re.sub(r"\^(-?\d+)", lambda power: superscript(power[1]), unit), y, u)
 
 
-_SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+def superscript(exponent: int | str) -> str:
+    """An exponent in superscript digits."""
+    return str(exponent).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
 
 
 def number(value: float, unit: str = "") -> str:
-    """Four significant digits; words for what is infinite or undefined."""
+    """A value with four significant digits; a word or a sign for an infinite or undefined one."""
     if math.isnan(value):
         return "–"
     if math.isinf(value):
-        if value < 0:
-            return "−∞"
-        return "never" if unit == "s" else "∞"
-    if abs(value) < 1e-9:
+        return "−∞" if value < 0 else _INFINITE.get(unit, "∞")
+    if abs(value) < _ZERO:
         return "0"
     if 1e-3 <= abs(value) < 1e5:
         digits = max(0, 3 - math.floor(math.log10(abs(value))))
         return f"{value:.{digits}f}".replace("-", "−")
+    return _scientific(value)
+
+
+def _scientific(value: float) -> str:
+    """A value with four significant digits and a power of ten."""
     mantissa, exponent = f"{value:.3e}".split("e")
-    return f"{mantissa}·10^{int(exponent)}".replace("-", "−")
+    return f"{mantissa}·10{superscript(int(exponent))}".replace("-", "−")
 
 
 def _verdict(key: str, title: str, unit: str, values: dict[str, float], rounding: float) -> Verdict:
     minimum, maximum = min(values.values()), max(values.values())
     if _equal(minimum, maximum, rounding):
         apart = maximum - minimum if minimum < maximum else 0.0
-        within = f", within {apart:.2g}{f' {unit}' if unit else ''}" if apart else ""
-        sentence = f"{title}: no difference between {_listed(tuple(values))}{within}."
+        size = number(apart) if apart >= _ZERO else _scientific(apart)
+        within = f", within {size}{f' {unit}' if unit else ''}" if apart else ""
+        sentence = f"{title}: equal for {_listed(tuple(values))}{within}."
         return Verdict(key, title, unit, (), (), minimum, maximum, sentence)
     best = tuple(plan for plan, value in values.items() if _equal(value, minimum, rounding))
     worst = tuple(plan for plan, value in values.items() if _equal(value, maximum, rounding))
     with_unit = f" {unit}" if unit else ""
-    verb, lose = ("wins" if len(best) == 1 else "win"), ("loses" if len(worst) == 1 else "lose")
     high = number(maximum, unit) + (with_unit if math.isfinite(maximum) else "")
     low = number(minimum) + with_unit
-    sentence = f"{title}: {_listed(best)} {verb} with {low}, {_listed(worst)} {lose} with {high}"
+    sentence = f"{title}: best {low} ({_listed(best)}), worst {high} ({_listed(worst)})"
     if minimum > rounding and math.isfinite(maximum) and 1.05 <= maximum / minimum < 1e4:
-        sentence += f" ({maximum / minimum:.3g} times)"
+        sentence += f", ratio {number(maximum / minimum)}"
     return Verdict(key, title, unit, best, worst, minimum, maximum, sentence + ".")
 
 

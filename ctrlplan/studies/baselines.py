@@ -1,4 +1,4 @@
-"""What a designer could send in the place of a planned reference: steps, profiles, polynomials."""
+"""Baselines of a planned reference: steps, motion profiles, polynomials."""
 
 from __future__ import annotations
 
@@ -28,25 +28,26 @@ _DEGREES = {1: "straight line", 3: "cubic", 5: "quintic", 7: "septic", 9: "nonic
 def baseline_plans(
     waypoints: Sequence[Waypoint], limits: Mapping[str, object] | None = None, shaper: Shaper | None = None
 ) -> dict[str, Trajectory]:
-    """What a designer could send in the place of a trigonometric plan, in the same time.
+    """Baselines of a trigonometric plan, through the same waypoints at the same times.
 
     Parameters
     ----------
     waypoints : sequence of Waypoint
         Two or more, all positions given.
     limits : mapping, optional
-        Of velocity, acceleration and jerk, as for `fastest`: profiles have the
-        proportions of the fastest ones under them.
+        Of velocity, acceleration and jerk, as for `fastest`: profiles are
+        time-scaled copies of the fastest profiles under these limits.
     shaper : Shaper, optional
-        What step and S-curve are shaped by, for a lightly damped mode.
+        Input shaper for step and S-curve, for a lightly damped mode.
 
     Returns
     -------
     dict of str to Trajectory
-        step (to the goal at once), trapezoid and S-curve (at rest at every
-        waypoint), shaped step and shaped S-curve where there is a shaper,
-        quintic a leg (or what the entries given make of it), minimum jerk
-        (through the positions); one under both names where they are equal.
+        step (to the final position at the start), trapezoid and S-curve (at
+        rest at every waypoint), shaped step and shaped S-curve with a shaper,
+        quintic per segment (or the degree that the waypoints imply), minimum
+        jerk (through the positions); one plan for the last two if they are
+        equal.
     """
     points = tuple(waypoints)
     spline = PiecewiseSpline(points)
@@ -57,12 +58,12 @@ def baseline_plans(
     timed = profiles(points, spline.labels, bounds, shaper)
     shaped = {} if shaper is None else {"shaped step": shaper(plans["step"])}
     plans |= {name: timed.pop(name) for name in ("trapezoid", "S-curve")} | shaped | timed
-    # Entries above the acceleration leave minimum jerk nothing to choose.
+    # With prescribed derivatives above the acceleration, minimum jerk would have no free parameter.
     ends = (0, len(points) - 1)
     freed = [point.truncated(2 if i in ends else 0) for i, point in enumerate(points)]
     jerk = optimize_waypoints(freed, 3, labels=spline.labels).plan
     degree = max(max(piece.degree) for piece in spline.segments)
-    name = f"{_DEGREES.get(degree, f'degree {degree}')}{' a leg' if len(points) > 2 else ''}"
+    name = f"{_DEGREES.get(degree, f'degree {degree}')}{' per segment' if len(points) > 2 else ''}"
     t = np.linspace(spline.start, spline.end, 101)
     if np.abs(jerk.jet(t, 0) - spline.jet(t, 0)).max() <= 1e-9 * np.abs(spline.jet(t, 0)).max():
         return plans | {f"{name} (minimum jerk)": spline}
@@ -77,7 +78,7 @@ def profiles(
     *,
     timed: bool = True,
 ) -> dict[str, Trajectory]:
-    """Profiles at rest at every waypoint: trapezoid, S-curve, and the S-curve shaped where there is time for it.
+    """Profiles at rest at every waypoint: trapezoid, S-curve, and shaped S-curve if the segments are long enough.
 
     Parameters
     ----------
@@ -86,12 +87,12 @@ def profiles(
     labels : tuple of str
         Labels of the axes.
     limits : tuple of ndarray
-        Velocity, acceleration and jerk, axis by axis; inf where there is none.
+        Velocity, acceleration and jerk by axis; inf for no limit.
     shaper : Shaper, optional
-        For a lightly damped mode.
+        Input shaper for a lightly damped mode.
     timed : bool, optional
-        Whether each takes the time between its waypoints; otherwise it is as
-        fast as the limits allow.
+        Whether each segment has the duration between its waypoints; otherwise
+        it is as fast as the limits allow.
     """
     found = {
         "trapezoid": _profile(waypoints, labels, Trapezoid, limits, timed),
@@ -103,7 +104,7 @@ def profiles(
 
 
 def smoother_polynomials(waypoints: Sequence[Waypoint]) -> dict[str, Trajectory]:
-    """Polynomials that are smoother at their ends than what the waypoints prescribe.
+    """Polynomials with more zero derivatives at their ends than the waypoints prescribe.
 
     Parameters
     ----------
@@ -113,10 +114,10 @@ def smoother_polynomials(waypoints: Sequence[Waypoint]) -> dict[str, Trajectory]
     Returns
     -------
     dict of str to Trajectory
-        Between two waypoints at rest the septic (jerk 0 at both ends) and the
-        nonic (snap 0 as well); through more, the plans of minimum snap and of
-        minimum fifth derivative with such ends, of these degrees segment by
-        segment. None where an end is not at rest.
+        Between two waypoints at rest the septic (zero jerk at both ends) and
+        the nonic (zero snap as well); through more waypoints, the plans of
+        minimum snap and of minimum fifth derivative with these ends, of the
+        same degrees per segment. Empty if an end is not at rest.
     """
     points = tuple(waypoints)
     ends = points[0], points[-1]
@@ -130,18 +131,18 @@ def smoother_polynomials(waypoints: Sequence[Waypoint]) -> dict[str, Trajectory]
         if len(points) == 2:
             found[name] = PolySpline([first, last])
         else:
-            found[f"{name} a segment"] = optimize_waypoints([first, *points[1:-1], last], order).plan
+            found[f"{name} per segment"] = optimize_waypoints([first, *points[1:-1], last], order).plan
     return found
 
 
 def _at_rest(point: Waypoint, entries: int) -> Waypoint:
-    """Same position, with so many entries, the derivatives 0."""
+    """Waypoint with the same position and zero derivatives, `entries` values per axis."""
     zero = [0.0] * point.naxes
     return Waypoint.from_dict(point.to_dict() | {"jet": [point.position.tolist(), *[zero] * (entries - 1)]})
 
 
 def peak_limits(plan: Trajectory) -> dict[str, float]:
-    """Velocity, acceleration and jerk that a plan needs, axis by axis."""
+    """Peak velocity, acceleration and jerk of a plan, by axis, as limits."""
     peaks = {order: plan.peak(order) for order in (1, 2, 3)}
     names = [[label, f"{label}_d1", f"{label}_d2", f"{label}_d3"] for label in plan.labels]
     return {
@@ -153,16 +154,16 @@ def peak_limits(plan: Trajectory) -> dict[str, float]:
 
 
 Limits = tuple[Array, Array, Array]
-"""Velocity, acceleration and jerk, axis by axis; inf where there is none."""
+"""Velocity, acceleration and jerk by axis; inf for no limit."""
 
 
 def derivative_limits(plan: Trajectory, limits: Mapping[str, object]) -> Limits:
-    """Limits of velocity, acceleration and jerk among others, axis by axis."""
+    """Limits of velocity, acceleration and jerk by axis, from a mapping that may contain others."""
     found = np.full((3, plan.naxes), np.inf)
     known = {name: limit for name, limit in limits.items() if name in _names(plan)}
     for bound in Limited(plan, known).bounds if known else ():
         if bound.axis is not None:
-            # Where only one sign is allowed, of that sign.
+            # If only one sign is permitted, the limit of that sign.
             sides = [side for side in (bound.high, -bound.low) if side > 0.0]
             found[bound.order - 1, bound.axis] = min(sides, default=np.inf)
     return found[0], found[1], found[2]
@@ -180,7 +181,7 @@ def _profile(
     timed: bool,
     shaper: Shaper | None = None,
 ) -> Trajectory:
-    """Profiles from rest to rest, one after the other: each in the time of its leg, or as fast as it can be."""
+    """Profiles from rest to rest in sequence, each with the duration of its segment or as fast as possible."""
     parts: list[Trajectory] = []
     for first, last in pairwise(points):
         duration, distance = last.time - first.time, np.abs(last.position - first.position)
@@ -188,7 +189,7 @@ def _profile(
             parts.append(PolySpline([Waypoint(p.time, p.position, 0, 0) for p in (first, last)], labels=labels))
             continue
         distance = np.maximum(distance, 1e-9 * distance.max())
-        # Where there is no limit, that of a move in equal thirds.
+        # Without a limit: the value of a move in three phases of equal duration.
         velocity, acceleration, jerk = (
             np.where(np.isfinite(limit), limit, usual * distance / duration**order)
             for order, usual, limit in zip((1, 2, 3), (1.5, 4.5, 27.0), limits, strict=True)

@@ -1,4 +1,4 @@
-"""What is chosen for the crane: durations under limits, and whether the paper's path is the best there is."""
+"""Crane studies of planning: minimum durations under limits, and the paper's claim of optimality."""
 
 from __future__ import annotations
 
@@ -41,18 +41,19 @@ from ctrlplan.systems.plants import LAWS, crane_loop
 from ctrlplan.trajectories import PiecewiseSpline, Trajectory, TrigSpline, Waypoint
 
 LOAD_RADIUS, MARGIN = 0.5, 0.3
-"""Radius of the load, and the clearance that it and its rope keep [m]."""
+"""Radius of the load, and the clearance required of load and rope [m]."""
 WALLS = (Rectangle(*WALL),)
 _LIMITS = {"F": 5e3, "C": TORQUE_LIMITS, "T": (0.0, None), "theta": 0.1, "R": (1.0, 12.0)}
 _COMFORT = {"velocity": 2.5, "acceleration": 0.6, "jerk": 0.4, "theta": 0.06, "R": (1.0, 12.0)}
-_POLYLINE = "polyline (no path is shorter)"
+_QUINTIC = "quintic per segment (minimum jerk)"
+_POLYLINE = "polyline (lower bound)"
 
 
 def nominal_benefit() -> Benefit:
-    """The nominal move compared with its baselines, all through the flat map that are smooth enough for it."""
+    """The nominal move compared with its baselines; sufficiently smooth plans use the flat map."""
 
     def build(name: str, plan: Trajectory) -> ct.InterconnectedSystem:
-        # The flat map contains accelerations: where these jump, trolley and rope would have to.
+        # The flat map contains accelerations: if these jump, so do the references of trolley and rope.
         law = LAWS["setpoint" if plan.jumps(2) else "generator"]
         return crane_loop(CRANE, plan, law, force_limits=FORCE_LIMITS, torque_limits=TORQUE_LIMITS)
 
@@ -75,37 +76,38 @@ def nominal_benefit() -> Benefit:
         factors=(0.75, 1.0, 1.5),
         decisive=("settling_time", "sway_after", "force_peak"),
         baselines=smoother_polynomials,
-        note="Every plan with a continuous acceleration goes to the drives through the flat map of the load (figure "
-        "3): splines, polynomials up to the nonic, S-curves, shaped or not. Steps and the trapezoid, whose "
-        "acceleration jumps, go there as if the load hung at rest. All drives are limited. A run ends where the rope "
-        "goes slack.",
+        note="Plans with continuous acceleration (splines, polynomials up to degree 9, S-curves, shaped or not) are "
+        "mapped to the drive references by the flat map of the load (figure 3). Steps and the trapezoid, whose "
+        "acceleration is discontinuous, are mapped with a vertical rope. All drives are limited. A run ends when the "
+        "rope becomes slack.",
     )
-    title = "Crane, nominal case: planned beside its rivals"
+    title = "Crane, nominal case: planned reference and baselines"
     return benefit_of(experiment, build, choices, units=UNITS, title=title)
 
 
 @cache
 def nominal_fastest() -> Fastest:
-    """The nominal move with ten constraints an axis, as fast as 5 kN and the other limits allow."""
+    """The nominal move with ten constraints per axis in minimum time, for 5 kN and further limits."""
     return fastest(TrigSpline(nominal_waypoints(5), alpha=1.0), _LIMITS, CRANE)
 
 
 def fastest_notes(found: Fastest) -> tuple[str, ...]:
-    """What limits make of the nominal move, on its own time law and on another."""
+    """Minimum duration of the nominal move under limits, with its own time law and with another."""
     law = fastest(found.plan, _LIMITS, CRANE, hold="path")
     others = ", ".join(f"{row.bound.name} {row.share}" for row in found.margins.rows[1:] if "%" in row.share)
     active = found.active
     return (
-        f"Within 5 kN, 0.1 rad of sway and 12 m of rope the ten-constraint move takes {found.duration:.4g} s at least: "
-        f"{active.bound.name} is at its limit at {active.time:.3g} s. What the other limits leave: {others}. The same "
-        f"path on another time law takes {law.duration:.4g} s, with {law.active.bound.name} at its limit at "
+        "With limits of 5 kN on the force, 0.1 rad on the sway and 12 m on the rope length, the minimum duration of "
+        f"the move with ten constraints per axis is {found.duration:.4g} s. The active limit is {active.bound.name} "
+        f"at {active.time:.3g} s. Margins of the other limits: {others}. With an optimized time law on the same path "
+        f"the minimum duration is {law.duration:.4g} s, with {law.active.bound.name} as the active limit at "
         f"{law.active.time:.3g} s.",
     )
 
 
 @cache
 def optimality_grids() -> tuple[Grid, Grid]:
-    """Length and squared jerk of one trigonometric spline through the paper's waypoints, over alpha and end time."""
+    """Path length and squared jerk of a trigonometric spline through the paper's waypoints, by alpha and end time."""
     ends, alphas = np.array([14.0, 15.0, 16.0, 17.0, 18.0, 20.0]), np.array([0.0, 1.0, 2.0, 3.0, 4.0, 4.5, 5.0])
     shapes, baselines = [], []
     for end in ends.tolist():
@@ -113,16 +115,16 @@ def optimality_grids() -> tuple[Grid, Grid]:
         shapes.append([TrigSpline(points, alpha=a, warn=False) for a in alphas.tolist()])
         baselines.append(
             {
-                "quintic a leg (minimum jerk)": PiecewiseSpline(points),
+                _QUINTIC: PiecewiseSpline(points),
                 "minimum jerk through the positions": _freed(points),
-                "shortest of one trigonometric spline a leg": choose_alpha(points, family=PiecewiseSpline).plan,
+                "shortest of one trigonometric spline per segment": choose_alpha(points, family=PiecewiseSpline).plan,
             }
         )
     polyline = [_polyline(obstacle_waypoints(end)) for end in ends.tolist()]
     jerk = SquaredDerivative(3)
     return (
         Grid(
-            "Length of the path",
+            "Path length",
             "m",
             ends,
             alphas,
@@ -143,7 +145,7 @@ def optimality_grids() -> tuple[Grid, Grid]:
 
 
 def optimality_claim(grids: tuple[Grid, Grid]) -> tuple[str, ...]:
-    """What becomes of the paper's claim that the trigonometric path is optimal."""
+    """Check of the paper's claim that the trigonometric path is optimal."""
     length, jerk = grids
     row = int(np.flatnonzero(length.durations == 16.0)[0])
     best = choose_alpha(obstacle_waypoints())
@@ -154,29 +156,29 @@ def optimality_claim(grids: tuple[Grid, Grid]) -> tuple[str, ...]:
     polynomial = int((length.values[:, 1:] < length.values[:, :1] * (1.0 - 1e-3)).sum())
     straight = choose_alpha(nominal_waypoints())
     freer = ", ".join(f"{length:.2f} m with {freedom}" for freedom, length in _freer_paths(best.plan).items())
-    fails = "fails" if not better else f"holds in {better} of {cells} cases, and fails in the others"
+    verdict = "is not true in any case" if not better else f"is true in {better} of {cells} cases"
     return (
-        f"The paper calls its trigonometric path optimal. Over {cells // 2} pairs of alpha and end time, against "
-        f"minimum jerk and the shortest plan known through the same waypoints, the claim {fails}.",
-        f"Length: with 16 s, of the trigonometric paths of lowest degree and mean gamma the shortest has alpha = "
-        f"{best.alpha:.4g} and {best.value:.4g} m. Alpha alone was searched for that; other freedoms give shorter "
-        f"ones: {freer}. {baseline[0].upper()}{baseline[1:]} has {shortest:.4g} m, and no path is shorter than the "
-        f"polyline's {bound:.4g} m. "
-        f"Against the one polynomial through all of them it is shorter in {polynomial} of {length.values[:, 1:].size} "
-        "cases: that is what the paper compared with.",
-        "Jerk: one quintic a leg has the least squared jerk of all plans through these entries, which is a theorem; "
-        f"at 16 s it has {jerk.baselines['quintic a leg (minimum jerk)'][row]:.3g} m²/s⁵, the best trigonometric plan "
-        f"of the table {jerk.values[row, 1:].min():.3g}.",
-        f"From rest to rest, as in simulation 1, the path is a straight line of {straight.value:.4g} m whatever the "
-        f"alpha below pi: it is the shortest, and so is every other; the least squared jerk is the polynomial's "
-        f"(alpha = {straight.alpha:g}).",
+        f"The paper calls its trigonometric path optimal. In {cells // 2} combinations of alpha and end time, compared "
+        f"with minimum-jerk plans and with the shortest known plan through the same waypoints, the claim {verdict}.",
+        f"Length: for 16 s, the shortest trigonometric path of minimum degree with mean gamma has alpha = "
+        f"{best.alpha:.4g} and a length of {best.value:.4g} m, from a search over alpha alone. With other free "
+        f"parameters there are shorter paths: {freer}. The path of the best baseline, {baseline}, has a length of "
+        f"{shortest:.4g} m; the polyline, a lower bound, has {bound:.4g} m. Compared with a single polynomial through "
+        f"all waypoints, as in the paper, the trigonometric path is shorter in {polynomial} of "
+        f"{length.values[:, 1:].size} cases.",
+        "Jerk: one quintic per segment minimizes the integral of the squared jerk among all plans with these "
+        f"constraints. For 16 s its value is {jerk.baselines[_QUINTIC][row]:.3g} m²/s⁵; the smallest value of a "
+        f"trigonometric plan in the table is {jerk.values[row, 1:].min():.3g} m²/s⁵.",
+        f"For a move from rest to rest, as in simulation 1, every path with alpha below pi is the straight line of "
+        f"{straight.value:.4g} m and so has minimum length. The integral of the squared jerk is smallest for the "
+        f"polynomial (alpha = {straight.alpha:g}).",
         length.verdict,
         jerk.verdict,
     )
 
 
 def _freer_paths(plan: Trajectory) -> dict[str, float]:
-    """Lengths of trigonometric paths through the paper's waypoints with more freedom than alpha, by that freedom."""
+    """Lengths of trigonometric paths through the paper's waypoints with further free parameters."""
     points = obstacle_waypoints()
     found = {
         f"degree {degree} at alpha = {alpha:g}": plan_length(TrigSpline(points, alpha=alpha, degree=degree))
@@ -191,18 +193,18 @@ def _freer_paths(plan: Trajectory) -> dict[str, float]:
             return math.inf
 
     freest = minimize(length, start, method="Nelder-Mead", options={"xatol": 1e-3, "fatol": 1e-4})
-    return found | {"a gamma of its own for each axis": float(freest.fun)}
+    return found | {"a separate gamma for each axis": float(freest.fun)}
 
 
 def clearance_note(plans: Mapping[str, Trajectory]) -> str:
-    """How near each plan comes to the wall, with load and rope."""
+    """Clearance between the wall and load and rope, for each plan."""
     found = {
         name: clearance(plan, WALLS, load=LOAD_RADIUS, rope=CRANE.rope())
         for name, plan in plans.items()
         if plan.duration
     }
-    parts = ", ".join(f"{name} {least.minimum:.2f} m ({least.part})" for name, least in found.items())
-    return f"Certified over the whole way, load and rope keep from the wall: {parts}."
+    parts = ", ".join(f"{name} {one.minimum:.2f} m ({one.part})" for name, one in found.items())
+    return f"Clearance of load and rope from the wall, verified over the whole move: {parts}."
 
 
 def _freed(points: tuple[Waypoint, ...]) -> Trajectory:

@@ -91,24 +91,24 @@ def crane_nominal_study(progress: bool = True) -> Study:
         "Crane: nominal case (simulation 1, figure 4)",
         found,
         summary=(
-            "The load goes 20 m across and 1 m down in 15 s, from rest to rest. The plan of the load becomes "
-            "references of trolley and rope through (15a,b); two PIDs follow them. The step sends both drives to the "
-            "goal at once."
+            "The load moves 20 m horizontally and 1 m down in 15 s, from rest to rest. Equations (15a,b) map the "
+            "plan of the load to references of the trolley position and the rope length, which two PID controllers "
+            "follow. In the step run, both references jump to their final values."
         ),
         notes=(
             *found.notes,
-            f"The paper's claim that both splines are globally equivalent here holds: the load is within "
-            f"{1e3 * poly['error_travel']:.3g} mm of the polynomial and {1e3 * trig['error_travel']:.3g} mm of the "
-            "trigonometric plan on the way.",
+            f"The paper states that both splines give equivalent results for this move. This is confirmed: the peak "
+            f"tracking error during the move is {1e3 * poly['error_travel']:.3g} mm with the polynomial and "
+            f"{1e3 * trig['error_travel']:.3g} mm with the trigonometric plan.",
             _step_note(found),
             _limits_note(found),
-            f"Figure 3's generator has no feedback from the load. Linearised at R = 10 m, its slowest pole pair is at "
-            f"{grows.real:+.5f} ± {abs(grows.imag):.3f}j 1/s: with the study's PIDs the sway is not damped, it grows "
-            f"slowly (the integral action does it). Feedback from the load's x moves the slowest pole to "
-            f"{damped.real:.2f} 1/s and damps it: the figure shows both.",
-            f"The whole law (9)-(11), by dynamic extension, follows a plan of ten constraints to "
-            f"{whole['error_travel']:.1g} m on the nominal model; so does its open-loop half, without any feedback to "
-            "correct what is not nominal.",
+            "The controller of figure 3 has no feedback of the load position. Linearised at R = 10 m, its slowest "
+            f"pole pair is at {grows.real:+.5f} ± {abs(grows.imag):.3f}j 1/s: with the PID controllers of this study "
+            "the sway is not damped but grows slowly, because of the integral action. Feedback of the load position "
+            f"x moves the slowest pole to {damped.real:.2f} 1/s, and the sway is damped. The figure shows both cases.",
+            f"The complete control law (9)-(11), with dynamic extension, follows a plan with ten constraints per axis "
+            f"with a peak tracking error of {whole['error_travel']:.1g} m on the nominal model. Its feedforward part "
+            "alone does the same, but cannot correct deviations from the nominal model.",
             *fastest_notes(limited),
         ),
         sections=_nominal_sections(points, limited),
@@ -121,14 +121,13 @@ def _nominal_sections(points: tuple[Waypoint, Waypoint], limited: Fastest) -> tu
         CraneSketch(caption="The crane and its variables (figure 2), z down."),
         LoopBlocks(
             crane_loop(CRANE, PolySpline(points)),
-            {"plan": "path generator", "generator": "flat law (15a,b)", "trolley_pid": "PID", "hoist_pid": "PID"},
-            caption="Structure of the controller (figure 3), drawn from the blocks and connections of the model "
-            "itself.",
+            {"plan": "path generator", "generator": "flat map (15a,b)", "trolley_pid": "PID", "hoist_pid": "PID"},
+            caption="Structure of the controller (figure 3), drawn from the blocks and connections of the model.",
         ),
         CraneTime(),
         CraneStep(
-            caption="The step: force and torque at their limits (dashed), up to the slack rope: where the tension "
-            "comes to 0 the model ends, and so does the run."
+            caption="Step run: force and torque with their limits (dashed), up to the time at which the rope becomes "
+            "slack. The model is not valid for a slack rope, and the run ends there."
         ),
         CraneMotion(),
         _sway_curves(),
@@ -154,20 +153,22 @@ def crane_first_order_study(progress: bool = True) -> Study:
         "Crane: first-order data (simulation 2, figure 5)",
         found,
         summary=(
-            "Only the first and last position are prescribed, 30 s apart. The polynomial is a straight line in time, "
-            "which starts and stops at speed; the paper's trigonometric spline is 12 + 2 sin(tau − pi/2) in z."
+            "Only the initial and the final position are prescribed, 30 s apart. The polynomial has constant velocity, "
+            "which is not zero at the start and at the end. The trigonometric spline of the paper is "
+            "12 + 2 sin(tau − pi/2) in z."
         ),
         notes=(
             *found.notes,
-            f"Holds: on the way the load swings up to {rows['polynomial']['error_travel']:.3g} m about the polynomial, "
-            f"and {1e3 * rows['trigonometric']['error_travel']:.2g} mm about the trigonometric plan.",
-            "The reason is not that the spline's derivatives never vanish: it is that this spline starts at rest "
-            "(gamma = pi/2) where the line starts at speed. With the same alpha and gamma the mean, as the paper's "
-            "definition 1 has it, it would start at speed as well.",
-            f"The terminal oscillation that the paper reports ({rows['trigonometric']['error_after']:.3g} m here) is a "
-            "choice, not a property: the figure shows the speed that is left at the end over alpha. At alpha = pi the "
-            f"plan is at rest at both ends, and "
-            f"{1e3 * rows['trigonometric, alpha pi']['error_after']:.2g} mm are left.",
+            "The result of the paper is confirmed: the peak tracking error during the move is "
+            f"{rows['polynomial']['error_travel']:.3g} m with the polynomial and "
+            f"{1e3 * rows['trigonometric']['error_travel']:.2g} mm with the trigonometric plan.",
+            "The reason is the velocity at the start, not, as the paper says, the nonzero derivatives of the spline. "
+            "With gamma = pi/2 the spline starts at rest, and the polynomial does not. With the same alpha and the "
+            "mean gamma of definition 1, the spline has a nonzero initial velocity as well.",
+            f"The residual oscillation that the paper reports ({rows['trigonometric']['error_after']:.3g} m here) is "
+            "caused by the velocity of the plan at its end, which depends on alpha and gamma (figure). At alpha = pi "
+            "the plan is at rest at both ends, and the residual error is "
+            f"{1e3 * rows['trigonometric, alpha pi']['error_after']:.2g} mm.",
             _step_note(found),
             _limits_note(found),
         ),
@@ -192,25 +193,28 @@ def crane_obstacle_study(progress: bool = True) -> Study:
     grids = optimality_grids()
     return Study(
         "crane-obstacle",
-        "Crane: over an obstacle (simulation 3, figure 6)",
+        "Crane: obstacle (simulation 3, figure 6)",
         found,
         summary=(
-            "A wall stands in the way; the load passes A at 6 s and B at 11 s with given velocity and acceleration. "
-            "One plan meets all twelve constraints an axis (the paper's second approach), or one quintic a leg does "
-            "(its first)."
+            "The load passes over a wall through two waypoints, A at 6 s and B at 11 s, with given velocity and "
+            "acceleration. In the second approach of the paper, one spline satisfies all twelve constraints per axis; "
+            "in the first, one quintic polynomial per segment does."
         ),
         notes=(
             *found.notes,
-            f"Holds at alpha = 4 and 16 s: the polynomial wanders over {lengths['polynomial']:.2f} m, the "
-            f"trigonometric plan takes {lengths['trigonometric']:.2f} m; the polyline through the waypoints has "
-            f"{polyline:.1f} m.",
-            "Does not hold in general: over alpha and duration the trigonometric path can be far longer than the "
-            "polynomial's (alpha above 5), and at 20 s both wander. The figure shows where the claim is true.",
-            f"The paper's other approach, one quintic a leg, takes {lengths['piecewise']:.2f} m and "
-            f"{_piecewise_lengths()} What it costs is a jump of the jerk at A and B; the load follows it within "
-            f"{1e3 * rows['piecewise']['error_travel']:.2g} mm.",
-            f"The paper gives A and B. Without them, a load of {LOAD_RADIUS:g} m radius, its rope, and {MARGIN:g} m of "
-            f"clearance, the via points are found: {_via_points(found.plans['via points chosen'])}; the path has "
+            "The claim of the paper that the trigonometric path is shorter is confirmed for alpha = 4 and a duration "
+            f"of 16 s: the path length is {lengths['polynomial']:.2f} m with the polynomial and "
+            f"{lengths['trigonometric']:.2f} m with the trigonometric plan. The polyline through the waypoints has a "
+            f"length of {polyline:.1f} m.",
+            "The claim is not true in general. For alpha above 5 the trigonometric path can be much longer than that "
+            "of the polynomial, and for a duration of 20 s both are much longer than the polyline. The figure shows "
+            "where the claim is true.",
+            f"The path of the first approach, one quintic polynomial per segment, has a length of "
+            f"{lengths['piecewise']:.2f} m and {_piecewise_lengths()} Its jerk is discontinuous at A and B; the peak "
+            f"tracking error is {1e3 * rows['piecewise']['error_travel']:.2g} mm.",
+            f"The paper prescribes A and B. If they are optimized instead, for a load of {LOAD_RADIUS:g} m radius, its "
+            f"rope, and a clearance of {MARGIN:g} m, the via points are "
+            f"{_via_points(found.plans['via points chosen'])}, and the path length is "
             f"{rows['via points chosen']['path_length']:.2f} m. {clearance_note(found.plans)}",
             _step_note(found),
             _limits_note(found),
@@ -227,7 +231,7 @@ def crane_obstacle_study(progress: bool = True) -> Study:
 
 
 def _via_points(plan: Trajectory) -> str:
-    """Where and when a plan passes between its ends."""
+    """Positions and times of the inner waypoints of a plan."""
     return ", ".join(f"({w.position[0]:.3g}, {w.position[1]:.3g}) m at {w.time:.3g} s" for w in plan.waypoints[1:-1])
 
 
@@ -235,7 +239,7 @@ _STEP: _Loop = {"law": "setpoint", "force_limits": FORCE_LIMITS, "torque_limits"
 
 
 def _avoiding(plan: Trajectory) -> Trajectory:
-    """Plan through via points, with a margin between wall and load or rope."""
+    """Plan through via points with a clearance between the wall and load and rope."""
     return avoid(plan, WALLS, clearance=MARGIN, load=LOAD_RADIUS, rope=CRANE.rope()).plan
 
 
@@ -255,7 +259,7 @@ def _compared(
 
     def limited(run: Run) -> dict[str, float]:
         options = laws[id(run.plan)]
-        own = as_law(options.get("law", "generator")).outputs != Law.outputs  # it commands force and torque itself
+        own = as_law(options.get("law", "generator")).outputs != Law.outputs  # the law commands force and torque
         return {"error_limited": np.nan if own else _limited_error(run.plan, options, timepts)}
 
     found = compare(
@@ -274,7 +278,7 @@ def _compared(
 
 
 def _limited_error(plan: Trajectory, options: _Loop, timepts: Array) -> float:
-    """Greatest error of the load with force and torque limited as the step's are; nan where the rope goes slack."""
+    """Peak tracking error with the force and torque limits of the step run; nan if the rope becomes slack."""
     loop = crane_loop(CRANE, plan, **options | {"force_limits": FORCE_LIMITS, "torque_limits": TORQUE_LIMITS})
     response = simulate(loop, timepts, events=(SLACK,))
     if response.time[-1] < timepts[-1]:
@@ -284,18 +288,18 @@ def _limited_error(plan: Trajectory, options: _Loop, timepts: Array) -> float:
 
 
 def _limits_note(found: Comparison) -> str:
-    """What the plans ask of drives that have the step's limits, and what that costs."""
+    """Peak forces of the plans, and their tracking errors with the limits of the step run."""
     names = ("polynomial", "trigonometric", "piecewise")
     peaks = ", ".join(f"{name} {1e-3 * found.metrics[name]['force_peak']:.3g} kN" for name in names)
     limited = {name: found.metrics[name]["error_limited"] for name in names}
     errors = ", ".join(
-        f"{name} {'none, since the rope goes slack' if np.isnan(error) else f'{error:.2g} m'}"
+        f"{name} {'not defined (slack rope)' if np.isnan(error) else f'{error:.2g} m'}"
         for name, error in limited.items()
     )
     return (
-        f"Only the step runs with limited drives above; the plans ask for a force of up to {peaks}, much of it where "
-        f"their acceleration or speed begins and ends with a jump. With the step's limits (30 kN) their greatest "
-        f"errors are: {errors}."
+        f"Only the step run has limited drives. The peak trolley forces of the plans are: {peaks}. They occur mainly "
+        "at the start and at the end, where acceleration or velocity of a plan is discontinuous. With the limits of "
+        f"the step run (30 kN) the peak tracking errors are: {errors}."
     )
 
 
@@ -306,17 +310,17 @@ def _parameters(t_end: float) -> dict[str, object]:
         "trolley": f"M_c = {crane.trolley_mass:g} kg, f1 = {crane.trolley_friction:g} N s/m",
         "drum": f"J = {crane.drum_inertia:g} kg m², b = {crane.drum_radius:g} m, f2 = {crane.drum_friction:g} N m s",
         "gravity": f"{crane.gravity:g} m/s²",
-        "PIDs": "gains of a triple pole at −5 rad/s; with the derivative filter of 0.02 s the closed loop of the "
-        f"trolley has its poles at {_poles(crane.linear_trolley_loop())}, that of the hoist at "
-        f"{_poles(crane.linear_hoist_loop())} rad/s",
-        "limits for the step": "|F| ≤ 30 kN, C from −3 to 1 kN m, with anti-windup",
-        "start": "at rest at the first position",
-        "run": f"{t_end:g} s",
+        "PID controllers": "gains for a triple pole at −5 rad/s; with a derivative filter of 0.02 s the closed-loop "
+        f"poles are {_poles(crane.linear_trolley_loop())} (trolley) and {_poles(crane.linear_hoist_loop())} rad/s "
+        "(hoist)",
+        "limits in the step run": "|F| ≤ 30 kN, C from −3 to 1 kN m, with anti-windup",
+        "initial state": "at rest at the initial position",
+        "simulated time": f"{t_end:g} s",
     }
 
 
 def _poles(loop: ct.StateSpace) -> str:
-    """Poles of a loop, pairs once."""
+    """Poles of a loop, each complex pair once."""
     poles = sorted((pole for pole in np.asarray(loop.poles()) if pole.imag >= 0.0), key=lambda pole: -pole.real)
     return ", ".join(f"{p.real:.3g}" + (f" ± {p.imag:.3g}j" if p.imag else "") for p in poles).replace("-", "−")
 
@@ -328,17 +332,16 @@ def _step_note(found: Comparison) -> str:
     limited = float(metrics.saturation_time(np.asarray(response.time), force, *FORCE_LIMITS))
     slack = found.stopped.get("step")
     end = (
-        f"and the load still swings by {step['sway_after']:.2g} rad after the other plans have arrived."
+        f"The residual sway is {step['sway_after']:.2g} rad."
         if slack is None
-        else f"until the rope goes slack at {slack:.3g} s. There the model ends, and so does the run: what a step "
-        "would do afterwards is not known, and its figures are not ranked."
+        else f"The rope becomes slack at {slack:.3g} s. The model is not valid for a slack rope, so the run ends there "
+        "and the metrics of the step are not ranked."
     )
-    held = f"it holds the trolley's drive at its limit for {limited:.2g} s"
-    return f"The step does what the introduction says: {held}, {end}"
+    return f"The step saturates the trolley drive for {limited:.2g} s, as the introduction of the paper says. {end}"
 
 
 def _linear_loop(law: str) -> ct.StateSpace:
-    """Closed loop linearised about rest at R = 10 m, with the sway as output."""
+    """Closed loop linearised at the equilibrium with R = 10 m, with the sway as output."""
     start = Step([0.0, 10.0], [0.0, 10.0], labels=["x", "z"])
     loop = crane_loop(CRANE, start, LAWS[law])
     linear = ct.linearize(loop, loop.initial_state, 0)
@@ -348,27 +351,27 @@ def _linear_loop(law: str) -> ct.StateSpace:
 
 
 def _slowest(system: ct.StateSpace) -> complex:
-    """Pole farthest to the right, of those that move the sway."""
+    """Pole with the largest real part, without the poles at 0."""
     poles = np.asarray(system.poles())
-    swinging = poles[np.abs(poles) > 1e-6]
-    return complex(swinging[swinging.real.argmax()])
+    nonzero = poles[np.abs(poles) > 1e-6]
+    return complex(nonzero[nonzero.real.argmax()])
 
 
 def _sway_curves() -> Curves:
-    """Sway of the linearised loops from 0.05 rad, with figure 3's generator and with load feedback."""
+    """Sway of the linearised loops from 0.05 rad, for the controller of figure 3 and with load feedback."""
     t = np.linspace(0.0, 600.0, 6001)
     rows = {}
-    for law, label in (("generator", "figure 3's generator"), ("load_feedback", "with load feedback")):
+    for law, label in (("generator", "controller of figure 3"), ("load_feedback", "with load feedback")):
         system = _linear_loop(law)
         state = np.zeros(system.nstates)
         state[system.nstates - 6 + 2] = 0.05
         rows[label] = np.asarray(simulate(system, t, initial_state=state).outputs).reshape(-1)
-    caption = "Sway after a push of 0.05 rad, loops linearised at R = 10 m."
+    caption = "Response of the sway to an initial value of 0.05 rad; loops linearised at R = 10 m."
     return Curves("time [s]", "sway [rad]", t, rows, key="crane-sway", caption=caption)
 
 
 def _speed_curves(points: tuple[Waypoint, Waypoint]) -> Curves:
-    """Speed at start and end over alpha, with the paper's gamma and with the mean."""
+    """Speed of the plan at start and end versus alpha, for the paper's gamma and for the mean gamma."""
     alphas = np.linspace(0.05, 5.5, 220)
     rows: dict[str, list[float]] = {"start, gamma pi/2": [], "end, gamma pi/2": [], "both ends, gamma mean": []}
     for alpha in alphas.tolist():
@@ -388,23 +391,25 @@ def _speed_curves(points: tuple[Waypoint, Waypoint]) -> Curves:
         alphas,
         {name: np.array(row) for name, row in rows.items()},
         key="crane-curves",
-        caption="Speed at which the plan starts and ends over alpha: what is not 0 there, the load swings off.",
+        caption="Speed of the plan at its start and end versus alpha. A nonzero speed excites the sway.",
     )
 
 
 def _piecewise_lengths() -> str:
-    """Whether one quintic a leg is the shortest path at every alpha and end time drawn."""
+    """Where one quintic per segment gives the shorter path, in words."""
     rows = _length_curves().rows
-    pairs = [(rows[name], rows[name.replace("one plan", "one quintic a leg")]) for name in rows if "one plan" in name]
+    pairs = [
+        (rows[name], rows[name.replace("one plan", "one quintic per segment")]) for name in rows if "one plan" in name
+    ]
     if all(np.all(segments <= whole) for whole, segments in pairs):
-        return "is the shortest at every alpha and end time drawn."
+        return "is the shortest for all values of alpha and all end times in the figure."
     share = np.mean([np.mean(segments <= whole) for whole, segments in pairs])
-    return f"is the shorter one at {100 * share:.0f} % of the alphas and end times drawn."
+    return f"is the shorter one for {100 * share:.0f} % of the values of alpha and end times in the figure."
 
 
 @cache
 def _length_curves() -> Curves:
-    """Path length over alpha for several durations, the polynomial at alpha 0, and one quintic a leg."""
+    """Path length versus alpha for several durations, of one plan and of one quintic per segment."""
     alphas = np.linspace(0.0, 5.6, 113)
     rows = {}
     for duration in (14.0, 16.0, 20.0):
@@ -413,7 +418,7 @@ def _length_curves() -> Curves:
         lengths = [float(metrics.path_length(t, TrigSpline(points, alpha=a, warn=False)(t))) for a in alphas.tolist()]
         rows[f"one plan, {duration:g} s"] = np.array(lengths)
         segments = float(metrics.path_length(t, PiecewiseSpline(points)(t)))
-        rows[f"one quintic a leg, {duration:g} s"] = np.full(alphas.size, segments)
+        rows[f"one quintic per segment, {duration:g} s"] = np.full(alphas.size, segments)
     return Curves(
         "alpha [rad] (0: polynomial)",
         "path length [m]",
@@ -422,5 +427,5 @@ def _length_curves() -> Curves:
         log=True,
         paired=True,
         key="crane-curves",
-        caption="Length of the path over alpha for three end times; A and B stay at 6 and 11 s.",
+        caption="Path length versus alpha for three end times. A and B are passed at 6 s and 11 s.",
     )

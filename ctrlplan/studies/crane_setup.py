@@ -1,4 +1,4 @@
-"""The crane of the studies: its parameters, its moves, and what is measured of it."""
+"""The crane of the studies: parameters, moves and metrics."""
 
 from __future__ import annotations
 
@@ -30,24 +30,24 @@ TORQUE_LIMITS = (-3e3, 1e3)
 WALL = ((7.0, 13.0), (6.5, 12.0))
 """The obstacle of the third simulation: sides in x and in z (down) [m]."""
 SLACK = Event("T", low=0.0, stop=True, name="rope tension")
-"""Where the model ends: a rope only pulls."""
+"""Event at which the model is no longer valid: the rope tension must stay positive."""
 
 CRANE_MEASURES = {
-    "error_travel": Measure("Greatest error of the load on the way", "m"),
-    "error_after": Measure("Greatest error of the load afterwards", "m"),
-    "sway_after": Measure("Greatest sway afterwards", "rad"),
-    "force_peak": Measure("Greatest force asked of the trolley", "N"),
-    "error_limited": Measure("Greatest error with the drives limited", "m"),
-    "slack_time": Measure("Time with a slack rope", "s"),
-    "path_length": Measure("Length of the planned path", "m"),
-    "load_path": Measure("Length of the load's path", "m"),
+    "error_travel": Measure("Peak tracking error during the move", "m"),
+    "error_after": Measure("Peak tracking error after the move (residual)", "m"),
+    "sway_after": Measure("Residual sway", "rad"),
+    "force_peak": Measure("Peak trolley force", "N"),
+    "error_limited": Measure("Peak tracking error with limited drives", "m"),
+    "slack_time": Measure("Time with slack rope", "s"),
+    "path_length": Measure("Path length of the plan", "m"),
+    "load_path": Measure("Path length of the load", "m"),
 }
 
 UNITS = {"x": "m", "z": "m", "F": "N", "C": "N m", "theta": "rad", "T": "N", "R": "m"}
 
 
 def nominal_waypoints(prescribed: int = 3) -> tuple[Waypoint, Waypoint]:
-    """First simulation: 20 m across and 1 m down in 15 s, `prescribed` entries prescribed at both ends."""
+    """First simulation: 20 m across and 1 m down in 15 s; `prescribed` values per axis and end, derivatives zero."""
     zeros = [0.0] * (prescribed - 1)
     return (
         Waypoint.from_jets(0.0, x=[0.0, *zeros], z=[10.0, *zeros]),
@@ -56,7 +56,7 @@ def nominal_waypoints(prescribed: int = 3) -> tuple[Waypoint, Waypoint]:
 
 
 def first_order_waypoints() -> tuple[Waypoint, Waypoint]:
-    """Second simulation: only the two positions, in 30 s."""
+    """Second simulation: two positions, 30 s apart."""
     return Waypoint.from_jets(0.0, x=[0.0], z=[10.0]), Waypoint.from_jets(30.0, x=[20.0], z=[11.0])
 
 
@@ -71,7 +71,7 @@ def obstacle_waypoints(duration: float = 16.0) -> tuple[Waypoint, ...]:
 
 
 def load_metrics(plan: Trajectory, response: ct.TimeResponseData, last: float) -> dict[str, float]:
-    """Metrics of the load against its plan, the way before `last` [s] and the time after.
+    """Tracking error and sway of the load during the move, up to `last` [s], and after it.
 
     Parameters
     ----------
@@ -91,15 +91,17 @@ def load_metrics(plan: Trajectory, response: ct.TimeResponseData, last: float) -
     signals = signals_of(response)
     load = np.stack([signals["x"], signals["z"]])
     error = np.hypot(*(load - plan.jet(t, 0)[0]))
-    way, after = t <= last, t >= last
+    during, after = t <= last, t >= last
     travelled = None if plan.jumps(0) else plan.jet(np.linspace(plan.start, plan.end, 4001), 0)[0]
     slack = float(metrics.saturation_time(t, signals["T"], 0.0, np.inf))
     return {
-        "error_travel": _peak(t[way], error[way]),
+        "error_travel": _peak(t[during], error[during]),
         "error_after": _peak(t[after], error[after]),
         "sway_after": _peak(t[after], signals["theta"][after]),
         "force_peak": _limited_peak(t, signals["F"]),
-        "slack_time": slack if slack > 1e-9 * (t[-1] - t[0]) else 0.0,  # a run that ends there is at 0 to rounding
+        "slack_time": slack
+        if slack > 1e-9 * (t[-1] - t[0])
+        else 0.0,  # at the event itself the tension is 0 up to rounding
         "path_length": np.nan
         if travelled is None
         else float(metrics.path_length(np.linspace(plan.start, plan.end, 4001), travelled)),
@@ -107,25 +109,25 @@ def load_metrics(plan: Trajectory, response: ct.TimeResponseData, last: float) -
     }
 
 
-LOAD = Measure("Load against its plan", of="run", function=lambda run: load_metrics(run.plan, run.response, run.last))
-"""Metrics of the load, which `CRANE_MEASURES` describes."""
+LOAD = Measure("Tracking of the load", of="run", function=lambda run: load_metrics(run.plan, run.response, run.last))
+"""Measure that returns the metrics of `CRANE_MEASURES`."""
 
 
 def _limited_peak(t: Array, values: Array) -> float:
-    """Greatest magnitude of what a limit may cut off: a curve through samples would go beyond it at the corner."""
+    """Peak magnitude of a signal that may saturate: interpolation between samples would exceed the limit there."""
     size = np.abs(values)
     return float(size.max()) if np.count_nonzero(size == size.max()) > 1 else _peak(t, values)
 
 
 def _peak(t: Array, values: Array) -> float:
-    """Greatest magnitude, nan of a record too short to have one."""
+    """Peak magnitude; nan for fewer than two samples."""
     return float(metrics.peak(t, values)) if t.size > 1 else np.nan
 
 
 def marked_slack(found: Comparison) -> Comparison:
-    """Comparison with a mark on every plan whose rope goes slack, at `SLACK` or in a run that goes on."""
+    """Comparison with a mark on each plan with a slack rope, whether the event `SLACK` ended the run or not."""
     ended = {
-        name: f"the rope is slack from {time:.4g} s on, where the model of the crane ends"
+        name: f"the rope is slack from {time:.4g} s on, and the model is not valid for a slack rope"
         for name, time in found.stopped.items()
         if any(event.name == SLACK.name and event.stop for event in found.responses[name].events)
     }
@@ -133,7 +135,7 @@ def marked_slack(found: Comparison) -> Comparison:
     slack = {name: values["slack_time"] for name, values in found.metrics.items() if values["slack_time"] > 0.0}
     return found.marked(
         {
-            name: f"the rope is slack for {time:.2g} s; from then on the model is no crane"
+            name: f"the rope is slack for {time:.2g} s, and the model is not valid for a slack rope"
             for name, time in slack.items()
         }
     )

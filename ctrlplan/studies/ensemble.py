@@ -150,7 +150,7 @@ class Ensemble:
 
         return plot_bands(self, ax=ax)
 
-    def report(self, path: str | os.PathLike[str], title: str = "Spread over draws") -> Path:
+    def report(self, path: str | os.PathLike[str], title: str = "Monte Carlo simulation") -> Path:
         """Write one self-contained HTML page and return its path.
 
         Parameters
@@ -168,23 +168,23 @@ class Ensemble:
         return write_page([study], path, title=title)
 
     def notes(self) -> Iterator[str]:
-        """What a reader must know of the draws."""
+        """Notes on the draws: ranges, failures, and the best plan by metric."""
         ranges = ", ".join(f"{k} {v.min():.4g} to {v.max():.4g}" for k, v in self.params.items())
         whose = "the loop's own parameters" if self.nominal_draw is None else f"draw {self.nominal_draw}"
-        yield f"{self.finished} draws of {ranges}; the responses below are those of {whose}."
+        yield f"{self.finished} draws: {ranges}. The responses below are those of {whose}."
         if self.finished < self.ndraws:
-            yield f"The run was interrupted: {self.ndraws - self.finished} draws were not reached."
+            yield f"The run was interrupted; {self.ndraws - self.finished} draws were not run."
         if self.failures:
             first = self.failures[0]
             where = ", ".join(f"{key} = {value:.4g}" for key, value in first.params.items())
             with_plan = f" and the plan {first.plan}" if first.plan else ""
             count = len({failure.draw for failure in self.failures})
-            yield f"{count} draws failed; the first, with {where}{with_plan}: {first.message}"
-            yield "A draw that failed is in no band and no quantile."
+            yield f"{count} of {self.finished} draws failed. The first, with {where}{with_plan}: {first.message}"
+            yield "Failed draws are excluded from bands and quantiles."
         yield from self._best_shares()
 
     def best(self, name: str) -> dict[str, float]:
-        """Share of the draws in which a plan has the smallest value of a metric, of those in which one has it.
+        """Share of the draws in which each plan has the smallest value of a metric.
 
         Values that differ by rounding, a millionth of the scale of the metric
         in the nominal loop, count as equal, and each plan with one is counted.
@@ -204,9 +204,9 @@ class Ensemble:
             return
         for name in list(names)[:3]:
             shares = self.best(name)
-            title = self.nominal.measures[name].title.lower() if name in self.nominal.measures else name
+            title = self.nominal.measures[name].title if name in self.nominal.measures else name
             yield (
-                f"Best in {title}: "
-                + ", ".join(f"{p} in {100 * s:.0f} % of the draws" for p, s in shares.items())
+                f"{title}, share of the draws in which each plan is best: "
+                + ", ".join(f"{p} {100 * s:.0f} %" for p, s in shares.items())
                 + "."
             )

@@ -29,15 +29,15 @@ NUMBERED = {
     "step": {1.0: (-26, -4), 5.0: (-34, 12), 20.0: (-34, 0), 100.0: (-34, 0), 1000.0: (-36, 2)},
     "trigonometric": {1.0: (26, 4), 5.0: (30, 0), 20.0: (44, 22), 100.0: (-14, 12), 1000.0: (24, 9)},
 }
-"""Gains whose points figure 1 marks, and where their numbers stand beside them [pt]; of few plans, or they overlap."""
+"""Gains marked in figure 1, with the offsets of their labels [pt]; of two plans only, so that labels do not overlap."""
 SWEPT = ("settling_time", "overshoot_error", "control_peak", "control_effort")
 FED = "trigonometric, feedforward"
 STEP_LIMIT = (-np.log(0.02) / 0.5, 100.0)
-"""Settling time [s] and overshoot [%] that the step tends to as the gain grows."""
+"""Limit of settling time [s] and overshoot [%] of the step response for infinite gain."""
 
 
 def linear_plans() -> dict[str, Trajectory]:
-    """Step, quintic, and the trigonometric spline that matches the paper's figures (alpha = 1)."""
+    """Step, quintic, and the trigonometric spline of the paper's figures (alpha = 1)."""
     return {
         "step": Step(1.0),
         "polynomial": PolySpline(WAYPOINTS),
@@ -74,10 +74,10 @@ def linear_study(progress: bool = True, count: int = 241, finest: float = 1e-3) 
         parameters={
             "plant": "k/(s² + s), unity feedback",
             "gain k": f"{GAIN:g}; sweep {GAINS[0]:g} to {GAINS[1]:g}",
-            "move": "0 to 1 in 1 s, velocity and acceleration 0 at both ends",
+            "move": "0 to 1 in 1 s, zero velocity and acceleration at both ends",
             "trigonometric": "alpha = 1 rad, m = 3, gamma = mean",
             "polynomial": "degree 5",
-            "run": f"{TIMEPTS[-1]:g} s",
+            "simulated time": f"{TIMEPTS[-1]:g} s",
         },
     )
     comparison = comparison.with_benefit(benefit(comparison, _loop(GAIN)))
@@ -87,9 +87,10 @@ def linear_study(progress: bool = True, count: int = 241, finest: float = 1e-3) 
         "Linear loop (section 2, figure 1)",
         comparison,
         summary=(
-            "A proportional loop around k/(s² + s) is asked to go from 0 to 1, once by a step and once by plans "
-            "that take one second. Nothing in the loop changes but the reference. Overshoot is measured on the "
-            "tracking error, as the paper does; settling is the last entry into ±2 % of the change."
+            "Unity feedback with a proportional controller around 1/(s² + s), open loop k/(s² + s). The reference "
+            "moves from 0 to 1: as a step, and as plans with a duration of 1 s. Only the reference differs between "
+            "the runs. Overshoot is measured on the tracking error, as in the paper. The settling time is the time "
+            "of the last entry into the band of ±2 % of the move."
         ),
         notes=tuple(_notes(comparison, swept)),
         sections=(
@@ -97,16 +98,16 @@ def linear_study(progress: bool = True, count: int = 241, finest: float = 1e-3) 
                 swept,
                 NUMBERED,
                 STEP_LIMIT,
-                "limit of the step, k → ∞",
-                caption=f"Settling time against overshoot on the error as the gain runs from {GAINS[0]:g} to "
-                f"{GAINS[1]:g} (figure 1 of the paper). Curves are broken where the settling time jumps.",
+                "step, k → ∞",
+                caption=f"Settling time versus overshoot on the tracking error for gains from {GAINS[0]:g} to "
+                f"{GAINS[1]:g} (figure 1 of the paper). Curves are interrupted where the settling time is "
+                "discontinuous.",
             ),
             SweepCurves(
                 swept,
                 ("settling_time", "overshoot_error", "control_peak", "control_effort"),
-                in_results=(),  # the plane has them
-                caption="The same over the gain, with what each reference asks of the control: its peak and its "
-                "effort ∫u² dt.",
+                in_results=(),  # as part of the plane
+                caption="The same metrics versus the gain, with peak control and control effort ∫u² dt.",
             ),
             PlanCurves(),
             Responses(),
@@ -136,7 +137,7 @@ def _refined_sweep(count: int, finest: float, progress: bool) -> Sweep:
 
     def swept(gains: Array) -> Sweep:
         found = sweep(_loop, gains, linear_plans(), TIMEPTS, progress=progress, parameter="gain", measures=SWEPT)
-        if found.interrupted:  # a study is made whole or not at all
+        if found.interrupted:  # an incomplete sweep is not a result
             raise KeyboardInterrupt
         return found
 
@@ -153,7 +154,7 @@ def _refined_sweep(count: int, finest: float, progress: bool) -> Sweep:
 
 
 def _notes(comparison: Comparison, swept: Sweep) -> list[str]:
-    """What the study finds, and each place where the paper's section 2 says otherwise."""
+    """Findings of the study, and the differences from section 2 of the paper."""
     step, plan = comparison.metrics["step"], comparison.metrics["trigonometric"]
     gains, trig, poly = swept.values, swept.metrics["trigonometric"], swept.metrics["polynomial"]
     peak_gain, peak = overshoot_peak(gains, trig["overshoot_error"])
@@ -162,33 +163,36 @@ def _notes(comparison: Comparison, swept: Sweep) -> list[str]:
     band = TrigSpline(WAYPOINTS, alpha=1.0)
     enters = _enters_band(band)
     return [
-        f"At k = 5 the step overshoots {step['overshoot_error']:.4g} % and settles in {step['settling_time']:.4g} s, "
-        f"the trigonometric plan {plan['overshoot_error']:.4g} % and {plan['settling_time']:.4g} s. The paper prints "
-        "48 %, 7.6 s, 44 % and 8 s: the same figures, the overshoots cut off rather than rounded. Here the plan "
-        "settles later than the step: at small gains planning buys nothing, as the paper says.",
-        "Equation (1) as printed lacks the factor k, and the sign in ξ = −cos φ, with φ the argument of the lower of "
-        "the two conjugate poles. With both it is the step response of this loop, "
+        f"At k = 5 the step has an overshoot of {step['overshoot_error']:.4g} % and a settling time of "
+        f"{step['settling_time']:.4g} s, the trigonometric plan {plan['overshoot_error']:.4g} % and "
+        f"{plan['settling_time']:.4g} s. The paper prints 48 %, 7.6 s, 44 % and 8 s: the same values, with the "
+        "overshoots truncated. At this gain the plan settles later than the step. At small gains planning has no "
+        "benefit, as the paper says.",
+        "Equation (1) as printed omits the factor k, and the minus sign in ξ = −cos φ, where φ is the argument of the "
+        "complex pole with negative imaginary part. With both corrections it is the step response of this loop, "
         "y = 1 − (ω_n/ω_p) exp(−ξ ω_n t) sin(ω_p t + arccos ξ) with ω_n = √k and ξ = 1/(2 √k).",
-        "The paper says that no closed form exists for the response to the trigonometric spline. It does: the spline "
-        "is the output of a linear system, so loop and plan together are one matrix exponential. Every curve here is "
-        "computed that way, without interpolation.",
-        f"The paper's settling limit of the plan for large gains is 1 s, the end of the plan. The limit is "
-        f"{enters:.4g} s: the reference itself enters the ±2 % band that early, and a stiff loop follows it. "
-        f"At k = 1000 the plan settles in {trig['settling_time'][-1]:.4g} s.",
-        f"The paper says that the plan's overshoot rises to about 50 % and then falls to 0. It peaks at "
-        f"{peak:.5g} % at k = {peak_gain:.2f} and is {last['trigonometric']:.3g} % at k = 1000.",
-        f"The step's limit point for k → ∞ is ({STEP_LIMIT[0]:.4g} s, 100 %), as in the paper; at k = 1000 it is still "
-        f"at {last['step']:.4g} %. Its settling time jumps wherever an oscillation leaves the band; gains are refined "
-        "there, so that the jumps are drawn as jumps.",
-        f"The step settles sooner than the trigonometric plan {_shares(gains, later)}, and at no gain above "
-        f"k = {gains[later].max():.3g}; the paper puts the limit at k = 10."
+        "The paper says that the response to the trigonometric spline has no closed form. It has one: the spline is "
+        "the output of an autonomous linear system, so that the response of loop and plan is a matrix exponential. "
+        "All curves of this study are computed in this way, without numerical integration.",
+        f"For large gains the paper states a limit of 1 s for the settling time of the plan, the end of the plan. The "
+        f"limit is {enters:.4g} s: at this time the reference enters the ±2 % band, and for large gains the output "
+        f"follows the reference. At k = 1000 the settling time is {trig['settling_time'][-1]:.4g} s.",
+        f"The paper says that the overshoot of the plan rises to about 50 % and then falls to 0 as the gain increases. "
+        f"Its maximum is {peak:.5g} % at k = {peak_gain:.2f}; at k = 1000 it is {last['trigonometric']:.3g} %.",
+        f"For k → ∞ the step tends to the point ({STEP_LIMIT[0]:.4g} s, 100 %) of figure 1, as in the "
+        f"paper; at k = 1000 the overshoot is {last['step']:.4g} %. The settling time is a discontinuous function of "
+        "the gain: it jumps where an extremum of the oscillation crosses the edge of the band. The grid of gains is "
+        "refined at these jumps.",
+        f"The step settles earlier than the trigonometric plan {_shares(gains, later)}, and at no gain above "
+        f"k = {gains[later].max():.3g}; the paper states k = 10."
         if later.any()
-        else "The trigonometric plan settles sooner than the step at every gain.",
-        f"With the plan's derivatives fed forward, r + (r'' + r')/k in place of r, the same loop follows the same plan "
-        f"to {_digits(comparison.metrics[FED])} at k = 5 already: what flatness is for a linear loop.",
-        f"A quintic does as well as the trigonometric spline, as the paper foretells: it settles sooner "
-        f"{_shares(gains, poly['settling_time'] < trig['settling_time'])}. What is gained here is gained by planning, "
-        "not by the kind of spline.",
+        else "The trigonometric plan settles earlier than the step at every gain.",
+        f"With feedforward of the derivatives of the plan, reference input r + (r'' + r')/k in place of r, the "
+        f"tracking error of the same loop is {_digits(comparison.metrics[FED])} at k = 5: flatness-based control of a "
+        "linear plant.",
+        "The quintic polynomial and the trigonometric spline have similar results, as the paper predicts. The "
+        f"polynomial settles earlier {_shares(gains, poly['settling_time'] < trig['settling_time'])}. The benefit "
+        "comes from planning, not from the type of spline.",
     ]
 
 
@@ -207,7 +211,7 @@ def overshoot_peak(gains: Array, overshoot: Array) -> tuple[float, float]:
 
 
 def _shares(gains: Array, where: NDArray[np.bool_]) -> str:
-    """How much of the range of gains some of them stand for: they are not evenly spaced, and are not counted."""
+    """Share of the range of gains, by length of the range, since gains are not evenly spaced."""
     shares = []
     for scale in (np.log(gains), gains):
         edges = np.concatenate([scale[:1], 0.5 * (scale[1:] + scale[:-1]), scale[-1:]])
@@ -216,13 +220,13 @@ def _shares(gains: Array, where: NDArray[np.bool_]) -> str:
 
 
 def _digits(found: dict[str, float]) -> str:
-    """Greatest error of a plan from 0 to 1, in words."""
+    """Peak error of a plan from 0 to 1, in words."""
     worst = max(found["overshoot_error"], found["lag_error"]) / 100.0
-    return "rounding" if worst < 1e-12 else f"{worst:.1g}"
+    return "at rounding level" if worst < 1e-12 else f"at most {worst:.1g}"
 
 
 def _enters_band(plan: Trajectory) -> float:
-    """Time at which a plan from 0 to 1 enters the 2 % band for good, by bisection."""
+    """Time at which a plan from 0 to 1 enters the 2 % band, by bisection."""
     low, high = plan.start, plan.end
     while high - low > 1e-13:
         middle = 0.5 * (low + high)

@@ -234,7 +234,7 @@ MEASURES = {
         lambda seen: metrics.settling_time(seen.t, seen.y, seen.final, seen.origin, band=seen.band, start=seen.start),
     ),
     "tracking_settling_time": Measure(
-        "Settling time of the error",
+        "Settling time of the tracking error",
         "s",
         "response",
         lambda seen: metrics.tracking_settling_time(
@@ -242,7 +242,7 @@ MEASURES = {
         ),
     ),
     "overshoot_error": Measure(
-        "Overshoot on the error",
+        "Overshoot on the tracking error",
         "%",
         "response",
         lambda seen: metrics.overshoot(seen.t, seen.y, seen.final, seen.origin, reference=seen.reference),
@@ -254,64 +254,62 @@ MEASURES = {
         lambda seen: metrics.overshoot(seen.t, seen.y, seen.final, seen.origin),
     ),
     "lag_error": Measure(
-        "Greatest lag behind the reference",
+        "Peak lag behind the reference",
         "%",
         "response",
         lambda seen: metrics.lag(seen.t, seen.y, seen.final, seen.origin, reference=seen.reference),
     ),
-    "iae": Measure("IAE against the reference", "{y} s", "response", lambda seen: metrics.iae(seen.t, seen.error)),
-    "ise": Measure("ISE against the reference", "{y}^2 s", "response", lambda seen: metrics.ise(seen.t, seen.error)),
+    "iae": Measure("IAE of the tracking error", "{y} s", "response", lambda seen: metrics.iae(seen.t, seen.error)),
+    "ise": Measure("ISE of the tracking error", "{y}^2 s", "response", lambda seen: metrics.ise(seen.t, seen.error)),
     "itae": Measure(
-        "ITAE against the reference",
+        "ITAE of the tracking error",
         "{y} s^2",
         "response",
         lambda seen: metrics.itae(seen.t, seen.error, start=seen.start),
     ),
     "iae_final": Measure(
-        "IAE against the final value", "{y} s", "response", lambda seen: metrics.iae(seen.t, seen.remainder)
+        "IAE relative to the final value", "{y} s", "response", lambda seen: metrics.iae(seen.t, seen.remainder)
     ),
     "ise_final": Measure(
-        "ISE against the final value", "{y}^2 s", "response", lambda seen: metrics.ise(seen.t, seen.remainder)
+        "ISE relative to the final value", "{y}^2 s", "response", lambda seen: metrics.ise(seen.t, seen.remainder)
     ),
     "itae_final": Measure(
-        "ITAE against the final value",
+        "ITAE relative to the final value",
         "{y} s^2",
         "response",
         lambda seen: metrics.itae(seen.t, seen.remainder, start=seen.start),
     ),
-    "control_peak": Measure("Peak of the control", "{u}", "control", lambda seen: metrics.peak(seen.t, seen.u)),
-    "control_effort": Measure(
-        "Effort of the control", "{u}^2 s", "control", lambda seen: metrics.effort(seen.t, seen.u)
-    ),
+    "control_peak": Measure("Peak control", "{u}", "control", lambda seen: metrics.peak(seen.t, seen.u)),
+    "control_effort": Measure("Control effort", "{u}^2 s", "control", lambda seen: metrics.effort(seen.t, seen.u)),
     "control_variation": Measure(
         "Total variation of the control", "{u}", "control", lambda seen: metrics.total_variation(seen.t, seen.u)
     ),
     "wandering": Measure(
-        "Path length beyond the waypoints' polyline",
+        "Excess path length (path length / waypoint polyline − 1)",
         "",
         "path",
         _smooth(lambda seen: metrics.wandering(seen.t, seen.path, seen.points)),
     ),
     "excess_variation": Measure(
-        "Variation beyond what the waypoints force",
+        "Excess total variation",
         "",
         "path",
         _smooth(lambda seen: metrics.excess_variation(seen.t, seen.path, seen.points)),
     ),
     "turning_points": Measure(
-        "Turning points beyond those forced",
+        "Extra reversals",
         "",
         "path",
         _smooth(lambda seen: metrics.turning_points(seen.t, seen.path, seen.points)),
     ),
     "outside_box": Measure(
-        "Distance outside the waypoints' box",
+        "Peak distance outside the waypoints' bounding box",
         "{y}",
         "path",
         _smooth(lambda seen: metrics.outside_box(seen.t, seen.path, seen.points)),
     ),
     "reference_jerk": Measure(
-        "Integral of the reference's squared jerk", "{y}^2/s^5", "path", lambda seen: jerk_cost(seen.plan)
+        "Integral of the squared jerk of the reference", "{y}^2/s^5", "path", lambda seen: jerk_cost(seen.plan)
     ),
 }
 """The metrics of a comparison by name, in the order in which they are shown: an entry is computed, listed and shown."""

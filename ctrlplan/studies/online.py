@@ -1,4 +1,4 @@
-"""What is done while the loop runs: one crane, four troubles, each met in five ways."""
+"""On-line methods: one crane in four scenarios, each with five control schemes."""
 
 from __future__ import annotations
 
@@ -33,42 +33,42 @@ from ctrlplan.trajectories import PiecewiseSpline, PolySpline, Step, Trajectory,
 Array = NDArray[np.float64]
 
 NEAR = 0.1
-"""Distance from the goal [m] within which the load counts as there."""
+"""Distance from the goal [m] within which the load has arrived."""
 
 ONLINE_MEASURES = {
-    "arrival": Measure(f"Load within {NEAR:g} m of the goal for good", "s"),
-    "error_end": Measure("Greatest distance from the goal in the last 5 s", "m"),
-    "overshoot_goal": Measure("Greatest distance beyond the goal", "m"),
-    "error_reference": Measure("Greatest distance from the reference in force", "m"),
-    "sway_peak": Measure("Greatest sway", "rad"),
-    "sway_end": Measure("Greatest sway in the last 5 s", "rad"),
-    "force_peak": Measure("Greatest force of the trolley", "N"),
-    "limited_time": Measure("Time with that force at its limit", "s"),
+    "arrival": Measure(f"Settling time to within {NEAR:g} m of the goal", "s"),
+    "error_end": Measure("Peak distance from the goal in the last 5 s", "m"),
+    "overshoot_goal": Measure("Overshoot beyond the goal", "m"),
+    "error_reference": Measure("Peak tracking error", "m"),
+    "sway_peak": Measure("Peak sway", "rad"),
+    "sway_end": Measure("Peak sway in the last 5 s", "rad"),
+    "force_peak": Measure("Peak trolley force", "N"),
+    "limited_time": Measure("Time with the force at its limit", "s"),
 }
 
 START = nominal_waypoints(1)[0].position
 _LAW = LoadFeedbackLaw(load_bandwidth=0.5)
 _FILTER, _LAGS = 0.8, 5
-"""Bandwidth [rad/s] and order of the filter behind the governor: references of force that is continuous."""
+"""Bandwidth [rad/s] and order of the filter after the governor, so that the trolley force is continuous."""
 _PERIODS = {"replanned": 0.25, "governed": 0.5}
 
 
 @dataclass(frozen=True)
 class Scenario:
-    """What happens to the crane on its way.
+    """Disturbance, limit or change of goal during a move of the crane.
 
     Attributes
     ----------
     goal : Trajectory
-        Where the load is to go, over time.
+        Goal of the load over time.
     off_line : Trajectory
-        What is planned without knowing of the scenario.
+        Plan made without knowledge of the scenario.
     force : float
-        Greatest force of the trolley [N].
+        Limit of the trolley force [N].
     wind : Trajectory or None
         Horizontal force on the load [N].
     params : dict of str to float
-        Parameters of the crane that the loop does not know of.
+        Parameters of the crane that differ from the model of the controllers.
     """
 
     goal: Trajectory
@@ -79,12 +79,12 @@ class Scenario:
 
     @property
     def plan(self) -> Trajectory:
-        """The move as it was planned before the goal was moved."""
+        """The plan of the move to the first goal."""
         return _move()
 
 
 def online_gust_study(progress: bool = True) -> Study:
-    """A gust of 300 N on the load, half way."""
+    """A gust of 300 N on the load during the move."""
     gust = PiecewiseSpline(
         [Waypoint(5.0, 0.0, 0.0), Waypoint(6.0, 300.0, 0.0), Waypoint(8.0, 300.0, 0.0), Waypoint(9.0, 0.0, 0.0)]
     )
@@ -95,92 +95,98 @@ def online_gust_study(progress: bool = True) -> Study:
     return _study(
         "online-gust",
         found,
-        "A gust pushes the load with up to 300 N from 5 to 9 s, on the nominal move of 20 m in 15 s.",
-        f"Figure 3's generator does not see the load: off line it still swings by {blind['sway_end']:.2g} rad at the "
-        "end of the run. Replanned from the measured load every time it is 0.2 m off, the same generator brings it to "
-        f"the goal in {again['arrival']:.3g} s: planning again is a feedback.",
-        "It has its price: every fit begins where the load is, the reference jumps there, and the force is at its "
-        f"limit for {again['limited_time']:.2g} s. Feedback of the load by the law itself needs "
-        f"{law['force_peak'] / 1e3:.2g} kN and arrives after {law['arrival']:.3g} s.",
-        f"The governed way, which has no plan but a filter, arrives after {governed['arrival']:.3g} s. The slowed "
-        f"clock waits while the law gets the load back: {slowed['arrival']:.3g} s.",
-        "Who is first hangs on how fast each is made: fits over 6 s here, feedback with 0.5 rad/s.",
+        "A horizontal gust of up to 300 N acts on the load from 5 s to 9 s, during the nominal move of 20 m in 15 s.",
+        "The controller of figure 3 has no feedback of the load. With the off-line plan the sway in the last 5 s is "
+        f"{blind['sway_end']:.2g} rad. When the plan is recomputed from the measured load position after a deviation "
+        f"of 0.2 m, the load reaches the goal in {again['arrival']:.3g} s with the same controller: replanning acts "
+        "as a feedback.",
+        "Each new plan starts at the measured load position, so the reference jumps and the force is at its limit for "
+        f"{again['limited_time']:.2g} s. With feedback of the load in the control law, the peak force is "
+        f"{law['force_peak'] / 1e3:.2g} kN and the settling time {law['arrival']:.3g} s.",
+        f"The reference governor, with a filter in place of a plan, settles in {governed['arrival']:.3g} s. With time "
+        f"scaling, which slows the plan while the tracking error is large, the settling time is "
+        f"{slowed['arrival']:.3g} s.",
+        "The order depends on the tuning: here a horizon of 6 s for replanning, and a bandwidth of 0.5 rad/s for the "
+        "feedback of the load.",
     )
 
 
 def online_payload_study(progress: bool = True) -> Study:
-    """A load twice as heavy as modelled."""
+    """A load of twice the modelled mass."""
     found = _compared(
         Scenario(_fixed_goal(), _move(), params={"load_mass": 2.0 * CRANE.load_mass}),
-        "On line: a load twice as heavy as modelled",
-        f"m = {2.0 * CRANE.load_mass:g} kg, modelled as {CRANE.load_mass:g} kg",
+        "On line: load mass twice the modelled value",
+        f"m = {2.0 * CRANE.load_mass:g} kg, {CRANE.load_mass:g} kg in the model",
     )
     arrivals = ", ".join(f"{name} {values['arrival']:.3g} s" for name, values in found.metrics.items())
     return _study(
         "online-payload",
         found,
-        "The load is twice as heavy as laws, drives and governor take it to be.",
-        "The flat map of the load does not contain its mass: references of trolley and rope are the same, and the "
-        f"drives' integral action finds the weight. Arrivals: {arrivals}.",
-        "There is nothing here that planning again could mend: the load is never so far off that it is tried.",
+        "The mass of the load is twice the value used in the control laws and in the governor.",
+        "The flat map of the load does not contain its mass, so the references of trolley and rope do not change. The "
+        f"integral action of the drive controllers compensates the weight. Settling times: {arrivals}.",
+        "Replanning has no effect here: the deviation of the load never exceeds the threshold that triggers it.",
     )
 
 
 def online_goal_study(progress: bool = True) -> Study:
-    """A goal that is moved at half way."""
+    """A change of the goal during the move."""
     goal, late = Step([24.0, 11.0], [20.0, 11.0], 7.5, labels=["x", "z"]), 8.0
     rest = nominal_waypoints(5)[1]
     further = Waypoint(rest.time + late, [24.0, 11.0], 0, 0, 0, 0)
     second = PolySpline([Waypoint(rest.time, [20.0, 11.0], 0, 0, 0, 0), further], labels=["x", "z"])
     found = _compared(
         Scenario(goal, _move().then(second)),
-        "On line: the goal moved at half way",
-        f"from x = 20 to 24 m at 7.5 s; off line a second move of {late:g} s follows the first",
+        "On line: change of the goal during the move",
+        f"goal changed from x = 20 m to 24 m at 7.5 s; the off-line plan adds a second move of {late:g} s",
     )
     arrivals = {name: f"{values['arrival']:.3g} s" for name, values in found.metrics.items()}
     return _study(
         "online-goal",
         found,
-        "At 7.5 s, half way, the goal is moved by 4 m. Off line the crane finishes its move and makes another.",
-        "Replanned from the reference, which goes on without a jump up to its fourth derivative, the load is there "
-        f"after {arrivals['replanned']}, before the first move was to end; the second move takes until "
-        f"{arrivals['off-line']}.",
-        f"The governor needs no plan at all and takes {arrivals['governed']}. Slowing the clock is no answer to a "
-        "goal: that plan makes the second move as well.",
+        "At 7.5 s, half of the duration of the move, the goal is changed by 4 m. The off-line plan completes the first "
+        "move and then makes a second one.",
+        "Replanning from the current reference, continuous up to the fourth derivative, brings the load to the goal in "
+        f"{arrivals['replanned']}, before the end of the first move. With the off-line plan and its second move the "
+        f"settling time is {arrivals['off-line']}.",
+        f"The governor needs no plan; its settling time is {arrivals['governed']}. Time scaling does not react to a "
+        "change of the goal: its plan contains the second move as well.",
     )
 
 
 def online_saturated_study(progress: bool = True) -> Study:
-    """Trolley with less force than the plan asks for."""
+    """A force limit below the peak force of the plan."""
     limit = 2e3
-    force = f"{limit / 1e3:g} kN where the plan asks for {_peak_force() / 1e3:.3g} kN"
+    force = f"{limit / 1e3:g} kN, where the plan requires {_peak_force() / 1e3:.3g} kN"
     found = _compared(
         Scenario(_fixed_goal(), _move(), force=limit), "On line: saturated actuators", f"|F| at most {force}"
     )
-    past = {name: f"{values['overshoot_goal']:.2g} m past the goal" for name, values in found.metrics.items()}
+    overshoots = {name: f"{values['overshoot_goal']:.2g} m" for name, values in found.metrics.items()}
     arrivals = {name: f"{values['arrival']:.3g} s" for name, values in found.metrics.items()}
     return _study(
         "online-saturated",
         found,
-        f"The trolley has {force}.",
-        f"Off line the trolley falls behind and runs {past['off-line']}, anti-windup or not. With feedback of the load "
-        f"it is {past['load feedback']}, but the sway goes on growing: feedback asks for more, which is not there.",
-        f"A clock that slows as the error grows arrives after {arrivals['slowed']}, {past['slowed']}; the governor, "
-        f"which never asks for more than there is, after {arrivals['governed']}, {past['governed']}; replanned from "
-        f"the measured load it is {arrivals['replanned']}, {past['replanned']}.",
+        f"The trolley force is limited to {force}.",
+        f"With the off-line plan the trolley lags behind and overshoots the goal by {overshoots['off-line']}, in "
+        f"spite of anti-windup. With feedback of the load the overshoot is {overshoots['load feedback']}, but the "
+        "sway grows: the commanded force exceeds the limit.",
+        f"Time scaling, which slows the plan as the tracking error grows, settles in {arrivals['slowed']} with an "
+        f"overshoot of {overshoots['slowed']}; the governor, which respects the limit, settles in "
+        f"{arrivals['governed']} with {overshoots['governed']}; replanning from the measured load settles in "
+        f"{arrivals['replanned']} with {overshoots['replanned']}.",
         _in_time_note(limit),
     )
 
 
 def online_metrics(goal: Array, force: float, response: ct.TimeResponseData) -> dict[str, float]:
-    """Metrics of a crane against the goal that it has in the end.
+    """Metrics of a crane relative to its final goal.
 
     Parameters
     ----------
     goal : array_like, shape (2,)
         x and z [m].
     force : float
-        Greatest force of the trolley [N].
+        Limit of the trolley force [N].
     response : control.TimeResponseData
         Of a `crane_loop`.
 
@@ -192,16 +198,16 @@ def online_metrics(goal: Array, force: float, response: ct.TimeResponseData) -> 
     t = np.asarray(response.time)
     signals = signals_of(response)
     distance = np.hypot(signals["x"] - goal[0], signals["z"] - goal[1])
-    behind = np.hypot(signals["x"] - signals["x_ref"], signals["z"] - signals["z_ref"])
+    error = np.hypot(signals["x"] - signals["x_ref"], signals["z"] - signals["z_ref"])
     end = t >= t[-1] - 5.0
     limit, far = force * (1.0 - 1e-9), max(float(distance.max()), NEAR)
-    # Below a tenth of a millimetre, and what that is of the rope, nothing is left.
+    # Smaller than 0.1 mm, and the corresponding angle of the rope, counts as zero.
     left, sway = float(distance[end].max()), float(metrics.peak(t[end], signals["theta"][end]))
     return {
         "arrival": float(metrics.settling_time(t, distance, 0.0, far, NEAR / far)),
         "error_end": left if left > 1e-4 else 0.0,
         "overshoot_goal": max(0.0, float(metrics.peak(t, signals["x"])) - float(goal[0])),
-        "error_reference": float(metrics.peak(t, behind)),
+        "error_reference": float(metrics.peak(t, error)),
         "sway_peak": float(metrics.peak(t, signals["theta"])),
         "sway_end": sway if sway > 1e-5 else 0.0,
         "force_peak": float(np.abs(signals["F"]).max()),
@@ -209,7 +215,7 @@ def online_metrics(goal: Array, force: float, response: ct.TimeResponseData) -> 
     }
 
 
-# The five ways
+# The five control schemes
 
 
 def _off_line(scenario: Scenario, limits: DriveLimits) -> ct.InterconnectedSystem:
@@ -221,7 +227,7 @@ def _load_feedback(scenario: Scenario, limits: DriveLimits) -> ct.Interconnected
 
 
 def _replanned(scenario: Scenario, limits: DriveLimits) -> ct.InterconnectedSystem:
-    """Generator, its plan made again: from the reference for a new goal, from the load where that is off."""
+    """Flat map with replanning: from the reference for a new goal, from the load after a deviation."""
     period = _PERIODS["replanned"]
     if scenario.goal.start > scenario.plan.start:
         replanner = create_replanner_iosystem(
@@ -244,7 +250,7 @@ def _replanned(scenario: Scenario, limits: DriveLimits) -> ct.InterconnectedSyst
 
 
 def _governed(scenario: Scenario, limits: DriveLimits) -> ct.InterconnectedSystem:
-    """Goal itself through a governor and a filter: no plan."""
+    """Goal through a reference governor and a filter, without a plan."""
     core = _filtered_loop(scenario.wind, limits)
     governor = create_governor_iosystem(_admissible(scenario.force), initial=START[:1])
     goal = stack([scenario.goal], labels=["x_command_cmd", "z_command"])
@@ -274,7 +280,7 @@ WAYS: dict[str, Callable[[Scenario, DriveLimits], ct.InterconnectedSystem]] = {
 
 
 def _filtered_loop(wind: Trajectory | None = None, limits: DriveLimits | None = None) -> ct.InterconnectedSystem:
-    """Crane with load feedback behind filters of commands x_command and z_command."""
+    """Crane with load feedback and with filters for the commands x_command and z_command."""
     filters = [
         create_command_filter_iosystem(
             _FILTER, 2, _LAGS, initial=start, inputs=f"{axis}_command", outputs=f"{axis}_ref"
@@ -289,7 +295,7 @@ def _filtered_loop(wind: Trajectory | None = None, limits: DriveLimits | None = 
 
 @cache
 def _admissible(force: float) -> AdmissibleSet:
-    """What keeps nine tenths of a force, on the way across linearised half way down; the hoist does not act on it."""
+    """Admissible set for 90 % of a force limit, of the horizontal motion linearised at the mean depth."""
     loop = _filtered_loop()
     rest = np.array(loop.initial_state)
     middle = 0.5 * (START[1] + 11.0)
@@ -338,35 +344,37 @@ def _compared(scenario: Scenario, title: str, what: str) -> Comparison:
         params=scenario.params,
         measures=[
             *(replace(one, name=name) for name, one in ONLINE_MEASURES.items()),
-            Measure("Crane against its goal", of="run", function=measure),
+            Measure("Crane relative to its goal", of="run", function=measure),
         ],
         units=UNITS,
         title=title,
         parameters={
             "scenario": what,
-            "move": "20 m across and 1 m down in 15 s, trigonometric, alpha = 1, ten constraints an axis",
+            "move": "20 m horizontally and 1 m down in 15 s, trigonometric, alpha = 1, ten constraints per axis",
             "limits": f"|F| ≤ {scenario.force / 1e3:g} kN, C from −3 to 1 kN m, with anti-windup",
-            "off-line": "the plan through figure 3's generator, which does not see the load",
-            "load feedback": "the plan through the law with feedback of the load's x, 0.5 rad/s",
-            "replanned": "figure 3's generator; for a new goal from the reference, joined to the fourth derivative; "
-            "else from the measured load where it is 0.2 m off, over 6 s; looked at every 0.25 s",
-            "governed": f"the goal itself, without a plan, through a governor (every 0.5 s, linear model, 0.9 of the "
-            f"limit, 0.2 rad) and a filter ({_LAGS} lags of {_FILTER:g} rad/s); load feedback",
-            "slowed": "the plan on a clock that slows from 0.05 to 0.5 m of error in x; load feedback",
-            "run": f"{timepts[-1]:g} s",
+            "off-line": "the plan with the controller of figure 3, without feedback of the load",
+            "load feedback": "the plan with feedback of the load position x, bandwidth 0.5 rad/s",
+            "replanned": "controller of figure 3; for a new goal, a plan from the current reference, continuous up to "
+            "the fourth derivative; otherwise a plan of 6 s from the measured load after a deviation of 0.2 m; checked "
+            "every 0.25 s",
+            "governed": f"no plan: the goal through a reference governor (period 0.5 s, linear model, 90 % of the "
+            f"force limit, sway limit 0.2 rad) and a filter ({_LAGS} first-order lags, {_FILTER:g} rad/s); load "
+            "feedback",
+            "slowed": "the plan with time scaling, slowed from 0.05 m to 0.5 m of tracking error in x; load feedback",
+            "simulated time": f"{timepts[-1]:g} s",
         },
     )
 
 
 def _in_time_note(limit: float) -> str:
-    """What it is worth to know a limit before one starts."""
+    """Result of a plan that takes the force limit into account from the start."""
     seconds = float(np.ceil(10.0 * fastest(_move(), {"F": limit}, CRANE).duration)) / 10.0
     loop = crane_loop(CRANE, _move().retime(seconds), _LAW, force_limits=(-limit, limit), torque_limits=TORQUE_LIMITS)
     found = online_metrics(_fixed_goal().final, limit, simulate(loop, np.linspace(0.0, 50.0, 2501)))
     return (
-        f"Who knows the limit before the start does best: in {seconds:.3g} s the same path asks for no more than "
-        f"{limit / 1e3:g} kN, and the load arrives after {found['arrival']:.3g} s, "
-        f"{found['overshoot_goal']:.1g} m past the goal."
+        f"A plan that takes the limit into account from the start gives the best result: with a duration of "
+        f"{seconds:.3g} s the same path requires at most {limit / 1e3:g} kN, and the load settles in "
+        f"{found['arrival']:.3g} s with an overshoot of {found['overshoot_goal']:.1g} m."
     )
 
 
@@ -375,12 +383,12 @@ def _study(name: str, found: Comparison, summary: str, *notes: str) -> Study:
 
 
 def _move() -> TrigSpline:
-    """The nominal move with four derivatives at rest at both ends: a force without jumps."""
+    """The nominal move with four zero derivatives at both ends, so that the force is continuous."""
     return TrigSpline(nominal_waypoints(5), alpha=1.0)
 
 
 def _fixed_goal() -> Step:
-    """A goal that is there from the start."""
+    """A goal that does not change."""
     first, last = nominal_waypoints(1)
     return Step(last.position, first.position, labels=["x", "z"])
 
@@ -390,5 +398,5 @@ def _constant_start() -> Step:
 
 
 def _peak_force() -> float:
-    """Greatest force that the move asks of the trolley [N]."""
+    """Peak trolley force of the move [N]."""
     return abs(margins(_move(), {"F": 1.0}, CRANE).active.value)

@@ -23,9 +23,9 @@ class RequiredDuration:
     duration : float
         Minimum duration [s], nan where there is none.
     limit : str
-        Active limit, or why there is no duration.
+        Active limit, or the reason why no duration satisfies the limits.
     satisfied : str
-        Whether it satisfies the limits in the time of the waypoints.
+        Whether the plan satisfies the limits at the times of the waypoints.
     """
 
     name: str
@@ -40,40 +40,44 @@ def required_duration(name: str, plan: Trajectory, fast: Trajectory, limited: Li
     Parameters
     ----------
     name : str
-        What it is called.
+        Name of the plan.
     plan : Trajectory
-        The plan in the time of the waypoints.
+        The plan with the times of the waypoints.
     fast : Trajectory
-        The same where limits alone decide its duration; otherwise `plan` itself.
+        The plan as fast as its own limits allow, for a profile; otherwise
+        `plan` itself.
     limited : Limited
         The limits.
     """
     if plan.jumps(0):
-        return RequiredDuration(name, math.nan, "jumps: no limit on a derivative holds", "broken")
+        return RequiredDuration(name, math.nan, "position jumps: no limit on a derivative can hold", "violated")
     try:
         limited.check_smooth(plan)
         worst = limited.margins(plan).active
-        satisfied = "all kept" if worst.fraction >= -SAME else f"{worst.bound.name} {worst.share} beyond"
+        satisfied = "satisfied" if worst.fraction >= -SAME else f"{worst.bound.name} exceeded by {worst.share}"
         shortest = limited.margins(fast)
         duration = fast.duration
         if fast is plan or not shortest.hold:
             found = fastest_within(fast, limited)
             duration, shortest = found.duration, found.margins
-    except ValueError as refusal:
-        return RequiredDuration(name, math.nan, str(refusal), "broken")
+    except ValueError as reason:
+        return RequiredDuration(name, math.nan, str(reason), "violated")
     active = shortest.active
     return RequiredDuration(
-        name, duration, f"{active.bound.name} {active.bound.range}, at {active.time:.3g} s", satisfied
+        name, duration, f"{active.bound.name} {active.bound.range} at {active.time:.3g} s", satisfied
     )
 
 
 def sentence_of(required: Sequence[RequiredDuration]) -> str:
-    """The plan with the minimum duration, and the others, in a sentence."""
-    possible = [one for one in required if not math.isnan(one.duration)]
-    if not possible:
-        return "Under these limits no plan is possible."
-    first = min(possible, key=lambda one: one.duration)
-    others = ", ".join(f"{one.name} {one.duration:.4g} s" for one in possible if one is not first)
+    """The minimum durations of all plans, in a sentence."""
+    feasible = [one for one in required if not math.isnan(one.duration)]
+    if not feasible:
+        return "No plan satisfies these limits at any duration."
+    first = min(feasible, key=lambda one: one.duration)
+    others = ", ".join(f"{one.name} {one.duration:.4g} s" for one in feasible if one is not first)
     never = [one.name for one in required if math.isnan(one.duration)]
-    without = f"; {', '.join(never)} cannot keep them at any" if never else ""
-    return f"Under the same limits {first.name} is the fastest with {first.duration:.4g} s ({others}{without})."
+    without = f"; no duration satisfies them for {', '.join(never)}" if never else ""
+    return (
+        f"Under the same limits, {first.name} has the shortest minimum duration, {first.duration:.4g} s"
+        f"{f' ({others})' if others else ''}{without}."
+    )

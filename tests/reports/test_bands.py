@@ -212,7 +212,7 @@ def test_the_page_has_the_table_of_draws_before_that_of_the_loop(page):
     np.testing.assert_allclose(numbers(cells[0]), math.log(50) * TAU[[10, 1, 19]], rtol=1e-3)
     assert re.fullmatch(r"[\d.]+ \([\d.]+ to [\d.]+\)", cells[0].words())
     assert float(cells[0].attributes["data-order"]) == pytest.approx(math.log(50), rel=1e-5)
-    assert rows["IAE against the reference"][0] == "m s"
+    assert rows["IAE of the tracking error"][0] == "m s"
     assert next(nominal.all("tbody")) is not None
 
 
@@ -226,8 +226,8 @@ def test_the_page_shows_bands_and_responses(page):
 
 
 def test_the_page_says_what_was_drawn(page):
-    (findings,) = (e for e in page.all("ul") if "draws of" in e.words())
-    assert "21 draws of tau 0.5 to 1.5" in findings.words()
+    (findings,) = (e for e in page.all("ul") if "21 draws" in e.words())
+    assert "21 draws: tau 0.5 to 1.5" in findings.words()
     assert "failed" not in findings.words()
 
 
@@ -235,12 +235,12 @@ def test_the_page_says_what_was_drawn(page):
 def test_the_page_says_what_failed(failed, read):
     study = Study("draws", "Draws", failed.nominal, notes=tuple(failed.notes()), sections=(Bands(failed),))
     text = read(render_page([study], "Draws")).words()
-    assert "1 draws failed; the first, with tau = 3: ValueError: tau is too long & <slow>" in text
+    assert "1 of 3 draws failed. The first, with tau = 3: ValueError: tau is too long & <slow>" in text
 
 
 def test_the_report_says_what_failed(failed, tmp_path, read):
     text = read(failed.report(tmp_path / "failed.html").read_text(encoding="utf-8")).words()
-    assert "1 draws failed; the first, with tau = 3: ValueError: tau is too long & <slow>" in text
+    assert "1 of 3 draws failed. The first, with tau = 3: ValueError: tau is too long & <slow>" in text
     assert (tmp_path / "failed.html").exists()
 
 

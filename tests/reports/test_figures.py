@@ -476,7 +476,7 @@ def test_a_loop_without_controls_and_one_that_explodes_are_drawn_too(tmp_path):
 
 def test_labels_of_a_sweep_carry_units(swept):
     axes = axes_of(plot_sweep(swept))
-    assert [a.get_ylabel() for a in axes] == ["Settling time [s]", "Overshoot on the error [%]"]
+    assert [a.get_ylabel() for a in axes] == ["Settling time [s]", "Overshoot on the tracking error [%]"]
     assert {a.get_xlabel() for a in axes} == {"gain"}
     assert {a.get_xscale() for a in axes} == {"log"}
 
@@ -577,7 +577,7 @@ def test_a_plane_of_any_loop_says_what_its_parameter_and_its_band_are():
         cp.plants.integrator_lag_loop, [2.0, 4.0], MOVE, TIMES, parameter="stiffness", band=0.05, progress=False
     )
     (block,) = draw(sections.Plane(found), Study("it", "It", None)).blocks
-    assert block.caption.startswith("Settling time against overshoot on the error as stiffness runs from 2 to 4.")
+    assert block.caption.startswith("Settling time versus overshoot on the tracking error for stiffness from 2 to 4.")
     assert block.plot.axes[0, 0].get_xlabel() == "settling time ±5 % [s]"
     assert not [line for line in block.plot.lines[0, 0] if line.get_marker() in ("*", "o")]
 

@@ -88,7 +88,7 @@ def test_a_section_of_ones_own_is_on_the_page_in_its_place(own, read):
         "Findings",
         "Durations & <limits>",
         "Metrics",
-        "Who wins, who loses",
+        "Best and worst by metric",
         "Parameters",
     ]
     assert [figure.attributes["id"] for figure in page.all("figure")] == ["mine-plans", "mine-first", "mine-responses"]
@@ -124,7 +124,7 @@ def test_data_of_a_section_is_in_the_results(own):
 
 def test_a_section_may_stand_below_the_metrics(compared, read):
     page = read(render_page([Study("mine", "Mine", compared, sections=(Durations(1.0, below=True),))], "Mine"))
-    assert heads(page) == ["Mine", "Metrics", "Who wins, who loses", "Durations & <limits>", "Parameters"]
+    assert heads(page) == ["Mine", "Metrics", "Best and worst by metric", "Durations & <limits>", "Parameters"]
 
 
 def test_sections_of_one_type_have_ids_of_their_own(compared, read):

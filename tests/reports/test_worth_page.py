@@ -3,6 +3,7 @@
 import json
 import math
 import re
+import unicodedata
 from dataclasses import replace
 
 import numpy as np
@@ -19,7 +20,7 @@ from ctrlplan.studies.sections import ClaimTable, FastestMove
 
 MOVE = [cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1, 0, 0)]
 TIMES = np.linspace(0, 10, 501)
-WORTH, FASTEST, OPTIMAL = "Is it worth it?", "As fast as limits allow", "Is the trigonometric path optimal?"
+WORTH, FASTEST, OPTIMAL = "Benefit of planning", "Minimum duration within limits", "Is the trigonometric path optimal?"
 
 
 def loop(gain):
@@ -91,7 +92,7 @@ def tables(page, kind):
 
 
 def number(text):
-    return float(text.rstrip(" ▲▽").replace("−", "-").replace("·10^", "e"))
+    return float(unicodedata.normalize("NFKC", text.rstrip(" ▲▽").replace("·10", "e")).replace("−", "-"))
 
 
 # The page
@@ -130,12 +131,12 @@ def test_words_of_others_are_escaped(html):
 def test_without_units_there_are_no_brackets(shown, study):
     worth = replace(study.comparison.benefit, comparison=replace(study.comparison.benefit.comparison, units={}))
     words, _ = shown(replace(study.comparison, units={}, benefit=worth))
-    assert "Peak of the control over duration and alpha:" in words
+    assert "Peak control over duration and alpha:" in words
     assert "[]" not in words
     assert not re.search(r"\{\w*\}|\bnan\b", words)
 
 
-# Is it worth it?
+# Benefit of planning
 
 
 def test_all_baselines_are_in_the_table_of_the_section(study, page):
@@ -145,7 +146,7 @@ def test_all_baselines_are_in_the_table_of_the_section(study, page):
     assert expected <= set(titles(beside))
     found = {row[0]: row[2:] for row in rows(beside)}
     metrics = study.comparison.benefit.comparison.metrics
-    for title, key in (("Settling time", "settling_time"), ("Peak of the control", "control_peak")):
+    for title, key in (("Settling time", "settling_time"), ("Peak control", "control_peak")):
         for text, values in zip(found[title], metrics.values(), strict=True):
             assert number(text) == pytest.approx(values[key], rel=5e-4)
     settles = [printed(100, plan)[1] for plan in ("trigonometric", "step")]
@@ -156,24 +157,24 @@ def test_needs_are_shown_with_the_limit_that_is_active_and_where(study, page):
     (table,) = tables(page, "durations")
     assert titles(table) == [
         "plan",
-        "takes [s]",
-        "limit that does not let it be shorter",
-        "limits in the time above",
+        "minimum duration [s]",
+        "active limit",
+        "limits at the given duration",
     ]
     shown = rows(table)
-    for (name, text, why, kept), one in zip(shown, study.comparison.benefit.required_durations, strict=True):
-        assert (name, why, kept) == (one.name, one.limit, one.satisfied)
+    for (name, text, why, satisfied), one in zip(shown, study.comparison.benefit.required_durations, strict=True):
+        assert (name, why, satisfied) == (one.name, one.limit, one.satisfied)
         if math.isnan(one.duration):
             assert text == "–"
         else:
             assert number(text) == pytest.approx(one.duration, rel=5e-4)
     takes = {name: text for name, text, *_ in shown}
-    kept = {name: words for name, _, _, words in shown}
-    assert kept["quintic (minimum jerk)"] == kept["S-curve"] == "all kept"
+    satisfied = {name: words for name, _, _, words in shown}
+    assert satisfied["quintic (minimum jerk)"] == satisfied["S-curve"] == "satisfied"
     plan = study.comparison.benefit.comparison.plans["trigonometric"]
     beyond = np.abs(plan(np.linspace(0, 1, 20_001), 2)).max() / (10.0 / math.sqrt(3.0)) - 1.0
     assert beyond > np.abs(plan(np.linspace(0, 1, 20_001), 1)).max() / 1.875 - 1.0 > 0.0
-    assert kept["trigonometric"] == f"y_d2 {100 * beyond:.3g} % beyond"
+    assert satisfied["trigonometric"] == f"y_d2 exceeded by {100 * beyond:.3g} %"
     assert takes["quintic (minimum jerk)"] == "1.000"
     assert takes["S-curve"] == "0.9543 ▲"
     winners = [row.children[0].words() for row in table.all("tr") if list(row.all("td", class_="better"))]
@@ -181,8 +182,11 @@ def test_needs_are_shown_with_the_limit_that_is_active_and_where(study, page):
 
 
 def test_alpha_and_limits_are_said_in_words(page):
-    assert "A trigonometric plan (alpha = 1 rad) beside" in page.words()
-    assert "Under the same limits (y_d1 within ±1.875; y_d2 within ±5.774; y_d3 within ±60)" in page.words()
+    assert "A trigonometric plan (alpha = 1 rad) is compared with" in page.words()
+    assert (
+        "Minimum duration of each plan under the same limits (y_d1 within ±1.875; y_d2 within ±5.774; y_d3 within ±60):"
+        in page.words()
+    )
 
 
 def test_verdicts_are_there(study, page):
@@ -207,7 +211,7 @@ def test_tables_over_alpha_and_duration_are_those_of_the_grids(study, page):
     assert len(shown) == len(grids) == 3
     for table, grid in zip(shown, grids, strict=True):
         alphas = [f"alpha {a:.3g}" if a else "alpha 0 (polynomial)" for a in grid.alphas]
-        assert titles(table) == ["takes [s]", *alphas, *grid.baselines]
+        assert titles(table) == ["duration [s]", *alphas, *grid.baselines]
         for row, duration, values, k in zip(rows(table), grid.durations, grid.values, range(9), strict=False):
             assert float(row[0]) == pytest.approx(duration, rel=1e-3)
             expected = [*values, *(baseline[k] for baseline in grid.baselines.values())]
@@ -219,7 +223,7 @@ def test_tables_over_alpha_and_duration_are_those_of_the_grids(study, page):
 
 
 def test_units_are_in_the_headings_of_the_tables(page):
-    for heading in ("Settling time [s]", "Peak of the control [N]", "Length & width [m²/s⁵]"):
+    for heading in ("Settling time [s]", "Peak control [N]", "Length & width [m²/s⁵]"):
         assert f"{heading} over duration and alpha:" in page.words()
 
 
@@ -231,14 +235,14 @@ def test_the_figure_of_the_baselines_names_all(html, study):
         assert label in comments
 
 
-# As fast as limits allow
+# Minimum duration within limits
 
 
 def test_the_active_limit_and_the_margins_of_the_others(page):
     """15/8 of 1 m at 2.5 m/s takes 0.75 s; the acceleration then comes to 10/sqrt 3/0.75^2."""
     (table,) = tables(page, "margins")
-    assert "0.7500 s is the shortest duration; y_d1 is at its limit at 0.3750 s." in page.words()
-    assert titles(table) == ["limit", "unit", "must stay", "comes to", "at [s]", "left"]
+    assert "The minimum duration is 0.7500 s. The active limit is y_d1, reached at 0.3750 s." in page.words()
+    assert titles(table) == ["limit", "unit", "permitted range", "value nearest to the limit", "time [s]", "margin"]
     peak = 10 / 3**0.5 / 0.75**2
     left = 100 * (100 - peak) / 150
     at = 0.75 * (0.5 + 3**0.5 / 6)
@@ -287,7 +291,7 @@ def test_limits_that_no_plan_can_keep_have_a_page(study, shown):
     words, page = shown(
         replace(study.comparison, benefit=replace(study.comparison.benefit, required_durations=required))
     )
-    assert "Under these limits no plan is possible." in words
+    assert "No plan satisfies these limits at any duration." in words
     (table,) = tables(page, "durations")
     assert {row[1] for row in rows(table)} == {"–"}
     assert not list(table.all("td", class_="better"))
@@ -321,7 +325,7 @@ def test_the_reproduction_asks_all_three(reproduced, read):
     assert [heads(page).count(title) for title in (FASTEST, WORTH, OPTIMAL)] == [1, len(asked), 1]
     assert not re.search(r"\{\w*\}|\bnan\b|\bNone\b", page.words())
     assert "theta is at its limit" in page.words()
-    for row in ("Length of the path [m]", "Integral of the squared jerk [m²/s⁵]", "Greatest sway afterwards [rad]"):
+    for row in ("Path length [m]", "Integral of the squared jerk [m²/s⁵]", "Residual sway [rad]"):
         assert f"{row} over duration and alpha:" in page.words()
     assert all(found["needs"]["step"] is None for found in asked.values())
     assert asked["crane-nominal"]["needs"]["quintic (minimum jerk)"] == pytest.approx(15.0, rel=1e-9)

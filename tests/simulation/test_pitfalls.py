@@ -102,8 +102,8 @@ def test_a_plan_whose_run_is_ended_wins_nothing(tmp_path):
     area = np.sum(0.5 * (error[1:] + error[:-1]) * np.diff(violent.time))
     assert found.metrics["violent"]["iae"] == pytest.approx(area, rel=1e-2)
     assert found.metrics["violent"]["iae"] < found.metrics["gentle"]["iae"]  # and yet it is not the best
-    assert "the run was ended" in found.marks["violent"]
-    assert any("With violent, u left its limits 1 times" in note for note in found.notes)
+    assert "an event ended the run" in found.marks["violent"]
+    assert any("Events in the run with violent: u left its limits (at " in note for note in found.notes)
     page = found.report(tmp_path / "page.html").read_text(encoding="utf-8")
     assert "violent is best" not in page
 
@@ -111,7 +111,7 @@ def test_a_plan_whose_run_is_ended_wins_nothing(tmp_path):
 def test_what_happened_on_the_way_is_a_note():
     found = stopping([cp.Event("u", high=15.0)])
     assert "iae" in found.metrics["violent"]
-    assert any(note.startswith("With violent, u left its limits") for note in found.notes)
+    assert any(note.startswith("Events in the run with violent: u left its limits") for note in found.notes)
 
 
 def explosive():

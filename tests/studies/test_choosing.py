@@ -24,10 +24,10 @@ from ctrlplan.studies.crane_setup import nominal_waypoints, obstacle_waypoints
 from ctrlplan.systems.plants import Crane, crane_loop
 
 G, DRUM, TROLLEY, LOAD, INERTIA = 9.81, 0.25, 5000.0, 500.0, 50.0
-QUINTIC = "quintic a leg (minimum jerk)"
+QUINTIC = "quintic per segment (minimum jerk)"
 FREED = "minimum jerk through the positions"
-LEGS = "shortest of one trigonometric spline a leg"
-POLYLINE = "polyline (no path is shorter)"
+PER_SEGMENT = "shortest of one trigonometric spline per segment"
+POLYLINE = "polyline (lower bound)"
 L0 = 50**0.5 + 10 + 61**0.5
 
 
@@ -42,7 +42,7 @@ def fast():
 
 
 def quintics(end):
-    """One quintic a leg through the paper's waypoints, by scipy."""
+    """One quintic per segment through the paper's waypoints, by scipy."""
     points = obstacle_waypoints(end)
     return BPoly.from_derivatives([w.time for w in points], [w.jet for w in points])
 
@@ -76,15 +76,15 @@ def cell(grid, end, alpha):
 
 def test_grids_are_of_length_and_squared_jerk(grids):
     assert [(grid.title, grid.unit) for grid in grids] == [
-        ("Length of the path", "m"),
+        ("Path length", "m"),
         ("Integral of the squared jerk", "m²/s⁵"),
     ]
     for grid in grids:
         assert grid.values.shape == (grid.durations.size, grid.alphas.size)
         assert {14.0, 16.0, 20.0} <= set(grid.durations)
         assert {0.0, 4.0, 5.0} <= set(grid.alphas)
-    assert list(grids[0].baselines) == [QUINTIC, FREED, LEGS, POLYLINE]
-    assert list(grids[1].baselines) == [QUINTIC, FREED, LEGS]
+    assert list(grids[0].baselines) == [QUINTIC, FREED, PER_SEGMENT, POLYLINE]
+    assert list(grids[1].baselines) == [QUINTIC, FREED, PER_SEGMENT]
     assert (grids[0].not_ranked, grids[1].not_ranked) == ((POLYLINE,), ())
 
 
@@ -112,7 +112,7 @@ def test_baselines_against_splines_of_scipy(grids, end):
         assert grids[1].baselines[name][row] == pytest.approx(jerk(spline.derivative(3), end), rel=1e-8)
 
 
-def test_the_polyline_and_how_near_one_quintic_a_leg_comes_to_it(grids):
+def test_the_polyline_and_the_length_of_one_quintic_per_segment(grids):
     baselines = dict(grids[0].baselines)
     np.testing.assert_allclose(baselines.pop(POLYLINE), L0, rtol=1e-12)
     assert f"{L0:.1f}" == "24.9"
@@ -122,8 +122,8 @@ def test_the_polyline_and_how_near_one_quintic_a_leg_comes_to_it(grids):
     assert (f"{of_end[16.0]:.2f}", f"{of_end[20.0]:.2f}") == ("1.03", "1.06")
 
 
-def test_no_trigonometric_spline_a_leg_is_shorter_than_that_of_the_table(grids):
-    for end, found in zip(grids[0].durations, grids[0].baselines[LEGS], strict=True):
+def test_no_trigonometric_spline_per_segment_is_shorter_than_that_of_the_table(grids):
+    for end, found in zip(grids[0].durations, grids[0].baselines[PER_SEGMENT], strict=True):
         t = np.linspace(0, end, 2001)
         alphas = np.linspace(0, 5.5, 23)
         ways = [
@@ -134,36 +134,38 @@ def test_no_trigonometric_spline_a_leg_is_shorter_than_that_of_the_table(grids):
         assert found == pytest.approx(min(ways), rel=1e-3)
 
 
-def test_one_quintic_a_leg_has_the_least_jerk_through_its_entries_and_freed_ones_less(grids):
+def test_one_quintic_per_segment_has_the_minimum_jerk_for_its_constraints_and_freed_ones_less(grids):
     least = grids[1].baselines
     assert (grids[1].values > least[QUINTIC][:, None]).all()
-    assert (least[LEGS] >= least[QUINTIC] * (1 - 1e-9)).all()
+    assert (least[PER_SEGMENT] >= least[QUINTIC] * (1 - 1e-9)).all()
     assert (least[FREED] < least[QUINTIC]).all()
 
 
 # The claim
 
 
-def test_the_claim_fails_and_says_how(grids):
+def test_the_claim_is_not_true_and_the_text_gives_the_values(grids):
     claim = optimality_claim(grids)
     text = " ".join(claim)
     assert all(mark == "worse" for grid in grids for row in grid.marks() for mark in row)
-    assert "Over 36 pairs of alpha and end time" in claim[0]
-    assert claim[0].endswith("the claim fails.")
+    assert "In 36 combinations of alpha and end time" in claim[0]
+    assert claim[0].endswith("the claim is not true in any case.")
     assert claim[-2:] == (grids[0].verdict, grids[1].verdict)
     shorter = sum(value < 0.999 * row[0] for row in grids[0].values for value in row[1:])
     assert f"shorter in {shorter} of 36 cases" in text
     at_16 = grids[1].values[list(grids[1].durations).index(16.0)]
-    assert f"it has {jerk(quintics(16.0).derivative(3), 16.0):.3g} m²/s⁵" in text
-    assert f"best trigonometric plan of the table {min(at_16[1:]):.3g}." in text
-    assert f"{length(quintics(16.0).derivative(), 16.0):.4g} m, and no path" in text
-    assert f"the polyline's {L0:.4g} m" in text
-    assert f"straight line of {401**0.5:.4g} m" in text
+    assert f"For 16 s its value is {jerk(quintics(16.0).derivative(3), 16.0):.3g} m²/s⁵" in text
+    assert f"of a trigonometric plan in the table is {min(at_16[1:]):.3g} m²/s⁵." in text
+    assert f"{QUINTIC}, has a length of {length(quintics(16.0).derivative(), 16.0):.4g} m; the polyline" in text
+    assert f"the polyline, a lower bound, has {L0:.4g} m." in text
+    assert f"the straight line of {401**0.5:.4g} m" in text
     assert "nan" not in text
 
 
 def test_the_shortest_path_of_the_claim_is_the_shortest_of_a_scan(grids):
-    alpha, metres = map(float, re.search(r"has alpha = ([\d.]+) and ([\d.]+) m", optimality_claim(grids)[1]).groups())
+    alpha, metres = map(
+        float, re.search(r"has alpha = ([\d.]+) and a length of ([\d.]+) m", optimality_claim(grids)[1]).groups()
+    )
     t = np.linspace(0, 16, 4001)
     alphas = np.linspace(3.9, 4.4, 51)
     ways = [np.hypot(*np.diff(cp.TrigSpline(obstacle_waypoints(), alpha=a)(t))).sum() for a in alphas.tolist()]
@@ -171,12 +173,12 @@ def test_the_shortest_path_of_the_claim_is_the_shortest_of_a_scan(grids):
     assert metres == pytest.approx(min(ways), abs=0.006)
 
 
-def test_the_claim_would_hold_where_it_held(grids):
+def test_the_claim_is_counted_where_it_is_true(grids):
     """The words follow the numbers: a plan that is shorter than all baselines is counted."""
     values = grids[0].values.copy()
     values[2, 4] = values[0, 1] = 24.9
     won = optimality_claim((replace(grids[0], values=values), grids[1]))
-    assert "the claim holds in 2 of 72 cases, and fails in the others." in won[0]
+    assert "the claim is true in 2 of 72 cases." in won[0]
 
 
 @pytest.mark.parametrize("alpha", [0.0, 1.0, 2.0, 3.0, np.pi])
@@ -193,7 +195,7 @@ def test_from_rest_to_rest_the_polynomial_has_the_least_jerk():
     assert costs[0] == pytest.approx(720 * 401 / 15**5, rel=1e-9)
 
 
-# As fast as limits allow
+# Minimum duration within limits
 
 
 def drives(plan):
@@ -245,11 +247,11 @@ def test_margins_are_what_dense_samples_leave(fast):
 @pytest.mark.slow
 def test_the_notes_say_which_limit_where_and_what_the_others_leave(fast):
     (note,) = fastest_notes(fast)
-    assert f"takes {fast.duration:.4g} s at least: theta is at its limit at {fast.active.time:.3g} s" in note
+    assert f"is {fast.duration:.4g} s. The active limit is theta at {fast.active.time:.3g} s." in note
     for name in "RFC":
         assert re.search(rf"\b{name} [\d.]+", note)
-    assert "theta" not in note.partition("What the other limits leave")[2].partition("The same path")[0]
-    other = float(re.search(r"another time law takes ([\d.]+) s", note)[1])
+    assert "theta" not in note.partition("Margins of the other limits:")[2].partition("With an optimized time law")[0]
+    other = float(re.search(r"With an optimized time law on the same path the minimum duration is ([\d.]+) s", note)[1])
     assert 0.5 * fast.duration < other < fast.duration
 
 

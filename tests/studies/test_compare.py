@@ -398,7 +398,7 @@ def test_a_loop_that_keeps_an_error_never_settles_and_says_so():
 def test_a_run_that_is_too_short_says_so_of_the_plans_concerned():
     slow = cp.PolySpline([cp.Waypoint(0, 0, 0, 0), cp.Waypoint(30, 1, 0, 0)])
     (note,) = cp.compare(loop(5.0), {"fast": cp.Step(1.0), "slow": slow}, TIMES).notes
-    assert note.startswith("With slow the output does not settle")
+    assert note.startswith("slow: the output does not settle")
 
 
 def test_a_stable_loop_that_settles_needs_no_note(standard):
@@ -411,8 +411,8 @@ def test_where_the_planned_reference_loses_the_verdict_says_so(standard):
     verdict = found["settling_time"]
     assert verdict.best == ("step",)
     assert set(verdict.worst) == {"polynomial", "trigonometric", "piecewise"}
-    assert "step wins with 7.561 s" in verdict.sentence
-    assert "lose with 8.026 s" in verdict.sentence
+    assert "best 7.561 s (step)" in verdict.sentence
+    assert "worst 8.026 s (" in verdict.sentence
     assert found["overshoot_error"].worst == ("step",)
 
 
@@ -495,7 +495,7 @@ def test_one_loop_of_several_may_be_unstable():
         plans = {name: cp.PolySpline(MOVE) for name in order}
         found = cp.compare(lambda name, plan: closed[name], plans, TIMES)
         (note,) = found.notes
-        assert note.startswith("With bad, the loop is unstable: it has a pole at 2 1/s")
+        assert note.startswith("bad: the loop is unstable: it has a pole at 2 1/s")
         assert found.metrics["bad"]["settling_time"] == np.inf
         assert found.metrics["good"]["settling_time"] == pytest.approx(printed(5, "quintic")[1], rel=1e-4)
         assert "settling_time" in {v.key for v in verdicts(found)}

@@ -155,7 +155,7 @@ def test_what_a_step_did_outside_the_model_is_not_reported(nominal):
     assert row["slack_time"] == 0.0
     assert row["error_limited"] is None
     assert "slack" in nominal.marks["step"]
-    assert any("the run was ended at 5.866 s, and is measured up to then" in note for note in nominal.notes)
+    assert any("The run ended at 5.866 s; metrics cover the time before it." in note for note in nominal.notes)
     assert all("step" not in (*v.best, *v.worst) for v in verdicts(nominal))
     note = studies._step_note(nominal)
     assert "slack at 5.87 s" in note
@@ -164,7 +164,7 @@ def test_what_a_step_did_outside_the_model_is_not_reported(nominal):
 
 def test_the_poles_of_the_pids_are_those_of_their_loops(nominal):
     """Roots of (M s^2 + f s) s (Tf s + 1) + (Kp s + Ki)(Tf s + 1) + Kd s^2, gains of a triple pole at -5."""
-    said = nominal.parameters["PIDs"]
+    said = nominal.parameters["PID controllers"]
     crane, w, tf = Crane(), 5.0, 0.02
     b = crane.drum_radius
     drives = (
@@ -182,7 +182,7 @@ def test_the_poles_of_the_pids_are_those_of_their_loops(nominal):
 
 
 def test_drives_are_at_their_limits_and_do_not_leave_them(nominal):
-    (note,) = (note for note in nominal.notes if note.startswith("With step"))
+    (note,) = (note for note in nominal.notes if note.startswith("Events in the run with step"))
     assert "F was at its limit" in note
     assert "C was at its limit" in note
     assert "left its limits" not in note.replace("rope tension left its limits", "")
@@ -195,4 +195,4 @@ def test_no_control_of_the_crane_is_ranked_with_another_unit(nominal):
     force = np.abs(np.asarray(found.outputs)[found.output_labels.index("F")]).max()
     assert row["control_peak_F"] == pytest.approx(force, rel=5e-3)  # between samples, too
     assert "control_effort_C" in nominal.measures
-    assert "the worst of x, z" in nominal.parameters["figures"]
+    assert "maximum over the outputs x, z" in nominal.parameters["metrics"]

@@ -170,5 +170,5 @@ def test_former_attributes_of_a_benefit_and_a_verdict_warn():
 
 
 def test_the_figure_of_baselines_has_a_former_name():
-    with pytest.warns(FutureWarning, match="plot_rivals is deprecated.*use plot_baselines"):
+    with pytest.warns(FutureWarning, match="plot_rivals is deprecated.*use ctrlplan.reports.plot_baselines"):
         assert reports.plot_rivals is reports.plot_baselines

@@ -15,7 +15,7 @@ from ctrlplan.studies.linear import _shares, overshoot_peak
 MOVE = [cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1, 0, 0)]
 TIMES = np.linspace(0.0, 20.0, 8001)
 
-# Overshoot on the error [%] and settling time [s] of the step, the trigonometric plan, the quintic.
+# Overshoot on the tracking error [%] and settling time [s] of the step, the trigonometric plan, the quintic.
 TABLE = {k: [v for plan in linear_table.PLANS for v in linear_table.printed(k, plan)] for k in linear_table.GAINS}
 FINEST = 0.02
 
@@ -141,10 +141,10 @@ def test_notes_say_where_the_paper_differs_and_why(study):
 
 def test_notes_tell_what_the_numbers_say(study):
     gains, sweep = study.sections[0].sweep.values, study.sections[0].sweep.metrics
-    (peak,) = (note for note in study.notes if "peaks at" in note)
-    assert "It peaks at 51.065 % at k = 12.50 " in peak  # located to the digits printed by the test below
+    (peak,) = (note for note in study.notes if "overshoot of the plan rises" in note)
+    assert "Its maximum is 51.065 % at k = 12.50;" in peak  # located to the digits printed by the test below
     later = sweep["trigonometric"]["settling_time"] > sweep["step"]["settling_time"]
-    (share,) = (note for note in study.notes if "sooner than the trigonometric plan" in note)
+    (share,) = (note for note in study.notes if "earlier than the trigonometric plan" in note)
     assert f"at no gain above k = {gains[later].max():.3g}" in share
     said = re.search(r"on (\d+) % of the range of gains on a logarithmic scale \((\d+) % on a linear one\)", share)
     # By Monte Carlo: gains drawn evenly on each scale, each answered for by the nearest gain swept.

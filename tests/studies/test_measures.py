@@ -8,7 +8,7 @@ import pytest
 
 import ctrlplan as cp
 from ctrlplan.reports import render_page, summary, verdicts
-from ctrlplan.reports.words import unit_of
+from ctrlplan.reports.words import number, unit_of
 from ctrlplan.simulation import Occurrence
 from ctrlplan.studies import MEASURES, Measure, Study
 from ctrlplan.studies.units import in_units
@@ -126,8 +126,8 @@ def test_signals_of_different_units_are_not_ranked_together():
         assert not math.isnan(row["settling_time"])  # seconds are seconds
         assert not math.isnan(row["overshoot_error"])
     page = render_page([Study("mine", "Mine", found, sections=())], "Page")
-    assert "Peak of the control (F)" in page
-    assert "Effort of the control (M)" in page
+    assert "Peak control (F)" in page
+    assert "Control effort (M)" in page
     assert unit_of(found, "control_effort_M") == "(N m)² s"
     assert unit_of(found, "iae_theta") == "rad s"
     assert {v.key for v in verdicts(found)} >= {"control_effort_F", "control_effort_M", "iae_x", "iae_theta"}
@@ -142,10 +142,10 @@ def test_signals_that_are_not_known_to_differ_have_a_worst(units):
 
 
 def test_the_report_says_that_figures_are_the_worst_of_the_axes():
-    said = two_axes().parameters["figures"]
-    assert "of outputs the worst of x, theta" in said
-    assert "of controls the worst of F, M" in said
-    assert "figures" not in cp.compare(loop(5.0), MOVE, T).parameters
+    said = two_axes().parameters["metrics"]
+    assert "maximum over the outputs x, theta" in said
+    assert "maximum over the controls F, M" in said
+    assert "metrics" not in cp.compare(loop(5.0), MOVE, T).parameters
 
 
 # Ties
@@ -168,7 +168,7 @@ def test_rounding_is_a_tie_and_says_within_how_much(metric, scale):
     """The plan is 1 long, the run 8 s: a difference of a millionth of the scale is rounding, of ten is not."""
     tie = named(metric, 0.0, 0.5e-6 * scale)
     assert (tie.best, tie.worst) == ((), ())
-    assert f"no difference between a and b, within {0.5e-6 * scale:.2g}" in tie.sentence
+    assert f"equal for a and b, within {number(0.5e-6 * scale)}" in tie.sentence
     real = named(metric, 0.0, 1e-5 * scale)
     assert (real.best, real.worst) == (("a",), ("b",))
 
@@ -195,7 +195,7 @@ def test_two_exact_loops_tie_though_their_rounding_differs():
     tied = {v.key: v for v in verdicts(found)}
     for metric in ("overshoot_error", "lag_error", "iae", "ise", "itae"):
         assert tied[metric].best == ()
-    assert "a millionth of the scale" in summary(found)
+    assert "10⁻⁶ of the scale" in summary(found)
 
 
 # Runs that are ended
@@ -211,9 +211,9 @@ def test_a_run_that_is_ended_is_measured_up_to_then_and_says_so():
     area = np.sum(0.5 * (np.abs(1 - y[1:]) + np.abs(1 - y[:-1])) * np.diff(t))
     assert found.metrics["step"]["iae"] == pytest.approx(area, rel=1e-3)
     assert found.metrics["step"]["overshoot_error"] == pytest.approx(30.0, rel=1e-9)
-    assert "measured up to then, and not ranked" in found.marks["step"]
-    (note,) = (note for note in found.notes if note.startswith("With step"))
-    assert f"the run was ended at {t[-1]:.4g} s, and is measured up to then" in note
+    assert "metrics cover the time before it and are not ranked" in found.marks["step"]
+    (note,) = (note for note in found.notes if note.startswith("Events in the run with step"))
+    assert f"The run ended at {t[-1]:.4g} s; metrics cover the time before it." in note
     assert all("step" not in (*v.best, *v.worst) for v in verdicts(found))
     assert "not ranked" in summary(found).lower()
 
@@ -340,7 +340,7 @@ def test_an_event_keeps_its_words_whatever_it_is_called():
     event = cp.Event("u", high=15.0, name="tank: level")
     found = cp.compare(loop(100.0), {"step": cp.Step(1.0)}, T, events=[event])
     (note,) = (note for note in found.notes if "tank" in note)
-    assert note.startswith("With step, tank: level left its limits ")
+    assert note.startswith("Events in the run with step: tank: level left its limits ")
     assert str(Occurrence(1.25, "tank: level", "above")) == "1.25 s: tank: level above its limit"
     assert str(Occurrence(1.25, "tank: level", "inside")) == "1.25 s: tank: level within its limits"
 
@@ -351,8 +351,8 @@ def test_an_actuator_is_at_its_limit_and_does_not_leave_it():
     law = ct.ss([], [], [], [[4.0, -4.0]], inputs=["r", "y"], outputs="v", name="law")
     whole = ct.interconnect([law, limited, plant], inputs=["r"], outputs=["y", "u"], name="whole")
     found = cp.compare(whole, {"step": cp.Step(1.0, labels=["r"])}, T, outputs=["y"])
-    (note,) = (note for note in found.notes if note.startswith("With step, u"))
-    assert "u was at its limit 1 times, first at 0 s" in note
+    (note,) = (note for note in found.notes if note.startswith("Events in the run with step: u"))
+    assert "u was at its limit (at 0 s)." in note
     occurrence = found.responses["step"].events[0]
     assert occurrence.name == "u"
     assert str(occurrence) == "0 s: u was at its limit"
