@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from functools import singledispatch
 
-import numpy as np
-
+from ctrlplan.planning.limits import limit_words
 from ctrlplan.reports.crane_figures import (
     animation_data,
     plot_motion,
@@ -28,7 +27,6 @@ from ctrlplan.reports.parts import Animation, Block, Head, Items, Part, Picture,
 from ctrlplan.reports.planning_figures import plot_baselines
 from ctrlplan.reports.style import line_styles, roles_of
 from ctrlplan.reports.tables import durations_of, grid_of, metrics_of, spread_of
-from ctrlplan.reports.words import number, unit_in
 from ctrlplan.studies.benefit import Benefit
 from ctrlplan.studies.comparison import Comparison
 from ctrlplan.studies.grids import Grid
@@ -54,6 +52,7 @@ from ctrlplan.studies.sections import (
     SweepCurves,
 )
 from ctrlplan.studies.study import Study
+from ctrlplan.studies.verdicts import number, unit_in
 
 
 @singledispatch
@@ -186,7 +185,7 @@ def _(section: Benefit, study: Study) -> Part:
         "References through the same waypoints in the same time, what the loop makes of them, and what that asks of "
         "its controls."
     )
-    limits = "; ".join(f"{limit} {_limit_words(value)}" for limit, value in section.limits.items())
+    limits = "; ".join(f"{limit} {limit_words(value)}" for limit, value in section.limits.items())
     over = "Over duration and alpha: ▲ better than every rival that counts, ▽ worse than the best of them (underlined)."
     blocks: list[Block] = [
         Text(f"{words} {section.note}" if section.note else words),
@@ -209,12 +208,6 @@ def _grids(grids: list[tuple[Grid, str]]) -> list[Block]:
         title = f"{grid.title} [{unit}]" if unit else grid.title
         blocks += [Text(f"{title} over duration and alpha:", hint=True), grid_of(grid, unit)]
     return blocks
-
-
-def _limit_words(value: object) -> str:
-    """A limit as it was given, to four digits."""
-    sides = ["any" if side is None else f"{side:.4g}" for side in np.array(value, dtype=object).reshape(-1)]
-    return f"within ±{sides[0]}" if len(sides) == 1 else f"from {sides[0]} to {sides[1]}"
 
 
 # Cranes and loops
