@@ -142,7 +142,7 @@ class Comparison(Displayed):
             for name, measure in listed.items()
         }
         names = leading_metrics(cells)
-        first = {verdict.key: verdict.winners for verdict in verdicts(self)}
+        first = {verdict.key: verdict.best for verdict in verdicts(self)}
         best = [
             (i, j + 2)
             for i, name in enumerate(names)
