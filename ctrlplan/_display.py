@@ -18,7 +18,7 @@ ROWS = 8
 """Rows that a table has at most, where there may be many."""
 
 _LONGEST = 46
-"""Letters of a cell."""
+"""Columns that a cell takes at most."""
 
 
 @dataclass(frozen=True)
@@ -181,10 +181,12 @@ def _facts_lines(facts: Facts) -> list[str]:
 
 def _table_lines(table: Table) -> list[str]:
     """Table with as many columns side by side as fit, the others below under the same first column."""
-    mark = bool(table.best)
-    grid = [[_cell(head) + " " * mark for head in table.heads]]
+    marked = {j for _, j in table.best}
+    grid = [[_cell(head) for head in table.heads]]
     for i, row in enumerate(table.rows):
-        grid.append([_cell(cell) + ("*" if (i, j) in table.best else " ") * mark for j, cell in enumerate(row)])
+        grid.append(
+            [_cell(cell) + ("*" if (i, j) in table.best else " ") * (j in marked) for j, cell in enumerate(row)]
+        )
     widths = [max(map(_width, column)) for column in zip(*grid, strict=True)]
     starts, used = [1], widths[0]
     for j, wide in enumerate(widths[1:], 1):
@@ -223,15 +225,19 @@ def _line(text: str) -> str:
 def _cell(text: str) -> str:
     """Text of a cell, the middle of a very long one left out."""
     line = _line(text)
-    return line if len(line) <= _LONGEST else f"{line[: _LONGEST - 14].rstrip()} ... {line[-9:].lstrip()}"
+    if _width(line) <= _LONGEST:
+        return line
+    last = _wrapped([line[::-1]], 9)[0][::-1].lstrip()
+    return f"{_wrapped([line], _LONGEST - 14)[0].rstrip()} ... {last}"
 
 
 def _width(text: str) -> int:
-    """Columns that a text takes."""
+    """Columns that a text takes: two for a wide letter, none for an accent."""
     if text.isascii():
         return len(text)
-    wide = sum(1 + (unicodedata.east_asian_width(letter) in "WF") for letter in text)
-    return wide - sum(unicodedata.combining(letter) != 0 for letter in text)
+    return sum(
+        0 if unicodedata.combining(letter) else 1 + (unicodedata.east_asian_width(letter) in "WF") for letter in text
+    )
 
 
 def _padded(text: str, width: int, *, right: bool = False) -> str:

@@ -626,7 +626,8 @@ class Trajectory(Displayed, Fields, ABC):
 
     def _facts(self) -> list[tuple[str, str]]:
         """Values that a description states, by name; kinds add their own."""
-        jumps = self.jumps(0)
+        with np.errstate(over="ignore", invalid="ignore"):
+            jumps = self.jumps(0) if self._has_quick_peaks() else ()
         times = list(dict.fromkeys(f"{jump.time:.6g} s" for jump in jumps))
         return [
             ("duration", f"{self.duration:.6g} s" if self.duration else ""),
@@ -643,7 +644,8 @@ class Trajectory(Displayed, Fields, ABC):
         rows = []
         for nu in range(1, 4 if self.duration else 1):
             try:
-                peaks = [number(value) for value in self.peak(nu).tolist()]
+                with np.errstate(over="ignore", invalid="ignore"):
+                    peaks = [number(value) for value in self.peak(nu).tolist()]
             except (ValueError, RuntimeError):  # beyond floating point, or not resolved
                 peaks = ["n/a"] * self.naxes
             rows.append([f"peak {ENTRIES[nu]} [1/s{f'^{nu}' if nu > 1 else ''}]", *peaks])
