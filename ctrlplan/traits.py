@@ -10,13 +10,15 @@ else is read off a block: an attribute that happens to be called ``delay`` or
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any, Generic, Self, SupportsFloat, TypeAlias, TypeVar, overload
 
 import control as ct
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from ctrlplan._display import Displayed, Facts, Part
 
 if TYPE_CHECKING:
     from ctrlplan.trajectories import Trajectory
@@ -31,8 +33,8 @@ Watched: TypeAlias = Mapping[str, tuple[BlockFunction, float, float]]
 _ATTRIBUTE = "_ctrlplan_traits"
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class BlockTraits:
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
+class BlockTraits(Displayed):
     """Declared properties of a block; set by `declare`, read by `traits_of`.
 
     Attributes
@@ -92,6 +94,19 @@ class BlockTraits:
     delay: float | None = None
     initial: ArrayLike = 0.0
     block: ct.InputOutputSystem | None = None
+
+    def _describe(self) -> Iterator[Part]:
+        stated = {name: getattr(self, name) for name in _NAMES}
+        stated = {name: value for name, value in stated.items() if value is not getattr(_NONE, name)}
+        yield f"BlockTraits: {', '.join(stated) or 'none declared'}"
+        yield Facts([(name, _shown(value)) for name, value in stated.items()])
+
+
+def _shown(value: object) -> str:
+    """Value of a trait: a name for what is a function or a block."""
+    if isinstance(value, Mapping):
+        return ", ".join(map(str, value))
+    return str(getattr(value, "__name__", None) or getattr(value, "name", None) or repr(value))
 
 
 _NAMES = tuple(field.name for field in fields(BlockTraits))

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import control.flatsys as fs
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ctrlplan._checks import check_kind, checked_labels, checked_timepts, default_labels, real_array
+from ctrlplan._display import Displayed, Facts, Part
 from ctrlplan._types import Array
 from ctrlplan.trajectories import Trajectory
 
@@ -16,7 +17,7 @@ Params = Mapping[str, float] | None
 Flag = Sequence[Array]
 
 
-class FlatSystem(fs.FlatSystem):  # type: ignore[misc]
+class FlatSystem(Displayed, fs.FlatSystem):  # type: ignore[misc]
     """Flat system with named flat outputs and maps over many times.
 
     A `control.flatsys.FlatSystem`: `forward` and `reverse` work in
@@ -119,6 +120,25 @@ class FlatSystem(fs.FlatSystem):  # type: ignore[misc]
             raise ValueError(
                 f"orders must add up to at least the number of states, {len(states)}, got {sum(self.orders)}"
             )
+
+    __repr__ = fs.FlatSystem.__repr__
+
+    def _describe(self) -> Iterator[Part]:
+        outputs = [f"{label} (derivatives up to {r})" for label, r in zip(self.flat_labels, self.orders, strict=True)]
+        yield f"{type(self).__name__} {self.name} with flat outputs {', '.join(self.flat_labels)}"
+        yield Facts(
+            [
+                ("flat outputs", ", ".join(outputs)),
+                ("states", ", ".join(self.state_labels)),
+                ("inputs", ", ".join(self.input_labels)),
+                ("outputs", ", ".join(self.output_labels)),
+                (
+                    "dynamic extension",
+                    f"{self.extension} states" if self.extension else "none",
+                ),
+                ("parameters", ", ".join(f"{name} = {value}" for name, value in self.params.items())),
+            ]
+        )
 
     def states_and_inputs(
         self, plan: Trajectory, timepts: ArrayLike, *, start: ArrayLike | None = None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from numbers import Real
 from typing import TYPE_CHECKING, Any
@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
+from ctrlplan._display import Displayed, Facts, Figure, Part, number, title_of
 from ctrlplan.planning.objectives import (
     Objective,
     ObjectiveName,
@@ -36,7 +37,7 @@ _BLOWN = 10.0
 
 
 @dataclass(frozen=True, repr=False)
-class AlphaChoice:
+class AlphaChoice(Displayed):
     """Shape parameter that was chosen, and the objective over alpha.
 
     ``float(choice)`` is the alpha, so that a choice can stand where a plan
@@ -75,8 +76,20 @@ class AlphaChoice:
     def __float__(self) -> float:
         return self.alpha
 
-    def __repr__(self) -> str:
-        return f"<AlphaChoice alpha = {self.alpha:.6g} rad: {self.objective} {self.value:.6g}>"
+    def _describe(self) -> Iterator[Part]:
+        objective = self.objective.replace("_", " ")
+        yield f"Optimal alpha = {self.alpha:.6g} rad: {objective} {self.value:.6g}"
+        yield Facts(
+            [
+                ("alpha", f"{self.alpha:.6g} rad"),
+                ("objective", f"{objective}, {self.value:.6g}"),
+                ("at alpha = 0 (polynomial)", number(float(self.values[0]))),
+                ("ten times the minimum from", f"{number(self.blow_up)} rad" if self.blow_up < 2.0 * math.pi else ""),
+                ("decided by", "integral of the squared jerk, at equal objective" if self.tied else ""),
+                ("plan", title_of(self.plan)),
+            ]
+        )
+        yield Figure("Position and velocity of the plan over time.", 2, lambda axes: self.plan.plot(ax=axes))
 
     def plot(self, *, ax: AxesLike | None = None) -> ControlPlot:
         """Objective over alpha up to where it blows up, the choice marked.

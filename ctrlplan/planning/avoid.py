@@ -17,6 +17,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
 from ctrlplan._checks import checked_count, checked_finite
+from ctrlplan._display import Displayed, Facts, Figure, Part, title_of
 from ctrlplan._renamed import warn_renamed
 from ctrlplan.planning.clearance import Clearance, Rope, checked_obstacles, checked_rope
 from ctrlplan.planning.clearance import clearance as certified_clearance
@@ -24,6 +25,7 @@ from ctrlplan.planning.objectives import plan_length
 from ctrlplan.planning.obstacles import Obstacle
 from ctrlplan.trajectories import PiecewiseSpline, Trajectory, Waypoint, WaypointSpline
 from ctrlplan.trajectories.common import Array
+from ctrlplan.trajectories.waypoint import waypoint_table
 
 Build = Callable[[Iterable[Waypoint]], Trajectory]
 Pairs = NDArray[np.intp]
@@ -40,7 +42,7 @@ _PRICE = 3e2  # of a clearance missed by the length of the path, in units of the
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Avoidance:
+class Avoidance(Displayed):
     """Plan that keeps clear of obstacles; made by `avoid`.
 
     For one release it can be used as the plan itself, with a FutureWarning.
@@ -58,8 +60,11 @@ class Avoidance:
 
     __array_ufunc__ = None
 
-    def __repr__(self) -> str:
-        return f"<Avoidance with {self.plan!r}: {self.clearance}>"
+    def _describe(self) -> Iterator[Part]:
+        yield f"{title_of(self.plan)}, clearance at least {self.clearance.lower:.6g}"
+        yield Facts(self.clearance.facts())
+        yield waypoint_table(self.plan.waypoints, self.plan.labels)
+        yield Figure("Position and velocity of the plan over time.", 2, lambda axes: self.plan.plot(ax=axes))
 
     def _as_plan(self) -> Trajectory:
         warn_renamed("avoid(...) used as a plan", "avoid(...).plan")

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 
 from ctrlplan._checks import checked_finite, checked_number
+from ctrlplan._display import Displayed, Facts, Part, number
 from ctrlplan._renamed import warn_renamed
 from ctrlplan.planning.obstacles import Obstacle
 from ctrlplan.trajectories import Trajectory
@@ -34,8 +35,8 @@ class Rope(Protocol):
         """Bounds (order + 1, 2) of the length of d top/d entry, for each entry of the jets of a plan."""
 
 
-@dataclass(frozen=True)
-class Clearance:
+@dataclass(frozen=True, repr=False)
+class Clearance(Displayed):
     """Certified clearance of a plan.
 
     Attributes
@@ -75,13 +76,21 @@ class Clearance:
         warn_renamed("Clearance.least", "minimum")
         return self.minimum
 
-    def __str__(self) -> str:
+    def _describe(self) -> Iterator[Part]:
+        verdict = {True: "satisfied", False: "violated", None: ""}[self.certified]
+        wanted = f", {number(self.required)} required: {verdict}" if self.required is not None else ""
+        yield f"Clearance of at least {self.lower:.6g} over the whole plan{wanted}"
+        yield Facts(self.facts())
+
+    def facts(self) -> list[tuple[str, str]]:
+        """Values with their names, as print shows them."""
         x, z = self.position
-        asked = {True: f"; {self.required} is kept", False: f"; {self.required} is not kept", None: ""}[self.certified]
-        return (
-            f"at least {self.lower:.6g} over the whole interval, {self.minimum:.6g} met by the {self.part} beside "
-            f"obstacles[{self.obstacle}] at {self.time:.6g} s with the load at ({x:.4g}, {z:.4g}){asked}"
-        )
+        return [
+            ("certified lower bound", f"{self.lower:.6g}"),
+            ("minimum found", f"{self.minimum:.6g}, {self.part} to obstacles[{self.obstacle}]"),
+            ("at", f"{self.time:.6g} s, position ({number(x)}, {number(z)})"),
+            ("required", "" if self.required is None else f"{self.required:.6g}"),
+        ]
 
 
 def clearance(

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
-from html import escape
 from typing import TYPE_CHECKING, Literal, NoReturn, get_args
 
 import numpy as np
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq
 
 from ctrlplan._checks import checked_pair
+from ctrlplan._display import Displayed, Facts, Figure, Part
 from ctrlplan._renamed import warn_renamed
 from ctrlplan.planning.limits import Limited, Margin, Margins
 from ctrlplan.planning.quantities import System, system_given
@@ -34,7 +34,7 @@ _PER_OCTAVE = 24
 
 
 @dataclass(frozen=True, repr=False)
-class Fastest:
+class Fastest(Displayed):
     """Shortest plan under limits; made by `fastest`.
 
     Attributes
@@ -82,22 +82,24 @@ class Fastest:
         warn_renamed("Fastest.refusal", "rejection")
         return self.rejection
 
-    def __repr__(self) -> str:
-        note = f"\nshorter plans are rejected: {self.rejection}" if self.rejection else ""
-        return f"fastest with the {self.hold} held: {self.duration:.6g} s ({self._sets}){note}\n{self.margins!r}"
-
-    def _repr_html_(self) -> str:
-        note = f" Shorter plans are rejected: {escape(self.rejection)}." if self.rejection else ""
-        return (
-            f"<p>Shortest duration with the {self.hold} held: <b>{self.duration:.6g} s</b> ({self._sets}).{note}</p>"
-            f"{self.margins._repr_html_()}"
-        )
-
-    @property
-    def _sets(self) -> str:
-        found = "feasible: " + ", ".join(f"{low:.6g} to {high:.6g} s" for low, high in self.feasible)
+    def _describe(self) -> Iterator[Part]:
+        active = "" if self.rejection else self.active.bound.name
+        limit = f", active limit {active}" if active else ""
+        yield f"Fastest plan at fixed {self.hold}: {self.duration:.6g} s{limit}"
         cut = math.isfinite(self.searched[1]) and self.feasible[-1][1] >= self.searched[1] * (1.0 - 1e-9)
-        return f"{found}, where the search ended" if cut else found
+        sets = ", ".join(
+            f"from {low:.6g} s" if math.isinf(high) else f"{low:.6g} to {high:.6g} s" for low, high in self.feasible
+        )
+        yield Facts(
+            [
+                ("minimum duration", f"{self.duration:.6g} s"),
+                ("active limit", f"{active} {self.active.bound.range}, at {self.active.time:.6g} s" if active else ""),
+                ("feasible durations", f"{sets}, the end of the search" if cut else sets),
+                ("shorter plans rejected", self.rejection),
+            ]
+        )
+        yield self.margins.table()
+        yield Figure("Position and velocity of the plan over time.", 2, lambda axes: self.plan.plot(ax=axes))
 
     def plot(self, units: Mapping[str, str] | None = None, *, ax: AxesLike | None = None) -> ControlPlot:
         """Every limited signal over time with its limits.

@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from html import escape
 from numbers import Real
 from typing import TYPE_CHECKING, Any, TypeGuard
 
 import numpy as np
 
 from ctrlplan._checks import checked_limits, real_array
+from ctrlplan._display import Displayed, Part, Table, counted
 from ctrlplan.planning.quantities import Quantities, System, quantities_of, system_given
 from ctrlplan.trajectories import Trajectory, derivative_name
 from ctrlplan.trajectories.common import Array
@@ -50,8 +50,8 @@ class Limits:
     --------
     >>> import ctrlplan as cp
     >>> move = cp.PolySpline([cp.Waypoint(0, 0, 0, 0), cp.Waypoint(2, 1, 0, 0)])
-    >>> print(cp.margins(move, {"y_d1": cp.Limits(high=1.0)}))
-    y_d1 at most 1: 0.9375 at 1 s, 0.0625 left
+    >>> cp.margins(move, {"y_d1": cp.Limits(high=1.0)})
+    <Margins of 1 limit: y_d1 at most 1: 0.9375 at 1 s, 0.0625 left>
     """
 
     low: float | None = None
@@ -145,11 +145,31 @@ class Bound:
     @property
     def range(self) -> str:
         """The limits in words."""
-        if math.isinf(self.low):
-            return f"at most {self.high:g}"
-        if math.isinf(self.high):
-            return f"at least {self.low:g}"
-        return f"within ±{self.high:g}" if self.low == -self.high else f"from {self.low:g} to {self.high:g}"
+        return _range(self.low, self.high)
+
+
+def limit_words(limit: object) -> str:
+    """A limit in words, in any of the forms that `margins` accepts; of several axes one after the other."""
+    if isinstance(limit, Limits):
+        return _range(*limit._sides())
+    given = np.array(limit, dtype=object)
+    if given.ndim == 0:
+        return _range(-float(given), float(given))
+    if isinstance(limit, tuple) and given.shape == (2,):
+        low, high = (side if value is None else float(value) for value, side in zip(limit, _NO_SIDES, strict=True))
+        return _range(low, high)
+    return "; ".join(limit_words(tuple(row) if np.ndim(row) else row) for row in given)
+
+
+_NO_SIDES = (-math.inf, math.inf)
+
+
+def _range(low: float, high: float) -> str:
+    if math.isinf(low):
+        return f"at most {high:g}"
+    if math.isinf(high):
+        return f"at least {low:g}"
+    return f"within ±{high:g}" if low == -high else f"from {low:g} to {high:g}"
 
 
 @dataclass(frozen=True)
@@ -191,7 +211,7 @@ class Margin:
 
 
 @dataclass(frozen=True, repr=False)
-class Margins:
+class Margins(Displayed):
     """Margins of all limits over a whole plan, the smallest first.
 
     Attributes
@@ -218,8 +238,25 @@ class Margins:
     def __len__(self) -> int:
         return len(self.rows)
 
-    def __repr__(self) -> str:
-        return "\n".join(map(str, self.rows))
+    def _describe(self) -> Iterator[Part]:
+        yield f"Margins of {counted(len(self), 'limit')}: {self.active}"
+        yield self.table()
+
+    def table(self) -> Table:
+        """Table with a row a limit, as print shows it."""
+        rows = [
+            (
+                row.bound.name,
+                row.bound.range,
+                f"{row.value:.6g}",
+                f"{row.time:.6g}",
+                row.share if row.fraction >= 0.0 or row.share == "nothing" else f"-{row.share}",
+            )
+            for row in self.rows
+        ]
+        return Table(
+            "Margins over the whole plan, the smallest first", ("limit", "must stay", "value", "at [s]", "margin"), rows
+        )
 
     def to_pandas(self) -> pd.DataFrame:
         """Table with a row a limit: low, high, value, time, margin."""
@@ -236,15 +273,6 @@ class Margins:
             for row in self.rows
         }
         return pd.DataFrame(table).T.rename_axis(index="limit")
-
-    def _repr_html_(self) -> str:
-        cells = "".join(
-            f"<tr><th>{escape(row.bound.name)}</th><td>{row.bound.range}</td><td>{row.value:.6g}</td>"
-            f"<td>{row.time:.6g}</td><td>{'' if row.fraction >= 0.0 else '−'}{row.share}</td></tr>"
-            for row in self.rows
-        )
-        heads = "".join(f"<th>{head}</th>" for head in ("limit", "must stay", "comes to", "at [s]", "margin"))
-        return f"<table><thead><tr>{heads}</tr></thead><tbody>{cells}</tbody></table>"
 
 
 def margins(
@@ -291,8 +319,8 @@ def margins(
     --------
     >>> import ctrlplan as cp
     >>> move = cp.PolySpline([cp.Waypoint(0, 0, 0, 0), cp.Waypoint(2, 1, 0, 0)])
-    >>> print(cp.margins(move, {"y_d1": 1.0}))
-    y_d1 within ±1: 0.9375 at 1 s, 6.25 % left
+    >>> cp.margins(move, {"y_d1": 1.0})
+    <Margins of 1 limit: y_d1 within ±1: 0.9375 at 1 s, 6.25 % left>
     """
     limited = Limited(plan, limits, system_given(system, quantities))
     limited.check_smooth(plan)

@@ -30,11 +30,13 @@ from scipy.linalg import blas, qr
 from scipy.optimize import minimize
 
 from ctrlplan._checks import checked_count, checked_finite, checked_labels
+from ctrlplan._display import Displayed, Facts, Figure, Part, counted, number, title_of
 from ctrlplan.trajectories import Joined, PiecewiseSpline, PolySpline, Trajectory, TrigSpline, Waypoint
 from ctrlplan.trajectories.common import FACTORIALS, Array, readonly
 from ctrlplan.trajectories.newton import NewtonSystem
 from ctrlplan.trajectories.newton_spline import given_entries
 from ctrlplan.trajectories.trigonometric import checked_alpha
+from ctrlplan.trajectories.waypoint import entry_name, waypoint_table
 from ctrlplan.trajectories.waypoint_spline import checked_waypoints
 
 _EPS = float(np.finfo(float).eps)
@@ -42,7 +44,7 @@ _FEW, _NONE = 1e-6, 1e-2  # estimated relative errors of the cost, above which t
 
 
 @dataclass(frozen=True, repr=False)
-class Optimum:
+class Optimum(Displayed):
     """Waypoints without free entries, and the plan through them.
 
     Iterating gives the waypoints.
@@ -75,9 +77,19 @@ class Optimum:
     def __len__(self) -> int:
         return len(self.waypoints)
 
-    def __repr__(self) -> str:
+    def _describe(self) -> Iterator[Part]:
         note = "" if self.unique else ", not unique"
-        return f"<Optimum of {len(self)} waypoints, int (y^({self.derivative}))^2 = {self.cost:.6g}{note}>"
+        cost = f"integral of the squared {entry_name(self.derivative)}"
+        yield f"Optimum of {counted(len(self), 'waypoint')}: {cost} {self.cost:.6g}{note}"
+        yield Facts(
+            [
+                (cost, number(self.cost)),
+                ("unique", "yes" if self.unique else "no"),
+                ("plan", title_of(self.plan)),
+            ]
+        )
+        yield waypoint_table(self.waypoints, self.plan.labels)
+        yield Figure("Position and velocity of the plan over time.", 2, lambda axes: self.plan.plot(ax=axes))
 
 
 def optimize_waypoints(

@@ -16,7 +16,7 @@ from ctrlplan.reports.page import CraneAnimation, comparison_fragment, render_pa
 from ctrlplan.reports.parts import Cell, Head, Items, MetricsTable, Part, Picture, Svg, Table, Text
 from ctrlplan.reports.planning_figures import plot_baselines
 from ctrlplan.reports.sections import draw
-from ctrlplan.reports.words import Verdict, summary, verdicts
+from ctrlplan.studies.verdicts import Verdict, summary, verdicts
 
 __all__ = [
     "Cell",

@@ -8,7 +8,6 @@ import hashlib
 import json
 import os
 import platform
-import re
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
@@ -20,16 +19,17 @@ from markupsafe import Markup
 
 import ctrlplan
 from ctrlplan import _files
+from ctrlplan._display import in_line, readable
 from ctrlplan.reports.crane_figures import animation_data
 from ctrlplan.reports.parts import Animation, MetricsTable, Part, Picture, Svg
 from ctrlplan.reports.sections import draw
 from ctrlplan.reports.style import page_style, slug, to_svg
 from ctrlplan.reports.tables import metrics_of
-from ctrlplan.reports.words import summary, verdicts
 from ctrlplan.studies.benefit import Benefit
 from ctrlplan.studies.comparison import Comparison
 from ctrlplan.studies.sections import Section, Wall
 from ctrlplan.studies.study import Study
+from ctrlplan.studies.verdicts import summary, verdicts
 
 
 def write_page(studies: Sequence[Study], path: str | os.PathLike[str], title: str) -> Path:
@@ -151,10 +151,8 @@ class CraneAnimation:
 
 
 def comparison_fragment(comparison: Comparison) -> str:
-    """Metrics table and verdict for a notebook cell."""
-    return _template("fragment.html").render(
-        title=comparison.title, table=metrics_of(comparison), summary=summary(comparison), notes=comparison.notes
-    )
+    """A comparison as Jupyter shows it."""
+    return comparison._repr_html_()
 
 
 def _template(name: str) -> Template:
@@ -173,13 +171,9 @@ def _environment() -> Environment:
     )
 
 
-# Control characters, overrides of the direction of writing, halves of surrogate pairs (of file names), no characters.
-_UNREADABLE = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udfff\ufffe\uffff]")
-
-
 def _readable(value: object) -> object:
     """What is put into the page: of a text every character that can be seen and written."""
-    return _UNREADABLE.sub("\N{REPLACEMENT CHARACTER}", value) if type(value) is str else value
+    return readable(value) if type(value) is str else value
 
 
 def _script(name: str) -> Markup:
@@ -248,7 +242,7 @@ class _Shown:
     @property
     def parameters(self) -> dict[str, str]:
         """How the comparison was made."""
-        return {name: str(value) for name, value in self.study.comparison.parameters.items()}
+        return {name: in_line(value) for name, value in self.study.comparison.parameters.items()}
 
     @property
     def table(self) -> MetricsTable:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from functools import singledispatch
 
-import numpy as np
-
+from ctrlplan.planning.limits import limit_words
 from ctrlplan.reports.crane_figures import (
     animation_data,
     plot_motion,
@@ -28,7 +27,6 @@ from ctrlplan.reports.parts import Animation, Block, Head, Items, Part, Picture,
 from ctrlplan.reports.planning_figures import plot_baselines
 from ctrlplan.reports.style import line_styles, roles_of
 from ctrlplan.reports.tables import durations_of, grid_of, metrics_of, spread_of
-from ctrlplan.reports.words import number, unit_in
 from ctrlplan.studies.benefit import Benefit
 from ctrlplan.studies.comparison import Comparison
 from ctrlplan.studies.grids import Grid
@@ -54,6 +52,7 @@ from ctrlplan.studies.sections import (
     SweepCurves,
 )
 from ctrlplan.studies.study import Study
+from ctrlplan.studies.verdicts import number, unit_in
 
 
 @singledispatch
@@ -182,7 +181,7 @@ def _(section: Benefit, study: Study) -> Part:
         "alpha and duration."
     )
     caption = "References through the same waypoints in the same time, with the outputs and controls of the loop."
-    limits = "; ".join(f"{limit} {_limit_words(value)}" for limit, value in section.limits.items())
+    limits = "; ".join(f"{limit} {limit_words(value)}" for limit, value in section.limits.items())
     over = (
         "Metrics over duration and alpha: ▲ better than every ranked baseline, ▽ worse than the best ranked baseline "
         "(underlined)."
@@ -208,12 +207,6 @@ def _grids(grids: list[tuple[Grid, str]]) -> list[Block]:
         title = f"{grid.title} [{unit}]" if unit else grid.title
         blocks += [Text(f"{title} over duration and alpha:", hint=True), grid_of(grid, unit)]
     return blocks
-
-
-def _limit_words(value: object) -> str:
-    """A limit as it was given, to four digits."""
-    sides = ["unlimited" if side is None else f"{side:.4g}" for side in np.array(value, dtype=object).reshape(-1)]
-    return f"within ±{sides[0]}" if len(sides) == 1 else f"from {sides[0]} to {sides[1]}"
 
 
 # Cranes and loops

@@ -7,11 +7,11 @@ from collections.abc import Mapping, Sequence
 
 from ctrlplan.reports.parts import Cell, Head, MetricRow, MetricsTable, Plan, Table
 from ctrlplan.reports.style import Style, line_styles, roles_of
-from ctrlplan.reports.words import number, unit_of, verdicts
 from ctrlplan.studies.comparison import Comparison
 from ctrlplan.studies.ensemble import Ensemble
 from ctrlplan.studies.grids import SAME, Grid
 from ctrlplan.studies.required_durations import RequiredDuration
+from ctrlplan.studies.verdicts import number, unit_of, verdicts
 
 _NONE = (math.nan,) * 5
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ctrlplan._checks import Range, checked_finite, checked_limits
+from ctrlplan._display import Displayed, Facts, Part, Table, number
 from ctrlplan._types import Array, Frozen, Params, System
 from ctrlplan.simulation import methods
 from ctrlplan.simulation.built_forms import NotApplicableError
@@ -29,7 +30,7 @@ _COUNTS = 20, 100_000
 """Minimum and maximum number of times at which a prediction is evaluated."""
 
 
-class Predictor(Frozen):
+class Predictor(Displayed, Frozen):
     """Admissible references of a nonlinear loop, by simulation.
 
     `create_governor_iosystem` accepts it in place of a linear loop. A reference
@@ -164,8 +165,20 @@ class Predictor(Frozen):
             _params=dict(params or {}),
         )
 
-    def __repr__(self) -> str:
-        return f"<Predictor of {self._prepared.name} over {self.horizon:g} s>"
+    def _describe(self) -> Iterator[Part]:
+        yield f"Predictor of {self._prepared.name} over {self.horizon:g} s"
+        yield Facts(
+            [
+                ("references", ", ".join(self.references)),
+                ("states", ", ".join(self.states)),
+                ("horizon", f"{self.horizon:.6g} s, evaluated at {self._times.size} times"),
+                ("accuracy of the fraction", number(self._resolution)),
+            ]
+        )
+        sides = zip(self._rows, self._low - self._inset, self._high + self._inset, self._inset, strict=True)
+        names = self._prepared.output_labels
+        rows = [(names[row], number(low), number(high), number(inset)) for row, low, high, inset in sides]
+        yield Table("Limits", ("output", "minimum", "maximum", "margin"), rows)
 
     def contains(self, x: ArrayLike, v: ArrayLike) -> bool:
         """Whether a reference, held constant from a state, is admissible.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -10,6 +10,7 @@ import control as ct
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ctrlplan._display import Displayed, Facts, Part, counted
 from ctrlplan._lru import BUILDING, Lru
 from ctrlplan._types import Array, Params, System, Value
 from ctrlplan.simulation.built_forms import BuiltForm, BuiltForms, DisagreementError, NotCompiledError
@@ -32,7 +33,7 @@ _CACHE_SIZE = 16
 """Number of systems whose forms `simulate` caches."""
 
 
-class Prepared:
+class Prepared(Displayed):
     """System prepared for simulation; returned by `prepare`.
 
     Attributes
@@ -76,8 +77,17 @@ class Prepared:
         self._sources = [PlanSignal(b.plan, b.traits.derivatives) for b in self._blocks() if b.plan is not None]
         self._built_forms = BuiltForms()
 
-    def __repr__(self) -> str:
-        return f"<Prepared form of {self.name}: {self.nstates} states>"
+    def _describe(self) -> Iterator[Part]:
+        yield f"Prepared form of {self.name}: {counted(self.nstates, 'state')}"
+        yield Facts(
+            [
+                ("inputs", ", ".join(self.input_labels)),
+                ("outputs", ", ".join(self.output_labels)),
+                ("states", ", ".join(self.state_labels)),
+                ("time", f"discrete, dt = {self.dt}" if self.is_discrete else "continuous"),
+                ("linear", f"no: {self.not_linear}" if self.not_linear else "yes"),
+            ]
+        )
 
     @property
     def initial_state(self) -> Array | None:

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import control as ct
 from numpy.typing import ArrayLike
 
+from ctrlplan._display import ROWS, Displayed, Facts, Part, Table, number, shortened
 from ctrlplan._types import Array
 from ctrlplan.simulation.events import Occurrence
 
 
-class SimulationResponse(ct.TimeResponseData):  # type: ignore[misc] # python-control has no types
+class SimulationResponse(Displayed, ct.TimeResponseData):  # type: ignore[misc] # python-control has no types
     """Time response of a system, with the method used and its events.
 
     A `control.TimeResponseData`: signals, labels, indexing, ``plot()`` and
@@ -83,3 +84,26 @@ class SimulationResponse(ct.TimeResponseData):  # type: ignore[misc] # python-co
     ) -> None:
         super().__init__(time, outputs, states, inputs, **labels)
         self.method, self.reason, self.events = method, reason, list(events)
+
+    def _describe(self) -> Iterator[Part]:
+        times = f"{self.t.size} times" + (f" from {self.t[0]:.6g} to {self.t[-1]:.6g} s" if self.t.size else "")
+        yield f"{type(self).__name__} of {', '.join(self.output_labels or ()) or 'no output'} at {times}"
+        yield Facts(
+            [
+                ("method", f"{self.method}: {self.reason}" if self.method and self.reason else self.method),
+                ("time", times),
+                ("inputs", ", ".join(self.input_labels or ())),
+                ("states", ", ".join(self.state_labels or ())),
+            ]
+        )
+        rows = [
+            (label, *(number(float(value)) for value in (row.min(), row.max(), row[-1])))
+            for label, row in zip(self.output_labels or (), self.y.reshape(-1, self.t.size), strict=False)
+            if row.size
+        ]
+        if rows:
+            yield Table("Outputs", ("output", "minimum", "maximum", "final value"), shortened(rows))
+        for event in self.events[:ROWS]:
+            yield f"Event at {event}"
+        if len(self.events) > ROWS:
+            yield f"{len(self.events) - ROWS} more events"

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -10,9 +11,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ctrlplan._checks import real_array
+from ctrlplan._display import Displayed, Facts, Part, Table, counted, number
 from ctrlplan._renamed import FormerAttribute
 from ctrlplan._types import Array
-from ctrlplan.planning.limits import Limited
+from ctrlplan.planning.limits import Limited, limit_words
 from ctrlplan.planning.quantities import System as Quantified
 from ctrlplan.simulation import state_space
 from ctrlplan.studies.baselines import baseline_plans, derivative_limits, peak_limits, profiles
@@ -38,8 +40,8 @@ OWN_LIMITS = (
 """What must be said where limits are the polynomial's own peaks."""
 
 
-@dataclass(frozen=True)
-class Benefit:
+@dataclass(frozen=True, repr=False)
+class Benefit(Displayed):
     """A planned reference compared with its baselines; made by `benefit`.
 
     Attributes
@@ -66,6 +68,22 @@ class Benefit:
     note: str = ""
 
     needs = FormerAttribute("required_durations")
+
+    def _describe(self) -> Iterator[Part]:
+        baselines = counted(len(self.comparison.plans) - 1, "other reference")
+        yield f"Benefit of a trigonometric plan, alpha = {number(self.alpha)} rad, compared with {baselines}"
+        yield Facts([(f"limit of {name}", limit_words(limit)) for name, limit in self.limits.items()])
+        yield from self.verdicts
+        without = [plan for plan in self.required_durations if math.isnan(plan.duration)]
+        rows = [
+            (plan.name, number(plan.duration), "" if plan in without else plan.limit)
+            for plan in self.required_durations
+        ]
+        yield Table("Minimum durations under these limits", ("plan", "duration [s]", "active limit"), rows)
+        yield from (f"{plan.name}: {plan.limit}" for plan in without)
+        yield self.comparison.metric_table()
+        if self.note:
+            yield self.note
 
     @property
     def verdicts(self) -> tuple[str, ...]:

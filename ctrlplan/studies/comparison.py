@@ -5,20 +5,21 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from numpy.typing import ArrayLike
 
+from ctrlplan._display import Displayed, Facts, Part, Table, in_line, number
 from ctrlplan._files import write_text
 from ctrlplan._renamed import FormerAttribute
 from ctrlplan._types import Params
 from ctrlplan.simulation import Event, SimulationResponse
 from ctrlplan.studies.experiment import Experiment, Measured
 from ctrlplan.studies.limits import limits_of
-from ctrlplan.studies.measures import MEASURES, Measure, shown_measures
+from ctrlplan.studies.measures import MEASURES, Measure, leading_metrics, shown_measures
 from ctrlplan.studies.notes import how_measured, mark_of, notes_of
 from ctrlplan.studies.plans import references_of, waypoints_given
 from ctrlplan.studies.roles import Role, Stability, role_of, stability_of
@@ -26,6 +27,7 @@ from ctrlplan.studies.running import Builder, System
 from ctrlplan.studies.sections import AnimatedCrane, PlanCurves, Responses, Section
 from ctrlplan.studies.study import Study
 from ctrlplan.studies.units import Signals, checked_units, listed_measures, scales_of, signals_of_runs
+from ctrlplan.studies.verdicts import unit_of, verdicts
 from ctrlplan.trajectories import Trajectory, Waypoint
 
 if TYPE_CHECKING:
@@ -37,7 +39,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, repr=False)
-class Comparison:
+class Comparison(Displayed):
     """Responses of a loop to several plans, with their metrics; made by `compare`.
 
     Attributes
@@ -110,9 +112,52 @@ class Comparison:
 
     worth = FormerAttribute("benefit")
 
-    def __repr__(self) -> str:
+    def _describe(self) -> Iterator[Part]:
         failed = f" ({', '.join(self.failures)} failed)" if self.failures else ""
-        return f"<Comparison of {', '.join(self.plans)}{failed}: {self.title}>"
+        yield f"Comparison of {', '.join(self.plans)}{failed}: {self.title}"
+        times = [response.time for response in self.responses.values() if len(response.time)]
+        span = f"{min(t[0] for t in times):.6g} to {max(t[-1] for t in times):.6g} s" if times else ""
+        yield Facts(
+            [
+                ("outputs", ", ".join(self.outputs)),
+                ("controls", ", ".join(self.controls)),
+                ("time", span),
+                ("loop", "" if self.stability is Stability.UNKNOWN else self.stability.value),
+            ]
+        )
+        yield self.metric_table()
+        yield from self.notes
+        for verb, reasons in (("", self.marks), ("failed: ", self.failures)):
+            for plan, reason in reasons.items():
+                yield f"{plan}: {verb}{reason}"
+
+    def metric_table(self) -> Table:
+        """Metrics as print shows them, eight at most, the best value of each marked."""
+        listed = {name: one for name, one in self.measures.items() if any(name in row for row in self.metrics.values())}
+        cells = {
+            name: [
+                unit_of(self, name),
+                *(number(self._rounded(row.get(name, math.nan), name), measure.unit) for row in self.metrics.values()),
+            ]
+            for name, measure in listed.items()
+        }
+        names = leading_metrics(cells)
+        first = {verdict.key: verdict.best for verdict in verdicts(self)}
+        best = [
+            (i, j + 2)
+            for i, name in enumerate(names)
+            for j, plan in enumerate(self.metrics)
+            if plan in first.get(name, ())
+        ]
+        left = len(listed) - len(names)
+        more = f"; {left} more in .metrics" if left else ""
+        caption = f"Metrics{' (* best)' if best else ''}{more}"
+        rows = [[self.measures[name].title, *cells[name]] for name in names]
+        return Table(caption, ("metric", "unit", *self.metrics), rows, frozenset(best))
+
+    def _rounded(self, value: float, name: str) -> float:
+        """Value of a metric, 0 where that is what it differs from by rounding."""
+        return 0.0 if abs(value) <= 1e-9 * self.scales.get(name, 0.0) else value
 
     def to_pandas(self) -> pd.DataFrame:
         """Metrics as a table, one row a metric, one column a plan."""
@@ -130,7 +175,7 @@ class Comparison:
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write metrics, plans and parameters as JSON, whole or not at all."""
         plans = {name: found | {"trajectory": self.plans[name].to_dict()} for name, found in self._plans().items()}
-        stated = {"title": self.title, "parameters": {k: str(v) for k, v in self.parameters.items()}}
+        stated = {"title": self.title, "parameters": {k: in_line(v) for k, v in self.parameters.items()}}
         data = self.results() | {"plans": plans} | stated
         write_text(path, json.dumps(data, indent=1, allow_nan=False) + "\n")
 
@@ -186,11 +231,6 @@ class Comparison:
 
         study = Study("comparison", self.title, self, notes=self.notes, sections=self.sections())
         return write_page([study], path, title=self.title)
-
-    def _repr_html_(self) -> str:
-        from ctrlplan.reports import comparison_fragment
-
-        return comparison_fragment(self)
 
 
 def compare(

@@ -11,10 +11,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from ctrlplan._display import Displayed, Facts, Part, Table, counted, number
 from ctrlplan.studies.comparison import Comparison, finite_or_none
+from ctrlplan.studies.measures import leading_metrics
 from ctrlplan.studies.sections import Bands, DrawTable, PlanCurves
 from ctrlplan.studies.study import Study
 from ctrlplan.studies.units import ROUNDING
+from ctrlplan.studies.verdicts import unit_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -51,7 +54,7 @@ class Failure:
 
 
 @dataclass(frozen=True, repr=False)
-class Ensemble:
+class Ensemble(Displayed):
     """Responses of a loop to plans over draws of its parameters; made by `monte_carlo`.
 
     Attributes
@@ -89,11 +92,30 @@ class Ensemble:
     nominal_draw: int | None = None
     interrupted: bool = False
 
-    def __repr__(self) -> str:
-        return (
-            f"<Ensemble of {', '.join(self.nominal.plans)} over {self.finished} draws of {', '.join(self.params)}; "
-            f"{len(self.failures)} failures>"
-        )
+    def _describe(self) -> Iterator[Part]:
+        failed = counted(len(self.failures), "failure")
+        draws = f"{counted(self.finished, 'draw')} of {', '.join(self.params)}"
+        yield f"Ensemble of {', '.join(self.nominal.plans)} over {draws}; {failed}"
+        ranges = {name: (float(values.min()), float(values.max())) for name, values in self.params.items()}
+        rows = [(name, f"{number(low)} to {number(high)}") for name, (low, high) in ranges.items()]
+        yield Facts([*rows, ("interrupted", f"{self.finished} of {self.ndraws} draws run" if self.interrupted else "")])
+        yield self.metric_table()
+        if self.failures:
+            yield f"First failure: draw {self.failures[0].draw}: {self.failures[0].message}"
+
+    def metric_table(self) -> Table:
+        """Median and 5 to 95 % range of the metrics over the draws, as print shows them, eight at most."""
+        measures, cells = self.nominal.measures, {}
+        for name, measure in measures.items():
+            if any(name in row for row in self.metrics.values()):
+                cells[name] = [unit_of(self.nominal, name)]
+                for quantiles in self.quantiles(name).values():
+                    low, _, middle, _, high = (number(value, measure.unit) for value in quantiles.tolist())
+                    cells[name].append(middle if low == high else f"{middle} ({low} to {high})")
+        names = leading_metrics(cells)
+        caption = "Median of each metric (5 % to 95 % of the draws)"
+        rows = [[measures[name].title, *cells[name]] for name in names]
+        return Table(caption, ("metric", "unit", *self.metrics), rows)
 
     @property
     def ndraws(self) -> int:

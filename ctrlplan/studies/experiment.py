@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from functools import cached_property
 
@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ctrlplan._checks import real_array
+from ctrlplan._display import Displayed, Facts, Part, counted, title_of
 from ctrlplan._types import Array, Params
 from ctrlplan.simulation import Event
 from ctrlplan.studies.alike import Linear, numbers_of, outputs_together
@@ -65,8 +66,8 @@ class Measured:
         return self
 
 
-@dataclass(frozen=True, init=False, eq=False)
-class Experiment:
+@dataclass(frozen=True, init=False, eq=False, repr=False)
+class Experiment(Displayed):
     """Plans, the times at which loops are sampled, and what is measured of each response.
 
     `compare`, `sweep`, `monte_carlo`, `benefit` and study files each make one,
@@ -176,6 +177,23 @@ class Experiment:
         }
         for name, value in checked.items():
             object.__setattr__(self, name, value)
+
+    def _describe(self) -> Iterator[Part]:
+        times = f"{self.timepts.size} times from {self.timepts[0]:.6g} to {self.timepts[-1]:.6g} s"
+        yield f"Experiment of {counted(len(self.plans), 'plan')} at {times}"
+        names = [one.name or one.title if isinstance(one, Measure) else one for one in self.measures or ()]
+        yield Facts(
+            [
+                *((f"plan {name}", title_of(plan)) for name, plan in self.plans.items()),
+                ("waypoints", str(len(self.waypoints)) if self.waypoints else ""),
+                ("metrics count from", f"{self.since:.6g} s"),
+                ("settling band", f"{100.0 * self.band:.4g} % of the range of the plan"),
+                ("outputs", ", ".join(self.outputs or ())),
+                ("controls", ", ".join(self.controls or ())),
+                ("events", "" if self.events is None else ", ".join(event.name for event in self.events) or "none"),
+                ("measures", ", ".join(names) if self.measures is not None else "all of MEASURES"),
+            ]
+        )
 
     @property
     def axes(self) -> tuple[str, ...]:

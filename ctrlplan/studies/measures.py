@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Literal, TypeAlias, get_args
@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctrlplan import metrics
+from ctrlplan._display import ROWS, Displayed, Facts, Part
 from ctrlplan._types import Array
 from ctrlplan.planning import SquaredDerivative
 from ctrlplan.simulation import Occurrence, Prepared, SimulationResponse
@@ -170,8 +171,8 @@ class Run:
         return np.array([self.signals[name] for name in names]).reshape(-1, self.t.size)
 
 
-@dataclass(frozen=True)
-class Measure:
+@dataclass(frozen=True, repr=False)
+class Measure(Displayed):
     """A metric: how it is called, and how it is computed; less is better in every one.
 
     Attributes
@@ -219,6 +220,17 @@ class Measure:
             raise ValueError(
                 f"a measure with a function must say what it is of, and the other way round, got no {what}"
             )
+
+    def _describe(self) -> Iterator[Part]:
+        yield f"Measure {self.name or self.title}"
+        yield Facts(
+            [
+                ("title", self.title),
+                ("unit", self.unit.replace("{y}", "[output]").replace("{u}", "[control]")),
+                ("of", self.of),
+                ("function", getattr(self.function, "__name__", "") if self.function else ""),
+            ]
+        )
 
 
 def _smooth(function: Callable[[Path], float | Array]) -> Callable[[Path], float | Array]:
@@ -313,6 +325,43 @@ MEASURES = {
     ),
 }
 """The metrics of a comparison by name, in the order in which they are shown: an entry is computed, listed and shown."""
+
+
+_LEADING = (
+    "settling_time",
+    "tracking_settling_time",
+    "overshoot_error",
+    "overshoot_final",
+    "iae",
+    "control_peak",
+    "control_effort",
+    "wandering",
+)
+
+
+def leading_metrics(cells: Mapping[str, Sequence[str]]) -> list[str]:
+    """Names of the metrics that a short table shows: measures of one's own, then those that matter first.
+
+    Parameters
+    ----------
+    cells : mapping of str to sequence of str
+        Row of the table by the metric's name, in the order in which metrics are
+        shown. Rows that repeat another one, or hold nothing, are left out.
+    """
+    rows: dict[tuple[str, ...], str] = {}
+    for name, row in sorted(cells.items(), key=lambda item: _rank(item[0])):
+        if any(cell != "n/a" for cell in row[1:]):
+            rows.setdefault(tuple(row), name)
+    chosen = list(rows.values())[:ROWS]
+    return [name for name in cells if name in chosen]
+
+
+def _rank(name: str) -> int:
+    """Place of a metric among those that a short table shows, whichever signal it is of."""
+    known = max((key for key in MEASURES if name == key or name.startswith(f"{key}_")), key=len, default="")
+    if not known:
+        return -1
+    return _LEADING.index(known) if known in _LEADING else len(_LEADING)
 
 
 def signals_of(response: ct.TimeResponseData) -> dict[str, Array]:

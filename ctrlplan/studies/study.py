@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from ctrlplan._display import Displayed, Part
 from ctrlplan.studies.sections import PlanCurves, Responses, Section
 
 if TYPE_CHECKING:  # comparisons and ensembles make studies of themselves for their pages
     from ctrlplan.studies.comparison import Comparison
 
 
-@dataclass(frozen=True)
-class Study:
+@dataclass(frozen=True, repr=False)
+class Study(Displayed):
     """A comparison with what a report says around it.
 
     Attributes
@@ -50,6 +52,13 @@ class Study:
             if not isinstance(section, Section):
                 got = f"the class {section.__name__}" if isinstance(section, type) else type(section).__name__
                 raise TypeError(f"sections must be instances of subclasses of Section, got {got} as sections[{place}]")
+
+    def _describe(self) -> Iterator[Part]:
+        yield f"Study {self.name}: {self.title}"
+        if self.summary:
+            yield self.summary
+        yield self.comparison.metric_table()
+        yield from self.notes
 
     def results(self) -> dict[str, object]:
         """Plain data for ``results.json``.

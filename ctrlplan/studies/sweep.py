@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ctrlplan._checks import real_array
+from ctrlplan._display import Displayed, Facts, Part, Table, counted, number
 from ctrlplan._renamed import outside_stacklevel
 from ctrlplan._types import Params
 from ctrlplan.simulation import Event
@@ -29,7 +30,7 @@ from ctrlplan.studies.executing import (
     tried,
 )
 from ctrlplan.studies.experiment import Experiment, Metrics
-from ctrlplan.studies.measures import Measure
+from ctrlplan.studies.measures import MEASURES, Measure, leading_metrics
 from ctrlplan.studies.roles import Role, role_of
 from ctrlplan.studies.running import Builder, System, is_builder
 from ctrlplan.trajectories import Trajectory, Waypoint
@@ -44,7 +45,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, repr=False)
-class Sweep:
+class Sweep(Displayed):
     """Metrics of every plan over a parameter; made by `sweep`.
 
     Attributes
@@ -73,8 +74,34 @@ class Sweep:
     roles: dict[str, Role] = field(default_factory=dict)
     band: float = 0.02
 
-    def __repr__(self) -> str:
-        return f"<Sweep of {', '.join(self.metrics)} over {self.values.size} values of {self.parameter}>"
+    def _describe(self) -> Iterator[Part]:
+        yield f"Sweep of {', '.join(self.metrics)} over {counted(self.values.size, 'value')} of {self.parameter}"
+        ends = f"{number(float(self.values.min()))} to {number(float(self.values.max()))}" if self.values.size else ""
+        yield Facts(
+            [
+                (self.parameter, ends),
+                ("failures", str(len(self.failures)) if self.failures else ""),
+                ("interrupted", "yes: some values were not run" if self.interrupted else ""),
+            ]
+        )
+        yield self.metric_table()
+        if self.failures:
+            first = self.failures[0]
+            yield f"First failure: {self.parameter} = {number(float(self.values[first.draw]))}: {first.message}"
+
+    def metric_table(self) -> Table:
+        """Minimum and maximum of the metrics over the values, as print shows them, eight at most."""
+        cells = {}
+        for name in dict.fromkeys(name for row in self.metrics.values() for name in row):
+            unit = MEASURES[name].unit if name in MEASURES else ""
+            cells[name] = ["" if "{" in unit else unit]
+            for plan in self.metrics:
+                column = self._column(plan, name)
+                known = column[~np.isnan(column)]
+                low, high = (number(float(f(known)), unit) if known.size else "n/a" for f in (np.min, np.max))
+                cells[name].append(low if low == high else f"{low} to {high}")
+        rows = [[MEASURES[name].title if name in MEASURES else name, *cells[name]] for name in leading_metrics(cells)]
+        return Table("Metrics over all values, minimum to maximum", ("metric", "unit", *self.metrics), rows)
 
     def to_pandas(self) -> pd.DataFrame:
         """Table of one row a value; columns plan and metric."""

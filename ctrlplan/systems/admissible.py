@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import linprog
 
 from ctrlplan._checks import Range, checked_finite, checked_limits, checked_number
+from ctrlplan._display import Displayed, Facts, Part, counted
 from ctrlplan._types import Array, System
 from ctrlplan.systems.output_cells import Problem, elevated, erosion, output_cells, seen_directions
 from ctrlplan.systems.polytope import Polytope, Rows
@@ -30,7 +31,7 @@ _FAR = 1e6
 """Distance of the other limit of an output with one limit, relative to its size: unbounded sets need no finite rows."""
 
 
-class AdmissibleSet(Fields):
+class AdmissibleSet(Displayed, Fields):
     r"""Maximal output admissible set of a linear loop.
 
     The pairs of a state x and a constant reference v from which every limited
@@ -149,8 +150,18 @@ class AdmissibleSet(Fields):
             _margin=share,
         )
 
-    def __repr__(self) -> str:
-        return f"<AdmissibleSet of {len(self.bounds)} rows from {self.periods} periods of {self.dt:g} s>"
+    def _describe(self) -> Iterator[Part]:
+        periods = f"{counted(self.periods, 'period')} of {self.dt:g} s"
+        yield f"AdmissibleSet of {counted(len(self.bounds), 'row')} from {periods}"
+        yield Facts(
+            [
+                ("references", ", ".join(self.references)),
+                ("states", ", ".join(self.states)),
+                ("inequalities G x + F v <= h", str(len(self.bounds))),
+                ("determined by the first", periods),
+                ("margin of the steady state", f"{100.0 * self._margin:.4g} % of half the distance between limits"),
+            ]
+        )
 
     def contains(self, x: ArrayLike, v: ArrayLike) -> bool:
         """Whether a state and a reference are in the set.

@@ -23,6 +23,9 @@ class _Combined(Trajectory):
     initial: Array
     final: Array
 
+    def _has_quick_peaks(self) -> bool:
+        return super()._has_quick_peaks() and all(part._has_quick_peaks() for part in self.parts)
+
     def to_dict(self) -> Data:
         """Plain data that `trajectory_from_dict` reads."""
         return {
@@ -267,6 +270,9 @@ class Joined(Trajectory):
             final=parts[-1].final,
             _segments=segments,
         )
+
+    def _has_quick_peaks(self) -> bool:
+        return super()._has_quick_peaks() and all(part._has_quick_peaks() for part in self.parts)
 
     def to_dict(self) -> Data:
         """Plain data that `trajectory_from_dict` reads."""

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctrlplan._checks import checked_count, checked_labels
+from ctrlplan._display import number
 from ctrlplan._types import Data, Value
 from ctrlplan.trajectories.common import Array, derivative_scale, mapped_time, readonly
 from ctrlplan.trajectories.newton import NEARLY_CLOSED, NewtonSystem
@@ -241,6 +242,9 @@ class NewtonSpline(WaypointSpline):
             "labels": list(self.labels),
         }
         return data | {k: v for k, v in self._options.given().items() if k != "labels"}
+
+    def _facts(self) -> list[tuple[str, str]]:
+        return [*super()._facts(), ("alpha", f"{number(self.alpha)} rad" if self.alpha else "")]
 
 
 def _solved(system: NewtonSystem, data: Array, times: list[float], duration: float) -> Array:

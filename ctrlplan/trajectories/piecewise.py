@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctrlplan._checks import checked_labels
+from ctrlplan._display import number
 from ctrlplan._renamed import warn_renamed
 from ctrlplan._types import Data, Value
 from ctrlplan.trajectories.common import FACTORIALS, Array, mapped_time, readonly, times_powers
@@ -189,6 +190,9 @@ class PiecewiseSpline(WaypointSpline):
     def segment_series(self, segment: int, s: Value, order: int) -> list[list[Value]]:
         """Taylor series of a segment; as `Trajectory.segment_series`."""
         return self.segments[segment].segment_series(0, s, order)
+
+    def _facts(self) -> list[tuple[str, str]]:
+        return [*super()._facts(), ("alpha", f"{number(self.alpha)} rad" if self.alpha else "")]
 
 
 def _filled(points: tuple[Waypoint, ...], alpha: float) -> tuple[list[Waypoint], NDArray[np.object_] | None]:

@@ -103,6 +103,9 @@ class Retimed(Trajectory):
         """Same path at other times; as `Trajectory.map_time`."""
         return type(self)(self.plan, self.law.map_time(origin, target, rate), self.labels)
 
+    def _has_quick_peaks(self) -> bool:
+        return False
+
     def _sample(self, t: Array, low: int, high: int, left: bool) -> Array:
         out = super()._sample(t, low, high, left)
         at_end = t == self.end

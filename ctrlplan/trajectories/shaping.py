@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from collections.abc import Iterator
 from typing import Self
 
 import numpy as np
@@ -11,13 +12,14 @@ from numpy.typing import ArrayLike
 from scipy.special import comb
 
 from ctrlplan._checks import checked_count, checked_finite, finite_vector, new_numbers
+from ctrlplan._display import Displayed, Facts, Part, Table, counted, number, shortened
 from ctrlplan.trajectories.combined import Sum
 from ctrlplan.trajectories.common import Array, readonly
 from ctrlplan.trajectories.fields import Fields
 from ctrlplan.trajectories.trajectory import Trajectory
 
 
-class Shaper(Fields):
+class Shaper(Displayed, Fields):
     r"""Input shaper, a sequence of impulses.
 
     The shaped reference is :math:`\sum_i w_i\,r(t - t_i)`. If the response of a
@@ -224,8 +226,12 @@ class Shaper(Fields):
         left: Array = np.abs(np.exp(mode[..., None] * (self.delays - self.delays[-1])) @ self.weights)
         return left
 
-    def __repr__(self) -> str:
-        return f"<Shaper of {self.delays.size} impulses over {self.duration:g} s>"
+    def _describe(self) -> Iterator[Part]:
+        yield f"Shaper of {counted(self.delays.size, 'impulse')} over {self.duration:g} s"
+        yield Facts([("added to the duration", f"{self.duration:.6g} s")])
+        impulses = zip(self.delays.tolist(), self.weights.tolist(), strict=True)
+        rows = [(str(k + 1), f"{delay:.6g}", number(weight)) for k, (delay, weight) in enumerate(impulses)]
+        yield Table("Impulses", ("", "delay [s]", "weight"), shortened(rows))
 
 
 def _checked_damping(damping: ArrayLike) -> Array:

@@ -7,7 +7,7 @@ import math
 import os
 import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
 from numbers import Real
 from typing import TYPE_CHECKING, Any, ClassVar, Self
@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ctrlplan._checks import checked_count, checked_finite, checked_number, checked_timepts, one_number
+from ctrlplan._display import Displayed, Facts, Figure, Part, Table, number
 from ctrlplan._renamed import warn_renamed
 from ctrlplan._types import Data, Value
 from ctrlplan.trajectories import extrema as _extrema
@@ -23,6 +24,7 @@ from ctrlplan.trajectories import sampling as _sampling
 from ctrlplan.trajectories.common import FACTORIALS, Array, readonly
 from ctrlplan.trajectories.continuity import Jump, find_jumps
 from ctrlplan.trajectories.fields import Fields
+from ctrlplan.trajectories.waypoint import ENTRIES, waypoint_table
 
 if TYPE_CHECKING:
     from control import ControlPlot
@@ -31,7 +33,7 @@ if TYPE_CHECKING:
     from ctrlplan.trajectories.waypoint import Waypoint
 
 
-class Trajectory(Fields, ABC):
+class Trajectory(Displayed, Fields, ABC):
     """Function of time with exact derivatives.
 
     A trajectory is analytic between breakpoints. Before its start it is constant
@@ -605,10 +607,49 @@ class Trajectory(Fields, ABC):
     def __neg__(self) -> Trajectory:
         return self * -1.0
 
-    def __repr__(self) -> str:
+    def _describe(self) -> Iterator[Part]:
         axes = ", ".join(self.labels)
         when = f"from {self.start:g} s to {self.end:g} s" if self.duration else f"at {self.start:g} s"
-        return f"<{type(self).__name__} of {axes} {when}>"
+        yield f"{type(self).__name__} of {axes} {when}"
+        yield Facts(self._facts())
+        if self.waypoints:
+            yield waypoint_table(self.waypoints, self.labels)
+        ends = [
+            ["initial position", *map(number, self.initial.tolist())],
+            ["final position", *map(number, self.final.tolist())],
+        ]
+        quick = self._has_quick_peaks()
+        yield Table("Positions and peaks", ("", *self.labels), [*ends, *(self._peaks() if quick else [])])
+        if not quick:
+            yield "Peaks of derivatives are not computed for this text; call peak(order)."
+        yield Figure("Position and velocity over time.", 2, lambda axes: self.plot(ax=axes))
+
+    def _facts(self) -> list[tuple[str, str]]:
+        """Values that a description states, by name; kinds add their own."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            jumps = self.jumps(0) if self._has_quick_peaks() else ()
+        times = list(dict.fromkeys(f"{jump.time:.6g} s" for jump in jumps))
+        return [
+            ("duration", f"{self.duration:.6g} s" if self.duration else ""),
+            ("segments", f"{self.breakpoints.size - 1}" if self.breakpoints.size > 2 else ""),
+            ("position jumps at", ", ".join(times[:4]) + (f" and {len(times) - 4} more" if len(times) > 4 else "")),
+        ]
+
+    def _has_quick_peaks(self) -> bool:
+        """Whether peaks are found in a few hundredths of a second."""
+        return self.naxes * max(self.breakpoints.size, len(self.waypoints)) <= 60
+
+    def _peaks(self) -> list[list[str]]:
+        """Rows of a table: the peak magnitude of each derivative up to the jerk."""
+        rows = []
+        for nu in range(1, 4 if self.duration else 1):
+            try:
+                with np.errstate(over="ignore", invalid="ignore"):
+                    peaks = [number(value) for value in self.peak(nu).tolist()]
+            except (ValueError, RuntimeError):  # beyond floating point, or not resolved
+                peaks = ["n/a"] * self.naxes
+            rows.append([f"peak {ENTRIES[nu]} [1/s{f'^{nu}' if nu > 1 else ''}]", *peaks])
+        return rows
 
     def _moved(self, origin: float, target: float, rate: float) -> Self:
         """As `map_time`, with a check of the rounding of the intervals between times."""

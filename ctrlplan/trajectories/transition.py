@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ctrlplan._checks import checked_count, checked_finite, real_array
+from ctrlplan._display import Displayed, Facts, Part, number
 from ctrlplan._types import Value
 from ctrlplan.trajectories.common import FACTORIALS, Array, derivative_scale
 from ctrlplan.trajectories.fields import Fields
@@ -17,7 +18,7 @@ from ctrlplan.trajectories.newton import NewtonSystem, newton_series, pair_serie
 from ctrlplan.trajectories.trigonometric import checked_alpha
 
 
-class Transition(Fields):
+class Transition(Displayed, Fields):
     r"""Splines between two jets over a fixed horizon.
 
     The linear system of the coefficients is factorised once. Continuous
@@ -87,6 +88,20 @@ class Transition(Fields):
             _rows=family.rows,
             _data_scale=(powers[family.system.order_index] * family.inverse)[:, None],
             _time_scale=(1.0 / powers)[:, None],
+        )
+
+    def _describe(self) -> Iterator[Part]:
+        degree = 2 * self.order + 1
+        kind = f"trigonometric, alpha = {self.alpha:.6g} rad" if self.alpha else f"polynomial of degree {degree}"
+        yield f"Transition of order {self.order} over {self.horizon:.6g} s"
+        gains = [f"k_{j} = {number(k)}" for j, k in enumerate(self.gains().tolist())]
+        yield Facts(
+            [
+                ("spline", kind),
+                ("derivatives joined", f"0 to {self.order}"),
+                ("horizon", f"{self.horizon:.6g} s"),
+                ("gains of continuous replanning", ", ".join(gains)),
+            ]
         )
 
     def coefficients(self, jets: Array) -> Array:

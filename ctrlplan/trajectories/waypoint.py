@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ctrlplan._checks import checked_finite, new_numbers
+from ctrlplan._checks import checked_finite, default_labels, new_numbers
+from ctrlplan._display import Displayed, Part, Table, number, shortened
 from ctrlplan._types import Data
 from ctrlplan.trajectories.common import Array, readonly, times_powers
 from ctrlplan.trajectories.fields import Fields
@@ -15,7 +16,7 @@ from ctrlplan.trajectories.fields import Fields
 ENTRIES = ("position", "velocity", "acceleration", "jerk", "snap")
 
 
-class Waypoint(Fields):
+class Waypoint(Displayed, Fields):
     """Prescribed position and derivatives at one time.
 
     Parameters
@@ -213,6 +214,34 @@ class Waypoint(Fields):
         values = self.jet[:, 0] if self.naxes == 1 else self.jet
         named = ", ".join(f"{n}={v.tolist()}" for n, v in zip(ENTRIES, values, strict=False))
         return f"Waypoint({self.time!r}, {named})"
+
+    def _describe(self) -> Iterator[Part]:
+        yield f"Waypoint at {self.time:.6g} s"
+        rows = [[entry_name(k), *map(_prescribed, row)] for k, row in enumerate(self.jet.tolist())]
+        yield Table("Prescribed values", ("", *(self.labels or default_labels(self.naxes))), rows)
+
+
+def waypoint_table(waypoints: Sequence[Waypoint], labels: Sequence[str]) -> Table:
+    """Waypoints by time: what each prescribes of every axis, from the position on."""
+    count = max(len(point.jet) for point in waypoints)
+    rows = []
+    for point in waypoints:
+        cells = []
+        for jet in point.jet.T.tolist():
+            given = max((k + 1 for k, value in enumerate(jet) if value == value), default=1)
+            cells.append(", ".join(map(_prescribed, jet[:given])))
+        rows.append([f"{point.time:.6g}", *cells])
+    names = ", ".join(map(entry_name, range(count)))
+    return Table(f"{len(waypoints)} waypoints: {names}", ("time [s]", *labels), shortened(rows))
+
+
+def entry_name(order: int) -> str:
+    """Name of a derivative: position, velocity, ..., derivative 5."""
+    return ENTRIES[order] if order < len(ENTRIES) else f"derivative {order}"
+
+
+def _prescribed(value: float) -> str:
+    return "free" if value != value else number(value)
 
 
 def _jet(entries: list[ArrayLike | None]) -> Array:

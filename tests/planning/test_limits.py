@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 import ctrlplan as cp
 from ctrlplan import Waypoint
 from ctrlplan.planning import Margin, Margins, margins
+from ctrlplan.planning.limits import limit_words
 from ctrlplan.studies.crane import CRANE, nominal_waypoints, obstacle_waypoints
 
 MOVE = cp.PolySpline([Waypoint(0, 0, 0, 0), Waypoint(1, 1, 0, 0)])
@@ -234,7 +235,7 @@ def test_a_quantity_is_limited_over_the_whole_interval():
 def test_quantities_of_a_plant():
     limits = {"theta": 0.1, "T": (0, 6e3), "R": (9, 12), "x_d1": 3.0}
     by_plant, by_function = margins(HOIST, limits, CRANE), margins(HOIST, limits, CRANE.quantities)
-    assert repr(by_plant) == repr(by_function)
+    assert str(by_plant) == str(by_function)
     x, z = HOIST.jet(np.linspace(0, 15, 100_001), 2).transpose(1, 0, 2)
     hang = CRANE.gravity - z[2]
     tension, theta = 500 * np.hypot(x[2], hang), np.arctan2(-x[2], hang)
@@ -274,17 +275,35 @@ def test_a_plan_that_the_plant_cannot_follow():
 
 
 def test_margins_in_words():
-    text = repr(margins(MOVE, {"y_d1": 2.0, "y_d2": (-5.0, 8.0)}))
-    assert text.splitlines()[1] == "y_d1 within ±2: 1.875 at 0.5 s, 6.25 % left"
-    assert text.splitlines()[0].startswith("y_d2 from -5 to 8: -5.7735 at 0.788675 s")
-    assert text.splitlines()[0].endswith("% beyond")
+    found = margins(MOVE, {"y_d1": 2.0, "y_d2": (-5.0, 8.0)})
+    first, second = map(str, found)
+    assert second == "y_d1 within ±2: 1.875 at 0.5 s, 6.25 % left"
+    assert first.startswith("y_d2 from -5 to 8: -5.7735 at 0.788675 s")
+    assert first.endswith("% beyond")
+    assert repr(found) == f"<Margins of 2 limits: {first}>"
+    assert [" ".join(line.split()) for line in str(found).splitlines()[-3:]] == [
+        "limit must stay value at [s] margin",
+        f"y_d2 from -5 to 8 -5.7735 0.788675 -{100 * (5.773502691896258 - 5.0) / 6.5:.3g} %",
+        "y_d1 within ±2 1.875 0.5 6.25 %",
+    ]
 
 
 @pytest.mark.parametrize(
     ("limit", "words"), [((None, 2.0), "at most 2"), ((-3.0, None), "at least -3"), ((0.0, None), "at least 0")]
 )
 def test_lone_sides_in_words(limit, words):
-    assert f"y_d1 {words}:" in repr(margins(MOVE, {"y_d1": limit}))
+    (row,) = margins(MOVE, {"y_d1": limit})
+    assert str(row).startswith(f"y_d1 {words}: ")
+    assert limit_words(limit) == words
+
+
+def test_limits_in_words_whatever_their_form():
+    assert limit_words(3) == "within ±3"
+    assert limit_words(np.array(3.0)) == "within ±3"
+    assert limit_words((-1.0, 2.5)) == "from -1 to 2.5"
+    assert limit_words(cp.Limits(low=-1.0)) == "at least -1"
+    assert limit_words([1.0, 2.0]) == "within ±1; within ±2"
+    assert limit_words(np.array([[-1.0, 2.0], [-3.0, 3.0]])) == "from -1 to 2; within ±3"
 
 
 def test_margins_as_tables():

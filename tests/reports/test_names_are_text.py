@@ -15,9 +15,9 @@ from hostile import CONTROL, MARKUP, NOT_WRITTEN_SO, SHOWN, TEXTS, mixed, study
 import ctrlplan as cp
 from ctrlplan.reports import CraneAnimation, comparison_fragment, plot_plans, render_page, write_page
 from ctrlplan.reports.style import to_svg
-from ctrlplan.reports.words import unit_in
 from ctrlplan.studies import Study
 from ctrlplan.studies.sections import PlanCurves
+from ctrlplan.studies.verdicts import unit_in
 
 DIRECTIONS = set("\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069")
 

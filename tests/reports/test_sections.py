@@ -14,10 +14,10 @@ import pytest
 import ctrlplan as cp
 from ctrlplan import reports
 from ctrlplan.reports import Cell, Head, Items, Part, Picture, Svg, Table, Text, draw, plot_blocks, render_page
-from ctrlplan.reports.words import unit_in
 from ctrlplan.studies import PAPER, Study
 from ctrlplan.studies.files import load_study
 from ctrlplan.studies.sections import Curves, PlanCurves, Plane, Responses, Section, SweepCurves
+from ctrlplan.studies.verdicts import unit_in
 
 MOVE = [cp.Waypoint(0, 0, 0, 0), cp.Waypoint(2, 1, 0, 0)]
 TIMES = np.linspace(0, 6, 61)

@@ -8,10 +8,10 @@ import pytest
 
 import ctrlplan as cp
 from ctrlplan.reports import render_page, summary, verdicts
-from ctrlplan.reports.words import number, unit_of
 from ctrlplan.simulation import Occurrence
 from ctrlplan.studies import MEASURES, Measure, Study
 from ctrlplan.studies.units import in_units
+from ctrlplan.studies.verdicts import number, unit_of
 
 T = np.linspace(0.0, 8.0, 8001)
 MOVE = [cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1, 0, 0)]

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 import ctrlplan as cp
-from ctrlplan.reports.words import verdicts
 from ctrlplan.studies import ONLINE
 from ctrlplan.studies import online as studies
+from ctrlplan.studies.verdicts import verdicts
 
 WAYS = ["off-line", "load feedback", "replanned", "governed", "slowed"]
 

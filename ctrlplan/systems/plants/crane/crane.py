@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
+from ctrlplan._display import Displayed, Facts, Part
 from ctrlplan.systems.plants.crane import flatness, linear, model, rope
-from ctrlplan.systems.plants.crane.parameters import CraneParameters
+from ctrlplan.systems.plants.crane.parameters import FRICTIONS, POSITIVE, CraneParameters
+
+_UNITS = dict(zip((*POSITIVE, *FRICTIONS), ("kg", "kg", "kg m^2", "m", "m/s^2", "N s/m", "N m s"), strict=True))
 
 
-class Crane(CraneParameters):
+class Crane(CraneParameters, Displayed):
     """Crane with a trolley, a drum and a load; its equations, flat maps and loops.
 
     z points down. Equation numbers in the methods are the paper's.
@@ -65,3 +70,9 @@ class Crane(CraneParameters):
     hoist_pid = linear.hoist_pid
     linear_trolley_loop = linear.linear_trolley_loop
     linear_hoist_loop = linear.linear_hoist_loop
+
+    def _describe(self) -> Iterator[Part]:
+        yield f"Crane with a load of {self.load_mass:g} kg"
+        rows = [(name.replace("_", " "), f"{getattr(self, name):g} {unit}") for name, unit in _UNITS.items()]
+        yield Facts([*rows, ("rope winds on the drum as theta turns", "yes" if self.rope_wrap else "neglected")])
+        yield "Flat outputs: x and z of the load. Inputs: force F [N] of the trolley and torque C [N m] of the drum."

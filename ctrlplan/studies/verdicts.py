@@ -5,11 +5,14 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from ctrlplan._renamed import FormerAttribute
-from ctrlplan.studies.comparison import Comparison
 from ctrlplan.studies.roles import Stability
 from ctrlplan.studies.units import ROUNDING, in_units
+
+if TYPE_CHECKING:  # comparisons show their verdicts
+    from ctrlplan.studies.comparison import Comparison
 
 TIE = 1e-3
 """Relative difference below which two values count as equal."""

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 import ctrlplan as cp
 from ctrlplan.reports import summary, verdicts
-from ctrlplan.reports.words import TIE, number, unit_of
 from ctrlplan.studies import MEASURES, Comparison
+from ctrlplan.studies.verdicts import TIE, number, unit_of
 
 PLAN = cp.Step(1.0, labels=["x"])
 NAN, INF = math.nan, math.inf
