@@ -322,7 +322,7 @@ def test_it_is_exported_to_every_format(plan, ending, tmp_path):
     """Except that a cam has no jump of position or velocity."""
     path = tmp_path / f"plan{ending}"
     if ".cam" in ending and any(jump.order < 2 for jump in plan.jumps(1) if plan.start < jump.time < plan.end):
-        with pytest.raises(ValueError, match="(position|velocity) of a cam must be continuous, got a jump"):
+        with pytest.raises(ValueError, match=r"(position|velocity) of a cam must be continuous, got a jump"):
             plan.export(path)
         return
     files = plan.export(path)
