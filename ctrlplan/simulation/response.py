@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
+from pathlib import Path
 
 import control as ct
 from numpy.typing import ArrayLike
 
 from ctrlplan._types import Array
 from ctrlplan.simulation.events import Occurrence
+from ctrlplan.trajectories.export import Table, export_table
 
 
 class SimulationResponse(ct.TimeResponseData):  # type: ignore[misc] # python-control has no types
@@ -81,3 +84,38 @@ class SimulationResponse(ct.TimeResponseData):  # type: ignore[misc] # python-co
     ) -> None:
         super().__init__(time, outputs, states, inputs, **labels)
         self.method, self.reason, self.events = method, reason, list(events)
+
+    def export(self, path: str | os.PathLike[str]) -> Path:
+        """Write times and signals, in the format of the path's ending: .csv, .mat or .npz.
+
+        Columns are the outputs, inputs and states by their labels. A label that
+        an earlier signal has gets ``input.`` or ``state.`` before it.
+
+        Parameters
+        ----------
+        path : str or path
+            File to be written, in an existing folder.
+
+        Returns
+        -------
+        Path
+            File written.
+
+        Raises
+        ------
+        ValueError
+            If the ending is unknown, or names are not unique in the format.
+        OSError
+            If the file cannot be written; an existing file is then unchanged.
+        """
+        return export_table(signal_table(self), path)
+
+
+def signal_table(response: ct.TimeResponseData) -> Table:
+    """Outputs, inputs and states of a response by their labels."""
+    groups = {
+        "output": (response.output_labels, response.y),
+        "input": (response.input_labels, response.u),
+        "state": (response.state_labels, response.x),
+    }
+    return Table.of(response.t, {name: (labels, rows) for name, (labels, rows) in groups.items() if labels})

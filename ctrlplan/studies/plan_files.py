@@ -78,14 +78,15 @@ def plan_files(study: StudyFile, path: Path, options: Options) -> dict[Path, str
 
 
 def _table(study: StudyFile, options: Options) -> Table:
-    """Samples of all plans, with an apostrophe before names that a spreadsheet would take for a formula."""
+    """Samples of all plans, waypoints included unless a period was given."""
     start, end = study.waypoints[0].time, study.waypoints[-1].time
     times = options.times(start, end)
     if options.dt is None:
         times = np.union1d(times, [w.time for w in study.waypoints])
-    names: list[str] = []
-    for name, plan in study.plans.items():
-        head = f"'{name}" if name.startswith(("=", "+", "-", "@", "\t", "\r")) else name
-        names += [f"{head}.{signal}" for signal in signal_names(plan.labels, options.derivatives)]
+    names = [
+        f"{name}.{signal}"
+        for name, plan in study.plans.items()
+        for signal in signal_names(plan.labels, options.derivatives)
+    ]
     rows = [signal_rows(plan, times, options.derivatives) for plan in study.plans.values()]
     return Table(times, tuple(names), np.concatenate(rows))

@@ -17,16 +17,21 @@ from ctrlplan._files import write_bytes
 from ctrlplan.trajectories.export.formats import Options, Table, TableFormat, sampled
 from ctrlplan.trajectories.trajectory import Trajectory
 
+_FORMULA = ("=", "+", "-", "@", "\t", "\r")
+
 
 class CSV(TableFormat):
-    """Comma-separated values; every bit of a number returns."""
+    """Comma-separated values; every bit of a number returns.
+
+    An apostrophe stands before names that a spreadsheet would take for a formula.
+    """
 
     def encoded(self, table: Table) -> str:
         """Text of the file; as `TableFormat.encoded`."""
         text = io.StringIO(newline="")
-        header = csv_line(["time", *table.names])
+        names = (f"'{name}" if name.startswith(_FORMULA) else name for name in table.names)
         columns = np.concatenate([table.times[None], table.rows]).T
-        np.savetxt(text, columns, fmt="%.17g", delimiter=",", header=header, comments="")
+        np.savetxt(text, columns, fmt="%.17g", delimiter=",", header=csv_line(["time", *names]), comments="")
         return text.getvalue()
 
 
