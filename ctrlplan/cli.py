@@ -34,6 +34,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
+_PLAN_OUT = (
+    "file to write: .json (plans), .csv, .mat, .npz (samples), .yaml (ROS JointTrajectory), .cam.csv, .cam.st (cams), "
+    ".ppoly.json (polynomials) or .c (C99)"
+)
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="ctrlplan", description="Plan the reference that a closed loop should follow, and show what that is worth."
@@ -56,7 +62,8 @@ def _parser() -> argparse.ArgumentParser:
 
     plan = commands.add_parser("plan", help="write only the trajectories of a study")
     plan.add_argument("study", type=Path, help="study file (TOML)")
-    plan.add_argument("--out", type=Path, required=True, help="file to write: .csv (samples) or .json (plans)")
+    plan.add_argument("--out", type=Path, required=True, help=_PLAN_OUT)
+    plan.add_argument("--dt", type=float, help="sampling period [s] of sampled files (default: 1001 samples)")
     plan.set_defaults(run=_plan)
     return parser
 
@@ -99,14 +106,14 @@ def _report(options: argparse.Namespace) -> list[Path]:
 
 def _plan(options: argparse.Namespace) -> list[Path]:
     from ctrlplan.reports import write_all
-    from ctrlplan.studies.files import plans_as_csv, plans_as_json
+    from ctrlplan.studies.plan_files import plan_ending, plan_files
+    from ctrlplan.trajectories.export import Options
 
-    writers = {".csv": plans_as_csv, ".json": plans_as_json}
-    if options.out.suffix not in writers:
-        raise ValueError(f"--out must end in .csv or .json, got {options.out}")
+    wanted = Options(dt=options.dt)
+    plan_ending(options.out, wanted)
     stated = _stated(options.study)
     _say(f"plans of {stated.name}")
-    return write_all({options.out: writers[options.out.suffix](stated)})
+    return write_all(plan_files(stated, options.out, wanted))
 
 
 def _stated(path: Path) -> StudyFile:

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.io import loadmat
 from strict import WARNINGS
 
 import ctrlplan as cp
@@ -112,6 +113,53 @@ def test_plan_writes_json_from_which_every_plan_returns(study, tmp_path, capsys)
     capsys.readouterr()
 
 
+def test_plan_writes_samples_by_their_period(study, tmp_path, capsys):
+    for ending in (".csv", ".mat", ".npz"):
+        assert main(["plan", str(study), "--out", str(tmp_path / f"plan{ending}"), "--dt", "0.25"]) == 0
+    times = 1.0 + 0.25 * np.arange(17)
+    with np.load(tmp_path / "plan.npz") as data:
+        np.testing.assert_array_equal(data["time"], times)
+        np.testing.assert_allclose(data["polynomial.x_d1"], quintic(times)[1], rtol=0, atol=1e-12)
+    table = np.loadtxt(tmp_path / "plan.csv", delimiter=",", skiprows=1)
+    np.testing.assert_array_equal(table[:, 0], times)
+    mat = loadmat(tmp_path / "plan.mat", simplify_cells=True)
+    np.testing.assert_allclose(mat["turned_x"]["signals"]["values"][-1], 5.0, rtol=1e-12)
+    capsys.readouterr()
+
+
+@pytest.mark.parametrize("ending", [".yaml", ".cam.csv", ".cam.st", ".ppoly.json", ".c"])
+def test_plan_writes_one_file_a_plan_of_what_holds_one(ending, study, tmp_path, capsys):
+    """A step has no duration and is left out."""
+    assert main(["plan", str(study), "--out", str(tmp_path / f"move{ending}")]) == 0
+    names = [
+        f"move-{plan}{e}" for plan in ("polynomial", "turned") for e in ([".c", ".h"] if ending == ".c" else [ending])
+    ]
+    assert capsys.readouterr().out.splitlines() == [str(tmp_path / name) for name in names]
+    assert {p.name for p in tmp_path.iterdir()} == {study.name, *names}
+
+
+def test_plan_of_a_study_with_one_plan_keeps_the_name_given(study, tmp_path, capsys):
+    head, _, tail = STUDY.partition("[[plans]]\nname = ")
+    study.write_text(head + "[[waypoints]]" + tail.partition("[[waypoints]]")[2])
+    assert main(["plan", str(study), "--out", str(tmp_path / "move.ppoly.json")]) == 0
+    assert capsys.readouterr().out.splitlines() == [str(tmp_path / "move.ppoly.json")]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["plan.c", "--dt", "0.1"], r"dt must not be given for \.c \(only for .*\), got 0\.1"),
+        (["plan.json", "--dt", "0.1"], r"dt must not be given for \.json, which holds the plans themselves"),
+        (["plan.csv", "--dt", "0"], r"dt must be finite and above 0, got 0\.0"),
+        (["plan.csv", "--dt", "1e-300"], r"dt must leave at most 100000000 samples, .*"),
+    ],
+)
+def test_plan_says_what_is_wrong_in_one_line(arguments, message, study, tmp_path, capsys):
+    assert main(["plan", str(study), "--out", str(tmp_path / arguments[0]), *arguments[1:]]) == 2
+    assert re.search(rf"^ctrlplan: .*{message}$", capsys.readouterr().err.splitlines()[-1])
+    assert list(tmp_path.iterdir()) == [study]
+
+
 @pytest.mark.parametrize("name", ["plan.csv", "plan.json", "a/new/folder/plan.csv"])
 def test_plan_says_the_path_on_stdout_and_progress_on_stderr(name, study, tmp_path, capsys):
     out = tmp_path / name
@@ -205,7 +253,7 @@ def test_python_m_is_the_same_command(study, tmp_path):
     done = python_m("plan", study, "--out", tmp_path / "plan.txt")
     assert done.returncode == 2
     assert done.stdout == ""
-    assert re.fullmatch(r"ctrlplan: --out must end in \.csv or \.json, got \S+plan\.txt\n", done.stderr)
+    assert re.fullmatch(r"ctrlplan: --out must end in one of \.json, \.csv, .*, got \S+plan\.txt\n", done.stderr)
 
 
 @pytest.mark.slow

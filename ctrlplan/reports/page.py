@@ -78,7 +78,7 @@ def write_report(studies: Sequence[Study], folder: str | os.PathLike[str], title
     )
 
 
-def write_all(texts: Mapping[Path, str]) -> list[Path]:
+def write_all(texts: Mapping[Path, str | bytes]) -> list[Path]:
     """Write files, of which none is replaced before all are on the disk; their folders are made if need be.
 
     Raises

@@ -5,7 +5,7 @@ from ctrlplan.simulation.events import Event, Occurrence, what_happened
 from ctrlplan.simulation.interpreted import SolverError
 from ctrlplan.simulation.predictor import Predictor
 from ctrlplan.simulation.prepared import Prepared, prepare, prepared_form, state_space, stated_start
-from ctrlplan.simulation.response import SimulationResponse
+from ctrlplan.simulation.response import SimulationResponse, signal_table
 from ctrlplan.simulation.simulate import simulate
 
 __all__ = [
@@ -19,6 +19,7 @@ __all__ = [
     "equilibrium_state",
     "prepare",
     "prepared_form",
+    "signal_table",
     "simulate",
     "state_space",
     "stated_start",

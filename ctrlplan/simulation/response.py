@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 
 import control as ct
 from numpy.typing import ArrayLike
@@ -10,6 +12,8 @@ from numpy.typing import ArrayLike
 from ctrlplan._display import ROWS, Displayed, Facts, Part, Table, number, shortened
 from ctrlplan._types import Array
 from ctrlplan.simulation.events import Occurrence
+from ctrlplan.trajectories.export import Table as SampledTable
+from ctrlplan.trajectories.export import export_table
 
 
 class SimulationResponse(Displayed, ct.TimeResponseData):  # type: ignore[misc] # python-control has no types
@@ -85,6 +89,31 @@ class SimulationResponse(Displayed, ct.TimeResponseData):  # type: ignore[misc] 
         super().__init__(time, outputs, states, inputs, **labels)
         self.method, self.reason, self.events = method, reason, list(events)
 
+    def export(self, path: str | os.PathLike[str]) -> Path:
+        """Write times and signals, in the format of the path's ending: .csv, .mat or .npz.
+
+        Columns are the outputs, inputs and states by their labels. A label that
+        an earlier signal has gets ``input.`` or ``state.`` before it.
+
+        Parameters
+        ----------
+        path : str or path
+            File to be written, in an existing folder.
+
+        Returns
+        -------
+        Path
+            File written.
+
+        Raises
+        ------
+        ValueError
+            If the ending is unknown, or names are not unique in the format.
+        OSError
+            If the file cannot be written; an existing file is then unchanged.
+        """
+        return export_table(signal_table(self), path)
+
     def _describe(self) -> Iterator[Part]:
         times = f"{self.t.size} times" + (f" from {self.t[0]:.6g} to {self.t[-1]:.6g} s" if self.t.size else "")
         yield f"{type(self).__name__} of {', '.join(self.output_labels or ()) or 'no output'} at {times}"
@@ -107,3 +136,13 @@ class SimulationResponse(Displayed, ct.TimeResponseData):  # type: ignore[misc] 
             yield f"Event at {event}"
         if len(self.events) > ROWS:
             yield f"{len(self.events) - ROWS} more events"
+
+
+def signal_table(response: ct.TimeResponseData) -> SampledTable:
+    """Outputs, inputs and states of a response by their labels."""
+    groups = {
+        "output": (response.output_labels, response.y),
+        "input": (response.input_labels, response.u),
+        "state": (response.state_labels, response.x),
+    }
+    return SampledTable.of(response.t, {name: (labels, rows) for name, (labels, rows) in groups.items() if labels})

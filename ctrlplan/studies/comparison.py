@@ -10,13 +10,14 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
 from numpy.typing import ArrayLike
 
 from ctrlplan._display import Displayed, Facts, Part, Table, in_line, number
 from ctrlplan._files import write_text
 from ctrlplan._renamed import FormerAttribute
 from ctrlplan._types import Params
-from ctrlplan.simulation import Event, SimulationResponse
+from ctrlplan.simulation import Event, SimulationResponse, signal_table
 from ctrlplan.studies.experiment import Experiment, Measured
 from ctrlplan.studies.limits import limits_of
 from ctrlplan.studies.measures import MEASURES, Measure, leading_metrics, shown_measures
@@ -29,6 +30,8 @@ from ctrlplan.studies.study import Study
 from ctrlplan.studies.units import Signals, checked_units, listed_measures, scales_of, signals_of_runs
 from ctrlplan.studies.verdicts import unit_of, verdicts
 from ctrlplan.trajectories import Trajectory, Waypoint
+from ctrlplan.trajectories.export import Table as SampledTable
+from ctrlplan.trajectories.export import export_table
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -178,6 +181,39 @@ class Comparison(Displayed):
         stated = {"title": self.title, "parameters": {k: in_line(v) for k, v in self.parameters.items()}}
         data = self.results() | {"plans": plans} | stated
         write_text(path, json.dumps(data, indent=1, allow_nan=False) + "\n")
+
+    def export(self, path: str | os.PathLike[str]) -> Path:
+        """Write the responses, in the format of the path's ending: .csv, .mat or .npz.
+
+        Columns are plan.signal, with the signals of `SimulationResponse.export`;
+        nan after an event has stopped a run.
+
+        Parameters
+        ----------
+        path : str or path
+            File to be written, in an existing folder.
+
+        Returns
+        -------
+        Path
+            File written.
+
+        Raises
+        ------
+        ValueError
+            If the ending is unknown, or names are not unique in the format.
+        OSError
+            If the file cannot be written; an existing file is then unchanged.
+        """
+        tables = {plan: signal_table(response) for plan, response in self.responses.items()}
+        times = np.unique(np.concatenate([table.times for table in tables.values()]))
+        names, rows = [], []
+        for plan, table in tables.items():
+            values = np.full((len(table.names), times.size), np.nan)
+            values[:, np.searchsorted(times, table.times)] = table.rows
+            names += [f"{plan}.{name}" for name in table.names]
+            rows.append(values)
+        return export_table(SampledTable(times, tuple(names), np.concatenate(rows)), path)
 
     def _plans(self) -> dict[str, dict[str, object]]:
         return {

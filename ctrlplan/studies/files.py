@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import io
-import json
 import os
 import tomllib
 from collections.abc import Callable
@@ -26,10 +24,9 @@ from ctrlplan.studies.reading import Reader, StudyError, got, named_in_module, o
 from ctrlplan.studies.running import Builder, System
 from ctrlplan.studies.study import Study
 from ctrlplan.trajectories import PolySpline, Trajectory, TrigSpline, Waypoint
-from ctrlplan.trajectories.files import csv_header, signal_names, signal_rows
 from ctrlplan.trajectories.waypoint_spline import FromWaypoints, families, family_name
 
-__all__ = ["StudyError", "StudyFile", "build_loop", "load_study", "plans_as_csv", "plans_as_json"]
+__all__ = ["StudyError", "StudyFile", "build_loop", "load_study"]
 
 
 @dataclass(frozen=True)
@@ -216,32 +213,6 @@ def _parsed(source: Path) -> Data:
         raise StudyError(f"{source}: must be valid TOML, got lists or tables nested too deep") from None
     except ValueError as error:  # invalid TOML, or a number too long to read
         raise StudyError(f"{source}: must be valid TOML, got {error}") from None
-
-
-def plans_as_json(study: StudyFile) -> str:
-    """Plans of a study as JSON text: each by name, for `trajectory_from_dict`."""
-    return json.dumps({name: plan.to_dict() for name, plan in study.plans.items()}, indent=1, allow_nan=False) + "\n"
-
-
-def plans_as_csv(study: StudyFile, order: int = 2) -> str:
-    """Samples of all plans as one table: time, then plan.axis with its derivatives.
-
-    An apostrophe stands before names that a spreadsheet would take for a formula.
-    """
-    times = np.linspace(study.waypoints[0].time, study.waypoints[-1].time, 1001)
-    times = np.union1d(times, [w.time for w in study.waypoints])
-    names, rows = ["time"], [times]
-    for name, plan in study.plans.items():
-        head = f"'{name}" if name.startswith(("=", "+", "-", "@", "\t", "\r")) else name
-        names += [f"{head}.{signal}" for signal in signal_names(plan.labels, order)]
-        rows += list(signal_rows(plan, times, order))
-    try:
-        header = csv_header(names)
-    except ValueError as error:
-        raise StudyError(f"{study.path}: waypoints: {error}") from None
-    table = io.StringIO(newline="")
-    np.savetxt(table, np.array(rows).T, fmt="%.17g", delimiter=",", header=header, comments="")
-    return table.getvalue()
 
 
 class _FileReader(Reader):

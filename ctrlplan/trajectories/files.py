@@ -1,23 +1,14 @@
-"""Trajectories as plain data, JSON and CSV."""
+"""Trajectories as plain data and JSON, and the names of their signals."""
 
 from __future__ import annotations
 
-import bz2
-import csv
-import gzip
-import io
 import json
-import lzma
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from pathlib import Path
 from typing import NoReturn
 
-import numpy as np
-from numpy.typing import ArrayLike
-
-from ctrlplan._checks import checked_count, checked_timepts
-from ctrlplan._files import write_bytes, write_text
+from ctrlplan._files import write_text
 from ctrlplan._types import Data
 from ctrlplan.trajectories.common import Array
 from ctrlplan.trajectories.trajectory import Trajectory
@@ -91,62 +82,6 @@ def load_trajectory(path: str | os.PathLike[str]) -> Trajectory:
 def _no_number(name: str) -> NoReturn:
     """Raise for nan and inf, which are not JSON and which `save` does not write."""
     raise ValueError(f"numbers must be finite, got {name}")
-
-
-def write_csv(plan: Trajectory, path: str | os.PathLike[str], timepts: ArrayLike | None = None, order: int = 2) -> None:
-    """Write times and jets as a table: time, then each axis with its derivatives.
-
-    Parameters
-    ----------
-    plan : Trajectory
-        Plan to be sampled.
-    path : str or path
-        File to be written.
-    timepts : array_like, shape (ntime,), optional
-        Times [s]; default: 1001 from start to end.
-    order : int, optional
-        Highest derivative; columns are x, x_d1, x_d2, ...
-
-    Raises
-    ------
-    ValueError
-        If `timepts` is not a sequence of times (but a sampling period), if a
-        time is nan, or if the order is negative.
-    OSError
-        If the file cannot be written; an existing file is then unchanged.
-    """
-    times = np.linspace(plan.start, plan.end, 1001) if timepts is None else checked_timepts(timepts)
-    if times.ndim != 1:
-        got = f"the scalar {times:g}" if times.ndim == 0 else f"shape {times.shape}"
-        step = f"{times:g}" if times.ndim == 0 else "dt"
-        raise ValueError(
-            f"timepts must be sample times of shape (ntime,), got {got}; for one row every {step} s pass "
-            f"np.arange(plan.start, plan.end, {step})"
-        )
-    highest = checked_count(order, "order")
-    columns = np.concatenate([times[None], signal_rows(plan, times, highest)])
-    table = io.StringIO()
-    np.savetxt(
-        table, columns.T, fmt="%.17g", delimiter=",", header=csv_header(column_names(plan, highest)), comments=""
-    )
-    # As numpy does for paths with these suffixes.
-    packers: dict[str, Callable[[bytes], bytes]] = {".gz": gzip.compress, ".bz2": bz2.compress, ".xz": lzma.compress}
-    write_bytes(path, packers.get(Path(path).suffix, bytes)(table.getvalue().encode("utf-8")))
-
-
-def csv_header(names: list[str]) -> str:
-    """Header line of a table, with names quoted where necessary; duplicate names raise."""
-    for name in names:
-        if names.count(name) > 1:
-            raise ValueError(f"columns must have different names, got {name!r} twice; rename an axis")
-    line = io.StringIO(newline="")
-    csv.writer(line, lineterminator="\r\n").writerow(names)  # csv then quotes names that contain either character
-    return line.getvalue()[:-2]
-
-
-def column_names(plan: Trajectory, order: int) -> list[str]:
-    """Names of the columns: time, x, x_d1, x_d2, z, z_d1, ..."""
-    return ["time", *signal_names(plan.labels, order)]
 
 
 def signal_names(labels: Iterable[str], order: int) -> list[str]:

@@ -10,6 +10,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
 from numbers import Real
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
     from control import ControlPlot
 
     from ctrlplan.reports.style import AxesLike
+    from ctrlplan.trajectories.export import FlatMaps
     from ctrlplan.trajectories.waypoint import Waypoint
 
 
@@ -519,11 +521,83 @@ class Trajectory(Displayed, Fields, ABC):
 
         return Selected(self, (labels,) if isinstance(labels, str) else labels)
 
-    def to_csv(self, path: str | os.PathLike[str], timepts: ArrayLike | None = None, order: int = 2) -> None:
-        """Write times and jets as a CSV table with a header line."""
-        from ctrlplan.trajectories.files import write_csv
+    def export(
+        self,
+        path: str | os.PathLike[str],
+        *,
+        dt: float | None = None,
+        timepts: ArrayLike | None = None,
+        derivatives: int = 2,
+        flat: FlatMaps | None = None,
+    ) -> tuple[Path, ...]:
+        """Write for another program, in the format of the path's ending.
 
-        write_csv(self, path, timepts, order)
+        =============== ============================================================
+        Ending          Content
+        =============== ============================================================
+        ``.csv``        samples: time, x, x_d1, x_d2, z, ...
+        ``.mat``        samples: one structure with time per signal, for the
+                        Simulink block From Workspace
+        ``.npz``        samples: one array per signal
+        ``.yaml``       samples as trajectory_msgs/JointTrajectory of ROS 2
+        ``.cam.csv``    position, velocity and acceleration at master positions
+        ``.cam.st``     the same as global variables MC_CAM_REF of CODESYS
+        ``.ppoly.json`` coefficients for `scipy.interpolate.PPoly`
+        ``.c``          C99 source, and its header
+        =============== ============================================================
+
+        The master position of a cam is the time. Cams, polynomials and C state a
+        bound of their error. `save` writes the plan itself.
+
+        Parameters
+        ----------
+        path : str or path
+            File to be written, in an existing folder.
+        dt : float, optional
+            Sampling period [s]. The last sample is the first one at or after the
+            end.
+        timepts : array_like, shape (ntime,), optional
+            Sample times [s]. Default: 1001 from start to end; for cams, as many
+            as keep the error of the position below 1e-6 of its range.
+        derivatives : int, optional
+            Highest derivative.
+        flat : flat system, optional
+            System whose states and inputs along the plan are added to the samples;
+            it must have a method ``states_and_inputs``. In ROS the inputs are the
+            effort.
+
+        Returns
+        -------
+        tuple of Path
+            Files written.
+
+        Raises
+        ------
+        ValueError
+            If the ending is unknown, an argument does not apply to it, or the
+            format cannot represent the plan.
+        OSError
+            If a file cannot be written; existing files are then unchanged.
+
+        Examples
+        --------
+        >>> import ctrlplan as cp
+        >>> move = cp.PolySpline([cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1, 0, 0)])
+        >>> move.export("move.txt")
+        Traceback (most recent call last):
+        ...
+        ValueError: path must end in one of .csv, .mat, .npz, .ppoly.json, .yaml, .cam.csv, .cam.st, .c, got move.txt
+        """
+        from ctrlplan.trajectories.export import Options, export_plan
+
+        return export_plan(self, path, Options(dt, timepts, derivatives, flat))
+
+    def to_csv(self, path: str | os.PathLike[str], timepts: ArrayLike | None = None, order: int = 2) -> None:
+        """Write as CSV, whatever the file name; .gz, .bz2 and .xz are compressed. See `export`."""
+        from ctrlplan.trajectories.export import Options
+        from ctrlplan.trajectories.export.csv_table import write_csv
+
+        write_csv(self, path, Options(timepts=timepts, derivatives=checked_count(order, "order")))
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write to a JSON file that `load_trajectory` reads, exact to every bit."""

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from linear_table import printed
 from scipy.integrate import solve_ivp
+from scipy.io import loadmat
 from scipy.optimize import brentq
 
 import ctrlplan as cp
@@ -499,3 +500,51 @@ def test_one_loop_of_several_may_be_unstable():
         assert found.metrics["bad"]["settling_time"] == np.inf
         assert found.metrics["good"]["settling_time"] == pytest.approx(printed(5, "quintic")[1], rel=1e-4)
         assert "settling_time" in {v.key for v in verdicts(found)}
+
+
+# Responses as files
+
+
+def read_csv(path):
+    names, *rows = [line.split(",") for line in path.read_text(encoding="utf-8").splitlines()]
+    return dict(zip(names, np.array(rows, dtype=float).T, strict=True))
+
+
+def test_responses_are_exported_plan_by_plan(standard, tmp_path):
+    assert standard.export(tmp_path / "runs.csv") == tmp_path / "runs.csv"
+    standard.export(tmp_path / "runs.npz")
+    standard.export(tmp_path / "runs.mat")
+    table = read_csv(tmp_path / "runs.csv")
+    mat = loadmat(tmp_path / "runs.mat", simplify_cells=True)
+    np.testing.assert_array_equal(table["time"], TIMES)
+    with np.load(tmp_path / "runs.npz") as data:
+        assert list(data) == list(table)
+        for name, response in standard.responses.items():
+            for row, label in zip(response.y, response.output_labels, strict=True):
+                np.testing.assert_array_equal(table[f"{name}.{label}"], row)
+                np.testing.assert_array_equal(data[f"{name}.{label}"], row)
+                np.testing.assert_array_equal(mat[f"{name}_{label}"]["signals"]["values"], row)
+    assert sum(name.startswith("step.") for name in table) == sum(name.startswith("polynomial.") for name in table) > 2
+
+
+def test_a_run_that_was_stopped_has_nan_in_the_file(tmp_path):
+    """The lag 1/(s + 1) of a unit step passes 0.5 at log 2; the slow plan stays below."""
+    plans = {"fast": cp.Step(1.0), "slow": cp.Step(0.4)}
+    lag = ct.ss([[-1.0]], [[1.0]], [[1.0]], [[0.0]], inputs=["r"], outputs=["y"])
+    times = np.linspace(0.0, 2.0, 21)
+    result = cp.compare(lag, plans, times, events=[cp.Event("y", high=0.5, stop=True)])
+    result.export(tmp_path / "runs.csv")
+    table = read_csv(tmp_path / "runs.csv")
+    assert set(times) <= set(table["time"])
+    after = table["time"] > np.log(2.0) + 1e-9
+    assert np.isnan(table["fast.y"][after]).all()
+    at = np.isin(table["time"], times) & ~after
+    np.testing.assert_allclose(table["fast.y"][at], 1.0 - np.exp(-table["time"][at]), atol=1e-9)
+    at = np.isin(table["time"], times)
+    np.testing.assert_allclose(table["slow.y"][at], 0.4 * (1.0 - np.exp(-times)), atol=1e-9)
+
+
+def test_a_comparison_is_exported_to_tables_only(standard, tmp_path):
+    with pytest.raises(ValueError, match=r"path must end in one of \.csv, \.mat, \.npz, got .*runs\.c"):
+        standard.export(tmp_path / "runs.c")
+    assert list(tmp_path.iterdir()) == []

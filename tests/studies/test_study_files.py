@@ -3,6 +3,7 @@
 import csv
 import io
 import tomllib
+from pathlib import Path
 
 import control as ct
 import numpy as np
@@ -11,7 +12,9 @@ from natural import NaturalCubic
 from study_text import VALID, Verbatim, to_toml, valid
 
 import ctrlplan as cp
-from ctrlplan.studies.files import StudyError, StudyFile, build_loop, load_study, plans_as_csv, plans_as_json
+from ctrlplan.studies.files import StudyError, StudyFile, build_loop, load_study
+from ctrlplan.studies.plan_files import plan_files
+from ctrlplan.trajectories.export import Options
 from ctrlplan.trajectories.waypoint_spline import families
 
 FAMILIES = {"step": cp.Step, **{name: k for name, k in families().items() if k.__module__.startswith("ctrlplan.")}}
@@ -217,7 +220,7 @@ def test_alpha_can_be_left_to_be_chosen(family, stated):
 
     assert way(plan.alpha) <= min(map(way, np.linspace(0.0, 6.0, 61))) + 1e-5
     assert f"alpha = {plan.alpha:g} rad" in " ".join(map(str, stated_file.parameters().values()))
-    assert '"auto"' not in plans_as_json(stated_file)
+    assert '"auto"' not in written(stated_file, ".json")
 
 
 def test_a_gamma_cannot_be_chosen(stated):
@@ -383,11 +386,17 @@ def test_a_nonlinear_loop_is_compared_too(tmp_path):
 # Plans as data
 
 
+def written(study, ending):
+    """Text of the one file that holds all plans."""
+    ((_, text),) = plan_files(study, Path(f"plan{ending}"), Options()).items()
+    return text
+
+
 def test_plans_as_json_restore_every_bit(stated):
     import json
 
     found = stated(valid())
-    data = json.loads(plans_as_json(found))
+    data = json.loads(written(found, ".json"))
     assert list(data) == ["trigonometric", "poly", "legs", "step"]
     t = np.linspace(-1, 17, 1001)
     for name, plan in found.plans.items():
@@ -396,7 +405,7 @@ def test_plans_as_json_restore_every_bit(stated):
 
 def test_plans_as_csv_are_their_samples(stated):
     found = stated(valid())
-    head, *lines = plans_as_csv(found).splitlines()
+    head, *lines = written(found, ".csv").splitlines()
     names = head.split(",")
     table = np.array([line.split(",") for line in lines], dtype=float).T
     assert names[0] == "time"
@@ -424,7 +433,7 @@ NAMES = [
 @pytest.mark.parametrize("name", NAMES)
 def test_csv_has_as_many_names_as_columns_whatever_the_plan_is_called(stated, name):
     found = stated(valid(plans=[{"name": name, "family": "polynomial"}]))
-    head, *rows = csv.reader(io.StringIO(plans_as_csv(found), newline=""))
+    head, *rows = csv.reader(io.StringIO(written(found, ".csv"), newline=""))
     assert head == ["time", *(f"{name}.{x}" for x in ("x", "x_d1", "x_d2"))]
     assert {len(row) for row in rows} == {4}
 
@@ -432,7 +441,7 @@ def test_csv_has_as_many_names_as_columns_whatever_the_plan_is_called(stated, na
 @pytest.mark.parametrize("name", ['=HYPERLINK("http://evil.example")', "+1", "-2+3", "@SUM(A1)", "\t=1", "\r=1"])
 def test_a_spreadsheet_takes_no_name_of_a_plan_for_a_formula(stated, name):
     found = stated(valid(plans=[{"name": name, "family": "polynomial"}]))
-    head, *_ = csv.reader(io.StringIO(plans_as_csv(found), newline=""))
+    head, *_ = csv.reader(io.StringIO(written(found, ".csv"), newline=""))
     assert head == ["time", *(f"'{name}.{x}" for x in ("x", "x_d1", "x_d2"))]
 
 
@@ -440,7 +449,7 @@ def test_csv_names_no_two_columns_alike(stated):
     points = [{"time": 0.0, "x": [0.0], "x_d1": [0.0]}, {"time": 1.0, "x": [1.0], "x_d1": [2.0]}]
     data = valid(plans=[{"family": "polynomial"}], waypoints=points, units={})
     try:
-        head = plans_as_csv(stated(data)).splitlines()[0].split(",")
+        head = written(stated(data), ".csv").splitlines()[0].split(",")
     except StudyError:
         return  # names that would be alike are refused
     assert len(head) == len(set(head))

@@ -11,6 +11,7 @@ import pytest
 
 from ctrlplan import trajectories
 from ctrlplan.trajectories import Trajectory, Waypoint
+from ctrlplan.trajectories.export import ENDINGS
 
 # Data drawn at random and every alpha: most of these plans swing, on purpose.
 pytestmark = pytest.mark.filterwarnings("ignore:the plan swings")
@@ -313,3 +314,17 @@ def test_csv(plan, tmp_path):
     values = np.array([[float(v) for v in row.split(",")] for row in rows]).T
     np.testing.assert_array_equal(values[0], t)
     np.testing.assert_array_equal(values[1:], plan.jet(t, 1).transpose(1, 0, 2).reshape(-1, t.size))
+
+
+@moving
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_it_is_exported_to_every_format(plan, ending, tmp_path):
+    """Except that a cam has no jump of position or velocity."""
+    path = tmp_path / f"plan{ending}"
+    if ".cam" in ending and any(jump.order < 2 for jump in plan.jumps(1) if plan.start < jump.time < plan.end):
+        with pytest.raises(ValueError, match=r"(position|velocity) of a cam must be continuous, got a jump"):
+            plan.export(path)
+        return
+    files = plan.export(path)
+    assert set(tmp_path.iterdir()) == set(files)
+    assert all(file.stat().st_size for file in files)
