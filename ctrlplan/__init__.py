@@ -1,6 +1,65 @@
-"""Plan the reference that a closed loop should follow, and show what that is worth.
+"""Planned references for closed loops: what to call for what, in the order of work.
 
-Imported beside python-control: ``import control as ct; import ctrlplan as cp``.
+Used alongside python-control: ``import control as ct; import ctrlplan as cp``. Each name below has a
+docstring with an example, ``help(cp.compare)``; the README has a line of code for each job.
+
+Plan a move
+    Waypoint                  time, position and derivatives that a plan must meet; None leaves one free
+    TrigSpline, PolySpline    one spline through all waypoints: trigonometric, polynomial (alpha = 0)
+    PiecewiseSpline           one spline for each segment, continuous in the derivatives left free
+    SCurve, Trapezoid, Step   moves with limited jerk, with limited acceleration, without limits
+    Shaper                    input shaping of any plan, against a known mode
+    stack                     plans of single axes as one plan
+    load_trajectory, trajectory_from_dict    stored plans
+    Trajectory                what all plans have: values, derivatives, extrema, plot, save, algebra
+    WaypointSpline            base class of a spline of your own
+Choose what is left free
+    choose_alpha              shape by an objective: PeakDerivative, SquaredDerivative -> AlphaChoice
+    optimize_waypoints        derivatives and times at via points, by minimum jerk or snap -> Optimum
+    fastest                   minimum duration under limits -> Fastest, with a time law Retimed
+    Limits                    limits that are one-sided
+    margins                   how near a plan is to its limits, and when -> Margins
+    avoid, clearance          around Rectangle, Disc, HalfPlane -> Avoidance, Clearance: certified
+Build the loop
+    create_source_iosystem    plan as a block with outputs y, y_d1, ...; source_samples: the same as arrays
+    create_pid_iosystem       PID with limits and anti-windup
+    create_saturation_iosystem, create_delay_iosystem    limits of an actuator, transport delay
+    create_flat_iosystem      flat control of a flat plant; create_feedforward_iosystem: of a linear loop
+    sample_hold               discrete block in a continuous loop; expose_states: states among the outputs
+    create_command_filter_iosystem    filter with derivative outputs; command_filter_gains: its feedforward
+    plants                    motor, flexible joint, integrators, crane with its loops; Law: laws of the crane
+    declare, traits_of        what the simulation must know of a block of your own -> BlockTraits
+Simulate
+    simulate                  response of any python-control system -> SimulationResponse; exact if linear
+    prepare                   the built form, for many runs -> Prepared
+    Event                     a limit whose crossing is recorded or ends the run -> Occurrence
+    SolverError               raised where an integrator fails
+Compare and report
+    compare                   plans in one loop, with metrics, figures and a page -> Comparison
+    benefit                   planning against steps, profiles and shaped steps -> Benefit
+    sweep                     over a parameter -> Sweep
+    monte_carlo, draws        over random parameters -> Ensemble
+    Experiment, Measure       what is compared, once, for many loops; a metric of your own
+    metrics                   settling time, overshoot, IAE, ... as functions of (timepts, signal)
+On line
+    create_replanner_iosystem       fits the plan again while the loop runs; Transition: its linear law
+    create_governor_iosystem        reference within limits; AdmissibleSet (linear), Predictor (nonlinear)
+    create_time_scaling_iosystem    slows the plan as an error grows
+Without Python
+    ``ctrlplan reproduce``, ``ctrlplan report STUDY.toml``, ``ctrlplan plan``: see `ctrlplan.studies.files`
+Old names, which warn
+    command_lead, flat_quantities
+
+Glossary
+    jet        position and derivatives at one time, an array (order + 1, naxes)
+    flag       jet of one flat output up to the order that states and inputs need
+    alpha      shape parameter of a trigonometric spline [rad], from 0 (the polynomial) to below 2 pi:
+               the duration of the plan in the angle tau of its basis, equation (4)
+    gamma      phase of its highest harmonic; by default the mean of tau over the constraints
+    segment    part of a plan between two waypoints
+    degree     highest power of a polynomial, highest harmonic of a trigonometric spline
+    order      highest derivative that something has or reads
+    benefit    what a plan gains over the baselines: step, trapezoid, S-curve, shaped step, quintic
 """
 
 from importlib import import_module

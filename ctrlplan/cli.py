@@ -1,4 +1,4 @@
-"""The ``ctrlplan`` command."""
+"""The ``ctrlplan`` command: reproduce, online, report, plan. Study files: `ctrlplan.studies.files`."""
 
 from __future__ import annotations
 

@@ -220,6 +220,38 @@ def test_subpackages_are_those_of_the_map():
     assert {"ctrlplan.studies", "ctrlplan.reports", "ctrlplan.systems.plants"} <= set(SUBPACKAGES)
 
 
+# Its index
+
+
+INDEX, GLOSSARY = cp.__doc__.split("\nGlossary\n")
+
+
+def test_the_index_is_two_screens():
+    lines = cp.__doc__.splitlines()
+    assert len(lines) <= 100
+    assert max(map(len, lines)) <= 110
+    assert len(GLOSSARY.strip().splitlines()) <= 12
+
+
+def test_every_export_is_in_the_index():
+    assert [name for name in cp.__all__ if not re.search(rf"\b{name}\b", INDEX)] == []
+
+
+def test_every_name_in_the_index_exists():
+    rows = re.findall(r"^    ([A-Za-z_, ]+?)(?:  .*)?$", INDEX, re.MULTILINE)
+    listed = {name for row in rows for name in row.split(", ")}
+    compound = set(re.findall(r"\b(?:[a-z]+(?:_[a-z]+)+|[A-Z][a-z]+[A-Z]\w+)\b", INDEX))
+    assert len(listed) > 40
+    assert {name for name in listed | compound if name not in cp.__all__} == set()
+
+
+@pytest.mark.parametrize("line", GLOSSARY.strip("\n").splitlines())
+def test_the_glossary_explains_terms_that_are_used(line):
+    term = re.match(r"    (\w+)  ", line)
+    used = [path for path in ROOT.rglob("*.py") if term and re.search(rf"\b{term[1]}\b", path.read_text("utf-8"))]
+    assert len(used) > 3 or line.startswith("               ")
+
+
 # One version, and what the package carries
 
 

@@ -1,4 +1,52 @@
-"""A user's own study, stated in a TOML file."""
+"""A user's own study, stated in a TOML file.
+
+``ctrlplan report STUDY.toml --out DIR`` runs a study and writes ``index.html``,
+which opens offline, and ``results.json``; ``ctrlplan plan STUDY.toml --out
+plan.csv`` (or ``.json``) writes the trajectories alone. A complete file:
+
+.. code-block:: toml
+
+    title = "Over the wall"
+    t_end = 30.0
+    samples = 4001            # optional
+    benefit = true            # optional: compare with steps, profiles and minimum jerk, in the same time and limits
+    [loop]
+    kind = "linear"           # num/den with a gain in unity feedback
+    num = [1.0]
+    den = [1.0, 1.0, 0.0]
+    gain = 5.0
+    [units]                   # optional
+    x = "m"
+    [experiment]              # optional: further fields of ctrlplan.Experiment
+    band = 0.02
+    [[plans]]                 # without plans: step, polynomial, trigonometric, piecewise
+    name = "trigonometric"
+    family = "trigonometric"
+    alpha = 4.0               # or "auto": the shortest path
+    [[plans]]
+    family = "step"
+    [[waypoints]]
+    time = 0.0
+    x = [0.0, 0.0, 0.0]       # position, velocity, acceleration, ...: as many as prescribed
+    [[waypoints]]
+    time = 16.0
+    x = [20.0, 0.0, 0.0]
+
+Kinds of loops:
+
+- ``"linear"``: ``num``, ``den`` and ``gain``.
+- ``"crane"``: the axes are x and z (downwards). Optional: ``law`` ("setpoint",
+  "generator", "load_feedback", "dynamic", "feedforward"), ``force_limits``,
+  ``torque_limits``, and any parameter of `ctrlplan.plants.Crane`
+  (``load_mass = 800.0``, ...).
+- ``"python:module:function"``: a function declared to return a loop, ``def
+  build() -> control.InputOutputSystem``. Such a file is code: running the study
+  runs the module. ``ctrlplan plan`` runs nothing of it.
+
+Families of plans: trigonometric, polynomial, piecewise, step, s_curve,
+trapezoid, or ``"python:module:Class"``, a class derived from
+`ctrlplan.WaypointSpline`.
+"""
 
 from __future__ import annotations
 
@@ -130,7 +178,7 @@ def load_study(path: str | os.PathLike[str]) -> StudyFile:
     Parameters
     ----------
     path : str or path
-        A TOML file; see the README for its entries.
+        A TOML file; its entries are listed in the docstring of this module.
 
     Returns
     -------

@@ -1,4 +1,15 @@
-"""Functions of time with exact derivatives: the references of a control loop."""
+"""Functions of time with exact derivatives: the references of a control loop.
+
+``plan(t, nu)`` is the derivative nu, ``plan.jet(t, order)`` all up to an order,
+``plan.extrema(nu)`` and ``plan.peak(nu)`` the extrema between samples too,
+``plan.plot()`` a figure that ``plt.show()`` shows (``ax=drawn.axes`` overlays a
+second plan). Plans are added, scaled, shifted (``shift``), retimed
+(``retime``), joined (``then``), stacked (`stack`) and split (``select``);
+``plan.save(path)`` writes JSON that `load_trajectory` restores exactly.
+
+Before its start a plan holds its first position, after its end the last, with
+all derivatives zero. Times are in seconds, signals are (channel, time).
+"""
 
 from ctrlplan.trajectories.combined import Joined, Scaled, Selected, Stacked, Sum, stack
 from ctrlplan.trajectories.continuity import Jump
