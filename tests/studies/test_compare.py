@@ -458,13 +458,16 @@ def test_saved_json_holds_the_metrics_and_the_plans(standard, tmp_path):
     assert data["plans"]["step"]["metrics"]["wandering"] is None  # undefined
 
 
-def test_in_a_notebook_it_is_a_table_with_a_verdict(standard):
+def test_in_a_notebook_it_is_a_table_with_the_best_values_marked(standard):
     cell = standard._repr_html_()
     assert cell.count("<table") == cell.count("</table>") == 1
     for plan in standard.plans:
         assert plan in cell
-    assert "7.561" in cell
-    assert "step is best in" in cell
+    settling = [standard.metrics[plan]["settling_time"] for plan in standard.plans]
+    row = cell[cell.index("Settling time") :].partition("</tr>")[0]
+    assert [f"<strong>{value:.4g}</strong>*" in row for value in settling] == [
+        value == min(settling) for value in settling
+    ]
 
 
 def test_names_are_escaped_wherever_they_are_shown(tmp_path):
