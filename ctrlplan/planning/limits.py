@@ -255,7 +255,7 @@ class Margins(Displayed):
             for row in self.rows
         ]
         return Table(
-            "Margins over the whole plan, the smallest first", ("limit", "must stay", "value", "at [s]", "margin"), rows
+            "Margins over the whole plan, the smallest first", ("signal", "limits", "value", "time [s]", "margin"), rows
         )
 
     def to_pandas(self) -> pd.DataFrame:

@@ -282,7 +282,7 @@ def test_margins_in_words():
     assert first.endswith("% beyond")
     assert repr(found) == f"<Margins of 2 limits: {first}>"
     assert [" ".join(line.split()) for line in str(found).splitlines()[-3:]] == [
-        "limit must stay value at [s] margin",
+        "signal limits value time [s] margin",
         f"y_d2 from -5 to 8 -5.7735 0.788675 -{100 * (5.773502691896258 - 5.0) / 6.5:.3g} %",
         "y_d1 within ±2 1.875 0.5 6.25 %",
     ]

@@ -74,5 +74,5 @@ class Crane(CraneParameters, Displayed):
     def _describe(self) -> Iterator[Part]:
         yield f"Crane with a load of {self.load_mass:g} kg"
         rows = [(name.replace("_", " "), f"{getattr(self, name):g} {unit}") for name, unit in _UNITS.items()]
-        yield Facts([*rows, ("rope winds on the drum as theta turns", "yes" if self.rope_wrap else "neglected")])
+        yield Facts([*rows, ("rope winding with theta", "included" if self.rope_wrap else "neglected")])
         yield "Flat outputs: x and z of the load. Inputs: force F [N] of the trolley and torque C [N m] of the drum."
