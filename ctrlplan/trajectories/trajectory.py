@@ -7,7 +7,7 @@ import math
 import os
 import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
 from numbers import Real
 from pathlib import Path
@@ -483,6 +483,46 @@ class Trajectory(Displayed, Fields, ABC):
             raise ValueError("a trajectory must have a duration to be retimed, got a step")
         wanted = checked_finite(duration, "duration", above=0.0)
         return self._moved(self.start, self.start, self.duration / wanted)
+
+    def on_cycle(self, dt: float, limits: Mapping[str, object] | None = None) -> Trajectory:
+        """Plan whose segments last a whole number of cycles of a drive.
+
+        The start stays. Between waypoints each duration is rounded up to cycles;
+        values and derivatives that waypoints prescribe stay. A plan without
+        waypoints, as a profile, is retimed as a whole; joined plans are put on the
+        cycle one by one.
+
+        Parameters
+        ----------
+        dt : float
+            Cycle time [s].
+        limits : mapping, optional
+            Limits on derivatives, as for `ctrlplan.fastest`. Segments that violate
+            them get further cycles until they are satisfied over the whole plan.
+
+        Returns
+        -------
+        Trajectory
+            Of the same kind; the plan itself where it is on the cycle already.
+
+        Raises
+        ------
+        ValueError
+            If `dt` is not above 0, waypoints cannot be moved on their own (of a sum
+            whose parts are not on the cycle), a shaped plan would change its
+            duration, a waypoint prescribes more than a limit, or a segment violates
+            a limit whatever its duration.
+
+        Examples
+        --------
+        >>> import ctrlplan as cp
+        >>> move = cp.PolySpline([cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1.0, 1, 0, 0)])
+        >>> move.on_cycle(0.3).end, move.on_cycle(0.3, {"velocity": 1.0}).end
+        (1.2, 2.1)
+        """
+        from ctrlplan.trajectories.cycle import on_cycle
+
+        return on_cycle(self, dt, limits)
 
     def shift(self, dt: float) -> Self:
         """Same path, dt seconds later.

@@ -1,0 +1,71 @@
+"""Plans on the cycle of a drive: every segment lasts a whole number of cycles."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+
+from ctrlplan._checks import checked_finite
+from ctrlplan.trajectories.combined import Joined, is_shaped
+from ctrlplan.trajectories.common import Array
+from ctrlplan.trajectories.trajectory import Trajectory
+from ctrlplan.trajectories.waypoint import Waypoint
+from ctrlplan.trajectories.waypoint_spline import WaypointSpline
+
+
+def on_cycle(plan: Trajectory, dt: float, limits: Mapping[str, object] | None = None) -> Trajectory:
+    """Plan whose duration and waypoints are on a cycle; as `Trajectory.on_cycle`."""
+    dt = checked_finite(dt, "dt", above=0.0)
+    if isinstance(plan, Joined):
+        parts = [on_cycle(part, dt, limits) for part in plan.parts]
+        same = all(part is before for part, before in zip(parts, plan.parts, strict=True))
+        return plan if same else Joined(parts)
+    if not plan.duration:
+        return plan
+    knots = knots_of(plan)
+    rounding = 4.0 * np.spacing(np.abs(knots).max()) / dt
+    counts = np.ceil(np.diff(knots) / dt * (1.0 - 4.0 * np.finfo(float).eps) - rounding).clip(min=1.0)
+    if counts.sum() > 2.0**53:
+        raise ValueError(f"dt must divide the plan into fewer than 2^53 cycles, got {dt:g} s in {plan.duration:g} s")
+    if limits is None:
+        return moved(plan, dt, counts)
+    from ctrlplan.planning.cycle import lengthened
+
+    return lengthened(plan, dt, counts, limits)
+
+
+def knots_of(plan: Trajectory) -> Array:
+    """Times (nsegments + 1,) between which the duration of a plan can be chosen."""
+    if isinstance(plan, WaypointSpline):
+        return np.unique([*(w.time for w in plan.waypoints), plan.end])
+    return np.unique([plan.start, plan.end])
+
+
+def moved(plan: Trajectory, dt: float, counts: Array) -> Trajectory:
+    """Plan whose segments last so many cycles; the same object if they do already."""
+    times = plan.start + dt * np.concatenate([[0.0], np.cumsum(counts)])
+    near = 4.0 * np.spacing(np.abs(times).max())
+    if np.abs(times - knots_of(plan)).max() > near:
+        if isinstance(plan, WaypointSpline):
+            if plan.waypoints[-1].time < plan.end:  # one period of a cyclic plan
+                plan = plan.retime(times[-1] - plan.start)
+            pairs = zip(plan.waypoints, times.tolist(), strict=False)
+            plan = plan.through(Waypoint.from_array(t, w.jet, w.labels) for w, t in pairs)
+        else:
+            plan = plan.retime(times[-1] - plan.start)
+    for time in () if is_shaped(plan) else _inner_times(plan):
+        cycles = (time - plan.start) / dt
+        if abs(cycles - round(cycles)) * dt > 2.0 * near:
+            raise ValueError(
+                f"waypoints of a {type(plan).__name__} must be on the cycle once its duration is, got one at "
+                f"{time:.9g} s, {cycles:.6g} cycles of {dt:g} s after the start; put its parts on the cycle first"
+            )
+    return plan
+
+
+def _inner_times(plan: Trajectory) -> Iterator[float]:
+    """Times of the waypoints of a plan and of those that it is made of."""
+    yield from (w.time for w in plan.waypoints)
+    for part in getattr(plan, "parts", ()):
+        yield from _inner_times(part)
