@@ -240,6 +240,8 @@ class Phase(Section):
             """
 @draw.register
 def _(section: Phase, study: Study) -> Part:
+    import numpy as np
+
     from ctrlplan.reports.style import Drawing
 
     drawing, rows = Drawing(None, (1, 1), (5.0, 4.0)), []
