@@ -12,15 +12,15 @@ feedforward), `create_pid_iosystem`, `create_saturation_iosystem`,
 `create_delay_iosystem`, `create_command_filter_iosystem`, `sample_hold`
 (discrete blocks in continuous loops), and the plants and loops of `plants`.
 
-On line, a block in the place of the plan handles what no plan foresees:
+On line, a block in the place of the plan responds to what is not known before the run:
 
 `create_replanner_iosystem`
     Fits the plan again every period, from the reference to a goal that moves,
     or from what is measured. Without a disturbance the plan is unchanged; each
     fit adds a correction in the family of the plan. A period, horizon and alpha
     of which the map from fit to fit is unstable are an error that gives its
-    spectral radius; a goal out of reach, or a measurement that is nan, leaves
-    the last valid plan in force and is recorded as an event. A fit from what is
+    spectral radius. While a goal is out of reach, or a measurement is nan, the
+    last valid plan is followed, and an event is recorded. A fit from what is
     measured is feedback: it requires a loop that follows the plan between fits.
     A fit takes 10 to 20 microseconds for two axes and jets of order 2.
 `create_governor_iosystem`
@@ -30,7 +30,7 @@ On line, a block in the place of the plan handles what no plan foresees:
     nonlinear loops by a `ctrlplan.Predictor`, which simulates the loop ahead.
 `create_time_scaling_iosystem`
     Time scaling: the plan slows as an error grows or an actuator comes near its
-    limit, and catches up afterwards. The path does not change.
+    limit, and then catches up. The path does not change.
 
 ``ctrlplan online`` compares them on a crane in four scenarios: a gust, a payload
 twice as heavy, a goal that moves on the way, too little force.
