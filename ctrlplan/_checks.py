@@ -1,4 +1,4 @@
-"""Checks of what a user gives, on the ground floor: always (value, name)."""
+"""Checks of arguments; the parameters are always (value, name)."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from numpy.typing import ArrayLike
 from ctrlplan._types import Array
 
 Range = float | Sequence[float]
-"""Limits of a signal as `checked_range` reads them: (low, high), or a number a for (-a, a)."""
+"""Limits of a signal for `checked_range`: (low, high), or a number a for (-a, a)."""
 
 MAXIMUM = 100
-"""Highest order of a derivative, and highest degree."""
+"""Maximum order of a derivative, and maximum degree."""
 
 _NO_NUMBERS = (bool, np.bool_, str, bytes, complex, np.complexfloating, np.datetime64, np.timedelta64)
-"""Kinds that Python or numpy would convert to numbers without their being some."""
+"""Types that Python or numpy would convert to numbers although they are not."""
 
 
 def real_array(values: ArrayLike, name: str) -> Array:
@@ -30,20 +30,20 @@ def real_array(values: ArrayLike, name: str) -> Array:
     values : array_like
         Numbers of any real type.
     name : str
-        What they are called in messages.
+        Name of the argument, for messages.
 
     Returns
     -------
     ndarray of float
-        The same array where it is one already.
+        The same array if it is one of floats already.
 
     Raises
     ------
     TypeError
-        If the values are strings, complex, dates or time differences, or carry
-        a physical unit: which unit is meant would be a guess.
+        If the values are strings, complex, dates or time differences, or have
+        a physical unit, as the required unit is not known.
     ValueError
-        If a value is masked or beyond floating point, or rows differ in length.
+        If a value is masked or overflows, or rows differ in length.
     """
     if type(values) is np.ndarray and values.dtype == np.float64:
         return values
@@ -77,12 +77,12 @@ def default_labels(naxes: int) -> tuple[str, ...]:
 
 
 def checked_labels(labels: Sequence[str] | str | None, naxes: int) -> tuple[str, ...]:
-    """Labels as a tuple: as many as axes, unique, without dots."""
+    """Labels as a tuple, checked to be unique, one per axis, and without dots."""
     if labels is None:
         return default_labels(naxes)
     names = (labels,) if isinstance(labels, str) else tuple(labels)
     if len(names) != naxes:
-        raise ValueError(f"labels must be as many as axes, {naxes}, got {len(names)}: {names}")
+        raise ValueError(f"labels must be one per axis, {naxes}, got {len(names)}: {names}")
     for name in names:
         if not isinstance(name, str):
             raise TypeError(f"labels must be strings, got {name!r}")
@@ -94,7 +94,7 @@ def checked_labels(labels: Sequence[str] | str | None, naxes: int) -> tuple[str,
 
 
 def checked_finite(value: object, name: str, *, above: float | None = None, minimum: float | None = None) -> float:
-    """Finite number, above a bound that is not allowed itself, or at least a minimum."""
+    """Finite number, strictly above a bound, or at least a minimum."""
     number = one_number(value, name)
     if math.isfinite(number) and (above is None or number > above) and (minimum is None or number >= minimum):
         return number
@@ -104,7 +104,7 @@ def checked_finite(value: object, name: str, *, above: float | None = None, mini
 
 
 def one_number(value: object, name: str, rule: str = "a number") -> float:
-    """One number: no truth value, text, complex number, date, nor anything with a unit."""
+    """One real number: not a truth value, string, complex number, date, or quantity with a unit."""
     if type(value) is float:
         return value
     given: Any = value
@@ -122,7 +122,7 @@ def one_number(value: object, name: str, rule: str = "a number") -> float:
 
 
 def new_numbers(values: object, name: str) -> Array:
-    """Numbers as a new array of floats; None is nan. The kinds that `one_number` rejects are rejected here."""
+    """Numbers as a new array of floats; None is nan. Rejects the same types as `one_number`."""
     _check_kinds(values, name)
     try:
         return np.array(values, dtype=float)
@@ -134,15 +134,15 @@ def checked_timepts(t: ArrayLike, name: str = "times") -> Array:
     """Times as an array of any shape, without nan."""
     times = real_array(t, name)
     if times is not t and np.asarray(t).dtype.kind == "b":
-        raise TypeError(f"{name} must be numbers, got truth values {t!r:.60}; index times by a mask before")
-    # One number tells: the minimum of times with a nan among them is nan.
+        raise TypeError(f"{name} must be numbers, got truth values {t!r:.60}; apply a mask to the times first")
+    # The minimum is nan if any time is nan.
     if times.size and np.isnan(times.min()):
         raise ValueError(f"{name} must not be nan, got nan at index {int(np.isnan(times).argmax())}")
     return times
 
 
 def checked_number(value: object, name: str) -> float:
-    """Number that is not nan."""
+    """Real number that is not nan."""
     if not isinstance(value, Real):
         raise TypeError(f"{name} must be a number, got {value!r}")
     number = one_number(value, name)
@@ -152,7 +152,7 @@ def checked_number(value: object, name: str) -> float:
 
 
 def checked_pair(pair: object, name: str) -> tuple[float, float]:
-    """Two numbers that increase."""
+    """Two increasing numbers."""
     if not isinstance(pair, Sequence | np.ndarray) or isinstance(pair, str) or len(pair) != 2:
         raise ValueError(f"{name} must be two numbers, got {pair!r}")
     low, high = checked_number(pair[0], name), checked_number(pair[1], name)
@@ -162,10 +162,7 @@ def checked_pair(pair: object, name: str) -> tuple[float, float]:
 
 
 def checked_range(limits: object, name: str) -> tuple[float, float]:
-    """Lower and upper limit, each of which may be infinite.
-
-    The only place that reads the short form: a number a above 0 means (-a, a).
-    """
+    """Lower and upper limit, each of which may be infinite; a number a above 0 is short for (-a, a)."""
     if isinstance(limits, Real) or (isinstance(limits, np.ndarray) and not limits.ndim):
         size = checked_finite(limits, name, above=0.0)
         return -size, size
@@ -173,29 +170,29 @@ def checked_range(limits: object, name: str) -> tuple[float, float]:
 
 
 def checked_limits(limits: object, name: str) -> tuple[float, float, float]:
-    """Lower and upper limit of which one is finite; and half their distance, or the size of the only one."""
+    """Lower and upper limit, at least one finite, and a scale: half their distance, or the size of a single one."""
     low, high = checked_range(limits, name)
     if math.isinf(low) and math.isinf(high):
-        raise ValueError(f"{name} must hold a finite one, got {low:g} and {high:g}")
+        raise ValueError(f"{name} must contain a finite one, got {low:g} and {high:g}")
     if math.isfinite(low) and math.isfinite(high):
         return low, high, 0.5 * (high - low)
     return low, high, abs(low if math.isfinite(low) else high) or 1.0
 
 
 def checked_count(value: float | Real, name: str, minimum: int = 0) -> int:
-    """Whole number of some least value."""
+    """Integer of at least a minimum."""
     if not isinstance(value, Real):
-        raise TypeError(f"{name} must be a whole number from {minimum}, got {value!r}")
-    number = one_number(value, name, f"a whole number from {minimum}")
+        raise TypeError(f"{name} must be an integer of at least {minimum}, got {value!r}")
+    number = one_number(value, name, f"an integer of at least {minimum}")
     if not math.isfinite(number) or number != int(number) or number < minimum:
-        raise ValueError(f"{name} must be a whole number from {minimum}, got {value}")
+        raise ValueError(f"{name} must be an integer of at least {minimum}, got {value}")
     if number > MAXIMUM:
         raise ValueError(f"{name} must be at most {MAXIMUM}, got {value}")
     return int(number)
 
 
 def finite_vector(values: ArrayLike, name: str, size: str, scalar: bool = False) -> Array:
-    """One or more finite numbers as a new array; `size` is the name of their number, `scalar` whether one may be."""
+    """One or more finite numbers as a new vector; `size` names its length in messages, `scalar` allows a scalar."""
     found = new_numbers(values, name)
     if found.ndim > 1 or (found.ndim == 0 and not scalar) or not found.size:
         forms = f"a scalar or of shape ({size},)" if scalar else f"of shape ({size},)"
@@ -206,7 +203,7 @@ def finite_vector(values: ArrayLike, name: str, size: str, scalar: bool = False)
 
 
 def checked_vector(values: ArrayLike, name: str, count: int) -> Array:
-    """New array (count,) of finite numbers; one number stands for all."""
+    """New array (count,) of finite numbers, from as many numbers or one for all."""
     given = real_array(values, name)
     if given.shape not in ((), (count,)) or not np.isfinite(given).all():
         raise ValueError(f"{name} must be a finite number or {count} of them, got {values!r:.80}")
@@ -214,7 +211,7 @@ def checked_vector(values: ArrayLike, name: str, count: int) -> Array:
 
 
 def checked_names(names: Sequence[str] | str, name: str, count: int | None = None) -> list[str]:
-    """Names of signals: different strings, as many as a count; one string is one name."""
+    """Names of signals as a list, checked to be different strings; one string is one name."""
     given = [names] if isinstance(names, str) else list(names) if isinstance(names, Iterable) else [names]
     for entry in given:
         if not isinstance(entry, str) or not entry:
@@ -227,16 +224,13 @@ def checked_names(names: Sequence[str] | str, name: str, count: int | None = Non
 
 
 def check_kind(value: object, name: str, kind: type, what: str = "") -> None:
-    """Raise unless a value is an object of a class, which messages may call by other words."""
+    """Raise unless a value is an object of a class, described as `what` in messages."""
     if not isinstance(value, kind):
         raise TypeError(f"{name} must be {what or f'a {kind.__name__}'}, got {type(value).__name__}")
 
 
-_NO_NUMBERS = (bool, np.bool_, str, bytes, complex, np.complexfloating, np.datetime64, np.timedelta64)
-
-
 def _has_mask(values: Any) -> bool:
-    """Whether an array, or one inside a list, has masked values."""
+    """Whether an array, or an array in a list, has masked values."""
     if isinstance(values, list | tuple):
         return any(_has_mask(value) for value in values if isinstance(value, list | tuple | np.ma.MaskedArray))
     return bool(np.ma.is_masked(values))
@@ -248,7 +242,7 @@ def _has_unit(value: Any) -> bool:
 
 
 def _check_kinds(values: Any, name: str) -> None:
-    """Reject what numpy would convert to numbers without being some."""
+    """Raise for values that numpy would convert to numbers although they are not."""
     if type(values) in (float, int) or values is None:
         return
     if isinstance(values, list | tuple):
@@ -261,4 +255,4 @@ def _check_kinds(values: Any, name: str) -> None:
     if kind == "O" and isinstance(values, np.ndarray):
         _check_kinds(values.tolist(), name)
     elif type(values) is not np.ndarray or kind not in ("i", "u", "f"):
-        real_array(values, name)  # what has a unit, is a date, or is masked
+        real_array(values, name)  # rejects units, dates and masks

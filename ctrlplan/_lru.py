@@ -1,4 +1,4 @@
-"""Built objects that are kept for further use, the most recently used ones."""
+"""Cache of the most recently used objects."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ K = TypeVar("K", bound=Hashable)
 V = TypeVar("V")
 
 BUILDING = threading.RLock()
-"""Held by a thread that builds what others may use as well: one lock for all, so that no two wait for each other."""
+"""Lock of a thread that builds an entry: one for all caches, which excludes deadlocks."""
 
 
 class Lru(Generic[K, V]):
-    """Bounded mapping that builds missing entries and drops the least recently used one; safe in threads.
+    """Bounded mapping that builds missing entries and drops the least recently used one; thread-safe.
 
-    A copy, or what another process receives, is empty.
+    Copies and pickles are empty.
 
     Parameters
     ----------
@@ -36,7 +36,7 @@ class Lru(Generic[K, V]):
         return type(self), (self.size,)
 
     def get(self, key: K, make: Callable[[], V]) -> V:
-        """Entry of a key, built if it is missing."""
+        """Entry of a key, built if missing."""
         with BUILDING:
             if key not in self._entries:
                 made = make()
@@ -47,6 +47,6 @@ class Lru(Generic[K, V]):
             return self._entries[key]
 
     def clear(self) -> None:
-        """Drop all entries."""
+        """Remove all entries."""
         with BUILDING:
             self._entries.clear()

@@ -1,4 +1,4 @@
-"""Old names that still work for one release, with a warning at the caller's line."""
+"""Deprecated names, which work for one release with a warning at the caller's line."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ T = TypeVar("T")
 
 
 def warn_renamed(old: str, new: str) -> None:
-    """Warn that an old name is used, at the first line outside the package.
+    """Warn of a deprecated name, at the first line outside the package.
 
     Parameters
     ----------
     old, new : str
-        What was written and what to write, as in the caller's code:
-        ``"quantities="``, ``"system="``.
+        Deprecated and new name, as in the caller's code: ``"quantities="``,
+        ``"system="``.
 
     Warns
     -----
     FutureWarning
-        Always: unlike a DeprecationWarning it is shown to everyone who runs
-        the code, as python-control does it.
+        Always, as in python-control: unlike a DeprecationWarning it is shown
+        to all users.
     """
     warnings.warn(
         f"{old} is deprecated and will be removed in the next release; use {new}",
@@ -36,14 +36,14 @@ def warn_renamed(old: str, new: str) -> None:
 
 
 def renamed_argument(old: str, old_value: Any, new: str, new_value: Any) -> Any:
-    """Value of a keyword argument that may be given under its old name.
+    """Value of a keyword argument with a deprecated name.
 
     Parameters
     ----------
     old, new : str
-        The names, without the equals sign.
+        Names, without the equals sign.
     old_value, new_value : object
-        What was given under each; None where nothing was.
+        Value given under each; None if not given.
 
     Raises
     ------
@@ -58,20 +58,20 @@ def renamed_argument(old: str, old_value: Any, new: str, new_value: Any) -> Any:
     if old_value is None:
         return new_value
     if new_value is not None:
-        raise TypeError(f"{old}= is the old name of {new}=: only one of them may be given, got both")
+        raise TypeError(f"{old}= is the deprecated name of {new}=; only one of them may be given, got both")
     warn_renamed(f"{old}=", f"{new}=")
     return old_value
 
 
 def renamed_members(module: str, renamed: Mapping[str, str]) -> Callable[[str], Any]:
-    """`__getattr__` of a module that still has its members' old names.
+    """`__getattr__` of a module whose members have deprecated names.
 
     Parameters
     ----------
     module : str
         Name of the module.
     renamed : mapping of str to str
-        New name of each old one.
+        New name of each deprecated one.
     """
 
     def member(name: str) -> Any:
@@ -129,32 +129,32 @@ def former_signature(
     renamed: Mapping[str, str] | None = None,
     implied: Mapping[str, Mapping[str, object]] | None = None,
 ) -> Callable[[Callable[P, T]], Callable[P, T]]:
-    """Decorator: a call as it was written before still works, with a warning.
+    """Decorator that accepts a former signature with a warning.
 
     Parameters
     ----------
     *positional : str
-        Names of the arguments that could be given by position, after those that
-        still can; old names where they have new ones.
+        Names of the arguments that could formerly be given by position, after
+        those that still can; deprecated names if renamed.
     renamed : mapping of str to str, optional
-        New keyword of each old one.
+        New keyword of each deprecated one.
     implied : mapping of str to mapping, optional
-        Keywords that come with an old one, so that its meaning is kept.
+        Additional keywords that a deprecated one implies.
 
     Returns
     -------
     callable
-        Decorator of a function of the present signature, which it still shows.
+        Decorator of a function, which preserves its signature.
 
     Raises
     ------
     TypeError
-        By the function, where an argument is given twice or under both names.
+        By the function, if an argument is given twice or under both names.
 
     Warns
     -----
     FutureWarning
-        By the function, where an old form is used.
+        By the function, if a deprecated form is used.
 
     Examples
     --------
@@ -180,11 +180,11 @@ def former_signature(
         def called(*args: Any, **kwargs: Any) -> T:
             extra = dict(zip(positional, args[count:], strict=False))
             if len(args) - count > len(positional) or extra.keys() & kwargs.keys():
-                return call(*args, **kwargs)  # too many arguments, or one of them twice: Python says which
+                return call(*args, **kwargs)  # too many arguments, or one of them twice: Python raises
             given = extra | kwargs
             for old, new in new_names.items():
                 if given.get(old) is not None and given.get(new) is not None:
-                    raise TypeError(f"{old}= is the old name of {new}=: only one of them may be given, got both")
+                    raise TypeError(f"{old}= is the deprecated name of {new}=; only one of them may be given, got both")
             if extra:
                 keywords = [f"{new_names.get(name, name)}=" for name in extra]
                 keywords += [f"{k}={v!r}" for name in extra for k, v in also.get(name, {}).items()]
@@ -205,7 +205,7 @@ def former_signature(
 
 
 def outside_stacklevel() -> int:
-    """`stacklevel` for a warning of the caller that names the first line outside the package."""
+    """`stacklevel` of a warning by the caller, for the first line outside the package."""
     package, level = __name__.partition(".")[0], 1
     frame = sys._getframe(1)
     while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] == package:

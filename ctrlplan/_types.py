@@ -1,4 +1,4 @@
-"""Small types of several floors, on the ground floor."""
+"""Types shared by several subpackages."""
 
 from __future__ import annotations
 
@@ -14,26 +14,26 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 System: TypeAlias = "ct.InputOutputSystem"
-"""Any system of python-control, which has no types of its own."""
+"""Any system of python-control, which is not typed."""
 
 Value: TypeAlias = Any
-"""Number, array or symbol, or a sequence of them: what functions that are evaluated with symbols as well take."""
+"""Number, array or symbol, or a sequence of them: arguments of functions that can be evaluated symbolically."""
 
 Data: TypeAlias = dict[str, Any]
-"""A table of plain data, as of JSON or TOML: of what kind an entry is, is known once it is checked."""
+"""A table of plain data, as from JSON or TOML, before its entries are checked."""
 
 Params: TypeAlias = Mapping[str, Value]
-"""Parameters of blocks by name, of any kind that a block can use."""
+"""Parameters of blocks by name, of any type."""
 
 BlockMap: TypeAlias = Callable[[Value, Value, Value], Value]
-"""(t, state, input) of a block -> its outputs or rates."""
+"""(t, state, input) of a block -> outputs or rates."""
 
 
 class Frozen:
-    """Base of the public objects: attributes are set by the constructor only."""
+    """Base class of immutable objects."""
 
     def __setattr__(self, name: str, value: object) -> NoReturn:
-        raise AttributeError(f"{type(self).__name__} is immutable; make a new one instead of setting {name}")
+        raise AttributeError(f"{type(self).__name__} is immutable; create a new object instead of setting {name}")
 
     def __delattr__(self, name: str) -> NoReturn:
         raise AttributeError(f"{type(self).__name__} is immutable; {name} cannot be deleted")
@@ -52,24 +52,23 @@ class Frozen:
 
 
 class EventName(str):
-    """Name of an event that says in words of its own what happened.
+    """Name of an event with its own description.
 
-    A block declares what it watches by such a name; of a plain name it is said
-    that the signal left its limits.
+    For a plain name the description is that the signal left its limits.
 
     Parameters
     ----------
     name : str
-        The name.
+        Name of the event.
     words : str, optional
-        What is said of it, as "was at its limit" of an actuator; empty where
-        the name is itself a condition, as "goal out of reach".
+        Description, such as "was at its limit" for an actuator; empty if the
+        name is itself a condition, such as "goal out of reach".
     """
 
     words: str
 
     def __new__(cls, name: str, words: str = "") -> EventName:
-        """Name with its words."""
+        """Name with its description."""
         self = super().__new__(cls, name)
         self.words = words
         return self

@@ -1,10 +1,9 @@
-"""What a block declares to the simulation.
+"""Declared properties of blocks for the simulation.
 
-python-control knows of a block its equations, its signals and its time base.
-What else `ctrlplan.simulate` should know, the block declares: times at which
-its equations jump, direct feedthrough, a sample period, a start state. Nothing
-else is read off a block: an attribute that happens to be called ``delay`` or
-``period`` means nothing.
+A block of python-control has equations, signals and a time base. Further
+properties that `ctrlplan.simulate` uses are declared: times at which the equations
+jump, direct feedthrough, a sample period, an initial state. Other attributes of a
+block, such as ``delay`` or ``period``, are not used.
 """
 
 from __future__ import annotations
@@ -35,49 +34,49 @@ _ATTRIBUTE = "_ctrlplan_traits"
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class BlockTraits(Displayed):
-    """Declared properties of a block; set by `declare`, read by `traits_of`.
+    """Declared properties of a block; see `declare` and `traits_of`.
 
     Attributes
     ----------
     breakpoints : tuple of float, or None
-        Times [s] at which the equations of the block may jump or bend, as a
-        pulse or a switch in t does: the integrator stops there. None (default)
-        where they are not known: switches are looked for where the block can be
-        compiled; otherwise, if its functions read t, no step is longer than the
-        distance of two sample times.
+        Times [s] at which the equations of the block may be discontinuous or
+        not smooth in t, such as the edges of a pulse: the integrator stops there.
+        None (default) if unknown: switches are then detected if the block can be
+        compiled; otherwise, if its functions depend on t, steps are at most as
+        long as the distance of two sample times.
     feedthrough : None, bool or ndarray of bool, shape (noutputs, ninputs)
-        Which outputs depend directly on which inputs; None (default) where it
-        is not known.
+        Direct feedthrough from inputs to outputs; None (default) if unknown.
     initial_state : ndarray, shape (nstates,), or None
-        State at which a run starts unless `simulate` is given one. Default None: 0.
+        Initial state unless one is passed to `simulate`. Default None: 0.
     longest : float
-        Longest step from stop to stop [s] that the block allows. Default: infinite.
+        Maximum step of the integrator [s]. Default: infinite.
     watched : mapping of str to (callable, float, float)
-        Signals of the block whose limits are recorded as events: name, function
-        of (t, x, u, params), time last, lower and upper limit. Default: none.
+        Signals of the block of which limit violations are recorded as events:
+        function of (t, x, u, params) with time last, lower and upper limit, by
+        name. Default: none.
     period : float or None
-        Time between samples [s] of a block that is discrete in a continuous
-        loop; needs `sample`. Default None: the block is continuous.
+        Sample period [s] of a discrete-time block in a continuous-time loop;
+        requires `sample`. Default None: the block is in continuous time.
     offset : float
-        Time of the first sample [s] after the run begins. Default 0.
+        Time of the first sample [s] after the start of the simulation. Default 0.
     sample : callable or None
-        Function of (t, x, u, params) that returns the state after a sample, as
-        (nstates,). Between samples the state is held and ``outfcn`` gives the outputs.
+        Function of (t, x, u, params) that returns the state (nstates,) after a
+        sample. Between samples the state is constant and ``outfcn`` gives the
+        outputs.
     samples_first : bool
-        Whether the block is sampled before the other blocks that are due.
-        Default False.
+        Whether the block is sampled before other blocks with the same sample
+        time. Default False.
     plan : Trajectory or None
-        Trajectory that the outputs follow, axis by axis with its derivatives;
-        such a block has neither states nor inputs.
+        Trajectory of the outputs, axis by axis with derivatives; such a block has
+        neither states nor inputs.
     derivatives : int
-        Highest derivative of the plan among the outputs. Default 0.
+        Highest derivative of the plan in the outputs. Default 0.
     delay : float or None
-        Time [s] by which the outputs are the inputs delayed; such a block has
-        no states.
+        Delay [s] from the inputs to the outputs; such a block has no states.
     initial : float or ndarray, shape (ninputs,)
-        Outputs of a delay before the first input has passed. Default 0.
+        Outputs of a delay until the first delayed input. Default 0.
     block : control system or None
-        System inside, whose changes are changes of this block.
+        Inner system, whose changes are changes of this block.
     """
 
     breakpoints: tuple[float, ...] | None = None
@@ -114,14 +113,14 @@ _NONE = BlockTraits()
 
 
 def declare(system: S, **traits: object) -> S:
-    """Declare traits of a block to `ctrlplan.simulate`.
+    """Declare properties of a block for `ctrlplan.simulate`.
 
-    Traits declared before stay unless they are given again.
+    Previously declared traits remain unless they are given again.
 
     Parameters
     ----------
     system : control system
-        Block that is declared; python-control ignores the declaration.
+        Block; python-control ignores the declaration.
     **traits
         Fields of `BlockTraits` by name.
 
@@ -133,15 +132,14 @@ def declare(system: S, **traits: object) -> S:
     Raises
     ------
     TypeError
-        If a trait is unknown or of the wrong kind.
+        If a trait is unknown or of the wrong type.
     ValueError
-        If a value does not fit the block.
+        If a value is not valid for the block.
 
     Examples
     --------
-    A block with breakpoints. A force acts for one second; its jumps are
-    declared, so that no step of the integrator passes over them, however far
-    apart the sample times are:
+    A block with breakpoints. A force acts for one second. Its jumps are declared, so
+    that the integrator stops there, for any sample times:
 
     >>> import control as ct
     >>> import numpy as np
@@ -154,10 +152,10 @@ def declare(system: S, **traits: object) -> S:
     >>> cp.simulate(loop, [0, 10, 20]).outputs.round(9).tolist()
     [[0.0, 1.0, 1.0]]
 
-    A sampled block. A PI controller computes its output every 0.1 s and holds
-    it in between. `sample` returns the states after a sample, here the held
-    output and the sum of errors; ``outfcn`` gives the output between samples,
-    which does not depend on the input at that time:
+    A sampled block. A PI controller computes its output every 0.1 s and holds it
+    in between. `sample` returns the states after a sample, here the output and
+    the integrated error; ``outfcn`` gives the output between samples, without
+    direct feedthrough:
 
     >>> def sample(t, x, u, params):
     ...     error = u[0] - u[1]
@@ -166,7 +164,7 @@ def declare(system: S, **traits: object) -> S:
     >>> controller = ct.nlsys(
     ...     lambda t, x, u, params: [0.0, 0.0],
     ...     lambda t, x, u, params: x[0],
-    ...     inputs=["r", "y"], outputs="u", states=["held", "total"], params={"kp": 2.0, "ki": 1.0}, name="pi",
+    ...     inputs=["r", "y"], outputs="u", states=["output", "total"], params={"kp": 2.0, "ki": 1.0}, name="pi",
     ... )
     >>> controller = cp.declare(controller, period=0.1, sample=sample, feedthrough=False)
     >>> plant = ct.tf([1], [1, 1], inputs="u", outputs="y", name="plant")
@@ -175,11 +173,10 @@ def declare(system: S, **traits: object) -> S:
     >>> response.outputs["u"][:4].round(4).tolist()
     [2.1, 2.1, 1.7803, 1.7803]
 
-    A block without direct feedthrough. An observer's output is an estimate that
-    a function of states and measurements computes together with other values;
-    which of them depend on the input, its code does not say. Without the
-    declaration the loop through it would be an algebraic one, to be ruled out
-    by trial calls:
+    A block without direct feedthrough. The output of an observer is an estimate,
+    computed by a function of states and measurements together with other values.
+    Whether it depends on the input is not known from the code: without the
+    declaration trial calls are required to exclude an algebraic loop:
 
     >>> def observer(x, u, params):
     ...     return x, 3.0 * (u - x)  # estimate, and its rate
@@ -208,7 +205,7 @@ def declare(system: S, **traits: object) -> S:
 
 
 def traits_of(system: object) -> BlockTraits:
-    """Traits that a block has declared; the defaults where it has declared none.
+    """Declared traits of a block, or the defaults.
 
     Parameters
     ----------
@@ -225,13 +222,13 @@ def traits_of(system: object) -> BlockTraits:
     >>> cp.traits_of(cp.create_source_iosystem(plan)).plan is plan
     True
     """
-    # Of the object itself: a class or a foreign __getattr__ declares nothing.
+    # Of the object itself, not of its class or by __getattr__.
     found = getattr(system, "__dict__", {}).get(_ATTRIBUTE, _NONE)
     return found if isinstance(found, BlockTraits) else _NONE
 
 
 class DeclaredTrait(Generic[T]):
-    """Attribute of a block class that reads and sets a declared trait of the same name."""
+    """Attribute of a block class for the declared trait of the same name."""
 
     def __set_name__(self, owner: type, name: str) -> None:
         self._name = name
@@ -250,7 +247,7 @@ class DeclaredTrait(Generic[T]):
 
 
 def _check_kind(system: ct.InputOutputSystem, traits: Mapping[str, object], label: str) -> None:
-    """Raise where a trait would have no effect on a system of this kind."""
+    """Raise if a trait has no effect on a system of this type."""
     if isinstance(system, ct.NonlinearIOSystem) and not isinstance(system, ct.InterconnectedSystem | ct.StateSpace):
         return
     if not isinstance(system, ct.InputOutputSystem):
@@ -258,12 +255,12 @@ def _check_kind(system: ct.InputOutputSystem, traits: Mapping[str, object], labe
     inner = isinstance(system, ct.InterconnectedSystem)
     for name in traits:
         if name != "initial_state":
-            what = "an interconnection: declare it on its block" if inner else "a linear system: make a nonlinear block"
+            what = "an interconnection: declare it for its block" if inner else "a linear system: use a nonlinear block"
             raise TypeError(f"{name} has no effect on {label}, {what}")
 
 
 def _check_function_of_time(traits: BlockTraits, system: ct.InputOutputSystem, label: str) -> None:
-    """Raise unless a delay, or the source of a plan, has the signals that belong to it."""
+    """Raise unless a delay or the source of a plan has the required signals."""
     if traits.delay is None and traits.plan is None:
         return
     if traits.delay is not None and traits.plan is not None:
@@ -273,12 +270,12 @@ def _check_function_of_time(traits: BlockTraits, system: ct.InputOutputSystem, l
     if states or outputs != wanted or (traits.plan is not None and inputs):
         kind = "a delay" if traits.delay is not None else f"the source of a plan with {traits.derivatives} derivatives"
         raise ValueError(
-            f"{label} must have no states and as many signals as {kind} has, got {inputs} inputs, {outputs} outputs "
+            f"{label} must have no states and the signals of {kind}, got {inputs} inputs, {outputs} outputs "
             f"and {states} states"
         )
 
 
-def _checked(name: str, value: object, system: ct.InputOutputSystem) -> Any:  # by the field that it is for
+def _checked(name: str, value: object, system: ct.InputOutputSystem) -> Any:  # type of the field
     label = f"{name} of {_label(system)}"
     check = _CHECKS.get(name)
     return value if check is None else check(value, label, system)

@@ -81,7 +81,7 @@ def test_limits_of_one_side():
     assert checked_range((-math.inf, math.inf), "limits") == (-math.inf, math.inf)
     assert checked_limits((-math.inf, 5.0), "limits") == (-math.inf, 5.0, 5.0)
     assert checked_limits((0.0, math.inf), "limits") == (0.0, math.inf, 1.0)
-    with pytest.raises(ValueError, match=r"^limits must hold a finite one, got -inf and inf$"):
+    with pytest.raises(ValueError, match=r"^limits must contain a finite one, got -inf and inf$"):
         checked_limits((-math.inf, math.inf), "limits")
 
 

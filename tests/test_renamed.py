@@ -42,7 +42,7 @@ def test_an_old_keyword_is_read_with_a_warning():
 
 
 def test_both_names_together_are_an_error():
-    with pytest.raises(TypeError, match=re.escape("only= is the old name of measures=")):
+    with pytest.raises(TypeError, match=re.escape("only= is the deprecated name of measures=")):
         renamed_argument("only", ("a",), "measures", ("a",))
 
 
@@ -51,6 +51,7 @@ OLD_NAMES = [
     (lambda: cp.clearance(PLANE, [cp.Disc((9.0, 0.0), 1.0)]), "least", "minimum"),
     (lambda: cp.fastest(cp.PolySpline(MOVE), {"velocity": 1.0}), "refusal", "rejection"),
     (lambda: reports, "plot_rivals", "plot_baselines"),
+    (lambda: cp.margins(cp.PolySpline(MOVE), {"velocity": 9.0}), "hold", "satisfied"),
     (lambda: planning, "path_length", "plan_length"),
     (lambda: planning, "wandering", "plan_excess_length"),
 ]

@@ -131,8 +131,8 @@ def test_a_trait_declared_later_is_seen_by_the_next_run():
         ({"sample": len}, ValueError, "period and sample of lag must be declared together"),
         ({"period": 1.0, "sample": 3}, TypeError, "sample of lag must be a function"),
         ({"offset": -0.1}, ValueError, "offset of lag must be finite and at least 0 s"),
-        ({"delay": 0.5}, ValueError, "lag must have no states and as many signals as a delay has"),
-        ({"plan": PLAN}, ValueError, "lag must have no states and as many signals as the source of a plan"),
+        ({"delay": 0.5}, ValueError, "lag must have no states and the signals of a delay"),
+        ({"plan": PLAN}, ValueError, "lag must have no states and the signals of the source of a plan"),
         ({"watched": {"u": (len, 2.0, 1.0)}}, ValueError, "watched of lag must map names"),
     ],
 )
@@ -148,7 +148,7 @@ def test_traits_that_do_not_fit(traits, kind, message):
         (ct.tf([1], [1, 1], name="plant"), "breakpoints has no effect on plant, a linear system"),
         (
             ct.interconnect([lag()], inputs="u", outputs="y", name="loop"),
-            "breakpoints has no effect on loop, an interconnection: declare it on its block",
+            "breakpoints has no effect on loop, an interconnection: declare it for its block",
         ),
         ("plant", "system must be a control system, got str"),
     ],

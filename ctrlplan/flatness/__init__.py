@@ -1,4 +1,4 @@
-"""Differential flatness: plants whose states and inputs follow from their flat outputs."""
+"""Differential flatness: states and inputs as functions of flat outputs."""
 
 from ctrlplan.flatness.system import FlatSystem
 

@@ -6,10 +6,10 @@ the flat output z of the reachable form,
 .. math:: z^{(k)} = q A^k x \ (k < n), \quad z^{(n)} = u - \sum_k a_k z^{(k)}, \quad
     x = \sum_k w_k z^{(k)}, \quad w_{n-1} = B, \ w_{k-1} = A w_k + a_k B
 
-where q is the row with q w_k = 0 but for q w_0 = 1. Floating-point numbers are
-fractions, so that all of this is computed without rounding; python-control's
-`LinearFlatSystem` inverts the reachability matrix, which costs digits where
-time constants are far apart.
+where q is the row with q w_k = 0 except for q w_0 = 1. Floating-point numbers are
+fractions, so all of this is computed without rounding. python-control's
+`LinearFlatSystem` inverts the reachability matrix, which is inaccurate if time
+constants differ by orders of magnitude.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ from ctrlplan._types import Array, Value
 Matrix = list[list[Fraction]]
 
 _NOTHING = 1e-9
-"""Part of its terms up to which a coefficient counts as 0."""
+"""Magnitude relative to its terms below which a coefficient is 0."""
 
 
 class LinearMaps(NamedTuple):
-    """Flag and state of a linear flat system, and its output by the flag."""
+    """Maps between flag and state of a linear flat system, and its output as a function of the flag."""
 
-    flag: Array  # (n + 1, n + 1), z, ..., z^(n) by state and input
-    states: Array  # (n, n), by z, ..., z^(n - 1)
-    inputs: Array  # (1, n + 1), by z, ..., z^(n): a_0, ..., a_(n - 1), 1
-    output: Array  # (n + 1,), by z, ..., z^(n)
+    flag: Array  # (n + 1, n + 1), z, ..., z^(n) as functions of state and input
+    states: Array  # (n, n), as functions of z, ..., z^(n - 1)
+    inputs: Array  # (1, n + 1), as functions of z, ..., z^(n): a_0, ..., a_(n - 1), 1
+    output: Array  # (n + 1,), as a function of z, ..., z^(n)
 
     def forward(self, x: Value, u: Value) -> list[Value]:
         """Flag of a state and an input."""
@@ -66,7 +66,7 @@ def linear_maps(system: fs.LinearFlatSystem) -> LinearMaps:
     Raises
     ------
     ValueError
-        If the system is not controllable, or a coefficient is beyond floating point.
+        If the system is not controllable, or a coefficient overflows.
     """
     a, b, c = (_fractions(matrix) for matrix in (system.A, system.B, system.C))
     n, through = len(a), Fraction(float(system.D[0, 0]))
@@ -89,7 +89,7 @@ def linear_maps(system: fs.LinearFlatSystem) -> LinearMaps:
         )
     except OverflowError:
         raise ValueError(
-            f"coefficients of the flat maps of {system.name} must stay within floating point, got larger ones; "
+            f"coefficients of the flat maps of {system.name} must stay within floating point, got an overflow; "
             "choose a time unit nearer to its time constants"
         ) from None
 

@@ -1,4 +1,4 @@
-"""States and inputs of flat systems without names of their own, as functions of the jet of a plan."""
+"""States and inputs of python-control's flat systems as functions of the jet of a plan."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ctrlplan.flatness.verify import FlatPlant, check_maps, checked_plant, warn_
 
 
 def flat_quantities(flat_system: fs.FlatSystem) -> Callable[[Array], dict[str, Array]]:
-    """Old name: `ctrlplan.fastest` and `ctrlplan.margins` take the flat system itself.
+    """Deprecated: pass the flat system itself to `fastest` or `margins`.
 
     Warns
     -----
@@ -27,42 +27,44 @@ def flat_quantities(flat_system: fs.FlatSystem) -> Callable[[Array], dict[str, A
 
 
 def quantities_of_flat_system(flat_system: fs.FlatSystem) -> Callable[[Array], dict[str, Array]]:
-    """States and inputs of a flat system as functions of the jet of its flat outputs.
+    """States and inputs of a flat system as functions of the jet.
 
-    Those of a `ctrlplan.flatness.FlatSystem` itself; of any other of
-    python-control's by its reverse map, one time after the other.
+    For a `ctrlplan.flatness.FlatSystem`, its method `quantities`; for other flat
+    systems of python-control, by the reverse map, one time after the other.
 
     Parameters
     ----------
     flat_system : control.flatsys.FlatSystem
-        In continuous time; the states must be functions of the flags without
-        their last entries.
+        Flat system in continuous time, whose states must be functions of the
+        flags without their last entries.
 
     Returns
     -------
     callable
         Maps a jet (order + 1, nflat, ntime) to states and inputs (ntime,) by
-        name: the states from one order less than the inputs need.
+        name. The states require one order less than the inputs.
 
     Raises
     ------
     TypeError
-        If `flat_system` is no `control.flatsys.FlatSystem`.
+        If `flat_system` is not a `control.flatsys.FlatSystem`.
     ValueError
         If it is in discrete time, or `forward`, `reverse` and the equations of
-        motion do not belong together; by the function, if the jet is too short or
-        has another number of axes.
+        motion are inconsistent; by the returned function, if the jet is too short
+        or has another number of axes.
 
     Warns
     -----
     UserWarning
         If it is a `LinearFlatSystem` whose output is not its flat output, but a
-        multiple of it or, where the plant has zeros, a sum of its derivatives.
+        multiple of it or, if the plant has zeros, a linear combination of its
+        derivatives.
 
     Notes
     -----
-    What the flat output does not determine at rest (heading and steering angle of
-    a car, quotients of derivatives that are 0 there) is nan at rest.
+    States and inputs that the flat output does not determine at rest (heading and
+    steering angle of a car, quotients of derivatives that are 0 there) are nan
+    at rest.
     """
     if isinstance(flat_system, FlatSystem):
         return flat_system.quantities
@@ -70,7 +72,7 @@ def quantities_of_flat_system(flat_system: fs.FlatSystem) -> Callable[[Array], d
     warn_of_output(flat_system)
     check_maps(flat_system)
     states, inputs = list(flat_system.state_labels), list(flat_system.input_labels)
-    # Off zero, where some flags are not finite.
+    # Not at zero, where some flags are not finite.
     flag = plant.forward(0.1 * np.ones(len(states)), 0.1 * np.ones(len(inputs)))
     lengths = [len(row) for row in flag]
     longest = max(lengths)
@@ -85,14 +87,14 @@ def quantities_of_flat_system(flat_system: fs.FlatSystem) -> Callable[[Array], d
         known = len(jet) >= longest
         values = jet if known else np.concatenate([jet, np.zeros((1, *jet.shape[1:]))])
         columns: list[NDArray[np.generic]] = []
-        with np.errstate(divide="ignore", invalid="ignore"):  # nan says the same
+        with np.errstate(divide="ignore", invalid="ignore"):  # the result is nan
             for k in range(jet.shape[2]):
                 x, u = plant.reverse([values[:length, j, k] for j, length in enumerate(lengths)])
                 columns.append(np.concatenate([x, u]))
         rows = np.array(columns, dtype=float).T
         if undetermined.any():
             speed = np.abs(values[1]).max(axis=0)
-            # Nearer to rest than this a quotient of derivatives is one of their rounding.
+            # Nearer to rest a quotient of derivatives is one of rounding errors.
             rows[np.ix_(undetermined, speed <= 1e-6 * speed.max())] = np.nan
         names = [*states, *inputs] if known else states
         return dict(zip(names, rows, strict=False))
@@ -101,15 +103,15 @@ def quantities_of_flat_system(flat_system: fs.FlatSystem) -> Callable[[Array], d
 
 
 def _undetermined_at_rest(plant: FlatPlant, lengths: list[int]) -> NDArray[np.bool_]:
-    """Whether each state and input keeps depending on derivatives however slow the plan is."""
+    """Whether each state and input depends on derivatives in the limit of a slow plan."""
 
     def found(flag: list[Array], pace: float) -> Array | None:
-        """States and inputs along a plan that is slowed down, None outside of their domain."""
+        """States and inputs along a slower plan; None outside of their domain."""
         slowed = [row * pace ** np.arange(row.size) for row in flag]
         with np.errstate(all="ignore"):
             try:
                 both = np.concatenate(plant.reverse(slowed)).astype(float)
-            except Exception:  # of a trial call, whatever it is
+            except Exception:  # any exception of a trial call
                 return None
         return both if np.isfinite(both).all() else None
 

@@ -1,4 +1,4 @@
-"""The flat-system interface: one class, whatever its maps come from."""
+"""Flat systems with named flat outputs."""
 
 from __future__ import annotations
 
@@ -18,11 +18,12 @@ Flag = Sequence[Array]
 
 
 class FlatSystem(Displayed, fs.FlatSystem):  # type: ignore[misc]
-    """Flat system with named flat outputs and maps over many times.
+    """Flat system with named flat outputs and vectorised maps.
 
-    A `control.flatsys.FlatSystem`: `forward` and `reverse` work in
-    `control.flatsys.point_to_point`, and the system simulates and connects as
-    any other. `ctrlplan.fastest` and `ctrlplan.margins` take it as ``system=``.
+    A `control.flatsys.FlatSystem`: `forward` and `reverse` can be used by
+    `control.flatsys.point_to_point`, and the system can be simulated and
+    interconnected as any other. `ctrlplan.fastest` and `ctrlplan.margins` accept
+    it as ``system=``.
 
     Parameters
     ----------
@@ -32,11 +33,11 @@ class FlatSystem(Displayed, fs.FlatSystem):  # type: ignore[misc]
     reverse : callable
         ``reverse(flag, params) -> (x, u)``. Rows of the flag have the shape
         (r_j + 1, ...), x (nstates, ...) and u (ninputs, ...): the trailing axes
-        are times, which one call maps all.
+        are times, all mapped by one call.
     updfcn, outfcn : callable
         As in `control.nlsys`.
     orders : sequence of int
-        r_j of each flat output: the highest derivative that `reverse` reads.
+        r_j of each flat output, the highest derivative that `reverse` uses.
     flat_labels : sequence of str
         Names of the flat outputs.
     states, inputs, outputs : sequence of str
@@ -44,16 +45,17 @@ class FlatSystem(Displayed, fs.FlatSystem):  # type: ignore[misc]
     name : str
         Name of the system.
     quantities : callable, optional
-        Replaces the method `quantities`, for signals beyond states and inputs.
+        Replaces the method `quantities`, for signals in addition to states and
+        inputs.
     params : mapping of str to float, optional
         Default parameters.
 
     Attributes
     ----------
     orders : tuple of int
-        See above. They add up to ``nstates + extension``.
+        r_j of each flat output, of sum ``nstates + extension``.
     extension : int
-        Number of states of the dynamic extension: 0 where static feedback
+        Number of states of the dynamic extension: 0 if static feedback
         linearises the system.
     flat_labels : tuple of str
         Names of the flat outputs, in the order of the flag.
@@ -61,8 +63,8 @@ class FlatSystem(Displayed, fs.FlatSystem):  # type: ignore[misc]
     Raises
     ------
     ValueError
-        If orders or labels are not one for each input, or the orders add up to
-        less than the number of states.
+        If the number of orders or labels differs from that of inputs, or the sum
+        of the orders is less than the number of states.
 
     Examples
     --------
@@ -148,15 +150,15 @@ class FlatSystem(Displayed, fs.FlatSystem):  # type: ignore[misc]
         Parameters
         ----------
         plan : Trajectory
-            Plan of the flat outputs: by name where its labels are theirs, in
-            order where its labels are the default ones. Before its start and
-            after its end the positions are held.
+            Plan of the flat outputs, assigned by name if its labels are those of
+            the flat outputs, or in order if its labels are the defaults. Before
+            its start and after its end the positions are constant.
         timepts : array_like, any shape
             Times [s], in any order.
         start : array_like, shape (nstates,), optional
-            State at the plan's start. It selects among several states that have
-            the same flag; maps in closed form, as the crane's, have one branch
-            and do not read it.
+            State at the plan's start, to select one of several states with the
+            same flag. Closed-form maps, as those of the crane, have one branch
+            and ignore it.
 
         Returns
         -------
@@ -168,11 +170,11 @@ class FlatSystem(Displayed, fs.FlatSystem):  # type: ignore[misc]
         Raises
         ------
         TypeError
-            If `plan` is no trajectory.
+            If `plan` is not a trajectory.
         ValueError
             If the plan's labels are not those of the flat outputs, a derivative
-            below r_j jumps between the times (which, and when), `start` has a
-            wrong shape, or the maps are singular (which signal, and when).
+            below r_j jumps between the times, `start` has a wrong shape, or the
+            maps are singular. The message states the signal and the time.
         """
         plan = self._matched(plan)
         times = checked_timepts(timepts)
@@ -190,19 +192,19 @@ class FlatSystem(Displayed, fs.FlatSystem):  # type: ignore[misc]
         return np.asarray(x), np.asarray(u)
 
     def quantities(self, jet: ArrayLike) -> dict[str, Array]:
-        """Signals of the plant by name, as functions of the jet of the flat outputs.
+        """Signals of the plant by name, from the jet of the flat outputs.
 
         Parameters
         ----------
         jet : array_like, shape (order + 1, nflat, ...)
-            Derivatives of the flat outputs. Inputs need the order max(orders),
-            states one less.
+            Derivatives of the flat outputs, up to the order max(orders) for
+            inputs, or one less for states.
 
         Returns
         -------
         dict of str to ndarray, shape (...)
-            States, inputs and what the plant adds; of a shorter jet those that
-            follow from it.
+            States, inputs and additional signals of the plant; for a shorter jet
+            those that are determined by it.
 
         Raises
         ------
@@ -219,7 +221,7 @@ class FlatSystem(Displayed, fs.FlatSystem):  # type: ignore[misc]
                 f"{highest} for inputs, got {values.shape}"
             )
         known = len(values) > highest
-        if not known:  # the states do not depend on the last derivatives
+        if not known:  # states do not depend on the last derivatives
             values = np.concatenate([values, np.zeros((1, *values.shape[1:]))])
         x, u = self.reverse([values[: r + 1, j] for j, r in enumerate(self.orders)], self.params)
         found = dict(zip(self.state_labels, np.asarray(x), strict=True))
@@ -238,10 +240,10 @@ class FlatSystem(Displayed, fs.FlatSystem):  # type: ignore[misc]
         )
 
     def _check_smooth(self, plan: Trajectory, first: float, last: float) -> None:
-        """Reject a plan of which a derivative below r_j jumps between two times."""
+        """Raise if a derivative below r_j jumps between two times."""
         order_of = dict(zip(plan.labels, self.orders, strict=True))
         for jump in plan.jumps(max(self.orders) - 1):
-            # At an inner breakpoint and at the start the value is that from the right, at the end that from the left.
+            # At inner breakpoints and the start the value is the right limit, at the end the left limit.
             between = first <= jump.time < last if jump.time == plan.end else first < jump.time <= last
             if between and jump.order < order_of[jump.label]:
                 what = "position" if jump.order == 0 else f"derivative {jump.order}"
@@ -251,7 +253,7 @@ class FlatSystem(Displayed, fs.FlatSystem):  # type: ignore[misc]
                 )
 
     def _check_regular(self, row: Array, label: str, times: Array) -> None:
-        """Reject a signal that the plan does not determine."""
+        """Raise for a signal that the plan does not determine."""
         wrong = np.broadcast_to(~np.isfinite(row), times.shape)
         if wrong.any():
             k = np.unravel_index(int(wrong.argmax()), times.shape)

@@ -1,7 +1,7 @@
-"""Checks of a flat system's maps: that they belong together, to its motion, and that static feedback linearises it.
+"""Checks of the maps of flat systems: consistency, equations of motion, linearisation by static feedback.
 
-The maps are evaluated at a few states, drawn at random from a fixed seed and
-from `reverse`: a system is rejected for what is found there.
+The maps are evaluated at a few states, drawn at random with a fixed seed and
+from `reverse`.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ _PROBES = 8
 """Points of each kind at which the maps are evaluated."""
 
 _SAME = 1e-6
-"""Relative difference up to which numbers count as equal, and singular values as 0."""
+"""Relative tolerance for equal numbers and zero singular values."""
 
 _MUST = "flat must be linearisable by static feedback"
 
 
 @dataclass(frozen=True)
 class FlatPlant:
-    """A flat system's maps at its own parameters."""
+    """Maps of a flat system at its default parameters."""
 
     system: System
     nstates: int
@@ -66,7 +66,7 @@ class Probe:
 
 @dataclass(frozen=True)
 class _LinearPlant(FlatPlant):
-    """A linear flat system with maps of all digits."""
+    """A linear flat system with maps correct to rounding."""
 
     maps: LinearMaps
 
@@ -78,7 +78,7 @@ class _LinearPlant(FlatPlant):
 
 
 def checked_plant(flat_system: System, label: str = "flat_system") -> FlatPlant:
-    """Maps of a flat system in continuous time, which has states and inputs."""
+    """Maps of a flat system, checked to be in continuous time with states and inputs."""
     if not isinstance(flat_system, fs.FlatSystem):
         raise TypeError(f"{label} must be a control.flatsys.FlatSystem, got {type(flat_system).__name__}")
     if flat_system.dt not in (None, 0):
@@ -92,20 +92,20 @@ def checked_plant(flat_system: System, label: str = "flat_system") -> FlatPlant:
 
 
 def check_maps(flat_system: fs.FlatSystem) -> None:
-    """Raise where the maps of a flat system do not belong together, or to its motion.
+    """Raise if the maps of a flat system are inconsistent with each other or with its equations of motion.
 
     Raises
     ------
     ValueError
-        With what was found: a state and an input whose flag `reverse` does not
-        return to, or whose flag changes at other rates than it states.
+        With a state and an input for which `reverse` is not the inverse of
+        `forward`, or the flag is not consistent with its derivatives.
     """
     plant = checked_plant(flat_system)
     if isinstance(plant, _LinearPlant):
         return
     try:
         probes = random_probes(plant)
-    except ValueError:  # it is regular elsewhere: nothing is known of it
+    except ValueError:  # it may be regular elsewhere
         return
     names = default_labels(plant.ninputs)
     sizes = _sizes(probes)
@@ -115,7 +115,7 @@ def check_maps(flat_system: fs.FlatSystem) -> None:
 
 
 def warn_of_output(flat_system: fs.FlatSystem) -> None:
-    """Warn where a linear system's flat output, which python-control chose, is not its output."""
+    """Warn if the flat output of a linear system, as python-control defines it, is not its output."""
     if not is_linear(flat_system):
         return
     coefficients = linear_maps(flat_system).output
@@ -124,24 +124,24 @@ def warn_of_output(flat_system: fs.FlatSystem) -> None:
     if not coefficients[1:].any():
         if abs(gain - 1.0) > _SAME:
             warnings.warn(
-                f"{chosen}, but {name} is {gain:.6g} times it: a plan of {name} must be multiplied by "
-                f"{1.0 / gain:.6g}, or flat_system be a control.flatsys.FlatSystem whose flat output it is",
+                f"{chosen}, but {name} is {gain:.6g} times the flat output: multiply a plan of {name} by "
+                f"{1.0 / gain:.6g}, or use a control.flatsys.FlatSystem with the flat output {name}",
                 stacklevel=outside_stacklevel(),
             )
         return
     terms = [f"{value:.6g} {derivative_name('z', k)}" for k, value in enumerate(coefficients.tolist()) if value]
-    at_rest = f"{name} is 0 wherever z is at rest"
+    at_rest = f"at rest {name} is 0"
     if gain:
-        at_rest = f"it leads {name} from rest to rest where its positions are those of {name} times {1.0 / gain:.6g}"
+        at_rest = f"at rest z is {name} times {1.0 / gain:.6g}"
     warnings.warn(
         f"{chosen}, since the plant has zeros: {name} = {' + '.join(terms)}, z the flat output. A plan is one of z, "
-        f"not of {name}; {at_rest}, and on the way {name} differs from its plan by the derivatives of z",
+        f"not of {name}; {at_rest}, and in motion {name} depends on the derivatives of z",
         stacklevel=outside_stacklevel(),
     )
 
 
 def finite_rows(function: Callable[..., Value], *args: Value) -> list[Array] | None:
-    """What a map returns, row by row, or None outside of its domain."""
+    """Rows of the result of a map, or None outside of its domain."""
     with np.errstate(all="raise", under="ignore"):
         try:
             rows = [np.atleast_1d(np.asarray(row, dtype=float)) for row in function(*args)]
@@ -151,32 +151,32 @@ def finite_rows(function: Callable[..., Value], *args: Value) -> list[Array] | N
 
 
 def random_probes(plant: FlatPlant) -> list[Probe]:
-    """Random states and inputs, where the flag is finite."""
+    """Random states and inputs with a finite flag."""
     rng = np.random.default_rng(0)
     draws = [(rng.normal(size=plant.nstates), rng.normal(size=plant.ninputs)) for _ in range(_PROBES)]
     probes = [probe for x, u in draws for probe in _probe(plant, x, u)]
     if not probes:
         with np.errstate(all="ignore"):
-            got = plant.forward(*draws[0])  # says itself what is wrong, where it fails
-        raise ValueError(f"forward must be finite in some of the states probed, got {got} and the like")
+            got = plant.forward(*draws[0])  # raises the error of the map, if any
+        raise ValueError(f"forward must be finite in some of the random states, got {got}")
     orders = probes[0].orders
     if len(orders) != plant.ninputs or min(orders) < 1 or any(probe.orders != orders for probe in probes):
         raise ValueError(
-            f"forward must return as many flags as inputs, {plant.ninputs}, each of two entries or more and always "
-            f"as long, got lengths {[r + 1 for r in probes[-1].orders]}"
+            f"forward must return one flag per input, {plant.ninputs}, each of two entries or more and of constant "
+            f"length, got lengths {[r + 1 for r in probes[-1].orders]}"
         )
     return probes
 
 
 def planned_probes(plant: FlatPlant, orders: list[int]) -> list[Probe]:
-    """States and inputs of random flags, which have the plant's own size; and the zero state under the law's input."""
+    """States and inputs of random flags of realistic magnitude, and the zero state with the input of the law."""
     rng = np.random.default_rng(1)
     flags = [[rng.normal(size=r + 1) for r in orders] for _ in range(_PROBES)]
     probes = [probe for flag in flags for x, u in _reversed(plant, flag) for probe in _probe(plant, x, u)]
     if not probes:
         with np.errstate(all="ignore"):
             got = plant.reverse(flags[0])
-        raise ValueError(f"reverse must be finite for some of the flags probed, got {got} and the like")
+        raise ValueError(f"reverse must be finite for some of the random flags, got {got}")
     for rest in _probe(plant, np.zeros(plant.nstates), np.zeros(plant.ninputs)):
         for _, u in _reversed(plant, [np.append(row[:-1], 0.0) for row in rest.flag]):
             probes += _probe(plant, rest.x, u)
@@ -184,7 +184,7 @@ def planned_probes(plant: FlatPlant, orders: list[int]) -> list[Probe]:
 
 
 def _probe(plant: FlatPlant, x: Array, u: Array) -> Iterator[Probe]:
-    """The probe at a state and an input, if the flag is finite there."""
+    """The probe at a state and an input, if its flag is finite."""
     flag = finite_rows(plant.forward, x, u)
     if flag is not None:
         yield Probe(x, u, flag)
@@ -203,7 +203,7 @@ def _reversed(plant: FlatPlant, flag: list[Array]) -> Iterator[tuple[Array, Arra
 
 
 def flat_labels(plant: FlatPlant, probes: list[Probe], labels: Sequence[str] | str | None) -> tuple[str, ...]:
-    """Names of the flat outputs: the given ones, those of the outputs that they are, or y, y1, ..."""
+    """Names of the flat outputs: the given ones, those of equal outputs, or y, y1, ..."""
     outputs = list(plant.system.output_labels or [])
     if labels is None and len(outputs) == plant.ninputs and not any("[" in label for label in outputs):
         first = [[row[0] for row in probe.flag] for probe in probes]
@@ -213,7 +213,7 @@ def flat_labels(plant: FlatPlant, probes: list[Probe], labels: Sequence[str] | s
 
 
 def check_linearises(plant: FlatPlant, probes: list[Probe], names: Sequence[str]) -> None:
-    """Raise for maps of which the law would not make chains of integrators."""
+    """Raise if static feedback does not give chains of integrators."""
     if isinstance(plant, _LinearPlant):  # its maps are exact
         return
     sizes = _sizes(probes)
@@ -233,12 +233,12 @@ def check_linearises(plant: FlatPlant, probes: list[Probe], names: Sequence[str]
 
 
 def _sizes(probes: list[Probe]) -> list[Array]:
-    """Size of each entry of the flags, over all probes."""
+    """Magnitude of each entry of the flags over all probes."""
     return [np.max(rows, axis=0) for rows in zip(*([np.abs(row) for row in p.flag] for p in probes), strict=True)]
 
 
 def _varied(plant: FlatPlant, probe: Probe, step: float) -> Iterator[tuple[int, float, list[Array], list[Array]]]:
-    """Flags with each input in turn a step lower and higher."""
+    """Flags with each input decreased and increased by a step."""
     for j in range(plant.ninputs):
         change = np.zeros(plant.ninputs)
         change[j] = step * max(1.0, abs(probe.u[j]))
@@ -248,7 +248,7 @@ def _varied(plant: FlatPlant, probe: Probe, step: float) -> Iterator[tuple[int, 
 
 
 def _check_below(plant: FlatPlant, probe: Probe, names: Sequence[str], sizes: list[Array]) -> None:
-    """Raise where a derivative below the last depends on an input."""
+    """Raise if a derivative below the last depends on an input."""
     for j, _, low, high in _varied(plant, probe, 0.5):
         for name, below, above, size in zip(names, low, high, sizes, strict=True):
             moved = np.abs(above - below)[:-1] > _SAME * size[:-1]
@@ -261,7 +261,7 @@ def _check_below(plant: FlatPlant, probe: Probe, names: Sequence[str], sizes: li
 
 
 def _check_decoupling(plant: FlatPlant, probe: Probe, names: Sequence[str]) -> None:
-    """Raise where the inputs cannot set the last derivatives."""
+    """Raise if the decoupling matrix is singular."""
     matrix = np.full((plant.ninputs, plant.ninputs), np.nan)
     for j, change, low, high in _varied(plant, probe, 1e-4):
         below, above = (np.array([row[-1] for row in flag]) for flag in (low, high))
@@ -274,29 +274,28 @@ def _check_decoupling(plant: FlatPlant, probe: Probe, names: Sequence[str]) -> N
         if not row.any():
             raise ValueError(
                 f"{_MUST}: the last derivative of a flag must depend on an input, got derivative {r} of flat output "
-                f"{name}, which depends on none {where}: a flag too short or a singular decoupling matrix"
+                f"{name}, which does not {where}: the flag is too short or the decoupling matrix singular"
             )
-    # Inputs and flat outputs have units of their own.
+    # Scaled, as inputs and flat outputs have different units.
     for axis in (1, 0):
         size = np.abs(matrix).max(axis=axis, keepdims=True)
         matrix = matrix / np.where(size > 0.0, size, 1.0)
     rank = int((np.linalg.svd(matrix, compute_uv=False) > _SAME).sum())
     if rank < plant.ninputs:
         raise ValueError(
-            f"{_MUST}: the decoupling matrix, last derivatives by inputs, must have rank {plant.ninputs}, "
-            f"got {rank} {where}"
+            f"{_MUST}: the decoupling matrix of last derivatives must have rank {plant.ninputs}, got {rank} {where}"
         )
 
 
 def _check_derivatives(plant: FlatPlant, probe: Probe, names: Sequence[str]) -> None:
-    """Raise where an entry of a flag is not the derivative of the one before."""
+    """Raise if an entry of a flag is not the derivative of the previous one."""
     try:
         found = finite_rows(plant.rates, probe.x, probe.u)
-    except NotImplementedError:  # a flat system may come without equations of motion
+    except NotImplementedError:  # a flat system without equations of motion
         return
     if found is None:
         return
-    # Points along the motion, so close that no state changes by more than about 1e-4.
+    # Points along the motion, with changes of the states of at most about 1e-4.
     pace = float(np.max(np.abs(found[0]) / (1.0 + np.abs(probe.x)))) or 1.0
     h = 1e-4 / pace
     flags = [flag for k in (-2, -1, 1, 2) if (flag := finite_rows(plant.forward, probe.x + k * h * found[0], probe.u))]
@@ -315,15 +314,15 @@ def _check_derivatives(plant: FlatPlant, probe: Probe, names: Sequence[str]) -> 
 
 
 def _check_reverse(plant: FlatPlant, probe: Probe, names: Sequence[str], sizes: list[Array]) -> None:
-    """Raise where reverse does not undo forward; another state with the same flag is accepted."""
+    """Raise if reverse is not the inverse of forward; another state with the same flag is accepted."""
     for x, u in _reversed(plant, probe.flag):
         again = finite_rows(plant.forward, x, u) or [np.full(size.shape, np.nan) for size in sizes]
         for name, given, got, size in zip(names, probe.flag, again, sizes, strict=True):
-            # python-control's own maps of stiff linear systems lose some of the digits.
-            kept = np.abs(got - given) <= 100.0 * _SAME * size
-            if not kept.all():
-                k = int(kept.argmin())
+            # python-control's maps of stiff linear systems have rounding errors.
+            equal = np.abs(got - given) <= 100.0 * _SAME * size
+            if not equal.all():
+                k = int(equal.argmin())
                 raise ValueError(
-                    f"reverse must undo forward, got a state and an input with {got[k]:.6g} as derivative {k} of flat "
-                    f"output {name} for a flag with {given[k]:.6g}"
+                    f"reverse must be the inverse of forward, got {got[k]:.6g} after both as derivative "
+                    f"{k} of flat output {name} of a flag with {given[k]:.6g}"
                 )

@@ -1,8 +1,9 @@
-"""What a response and a plan are worth: plain functions of times and signals.
+"""Metrics of responses and plans: functions of sample times and signals.
 
-Every function takes sample times first, (ntime,), strictly increasing and not necessarily even, and signals with time
-last. Where leading axes are allowed, (..., ntime), a single record gives a float and more give an array (...). Between
-samples a signal is taken for a cubic, so that a smooth signal's metrics are of fourth order in the sample spacing.
+The first argument of every function is an array of sample times, (ntime,), strictly increasing but not necessarily
+even; signals have time last. Where leading axes are allowed, (..., ntime), a single signal gives a float and several
+give an array (...). Between samples a signal is interpolated by cubics: for smooth signals the error of the metrics is
+of fourth order in the sample spacing.
 """
 
 from ctrlplan.metrics._control import effort, peak, saturation_time, total_variation

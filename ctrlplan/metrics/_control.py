@@ -1,4 +1,4 @@
-"""Metrics of a control signal: what it costs, how far and how much it moves, how long it is at a limit."""
+"""Metrics of control signals: effort, peak, total variation, saturation time."""
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -8,7 +8,7 @@ from ctrlplan.metrics._pieces import maxima, pieces
 from ctrlplan.metrics._records import QUIET, Array, Value, diverged, each, fitted, plain, real, times
 from ctrlplan.metrics._records import signal as checked
 
-_AT_LIMIT = 1e-9  # of the range between the limits: nearer than this is at the limit
+_AT_LIMIT = 1e-9  # distance from a limit, relative to the range, that counts as saturation
 
 
 def effort(timepts: ArrayLike, u: ArrayLike) -> Value:
@@ -26,12 +26,12 @@ def effort(timepts: ArrayLike, u: ArrayLike) -> Value:
     Returns
     -------
     float or ndarray, shape (...)
-        In the unit of `u` squared times s; inf where `u` holds inf or its square overflows.
+        In the unit of `u` squared times s; inf where `u` contains inf or its square overflows.
 
     Raises
     ------
     ValueError
-        If the last axis of `u` differs from ``len(timepts)``, `timepts` does not increase or `u` holds nan.
+        If the last axis of `u` differs from ``len(timepts)``, `timepts` does not increase or `u` contains nan.
     TypeError
         If an argument is not made of real numbers.
 
@@ -49,7 +49,7 @@ def effort(timepts: ArrayLike, u: ArrayLike) -> Value:
 
 
 def peak(timepts: ArrayLike, signal: ArrayLike) -> Value:
-    r"""Greatest magnitude of a signal, between samples too.
+    r"""Peak magnitude of a signal, also between samples.
 
     .. math:: \max_t |u(t)|
 
@@ -63,12 +63,13 @@ def peak(timepts: ArrayLike, signal: ArrayLike) -> Value:
     Returns
     -------
     float or ndarray, shape (...)
-        In the unit of `signal`; the cubic's maximum near a peak, the sample itself at a jump.
+        In the unit of `signal`: the maximum of the interpolating cubic, or the sample at a jump.
 
     Raises
     ------
     ValueError
-        If the last axis of `signal` differs from ``len(timepts)``, `timepts` does not increase or `signal` holds nan.
+        If the last axis of `signal` differs from ``len(timepts)``, `timepts` does not increase or `signal` contains
+        nan.
     TypeError
         If an argument is not made of real numbers.
 
@@ -86,7 +87,7 @@ def peak(timepts: ArrayLike, signal: ArrayLike) -> Value:
 
 
 def total_variation(timepts: ArrayLike, signal: ArrayLike) -> Value:
-    r"""Length of the way a signal goes up and down.
+    r"""Total variation of a signal.
 
     .. math:: \int_{t_0}^{t_f} |\dot u(t)|\,dt, \text{ with each jump's height}
 
@@ -100,12 +101,13 @@ def total_variation(timepts: ArrayLike, signal: ArrayLike) -> Value:
     Returns
     -------
     float or ndarray, shape (...)
-        In the unit of `signal`; turns between samples count, jumps count once.
+        In the unit of `signal`; includes extrema between samples, and the height of each jump.
 
     Raises
     ------
     ValueError
-        If the last axis of `signal` differs from ``len(timepts)``, `timepts` does not increase or `signal` holds nan.
+        If the last axis of `signal` differs from ``len(timepts)``, `timepts` does not increase or `signal` contains
+        nan.
     TypeError
         If an argument is not made of real numbers.
 
@@ -123,12 +125,12 @@ def total_variation(timepts: ArrayLike, signal: ArrayLike) -> Value:
 
 
 def saturation_time(timepts: ArrayLike, u: ArrayLike, lower: ArrayLike, upper: ArrayLike) -> Value:
-    r"""Time that a control spends at its limits or beyond.
+    r"""Time during which a control signal is at or beyond its limits.
 
     .. math:: \int_{t_0}^{t_f} [u(t) \le u_{\min} \text{ or } u(t) \ge u_{\max}]\,dt
 
-    Where `u` runs into a limit and stays there, the time of arrival is extrapolated from the samples before; where it
-    leaves, from those after. A jump to or from a limit belongs to the sample that follows it.
+    The time at which `u` reaches a limit is extrapolated from the previous samples, the time at which it leaves the
+    limit from the following ones. A jump to or from a limit is at the sample that follows it.
 
     Parameters
     ----------
@@ -137,7 +139,7 @@ def saturation_time(timepts: ArrayLike, u: ArrayLike, lower: ArrayLike, upper: A
     u : array_like, shape (..., ntime)
         Control, any unit.
     lower, upper : array_like, broadcast to shape (...)
-        Limits in the unit of `u`; -inf and inf where there is none. Within 1e-9 of the range is at the limit.
+        Limits in the unit of `u`; -inf and inf for none. A distance of 1e-9 of the range counts as saturation.
 
     Returns
     -------
@@ -147,7 +149,7 @@ def saturation_time(timepts: ArrayLike, u: ArrayLike, lower: ArrayLike, upper: A
     Raises
     ------
     ValueError
-        If the last axis of `u` differs from ``len(timepts)``, `timepts` does not increase, an argument holds nan, or
+        If the last axis of `u` differs from ``len(timepts)``, `timepts` does not increase, an argument contains nan, or
         `lower` is not below `upper`.
     TypeError
         If an argument is not made of real numbers.
@@ -180,15 +182,15 @@ def variation(t: Array, f: Array) -> float:
 def _saturated(t: Array, u: Array, low: float, high: float) -> float:
     sides = [side for side in (low, high) if np.isfinite(side)]
     scale = high - low if len(sides) == 2 else max(map(abs, sides), default=0.0)
-    most = 2 * max(np.abs(u[np.isfinite(u)]).max(initial=1.0), *map(abs, sides), 1.0)
-    u = np.clip(u, -most, most)  # a diverged control is beyond the limit: where it went does not matter
+    bound = 2 * max(np.abs(u[np.isfinite(u)]).max(initial=1.0), *map(abs, sides), 1.0)
+    u = np.clip(u, -bound, bound)  # a diverged control is beyond the limit, at whatever value
     total = sum(_beyond(t, g, _AT_LIMIT * scale) for g in (low - u, u - high) if np.isfinite(g).all())
-    # What is taken to be at a limit on one side may reach into what is on the other.
+    # The intervals at both limits may overlap.
     return min(total, float(t[-1] - t[0]))
 
 
 def _beyond(t: Array, g: Array, tolerance: float) -> float:
-    """Return the time during which g >= 0, where a sample within the tolerance rests at the limit."""
+    """Return the time during which g >= 0, where samples within the tolerance are at the limit."""
     at = g >= -tolerance
     resting = at & (g <= tolerance)
     stays = np.flatnonzero(resting[:-1] & resting[1:])
@@ -205,13 +207,13 @@ def _beyond(t: Array, g: Array, tolerance: float) -> float:
     time = np.sum(p.step[~mixed & (p.end >= -tolerance)]) + np.sum(crossed.step * np.diff(cuts, axis=0) * above)
     time += np.sum(t[stays + 1] - t[stays])
     time += np.sum(t[enters + 1] - _arrivals(t, g, enters, t[enters + 1]))
-    back = t.size - 2 - leaves  # the same samples with time reversed
+    back = t.size - 2 - leaves  # the samples with time reversed
     time += np.sum(-_arrivals(-t[::-1], g[::-1], back, -t[leaves + 1]) - t[leaves])
     return float(time)
 
 
 def _arrivals(t: Array, g: Array, k: NDArray[np.intp], otherwise: Array) -> Array:
-    """Return when the parabola through samples k - 2 to k gets to zero before sample k + 1, or `otherwise`."""
+    """Return the time at which the parabola through samples k - 2 to k is zero before sample k + 1, or `otherwise`."""
     one, two = np.maximum(k - 1, 0), np.maximum(k - 2, 0)
     known = (k >= 1) & (g[one] < 0)
     curved = known & (k >= 2) & (g[two] < 0)

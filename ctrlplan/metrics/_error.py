@@ -1,4 +1,4 @@
-"""Integrals of an error."""
+"""Integrals of a tracking error."""
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -12,8 +12,8 @@ def iae(timepts: ArrayLike, error: ArrayLike) -> Value:
 
     .. math:: \int_{t_0}^{t_f} |e(t)|\,dt
 
-    The cubics through the samples are integrated, split where they change sign: on a smooth signal the error is of
-    fourth order in the sample spacing. A jump counts as lying in the middle of its interval.
+    The interpolating cubics are integrated between their zeros: for a smooth signal the error is of fourth order in the
+    sample spacing. A jump is placed in the middle of its interval.
 
     Parameters
     ----------
@@ -25,12 +25,12 @@ def iae(timepts: ArrayLike, error: ArrayLike) -> Value:
     Returns
     -------
     float or ndarray, shape (...)
-        In the unit of `error` times s; inf where `error` holds inf.
+        In the unit of `error` times s; inf where `error` contains inf.
 
     Raises
     ------
     ValueError
-        If the last axis of `error` differs from ``len(timepts)``, `timepts` does not increase or `error` holds nan.
+        If the last axis of `error` differs from ``len(timepts)``, `timepts` does not increase or `error` contains nan.
     TypeError
         If an argument is not made of real numbers.
 
@@ -59,17 +59,17 @@ def itae(timepts: ArrayLike, error: ArrayLike, start: float | None = None) -> Va
     error : array_like, shape (..., ntime)
         Tracking error, any unit.
     start : float, optional
-        The time :math:`t_0` [s], the first sample unless given. What comes before it does not count.
+        The time :math:`t_0` [s]; default: the first sample. Earlier samples are ignored.
 
     Returns
     -------
     float or ndarray, shape (...)
-        In the unit of `error` times s^2; inf where `error` holds inf.
+        In the unit of `error` times s^2; inf where `error` contains inf.
 
     Raises
     ------
     ValueError
-        If the last axis of `error` differs from ``len(timepts)``, `timepts` does not increase, `error` holds nan or
+        If the last axis of `error` differs from ``len(timepts)``, `timepts` does not increase, `error` contains nan or
         `start` is after the record.
     TypeError
         If an argument is not made of real numbers.
@@ -103,12 +103,12 @@ def ise(timepts: ArrayLike, error: ArrayLike) -> Value:
     Returns
     -------
     float or ndarray, shape (...)
-        In the unit of `error` squared times s; inf where `error` holds inf or its square overflows.
+        In the unit of `error` squared times s; inf where `error` contains inf or its square overflows.
 
     Raises
     ------
     ValueError
-        If the last axis of `error` differs from ``len(timepts)``, `timepts` does not increase or `error` holds nan.
+        If the last axis of `error` differs from ``len(timepts)``, `timepts` does not increase or `error` contains nan.
     TypeError
         If an argument is not made of real numbers.
 
@@ -137,7 +137,7 @@ def squared(t: Array, f: Array) -> Value:
 
 
 def _absolute(t: Array, f: Array, since: float | None = None) -> float:
-    """Return the integral of abs(f), weighted by the time after `since` where that is given."""
+    """Return the integral of abs(f), weighted by the time after `since` if given."""
     if diverged(f):
         return np.inf
     p = pieces(t, f)

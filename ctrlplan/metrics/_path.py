@@ -1,4 +1,4 @@
-"""Metrics of a path against the waypoints it was laid through: how far it wanders from what they ask for."""
+"""Metrics of paths, alone and relative to their waypoints."""
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -8,7 +8,7 @@ from ctrlplan.metrics._error import squared
 from ctrlplan.metrics._pieces import Pieces, maximum, pieces
 from ctrlplan.metrics._records import Array, axes, diverged, each, times, waypoints
 
-_SWING = 1e-6  # of the waypoints' box: less is rounding and no turn
+_SWING = 1e-6  # of the waypoints' bounding box: smaller reversals are rounding
 
 
 def path_length(timepts: ArrayLike, path: ArrayLike) -> float:
@@ -16,8 +16,8 @@ def path_length(timepts: ArrayLike, path: ArrayLike) -> float:
 
     .. math:: \int_{t_0}^{t_f} \Bigl(\sum_i \dot p_i(t)^2\Bigr)^{1/2} dt
 
-    The curve is the cubic through the samples, axis by axis: on a smooth path the error is of fourth order in the
-    sample spacing. A jump counts as a straight line.
+    Each axis is interpolated by cubics: for a smooth path the error is of fourth order in the sample spacing. A jump is
+    a straight line.
 
     Parameters
     ----------
@@ -29,13 +29,13 @@ def path_length(timepts: ArrayLike, path: ArrayLike) -> float:
     Returns
     -------
     float
-        In the unit of `path`; inf where `path` holds inf.
+        In the unit of `path`; inf where `path` contains inf.
 
     Raises
     ------
     ValueError
         If the last axis of `path` differs from ``len(timepts)``, it has more than two axes, `timepts` does not
-        increase or `path` holds nan.
+        increase or `path` contains nan.
     TypeError
         If an argument is not made of real numbers.
 
@@ -53,7 +53,7 @@ def path_length(timepts: ArrayLike, path: ArrayLike) -> float:
 
 
 def wandering(timepts: ArrayLike, path: ArrayLike, points: ArrayLike) -> float:
-    r"""Length of a path beyond that of its waypoints' polyline.
+    r"""Path length relative to the waypoint polyline, minus 1.
 
     .. math:: L / L_0 - 1, \qquad L_0 = \sum_j |w_{j+1} - w_j|
 
@@ -69,8 +69,8 @@ def wandering(timepts: ArrayLike, path: ArrayLike, points: ArrayLike) -> float:
     Returns
     -------
     float
-        A fraction of the polyline's length; negative for a path that takes short cuts, nan where the polyline has no
-        length.
+        Excess length as a fraction of the polyline's length; negative for a path that cuts corners, nan if the polyline
+        has length 0.
 
     Raises
     ------
@@ -99,12 +99,11 @@ def wandering(timepts: ArrayLike, path: ArrayLike, points: ArrayLike) -> float:
 
 
 def excess_variation(timepts: ArrayLike, path: ArrayLike, points: ArrayLike) -> float:
-    r"""Total variation of a path beyond what its waypoints force.
+    r"""Relative excess of a path's total variation over its waypoints.
 
     .. math:: \sum_i \max(0, V(p_i) - V(w_i)) \Big/ \sum_i V(w_i)
 
-    with V(p_i) the total variation of an axis. An axis that falls short of its waypoints counts zero, and makes up for
-    no other axis.
+    with V(p_i) the total variation of an axis. An axis with less variation than its waypoints contributes zero.
 
     Parameters
     ----------
@@ -118,7 +117,7 @@ def excess_variation(timepts: ArrayLike, path: ArrayLike, points: ArrayLike) -> 
     Returns
     -------
     float
-        A fraction of the waypoints' own variation; nan where that is zero.
+        Excess as a fraction of the variation of the waypoints; nan if that is zero.
 
     Raises
     ------
@@ -148,11 +147,11 @@ def excess_variation(timepts: ArrayLike, path: ArrayLike, points: ArrayLike) -> 
 
 
 def turning_points(timepts: ArrayLike, path: ArrayLike, points: ArrayLike) -> int:
-    """Count the turns of a path that its waypoints do not force.
+    """Number of reversals of a path beyond those of its waypoints.
 
-    A turn is a change of direction of one axis. Each axis's turns beyond those of its waypoints are counted, and
-    the axes added. Swings up to 1e-6 of the longest side of the waypoints' box (of the path's own, where the waypoints
-    coincide) are no turns, so that rounding makes none.
+    A reversal is a change of direction of one axis. The reversals of each axis beyond those of its waypoints are
+    counted, and summed over the axes. Reversals of up to 1e-6 of the longest side of the waypoints' bounding box (or
+    of the path's, if the waypoints coincide) are ignored as rounding.
 
     Parameters
     ----------
@@ -166,7 +165,7 @@ def turning_points(timepts: ArrayLike, path: ArrayLike, points: ArrayLike) -> in
     Returns
     -------
     int
-        Zero or more. Turns are read off the samples: two between the same two samples are not seen.
+        Zero or more. Reversals are found from samples: two between the same two samples are missed.
 
     Raises
     ------
@@ -188,16 +187,16 @@ def turning_points(timepts: ArrayLike, path: ArrayLike, points: ArrayLike) -> in
     polyline = waypoints(points, positions)
     size = float(np.ptp(polyline, axis=1).max())
     if size == 0:
-        held = np.where(np.isfinite(positions), positions, polyline[:, :1])
-        size = float(np.ptp(held, axis=1).max())
+        finite = np.where(np.isfinite(positions), positions, polyline[:, :1])
+        size = float(np.ptp(finite, axis=1).max())
     swing = _SWING * size
     return sum(max(_turns(p, swing) - _turns(w, swing), 0) for p, w in zip(positions, polyline, strict=True))
 
 
 def outside_box(timepts: ArrayLike, path: ArrayLike, points: ArrayLike) -> float:
-    """Greatest distance of a path from its waypoints' box.
+    """Maximum distance of a path from its waypoints' bounding box.
 
-    The box is the smallest one with sides along the axes that holds every waypoint; the distance is Euclidean.
+    The bounding box of the waypoints has sides parallel to the axes; the distance is Euclidean.
 
     Parameters
     ----------
@@ -235,7 +234,7 @@ def outside_box(timepts: ArrayLike, path: ArrayLike, points: ArrayLike) -> float
     def distance(positions: Array) -> float:
         low, high = polyline.min(axis=1, keepdims=True), polyline.max(axis=1, keepdims=True)
         beyond = np.maximum(low - positions, positions - high)
-        # The distance has corners where the path enters the box; a single axis has none.
+        # The distance is not smooth where the path enters the box; those of single axes are.
         sides = [maximum(t, side) for p in (low - positions, positions - high) for side in p]
         return max(maximum(t, np.sqrt((np.maximum(beyond, 0.0) ** 2).sum(axis=0))), *sides, 0.0)
 
@@ -243,7 +242,7 @@ def outside_box(timepts: ArrayLike, path: ArrayLike, points: ArrayLike) -> float
 
 
 def jerk_cost(timepts: ArrayLike, jerk: ArrayLike) -> float:
-    r"""Integral of the squared jerk, all axes together.
+    r"""Integral of the squared jerk, summed over the axes.
 
     .. math:: \int_{t_0}^{t_f} \sum_i \dddot p_i(t)^2\,dt
 
@@ -257,19 +256,19 @@ def jerk_cost(timepts: ArrayLike, jerk: ArrayLike) -> float:
     Returns
     -------
     float
-        In the unit of `jerk` squared times s; inf where `jerk` holds inf or its square overflows.
+        In the unit of `jerk` squared times s; inf where `jerk` contains inf or its square overflows.
 
     Raises
     ------
     ValueError
         If the last axis of `jerk` differs from ``len(timepts)``, it has more than two axes, `timepts` does not
-        increase or `jerk` holds nan.
+        increase or `jerk` contains nan.
     TypeError
         If an argument is not made of real numbers.
 
     Examples
     --------
-    The quintic from rest to rest over a unit of way and time:
+    The quintic rest-to-rest move over unit distance and time:
 
     >>> import numpy as np
     >>> from ctrlplan.metrics import jerk_cost
@@ -292,7 +291,7 @@ def _length(t: Array, path: Array) -> float:
 
 
 def _arc(curves: list[Pieces], cuts: Array | None) -> float:
-    """Return the length of the curves' path, each interval cut where an axis turns and the speed may have a corner."""
+    """Return the path length of the curves; intervals are split at reversals, where the speed may not be smooth."""
 
     def speed(s: Array) -> Array:
         return np.asarray(np.sqrt(np.sum([(p.slope(s) / p.step) ** 2 for p in curves], axis=0)))
@@ -301,7 +300,7 @@ def _arc(curves: list[Pieces], cuts: Array | None) -> float:
 
 
 def _turns(f: Array, swing: float) -> int:
-    """Return how often a record (ntime,) turns back by more than `swing`."""
+    """Return the number of reversals of a signal (ntime,) by more than `swing`."""
     way = (f[1:] > f[:-1]).astype(int) - (f[1:] < f[:-1])
     moves = np.flatnonzero(way)
     ends = moves[1:][way[moves[1:]] != way[moves[:-1]]]

@@ -1,15 +1,15 @@
-r"""What a signal does between its samples: one cubic an interval.
+r"""Interpolation of a signal between its samples: one cubic per interval.
 
 On the interval from :math:`t_k` to :math:`t_{k+1}`, with :math:`d_k` the second divided difference about sample k and
 :math:`c_k` the third one of samples k - 1 to k + 2, the cubic through these four samples is
 
 .. math:: p(t) = \text{chord}(t) + (t - t_k)(t - t_{k+1}) [d_k + (t - t_{k-1}) c_k],
 
-whose bracket runs between :math:`d_k` and :math:`d_{k+1}`. On smooth signals its error is of fourth order. A jump or a
-kink makes one of the two curvatures large, and the cubic would then swing by 6 % of the jump on either side. As in
+whose bracket is between :math:`d_k` and :math:`d_{k+1}`. For smooth signals its error is of fourth order. A jump or a
+kink makes one of the two curvatures large, and the cubic would then oscillate by 6 % of the jump on either side. As in
 essentially non-oscillatory schemes (Harten et al., 1987, doi 10.1016/0021-9991(87)90031-3) the smoother side is
-trusted: :math:`c_k` is cut to a multiple of its neighbours and the smaller curvature kept. Where a signal is smooth the
-cut is of fourth order too, so that the order of every metric stays.
+used: :math:`c_k` is limited to a multiple of its neighbours, with the smaller curvature. For smooth signals the effect
+of the limit is of fourth order too, so that the order of the metrics is preserved.
 """
 
 from collections.abc import Callable, Iterator
@@ -23,10 +23,10 @@ from ctrlplan.metrics._records import Array
 
 G = TypeVar("G", bound=np.generic)
 
-_NEIGHBOURS = 4.0  # times a neighbouring third difference: more is a kink
-_CURVATURES = 0.5  # of the smaller curvature: two curvatures as close as this are smooth
-_ASIDE = 0.25  # of the greater curvature: a lesser one of the other sign is the smooth side of a kink
-_JUMP = 2.0  # times either neighbouring slope: more is a jump
+_NEIGHBOURS = 4.0  # multiple of a neighbouring third difference above which there is a kink
+_CURVATURES = 0.5  # difference relative to the smaller curvature up to which two curvatures are smooth
+_ASIDE = 0.25  # of the larger curvature: a smaller one of opposite sign is the smooth side of a kink
+_JUMP = 2.0  # multiple of both neighbouring slopes above which there is a jump
 _BLOCK = 2**15  # samples
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(4)
 _NODES, _WEIGHTS = (_NODES + 1) / 2, _WEIGHTS / 2
@@ -65,7 +65,7 @@ class Pieces:
         return np.asarray(self.begin + s * self.step)
 
     def held(self, s: float | Array) -> Array:
-        """Return the values at s with each jump in the middle of its interval, as the trapezoidal rule has it."""
+        """Return the values at s with each jump in the middle of its interval, as in the trapezoidal rule."""
         values = self(s)
         if self.jump.any():
             values = np.where(self.jump, np.where(s < 0.5, self.a, self.end), values)
@@ -76,7 +76,7 @@ class Pieces:
         return np.stack([np.zeros_like(self.a), np.ones_like(self.a)])
 
     def cuts(self) -> Array:
-        """Return 0, the places where the direction turns, and 1, shape (4, m): monotone in between."""
+        """Return 0, the stationary points and 1, shape (4, m): monotone in between."""
         inner = np.sqrt(self.c**2 - 3 * self.d * self.b)
         q = -(self.c + np.copysign(inner, self.c))
         turns = np.stack([np.zeros_like(q), q / (3 * self.d), self.b / q, np.ones_like(q)])
@@ -84,13 +84,13 @@ class Pieces:
         return np.sort(np.clip(turns, 0.0, 1.0), axis=0)
 
     def at_cuts(self, cuts: Array) -> Array:
-        """Return the values at cuts, the samples' own at either end."""
+        """Return the values at cuts, those of the samples at either end."""
         values = self(cuts)
         values[0], values[-1] = self.a, self.end
         return values
 
     def splits(self) -> Array:
-        """Return cuts with the zeros between them, shape (7, m): of one sign in between."""
+        """Return cuts and the zeros between them, shape (7, m): of constant sign in between."""
         cuts = self.cuts()
         values = self.at_cuts(cuts)
         low, high = cuts[:-1], cuts[1:]
@@ -102,7 +102,7 @@ class Pieces:
         low, high = np.broadcast_arrays(low, high)
         rising = self(high) > self(low)
         s = (low + high) / 2
-        for _ in range(60):  # Newton within a bracket; bisection alone would end in as many
+        for _ in range(60):  # Newton's method with bisection, which alone would converge in as many
             above = (self(s) > level) == rising
             low, high = np.where(above, low, s), np.where(above, s, high)
             newton = s - (self(s) - level) / self.slope(s)
@@ -113,7 +113,7 @@ class Pieces:
         return s
 
     def square(self) -> Array:
-        """Return the integrals over time of the squares (...), from the cubics' series in Legendre polynomials."""
+        """Return the integrals over time of the squares (...), from Legendre series of the cubics."""
         bend = (self.c + 1.5 * self.d) / 6
         mean = (self.a + self.end) / 2 - bend
         tilt = self.end - self.a - self.d / 10
@@ -132,12 +132,12 @@ class Pieces:
 
 
 def pieces(t: Array, f: Array, chosen: NDArray[np.intp] | None = None, rows: NDArray[np.intp] | None = None) -> Pieces:
-    """Return the cubics of a signal (ntime,) on all intervals, or on those chosen; of several, each of its row."""
+    """Return the cubics of a signal (ntime,) on all or some intervals; for several signals, each of its row."""
     if chosen is None:
         return _cubics(t, f)
     if rows is None:
         return _cubics(t, f)[chosen]
-    # A cubic depends on the samples up to four intervals away: a few windows cost less than whole records.
+    # A cubic depends on the samples up to four intervals away: a few windows are faster than whole signals.
     width = min(t.size, 10)
     first = np.clip(chosen - 4, 0, t.size - width)
     window = first[:, None] + np.arange(width)
@@ -145,14 +145,14 @@ def pieces(t: Array, f: Array, chosen: NDArray[np.intp] | None = None, rows: NDA
 
 
 class Bulges:
-    """Bound on how far the cubics of signals at some times leave their chords."""
+    """Bound on the distance of the cubics of signals from their chords."""
 
     def __init__(self, t: Array) -> None:
         step = np.diff(t)
         self.pace, self.width, self.share = 1.0 / step, 1.0 / (t[2:] - t[:-2]), step[1:-1] ** 2 / 4
 
     def __call__(self, f: Array, first: int = 0) -> Array:
-        """Return the bounds of a record from sample `first` on, one an interval: none is known for the outer two."""
+        """Return the bounds of a signal from sample `first` on, one per interval without the outer two."""
         slope = (f[first + 1 :] - f[first:-1]) * self.pace[first:]
         d = slope[1:] - slope[:-1]
         d *= self.width[first:]
@@ -163,22 +163,22 @@ class Bulges:
 
 
 def blocks(f: Array) -> Iterator[slice]:
-    """Yield rows (nrows, ntime) by as many as a cache holds: fewer calls than row by row, and quick ones."""
+    """Yield rows (nrows, ntime) in blocks that fit into the cache."""
     count = max(1, _BLOCK // f.shape[1])
     return (slice(begin, begin + count) for begin in range(0, len(f), count))
 
 
 def maximum(t: Array, f: Array) -> float:
-    """Return the greatest value of a signal (ntime,), between samples too."""
+    """Return the maximum of a signal (ntime,), also between samples."""
     return float(maxima(t, f[None])[0])
 
 
 def maxima(t: Array, f: Array) -> Array:
-    """Return the greatest value of each of several signals (nrows, ntime)."""
+    """Return the maximum of each of several signals (nrows, ntime)."""
     top, bulges = f.max(axis=1), Bulges(t)
-    near = [  # what is not a number is near: it cannot be told
-        np.flatnonzero(~(np.maximum(row[:-1], row[1:]) + bulges(row) <= most)) if np.isfinite(most) else NOWHERE
-        for row, most in zip(f, top, strict=True)
+    near = [  # nan is included, as it cannot be excluded
+        np.flatnonzero(~(np.maximum(row[:-1], row[1:]) + bulges(row) <= peak)) if np.isfinite(peak) else NOWHERE
+        for row, peak in zip(f, top, strict=True)
     ]
     chosen, rows = gathered(near)
     p = pieces(t, f, chosen, rows)
@@ -187,7 +187,7 @@ def maxima(t: Array, f: Array) -> Array:
 
 
 def gathered(chosen: list[NDArray[np.intp]]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return what is chosen in each row one after the other, and the rows."""
+    """Return the chosen intervals of all rows in one array, and their rows."""
     return np.concatenate([NOWHERE, *chosen]), np.repeat(np.arange(len(chosen)), [k.size for k in chosen])
 
 
@@ -210,18 +210,18 @@ def _cubics(t: Array, f: Array) -> Pieces:
 
 
 def _shapes(t: Array, d: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Return the bracket of each cubic at the interval's begin, its slope, and whether most of that was cut."""
+    """Return the bracket of each cubic at the interval's start, its slope, and whether it was mainly cut."""
     span = t[..., 3:] - t[..., :-3]
     change, left, right, size = np.diff(d), d[..., :-1], d[..., 1:], np.abs(d)
     third = _finite(change / span)
     steady = np.abs(change) <= _CURVATURES * np.minimum(size[..., :-1], size[..., 1:])
 
-    # Where the curvature is steady, all four samples are trusted; elsewhere their third difference is cut to a
-    # multiple of those beside, and the smoother side kept.
+    # Where the curvature is smooth, all four samples are used; elsewhere their third difference is limited to a
+    # multiple of its neighbours, with the smoother side.
     base, twist, broken = left.copy(), third.copy(), np.zeros_like(steady)
     at = np.nonzero(~steady)
     c, one, other = third[at], left[at], right[at]
-    cut = _cut(c, *_beside(third, at))
+    cut = _cut(c, *_neighbours(third, at))
     nearer = np.where(np.abs(one) <= np.abs(other), one, other - np.broadcast_to(span, third.shape)[at] * cut)
     lesser, greater = np.minimum(np.abs(one), np.abs(other)), np.maximum(np.abs(one), np.abs(other))
     across = (np.sign(one) * np.sign(other) <= 0) & (lesser > _ASIDE * greater)
@@ -230,16 +230,16 @@ def _shapes(t: Array, d: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
     broken[at] = np.abs(c - cut) > np.abs(c) / 2
     bow = base + (t[..., 1:-2] - t[..., :-3]) * twist
 
-    # An outer interval shares its neighbour's four samples and sees one side only: what is cut there and next to it
-    # counts against the curvature itself.
+    # An outer interval has the four samples of its neighbour and one side only: its curvature is reduced by what was
+    # cut there and next to it.
     count = third.shape[-1]
     outer = []
     for end, inner, far in ((0, min(1, count - 1), min(2, count - 1)), (-1, max(count - 2, 0), max(count - 3, 0))):
         c, wide = third[..., end], span[..., end]
-        beside = np.abs(third[..., inner] - twist[..., inner]) * span[..., inner]
+        change = np.abs(third[..., inner] - twist[..., inner]) * span[..., inner]
         cut = _cut(c, third[..., inner], third[..., far])
-        slope = np.where(steady[..., end] & (beside == 0), c, cut)
-        rough = np.abs(c - slope) * wide + beside
+        slope = np.where(steady[..., end] & (change == 0), c, cut)
+        rough = np.abs(c - slope) * wide + change
         outer.append((_shrunk(d[..., end], rough), slope, rough > np.abs(c) * wide / 2))
     (first, begin, jump), (last, ending, drop) = outer
     first = first - (t[..., 2] - t[..., 0]) * begin
@@ -247,8 +247,8 @@ def _shapes(t: Array, d: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
     return _between(first, bow, last), _between(begin, twist, ending), _between(jump, broken, drop)
 
 
-def _beside(third: Array, at: tuple[NDArray[np.intp], ...]) -> tuple[Array, Array]:
-    """Return the third differences before and after some; the outer ones have two on one side."""
+def _neighbours(third: Array, at: tuple[NDArray[np.intp], ...]) -> tuple[Array, Array]:
+    """Return the third differences before and after some; for the outer ones, two from one side."""
     *rows, k = at
     last = third.shape[-1] - 1
     before, after = np.where(k > 0, k - 1, min(2, last)), np.where(k < last, k + 1, max(last - 2, 0))
@@ -256,7 +256,7 @@ def _beside(third: Array, at: tuple[NDArray[np.intp], ...]) -> tuple[Array, Arra
 
 
 def _cut(c: Array, before: Array, after: Array) -> Array:
-    """Return third differences cut to a multiple of those beside them."""
+    """Return third differences limited to a multiple of their neighbours."""
     low = _NEIGHBOURS * np.minimum(np.maximum(before, after), 0.0)
     high = _NEIGHBOURS * np.maximum(np.minimum(before, after), 0.0)
     return np.minimum(np.maximum(c, low), high)
@@ -271,15 +271,15 @@ def _shrunk(value: Array, by: Array) -> Array:
 
 
 def _steep(slope: Array) -> NDArray[np.bool_]:
-    """Return which intervals are much steeper than those beside them: jumps, or flat places of a smooth signal."""
+    """Return which intervals are much steeper than their neighbours: jumps, or stationary points of smooth signals."""
     steep = np.abs(slope)
-    beside = np.empty_like(steep)
-    beside[..., 1:-1] = np.maximum(steep[..., :-2], steep[..., 2:])
-    beside[..., 0], beside[..., -1] = steep[..., 1:4].max(axis=-1), steep[..., -4:-1].max(axis=-1)
-    return steep > _JUMP * beside
+    neighbours = np.empty_like(steep)
+    neighbours[..., 1:-1] = np.maximum(steep[..., :-2], steep[..., 2:])
+    neighbours[..., 0], neighbours[..., -1] = steep[..., 1:4].max(axis=-1), steep[..., -4:-1].max(axis=-1)
+    return steep > _JUMP * neighbours
 
 
 def _finite(d: Array) -> Array:
-    """Return divided differences with 0 for those that have left the range of numbers."""
+    """Return divided differences with 0 for those that overflow."""
     known = np.isfinite(d)
     return d if known.all() else np.where(known, d, 0.0)

@@ -1,4 +1,4 @@
-"""What a metric accepts: times, signals and levels, checked once and in one place."""
+"""Checks of the arguments of metrics: times, signals and levels."""
 
 from collections.abc import Callable
 from typing import Any
@@ -16,20 +16,20 @@ HUGE = np.finfo(np.float64).max / 1e3
 
 
 def real(value: ArrayLike, name: str) -> Array:
-    """Return an array of floats without nan, or say what is wrong with `name`."""
+    """Return an array of floats without nan; messages call it `name`."""
     try:
         kind = np.asarray(value).dtype
     except ValueError:
         raise TypeError(f"{name} must be an array of real numbers, got a ragged sequence") from None
     if kind.kind not in "buifmM":
         raise TypeError(f"{name} must be an array of real numbers, got dtype {kind}")
-    array = real_array(value, name)  # without units, dates and masks
-    _forbid(array, name, np.isnan(array), "hold no nan")
+    array = real_array(value, name)  # rejects units, dates and masks
+    _forbid(array, name, np.isnan(array), "contain no nan")
     return array
 
 
 def finite(value: ArrayLike, name: str) -> Array:
-    """Return an array of finite floats, or say what is wrong with `name`."""
+    """Return an array of finite floats; messages call it `name`."""
     array = real(value, name)
     _forbid(array, name, np.isinf(array), "be finite")
     return array
@@ -52,7 +52,7 @@ def signal(value: ArrayLike, name: str, t: Array) -> Array:
     array = real(value, name)
     if array.ndim == 0 or array.shape[-1] != t.size:
         raise ValueError(f"{name} must have {t.size} samples on its last axis, as timepts has, got shape {array.shape}")
-    # Records are walked along time.
+    # Signals are processed along time.
     return array if array.strides[-1] == array.itemsize else np.ascontiguousarray(array)
 
 
@@ -73,7 +73,7 @@ def waypoints(value: ArrayLike, path: Array) -> Array:
 
 
 def fitted(array: Array, name: str, shape: tuple[int, ...]) -> Array:
-    """Broadcast a level or a reference to the shape of what it is compared with."""
+    """Broadcast a level or a reference to the shape of a signal."""
     try:
         return np.broadcast_to(array, shape)
     except ValueError as error:
@@ -81,12 +81,12 @@ def fitted(array: Array, name: str, shape: tuple[int, ...]) -> Array:
 
 
 def diverged(f: Array) -> bool:
-    """Return whether a record holds inf, or values so near it that their differences would."""
+    """Return whether a signal contains inf, or values whose differences overflow."""
     return not np.abs(f).max() < HUGE
 
 
 def instant(start: float | None, t: Array) -> float:
-    """Return the time that counts as zero, the first sample unless given."""
+    """Return the reference time; default: the first sample."""
     if start is None:
         return float(t[0])
     since = finite(start, "start")
@@ -96,9 +96,9 @@ def instant(start: float | None, t: Array) -> float:
 
 
 def each(metric: Callable[..., float], lead: tuple[int, ...], *arguments: Array, **options: Any) -> Value:
-    """Apply a metric of one record along the leading axes: a float if there are none.
+    """Apply a metric of one signal along the leading axes; a float if there are none.
 
-    Overflow and inf - inf are met where they arise, so that a diverged loop gives inf and no warning.
+    Overflow and inf - inf are handled by the metrics, so that a diverged loop gives inf without a warning.
     """
     values = np.empty(lead)
     with np.errstate(**QUIET):
@@ -108,7 +108,7 @@ def each(metric: Callable[..., float], lead: tuple[int, ...], *arguments: Array,
 
 
 def plain(values: Array, lead: tuple[int, ...]) -> Value:
-    """Return values in the shape of the leading axes: a float if there are none."""
+    """Return values in the shape of the leading axes; a float if there are none."""
     return values.reshape(lead) if lead else float(values.item())
 
 

@@ -1,4 +1,4 @@
-"""Metrics of a response: how long it takes to settle, how far it runs ahead, how far it stays behind."""
+"""Metrics of a response: settling time, overshoot, lag."""
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -6,7 +6,7 @@ from numpy.typing import ArrayLike
 from ctrlplan.metrics._pieces import NOWHERE, Bulges, gathered, maxima, pieces
 from ctrlplan.metrics._records import HUGE, QUIET, Array, Value, finite, fitted, instant, plain, signal, times
 
-_ROUNDING = 4 * np.finfo(np.float64).eps  # of the levels: a response held on the edge of the band is inside
+_ROUNDING = 4 * np.finfo(np.float64).eps  # of the levels: a response on the edge of the band is inside
 
 
 def settling_time(
@@ -17,43 +17,43 @@ def settling_time(
     band: float = 0.02,
     start: float | None = None,
 ) -> Value:
-    r"""Time after which a response stays near its final value.
+    r"""Settling time of a response to its final value.
 
     .. math:: \inf\{t : |y(s) - y_f| \le \text{band}\,|y_f - y_0| \text{ for all } s \ge t\}
 
-    The entry into the band is the root of the cubic through the samples beside it, and a peak that leaves the band
-    between two samples counts: on a smooth response the error is of fourth order in the sample spacing.
+    The entry into the band is a root of the interpolating cubic, and peaks outside the band between two samples are
+    considered: for a smooth response the error is of fourth order in the sample spacing.
 
     Parameters
     ----------
     timepts : array_like, shape (ntime,)
         Sample times [s], strictly increasing; need not be even.
     y : array_like, shape (..., ntime)
-        Response, any unit; may hold inf, as after divergence.
+        Response, any unit; may contain inf, as after divergence.
     final, initial : array_like, broadcast to shape (...)
         Values after and before the planned change, in the unit of `y`.
     band : float, default 0.02
         Half the width of the band, as a fraction of the change.
     start : float, optional
-        Time that counts as zero [s]; the first sample unless given.
+        Reference time [s]; default: the first sample.
 
     Returns
     -------
     float or ndarray, shape (...)
-        Time elapsed since `start` [s]; 0 if `y` is never outside the band (or only before `start`), inf if it never
-        stays inside or enters only after the last sample but one, nan where `final` equals `initial`.
+        Time since `start` [s]; 0 if `y` is never outside the band (or only before `start`), inf if it does not settle
+        or enters the band after the last sample but one, nan if `final` equals `initial`.
 
     Raises
     ------
     ValueError
-        If the shapes disagree, `timepts` does not increase, a signal holds nan, a level is not finite, `band` is not
-        positive or `start` is after the record.
+        If the shapes differ, `timepts` does not increase, a signal contains nan, a level is not finite, `band` is not
+        positive or `start` is after the last sample.
     TypeError
         If an argument is not made of real numbers.
 
     Examples
     --------
-    A first-order lag of 1 s enters the band of 2 % at log 50 s:
+    A first-order lag with a time constant of 1 s settles to 2 % in log 50 s:
 
     >>> import numpy as np
     >>> from ctrlplan.metrics import settling_time
@@ -76,7 +76,7 @@ def tracking_settling_time(
     band: float = 0.02,
     start: float | None = None,
 ) -> Value:
-    r"""Time after which a response stays near its reference.
+    r"""Settling time of a response to its reference.
 
     .. math:: \inf\{t : |y(s) - r(s)| \le \text{band}\,|y_f - y_0| \text{ for all } s \ge t\}
 
@@ -85,31 +85,31 @@ def tracking_settling_time(
     timepts : array_like, shape (ntime,)
         Sample times [s], strictly increasing; need not be even.
     y : array_like, shape (..., ntime)
-        Response, any unit; may hold inf, as after divergence.
+        Response, any unit; may contain inf, as after divergence.
     reference : array_like, broadcast to shape (..., ntime)
-        What `y` should follow, in the unit of `y`.
+        Reference of `y`, in the unit of `y`.
     final, initial : array_like, broadcast to shape (...)
-        Values after and before the planned change, in the unit of `y`; they set the width of the band alone.
+        Values after and before the planned change, in the unit of `y`; they determine the width of the band.
     band : float, default 0.02
         Half the width of the band, as a fraction of the change.
     start : float, optional
-        Time that counts as zero [s]; the first sample unless given.
+        Reference time [s]; default: the first sample.
 
     Returns
     -------
     float or ndarray, shape (...)
-        Time elapsed since `start` [s]; 0, inf and nan as in `settling_time`.
+        Time since `start` [s]; 0, inf and nan as in `settling_time`.
 
     Raises
     ------
     ValueError
-        As `settling_time`, and if `reference` does not fit `y` or is not finite.
+        As `settling_time`, and if `reference` does not broadcast to `y` or is not finite.
     TypeError
         If an argument is not made of real numbers.
 
     See Also
     --------
-    settling_time : The same against the final value.
+    settling_time : Settling time to the final value.
 
     Examples
     --------
@@ -128,39 +128,39 @@ def tracking_settling_time(
 def overshoot(
     timepts: ArrayLike, y: ArrayLike, final: ArrayLike, initial: ArrayLike, reference: ArrayLike | None = None
 ) -> Value:
-    r"""Greatest excess of a response in the direction of the change.
+    r"""Overshoot of a response over its final value or reference.
 
     .. math:: 100\,\max\bigl(0, \max_t \operatorname{sgn}(y_f - y_0)\,(y(t) - r(t))\bigr) / |y_f - y_0|
 
     With a `reference` r this is the overshoot on the error of section 2 of the paper; without, r is the final value.
-    Peaks are those of the cubic through the samples beside them: of fourth order in the sample spacing.
+    Peaks are those of the interpolating cubics, with an error of fourth order in the sample spacing.
 
     Parameters
     ----------
     timepts : array_like, shape (ntime,)
         Sample times [s], strictly increasing; need not be even.
     y : array_like, shape (..., ntime)
-        Response, any unit; may hold inf, as after divergence.
+        Response, any unit; may contain inf, as after divergence.
     final, initial : array_like, broadcast to shape (...)
         Values after and before the planned change, in the unit of `y`.
     reference : array_like, broadcast to shape (..., ntime), optional
-        What `y` should follow, in the unit of `y`; `final` unless given.
+        Reference of `y`, in the unit of `y`; default: `final`.
 
     Returns
     -------
     float or ndarray, shape (...)
-        In percent of the change; nan where `final` equals `initial`.
+        In percent of the change; nan if `final` equals `initial`.
 
     Raises
     ------
     ValueError
-        If the shapes disagree, `timepts` does not increase, `y` holds nan, or a level or the reference is not finite.
+        If the shapes differ, `timepts` does not increase, `y` contains nan, or a level or the reference is not finite.
     TypeError
         If an argument is not made of real numbers.
 
     Examples
     --------
-    Damping 1/sqrt 2 gives an overshoot of 100 exp(-pi), whatever the spacing of the samples:
+    A damping ratio of 1/sqrt 2 gives an overshoot of 100 exp(-pi) percent:
 
     >>> import numpy as np
     >>> from ctrlplan.metrics import overshoot
@@ -174,7 +174,7 @@ def overshoot(
 def lag(
     timepts: ArrayLike, y: ArrayLike, final: ArrayLike, initial: ArrayLike, reference: ArrayLike | None = None
 ) -> Value:
-    r"""Greatest shortfall of a response against the change.
+    r"""Maximum lag of a response behind its final value or reference.
 
     .. math:: 100\,\max\bigl(0, \max_t \operatorname{sgn}(y_f - y_0)\,(r(t) - y(t))\bigr) / |y_f - y_0|
 
@@ -183,16 +183,16 @@ def lag(
     timepts : array_like, shape (ntime,)
         Sample times [s], strictly increasing; need not be even.
     y : array_like, shape (..., ntime)
-        Response, any unit; may hold inf, as after divergence.
+        Response, any unit; may contain inf, as after divergence.
     final, initial : array_like, broadcast to shape (...)
         Values after and before the planned change, in the unit of `y`.
     reference : array_like, broadcast to shape (..., ntime), optional
-        What `y` should follow, in the unit of `y`; `final` unless given.
+        Reference of `y`, in the unit of `y`; default: `final`.
 
     Returns
     -------
     float or ndarray, shape (...)
-        In percent of the change; nan where `final` equals `initial`.
+        In percent of the change; nan if `final` equals `initial`.
 
     Raises
     ------
@@ -203,7 +203,7 @@ def lag(
 
     See Also
     --------
-    overshoot : The other sign.
+    overshoot : Maximum of the opposite sign.
 
     Examples
     --------
@@ -233,7 +233,7 @@ def _settling(
 
 
 def _last_entries(t: Array, e: Array, edges: Array) -> Array:
-    """Return the times after which abs(e) <= edge, for rows e (nrows, ntime).
+    """Return the times from which on abs(e) <= edge, for rows e (nrows, ntime).
 
     -inf if always, inf if e is outside after the last sample but one.
     """
@@ -279,5 +279,5 @@ def _excess(
     with np.errstate(**QUIET):
         ahead = response - followed
         ahead *= side * np.sign(change)[..., None]
-        most = maxima(t, ahead.reshape(-1, t.size)).reshape(lead)
-        return plain(np.where(change == 0, np.nan, 100 * np.maximum(most, 0.0) / np.abs(change)), lead)
+        excess = maxima(t, ahead.reshape(-1, t.size)).reshape(lead)
+        return plain(np.where(change == 0, np.nan, 100 * np.maximum(excess, 0.0) / np.abs(change)), lead)

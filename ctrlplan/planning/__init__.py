@@ -1,28 +1,29 @@
-"""Choosing what the designer left free: shape, derivatives, times, durations, ways around obstacles.
+"""Optimisation of plans: shape, derivatives, times, duration, obstacle avoidance.
 
-Limits hold over the whole interval, not at samples. In the order of work:
+Limits are satisfied over the whole interval, not only at samples. In the order of work:
 
 `choose_alpha`
     Shape parameter of a trigonometric spline by an objective: path length, a
-    peak, a squared derivative, or a function of your own.
+    peak, a squared derivative, or a user's function.
 `optimize_waypoints`
     Free derivatives at via points, and their times, by minimum jerk or snap.
 `fastest`
     Minimum duration under limits on derivatives and on quantities of a plant.
-    ``hold`` says what is kept: the shape, with all times in proportion; the
-    derivatives of the waypoints, where feasibility is not monotone in the
-    duration and the feasible set is reported; or the path alone. Limits that
-    no duration satisfies are an error with the reason.
+    ``hold`` selects what is preserved: the shape, with all times in proportion;
+    the derivatives at the waypoints, where feasibility is not monotone in the
+    duration and the feasible set is reported; or only the path. Limits that
+    no duration satisfies raise an error with the reason.
 `margins`
-    How near a given plan is to each limit, and when.
+    Margin of a given plan to each limit, and its time.
 `avoid`, `clearance`
-    Ways around obstacles, and the certified distance to them. The rope of a
+    Paths around obstacles, and the certified distance to them. The rope of a
     crane is inclined where the load accelerates: check its clearance again
-    after a plan was retimed. An obstacle that must not be passed above is a
-    half-plane: ``HalfPlane((0, -1), -2.0)`` keeps the load below z = 2.
+    after a plan was retimed. A half-plane excludes paths above an obstacle:
+    ``HalfPlane((0, -1), -2.0)`` keeps the load below z = 2.
 
-Limits on derivatives have a closed form. On a crane `fastest` takes about a
-tenth of a second (a second or two with ``hold="path"``), `choose_alpha` 40 ms.
+Limits on derivatives have a closed-form solution. For a crane `fastest` takes
+about a tenth of a second (one or two seconds with ``hold="path"``),
+`choose_alpha` 40 ms.
 
 Examples
 --------

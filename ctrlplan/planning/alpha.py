@@ -1,4 +1,4 @@
-"""The shape parameter alpha, chosen by an objective over its whole range."""
+"""Optimisation of the shape parameter alpha over its whole range."""
 
 from __future__ import annotations
 
@@ -38,30 +38,30 @@ _BLOWN = 10.0
 
 @dataclass(frozen=True, repr=False)
 class AlphaChoice(Displayed):
-    """Shape parameter that was chosen, and the objective over alpha.
+    """Optimum shape parameter, and the objective over alpha.
 
-    ``float(choice)`` is the alpha, so that a choice can stand where a plan
-    takes one.
+    ``float(choice)`` is alpha, so a choice can be passed as the argument `alpha`
+    of a spline.
 
     Attributes
     ----------
     alpha : float
-        Shape parameter [rad] of the least objective.
+        Shape parameter [rad] that minimises the objective.
     value : float
-        That objective.
+        Minimum of the objective.
     plan : Trajectory
-        The plan with it.
+        Plan with this alpha.
     alphas, values : ndarray, shape (npoints,)
-        The objective over alpha, increasing; inf where the waypoints do not
-        determine a plan.
+        Values of alpha, increasing, and the objective there; inf where the
+        waypoints do not determine a plan.
     blow_up : float
-        Alpha [rad] from which on the objective is above ten times the
-        minimum for good; 2 pi where it never is.
+        Alpha [rad] above which the objective always exceeds ten times its
+        minimum; 2 pi if there is none.
     tied : bool
-        Whether the objective does not depend on alpha near its least value, so
-        that the integral of the squared jerk decided.
+        Whether the minimum is not unique, so that the integral of the squared
+        jerk determined alpha.
     objective : str
-        Its name.
+        Name of the objective.
     """
 
     alpha: float
@@ -92,12 +92,13 @@ class AlphaChoice(Displayed):
         yield Figure("Position and velocity of the plan over time.", 2, lambda axes: self.plan.plot(ax=axes))
 
     def plot(self, *, ax: AxesLike | None = None) -> ControlPlot:
-        """Objective over alpha up to where it blows up, the choice marked.
+        """Plot the objective over alpha up to `blow_up`, with the optimum.
 
         Parameters
         ----------
         ax : Axes, optional
-            Where to draw; None: an empty current figure, or a new one.
+            Axes to plot in; default: the current figure if it is empty,
+            otherwise a new one.
 
         Returns
         -------
@@ -116,39 +117,42 @@ def choose_alpha(
     family: Callable[..., Trajectory] = TrigSpline,
     **options: Any,
 ) -> AlphaChoice:
-    """Shape parameter of the least objective, over all of [0, 2 pi).
+    """Shape parameter that minimises an objective over [0, 2 pi).
 
-    The objective is taken on a grid that is the finer the more constraints
-    there are, and every valley in which the least value can lie is solved for.
-    Where the objective does not depend on alpha (the path of a straight move
-    has one length) the least integral of the squared jerk decides.
+    The objective is evaluated on a grid, which is finer for more constraints, and
+    every local minimum that may be the global one is refined. If the minimum is
+    not unique (the path length of a straight move does not depend on alpha), the
+    integral of the squared jerk is minimised among the minimisers.
 
     Parameters
     ----------
     waypoints : iterable of Waypoint
-        What the plan meets.
+        Prescribed positions and derivatives.
     objective : str or callable, optional
-        What should be least: "path" (length), "wandering", "peak_velocity",
+        Objective to be minimised: "path" (length), "wandering", "peak_velocity",
         "peak_acceleration", "peak_jerk", "peak_snap", "squared_velocity", ...,
         "squared_snap", an objective such as ``PeakDerivative(5)``, or any
-        function of a plan that returns a number. Axes must share a unit.
+        function of a plan that returns a number. Axes must have the same unit.
     family : callable, optional
-        Kind of plan with an argument alpha: `TrigSpline` or `PiecewiseSpline`.
+        Class of the plan, with an argument `alpha`: `TrigSpline` or
+        `PiecewiseSpline`.
     **options
         Further arguments of the family: gamma, degree, labels, ...
 
     Returns
     -------
     AlphaChoice
+        With the attributes alpha, value (of the objective), plan, alphas and
+        values (the objective over alpha), blow_up, tied and objective (its name).
 
     Raises
     ------
     ValueError
-        If no alpha gives a plan, or the objective returns nan.
+        If there is no plan for any alpha, or the objective returns nan.
 
     Examples
     --------
-    The least peak jerk of a unit move is less than the polynomial's 60:
+    The minimum peak jerk of a unit move, which is 60 for the polynomial:
 
     >>> import ctrlplan as cp
     >>> found = cp.choose_alpha([cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1, 0, 0)], "peak_jerk")
@@ -160,7 +164,7 @@ def choose_alpha(
     if not callable(family):
         raise TypeError(f"family must be TrigSpline, PiecewiseSpline or a function like them, got {family!r}")
 
-    # Candidates swing wherever alpha is too large: only the choice may warn.
+    # Candidates swing where alpha is too large: only the optimum may warn.
     quiet = options | {"warn": False} if _can_be_quiet(family) else options
 
     def plan_of(alpha: float) -> Trajectory:
@@ -175,7 +179,7 @@ def choose_alpha(
     scale = abs(best) if declared is None else declared
     level = best + _TIE * scale
     tied = np.flatnonzero(values <= level)
-    # Of one valley only its bottom is tied; of a plateau, or of several valleys, whole steps of the grid.
+    # A single minimum ties one grid point; a plateau, or several equal minima, tie points further apart.
     flat = bool(np.ptp(alphas[tied]) > 0.5 * np.diff(alphas).max())
     if flat:
         alpha, value = _smoothest(search, plan_of, alphas, tied, level)
@@ -197,12 +201,12 @@ def _can_be_quiet(family: Callable[..., Trajectory]) -> bool:
     """Whether a family has an argument `warn`."""
     try:
         return "warn" in inspect.signature(family).parameters
-    except ValueError:  # of a function written in another language nothing is known
+    except ValueError:  # a compiled function without a signature
         return False
 
 
 class _Search:
-    """Objective as a function of alpha: inf where there is no plan."""
+    """Objective as a function of alpha; inf where there is no plan."""
 
     def __init__(self, plan_of: Callable[[float], Trajectory], goal: Objective) -> None:
         self._plan_of, self._goal = plan_of, goal
@@ -211,7 +215,7 @@ class _Search:
     def __call__(self, alpha: float) -> float:
         try:
             plan = self._plan_of(float(alpha))
-        except ValueError as rejection:  # free entries can make single alphas singular
+        except ValueError as rejection:  # with free entries the system may be singular at some alphas
             self.rejection = self.rejection or rejection
             return math.inf
         value: Any = self._goal(plan)
@@ -223,10 +227,10 @@ class _Search:
 
 
 def _grid(points: tuple[Waypoint, ...]) -> Array:
-    """Alphas from 0 to just below 2 pi, so many that the highest harmonic is followed."""
+    """Grid from 0 to just below 2 pi that resolves the highest harmonic."""
     _, patterns = given_entries(points)
-    most = max(sum(map(len, pattern)) for pattern in patterns)
-    return np.linspace(0.0, 2.0 * math.pi * 0.995, 33 + 3 * most)
+    count = max(sum(map(len, pattern)) for pattern in patterns)
+    return np.linspace(0.0, 2.0 * math.pi * 0.995, 33 + 3 * count)
 
 
 def _smoothest(
@@ -236,10 +240,10 @@ def _smoothest(
     tied: NDArray[np.intp],
     level: float,
 ) -> tuple[float, float]:
-    """Of the alphas whose objective is at its least, that of the least integral of the squared jerk."""
+    """Minimiser of the integral of the squared jerk among the minimisers of the objective."""
     jerk = _Search(plan_of, SquaredDerivative(3))
     costs = np.array([jerk(alpha) for alpha in alphas[tied].tolist()])
-    # The first of equals: the polynomial, if it is one of them.
+    # The first of equal values: the polynomial, if it is among them.
     k = int(tied[int(np.argmax(costs <= costs.min() * (1.0 + 1e-12)))])
     here = float(alphas[k])
     low, high = (
@@ -254,13 +258,13 @@ def _smoothest(
 
 
 def _level_edge(search: Callable[[float], float], inside: float, outside: float, level: float) -> float:
-    """How far towards a neighbour the objective stays at its least."""
+    """Limit, towards a neighbour, of the interval in which the objective is at its minimum."""
     if search(outside) <= level:
         return outside
     return bisected(lambda alpha: search(alpha) <= level, inside, outside, 1e-9)[0]
 
 
 def _blow_up(alphas: Array, values: Array, bound: float) -> float:
-    """Alpha from which on the objective stays above a bound."""
+    """Alpha above which the objective always exceeds a bound."""
     last = int(np.flatnonzero(values <= bound)[-1])
     return float(alphas[last + 1]) if last + 1 < alphas.size else 2.0 * math.pi

@@ -1,4 +1,4 @@
-"""A way around obstacles: via points that the designer need not give."""
+"""Obstacle avoidance by automatically inserted via points."""
 
 from __future__ import annotations
 
@@ -31,19 +31,19 @@ Build = Callable[[Iterable[Waypoint]], Trajectory]
 Pairs = NDArray[np.intp]
 Mask = NDArray[np.bool_]
 
-_WAYS = 3  # classes of ways round the obstacles that are tried,
-_DETOUR = 1.5  # none longer than this many times the shortest
-_LONG = 2.0  # times the shortest way, above which there is a warning
+_MAXIMUM_CLASSES = 3  # maximum number of homotopy classes that are tried,
+_DETOUR = 1.5  # with lengths up to this multiple of the shortest path
+_LONG = 2.0  # length relative to the shortest path above which a warning is issued
 _SAMPLES = 257
-_WINDOW = 8  # samples that share one constraint: their least
-_TRIES = 3  # at a certificate with the same via points, each with more room
-_STEP = 1e-7  # of differences, of unknowns about 1 in size
-_PRICE = 3e2  # of a clearance missed by the length of the path, in units of the roughness at first
+_WINDOW = 8  # samples per constraint, which is on their minimum
+_TRIES = 3  # optimisations with the same via points and increasing margins
+_STEP = 1e-7  # step of finite differences, for unknowns of magnitude 1
+_PRICE = 3e2  # penalty of a clearance violation of one path length, relative to the initial roughness
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Avoidance(Displayed):
-    """Plan that keeps clear of obstacles; made by `avoid`.
+    """Plan with certified clearance from obstacles, see `avoid`.
 
     For one release it can be used as the plan itself, with a FutureWarning.
 
@@ -52,7 +52,7 @@ class Avoidance(Displayed):
     plan : Trajectory
         The plan.
     clearance : Clearance
-        Its certified clearance over the whole interval.
+        Certified clearance over the whole plan.
     """
 
     plan: Trajectory
@@ -109,58 +109,59 @@ def avoid(
     rope: Rope | None = None,
     max_points: int = 4,
 ) -> Avoidance:
-    r"""Plan through the same waypoints that keeps clear of obstacles.
+    r"""Plan through the same waypoints that avoids obstacles.
 
-    Shortest polylines, one a class of ways round the obstacles, give the first
-    via points; positions and times of these are then moved to where the plan is
-    least rough, and further ones inserted where it comes too near. Of the plans
-    whose clearance is certified over the whole interval, the least rough is
-    returned: of the kind given if there is one, otherwise a `PiecewiseSpline`.
-    With T the duration and L the length of the given plan's path, the roughness
-    is
+    The shortest polyline of each homotopy class of paths around the obstacles
+    gives initial via points. Their positions and times are optimised for minimum
+    roughness, and further via points are inserted where the plan is too near to
+    an obstacle. Of the plans with certified clearance over the whole interval,
+    that of minimum roughness is returned: one of the class of the given plan, or
+    otherwise a `PiecewiseSpline`. With T the duration and L the path length of
+    the given plan, the roughness is
 
     .. math:: \frac{T^5}{720 L^2} \int |p'''|^2 dt + \frac{1}{L} \int |p'| dt
 
-    What a plant asks of a plan besides (`Crane.check`) is not looked at: that a
-    load stays below its trolley takes a half-plane above.
+    Other constraints of a plant (`Crane.check`) are not considered. To keep a
+    load below its trolley, add a half-plane above it.
 
     Parameters
     ----------
     plan : Trajectory
-        Plan of two axes. The result has the plan itself if it keeps clear.
-        Otherwise it must be made through waypoints, a `WaypointSpline` such as
-        `PolySpline`, whose axes do not depend on each other; its waypoints are
-        kept, all entries and times.
+        Plan of two axes, which is returned if it has the clearance. Otherwise it
+        must be a `WaypointSpline`, such as `PolySpline`, with independent axes;
+        the times and entries of its waypoints are preserved.
     obstacles : iterable of Obstacle
         One or more.
     clearance : float, optional
-        Distance to keep, at least 0.
+        Required clearance, at least 0.
     load : float, optional
         Radius of the load.
     rope : Rope, optional
-        Straight rope that must stay clear as well, such as `Crane.rope()`.
+        Straight rope, such as `Crane.rope()`, which must have the clearance as
+        well.
     max_points : int, optional
-        Via points inserted at most.
+        Maximum number of inserted via points.
 
     Returns
     -------
     Avoidance
-        The plan, and its certified clearance.
+        With the attributes plan and clearance, a `Clearance`.
 
     Raises
     ------
     ValueError
-        If a waypoint is too near to an obstacle, or its rope where the waypoint
-        settles it; or if no plan is found: with the best clearance reached,
-        where, when, and to which obstacle.
+        If a waypoint, or its rope if the waypoint determines it, is too near to
+        an obstacle; or if no plan is found, with the maximum clearance found and
+        its position, time and obstacle.
     TypeError
-        If the plan comes too near and is not made through waypoints (an S-curve,
-        a shaped plan, a sum of plans), or an obstacle is none.
+        If the plan is too near to an obstacle and is not a `WaypointSpline` (an
+        S-curve, a shaped plan, a sum of plans), or if an object is not an
+        obstacle.
 
     Warns
     -----
     UserWarning
-        If the path is more than twice as long as the shortest way round the
+        If the path is more than twice as long as the shortest path around the
         obstacles.
 
     Examples
@@ -186,26 +187,26 @@ def avoid(
     if task.given.certified:
         return Avoidance(plan, task.given)
     best = task.given
-    spline = _made_through_waypoints(task)
-    ways = _ways(task)
+    spline = _rebuildable(task)
+    polylines = _polylines(task)
     for build in _kinds(spline):
         found = []
-        for way in ways:
-            reached, certificate = _search(task, build, way)
+        for polyline in polylines:
+            reached, certificate = _search(task, build, polyline)
             if certificate.certified:
                 found.append(Avoidance(reached, certificate))
-            elif certificate.lower > best.minimum:  # certainly better: rounding is a tie, and the earlier plan stays
+            elif certificate.lower > best.minimum:  # larger beyond rounding; in a tie the earlier plan is retained
                 best = certificate
         if found:
             smoothest = min(found, key=lambda avoidance: task.roughness(avoidance.plan))
-            _check_length(smoothest.plan, sum(map(_length, ways[0])))
+            _check_length(smoothest.plan, sum(map(_length, polylines[0])))
             return smoothest
     x, z = best.position
     raise ValueError(
-        f"no plan with {task.max_points} via points or fewer was found that keeps {task.wanted:g} from every obstacle: "
-        f"the best keeps {best.minimum:.4g}, the {best.part} from obstacles[{best.obstacle}] "
-        f"with the load at ({x:.4g}, {z:.4g}) at {best.time:.4g} s; plans may exist that the search does not find: "
-        f"give via waypoints, more of them by max_points, or another clearance"
+        f"no plan with {task.max_points} via points or fewer and a clearance of {task.required:g} was found: "
+        f"the maximum clearance is {best.minimum:.4g}, of the {best.part} from obstacles[{best.obstacle}] "
+        f"with the load at ({x:.4g}, {z:.4g}) at {best.time:.4g} s; the search does not find every plan: "
+        f"add waypoints, increase max_points or reduce the clearance"
     )
 
 
@@ -213,19 +214,19 @@ def _check_length(plan: Trajectory, shortest: float) -> None:
     length = plan_length(plan)
     if length > _LONG * shortest:
         warnings.warn(
-            f"the path found is {length:.4g} long, {length / shortest:.2g} times the shortest way round the obstacles: "
-            f"a local optimum; give via waypoints, or prescribe fewer derivatives",
+            f"the path found is {length:.4g} long, {length / shortest:.2g} times the shortest path around obstacles: "
+            f"a local optimum; add waypoints, or prescribe fewer derivatives",
             stacklevel=3,
         )
 
 
 @dataclass(frozen=True)
 class _Task:
-    """What is asked for, and what every candidate is measured by."""
+    """Requirements, and the evaluation of candidates."""
 
     plan: Trajectory
     obstacles: tuple[Obstacle, ...]
-    wanted: float
+    required: float
     load: float
     rope: Rope | None
     max_points: int
@@ -242,22 +243,22 @@ class _Task:
 
     @cached_property
     def given(self) -> Clearance:
-        """Clearance of the plan given."""
+        """Clearance of the given plan."""
         return self.certificate(self.plan)
 
     @property
     def ngaps(self) -> int:
-        """Number of clearances: of the load and of the rope, from each obstacle."""
+        """Number of clearances, of the load and of the rope, from each obstacle."""
         return len(self.obstacles) * (1 if self.rope is None else 2)
 
     @cached_property
     def size(self) -> float:
-        """Length of the given plan's path."""
+        """Path length of the given plan."""
         path = self.plan(np.linspace(self.plan.start, self.plan.end, _SAMPLES))
         return float(np.hypot(*np.diff(path)).sum()) or 1.0
 
     def check_waypoints(self) -> None:
-        """Refuse waypoints that are too near to an obstacle, whatever the way between them."""
+        """Raise for waypoints that are too near to an obstacle."""
         if not self.plan.waypoints:
             return
         slack = 1e-9 * float(np.abs(self.points).max())
@@ -265,10 +266,10 @@ class _Task:
             jet = point.jet[:, :, None]
             for j, thing in enumerate(self.obstacles):
                 gap = float(thing.distance(jet[0])[0])
-                if gap - self.load < self.wanted - slack:
-                    what = f"lies {-gap:.4g} inside" if gap < 0.0 else f"keeps {gap - self.load:.4g} from"
+                if gap - self.load < self.required - slack:
+                    what = f"lies {-gap:.4g} inside" if gap < 0.0 else f"is {gap - self.load:.4g} from"
                     raise ValueError(
-                        f"the load must keep {self.wanted:g} from every obstacle at each waypoint, "
+                        f"the load must have a clearance of {self.required:g} at each waypoint, "
                         f"got waypoints[{i}] that {what} obstacles[{j}]"
                     )
                 if self.rope is None or len(jet) <= self.rope.order:
@@ -277,14 +278,14 @@ class _Task:
                 if not np.isfinite(jet).all():
                     continue
                 gap = float(thing.segment_distance(self.rope.top(jet), jet[0])[0])
-                if gap < self.wanted - slack:
+                if gap < self.required - slack:
                     raise ValueError(
-                        f"the rope must keep {self.wanted:g} from every obstacle at each waypoint, "
+                        f"the rope must have a clearance of {self.required:g} at each waypoint, "
                         f"got {gap:.4g} from obstacles[{j}] at waypoints[{i}]"
                     )
 
     def certificate(self, plan: Trajectory) -> Clearance:
-        return certified_clearance(plan, self.obstacles, load=self.load, rope=self.rope, required=self.wanted)
+        return certified_clearance(plan, self.obstacles, load=self.load, rope=self.rope, required=self.required)
 
     def clearances(self, jet: Array) -> Array:
         """Clearances (nvalues, ...) of the load, then of the rope, from jets (order + 1, 2, ...)."""
@@ -300,7 +301,7 @@ class _Task:
 
 
 def _roughness(t: Array, jet: Array, size: float) -> Array:
-    """What the docstring of `avoid` says, by the trapezoidal rule, from jets (order + 1, 2, ..., ntime)."""
+    """Roughness as in the docstring of `avoid`, by the trapezoidal rule, from jets (order + 1, 2, ..., ntime)."""
     duration = t[-1] - t[0]
     jerk = trapezoid(np.sum(jet[3] ** 2, axis=0), t)
     return np.asarray(duration**5 / (720.0 * size**2) * jerk + trapezoid(np.hypot(*jet[1]), t) / size)
@@ -312,7 +313,7 @@ def _checked_plan(plan: Trajectory) -> Trajectory:
     if plan.naxes != 2:
         raise ValueError(f"a plan among obstacles must have two axes, got {plan.naxes}")
     if not plan.duration:
-        raise TypeError(f"plan must have a duration, made through waypoints, got a {type(plan).__name__}")
+        raise TypeError(f"plan must be a spline through waypoints with a duration, got a {type(plan).__name__}")
     if isinstance(plan, WaypointSpline):
         if plan.end != plan.waypoints[-1].time:
             last = plan.waypoints[-1].time
@@ -324,41 +325,42 @@ def _checked_plan(plan: Trajectory) -> Trajectory:
     return plan
 
 
-def _made_through_waypoints(task: _Task) -> WaypointSpline:
-    """The plan given, of which others through further waypoints can be made."""
+def _rebuildable(task: _Task) -> WaypointSpline:
+    """The given plan, checked to be a spline that can be rebuilt through further waypoints."""
     plan, given = task.plan, task.given
     if not isinstance(plan, WaypointSpline):
         raise TypeError(
-            f"plan must be made through waypoints to be led round obstacles (a WaypointSpline, such as PolySpline), "
-            f"got a {type(plan).__name__} that keeps {given.minimum:.4g} from obstacles[{given.obstacle}] at "
-            f"{given.time:.4g} s; plan a spline through the same points, and shape or combine the result"
+            f"plan must be a WaypointSpline, such as PolySpline, to be led around obstacles, "
+            f"got a {type(plan).__name__} with a clearance of {given.minimum:.4g} from obstacles[{given.obstacle}] at "
+            f"{given.time:.4g} s; use a spline through the same waypoints, and shape or combine the result"
         )
     return plan
 
 
 def _kinds(plan: WaypointSpline) -> Iterator[Build]:
-    """How plans through other waypoints are made: as the given one, then of minimum-jerk segments."""
+    """Functions that build plans through other waypoints: of the same class, then with minimum-jerk segments."""
     yield plan.quiet().through
     if not (isinstance(plan, PiecewiseSpline) and plan.alpha == 0.0):
         yield lambda points: PiecewiseSpline(points, labels=plan.labels, warn=False)
 
 
-# Ways: polylines round the obstacles
+# Polylines around the obstacles
 
 
-def _ways(task: _Task) -> list[list[Array]]:
+def _polylines(task: _Task) -> list[list[Array]]:
     """Shortest polyline of each homotopy class as corners (2, n) by segment, with waypoints; the shortest first."""
-    for margin in ((1.0 + 1e-3) * (task.load + task.wanted), 0.0):
-        # Where there is no room for what is wanted, how near a plan comes is still worth knowing.
+    for margin in ((1.0 + 1e-3) * (task.load + task.required), 0.0):
+        # If the required clearance is impossible, the maximum clearance found is still reported.
         nodes, edges = _visible(task, margin)
         found = {}
         for barred in _barred(task, nodes, edges, margin):
-            way = _shortest(nodes, edges[:, ~barred], task.times.size)
-            if way:
-                found[np.concatenate(way, axis=1).tobytes()] = sum(map(_length, way)), way
+            polyline = _shortest(nodes, edges[:, ~barred], task.times.size)
+            if polyline:
+                found[np.concatenate(polyline, axis=1).tobytes()] = sum(map(_length, polyline)), polyline
         if found:
-            ways = sorted(found.values(), key=lambda pair: pair[0])
-            return [way for length, way in ways[:_WAYS] if length <= _DETOUR * ways[0][0]]
+            polylines = sorted(found.values(), key=lambda pair: pair[0])
+            longest = _DETOUR * polylines[0][0]
+            return [polyline for length, polyline in polylines[:_MAXIMUM_CLASSES] if length <= longest]
     return [[task.points[:, k : k + 2] for k in range(task.times.size - 1)]]
 
 
@@ -367,14 +369,14 @@ def _length(line: Array) -> float:
 
 
 def _visible(task: _Task, margin: float) -> tuple[Array, Pairs]:
-    """Nodes, the waypoints first, and the pairs of them that see each other."""
+    """Nodes of the visibility graph, the waypoints first, and its edges."""
     nodes = np.concatenate([task.points, *(thing.corners(margin) for thing in task.obstacles)], axis=1)
     reach = margin - 1e-9 * float(np.abs(nodes).max())
     clear = np.all([thing.distance(nodes) >= reach for thing in task.obstacles], axis=0)
     clear[: task.times.size] = True
     nodes = nodes[:, clear]
     pairs = np.stack(np.triu_indices(nodes.shape[1], 1))
-    # A waypoint may be nearer than the corners by what rounds them.
+    # A waypoint may be nearer to an obstacle than the corners by their rounding.
     reach -= 2e-3 * margin
     seen = [thing.segment_distance(*(nodes[:, end] for end in pairs)) >= reach for thing in task.obstacles]
     pairs = pairs[:, np.all(seen, axis=0)]
@@ -384,11 +386,11 @@ def _visible(task: _Task, margin: float) -> tuple[Array, Pairs]:
     jet = np.zeros((task.rope.order + 1, 2, p.shape[1], 33))
     jet[0] = p + np.linspace(0.0, 1.0, 33) * (q - p)
     hanging = task.clearances(jet)[len(task.obstacles) :].min(axis=(0, 2))
-    return nodes, pairs[:, hanging >= min(task.wanted, reach)]
+    return nodes, pairs[:, hanging >= min(task.required, reach)]
 
 
 def _barred(task: _Task, nodes: Array, edges: Pairs, margin: float) -> Iterator[Mask]:
-    """Edges barred, class by class: those that cross a ray to one side or the other from inside an obstacle."""
+    """Barred edges of each homotopy class: those that cross a ray from inside an obstacle to one side or the other."""
     none = np.zeros(edges.shape[1], dtype=bool)
     x, z = task.points[:, -1] - task.points[:, 0]
     across = np.array([-z, x]) if x or z else np.array([0.0, 1.0])
@@ -409,28 +411,28 @@ def _barred(task: _Task, nodes: Array, edges: Pairs, margin: float) -> Iterator[
 
 
 def _shortest(nodes: Array, edges: Pairs, npoints: int) -> list[Array]:
-    """Shortest polyline from each waypoint to the next; none if one cannot be reached."""
+    """Shortest polyline from each waypoint to the next; empty if one cannot be reached."""
     lengths = np.hypot(*(nodes[:, edges[1]] - nodes[:, edges[0]]))
-    # csgraph of scipy 1.14 reads indices of 32 bits only.
+    # csgraph of scipy 1.14 accepts 32-bit indices only.
     graph = csr_array((lengths, tuple(edges.astype(np.int32))), shape=(nodes.shape[1],) * 2)
     far, before = dijkstra(graph, directed=False, indices=range(npoints - 1), return_predecessors=True)
-    way = []
+    polyline = []
     for segment in range(npoints - 1):
         passed = [segment + 1]
         while passed[-1] != segment:
             if not np.isfinite(far[segment, segment + 1]):
                 return []
             passed.append(before[segment, passed[-1]])
-        way.append(nodes[:, passed[::-1]])
-    return way
+        polyline.append(nodes[:, passed[::-1]])
+    return polyline
 
 
-# Via points: from the corners of a way to a certified plan
+# Via points: from the corners of a polyline to a certified plan
 
 
 @dataclass(frozen=True)
 class _Vias:
-    """Via points in order: the segment of each, its time and position."""
+    """Via points in order of time, with their segments and positions."""
 
     segments: NDArray[np.intp]
     times: Array
@@ -445,9 +447,9 @@ class _Vias:
         )
 
 
-def _search(task: _Task, build: Build, way: list[Array]) -> tuple[Trajectory, Clearance]:
-    """Certified plan along a way, or the one that keeps farthest from the obstacles."""
-    vias = _first(task, way)
+def _search(task: _Task, build: Build, polyline: list[Array]) -> tuple[Trajectory, Clearance]:
+    """Certified plan along a polyline, or the plan of maximum clearance."""
+    vias = _first(task, polyline)
     best: Trajectory = task.plan
     nearest = task.given
     while True:
@@ -459,28 +461,28 @@ def _search(task: _Task, build: Build, way: list[Array]) -> tuple[Trajectory, Cl
             try:
                 plan = _through(task, build, vias)
                 found = task.certificate(plan)
-            except ValueError:  # no plan of this kind through so many points, or one that the rope cannot follow
+            except ValueError:  # no plan of this class through these points, or a slack rope
                 break
             if found.certified:
                 return plan, found
             if found.minimum > nearest.minimum:
                 best, nearest = plan, found
-            missed = task.wanted - found.minimum
-            if missed > 3.0 * margin:  # more than what lies between samples
+            missed = task.required - found.minimum
+            if missed > 3.0 * margin:  # more than the error between samples
                 break
             margin += 1.5 * max(missed, 0.0)
-        # One via point more that has brought nothing is followed by no other.
+        # Stop if an additional via point did not increase the clearance.
         stuck = found is not task.given and vias.times.size > 1 and nearest.minimum < before + fine
         if stuck or vias.times.size >= task.max_points:
             return best, nearest
-        time = _beside(task, vias, found.time)
+        time = _apart(task, vias, found.time)
         vias = vias.inserted(task, time, plan(time))
 
 
-def _first(task: _Task, way: list[Array]) -> _Vias:
-    """Corners that bend a way most, at times in proportion to its length; if it has none, the worst place on it."""
+def _first(task: _Task, polyline: list[Array]) -> _Vias:
+    """Sharpest corners of a polyline, at times in proportion to its length; without corners, its worst point."""
     vias = _Vias(np.empty(0, dtype=np.intp), np.empty(0), np.empty((2, 0)))
-    lines = list(way)
+    lines = list(polyline)
     while True:
         bends: dict[tuple[int, int], float] = {}
         for segment, line in enumerate(lines):
@@ -494,18 +496,18 @@ def _first(task: _Task, way: list[Array]) -> _Vias:
     for segment, k in bends:
         run = np.cumsum(np.hypot(*np.diff(lines[segment])))
         begin, end = task.times[segment : segment + 2]
-        time = _beside(task, vias, begin + (end - begin) * run[k - 1] / run[-1])
+        time = _apart(task, vias, begin + (end - begin) * run[k - 1] / run[-1])
         vias = vias.inserted(task, time, lines[segment][:, k])
     if not bends:
-        time = _beside(task, vias, task.given.time)
+        time = _apart(task, vias, task.given.time)
         segment = int(np.searchsorted(task.times, time)) - 1
         begin, end = task.times[segment : segment + 2]
         vias = vias.inserted(task, time, lines[segment] @ np.array([end - time, time - begin]) / (end - begin))
     return vias
 
 
-def _beside(task: _Task, vias: _Vias, time: float) -> float:
-    """Time kept away from the waypoints and via points about it."""
+def _apart(task: _Task, vias: _Vias, time: float) -> float:
+    """Time moved away from the neighbouring waypoints and via points."""
     knots = np.sort(np.concatenate([task.times, vias.times]))
     after = int(np.clip(np.searchsorted(knots, time), 1, knots.size - 1))
     a, b = knots[after - 1 : after + 1].tolist()
@@ -521,26 +523,26 @@ def _through(task: _Task, build: Build, vias: _Vias) -> Trajectory:
 
 
 def _moved(task: _Task, build: Build, vias: _Vias, margin: float) -> _Vias:
-    """Via points where the plan is least rough among those clear at samples, or misses what is wanted by least.
+    """Via points of minimum roughness subject to the clearance at samples, or of minimum violation.
 
     The unknowns are the positions in units of the size, the logarithms of the
-    shares of a segment's duration (the last one's is 0), and by how much the
-    clearance may be missed: with it no step of the search is without a solution.
+    relative durations within a segment (0 for the last one), and the violation of
+    the clearance, a slack variable that makes every step of the search feasible.
     """
     count = vias.segments.size
     t = np.linspace(task.plan.start, task.plan.end, _SAMPLES)
     order = 3 if task.rope is None else max(3, task.rope.order)
     windows = np.arange(0, t.size, _WINDOW)
-    # At the waypoints themselves there may be no more room than wanted.
+    # At the waypoints themselves the clearance may be just the required one.
     room = np.abs(t - task.times[:, None]).min(axis=0) / (0.05 * task.plan.duration)
-    wanted = task.wanted + margin * np.minimum(1.0, room)
+    required = task.required + margin * np.minimum(1.0, room)
 
     def jets(x: Array) -> Array:
         return _through(task, build, _decoded(task, vias, x)).jet(t, order)
 
     def valued(jet: Array) -> Array:
-        """Roughness, then the room in each window: shape (nvalues, ...) from jets (order + 1, 2, ..., ntime)."""
-        rooms = np.minimum.reduceat(task.clearances(jet) - wanted, windows, axis=-1) / task.size
+        """Roughness, then the clearance in each window: shape (nvalues, ...) from jets (order + 1, 2, ..., ntime)."""
+        rooms = np.minimum.reduceat(task.clearances(jet) - required, windows, axis=-1) / task.size
         rows = np.moveaxis(rooms, -1, 1).reshape(-1, *jet.shape[2:-1])
         return np.concatenate([_roughness(t, jet, task.size)[None], rows])
 
@@ -548,7 +550,7 @@ def _moved(task: _Task, build: Build, vias: _Vias, margin: float) -> _Vias:
     def measured(key: bytes) -> Array:
         try:
             return valued(jets(np.frombuffer(key)))
-        except ValueError:  # far from any plan: the search steps back
+        except ValueError:  # no plan here: the search steps back
             return np.append(1e6, np.full(windows.size * task.ngaps, -1e3))
 
     @lru_cache(maxsize=1)
@@ -556,7 +558,7 @@ def _moved(task: _Task, build: Build, vias: _Vias, margin: float) -> _Vias:
         x, steps = np.frombuffer(key), _STEP * np.eye(3 * count + 1)
         try:
             here = jets(x)
-            # The axes of a plan are independent: one plan shows what moving a point along either of them does.
+            # The axes of a plan are independent: one plan gives the derivatives along both.
             both = np.stack([jets(x + steps[i] + steps[count + i]) for i in range(count)], axis=2)
             along = np.repeat(here[:, :, None], 2 * count, axis=2)
             along[:, 0, :count], along[:, 1, count:] = both[:, 0], both[:, 1]
@@ -588,7 +590,7 @@ def _moved(task: _Task, build: Build, vias: _Vias, margin: float) -> _Vias:
 
 
 def _decoded(task: _Task, vias: _Vias, x: Array) -> _Vias:
-    """Via points of the unknowns of `_moved`."""
+    """Via points from the unknowns of `_moved`."""
     count, times = vias.segments.size, vias.times.copy()
     for segment in np.unique(vias.segments):
         here = vias.segments == segment
@@ -599,7 +601,7 @@ def _decoded(task: _Task, vias: _Vias, x: Array) -> _Vias:
 
 
 def _logarithms(task: _Task, vias: _Vias, segment: int) -> Array:
-    """Logarithms of the shares of a segment's duration, the last one's subtracted."""
+    """Logarithms of the relative durations within a segment, relative to the last one."""
     shares = np.log(np.diff([task.times[segment], *vias.times[vias.segments == segment], task.times[segment + 1]]))
     return shares[:-1] - shares[-1]
 

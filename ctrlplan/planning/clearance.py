@@ -1,4 +1,4 @@
-"""How far a plan stays from obstacles: a fact about its whole interval."""
+"""Certified clearance of a plan from obstacles over its whole interval."""
 
 from __future__ import annotations
 
@@ -16,23 +16,26 @@ from ctrlplan.planning.obstacles import Obstacle
 from ctrlplan.trajectories import Trajectory
 from ctrlplan.trajectories.common import Array
 
-_TIGHT = 1e-6  # gap between the bound and what is attained, where the size itself is asked for
-_ROUNDING = 1e-9  # of the coordinates: a plan that rests just as far from an obstacle as it must keeps clear of it
+_TIGHT = 1e-6  # relative gap between the bound and the attained minimum, unless a clearance is required
+_ROUNDING = 1e-9  # of the coordinates: a plan at rest at exactly the required clearance is certified
 
 
 @runtime_checkable
 class Rope(Protocol):
-    """Straight rope from the load up to a point that the load's jet gives."""
+    """Straight rope from the load up to a point `top`."""
 
     @property
     def order(self) -> int:
-        """Highest derivative of the load that `top` reads."""
+        """Highest derivative of the load that `top` uses."""
 
     def top(self, jet: Array) -> Array:
         """Upper end (2, ntime) from the load's jet (order + 1, 2, ntime)."""
 
     def slopes(self, plan: Trajectory) -> Array:
-        """Bounds (order + 1, 2) of the length of d top/d entry, for each entry of the jets of a plan."""
+        """Bounds (order + 1, 2) of the partial derivatives of `top`.
+
+        Norms, over the jets of a plan.
+        """
 
 
 @dataclass(frozen=True, repr=False)
@@ -42,23 +45,23 @@ class Clearance(Displayed):
     Attributes
     ----------
     lower : float
-        Everywhere on the whole interval the clearance is at least this, what
-        rounds the coordinates subtracted.
+        Lower bound of the clearance over the whole interval, including the
+        rounding of coordinates.
     minimum : float
         Minimum clearance, which is attained.
     time : float
-        When [s].
+        Time of the minimum [s].
     position : tuple of float
-        Where the load is then.
+        Position of the load at that time.
     obstacle : int
-        Index of the obstacle that is nearest then.
+        Index of the nearest obstacle at that time.
     part : "load" or "rope"
-        What it is nearest to.
+        Part that is nearest to the obstacle.
     required : float or None
-        What was asked for.
+        Required clearance.
     certified : bool or None
-        Whether `lower` reaches `required`, to rounding (1e-9 of the size of
-        the coordinates); None where nothing was asked for.
+        Whether `lower` is at least `required`, up to rounding (1e-9 of the size
+        of the coordinates); None if no clearance was required.
     """
 
     lower: float
@@ -102,15 +105,15 @@ def clearance(
     required: float | None = None,
     max_cells: int = 200_000,
 ) -> Clearance:
-    """Clearance of a plan in the plane, certified over its whole interval.
+    """Certified clearance of a plan in the plane from obstacles.
 
-    Cells of each segment are refined until a bound decides, not a sample. In a cell
-    of duration h the load leaves its chord by no more than h^2/8 times the
-    bound of its acceleration; the rope's ends move by no more than h/2 times
-    the bounds of their speeds. Both bounds come from the jet at the centre and
-    the plan's own peaks. What is asked for is `required`; without it, or where
-    it is missed, `lower` comes as near to `minimum` as 1e-6, relative where that is
-    above 1, or as `max_cells` allow.
+    Cells of each segment are refined until a bound, not a sample, is sufficient.
+    In a cell of duration h the distance of the load from its chord is at most
+    h^2/8 times the bound of its acceleration; the ends of the rope move by at
+    most h/2 times the bounds of their speeds. Both bounds come from the jet at the
+    centre and the peaks of the plan. The refinement ends when `required` is
+    certified; without it, or if it is violated, when the gap between `lower` and
+    `minimum` is below 1e-6, relative to a minimum above 1.
 
     Parameters
     ----------
@@ -121,23 +124,25 @@ def clearance(
     load : float, optional
         Radius of the load.
     rope : Rope, optional
-        Straight rope that must stay clear as well, such as `Crane.rope()`.
+        Straight rope, such as `Crane.rope()`, which is considered as well.
     required : float, optional
-        Clearance asked for.
+        Required clearance.
     max_cells : int, optional
-        Cells at most.
+        Maximum number of cells.
 
     Returns
     -------
     Clearance
+        With the attributes lower, minimum, time, position, obstacle, part,
+        required and certified.
 
     Raises
     ------
     ValueError
         If the plan has no duration or not two axes, there is no obstacle, the
-        load's radius is negative, or `max_cells` cells do not decide.
+        load's radius is negative, or `max_cells` is reached.
     TypeError
-        If an obstacle is none.
+        If an object is not an obstacle.
 
     Examples
     --------
@@ -155,7 +160,7 @@ def clearance(
     if plan.naxes != 2:
         raise ValueError(f"a plan among obstacles must have two axes, got {plan.naxes}")
     if not plan.duration:
-        raise ValueError("a trajectory without duration keeps clear of nothing on its way, got a step")
+        raise ValueError("a trajectory must have a duration for its clearance, got a step")
     cells = _Cells(plan, things, radius, rope)
     slack = _ROUNDING * float(plan.peak().max(initial=abs(goal or 0.0)))
     times = np.concatenate([np.linspace(a, b, 65)[:-1] for a, b in itertools.pairwise(plan.breakpoints.tolist())])
@@ -171,7 +176,7 @@ def clearance(
             if goal is not None and minimum >= goal - slack:
                 raise ValueError(
                     f"the clearance must be decided within {max_cells} cells, got a bound of {bound.min():.6g} and a "
-                    f"minimum of {minimum:.6g} where {goal:g} is required; raise max_cells or lower what is required"
+                    f"minimum of {minimum:.6g} where {goal:g} is required; increase max_cells or reduce required"
                 )
             open_[:] = False
         lower = min(lower, float(bound[~open_].min(initial=np.inf)))
@@ -182,7 +187,7 @@ def clearance(
 
 
 def checked_obstacles(obstacles: Iterable[Obstacle]) -> tuple[Obstacle, ...]:
-    """Obstacles as a tuple: one or more."""
+    """Obstacles as a tuple of at least one."""
     if isinstance(obstacles, Obstacle) or not isinstance(obstacles, Iterable):
         raise TypeError(f"obstacles must be a sequence of obstacles, got {obstacles!r}")
     things = tuple(obstacles)
@@ -195,14 +200,14 @@ def checked_obstacles(obstacles: Iterable[Obstacle]) -> tuple[Obstacle, ...]:
 
 
 def checked_rope(rope: Rope | None) -> Rope | None:
-    """Rope as clearances read it, or none."""
+    """Rope, checked, or None."""
     if rope is not None and not isinstance(rope, Rope):
         raise TypeError(f"rope must be a rope such as crane.rope(), got {rope!r:.60}")
     return rope
 
 
 class _Cells:
-    """Bounds on cells of a plan's interval, and the least clearance met so far."""
+    """Bounds on cells of a plan's interval, and the minimum clearance so far."""
 
     def __init__(self, plan: Trajectory, obstacles: tuple[Obstacle, ...], load: float, rope: Rope | None) -> None:
         self.plan, self.obstacles, self.load, self.rope = plan, obstacles, load, rope
@@ -221,9 +226,9 @@ class _Cells:
         """Lower bound (ncells,) of the clearance in each cell."""
         centre, half = 0.5 * (left + right), 0.5 * (right - left)
         jet = self.plan.jet(centre, self.order)
-        # In its cell a derivative moves by no more than the next one's value at the centre and slope allow.
-        most = np.minimum(self.peaks[:-1], np.abs(jet) + half * self.peaks[1:])
-        speed, acceleration = np.hypot(*most[1]), np.hypot(*most[2])
+        # Within a cell the change of a derivative is bounded by the next one's value at the centre and its slope.
+        bounds = np.minimum(self.peaks[:-1], np.abs(jet) + half * self.peaks[1:])
+        speed, acceleration = np.hypot(*bounds[1]), np.hypot(*bounds[2])
         ends = self.plan.jet(left, 0)[0], self.plan.jet(right, 0, left=True)[0]
         away = self.load + 0.5 * half**2 * acceleration
         chords = np.stack([thing.segment_distance(*ends) for thing in self.obstacles])
@@ -233,14 +238,14 @@ class _Cells:
         if self.rope is not None:
             order = self.rope.order
             top = self.rope.top(jet[: order + 1])
-            moves = half * np.maximum(speed, np.sum(self.slopes * most[1 : order + 2], axis=(0, 1)))
+            moves = half * np.maximum(speed, np.sum(self.slopes * bounds[1 : order + 2], axis=(0, 1)))
             values = np.stack([thing.segment_distance(top, jet[0]) for thing in self.obstacles])
             self._meet(centre, values, True)
             bound = np.minimum(bound, values.min(axis=0) - moves)
         return bound
 
     def _meet(self, t: Array, values: Array, rope: bool) -> None:
-        """Take the least of values (nobstacles, ntime) into account."""
+        """Update the minimum with values (nobstacles, ntime)."""
         if not np.isfinite(values).all():
             raise ValueError("distances must be finite over the plan, got nan or inf")
         obstacle, at = np.unravel_index(np.argmin(values), values.shape)
@@ -250,7 +255,7 @@ class _Cells:
     def result(self, lower: float, required: float | None, certified: bool | None) -> Clearance:
         time, obstacle, rope = self.where
         x, z = self.plan(time).tolist()
-        # Coordinates and distances are rounded; a bound is not allowed to be so upwards.
+        # Coordinates and distances are rounded; the bound is rounded down.
         safe = min(lower, self.minimum) - 32.0 * float(np.finfo(float).eps) * max(
             self.peaks[0].max(), abs(self.minimum)
         )

@@ -1,4 +1,4 @@
-"""The shortest duration for which limits hold over the whole of a plan."""
+"""Minimum duration of a plan under limits over its whole interval."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from ctrlplan._renamed import warn_renamed
 from ctrlplan.planning.limits import Limited, Margin, Margins
 from ctrlplan.planning.quantities import System, system_given
 from ctrlplan.planning.scalar_search import bisected, scan
-from ctrlplan.planning.time_law import with_fastest_law
+from ctrlplan.planning.time_law import with_fast_time_law
 from ctrlplan.trajectories import Trajectory, WaypointSpline
 from ctrlplan.trajectories.common import Array
 
@@ -28,34 +28,33 @@ if TYPE_CHECKING:
     from ctrlplan.reports.style import AxesLike
 
 Hold = Literal["shape", "waypoints", "path"]
-"""What `fastest` keeps of a plan."""
+"""Property of a plan that `fastest` preserves."""
 _PER_OCTAVE = 24
-"""Durations looked at while one doubles."""
+"""Number of durations per octave at which limits are evaluated."""
 
 
 @dataclass(frozen=True, repr=False)
 class Fastest(Displayed):
-    """Shortest plan under limits; made by `fastest`.
+    """Plan of minimum duration under limits; returned by `fastest`.
 
     Attributes
     ----------
     plan : Trajectory
-        Shortest plan found.
+        Plan of minimum duration.
     margins : Margins
-        Of every limit over the whole plan, the active one first.
+        Margins of all limits over the whole plan, the active one first.
     feasible : tuple of (float, float)
-        Intervals of durations [s] for which the limits hold, increasing; the
-        last end is inf where every longer duration will do, else where the
-        search ended.
+        Intervals of feasible durations [s], increasing. The last end is inf if
+        every longer duration is feasible, otherwise the end of the search.
     hold : str
-        What was kept.
+        Property that was preserved: "shape", "waypoints" or "path".
     limited : Limited
-        The limits, to look at other plans with.
+        The limits, for the evaluation of other plans.
     rejection : str
-        What the plant says of shorter plans, where that holds the plan back and
-        no limit does; else empty.
+        Reason for which shorter plans are infeasible for the plant, if no limit
+        is active; otherwise empty.
     searched : (float, float)
-        Durations [s] between which was searched.
+        Interval of durations [s] of the search.
     """
 
     plan: Trajectory
@@ -73,7 +72,7 @@ class Fastest(Displayed):
 
     @property
     def active(self) -> Margin:
-        """The active limit, which prevents a shorter plan unless `rejection` says what does."""
+        """The smallest margin, of the active limit without `rejection`."""
         return self.margins.active
 
     @property
@@ -102,15 +101,15 @@ class Fastest(Displayed):
         yield Figure("Position and velocity of the plan over time.", 2, lambda axes: self.plan.plot(ax=axes))
 
     def plot(self, units: Mapping[str, str] | None = None, *, ax: AxesLike | None = None) -> ControlPlot:
-        """Every limited signal over time with its limits.
+        """Plot all limited signals over time with their limits.
 
         Parameters
         ----------
         units : mapping of str to str, optional
-            Units by the signals' names.
+            Units of the signals by name.
         ax : array of Axes, shape (number of limits,), optional
-            Where to draw, in the order of the limits; None: an empty current
-            figure, or a new one.
+            Axes to plot in, in the order of the limits; default: the current
+            figure if it is empty, otherwise a new one.
 
         Returns
         -------
@@ -131,69 +130,70 @@ def fastest(
     durations: tuple[float, float] | None = None,
     quantities: System | None = None,
 ) -> Fastest:
-    """Shortest duration for which limits hold over the whole interval.
+    """Plan of minimum duration under limits.
 
-    Longer or shorter than the plan's own: what is given is retimed to limits
-    either way.
+    The limits are satisfied over the whole interval. The duration may be shorter
+    or longer than that of the given plan.
 
     Parameters
     ----------
     plan : Trajectory
-        What is retimed; one without duration has nothing to retime.
+        Plan to be retimed, with a duration.
     limits, system
-        As for `margins`: of derivatives, and of quantities of a system: a flat
-        system, a `Crane`, or a function of the jet.
+        Limits of derivatives, and of quantities of a system (a flat system, a
+        `Crane`, or a function of the jet), as for `margins`.
     hold : {"shape", "waypoints", "path"}, optional
-        What is kept. "shape": all times move in proportion, derivatives scale
-        with them, at the ends as well. "waypoints": their times move in
-        proportion, the derivatives given there are kept, and the spline is made
-        again through them. "path": the positions in their order; a time law is
-        searched that slows down where a limit requires it (`Retimed`). An end
-        at rest stays at rest; where the plan starts or ends in motion, the
-        speed there is free, and only its direction is kept.
+        Property that is preserved. "shape": time is scaled uniformly, and the
+        derivatives with it, including those at the ends. "waypoints": the times
+        of the waypoints are scaled, their prescribed derivatives are preserved,
+        and the spline is rebuilt. "path": the geometric path; a time law
+        (`Retimed`) is optimised. An end at rest remains at rest; if the plan
+        starts or ends in motion, the speed there is free.
     durations : (float, float), optional
-        Durations [s] between which is searched: unless given, from a 64th of
-        the shortest that was found (of the plan's duration where waypoints are
-        held) to 64 times the plan's.
+        Interval of durations [s] of the search. Default: from 1/64 of the minimum
+        that was found (of the plan's duration for "waypoints") to 64 times the
+        plan's duration.
     quantities : optional
-        Old name of `system`, with a FutureWarning.
+        Deprecated name of `system`.
 
     Returns
     -------
     Fastest
+        With the attributes plan, duration, margins, active (the active limit),
+        feasible, hold, limited, rejection and searched.
 
     Raises
     ------
     ValueError
-        If no duration will do: the message says which limit cannot hold, its
-        value, and where; if limits are wrong, the plan does not move, or a
-        derivative of the plan jumps that a limited signal is the derivative of;
-        if the plan is shaped (`Shaper`), since another duration would change
-        the delays; if the plan is closed in motion and the path is held, since
-        the time law would open it.
+        If no duration is feasible: the message states the violated limit, the
+        value and the time. If limits are wrong, the plan does not move, or a
+        limited signal is infinite at a jump of a lower derivative. If the plan is
+        shaped (`Shaper`), since another duration would change the delays. If the
+        plan is closed and in motion at its ends and `hold` is "path", since the
+        velocities at the ends would differ.
     RuntimeError
-        If a quantity is not resolved, since it is noisy or oscillates.
+        If a quantity is not resolved because it is noisy or oscillates.
 
     Notes
     -----
-    With the shape held, limits on derivatives alone have the closed form
-    T = T_0 max_k (peak_k/limit_k)^(1/k). All else is a search: feasibility need
-    not be monotone in the duration (a quintic from 0 to 1 with end speeds 1
-    needs no acceleration in 1 s, and some in 0.8 s and in 2 s). Durations are
-    looked at 24 times an octave on samples, valleys between them are searched,
-    and the ends of every feasible interval are solved for with the extrema of
-    the whole plan. What is returned satisfies every limit: of derivatives to
-    the last bit, of quantities to the tolerance of `margins`; where a limit is
-    touched at rest, to rounding. Inside the intervals of `Fastest.feasible`
-    limits were evaluated at samples only.
+    With fixed shape, limits on derivatives have the closed-form solution
+    T = T_0 max_k (peak_k/limit_k)^(1/k). All other cases require a search, since
+    feasibility may not be monotone in the duration (a quintic from 0 to 1 with end
+    speeds 1 has no acceleration in 1 s, but has some in 0.8 s and in 2 s). Limits
+    are evaluated on samples at 24 durations per octave, local minima of the
+    violation are refined, and the ends of all feasible intervals are computed
+    with the extrema over the whole plan. The returned plan satisfies every limit:
+    of derivatives exactly, of quantities to the tolerance of `margins`, and up to
+    rounding where a limit is attained at rest. Inside the intervals of
+    `Fastest.feasible` limits were evaluated at samples only.
 
-    With the path held the plan is not time-optimal. The rate of the time law is
-    a spline with 16 knots in the time of the plan given, not along its path, so
-    that the duration depends on the timing of that plan, and a dwell in it
-    stays. A straight move through n equally spaced waypoints (velocity 10,
-    acceleration 1, length 1: 2 s at best) takes 2.04 s for n = 2 and 2.9 s for
-    n = 10; paths through 5 to 50 waypoints took 1.4 times the time-optimal
-    duration in the median, and twice at worst.
+    With fixed path the plan is not exactly time-optimal. The rate of the time law
+    is a spline with 16 knots in the time of the given plan, not along its path, so
+    the duration depends on the timing of that plan, and a dwell remains. A
+    straight move through n equally spaced waypoints (velocity 10, acceleration 1,
+    length 1, time-optimal 2 s) has a duration of 2.04 s for n = 2 and 2.9 s for
+    n = 10. For paths through 5 to 50 waypoints the duration relative to the
+    time-optimal one was 1.4 (median) and 2 (maximum).
 
     Examples
     --------
@@ -203,7 +203,7 @@ def fastest(
     >>> round(found.duration, 9), found.active.bound.name
     (3.75, 'y_d1')
 
-    A turn of a motor, as fast as 120 V allow:
+    One revolution of a motor in minimum time with 120 V:
 
     >>> turn = cp.PolySpline([cp.Waypoint(0, 0, 0, 0, 0), cp.Waypoint(2, 6.28, 0, 0, 0)])
     >>> found = cp.fastest(turn, {"voltage": 120.0}, cp.plants.dc_motor())
@@ -216,7 +216,7 @@ def fastest(
     limited.check_smooth(plan)
     extrema = plan.extrema()
     if not (extrema.maximum - extrema.minimum > 1e-14 * plan.peak()).any():
-        raise ValueError(f"plan must move to be limited by its duration, got none of its axes that does: {plan!r}")
+        raise ValueError(f"plan must move, got constant axes: {plan!r}")
     span = None if durations is None else checked_pair(durations, "durations")
     if span is not None and not (span[0] > 0.0 and math.isfinite(span[1])):
         raise ValueError(f"durations must be above 0 and finite, got {span[0]:g} to {span[1]:g}")
@@ -227,14 +227,14 @@ def fastest(
     uniform = fastest_within(plan, limited, span)
     if hold == "shape":
         return uniform
-    # The law is made of times: counted from 0 they keep the digits that a late start would cost.
-    law = with_fastest_law(uniform.plan.shift(-plan.start), limited).shift(plan.start)
+    # The values of the time law are times: relative to the start they have full precision.
+    law = with_fast_time_law(uniform.plan.shift(-plan.start), limited).shift(plan.start)
     retimed = fastest_within(law, limited, span)
     return replace(min(retimed, uniform, key=lambda found: found.duration), hold=hold)
 
 
 def _check_open(plan: Trajectory) -> None:
-    """Reject a plan that is closed in motion, which a time law with free ends would open."""
+    """Raise for a plan that is closed and in motion at its ends, for which a time law has different end velocities."""
     first, last = plan.jet(plan.start, 2), plan.jet(plan.end, 2, left=True)
     size, extrema = np.stack([plan.peak(nu) for nu in range(3)]), plan.extrema()
     slack = 1e-9 * size
@@ -249,7 +249,7 @@ def _check_open(plan: Trajectory) -> None:
 
 
 class _Scaled:
-    """A plan of any duration, its shape held: jets scale by powers."""
+    """Plans of fixed shape as a function of duration: jets are scaled by powers."""
 
     def __init__(self, plan: Trajectory, limited: Limited) -> None:
         self._plan, self.limited = plan, limited
@@ -264,13 +264,13 @@ class _Scaled:
 
 
 class _Replanned:
-    """A plan of any duration, the derivatives at its waypoints held."""
+    """Plans with fixed derivatives at the waypoints as a function of duration."""
 
     def __init__(self, plan: Trajectory, limited: Limited) -> None:
         if not isinstance(plan, WaypointSpline):
             raise TypeError(
-                f"waypoints are held of a spline made through them (a WaypointSpline, such as PolySpline), "
-                f"got a {type(plan).__name__}; hold the shape or the path"
+                f'plan must be a WaypointSpline, such as PolySpline, for hold="waypoints", '
+                f'got a {type(plan).__name__}; use hold="shape" or "path"'
             )
         self._plan, self.limited = plan.quiet(), limited
 
@@ -284,20 +284,20 @@ class _Replanned:
 
 
 def fastest_within(plan: Trajectory, limited: Limited, span: tuple[float, float] | None = None) -> Fastest:
-    """Shortest duration with the shape held, for limits that were made ready before."""
+    """Plan of minimum duration with fixed shape, for precomputed limits."""
     scaled = _Scaled(plan, limited)
     _check_rest(plan, limited)
     minimum = _closed_form(plan, limited)
     if limited.derivatives_only and span is None:
         if not minimum:
-            raise ValueError("limits must name a derivative that the plan has, got none that a shorter one would break")
-        found = _holding(limited, plan.retime, minimum)
+            raise ValueError("limits must include one that a shorter plan would violate, got none")
+        found = _satisfying(limited, plan.retime, minimum)
         return Fastest(found, limited.margins(found), ((found.duration, math.inf),), "shape", limited)
     return _searched(scaled, span or _span(scaled, plan.duration, minimum), "shape", endless=True)
 
 
 def _check_rest(plan: Trajectory, limited: Limited) -> None:
-    """Reject limits of positions and quantities that a plan breaks however slow it is."""
+    """Raise for limits of positions and quantities that are violated at every duration."""
     still = limited.at_rest(plan)
     for bound, values in zip(limited.bounds, limited.values(still), strict=True):
         worst = int(bound.excess(values).argmax())
@@ -305,13 +305,13 @@ def _check_rest(plan: Trajectory, limited: Limited) -> None:
             place = zip(plan.labels, still[0, :, worst].tolist(), strict=True)
             where = ", ".join(f"{label} = {value:.4g}" for label, value in place)
             raise ValueError(
-                f"limits must hold at rest, however slow the plan, got {bound.name} = {values[worst]:.6g} at rest "
-                f"at {where}, where it must stay {bound.range}"
+                f"limits must be satisfied at rest, at any duration, got {bound.name} = {values[worst]:.6g} at rest "
+                f"at {where}, where it must be {bound.range}"
             )
 
 
 def _closed_form(plan: Trajectory, limited: Limited) -> float:
-    """Duration below which some derivative breaks its limits, T_0 max_k (peak_k/limit_k)^(1/k)."""
+    """Minimum duration for limits of derivatives, T_0 max_k (peak_k/limit_k)^(1/k)."""
     minimum = 0.0
     for bound in limited.bounds:
         if bound.axis is not None and bound.order:
@@ -324,9 +324,9 @@ def _closed_form(plan: Trajectory, limited: Limited) -> float:
             for value, side, time in sides:
                 if side > 0.0:
                     minimum = max(minimum, plan.duration * (max(value, 0.0) / side) ** (1.0 / bound.order))
-                elif value > rounding:  # a sign that must not be, whatever the duration
+                elif value > rounding:  # a sign that violates the limit at any duration
                     raise ValueError(
-                        f"limits must hold for some duration, got {bound.name} of both signs where it must stay "
+                        f"limits must be satisfied for some duration, got {bound.name} of both signs where it must be "
                         f"{bound.range}: its sign at {time:.6g} s is the same at every duration"
                     )
     return minimum
@@ -337,24 +337,24 @@ def _around(duration: float) -> tuple[float, float]:
 
 
 def _span(scaled: _Scaled, duration: float, minimum: float) -> tuple[float, float]:
-    """Durations between which is searched, from where limits are broken to where they hold."""
+    """Interval of durations of the search, from violated to satisfied limits."""
     excess, high = scaled.excess, max(duration, minimum)
     for _ in range(60):
         if excess(high) <= 0.0 and scaled.limited.exact_excess(scaled.plan(1.01 * high)) <= 0.0:
             break
         high *= 2.0
     else:
-        raise ValueError(f"limits must hold for some duration, got none up to {high:.3g} s")
+        raise ValueError(f"limits must be satisfied for some duration, got none up to {high:.3g} s")
     low = high / 64.0
     while low > minimum and excess(low) <= 0.0:
         low /= 64.0
         if low < 1e-12 * high:
-            raise ValueError("limits must include one that a shorter plan would break, got none")
+            raise ValueError("limits must include one that a shorter plan would violate, got none")
     return max(low, 0.999 * minimum), 1.01 * high
 
 
 def _searched(family: _Scaled | _Replanned, span: tuple[float, float], hold: Hold, endless: bool) -> Fastest:
-    """Feasible durations within a span, and the plan of the shortest; endless where every slower plan is feasible."""
+    """Plan of minimum duration, and all feasible durations; `endless` if every slower plan is feasible."""
     limited = family.limited
     exact = cache(lambda duration: limited.exact_excess(family.plan(duration)))
     count = max(9, math.ceil(_PER_OCTAVE * math.log2(span[1] / span[0])))
@@ -362,7 +362,7 @@ def _searched(family: _Scaled | _Replanned, span: tuple[float, float], hold: Hol
     feasible = []
     for low, high in _runs(excess <= 0.0):
         inside = low + np.argsort(excess[low : high + 1])[:8]
-        # Samples can have seen less than there is.
+        # Samples may miss the extrema.
         middle = next((d for d in durations[inside].tolist() if exact(d) <= 0.0), None)
         if middle is None:
             continue
@@ -377,9 +377,9 @@ def _searched(family: _Scaled | _Replanned, span: tuple[float, float], hold: Hol
         _reject(family, durations, excess)
     if endless and feasible[-1][1] == durations[-1]:
         feasible[-1] = (feasible[-1][0], math.inf)
-    plan = _holding(limited, family.plan, feasible[0][0])
+    plan = _satisfying(limited, family.plan, feasible[0][0])
     found = limited.margins(plan)
-    # Where no limit is met, something else holds it back: a plant that cannot follow.
+    # If no limit is active, shorter plans are infeasible for the plant.
     rejection = limited.rejection(family.plan(0.99 * plan.duration)) if found.active.fraction > 1e-6 else ""
     searched = (span[0], math.inf if math.isinf(feasible[-1][1]) else span[1])
     return Fastest(plan, found, tuple(feasible), hold, limited, rejection, searched)
@@ -394,15 +394,15 @@ def _runs(inside: NDArray[np.bool_]) -> list[tuple[int, int]]:
 def _feasible_edge(
     exact: Callable[[float], float], sampled: Callable[[float], float], inside: float, outside: float
 ) -> float:
-    """Duration between a feasible and an infeasible one at which limits begin to hold."""
-    # Samples come cheap, and tell where to look.
+    """Boundary of the feasible durations between a feasible and an infeasible one."""
+    # Samples are fast, and give an approximate boundary.
     good, bad = bisected(lambda duration: sampled(duration) <= 0.0, inside, outside, 0.0, 1e-6)
     step = good - bad
-    while exact(good) > 0.0:  # the whole interval says more than its samples: go inwards
+    while exact(good) > 0.0:  # violated between samples: move inwards
         good, bad, step = good + step, good, 8.0 * step
         if (good - inside) * step > 0.0:
             good = inside
-    while math.isinf(exact(bad)) and abs(bad - good) > 1e-13 * good:  # the plant cannot follow: there is no root
+    while math.isinf(exact(bad)) and abs(bad - good) > 1e-13 * good:  # infeasible for the plant: there is no root
         middle = 0.5 * (good + bad)
         good, bad = (middle, bad) if exact(middle) <= 0.0 else (good, middle)
     if math.isinf(exact(bad)):
@@ -410,24 +410,24 @@ def _feasible_edge(
     return float(brentq(exact, good, bad, xtol=1e-14 * good, rtol=1e-14)) if exact(bad) > 0.0 else bad
 
 
-def _holding(limited: Limited, plan_of: Callable[[float], Trajectory], duration: float) -> Trajectory:
-    """Plan of a duration, lengthened by as many roundings as its limits need to hold."""
+def _satisfying(limited: Limited, plan_of: Callable[[float], Trajectory], duration: float) -> Trajectory:
+    """Plan of a duration, which is increased by roundings until the limits are satisfied."""
     step = float(np.spacing(duration))
     while step < 1e-6 * duration:
         plan = plan_of(duration)
         if limited.exact_excess(plan) <= 0.0:
             return plan
         duration, step = duration + step, 2.0 * step
-    raise ValueError(f"limits must hold near {duration:.6g} s, got {limited.margins(plan).active}")
+    raise ValueError(f"limits must be satisfied near {duration:.6g} s, got {limited.margins(plan).active}")
 
 
 def _reject(family: _Scaled | _Replanned, durations: Array, excess: Array) -> NoReturn:
     span = f"from {durations[0]:.4g} to {durations[-1]:.4g} s"
     if math.isinf(excess.min()):
-        raise ValueError(f"the plant must be able to follow for some duration {span}, got none")
+        raise ValueError(f"the plan must be feasible for the plant for some duration {span}, got none")
     nearest = float(durations[int(excess.argmin())])
     worst = family.limited.margins(family.plan(nearest)).active
-    further = "; they may hold beyond, give durations=(low, high)" if nearest in (durations[0], durations[-1]) else ""
+    further = "; for a wider search pass durations=(low, high)" if nearest in (durations[0], durations[-1]) else ""
     raise ValueError(
-        f"limits must hold for some duration {span}, got none; nearest at {nearest:.4g} s: {worst}{further}"
+        f"limits must be satisfied for some duration {span}, got none; nearest at {nearest:.4g} s: {worst}{further}"
     )

@@ -1,4 +1,4 @@
-"""What must hold along a plan: limits on derivatives, and on whatever a flat plant makes of them."""
+"""Limits of plans: on derivatives, and on states and inputs of a flat plant along the plan."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any, TypeGuard
 
 import numpy as np
 
-from ctrlplan._checks import checked_limits, real_array
+from ctrlplan._checks import checked_limits
 from ctrlplan._display import Displayed, Part, Table, counted
+from ctrlplan._renamed import warn_renamed
 from ctrlplan.planning.quantities import Quantities, System, quantities_of, system_given
 from ctrlplan.trajectories import Trajectory, derivative_name
 from ctrlplan.trajectories.common import Array
@@ -23,21 +24,21 @@ if TYPE_CHECKING:
 
 _SAMPLES = 193
 _HIGHEST = 8
-"""Derivatives up to which limits are looked for."""
+"""Maximum order of the derivatives with limits."""
 
 
 @dataclass(frozen=True)
 class Limits:
     """Limits of one signal, for `fastest` and `margins`.
 
-    A number above 0 is the short form of limits of the magnitude, ``Limits(-5.0,
-    5.0)``; a pair is that of both sides, with None where there is none.
+    Short forms are a number above 0, 5.0 for ``Limits(-5.0, 5.0)``, and a pair
+    (minimum, maximum), with None for a side without limit.
 
     Parameters
     ----------
     low, high : float, optional
-        Minimum and maximum, in the unit of the signal; None or an infinite one
-        where there is none.
+        Minimum and maximum, in the unit of the signal; None or infinite for no
+        limit.
 
     Raises
     ------
@@ -58,18 +59,20 @@ class Limits:
     high: float | None = None
 
     def __post_init__(self) -> None:
-        self._check("Limits")
+        low, high, _ = checked_limits(_sides(self.low, self.high), "Limits")
+        object.__setattr__(self, "low", None if math.isinf(low) else low)
+        object.__setattr__(self, "high", None if math.isinf(high) else high)
 
     @classmethod
     def of(cls, limit: object, name: str) -> Limits:
-        """Limits from themselves or from a short form.
+        """Limits from an object of this class or a short form.
 
         Parameters
         ----------
         limit : Limits, float or (float, float)
-            What was given.
+            Limits or short form.
         name : str
-            Signal, for messages.
+            Name of the signal, for messages.
 
         Raises
         ------
@@ -81,30 +84,14 @@ class Limits:
         if _is_listed(limit):
             if len(limit) != 2:
                 raise ValueError(f"limits of {name} must be a number or a pair, got {limit!r}")
-            found = cls.__new__(cls)
-            for side, value in zip(("low", "high"), limit, strict=True):
-                object.__setattr__(found, side, value)
-            found._check(f"limits of {name}")
-            return found
-        if isinstance(limit, bool) or not isinstance(limit, Real | np.ndarray):
+            limit = _sides(*limit)
+        elif isinstance(limit, bool) or not isinstance(limit, Real | np.ndarray):
             raise TypeError(f"limits of {name} must be a number or a pair, got {limit!r}")
-        magnitude = float(real_array(np.asarray(limit), f"limits of {name}"))
-        if not 0.0 < magnitude < math.inf:
-            raise ValueError(f"limits must be above 0 and finite, got {name} = {magnitude:g}")
-        return cls(-magnitude, magnitude)
-
-    def _check(self, name: str) -> None:
-        """Make the sides numbers, once they are found to be limits; messages call them by a name."""
-        low, high, _ = checked_limits(self._sides(), name)
-        object.__setattr__(self, "low", None if math.isinf(low) else low)
-        object.__setattr__(self, "high", None if math.isinf(high) else high)
-
-    def _sides(self) -> tuple[float, float]:
-        return -math.inf if self.low is None else self.low, math.inf if self.high is None else self.high
+        return cls(*checked_limits(limit, f"limits of {name}")[:2])
 
     def bound(self, name: str, order: int, axis: int | None) -> Bound:
-        """Limits of a signal that is made of derivatives up to an order."""
-        low, high, scale = checked_limits(self._sides(), f"limits of {name}")
+        """Limits of a signal that depends on derivatives up to an order."""
+        low, high, scale = checked_limits(_sides(self.low, self.high), f"limits of {name}")
         return Bound(name, low, high, scale, order, axis)
 
 
@@ -117,17 +104,17 @@ class Bound:
     name : str
         Derivative of an axis (x_d1), or a quantity of the plant.
     low, high : float
-        Between which it must stay; one may be infinite.
+        Minimum and maximum; one may be infinite.
     scale : float
-        What margins are fractions of: half their distance, or the size of the
-        only one.
+        Scale of margins: half the distance of the limits, or the magnitude of a
+        single limit.
     order : int
-        Highest derivative that the signal is made of.
+        Highest derivative that the signal depends on.
     axis : int or None
         Axis of a derivative; None for a quantity.
     slack : float
-        What rounding may add to the excess: above 0 where the limit is touched at
-        rest, so that no duration can keep away from it.
+        Tolerance of the excess for rounding; above 0 if the limit is attained
+        at rest, and thus at every duration.
     """
 
     name: str
@@ -139,7 +126,7 @@ class Bound:
     slack: float = 0.0
 
     def excess(self, values: Array) -> Array:
-        """By how much values are beyond the limits, as a fraction of the scale; negative inside."""
+        """Violation by values, relative to the scale; negative inside."""
         return np.maximum(values - self.high, self.low - values) / self.scale - self.slack
 
     @property
@@ -151,17 +138,13 @@ class Bound:
 def limit_words(limit: object) -> str:
     """A limit in words, in any of the forms that `margins` accepts; of several axes one after the other."""
     if isinstance(limit, Limits):
-        return _range(*limit._sides())
+        return _range(*_sides(limit.low, limit.high))
     given = np.array(limit, dtype=object)
     if given.ndim == 0:
         return _range(-float(given), float(given))
     if isinstance(limit, tuple) and given.shape == (2,):
-        low, high = (side if value is None else float(value) for value, side in zip(limit, _NO_SIDES, strict=True))
-        return _range(low, high)
+        return _range(*map(float, _sides(*limit)))
     return "; ".join(limit_words(tuple(row) if np.ndim(row) else row) for row in given)
-
-
-_NO_SIDES = (-math.inf, math.inf)
 
 
 def _range(low: float, high: float) -> str:
@@ -174,17 +157,17 @@ def _range(low: float, high: float) -> str:
 
 @dataclass(frozen=True)
 class Margin:
-    """How near a signal comes to its limits over a whole plan.
+    """Margin of a signal to its limits over a whole plan.
 
     Attributes
     ----------
     bound : Bound
         The limits.
     value, time : float
-        Where it comes nearest, or is farthest beyond, and when [s].
+        Value nearest to a limit, or of maximum violation, and its time [s].
     fraction : float
-        Distance left there as a fraction of the bound's scale; negative where
-        the limit does not hold.
+        Distance to the limit as a fraction of the scale; negative if the limit
+        is violated.
     """
 
     bound: Bound
@@ -197,12 +180,12 @@ class Margin:
 
     @property
     def room(self) -> str:
-        """What is left of the room inside the limits, or by how much they are broken."""
+        """Margin or violation as text."""
         return f"{self.share} {'left' if self.fraction >= 0.0 else 'beyond'}"
 
     @property
     def share(self) -> str:
-        """Margin in words: in percent, or as it is where the limit is a lone 0."""
+        """Absolute margin as text: in percent, or in the signal's unit."""
         size = abs(self.fraction)
         if size < 1e-9:
             return "nothing"
@@ -217,20 +200,26 @@ class Margins(Displayed):
     Attributes
     ----------
     rows : tuple of Margin
-        One a limit.
+        One per limit.
     """
 
     rows: tuple[Margin, ...]
 
     @property
     def active(self) -> Margin:
-        """The smallest margin: the limit that holds the plan back, or is broken."""
+        """The smallest margin."""
         return self.rows[0]
 
     @property
-    def hold(self) -> bool:
-        """Whether every limit holds over the whole plan."""
+    def satisfied(self) -> bool:
+        """Whether all limits are satisfied over the whole plan."""
         return self.active.fraction >= 0.0
+
+    @property
+    def hold(self) -> bool:
+        """Deprecated name of `satisfied`."""
+        warn_renamed("Margins.hold", "satisfied")
+        return self.satisfied
 
     def __iter__(self) -> Iterator[Margin]:
         return iter(self.rows)
@@ -259,7 +248,7 @@ class Margins(Displayed):
         )
 
     def to_pandas(self) -> pd.DataFrame:
-        """Table with a row a limit: low, high, value, time, margin."""
+        """Table with one row per limit: low, high, value, time, margin."""
         import pandas as pd
 
         table = {
@@ -278,42 +267,43 @@ class Margins(Displayed):
 def margins(
     plan: Trajectory, limits: Mapping[str, object], system: System | None = None, *, quantities: System | None = None
 ) -> Margins:
-    """How near a plan comes to limits, over its whole interval.
+    """Margins of a plan to limits over its whole interval.
 
     Parameters
     ----------
     plan : Trajectory
-        Of any duration above 0.
+        Plan with a duration.
     limits : mapping of str to float, (float, float), Limits or array_like
-        By the name of a derivative (x, x_d1, x_d2, ...) or of a quantity: a
-        number above 0 for a magnitude, or minimum and maximum, None where there
-        is none; or `Limits`. By velocity, acceleration, jerk or snap for those of every
-        axis: a number, or a tuple (minimum, maximum), for all axes; a list or
-        array of naxes numbers, or of shape (naxes, 2), by axis. A derivative
-        must be allowed to be 0.
+        Limits by the name of a derivative (x, x_d1, x_d2, ...) or of a quantity:
+        a number above 0 for the magnitude, a pair (minimum, maximum) with None
+        for no limit, or `Limits`. The names velocity, acceleration, jerk and
+        snap stand for the derivatives of every axis: with a number or a tuple
+        (minimum, maximum) for all axes, or with a list or array of naxes numbers
+        or of shape (naxes, 2) by axis. Limits of a derivative must include 0.
     system : flat system, Crane or callable, optional
-        Whose quantities are limited by name: a `control.flatsys.FlatSystem`
-        (states and inputs), a `Crane`, any plant with a method ``quantities``,
-        or a function that maps a jet (order + 1, naxes, ntime) to a mapping of
-        names to signals (ntime,). What the plan does not determine at rest
-        (heading and steering angle of a car) is nan there and rejected.
+        System of the limited quantities: a `control.flatsys.FlatSystem` (states
+        and inputs), a `Crane`, a plant with a method ``quantities``, or a
+        function that maps a jet (order + 1, naxes, ntime) to a mapping of names
+        to signals (ntime,). Quantities that the plan does not determine at rest
+        (heading and steering angle of a car) are nan there and rejected.
     quantities : optional
-        Old name of `system`, with a FutureWarning.
+        Deprecated name of `system`.
 
     Returns
     -------
     Margins
-        From the extrema of derivatives, which are exact to rounding, and from
-        those of quantities by `Trajectory.extrema_of`, to 1e-9 of the larger of
-        magnitude and limit.
+        With the attributes rows (a `Margin` per limit, the smallest first),
+        active (the smallest margin) and satisfied. Extrema of derivatives are
+        exact up to rounding, those of quantities (`Trajectory.extrema_of`) have
+        an error below 1e-9 of the larger of magnitude and limit.
 
     Raises
     ------
     ValueError
-        If a limit is not positive or does not increase, a name is unknown, or
-        a derivative jumps that a limited signal is the derivative of.
+        If a limit is not positive or does not increase, a name is unknown, or a
+        limited signal is infinite at a jump of a lower derivative.
     RuntimeError
-        If a quantity is not resolved, since it is noisy or oscillates.
+        If a quantity is not resolved because it is noisy or oscillates.
 
     Examples
     --------
@@ -328,20 +318,20 @@ def margins(
 
 
 class UndeterminedError(ValueError):
-    """A signal that the plan does not determine: the plant's maps are singular on it."""
+    """A signal is not determined by the plan because the plant's maps are singular."""
 
 
 class Limited:
-    """Limits of a kind of plan, ready to be looked at for many plans of that kind.
+    """Limits for the evaluation of many plans with the same axes.
 
-    Parameters are those of `margins`; the plan stands for others of its axes.
+    Parameters are those of `margins`, for one of the plans.
     """
 
     def __init__(self, plan: Trajectory, limits: Mapping[str, object], system: System | None = None) -> None:
         if not isinstance(plan, Trajectory):
-            raise TypeError(f"plan must be a Trajectory (the attribute plan of what was chosen), got {plan!r:.60}")
+            raise TypeError(f"plan must be a Trajectory (the attribute plan of a result), got {plan!r:.60}")
         if not plan.duration:
-            raise ValueError("a plan that is limited must have a duration, got a step")
+            raise ValueError("a plan under limits must have a duration, got a step")
         if not isinstance(limits, Mapping):
             raise TypeError(f"limits must be a mapping of names to limits, got {type(limits).__name__}")
         self._quantities = quantities_of(system)
@@ -364,20 +354,20 @@ class Limited:
     def values(self, jet: Array) -> Array:
         """Limited signals (nbounds, ntime) of a jet (order + 1, naxes, ntime)."""
         rows = self._rows(jet)
-        if not jet[1:].any():  # infinitely slow, so that nothing is said of plans that move
+        if not jet[1:].any():  # at rest, which is no statement about plans that move
             return rows
         for row, b in zip(rows, self.bounds, strict=True):
             if np.isnan(row).any():
                 still = not jet[1:, :, int(np.isnan(row).argmax())].any()
                 raise UndeterminedError(
                     f"{b.name} must be determined by the plan, got nan{' where the plan is at rest' if still else ''}: "
-                    "the maps of the plant are singular there, as those of a car are at rest; limit it along plans "
-                    "that keep moving, by margins, or limit what is determined"
+                    "the maps of the plant are singular there, as those of a car are at rest; limit it for plans "
+                    "that do not stop, or limit another signal"
                 )
         return rows
 
     def _rows(self, jet: Array) -> Array:
-        """The same with nan where the plan does not determine a signal."""
+        """Limited signals, nan where the plan does not determine them."""
         found = {} if self.derivatives_only or self._quantities is None else self._quantities(jet)
         rows = np.empty((len(self.bounds), jet.shape[2]))
         for row, b in zip(rows, self.bounds, strict=True):
@@ -385,16 +375,16 @@ class Limited:
         return rows
 
     def excess(self, jet: Array) -> float:
-        """Greatest excess over a sampled jet, inf where the plant cannot follow at all."""
+        """Maximum excess over a sampled jet; inf if the plan is infeasible for the plant."""
         try:
             values = self.values(jet)
-        except ValueError:  # the plant cannot follow: a rope that would have to push
+        except ValueError:  # infeasible for the plant, such as a rope under compression
             return math.inf
         worst = max(float(b.excess(row).max()) for b, row in zip(self.bounds, values, strict=True))
         return math.inf if math.isnan(worst) else worst
 
     def rejection(self, plan: Trajectory) -> str:
-        """Why the plant cannot follow a plan, empty where it can."""
+        """Reason for which a plan is infeasible for the plant; empty if it is feasible."""
         try:
             self.values(self.sampled(plan))
         except ValueError as rejection:
@@ -402,7 +392,7 @@ class Limited:
         return ""
 
     def exact_excess(self, plan: Trajectory) -> float:
-        """Greatest excess over a whole plan."""
+        """Maximum excess over a whole plan."""
         try:
             return -self.margins(plan).active.fraction
         except ValueError:
@@ -419,17 +409,17 @@ class Limited:
         ]
         others = [k for k, b in enumerate(self.bounds) if b.axis is None]
         if others:
-            scales = [self.bounds[k].scale for k in others]  # a quantity of 0 is not resolved to its rounding
+            scales = [self.bounds[k].scale for k in others]  # no relative tolerance for a quantity near 0
             found = function_extrema(plan, lambda jet: self.values(jet)[others], self.order, scales)
             columns = zip(found.minimum, found.maximum, found.time_min, found.time_max, strict=True)
             rows += [_margin(self.bounds[k], *column) for k, column in zip(others, columns, strict=True)]
         return Margins(tuple(sorted(rows, key=lambda row: row.fraction)))
 
     def check_smooth(self, plan: Trajectory) -> None:
-        """Refuse a plan of which a derivative jumps where a limited signal would be infinite.
+        """Raise for a jump of a derivative that makes a limited signal infinite.
 
-        Rest before the start and after the end counts, except where the plan
-        has speed there: it is the continuation of a motion.
+        The plan is at rest before its start and after its end, except if its speed
+        there is not 0: then it is the continuation of a motion.
         """
         moving = {t for t in (plan.start, plan.end) if plan.jet(t, 1, left=t > plan.start)[1].any()}
         for bound in self.bounds:
@@ -437,24 +427,24 @@ class Limited:
                 if jump.time not in moving and (bound.axis is None or plan.labels[bound.axis] == jump.label):
                     what = "position" if jump.order == 0 else derivative_name(jump.label, jump.order)
                     raise ValueError(
-                        f"{bound.name} is limited, which needs a plan continuous up to derivative {bound.order - 1} "
-                        f"(rest before and after counts), got {what} that jumps by {jump.size:.4g} at {jump.time:g} s"
+                        f"limits of {bound.name} require a plan that is continuous up to derivative {bound.order - 1} "
+                        f"(and at rest before and after), got {what} that jumps by {jump.size:.4g} at {jump.time:g} s"
                     )
 
     def at_rest(self, plan: Trajectory) -> Array:
-        """Jet at samples of a plan that is infinitely slow."""
+        """Jet at samples of the plan with zero derivatives."""
         return self.sampled(plan) * (np.arange(self.order + 1) == 0)[:, None, None]
 
     def _slackened(self, plan: Trajectory) -> Iterator[Bound]:
-        """The bounds, with slack where they are touched at rest."""
+        """The bounds, with slack where they are attained at rest."""
         try:
             self.values(self.sampled(plan))
-        except UndeterminedError:  # as it is at any other duration
+        except UndeterminedError:  # as at any other duration
             raise
-        except ValueError:  # what the plant cannot follow, it may follow more slowly
+        except ValueError:  # infeasible for the plant, but possibly feasible more slowly
             pass
         for bound, values in zip(self.bounds, self.values(self.at_rest(plan)), strict=True):
-            if np.isnan(values).any():  # what is singular at rest touches nothing there
+            if np.isnan(values).any():  # a signal that is singular at rest attains no limit there
                 yield replace(bound, slack=0.0)
                 continue
             rounding = 1e-12 * (1.0 + float(np.abs(values).max()) / bound.scale)
@@ -481,7 +471,7 @@ class Limited:
                     yield replace(_bound(name, own, order, axis), name=named)
             else:
                 plain = [quantity for quantity in orders if "_d" not in quantity]
-                known = f", or quantities ({', '.join(plain)}, ...)" if orders else "; a system was not given"
+                known = f", or quantities ({', '.join(plain)}, ...)" if orders else "; no system was given"
                 axes = ", ".join(derivative_name(label, 1) for label in plan.labels)
                 raise ValueError(
                     f"limits must name derivatives of the axes ({axes}, ...), velocity, acceleration, jerk or snap of "
@@ -489,11 +479,11 @@ class Limited:
                 )
 
 
-_FORMS = "a tuple (minimum, maximum) holds for every axis, a list of one number an axis gives magnitudes"
+_FORMS = "a tuple (minimum, maximum) applies to every axis, a list of one number per axis gives magnitudes"
 
 
 def _by_axis(name: str, limit: object, naxes: int) -> list[object]:
-    """Limits of each axis, from those of all of them."""
+    """Limits of each axis from those of all axes."""
     if isinstance(limit, str | Mapping) or not np.iterable(limit):
         return [limit] * naxes
     rows, given = list(limit), isinstance(limit, tuple)
@@ -507,8 +497,13 @@ def _by_axis(name: str, limit: object, naxes: int) -> list[object]:
     )
 
 
+def _sides(low: float | None, high: float | None) -> tuple[float, float]:
+    """Both limits as numbers, infinite for None."""
+    return -math.inf if low is None else low, math.inf if high is None else high
+
+
 def _is_listed(limit: object) -> TypeGuard[Sequence[float | None]]:
-    """Whether limits are several numbers."""
+    """Whether limits are a list or array."""
     given: Any = limit
     return bool(np.ndim(given))
 
@@ -521,14 +516,13 @@ def _bound(name: str, limit: object, order: int, axis: int | None) -> Bound:
         raise ValueError(f"{error}{forms}") from None
     if axis is not None and order and not bound.low <= 0.0 <= bound.high:
         raise ValueError(
-            f"limits of {name} must allow 0, which every plan has at rest, got from {bound.low:g} to {bound.high:g}; "
-            f"{_FORMS}"
+            f"limits of {name} must include 0, the value at rest, got from {bound.low:g} to {bound.high:g}; {_FORMS}"
         )
     return bound
 
 
 def _orders(quantities: Quantities, plan: Trajectory) -> dict[str, int]:
-    """Lowest order of the jet from which each quantity is made, seen at rest at the start."""
+    """Lowest order of the jet that each quantity depends on, at rest at the start."""
     still = np.zeros((_HIGHEST + 1, plan.naxes, 1))
     still[0] = plan.initial[:, None]
     orders: dict[str, int] = {}
@@ -537,7 +531,7 @@ def _orders(quantities: Quantities, plan: Trajectory) -> dict[str, int]:
         try:
             with np.errstate(all="ignore"):
                 found = quantities(still[: order + 1])
-        except (ValueError, IndexError, KeyError) as reason:  # it reads more than this
+        except (ValueError, IndexError, KeyError) as reason:  # it depends on higher orders
             rejection = reason
             continue
         if not isinstance(found, Mapping):
@@ -546,14 +540,14 @@ def _orders(quantities: Quantities, plan: Trajectory) -> dict[str, int]:
             orders.setdefault(name, order)
     if not orders:
         raise ValueError(
-            f"quantities must take jets (order + 1, {plan.naxes}, ntime) of up to {_HIGHEST} derivatives, got "
+            f"quantities must accept jets (order + 1, {plan.naxes}, ntime) of up to {_HIGHEST} derivatives, got "
             f"{type(rejection).__name__}: {rejection}"
         )
     return orders
 
 
 def _signal(name: str, values: Array, shape: tuple[int, ...]) -> Array:
-    """Values of a quantity over time."""
+    """Values of a quantity over time, checked."""
     found = np.asarray(values, dtype=float)
     if found.shape != shape:
         raise TypeError(f"quantities must be signals of shape (ntime,), got {name} of shape {found.shape}")
@@ -561,7 +555,7 @@ def _signal(name: str, values: Array, shape: tuple[int, ...]) -> Array:
 
 
 def _margin(bound: Bound, minimum: float, maximum: float, time_min: float, time_max: float) -> Margin:
-    """The nearer of both sides."""
+    """Margin to the nearer of both limits."""
     low, high = ((side / bound.scale + bound.slack) for side in (minimum - bound.low, bound.high - maximum))
     value, time, fraction = (minimum, time_min, low) if low < high else (maximum, time_max, high)
     return Margin(bound, float(value), float(time), float(fraction))

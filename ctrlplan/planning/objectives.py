@@ -1,7 +1,7 @@
-"""What a designer wants little of: numbers that a plan is judged by.
+"""Objectives: functions of a plan to be minimised.
 
-Every objective is a function of a plan. Those of this module take a fraction
-of a millisecond, so that a search can afford some hundred plans.
+Those of this module take a fraction of a millisecond, for searches over
+hundreds of plans.
 """
 
 from __future__ import annotations
@@ -42,10 +42,9 @@ _SIZE = "_ctrlplan_size"
 
 
 def of_size(size: float) -> Callable[[F], F]:
-    """Declare the size of an objective whose minimum may be 0, as that of a fraction is 1.
+    """Declare the scale of an objective whose minimum may be 0, such as 1 for a fraction.
 
-    Differences of an objective count as fractions of its size: of the magnitude
-    of its minimum where no size is declared.
+    Tolerances are relative to this scale; default: the magnitude of the minimum.
     """
 
     def declare(objective: F) -> F:
@@ -56,26 +55,30 @@ def of_size(size: float) -> Callable[[F], F]:
 
 
 def declared_size(objective: Objective) -> float | None:
-    """Size that an objective declares, None where it declares none."""
+    """Declared scale of an objective; None if there is none."""
     size: float | None = getattr(objective, _SIZE, None)
     return size
 
 
 def plan_length(plan: Trajectory) -> float:
-    r"""Length of the path that a plan takes.
+    r"""Path length of a plan, from its derivatives.
 
     .. math:: \int \Bigl(\sum_i \dot y_i(t)^2\Bigr)^{1/2} dt
 
     Parameters
     ----------
     plan : Trajectory
-        Axes in the same unit. A step takes no path: 0.
+        Axes in the same unit.
 
     Returns
     -------
     float
-        In the unit of the axes: to 1e-9 of it, or 1e-6 where a path of several
-        axes nearly stops.
+        In the unit of the axes, with a relative error of 1e-9, or 1e-6 if a
+        path of several axes nearly stops; 0 for a step.
+
+    See Also
+    --------
+    ctrlplan.metrics.path_length : Path length from samples.
     """
     length = _variation if plan.naxes == 1 else _arc
     return sum(length(plan, left, right) for left, right in pairwise(plan.breakpoints.tolist()))
@@ -88,12 +91,12 @@ def plan_excess_length(plan: Trajectory) -> float:
     Parameters
     ----------
     plan : Trajectory
-        With waypoints whose positions are all given.
+        Plan with waypoints whose positions are all prescribed.
 
     Returns
     -------
     float
-        Path length over polyline length, minus 1; nan where the polyline has none.
+        Relative excess length; nan if the polyline has length 0.
     """
     points = np.array([point.position for point in plan.waypoints]).reshape(-1, plan.naxes)
     shortest = float(np.sqrt(np.square(np.diff(points, axis=0)).sum(axis=1)).sum())
@@ -105,10 +108,10 @@ _GRADED = np.array([0.0, *0.1 ** np.arange(4.0)[::-1]])[:, None]
 
 @dataclass(frozen=True)
 class PeakDerivative:
-    """Greatest magnitude of a derivative, over all axes.
+    """Maximum magnitude of a derivative over all axes.
 
-    Made for searches: extrema are bracketed by samples and polished, where
-    `Trajectory.peak` proves that none is missed.
+    For use in searches: extrema are bracketed by samples and refined, whereas
+    `Trajectory.peak` guarantees that none is missed.
 
     Parameters
     ----------
@@ -129,7 +132,7 @@ class PeakDerivative:
         checked_count(self.nu, "nu")
 
     def __call__(self, plan: Trajectory) -> float:
-        """Greatest magnitude over the whole plan, in units of the axes per s^nu."""
+        """Maximum magnitude over the whole plan, in units of the axes per s^nu."""
         count = 64 + 16 * max((point.jet.shape[0] for point in plan.waypoints), default=0)
         return max(
             (_peak(plan, left, right, self.nu, count) for left, right in pairwise(plan.breakpoints.tolist())),
@@ -143,7 +146,7 @@ class SquaredDerivative:
 
     .. math:: \int \sum_i y_i^{(\nu)}(t)^2\,dt
 
-    between breakpoints; what jumps at them counts nothing.
+    between breakpoints, without impulses at jumps.
 
     Parameters
     ----------
@@ -189,7 +192,7 @@ OBJECTIVES: dict[ObjectiveName, Objective] = {
 
 
 def checked_objective(objective: ObjectiveName | Objective) -> Objective:
-    """Objective by its name, or the function itself."""
+    """Objective from its name or function, checked."""
     if isinstance(objective, str):
         if objective not in OBJECTIVES:
             raise ValueError(f"objective must be one of {', '.join(OBJECTIVES)} or a function, got {objective!r}")
@@ -200,7 +203,7 @@ def checked_objective(objective: ObjectiveName | Objective) -> Objective:
 
 
 def _arc(plan: Trajectory, left: float, right: float) -> float:
-    """Length of one segment in panels; where the speed nearly vanishes, in ever smaller ones about its least value."""
+    """Length of one segment by quadrature on panels, graded towards the minimum of the speed where it is near 0."""
     nodes, weights = gauss(16)
     edges = np.linspace(left, right, 13)
     squares = _squares(plan, edges[:-1], edges[1:])
@@ -220,9 +223,9 @@ def _arc(plan: Trajectory, left: float, right: float) -> float:
 
 
 def _variation(plan: Trajectory, left: float, right: float) -> float:
-    """Length of one segment of one axis: from turning point to turning point."""
+    """Length of one segment of one axis, summed between reversals."""
     t = left + (right - left) * gauss(128)[0]
-    # Between points of inflection the slope is monotone: no two turning points can hide between samples.
+    # Between points of inflection the slope is monotone: no two reversals can lie between samples.
     t = np.sort(np.concatenate([t, _crossings(plan, t, 2)]))
     ends = plan.jet([left], 0)[0, 0], plan.jet([right], 0, left=True)[0, 0]
     turned = plan.jet(_crossings(plan, t, 1), 0)[0, 0]
@@ -230,7 +233,7 @@ def _variation(plan: Trajectory, left: float, right: float) -> float:
 
 
 def _crossings(plan: Trajectory, t: Array, nu: int) -> Array:
-    """Where the nu-th derivative of the only axis changes its sign between increasing times."""
+    """Times of the sign changes of the nu-th derivative of a single axis between increasing times."""
     values = plan.jet(t, nu)[nu, 0]
     cell = np.flatnonzero(values[1:] * values[:-1] < 0.0)
     low, high = t[cell], t[cell + 1]
@@ -248,7 +251,7 @@ def _squares(plan: Trajectory, begin: Array, end: Array) -> Array:
 
 
 def _vertex(x: Array, y: Array) -> Array:
-    """Where parabolas through three points (nparabolas, 3) are least; the middle point where they are straight."""
+    """Vertices of parabolas through three points (nparabolas, 3); the middle point for straight lines."""
     rise, fall = (y[:, 2] - y[:, 1]) / (x[:, 2] - x[:, 1]), (y[:, 1] - y[:, 0]) / (x[:, 1] - x[:, 0])
     curve = (rise - fall) / (x[:, 2] - x[:, 0])
     bent = curve > 0.0
@@ -257,23 +260,23 @@ def _vertex(x: Array, y: Array) -> Array:
 
 @lru_cache(maxsize=8)
 def _last_legendre(count: int) -> Array:
-    """From values at the nodes to the last two Legendre coefficients, shape (count, 2)."""
+    """Matrix (count, 2) from values at the nodes to the last two Legendre coefficients."""
     nodes, weights = np.polynomial.legendre.leggauss(count)
     degrees = np.arange(count - 2, count)
     return np.polynomial.legendre.legvander(nodes, count - 1)[:, -2:] * weights[:, None] * (degrees + 0.5)
 
 
 def _peak(plan: Trajectory, left: float, right: float, nu: int, count: int) -> float:
-    """Greatest magnitude on one segment: samples, and the vertex of a parabola wherever the slope changes its sign."""
+    """Maximum magnitude on one segment from samples, refined by parabolas where the slope changes its sign."""
     inside = np.linspace(left, right, count)
-    # The ends belong to this segment, not to what follows.
+    # The ends belong to this segment, not to the next.
     inside[0], inside[-1] = np.nextafter(left, right), np.nextafter(right, left)
     value, slope, curve = plan.jet(inside, nu + 2)[nu:]
     best = float(np.abs(value).max())
     axis, cell = np.nonzero(slope[:, 1:] * slope[:, :-1] < 0.0)
     if not cell.size:
         return best
-    # Where the chord of the slope crosses zero is near; only the cells that can hold the greatest are polished.
+    # Start at the zeros of the chords of the slope; only cells that may contain the maximum are refined.
     width = inside[cell + 1] - inside[cell]
     start = inside[cell] + width * slope[axis, cell] / (slope[axis, cell] - slope[axis, cell + 1])
     bound = np.abs(value[axis, cell]) + 0.5 * width**2 * np.maximum(*np.abs(curve[axis, [cell, cell + 1]]))

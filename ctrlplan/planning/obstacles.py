@@ -1,4 +1,4 @@
-"""What a plan in the plane must keep clear of: rectangles, discs and half-planes."""
+"""Obstacles in the plane: rectangles, discs and half-planes."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from ctrlplan.trajectories.common import Array
 
 @runtime_checkable
 class Obstacle(Protocol):
-    """Closed set of the plane, seen through its distances.
+    """Protocol of obstacles: closed sets of the plane.
 
-    Whatever has these three methods is an obstacle: `Rectangle`, `Disc` and
-    `HalfPlane` are.
+    Any object with these three methods is an obstacle, such as `Rectangle`,
+    `Disc` and `HalfPlane`.
     """
 
     def distance(self, points: ArrayLike) -> Array:
@@ -34,7 +34,7 @@ class Obstacle(Protocol):
         -------
         ndarray, shape (...)
             Euclidean distance to the set; in the set at most 0, minus a depth.
-            Two points' values differ by no more than the points' distance.
+            The function must have the Lipschitz constant 1.
         """
 
     def segment_distance(self, p: ArrayLike, q: ArrayLike) -> Array:
@@ -48,34 +48,34 @@ class Obstacle(Protocol):
         Returns
         -------
         ndarray, shape (...)
-            Least distance of a point of the segment; not above 0 where the
-            segment meets the set. No greater move of either end moves it more.
+            Minimum distance over the segment; at most 0 if the segment meets the
+            set. The function must have the Lipschitz constant 1 in either end.
         """
 
     def corners(self, margin: float) -> Array:
-        """Corners of a polygon about the set, which short ways round it pass.
+        """Corners of a polygon around the set, for paths around it.
 
         Parameters
         ----------
         margin : float
-            Least distance of the polygon from the set.
+            Minimum distance of the polygon from the set.
 
         Returns
         -------
         ndarray, shape (2, ncorners)
-            None for a set that no way leads round.
+            With ncorners = 0 for a set without a path around it.
         """
 
 
 @dataclass(frozen=True)
 class Rectangle:
-    """Rectangle with its sides along the axes.
+    """Rectangle with sides parallel to the axes.
 
     Parameters
     ----------
     x, z : tuple of float
-        Least and greatest value on the first and on the second axis; either
-        may be infinite, so that walls and corridors are rectangles as well.
+        Minimum and maximum on the first and on the second axis; either may be
+        infinite, for walls and corridors.
 
     Raises
     ------
@@ -100,20 +100,20 @@ class Rectangle:
             raise ValueError("a rectangle must have a finite side, got none")
 
     def distance(self, points: ArrayLike) -> Array:
-        """Signed Euclidean distance (...) to points (2, ...), negative inside."""
+        """Signed distance (...) to points (2, ...), negative inside."""
         x, z = _plane(points, "points")
-        beside = np.maximum(self.x[0] - x, x - self.x[1])
+        across = np.maximum(self.x[0] - x, x - self.x[1])
         above = np.maximum(self.z[0] - z, z - self.z[1])
-        outside = np.hypot(np.maximum(beside, 0.0), np.maximum(above, 0.0))
-        return np.where(outside > 0.0, outside, np.maximum(beside, above))
+        outside = np.hypot(np.maximum(across, 0.0), np.maximum(above, 0.0))
+        return np.where(outside > 0.0, outside, np.maximum(across, above))
 
     def segment_distance(self, p: ArrayLike, q: ArrayLike) -> Array:
-        """Least signed distance (...) on the segments from p (2, ...) to q."""
+        """Minimum signed distance (...) on segments from p (2, ...) to q."""
         a, b = np.broadcast_arrays(_plane(p, "p"), _plane(q, "q"))
         outside = np.minimum(self.distance(a), self.distance(b))
         for corner in itertools.product(*(filter(math.isfinite, sides) for sides in (self.x, self.z))):
             outside = np.minimum(outside, _to_segment(np.array(corner), a, b))
-        # Beyond each side the distance is affine along the segment: the least of their maximum is where two are equal.
+        # The distance from each side is affine along the segment: the minimum of the maximum is where two are equal.
         ends = [
             (sign * (a[axis] - side), sign * (b[axis] - side))
             for axis, sides in enumerate((self.x, self.z))
@@ -130,7 +130,7 @@ class Rectangle:
         return np.where(depth > 0.0, outside, depth)
 
     def corners(self, margin: float) -> Array:
-        """Corners of the rectangle grown by a margin, two for each of its own."""
+        """Corners of the enlarged rectangle, two for each corner."""
         turns = np.pi / 8 * np.array([1.0, 3.0])
         step = margin / math.cos(np.pi / 8) * np.stack([np.cos(turns), np.sin(turns)])
         found = [
@@ -144,14 +144,14 @@ class Rectangle:
 
 @dataclass(frozen=True)
 class Disc:
-    """Disc about a point.
+    """Disc.
 
     Parameters
     ----------
     centre : tuple of float
-        Its position.
+        Position of the centre.
     radius : float
-        Above 0.
+        Radius, above 0.
 
     Raises
     ------
@@ -174,17 +174,17 @@ class Disc:
             raise ValueError(f"radius must be finite and above 0, got {self.radius:g}")
 
     def distance(self, points: ArrayLike) -> Array:
-        """Signed Euclidean distance (...) to points (2, ...), negative inside."""
+        """Signed distance (...) to points (2, ...), negative inside."""
         x, z = _plane(points, "points")
         return np.asarray(np.hypot(x - self.centre[0], z - self.centre[1]) - self.radius)
 
     def segment_distance(self, p: ArrayLike, q: ArrayLike) -> Array:
-        """Least signed distance (...) on the segments from p (2, ...) to q."""
+        """Minimum signed distance (...) on segments from p (2, ...) to q."""
         a, b = np.broadcast_arrays(_plane(p, "p"), _plane(q, "q"))
         return np.asarray(_to_segment(np.array(self.centre), a, b) - self.radius)
 
     def corners(self, margin: float) -> Array:
-        """Corners of the polygon of 16 sides about the disc grown by a margin."""
+        """Corners of a polygon of 16 sides around the enlarged disc."""
         turns = 2.0 * np.pi / 16 * np.arange(16)
         reach = (self.radius + margin) / math.cos(np.pi / 16)
         return np.array(self.centre)[:, None] + reach * np.stack([np.cos(turns), np.sin(turns)])
@@ -192,14 +192,14 @@ class Disc:
 
 @dataclass(frozen=True)
 class HalfPlane:
-    """Half-plane: where normal . p is at least an offset.
+    """Half-plane of the points p with normal . p at least an offset.
 
     Parameters
     ----------
     normal : tuple of float
-        Direction into the set, of any length above 0; it is stored with length 1.
+        Normal vector into the set, of any length above 0; stored with length 1.
     offset : float
-        As for the normal given: both are divided by its length.
+        Offset for the given normal; both are divided by the length of the normal.
 
     Raises
     ------
@@ -208,7 +208,7 @@ class HalfPlane:
 
     Examples
     --------
-    The ground 12 m below a crane's trolley, z down:
+    The ground 12 m below the trolley of a crane, with z downwards:
 
     >>> HalfPlane((0.0, 1.0), 12.0).distance([3.0, 10.0])
     array(2.)
@@ -228,16 +228,16 @@ class HalfPlane:
         object.__setattr__(self, "offset", offset / length)
 
     def distance(self, points: ArrayLike) -> Array:
-        """Signed Euclidean distance (...) to points (2, ...), negative inside."""
+        """Signed distance (...) to points (2, ...), negative inside."""
         x, z = _plane(points, "points")
         return np.asarray(self.offset - self.normal[0] * x - self.normal[1] * z)
 
     def segment_distance(self, p: ArrayLike, q: ArrayLike) -> Array:
-        """Least signed distance (...) on the segments from p (2, ...) to q."""
+        """Minimum signed distance (...) on segments from p (2, ...) to q."""
         return np.asarray(np.minimum(self.distance(p), self.distance(q)))
 
     def corners(self, margin: float) -> Array:
-        """No way leads round a half-plane: shape (2, 0)."""
+        """No corners, shape (2, 0): there is no path around a half-plane."""
         return np.empty((2, 0))
 
 

@@ -1,4 +1,4 @@
-r"""Free entries of waypoints by least squares.
+r"""Optimisation of free entries of waypoints by least squares.
 
 A plan is linear in its data, so its cost is a sum of squares of samples,
 
@@ -6,13 +6,13 @@ A plan is linear in its data, so its cost is a sum of squares of samples,
     d_{free} = -A_{free}^{+} A_{fixed}\,d_{fixed}
 
 with samples at the nodes of a Gauss-Legendre rule that is exact to rounding.
-Times are relative to the duration and derivatives scaled alike, so that no
-duration costs a digit. The cost of one segment of duration h in that unit is
+Times are relative to the duration and derivatives scaled accordingly, so that
+the accuracy does not depend on the duration. The cost of one segment of relative duration h is
 :math:`h^{1-2k} |R H d|^2` with the matrix R of the unit segment and H the powers of h
 that scale derivatives: segments share one factorised system.
 
-Times are chosen over the optimum at each of them. There the free entries are
-stationary, so that only the prescribed ones count in the slope of the cost.
+Times are optimised over the optimum at given times. There the cost is stationary
+in the free entries, so that its gradient depends on the prescribed ones only.
 """
 
 from __future__ import annotations
@@ -40,27 +40,27 @@ from ctrlplan.trajectories.waypoint import entry_name, waypoint_table
 from ctrlplan.trajectories.waypoint_spline import checked_waypoints
 
 _EPS = float(np.finfo(float).eps)
-_FEW, _NONE = 1e-6, 1e-2  # estimated relative errors of the cost, above which there is a warning, an error
+_FEW, _NONE = 1e-6, 1e-2  # estimated relative error of the cost above which a warning, an error is raised
 
 
 @dataclass(frozen=True, repr=False)
 class Optimum(Displayed):
-    """Waypoints without free entries, and the plan through them.
+    """Optimum waypoints, and the plan through them.
 
-    Iterating gives the waypoints.
+    Iteration gives the waypoints.
 
     Attributes
     ----------
     waypoints : tuple of Waypoint
-        Complete up to the order of the plan; nan where an entry was free on
+        Complete up to the order of the plan; nan for an entry that was free on
         each side separately.
     plan : Trajectory
-        A spline where `single`; a `PiecewiseSpline` where segments share every
-        entry up to the order; otherwise segments joined.
+        A spline for `single`; a `PiecewiseSpline` if all entries up to the
+        order are continuous; otherwise a sequence of segments (`Joined`).
     cost : float
         Weighted sum over the axes of int (y^(derivative))^2 dt within the segments.
     unique : bool
-        Whether the prescribed entries leave no function of zero cost free.
+        Whether the optimum is unique.
     derivative : int
         Order of the derivative in the cost.
     """
@@ -104,74 +104,74 @@ def optimize_waypoints(
     weights: ArrayLike | None = None,
     labels: Sequence[str] | None = None,
 ) -> Optimum:
-    """Free entries, and times, of least squared derivative.
+    """Free entries and times that minimise a squared derivative.
 
-    Entries up to `order` that waypoints leave free are chosen in closed form
-    so that the integral of the squared derivative is least: minimum jerk,
-    minimum snap. Where the prescribed entries leave a function of zero cost
-    free (two positions alone leave a quadratic under minimum jerk), the choice
-    of least norm is taken, of entries in units of the plan's duration, and
-    `Optimum.unique` is False.
+    Free entries of the waypoints up to `order` are computed in closed form to
+    minimise the integral of the squared derivative: minimum jerk, minimum snap.
+    If the optimum is not unique (two positions alone do not determine a quadratic
+    under minimum jerk), it is that of minimum norm, of entries in units of the
+    plan's duration, and `Optimum.unique` is False.
 
     Parameters
     ----------
     waypoints : iterable of Waypoint
         Two or more, times increasing; entries that are missing or nan are free,
-        positions too.
+        including positions.
     derivative : int, optional
         Order of the derivative in the cost, from 1: 3 is minimum jerk, 4
         minimum snap.
     order : int, optional
-        Highest order of the entries; derivative - 1 unless given, or the
-        continuity where that is higher. Prescribed entries above it raise it.
+        Highest order of the entries; default: derivative - 1, or the
+        continuity if higher. Prescribed entries above it increase it.
     single : bool, optional
-        One spline through all waypoints instead of one a segment.
+        One spline through all waypoints instead of one per segment.
     alpha : float, optional
         Shape parameter in [0, 2 pi) [rad] of the spline or of every segment; 0 gives
         polynomials.
     continuity : int, optional
-        Highest derivative that segments share at inner waypoints, `order` unless
-        given. Above it free entries are free on each side separately and may
-        jump, which the cost does not count; prescribed ones hold on both sides.
+        Highest derivative that is continuous at inner waypoints; default:
+        `order`. Above it free entries are free on each side separately and may
+        jump, without a contribution to the cost; prescribed ones apply to both
+        sides.
     free_times : bool, optional
-        Choose the times of inner waypoints too. Prescribed derivatives stay as
-        they are, and no segment becomes shorter than 1e-4 of the mean one or half
-        the shortest given. The result is the best of several local minima,
-        never worse than the given times.
+        Optimise the times of inner waypoints as well. Prescribed derivatives are
+        preserved, and no segment becomes shorter than 1e-4 of the mean duration
+        or half the shortest given one. The result is the best of several local
+        minima, at least as good as the given times.
     weights : array_like, shape (naxes,), optional
-        Factors of the axes in the cost, above 0.
+        Weights of the axes in the cost, above 0.
     labels : sequence of str, optional
         Names of the axes.
 
     Returns
     -------
     Optimum
-        waypoints, plan, cost, unique.
+        With the attributes waypoints, plan, cost, unique and derivative.
 
     Raises
     ------
     ValueError
         If an argument is out of range, times do not increase, axes differ, the
-        order is below the continuity, or an axis prescribes nothing; if
-        waypoints are so near in time, or so far from the origin, that rounding
-        of the data costs the digits of the cost.
+        order is below the continuity, or an axis has no prescribed entry; if the
+        estimated relative error of the cost is above 1e-2, because waypoints are
+        too near in time or too far from the origin.
 
     Warns
     -----
     UserWarning
-        If the estimated relative error of the cost is above 1e-6; above 1e-2 it
-        is an error. The error grows with the power 2 `derivative` - 1 of the
-        ratio between the mean and the shortest segment.
+        If the estimated relative error of the cost is above 1e-6. It grows with
+        the power 2 `derivative` - 1 of the ratio between the mean and the
+        shortest segment.
 
     Examples
     --------
-    From rest to rest through a point, velocity and acceleration there chosen:
+    A rest-to-rest move through a point, with optimum velocity and acceleration there:
 
     >>> best = optimize_waypoints([Waypoint(0, 0, 0, 0), Waypoint(1, 1), Waypoint(2, 0, 0, 0)])
     >>> best.waypoints[1].acceleration.round(6).tolist(), round(best.cost, 6)
     ([-6.666667], 640.0)
 
-    The waypoint in the middle of a move belongs in the middle of its time:
+    The optimum time of a waypoint in the middle of a move is the middle of its duration:
 
     >>> points = [Waypoint(0, 0, 0, 0), Waypoint(0.5, 1), Waypoint(4, 2, 0, 0)]
     >>> round(optimize_waypoints(points, free_times=True).waypoints[1].time, 6)
@@ -204,7 +204,7 @@ def optimize_waypoints(
             found, times = better, chosen
     _check_digits(problem, found, times)
 
-    sides = np.where(np.isnan(table), found.sides / unit, table)  # prescribed entries to the last bit
+    sides = np.where(np.isnan(table), found.sides / unit, table)  # prescribed entries are exact
     before, after = (
         [Waypoint.from_array(t, jet.copy(), names) for t, jet in zip(times.tolist(), side, strict=True)]
         for side in sides
@@ -213,7 +213,7 @@ def optimize_waypoints(
     split = problem.split()
     plan: Trajectory
     if single or split.any():
-        # Of joined segments each is measured by its own ends alone, which says nothing of the whole.
+        # The range of joined segments was compared with their own ends only.
         splines = [TrigSpline(p, alpha=alpha, warn=single) if alpha else PolySpline(p, warn=single) for p in parts]
         plan = splines[0] if single else Joined.without_shift(splines)
     else:
@@ -225,26 +225,28 @@ def optimize_waypoints(
 
 
 def _check_digits(problem: _Problem, found: _Solution, times: Array) -> None:
-    """Say how many digits of the cost are left, where rounding of the data costs many."""
+    """Warn or raise if rounding of the data causes a large error of the cost."""
     position, higher = problem.table[:, 0], np.nan_to_num(problem.table[:, 1:])
     size = np.nanmax(np.abs(position), axis=0, initial=0.0)
     ranges = np.nanmax(position, axis=0, initial=-np.inf) - np.nanmin(position, axis=0, initial=np.inf)
-    ranges[ranges <= 4.0 * _EPS * size] = 0.0  # equal but for rounding
+    ranges[ranges <= 4.0 * _EPS * size] = 0.0  # equal up to rounding
     data = ranges**2 + (higher**2).sum(axis=(0, 1))
-    # A cost of 0 is met to rounding: what counts is its size beside that of other plans through such data.
-    lost = float(np.divide(found.rounding, np.maximum(found.cost, 1e-6 * data), where=data > 0.0, out=0.0 * data).max())
-    if not lost > _FEW:
+    # A cost of 0 is attained up to rounding, relative to that of other plans through similar data.
+    error = float(
+        np.divide(found.rounding, np.maximum(found.cost, 1e-6 * data), where=data > 0.0, out=0.0 * data).max()
+    )
+    if not error > _FEW:
         return
     steps = np.diff(times)
     k = int(steps.argmin())
     why = (
-        f"an estimated relative error of {lost:.1g}: positions up to {size.max():.3g} are known to 16 digits, and "
-        f"{steps[k]:.3g} s from waypoints[{k}] to [{k + 1}] are {steps[k] / steps.mean():.2g} of the mean segment; "
-        f"merge waypoints that are so near, or measure positions from a nearer origin"
+        f"an estimated relative error of {error:.1g}: positions up to {size.max():.3g} have 16 digits, and "
+        f"the time from waypoints[{k}] to [{k + 1}] is {steps[k] / steps.mean():.2g} of the mean segment; "
+        f"merge waypoints, or use an origin nearer to the positions"
     )
-    if lost > _NONE:
+    if error > _NONE:
         raise ValueError(f"the cost must be resolved in double precision, got {why}")
-    warnings.warn(f"the optimum is known to few digits only, with {why}", stacklevel=3)
+    warnings.warn(f"the optimum is inaccurate, with {why}", stacklevel=3)
 
 
 class _Solution(NamedTuple):
@@ -258,13 +260,13 @@ class _Solution(NamedTuple):
 
 
 class _Problem:
-    """What stays the same while times vary."""
+    """Data of the optimisation that do not depend on the times."""
 
     def __init__(self, table: Array, continuity: int, alpha: float, derivative: int, single: bool) -> None:
         self.table = table
         self.family = _Whole if single else _Segments
         self.shape = (alpha, table.shape[1] - 1, derivative)
-        self.loose = np.zeros(table.shape[:2], dtype=bool)  # segments need not share it where it is free
+        self.loose = np.zeros(table.shape[:2], dtype=bool)  # need not be continuous if free
         self.loose[1:-1, continuity + 1 :] = not single
         known = ~np.isnan(table)
         patterns, which = np.unique(known.reshape(-1, table.shape[2]), axis=1, return_inverse=True)
@@ -275,7 +277,7 @@ class _Problem:
         return np.isnan(self.table) & self.loose[:, :, None]
 
     def solve(self, times: Array) -> _Solution:
-        """Least cost at relative times."""
+        """Minimum cost at relative times."""
         family = self.family(times, *self.shape)
         count, _, naxes = self.table.shape
         sides, cost, slope = np.empty((2, *self.table.shape)), np.empty(naxes), np.empty((count - 1, naxes))
@@ -288,7 +290,7 @@ class _Problem:
         return _Solution(sides, cost, slope, unique, rounding)
 
     def scale(self, times: Array) -> Array:
-        """Cost (naxes,) of entries of these sizes that cancel nowhere: free ones 0, signs alternating."""
+        """Cost (naxes,) of entries of these magnitudes without cancellation: free ones 0, alternating signs."""
         known = np.ones(self.table.shape[:2], dtype=bool)
         entries = np.abs(np.nan_to_num(self.table))
         entries[1::2] *= -1.0
@@ -296,7 +298,7 @@ class _Problem:
 
 
 class _Segments:
-    """One spline a segment."""
+    """One spline per segment."""
 
     def __init__(self, times: Array, alpha: float, order: int, derivative: int) -> None:
         self.root = _segment_root(alpha, order, derivative)
@@ -305,8 +307,8 @@ class _Segments:
         self.orders = np.tile(np.arange(order + 1), 2)
 
     def solve(self, known: NDArray[np.bool_], table: Array, loose: NDArray[np.bool_]) -> _Solution:
-        """Optimum of axes that share a pattern of prescribed entries."""
-        # Columns of the entries on the right of each waypoint; those on the left are the same, or further ones.
+        """Optimum of axes with the same pattern of prescribed entries."""
+        # Columns of the entries to the right of each waypoint; those to the left are the same, or additional ones.
         right = np.arange(known.size).reshape(known.shape)
         left = right.copy()
         apart = loose & ~known
@@ -341,7 +343,7 @@ class _Whole:
         self.system = NewtonSystem(alpha, times, given)
         self.samples = self.system.squared_samples(derivative)
         self.jets = (self.system.taylor(times, order + 1) * FACTORIALS[: order + 2, None]).transpose(2, 1, 0)
-        # The part of the top harmonic that turns its phase is what a system of another gamma has more than this one.
+        # The component of the top harmonic that changes its phase, from a system with another gamma.
         self.turn = None
         if self.system.gamma is not None:
             m = self.system.size // 2
@@ -349,7 +351,7 @@ class _Whole:
             self.turn = 2.0 * alpha * m / times.size * (turned.squared_samples(derivative) - self.samples)[:, -1]
 
     def solve(self, known: NDArray[np.bool_], table: Array, loose: NDArray[np.bool_]) -> _Solution:
-        """Optimum of axes that share a pattern of prescribed entries."""
+        """Optimum of axes with the same pattern of prescribed entries."""
         fixed = known.ravel()
         entries = np.nan_to_num(table).reshape(fixed.size, -1)
         matrix = self.samples @ _fitted(self.system, np.eye(fixed.size))
@@ -358,16 +360,16 @@ class _Whole:
 
         coefficients = _fitted(self.system, entries)
         value = self.samples @ coefficients
-        # The price of a prescribed entry; a waypoint that moves takes its entries along, and they are then worth
-        # what they lose by Taylor's theorem.
+        # Sensitivity to a prescribed entry. When a waypoint moves in time, its entries are constant, and differ from
+        # those of the plan by Taylor's theorem.
         scale = _norms(self.samples)
         basis, upper = np.linalg.qr((self.jets[:, :-1][known] / scale).T)
         price = np.zeros_like(table)
         price[known] = blas.dtrsm(1.0, upper, basis.T @ (self.samples.T @ value / scale[:, None]))
         slope = -2.0 * (price * (self.jets[:, 1:] @ coefficients)).sum(axis=1)
-        if self.turn is not None:  # the mean moves, too, and with it gamma
+        if self.turn is not None:  # the mean moves as well, and with it gamma
             slope += (self.turn @ value) * coefficients[-1]
-        slope[-1] = 0.0  # the last time stays
+        slope[-1] = 0.0  # the last time is fixed
         side = entries.reshape(table.shape)
         along = np.cumsum(slope[:0:-1], axis=0)[::-1]
         rounding = _rounding(value, np.abs(matrix) @ np.abs(entries)).sum(axis=0)
@@ -383,18 +385,18 @@ def _segment_root(alpha: float, order: int, derivative: int) -> Array:
 
 
 def _fitted(system: NewtonSystem, entries: Array) -> Array:
-    """Coefficients (size, naxes) from entries (size, naxes), complete and waypoint by waypoint."""
+    """Coefficients (size, naxes) from complete entries (size, naxes), sorted by waypoint."""
     orders = system.order_index
     rows = system.waypoint_index * (orders.max() + 1) + orders
     return system.coefficients(entries[rows] / FACTORIALS[orders, None])
 
 
 def _least_squares(matrix: Array, right: Array, weight: Array) -> tuple[Array, bool]:
-    """Solution of least norm of weighted equations, and whether it is the only one.
+    """Minimum-norm solution of weighted equations, and whether it is unique.
 
-    Weights of rows do not change what is determined, and would hide it where
-    they differ by powers of ten. Rows in falling order of weight and pivoted
-    columns keep each row's digits.
+    The rank does not depend on the weights of rows, and is determined without
+    them, as they may differ by orders of magnitude. Rows in decreasing order of
+    weight and pivoted columns preserve the accuracy of each row.
     """
     count = matrix.shape[1]
     scale = _norms(matrix)
@@ -405,7 +407,7 @@ def _least_squares(matrix: Array, right: Array, weight: Array) -> tuple[Array, b
     size = _norms(rows)
     basis, upper, pivots = qr(rows / size, mode="economic", pivoting=True)
     found = np.zeros((count, right.shape[1]))
-    if rank:  # not by LAPACK's dtrtrs, which waits for its threads however small the system
+    if rank:  # not by LAPACK's dtrtrs, whose threads are slow for small systems
         found[pivots[:rank]] = blas.dtrsm(1.0, upper[:rank, :rank], basis.T[:rank] @ right)
     found /= size[:, None]
     if rank < count:
@@ -415,20 +417,20 @@ def _least_squares(matrix: Array, right: Array, weight: Array) -> tuple[Array, b
 
 
 def _rounding(value: Array, size: Array) -> Array:
-    """Errors of squared samples that are sums of terms of some size: what rounding of the terms leaves in them."""
+    """Rounding errors of squared samples that are sums of terms of given magnitudes."""
     error = 16.0 * _EPS * size
     return 2.0 * np.abs(value) * error + error**2
 
 
 def _norms(matrix: Array) -> Array:
-    """Norms of the columns, 1 where a column is 0."""
+    """Norms of the columns, 1 for a zero column."""
     norms = np.linalg.norm(matrix, axis=0)
     return np.where(norms > 0.0, norms, 1.0)
 
 
 def _best_times(problem: _Problem, given: Array, first: _Solution, weights: Array) -> Array:
-    """Relative times of least cost found from several starts."""
-    # Costs below are rounding, and their logarithm would lead nowhere.
+    """Relative times of minimum cost from several starts."""
+    # Costs below this are rounding, of which the logarithm has no meaning.
     floor = 1e-26 * float(problem.scale(given) @ weights)
     if first.cost @ weights <= floor:
         return given
@@ -467,23 +469,23 @@ def _times(durations: Array) -> Array:
 def _checked_orders(
     points: tuple[Waypoint, ...], derivative: int, order: int | None, continuity: int | None, single: bool
 ) -> tuple[int, int]:
-    """Highest order of the entries, and that which segments share."""
+    """Highest order of the entries, and of the continuous ones."""
     if single and continuity is not None:
-        raise ValueError(f"continuity must be left out for a single plan, which is smooth, got {continuity}")
+        raise ValueError(f"continuity must not be given for a single plan, which is smooth, got {continuity}")
     shared = 0 if continuity is None else checked_count(continuity, "continuity")
-    asked = max(derivative - 1, shared) if order is None else checked_count(order, "order")
+    highest_order = max(derivative - 1, shared) if order is None else checked_count(order, "order")
     prescribed = [int(np.flatnonzero(~np.isnan(p.jet).all(axis=1)).max(initial=0)) for p in points]
-    highest = max(asked, *prescribed)
+    highest = max(highest_order, *prescribed)
     if shared > highest:
         raise ValueError(f"order must be at least the continuity {shared}, got {highest}")
     return highest, highest if continuity is None else shared
 
 
 def _checked_weights(weights: ArrayLike | None, naxes: int) -> Array:
-    """Factors of the axes, above 0."""
+    """Weights of the axes, above 0."""
     if weights is None:
         return np.ones(naxes)
     factors = np.array([checked_finite(w, f"weights[{i}]", above=0.0) for i, w in enumerate(np.ravel(weights))])
     if factors.size != naxes:
-        raise ValueError(f"weights must be one number an axis, {naxes}, got {factors.size}")
+        raise ValueError(f"weights must be one number per axis, {naxes}, got {factors.size}")
     return factors

@@ -1,4 +1,4 @@
-"""The adapter between planning and plants: signals of a system as functions of the jet of a plan."""
+"""Adapter of plants for planning: signals of a system as functions of the jet of a plan."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Quantities = Callable[[Array], Mapping[str, Array]]
 
 
 class HasQuantities(Protocol):
-    """A plant whose signals are functions of the jet of a plan: a flat system, a crane."""
+    """Protocol of plants whose signals are functions of the jet of a plan, such as a flat system or a crane."""
 
     @property
     def quantities(self) -> Quantities:
@@ -21,25 +21,24 @@ class HasQuantities(Protocol):
 
 
 System = Quantities | HasQuantities
-"""What `fastest` and `margins` take; control.flatsys.FlatSystem as well."""
+"""Argument of `fastest` and `margins`; or a control.flatsys.FlatSystem."""
 
 
 def quantities_of(system: Any) -> Quantities | None:
-    """Signals of a system by name, as a function of the jet; None of None.
+    """Function from the jet to the signals of a system by name; None for None.
 
     Parameters
     ----------
     system : flat system, plant with a method `quantities`, or callable, optional
-        Of a `control.flatsys.FlatSystem` without that method the states and
-        inputs are evaluated by its reverse map, one time after the other.
+        For a `control.flatsys.FlatSystem` without that method, states and inputs
+        are evaluated by its reverse map, one time after the other.
 
     Raises
     ------
     TypeError
-        If it is none of these.
+        If `system` is none of these.
     ValueError
-        If the maps of a flat system do not belong together, or it is in
-        discrete time.
+        If the maps of a flat system are inconsistent, or it is in discrete time.
     """
     if system is None:
         return None
@@ -60,5 +59,5 @@ def quantities_of(system: Any) -> Quantities | None:
 
 
 def system_given(system: System | None, quantities: System | None) -> System | None:
-    """The argument ``system``, which may come under its old name ``quantities``."""
+    """The argument ``system``, or its deprecated name ``quantities``."""
     return renamed_argument("quantities", quantities, "system", system)

@@ -1,4 +1,4 @@
-"""Search over one number: a grid whose valleys are solved for, and bisection."""
+"""Scalar search: local minima from a grid, and bisection."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from ctrlplan.trajectories.common import Array
 
 
 def scan(function: Callable[[float], float], grid: Array, target: float | None = None) -> tuple[Array, Array]:
-    """Points of a function that include the bottom of every valley that matters.
+    """Samples of a function that include its relevant local minima.
 
     Parameters
     ----------
     function : callable
-        Of one number; inf where it has no value.
+        Function of one number; inf where it is undefined.
     grid : ndarray, shape (npoints,)
-        Where to look first, increasing; as fine as the function's features.
+        Initial points, increasing; as fine as the features of the function.
     target : float, optional
-        Valleys that cannot reach down to it are left alone; the least value on
-        the grid unless given.
+        Local minima that cannot be below it are not refined; default: the minimum
+        on the grid.
 
     Returns
     -------
@@ -31,7 +31,7 @@ def scan(function: Callable[[float], float], grid: Array, target: float | None =
     """
     values = np.array([function(x) for x in grid.tolist()])
     finite = values[np.isfinite(values)]
-    # A search between a value and none must compare numbers.
+    # Between a value and inf the search compares finite numbers.
     wall = float(finite.max() + np.ptp(finite) + 1.0) if finite.size else math.inf
     found = [
         _bottom(lambda x: min(function(x), wall), grid, k)
@@ -46,16 +46,16 @@ def scan(function: Callable[[float], float], grid: Array, target: float | None =
 def bisected(
     holds: Callable[[float], bool], inside: float, outside: float, atol: float, rtol: float = 0.0
 ) -> tuple[float, float]:
-    """Two near points between which a condition ceases to hold.
+    """Two neighbouring points between which a condition changes.
 
     Parameters
     ----------
     holds : callable
         The condition, of one number: true at `inside`.
     inside, outside : float
-        Points between which it ceases to hold, in any order.
+        Points at which the condition is true and false, in any order.
     atol, rtol : float
-        Distance at the end, and as a fraction of the point inside.
+        Final distance, absolute and relative to the point inside.
 
     Returns
     -------
@@ -69,18 +69,18 @@ def bisected(
 
 
 def _valleys(values: Array, target: float) -> list[int]:
-    """Grid points below both neighbours, beside which the target can be reached."""
+    """Grid points below both neighbours, near which the target can be reached."""
     padded = np.concatenate([[math.inf], values, [math.inf]])
     left, here, right = padded[:-2], padded[1:-1], padded[2:]
     low = np.isfinite(here) & (here <= left) & (here <= right)
-    # Between three points a parabola falls by at most an eighth of what the ends rise; ten times that is allowed for.
+    # A parabola falls below the middle of three points by at most an eighth of the rise of the ends; allow ten times.
     with np.errstate(invalid="ignore"):
         rise = np.where(np.isfinite(left), left, here) + np.where(np.isfinite(right), right, here) - 2.0 * here
         return np.flatnonzero(low & ~(here - 1.25 * rise > target)).tolist()
 
 
 def _bottom(function: Callable[[float], float], grid: Array, k: int) -> tuple[float, float]:
-    """Least value between the neighbours of a grid point."""
+    """Minimum between the neighbours of a grid point."""
     low, high = float(grid[max(k - 1, 0)]), float(grid[min(k + 1, grid.size - 1)])
     found = minimize_scalar(function, bounds=(low, high), method="bounded", options={"xatol": 1e-7 * (high + low)})
     return float(found.x), float(found.fun)

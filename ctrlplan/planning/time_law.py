@@ -1,4 +1,4 @@
-"""A time law that is slow only where limits need it: the path stays, the clock along it changes."""
+"""Optimisation of the time law of a plan with fixed path."""
 
 from __future__ import annotations
 
@@ -16,36 +16,37 @@ _SAMPLES = 161
 _STEP = 1e-6
 _STEPS = 150
 _ROUNDING = 1e-12
-"""Violation that is rounding, as a fraction of a limit's scale: of a position limit that the path touches."""
+"""Violation attributed to rounding, as a fraction of a limit's scale, for position limits that the path attains."""
 
 
-def with_fastest_law(plan: Trajectory, limited: Limited) -> Trajectory:
-    """Plan on the fastest clock found that keeps its limits at samples.
+def with_fast_time_law(plan: Trajectory, limited: Limited) -> Trajectory:
+    """Plan with a time law of minimum duration under limits at samples.
 
-    The clock's rate is a spline of degree 4 with positive coefficients, so that
-    the clock always runs forwards and has four continuous derivatives, as many
-    as a crane's force needs. The duration is the reciprocal of the mean rate.
-    A fastest clock meets about as many limits as it has coefficients, so linear
-    programs within a trust region get there in tens of steps; after each the
-    clock is slowed down as a whole until limits hold again.
+    The rate of the time law is a spline of degree 4 with positive coefficients,
+    so that the time law is increasing and has four continuous derivatives, as
+    many as the force of a crane requires. The duration is the reciprocal of the
+    mean rate. At the optimum about as many limits are active as there are
+    coefficients, so linear programs within a trust region converge in tens of
+    steps. After each step the rate is reduced uniformly until the limits are
+    satisfied.
 
     Parameters
     ----------
     plan : Trajectory
-        It keeps the limits.
+        Plan that satisfies the limits.
     limited : Limited
         The limits.
 
     Returns
     -------
     Trajectory
-        `Retimed`; it may break limits between samples by a little.
+        A `Retimed` plan, which may slightly violate limits between samples.
     """
     law = _Law(plan, limited)
     logs, reach = np.zeros(law.size), 0.5
     for _ in range(_STEPS):
         room, slope = law.room_and_slope(logs)
-        # Fastest for limits that are straight lines: as many of them are met as there are variables.
+        # Minimum duration for linearised limits, of which as many are active as there are variables.
         step = linprog(
             -law.weights * np.exp(logs),
             -slope,
@@ -58,11 +59,11 @@ def with_fastest_law(plan: Trajectory, limited: Limited) -> Trajectory:
         logs, reach = (tried, min(1.5 * reach, 2.0)) if gain > 0.0 else (logs, 0.3 * reach)
         if reach < 1e-3 or 0.0 < gain < 1e-5:
             break
-    return Retimed(plan, law.clock(logs))
+    return Retimed(plan, law.time_law(logs))
 
 
 class _Law:
-    """Clocks of a plan, by the logarithms of their rates' coefficients."""
+    """Time laws of a plan, by the logarithms of the coefficients of their rates."""
 
     def __init__(self, plan: Trajectory, limited: Limited) -> None:
         self._knots = _graded(_PIECES, limited)
@@ -70,13 +71,13 @@ class _Law:
         self.size = _PIECES + 4
         passed = BSpline(knots, np.eye(self.size), 4).antiderivative()
         self._plan, self._limited = plan, limited
-        # Limits of positions hold on every clock; where one is touched, its room would be rounding.
+        # Limits of positions do not depend on the time law; where one is attained, its margin is rounding.
         self._moving = [k for k, bound in enumerate(limited.bounds) if bound.axis is None or bound.order]
         self._bounds = [limited.bounds[k] for k in self._moving]
         self.weights = passed(1.0)
         samples = _graded(_SAMPLES - 1, limited)
         orders = range(limited.order + 1)
-        # Taylor coefficients of the clock at the samples, in parts of the duration.
+        # Taylor coefficients of the time law at the samples, in normalised time.
         self._basis = np.stack([passed(samples, nu=k) / FACTORIALS[k] for k in orders])
         self._at_knots = np.stack([passed(self._knots, nu=k) for k in range(3)])
 
@@ -91,7 +92,7 @@ class _Law:
         return room[:, 0], (room[:, 1:] - room[:, :1]) / _STEP
 
     def within_limits(self, logs: Array) -> Array:
-        """Same law, slowed down as a whole until limits hold at the samples."""
+        """Same law with the rate reduced uniformly until limits are satisfied at the samples."""
         slowest, fastest = logs - 3.0, logs
         if self._holds(fastest):
             return fastest
@@ -101,11 +102,11 @@ class _Law:
         return slowest
 
     def _holds(self, logs: Array) -> bool:
-        """Whether every limit holds at the samples."""
+        """Whether all limits are satisfied at the samples."""
         return bool(self._room(logs[:, None]).min() >= -_ROUNDING)
 
-    def clock(self, logs: Array) -> PiecewiseSpline:
-        """The clock: a quintic a part, from the plan's start to its end."""
+    def time_law(self, logs: Array) -> PiecewiseSpline:
+        """The time law from the plan's start to its end, one quintic per interval."""
         plan, duration = self._plan, self.duration(logs)
         jets = plan.duration * duration * (self._at_knots @ np.exp(logs))
         jets[0] += plan.start
@@ -117,15 +118,15 @@ class _Law:
                 Waypoint(t, *jet)
                 for t, jet in zip(times.tolist(), (jets / length ** np.arange(3)[:, None]).T, strict=True)
             ],
-            labels=["clock"],
+            labels=["time"],
             warn=False,
         )
 
     def _room(self, logs: Array) -> Array:
-        """The same for many laws at once, shape (nlimits nsamples, nlaws)."""
+        """Distance from every limit for many laws, shape (nlimits nsamples, nlaws)."""
         rates = np.exp(logs)
         durations = 1.0 / (self.weights @ rates)
-        # A part of the duration is `durations` times the plan's own.
+        # Durations are relative to that of the plan.
         inner = (self._basis @ rates) * durations * self._plan.duration
         inner /= (durations * self._plan.duration) ** np.arange(len(inner))[:, None, None]
         times = np.clip(self._plan.start + inner[0], self._plan.start, self._plan.end).ravel()
@@ -135,7 +136,7 @@ class _Law:
         series = np.stack(composed(list(outer), list(inner[1:].reshape(shape))))
         try:
             values = self._limited.values(series * FACTORIALS[: order + 1, None, None])
-        except ValueError:  # the plant cannot follow: far beyond every limit
+        except ValueError:  # infeasible for the plant: far beyond every limit
             return np.full((2 * len(self._bounds) * _SAMPLES, logs.shape[1]), -1e3)
         rows = [(b.high - row) / b.scale + b.slack for b, row in zip(self._bounds, values[self._moving], strict=True)]
         rows += [(row - b.low) / b.scale + b.slack for b, row in zip(self._bounds, values[self._moving], strict=True)]
@@ -144,9 +145,9 @@ class _Law:
 
 
 def _graded(count: int, limited: Limited) -> Array:
-    """Numbers from 0 to 1; closer at both ends, where a plan that starts slowly needs a clock that starts fast.
+    """Knots from 0 to 1; denser at both ends, where a plan from rest requires a large rate.
 
-    Limits on more than accelerations do not let it, and would be rounding on short pieces.
+    Not with limits on derivatives above acceleration, which have large rounding errors on short intervals.
     """
     even = np.linspace(0.0, 1.0, count + 1)
     if limited.derivatives_only and limited.order <= 2:

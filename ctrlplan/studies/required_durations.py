@@ -57,7 +57,7 @@ def required_duration(name: str, plan: Trajectory, fast: Trajectory, limited: Li
         satisfied = "satisfied" if worst.fraction >= -SAME else f"{worst.bound.name} exceeded by {worst.share}"
         shortest = limited.margins(fast)
         duration = fast.duration
-        if fast is plan or not shortest.hold:
+        if fast is plan or not shortest.satisfied:
             found = fastest_within(fast, limited)
             duration, shortest = found.duration, found.margins
     except ValueError as reason:

@@ -1,8 +1,8 @@
-"""Equations of python-control's blocks as CasADi expressions, checked against Python.
+"""Equations of python-control's blocks as CasADi expressions, verified against Python.
 
-A block is called with symbols in place of numbers (`tracing`, `symbols`); the
-result counts only if it agrees with Python (`comparison`), and only as long as
-nothing has changed to which the block's functions refer (`fingerprint`).
+A block is called with symbols in place of numbers (`tracing`, `symbols`). The
+result is used only if it agrees with Python (`comparison`), and only while the
+objects that the block's functions refer to are unchanged (`fingerprint`).
 """
 
 from ctrlplan.symbolic.extra import missing_casadi

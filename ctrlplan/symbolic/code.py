@@ -1,4 +1,4 @@
-"""Names that the code of functions refers to."""
+"""Names in the code of functions."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, eq=False)
 class Code:
-    """Names in a code and in those inside it: globals, attributes and strings, imported modules."""
+    """Names in a code object and in nested ones: globals, attributes and strings, imported modules."""
 
     globals: tuple[str, ...]
     names: frozenset[str]
@@ -21,7 +21,7 @@ class Code:
 
 @functools.lru_cache(maxsize=4096)
 def code_of(code: types.CodeType) -> Code:
-    """Names in a code and in those inside it."""
+    """Names in a code object and in nested ones."""
     globals_: dict[str, None] = {}
     imports: dict[str, None] = {}
     names: set[str] = set()
@@ -44,7 +44,7 @@ def code_of(code: types.CodeType) -> Code:
 
 
 def imported_modules(name: str, package: str) -> Iterator[types.ModuleType]:
-    """Modules that an import inside a function may mean, in its package or a level above."""
+    """Modules that an import inside a function may refer to, in its package or a level above."""
     parts = package.split(".") if package else []
     for n in range(len(parts) + 1):
         module = sys.modules.get(".".join([*parts[:n], name]).strip("."))
@@ -59,6 +59,6 @@ def _strings(constant: object) -> set[str]:
 
 
 def codes_of(roots: Iterable[object]) -> frozenset[types.CodeType]:
-    """Code of the functions among some objects."""
+    """Code objects of the functions among some objects."""
     functions = (getattr(root, "__func__", root) for root in roots)
     return frozenset(function.__code__ for function in functions if isinstance(function, types.FunctionType))

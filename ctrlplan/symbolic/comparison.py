@@ -1,4 +1,4 @@
-"""When, and at which states of its runs, a compiled form is compared with Python."""
+"""Runs and states at which a compiled form is compared with Python."""
 
 from __future__ import annotations
 
@@ -11,31 +11,31 @@ from ctrlplan._lru import BUILDING
 from ctrlplan._types import Array
 
 _FEW = 4
-"""Changes of each switch that come before the peaks of the signals."""
+"""Number of changes of each switch with priority over the peaks of the signals."""
 
 _ENOUGH = 12
-"""States compared where nothing switches, and one for each signal."""
+"""Number of states that are compared without switches, plus one for each signal."""
 
 
 class Compared:
-    """Which sides of its switches a form has been compared on, and in which run it is next.
+    """Record of the runs, and sides of switches, in which a form has been compared.
 
     A form is compared in its first two runs, in one random run of the next two,
-    of the next four, and so on, and wherever a run is on a new side of a switch.
+    of the next four, and so on, and in any run on a new side of a switch.
     """
 
     def __init__(self, nswitches: int) -> None:
         self._seen = np.zeros((3, nswitches), dtype=bool)
-        self._runs, self._next = 0, 1  # the runs so far, and the one to be compared next
+        self._runs, self._next = 0, 1  # number of runs so far, and of the next comparison
         self._chance = random.Random(0)
 
     @property
     def is_expected(self) -> bool:
-        """Whether the next run is to be compared, wherever it goes."""
+        """Whether the next run is to be compared on any side of its switches."""
         return self._runs + 1 >= self._next
 
     def is_due(self, sides: Array) -> bool:
-        """Whether to compare a run with these sides (nswitches, ntime) of its switches."""
+        """Whether to compare a run on these sides (nswitches, ntime) of its switches."""
         reached = np.array([(sides == side).any(axis=1) for side in (-1.0, 0.0, 1.0)])
         with BUILDING:
             self._runs += 1
@@ -48,8 +48,8 @@ class Compared:
             return True
 
 
-def telling_states(sides: Array, signals: Array, most: int) -> NDArray[np.intp]:
-    """Places of a run at which a wrong form would show, in order of time.
+def telling_states(sides: Array, signals: Array, count: int) -> NDArray[np.intp]:
+    """Samples of a run at which an error of a form is likely, in order of time.
 
     Parameters
     ----------
@@ -57,14 +57,14 @@ def telling_states(sides: Array, signals: Array, most: int) -> NDArray[np.intp]:
         Signs of the switches' arguments.
     signals : ndarray, shape (nsignals, ntime)
         Signals and states.
-    most : int
-        Places at most.
+    count : int
+        Maximum number of samples.
 
     Returns
     -------
     ndarray of int
-        Both sides of changes of a switch, the first of every switch before the
-        second of one; maxima and minima of signals; some evenly spread.
+        Both sides of changes of switches, the first change of every switch
+        before any second one; maxima and minima of signals; some evenly spaced.
     """
     ntime = signals.shape[1]
     switch, before = np.nonzero(sides[:, 1:] != sides[:, :-1])
@@ -74,8 +74,8 @@ def telling_states(sides: Array, signals: Array, most: int) -> NDArray[np.intp]:
     early = 2 * int((rank < _FEW).sum())
     peaks = np.concatenate([signals.argmax(axis=1), signals.argmin(axis=1)])
     enough = _ENOUGH + len(signals)
-    most = min(most, changes.size + enough)
+    count = min(count, changes.size + enough)
     spread = np.concatenate([np.linspace(0, ntime - 1, enough).astype(int), np.arange(min(ntime, 2 * enough))])
     places = np.concatenate([[0, ntime - 1], changes[:early], peaks, changes[early:], spread])
     _, first = np.unique(places, return_index=True)
-    return np.sort(places[np.sort(first)[:most]].astype(np.intp))
+    return np.sort(places[np.sort(first)[:count]].astype(np.intp))

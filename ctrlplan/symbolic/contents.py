@@ -1,4 +1,4 @@
-"""What an object holds at one time, what has changed of it since, and how to put it back."""
+"""Contents of objects: copies, changes, and restoration."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from ctrlplan._types import Frozen
 from ctrlplan.symbolic.libraries import written_in_python
 
 MISSING = object()
-"""In the place of a value that is not there."""
+"""Placeholder of a missing value."""
 
 _FEW = 256
-"""Entries of an array up to which those that have changed are named one by one."""
+"""Maximum size of an array of which changed entries are listed."""
 
 
 class Slots:
-    """Attributes of an object that its classes keep in slots."""
+    """Attributes of an object in slots of its classes."""
 
     def __init__(self, value: object) -> None:
         self.value = value
@@ -33,7 +33,7 @@ class Slots:
         }
 
     def values(self) -> dict[str, object]:
-        """Those that are set, by name."""
+        """Values of the slots that are set, by name."""
         found = {}
         for name, member in self.places.items():
             try:
@@ -44,7 +44,7 @@ class Slots:
 
 
 def contents_of(value: object) -> object:
-    """Copy of what an object holds itself, or None where it cannot change."""
+    """Copy of the contents of an object, or None if it is immutable."""
     if isinstance(value, np.ndarray):
         return value.copy() if value.flags.writeable else None
     if isinstance(value, list | dict | set | bytearray | deque):
@@ -56,7 +56,7 @@ def contents_of(value: object) -> object:
 
 
 def changed_keys(value: object, before: object) -> list[object]:
-    """Keys of an object under which it holds something else than before; None stands for all."""
+    """Keys of an object with changed values; None stands for all."""
     if isinstance(value, np.ndarray) and isinstance(before, np.ndarray):
         return list(_changed_entries(value, before))
     now = contents_of(value)
@@ -68,8 +68,8 @@ def changed_keys(value: object, before: object) -> list[object]:
     return [] if now == before else [None]
 
 
-def put_back(value: object, before: object) -> None:
-    """Let an object hold again what it held before."""
+def restore(value: object, before: object) -> None:
+    """Restore the contents of an object."""
     if before is None:
         return
     if isinstance(value, np.ndarray):
@@ -84,7 +84,7 @@ def put_back(value: object, before: object) -> None:
         value.extend(before)
     elif isinstance(value, Slots) and isinstance(before, dict):
         for name, entry in before.items():
-            with suppress(AttributeError):  # one that cannot be set has not changed
+            with suppress(AttributeError):  # an attribute that cannot be set has not changed
                 value.places[name].__set__(value.value, entry)
     elif isinstance(before, dict):
         own = value.__dict__
@@ -93,7 +93,7 @@ def put_back(value: object, before: object) -> None:
 
 
 def bound(holder: object, key: str) -> object:
-    """What a name of a module, class or dictionary stands for, or a cell holds; MISSING where there is nothing."""
+    """Value of a name of a module, class or dictionary, or of a cell; MISSING if there is none."""
     if isinstance(holder, types.CellType):
         try:
             return holder.cell_contents
@@ -103,7 +103,7 @@ def bound(holder: object, key: str) -> object:
 
 
 def bind(holder: object, key: str, value: object) -> None:
-    """Let a name stand for a value again."""
+    """Restore the value of a name."""
     if not isinstance(holder, dict):
         setattr(holder, key, value)
     elif value is MISSING:
@@ -113,7 +113,7 @@ def bind(holder: object, key: str, value: object) -> None:
 
 
 def _changed_entries(value: NDArray[np.generic], before: NDArray[np.generic]) -> Iterator[int | None]:
-    """Places of an array whose entries differ; None for all of a long one."""
+    """Indices of changed entries of an array; None for all entries of a large one."""
     if not value.dtype.hasobject and value.tobytes() == before.tobytes():
         return
     if not value.dtype.hasobject and value.size > _FEW:

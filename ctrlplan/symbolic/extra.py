@@ -1,4 +1,4 @@
-"""Whether the extra package is there that symbolic work needs."""
+"""Availability of CasADi."""
 
 from __future__ import annotations
 
@@ -6,5 +6,5 @@ from importlib.util import find_spec
 
 
 def missing_casadi() -> str:
-    """Reason why nothing can be traced, with what to do; empty where CasADi is installed."""
+    """Reason why blocks cannot be traced, with the remedy; empty if CasADi is installed."""
     return "" if find_spec("casadi") is not None else "CasADi is not installed (pip install ctrlplan[fast])"

@@ -1,4 +1,4 @@
-"""What a run of a system depends on, as one value that is equal only where nothing has changed."""
+"""Fingerprint of a system: a value that is equal only if nothing that a run depends on has changed."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ctrlplan.traits import traits_of
 
 
 def fingerprint(system: System) -> tuple[object, ...]:
-    """What a run depends on: equal only where nothing has changed."""
+    """Fingerprint of a system, equal only if nothing that a run depends on has changed."""
     own = (id(system), str(system.name), system.dt, value_token(getattr(system, "params", None)))
     labels = (tuple(system.input_labels or ()), tuple(system.output_labels or ()), tuple(system.state_labels or ()))
     if isinstance(system, ct.InterconnectedSystem):
@@ -23,7 +23,7 @@ def fingerprint(system: System) -> tuple[object, ...]:
         return (own, labels, tuple(np.asarray(m).tobytes() for m in (system.A, system.B, system.C, system.D)))
     if isinstance(system, ct.TransferFunction):
         return (own, labels, _frozen([system.num, system.den]))
-    # The functions themselves, not their addresses: those of the dead are given to others.
+    # The functions themselves, not their addresses, which may be reused after deletion.
     functions = tuple(_frozen(getattr(system, name, None)) for name in ("updfcn", "outfcn"))
     # Traits are immutable and compared by identity.
     traits = traits_of(system)
@@ -38,7 +38,7 @@ def fingerprint(system: System) -> tuple[object, ...]:
 
 
 def _frozen(value: object) -> object:
-    """Something hashable that changes with a value."""
+    """Hashable value that changes with a value."""
     if isinstance(value, Mapping):
         return tuple((key, _frozen(entry)) for key, entry in value.items())
     if isinstance(value, list | tuple):
@@ -53,7 +53,7 @@ def _frozen(value: object) -> object:
 
 
 def _referred(system: System) -> tuple[object, ...]:
-    """What the functions of a block refer to, where they may be compiled."""
+    """Fingerprint of the objects that the functions of a block refer to, if they may be compiled."""
     traits = traits_of(system)
     if traits.plan is not None or traits.delay is not None:
         return ()
@@ -67,7 +67,7 @@ def value_token(value: object) -> tuple[object, ...]:
 
 
 def roots_of(system: System) -> Iterator[tuple[str, object]]:
-    """Functions of a block that a compiled form is made of; those of a sampled block are run by Python."""
+    """Functions of a block in a compiled form; those of a sampled block are run by Python."""
     for name in ("outfcn",) if traits_of(system).period is not None else ("outfcn", "updfcn"):
         function = getattr(system, name, None)
         if function is not None:

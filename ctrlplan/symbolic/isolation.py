@@ -1,4 +1,4 @@
-"""Calls of a block with made-up arguments, which leave nothing behind."""
+"""Trial calls of blocks without side effects."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ T = TypeVar("T")
 
 @contextmanager
 def untouched() -> Iterator[None]:
-    """Context of trial calls, one thread at a time: the filters of warnings belong to all.
+    """Context of trial calls, one thread at a time because warning filters are global.
 
-    Warnings and floating-point errors do not show, and the global random
-    generators (`random`, `numpy.random`) are left as they were: what another
-    thread draws meanwhile is drawn again.
+    Warnings and floating-point errors are suppressed, and the states of the global
+    random generators (`random`, `numpy.random`) are restored: numbers that another
+    thread draws meanwhile are drawn again.
     """
     with BUILDING:
         drawn, legacy = random.getstate(), np.random.get_state(legacy=False)  # noqa: NPY002
@@ -39,10 +39,10 @@ def untouched() -> Iterator[None]:
 
 
 def tried(call: Callable[[], T], otherwise: T) -> T:
-    """Result of a trial call, or another value where it raises: arguments outside of its domain.
+    """Result of a trial call, or another value if it raises, for arguments outside of its domain.
 
-    An interruption of the program passes; `SystemExit` counts as an error, for
-    it was the made-up arguments that a block did not accept.
+    KeyboardInterrupt is passed on. `SystemExit` is treated as an error, since the
+    block rejected the trial arguments.
     """
     try:
         return call()
@@ -51,7 +51,7 @@ def tried(call: Callable[[], T], otherwise: T) -> T:
 
 
 def same_answer(a: Iterable[ArrayLike] | None, b: Iterable[ArrayLike] | None) -> bool:
-    """Whether two results of trial calls are equal, entry by entry, where there are any."""
+    """Whether two results of trial calls exist and are equal, entry by entry."""
     if a is None or b is None:
         return a is b
     return all(np.array_equal(one, other, equal_nan=True) for one, other in zip(a, b, strict=True))

@@ -1,4 +1,4 @@
-"""Places that functions only write: logs and counters of their calls, without influence on their values."""
+"""Write-only locations of functions, such as logs and counters of calls, without effect on their values."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ import threading
 import types
 from collections import OrderedDict
 
-_KEPT = 256
-"""Maximum number of places kept."""
+_SIZE = 256
+"""Maximum number of stored locations."""
 
 
 class Logs:
-    """Places (object, key or attribute, None for all) and the functions that they have no influence on.
+    """Locations (object, key or attribute, None for all), and the functions on which they have no effect.
 
-    Safe in threads.
+    Thread-safe.
     """
 
     def __init__(self) -> None:
@@ -27,20 +27,20 @@ class Logs:
         return known is not None and known[0] is holder and codes <= known[1]
 
     def keys_of(self, holder: object, codes: frozenset[types.CodeType]) -> set[object]:
-        """Keys of an object that are such places for some functions."""
+        """Keys of an object that are such locations for some functions."""
         with self._lock:
             keys = [key for number, key in self._places if number == id(holder)]
         return {key for key in keys if (holder, key, codes) in self}
 
     def add(self, places: list[tuple[object, object]], codes: frozenset[types.CodeType]) -> None:
-        """Add places that some functions write and do not depend on."""
+        """Add locations that some functions write but do not depend on."""
         with self._lock:
             for holder, key in places:
                 _, known = self._places.pop((id(holder), key), (holder, frozenset()))
                 self._places[id(holder), key] = holder, known | codes
-            while len(self._places) > _KEPT:
+            while len(self._places) > _SIZE:
                 self._places.popitem(last=False)
 
 
 LOGS = Logs()
-"""Those found so far, in all blocks."""
+"""Locations found so far, in all blocks."""

@@ -1,8 +1,9 @@
-"""All that functions refer to, and a fingerprint of it.
+"""All objects that functions refer to, and their fingerprint.
 
-A compiled form holds the numbers that a block's functions found when they were
+A compiled form contains the numbers that a block's functions used when they were
 traced: globals, closures, defaults, attributes, entries of arrays. All of them
-are in the fingerprint; what cannot be is named, and its block is not compiled.
+are part of the fingerprint. A block that refers to an object without a
+fingerprint is not compiled, and the object is reported.
 """
 
 from __future__ import annotations
@@ -37,16 +38,16 @@ from ctrlplan.symbolic.libraries import (
 from ctrlplan.symbolic.logs import LOGS
 
 _MAXIMUM = 20_000
-"""Objects that a fingerprint covers."""
+"""Maximum number of objects of a fingerprint."""
 
 _BYTES = 1 << 26
-"""Bytes of arrays that a fingerprint covers."""
+"""Maximum size of the arrays of a fingerprint in bytes."""
 
 _LONG = 256
-"""Bytes above which an array is represented by a digest."""
+"""Size in bytes above which an array is represented by a digest."""
 
 _ALL = frozenset(str.split("getattr vars __dict__ attrgetter astuple asdict copy deepcopy replace"))
-"""Names in a code that may stand for any attribute."""
+"""Names in code that may access any attribute."""
 
 _DULL = frozenset(
     str.split(
@@ -58,34 +59,36 @@ _DULL = frozenset(
         "__annotations_cache__ __subclasshook__ __class_getitem__ __classcell__ __type_params__"
     )
 )
-"""Attributes of a class without influence on what its objects return."""
+"""Attributes of a class without effect on the results of its objects."""
 
 _MAKERS = frozenset(("__init__", "__post_init__", "__new__", "__set_name__"))
-"""Methods that set attributes of objects that are new."""
+"""Methods that set attributes of new objects."""
 
 
 class References:
-    """All that some objects refer to.
+    """All objects that some objects refer to, and their fingerprint.
 
     Parameters
     ----------
     roots : iterable of (str, object)
-        Functions and other objects, with what they are called in messages.
+        Functions and other objects, with their names for messages.
 
     Attributes
     ----------
     tokens : tuple
-        Equal where nothing has changed; it holds on to all that it compares by identity.
+        Fingerprint, equal if nothing has changed; it contains all objects that are
+        compared by identity.
     cached : tuple
-        The same of cached properties, which a first call adds to an object.
+        Fingerprint of cached properties, which a first call adds to an object.
     opaque : str
-        First of what cannot be fingerprinted, in words; empty where there is none.
+        Description of the first object without a fingerprint; empty if there is
+        none.
     names : set of str
         Names and strings in the code of the functions.
     objects : list
-        All objects found, kept alive.
+        All objects found.
     bindings : list of (object, str, object)
-        Names of modules, classes and closures, and what they stand for.
+        Names of modules, classes and closures, and their values.
     """
 
     def __init__(self, roots: Iterable[tuple[str, object]]) -> None:
@@ -93,19 +96,19 @@ class References:
         self.names: set[str] = set()
         self._tokens: list[object] = []
         self._seen: dict[int, int] = {}
-        self.objects: list[object] = []  # alive, so that no address is given to another
+        self.objects: list[object] = []  # references, so that no address is reused
         self._queue: deque[tuple[object, str]] = deque()
-        self._named: list[tuple[object, str, set[str]]] = []  # of these the attributes that are named count
+        self._named: list[tuple[object, str, set[str]]] = []  # objects of which the named attributes matter
         self.bindings: list[tuple[object, str, object]] = []
         self._cached: dict[str, object] = {}
-        self._made: set[type] = set()  # classes that may be called
+        self._made: set[type] = set()  # classes that may be instantiated
         self._bytes = 0
         self.roots = tuple(roots)
         self._codes = codes_of(root for _, root in self.roots)
         try:
             self._walk()
-        except Exception as error:  # whatever an object does when it is looked at
-            self._hide(f"which cannot be looked into: {type(error).__name__}", "an object")
+        except Exception as error:  # any exception of an object during inspection
+            self._hide(f"which cannot be inspected: {type(error).__name__}", "an object")
         self.tokens = tuple(self._tokens)
         self.cached = References(self._cached.items()).tokens if self._cached else ()
 
@@ -121,18 +124,18 @@ class References:
                 self._add_named()
 
     def _is_log(self, holder: object, key: object) -> bool:
-        """Whether a place is known to be written by the functions, and to have no influence on them."""
+        """Whether a location is known to be written by the functions without an effect on them."""
         return (holder, key, self._codes) in LOGS
 
     def _logs_of(self, holder: object) -> set[object]:
-        """Such places in an object."""
+        """Such locations of an object."""
         return LOGS.keys_of(holder, self._codes)
 
     def _hide(self, what: str, where: str) -> None:
         self.opaque = self.opaque or f"{where} ({what})"
 
     def _add(self, value: object, where: str) -> None:
-        """Token of a value, or its number among the objects, which are visited later."""
+        """Add the token of a value, or its number among the objects, which are visited later."""
         kind = type(value)
         if kind in _ATOMS:
             self._tokens += (kind, value.hex() if type(value) is float else value)
@@ -159,7 +162,7 @@ class References:
         self._instance(value, where)
 
     def _add_named(self) -> None:
-        """Attributes by the names that occur in the code found so far."""
+        """Add attributes with names that occur in the code found so far."""
         every = not self.names.isdisjoint(_ALL)
         for holder, where, done in list(self._named):
             found = vars(holder) if not isinstance(holder, Slots) else holder.values()
@@ -172,7 +175,7 @@ class References:
                     self._attribute(holder, name, found[name], f"{where}.{name}")
 
     def _counts(self, holder: object, name: str, every: bool) -> bool:
-        """Whether an attribute may have an influence."""
+        """Whether an attribute may have an effect."""
         if isinstance(holder, types.ModuleType):
             return name in self.names
         if not isinstance(holder, type):
@@ -194,7 +197,7 @@ class References:
             self.bindings.append((holder, name, value))
         self._add(value, where)
 
-    # Kinds of objects
+    # Types of objects
 
     def _function(self, value: types.FunctionType, where: str) -> None:
         code = code_of(value.__code__)
@@ -228,7 +231,7 @@ class References:
             if name in known:
                 self._add(known[name], name)
             elif name in HIDDEN:
-                self._hide("no function of its arguments", f"{name}()")
+                self._hide("not a function of its arguments", f"{name}()")
             else:
                 self._tokens.append(Same(getattr(builtins, name, None)))
 
@@ -321,7 +324,7 @@ class References:
         self._attributes(value, where)
 
     def _fixed(self, value: object, where: str) -> None:
-        """Values that cannot change: numbers, texts, names of an enumeration."""
+        """Immutable values: numbers, strings, names of an enumeration."""
         if isinstance(value, np.generic):
             self._tokens += (value.dtype.str, value.tobytes())
         else:
@@ -329,7 +332,7 @@ class References:
             self._attributes(value, where)
 
     def _identity(self, value: object, where: str) -> None:
-        """Objects of which no part can change."""
+        """Immutable objects, compared by identity."""
         if isinstance(value, np.ufunc) and "vectorized" in value.__name__:
             self._hide("made by numpy.frompyfunc", where)
         self._tokens.append(Same(value))
@@ -340,7 +343,7 @@ class References:
         self._add(value.__dict__, where)
 
     def _frozen(self, value: Frozen, where: str) -> None:
-        """Immutable objects of this package: by identity, but for parts that may be a user's."""
+        """Immutable objects of this package, by identity except for parts of other classes."""
         if not is_pure(type(value).__module__):
             self._attributes(value, where)
             return
@@ -355,7 +358,7 @@ class References:
             self._add(part, where)
 
     def _nothing(self, value: object, where: str) -> None:
-        """Objects with a state that does not show."""
+        """Objects with a hidden state."""
         self._hide(_KINDS.get(type(value).__name__, f"an object of {type(value).__module__}"), where)
         self._tokens.append(Same(value))
 
@@ -368,7 +371,7 @@ class References:
         self._attributes(value, where)
 
     def _attributes(self, value: object, where: str) -> None:
-        """Class and attributes of an object: those that are named where all its methods are known, or all."""
+        """Class and attributes of an object: named ones if all its methods are known, otherwise all."""
         kind = type(value)
         self._refer(kind, f"class {kind.__name__}")
         known = not is_dataclass(kind) and not inherits_from_library(kind)
@@ -387,7 +390,7 @@ class References:
                         self._add(entry, f"{where}.{name}")
 
     def _is_cached(self, value: object, name: str, entry: object) -> bool:
-        """Whether an attribute is that of a cached property, which is kept apart."""
+        """Whether an attribute is the value of a cached property, which is stored separately."""
         if not isinstance(getattr(type(value), name, None), functools.cached_property):
             return False
         self._cached[f"{name} of {id(value)}"] = entry
@@ -395,7 +398,7 @@ class References:
 
 
 class Same:
-    """Token of an object that is equal to itself alone, and keeps it."""
+    """Token of an object that is equal for the same object only, and references it."""
 
     __slots__ = ("value",)
 
@@ -446,11 +449,11 @@ _VISITS: tuple[tuple[type | tuple[type, ...], Callable[[References, Any, str], N
     ((int, float, complex, str, bytes, np.generic), References._fixed),
     ((Iterator, types.CoroutineType, functools._lru_cache_wrapper), References._nothing),
 )
-"""What is done with objects of some kinds, the first that fits."""
+"""Methods by type of object; the first match applies."""
 
 
 def _unbound(value: object) -> object:
-    """Function behind what stands in a class."""
+    """Function of an entry of a class."""
     if isinstance(value, staticmethod | classmethod):
         return value.__func__
     return value.func if isinstance(value, functools.cached_property) else value

@@ -1,4 +1,4 @@
-"""Where the equations of a compiled form switch: arguments of comparisons, abs, sign, min, max, floor and the like."""
+"""Switches in the equations of a compiled form: arguments of comparisons, abs, sign, min, max, floor, etc."""
 
 from __future__ import annotations
 
@@ -10,28 +10,28 @@ import numpy as np
 from ctrlplan._types import Array
 
 _GRID, _FINEST, _MAXIMUM = 4096, 2**17, 20_000
-"""Intervals of the grid on which changes are looked for at first and at last, and changes at most."""
+"""Initial and final number of intervals of the search grid, and maximum number of changes."""
 
 _HALVINGS = 60
-"""Halvings from a grid's spacing to rounding of a time."""
+"""Number of bisections from the grid spacing to rounding of a time."""
 
 
 def switch_arguments(function: ca.Function, bends: bool = True) -> ca.Function:
-    """Arguments whose changes of sign switch the equations of a function.
+    """Arguments whose sign changes switch the equations of a function.
 
     Parameters
     ----------
     function : casadi.Function
-        Of symbols of kind SX.
+        Function of SX symbols.
     bends : bool, optional
-        Whether those of continuous functions are wanted, as abs and the larger
-        of two values; otherwise of jumps alone.
+        Whether to include those of continuous functions, such as abs and max;
+        otherwise those of jumps only.
 
     Returns
     -------
     casadi.Function
-        Of the same arguments; its one result is a column: x - y of a comparison
-        or the larger of x and y, x of abs(x), sin(pi x) of floor(x), ...
+        Function of the same arguments with one column as result: x - y for a comparison
+        or the maximum of x and y, x for abs(x), sin(pi x) for floor(x), ...
     """
     inputs = [ca.SX.sym(function.name_in(i), function.sparsity_in(i)) for i in range(function.n_in())]
     entries = [value.nz for value in inputs]
@@ -56,24 +56,24 @@ def switch_arguments(function: ca.Function, bends: bool = True) -> ca.Function:
 
 
 def changes_of_side(sides: Callable[[Array], Array], first: float, last: float) -> list[float]:
-    """Times between two others at which a sign changes.
+    """Times of sign changes in an interval.
 
     Parameters
     ----------
     sides : callable
         Maps times (n,) to signs (nswitches, n).
     first, last : float
-        The times.
+        Interval.
 
     Returns
     -------
     list of float
-        To rounding of the times; on a grid that is refined until twice as many
-        times show no more changes. None where there are more than 20,000.
+        Accurate to rounding of times. The search grid is refined until doubling
+        its size gives no further changes. Empty if there are more than 20,000.
     """
     count, known = _GRID, np.empty(0)
     while True:
-        # What has been found is a time to look at as well: a narrow interval about a bend shows there.
+        # The times found are added to the grid, for narrow intervals around a kink.
         t = np.union1d(np.linspace(first, last, count + 1), known)
         found = _apart(np.union1d(known, _located(sides, t)), 1e-12 * max(abs(first), abs(last), last - first))
         if found.size == known.size and count > _GRID:
@@ -86,12 +86,12 @@ def changes_of_side(sides: Callable[[Array], Array], first: float, last: float) 
 
 
 def _apart(times: Array, tolerance: float) -> Array:
-    """Increasing times without those that follow another closely."""
+    """Increasing times without those within a tolerance of the previous one."""
     return times[np.diff(times, prepend=-np.inf) > tolerance]
 
 
 def _located(sides: Callable[[Array], Array], t: Array) -> Array:
-    """Times at which a sign changes between two of some times, by bisection of all at once."""
+    """Times of sign changes between neighbouring times, by simultaneous bisection."""
     signs = sides(t)
     switch, before = np.nonzero(signs[:, 1:] != signs[:, :-1])
     if not switch.size or switch.size > _MAXIMUM:

@@ -1,8 +1,8 @@
-"""Symbols that numpy takes for numbers: CasADi's, in a class of their own.
+"""CasADi symbols that support numpy's functions.
 
-CasADi's own symbols answer `float` with nan, have a hash, and change with
-CasADi's numpy mode. These have no number, no hash and no truth value, so that
-a branch on one raises; nothing of CasADi is changed.
+`float` of a symbol of CasADi itself returns nan, it has a hash, and it depends on
+CasADi's numpy mode. Symbols of this module have no numeric value, no hash and no
+truth value, so that a branch on one raises; CasADi is not changed.
 """
 
 from __future__ import annotations
@@ -17,25 +17,25 @@ import numpy as np
 from ctrlplan._types import Value
 
 Operation: TypeAlias = Callable[..., Value]
-"""Function of such values."""
+"""Function of numbers and symbols."""
 
 _LN2 = math.log(2.0)
 
 
 class Symbol:
-    """Scalar expression of CasADi, with the operators and functions of a numpy scalar.
+    """Scalar CasADi expression with the operators and functions of a numpy scalar.
 
     Attributes
     ----------
     sx : casadi.SX
         The expression, 1 by 1.
     truth : bool
-        Whether it is the outcome of a comparison, 1 where it holds and 0 elsewhere.
+        Whether it is the result of a comparison, 1 if true and 0 if false.
     """
 
     __slots__ = ("sx", "truth")
     __hash__ = None  # type: ignore[assignment]
-    __array_priority__ = 2000.0  # CasADi's values leave an operation to the one of higher priority
+    __array_priority__ = 2000.0  # CasADi delegates operations to the operand of higher priority
 
     def __init__(self, sx: ca.SX, truth: bool = False) -> None:
         self.sx, self.truth = sx, truth
@@ -55,12 +55,12 @@ class Symbol:
         return _by_function(function, args, kwargs)
 
     def clip(self, low: Value = None, high: Value = None) -> Value:
-        """Value within limits."""
+        """Value clipped to limits."""
         return _clip(self, low, high)
 
 
 class SymbolArray(np.ndarray[tuple[int, ...], np.dtype[np.object_]]):
-    """Array of symbols, and of numbers among them."""
+    """Array of symbols and numbers."""
 
     __array_priority__ = 2000.0
 
@@ -74,7 +74,7 @@ class SymbolArray(np.ndarray[tuple[int, ...], np.dtype[np.object_]]):
 
 
 def symbol_array(column: ca.SX) -> SymbolArray:
-    """Entries of a column of CasADi as an array of symbols."""
+    """Entries of a CasADi column as an array of symbols."""
     out = np.empty(column.numel(), dtype=object)
     for k in range(out.size):
         out[k] = Symbol(column[k])
@@ -82,7 +82,7 @@ def symbol_array(column: ca.SX) -> SymbolArray:
 
 
 def column_of(values: object) -> ca.SX:
-    """Column of CasADi from whatever a block returns: a symbol, a number, a list or an array of them.
+    """CasADi column from the result of a block: a symbol, a number, a list or an array of them.
 
     Raises
     ------
@@ -101,12 +101,12 @@ def _sx(value: Value) -> ca.SX:
 
 
 def _of(function: Operation, truth: bool = False) -> Operation:
-    """Operation on symbols and numbers from one on CasADi's expressions."""
+    """Operation on symbols and numbers from one on CasADi expressions."""
     return lambda *values: Symbol(function(*map(_sx, values)), truth)
 
 
 def _no_truths(function: Operation) -> Operation:
-    """Operation that numpy defines for conditions in another way than for numbers."""
+    """Operation on numbers only, as numpy defines it differently for conditions."""
 
     def checked(*values: Value) -> Value:
         if all(isinstance(value, bool | np.bool_) or getattr(value, "truth", False) for value in values):
@@ -117,7 +117,7 @@ def _no_truths(function: Operation) -> Operation:
 
 
 def _truths(function: Operation) -> Operation:
-    """Operation on conditions alone: of numbers it is one on their bits."""
+    """Operation on conditions only, as it is bitwise for numbers."""
 
     def checked(*values: Value) -> Value:
         if not all(isinstance(value, bool | np.bool_) or getattr(value, "truth", False) for value in values):
@@ -128,19 +128,19 @@ def _truths(function: Operation) -> Operation:
 
 
 def _remainder(x: ca.SX, y: ca.SX) -> ca.SX:
-    """Remainder with the sign of y, exact as Python's."""
+    """Remainder with the sign of y, exact as in Python."""
     rest = ca.fmod(x, y)
     return rest + ca.if_else(rest * y < 0, y, 0.0)
 
 
 def _floor_divide(x: ca.SX, y: ca.SX) -> ca.SX:
-    """Python's quotient: (x - remainder)/y, rounded to the nearest whole number."""
+    """Quotient as in Python: (x - remainder)/y, rounded to the nearest integer."""
     exact = (x - _remainder(x, y)) / y
     return ca.floor(exact + 0.5)
 
 
 def _rint(x: ca.SX) -> ca.SX:
-    """Nearest whole number, halves to the even one."""
+    """Nearest integer, halves to even."""
     low = ca.floor(x)
     rest = x - low
     up = ca.logic_or(rest > 0.5, ca.logic_and(ca.eq(rest, 0.5), ca.ne(ca.fmod(low, 2.0), 0.0)))
@@ -231,7 +231,7 @@ def _choice(condition: Value, x: Value, y: Value) -> Value:
 
 
 def _by_elements(ufunc: np.ufunc, method: str, inputs: Sequence[Value], kwargs: dict[str, Value]) -> Value:
-    """Elementwise function of numpy, entry by entry."""
+    """Result of an elementwise function of numpy."""
     plain = [_plain(value) for value in inputs]
     out = kwargs.pop("out", None)
     options = {key: kwargs[key] for key in ("axis", "keepdims", "axes") if kwargs.get(key) is not None}
@@ -257,7 +257,7 @@ def _by_elements(ufunc: np.ufunc, method: str, inputs: Sequence[Value], kwargs: 
 
 
 def _by_function(function: Value, args: Iterable[Value], kwargs: Mapping[str, Value]) -> Value:
-    """Function of numpy: from the table, or as numpy writes it by others."""
+    """Result of a function of numpy, from the table or by numpy's implementation."""
     known = _FUNCTIONS.get(function)
     if known is not None:
         return known(*args, **kwargs)
@@ -294,7 +294,7 @@ _FUNCTIONS: dict[Value, Operation] = {
     np.clip: _clipped,
     np.nan_to_num: _of_nan,
 }
-"""Functions of numpy that are not written by others of it."""
+"""Functions of numpy that are not implemented by elementwise ones."""
 
 
 def _plain(value: Value) -> Value:
@@ -313,7 +313,7 @@ def _wrapped(value: Value) -> Value:
 
 
 def _arrays(value: Value) -> Value:
-    """Arguments with arrays in the places of symbols, in lists as well."""
+    """Arguments with symbols replaced by arrays, also in lists."""
     if isinstance(value, Symbol):
         return _plain(value).view(SymbolArray)
     return type(value)(map(_arrays, value)) if type(value) in (list, tuple) else value
@@ -331,7 +331,7 @@ def _operator(name: str, reflected: bool) -> Callable[[Symbol, Value], Value]:
 
 
 def _equip() -> None:
-    """Give symbols Python's operators, and the methods that numpy calls on the entries of an array of objects."""
+    """Add Python's operators to `Symbol`, and the methods that numpy calls for entries of arrays of objects."""
     pairs = {"sub": "subtract", "mul": "multiply", "truediv": "divide", "pow": "power", "mod": "remainder"}
     pairs |= {"add": "add", "floordiv": "floor_divide", "and": "bitwise_and", "or": "bitwise_or", "xor": "bitwise_xor"}
     for name, ufunc in pairs.items():

@@ -1,6 +1,6 @@
-"""A block's equations as CasADi functions, found by calling them with symbols.
+"""Equations of blocks as CasADi functions, traced by calls with symbols.
 
-A trace counts only after it has agreed with Python.
+A trace is valid only if it agrees with Python.
 """
 
 from __future__ import annotations
@@ -27,39 +27,39 @@ Answer = tuple[Array, Array]
 """Outputs and rates of a block."""
 
 _SAME = 1e-8
-"""Relative difference up to which a trace and Python agree."""
+"""Relative tolerance between a trace and Python."""
 
 _AGAIN = 3
-"""Every third point is tried a second time."""
+"""Every third point is evaluated twice."""
 
 _FEWEST = 8
-"""Points at which a block must be finite to be checked."""
+"""Minimum number of points with finite values for a comparison."""
 
 
 class NotTraceableError(ValueError):
-    """A block that CasADi's symbols cannot go through; it is named."""
+    """A block cannot be traced; the message states its name and the reason."""
 
 
 class Traceable(Protocol):
-    """Block that can be traced: a python-control system and the parameters that reach it."""
+    """Protocol of traceable blocks: a python-control system and its parameters."""
 
     @property
     def name(self) -> str:
-        """Name in messages."""
+        """Name for messages."""
 
     @property
     def system(self) -> ct.NonlinearIOSystem:
-        """The system itself."""
+        """The system."""
 
     @property
     def params(self) -> Params:
-        """Its parameters, before those of a run."""
+        """Parameters of the block, without those of a run."""
 
     def output(self, params: Params) -> BlockMap:
-        """Outputs, at the parameters of a run."""
+        """Output map with the parameters of a run."""
 
     def update(self, params: Params) -> BlockMap:
-        """Rates of the states, at the parameters of a run."""
+        """State derivatives with the parameters of a run."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +71,7 @@ class Trace:
     output, update : casadi.Function
         Columns of outputs, and of rates.
     symbols : tuple of str
-        Parameters that are the entries of p; the others are constants in the functions.
+        Parameters that are the entries of p; the others are constants.
     """
 
     output: ca.Function
@@ -79,11 +79,11 @@ class Trace:
     symbols: tuple[str, ...]
 
     def depends_on_time(self) -> bool:
-        """Whether outputs or rates depend on t itself."""
+        """Whether outputs or rates depend explicitly on t."""
         return any(function.jac_sparsity(0, 0).nnz() > 0 for function in (self.output, self.update))
 
     def feedthrough(self) -> NDArray[np.bool_]:
-        """Which outputs have direct feedthrough of which inputs, (noutputs, ninputs): by structure, at every state."""
+        """Structural direct feedthrough from inputs to outputs, (noutputs, ninputs)."""
         found = np.zeros((self.output.numel_out(0), self.output.numel_in(2)), dtype=bool)
         if found.size:
             rows, columns = self.output.jac_sparsity(0, 2).get_triplet()
@@ -92,15 +92,15 @@ class Trace:
 
 
 def traced(block: Traceable, params: Params, t: float, x: Array, u: Array) -> Trace:
-    """Trace a block and compare with Python about a time, a state and an input.
+    """Trace of a block, verified against Python near a time, a state and an input.
 
-    What the block's functions refer to is left as it was; a block that cannot
-    be put back is not called.
+    All objects that the block's functions refer to are restored; a block for which
+    this is impossible is not called.
 
     Raises
     ------
     NotTraceableError
-        If no way of calling it with symbols gives what Python gives, or the
+        If no call with symbols gives a trace that agrees with Python, or the
         block is random or has memory.
     """
     values = {**block.params, **params}
@@ -111,7 +111,7 @@ def traced(block: Traceable, params: Params, t: float, x: Array, u: Array) -> Tr
             trace = _agreed(block, values, known)
             changes = keeper.changes()
             if changes and not _is_log_only(block, values, trace, known, keeper):
-                raise NotTraceableError(f"block {block.name} has memory: what it refers to changes when it is called")
+                raise NotTraceableError(f"block {block.name} has memory: its calls change objects that it refers to")
     finally:
         keeper.restore()
     keeper.ignore(changes)
@@ -121,10 +121,10 @@ def traced(block: Traceable, params: Params, t: float, x: Array, u: Array) -> Tr
 def _is_log_only(
     block: Traceable, values: Params, trace: Trace, known: list[tuple[Point, Answer]], keeper: Keeper
 ) -> bool:
-    """Whether what a block writes, such as a log or a counter of its calls, has no influence on its values.
+    """Whether data that a block writes, such as a log or a counter of calls, have no effect on its values.
 
-    They are the same before it was written and after. A second trace after the
-    first would depend on symbols of the first that were kept.
+    The values are compared before and after the writing. If the data had an effect,
+    a second trace would depend on symbols of the first.
     """
     for point, values_then in known[::_AGAIN]:
         keeper.restore()
@@ -136,12 +136,12 @@ def _is_log_only(
 
 
 def callable_references(blocks: Iterable[Traceable], params: Params) -> References:
-    """What blocks refer to that can be called and put back as they were.
+    """References of blocks, checked for calls that can be undone.
 
     Raises
     ------
     NotTraceableError
-        If one of them cannot.
+        If the objects of a block cannot be restored.
     """
     roots = []
     for block in blocks:
@@ -155,7 +155,7 @@ def callable_references(blocks: Iterable[Traceable], params: Params) -> Referenc
 
 
 def agrees(block: Traceable, trace: Trace, params: Params, t: Array, x: Array, u: Array) -> str:
-    """What is wrong with a trace at times (n,), states (nstates, n) and inputs (ninputs, n); empty where nothing."""
+    """Disagreement of a trace at times (n,), states (nstates, n) and inputs (ninputs, n); empty if it agrees."""
     values = {**block.params, **params}
     points: list[Point] = [(t[k], x[:, k], u[:, k], values) for k in range(t.size)]
     with untouched():
@@ -164,7 +164,7 @@ def agrees(block: Traceable, trace: Trace, params: Params, t: Array, x: Array, u
 
 
 def _known(block: Traceable, points: list[Point]) -> list[tuple[Point, Answer]]:
-    """Points inside the block's domain with Python's values, which are the same in a second call."""
+    """Points inside the block's domain with the values of Python, checked to be reproducible."""
     first = [_finite(block, point) for point in points]
     again = [_finite(block, point) for point in points[::_AGAIN]]
     if not all(same_answer(a, b) for a, b in zip(first[::_AGAIN], again, strict=True)):
@@ -178,7 +178,7 @@ def _known(block: Traceable, points: list[Point]) -> list[tuple[Point, Answer]]:
 
 
 def _agreed(block: Traceable, values: Params, known: list[tuple[Point, Answer]]) -> Trace:
-    """Trace that agrees with Python, numbers among the parameters as symbols if that can be."""
+    """Trace that agrees with Python, with numeric parameters as symbols if possible."""
     numbers = tuple(
         key for key, value in values.items() if np.ndim(value) == 0 and np.asarray(value).dtype.kind in "iuf"
     )
@@ -186,7 +186,7 @@ def _agreed(block: Traceable, values: Params, known: list[tuple[Point, Answer]])
     for symbols in dict.fromkeys((numbers, ())):
         try:
             trace = _trace(block, values, symbols)
-        except (Exception, SystemExit) as error:  # whatever a block does when it meets a symbol
+        except (Exception, SystemExit) as error:  # any exception of a block for symbols
             lines = str(error).strip().splitlines() or [""]
             why = why or f"{type(error).__name__}: {lines[-1]:.120}"
             continue
@@ -195,13 +195,13 @@ def _agreed(block: Traceable, values: Params, known: list[tuple[Point, Answer]])
             return trace
         why = wrong
     raise NotTraceableError(
-        f"block {block.name} cannot be traced ({why}); functions of numpy can be, as np.sin, np.maximum and np.where, "
-        "and lists of values, but not functions of math, branches on a state, or arrays that are filled"
+        f"block {block.name} cannot be traced ({why}); use functions of numpy, as np.sin, np.maximum and np.where, "
+        "and lists of values, instead of functions of math, branches on a state, or arrays that are filled"
     )
 
 
 def _points(values: Params, t: float, x: Array, u: Array) -> Iterator[Point]:
-    """Times, states, inputs and parameters near the given ones and far from them."""
+    """Times, states, inputs and parameters near and far from the given ones."""
     rng = np.random.default_rng(0)
     for scale in (0.0, 1e-3, 0.1, 1.0):
         for _ in range(6):
@@ -263,7 +263,7 @@ def _disagreement(trace: Trace, known: list[tuple[Point, Answer]]) -> str:
     p = p.reshape(-1, len(known))
     traced_values = np.concatenate([f(t, x, u, p).full() for f in (trace.output, trace.update)])
     found = np.array([np.concatenate(values) for _, values in known]).T
-    # Where a value is small by cancellation, the size of the same value elsewhere is what counts.
+    # For a value that is small by cancellation the tolerance is relative to its magnitude elsewhere.
     size = np.maximum(np.abs(found), 1e-3 * np.abs(found).max(axis=1, keepdims=True))
     wrong = ~(np.abs(traced_values - found) <= _SAME * size)
     if not wrong.any():

@@ -1,16 +1,14 @@
-"""Calls of a block that only try it: on copies of what it remembers, whatever it raises.
+"""Trial calls of blocks on copies of their functions.
 
-A run needs to know of a block what only its functions tell: which outputs
-depend directly on which inputs, whether two calls with equal arguments give
-equal values. Such trial calls are made on copies of the functions, with copies
-of the objects that they refer to, so that a block with a memory does not
-remember them.
+Direct feedthrough and reproducibility of a block can only be found by calls of its
+functions. Such trial calls are made on copies of the functions, with copies of the
+objects that they refer to, so that they have no effect on a block with memory.
 
-A `Keeper` calls the functions themselves and puts back what they found. Neither
-replaces the other: two memories at one time, of a run and of a second attempt,
-need copies, and so do random generators, whose state cannot be compared; that
-*nothing* is left behind, wherever a function stored it, only a keeper can
-guarantee, and it alone tells whether a call has changed anything.
+A `Keeper` in contrast calls the functions themselves and restores all contents.
+Both are required: two memories at one time, of a run and of a second attempt,
+require copies, as do random generators, whose state cannot be compared. Only a
+`Keeper` guarantees that *nothing* is stored anywhere, and detects whether a call
+has changed anything.
 """
 
 from __future__ import annotations
@@ -31,16 +29,16 @@ from ctrlplan.symbolic.isolation import tried
 from ctrlplan.traits import declare, traits_of
 
 _DEPTH = 6
-"""Functions that call functions are copied so many levels deep."""
+"""Maximum depth of the copied function calls."""
 
 _LIBRARIES = frozenset({"casadi", "control", "ctrlplan", "math", "matplotlib", "numpy", "pandas", "scipy", "sympy"})
-"""Packages whose functions have no memory of a block."""
+"""Packages whose functions do not store data of a block."""
 
 _STORES = frozenset({"STORE_DEREF", "STORE_GLOBAL", "DELETE_DEREF", "DELETE_GLOBAL", "STORE_ATTR", "IMPORT_NAME"})
-"""Instructions by which a function may leave something behind."""
+"""Instructions by which a function may store data."""
 
 _CODES = 1024
-"""Codes of functions whose instructions are not read again."""
+"""Results for code objects, to read their instructions once."""
 
 _PLAIN = (
     type(None),
@@ -59,12 +57,12 @@ _PLAIN = (
 
 
 def trial_copy(system: System) -> System:
-    """Copy of a block whose functions share no memory with those of the block.
+    """Copy of a block whose functions share no data with those of the block.
 
     Parameters
     ----------
     system : control.NonlinearIOSystem
-        Block; of a sampled one the system inside is copied as well.
+        Block; the inner system of a sampled one is copied as well.
     """
     made, memo = copy.copy(system), {id(system): system}
     for name in ("updfcn", "outfcn"):
@@ -80,7 +78,7 @@ def trial_copy(system: System) -> System:
 
 
 def can_remember(system: System) -> bool:
-    """Whether a block may have a memory besides its state: False is certain, True is not."""
+    """Whether a block may have memory in addition to its state: False is certain, True is not."""
     traits = traits_of(system)
     inner = traits.block
     if inner is not None:
@@ -90,12 +88,12 @@ def can_remember(system: System) -> bool:
 
 
 def values_of(function: Callable[..., ArrayLike], *arguments: object) -> Array | None:
-    """Values of a trial call as an array (n,); None where the arguments are outside of the function's domain."""
+    """Values of a trial call as an array (n,); None if the arguments are outside of the function's domain."""
     return tried(lambda: np.array(np.ravel(function(*arguments)), dtype=float), None)
 
 
 def reads(function: Callable[..., Value], position: int) -> bool:
-    """Whether a function can read one of its arguments, by its code: False is certain, True is not.
+    """Whether the code of a function may use an argument: False is certain, True is not.
 
     Parameters
     ----------
@@ -117,7 +115,7 @@ def reads(function: Callable[..., Value], position: int) -> bool:
 
 @functools.lru_cache(_CODES)
 def _reads(code: CodeType, position: int) -> bool:
-    """Whether a code can read one of its arguments."""
+    """Whether a code object may use an argument."""
     name = code.co_varnames[position]
     if name in code.co_cellvars or any(i.opname in ("IMPORT_NAME", "IMPORT_STAR") for i in dis.get_instructions(code)):
         return True
@@ -131,7 +129,7 @@ def _loads(code: CodeType) -> Iterator[dis.Instruction]:
 
 
 def _function(function: Value, memo: dict[int, object], depth: int) -> Value:
-    """Copy of something that is called."""
+    """Copy of a callable."""
     if isinstance(function, functools.partial):
         arguments = [_value(entry, memo, depth) for entry in function.args]
         keywords = {key: _value(entry, memo, depth) for key, entry in function.keywords.items()}
@@ -163,7 +161,7 @@ def _function(function: Value, memo: dict[int, object], depth: int) -> Value:
 
 
 def _value(value: Value, memo: dict[int, object], depth: int) -> Value:
-    """Copy of something that a function refers to."""
+    """Copy of an object that a function refers to."""
     if isinstance(value, _PLAIN) or value is None:
         return value
     if isinstance(value, FunctionType | MethodType | functools.partial):
@@ -172,12 +170,12 @@ def _value(value: Value, memo: dict[int, object], depth: int) -> Value:
         return trial_copy(value)
     try:
         return copy.deepcopy(value, memo)
-    except Exception:  # what cannot be copied is shared
+    except Exception:  # an object that cannot be copied is shared
         return value
 
 
 def _has_memory(value: object, seen: set[int], depth: int) -> bool:
-    """Whether a function, or what it refers to, may keep something from call to call."""
+    """Whether a function, or an object that it refers to, may store data between calls."""
     if isinstance(value, _PLAIN) or id(value) in seen:
         return False
     seen.add(id(value))
@@ -212,7 +210,7 @@ def _has_memory(value: object, seen: set[int], depth: int) -> bool:
 
 @functools.lru_cache(_CODES)
 def _stores(code: CodeType) -> bool:
-    """Whether a code may leave something behind."""
+    """Whether a code object may store data."""
     return any(i.opname in _STORES for i in dis.get_instructions(code))
 
 
@@ -225,7 +223,7 @@ def _contents(function: FunctionType) -> Iterator[object]:
 
 
 def of_library(thing: object) -> bool:
-    """Whether a function or class is of a library whose objects, but for arrays, are not changed by being called."""
+    """Whether a function or class is of a library whose objects, except arrays, are not changed by calls."""
     if isinstance(thing, functools.partial):
         return of_library(thing.func)
     return str(getattr(thing, "__module__", "")).partition(".")[0] in _LIBRARIES
@@ -236,6 +234,6 @@ def _levels(system: System) -> bool:
 
 
 def _names(code: CodeType) -> set[str]:
-    """Global names in a function's code, and in that of functions inside it."""
+    """Global names in a function's code and in nested functions."""
     inner = (constant for constant in code.co_consts if isinstance(constant, CodeType))
     return set(code.co_names).union(*map(_names, inner))

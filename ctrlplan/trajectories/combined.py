@@ -244,7 +244,7 @@ class Joined(Trajectory):
 
     @classmethod
     def without_shift(cls, parts: Sequence[Trajectory]) -> Self:
-        """Sequence of trajectories at their own times, without a shift that would round them."""
+        """Sequence of trajectories at their own times."""
         return cls._of(tuple(parts), parts[0].labels)
 
     @classmethod

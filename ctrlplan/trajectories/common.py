@@ -26,9 +26,9 @@ def times_powers(values: Array, base: float, orders: NDArray[np.integer[Any]]) -
         found = np.where(values == 0.0, 0.0, values * base**orders)
         size = np.abs(found)
         shrunk = (size < _TINY) & (np.abs(values) > 1e-290)  # only subnormal values may underflow to 0
-        lost = (values != 0.0) & np.isfinite(values) & (shrunk | ~(size < np.inf))
-    if lost.any():
-        place = tuple(np.argwhere(lost)[0])
+        out_of_range = (values != 0.0) & np.isfinite(values) & (shrunk | ~(size < np.inf))
+    if out_of_range.any():
+        place = tuple(np.argwhere(out_of_range)[0])
         raise ValueError(
             f"derivatives must stay within floating point, got {values[place]:g} times {base:g} to the power "
             f"{np.broadcast_to(orders, values.shape)[place]:g}; choose a time unit nearer to the plan's"

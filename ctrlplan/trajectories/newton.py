@@ -55,7 +55,7 @@ _MEET = 0.25
 _SUSPECT = 1e5
 """Amplification of rounding errors above which the loss of accuracy is estimated."""
 
-_KEPT = 1e-10
+_ACCURATE = 1e-10
 """Error relative to a plan's range above which decimal arithmetic is used."""
 
 _ACROSS = 1e-2
@@ -196,7 +196,7 @@ class NewtonSystem(Fields):
         loss = self.loss(taylor_data)
         if self._across(times, duration) < _ACROSS and self.hermite and len(values) <= _MAXIMUM_DIGITS:
             loss = 1.0  # the triangle itself is inaccurate
-        if loss <= _KEPT:
+        if loss <= _ACCURATE:
             return self.coefficients(taylor_data)
         if self.hermite and len(values) <= _MAXIMUM_DIGITS:
             return self.resolved(values, times, duration)
@@ -301,10 +301,10 @@ class NewtonSystem(Fields):
         solved = blas.dtrsm(1.0, self._triangle, data, lower=1)
         rounding = np.finfo(float).eps * (np.abs(self._triangle) @ np.abs(solved))
         functions, cardinal = self._samples
-        plan, lost = (np.abs(values).max(axis=1) for values in (functions @ solved, np.abs(cardinal) @ rounding))
+        plan, error = (np.abs(values).max(axis=1) for values in (functions @ solved, np.abs(cardinal) @ rounding))
         # Derivatives are scaled as Taylor coefficients: some differ from 0 by rounding only.
         size = np.maximum(plan, plan[0])
-        return float((lost / np.where(size > 0.0, size, 1.0)).max())
+        return float((error / np.where(size > 0.0, size, 1.0)).max())
 
     @cached_property
     def functions(self) -> Array:

@@ -79,7 +79,7 @@ class NewtonSpline(WaypointSpline):
         return plan
 
     def through(self, waypoints: Iterable[Waypoint]) -> Self:
-        """Plan of the same kind and shape through any waypoints of as many axes.
+        """Plan of the same class and shape through other waypoints.
 
         Raises
         ------
@@ -114,10 +114,10 @@ class NewtonSpline(WaypointSpline):
             )
         if not 0.0 < duration < np.inf:
             raise ValueError(f"duration must be finite and above 0, got {times[-1]} s after {start} s")
-        same_clock = donor is not None and donor._times == times and donor._duration == duration
-        relative = donor._relative if donor and same_clock else (np.array(times) - start) / duration
-        apart = donor._apart if donor and same_clock else _apart(times, relative, duration)
-        lent = donor._systems if donor and (same_clock or _same_pattern(donor, relative, apart)) else {}
+        same_times = donor is not None and donor._times == times and donor._duration == duration
+        relative = donor._relative if donor and same_times else (np.array(times) - start) / duration
+        apart = donor._apart if donor and same_times else _apart(times, relative, duration)
+        lent = donor._systems if donor and (same_times or _same_pattern(donor, relative, apart)) else {}
         table, patterns = given_entries(waypoints)
         systems: dict[Kind, NewtonSystem] = {}
         parts = []
@@ -136,7 +136,7 @@ class NewtonSpline(WaypointSpline):
             labels = donor.labels
         else:
             labels = checked_labels(options.labels or waypoints[0].labels, table.shape[2])
-        if donor is not None and same_clock:
+        if donor is not None and same_times:
             breakpoints = donor.breakpoints
         else:
             breakpoints = readonly(np.array([start, times[-1] if period is None else start + period]))
@@ -177,7 +177,10 @@ class NewtonSpline(WaypointSpline):
             warn_of_swing(values, self.waypoints, self.end, self.labels, remedy)
 
     def resolved(self, table: NDArray[Any], digits: int) -> Self:
-        """The same plan with coefficients from decimals (nwaypoints, order + 1, naxes), where possible."""
+        """Plan with coefficients from decimal entries, where possible.
+
+        The table has the shape (nwaypoints, order + 1, naxes).
+        """
         parts = []
         for axes, system, coefficients in self._parts:
             values = table[system.waypoint_index, system.order_index][:, list(axes)]
@@ -187,7 +190,7 @@ class NewtonSpline(WaypointSpline):
         return self._with_fields(_parts=parts)
 
     def quiet(self) -> Self:
-        """The same plan, with warnings of `through` and `with_values` disabled."""
+        """The same plan without warnings of `through` and `with_values`."""
         return self._again(self.waypoints, self._options._replace(warn=False))
 
     def _loaded(self) -> Self:

@@ -173,7 +173,7 @@ class PiecewiseSpline(WaypointSpline):
         return plan._with_fields(_warn=warn)
 
     def quiet(self) -> Self:
-        """The same plan, with warnings of `through` and `with_values` disabled."""
+        """The same plan without warnings of `through` and `with_values`."""
         return self._again(self.waypoints, False)
 
     def _check_swing(self) -> None:

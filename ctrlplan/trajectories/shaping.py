@@ -105,11 +105,12 @@ class Shaper(Displayed, Fields):
 
     @classmethod
     def zvd(cls, frequency: float, damping: float = 0.0, derivatives: int = 1) -> Self:
-        """Zero-vibration-and-derivative (ZVD) shaper, robust to frequency errors.
+        """Zero-vibration-and-derivative (ZVD) shaper for one mode.
 
-        The residual vibration and its derivatives with respect to frequency and
-        damping up to an order are 0. The shaper is `zv` convolved with itself,
-        with binomial weights. Each order adds half a period to the duration.
+        Robust to frequency errors: the residual vibration and its derivatives
+        with respect to frequency and damping up to an order are 0. The shaper is
+        `zv` convolved with itself, with binomial weights. Each order adds half a
+        period to the duration.
 
         Parameters
         ----------
@@ -135,7 +136,7 @@ class Shaper(Displayed, Fields):
 
     @property
     def duration(self) -> float:
-        """Delay [s] of the last impulse, added to the duration of a reference."""
+        """Delay of the last impulse [s], added to a plan's duration."""
         return float(self.delays[-1])
 
     def __call__(self, plan: Trajectory) -> Trajectory:

@@ -542,7 +542,9 @@ class Trajectory(Displayed, Fields, ABC):
         return self._moved(self.start, self.start + checked_finite(dt, "dt"), 1.0)
 
     def then(self, other: Trajectory) -> Trajectory:
-        """This trajectory followed by another, shifted to start at its end.
+        """This trajectory followed by another.
+
+        The other is shifted in time to start at the end of this one.
 
         Raises
         ------
@@ -640,7 +642,7 @@ class Trajectory(Displayed, Fields, ABC):
         write_csv(self, path, Options(timepts=timepts, derivatives=checked_count(order, "order")))
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write to a JSON file that `load_trajectory` reads, exact to every bit."""
+        """Write to a JSON file, exact to every bit; see `load_trajectory`."""
         from ctrlplan.trajectories.files import save_trajectory
 
         save_trajectory(self, path)
@@ -770,8 +772,8 @@ class Trajectory(Displayed, Fields, ABC):
         try:
             with np.errstate(over="raise", invalid="raise"):
                 moved = self.map_time(origin, target, rate)
-        except FloatingPointError as lost:
-            raise ValueError(f"times must stay within floating point, got a rate of {rate:g}: {lost}") from None
+        except FloatingPointError as error:
+            raise ValueError(f"times must stay within floating point, got a rate of {rate:g}: {error}") from None
         before, after = (np.union1d(p.breakpoints, [w.time for w in p.waypoints]) for p in (self, moved))
         if before.size < 2:
             return moved
@@ -844,7 +846,7 @@ class Trajectory(Displayed, Fields, ABC):
             )
 
     def segment_jet_at(self, moment: float, origin: float, s: Array, order: int) -> Array:
-        """Jet at origin + s of the analytic function of the segment at `moment`.
+        """Jet at origin + s of the function of the segment at `moment`.
 
         Parameters
         ----------
@@ -870,7 +872,7 @@ class Trajectory(Displayed, Fields, ABC):
         return held
 
     def segment_series_at(self, moment: float, origin: float, s: Value, order: int) -> list[list[Value]]:
-        """Taylor series of each axis at one number or symbol s; as `segment_jet_at`."""
+        """Taylor series at a number or symbol s; as `segment_jet_at`."""
         segment = int(np.searchsorted(self.breakpoints, moment)) - 1
         if 0 <= segment < self.breakpoints.size - 1:
             return self.segment_series(segment, s + (origin - float(self.breakpoints[segment])), order)

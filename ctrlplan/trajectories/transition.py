@@ -105,7 +105,7 @@ class Transition(Displayed, Fields):
         )
 
     def coefficients(self, jets: Array) -> Array:
-        """Coefficients of the Newton form in time [s], for `jet` and `series`.
+        """Coefficients of the Newton form, for `jet` and `series`.
 
         Parameters
         ----------
@@ -127,12 +127,15 @@ class Transition(Displayed, Fields):
         return values * derivative_scale(self.horizon, order)[:, None, None]
 
     def evaluation(self, s: float, order: int) -> Array:
-        """Matrix (order + 1, 2 (self.order + 1)) from coefficients to derivatives s seconds after the start."""
+        """Matrix from coefficients to derivatives at one time s [s].
+
+        Of shape (order + 1, 2 (self.order + 1)).
+        """
         rows = series(self.rate, np.eye(2 * self.order + 2).tolist(), s, s - self.horizon, order)
         return np.array(rows).T * FACTORIALS[: order + 1, None]
 
     def gains(self) -> Array:
-        """Gains k_0, ..., k_b [1/s^(b + 1 - j)] of continuous replanning, shape (order + 1,)."""
+        """Gains k_j [1/s^(b + 1 - j)] of continuous replanning, j = 0..b."""
         return -self._from_units_to_zero(0.0, self.order + 1)[-1]
 
     def radius(self, period: float) -> float:

@@ -136,7 +136,7 @@ class TrigSpline(NewtonSpline):
 
     @property
     def gamma(self) -> tuple[float | None, ...]:
-        """Phase of the top harmonic [rad of tau] of each axis; None if there is none."""
+        """Phase of the top harmonic of each axis [rad of tau], or None."""
         return tuple(s.gamma for s, _ in self._per_axis())
 
     def fourier(self) -> FourierCoefficients:

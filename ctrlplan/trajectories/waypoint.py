@@ -170,7 +170,7 @@ class Waypoint(Displayed, Fields):
         return self.jet[order] if order < len(self.jet) else np.full(self.naxes, np.nan)
 
     def scaled(self, time: float, rate: float) -> Waypoint:
-        """Same point at another time with derivatives scaled by a speed factor."""
+        """Same point at another time, with scaled derivatives."""
         moved = times_powers(self.jet, rate, np.arange(len(self.jet))[:, None])
         return Waypoint.from_array(checked_finite(time, "time"), moved, self.labels)
 

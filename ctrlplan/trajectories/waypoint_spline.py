@@ -143,7 +143,7 @@ class WaypointSpline(Trajectory, FromWaypoints):
         return self.through(same_times(waypoints, self.waypoints))
 
     def quiet(self) -> Self:
-        """The same spline, with warnings of `through` and `with_values` disabled."""
+        """The same spline without warnings of other methods."""
         return self
 
     def map_time(self, origin: float, target: float, rate: float) -> Self:

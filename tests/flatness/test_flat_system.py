@@ -239,7 +239,7 @@ def test_a_signal_that_the_plan_does_not_determine_is_named_with_its_time():
         ({"orders": (2,)}, r"orders must be one of at least 1 for each of 2 inputs, got \(2,\)"),
         ({"orders": (2, 0)}, r"orders must be one of at least 1"),
         ({"orders": (1, 1)}, r"orders must add up to at least the number of states, 3, got 2"),
-        ({"flat_labels": ("x",)}, "labels must be as many as axes, 2, got 1"),
+        ({"flat_labels": ("x",)}, "labels must be one per axis, 2, got 1"),
         ({"flat_labels": ("x", "x")}, "labels must be unique"),
     ],
 )

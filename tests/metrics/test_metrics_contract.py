@@ -76,7 +76,7 @@ def test_nan_is_rejected_by_name_and_place(name):
     given, signal = arguments(name)
     bad = RECORD.copy()
     bad[4] = np.nan
-    with pytest.raises(ValueError, match=rf"^{signal} must hold no nan, got {signal}\[4\] = nan"):
+    with pytest.raises(ValueError, match=rf"^{signal} must contain no nan, got {signal}\[4\] = nan"):
         getattr(metrics, name)(**{**given, signal: bad})
 
 
@@ -87,7 +87,7 @@ OTHERS = [(n, p) for n in NAMES for p in REST if p in inspect.signature(getattr(
 def test_nan_in_the_other_arguments_is_rejected_by_name(name, other):
     bad = np.array(REST[other], dtype=float)
     bad[(-1,) * bad.ndim] = np.nan
-    with pytest.raises(ValueError, match=rf"^{other} must hold no nan, got {other}"):
+    with pytest.raises(ValueError, match=rf"^{other} must contain no nan, got {other}"):
         call(name, **{other: bad})
 
 
@@ -106,7 +106,7 @@ def test_levels_and_points_are_finite(name, other):
         ([0.0, 1.0, 2.0, 2.0, 3.0, 4.0, 5.0], r"timepts must increase strictly, got timepts\[3\] = 2.0 after 2.0"),
         ([0.0, 1.0, 2.0, 1.5, 3.0, 4.0, 5.0], r"timepts must increase strictly, got timepts\[3\] = 1.5 after 2.0"),
         ([0.0, 1.0, 2.0, 2.5, 3.0, 4.0, np.inf], r"timepts must be finite, got timepts\[6\] = inf"),
-        ([0.0, np.nan, 2.0, 2.5, 3.0, 4.0, 5.0], r"timepts must hold no nan, got timepts\[1\] = nan"),
+        ([0.0, np.nan, 2.0, 2.5, 3.0, 4.0, 5.0], r"timepts must contain no nan, got timepts\[1\] = nan"),
         ([0.0], r"timepts must be 1-D with at least 2 samples, got shape \(1,\)"),
         ([TIMES], r"timepts must be 1-D with at least 2 samples, got shape \(1, 7\)"),
         (TIMES[:-1], r"must have 6 samples on its last axis, as timepts has, got shape \(7,\)"),

@@ -333,7 +333,7 @@ def test_a_singular_polynomial_leaves_the_others():
 
 
 def test_alphas_none_of_which_gives_a_plan():
-    with pytest.raises(ValueError, match="the entries left free must not make the system singular"):
+    with pytest.raises(ValueError, match="free entries must not make the system singular"):
         cp.choose_alpha([Waypoint(0, None, 0), Waypoint(1, None, 1)])
 
 
@@ -363,7 +363,7 @@ def test_unknown_options_are_rejected():
 
 @pytest.mark.parametrize("waypoints", [[], [Waypoint(0, 1)]])
 def test_too_few_waypoints(waypoints):
-    with pytest.raises(ValueError, match=f"a plan needs at least two waypoints, got {len(waypoints)}"):
+    with pytest.raises(ValueError, match=f"a plan must have at least two waypoints, got {len(waypoints)}"):
         cp.choose_alpha(waypoints)
 
 

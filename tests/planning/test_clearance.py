@@ -208,7 +208,7 @@ def test_clearance_is_frozen():
         (ACROSS, [Disc((0, 0), 1)], {"load": math.nan}, "load must be finite and at least 0, got nan"),
         (ACROSS, [Disc((0, 0), 1)], {"load": math.inf}, "load must be finite"),
         (ACROSS, [Disc((0, 0), 1)], {"required": math.nan}, "required must be a number, got nan"),
-        (cp.Step([1.0, 2.0]), [Disc((0, 0), 1)], {}, "without duration .* got a step"),
+        (cp.Step([1.0, 2.0]), [Disc((0, 0), 1)], {}, "must have a duration for its clearance, got a step"),
         (ACROSS.select(["y1"]), [Disc((0, 0), 1)], {}, "must have two axes, got 1"),
         (
             cp.PolySpline([cp.Waypoint(0, [0, 0, 0]), cp.Waypoint(1, [1, 1, 1])]),

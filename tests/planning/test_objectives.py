@@ -183,11 +183,11 @@ def test_a_step_takes_no_path(objective):
 @pytest.mark.parametrize(
     ("nu", "error", "message"),
     [
-        (-1, ValueError, "nu must be a whole number from 0, got -1"),
-        (1.5, ValueError, "nu must be a whole number from 0, got 1.5"),
+        (-1, ValueError, "nu must be an integer of at least 0, got -1"),
+        (1.5, ValueError, "nu must be an integer of at least 0, got 1.5"),
         (101, ValueError, "nu must be at most 100, got 101"),
-        ("2", TypeError, "nu must be a whole number from 0, got '2'"),
-        (True, TypeError, "nu must be a whole number from 0, got True"),
+        ("2", TypeError, "nu must be an integer of at least 0, got '2'"),
+        (True, TypeError, "nu must be an integer of at least 0, got True"),
     ],
 )
 def test_orders_that_are_no_orders(kind, nu, error, message):

@@ -635,16 +635,16 @@ GOOD = [Waypoint(0, [0, 0], 0), Waypoint(1, [1, 1]), Waypoint(2, [0, 0], 0)]
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"derivative": 0}, "derivative must be a whole number from 1, got 0"),
-        ({"derivative": 2.5}, "derivative must be a whole number from 1, got 2.5"),
-        ({"order": -1}, "order must be a whole number from 0, got -1"),
-        ({"continuity": -1}, "continuity must be a whole number from 0, got -1"),
+        ({"derivative": 0}, "derivative must be an integer of at least 1, got 0"),
+        ({"derivative": 2.5}, "derivative must be an integer of at least 1, got 2.5"),
+        ({"order": -1}, "order must be an integer of at least 0, got -1"),
+        ({"continuity": -1}, "continuity must be an integer of at least 0, got -1"),
         ({"order": 2, "continuity": 3}, "order must be at least the continuity 3, got 2"),
-        ({"continuity": 1, "single": True}, "continuity must be left out for a single plan"),
+        ({"continuity": 1, "single": True}, "continuity must not be given for a single plan"),
         ({"alpha": 6.3}, r"alpha must lie in \[0, 2 pi\), got 6.3"),
-        ({"weights": [1.0]}, "weights must be one number an axis, 2, got 1"),
+        ({"weights": [1.0]}, "weights must be one number per axis, 2, got 1"),
         ({"weights": [1.0, 0.0]}, r"weights\[1\] must be finite and above 0, got 0.0"),
-        ({"labels": ["a"]}, "labels must be as many as axes, 2, got 1"),
+        ({"labels": ["a"]}, "labels must be one per axis, 2, got 1"),
         ({"waypoints": GOOD[:1]}, "at least two waypoints, got 1"),
         ({"waypoints": GOOD[::-1]}, "times must increase strictly"),
         ({"waypoints": [*GOOD, Waypoint(3, 1)]}, "must have the same axes"),
@@ -728,7 +728,7 @@ def test_a_short_inner_segment_is_right_or_says_what_it_costs(gap, order):
     times = [0.0, 1.0, 1.0 + gap, 2.0]
     found, word = optimum_or_word(times, times, order=order)
     if gap <= 1e-6:
-        assert "known to 16 digits" in word
+        assert "have 16 digits" in word
         assert "from waypoints[1] to [2]" in word
     if gap >= 1e-4:
         assert not word
@@ -787,7 +787,7 @@ def test_digits_lost_far_from_the_origin():
     """A move of a millimetre at 1e12, where numbers are 0.1 mm apart."""
     found, word = optimum_or_word([0.0, 1.0, 2.0], [1e12, 1e12 + 1e-3, 1e12])
     assert found is None
-    assert "measure positions from a nearer origin" in word
+    assert "use an origin nearer to the positions" in word
 
 
 def test_a_single_spline_through_near_points_loses_digits_too():

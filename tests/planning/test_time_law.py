@@ -216,7 +216,7 @@ def test_position_limits_stay_what_they_are():
     assert trapezoid(20.0, 2.0, 0.5) <= found.duration <= 1.05 * trapezoid(20.0, 2.0, 0.5)
     # The path is held, and its positions with it: limits that it touches leave the time law as it is.
     assert found.duration == pytest.approx(fastest(plan, {"x_d1": 2.0, "x_d2": 0.5}, hold="path").duration, rel=1e-9)
-    with pytest.raises(ValueError, match="limits must hold at rest"):
+    with pytest.raises(ValueError, match="limits must be satisfied at rest"):
         fastest(plan, {"x": (0, 19), "x_d1": 2.0}, hold="path")
 
 

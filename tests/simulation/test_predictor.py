@@ -185,7 +185,7 @@ GOOD = {"limits": {"torque": (-1.0, 1.0)}, "horizon": 5.0}
         ({"limits": {"force": (-1, 1)}}, "limits must be among the outputs angle, torque, got 'force'"),
         ({"limits": {}}, "limits must not be empty"),
         ({"limits": {"torque": (2, 1)}}, "limits of torque must increase, got 2 and 1"),
-        ({"limits": {"torque": (-math.inf, math.inf)}}, "must hold a finite one"),
+        ({"limits": {"torque": (-math.inf, math.inf)}}, "must contain a finite one"),
         ({"limits": {"torque": -3.0}}, "limits of torque must be finite and above 0, got -3.0"),
         ({"horizon": 0.0}, "horizon must be finite and above 0, got 0.0"),
         ({"references": ["q"]}, "references must be among the inputs r, got 'q'"),

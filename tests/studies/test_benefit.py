@@ -242,7 +242,7 @@ def test_what_jumps_keeps_no_limit_and_says_why(stiff):
     assert math.isnan(found["step"].duration)
     assert found["step"].limit == "position jumps: no limit on a derivative can hold"
     assert math.isnan(found["trapezoid"].duration)
-    assert found["trapezoid"].limit.startswith("y_d3 is limited")
+    assert found["trapezoid"].limit.startswith("limits of y_d3 require")
 
 
 def test_the_sentence_names_the_fastest_and_those_that_cannot(stiff):
@@ -646,7 +646,7 @@ def test_what_cannot_be_asked():
                 cp.benefit(compared, loop(5.0), **{name: wrong})
     with pytest.raises(TypeError, match=r"waypoints must be Waypoints, got Step"):
         cp.Experiment({"step": cp.Step(1.0)}, TIMES, waypoints=[cp.Step(1.0)])
-    with pytest.raises(ValueError, match="limits must be above 0 and finite, got velocity = -1"):
+    with pytest.raises(ValueError, match="limits of velocity must be finite and above 0, got -1"):
         worth(loop(5.0), MOVE, TIMES, alpha=1.0, limits={"velocity": -1.0})
     with pytest.raises(ValueError, match=r"decisive"):
         worth(loop(5.0), MOVE, TIMES, alpha=1.0, decisive=("beauty",), alphas=(1.0,), factors=(1.0,))

@@ -61,7 +61,7 @@ def test_a_range_of_one_value_is_that_value():
 
 @pytest.mark.parametrize("count", [0, -1, True, 2.0, "3", None])
 def test_the_count_is_a_whole_number_from_1(count):
-    with pytest.raises(ValueError, match="count must be a whole number from 1, got"):
+    with pytest.raises(ValueError, match="count must be an integer of at least 1, got"):
         cp.draws(count, a=(0, 1))
 
 

@@ -67,7 +67,13 @@ WORDS = (
     Word("rival", "baseline", r"rivals?", r"rivals?"),
     Word("needs, takes", "required duration, duration", r"(?<=\w )takes? \d|needs? \d", r"needs|takes"),
     Word("kept", "satisfied", r"(limits?|bands?|constraints?|required)( is| are| was| were)?( not)? kept", r"kept"),
-    Word("win, lose", "best, worst", r"wins?|loses?|winners?|losers?", r"wins?|loses?|winners?|losers?"),
+    Word(
+        "win, lose",
+        "best, worst",
+        r"wins?|loses?|winners?|losers?",
+        r"wins?|loses?|winners?|losers?",
+        r"loses? (its |their |all |some )?(digits?|accuracy|precision)",
+    ),
     Word("let", "limit, allow", r"(does not|do not|which|that) lets?"),
     Word("lost", "nan, missing", r"(inputs?|signals?|measurements?|samples?) (is |are |was |were )?lost", r"lost"),
     Word("clock", "time law, time scaling", r"clocks?|laws? of time", r"clocks?", r"(wall|plc|cpu|system) clocks?"),
@@ -86,6 +92,10 @@ WORDS = (
     Word("as it likes", "unknown but bounded", r"as (it|they|he|one) likes?"),
     Word("get through", "fail", r"(get|gets|got) through"),
 )
+FIXED = ("wandering", "turning_points")
+"""Names of metrics that scripts use and that remain; in prose they are quoted."""
+
+_QUOTED = re.compile(rf"^(?:{'|'.join(FIXED)})$|[\"'`]({'|'.join(FIXED)})[\"'`]|\b({'|'.join(FIXED)})(?=\(|$)", re.M)
 _PROSE = [re.compile(rf"\b(?:{word.prose})\b") for word in WORDS]
 _ALLOWED = [re.compile(rf"\b(?:{word.allowed})\b") if word.allowed else None for word in WORDS]
 _NAMES = [re.compile(rf"(?:{word.names})") if word.names else None for word in WORDS]
@@ -93,7 +103,7 @@ _NAMES = [re.compile(rf"(?:{word.names})") if word.names else None for word in W
 
 def in_text(text):
     """Words of the list in a text, once for each time they occur."""
-    plain = re.sub(r"[\s_]+", " ", text).lower()
+    plain = re.sub(r"[\s_]+", " ", _QUOTED.sub("", text)).lower()
     found = []
     for word, pattern, allowed in zip(WORDS, _PROSE, _ALLOWED, strict=True):
         rest = allowed.sub("", plain) if allowed else plain
@@ -103,6 +113,8 @@ def in_text(text):
 
 def in_name(name):
     """Words of the list that are parts of a name."""
+    if name in FIXED:
+        return []
     parts = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name).lower().replace("least_squares", "").split("_")
     return [
         word

@@ -326,7 +326,7 @@ GOOD = {"limits": {"u": (-1.0, 1.0)}, "dt": 0.1}
         ({"limits": {}}, "limits must name at least one output"),
         ({"limits": {"u": (1, 1)}}, "limits of u must increase, got 1 and 1"),
         ({"limits": {"u": (math.nan, 1)}}, "limits of u must be a number, got nan"),
-        ({"limits": {"u": (-math.inf, math.inf)}}, "must hold a finite one"),
+        ({"limits": {"u": (-math.inf, math.inf)}}, "must contain a finite one"),
         ({"limits": {"u": (1, 2, 3)}}, "limits of u must be two numbers"),
         ({"limits": {"u": (1, 2)}}, "must allow a steady state .* too narrow by 2.01 of half"),  # u rests at 0
         ({"dt": 0.0}, "dt must be finite and above 0, got 0.0"),

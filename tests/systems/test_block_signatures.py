@@ -326,9 +326,9 @@ def test_an_old_form_gives_the_same_block_with_a_warning(name, args, kwargs, new
 
 
 def test_old_and_new_names_together_are_an_error():
-    with pytest.raises(TypeError, match=r"^output= is the old name of outputs=: only one of them may be given"):
+    with pytest.raises(TypeError, match=r"^output= is the deprecated name of outputs=; only one of them may be given"):
         cp.create_pid_iosystem(3.0, 1.0, 2.0, 0.1, output="F", outputs="F")
-    with pytest.raises(TypeError, match=r"^label= is the old name of labels=: only one of them may be given"):
+    with pytest.raises(TypeError, match=r"^label= is the deprecated name of labels=; only one of them may be given"):
         cp.create_feedforward_iosystem(LOOP, "q", labels="q")
     with pytest.raises(TypeError, match="positional argument"):
         cp.create_source_iosystem(PLAN, 2, "mine", name="other")

@@ -224,12 +224,12 @@ BAD = [
     (ValueError, "bandwidth must be finite and above 0, got inf", (math.inf,)),
     (ValueError, "bandwidth must be finite and above 0, got nan", (math.nan,)),
     (TypeError, "bandwidth must be a number, got 'a'", ("a",)),
-    (ValueError, "derivatives must be a whole number from 0, got -1", (1.0, -1)),
-    (ValueError, r"derivatives must be a whole number from 0, got 1\.5", (1.0, 1.5)),
-    (TypeError, "derivatives must be a whole number from 0, got '2'", (1.0, "2")),
-    (ValueError, "order must be a whole number from 3, got 2", (1.0, 2, 2)),
-    (ValueError, "order must be a whole number from 1, got 0", (1.0, 0, 0)),
-    (TypeError, "order must be a whole number from 3, got True", (1.0, 2, True)),
+    (ValueError, "derivatives must be an integer of at least 0, got -1", (1.0, -1)),
+    (ValueError, r"derivatives must be an integer of at least 0, got 1\.5", (1.0, 1.5)),
+    (TypeError, "derivatives must be an integer of at least 0, got '2'", (1.0, "2")),
+    (ValueError, "order must be an integer of at least 3, got 2", (1.0, 2, 2)),
+    (ValueError, "order must be an integer of at least 1, got 0", (1.0, 0, 0)),
+    (TypeError, "order must be an integer of at least 3, got True", (1.0, 2, True)),
 ]
 
 
@@ -244,8 +244,8 @@ def test_bad_input_of_the_filter(kind, message, given):
     [
         (ValueError, "bandwidth must be finite and above 0", (0.0, 2)),
         (TypeError, "bandwidth must be a number", (None, 2)),
-        (ValueError, "order must be a whole number from 1, got 0", (1.0, 0)),
-        (ValueError, r"order must be a whole number from 1, got 2\.5", (1.0, 2.5)),
+        (ValueError, "order must be an integer of at least 1, got 0", (1.0, 0)),
+        (ValueError, r"order must be an integer of at least 1, got 2\.5", (1.0, 2.5)),
     ],
 )
 def test_bad_input_of_the_lead(kind, message, given):

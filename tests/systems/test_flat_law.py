@@ -530,13 +530,13 @@ REJECTED = {
     "car": (car(3), r"got derivative 1 of flat output y1 \(the last is 2\), which depends on v$"),
     "car, flags cut": (
         car(2),
-        "the decoupling matrix, last derivatives by inputs, must have rank 2, got 1 at the state",
+        "the decoupling matrix of last derivatives must have rank 2, got 1 at the state",
     ),
     "aircraft": (pvtol(5), r"got derivative 2 of flat output y1 \(the last is 4\), which depends on u1$"),
     "aircraft, flags cut": (pvtol(3), "the decoupling matrix, .* must have rank 2, got 1 at the state"),
     "aircraft, flags cut shorter": (
         pvtol(2),
-        "got derivative 1 of flat output y1, which depends on none .* flag too short",
+        "got derivative 1 of flat output y1, which does not .* flag is too short",
     ),
     "pendulum, angle": (cart_pendulum("angle", 3), "must add up to the number of states, 4, got 2 of y$"),
     "pendulum, position": (cart_pendulum("position", 3), "must add up to the number of states, 4, got 2 of y$"),
@@ -546,7 +546,7 @@ REJECTED = {
     ),
     "ball": (ball_and_beam(False), r"got derivative 3 of flat output y \(the last is 4\), which depends on u$"),
     "ball, flag cut": (ball_and_beam(False, 4), "must add up to the number of states, 4, got 3 of y$"),
-    "ball, flag cut shorter": (ball_and_beam(False, 3), "got derivative 2 of flat output y, which depends on none"),
+    "ball, flag cut shorter": (ball_and_beam(False, 3), "got derivative 2 of flat output y, which does not"),
 }
 
 
@@ -594,11 +594,13 @@ def test_a_reverse_that_does_not_undo_forward_is_rejected():
         lambda flag, params: (array(flag[0][0], 0.0), flag[0][2:]),
         lambda flag, params: (flag[0][:2], flag[0][2:] + 0.01 * flag[0][1]),
     ):
-        with pytest.raises(ValueError, match=r"^reverse must undo forward, got .* flat output x for a flag with"):
+        with pytest.raises(
+            ValueError, match=r"^reverse must be the inverse of forward, got .* flat output x for a flag with"
+        ):
             create_flat_iosystem(double_integrator(reverse=reverse), [-1, -2])
     with pytest.raises(ValueError, match=r"^reverse must return 2 states and 1 inputs, got 1 and 1"):
         create_flat_iosystem(double_integrator(reverse=lambda flag, params: (flag[0][:1], flag[0][2:])), [-1, -2])
-    with pytest.raises(ValueError, match=r"^reverse must be finite for some of the flags probed, got .*nan"):
+    with pytest.raises(ValueError, match=r"^reverse must be finite for some of the random flags, got .*nan"):
         create_flat_iosystem(
             double_integrator(reverse=lambda flag, params: (np.full(2, np.nan), flag[0][2:])), [-1, -2]
         )
@@ -610,7 +612,7 @@ def test_a_reverse_that_does_not_undo_forward_is_rejected():
         (lambda x, u, params: [array(x[0])], r"got lengths \[1\]"),
         (lambda x, u, params: [array(x[0], u[0]), array(x[1], u[0])], r"as many flags as inputs, 1, .* got lengths"),
         (lambda x, u, params: [np.zeros(3 + (x[0] > 0))], "always as long"),
-        (lambda x, u, params: [array(x[0], x[1], np.nan)], "be finite in some of the states probed, got .*nan"),
+        (lambda x, u, params: [array(x[0], x[1], np.nan)], "be finite in some of the random states, got .*nan"),
     ],
     ids=["too short", "too many", "of varying length", "not a number"],
 )
@@ -676,7 +678,7 @@ def test_kinds_are_rejected():
 
 def test_labels_are_rejected():
     chain, chains = integrator_chain(2), integrator_chain(2, axes=2)
-    with pytest.raises(ValueError, match=r"^labels must be as many as axes, 2, got 1"):
+    with pytest.raises(ValueError, match=r"^labels must be one per axis, 2, got 1"):
         create_flat_iosystem(chains, [[-1, -2]] * 2, labels=["x"])
     with pytest.raises(ValueError, match=r"^labels must be unique"):
         create_flat_iosystem(chains, [[-1, -2]] * 2, labels=["x", "x"])

@@ -295,9 +295,9 @@ def test_parameters_are_rejected_by_name(factory, good, value):
 
 @pytest.mark.parametrize("value", [0, -1, 1.5, np.nan])
 def test_counts_are_rejected_by_name(value):
-    with pytest.raises(ValueError, match=r"^order must be a whole number from 1, got"):
+    with pytest.raises(ValueError, match=r"^order must be an integer of at least 1, got"):
         integrator_chain(value)
-    with pytest.raises(ValueError, match=r"^axes must be a whole number from 1, got"):
+    with pytest.raises(ValueError, match=r"^axes must be an integer of at least 1, got"):
         integrator_chain(2, value)
-    with pytest.raises(TypeError, match=r"^order must be a whole number from 1, got 'two'"):
+    with pytest.raises(TypeError, match=r"^order must be an integer of at least 1, got 'two'"):
         integrator_chain("two")

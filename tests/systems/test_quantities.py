@@ -86,7 +86,8 @@ def test_a_flat_output_in_another_unit_is_said(lags):
     order = len(coefficients) - 1
     flat = fs.LinearFlatSystem(system)
     gain = 1.0 / np.prod(lags)
-    told = rf"y\[0\] is {gain:.6g} times it: a plan of y\[0\] must be multiplied by {1 / gain:.6g}".replace("+", r"\+")
+    told = rf"y\[0\] is {gain:.6g} times the flat output: multiply a plan of y\[0\] by {1 / gain:.6g}"
+    told = told.replace("+", r"\+")
     with pytest.warns(UserWarning, match=told) as caught:
         quantities = quantities_of_flat_system(flat)
     assert caught[0].filename == __file__
@@ -131,7 +132,7 @@ def wrong_maps(forward=lambda v: v, reverse=lambda v: v, rate=lambda v: v):
 
 
 def test_maps_that_do_not_belong_together_give_no_limits():
-    with pytest.raises(ValueError, match="reverse must undo forward, got"):
+    with pytest.raises(ValueError, match="reverse must be the inverse of forward, got"):
         quantities_of_flat_system(wrong_maps(reverse=lambda v: 1.1 * v))
     with pytest.raises(ValueError, match="forward must return derivatives along the motion"):
         quantities_of_flat_system(wrong_maps(rate=lambda v: 2.0 * v))
@@ -200,7 +201,7 @@ def test_the_old_names_warn_and_do_the_same():
     with pytest.warns(FutureWarning, match=r"flat_quantities\(flat_system\) is deprecated.*use flat_system") as third:
         assert cp.fastest(TURN, limits, cp.flat_quantities(motor)).duration == new
     assert [w.filename for w in (*caught, *again, *third)] == [__file__] * 3
-    with pytest.raises(TypeError, match="quantities= is the old name of system="):
+    with pytest.raises(TypeError, match="quantities= is the deprecated name of system="):
         cp.fastest(TURN, limits, motor, quantities=motor)
 
 

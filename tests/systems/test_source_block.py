@@ -90,7 +90,7 @@ def test_a_whole_number_of_any_kind_counts_derivatives():
 @pytest.mark.parametrize("derivatives", [-1, 0.5, np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("function", [cp.create_source_iosystem, lambda plan, n: cp.source_samples(plan, T, n)])
 def test_a_wrong_number_of_derivatives(function, derivatives):
-    with pytest.raises(ValueError, match="derivatives must be a whole number from 0, got"):
+    with pytest.raises(ValueError, match="derivatives must be an integer of at least 0, got"):
         function(PLAN, derivatives)
 
 

@@ -513,13 +513,13 @@ def test_a_plan_without_duration_needs_a_bandwidth():
 BOTH = (TypeError, ValueError)
 BAD = [
     (TypeError, "plan must be a Trajectory, got str", {"plan": "x"}),
-    (ValueError, "derivatives must be a whole number from 0, got -1", {"derivatives": -1}),
-    (ValueError, "derivatives must be a whole number from 0, got 1.5", {"derivatives": 1.5}),
+    (ValueError, "derivatives must be an integer of at least 0, got -1", {"derivatives": -1}),
+    (ValueError, "derivatives must be an integer of at least 0, got 1.5", {"derivatives": 1.5}),
     (ValueError, "limits or errors must name a signal", {"limits": None}),
     (ValueError, "limits or errors must name a signal", {"limits": {}, "errors": {}}),
     *((ValueError, "limits of u must increase", {"limits": {"u": pair}}) for pair in ((1, -1), (1, 1))),
     *((BOTH, "limits of u must be", {"limits": {"u": pair}}) for pair in ((math.nan, 1), (1,), -3, "ab", (1, 2, 3))),
-    (ValueError, "limits of u must hold a finite one", {"limits": {"u": (-INF, INF)}}),
+    (ValueError, "limits of u must contain a finite one", {"limits": {"u": (-INF, INF)}}),
     (ValueError, "limits of u must contain a finite one that is not 0", {"limits": {"u": (0, INF)}}),
     (ValueError, "errors must name axes of the plan, x, got 'z'", {"errors": {"z": (0, 1)}}),
     *(

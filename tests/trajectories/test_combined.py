@@ -189,7 +189,7 @@ def test_step_jumps_at_its_time():
     assert Step(1.0)(0.0) == 1.0
     assert Step(1.0)(-1e-300) == 0.0
     np.testing.assert_array_equal(step.shift(1.0)([2.5, 3.0]), [[0.5, 1], [3, -2]])
-    with pytest.raises(ValueError, match="without duration cannot be retimed"):
+    with pytest.raises(ValueError, match="must have a duration to be retimed"):
         step.retime(1.0)
 
 

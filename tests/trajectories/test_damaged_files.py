@@ -182,14 +182,14 @@ CONTENTS = {
 def test_what_a_damaged_file_holds(name, tmp_path):
     path = tmp_path / "plan.json"
     path.write_text(CONTENTS[name], encoding="utf-8")
-    with pytest.raises(ValueError, match=r"plan\.json must hold a saved trajectory: "):
+    with pytest.raises(ValueError, match=r"plan\.json must contain a saved trajectory: "):
         load_trajectory(path)
 
 
 def test_data_that_are_no_json(tmp_path):
     for content in (b"\xff\xfe", b"\x80", bytes(range(256)), "{}".encode("utf-16")):
         (tmp_path / "plan.json").write_bytes(content)
-        with pytest.raises(ValueError, match="must hold a saved trajectory: "):
+        with pytest.raises(ValueError, match="must contain a saved trajectory: "):
             load_trajectory(tmp_path / "plan.json")
 
 
@@ -197,8 +197,8 @@ def test_data_nested_without_end():
     data = MOVE.to_dict()
     for _ in range(5000):
         data = {"type": "Sum", "parts": [data], "labels": ["y"]}
-    with pytest.raises(ValueError, match="nested so deep"):
+    with pytest.raises(ValueError, match="nested so deeply"):
         trajectory_from_dict(data)
     data["parts"] = [data]
-    with pytest.raises(ValueError, match="nested so deep"):
+    with pytest.raises(ValueError, match="nested so deeply"):
         trajectory_from_dict(data)

@@ -124,9 +124,9 @@ BAD = {
     "a class inside": (GOOD | {"type": "NewtonSpline"}, "type must be one of"),
     "another class inside": ({"type": "_Combined", "parts": [GOOD], "labels": ["y"]}, "type must be one of"),
     "a list": ([GOOD], "type must be one of"),
-    "an entry missing": ({"type": "PolySpline"}, "a PolySpline needs the entry 'waypoints'"),
-    "alpha missing": (GOOD | {"type": "TrigSpline"}, "a TrigSpline needs the entry 'alpha'"),
-    "a time missing": (GOOD | {"waypoints": [{"jet": [[1.0]]}] * 2}, "needs the entry 'time'"),
+    "an entry missing": ({"type": "PolySpline"}, "a PolySpline must have the entry 'waypoints'"),
+    "alpha missing": (GOOD | {"type": "TrigSpline"}, "a TrigSpline must have the entry 'alpha'"),
+    "a time missing": (GOOD | {"waypoints": [{"jet": [[1.0]]}] * 2}, "must have the entry 'time'"),
     "alpha out of range": (GOOD | {"type": "TrigSpline", "alpha": 7.0}, r"alpha must lie in \[0, 2 pi\), got 7"),
     "waypoints that are a number": (GOOD | {"waypoints": 5}, "must"),
     "waypoints that are texts": (GOOD | {"waypoints": ["a", "b"]}, "must"),
@@ -140,7 +140,7 @@ BAD = {
     "a part missing": ({"type": "Scaled", "parts": [], "labels": [], "factor": 1.0}, "must|at least one"),
     "labels that do not fit": (
         {"type": "Sum", "parts": [GOOD], "labels": ["a", "b"]},
-        "labels must be as many as axes",
+        "labels must be one per axis",
     ),
     "labels that are not unique": (
         {"type": "Stacked", "parts": [GOOD, GOOD], "labels": ["a", "a"]},
@@ -166,7 +166,7 @@ def test_what_is_not_a_trajectory_is_rejected(name, tmp_path):
         trajectory_from_dict(data)
     path = tmp_path / "plan.json"
     path.write_text(json.dumps(data))
-    with pytest.raises(ValueError, match=rf"plan\.json must hold a saved trajectory: .*({message})"):
+    with pytest.raises(ValueError, match=rf"plan\.json must contain a saved trajectory: .*({message})"):
         load_trajectory(path)
 
 
@@ -174,7 +174,7 @@ def test_what_is_not_a_trajectory_is_rejected(name, tmp_path):
 def test_files_that_hold_something_else(content, tmp_path):
     path = tmp_path / "plan.json"
     path.write_bytes(content)
-    with pytest.raises(ValueError, match="must hold a saved trajectory: "):
+    with pytest.raises(ValueError, match="must contain a saved trajectory: "):
         load_trajectory(path)
 
 

@@ -187,7 +187,7 @@ def test_times_of_pandas_without_a_unit():
 @pytest.mark.parametrize(
     ("timepts", "said"),
     [
-        (1e-3, r"got the scalar 0.001; for a row every 0.001 s give np.arange\(plan.start, plan.end, 0.001\)"),
+        (1e-3, r"got the scalar 0.001; for one row every 0.001 s pass np.arange\(plan.start, plan.end, 0.001\)"),
         (np.float64(0.5), "got the scalar 0.5"),
         ([[0.0, 0.5], [0.7, 1.0]], r"got shape \(2, 2\)"),
     ],

@@ -177,17 +177,17 @@ def test_with_values_retime_and_one_segment():
 @pytest.mark.parametrize("jets", [[[0.0], [None, 1.0], [1.0]], [[None, 0.0], [None, 1.0], [None, 0.0]], [[None]] * 3])
 def test_what_is_not_determined_is_rejected(jets):
     """A quadratic segment has no third derivative that could fix its end; nor have velocities a position."""
-    with pytest.raises(ValueError, match="left free at inner waypoints must be determined by the others"):
+    with pytest.raises(ValueError, match="free entries at inner waypoints must be determined by the prescribed ones"):
         PiecewiseSpline(waypoints([0.0, 1.0, 2.0], jets))
 
 
 def test_what_is_not_determined_stays_so_beside_a_short_segment():
-    with pytest.raises(ValueError, match="must be determined by the others; prescribe more"):
+    with pytest.raises(ValueError, match="must be determined by the prescribed ones; prescribe more"):
         PiecewiseSpline(waypoints([0.0, 1.0, 1.0 + 1e-7, 2.0], [[None], [None], [None], [None]]))
-    with pytest.raises(ValueError, match="must be determined by the others; prescribe more"):
+    with pytest.raises(ValueError, match="must be determined by the prescribed ones; prescribe more"):
         PiecewiseSpline(waypoints([0.0, 1.0, 1.0 + 1e-7], [[0.0], [None, 1.0], [1.0]]))
 
 
 def test_an_axis_with_nothing_prescribed_is_rejected():
-    with pytest.raises(ValueError, match="an axis needs at least one prescribed entry, got none"):
+    with pytest.raises(ValueError, match="an axis must have at least one prescribed entry, got none"):
         PiecewiseSpline(waypoints([0.0, 1.0], [[None], [None]]))

@@ -332,14 +332,14 @@ def wrong(kind=SCurve, final=1.0, initial=0.0, **changed):
             r"velocity must be a scalar or of shape \(2,\), got shape \(3,\)",
         ),
         ({"velocity": [[1.0]]}, r"velocity must be a scalar or of shape \(1,\), got shape \(1, 1\)"),
-        ({"final": 0.0}, r"final must differ from initial, by a finite length, got \[0.0\] after \[0.0\]"),
-        ({"final": 1e308, "initial": -1e308}, "final must differ from initial, by a finite length"),
+        ({"final": 0.0}, r"final must differ from initial by a finite length, got \[0.0\] after \[0.0\]"),
+        ({"final": 1e308, "initial": -1e308}, "final must differ from initial by a finite length"),
         ({"final": math.nan}, "final must be finite"),
         ({"final": [1.0, 2.0], "initial": [0.0] * 3}, "initial must have the shape of final"),
         ({"time": math.inf}, "time must be finite"),
-        ({"labels": ["a", "b"]}, "labels must be as many as axes, 1, got 2"),
-        ({"time": 1e17}, "limits must leave the rise of velocity more than 178 s at time = 1e[+]17 s, got"),
-        ({"acceleration": 1e300}, "limits must leave the rise of velocity more than"),
+        ({"labels": ["a", "b"]}, "labels must be one per axis, 1, got 2"),
+        ({"time": 1e17}, "limits must give an acceleration phase of more than 178 s at time = 1e[+]17 s, got"),
+        ({"acceleration": 1e300}, "limits must give an acceleration phase of more than"),
         ({"final": 1e300, "velocity": 1e-300}, "limits must give segments of finite durations, got"),
     ],
 )
@@ -365,5 +365,5 @@ def test_limits_are_given_by_name():
 def test_a_file_that_lacks_a_limit_is_rejected():
     data = wrong().to_dict()
     del data["jerk"]
-    with pytest.raises(ValueError, match="a SCurve needs the entry 'jerk'"):
+    with pytest.raises(ValueError, match="a SCurve must have the entry 'jerk'"):
         trajectory_from_dict(data)

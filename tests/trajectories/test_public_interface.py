@@ -143,7 +143,7 @@ def kinds(monkeypatch):
 
 def test_two_kinds_of_one_name_are_an_error(kinds):
     first = define("one")
-    with pytest.raises(ValueError, match=r"names of their own.* got Twin in two after that in one; rename the class"):
+    with pytest.raises(ValueError, match=r"different names.* got Twin in two after that in one; rename the class"):
         define("two")
     assert Trajectory.kinds["Twin"] is first
     with pytest.raises(ValueError, match="got PolySpline in one"):
@@ -222,7 +222,7 @@ def test_profiles_are_made_from_two_waypoints_at_rest(kind, options):
     for point in REST:
         np.testing.assert_array_equal(plan.jet(point.time, 1), point.jet[:2])  # a trapezoid's acceleration jumps there
     wrong = {
-        "one waypoint to one other, got 3": [*REST, Waypoint(20.0, [5.0, 0.0])],
+        "must have exactly two waypoints, got 3": [*REST, Waypoint(20.0, [5.0, 0.0])],
         r"at rest at its waypoints, got waypoints\[1\]": [REST[0], Waypoint(10.0, [4.0, 1.0], [0.1, 0.0])],
         r"positions prescribed, got waypoints\[0\]": [Waypoint(0.0, [np.nan, 1.0]), REST[1]],
         "within the 1 s between its waypoints, got ": [REST[0], Waypoint(3.0, [4.0, 1.0])],

@@ -351,9 +351,9 @@ def test_it_cannot_be_changed():
 @pytest.mark.parametrize(
     ("law", "message"),
     [
-        (line(0.0, 1.0, 1.0, 3.9), "law must lead from 1.0 s to 4.0 s, where the plan is, got 1.0 to 3.9"),
-        (line(0.0, 1.0, 0.9, 4.0), "law must lead from 1.0 s to 4.0 s, where the plan is, got 0.9 to 4.0"),
-        (line(0.0, 1.0, 4.0, 1.0), "law must lead from 1.0 s to 4.0 s, where the plan is, got 4.0 to 1.0"),
+        (line(0.0, 1.0, 1.0, 3.9), "law must lead from the plan's start 1.0 s to its end 4.0 s, got 1.0 to 3.9"),
+        (line(0.0, 1.0, 0.9, 4.0), "law must lead from the plan's start 1.0 s to its end 4.0 s, got 0.9 to 4.0"),
+        (line(0.0, 1.0, 4.0, 1.0), "law must lead from the plan's start 1.0 s to its end 4.0 s, got 4.0 to 1.0"),
         (stack([SQUARE, SQUARE]), "law must have one axis, got 2: y1, y2"),
         (PolySpline([Waypoint(0, 1, -1.0), Waypoint(1, 4)]), "law must increase, got the rate -1 at 0 s"),
         (
@@ -383,7 +383,7 @@ def test_other_arguments_that_are_rejected():
         Retimed(1.0, SQUARE)
     with pytest.raises(TypeError, match="law must be a Trajectory, got function"):
         Retimed(PLANS["piecewise"], lambda t: t)
-    with pytest.raises(ValueError, match="labels must be as many as axes, 2, got 1"):
+    with pytest.raises(ValueError, match="labels must be one per axis, 2, got 1"):
         Retimed(PLANS["piecewise"], SQUARE, labels=["a"])
 
 

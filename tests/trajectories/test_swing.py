@@ -41,7 +41,7 @@ def test_the_swing_is_measured(alpha):
 def test_a_polynomial_through_many_waypoints_swings():
     """Lagrange's polynomial through alternating values at 40 even times, by its first interval's middle."""
     points = [Waypoint(float(k), (-1.0) ** k) for k in range(40)]
-    with pytest.warns(UserWarning, match="use PiecewiseSpline, one polynomial a segment") as caught:
+    with pytest.warns(UserWarning, match="use PiecewiseSpline, one polynomial per segment") as caught:
         plan = PolySpline(points)
     t, others = 0.5, np.arange(40)
     value = sum(

@@ -266,8 +266,8 @@ def test_extrapolated_is_a_taylor_polynomial(n):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ((-1, 1.0), "order must be a whole number from 0, got -1"),
-        ((1.5, 1.0), "order must be a whole number from 0, got 1.5"),
+        ((-1, 1.0), "order must be an integer of at least 0, got -1"),
+        ((1.5, 1.0), "order must be an integer of at least 0, got 1.5"),
         ((2, 0.0), "horizon must be finite and above 0, got 0.0"),
         ((2, math.nan), "horizon must be finite and above 0, got nan"),
         ((2, 1.0, -0.1), r"alpha must lie in \[0, 2 pi\), got -0.1"),
