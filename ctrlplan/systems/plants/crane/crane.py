@@ -1,4 +1,4 @@
-"""The crane of the paper's section 5: trolley, hoist and a load on a rope."""
+"""Crane of the paper's section 5: trolley, hoist and a load on a rope."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from ctrlplan.systems.plants.crane.parameters import CraneParameters
 
 
 class Crane(CraneParameters):
-    """Crane with a trolley, a drum and a load; its equations, flat maps and loops.
+    """Crane with trolley, drum and load: equations, flat maps and loops.
 
-    z points down. Equation numbers in the methods are the paper's.
+    z points down. Equation numbers in the methods refer to the paper.
 
     Parameters
     ----------
@@ -28,8 +28,8 @@ class Crane(CraneParameters):
     gravity : float
         g [m/s^2].
     rope_wrap : bool
-        False is the paper's (14b), which neglects that the rope winds on the
-        drum as theta turns; True keeps that term, and with it the energy.
+        False: (14b) of the paper, which neglects that the rope winds on the drum
+        as theta changes. True: with that term; the model then conserves energy.
 
     Raises
     ------
@@ -51,13 +51,13 @@ class Crane(CraneParameters):
     accelerations = model.accelerations
     energy = model.energy
 
-    # Flat maps, and what a plan must meet: flatness.py, rope.py
+    # Flat maps and checks of a plan: flatness.py, rope.py
     flat_system = flatness.flat_system
     quantities = flatness.quantities
     check = flatness.check
     rope = rope.rope
 
-    # Linear models and the study's controllers: linear.py
+    # Linear models and controllers of the study: linear.py
     linear_trolley = linear.linear_trolley
     linear_hoist = linear.linear_hoist
     linear_coupled = linear.linear_coupled
