@@ -1,4 +1,4 @@
-"""What runs of a system have brought: its compiled forms, and which parameters are read."""
+"""Cache of the compiled forms of a system, and of which parameters are read."""
 
 from __future__ import annotations
 
@@ -20,29 +20,29 @@ _CACHE_SIZE = 8
 
 
 class NotApplicableError(ValueError):
-    """A method of simulation that does not apply to a system, and why."""
+    """A method of simulation does not apply to a system; the message gives the reason."""
 
 
 class NotCompiledError(NotApplicableError):
-    """A system that cannot be compiled, and why."""
+    """A system cannot be compiled; the message gives the reason."""
 
 
 class DisagreementError(NotCompiledError):
-    """A compiled system that is not what Python says at states that a run visited."""
+    """A compiled system disagrees with Python at states of a run."""
 
 
 @dataclass(frozen=True, eq=False)
 class BuiltForm:
-    """Compiled form, or why there is none, for some names of parameters.
+    """Compiled form for given names of parameters, or the reason why there is none.
 
     Attributes
     ----------
     names : frozenset of str
-        Parameters of the run for which it was built.
+        Names of the parameters for which it was built.
     constants : dict
-        Those that are constants in it, with their fingerprints.
+        Parameters that are constants in it, with their fingerprints.
     form : Compiled or NotCompiledError
-        What was built.
+        The compiled form, or the error.
     """
 
     names: frozenset[str]
@@ -50,7 +50,7 @@ class BuiltForm:
     form: Compiled | NotCompiledError
 
     def fits(self, params: Params) -> bool:
-        """Whether it holds for some parameters."""
+        """Whether the form is valid for given parameters."""
         scalars = isinstance(self.form, NotCompiledError) or all(
             np.ndim(params.get(name, 0.0)) == 0 for name in self.form.symbols
         )
@@ -61,10 +61,10 @@ class BuiltForm:
 
 
 class BuiltForms:
-    """Forms and findings of one system; safe in threads.
+    """Compiled forms of one system and results of trial calls; thread-safe.
 
-    A form is built once, and so is a finding made: the same call gets the same
-    one again. A form that was found wrong is not used again.
+    Each is computed once, so that equal calls give equal results. A form that
+    disagrees with Python is not used again.
     """
 
     def __init__(self, forms: Iterable[BuiltForm] = ()) -> None:
@@ -73,12 +73,12 @@ class BuiltForms:
         self._read: dict[str, bool] = {}
 
     def form(self, params: Params, build: Callable[[], BuiltForm]) -> Compiled:
-        """Form for some parameters, built once for all their values.
+        """Form for given parameters, built once for all their values.
 
         Raises
         ------
         NotCompiledError
-            If there is none; the reason is in the message.
+            If there is none; the message gives the reason.
         """
         found = self._known(params)
         if found is None:
@@ -92,7 +92,7 @@ class BuiltForms:
         return found.form
 
     def discard(self, form: Compiled, why: str) -> DisagreementError:
-        """Drop a form that was found wrong: the first time it may be built again, as its functions may have changed."""
+        """Discard a wrong form; it may be rebuilt once, since its functions may have changed."""
         with BUILDING:
             retained = []
             for entry in self.forms:
@@ -106,18 +106,18 @@ class BuiltForms:
         return DisagreementError(why)
 
     def reads(self, name: str, find: Callable[[], bool]) -> bool:
-        """Whether a parameter is read by a block, found out once."""
-        with BUILDING:  # trial calls put back what they found: one thread at a time
+        """Whether a parameter is read by a block; determined once."""
+        with BUILDING:  # trial calls restore what they change: one thread at a time
             if name not in self._read:
                 self._read[name] = find()
             return self._read[name]
 
     def usable(self) -> BuiltForms:
-        """Forms that another process can use."""
+        """Forms that can be used by another process."""
         return BuiltForms(entry for entry in self.forms if not isinstance(entry.form, NotCompiledError))
 
     def for_any(self, names: Iterable[str]) -> BuiltForms:
-        """Forms that hold for any values of some parameters."""
+        """Forms that are valid for all values of given parameters."""
         wanted = frozenset(names)
         return BuiltForms(entry for entry in self.forms if entry.names == wanted and not entry.constants)
 

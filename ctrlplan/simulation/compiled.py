@@ -1,4 +1,4 @@
-"""A network compiled by CasADi, and SUNDIALS' CVODES on it with the exact Jacobian."""
+"""Network compiled by CasADi, and its solution by CVODES (SUNDIALS) with the exact Jacobian."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ from ctrlplan.symbolic.switches import changes_of_side, switch_arguments
 from ctrlplan.symbolic.tracing import NotTraceableError, Trace, agrees
 
 Stats = Mapping[str, float]
-"""Statistics of an integrator, by name."""
+"""Statistics of an integrator by name."""
 
 _CACHE_SIZE = 64
-"""Integrators kept, one for each pattern of output times; and functions, one for each number of times."""
+"""Number of cached integrators, one for each pattern of output times, and of cached functions of many times."""
 
 _FEW = 64
-"""Output times of a segment up to which the pattern is rounded, so that segments of one length share an integrator."""
+"""Number of output times up to which the pattern is rounded, so that segments of one length share an integrator."""
 
 _FEW_STEPS = 2_000
-"""Steps from output to output at the first attempt."""
+"""Maximum number of steps between outputs in the first attempt."""
 
 _CLOSE = 129
-"""Output times of the second."""
+"""Number of output times in the second attempt."""
 
 _TOO_MANY = "too many steps are required"
 _FAILURES = {
@@ -47,13 +47,13 @@ _FAILURES = {
 }
 
 _STIFF = 3000.0
-"""Times that the fastest motion could die out within a segment, above which BDF takes fewer steps than Adams."""
+"""Segment length in units of the fastest time constant above which BDF requires fewer steps than Adams."""
 
 _EDGE = 100.0
-"""Tolerances of a step about a state within which equations must be defined."""
+"""Neighbourhood of a state, in tolerances of a step, in which the equations must be defined."""
 
 _SIGNALS = tuple(map(int, signal.valid_signals()))
-"""Numbers of the signals that may have handlers."""
+"""Numbers of the signals that can have handlers."""
 
 
 class Compiled:
@@ -62,7 +62,7 @@ class Compiled:
     Parameters
     ----------
     network : Network
-        What is run.
+        The network.
     traces : list of Trace or None
         Of every block that is neither linear nor a function of time.
 
@@ -105,23 +105,23 @@ class Compiled:
         self._equations: dict[int, dict[str, ca.SX]] = {}
 
     def __getstate__(self) -> dict[str, object]:
-        """Without what is made anew where it is needed."""
+        """State without what can be rebuilt."""
         return self.__dict__ | {"_traces": [], "_equations": {}}
 
     def parameters(self, params: Params) -> Array:
-        """Entries of p for a run."""
+        """Vector p for the parameters of a run."""
         return np.array([float(params.get(key, default)) for key, default in self._defaults])
 
     def outputs(self, t: Array, x: Array, time_values: Array, p: Array) -> Array:
-        """Outputs of the whole at many times, (noutputs, ntime)."""
+        """Outputs of the network at many times, (noutputs, ntime)."""
         return self._at_many("outputs", t, x, time_values, p)
 
     def rates(self, t: Array, x: Array, time_values: Array, p: Array) -> Array:
-        """Rates of all states at many times, (nstates, ntime)."""
+        """Derivatives of all states at many times, (nstates, ntime)."""
         return self._at_many("rates", t, x, time_values, p)
 
     def slopes(self, t: Array, x: Array, time_values: Array, p: Array) -> Array:
-        """Derivatives of the rates by the states at many times, column after column, (nstates**2, ntime)."""
+        """Jacobian by the states at many times, column by column, (nstates**2, ntime)."""
         return self._at_many("jacobian", t, x, time_values, p)
 
     def signals(self, t: Array, x: Array, time_values: Array, p: Array) -> Array:
@@ -129,14 +129,14 @@ class Compiled:
         return self._at_many("signals", t, x, time_values, p)
 
     def instants(self, first: float, last: float, time_values: Callable[[Array], Array], p: Array) -> list[float]:
-        """Times of a run at which the equations switch, where time and functions of time alone decide.
+        """Times of a run at which the equations switch depending on time and functions of time only.
 
         Parameters
         ----------
         first, last : float
             Beginning and end of the run [s].
         time_values : callable
-            Maps times (n,) to the functions of time (nd, n).
+            Maps times (n,) to the values of the functions of time (nd, n).
         p : ndarray
             Parameters of the run.
         """
@@ -155,7 +155,7 @@ class Compiled:
     def _of_time(
         self, name: str, switches: ca.Function, network: Network, argument: int
     ) -> tuple[str, ca.Function | None]:
-        """Those of some switches that depend on time (0) or functions of time (2), and on no state; None without."""
+        """Switches that depend on time (argument 0) or functions of time (2) but on no state; None if there is none."""
         delayed = np.zeros(network.nsignals, dtype=bool)
         for i in network.blocks_with("delay"):
             delayed[network.outputs[i]] = True
@@ -170,11 +170,11 @@ class Compiled:
         return f"timed {name}", self._functions[f"timed {name}"]
 
     def sides(self, t: Array, x: Array, time_values: Array, p: Array) -> Array:
-        """On which side of its switches the form is at many times, (nswitches, ntime): -1, 0 or 1."""
+        """Signs of the switching functions at many times, (nswitches, ntime)."""
         return np.sign(self._at_many("switches", t, x, time_values, p))
 
     def disagreement(self, network: Network, params: Params, t: Array, x: Array, w: Array) -> str:
-        """What is wrong with a trace at visited times, states and signals; empty where nothing."""
+        """Disagreement of a trace with Python at visited times, states and signals; empty if there is none."""
         for block, trace, states, fed in zip(network.blocks, self._traces, network.states, network.fed, strict=True):
             if trace is not None:
                 wrong = agrees(block, trace, params, t, x[states], fed(w))
@@ -183,15 +183,15 @@ class Compiled:
         return ""
 
     def fastest_decay(self, t: float, x: Array, time_values: Array, p: Array) -> float:
-        """Greatest rate [1/s] at which a motion about a state dies out."""
+        """Largest decay rate [1/s] of the equations linearised at a state."""
         jacobian = _called(self._jacobian, (np.array([t]), x, time_values, p), x.size)
         return float(-np.linalg.eigvals(jacobian).real.min()) if np.isfinite(jacobian).all() else np.inf
 
     def integrator(
         self, width: int, grid: Array, stiff: bool, rtol: float, atol: float, max_steps: int, longest: float
     ) -> ca.Function:
-        """CVODES over a segment of length 1, with outputs at some of its times."""
-        # CasADi runs without Python's lock: no integrator is used by two threads at once.
+        """CVODES over a segment scaled to length 1, with outputs at given times."""
+        # CasADi releases the global interpreter lock: each thread has its own integrators.
         key = (threading.get_ident(), width, grid.tobytes(), stiff, rtol, atol, max_steps, longest)
 
         def made() -> ca.Function:
@@ -211,13 +211,13 @@ class Compiled:
 
     def _at_many(self, name: str, t: Array, x: Array, time_values: Array, p: Array) -> Array:
         function = self._functions[name]
-        if not function.numel_out(0):  # a system without inputs and outputs has no signals
+        if not function.numel_out(0):  # no signals without inputs and outputs
             return np.zeros((0, t.size))
         at_all = self._maps.get((name, t.size), lambda: function.map(t.size))
         return _called(at_all, (t, x, time_values, np.repeat(p[:, None], t.size, axis=1)), function.numel_out(0))
 
     def _segment_equations(self, width: int) -> dict[str, ca.SX]:
-        """Equations of scaled states in s from 0 to 1, the functions of time as Chebyshev series of some width."""
+        """Equations of scaled states over s in [0, 1], with functions of time as Chebyshev series of given width."""
         if width not in self._equations:
             nx, nd, np_ = (self._rates.numel_in(k) for k in (1, 2, 3))
             shapes = {"s": (1,), "z": (nx,), "p": (np_,), "c": (nd, width), "bounds": (nd, 2)}
@@ -226,7 +226,7 @@ class Compiled:
             left, length, first, last, earliest, latest = (span[k] for k in range(6))
             t = ca.fmin(ca.fmax(left + s * length, earliest), latest)
             time_values = _series(c, (2.0 * t - first - last) / (last - first))
-            if width > 1:  # a signal that is nan stays nan
+            if width > 1:  # nan is preserved
                 time_values = ca.if_else(time_values < bounds[:, 0], bounds[:, 0], time_values)
                 time_values = ca.if_else(time_values > bounds[:, 1], bounds[:, 1], time_values)
             self._equations[width] = {
@@ -238,21 +238,22 @@ class Compiled:
         return self._equations[width]
 
     def _own_parameters(self, p: ca.SX) -> list[ca.SX]:
-        """Each block's part of p."""
+        """Entries of p for each block."""
         return [
             ca.vertcat(*[p[k] for k, (j, _) in enumerate(self._places) if j == i]) for i in range(len(self._traces))
         ]
 
 
 class CompiledSolver:
-    """CVODES on a compiled network, segment by segment.
+    """CVODES for a compiled network, segment by segment.
 
     Attributes
     ----------
     form : Compiled
         The compiled equations.
     evaluations : int
-        Evaluations of the right-hand side so far, counted where a comparison with Python is expected.
+        Evaluations of the right-hand side so far, counted if a comparison with
+        Python is expected.
     """
 
     calls_blocks = relative_by_state = False
@@ -278,23 +279,23 @@ class CompiledSolver:
         return self.form.signals(times, states, time_values, self._p)
 
     def outputs(self, times: Array, states: Array, time_values: Array) -> Array:
-        """Outputs (noutputs, ntime) of the whole."""
+        """Outputs (noutputs, ntime) of the network."""
         return self.form.outputs(times, states, time_values, self._p)
 
     def slopes(self, times: Array, states: Array, time_values: Array) -> Array:
-        """Derivatives of the rates by the states, (ntime, nstates, nstates)."""
+        """Jacobian of the derivatives by the states, (ntime, nstates, nstates)."""
         n = len(states)
         return self.form.slopes(times, states, time_values, self._p).reshape(n, n, times.size).transpose(2, 1, 0)
 
     def rates(self, times: Array, states: Array, time_values: Array) -> Array:
-        """Rates (nstates, ntime) of the states."""
+        """Derivatives (nstates, ntime) of the states."""
         return self.form.rates(times, states, time_values, self._p)
 
     def near_undefined(self, times: Array, states: Array, time_values: Array) -> bool:
-        """Whether equations are undefined within the tolerances of states found.
+        """Whether the equations are undefined within the tolerances of computed states.
 
-        There CVODES may stay for ever on a solution that has ended: a Newton
-        step beside an infinite slope is as small as it likes.
+        CVODES may otherwise not terminate where the solution ends: next to an
+        infinite slope its Newton steps become arbitrarily small.
         """
         rtol, atol = self._tolerances
         reach = (rtol * np.abs(states) + (atol * self._scales.scale)[:, None]) * _EDGE
@@ -304,16 +305,16 @@ class CompiledSolver:
         )
 
     def instants(self, first: float, last: float, time_values: Callable[[Array], Array]) -> list[float]:
-        """Times of a run at which the equations switch, where functions of time alone decide."""
+        """Times of a run at which the equations switch depending on functions of time only."""
         return self.form.instants(first, last, time_values, self._p)
 
     def advance(self, series: Series, left: float, grid: Array, state: Array) -> Array:
-        """States (nstates, ngrid) at times of a segment, of which the last is its end."""
+        """States (nstates, ngrid) at times of a segment; the last is its end."""
         if not state.size:
             return np.zeros((0, grid.size))
         right = float(grid[-1])
         relative = (grid - left) / (right - left)
-        if grid.size <= _FEW:  # a rounding error of the clock must not make a new integrator of every short segment
+        if grid.size <= _FEW:  # rounding errors of time must not require a new integrator for every short segment
             relative = np.round(relative, 12)
         if right - left > self._longest:
             decay = self.form.fastest_decay(left, state, series(left), self._p)
@@ -324,9 +325,9 @@ class CompiledSolver:
         known = [series.coefficients.ravel(order="F"), series.low, series.high, span, scales.shift, scales.scale]
         p = np.concatenate([self._p, *known])
         start = (state - scales.shift) / scales.scale
-        # What depends on time is seen at least once a sample: a pulse cannot be passed over unseen.
+        # Equations that depend on time are evaluated at least once per sample, so that no pulse is skipped.
         longest = round(float(np.diff(relative, prepend=0.0).max()), 6) if self.form.depends_on_time else 0.0
-        # A solution that explodes takes all the steps it may: few at first, then more, between outputs close together.
+        # A diverging solution exhausts the steps: few in the first attempt, then more, with closer outputs.
         close = np.union1d(relative, np.linspace(0.0, 1.0, _CLOSE)[1:])
         for outputs, allowed in ((relative, min(_FEW_STEPS, max_steps)), (close, max_steps)):
             settings = width, outputs, self._stiff, *self._tolerances, allowed, longest
@@ -344,7 +345,7 @@ class CompiledSolver:
         raise SolverError(f"the solver must reach {right:g} s from {left:g} s, but the segment fails: {why}")
 
     def count(self) -> None:
-        """Count evaluations from now on."""
+        """Start counting evaluations."""
         self._report = self._count
 
     def _count(self, stats: Stats) -> None:
@@ -353,16 +354,16 @@ class CompiledSolver:
 
 @contextmanager
 def _passing_interruptions() -> Iterator[None]:
-    """Let what signal handlers raise reach the caller, Ctrl-C among it.
+    """Propagate exceptions of signal handlers to the caller, as on Ctrl-C.
 
-    CVODES takes an exception that a handler raises while it runs for a failure
-    of the equations; one raised while a solver is made ends in a SystemError.
-    Handlers run in the main thread alone, so there they are accompanied; they
-    are found as they were.
+    CVODES treats an exception that a handler raises during a run as a failure of
+    the equations; one raised while a solver is constructed becomes a SystemError.
+    Handlers run in the main thread only; there they are wrapped and afterwards
+    restored.
     """
     raised: list[BaseException] = []
     handlers: dict[int, Callable[[int, FrameType | None], object]] = {}
-    inside = False  # while handlers are exchanged, what they raise waits
+    inside = False  # while handlers are exchanged, their exceptions are deferred
 
     def accompanied(number: int, frame: FrameType | None) -> None:
         try:
@@ -397,9 +398,9 @@ def _passing_interruptions() -> Iterator[None]:
 def _called(
     function: ca.Function, arguments: Sequence[Array], nrows: int, report: Callable[[Stats], None] | None = None
 ) -> Array:
-    """First result (nrows, n) of a function, without a detour through CasADi's own matrices."""
+    """First result (nrows, n) of a function, without conversion through CasADi matrices."""
     out = np.zeros((function.numel_out(0) // nrows if nrows else 0, nrows))
-    given: tuple[Value, Callable[[], None]] = function.buffer()  # with a signature that CasADi's stubs do not have
+    given: tuple[Value, Callable[[], None]] = function.buffer()  # not in the type stubs of CasADi
     buffer, evaluate = given
     columns = [np.ravel(values, order="F").astype(float) for values in arguments]
     for k, values in enumerate(columns):
@@ -436,7 +437,7 @@ def _signals(
         if step.unknown is None:
             _evaluate(network, traces, own, step.blocks[0], t, x, known)
             continue
-        # Unknown signals z with z = f(z): where f is linear, one solution of a small system.
+        # Unknown signals z with z = f(z): for linear f the solution of a small linear system.
         z = ca.SX.sym("z", step.unknown.size)
         trial = list(known)
         for k, row in enumerate(step.unknown):
@@ -460,7 +461,7 @@ def _signals(
 def _evaluate(
     network: Network, traces: list[Trace | None], own: list[ca.SX], i: int, t: ca.SX, x: ca.SX, known: list[ca.SX]
 ) -> None:
-    """Put a block's outputs among the known signals."""
+    """Store the outputs of a block in the known signals."""
     block, states, outs = network.blocks[i], network.states[i], network.outputs[i]
     fed = _sparse(network.wire[network.inputs[i]]) @ ca.vertcat(*known)
     trace = traces[i]
@@ -489,7 +490,7 @@ def _rates(network: Network, traces: list[Trace | None], own: list[ca.SX], t: ca
 
 
 def _part(x: ca.SX, rows: slice) -> ca.SX:
-    """Rows of a column, which where there are none is still a column."""
+    """Rows of a column; an empty column without rows."""
     return x[rows] if rows.stop > rows.start else ca.SX(0, 1)
 
 
@@ -499,7 +500,7 @@ def _linear(a: ArrayLike, b: ArrayLike, x: ca.SX, u: ca.SX) -> ca.SX:
 
 
 def _sparse(matrix: ArrayLike) -> ca.DM:
-    """Matrix without its zeros: 0 times nan is 0, and the equations are shorter."""
+    """Sparse matrix: 0 times nan is then 0, and the equations are shorter."""
     return ca.sparsify(ca.DM(np.asarray(matrix, dtype=float)))
 
 

@@ -1,4 +1,4 @@
-"""Where a loop is in equilibrium while its references are held, and whether it stays there."""
+"""Equilibrium of a loop with constant references, and its unstable poles."""
 
 from __future__ import annotations
 
@@ -22,48 +22,48 @@ from ctrlplan.trajectories import Trajectory
 Vector = Callable[[Array], Array]
 
 _LINEAR_RESIDUAL = 1e-9
-"""Rate of a state at equilibrium, relative to the terms it is the sum of, in a linear loop."""
+"""Residual of an equilibrium of a linear loop, relative to the terms of the derivative."""
 
 _RESIDUAL = 1e-8
-"""The same in a loop whose equilibrium was found by iteration."""
+"""The same for an equilibrium found by iteration."""
 
 _EVALUATIONS = 10_000
-"""Evaluations of the rates after which no further guess is tried."""
+"""Number of evaluations after which no further initial guess is tried."""
 
 _ITERATIONS = 40
-"""Steps of Newton's iteration."""
+"""Maximum number of Newton steps."""
 
 
 def equilibrium_at(
     system: System | Prepared, plan: Trajectory, time: float, outputs: Sequence[int], params: Params | None = None
 ) -> tuple[Array, str]:
-    """State in which a loop is at equilibrium at the first position of a plan.
+    """Equilibrium of a loop at the first position of a plan.
 
-    References, disturbances and all other plans in the loop are held at their
-    values at `time`, with zero derivatives. States that a block states itself
-    (``initial_state``) are kept; the others are found.
+    References, disturbances and other plans in the loop are constant at their
+    values at `time`, with zero derivatives. States that a block declares
+    (``initial_state``) are not changed.
 
     Parameters
     ----------
     system : control system or Prepared
-        The plan stands at its inputs, or inside as a block.
+        The loop; the plan is its input or a block inside.
     plan : Trajectory
         Reference.
     time : float
         Start of the run [s].
     outputs : sequence of int
-        Rows of the outputs that follow the plan. Of several equilibria, one
-        with these outputs near the plan's position is taken.
+        Indices of the outputs that track the plan. Of several equilibria the one
+        with these outputs closest to the position of the plan is returned.
     params : mapping, optional
         Parameters of the blocks.
 
     Returns
     -------
     state : ndarray, shape (nstates,)
-        The equilibrium; where none was found, the stated start, 0 for states
-        of which none is stated.
+        The equilibrium; if none is found, the declared initial state, 0 for
+        states without one.
     doubt : str
-        Why that is not known to be an equilibrium; empty where it is one.
+        Why the state is not known to be an equilibrium; empty if it is one.
     """
     prepared = prepared_form(system)
     stated = prepared.stated
@@ -85,25 +85,25 @@ def equilibrium_at(
         except FeedthroughError:  # no algebraic loop at the start, but elsewhere
             again = _Equations(prepared, held, time, params or {}, start, trials=False)
             return _found(again, rows, target, start, free)
-    except Exception as error:  # whatever a block does outside its domain; a run that fails there says so itself
+    except Exception as error:  # outside the domain of a block; a run that fails there raises the error
         return start, f"the equations cannot be evaluated ({type(error).__name__}: {error})"
 
 
 def equilibrium_state(system: System | Prepared, position: ArrayLike) -> Array:
-    """State at which a linear loop rests when its inputs are held.
+    """Equilibrium of a linear loop with constant inputs.
 
     Parameters
     ----------
     system : control system
-        Linear and continuous; of others the zero state is returned.
+        Linear and continuous; for others the zero state is returned.
     position : array_like, shape (ninputs,)
-        What the inputs are held at.
+        Constant values of the inputs.
 
     Returns
     -------
     ndarray, shape (nstates,)
-        A solution of A x + B w = 0, with outputs as near w as it allows; zero
-        where there is none.
+        A solution of A x + B w = 0, with outputs as close as possible to w; zero
+        if there is none.
     """
     held = np.atleast_1d(real_array(position, "position"))
     start = np.zeros(system.nstates or 0)
@@ -119,7 +119,7 @@ def equilibrium_state(system: System | Prepared, position: ArrayLike) -> Array:
 
 
 def unstable_poles(system: System | Prepared) -> NDArray[np.complex128]:
-    """Poles in the right half plane of a linear continuous system; of others none are known."""
+    """Poles in the right half plane of a linear continuous system; empty for others."""
     try:
         poles = np.linalg.eigvals(_form(system).a).astype(complex)
     except NotLinearError:
@@ -136,7 +136,7 @@ def _form(system: System | Prepared) -> LinearForm:
 
 
 def _held(signal: TimeSignal, time: float) -> Array:
-    """Values of a signal before anything happens at `time`, with derivatives of 0."""
+    """Values of a signal just before `time`, with zero derivatives."""
     if not isinstance(signal, PlanSignal):
         return signal.at(np.array([time]))[:, 0]
     jet = np.zeros((signal.plan.naxes, signal.derivatives + 1))
@@ -147,9 +147,9 @@ def _held(signal: TimeSignal, time: float) -> Array:
 def _linear_equilibrium(
     a: Array, supplied: Array, c: Array, passed: Array, target: Array, start: Array, free: NDArray[np.bool_]
 ) -> Array | None:
-    """State at which the free rows of A x + supplied vanish; None where there is none.
+    """State at which the free rows of A x + supplied are 0; None if there is none.
 
-    Where integrators leave a choice, outputs C x + passed come as near to `target` as they can.
+    If it is not unique, as with integrators, outputs C x + passed are as close as possible to `target`.
     """
     state = np.where(free, 0.0, start)
     inner = a[np.ix_(free, free)]
@@ -166,7 +166,7 @@ def _linear_equilibrium(
 
 
 def _scaled_solution(matrix: Array, right: Array) -> tuple[Array, float]:
-    """Least-squares solution with rows and columns scaled to size 1, and its residual relative to what is scaled so."""
+    """Least-squares solution with rows and columns scaled to unit size, and its relative residual."""
     rows = np.maximum(np.abs(matrix).max(axis=1, initial=0.0), np.abs(right))
     rows = 1.0 / np.where(rows > 0.0, rows, 1.0)
     columns = np.abs(rows[:, None] * matrix).max(axis=0, initial=0.0)
@@ -179,10 +179,10 @@ def _scaled_solution(matrix: Array, right: Array) -> tuple[Array, float]:
 
 
 class _Equations:
-    """Rates at which a loop moves away from a state, and its outputs, its references held.
+    """Derivatives of the states of a loop with constant references, and its outputs.
 
-    A state of a discrete block moves by what a sample changes it. Discrete blocks that are not linear
-    are not called, since some remember their calls: they are `unknown`, and their states `fixed`.
+    The entry of a discrete state is its change by a sample. Nonlinear discrete blocks are not called,
+    since calls may change their memory: they are `unknown`, and their states `fixed`.
     """
 
     def __init__(
@@ -209,7 +209,7 @@ class _Equations:
             self._network(prepared, held, time, params, start)
 
     def _by_control(self, prepared: Prepared, held: Array, time: float, params: Params) -> None:
-        """Equations of what only python-control runs."""
+        """Equations of a system that only python-control can run."""
         system, u = prepared.system, held[: prepared.ninputs]
         if self.discrete:
             self.unknown = (prepared.name,)
@@ -268,15 +268,15 @@ class _Equations:
         self._outputs = lambda x: network.to_outputs(equations.signals(time, x, held))
 
     def rates(self, x: Array) -> Array:
-        """Rates, nan outside the domain of a block."""
+        """Derivatives, nan outside the domain of a block."""
         return self._tried(self._rates, x)
 
     def outputs(self, x: Array) -> Array:
-        """Outputs of the whole, nan outside the domain of a block."""
+        """Outputs of the loop, nan outside the domain of a block."""
         return self._tried(self._outputs, x)
 
     def gaps(self, x: Array) -> Array:
-        """Inputs of the delays less their outputs."""
+        """Inputs of the delays minus their outputs."""
         return self._tried(self._gaps, x)
 
     def _tried(self, function: Vector, x: Array) -> Array:
@@ -285,14 +285,14 @@ class _Equations:
                 return np.asarray(function(x), dtype=float)
         except FeedthroughError:
             raise
-        except Exception:  # a trial: a block may be defined elsewhere
+        except Exception:  # a trial call: the block may be undefined here
             return np.full(x.size, np.nan)
 
 
 def _found(
     equations: _Equations, rows: list[int], target: Array, start: Array, free: NDArray[np.bool_]
 ) -> tuple[Array, str]:
-    """Equilibrium of a network, from a few guesses; of several the one with outputs nearest to `target`."""
+    """Equilibrium of a network from several initial guesses; the one with outputs closest to `target`."""
     free = free & ~equations.fixed
     if equations.unknown and equations.discrete:
         return start, "" if not target.any() else _of_samples(equations)
@@ -345,7 +345,7 @@ def _of_samples(equations: _Equations) -> str:
 
 
 def _guesses(start: Array, target: Array) -> Iterator[Array]:
-    """Where an equilibrium is looked for: at the stated start, and about the position."""
+    """Initial guesses: the declared initial state, and states of the size of the position."""
     yield start
     values = np.unique(np.concatenate([target, [1.0]]))
     for value in values[values != 0.0]:
@@ -358,7 +358,7 @@ def _guesses(start: Array, target: Array) -> Iterator[Array]:
 
 
 def _equilibrium(rates: Vector, missing: Vector, guess: Array, moves: Array, size: float) -> Array | None:
-    """State from a guess at which all rates vanish; None where none is found."""
+    """Equilibrium from an initial guess; None if none is found."""
     z = guess
     if z.size and (not _is_equilibrium(rates, z, moves) or np.abs(missing(z)).max(initial=0.0) > _RESIDUAL * size):
         weight = 1.0 / np.where(moves > 0.0, moves, 1.0)
@@ -376,7 +376,7 @@ def _equilibrium(rates: Vector, missing: Vector, guess: Array, moves: Array, siz
 
 
 def _newton(rates: Vector, z: Array) -> Array:
-    """Newton's iteration on the rates alone, by steps of minimum norm."""
+    """Newton's iteration on the derivatives, with steps of minimum norm."""
     f = rates(z)
     for _ in range(_ITERATIONS):
         if not _finite(f) or not f.any():
@@ -397,7 +397,7 @@ def _newton(rates: Vector, z: Array) -> Array:
 
 
 def _is_equilibrium(rates: Vector, z: Array, moves: Array) -> bool:
-    """Whether the rates are rounding compared with the terms that they sum, or with rates at other states."""
+    """Whether the derivatives are of the size of rounding errors of their terms, or of derivatives elsewhere."""
     f = rates(z)
     if not _finite(f):
         return False

@@ -1,20 +1,20 @@
-"""The exact response of linear systems to trajectories and to samples.
+"""Exact response of linear systems to trajectories and to samples.
 
-Between breakpoints the input is analytic. It is cut into cells so short that
-its Taylor series dies within a few terms; series and state together are then a
-linear system without input (a nilpotent chain behind the loop's state), and one
-matrix exponential, by scaling and squaring, carries the state over every cell.
-It is squared no more often than its Taylor series requires, and in twice the
-digits where its squares cancel, as those of matrices far from normal do.
+Between breakpoints the input is analytic. Time is divided into cells in which
+the Taylor series of the input converges within a few terms. Series and state
+then form a linear system without input (the state with a nilpotent chain as its input),
+and one matrix exponential, by scaling and squaring, propagates the state over
+every cell. The number of squarings is the minimum for convergence of the Taylor
+series; they are computed in double-double arithmetic where terms cancel, as for
+matrices far from normal.
 
-Where samples are evenly spaced, every cell holds the same number of them, and
-one table of exponentials, made by doubling, reads all samples off the states at
-the cells' beginnings: a matrix product. Several systems with one input go
-through it together. Elsewhere the cells are halved, all at once and through the
-same squarings, until the state's own Taylor series converges in them, and the
-samples are read off that series. Neither interpolates, and neither has a
-stiffness limit. What leaves the range of numbers is infinite, and so is what
-depends on it; the rest stays finite.
+With evenly spaced samples every cell contains the same number of them. A table
+of exponentials, computed by doubling, then gives all samples from the states at
+the starts of the cells by a matrix product, also for several systems with the
+same input. Otherwise the cells are halved together, by the same squarings, until
+the Taylor series of the state converges in them, and samples are evaluated from
+that series. Neither way interpolates or has a stiffness limit. Values that
+overflow are infinite, and so is what depends on them; others stay finite.
 """
 
 from __future__ import annotations
@@ -33,20 +33,20 @@ from ctrlplan._types import Array
 from ctrlplan.simulation.pairs import pair_product, pair_sum
 
 _TERMS = 18
-"""Taylor terms of the input in a cell."""
+"""Number of Taylor terms of the input in a cell."""
 
 _CROSSOVER = 8
-"""Samples in a cell from which on a table for all cells is quicker than a series in each; and states up to which
-products of their matrices are quicker than steps one by one."""
+"""Number of samples in a cell above which a table for all cells is faster than a series in each; and number of states
+up to which products of step matrices are faster than single steps."""
 
 _POWERS = 5
-"""Powers of a matrix after the first of which norms are taken: p (p - 1) <= _TERMS + 2."""
+"""Number of further powers of a matrix with a computed norm: p (p - 1) <= _TERMS + 2."""
 
 _CANCELLED = 16.0
-"""Ratio of the terms of a matrix product to its result from which on it is made in twice the digits, or avoided."""
+"""Ratio of the terms of a matrix product to its result above which it is computed in twice the digits or avoided."""
 
 _NUMBERS = 2**17
-"""Numbers in an array of exponentials, where there is one for each spacing."""
+"""Maximum number of entries in an array of exponentials with one for each spacing."""
 
 Jet = Callable[[float, float, Array, int], Array]
 """(moment, origin, s, order) -> derivatives (order + 1, ninputs, ntime) at origin + s
@@ -69,7 +69,7 @@ def exact_states(
     a, b : ndarray, shapes (..., nstates, nstates) and (..., nstates, ninputs)
         The system; or, along one axis in front, several with the same input.
     jet : callable
-        Jets of the input, see `Jet`.
+        Jets of the input; see `Jet`.
     breakpoints : sequence of float
         Times [s] between which the input is analytic.
     timepts : ndarray, shape (ntime,)
@@ -77,7 +77,7 @@ def exact_states(
     initial : ndarray, shape (..., nstates)
         State at the first of them.
     read : ndarray, shape (..., nrows, nstates), optional
-        Combinations of states wanted in place of the states.
+        Output matrix: combinations of states to return in place of the states.
 
     Returns
     -------
@@ -124,9 +124,9 @@ def sampled_states(a: Array, b: Array, samples: Array, timepts: Array, initial: 
     out[:1] = state
     steps: Array = np.diff(timepts)
     even = _spacing(timepts - timepts[0], float(timepts[-1] - timepts[0]))
-    if even:  # spacings that differ by rounding alone share an exponential
+    if even:  # spacings that differ only by rounding share an exponential
         steps[:] = even
-    terms = np.concatenate([samples[:, :-1], np.diff(samples)]).T  # Taylor terms in the time of each interval
+    terms = np.concatenate([samples[:, :-1], np.diff(samples)]).T  # Taylor terms, in units of each interval
     part = max(1, _NUMBERS // max(1, scale.size * (scale.size + terms.shape[1])))
     with np.errstate(all="ignore"):
         if even and scale.size > _CROSSOVER:
@@ -148,9 +148,9 @@ def sampled_states(a: Array, b: Array, samples: Array, timepts: Array, initial: 
 
 
 def matrix_product(left: Array, right: Array) -> Array:
-    """Matrix product in which 0 times inf is 0 and what is undefined is infinite.
+    """Matrix product in which 0 times inf is 0 and undefined results are infinite.
 
-    A signal that has left the range of numbers spoils only what depends on it.
+    A signal that has overflowed affects only what depends on it.
     """
     with np.errstate(over="ignore", invalid="ignore"):
         product: Array = left @ right
@@ -168,25 +168,25 @@ def matrix_product(left: Array, right: Array) -> Array:
 
 
 def state_scale(a: Array) -> Array:
-    """Scale (nstates,) in which rows and columns of a system's matrix are of one size, powers of two."""
+    """Balancing scale (nstates,) of a system matrix, powers of two."""
     if not a.size:
         return np.ones(0)
-    with np.errstate(invalid="ignore"):  # scipy reads a scale as an index as well, which it does not use
+    with np.errstate(invalid="ignore"):  # scipy also converts the scale to an index, which is not used
         scale: Array = matrix_balance(a, permute=False, separate=True)[1][0]
     return scale
 
 
 def largest_change(a: Array, duration: float) -> float:
-    """Largest number in exp(a t) - 1 for t = duration, duration/2, ..., 0."""
+    """Largest magnitude in exp(a t) - 1 for t = duration, duration/2, ..., 0."""
     with np.errstate(all="ignore"):
         changes = _changes(duration * a, np.zeros((len(a), 0)), 1)
     return max(float(np.abs(change).max(initial=0.0)) for change in changes)
 
 
 def _balanced(a: Array, b: Array, initial: Array) -> tuple[Array, Array, Array, Array]:
-    """Scale (nstates,) of the states, and systems and initial states in it.
+    """Balancing scale (nstates,), and systems and initial states in it.
 
-    Powers of two, which change no digit, and let the cells be longer.
+    Powers of two, which cause no rounding; balancing allows longer cells.
     """
     scale = state_scale(np.abs(a).max(axis=0)) if a.size else np.ones(0)
     return scale, a * (scale / scale[:, None]), b / scale[:, None], initial / scale
@@ -203,11 +203,11 @@ def _segment(
     read: Array,
     out: Array,
 ) -> Array:
-    """Write what is read at the samples (times since `left`) of an analytic segment, return the states at its end."""
+    """Compute outputs at the samples (times since `left`) of an analytic segment; return the states at its end."""
     moment, duration = 0.5 * (left + right), right - left
 
     def series(starts: Array, h: float) -> Array:
-        """Taylor terms (nterms, ninputs, ncells) about the cells' starts, in units of h."""
+        """Taylor terms (nterms, ninputs, ncells) at the starts of the cells, in units of h."""
         factor = h ** np.arange(nterms, dtype=float) / _FACTORIALS[:nterms]
         return jet(moment, left, starts, nterms - 1) * factor[:, None, None]
 
@@ -216,7 +216,7 @@ def _segment(
     if per:
         h = per * float(samples[-1] - samples[0]) / (samples.size - 1)
         changes = _changes(h * a, h * b, nterms, halvings=per.bit_length() - 1)
-        while per >= _CROSSOVER and not np.isfinite(changes[-1]).all():  # an unstable system outgrows a cell
+        while per >= _CROSSOVER and not np.isfinite(changes[-1]).all():  # an unstable system overflows within a cell
             changes, per, h = changes[:-1], per // 2, 0.5 * h
         if per >= _CROSSOVER:
             return _even_segment(a, b, series, duration, nterms, per, h, changes, samples, state, read, out)
@@ -243,7 +243,7 @@ def _even_segment(
     read: Array,
     out: Array,
 ) -> Array:
-    """Same, for evenly spaced samples, a power of two of them, `per`, in each cell of length h."""
+    """The same for evenly spaced samples, `per` (a power of two) in each cell of length h."""
     (count, n), m = state.shape, b.shape[-1]
     whole, remainder = divmod(samples.size, per)
     last = int(duration // h)  # the cell in which the segment ends
@@ -253,7 +253,7 @@ def _even_segment(
     known[:, :, :n] = _marched(state, changes, cells[:, :, :-1]).swapaxes(1, 2)
     known[:, :, n:] = chain.T
 
-    table = np.zeros((count, n, per, known.shape[2]))  # from a cell's beginning to its samples
+    table = np.zeros((count, n, per, known.shape[2]))  # from the start of a cell to its samples
     if samples[0]:
         table[:, :, 0] = _part(a, b, nterms, h, samples[0] / h)
     have = 1
@@ -279,7 +279,7 @@ def _even_segment(
 
 
 def _part(a: Array, b: Array, nterms: int, h: float, part: float) -> Array:
-    """Change of states over a part of a cell, from states and the input's terms in the time of the whole cell."""
+    """Change of states over a fraction of a cell, from states and the input terms of the whole cell."""
     n, powers = a.shape[-1], np.repeat(part ** np.arange(nterms), b.shape[-1])
     change: Array = _changes(part * h * a, part * h * b, nterms)[-1]
     change[..., n:] *= powers
@@ -287,7 +287,7 @@ def _part(a: Array, b: Array, nterms: int, h: float, part: float) -> Array:
 
 
 def _any_segment(a: Array, b: Array, series: Array, samples: Array, state: Array) -> tuple[Array, Array]:
-    """States of one system at any samples, and at the end of the segment; the unit of time is a cell."""
+    """States of one system at arbitrary samples, and at the end of the segment; the unit of time is a cell."""
     n, ncells = len(a), series.shape[2]
     changes = _changes(a, b, len(series))
     states = _marched(state[None], [change[None] for change in changes], series)[0]
@@ -305,9 +305,9 @@ def _any_segment(a: Array, b: Array, series: Array, samples: Array, state: Array
         middle = _propagated(states, first, changes[: level + 1])
         states = np.stack([states, middle], axis=2).reshape(n, -1)
         series = np.stack([first, second], axis=3).reshape(*first.shape[:2], 2 * first.shape[2])
-        later = sigma >= 0.5  # doubling and this difference are exact, until nothing is left of any sample
+        later = sigma >= 0.5  # doubling and this difference are exact; repeated until all remainders are 0
         where, sigma = 2 * where + later, 2.0 * sigma - later
-        if states.shape[1] > 4 * samples.size + 64:  # stiff: only cells with samples in them matter
+        if states.shape[1] > 4 * samples.size + 64:  # stiff: only cells that contain samples are required
             used, where = np.unique(where, return_inverse=True)
             states, series = states[:, used], series[:, :, used]
     found = _evaluated(_taylor(h * a, h * b, states, series), where, sigma) if sigma.any() else states[:, where]
@@ -316,7 +316,7 @@ def _any_segment(a: Array, b: Array, series: Array, samples: Array, state: Array
 
 
 def _cells(jet: Callable[[Array, int], Array], duration: float) -> tuple[int, int]:
-    """Number of cells in which the input's Taylor series dies, and of its terms."""
+    """Number of cells in which the Taylor series of the input converges, and of its terms."""
     order = _TERMS + 7
     size = np.abs(jet(np.linspace(0.0, duration, 9), order)).max(axis=2)  # (order + 1, ninputs)
     if not np.isfinite(size[:_TERMS]).all():
@@ -327,7 +327,7 @@ def _cells(jet: Callable[[Array, int], Array], duration: float) -> tuple[int, in
     ncells = 1
     while ncells < 4096:
         terms = size * ((duration / ncells) ** np.arange(order + 1) / _LONG_FACTORIALS)[:, None]
-        # Terms larger than the input itself would cancel, and cost digits.
+        # Terms larger than the input itself would cancel with loss of digits.
         if np.all(terms[_TERMS:] <= 1e-17 * terms.max(axis=0)) and np.all(terms.sum(axis=0) <= 8.0 * terms[0]):
             break
         ncells *= 2
@@ -335,17 +335,17 @@ def _cells(jet: Callable[[Array, int], Array], duration: float) -> tuple[int, in
 
 
 def _samples_per_cell(samples: Array, duration: float, longest: float) -> int:
-    """Power of two of evenly spaced samples for each cell; 0 where they are uneven, or too few to be worth it."""
+    """Number of evenly spaced samples per cell, a power of two; 0 if they are uneven or too few."""
     step = _spacing(samples, duration) if samples.size >= 32 else 0.0
     if not step or max(samples[0], duration - samples[-1]) > step:
         return 0
-    # Longer cells than the square root and the table costs more than the march.
+    # Above the square root of the number of samples the table is more expensive than the propagation.
     maximum = min(longest / step - 1.0, 2.0 * samples.size**0.5)
     return 2 ** int(np.log2(maximum)) if maximum >= _CROSSOVER else 0
 
 
 def _spacing(samples: Array, duration: float) -> float:
-    """Spacing of evenly spaced samples, to rounding of the segment's own clock; 0 where they are not."""
+    """Spacing of evenly spaced samples, up to rounding of times in the segment; 0 if they are uneven."""
     if samples.size < 2:
         return 0.0
     step = float(samples[-1] - samples[0]) / (samples.size - 1)
@@ -354,13 +354,13 @@ def _spacing(samples: Array, duration: float) -> float:
 
 
 def _changes(a: Array, b: Array, nterms: int, halvings: int = 0) -> list[Array]:
-    """Change of states over ..., 1/4, 1/2, 1 units of time; at least so many halvings.
+    """Change of states over ..., 1/4, 1/2, 1 units of time, with a minimum number of halvings.
 
-    States (..., n, n + nterms * ninputs) from states and the input's Taylor
-    terms, each in the time that it is for. By the Taylor series up to the time
-    that `_products` gives for each system, then each from two of the one
-    before. The change, not the state: beside a fast mode, squaring would cost a
-    slow one a digit every three levels.
+    Matrices (..., n, n + nterms * ninputs) from states and Taylor terms of the
+    input, each in its own unit of time. By Taylor series up to the time given by
+    `_products` for each system, then by squaring. The change is squared instead
+    of the transition matrix: next to a fast mode a slow one would otherwise lose
+    a digit every three squarings.
     """
     if a.ndim == 2:
         return [change[0] for change in _changes(a[None], b[None], nterms, halvings)]
@@ -382,11 +382,11 @@ def _changes(a: Array, b: Array, nterms: int, halvings: int = 0) -> list[Array]:
 
 
 def _products(a: Array, b: Array) -> tuple[Array, NDArray[np.intp]]:
-    """Products a^k [a, b] (nsystems, n, n + ninputs, nproducts) in a time of 2^-halvings, and halvings (nsystems,).
+    """Products a^k [a, b] (nsystems, n, n + ninputs, nproducts) over a time of 2^-halvings, and halvings (nsystems,).
 
-    So many that the Taylor series converges: the roots of norms of the matrix's
-    powers are at most 1. Of a matrix that is not normal they are far smaller
-    than its norm. Al-Mohy and Higham, A new scaling and squaring algorithm for
+    The number of halvings ensures convergence of the Taylor series: the roots of
+    the norms of the powers of the matrix are at most 1. For a nonnormal matrix
+    they are much smaller than its norm. Al-Mohy and Higham, A new scaling and squaring algorithm for
     the matrix exponential, SIAM J. Matrix Anal. Appl. 31 (2009), 970-989:
     ``norm(a^k) <= max(norm(a^p)^(1/p), norm(a^(p+1))^(1/(p+1)))^k`` for k >= p (p - 1).
     """
@@ -402,7 +402,7 @@ def _products(a: Array, b: Array) -> tuple[Array, NDArray[np.intp]]:
         sizes = np.abs(products)[..., :n].sum(axis=2).max(axis=2)
         roots = sizes ** (1.0 / np.arange(1.0, _POWERS + 2.0)[:, None])
         root = np.maximum(roots[:-1], roots[1:]).min(axis=0)
-        # The bounds keep the products, and what rounding leaves of them, within the range of numbers.
+        # The bounds prevent overflow of the products and underflow of their rounding errors.
         saved = np.floor(-np.log2(np.clip(root, 2.0**-50, 1.0))) * (np.abs(b).max(axis=(1, 2), initial=0.0) < 1e200)
         saved = np.minimum(saved, halvings)
         halvings, factor = halvings - saved, 2.0 ** saved[:, None, None]
@@ -414,7 +414,7 @@ def _products(a: Array, b: Array) -> tuple[Array, NDArray[np.intp]]:
 
 
 def _doubled(products: Array, minimum: NDArray[np.intp], nterms: int, levels: int) -> list[Array]:
-    """Changes over 2^-levels, ..., 1/2, 1 units of time: by the series up to 2^-least, then by squaring."""
+    """Changes over 2^-levels, ..., 1/2, 1 units of time: by the series up to 2^-minimum, then by squaring."""
     n, m = products.shape[1], products.shape[2] - products.shape[1]
     shift, powers = _shift(nterms, m, 1.0), np.repeat(0.5 ** np.arange(nterms), m)
     orders = np.arange(1.0, products.shape[3] + 1.0)
@@ -430,7 +430,7 @@ def _doubled(products: Array, minimum: NDArray[np.intp], nterms: int, levels: in
             terms, shorter = (products, minimum) if not squared.any() else (products[~squared], minimum[~squared])
             if (shorter < level).any():
                 terms = terms * (0.5 ** (level - shorter[:, None, None, None])) ** orders
-            # By einsum, equal rows have equal sums, which a product of matrices does not promise.
+            # einsum gives equal sums for equal rows, which matmul does not guarantee.
             sums = np.einsum("rk,jk->rj", terms.reshape(-1, orders.size), _WEIGHTS[:nterms])
             change[~squared] = _arranged(sums, n, m)
         found.append(change)
@@ -438,7 +438,7 @@ def _doubled(products: Array, minimum: NDArray[np.intp], nterms: int, levels: in
 
 
 def _cancelling(left: Array, right: Array, result: Array) -> NDArray[np.bool_]:
-    """Products (...) of matrices that cost digits: with terms far larger than factors and result, and than 1."""
+    """Matrix products (...) with cancellation: terms much larger than factors and result, and than 1."""
     terms = (np.abs(left) @ np.abs(right)).max(axis=(-2, -1))
     sizes = (np.abs(matrix).max(axis=(-2, -1), initial=1.0) for matrix in (left, right, result))
     found: NDArray[np.bool_] = terms > _CANCELLED * reduce(np.maximum, sizes)
@@ -446,7 +446,7 @@ def _cancelling(left: Array, right: Array, result: Array) -> NDArray[np.bool_]:
 
 
 def _doubled_precisely(both: Array, minimum: NDArray[np.intp], nterms: int, levels: int) -> list[Array]:
-    """Same as `_doubled` in twice the digits, from [a, b] in a time of 2^-least."""
+    """The same as `_doubled` in double-double arithmetic, from [a, b] over a time of 2^-minimum."""
     n, m = both.shape[1], both.shape[2] - both.shape[1]
     powers = np.concatenate([np.ones(n), np.repeat(0.5 ** np.arange(nterms), m)])
     shift, orders = _shift(nterms, m, 1.0), np.arange(1.0, _TERMS + 2.0)
@@ -484,14 +484,14 @@ def _arranged(sums: Array, n: int, m: int) -> Array:
 
 @lru_cache(maxsize=64)
 def _shift(nterms: int, m: int, time: float) -> Array:
-    """Change of the input's Taylor terms over some time."""
+    """Change of the Taylor terms of the input over a time."""
     k = np.arange(nterms)
     powers = time ** np.maximum(k - k[:, None], 0.0)
     return np.kron(_PASCAL[:nterms, :nterms] * powers - np.eye(nterms), np.eye(m))
 
 
 def _followed(early: Array, change: Array, terms: Array) -> Array:
-    """Changes of states over some times (..., n, ntime, width), followed by one more change."""
+    """Changes of states over given times (..., n, ntime, width), followed by one more change."""
     n = change.shape[-2]
     both = early + change[..., None, :] + early[..., :n] @ change[..., None, :, :]
     both[..., n:] += early[..., n:] @ terms
@@ -503,7 +503,7 @@ def _followed(early: Array, change: Array, terms: Array) -> Array:
 
 
 def _marched(state: Array, changes: list[Array], series: Array) -> Array:
-    """States (nsystems, n, ncells + 1) at the ends of cells, with the input's terms (nterms, ninputs, ncells)."""
+    """States (nsystems, n, ncells + 1) at the ends of cells, with the input terms (nterms, ninputs, ncells)."""
     (count, n), ncells = state.shape, series.shape[2]
     states = np.empty((count, n, ncells + 1))
     states[:, :, 0] = state
@@ -521,16 +521,16 @@ def _marched(state: Array, changes: list[Array], series: Array) -> Array:
 
 
 def _first_overflow(states: Array) -> int:
-    """Index of the first time at which a state is not finite; their number where all are."""
+    """Index of the first time at which a state is not finite; the number of times if all are finite."""
     overflowed = ~np.isfinite(states).all(axis=0)
     return int(overflowed.argmax()) if overflowed.any() else overflowed.size
 
 
 def _propagated(states: Array, series: Array, changes: list[Array]) -> Array:
-    """States (n, ncells) after the last of some changes, of one system with the input's terms in each cell.
+    """States (n, ncells) of one system after the last of given changes, with the input terms in each cell.
 
-    Where that change is beyond the range of numbers, by shorter ones: what is
-    zero, or does not depend on what has overflowed, is not touched by it.
+    If that change has overflowed, by shorter ones: states that are 0 or do not
+    depend on what has overflowed are then not affected.
     """
     change = changes[-1]
     known = np.concatenate([states, series.reshape(-1, series.shape[2])])
@@ -558,8 +558,8 @@ def _propagated(states: Array, series: Array, changes: list[Array]) -> Array:
 def _recurrence(change: Array, forced: Array, state: Array) -> Array:
     """States (nsteps, n) after each of the steps x + change x + forced, shapes (nsteps, n, n) and (nsteps, n, 1).
 
-    Of few states in blocks of as many steps as there are blocks: all blocks
-    side by side from a state still unknown, then that state from block to block.
+    For few states in sqrt(nsteps) blocks: the affine map of each block is
+    computed for all blocks together, then the state from block to block.
     """
     nsteps, n = change.shape[:2]
     if n > _CROSSOVER:
@@ -583,7 +583,7 @@ def _recurrence(change: Array, forced: Array, state: Array) -> Array:
 
 
 def _one_by_one(change: Array, forced: Array, state: Array) -> Array:
-    """Same, each step from the one before."""
+    """The same, one step after the other."""
     found = np.empty(change.shape[:2])
     for k in range(len(found)):
         state = state + (change[k] @ state + forced[k, :, 0])
@@ -592,16 +592,16 @@ def _one_by_one(change: Array, forced: Array, state: Array) -> Array:
 
 
 def _halved(series: Array) -> tuple[Array, Array]:
-    """Taylor terms (nterms, ninputs, ncells) of the first and second half of each cell, in their own time."""
+    """Taylor terms (nterms, ninputs, ncells) of the first and second half of each cell, in units of a half."""
     nterms = len(series)
     halves = 0.5 ** np.arange(nterms, dtype=float)
-    # The polynomial of the whole cell about its middle, in the time of its second half.
+    # The polynomial of the cell about its midpoint, in units of its second half.
     second = (_PASCAL[:nterms, :nterms] * halves) @ series.reshape(nterms, -1)
     return series * halves[:, None, None], second.reshape(series.shape)
 
 
 def _taylor(a: Array, b: Array, states: Array, series: Array) -> list[Array]:
-    """Taylor terms of the state over the unit of time of the first of `_changes`."""
+    """Taylor terms of the state over the shortest time of `_changes`."""
     terms = [states]
     for j in range(_TERMS + 1):
         following = matrix_product(a, terms[-1])
@@ -612,7 +612,7 @@ def _taylor(a: Array, b: Array, states: Array, series: Array) -> list[Array]:
 
 
 def _evaluated(terms: list[Array], where: NDArray[np.intp], sigma: Array) -> Array:
-    """Taylor series of cells `where`, a fraction sigma into them."""
+    """Taylor series of the cells `where`, evaluated at the fractions sigma."""
     out = np.take(terms[-1], where, axis=1)
     gathered = np.empty_like(out)
     for term in reversed(terms[:-1]):
@@ -629,6 +629,6 @@ _LONG_FACTORIALS = np.cumprod(np.concatenate([[1.0], np.arange(1.0, _TERMS + 8)]
 _PASCAL: Array = np.triu(pascal(_TERMS, kind="upper")).astype(float)
 _RATIOS = [[Fraction(factorial(j), factorial(i + j + 1)) for i in range(_TERMS + 1)] for j in range(_TERMS)]
 _WEIGHTS: Array = np.array(_RATIOS, dtype=float)
-"""j!/(i + j + 1)!: what a^i b, in units of time, adds to the change of states by the input's Taylor term j."""
+"""j!/(i + j + 1)!: factor of a^i b in the change of states by Taylor term j of the input."""
 _WEIGHTS_ERROR: Array = np.array([[ratio - Fraction(float(ratio)) for ratio in row] for row in _RATIOS], dtype=float)
-"""What rounding cuts off them."""
+"""Their rounding errors."""

@@ -1,4 +1,4 @@
-"""A network run by Python: its equations, and the solver that takes them as they are."""
+"""Network evaluated by Python, and its solution by LSODA."""
 
 from __future__ import annotations
 
@@ -31,56 +31,56 @@ from ctrlplan.symbolic.isolation import untouched
 from ctrlplan.symbolic.trials import can_remember, trial_copy, values_of
 
 Call = Callable[[float, Array, Array], None]
-"""(t, state of the network, its signals): puts a block's outputs among the signals."""
+"""(t, state of the network, its signals): stores the outputs of a block in the signals."""
 
 _MIN_RTOL = 2.3e-14
-"""Smallest relative tolerance of scipy's solvers."""
+"""Minimum relative tolerance of the solvers of scipy."""
 
 _SHARED = tuple(int(part) for part in scipy.__version__.split(".")[:2]) < (1, 17)
-"""Whether all threads share the state of scipy's LSODA, which was Fortran before."""
+"""Whether all threads share the state of scipy's LSODA, as in its former Fortran version."""
 
 _LSODA_LOCK = threading.Lock()
-"""Held by the run that uses LSODA where its state is shared."""
+"""Lock of the run that uses LSODA, if its state is shared."""
 
 _CALLS, _INSTANT = 2000, 1e-9
-"""Calls about one instant, a part of the segment, after which a solver is taken to stay there."""
+"""Number of calls about one time (width relative to the segment) after which a solver counts as stalled."""
 
 _PASSING, _PASSED = 3000, 1e-7
-"""Calls of an explicit solver about such an instant, and the part of a segment after which it has passed it."""
+"""The same for an explicit solver, and the fraction of a segment after which it has passed that time."""
 
 _PASSES = 100
-"""Such instants of a segment."""
+"""Maximum number of such times in a segment."""
 
 _EVALUATIONS, _A_SEGMENT, _REVIEWED = 60_000, 300, 20_000
-"""Evaluations of a run, and more a segment, after which every so many the cause is looked for."""
+"""Evaluations of a run, plus those per segment, after which the cause is searched for, and how often."""
 
 
 class LoopError(RuntimeError):
-    """Blocks whose outputs depend on one another at once, without a solution found."""
+    """No solution found of an algebraic loop."""
 
 
 class SolverError(RuntimeError):
-    """A solver did not get through; the time is in the message."""
+    """The integrator failed; the message gives the time."""
 
 
 class FeedthroughError(RuntimeError):
-    """What depends on what at once is not what trials at the start of a run made of it."""
+    """The pattern of direct feedthrough has changed during a run."""
 
 
 class Interpreted:
-    """Equations of a network at some parameters, one call a block.
+    """Equations of a network with given parameters, one call of each block.
 
     Parameters
     ----------
     network : Network
-        What is run.
+        The network.
     params : mapping
-        Parameters of the run, which overrule the blocks' own.
+        Parameters of the run, which override those of the blocks.
     probe : (float, ndarray)
-        Time and state about which feedthrough is tried.
+        Time and state at which direct feedthrough is tested by trial calls.
     trials : bool, optional
-        Whether an algebraic loop that may be one may be ruled out by trying
-        what depends on what; it is then solved as one otherwise.
+        Whether trial calls may exclude a possible algebraic loop; if not, it is
+        solved as an algebraic loop.
     """
 
     def __init__(self, network: Network, params: Params, probe: tuple[float, Array], trials: bool = True) -> None:
@@ -99,14 +99,14 @@ class Interpreted:
         self._a, self._b, self._linear_columns, self._moving = _merged_linear(network)
 
     def rates(self, t: float, x: Array, time_values: Array) -> Array:
-        """Derivatives of all states, given the signals that are functions of time."""
+        """Derivatives of all states, from the values of the functions of time."""
         check(t)
         self.evaluations += 1
         w = self._signals(self._for_all if self._doubtful else self._for_rates, t, x, time_values)
         return self.rates_of(t, x, w)
 
     def rates_of(self, t: float, x: Array, w: Array) -> Array:
-        """The same, given all signals; the next states of a discrete system."""
+        """The same from all signals; for a discrete system the next states."""
         dx = self._a @ x + self._b @ w[self._linear_columns]
         for i in self._moving:
             place = self.network.states[i]
@@ -130,10 +130,11 @@ class Interpreted:
         return np.array(rows).T.reshape(-1, times.size)
 
     def sampled(self, blocks: tuple[int, ...], t: float, x: Array, time_values: Array) -> Array:
-        """State after some discrete blocks have taken a sample, each seeing the others' new outputs.
+        """State after a sample of some discrete blocks, which read each other's new outputs.
 
-        Blocks that declare `samples_first` go before the others and see
-        their own outputs as they were, which may come back to them at once.
+        Blocks that declare `samples_first` are sampled before the others and read
+        the signals with their own previous outputs, even if these are fed back
+        directly.
         """
         first = tuple(i for i in blocks if self.network.blocks[i].traits.samples_first)
         others = tuple(i for i in blocks if i not in first)
@@ -143,38 +144,38 @@ class Interpreted:
         return self._after(others, t, x, self._seen(others, t, x, time_values)) if others else x
 
     def _after(self, blocks: tuple[int, ...], t: float, x: Array, w: Array) -> Array:
-        """State after some blocks have taken a sample of some signals."""
+        """State after some blocks have sampled given signals."""
         network, after = self.network, x.copy()
         for i in blocks:
             place = network.states[i]
             with _named(network.blocks[i].name, t):
                 following = self._samples[i][1](t, x[place], network.fed[i](w))
-            if network.blocks[i].held is not None:  # what is held has become known with the signals
+            if network.blocks[i].held is not None:  # the held outputs are among the signals
                 following = np.concatenate([following, w[network.outputs[i]]])
             after[place] = following
         return after
 
     def _seen(self, blocks: tuple[int, ...], t: float, x: Array, time_values: Array) -> Array:
-        """Signals at an instant, the outputs of some blocks being those after a sample."""
+        """Signals at a time, with the outputs of some blocks after a sample."""
         if blocks not in self._for_samples:
             self._for_samples[blocks] = self._sampling(blocks)
         return self._signals(self._for_samples[blocks], t, x, time_values)
 
     def _sampling(self, blocks: tuple[int, ...]) -> list[Call]:
-        """Steps to all signals at the instant of a sample."""
+        """Steps to all signals at a sample time."""
         outputs = list(self._outputs)
         for i in blocks:
             outputs[i] = self._samples[i][0]
-        # Of the blocks that are sampled all outputs are held, whether another block reads them or not.
+        # All outputs of sampled blocks are held, whether another block reads them or not.
         needed = self.network.signals_of_inputs()
         for i in blocks:
             needed[self.network.outputs[i]] = True
         return self._steps(outputs, needed, self._feeds(blocks)[0])
 
     def _feeds(self, sampled: Sequence[int] = ()) -> tuple[list[NDArray[np.bool_]], list[int]]:
-        """Feedthrough of every block, and the blocks of which it was tried.
+        """Direct feedthrough of every block, and the blocks for which trial calls were made.
 
-        It is assumed where nothing is known, and tried only where a loop seems to be.
+        Unknown feedthrough is assumed; trial calls are made only for a possible algebraic loop.
         """
         network, (t, x) = self.network, self._probe
         sizes = [(block.system.noutputs, block.system.ninputs or 0) for block in network.blocks]
@@ -183,7 +184,7 @@ class Interpreted:
         every = np.ones(network.nsignals, dtype=bool)
         unknown = [i for i, k in enumerate(known) if k is None]
         doubtful: list[int] = []
-        # What a sample makes of its inputs is tried last: it may take long.
+        # Sample functions are tried last, since they may be slow.
         for group in ([i for i in unknown if i not in sampled], [i for i in unknown if i in sampled]):
             if not (self._trials and any(step.unknown is not None for step in network.schedule(feeds, every))):
                 break
@@ -196,11 +197,11 @@ class Interpreted:
         return feeds, doubtful
 
     def _check(self, t: float, x: Array, w: Array) -> None:
-        """Raise where an output is not what its block makes of all signals: it depends on more than trials found."""
+        """Raise if the outputs of a block at all signals differ: it has more feedthrough than the trials found."""
         for i, remembers in self._doubtful:
             block, outs = self.network.blocks[i], self.network.outputs[i]
             place, fed = self.network.states[i], self.network.fed[i](w)
-            if remembers:  # a call of its own would be remembered
+            if remembers:  # a further call would change its memory
                 block = replace(block, system=trial_copy(block.system))
             with untouched() if remembers else nullcontext():
                 found = values_of(block.output(self.params), t, x[place], fed)
@@ -240,14 +241,14 @@ class Interpreted:
                 w[unknown] = z
                 after = w.copy()
                 for call, rows in zip(calls, owned, strict=True):
-                    fed = w.copy()  # every block sees the trial values, not its neighbours' new ones
+                    fed = w.copy()  # every block reads the trial values, not new outputs of other blocks
                     call(t, x, fed)
                     after[rows] = fed[rows]
                 return np.asarray(after[unknown])
 
             start = w[unknown]
             if settles:
-                # Signals that only seem to be a loop are passed on from block to block, as python-control does.
+                # A loop that is not algebraic is resolved by substitution from block to block, as in python-control.
                 found = _passed_on(image, start, len(calls) + 1)
                 if found is not None:
                     w[unknown] = found
@@ -282,7 +283,7 @@ class Interpreted:
 
 
 class InterpretedSolver:
-    """LSODA on a network's equations, segment by segment."""
+    """LSODA for a network, segment by segment."""
 
     calls_blocks = relative_by_state = True
 
@@ -299,10 +300,10 @@ class InterpretedSolver:
         return self._equations.evaluations
 
     def count(self) -> None:
-        """Evaluations are counted as it is."""
+        """Start counting evaluations; here they are always counted."""
 
     def scaled_rates(self, t: float, z: Array, time_values: Array) -> Array:
-        """Rates of the states in their scales."""
+        """Derivatives of the scaled states."""
         scales = self._scales
         return np.asarray(self._equations.rates(t, scales.shift + scales.scale * z, time_values) / scales.scale)
 
@@ -311,11 +312,11 @@ class InterpretedSolver:
         return self._equations.all_signals(times, states, time_values)
 
     def outputs(self, times: Array, states: Array, time_values: Array) -> Array:
-        """Outputs (noutputs, ntime) of the whole."""
+        """Outputs (noutputs, ntime) of the network."""
         return self._equations.network.to_outputs(self.signals(times, states, time_values))
 
     def slopes(self, times: Array, states: Array, time_values: Array) -> Array:
-        """Derivatives of the rates by the states, by differences, (ntime, nstates, nstates)."""
+        """Jacobian by the states, by finite differences, (ntime, nstates, nstates)."""
         n = len(states)
         steps = 1e-7 * np.maximum(self._scales.scale, np.abs(states).max(axis=1, initial=0.0))
         plain = self.rates(times, states, time_values)
@@ -327,12 +328,12 @@ class InterpretedSolver:
         return found
 
     def rates(self, times: Array, states: Array, time_values: Array) -> Array:
-        """Rates (nstates, ntime) of the states."""
+        """Derivatives (nstates, ntime) of the states."""
         rows = [self._equations.rates(t, states[:, k], time_values[:, k]) for k, t in enumerate(times.tolist())]
         return np.array(rows).T.reshape(-1, times.size)
 
     def advance(self, series: Series, left: float, grid: Array, state: Array) -> Array:
-        """States (nstates, ngrid) at times of a segment, of which the last is its end."""
+        """States (nstates, ngrid) at times of a segment; the last is its end."""
         if not state.size:
             return np.zeros((0, grid.size))
         shift, scale = self._scales.shift, self._scales.scale
@@ -341,13 +342,13 @@ class InterpretedSolver:
         rates = _Watched(self, series, left, right)
         out = np.empty((state.size, grid.size))
         t, z = left, (state - shift) / scale
-        with np.errstate(over="ignore", invalid="ignore"):  # what is infinite ends the run, and is said then
+        with np.errstate(over="ignore", invalid="ignore"):  # infinite states end the run with an error
             for _ in range(_PASSES):
                 with _implicit() as kind:
                     t, z, why = self._marched(kind, rates, t, z, grid, out)
                 if t >= right:
                     return np.asarray(shift[:, None] + scale[:, None] * out)
-                # What no implicit step gets over an explicit one may pass: a state that comes to rest at a jump.
+                # An explicit step may pass where an implicit one fails: a state that stops at a discontinuity.
                 passed, z, _ = self._marched(RK45, rates, t, z, grid, out)
                 if passed - t < _PASSED * (right - left):
                     break
@@ -355,18 +356,18 @@ class InterpretedSolver:
         raise self._ended(rates, t, z, why)
 
     def instants(self, first: float, last: float, time_values: Callable[[Array], Array]) -> list[float]:
-        """Times at which equations switch: of functions in Python none are known but those declared."""
+        """Times at which the equations switch: for Python functions only the declared ones are known."""
         return []
 
     def review(self, rates: _Watched, t: float, z: Array) -> None:
-        """Raise where so many evaluations have a cause in a block.
+        """Raise if a block is the cause of too many evaluations.
 
         Raises
         ------
         SolverError
-            If more than 60,000 evaluations, and 300 a segment, have been spent
-            and a block jumps, has an infinite slope or is random there; looked
-            for every 20,000 evaluations.
+            If more than 60,000 evaluations, plus 300 per segment, have been made
+            and a block is discontinuous, has an infinite slope or is random
+            there; checked every 20,000 evaluations.
         """
         if self._equations.evaluations < max(self._next, _EVALUATIONS + _A_SEGMENT * self._segments):
             return
@@ -378,13 +379,13 @@ class InterpretedSolver:
     def _marched(
         self, kind: type[OdeSolver], rates: _Watched, t: float, z: Array, grid: Array, out: Array
     ) -> tuple[float, Array, str]:
-        """As far as a solver gets to the end of the segment: time, scaled state, and why not further.
+        """Time and scaled state reached towards the end of the segment, and the reason of a failure.
 
-        An explicit solver goes on only until its steps are long again.
+        An explicit solver is used only until its steps are long again.
         """
         right = float(grid[-1])
         rates.begin(_PASSING if kind is RK45 else _CALLS)
-        # What depends on time is seen at least once a sample: a pulse as long cannot be passed over unseen.
+        # Equations that depend on time are evaluated at least once per sample: no longer pulse is skipped.
         longest = float(np.diff(grid, prepend=rates.left).max()) if self._bounded else math.inf
         solver = kind(rates, t, z, right, rtol=self._rtol, atol=self._atol, max_step=longest)
         if isinstance(solver, LSODA):
@@ -412,7 +413,7 @@ class InterpretedSolver:
         time_values = rates.series(t)
         try:
             w = equations.signals(t, x, time_values)
-        except Exception:  # outside of a block's domain, and no help
+        except Exception:  # outside the domain of a block
             return ""
         return cause(equations.network, equations.params, t, x, w, rates.right - rates.left)
 
@@ -425,7 +426,7 @@ class InterpretedSolver:
 
 @contextmanager
 def _implicit() -> Iterator[type[OdeSolver]]:
-    """LSODA, or BDF while another run, in a thread or inside a block, holds an LSODA whose state is shared."""
+    """LSODA; BDF while another run, in a thread or inside a block, uses an LSODA with shared state."""
     if not _SHARED:
         yield LSODA
     elif _LSODA_LOCK.acquire(blocking=False):
@@ -438,7 +439,7 @@ def _implicit() -> Iterator[type[OdeSolver]]:
 
 
 class _named:  # noqa: N801 (a context, of which a run opens thousands)
-    """Context that says in which block, and when, an error happened."""
+    """Context that adds block and time to an error."""
 
     __slots__ = ("_name", "_t")
 
@@ -456,7 +457,7 @@ class _named:  # noqa: N801 (a context, of which a run opens thousands)
 
 
 def _merged_linear(network: Network) -> tuple[Array, Array, NDArray[np.intp], list[int]]:
-    """Linear blocks as one: rates a x + b w of some signals w, and which; and the other blocks with states."""
+    """All linear blocks as one, a x + b w, with the indices of the signals w; and the other blocks with states."""
     a = np.zeros((network.nstates, network.nstates))
     b = np.zeros((network.nstates, network.nsignals))
     moving = []
@@ -470,18 +471,18 @@ def _merged_linear(network: Network) -> tuple[Array, Array, NDArray[np.intp], li
 
 
 def _used(matrix: Array) -> tuple[Array, NDArray[np.intp]]:
-    """Columns that are not 0, and which."""
+    """Nonzero columns and their indices."""
     columns = np.flatnonzero(matrix.any(axis=0))
     return matrix[:, columns], columns
 
 
 def _passed_on(image: Callable[[Array], Array], start: Array, times: int) -> Array | None:
-    """Signals that no longer change when they are passed on; None where they still do."""
+    """Fixed point of repeated substitution of signals; None if it is not reached."""
     z = image(start)
     for _ in range(times):
         try:
             following = image(z)
-        except Exception:  # these are no signals of the loop yet, and may lie outside of a block's domain
+        except Exception:  # intermediate signals may be outside the domain of a block
             return None
         if np.array_equal(following, z, equal_nan=True):
             return z
@@ -490,14 +491,14 @@ def _passed_on(image: Callable[[Array], Array], start: Array, times: int) -> Arr
 
 
 def _root(residual_of: Callable[[Array], Array], guess: Array, names: str, t: float) -> Array:
-    """Solution of an algebraic loop by Newton's iteration, in one step where it is linear."""
+    """Solution of an algebraic loop by Newton's iteration; one step if it is linear."""
     z = guess.copy()
     residual = residual_of(z)
 
     def trial_residual(z: Array) -> Array:
         try:
             return residual_of(z)
-        except Exception:  # outside of a block's domain
+        except Exception:  # outside the domain of a block
             return np.full(z.size, np.nan)
 
     for _ in range(50):
@@ -532,11 +533,11 @@ def _root(residual_of: Callable[[Array], Array], guess: Array, names: str, t: fl
 
 
 class _StalledError(Exception):
-    """A solver that gets no further than one instant."""
+    """A solver has stalled at one time."""
 
 
 class _Failures(dict[int, str]):
-    """Messages of LSODA that are raised in place of being shown as warnings."""
+    """Messages of LSODA, raised as errors instead of warnings."""
 
     def get(self, key: int, default: object = None) -> NoReturn:
         raise _StalledError(f"LSODA: {super().get(key, default)}")
@@ -549,7 +550,7 @@ def _raise_failures(solver: LSODA) -> None:
 
 
 class _Watched:
-    """Right-hand side of scaled states over a segment, which ends a solver that stays at one instant."""
+    """Right-hand side of scaled states over a segment, which raises if a solver stalls."""
 
     def __init__(self, solver: InterpretedSolver, series: Series, left: float, right: float) -> None:
         self._solver, self.series, self.left, self.right = solver, series, left, right
@@ -557,7 +558,7 @@ class _Watched:
         self.begin(_CALLS)
 
     def begin(self, calls: int) -> None:
-        """Count anew, with so many calls about one instant."""
+        """Reset the counter, with a maximum number of calls about one time."""
         self._calls, self._about, self._count = calls, -math.inf, 0
 
     def __call__(self, t: float, z: Array) -> Array:

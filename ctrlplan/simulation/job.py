@@ -21,21 +21,21 @@ _EVENT_TIMES = 400, 20_000
 """Minimum and maximum number of times, in addition to the sample times, at which signals of events are evaluated."""
 
 _EVENT_TIMES_A_PERIOD = 16
-"""Such times in a period of the fastest oscillation about the state where a run begins."""
+"""Number of such times per period of the fastest oscillation about the initial state."""
 
 
 @dataclass(frozen=True, eq=False)
 class Job:
-    """What one call of `simulate` is to run.
+    """Simulation to be run: the checked arguments of `simulate`.
 
     Attributes
     ----------
     prepared : Prepared
-        Built form of the system.
+        Internal form of the system.
     times : ndarray, shape (ntime,)
         Sample times [s].
     inputs : list of TimeSignal
-        Signals at the inputs, in order.
+        Input signals, in order.
     state : ndarray, shape (nstates,)
         Initial state.
     params : dict
@@ -45,11 +45,12 @@ class Job:
     events : sequence of Event or None
         See `simulate`.
     network : Network or None
-        Blocks that are run; of another attempt copies, which have the memory that the blocks had before.
+        Blocks that are run. For another attempt they are copies, with the memory
+        that the blocks had before the first.
     reason : str
-        Why the method was chosen that runs the job.
+        Why the method that runs the job was chosen.
     trials : bool
-        Whether trial calls at the start may rule out an algebraic loop.
+        Whether trial calls at the start may exclude an algebraic loop.
     """
 
     prepared: Prepared
@@ -66,18 +67,18 @@ class Job:
 
     @property
     def blocks(self) -> Network:
-        """Network that is run."""
+        """Network of blocks; raises if there is none."""
         if self.network is None:
             raise NotCompiledError(self.prepared.unsupported)
         return self.network
 
     @property
     def first(self) -> float:
-        """Where the run begins [s]."""
+        """Start of the run [s]."""
         return float(self.times[0])
 
     def watched(self) -> tuple[Watched, ...]:
-        """Events of the call, and those that blocks declare unless an empty sequence was given."""
+        """Events given by the user and declared by blocks; none if an empty sequence was given."""
         prepared = self.prepared
         # An output hides an input or a state of the same name.
         kinds = (("u", prepared.input_labels), ("x", prepared.state_labels), ("y", prepared.output_labels))
@@ -95,20 +96,20 @@ class Job:
 
 @dataclass(frozen=True, eq=False)
 class Record:
-    """States at the times of a run, and how to evaluate it elsewhere.
+    """States at the times of a run, with functions that evaluate it at other times.
 
     Attributes
     ----------
     times, states : ndarray, shapes (ntime,) and (nstates, ntime)
-        As far as the run went.
+        Up to the end of the run.
     snapshot : callable
         Maps times and states to all signals.
     interpolate : callable
         Maps k and a time between times[k] and the next to the state there.
     watched : tuple of Watched
-        Signals whose limits count as events.
+        Signals with limits that are events.
     method, reason : str
-        What ran, and why.
+        Name of the method used, and why it was chosen.
     """
 
     times: Array
@@ -120,12 +121,12 @@ class Record:
     reason: str
 
     def state_at(self, k: int, t: float) -> Array:
-        """State at a time from times[k] to the next."""
+        """State at a time between times[k] and times[k + 1]."""
         return self.interpolate(k, t) if t > self.times[k] else self.states[:, k]
 
 
 def with_event_times(times: Array, watched: Sequence[Watched], slope: Callable[[], Array]) -> Array:
-    """Sample times, and more where events are watched, so that no crossing is missed between two."""
+    """Sample times, with further ones if there are events, so that crossings between samples are detected."""
     if not watched:
         return times
     matrix = slope()
@@ -138,12 +139,12 @@ def with_event_times(times: Array, watched: Sequence[Watched], slope: Callable[[
 def _of_block(
     function: BlockFunction, states: slice, fed: Callable[[Array], Array], params: Params, seen: Snapshot
 ) -> Array:
-    """Signal that a block declares, from its states and inputs."""
+    """Signal declared by a block, from its states and inputs."""
     return np.asarray(function(seen.t, seen.x[states], fed(seen.w), params))
 
 
 def fresh_job(job: Job) -> Job:
-    """Same job for another attempt, its sampled blocks with the memory that they have now."""
+    """Same job for another attempt, with copies of the sampled blocks and their present memory."""
     network = job.network
     if network is None or not any(can_remember(network.blocks[i].system) for i in network.blocks_with("period")):
         return job

@@ -1,4 +1,4 @@
-"""A linear interconnection of python-control as one state-space form."""
+"""State-space form of a linear interconnection of python-control."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from ctrlplan.traits import traits_of
 from ctrlplan.trajectories import Trajectory
 
 _FAST, _GROWING = 1e9, 20.0
-"""Durations in units of the fastest pole, and of the fastest growth, up to which rounding stays below `_UNCERTAIN`."""
+"""Durations relative to the fastest pole, and to the fastest growth, up to which rounding stays below `_UNCERTAIN`."""
 
 _UNCERTAIN = 1e-6
 
@@ -32,9 +32,9 @@ class LinearForm:
     Attributes
     ----------
     a, b, c, d : ndarray
-        The matrices; w is the external inputs, then the sources' outputs.
+        The matrices; w contains the external inputs, then the outputs of sources.
     sources : tuple of (Trajectory, int)
-        Each source block's plan and highest derivative; its outputs go axis
+        Plan and highest derivative of each source; its outputs are ordered axis
         by axis.
     """
 
@@ -45,16 +45,16 @@ class LinearForm:
     sources: tuple[tuple[Trajectory, int], ...]
 
     def outputs(self, states: Array, inputs: Array) -> Array:
-        """Outputs (noutputs, ntime); a state that has overflowed spoils only those that see it."""
+        """Outputs (noutputs, ntime); an overflowed state affects only those that depend on it."""
         with np.errstate(over="ignore", invalid="ignore"):
             found: Array = matrix_product(self.c, states) + self.d @ inputs
         found[np.isnan(found)] = np.inf
         return found
 
     def sensitivity(self, duration: float) -> tuple[bool, bool, bool]:
-        """Whether growth, poles so fast, or a matrix so far from normal, make a run depend on last digits to 1e-6.
+        """Whether growth, fast poles or nonnormality amplify rounding errors above 1e-6 over a duration [s].
 
-        The duration is in s. A perturbation of the matrix changes its
+        A perturbation of the matrix changes its
         exponential by at most duration * norm(perturbation) * max(norm(exp(A t)))^2.
         """
         if not self.a.size:
@@ -66,13 +66,13 @@ class LinearForm:
         scale = state_scale(self.a)
         a = duration * self.a * (scale / scale[:, None])
         rounding = np.finfo(float).eps * np.abs(a).sum(axis=0).max()
-        # norm(exp(a)) <= exp(greatest eigenvalue of the symmetric part), which most often is enough.
+        # norm(exp(a)) <= exp(largest eigenvalue of the symmetric part), which is usually sufficient.
         bound = np.exp(np.clip(np.linalg.eigvalsh(a + a.T).max(), 0.0, 700.0))
         nonnormal = rounding * bound > _UNCERTAIN and rounding * largest_change(a, 1.0) ** 2 > _UNCERTAIN
         return False, False, bool(nonnormal)
 
     def rounding(self, states: Array, inputs: Array) -> Array:
-        """What rounding of states and inputs of a size leaves in the outputs, shape (noutputs,)."""
+        """Rounding errors of the outputs for states and inputs of given size, shape (noutputs,)."""
         scale = state_scale(self.a)
         largest = np.abs(states / scale[:, None]).max(initial=0.0)
         fed = np.abs(self.c) @ scale * largest + np.abs(self.d) @ np.abs(inputs).max(axis=1, initial=0.0)
@@ -80,14 +80,14 @@ class LinearForm:
 
 
 def linear_form(system: System) -> LinearForm:
-    """Flatten a linear system, nested interconnections and plan sources included.
+    """Linear form of a system, nested interconnections and plan sources included.
 
-    States, inputs and outputs keep python-control's order.
+    States, inputs and outputs are in the order of python-control.
 
     Raises
     ------
     NotLinearError
-        If a block is nonlinear or discrete; its name is in the message.
+        If a block is nonlinear or discrete; the message names it.
     ValueError
         If blocks form an algebraic loop without a unique solution, or a matrix
         is not finite.
@@ -97,15 +97,15 @@ def linear_form(system: System) -> LinearForm:
 
 
 def linear_forms(systems: Sequence[System]) -> LinearForm:
-    """Flatten linear systems of one wiring together, as `linear_form` does each.
+    """Linear forms of systems with equal connections, stacked.
 
     Raises
     ------
     NotLinearError
         If a block is nonlinear or discrete.
     ValueError
-        If a loop has no unique solution, or the systems differ in more than
-        the numbers in their blocks.
+        If an algebraic loop has no unique solution, or the systems differ in more
+        than numerical values.
     """
     kinds = {_kind(system) for system in systems}
     if len(kinds) > 1:
@@ -131,7 +131,7 @@ def linear_forms(systems: Sequence[System]) -> LinearForm:
 
 
 def in_right_half(poles: NDArray[np.inexact]) -> NDArray[np.bool_]:
-    """Which poles lie in the right half plane, beyond rounding."""
+    """Which poles lie in the right half plane by more than rounding."""
     return np.asarray(poles.real > 1e-9 * np.maximum(1e-300, np.abs(poles)))
 
 
@@ -201,7 +201,7 @@ def _interconnections(systems: Sequence[System]) -> LinearForm:
 
 
 def _diagonal(blocks: list[Array]) -> Array:
-    """Matrices (nsystems, ., .) one after the other along the diagonal."""
+    """Block-diagonal matrices of stacks (nsystems, ., .)."""
     height, width = (sum(block.shape[axis] for block in blocks) for axis in (1, 2))
     out = np.zeros((len(blocks[0]), height, width))
     row = column = 0
@@ -213,9 +213,9 @@ def _diagonal(blocks: list[Array]) -> Array:
 
 
 def _singular_loop(closing: Array) -> NDArray[np.intp]:
-    """Signals of a loop without a unique solution in any of the systems; none where there is none.
+    """Signals of an algebraic loop without a unique solution in one of the systems; empty if there is none.
 
-    Only signals that depend on one another at once are judged: large gains in a row are no loop.
+    Only strongly connected signals are tested: large gains in series are not a loop.
     """
     size = closing.shape[1]
     reach = (closing != 0.0) | np.eye(size, dtype=bool)

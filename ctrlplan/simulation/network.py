@@ -1,10 +1,10 @@
-"""An interconnection as one list of blocks, each called once a step in order.
+"""Interconnection as a flat list of blocks, each called once per step.
 
-python-control calls every block several times to settle static connections,
-at every level of nesting. Here the connections of all levels become one matrix
-between the innermost blocks, and a schedule made from their true feedthrough
-says in which order their outputs are known. All signals stand in one vector:
-first the external inputs, then the outputs of the blocks.
+python-control calls every block several times to resolve static connections, at
+every level of nesting. Here the connections of all levels are combined into one
+matrix between the innermost blocks, and the order of evaluation follows from
+their direct feedthrough. All signals form one vector: first the external inputs,
+then the outputs of the blocks.
 """
 
 from __future__ import annotations
@@ -33,40 +33,40 @@ _TIME, _INPUT = 0, 2
 
 
 class UnsupportedError(ValueError):
-    """A construct that only python-control knows how to run; the block is named."""
+    """Only python-control can run a block; the message names it."""
 
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """Innermost block and the parameters that reach it, before those of a run."""
+    """Innermost block, and its parameters before those of a run."""
 
     system: System
     params: Params
 
     @property
     def name(self) -> str:
-        """What python-control calls it."""
+        """Name of the block."""
         return str(self.system.name)
 
     @cached_property
     def traits(self) -> BlockTraits:
-        """What the block has declared."""
+        """Declared traits of the block."""
         return traits_of(self.system)
 
     @property
     def linear(self) -> bool:
-        """Whether four matrices say it all."""
+        """Whether the block is linear and time-invariant, a state-space model."""
         return isinstance(self.system, ct.StateSpace)
 
     @property
     def plan(self) -> Trajectory | None:
-        """What the block puts out, where that is a plan."""
+        """Plan of a source block; None for other blocks."""
         plan = self.traits.plan
         return plan if isinstance(plan, Trajectory) else None
 
     @property
     def delay(self) -> float | None:
-        """How much later [s] the block puts out what goes in, where it does only that."""
+        """Delay [s] of a delay block; None for other blocks."""
         return self.traits.delay
 
     @property
@@ -76,7 +76,7 @@ class Block:
 
     @property
     def changes_unseen(self) -> bool:
-        """Whether the equations may switch at times that nobody has named, if they depend on time."""
+        """Whether the equations may switch at undeclared times, if they depend on time."""
         named = self.traits.breakpoints is not None or self.period is not None
         functions = (
             (self.system.outfcn, self.system.updfcn) if not (self.linear or self.is_time_function or named) else ()
@@ -85,22 +85,22 @@ class Block:
 
     @property
     def depends_on_time(self) -> bool:
-        """Whether a function of the block can read the time, by its code."""
+        """Whether a function of the block can read t, according to its code."""
         return any(f is not None and reads(f, _TIME) for f in (self.system.outfcn, self.system.updfcn))
 
     @property
     def held(self) -> System | None:
-        """Discrete system inside a sampled block whose held outputs are the block's; None of other blocks."""
+        """Discrete system whose held outputs are those of a sampled block; None for other blocks."""
         inner = self.traits.block if self.period is not None else None
         return inner if inner is not None and inner.noutputs == self.system.noutputs else None
 
     @property
     def is_time_function(self) -> bool:
-        """Whether the outputs are, over a segment, functions of time alone."""
+        """Whether the outputs are functions of time only over a segment."""
         return self.plan is not None or self.delay is not None
 
     def output(self, params: Params) -> BlockMap:
-        """Outputs, at the parameters of a run."""
+        """Output function with the parameters of a run."""
         if self.linear:
             c, d = np.asarray(self.system.C, dtype=float), np.asarray(self.system.D, dtype=float)
             return lambda t, x, u: c @ x + d @ u
@@ -110,7 +110,7 @@ class Block:
         return lambda t, x, u: out(t, x, u, own)
 
     def update(self, params: Params) -> BlockMap:
-        """Rates of a continuous block, next states of a discrete one."""
+        """State derivatives of a continuous block, next states of a discrete one."""
         if self.linear:
             a, b = np.asarray(self.system.A, dtype=float), np.asarray(self.system.B, dtype=float)
             return lambda t, x, u: a @ x + b @ u
@@ -120,10 +120,10 @@ class Block:
         return lambda t, x, u: update(t, x, u, own)
 
     def sampled(self, params: Params) -> tuple[BlockMap, BlockMap]:
-        """Outputs of a discrete block in a continuous loop when it takes a sample, and its states after it.
+        """Output and update functions of a discrete block in a continuous loop at a sample time.
 
-        Of a system that is held, output and update apart; the update returns
-        its states alone, behind which the held outputs follow.
+        For a held system, the update returns its states only; the held outputs
+        are appended to them.
         """
         sample, own = self.traits.sample, {**self.params, **params}
         inner = self.held
@@ -142,14 +142,14 @@ class Block:
 
 @dataclass(frozen=True)
 class Step:
-    """Blocks of which outputs become known together.
+    """Blocks whose outputs are evaluated together.
 
     Attributes
     ----------
     blocks : tuple of int
-        One block; or those of an algebraic loop.
+        One block, or those of an algebraic loop.
     unknown : ndarray or None
-        Of a loop, where its signals stand.
+        Indices of the signals of an algebraic loop.
     """
 
     blocks: tuple[int, ...]
@@ -158,7 +158,7 @@ class Step:
 
 @dataclass(frozen=True, eq=False)
 class WatchedSignal:
-    """Signal of a block that declares its limits: a function of (t, x, u, params) of the block, time last."""
+    """Signal with limits that a block declares: a function of its (t, x, u, params), time last."""
 
     name: str
     function: BlockFunction
@@ -171,24 +171,24 @@ class WatchedSignal:
 
 @dataclass(frozen=True, eq=False)
 class Network:
-    """Innermost blocks and how they are joined.
+    """Innermost blocks and their connections.
 
     Attributes
     ----------
     name : str
-        Of the whole.
+        Name of the system.
     blocks : tuple of Block
-        In python-control's order of states.
+        In the order of the states in python-control.
     wire : ndarray, shape (inputs of all blocks, nsignals)
-        The blocks' inputs from all signals.
+        Matrix from all signals to the inputs of the blocks.
     read : ndarray, shape (noutputs, nsignals)
-        The outputs of the whole from all signals.
+        Matrix from all signals to the outputs of the system.
     ninputs : int
-        External inputs, the first of the signals.
+        Number of external inputs, the first of the signals.
     breakpoints : tuple of float
-        Times [s] that blocks name at which their equations change.
+        Declared times [s] at which the equations of blocks change.
     watched : tuple of WatchedSignal
-        Signals of blocks that declare limits.
+        Signals with limits that blocks declare.
     """
 
     name: str
@@ -201,12 +201,12 @@ class Network:
 
     @classmethod
     def of(cls, system: System) -> Network:
-        """Flatten a system, nested at will.
+        """Network of a system with any nesting.
 
         Raises
         ------
         UnsupportedError
-            If a block computes its states or outputs in a way of its own.
+            If a block overrides the equations of its class.
         """
         part = _flattened(system, {})
         _warn_of_shared_parameters(system)
@@ -221,29 +221,29 @@ class Network:
         return replace(network, watched=tuple(network._watched_signals()))
 
     def for_trials(self) -> Network:
-        """Same network with blocks whose memory, if they have one, is not that of the run."""
+        """Same network for trial calls, with copies of blocks that have memory."""
         remember = [not block.linear and can_remember(block.system) for block in self.blocks]
         pairs = zip(self.blocks, remember, strict=True)
         return replace(self, blocks=tuple(replace(b, system=trial_copy(b.system)) if r else b for b, r in pairs))
 
     def without_blocks(self) -> Network:
-        """What a run of a compiled form needs, without functions that cannot be sent to another process."""
+        """Network for runs of a compiled form, without functions that cannot be pickled."""
         watched = tuple(w for w in self.watched if _can_be_sent(w))
         return Network(self.name, (), self.wire[:0], self.read, self.ninputs, self.breakpoints, watched)
 
     @cached_property
     def states(self) -> list[slice]:
-        """Where each block's states stand."""
+        """Indices of the states of each block."""
         return _slices([b.system.nstates or 0 for b in self.blocks], 0)
 
     @cached_property
     def inputs(self) -> list[slice]:
-        """Where each block's inputs stand among the rows of `wire`."""
+        """Indices of the inputs of each block among the rows of `wire`."""
         return _slices([b.system.ninputs or 0 for b in self.blocks], 0)
 
     @cached_property
     def outputs(self) -> list[slice]:
-        """Where each block's outputs stand among the signals."""
+        """Indices of the outputs of each block among the signals."""
         return _slices([b.system.noutputs for b in self.blocks], self.ninputs)
 
     @cached_property
@@ -253,22 +253,22 @@ class Network:
 
     @cached_property
     def to_outputs(self) -> Callable[[Array], Array]:
-        """Map of all signals, time last, to the outputs of the whole."""
+        """Map of all signals, time last, to the outputs of the system."""
         return _product(self.read)
 
     @property
     def nstates(self) -> int:
-        """States of all blocks."""
+        """Number of states of all blocks."""
         return self.states[-1].stop
 
     @property
     def nsignals(self) -> int:
-        """External inputs and outputs of all blocks."""
+        """Number of signals: external inputs and outputs of all blocks."""
         return self.wire.shape[1]
 
     @cached_property
     def time_rows(self) -> NDArray[np.intp]:
-        """Signals that are functions of time alone over a segment: inputs, plans, delayed signals."""
+        """Indices of signals that are functions of time only over a segment: inputs, plans, delayed signals."""
         rows = [np.arange(self.ninputs)]
         rows += [
             np.arange(place.start, place.stop)
@@ -278,24 +278,24 @@ class Network:
         return np.concatenate(rows)
 
     def blocks_with(self, kind: str) -> list[int]:
-        """Blocks of a kind: those with a period, a delay, ..."""
+        """Indices of the blocks of a kind: those with a period, a delay, ..."""
         return [i for i, block in enumerate(self.blocks) if getattr(block, kind) is not None]
 
     def schedule(self, feeds: Sequence[NDArray[np.bool_]], needed: NDArray[np.bool_]) -> list[Step]:
-        """Order in which the signals needed become known.
+        """Order in which the required signals are evaluated.
 
         Parameters
         ----------
         feeds : sequence of ndarray of bool, shape (noutputs, ninputs)
-            Which outputs of each block depend on which of its inputs at once.
+            Direct feedthrough of each block.
         needed : ndarray of bool, shape (nsignals,)
-            Signals needed.
+            Required signals.
 
         Returns
         -------
         list of Step
-            A block may stand in it twice. Signals that depend on one another
-            at once are one step.
+            A block may appear twice. The signals of an algebraic loop are one
+            step.
         """
         known = np.zeros(self.nsignals, dtype=bool)
         known[self.time_rows] = True
@@ -316,7 +316,7 @@ class Network:
         return steps
 
     def delays_feed_delays(self, feeds: Sequence[NDArray[np.bool_]]) -> bool:
-        """Whether what a delay puts out goes into one at once: jumps then go round for ever."""
+        """Whether the output of a delay reaches a delay by direct feedthrough: jumps then recur without end."""
         depends, delays = _dependencies(self, feeds), self.blocks_with("delay")
         if not delays:
             return False
@@ -325,11 +325,11 @@ class Network:
         return any(reached[self.outputs[i]].any() for i in delays)
 
     def signals_of_inputs(self) -> NDArray[np.bool_]:
-        """Which signals feed a block at all."""
+        """Which signals are inputs of a block."""
         return np.any(self.wire != 0.0, axis=0)
 
     def names(self, blocks: Sequence[int]) -> str:
-        """Blocks by name, in words."""
+        """Names of blocks, separated by commas."""
         return ", ".join(self.blocks[i].name for i in blocks)
 
     def _watched_signals(self) -> Iterator[WatchedSignal]:
@@ -342,10 +342,10 @@ class Network:
 
 
 def known_feedthrough(block: Block) -> NDArray[np.bool_] | None:
-    """Which outputs of a block depend on which inputs at once, (noutputs, ninputs), where that is certain.
+    """Direct feedthrough (noutputs, ninputs) of a block; None if it is not known.
 
-    Of linear blocks by their matrix; of others where they declare it, output
-    their states, or have a function that never reads its input.
+    It is known for linear blocks by their matrix D, and for others that declare
+    it, output their states, or do not read their input in the output function.
     """
     shape = (block.system.noutputs, block.system.ninputs or 0)
     if block.linear:
@@ -359,7 +359,7 @@ def known_feedthrough(block: Block) -> NDArray[np.bool_] | None:
 
 
 def sampled_feedthrough(block: Block) -> NDArray[np.bool_] | None:
-    """The same for a block at the instant of a sample, of which outputs follow from states after it."""
+    """The same for a sampled block at a sample time."""
     inner = block.held
     if inner is None or isinstance(inner, ct.InterconnectedSystem):
         return None
@@ -367,7 +367,7 @@ def sampled_feedthrough(block: Block) -> NDArray[np.bool_] | None:
 
 
 def tried_feedthrough(output: BlockMap, noutputs: int, nin: int, t: float, x: Array) -> NDArray[np.bool_]:
-    """Which outputs change when an input does, about a time and a state; all, where no trial tells."""
+    """Direct feedthrough by trial calls near a time and a state; True for inputs without a valid trial."""
     found = np.zeros((noutputs, nin), dtype=bool)
     known = np.zeros(nin, dtype=bool)
     rng = np.random.default_rng(1)
@@ -390,7 +390,7 @@ def tried_feedthrough(output: BlockMap, noutputs: int, nin: int, t: float, x: Ar
 
 
 def _once(sample: BlockMap) -> BlockMap:
-    """States after a sample, taken once though a run asks for them and for the outputs that follow from them."""
+    """Sample function that is evaluated once for equal arguments, for the states and for the outputs after it."""
     last: tuple[object, Array] = (None, np.empty(0))
 
     def sampled_once(t: float, x: Array, u: Array) -> Array:
@@ -411,13 +411,13 @@ class _Part:
     inner: Array
     outer: Array
     read: Array  # outputs of the level from the blocks' outputs
-    through: Array  # and from inputs of the level
+    through: Array  # outputs of the level from inputs of the level
 
 
 def _flattened(system: System, above: Params) -> _Part:
     if not isinstance(system, ct.InterconnectedSystem):
         return _innermost(system, above)
-    # python-control lets a level's parameters overrule those inside it.
+    # In python-control the parameters of a level override those inside it.
     params = {**system.params, **above}
     parts = [_flattened(block, params) for block in system.syslist]
     inner, outer, read, through = (
@@ -427,7 +427,7 @@ def _flattened(system: System, above: Params) -> _Part:
     external = np.asarray(system.input_map, dtype=float).reshape(len(connect), system.ninputs or 0)
     outputs = np.asarray(system.output_map, dtype=float)
     from_out, from_in = outputs[:, : len(read)], outputs[:, len(read) :]
-    # Parts take v = connect @ (read @ y + through @ v) + external @ r.
+    # Inputs of the parts: v = connect @ (read @ y + through @ v) + external @ r.
     wires = np.eye(len(connect)) - connect @ through
     if wires.size and np.linalg.matrix_rank(wires) < len(wires):  # numpy 1.26 has no rank of an empty matrix
         raise ValueError(f"connections must not form a loop without a block, got one in {system.name}")
@@ -456,7 +456,7 @@ def _innermost(system: System, above: Params) -> _Part:
 
 
 def _warn_of_shared_parameters(system: System) -> None:
-    """Two blocks with one key: python-control gives both the value of the last, and so does a run here."""
+    """Warn of blocks with a common key: python-control uses the value of the last for all, and so does this package."""
     if not isinstance(system, ct.InterconnectedSystem):
         return
     seen: dict[str, tuple[str, Value]] = {}
@@ -475,7 +475,7 @@ def _warn_of_shared_parameters(system: System) -> None:
 
 
 def _product(matrix: Array) -> Callable[[Array], Array]:
-    """Product with a matrix in which 0 times nan is 0: a signal that is lost is lost only where it goes."""
+    """Product with a matrix in which 0 times nan is 0: a nan affects only what depends on it."""
     rows, columns = np.nonzero(matrix)
     if np.array_equal(rows, np.arange(len(matrix))) and np.all(matrix[rows, columns] == 1.0):
         return partial(_selected, columns)
@@ -496,7 +496,7 @@ def _slices(counts: Sequence[int], first: int) -> list[slice]:
 
 
 def _dependencies(network: Network, feeds: Sequence[NDArray[np.bool_]]) -> NDArray[np.bool_]:
-    """Which signals depend on which at once, (nsignals, nsignals)."""
+    """Direct feedthrough between signals, (nsignals, nsignals)."""
     depends = np.zeros((network.nsignals, network.nsignals), dtype=bool)
     for feed, rows, columns in zip(feeds, network.outputs, network.inputs, strict=True):
         depends[rows] = feed.astype(int) @ (network.wire[columns] != 0.0).astype(int) > 0
@@ -504,7 +504,7 @@ def _dependencies(network: Network, feeds: Sequence[NDArray[np.bool_]]) -> NDArr
 
 
 def _reached(depends: NDArray[np.bool_], needed: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Signals needed, and those they depend on."""
+    """Required signals, and those they depend on."""
     wanted = needed.copy()
     while True:
         more = wanted | depends[wanted].any(axis=0)
@@ -514,7 +514,7 @@ def _reached(depends: NDArray[np.bool_], needed: NDArray[np.bool_]) -> NDArray[n
 
 
 def _first_loop(depends: NDArray[np.bool_], open_: NDArray[np.bool_]) -> NDArray[np.intp]:
-    """Signals among the open ones that depend on one another and on no other open one."""
+    """Strongly connected open signals that depend on no other open signal."""
     rows = np.flatnonzero(open_)
     among = depends[np.ix_(rows, rows)]
     count, group = connected_components(among, directed=True, connection="strong")
@@ -528,6 +528,6 @@ def _first_loop(depends: NDArray[np.bool_], open_: NDArray[np.bool_]) -> NDArray
 def _can_be_sent(what: object) -> bool:
     try:
         pickle.dumps(what)
-    except Exception:  # whatever pickle meets in a user's function
+    except Exception:  # any error of pickle with a user's function
         return False
     return True

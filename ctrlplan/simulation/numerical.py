@@ -1,4 +1,4 @@
-"""Numerical runs of a network: from segment to segment, in scales that fit the states."""
+"""Numerical runs of a network from segment to segment, with scaled states and error estimates."""
 
 from __future__ import annotations
 
@@ -24,53 +24,53 @@ from ctrlplan.simulation.signals import TimeSignal, breakpoints_of, signal_value
 from ctrlplan.symbolic.isolation import untouched
 
 VISITED = 12
-"""Visited states at which equations must be defined; and of a comparison where evaluations were not counted."""
+"""Number of visited states for checks, and for a comparison with Python without counted evaluations."""
 
 _PERTURBATION = 1e-6
-"""Distance, in the scales of the states, at which a neighbouring run starts."""
+"""Perturbation of the initial state of a neighbouring run, relative to the scales of the states."""
 
 _DISPLACED, _JITTER = 4, 1e-3
-"""Visited states that are displaced at random to see slopes elsewhere, and by which part of their size."""
+"""Number of visited states that are displaced at random for further Jacobians, and the relative displacement."""
 
 _STEEP = 30.0
-"""Change of a rate by a whole state, as its slope has it, over the largest rate, above which it bends on the way."""
+"""Ratio of (slope times state) to the largest derivative above which it counts as strongly nonlinear."""
 
 _GROWTH, _TIGHTEST = 30.0, 1e4
-"""Growth of a distance along a run above which steps are made with smaller tolerances, and how much smaller at most."""
+"""Growth of a perturbation along a run above which tolerances are reduced, and the maximum reduction."""
 
 _UNCERTAIN = 1e-6
-"""Uncertainty of an output, relative to its range, above which the response says so."""
+"""Uncertainty of an output, relative to its range, above which it is reported in the response."""
 
 
 class NumericalSolver(Solver, Protocol):
-    """Solver of a network's equations, and the equations themselves at many times."""
+    """Solver of the equations of a network, and the equations at many times."""
 
     switches: list[float]
-    """Times of the run [s] at which the equations jump, set before it: no evaluation lies on one."""
+    """Times of the run [s] at which the equations are discontinuous, set before it; they are not evaluated there."""
 
     @property
     def evaluations(self) -> int:
-        """Evaluations of the right-hand side so far, where they are counted."""
+        """Evaluations of the right-hand side so far, if they are counted."""
 
     @property
     def calls_blocks(self) -> bool:
-        """Whether the blocks' own functions are called, which may raise outside of their domain."""
+        """Whether functions of blocks are called, which may raise outside their domain."""
 
     @property
     def relative_by_state(self) -> bool:
         """Whether each state has a relative tolerance of its own."""
 
     def count(self) -> None:
-        """Count evaluations from now on."""
+        """Start counting evaluations."""
 
     def instants(self, first: float, last: float, values: Callable[[Array], Array]) -> list[float]:
-        """Times of a run at which the equations switch, where functions of time (n,) -> (nsignals, n) alone decide."""
+        """Times at which the equations switch depending on functions of time (n,) -> (nsignals, n) only."""
 
     def rates(self, times: Array, states: Array, time_values: Array) -> Array:
-        """Rates (nstates, ntime) of the states."""
+        """Derivatives (nstates, ntime) of the states."""
 
     def slopes(self, times: Array, states: Array, time_values: Array) -> Array:
-        """Derivatives of the rates by the states, (ntime, nstates, nstates)."""
+        """Jacobian by the states, (ntime, nstates, nstates)."""
 
 
 S = TypeVar("S", bound=NumericalSolver)
@@ -81,17 +81,17 @@ class NumericalMethod(Protocol[S]):
 
     @property
     def name(self) -> str:
-        """Name by which `simulate` takes it."""
+        """Name of the method in `simulate`."""
 
     def solver(self, attempt: Attempt[S]) -> S:
-        """Solver of one attempt, built before it runs."""
+        """Solver of an attempt, constructed before the run."""
 
     def check(self, attempt: Attempt[S]) -> None:
-        """Raise where what an attempt has found does not hold."""
+        """Raise if the result of an attempt is not valid."""
 
 
 def numerical(job: Job, method: NumericalMethod[S]) -> Record:
-    """Run from segment to segment, repeated where the scales of the states were not known."""
+    """Record of a numerical run, repeated with the scales of the states and if its accuracy requires it."""
     scales, fresh = Scales.plain(job.state.size, job.atol), fresh_job(job)
     attempt = Attempt(job, method, scales)
     attempt.go()
@@ -102,7 +102,7 @@ def numerical(job: Job, method: NumericalMethod[S]) -> Record:
         following = Attempt(fresh, method, found)
         try:
             following.go()
-        except SolverError:  # the run before stands, with what is said of its accuracy
+        except SolverError:  # the previous run is returned, with a note on its accuracy
             break
         scales, attempt = found, following
     if job.atol is None and attempt.expands():
@@ -113,7 +113,7 @@ def numerical(job: Job, method: NumericalMethod[S]) -> Record:
 
 
 def _tightened(attempt: Attempt[S], fresh: Job) -> Attempt[S]:
-    """Run whose errors of steps grow: measured by a run from beside, and made again with smaller ones."""
+    """Run repeated with smaller tolerances if a perturbation of the initial state grows, as a second run shows."""
     scales, perturbation = attempt.scales, _PERTURBATION * attempt.scales.scale
     perturbation = perturbation * np.where(np.arange(perturbation.size) % 2, -1.0, 1.0)
     try:
@@ -138,7 +138,7 @@ def _tightened(attempt: Attempt[S], fresh: Job) -> Attempt[S]:
 
 
 def _with_closer_states(attempt: Attempt[S], fresh: Job) -> Attempt[S]:
-    """Run again, with large states integrated more closely where others depend on them absolutely, as on an angle."""
+    """Run repeated with tighter tolerances of large states if others depend on their absolute error, as on an angle."""
     loose = attempt.loose()
     if not loose.any():
         return attempt
@@ -160,22 +160,22 @@ def _with_closer_states(attempt: Attempt[S], fresh: Job) -> Attempt[S]:
 
 @dataclass(eq=False)
 class Attempt(Generic[S]):
-    """One run with some scales of the states.
+    """One run with given scales of the states.
 
     Attributes
     ----------
     job, method, scales
-        What is run, how, and in which coordinates.
+        The job, the method, and the scales of the states.
     tighter : float
-        Factor by which the tolerances of a step are smaller than usual.
+        Factor by which the tolerances of a step are reduced.
     growth : float
-        Measured growth of the distance of neighbouring solutions.
+        Growth of a perturbation of the initial state.
     time_signals : list of TimeSignal
-        Inputs, then the outputs of blocks that are functions of time.
+        Inputs, then outputs of blocks that are functions of time.
     copies : Network
-        Same network, with blocks whose memory is not that of the run: for trial calls.
+        Network for trial calls, with copies of blocks that have memory.
     equations : Interpreted or None
-        By Python; None without blocks.
+        Equations evaluated by Python; None without blocks.
     """
 
     job: Job
@@ -203,7 +203,7 @@ class Attempt(Generic[S]):
         return any(entry.stop for entry in self.watched)
 
     def go(self) -> None:
-        """Run, and check what was found."""
+        """Run, and check the result."""
         job = self.job
         marks = self.solver.instants(job.first, float(job.times[-1]), lambda t: known_before(self.time_signals, t))
         self.solver.switches = sorted([*job.blocks.breakpoints, *marks])
@@ -221,7 +221,7 @@ class Attempt(Generic[S]):
         self.method.check(self)
 
     def loose(self) -> NDArray[np.bool_]:
-        """States (nstates,) whose tolerated error is too large for other states."""
+        """States (nstates,) whose tolerances are too large for the accuracy of other states."""
         states, scales = self.run.states, self.scales
         if len(states) < 2 or not np.isfinite(states).all():
             return np.zeros(len(states), dtype=bool)
@@ -229,7 +229,7 @@ class Attempt(Generic[S]):
         allowed = max(_UNCERTAIN, 100.0 * self.job.rtol) * np.ptp(states, axis=1) + 10.0 * scales.atol * scales.scale
         found = self.effects * error > allowed[:, None]
         if found.any() and self.job.blocks.blocks_with("period"):
-            # What feeds back from sample to sample is in no slope: only what others depend on absolutely counts.
+            # Feedback through samples is not in the Jacobian: only strongly nonlinear dependence counts.
             t, x, time_values = self.visited()
             size, rates = np.abs(states - scales.shift[:, None]).max(axis=1), self.solver.rates(t, x, time_values)
             found &= np.abs(self._slopes[: t.size]).max(axis=0) * size > _STEEP * np.abs(rates).max(
@@ -239,15 +239,15 @@ class Attempt(Generic[S]):
 
     @cached_property
     def effects(self) -> Array:
-        """Largest displacement of each state by a lasting one of another, of size 1, shape (nstates, nstates)."""
+        """Largest displacement of each state by a unit error of another, shape (nstates, nstates)."""
         return effects(self._slopes, float(self.run.times[-1] - self.run.times[0]))
 
     @cached_property
     def _slopes(self) -> Array:
-        """Derivatives of the rates by the states, (nplaces, nstates, nstates), first at the visited times."""
+        """Jacobians by the states, (nplaces, nstates, nstates), first at the visited times."""
         t, x, time_values = self.visited()
         some = slice(None, None, VISITED // _DISPLACED)
-        # Samples that are a turn of an angle apart see one slope of its sine, which may be 0.
+        # At samples that are full turns of an angle apart, the slope of its sine is the same and may be 0.
         displaced = x[:, some] * (1.0 + _JITTER * np.random.default_rng(0).uniform(-1.0, 1.0, x[:, some].shape))
         places = (
             np.append(t, t[some]),
@@ -264,9 +264,9 @@ class Attempt(Generic[S]):
         time_values: Array,
         shape: tuple[int, ...],
     ) -> Array:
-        """What a function of many times finds at states that a run need not have reached; nan where blocks raise.
+        """Values of a function at states that a run may not have reached; nan where blocks raise.
 
-        Its result has a shape, in which -1 stands for the times.
+        In `shape`, that of the result, -1 is the axis of the times.
         """
         if not self.solver.calls_blocks:
             return function(t, x, time_values)
@@ -277,7 +277,7 @@ class Attempt(Generic[S]):
                 return function(t[some], x[:, some], time_values[:, some])
             except (KeyboardInterrupt, TimeLimitError):
                 raise
-            except BaseException:  # outside of a block's domain, which a made-up argument may leave
+            except BaseException:  # outside the domain of a block, as a perturbed argument may be
                 return None
 
         with untouched():
@@ -288,7 +288,7 @@ class Attempt(Generic[S]):
         return np.concatenate([empty if part is None else part for part in found], axis=axis)
 
     def record(self) -> Record:
-        """What the run left, and how accurate it is where that is worse than usual."""
+        """Record of the run, with a note on its accuracy if that is insufficient."""
         said = _accuracy_note(self)
         reason = f"{self.job.reason}; {said}" if said else self.job.reason
         return Record(
@@ -296,7 +296,7 @@ class Attempt(Generic[S]):
         )
 
     def expands(self) -> bool:
-        """Whether neighbouring solutions may part, by the fastest growing motion along the run."""
+        """Whether neighbouring solutions may diverge, by the largest growth rate along the run."""
         t = self.visited()[0]
         slopes = self._slopes[: t.size]
         if t.size < 2 or not slopes.size or not np.isfinite(slopes).all():
@@ -306,7 +306,7 @@ class Attempt(Generic[S]):
 
     @property
     def tolerances(self) -> Tolerances:
-        """Tolerances of a step, so that the errors of all segments stay within those of the run."""
+        """Tolerances of a step for which the accumulated errors stay within the tolerances of the run."""
         job, network = self.job, self.job.blocks
         first, last = job.first, float(job.times[-1])
         marks = {t for t in (*breakpoints_of(self.time_signals), *network.breakpoints) if first < t < last}
@@ -314,7 +314,7 @@ class Attempt(Generic[S]):
         return Tolerances.of_run(job.rtol, self.scales, len(marks) + int(samples), self.tighter)
 
     def noise(self) -> Array:
-        """Rounding noise of the rates along the run, times its duration."""
+        """Rounding errors of the derivatives along the run, times its duration."""
         t, x, time_values = self.visited()
         rng = np.random.default_rng(0)
         plain, found = self.on_trial(self.solver.rates, t, x, time_values, (len(x), -1)), np.zeros(len(x))
@@ -325,7 +325,7 @@ class Attempt(Generic[S]):
         return found * float(self.run.times[-1] - self.run.times[0])
 
     def visited(self) -> tuple[Array, Array, Array]:
-        """Some times and states of the run, and the functions of time there."""
+        """Some times and states of the run, and the values of the functions of time."""
         some = np.unique(np.linspace(0, self.run.times.size - 1, VISITED).astype(int))
         t = self.run.times[some]
         return t, self.run.states[:, some], signal_values(self.time_signals, t)
@@ -355,12 +355,12 @@ class Attempt(Generic[S]):
 
 
 def equations_of(job: Job, network: Network) -> Interpreted | None:
-    """Equations by Python, where there are blocks."""
+    """Equations evaluated by Python; None without blocks."""
     return Interpreted(network, job.params, (job.first, job.state), job.trials) if network.blocks else None
 
 
 def _accuracy_note(attempt: Attempt[S]) -> str:
-    """What is uncertain in the outputs, and the tolerance that would do, in words; empty where nothing is."""
+    """Note on uncertain outputs with the tolerance that suffices; empty if there are none."""
     job, run, solver, scales = attempt.job, attempt.run, attempt.solver, attempt.scales
     some = np.unique(np.linspace(0, run.times.size - 1, VISITED).astype(int))
     t, x = run.times[some], run.states[:, some]
@@ -387,7 +387,7 @@ def _accuracy_note(attempt: Attempt[S]) -> str:
 
 
 def _slope(rates: Callable[[Array], Array], state: Array) -> Array:
-    """Derivatives of rates by the states, by differences."""
+    """Jacobian by the states, by finite differences."""
     steps = 1e-6 * (1.0 + np.abs(state))
     with np.errstate(all="ignore"):
         before = rates(state)

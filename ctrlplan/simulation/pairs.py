@@ -1,8 +1,8 @@
-"""Matrices of numbers in two parts, 106 binary digits together.
+"""Double-double matrices with 106 binary digits.
 
-A pair is two arrays of one shape, the numbers and what rounding has cut off
-them. Matrix products are made of products of leading digits, so short that
-floating point holds their sums without rounding.
+A pair consists of two arrays of equal shape, the numbers and their rounding
+errors. Matrix products are computed from products of leading digits, which are so
+few that floating-point sums of them are exact.
 
 References
 ----------
@@ -23,7 +23,7 @@ Pair = tuple[Array, Array]
 
 
 def pair_sum(*pairs: Pair) -> Pair:
-    """Sum of pairs of one shape."""
+    """Sum of pairs of equal shape."""
     total, error = pairs[0]
     for value, more in pairs[1:]:
         before, total = total, total + value
@@ -36,16 +36,16 @@ def pair_sum(*pairs: Pair) -> Pair:
 def pair_product(left: Pair, right: Pair, groups: int = 1) -> Pair:
     """Matrix product of pairs, (..., n, k) and (..., k, m).
 
-    The error is at most 8 k^2 2^-105 times the product of the largest numbers
-    in a row and in a column of k, and a few roundings of the single products.
+    The error is at most 8 k^2 2^-105 times the product of the largest magnitudes
+    in a row of `left` and a column of `right`, plus rounding of the products.
 
     Parameters
     ----------
     left, right : tuple of two ndarray
         The pairs.
     groups : int
-        Columns of `left` whose indices differ by multiples of this number are
-        of one size; others may be of another.
+        Columns of `left` whose indices differ by multiples of this number have a
+        common scale.
     """
     height, k = left[0].shape[-2:]
     size = np.abs(left[0]).reshape(*left[0].shape[:-2], height, -1, groups).max(axis=-2)
@@ -58,7 +58,7 @@ def pair_product(left: Pair, right: Pair, groups: int = 1) -> Pair:
 
 
 def _split(values: Pair, size: Array, digits: int) -> tuple[Array, Array, Array]:
-    """Binary digits of values, so many below the first one of a size, as many again, and the rest."""
+    """Leading binary digits of values relative to a size, the next as many digits, and the remainder."""
     unit = np.ldexp(1.5, np.frexp(size)[1] + 52 - digits)
     first = (values[0] + unit) - unit
     error, unit = values[0] - first, np.ldexp(unit, -digits)

@@ -1,18 +1,18 @@
-"""The scale of each state, in which a numerical solver controls its error.
+"""Scales of the states for the error control of a numerical solver.
 
-A position in micrometres and a force in meganewtons need absolute tolerances
-that are twelve powers of ten apart. The scale of a state is its largest
-displacement from its start during the run, which only a run tells: the first
-one is made with scales of 1, and it is repeated where a state moves a thousand
-times less, or a hundred times less than it is away from zero. A state that
-moves little about an offset is integrated as its displacement from there.
+A position in micrometres and a force in meganewtons require absolute tolerances
+that differ by twelve orders of magnitude. The scale of a state is its largest
+displacement from its initial value, which is known only after a run: the first
+run has scales of 1 and is repeated if a state moves by less than 1e-3, or by less
+than 1 % of its magnitude. A state with small motion about an offset is integrated
+as its displacement from there.
 
-An angle of thousands of turns is accurate to a small part of itself, and a
-position that depends on its sine is then not. Where the slopes of the rates at
-some states of a run show that the tolerated error of one state displaces
-another by more than is tolerated there, the run is repeated with a thousandth
-of the relative tolerance, of that state alone where the solver has tolerances
-by state; how far the two runs are apart tells the error.
+The relative error of an angle of thousands of turns can be small although that of
+a position that depends on its sine is not. If the Jacobian at some states of a run
+shows that the tolerated error of one state displaces another by more than its
+tolerance, the run is repeated with a thousandth of the relative tolerance, of that
+state alone if the solver has tolerances by state; the difference of the two runs
+is an estimate of the error.
 """
 
 from __future__ import annotations
@@ -27,45 +27,45 @@ from numpy.typing import NDArray
 from ctrlplan._types import Array
 
 RELATIVE = 1e-10
-"""Absolute tolerance of a state in its own scale, unless a number is given."""
+"""Default absolute tolerance of a state, relative to its scale."""
 
 PASSES = 4
-"""Runs at most until the scales are found."""
+"""Maximum number of runs until the scales are found."""
 
 _SMALL = 1e-3
-"""Part of the scale below which a state's displacement asks for a smaller one."""
+"""Fraction of the scale below which the displacement of a state requires a smaller scale."""
 
 _OFFSET = 1e-2
-"""Part of a state's size below which its displacement is what is integrated."""
+"""Fraction of the magnitude of a state below which its displacement is integrated instead."""
 
 _NOISE = 1e11
-"""Scale of a state whose rate is noise of size 1 over a run of length 1: a tenth of it is the tolerance."""
+"""Minimum scale of a state relative to the rounding errors of its derivative times the duration."""
 
 _ADDED = 0.3
-"""Error of a state at the end of a run, relative to the tolerance of the run, as errors of steps add up."""
+"""Accumulated error of a state at the end of a run, relative to the tolerance of the run."""
 
 _CLOSER = 1e-3
-"""Part of the relative tolerance with which large states are integrated that others depend on absolutely."""
+"""Fraction of the relative tolerance for large states whose absolute error affects others."""
 
 _OWN = 0.1
-"""Scale of such a state at most, as a part of its size."""
+"""Maximum scale of such a state, relative to its magnitude."""
 
 _FOLLOWED = 0.02
-"""Error of a run with the smaller tolerance, over that of the run before it; rounding besides."""
+"""Error of a run with the smaller tolerance relative to that of the run before it, without rounding."""
 
 _A_STEP, _A_SEGMENT = 100.0, 4.0
-"""Tolerance of a run over that of a step; or, of many segments, so many times their number."""
+"""Ratio of the tolerances of a run and a step: the first, or the second times the number of segments."""
 
 
 class Tolerances(NamedTuple):
-    """Tolerances of a step: relative, shape (nstates,), and in the scales of the states."""
+    """Tolerances of a step: relative, shape (nstates,), and absolute in the scales of the states."""
 
     rtol: Array
     atol: float
 
     @classmethod
     def of_run(cls, rtol: float, scales: Scales, nsegments: int, tighter: float = 1.0) -> Tolerances:
-        """Of a run that restarts at every segment: the errors of all add up."""
+        """Tolerances of a step for a run that restarts at every segment, where errors accumulate."""
         divisor = tighter * max(_A_STEP, _A_SEGMENT * nsegments)
         return cls(np.maximum(rtol * scales.relative / divisor, min(rtol, 1e-13)), scales.atol / divisor)
 
@@ -81,7 +81,7 @@ class Scales:
     atol : float
         Absolute tolerance in units of the scales.
     relative : ndarray, shape (nstates,)
-        Part of the relative tolerance that is used.
+        Factors of the relative tolerance.
     """
 
     shift: Array
@@ -91,19 +91,19 @@ class Scales:
 
     @classmethod
     def plain(cls, nstates: int, atol: float | None) -> Scales:
-        """The states as they are, with a tolerance in their own units."""
+        """Unscaled states, with a tolerance in their units."""
         return cls(np.zeros(nstates), np.ones(nstates), RELATIVE if atol is None else atol, np.ones(nstates))
 
     def renewed(self, states: Array, noise: Callable[[], Array]) -> Scales | None:
-        """Scales that fit the states of a run; None where these do.
+        """Scales for the states of a run; None if the present ones are adequate.
 
         Parameters
         ----------
         states : ndarray, shape (nstates, ntime)
-            States of the run, the first one at its start.
+            States of the run, from its start.
         noise : callable
-            Returns the rounding noise of each rate times the duration, shape
-            (nstates,): a state is not followed more closely.
+            Returns the rounding error of each derivative times the duration, shape
+            (nstates,): a lower bound of the tolerances.
         """
         moved = np.abs(states - states[:, :1]).max(axis=1, initial=0.0)
         size = np.abs(states).max(axis=1, initial=0.0)
@@ -120,23 +120,23 @@ class Scales:
         return replace(self, shift=shift, scale=np.minimum(scale, np.where(small, self.scale, np.inf)))
 
     def uncertainty(self, states: Array, rtol: float) -> Array:
-        """Error that the states of a run are taken to have (nstates,), where errors of steps do not grow."""
+        """Estimated error (nstates,) of the states of a run if errors do not grow."""
         size = np.abs(states - self.shift[:, None]).max(axis=1, initial=0.0)
         return _ADDED * (rtol * self.relative * size + self.atol * self.scale)
 
     def with_closer_states(self, states: Array, loose: NDArray[np.bool_], noise: Array, by_state: bool) -> Scales:
-        """Scales with which large states that others depend on absolutely are integrated more closely.
+        """Scales with tighter tolerances for large states whose absolute error affects others.
 
         Parameters
         ----------
         states : ndarray, shape (nstates, ntime)
             States of a run.
         loose : ndarray of bool, shape (nstates,)
-            States whose relative tolerance was too large for others.
+            States whose relative tolerance is too large for others.
         noise : ndarray, shape (nstates,)
-            Rounding noise of each rate times the duration.
+            Rounding error of each derivative times the duration.
         by_state : bool
-            Whether the solver has relative tolerances by state; otherwise all get the smaller one.
+            Whether the solver has relative tolerances by state; otherwise all states get the smaller one.
         """
         size = np.abs(states - self.shift[:, None]).max(axis=1, initial=0.0)
         close = np.where(loose & (size > 0.0), np.maximum(_OWN * size, _NOISE * noise), np.inf)
@@ -152,15 +152,15 @@ def output_uncertainty(outputs: Callable[[Array], Array], states: Array, uncerta
     outputs : callable
         Maps states (nstates, npoints) at some times to outputs (noutputs, npoints).
     states : ndarray, shape (nstates, npoints)
-        States there.
+        States at these times.
     uncertainty : ndarray, shape (nstates,)
-        Of the states.
+        Uncertainty of the states.
     """
     plain = outputs(states)
     total = np.zeros(plain.shape)
     with np.errstate(all="ignore"):
         for i, error in enumerate(uncertainty.tolist()):
-            # A step that is large beside rounding, and small beside what bends the outputs.
+            # A step large compared with rounding and small compared with the curvature of the outputs.
             step = max(error, 1e-7 * float(np.abs(states[i]).max(initial=0.0))) or 1.0
             near = states.copy()
             near[i] += step
@@ -170,20 +170,20 @@ def output_uncertainty(outputs: Callable[[Array], Array], states: Array, uncerta
 
 
 def effects(slopes: Array, duration: float) -> Array:
-    """Largest displacement of each state by a lasting one of another, of size 1, shape (nstates, nstates).
+    """Largest displacement of each state by a unit error of another, shape (nstates, nstates).
 
     Parameters
     ----------
     slopes : ndarray, shape (npoints, nstates, nstates)
-        Derivatives of the rates by the states at points of a run.
+        Jacobians by the states at points of a run.
     duration : float
-        Of the run [s].
+        Duration of the run [s].
 
     Notes
     -----
-    With x' = J x + e/T, an error that builds up to e in the duration T, and J as
-    at one point, the mean of x weighted by exp(-t/T) is (I - T J)^-1 e. Growth
-    is left out: J is shifted so that no motion grows.
+    For x' = J x + e/T, an error that accumulates to e over the duration T, with J
+    at one point, the mean of x weighted by exp(-t/T) is (I - T J)^-1 e. Growth is
+    excluded: J is shifted so that no mode grows.
     """
     n = slopes.shape[1]
     slopes = slopes[np.isfinite(slopes).all(axis=(1, 2))]
@@ -197,18 +197,18 @@ def effects(slopes: Array, duration: float) -> Array:
 
 
 def remaining(apart: Array, states: Array, loose: NDArray[np.bool_], evaluations: int) -> float:
-    """Error of a run over its distance from the run before it, which was made with larger tolerances.
+    """Error of a run relative to its difference from the previous run with larger tolerances.
 
     Parameters
     ----------
     apart : ndarray, shape (nstates,)
-        Largest distance of each state between the runs.
+        Largest difference of each state between the runs.
     states : ndarray, shape (nstates, ntime)
         States of the run.
     loose : ndarray of bool, shape (nstates,)
-        States that were integrated more closely.
+        States with tighter tolerances.
     evaluations : int
-        Evaluations of the right-hand side: each rounds the states.
+        Evaluations of the right-hand side, each with rounding of the states.
     """
     size = np.abs(states).max(axis=1, initial=0.0)
     rounding = 0.25 * np.finfo(float).eps * size * evaluations

@@ -28,48 +28,49 @@ from ctrlplan.simulation.signals import (
 )
 
 _WIDTH = 24
-"""Terms with which a signal that will be delayed is kept."""
+"""Number of Chebyshev terms of a stored signal of a delay."""
 
 _SHORTEST = 1.0 / 64.0
-"""Segments this much shorter than the delay are not halved for a signal's sake."""
+"""Length of a segment relative to the delay below which it is not halved to resolve a signal."""
 
 _HOPS = 6
-"""Delays after which what was a jump is smooth enough to be passed over."""
+"""Number of delays after which a jump has become smooth enough to be ignored."""
 
 
 _SHORTEST_DELAY = 1e-5
+"""Minimum delay, relative to the run."""
 
 _TOLERANCE = 1e-12
-"""Part of a run by which two instants that are meant to be one may differ."""
+"""Difference of two times, relative to the run, up to which they are considered equal."""
 
 _DENOMINATOR = 10**7
-"""Largest denominator of times that are taken for fractions."""
+"""Maximum denominator of times that are interpreted as fractions."""
 
 _ROUNDINGS = 64.0
 """Rounding errors of a plan, in units of the last place of its largest values."""
 
 _SEGMENTS = 2_000
-"""Maximum number of segments in a run that blocks require by their longest step."""
+"""Maximum number of segments that the declared `longest` step of blocks may cause."""
 
 _MARKS = 20_000
-"""Instants of jumps that a run stops at, at most."""
+"""Maximum number of times of jumps at which a run stops."""
 
 
 class Solver(Protocol):
     """Integrator of the states over a segment."""
 
     def advance(self, series: Series, left: float, grid: Array, state: Array) -> Array:
-        """States (nstates, ngrid) at times of a segment, of which the last is its end."""
+        """States (nstates, ngrid) at times of a segment; the last is its end."""
 
     def signals(self, times: Array, states: Array, time_values: Array) -> Array:
         """All signals (nsignals, ntime)."""
 
     def outputs(self, times: Array, states: Array, time_values: Array) -> Array:
-        """Outputs (noutputs, ntime) of the whole."""
+        """Outputs (noutputs, ntime) of the network."""
 
 
 class DelayedSignal:
-    """Signals of the past, kept as series of the segments they were seen on."""
+    """Delayed signals, stored as Chebyshev series by segments."""
 
     def __init__(self, delay: float, initial: Array, first: float) -> None:
         self.delay, self.width = delay, initial.size
@@ -85,11 +86,11 @@ class DelayedSignal:
         self._ends.append(piece.right)
 
     def analytic_at(self, moment: float, origin: float, s: Array) -> Array:
-        """Values as they were; segments end where they break."""
+        """Stored values; segments end at their breakpoints."""
         return self.at(origin + s)
 
     def bounds(self, moment: float, left: float, right: float) -> tuple[Array, Array]:
-        """Bounds of the signals as they were."""
+        """Bounds of the stored signals."""
         low, high = np.full(self.width, np.inf), np.full(self.width, -np.inf)
         if left - self.delay < self._first:
             low, high = self._initial, self._initial
@@ -99,8 +100,8 @@ class DelayedSignal:
         return low, high
 
     def at(self, times: Array) -> Array:
-        """Values as they were."""
-        # A jump that arrives at a time is seen there, however the times were rounded.
+        """Stored values."""
+        # A jump that arrives at a time is included, whatever the rounding of the times.
         past = times - self.delay + self.tolerance
         out = np.repeat(self._initial[:, None], times.size, axis=1)
         which = np.array([bisect_right(self._ends, t) for t in past.tolist()])
@@ -113,16 +114,16 @@ class DelayedSignal:
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """What a run left behind.
+    """Result of a run.
 
     Attributes
     ----------
     times : ndarray, shape (ntime,)
-        Sample times and those at which segments begin [s], as far as the run went.
+        Sample times and starts of segments [s], up to the end of the run.
     states : ndarray, shape (nstates, ntime)
-        Right-continuous where a discrete block takes a sample.
+        Right-continuous at the samples of discrete blocks.
     segments : list of (float, Series)
-        Where each segment begins, and the signals that are functions of time over it.
+        Start of each segment, and the signals that are functions of time over it.
     """
 
     times: Array
@@ -130,7 +131,7 @@ class Run:
     segments: list[tuple[float, Series]]
 
     def series(self, t: float) -> Series:
-        """Signals that are functions of time over the segment that begins at or before a time."""
+        """Signals that are functions of time, over the segment that contains a time."""
         return self.segments[max(0, bisect_right(self.segments, t, key=lambda segment: segment[0]) - 1)][1]
 
 
@@ -150,25 +151,25 @@ def integrate(
     Parameters
     ----------
     network, equations, solver
-        What is run, its equations by Python, and the integrator.
+        The network, its equations by Python, and the integrator.
     time_signals : sequence of TimeSignal
         Signals at the inputs, then the outputs of each block that are functions of time.
     times : ndarray, shape (ntime,)
-        Times at which states are wanted; the run goes from the first to the last.
+        Times of the run, from its start to its end.
     state : ndarray, shape (nstates,)
-        Where it starts.
+        Initial state.
     resolution : float
-        Relative accuracy of signals kept for delays.
+        Relative accuracy of the stored signals of delays.
     marks : sequence of float, optional
         Further times [s] at which equations switch.
     pause : callable, optional
-        Maps the times and states of a segment to whether the run may end behind
+        Maps the times and states of a segment to whether the run may end after
         it; segments are then short.
 
     Raises
     ------
     SolverError
-        If the solver fails, or a state is no longer finite; the time is in the message.
+        If the solver fails or a state is not finite; the message gives the time.
     """
     first, last = float(times[0]), float(times[-1])
     memory = _Memory(network, solver, time_signals, resolution)
@@ -181,13 +182,13 @@ def integrate(
         longest = min(longest, (last - first) / 64.0)
     shortest = 1e-9 * (last - first) if stops_after is not None else np.inf
     rounding = _rounding(time_signals, np.union1d(np.linspace(first, last, 257), schedule.marks))
-    known: list[tuple[Array, Array]] = []  # times and states of each segment, its end left to the next
+    known: list[tuple[Array, Array]] = []  # times and states of each segment, without its end
     segments: list[tuple[float, Series]] = []
     span: list[Series] = []
     left, reach = first, longest
     x = schedule.sample(equations, first, state)
     while left < last:
-        check(left)  # CVODES is not stopped within a segment, whose steps are bounded
+        check(left)  # CVODES is not interrupted within a segment, which has a maximum number of steps
         right = schedule.following(left)
         right = schedule.on(times, right) if right - left <= reach * (1.0 + 1e-9) else left + reach
         if memory.delays or not (span and span[-1].right >= right):
@@ -222,7 +223,7 @@ def integrate(
 
 
 def _longest(network: Network, delays: list[float], duration: float) -> float:
-    """Longest segment of a run [s] that its delays and the declarations of its blocks allow."""
+    """Maximum length of a segment [s], from the delays and the declarations of the blocks."""
     longest = min([duration, *delays])
     if longest < _SHORTEST_DELAY * duration:
         raise ValueError(
@@ -233,7 +234,7 @@ def _longest(network: Network, delays: list[float], duration: float) -> float:
 
 
 def _rounding(time_signals: Sequence[TimeSignal], times: Array) -> Array:
-    """Rounding errors of signals (nsignals,): where the terms of a plan cancel, those of its largest values."""
+    """Rounding errors of signals (nsignals,), of the size of those of their largest values."""
     largest = np.abs(known_before(time_signals, times)).max(axis=1)
     return np.asarray(_ROUNDINGS * np.finfo(float).eps * np.where(np.isfinite(largest), largest, 0.0))
 
@@ -241,7 +242,7 @@ def _rounding(time_signals: Sequence[TimeSignal], times: Array) -> Array:
 def _resolved(
     time_signals: Sequence[TimeSignal], moment: float, left: float, until: float, accuracy: float, rounding: Array
 ) -> list[Series]:
-    """Series, with their bounds, of the signals that hold at a moment."""
+    """Series and bounds of the signals in the segment of a time."""
     signals = partial(_analytic_at, time_signals, moment, left)
     return [
         series.bounded(*_bounds(time_signals, moment, series.left, series.right))
@@ -250,7 +251,7 @@ def _resolved(
 
 
 class _Memory:
-    """What goes into delays, kept segment by segment."""
+    """Stored inputs of the delays, segment by segment."""
 
     def __init__(self, network: Network, solver: Solver, time_signals: Sequence[TimeSignal], resolution: float) -> None:
         blocks = network.blocks_with("delay")
@@ -261,11 +262,11 @@ class _Memory:
         self.delays = [signal.delay for signal in self._time_signals]
 
     def nodes(self, left: float, right: float) -> Array:
-        """Times of a segment at which states are needed."""
+        """Times of a segment at which states are required."""
         return chebyshev_times(left, right, _WIDTH) if self._time_signals else np.empty(0)
 
     def record(self, left: float, right: float, series: Series, grid: Array, states: Array) -> bool:
-        """Keep a segment; False where it must be shorter for its signals to be resolved."""
+        """Store a segment; False if it must be shorter to resolve its signals."""
         if not self._time_signals:
             return True
         nodes = self.nodes(left, right)
@@ -279,11 +280,11 @@ class _Memory:
 
 
 class _Schedule:
-    """Instants at which a segment must end: breakpoints, and samples of discrete blocks.
+    """Times at which a segment must end: breakpoints, and sample times of discrete blocks.
 
-    Sample instants are multiples of a common tick, offset + k period as whole
-    numbers: 3 times 0.1 s is 0.3 s. A breakpoint that differs from an instant
-    by rounding is at that instant, and its sample sees what holds after it.
+    Sample times offset + k period are computed in rational arithmetic: 3 times
+    0.1 s is 0.3 s. A breakpoint that differs from a sample time by rounding is
+    considered equal; the sample then reads the values after it.
     """
 
     def __init__(
@@ -314,7 +315,7 @@ class _Schedule:
         return self._fixed
 
     def following(self, t: float) -> float:
-        """The next instant after t."""
+        """The next time after t."""
         due = self.fixed_after(t)
         sample = float(self._samples[0][0]) if self._samples else np.inf
         return sample if sample <= min(due + self._tolerance, self._fixed[-1]) else due
@@ -324,13 +325,13 @@ class _Schedule:
         return self._fixed[min(bisect_right(self._fixed, t + self._tolerance), len(self._fixed) - 1)]
 
     def on(self, times: Array, t: float) -> float:
-        """Sample time that equals an instant but for rounding, so that it counts as after it."""
+        """Output time that equals a time up to rounding, so that its values are those after it."""
         near = times[max(0, int(np.searchsorted(times, t)) - 1) :][:2]
         close = near[np.abs(near - t) <= self._tolerance]
         return float(close[0]) if close.size else t
 
     def sample(self, equations: Interpreted | None, t: float, x: Array) -> Array:
-        """State after the blocks due at t have taken their samples."""
+        """State after the samples of all blocks that are due at t."""
         due = []
         while self._samples and float(self._samples[0][0]) <= t + self._tolerance:
             instant, i = self._samples[0]
@@ -342,20 +343,20 @@ class _Schedule:
         return equations.sampled(tuple(sorted(due)), t, x, np.concatenate([np.zeros((0, 1)), *seen])[:, 0])
 
     def _after(self, signal: TimeSignal, t: float) -> float:
-        """Time at which a signal is read at an instant: at its breakpoint, where the two differ by rounding."""
+        """Time at which a signal is evaluated: its breakpoint if the two differ by rounding."""
         marks = signal.breakpoints
         k = int(np.searchsorted(marks, t))
         return float(marks[k]) if k < len(marks) and marks[k] - t <= self._tolerance else t
 
 
 def _fraction(seconds: float) -> Fraction:
-    """The fraction that a decimal or a quotient of small numbers was meant to be; otherwise the number itself."""
+    """Fraction with a small denominator that a number represents; otherwise its exact value."""
     simple = Fraction(seconds).limit_denominator(_DENOMINATOR)
     return simple if abs(float(simple) - seconds) <= 1e-15 * abs(seconds) else Fraction(seconds)
 
 
 def known_before(time_signals: Sequence[TimeSignal], times: Array) -> Array:
-    """Signals (nsignals, ntime) that are known before a run; 0 for those that a delay outputs."""
+    """Signals (nsignals, ntime) that are known before a run; 0 for the outputs of delays."""
     rows = [
         np.zeros((signal.width, times.size)) if isinstance(signal, DelayedSignal) else signal.at(times)
         for signal in time_signals
@@ -373,7 +374,7 @@ def _bounds(time_signals: Sequence[TimeSignal], moment: float, left: float, righ
 
 
 def _combined_bounds(wire: Array, time_rows: NDArray[np.intp], series: Series) -> tuple[Array, Array]:
-    """Bounds of sums of signals, where only functions of time are summed."""
+    """Bounds of sums of functions of time; infinite for other sums."""
     others = np.delete(wire, time_rows, axis=1)
     known = ~np.any(others != 0.0, axis=1)
     weights = wire[:, time_rows]
@@ -385,7 +386,7 @@ def _combined_bounds(wire: Array, time_rows: NDArray[np.intp], series: Series) -
 
 
 def _fixed(marks: Sequence[float], first: float, last: float, delays: list[float], hops: int) -> list[float]:
-    """Breakpoints inside the run, and the times to which delays shift them."""
+    """Breakpoints inside the run, also after shifts by delays."""
     found = {t for t in marks if first < t < last}
     fresh = {*found, first}
     for _ in range(hops if delays else 0):
@@ -397,7 +398,7 @@ def _fixed(marks: Sequence[float], first: float, last: float, delays: list[float
 
 
 def apart(times: list[float]) -> list[float]:
-    """Increasing times without those that are the same but for rounding; first and last stay."""
+    """Increasing times without those that are equal up to rounding; first and last are preserved."""
     distinct = [times[0]]
     for t in times[1:-1]:
         if t - distinct[-1] > 1e-14 * max(abs(t), times[-1] - times[0]) < times[-1] - t:

@@ -1,8 +1,8 @@
-"""Signals that are functions of time alone, as one short Chebyshev series a segment.
+"""Signals that are functions of time only, as Chebyshev series by segments.
 
-A plan is analytic between its breakpoints. A solver evaluates it,
-with all its derivatives, thousands of times: it does so by the series. Values at
-the sample times are the plan's own jets.
+A plan is analytic between its breakpoints. A solver evaluates it and its
+derivatives thousands of times, which the series makes fast. Values at the sample
+times are those of the plan itself.
 """
 
 from __future__ import annotations
@@ -25,23 +25,23 @@ from ctrlplan.trajectories.files import signal_rows
 Inputs = Trajectory | ArrayLike | Mapping[str, Trajectory | ArrayLike] | None
 
 WIDTHS = (1, 8, 16, 24, 32, 40, 48, 64)
-"""Numbers of terms of a series; a segment that needs more is halved."""
+"""Numbers of terms of a series; a segment that requires more is halved."""
 
 RESOLVED = 4e-15
-"""Size of the last terms, relative to the largest, at which a signal counts as resolved."""
+"""Magnitude of the last terms, relative to the largest, at which a signal counts as resolved."""
 
 
 _FLAT = 1e-7
-"""Relative size of terms that no longer fall, up to which they are taken for rounding errors."""
+"""Relative magnitude up to which terms that no longer decrease count as rounding errors."""
 
 _DENSE = np.cos(np.linspace(0.0, np.pi, 4 * WIDTHS[-1]))
-"""Where a series is compared with its bounds."""
+"""Points at which a series is compared with its bounds."""
 
 _ROUNDING = 1e-13
-"""Size, relative to the terms of a series, up to which it leaves its bounds by rounding."""
+"""Violation of the bounds, relative to the terms of a series, that counts as rounding."""
 
 _NOISE = 1e-11
-"""Size of the later half of the longest series up to which it is taken for noise."""
+"""Relative magnitude up to which the later half of the longest series counts as rounding errors."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,8 +51,8 @@ class Series:
     Attributes
     ----------
     low, high : ndarray, shape (nsignals,)
-        Bounds that no value may leave, as it would by rounding; infinite where
-        none is known.
+        Bounds to which values are clipped, since rounding may violate them;
+        infinite if they are not known.
     """
 
     left: float
@@ -67,7 +67,7 @@ class Series:
         if width == 1:
             return self.coefficients[:, 0]
         u = (2.0 * t - self.left - self.right) / (self.right - self.left)
-        # A solver's trial step may look a little beyond the segment.
+        # A trial step of a solver may end slightly beyond the segment.
         angle = math.acos(min(1.0, max(-1.0, u)))
         values = self.coefficients @ np.cos(angle * _counts(width))
         return np.asarray(np.minimum(np.maximum(values, self.low), self.high))
@@ -79,7 +79,7 @@ class Series:
         return np.asarray(np.clip(values, self.low[:, None], self.high[:, None]))
 
     def bounded(self, low: Array, high: Array) -> Series:
-        """Same signals with bounds, where they leave these by rounding alone."""
+        """Same signals with bounds, unless they violate these by more than rounding."""
         dense = np.polynomial.chebyshev.chebval(_DENSE, self.coefficients.T)
         slack = _ROUNDING * np.abs(self.coefficients).sum(axis=1)
         return replace(
@@ -90,7 +90,7 @@ class Series:
 
 
 class TimeSignal(Protocol):
-    """Some signals that are functions of time, analytic between breakpoints."""
+    """Signals that are functions of time, analytic between breakpoints."""
 
     @property
     def breakpoints(self) -> Array:
@@ -98,15 +98,15 @@ class TimeSignal(Protocol):
 
     @property
     def width(self) -> int:
-        """How many signals."""
+        """Number of signals."""
 
     def analytic_at(self, moment: float, origin: float, s: Array) -> Array:
         """Values (nsignals, ntime) at origin + s of the analytic functions that hold at `moment`."""
 
     def bounds(self, moment: float, left: float, right: float) -> tuple[Array, Array]:
-        """Minima and maxima (nsignals,) between two times that no breakpoint parts; infinite where not known.
+        """Minima and maxima (nsignals,) between two times without a breakpoint in between; infinite if unknown.
 
-        Where a signal exceeds them between the ends, they are ignored.
+        Bounds that a signal exceeds between the ends are ignored.
         """
 
     def at(self, times: Array) -> Array:
@@ -122,21 +122,21 @@ class PlanSignal:
 
     @property
     def breakpoints(self) -> Array:
-        """Those of the plan."""
+        """Breakpoints of the plan."""
         return self.plan.breakpoints
 
     @property
     def width(self) -> int:
-        """Signals of all axes."""
+        """Number of signals of all axes."""
         return self.plan.naxes * (self.derivatives + 1)
 
     def analytic_at(self, moment: float, origin: float, s: Array) -> Array:
-        """Values of the segment that holds at `moment`."""
+        """Values of the segment that contains `moment`."""
         jet = self.plan.segment_jet_at(moment, origin, s, self.derivatives)
         return jet.transpose(1, 0, 2).reshape(-1, s.size)
 
     def bounds(self, moment: float, left: float, right: float) -> tuple[Array, Array]:
-        """The plan's own values at both ends."""
+        """Bounds by the values of the plan at both ends."""
         return _ordered(self.analytic_at(moment, left, np.array([0.0, right - left])))
 
     def at(self, times: Array) -> Array:
@@ -145,31 +145,31 @@ class PlanSignal:
 
 
 class SampledSignal:
-    """One signal given by samples, straight in between; it breaks where it bends."""
+    """Signal given by samples, linear in between; its breakpoints are changes of slope."""
 
     width = 1
 
     def __init__(self, times: Array, values: Array) -> None:
         line = np.interp(times, times[[0, -1]], values[[0, -1]])
         if np.abs(values - line).max() <= 4.0 * np.finfo(float).eps * np.abs(values).max():
-            times, values = times[[0, -1]], values[[0, -1]]  # one line but for rounding
+            times, values = times[[0, -1]], values[[0, -1]]  # one line up to rounding
         self.times, self.values = times, values
         slope = np.diff(values) / np.diff(times)
         self.breakpoints = times[1:-1][slope[1:] != slope[:-1]]
 
     def analytic_at(self, moment: float, origin: float, s: Array) -> Array:
-        """Values of the straight line that holds at `moment`."""
+        """Values of the straight line that contains `moment`."""
         left = min(max(int(np.searchsorted(self.times, moment)) - 1, 0), self.times.size - 2)
         (t0, t1), (v0, v1) = self.times[left : left + 2], self.values[left : left + 2]
         return (v0 + (v1 - v0) * ((origin - t0 + s) / (t1 - t0)))[None]
 
     def bounds(self, moment: float, left: float, right: float) -> tuple[Array, Array]:
-        """The samples between which a straight line runs."""
+        """Bounds by the samples at both ends of a straight line."""
         start = min(max(int(np.searchsorted(self.times, moment)) - 1, 0), self.times.size - 2)
         return _ordered(self.values[None, start : start + 2])
 
     def at(self, times: Array) -> Array:
-        """Values between the samples."""
+        """Interpolated values."""
         after = np.clip(np.searchsorted(self.times, times, side="right"), 1, self.times.size - 1)
         first, second = self.values[after - 1], self.values[after]
         found = np.interp(times, self.times, self.values)
@@ -177,12 +177,12 @@ class SampledSignal:
 
 
 def input_signals(labels: Sequence[str], inputs: Inputs, times: Array) -> list[TimeSignal]:
-    """Signals at the inputs of a system, in order.
+    """Input signals of a system, in order.
 
     Raises
     ------
     ValueError
-        If an input is unknown, or what is given does not fit the inputs or the times.
+        If an input is unknown, or signals do not fit the inputs or the times.
     """
     given: list[Trajectory | ArrayLike]
     if isinstance(inputs, Mapping):
@@ -194,7 +194,7 @@ def input_signals(labels: Sequence[str], inputs: Inputs, times: Array) -> list[T
         if inputs.naxes != len(labels):
             known = f"({', '.join(labels)})" if labels else "(the system has no inputs)"
             raise ValueError(f"inputs must have {len(labels)} axes {known}, got {inputs.naxes}")
-        # By name where the names are the same, whatever their order.
+        # By name if the names are the same, in any order.
         crossed = set(inputs.labels) == set(labels) and inputs.labels != tuple(labels)
         return [PlanSignal(inputs.select(labels) if crossed else inputs)]
     elif inputs is None or (not isinstance(inputs, list | tuple) and np.ndim(inputs) == 0 and not callable(inputs)):
@@ -215,7 +215,7 @@ def input_signals(labels: Sequence[str], inputs: Inputs, times: Array) -> list[T
 
 
 def signal_values(time_signals: Sequence[TimeSignal], times: Array) -> Array:
-    """All signals of some time_signals (nsignals, ntime), right-continuous."""
+    """Values (nsignals, ntime) of functions of time, right-continuous."""
     return np.concatenate([np.zeros((0, times.size)), *(signal.at(times) for signal in time_signals)])
 
 
@@ -226,7 +226,7 @@ def resolved(
     tolerance: float = RESOLVED,
     rounding: Array | float = 0.0,
 ) -> list[Series]:
-    """Series of analytic signals over a segment, as many as it takes.
+    """Series of analytic signals over a segment, which is halved as required.
 
     Parameters
     ----------
@@ -235,11 +235,11 @@ def resolved(
     left, right : float
         The segment [s].
     tolerance : float, optional
-        Maximum size of what is cut off, relative to each signal.
+        Maximum truncation error, relative to each signal.
     rounding : ndarray, shape (nsignals,), or float, optional
-        Rounding errors of the signals, which no halving makes smaller.
+        Rounding errors of the signals, which halving does not reduce.
     """
-    # Never at the ends, where a neighbouring segment might be evaluated.
+    # Not at the ends, where an adjacent segment might be evaluated.
     duration = right - left
     values = signals(duration * _PROBES)
     if np.all(values == values[:, :1]):
@@ -250,8 +250,8 @@ def resolved(
         allowed = size.max(axis=1, keepdims=True)
         if np.all(size[:, -3:] <= np.maximum(tolerance * allowed, np.reshape(rounding, (-1, 1)))):
             return [_unbounded(left, right, coefficients)]
-    # Terms that no longer fall are rounding errors of the signal itself, which shorter segments make no smaller: where
-    # a plan is at rest, its derivatives are next to nothing compared with it.
+    # Terms that no longer decrease are rounding errors of the signal, which shorter segments do not reduce: where a
+    # plan is constant, its derivatives are negligible.
     half, end = size[:, width // 2 : -width // 4], size[:, -width // 4 :]
     noise = np.maximum(half.max(axis=1), end.max(axis=1))
     flat = half.max(axis=1) <= 10.0 * end.max(axis=1)
@@ -265,12 +265,12 @@ def resolved(
 
 
 def chebyshev_times(left: float, right: float, width: int) -> Array:
-    """Increasing times of a segment at which `chebyshev_coefficients` wants values."""
+    """Increasing times of a segment for the values of `chebyshev_coefficients`."""
     return chebyshev.points(width - 1, left, right)[::-1]
 
 
 def chebyshev_coefficients(values: Array) -> Array:
-    """Coefficients (nsignals, width) from values (nsignals, width) at `chebyshev_times`; of a constant, itself."""
+    """Coefficients (nsignals, width) from values (nsignals, width) at `chebyshev_times`; exact for constants."""
     coefficients = chebyshev.transform(values[:, ::-1])
     constant = np.all(values == values[:, :1], axis=1)
     coefficients[constant] = 0.0
@@ -313,8 +313,8 @@ def _time_signal(value: Trajectory | ArrayLike, name: str, times: Array) -> Time
 def within(left: float, right: float, switches: Sequence[float]) -> tuple[float, float]:
     """First and last time of a segment at which its equations are evaluated.
 
-    At a switch of the equations these are inside, by rounding of the times: at
-    the switch itself a block may already be on the other side.
+    At a switch of the equations they are shifted inside by a few rounding errors,
+    since at the switch a block may already be on the other side.
     """
     if not switches:
         return left, right
@@ -327,12 +327,12 @@ def within(left: float, right: float, switches: Sequence[float]) -> tuple[float,
 
 
 def breakpoints_of(time_signals: Iterable[TimeSignal]) -> list[float]:
-    """Times at which one of the time_signals is not analytic."""
+    """Times at which a function of time is not analytic."""
     return [float(t) for signal in time_signals for t in signal.breakpoints]
 
 
 _PROBES = np.array([0.0312345, 0.1234567, 0.25, 0.3456789, 0.5, 0.6543217, 0.75, 0.8765431, 0.9712345])
-"""Parts of a segment at which a signal is compared, to find whether it is constant."""
+"""Fractions of a segment at which values are compared to detect a constant signal."""
 
 
 @lru_cache(maxsize=32)

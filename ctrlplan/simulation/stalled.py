@@ -1,4 +1,4 @@
-"""Why a numerical run does not get on: the block, and what it does there."""
+"""Cause of a stalled numerical run: a block that is discontinuous, steep or random."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from ctrlplan.symbolic.isolation import untouched
 from ctrlplan.symbolic.trials import can_remember, trial_copy, values_of
 
 Values = Callable[[float, Array, Array], Array | None]
-"""(t, state, input) of a block -> its outputs and rates; None outside of its domain."""
+"""(t, state, input) of a block -> its outputs and state derivatives; None outside its domain."""
 
 _STEPS = 10.0 ** -np.arange(2.0, 13.0)
 """Distances, relative to the scale of an argument, at which a block is evaluated on both sides."""
 
 _CLOSE, _LAST = 3, 4
-"""First of the close distances, and how many of the closest ones decide."""
+"""Index of the first small distance, and the number of the smallest ones that decide."""
 
 _JUMP, _STEEP, _DROP = 0.7, 0.15, 0.02
-"""Change of values over a tenth of a distance, relative to that over the distance: 0.1 where they are smooth, 1 at a
-jump, in between where the slope is infinite; next to a jump it drops where the distance no longer reaches it."""
+"""Change of values over a tenth of a distance, relative to that over the distance: 0.1 if they are smooth, 1 at a
+jump, in between for an infinite slope; next to a jump it drops once the distance is too small to reach the jump."""
 
 _ROUNDING = 1e-13
-"""Change of values, relative to their size, below which it is taken for rounding."""
+"""Relative change of values below which it counts as rounding."""
 
 SMOOTHING = (
     "replace it with a steep continuous function, such as np.tanh(s/width) for np.sign(s) and "
@@ -34,13 +34,13 @@ SMOOTHING = (
 
 
 def unrepeatable(network: Network, params: Params, t: float, x: Array, w: Array) -> str:
-    """Block that answers differently to equal arguments, in words; empty where none does.
+    """Message on a block with different values for equal arguments; empty if there is none.
 
     Parameters
     ----------
     network : Network
-        Blocks, of which the continuous ones are called twice, on copies of what
-        they remember.
+        Network; its continuous blocks are called twice, on copies with their
+        memory.
     params : mapping
         Parameters of the run.
     t, x, w : float, ndarray, ndarray
@@ -60,9 +60,9 @@ def unrepeatable(network: Network, params: Params, t: float, x: Array, w: Array)
 
 
 def cause(network: Network, params: Params, t: float, x: Array, w: Array, span: float) -> str:
-    """What keeps a solver at a time and state, in words; empty where no block shows it.
+    """Message on the cause of a stalled solver; empty if no block shows one.
 
-    A jump, or an infinite slope, in one of the arguments of a block.
+    The cause is a discontinuity or an infinite slope in an argument of a block.
     """
     found = unrepeatable(network, params, t, x, w)
     if found:
@@ -80,7 +80,7 @@ def cause(network: Network, params: Params, t: float, x: Array, w: Array, span: 
 
 
 def _continuous(network: Network, params: Params) -> Iterator[tuple[int, Block, Values]]:
-    """Nonlinear continuous blocks, and their values on copies of what they remember."""
+    """Nonlinear continuous blocks, and their values on copies with their memory."""
     for i, block in enumerate(network.blocks):
         if block.linear or block.is_time_function or block.period is not None:
             continue
@@ -101,7 +101,7 @@ def _values(block: Block, params: Params) -> Values:
 
 
 def _kinds(values: Values, t: float, x: Array, u: Array, span: float) -> Iterator[str]:
-    """Whether values are smooth over each argument, "", or have a "jump" or an infinite "slope"."""
+    """Kind of values over each argument: smooth (""), "jump" or infinite "slope"."""
     arguments = np.concatenate([[t], x, u])
     scales = np.maximum(np.abs(arguments), 1.0)
     scales[0] = span
@@ -128,18 +128,18 @@ _WORDS = (
     ("jump", "is discontinuous there in", ", and the solution stays at the discontinuity"),
     ("slope", "has an infinite slope there in", ""),
 )
-"""Kinds of `_kind`, the first one found is named, and how."""
+"""Kinds of `_kind` with their words; the first one found is reported."""
 
 
 def _kind(changes: Array, size: float) -> str:
-    """Kind of one value by its changes over smaller and smaller distances."""
+    """Kind of a value by its changes over decreasing distances."""
     if not np.isfinite(changes).all():
         return ""
     real = changes > _ROUNDING * size
     both = real[1:] & real[:-1]
     ratios = np.divide(changes[1:], changes[:-1], out=np.full(changes.size - 1, np.nan), where=both)
     last = ratios[-_LAST:][both[-_LAST:]]
-    # From one distance to the next nothing is left of a change: the jump lies between.
+    # A change that vanishes from one distance to the next: the jump lies in between.
     vanished = np.append(changes[1:] <= np.maximum(_DROP * changes[:-1], _ROUNDING * size), False) & real
     stays = np.array([bool(np.all(changes[k + 1 :] <= _DROP * changes[k])) for k in range(changes.size)])
     flat = np.append(False, ratios > 0.5 * _JUMP)

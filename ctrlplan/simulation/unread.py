@@ -22,29 +22,29 @@ _PARAMS = 3
 
 
 def is_read(network: Network, name: str, value: Value, start: Array, at_start: Callable[[], Array]) -> bool:
-    """Whether a block reads a parameter about the state where a run begins.
+    """Whether a block reads a parameter near the initial state.
 
     Parameters
     ----------
     network : Network
-        The blocks; they are called, and left as they were.
+        The blocks; they are called, and their memory is restored.
     name : str
-        The parameter.
+        Name of the parameter.
     value : object
         Its value.
     start : ndarray, shape (nstates,)
-        The state.
+        Initial state.
     at_start : callable
-        Returns the values of the signals that are functions of time.
+        Returns the initial values of the signals that are functions of time.
     """
     blocks = [i for i, block in enumerate(network.blocks) if not (block.linear or block.is_time_function)]
     functions = {i: [*_functions(network.blocks[i].system)] for i in blocks}
-    # A call may take minutes, as that of an estimator which runs an optimiser: only what can tell is called.
+    # A call may take minutes, as with an optimising estimator: only functions that read parameters are called.
     tellers = {i: [f for f in functions[i] if reads(f, _PARAMS)] for i in blocks}
     if not any(tellers.values()):
         return False
     found = References((f"block {network.blocks[i].name}", f) for i in blocks for f in functions[i])
-    if found.opaque:  # a call might leave something behind: what the code names counts
+    if found.opaque:  # a call might have side effects: the names in the code decide
         return name in found.names or not found.names.isdisjoint(("keys", "values", "items"))
     keeper = Keeper(found)
 
@@ -67,12 +67,12 @@ def is_read(network: Network, name: str, value: Value, start: Array, at_start: C
 
 
 def _functions(system: System) -> Iterator[Callable[..., ArrayLike]]:
-    """Functions of a block that are called with its parameters."""
+    """Functions of a block with parameters as an argument."""
     return filter(None, (system.outfcn, system.updfcn, traits_of(system).sample))
 
 
 class _ReadRecorder(dict[str, Value]):
-    """Parameters that notice which of them are read."""
+    """Parameters that record which of them are read."""
 
     ALL = ""
 

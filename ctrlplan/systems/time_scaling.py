@@ -1,4 +1,4 @@
-"""A plan whose clock slows where the loop cannot keep up, as a block."""
+"""Time scaling: a plan that is slowed down online near actuator limits, as a block."""
 
 from __future__ import annotations
 
@@ -41,55 +41,55 @@ def create_time_scaling_iosystem(
     suffix: str = "",
     name: str = "time_scaling",
 ) -> ct.NonlinearIOSystem:
-    r"""Plan at a time of its own, which slows where actuators saturate or the error grows.
+    r"""Plan with online time scaling, slowed down near actuator limits.
 
-    Puts out y_d(sigma(t)) and its derivatives, sigma' the rate: 1 as long as
-    nothing happens; towards `slowest` as an actuator comes near a limit or an
-    error grows; above 1 afterwards, until nothing is left to catch up. The rate
-    goes through as many lags as there are derivatives,
+    The outputs are y_d(sigma(t)) and its derivatives. The rate sigma' is 1
+    nominally; it decreases towards `slowest` as an actuator approaches a limit
+    or an error grows, and is above 1 afterwards until the delay has been made
+    up. The rate passes through as many first-order lags as there are
+    derivatives,
 
     .. math:: \sigma' = \frac{\rho}{(s/w + 1)^n}, \qquad
         \rho = \rho_{min} + (1 - \text{severity})\,
         (\min(\rho_{max}, \max(\rho_{min}, 1 + (t - \sigma)/T)) - \rho_{min}),
 
-    so that sigma is n times continuously differentiable, and so is the
-    reference where the plan is. The path is the plan's own whatever the rate.
+    so that sigma is n times continuously differentiable, and the reference as
+    often as the plan. The path is that of the plan at any rate.
 
-    States: lag, which is t - sigma [s], and ``slow[1]``, ..., the lags of
-    1 - sigma'; the zero state follows the plan. Inputs: the signals in `limits`
-    (u for ``limits={"u": ...}``), then those in `errors`. Outputs: the jet of
-    each axis, x, x_d1, ..., as `create_source_iosystem` names it.
+    States: lag = t - sigma [s], and ``slow[1]``, ..., the states of the lags of
+    1 - sigma'; in the zero state the plan is not delayed. Inputs: the signals
+    in `limits` (u for ``limits={"u": ...}``), then those in `errors`. Outputs:
+    x, x_d1, ... of each axis, as `create_source_iosystem` names them.
 
     Parameters
     ----------
     plan : Trajectory
-        What is followed.
+        The plan, not shaped.
     derivatives : int, optional
-        Highest derivative put out: the order that the flat law needs.
+        Highest derivative among the outputs: the order of the flat controller.
     limits : mapping of str to (float, float) or float, optional
-        Minimum and maximum of actuators, one of them may be infinite; a number
-        a for (-a, a). A
-        clock that slows asks for force itself, and most of all where it has to
-        brake: without damping this can make things worse. An actuator that
-        rests near a limit keeps the clock slow.
+        Minimum and maximum of actuator signals, one of which may be infinite; a
+        number a for (-a, a). Slowing down requires force itself, above all
+        while braking: without damping it can increase the error. An actuator
+        that stays near a limit keeps the rate low.
     margin : float, optional
-        Part of the range between limits, above 0 to 0.5, within which the rate
-        falls; of the limit itself where the other is infinite.
+        Fraction of the range between limits, in (0, 0.5], over which the rate
+        decreases; of the magnitude of the limit if the other is infinite.
     errors : mapping of str to (float, float), optional
-        For axes by their names in the block: distance of what is measured from the
-        reference at which the rate begins to fall, and at which it is least.
-        Later than limits, and gentler: which of the two is better hangs on the
-        loop. Where a limit is known before the start, `retime` the plan.
+        For axes by their names in the block: tracking error at which the rate
+        begins to decrease, and at which it is `slowest`. Errors respond later
+        and more smoothly than limits; which of them is better depends on the
+        loop. If a limit is known in advance, `retime` the plan.
     bandwidth : float, optional
-        w [rad/s] of each lag; 10 over the plan's duration unless given. The
-        faster, the greater the force y_d' sigma'' that slowing itself asks for.
+        w [rad/s] of each lag, by default 10 divided by the duration of the plan.
+        The force y_d' sigma'' required for slowing down grows with it.
     slowest, fastest : float, optional
-        Least rate, from 0 below 1, and greatest, from 1.
+        Minimum rate in [0, 1), and maximum rate, at least 1.
     catch_up : float, optional
-        Time constant T [s] with which the lag is made up for; four times the
-        delay n/w of the lags unless given.
+        Time constant T [s] with which the delay is made up, by default four
+        times the delay n/w of the lags.
     labels : sequence of str or str, optional
-        Names of the axes in the place of the plan's own.
+        Names of the axes in place of those of the plan.
     suffix : str, optional
         Appended to each label of an output.
     name : str, optional
@@ -98,7 +98,7 @@ def create_time_scaling_iosystem(
     Returns
     -------
     control.NonlinearIOSystem
-        Continuous; it has the plan's breakpoints.
+        In continuous time, with the breakpoints of the plan declared.
 
     Raises
     ------
@@ -106,14 +106,14 @@ def create_time_scaling_iosystem(
         If `plan` is not a trajectory.
     ValueError
         If an argument is out of range, neither limits nor errors are given, the
-        lag would not settle, or an output and an input would have the same name;
-        if the plan is shaped (`Shaper`), since a slower clock would change the
-        delays.
+        delay would oscillate, or an output has the name of an input; if the
+        plan is shaped (`Shaper`), since a time scaling would change the delays
+        of the shaper.
 
     References
     ----------
-    Dahl and Nielsen 1990 on path velocity; y'' = y_d'' sigma'^2 + y_d' sigma'',
-    and so on by composing Taylor series.
+    O. Dahl, L. Nielsen, "Torque-limited path following by online trajectory time
+    scaling", IEEE Trans. Robotics and Automation 6 (1990) 554-561.
 
     Examples
     --------
@@ -125,7 +125,7 @@ def create_time_scaling_iosystem(
     >>> block.input_labels, block.output_labels, block.state_labels
     (['u'], ['x_ref', 'x_ref_d1', 'x_ref_d2'], ['lag', 'slow[1]', 'slow[2]'])
 
-    A PD law with the actuator's command as the signal that slows the plan:
+    A PD controller; the command of the actuator slows the plan down:
 
     >>> law = ct.ss([], [], [], [[20.0, 8.0, 1.0, -20.0, -8.0]], name="law", outputs="u",
     ...             inputs=["x_ref", "x_ref_d1", "x_ref_d2", "x", "x_d1"])
@@ -178,7 +178,7 @@ def create_time_scaling_iosystem(
         dt=0,
         name=name,
     )
-    # Once behind, the plan moves out of rest at times that no breakpoint names.
+    # With a delay, the plan starts moving at times that are not among the declared breakpoints.
     return declare(block, feedthrough=False, breakpoints=plan.breakpoints, longest=0.5 * _shortest_move(plan))
 
 
@@ -194,10 +194,10 @@ def _check_plan(plan: Trajectory) -> None:
 def _severity(
     plan: Trajectory, bounds: list[tuple[float, float, float]], bands: list[tuple[int, tuple[float, float]]]
 ) -> Callable[[Value, Value, Value], Value]:
-    """Function of (t, x, u): 0 where no signal is near its limits, 1 where one is at its limit.
+    """Function of (t, x, u): 0 if no signal is near its limits, 1 if one is at its limit.
 
-    The inputs are the signals of `bounds`, then those of `bands`, each the axis
-    of the plan with the errors between which the rate falls.
+    The inputs are the signals of `bounds`, then those of `bands`: an axis of the
+    plan and the errors between which the rate decreases.
     """
 
     def severity(t: Value, x: Value, u: Value) -> Value:
@@ -215,7 +215,7 @@ def _severity(
 
 
 def _checked_times(plan: Trajectory, n: int, bandwidth: float | None, catch_up: float | None) -> tuple[float, float]:
-    """Bandwidth [rad/s] of n lags and time constant [s] with which the lag is made up for."""
+    """Bandwidth [rad/s] of n lags and time constant [s] with which the delay is made up."""
     if bandwidth is None and not plan.duration:
         raise ValueError("bandwidth must be given for a plan without duration, got None")
     w = 10.0 / plan.duration if bandwidth is None else checked_finite(bandwidth, "bandwidth", above=0.0)
@@ -230,7 +230,7 @@ def _checked_times(plan: Trajectory, n: int, bandwidth: float | None, catch_up: 
 
 
 def _checked_shares(slowest: float, fastest: float, margin: float) -> tuple[float, float, float]:
-    """Minimum and maximum rate, and the part of the limits' range within which the rate falls."""
+    """Minimum and maximum rate, and the fraction of the range of limits over which the rate decreases."""
     minimum, maximum, inner = (
         checked_number(value, label)
         for label, value in (("slowest", slowest), ("fastest", fastest), ("margin", margin))
@@ -253,14 +253,14 @@ def _check_signals(inputs: Sequence[str], outputs: Sequence[str]) -> None:
 
 
 def _series(plan: Trajectory, t: Value, order: int) -> list[list[Value]]:
-    """Series of a plan; nan of a loop that is lost, which the run then says."""
+    """Taylor series of a plan; nan at a time that is not finite."""
     if isinstance(t, float) and not math.isfinite(t):
         return [[math.nan] * (order + 1)] * plan.naxes
     return plan.series(t, order)
 
 
 def _shortest_move(plan: Trajectory) -> float:
-    """Shortest time [s] for which the plan moves between two in which it dwells."""
+    """Shortest duration [s] of a motion of the plan between two dwells."""
     durations, shortest, lasted = np.diff(plan.breakpoints), math.inf, 0.0
     inside = plan.breakpoints[:-1, None] + durations[:, None] * np.array([0.13, 0.37, 0.61, 0.89])
     moving = np.append(plan.jet(inside, 2)[1:].any(axis=(0, 1, 3)), False)
@@ -272,7 +272,7 @@ def _shortest_move(plan: Trajectory) -> float:
 
 
 def _rate_weights(n: int, w: float) -> list[list[float]]:
-    """Derivatives 0, 1, ... of -slow[n] from slow[1], ..., slow[n], each of which follows the one before it."""
+    """Derivatives 0, 1, ... of -slow[n] as combinations of slow[1], ..., slow[n]."""
     row, rows = np.eye(n)[-1] * -1.0, []
     for _ in range(n):
         rows.append(row.tolist())
@@ -281,13 +281,13 @@ def _rate_weights(n: int, w: float) -> list[list[float]]:
 
 
 def _nearness(value: Value, low: float, high: float, reach: float) -> Value:
-    """0 up to `reach` inside the limits, 1 at a limit."""
+    """0 at a distance of `reach` or more inside the limits, 1 at a limit."""
     distance = np.fmin(value - low, high - value)
     return 1.0 - distance / reach
 
 
 def _checked_limits(pair: Range, label: str, margin: float) -> tuple[float, float, float]:
-    """Limits, and the distance from them within which the rate falls."""
+    """Limits, and the distance from them over which the rate decreases."""
     low, high, size = checked_limits(pair, f"limits of {label}")
     both = math.isfinite(low) and math.isfinite(high)
     if not both and 0.0 in (low, high):

@@ -27,4 +27,4 @@ METHODS: tuple[Method, ...] = (
     Discrete(),
     Delegated(),
 )
-"""In the order in which "auto" tries them. A new method is one more line."""
+"""Methods in the order of "auto". A new method is one more line."""

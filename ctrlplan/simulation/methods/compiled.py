@@ -1,4 +1,4 @@
-"""Continuous systems compiled by CasADi, and SUNDIALS' CVODES on them."""
+"""Continuous systems compiled by CasADi and solved by CVODES (SUNDIALS)."""
 
 from __future__ import annotations
 
@@ -23,22 +23,22 @@ if TYPE_CHECKING:
     from ctrlplan.simulation.compiled import CompiledSolver
 
 _SHARE = 5
-"""A compiled form is compared with Python at states a fifth as many as the run's evaluations of its equations."""
+"""Evaluations of the equations in a run per state at which the compiled form is compared with Python."""
 
 _CLOSE, _STRETCHES, _BETWEEN = 400, 8, 60
-"""A run with fewer times is followed once more, in some stretches with so many times each, to see where it switches."""
+"""A run with fewer times is repeated in some intervals with this many times each, to find where it switches."""
 
 _STEPS, _STEPS_WITH_STOPS = 20_000, 2_000
-"""Maximum steps of a segment; fewer where an event may end the run: beyond it there may be no solution."""
+"""Maximum number of steps of a segment; fewer if an event may end the run, after which there may be no solution."""
 
 
 class CompiledMethod:
-    """CVODES with the exact Jacobian, on equations that agree with Python at states that the run visits."""
+    """CVODES with the exact Jacobian, on compiled equations that are compared with Python along the run."""
 
     name = "compiled"
 
     def why_not(self, prepared: Prepared) -> str:
-        """Reason why a system cannot be compiled, as far as it is known before its blocks are traced."""
+        """Reason why a system cannot be compiled, if it is known before tracing its blocks."""
         if prepared.is_discrete:
             return f"{prepared.name} is discrete (dt = {prepared.dt})"
         return prepared.unsupported or missing_casadi()
@@ -54,17 +54,17 @@ class CompiledMethod:
         fresh = fresh_job(job)
         try:
             return numerical(job, self)
-        except DisagreementError:  # what a function refers to may have changed since it was traced
+        except DisagreementError:  # an object used by a function may have changed since it was traced
             return numerical(fresh, self)
 
     def solver(self, attempt: Attempt[CompiledSolver]) -> CompiledSolver:
         """CVODES on the compiled form."""
         job = attempt.job
         form = job.prepared.compiled(job.params, attempt.time_signals, job.first, job.state, job.trials)
-        from ctrlplan.simulation.compiled import CompiledSolver  # there is a form: so there is CasADi
+        from ctrlplan.simulation.compiled import CompiledSolver  # the form exists, hence CasADi is installed
 
         known = equations_of(job, attempt.copies)
-        if known is not None:  # an algebraic loop without a solution has a better name here
+        if known is not None:  # an algebraic loop without a solution gives a clearer error here
             known.signals(job.first, job.state, signal_values(attempt.time_signals, job.times[:1])[:, 0])
         max_steps = _STEPS_WITH_STOPS if attempt.stops else _STEPS
         return CompiledSolver(form, job.params, attempt.tolerances, attempt.scales, max_steps=max_steps)
@@ -82,7 +82,7 @@ class CompiledMethod:
 
 
 def _disagreement(attempt: Attempt[CompiledSolver], solver: CompiledSolver) -> str:
-    """What is wrong with a compiled form at states of a run; empty where nothing, or where no comparison is due."""
+    """Disagreement of a compiled form with Python at states of a run; empty if none, or if no comparison is due."""
     job, run, form = attempt.job, attempt.run, solver.form
     p = form.parameters(job.params)
     values = signal_values(attempt.time_signals, run.times)
@@ -93,12 +93,12 @@ def _disagreement(attempt: Attempt[CompiledSolver], solver: CompiledSolver) -> s
     values = signal_values(attempt.time_signals, t)
     w, sides = form.signals(t, x, values, p), form.sides(t, x, values, p)
     places = telling_states(sides, np.concatenate([w, x]), count)
-    # Blocks are compared at the inputs that the form computes: where each agrees, the whole does.
+    # Each block is compared at the inputs that the form computes: if all agree, so does the whole.
     return form.disagreement(attempt.copies, job.params, t[places], x[:, places], w[:, places])
 
 
 def _closer(run: Run, solver: CompiledSolver) -> tuple[Array, Array]:
-    """Times and states of a run, with more between them where they are few."""
+    """Times and states of a run, with further ones in between if there are few."""
     times, states = [run.times], [run.states]
     marks = np.unique(np.linspace(0, run.times.size - 1, _STRETCHES + 1).astype(int))
     for k, following in pairwise(marks.tolist() if run.times.size < _CLOSE else []):

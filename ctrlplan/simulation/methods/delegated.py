@@ -1,4 +1,4 @@
-"""Systems that only python-control can run, by its own function."""
+"""Systems that only python-control can run, by `control.input_output_response`."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from ctrlplan.simulation.scales import RELATIVE
 from ctrlplan.simulation.signals import signal_values
 
 DELEGATED = threading.RLock()
-"""One run by python-control at a time: it keeps the parameters of a run in the system."""
+"""Lock of runs by python-control, which stores the parameters of a run in the system."""
 
 
 class Delegated:
-    """Runs by `control.input_output_response`, without events, of blocks with equations of a kind of their own."""
+    """Runs by `control.input_output_response`, without events, of blocks that override the equations of their class."""
 
     name = "python"
 
     def why_not(self, prepared: Prepared) -> str:
-        """Reason why a system need not be run by python-control; empty where nothing else can run it."""
+        """Reason why a system need not be run by python-control; empty if no other method applies."""
         return "" if prepared.network is None else f"{prepared.name} has no block that only python-control runs"
 
     def run(self, job: Job) -> Record:

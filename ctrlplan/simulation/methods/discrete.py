@@ -16,21 +16,21 @@ _MAX_STEPS = 1e8
 """Maximum number of steps of a discrete system in a run."""
 
 _OFF_INSTANT = 1e-5
-"""Part of a sampling time by which a time may miss an instant, besides rounding of the times."""
+"""Fraction of the sampling time by which a time may differ from a sample time, in addition to rounding."""
 
 
 class Discrete:
     """Difference equations by Python.
 
-    At each sample first the outputs, in the order of the signal flow, then the
-    updates. Each function of a block is called once a sample, so that a block
-    may have a memory besides its states.
+    At each sample time first the outputs are evaluated, in the order of the signal
+    flow, then the updates. Each function of a block is called once per sample, so
+    that a block may have memory in addition to its states.
     """
 
     name = "python"
 
     def why_not(self, prepared: Prepared) -> str:
-        """Reason why a system is not run from sample to sample; empty where it is discrete."""
+        """Reason why a system is not run from sample to sample; empty if it is discrete."""
         if prepared.network is None:
             return prepared.unsupported
         return "" if prepared.is_discrete else f"{prepared.name} is continuous"
@@ -58,12 +58,12 @@ class Discrete:
             w = signals[:, np.searchsorted(instants, t, side="right") - 1]
             return Snapshot(t, x, now[: prepared.ninputs], network.to_outputs(w), lambda: w)
 
-        # Between samples nothing happens: what crosses a limit does so at the later one.
+        # Signals are constant between samples: a limit is crossed at the later one.
         return Record(instants, states, snapshot, lambda k, t: states[:, k], job.watched(), self.name, job.reason)
 
 
 def _sampling_instants(times: Array, dt: float | bool) -> Array:
-    """Sampling instants of a discrete system from the first time to the last, the times themselves among them."""
+    """Sample times of a discrete system from the first time to the last, which include the given times."""
     rounding = 4.0 * np.finfo(float).eps * np.abs(times).max()
     if isinstance(dt, bool):
         spacing = np.diff(times)
@@ -97,7 +97,7 @@ def _sampling_instants(times: Array, dt: float | bool) -> Array:
 
 
 def _on_breakpoints(times: Array, breakpoints: Array) -> Array:
-    """Times, but the breakpoint itself where a time is one but for rounding: 29 times 0.01 s is 0.29 s."""
+    """Times, replaced by a breakpoint that they equal up to rounding: 29 times 0.01 s is 0.29 s."""
     if not breakpoints.size:
         return times
     after = np.clip(np.searchsorted(breakpoints, times), 1, max(1, breakpoints.size - 1))

@@ -16,20 +16,20 @@ from ctrlplan.simulation.prepared import Prepared
 from ctrlplan.simulation.signals import PlanSignal, SampledSignal, signal_values
 
 _UNCERTAIN = 1e-6
-"""Part of an output's size from which on its uncertainty is reported."""
+"""Uncertainty of an output, relative to its magnitude, above which it is reported."""
 
 
 class Exact:
-    """Matrix exponentials: one a segment between breakpoints, and one for each spacing of samples."""
+    """Matrix exponentials: one per segment between breakpoints, and one for each spacing of samples."""
 
     name = "exact"
 
     def why_not(self, prepared: Prepared) -> str:
-        """Block that is not linear or not continuous, in words; empty where there is none."""
+        """Block that is not linear or not continuous; empty if there is none."""
         return "" if prepared.linear is not None else prepared.not_linear
 
     def run(self, job: Job) -> Record:
-        """States at the times of a job, to rounding."""
+        """States at the times of a job, to rounding errors."""
         form = job.prepared.linear
         if form is None:
             raise TypeError(f"{job.prepared.name} must be linear and continuous, but {job.prepared.not_linear}")
@@ -71,7 +71,7 @@ def _run(job: Job, form: LinearForm) -> Record:
     states = states_at(times, job.state)
     growing, fast, nonnormal = form.sensitivity(float(times[-1] - times[0]))
     if growing or fast or nonnormal:
-        # One factor for all entries turns a phase most; of a matrix far from normal each must change by itself.
+        # A common factor of all entries changes phases most; for a nonnormal matrix the entries change independently.
         signs = np.random.default_rng(0).choice([-1.0, 1.0], form.a.shape) if nonnormal else np.ones_like(form.a)
         nearly = states_at(times, job.state, form.a * (1.0 + 2.0**-50 * signs))
         values = signal_values(time_signals, times)
@@ -82,7 +82,7 @@ def _run(job: Job, form: LinearForm) -> Record:
 
 
 def _warn_of_uncertainty(job: Job, outputs: Array, others: Array, floor: Array) -> None:
-    """Warn of outputs that change by more than a floor when rates change in their last digits."""
+    """Warn of outputs that change by more than a floor with the last digits of the system matrix."""
     known = np.isfinite(outputs) & np.isfinite(others)
     with np.errstate(all="ignore"):
         apart = np.where(known, np.abs(outputs - others), 0.0).max(axis=1)
@@ -103,7 +103,7 @@ def _warn_of_uncertainty(job: Job, outputs: Array, others: Array, floor: Array) 
 
 
 def _warn_of_undefined(job: Job, form: LinearForm, times: Array, states: Array) -> None:
-    """Warn of outputs that are differences of states that have overflowed."""
+    """Warn of outputs that are differences of overflowed states."""
     if np.isfinite(states).all():
         return
     up, down = (states == np.inf).astype(float), (states == -np.inf).astype(float)
@@ -128,6 +128,6 @@ def _derivatives(jet: Array, high: int, order: int) -> Array:
 
 
 def _finite(values: Array) -> Array:
-    """An unstable loop that has left the range of numbers is infinite, not undefined."""
+    """Values with nan replaced by inf: an unstable loop that has overflowed is infinite."""
     values[np.isnan(values)] = np.inf
     return values

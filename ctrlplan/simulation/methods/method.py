@@ -1,4 +1,4 @@
-"""Interface of a simulation method, and how one is chosen."""
+"""Interface of a simulation method, and the choice of a method."""
 
 from __future__ import annotations
 
@@ -13,41 +13,41 @@ from ctrlplan.simulation.prepared import Prepared
 
 
 class Method(Protocol):
-    """A way to run a system.
+    """Method of simulation.
 
-    A new method is a file with a class of these three members, and its line in
-    ``ctrlplan.simulation.methods.METHODS``; for type checkers its name is one
-    of ``MethodName`` as well. One that solves differential
-    equations may leave segments, scales, delays, samples and events to
-    `ctrlplan.simulation.numerical.numerical`, and give the solver alone.
+    A new method is a class with these three members and a line in
+    ``ctrlplan.simulation.methods.METHODS``; for type checkers its name is added to
+    ``MethodName``. A method that solves differential equations can use
+    `ctrlplan.simulation.numerical.numerical` for segments, scales, delays, samples
+    and events, and define only the solver.
     """
 
     @property
     def name(self) -> str:
-        """Name by which `simulate` takes it, and which its responses have; several methods may share one."""
+        """Name of the method in `simulate` and in responses; several methods may share one."""
 
     def why_not(self, prepared: Prepared) -> str:
-        """Reason why the method does not apply to a system, in words; empty where it applies."""
+        """Reason why the method does not apply to a system; empty if it applies."""
 
     def run(self, job: Job) -> Record:
-        """States at the times of a job, at all of them unless an event ends the run.
+        """States at the times of a job, up to an event that ends the run.
 
         Raises
         ------
         NotApplicableError
-            If it turns out only now that the method does not apply.
+            If the method does not apply, which is known only during the run.
         SolverError
-            If it applies and fails.
+            If the method fails.
         """
 
 
 def named(methods: Sequence[Method], name: str) -> list[Method]:
-    """Methods of one name; all for "auto".
+    """Methods with a given name; all for "auto".
 
     Raises
     ------
     ValueError
-        If there is none.
+        If there is no such method.
     """
     found = [method for method in methods if name in ("auto", method.name)]
     if not found:
@@ -57,22 +57,22 @@ def named(methods: Sequence[Method], name: str) -> list[Method]:
 
 
 def applicable(methods: Sequence[Method], prepared: Prepared) -> Iterator[Method]:
-    """Methods that have no reason against a system, in order."""
+    """Methods that apply to a system, in order."""
     return (method for method in methods if not method.why_not(prepared))
 
 
 def recorded(job: Job, methods: Sequence[Method]) -> Record:
-    """Run by the first method that applies.
+    """Record by the first method that applies.
 
-    A method that turns out not to apply, or fails, is followed by the next,
-    which runs on blocks with the memory that they had before.
+    If it fails or turns out not to apply, the next one runs, on blocks with the
+    memory that they had before.
 
     Raises
     ------
     NotApplicableError
-        If none applies; the reasons are in the message.
+        If none applies; the message gives the reasons.
     SolverError
-        If the last that applies fails.
+        If the last one that applies fails.
     """
     reasons: dict[str, str] = {}
     why = job.reason

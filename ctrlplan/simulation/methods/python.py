@@ -1,4 +1,4 @@
-"""Continuous systems by Python: LSODA on the blocks' own functions."""
+"""Continuous systems by Python: LSODA with the functions of the blocks."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from ctrlplan.symbolic.isolation import same_answer, tried, untouched
 
 
 class Python:
-    """Each block called once a step, in the order of the signal flow; LSODA from segment to segment."""
+    """LSODA from segment to segment; each block is called once per step, in the order of the signal flow."""
 
     name = "python"
 
     def why_not(self, prepared: Prepared) -> str:
-        """Reason why a system cannot be run by Python's ODE solver; empty where it can."""
+        """Reason why a system cannot be run by LSODA; empty if it can."""
         if prepared.network is None:
             return prepared.unsupported
         if prepared.is_discrete:
@@ -29,18 +29,18 @@ class Python:
         return numerical(job, self)
 
     def solver(self, attempt: Attempt[NumericalSolver]) -> NumericalSolver:
-        """LSODA on the network's equations."""
+        """LSODA with the equations of the network."""
         if attempt.equations is None:
             raise TypeError(self.why_not(attempt.job.prepared))
         _check_repeatable(attempt)
         return InterpretedSolver(attempt.equations, attempt.tolerances, attempt.scales)
 
     def check(self, attempt: Attempt[NumericalSolver]) -> None:
-        """Nothing to check: these are the equations themselves."""
+        """Nothing to check: the equations are not compiled."""
 
 
 def _check_repeatable(attempt: Attempt[NumericalSolver]) -> None:
-    """Raise where rates are random: such a loop has no solution."""
+    """Raise if state derivatives are random: such a loop has no solution."""
     job = attempt.job
     tests, values = equations_of(job, attempt.copies), signal_values(attempt.time_signals, job.times[:1])[:, 0]
     if tests is None:

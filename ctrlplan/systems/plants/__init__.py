@@ -1,4 +1,4 @@
-"""Plants and the loops around them, one file each, the crane a package."""
+"""Plants and closed loops, one file each; the crane is a package."""
 
 from ctrlplan.systems.plants.crane import (
     LAWS,

@@ -1,4 +1,4 @@
-"""Direct-current motor with armature inductance, turning a load."""
+"""DC motor with armature inductance and a rotating load."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ def dc_motor(
     friction: float = 0.1,
     name: str = "dc_motor",
 ) -> FlatSystem:
-    r"""Motor from the armature's voltage to the angle, of order 3.
+    r"""DC motor from armature voltage to angle, a flat system of order 3.
 
     .. math:: J \ddot\varphi + b \dot\varphi = K i, \qquad L \dot i + R i + K \dot\varphi = V
 
-    States, which are the outputs as well: angle [rad], speed [rad/s], current
+    The states are also the outputs: angle [rad], speed [rad/s], current
     [A]. Input: voltage [V]. Flat output: the angle.
 
-    Parameters of a run of the same names overrule those below in the plant
-    alone, not in its flat maps.
+    Parameters given to a simulation under these names override those of the
+    plant, but not those of its flat maps.
 
     Parameters
     ----------
@@ -36,11 +36,11 @@ def dc_motor(
     inductance : float, optional
         L of the armature [H].
     motor_constant : float, optional
-        K, torque by current and voltage by speed [N m/A = V s/rad].
+        K, the torque and back-EMF constant [N m/A = V s/rad].
     inertia : float, optional
         J of rotor and load [kg m^2].
     friction : float, optional
-        b, viscous [N m s].
+        b, the viscous friction coefficient [N m s].
     name : str, optional
         Name of the block.
 
@@ -52,13 +52,18 @@ def dc_motor(
     Raises
     ------
     ValueError
-        If a parameter is not finite and above 0 (friction: at least 0).
+        If a parameter is not finite and positive (friction: non-negative).
 
     Examples
     --------
-    >>> motor = dc_motor(friction=0.0)
-    >>> [float(round(value, 6)) for value in motor.dynamics(0.0, [0.0, 2.0, 1.0], [1.0])]
-    [2.0, 1.0, -0.04]
+    >>> import control as ct
+    >>> import ctrlplan as cp
+    >>> motor = cp.plants.dc_motor()
+    >>> source = cp.create_source_iosystem(cp.Step(1.0), labels="voltage")
+    >>> loop = ct.interconnect([source, motor], inputs=0, outputs=["angle", "speed", "current"])
+    >>> response = cp.simulate(loop, [0.0, 5.0])
+    >>> round(float(response.outputs[1, -1]), 4)  # K/(R b + K^2)
+    0.0999
     """
     parameters = {
         "resistance": resistance,

@@ -1,4 +1,4 @@
-"""Robot's link driven through a spring."""
+"""Robot link with an elastic joint."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ def flexible_joint(
     gravity: float = 9.81,
     name: str = "flexible_joint",
 ) -> FlatSystem:
-    r"""Link behind an elastic joint, from the motor's torque, of order 4.
+    r"""Robot link with an elastic joint, a flat system of order 4.
 
     .. math:: I \ddot q_1 + m g l \sin q_1 + k (q_1 - q_2) = 0, \qquad J \ddot q_2 + k (q_2 - q_1) = u
 
-    States, which are the outputs as well: q1 and q2 [rad], the angles of link
-    (0 hanging down) and motor, and their rates q1_d1 and q2_d1 [rad/s]. Input:
-    u [N m]. Flat output: q1.
+    The states are also the outputs: q1 and q2 [rad], the angles of link
+    (0 hanging down) and motor, and their velocities q1_d1 and q2_d1 [rad/s].
+    Input: the motor torque u [N m]. Flat output: q1.
 
-    Parameters of a run of the same names overrule those below in the plant
-    alone, not in its flat maps.
+    Parameters given to a simulation under these names override those of the
+    plant, but not those of its flat maps.
 
     Parameters
     ----------
@@ -44,7 +44,7 @@ def flexible_joint(
     length : float, optional
         l from the joint to the link's centre of mass [m].
     gravity : float, optional
-        g [m/s^2]; 0 for a link that turns in a horizontal plane.
+        g [m/s^2]; 0 for a link in a horizontal plane.
     name : str, optional
         Name of the block.
 
@@ -56,13 +56,19 @@ def flexible_joint(
     Raises
     ------
     ValueError
-        If a parameter is not finite and above 0 (gravity: at least 0).
+        If a parameter is not finite and positive (gravity: non-negative).
 
     Examples
     --------
-    >>> joint = flexible_joint(gravity=0.0)
-    >>> [float(value) for value in joint.dynamics(0.0, [0.0, 0.0, 1.0, 2.0], [0.004])]
-    [1.0, 2.0, 0.0, 1.0]
+    >>> import control as ct
+    >>> import ctrlplan as cp
+    >>> plan = cp.PolySpline([cp.Waypoint(0, 0, 0, 0, 0, 0), cp.Waypoint(1, 1, 0, 0, 0, 0)], labels=["q1"])
+    >>> joint = cp.plants.flexible_joint()
+    >>> law = cp.create_flat_iosystem(joint, poles=[-9, -10, -11, -12], labels="q1")
+    >>> source = cp.create_source_iosystem(plan, 4, suffix="_ref")
+    >>> loop = ct.interconnect([source, law, joint], inputs=0, outputs=["q1"])
+    >>> bool(abs(cp.simulate(loop, [0.0, 0.5, 1.0]).outputs - plan([0.0, 0.5, 1.0])).max() < 1e-6)
+    True
     """
     parameters = {
         "link_inertia": link_inertia,

@@ -1,4 +1,4 @@
-"""Chains of integrators: what every flat plant becomes under its law."""
+"""Chains of integrators."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from ctrlplan.trajectories import derivative_name
 
 
 def integrator_chain(order: int, axes: int = 1, name: str = "integrator_chain") -> FlatSystem:
-    """Chains of integrators side by side: y^(order) = u on each axis.
+    """Parallel chains of integrators, y^(order) = u on each axis.
 
-    States, which are the outputs as well: axis by axis y, y_d1, ... up to
-    order - 1, in any unit of length per s^k; inputs u, or u1, u2, ... for more
-    than one axis (then y1, y1_d1, ..., y2, ...). Flat outputs: y, or y1, y2, ...
+    States, also the outputs: y, y_d1, ... up to order - 1 of each axis, in any
+    unit of length per s^k (y1, y1_d1, ..., y2, ... for more than one axis).
+    Inputs: u, or u1, u2, .... Flat outputs: y, or y1, y2, ....
 
     Parameters
     ----------
     order : int
-        Integrators an axis, 1 or more.
+        Number of integrators of each axis, at least 1.
     axes : int, optional
-        Chains, 1 or more.
+        Number of chains, at least 1.
     name : str, optional
         Name of the block.
 
@@ -34,7 +34,7 @@ def integrator_chain(order: int, axes: int = 1, name: str = "integrator_chain") 
     Raises
     ------
     ValueError
-        If `order` or `axes` is not a whole number from 1.
+        If `order` or `axes` is not a positive integer.
 
     Examples
     --------

@@ -16,18 +16,21 @@ from ctrlplan._types import Array
 def integrator_lag_loop(gain: float, outputs: Sequence[str] = ("y",)) -> ct.InterconnectedSystem:
     """Linear loop of the paper's section 2: k/(s^2 + s) in unity feedback.
 
+    States: those of the plant, ``plant_x[0]`` and ``plant_x[1]``. Inputs: r.
+    Outputs: y, or those in `outputs`.
+
     Parameters
     ----------
     gain : float
         k, finite.
     outputs : sequence of str, optional
-        Signals put out: of "y", the output, "u", the control k (r - y), and
-        "e", the error r - y.
+        Any of "y", the output, "u", the control signal k (r - y), and "e", the
+        error r - y.
 
     Returns
     -------
     control.InterconnectedSystem
-        Input r; outputs as asked; states of the plant.
+        Blocks error, controller and plant.
 
     Raises
     ------
@@ -46,7 +49,9 @@ def integrator_lag_loop(gain: float, outputs: Sequence[str] = ("y",)) -> ct.Inte
 def unity_feedback_loop(
     num: ArrayLike, den: ArrayLike, gain: float = 1.0, outputs: Sequence[str] = ("y",)
 ) -> ct.InterconnectedSystem | ct.StateSpace:
-    """Plant num/den behind a proportional gain, in unity feedback.
+    """Plant num/den with proportional gain in unity feedback.
+
+    States: those of the plant. Inputs: r. Outputs: y, or those in `outputs`.
 
     Parameters
     ----------
@@ -55,13 +60,13 @@ def unity_feedback_loop(
     gain : float, optional
         Proportional gain, finite.
     outputs : sequence of str, optional
-        Signals put out: of "y", "u" (behind the gain) and "e".
+        Any of "y", "u" (after the gain) and "e".
 
     Returns
     -------
     control.InterconnectedSystem
-        Blocks error, controller and plant; input r. A `control.StateSpace`
-        where num and den are of one degree.
+        Blocks error, controller and plant. A `control.StateSpace` if num and
+        den have the same degree.
 
     Raises
     ------
@@ -92,7 +97,7 @@ def _checked(gain: float, outputs: Sequence[str]) -> float:
 def _interconnected(
     num: tuple[float, ...], den: tuple[float, ...], gain: float, outputs: tuple[str, ...]
 ) -> ct.InterconnectedSystem:
-    """Loop of three blocks of its own: wired once for all gains, for wiring takes python-control a millisecond."""
+    """Loop of three blocks, interconnected once for all gains: python-control requires a millisecond for that."""
     wired = _wired(num, den, outputs)
     error, controller, plant = (ct.StateSpace(block, name=block.name) for block in wired.syslist)
     controller.D[0, 0] = gain
@@ -114,12 +119,12 @@ def _wired(num: tuple[float, ...], den: tuple[float, ...], outputs: tuple[str, .
 
 
 def _direct_loop(plant: ct.StateSpace, gain: float, outputs: Sequence[str]) -> ct.StateSpace:
-    """Loop around a plant that passes its input on, which `control.interconnect` cannot close."""
+    """Loop around a plant with direct feedthrough, which `control.interconnect` cannot close."""
     return ct.ss(*_closed(plant, gain, outputs), inputs="r", outputs=list(outputs), name="loop")
 
 
 def _closed(plant: ct.StateSpace, gain: float, outputs: Sequence[str]) -> tuple[Array, Array, Array, Array]:
-    """Matrices of the closed loop, exact; python-control's own come by finite differences."""
+    """Exact matrices of the closed loop; python-control computes them by finite differences."""
     a, b, c, d = (np.asarray(m) for m in (plant.A, plant.B, plant.C, plant.D))
     through = 1.0 / (1.0 + gain * d[0, 0])
     rows = {

@@ -1,4 +1,4 @@
-"""Parameters of a plant in a run."""
+"""Parameters of a plant in a simulation."""
 
 from __future__ import annotations
 
@@ -6,6 +6,6 @@ from ctrlplan._types import Params, Value
 
 
 def overridden(own: Params, params: Params | None) -> tuple[Value, ...]:
-    """A plant's own parameters in order, each overruled by the parameter of a run of its name."""
+    """A plant's own parameters in order, each overridden by a simulation parameter of its name."""
     given = params or {}
     return tuple(given.get(name, value) for name, value in own.items())

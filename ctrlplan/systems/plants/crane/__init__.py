@@ -1,4 +1,4 @@
-"""The crane of the paper's section 5: parameters, equations, flat maps, laws and loops."""
+"""Crane of the paper's section 5: parameters, equations, flat maps, control laws and loops."""
 
 from ctrlplan.systems.plants.crane.blocks import (
     create_crane_feedforward_iosystem,

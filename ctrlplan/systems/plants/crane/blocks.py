@@ -1,12 +1,14 @@
-"""The crane's laws as blocks: from a plan of the load to references of the PIDs, or to force and torque.
+"""Control laws of the crane as blocks: from a plan of the load to PID references, or to force and torque.
 
-Each is a block that `control.interconnect` joins by name to a source with the
-suffix ``_ref`` and to the crane, and is finite at zero inputs.
+`control.interconnect` connects each of them by name to a source with the suffix
+``_ref`` and to the crane. All are finite at zero inputs.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import inspect
+from collections.abc import Callable, Mapping, Sequence
+from typing import TypeVar
 
 import control as ct
 import numpy as np
@@ -21,9 +23,37 @@ from ctrlplan.systems.series import Quantity
 from ctrlplan.trajectories.files import signal_names
 
 Params = Mapping[str, float]
+F = TypeVar("F", bound=Callable[..., ct.NonlinearIOSystem])
+
+_ARGUMENTS = """labels : sequence of str, optional
+    Names of the plan's axes, by default x and z.
+suffix : str, optional
+    Appended to each label in the names of the references.
+name : str, optional
+    Name of the block.
+
+Returns
+-------
+control.NonlinearIOSystem
+    {}
+
+Raises
+------
+ValueError
+    If there are not two labels, or a reference has the name of another input."""
+"""Arguments that the factories share, in their docstrings."""
+
+
+def _documented(factory: F) -> F:
+    """Factory with the shared arguments in its docstring."""
+    static, dynamic = _ARGUMENTS.format("Static, of any time base."), _ARGUMENTS.format("In continuous time.")
+    doc = inspect.cleandoc(factory.__doc__ or "")
+    factory.__doc__ = doc.replace("%(static)s", static).replace("%(dynamic)s", dynamic)
+    return factory
 
 
 @former_signature("name")
+@_documented
 def create_setpoint_iosystem(
     crane: CraneParameters,
     *,
@@ -31,7 +61,7 @@ def create_setpoint_iosystem(
     suffix: str = "_ref",
     name: str = "setpoint",
 ) -> ct.NonlinearIOSystem:
-    """Set-point law: references of trolley and rope for a load at rest.
+    """Set-point law: trolley and rope references for a load at rest.
 
     No states. Inputs: x_ref and z_ref. Outputs: D_ref = x - b and R_ref = z [m].
 
@@ -39,22 +69,7 @@ def create_setpoint_iosystem(
     ----------
     crane : Crane
         The plant.
-    labels : sequence of str, optional
-        Names of the plan's axes: x and z unless given.
-    suffix : str, optional
-        Appended to each label in the names of the references.
-    name : str, optional
-        Name of the block.
-
-    Returns
-    -------
-    control.NonlinearIOSystem
-        Static, of any time base.
-
-    Raises
-    ------
-    ValueError
-        If labels are not two, or give a reference the name of another input.
+    %(static)s
 
     Examples
     --------
@@ -90,6 +105,7 @@ def create_still_iosystem(crane: CraneParameters, *args: str, **options: Value) 
 
 
 @former_signature("name")
+@_documented
 def create_generator_iosystem(
     crane: CraneParameters,
     *,
@@ -97,31 +113,16 @@ def create_generator_iosystem(
     suffix: str = "_ref",
     name: str = "generator",
 ) -> ct.NonlinearIOSystem:
-    """Figure 3's generator of references, (15a,b) of the planned jets.
+    """Reference generator of figure 3: (15a,b) with the planned jets.
 
     No states. Inputs: x_ref, x_ref_d1, x_ref_d2 and the same of z_ref. Outputs:
-    D_ref and R_ref [m]. Without feedback from the load, its sway is not damped.
+    D_ref and R_ref [m]. Without feedback from the load, sway is not damped.
 
     Parameters
     ----------
     crane : Crane
         The plant.
-    labels : sequence of str, optional
-        Names of the plan's axes: x and z unless given.
-    suffix : str, optional
-        Appended to each label in the names of the references.
-    name : str, optional
-        Name of the block.
-
-    Returns
-    -------
-    control.NonlinearIOSystem
-        Static, of any time base.
-
-    Raises
-    ------
-    ValueError
-        If labels are not two, or give a reference the name of another input.
+    %(static)s
 
     Examples
     --------
@@ -137,13 +138,14 @@ def create_generator_iosystem(
     """
 
     def out(t: float, state: Array, u: Array, params: Params) -> Array:
-        return np.array(_held(crane, u[0], u[2], u[3], u[5]))
+        return np.array(_pid_references(crane, u[0], u[2], u[3], u[5]))
 
     inputs = _input_names(2, labels, suffix)
     return ct.nlsys(None, out, inputs=inputs, outputs=["D_ref", "R_ref"], dt=None, name=name)
 
 
 @former_signature("name", renamed={"bandwidth": "load_bandwidth"})
+@_documented
 def create_load_feedback_iosystem(
     crane: CraneParameters,
     load_bandwidth: float = 1.0,
@@ -153,11 +155,11 @@ def create_load_feedback_iosystem(
     suffix: str = "_ref",
     name: str = "load_feedback",
 ) -> ct.NonlinearIOSystem:
-    """Generator with feedback from the load's x, which damps the sway.
+    """Reference generator with load feedback, which damps sway.
 
-    In (15a,b) x is the measured one and x'' the law
-    v = x_d'' - 2 zeta w (x' - x_d') - w^2 (x - x_d); z stays planned, because
-    feeding it back as well leaves a double zero eigenvalue.
+    In (15a,b) x is measured, and x'' is replaced by
+    v = x_d'' - 2 zeta w (x' - x_d') - w^2 (x - x_d). z is the planned one, because
+    feedback of z leaves a double eigenvalue at 0.
 
     No states. Inputs: x_ref, x_ref_d1, x_ref_d2, the same of z_ref, and the
     measured x and x_d1. Outputs: D_ref and R_ref [m].
@@ -167,26 +169,12 @@ def create_load_feedback_iosystem(
     crane : Crane
         The plant.
     load_bandwidth : float, optional
-        w [rad/s], above 0; stable with the study's PIDs from 0.1 to 3.
+        w [rad/s], above 0; the loop with the PIDs of the study is stable from
+        0.1 to 3.
     damping : float, optional
         zeta, above 0; 0.7 to 1.
-    labels : sequence of str, optional
-        Names of the plan's axes: x and z unless given.
-    suffix : str, optional
-        Appended to each label in the names of the references.
-    name : str, optional
-        Name of the block.
-
-    Returns
-    -------
-    control.NonlinearIOSystem
-        Static, of any time base.
-
-    Raises
-    ------
-    ValueError
-        If `load_bandwidth` or `damping` is not above 0, or
-        labels are not two, or give a reference the name of another input.
+    %(static)s
+        Also if `load_bandwidth` or `damping` is not above 0.
 
     Examples
     --------
@@ -206,13 +194,14 @@ def create_load_feedback_iosystem(
 
     def out(t: float, state: Array, u: Array, params: Params) -> Array:
         x2 = u[2] - s1 * (u[7] - u[1]) - s0 * (u[6] - u[0])
-        return np.array(_held(crane, u[6], x2, u[3], u[5]))
+        return np.array(_pid_references(crane, u[6], x2, u[3], u[5]))
 
     inputs = _input_names(2, labels, suffix, ["x", "x_d1"])
     return ct.nlsys(None, out, inputs=inputs, outputs=["D_ref", "R_ref"], dt=None, name=name)
 
 
 @former_signature("name")
+@_documented
 def create_dynamic_law_iosystem(
     crane: CraneParameters,
     poles: Sequence[complex] = (-1.0, -1.2, -1.4, -1.6),
@@ -221,36 +210,23 @@ def create_dynamic_law_iosystem(
     suffix: str = "_ref",
     name: str = "dynamic_law",
 ) -> ct.NonlinearIOSystem:
-    """The whole law (9)-(11), by dynamic extension: two chains of four integrators.
+    """Dynamic feedback linearisation of the crane, (9)-(11).
 
-    States: tension_offset [N], the tension as an offset from the weight of the
-    load, so that the zero state is equilibrium, and tension_rate [N/s]. Inputs:
-    x_ref, x_ref_d1, ... to order 4, the same of z_ref, then x, z, x_d1, z_d1, R,
+    The closed loop consists of two chains of four integrators.
+
+    States: tension_offset [N], the tension minus the weight of the load, so that
+    the zero state is the equilibrium, and tension_rate [N/s]. Inputs: x_ref,
+    x_ref_d1, ... up to order 4, the same of z_ref, then x, z, x_d1, z_d1, R,
     theta, D_d1, R_d1, theta_d1 of the crane. Outputs: F [N] and C [N m].
 
     Parameters
     ----------
     crane : Crane
-        The plant, of either model of the drum.
+        The plant, with either value of `rope_wrap`.
     poles : sequence of complex, optional
-        Four poles [rad/s] of the error of x, and the same of z.
-    labels : sequence of str, optional
-        Names of the plan's axes: x and z unless given.
-    suffix : str, optional
-        Appended to each label in the names of the references.
-    name : str, optional
-        Name of the block.
-
-    Returns
-    -------
-    control.NonlinearIOSystem
-        In continuous time.
-
-    Raises
-    ------
-    ValueError
-        If the poles are not four, not conjugate pairs, or not stable, or
-        labels are not two, or give a reference the name of another input.
+        Four poles [rad/s] of the error of x; the error of z has the same.
+    %(dynamic)s
+        Also if the poles are not four, not conjugate pairs, or not stable.
 
     Examples
     --------
@@ -307,6 +283,7 @@ def create_dynamic_law_iosystem(
 
 
 @former_signature("name")
+@_documented
 def create_crane_feedforward_iosystem(
     crane: CraneParameters,
     *,
@@ -314,31 +291,16 @@ def create_crane_feedforward_iosystem(
     suffix: str = "_ref",
     name: str = "feedforward",
 ) -> ct.NonlinearIOSystem:
-    """Force and torque from the planned jets alone: the open-loop half of the law.
+    """Flat feedforward of the crane: force and torque from the plan.
 
-    No states. Inputs: x_ref, x_ref_d1, ... to order 4 and the same of z_ref.
-    Outputs: F [N] and C [N m], exact for the model and without any correction.
+    No states. Inputs: x_ref, x_ref_d1, ... up to order 4 and the same of z_ref.
+    Outputs: F [N] and C [N m], exact for the model, without feedback.
 
     Parameters
     ----------
     crane : Crane
         The plant.
-    labels : sequence of str, optional
-        Names of the plan's axes: x and z unless given.
-    suffix : str, optional
-        Appended to each label in the names of the references.
-    name : str, optional
-        Name of the block.
-
-    Returns
-    -------
-    control.NonlinearIOSystem
-        Static, of any time base.
-
-    Raises
-    ------
-    ValueError
-        If labels are not two, or give a reference the name of another input.
+    %(static)s
 
     Examples
     --------
@@ -356,7 +318,7 @@ def create_crane_feedforward_iosystem(
 
     def out(t: float, state: Array, u: Array, params: Params) -> Array:
         jet = np.stack([np.asarray(u[:5]), np.asarray(u[5:10])], axis=1)
-        # Symbols are not checked; `crane_loop` has checked the whole plan.
+        # Symbols cannot be checked; `crane_loop` has checked the whole plan.
         found = checked_formulas(crane.numbers(), crane.rope_wrap, jet)
         return np.array([found["F"], found["C"]])
 
@@ -364,12 +326,12 @@ def create_crane_feedforward_iosystem(
 
 
 def _input_names(order: int, labels: Sequence[str] | None, suffix: str, measured: Sequence[str] = ()) -> list[str]:
-    """Names of the references axis by axis, then of what is measured."""
+    """Names of the references axis by axis, then of the measurements."""
     axes = [label + suffix for label in checked_labels(("x", "z") if labels is None else labels, 2)]
     return checked_names([*signal_names(axes, order), *measured], "inputs")
 
 
-def _held(crane: CraneParameters, x: Quantity, x2: Quantity, z: Quantity, z2: Quantity) -> list[Quantity]:
+def _pid_references(crane: CraneParameters, x: Quantity, x2: Quantity, z: Quantity, z2: Quantity) -> list[Quantity]:
     """D and R of (15a,b)."""
     b, hanging = crane.drum_radius, crane.gravity - z2
     pull = np.sqrt(x2 * x2 + hanging * hanging)

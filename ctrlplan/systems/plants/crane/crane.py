@@ -1,4 +1,4 @@
-"""The crane of the paper's section 5: trolley, hoist and a load on a rope."""
+"""Crane of the paper's section 5: trolley, hoist and a load on a rope."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ _UNITS = dict(zip((*POSITIVE, *FRICTIONS), ("kg", "kg", "kg m^2", "m", "m/s^2", 
 
 
 class Crane(CraneParameters, Displayed):
-    """Crane with a trolley, a drum and a load; its equations, flat maps and loops.
+    """Crane with trolley, drum and load: equations, flat maps and loops.
 
-    z points down. Equation numbers in the methods are the paper's.
+    z points down. Equation numbers in the methods refer to the paper.
 
     Parameters
     ----------
@@ -33,8 +33,8 @@ class Crane(CraneParameters, Displayed):
     gravity : float
         g [m/s^2].
     rope_wrap : bool
-        False is the paper's (14b), which neglects that the rope winds on the
-        drum as theta turns; True keeps that term, and with it the energy.
+        False: (14b) of the paper, which neglects that the rope winds on the drum
+        as theta changes. True: with that term; the model then conserves energy.
 
     Raises
     ------
@@ -56,13 +56,13 @@ class Crane(CraneParameters, Displayed):
     accelerations = model.accelerations
     energy = model.energy
 
-    # Flat maps, and what a plan must meet: flatness.py, rope.py
+    # Flat maps and checks of a plan: flatness.py, rope.py
     flat_system = flatness.flat_system
     quantities = flatness.quantities
     check = flatness.check
     rope = rope.rope
 
-    # Linear models and the study's controllers: linear.py
+    # Linear models and controllers of the study: linear.py
     linear_trolley = linear.linear_trolley
     linear_hoist = linear.linear_hoist
     linear_coupled = linear.linear_coupled

@@ -1,6 +1,6 @@
-"""The crane's flatness: states, tension and inputs from the jet of the load, (15a-d).
+"""Flatness of the crane: states, tension and inputs from the jet of the load, (15a-d).
 
-In (15c) the angle is in the right quadrant, theta = atan2(-x'', g - z'').
+The angle of (15c) is computed as theta = atan2(-x'', g - z'').
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from ctrlplan.flatness import FlatSystem
 from ctrlplan.systems import series
 from ctrlplan.systems.plants.crane import model
 from ctrlplan.systems.plants.crane.parameters import CraneParameters, Numbers
+from ctrlplan.systems.plants.crane.rope import check_taut
 from ctrlplan.systems.series import Taylor
 from ctrlplan.traits import declare
 from ctrlplan.trajectories import Extrema, Trajectory
@@ -26,12 +27,13 @@ ORDERS = (4, 4)
 
 
 def flat_system(crane: CraneParameters, name: str = "crane") -> FlatSystem:
-    """Crane as a flat system, its flat outputs the load's x and z.
+    """Crane as a flat system with the flat outputs x and z.
 
-    States, inputs and outputs as those of `iosystem`; orders (4, 4), that is
-    an extension of two states (the tension and its rate). The maps are those of
-    `quantities`; parameters of a run named as this crane's own override them
-    where they are given to `forward` and `reverse`.
+    States: D, R, theta, D_d1, R_d1, theta_d1. Inputs: F and C. Outputs: x, z, D,
+    R, theta, x_d1, z_d1, D_d1, R_d1, theta_d1, T. The orders are (4, 4), with an
+    extension of two states, the tension and its derivative. The maps are those
+    of `quantities`; parameters given to `forward` and `reverse` override those
+    of the crane.
 
     Examples
     --------
@@ -58,25 +60,25 @@ def flat_system(crane: CraneParameters, name: str = "crane") -> FlatSystem:
 
 
 def quantities(crane: CraneParameters, jet: ArrayLike) -> dict[str, Array]:
-    """States, tension and inputs from the jet of the load, (15a-d), in (15c) with the quadrant.
+    """States, tension and inputs from the jet of the load, (15a-d).
 
     Parameters
     ----------
     jet : array_like, shape (order + 1, 2, ...)
-        Derivatives of x and z; order 2 gives positions and tension, 3
-        their rates, 4 the inputs as well.
+        Derivatives of x and z. Order 2 gives positions and tension, order 3
+        also their first derivatives, order 4 also the inputs.
 
     Returns
     -------
     dict of str to ndarray
-        D, R, theta, T; from order 3 on D_d1, R_d1, theta_d1, T_d1; from
-        order 4 on D_d2, R_d2, theta_d2, T_d2, F, C.
+        D, R, theta, T; with order 3 also D_d1, R_d1, theta_d1, T_d1; with
+        order 4 also D_d2, R_d2, theta_d2, T_d2, F, C. In m, rad, N, N m and s.
 
     Raises
     ------
     ValueError
-        If the order is below 2, or g - z'' is not above 0 somewhere: the
-        rope cannot push.
+        If the order is below 2, or g - z'' is not positive everywhere: the rope
+        cannot push.
     """
     values = np.asarray(jet, dtype=float)
     if values.ndim < 2 or values.shape[1] != 2 or len(values) < 3:
@@ -87,12 +89,12 @@ def quantities(crane: CraneParameters, jet: ArrayLike) -> dict[str, Array]:
 def forward(
     crane: CraneParameters, x: Sequence[Array], u: Sequence[Array], params: Mapping[str, float] | None = None
 ) -> list[Array]:
-    """Flag of a state and inputs: x and z with four derivatives, the inputs held constant."""
+    """Flag of a state and constant inputs: x and z with four derivatives."""
     numbers = crane.numbers(params)
     given = [np.asarray(value, dtype=float) for value in x]
     state = [Taylor(value[None]) for value in given]
     force, torque = (np.asarray(value, dtype=float) for value in u)
-    for _ in range(3):  # each pass gives one more derivative of the accelerations
+    for _ in range(3):  # each iteration gives one more derivative of the accelerations
         second = model.solved(numbers, crane.rope_wrap, state, force, torque, 0.0)[:3]
         rates = [Taylor.integral(start, rate) for start, rate in zip(given[3:], second, strict=True)]
         state = [Taylor.integral(start, rate) for start, rate in zip(given[:3], rates, strict=True)] + rates
@@ -102,23 +104,21 @@ def forward(
 def reverse(
     crane: CraneParameters, flag: Sequence[ArrayLike], params: Mapping[str, float] | None = None
 ) -> tuple[Array, Array]:
-    """State (6, ...) and inputs (2, ...) of the flags of x and z, each (5, ...)."""
+    """State (6, ...) and inputs (2, ...) from the flags of x and z, each (5, ...)."""
     jet = np.stack([np.asarray(row)[: order + 1] for row, order in zip(flag, ORDERS, strict=True)], axis=1)
     found = checked_formulas(crane.numbers(params), crane.rope_wrap, jet)
     return np.stack([found[name] for name in model.STATES]), np.stack([found["F"], found["C"]])
 
 
 def checked_formulas(numbers: Numbers, rope_wrap: bool, jet: Array) -> dict[str, Array]:
-    """`formulas` of jets along which the rope is taut; of symbols nothing can be checked."""
+    """`formulas`, for numbers after the check of a taut rope."""
     if jet.dtype != object:
-        lowest = float(np.min(numbers[6] - jet[2, 1], initial=np.inf))
-        if not lowest > 0.0:
-            raise ValueError(f"g - z'' must be above 0 for a taut rope, got {lowest:.4g} m/s^2")
+        check_taut(numbers[6] - jet[2, 1])
     return formulas(numbers, rope_wrap, jet)
 
 
 def formulas(numbers: Numbers, rope_wrap: bool, jet: Array) -> dict[str, Array]:
-    """(15a-d) and the derivatives that the jet gives, of numbers or symbols."""
+    """(15a-d) and their derivatives as far as the jet determines them, numeric or symbolic."""
     m, trolley, inertia, b, f1, f2, g = numbers
     x, z = series.from_jet(jet[:, 0]), series.from_jet(jet[:, 1])
     across, fall = series.derivative(x, 2), series.derivative(z, 2)
@@ -147,11 +147,11 @@ def formulas(numbers: Numbers, rope_wrap: bool, jet: Array) -> dict[str, Array]:
 
 
 def check(crane: CraneParameters, plan: Trajectory) -> None:
-    """Reject a plan of the load that the crane cannot follow.
+    """Raise for a plan of the load that the crane cannot follow.
 
-    Over the whole interval, not at samples: g - z'' and T must be above 0
-    (from the exact extrema of z''), and so must R (from certified bounds of
-    a function of the jet).
+    g - z'', the tension T and the rope length R must be positive over the whole
+    interval, also between samples: the first two by the exact extrema of z'',
+    R by certified bounds.
 
     Parameters
     ----------
@@ -161,17 +161,11 @@ def check(crane: CraneParameters, plan: Trajectory) -> None:
     Raises
     ------
     ValueError
-        With the quantity, its limit, the worst value and its time.
+        If one of them is not; with its limit, its minimum and the time.
     """
-    if plan.naxes != 2:
-        raise ValueError(f"a plan of the load must have the axes x and z, got {plan.naxes} axes")
-    g = crane.gravity
+    check_axes(plan)
     fall = plan.extrema(2)
-    if not g - fall.maximum[1] > 0.0:
-        raise ValueError(
-            f"g - z'' must be above 0 for a taut rope, got {g - fall.maximum[1]:.4g} m/s^2 "
-            f"at {fall.time_max[1]:.4g} s (tension T <= 0)"
-        )
+    check_taut(crane.gravity - float(fall.maximum[1]), f" at {fall.time_max[1]:.4g} s (tension T <= 0)")
     if not plan.duration:
         shortest, time = float(min(plan.initial[1], plan.final[1])), plan.start
     else:
@@ -180,8 +174,14 @@ def check(crane: CraneParameters, plan: Trajectory) -> None:
         raise ValueError(f"the rope length R must be above 0, got {shortest:.4g} m at {time:.4g} s")
 
 
+def check_axes(plan: Trajectory) -> None:
+    """Raise unless a plan has two axes, x and z of the load."""
+    if plan.naxes != len(FLAT_LABELS):
+        raise ValueError(f"a plan of the load must have the axes x and z, got {plan.naxes} axes")
+
+
 def _shortest_rope(crane: CraneParameters, plan: Trajectory, acceleration: Extrema) -> tuple[float, float]:
-    """Certified lower bound of R over a plan, or its minimum where that decides or no bound does."""
+    """Certified lower bound of R over a plan and its time; the minimum itself if it is not positive or not bounded."""
     g, b = crane.gravity, crane.drum_radius
 
     def length(jet: Array) -> Array:
@@ -197,7 +197,7 @@ def _shortest_rope(crane: CraneParameters, plan: Trajectory, acceleration: Extre
     slopes[2] = (depth + b) / low, depth / low + (depth * pull + b * across) / low**2
     try:
         found = plan.bounds(length, 2, slopes, max_cells=200_000)
-    except ValueError:  # so near to a limit that no number of cells decides
+    except ValueError:  # too close to a limit for any number of cells
         resolved = plan.extrema_of(length, 2)
         return float(resolved.minimum[0]), float(resolved.time_min[0])
     return (found.lower, found.time_min) if found.minimum > 0.0 else (found.minimum, found.time_min)

@@ -1,4 +1,4 @@
-"""The crane's laws as values: what each needs of the plan, its options, and the block it builds."""
+"""Control laws of the crane as values: required derivatives of the plan, options, and the block."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ LawName = Literal["setpoint", "generator", "load_feedback", "dynamic", "feedforw
 
 @dataclass(frozen=True)
 class Law(ABC):
-    """Law of a crane's loop: what it requires of the plan, and its block.
+    """Control law of a crane loop.
 
     A new law is a frozen dataclass whose fields are its options. It must define
 
@@ -28,24 +28,25 @@ class Law(ABC):
       references of the PIDs,
     - `build`, which returns the block.
 
-    An instance is given to `crane_loop`; one line in `LAWS` adds a name for it,
-    which study files read as well.
+    An instance is given to `crane_loop`. One line in `LAWS` gives it a name, which
+    can also be used in study files.
 
     Attributes
     ----------
     name : str
         Name of the law, in messages and in `LAWS`.
     order : int
-        Highest derivative of the plan that the block reads.
+        Highest derivative of the plan among the inputs of the block.
     continuity : int
-        Highest derivative of the plan that must not jump; -1 where positions
+        Highest derivative of the plan that must be continuous; -1 if positions
         may jump.
     outputs : tuple of str
-        D_ref and R_ref, which the PIDs follow, or the inputs F and C of the crane.
+        D_ref and R_ref, the references of the PIDs, or F and C, the inputs of
+        the crane.
 
     Examples
     --------
-    Set points that are wrong by a constant, for a test of integral action:
+    A set-point law with a constant error, for a test of integral action:
 
     >>> from dataclasses import dataclass
     >>> import control as ct
@@ -81,19 +82,19 @@ class Law(ABC):
         Parameters
         ----------
         crane : Crane
-            The plant as the law knows it.
+            The plant model of the law.
 
         Returns
         -------
         control.NonlinearIOSystem
-            Inputs among x_ref, x_ref_d1, ... up to `order`, the same of z, and
-            outputs of the crane; outputs those in `outputs`.
+            Its inputs are among x_ref, x_ref_d1, ... up to `order`, the same of z,
+            and the outputs of the crane. Its outputs are those in `outputs`.
         """
 
 
 @dataclass(frozen=True)
 class SetpointLaw(Law):
-    """References of a load at rest, for steps; block `create_setpoint_iosystem`."""
+    """Set-point law for steps; block `create_setpoint_iosystem`."""
 
     name = "setpoint"
     order = 0
@@ -106,7 +107,7 @@ class SetpointLaw(Law):
 
 @dataclass(frozen=True)
 class GeneratorLaw(Law):
-    """Figure 3's reference generator; block `create_generator_iosystem`."""
+    """Reference generator of figure 3; block `create_generator_iosystem`."""
 
     name = "generator"
     order = 2
@@ -119,13 +120,15 @@ class GeneratorLaw(Law):
 
 @dataclass(frozen=True)
 class LoadFeedbackLaw(Law):
-    """Reference generator with feedback from the load; block `create_load_feedback_iosystem`.
+    """Reference generator with load feedback.
+
+    Its block is `create_load_feedback_iosystem`.
 
     Parameters
     ----------
     load_bandwidth : float, optional
-        Natural frequency of the load's error [rad/s], above 0; stable with the
-        study's PIDs from 0.1 to 3.
+        Natural frequency of the error of the load [rad/s], above 0; the loop
+        with the PIDs of the study is stable from 0.1 to 3.
     damping : float, optional
         Its damping ratio, above 0; 0.7 to 1.
 
@@ -155,12 +158,14 @@ class LoadFeedbackLaw(Law):
 
 @dataclass(frozen=True)
 class DynamicLaw(Law):
-    """The whole law (9)-(11), by dynamic extension; block `create_dynamic_law_iosystem`.
+    """Dynamic feedback linearisation, (9)-(11).
+
+    Its block is `create_dynamic_law_iosystem`.
 
     Parameters
     ----------
     poles : sequence of complex, optional
-        Four poles [rad/s] of the error of x, and the same of z.
+        Four poles [rad/s] of the error of x; the error of z has the same.
 
     Raises
     ------
@@ -186,7 +191,7 @@ class DynamicLaw(Law):
 
 @dataclass(frozen=True)
 class FeedforwardLaw(Law):
-    """Force and torque from the plan alone; block `create_crane_feedforward_iosystem`."""
+    """Flat feedforward; block `create_crane_feedforward_iosystem`."""
 
     name = "feedforward"
     order = 4
@@ -208,13 +213,13 @@ LAWS: dict[str, Law] = {
         FeedforwardLaw(),
     )
 }
-"""Laws by name, with their default options: the short form of a law."""
+"""Laws with their default options, by name."""
 
 _OLD_NAMES = {"still": "setpoint"}
 
 
 def as_law(law: Law | str) -> Law:
-    """Law itself, or the one of a name.
+    """Law from itself or from its name.
 
     Raises
     ------

@@ -1,6 +1,6 @@
-"""Linear models of the crane's drives, and the PIDs tuned on them.
+"""Linear models of trolley and hoist, and PIDs designed for them.
 
-The tension is a disturbance in the models of trolley and hoist alone.
+The rope tension is a disturbance of the models.
 """
 
 from __future__ import annotations
@@ -13,25 +13,30 @@ from ctrlplan.systems.plants.crane.parameters import CraneParameters
 
 
 def linear_trolley(crane: CraneParameters, name: str = "trolley") -> ct.StateSpace:
-    """D/F = 1/(s (M_c s + f1)): trolley alone, the tension a disturbance."""
+    """Linear model of the trolley, D/F = 1/(s (M_c s + f1)).
+
+    Inputs: F [N]. Outputs: D [m]. The rope tension is a disturbance.
+    """
     return _double(1.0 / crane.trolley_mass, crane.trolley_friction / crane.trolley_mass, "F", "D", name)
 
 
 def linear_hoist(crane: CraneParameters, name: str = "hoist", *, with_load: bool = False) -> ct.StateSpace:
-    """R/C = b/(s (J s + f2)): drum alone, the tension a disturbance.
+    """Linear model of the hoist, R/C = b/(s (J s + f2)).
 
-    With the load, whose weight is balanced, J + m b^2 stands for J: the
-    nonlinear crane linearised at equilibrium.
+    Inputs: C [N m]. Outputs: R [m]. The rope tension is a disturbance. With the
+    load, J is replaced by J + m b^2: the nonlinear crane linearised at
+    equilibrium, where its weight is balanced.
     """
     inertia = crane.drum_inertia + (crane.load_mass * crane.drum_radius**2 if with_load else 0.0)
     return _double(crane.drum_radius / inertia, crane.drum_friction / inertia, "C", "R", name)
 
 
 def linear_coupled(crane: CraneParameters, rope_length: float, name: str = "crane") -> ct.InterconnectedSystem:
-    """Trolley and swing about equilibrium at a rope length, coupled by the tension.
+    """Linear model of trolley and pendulum at a given rope length.
 
-    An interconnection of the trolley and the pendulum; input F, outputs D
-    and theta: D/F = (R s^2 + g)/(s [(M_c s + f1)(R s^2 + g) + m g s]).
+    An interconnection of the blocks trolley and pendulum, linearised at
+    equilibrium: D/F = (R s^2 + g)/(s [(M_c s + f1)(R s^2 + g) + m g s]).
+    Inputs: F [N]. Outputs: D [m] and theta [rad].
     """
     rope_length = checked_finite(rope_length, "rope_length", above=0.0)
     g = crane.gravity
@@ -67,7 +72,11 @@ def trolley_pid(
     limits: Range | None = None,
     tracking_time: float | None = None,
 ) -> ct.StateSpace | ct.NonlinearIOSystem:
-    """PID on D with a triple pole at -bandwidth [rad/s] on the trolley alone; inputs D_ref and D, output F."""
+    """PID of the trolley, a triple pole at -bandwidth [rad/s].
+
+    Inputs: D_ref and D [m]. Outputs: F [N]. The design model is
+    `linear_trolley`; other arguments as in `create_pid_iosystem`.
+    """
     return create_pid_iosystem(
         *_triple_pole(crane.trolley_mass, crane.trolley_friction, bandwidth),
         tf,
@@ -88,7 +97,12 @@ def hoist_pid(
     limits: Range | None = None,
     tracking_time: float | None = None,
 ) -> ct.StateSpace | ct.NonlinearIOSystem:
-    """PID on R, the load's inertia included and its weight as the bias; inputs R_ref and R, output C."""
+    """PID of the hoist, a triple pole at -bandwidth [rad/s].
+
+    Inputs: R_ref and R [m]. Outputs: C [N m]. The design model is
+    `linear_hoist` with the load, whose weight is the bias; other arguments as in
+    `create_pid_iosystem`.
+    """
     return create_pid_iosystem(
         *_hoist_gains(crane, bandwidth),
         tf,
@@ -102,13 +116,19 @@ def hoist_pid(
 
 
 def linear_trolley_loop(crane: CraneParameters, bandwidth: float = 5.0, tf: float = 0.02) -> ct.InterconnectedSystem:
-    """Trolley alone with its PID: input D_ref, output D."""
+    """Loop of `linear_trolley` with its PID.
+
+    Inputs: D_ref [m]. Outputs: D [m].
+    """
     blocks = [trolley_pid(crane, bandwidth, tf), linear_trolley(crane)]
     return ct.interconnect(blocks, inputs=["D_ref"], outputs=["D"], name="trolley_loop")
 
 
 def linear_hoist_loop(crane: CraneParameters, bandwidth: float = 5.0, tf: float = 0.02) -> ct.InterconnectedSystem:
-    """Drum and load with their PID, about the weight of the load: input R_ref, output R."""
+    """Loop of `linear_hoist` with the load and its PID.
+
+    Inputs: R_ref [m]. Outputs: R [m]. The weight of the load is balanced.
+    """
     pid = create_pid_iosystem(*_hoist_gains(crane, bandwidth), tf, inputs=("R_ref", "R"), outputs="C", name="hoist_pid")
     return ct.interconnect(
         [pid, linear_hoist(crane, with_load=True)], inputs=["R_ref"], outputs=["R"], name="hoist_loop"
@@ -128,6 +148,6 @@ def _double(gain: float, damping: float, source: str, sink: str, name: str) -> c
 
 
 def _triple_pole(mass: float, friction: float, bandwidth: float) -> tuple[float, float, float]:
-    """Kp, Ki, Kd that put three poles at -bandwidth on 1/(s (mass s + friction))."""
+    """Kp, Ki, Kd for a triple pole at -bandwidth with the plant 1/(s (mass s + friction))."""
     w = checked_finite(bandwidth, "bandwidth", above=0.0)
     return 3.0 * mass * w**2, mass * w**3, 3.0 * mass * w - friction

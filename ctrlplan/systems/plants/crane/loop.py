@@ -1,4 +1,4 @@
-"""The crane's closed loops: source, law, PIDs, crane."""
+"""Closed loops of the crane: source, control law, PIDs, crane."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ctrlplan._checks import Range, check_kind, checked_range
 from ctrlplan.systems.plants.crane import linear, model
-from ctrlplan.systems.plants.crane.flatness import check
+from ctrlplan.systems.plants.crane.flatness import FLAT_LABELS, check, check_axes
 from ctrlplan.systems.plants.crane.laws import Law, LawName, as_law
 from ctrlplan.systems.plants.crane.parameters import CraneParameters
 from ctrlplan.systems.source import create_source_iosystem
@@ -36,7 +36,11 @@ def crane_loop(
     inputs: Sequence[str] = (),
     name: str = "crane_loop",
 ) -> ct.InterconnectedSystem:
-    """Closed loop of figure 3: source, law, two PIDs, crane.
+    """Closed loop of figure 3: source, control law, two PIDs, crane.
+
+    States: those of source, law and PIDs, then those of the crane. Inputs: none,
+    or those in `inputs`. Outputs: those of the crane (x, z, D, R, theta, x_d1,
+    z_d1, D_d1, R_d1, theta_d1, T), F, C, x_ref and z_ref.
 
     Parameters
     ----------
@@ -45,49 +49,49 @@ def crane_loop(
     plan : Trajectory
         Plan of the load's x and z (down) [m].
     law : Law or {"setpoint", "generator", "load_feedback", "dynamic", "feedforward"}, optional
-        A law, or the name of one in `LAWS`: the references of a load at rest,
-        for steps; figure 3's reference generator; the generator with feedback
-        from the load; the whole law by dynamic extension; its open-loop half.
-        The first three output references of the PIDs, the others force and
-        torque without PIDs.
+        A law, or its name in `LAWS`: set-point law, for steps; reference
+        generator of figure 3; generator with load feedback; dynamic feedback
+        linearisation; flat feedforward. The outputs of the first three are the
+        references of the PIDs, those of the others force and torque, without
+        PIDs.
     load_bandwidth, damping, poles : optional
-        Options of a law given by its name, as in `LoadFeedbackLaw` and
+        Options of a law given by its name; see `LoadFeedbackLaw` and
         `DynamicLaw`.
     bandwidth : float, optional
         Triple pole of the PIDs [rad/s].
     tf : float, optional
-        Their derivative filter [s].
+        Time constant of their derivative filter [s].
     force_limits, torque_limits : (float, float) or float, optional
         Limits of F [N] and C [N m], with anti-windup; a number a for (-a, a).
     reference : sequence of control systems, optional
-        Blocks in the place of the plan's source: a replanner, a time scaling,
+        Blocks in place of the source of the plan: a replanner, a time scaling or
         a command filter, with the blocks that supply their inputs. (A governor,
-        which reads the states of the whole loop, stands outside.) Their outputs
-        that no other block reads must be the jets that the law reads, x_ref,
-        x_ref_d1, ..., z_ref, .... A block that does not start at 0 declares its
+        which reads the states of the whole loop, is connected outside.) Their
+        outputs must include the inputs of the law, x_ref, x_ref_d1, ..., z_ref,
+        .... A block whose initial state is not 0 declares it as
         ``initial_state``.
     wind : Trajectory, optional
         Horizontal force on the load [N], along x.
     inputs : sequence of str, optional
-        Signals that are inputs of the loop: what blocks of `reference` read, and
-        wind, where it is no trajectory.
+        Inputs of the loop: inputs of blocks of `reference`, and wind, if it is
+        not a trajectory.
     name : str, optional
         Name of the loop.
 
     Returns
     -------
     control.InterconnectedSystem
-        Without inputs unless given; outputs those of the crane, F and C, x_ref and z_ref.
-        Its attribute ``initial_state`` is the equilibrium at the plan's first position.
+        Its attribute ``initial_state`` is the equilibrium at the first position
+        of the plan, where `simulate` starts by default.
 
     Raises
     ------
     TypeError
-        If `plan`, `law`, `inputs` or `reference` is of a wrong kind.
+        If `plan`, `law`, `inputs` or `reference` has the wrong type.
     ValueError
         If the law is unknown or has no such option, the crane cannot follow the
-        plan, or a derivative that the law needs jumps: the message says which
-        and when.
+        plan, or a derivative that must be continuous for the law jumps; the
+        message gives the derivative and the time.
 
     Examples
     --------
@@ -121,10 +125,10 @@ def crane_loop(
         raise ValueError(f"limits must go with a law that uses the PIDs, got law {chosen.name!r}")
     blocks.append(model.iosystem(crane, wind=wind is not None or "wind" in inputs))
     _check_fed(reference or (), blocks, inputs)
-    outputs = [*model.OUTPUTS, "F", "C", "x_ref", "z_ref"]
+    outputs = [*model.OUTPUTS, *_ACTUATED, *(label + "_ref" for label in FLAT_LABELS)]
     loop = ct.interconnect(blocks, inputs=list(inputs) or 0, outputs=outputs, name=name)
     equilibrium = model.equilibrium(crane, float(plan.initial[0]), float(plan.initial[1]))[0]
-    # The crane comes last; the states of law and PIDs are 0 at rest.
+    # The crane is the last block; the states of law and PIDs are 0 at equilibrium.
     before = [_start(block) for block in blocks[:-1]]
     loop.initial_state = np.concatenate([*before, equilibrium])
     return declare(loop, initial_state=loop.initial_state)
@@ -135,7 +139,7 @@ _ACTUATED = ("F", "C")
 
 
 def _with_options(law: Law | str, options: dict[str, float | Sequence[complex] | None]) -> Law:
-    """The law, with the options given with its name."""
+    """Law with the options that are given with its name."""
     found = as_law(law)
     given = {name: value for name, value in options.items() if value is not None}
     if given and isinstance(law, Law):
@@ -150,7 +154,7 @@ def _with_options(law: Law | str, options: dict[str, float | Sequence[complex] |
 
 
 def _block(law: Law, crane: CraneParameters) -> ct.NonlinearIOSystem:
-    """Block of a law, which must have the outputs that the law states."""
+    """Block of a law, checked for the outputs that the law declares."""
     if law.outputs not in (_REFERENCES, _ACTUATED):
         raise ValueError(
             f"outputs of a law must be {_REFERENCES} or {_ACTUATED}, got {law.outputs} of the law {law.name!r}"
@@ -168,7 +172,7 @@ def _block(law: Law, crane: CraneParameters) -> ct.NonlinearIOSystem:
 def _check_signals(
     reference: Sequence[ct.InputOutputSystem] | None, wind: Trajectory | None, inputs: Sequence[str]
 ) -> None:
-    """Reject blocks, wind and inputs of a wrong kind."""
+    """Raise for blocks, wind or inputs of the wrong type."""
     for label, values in (("inputs", inputs), ("reference", reference)):
         if isinstance(values, str | ct.InputOutputSystem):
             raise TypeError(f"{label} must be a sequence, got {values!r:.60}")
@@ -185,7 +189,7 @@ def _check_signals(
 def _check_fed(
     reference: Sequence[ct.InputOutputSystem], blocks: Sequence[ct.InputOutputSystem], inputs: Sequence[str]
 ) -> None:
-    """Reject blocks of the reference with an input that no block outputs: it would be 0."""
+    """Raise for an unconnected input of a block of the reference: it would be 0."""
     known = {*inputs, *(label for block in blocks for label in block.output_labels)}
     for block in reference:
         missing = [label for label in block.input_labels or () if label not in known]
@@ -203,19 +207,16 @@ def _start(block: ct.InputOutputSystem) -> NDArray[np.float64]:
 
 
 def _named(plan: Trajectory) -> Trajectory:
-    """Plan of x and z: by name where its axes are called so, else in order."""
+    """Plan of x and z: by name if its axes have these labels, otherwise in order."""
     check_kind(plan, "plan", Trajectory)
-    if plan.naxes != 2:
-        raise ValueError(f"a plan of the load must have the axes x and z, got {plan.naxes} axes")
-    if plan.labels == ("x", "z"):
+    check_axes(plan)
+    if plan.labels == FLAT_LABELS:
         return plan
-    if set(plan.labels) == {"x", "z"}:
-        return plan.select(["x", "z"])
-    return stack([plan], labels=["x", "z"])
+    return plan.select(FLAT_LABELS) if set(plan.labels) == set(FLAT_LABELS) else stack([plan], labels=FLAT_LABELS)
 
 
 def _check_smooth(plan: Trajectory, law: Law) -> None:
-    """Reject a plan of which a derivative jumps that the law needs continuous."""
+    """Raise for a plan with a jump in a derivative that must be continuous for the law."""
     smooth = law.continuity
     for jump in plan.jumps(smooth) if smooth >= 0 else ():
         what = "position" if jump.order == 0 else f"derivative {jump.order}"

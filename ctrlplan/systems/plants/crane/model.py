@@ -1,8 +1,8 @@
-"""Equations of motion (13) and (14) of the crane, and the plant made of them.
+"""Nonlinear model of the crane: equations of motion (13) and (14).
 
-z points down. The rope leaves a drum of radius b on the trolley and hangs with
-length R from the point of tangency, at the angle theta from the vertical.
-Formulas take numbers, arrays, Taylor series and the symbols of a tracer alike.
+z points down. The rope leaves a drum of radius b on the trolley; R is its length
+from the point of tangency, theta its angle from the vertical. Formulas accept
+numbers, arrays, Taylor series and symbols.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ OUTPUTS = ("x", "z", "D", "R", "theta", "x_d1", "z_d1", "D_d1", "R_d1", "theta_d
 
 
 def iosystem(crane: CraneParameters, name: str = "crane", *, wind: bool = False) -> ct.NonlinearIOSystem:
-    """Nonlinear plant, equations (13) and (14).
+    """Nonlinear model of the crane, equations (13) and (14).
 
-    States D, R, theta and their rates; inputs F [N] on the trolley, C [N m]
-    on the drum, and with `wind` the horizontal force wind [N] on the load,
-    along x; outputs x, z, D, R, theta, the rates x_d1, z_d1,
-    D_d1, R_d1, theta_d1, and the tension T [N]. Parameters of a run named
-    as this crane's own (``params={"load_mass": 1000.0}``) override them in
-    the plant alone: a payload that the controller does not know of.
+    States: D, R [m], theta [rad] and their derivatives D_d1, R_d1, theta_d1.
+    Inputs: F [N] on the trolley, C [N m] on the drum; with `wind` also wind [N],
+    the horizontal force on the load along x. Outputs: x, z, D, R, theta, x_d1,
+    z_d1, D_d1, R_d1, theta_d1 and the tension T [N]. Parameters given to a
+    simulation (``params={"load_mass": 1000.0}``) override those of the model
+    only, as for a payload that is unknown to the controller.
     """
     block = ct.nlsys(
         partial(update, crane),
@@ -48,12 +48,12 @@ def iosystem(crane: CraneParameters, name: str = "crane", *, wind: bool = False)
 
 
 def equilibrium(crane: CraneParameters, x: float, z: float) -> tuple[Array, Array]:
-    """State and inputs (F, C) at which the load rests at (x, z).
+    """Equilibrium: state and inputs (F, C) with the load at (x, z).
 
     Raises
     ------
     ValueError
-        If z is not above 0: the load hangs below the trolley.
+        If z is not positive: the load hangs below the trolley.
     """
     x, z = checked_finite(x, "x"), checked_finite(z, "z", above=0.0)
     state = np.array([x - crane.drum_radius, z, 0.0, 0.0, 0.0, 0.0])
@@ -68,9 +68,9 @@ def accelerations(
 
 
 def energy(crane: CraneParameters, state: ArrayLike) -> Array:
-    """Mechanical energy [J] of states (6, ...); zero potential at z = 0.
+    """Mechanical energy [J] of states (6, ...), with zero potential at z = 0.
 
-    The drum turns at R'/b, or with `rope_wrap` at R'/b - theta'.
+    The speed of the drum is R'/b, with `rope_wrap` R'/b - theta'.
     """
     values = np.asarray(state, dtype=float)
     m, trolley, inertia, b, _, _, g = crane.numbers()
@@ -81,13 +81,13 @@ def energy(crane: CraneParameters, state: ArrayLike) -> Array:
 
 
 def update(crane: CraneParameters, t: float, state: Array, inputs: Array, params: Params) -> Array:
-    """Rates of the states, as `control.nlsys` calls them."""
+    """Derivatives of the states, in the form of `control.nlsys`."""
     d2, r2, theta2, _ = solved(crane.numbers(params), crane.rope_wrap, state, *_forces(inputs))
     return np.array([state[3], state[4], state[5], d2, r2, theta2])
 
 
 def output(crane: CraneParameters, t: float, state: Array, inputs: Array, params: Params) -> Array:
-    """`OUTPUTS`, as `control.nlsys` calls them."""
+    """`OUTPUTS`, in the form of `control.nlsys`."""
     numbers = crane.numbers(params)
     x, z, x_rate, z_rate = load(numbers[3], state)
     tension = solved(numbers, crane.rope_wrap, state, *_forces(inputs))[3]
@@ -95,7 +95,7 @@ def output(crane: CraneParameters, t: float, state: Array, inputs: Array, params
 
 
 def feedthrough(ninputs: int) -> NDArray[np.bool_]:
-    """Direct feedthrough (noutputs, ninputs): from forces and torque to the tension alone."""
+    """Direct feedthrough (noutputs, ninputs): from forces and torque to the tension only."""
     return np.array([[label == "T"] * ninputs for label in OUTPUTS])
 
 
@@ -133,5 +133,5 @@ def load(b: float, state: Quantity) -> tuple[Quantity, Quantity, Quantity, Quant
 
 
 def _forces(inputs: Array) -> tuple[float, float, float]:
-    """F, C and the wind, 0 where it is no input."""
+    """F, C and the wind, 0 if it is not an input."""
     return inputs[0], inputs[1], inputs[2] if inputs.shape[0] > 2 else 0.0

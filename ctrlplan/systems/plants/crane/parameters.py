@@ -1,4 +1,4 @@
-"""Parameters of the crane, checked when a crane is made."""
+"""Parameters of the crane."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Numbers = tuple[float, float, float, float, float, float, float]
 
 @dataclass(frozen=True, kw_only=True)
 class CraneParameters:
-    """Parameters of a crane; `Crane` states their units."""
+    """Parameters of a crane; see `Crane` for their units."""
 
     load_mass: float = 500.0
     trolley_mass: float = 5000.0
@@ -38,6 +38,6 @@ class CraneParameters:
             checked_finite(getattr(self, name), name, minimum=0.0)
 
     def numbers(self, params: Mapping[str, float] | None = None) -> Numbers:
-        """m, M_c, J, b, f1, f2, g, each overridden by the parameter of a run of its name."""
+        """m, M_c, J, b, f1, f2, g, each overridden by a simulation parameter of its name."""
         m, trolley, inertia, b, f1, f2, g = overridden({name: getattr(self, name) for name in NUMBERS}, params)
         return m, trolley, inertia, b, f1, f2, g

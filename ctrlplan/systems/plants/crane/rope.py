@@ -1,4 +1,4 @@
-"""The crane's rope as `planning.clearance` evaluates it."""
+"""Rope of the crane, for `ctrlplan.clearance`."""
 
 from __future__ import annotations
 
@@ -14,13 +14,20 @@ from ctrlplan.trajectories import Trajectory
 
 
 def rope(crane: CraneParameters) -> CraneRope:
-    """Rope of this crane, from the load up to the drum, for `ctrlplan.clearance`."""
+    """Rope from the load to the drum, for `ctrlplan.clearance`."""
     return CraneRope(crane.drum_radius, crane.gravity)
+
+
+def check_taut(hanging: Array | float, place: str = "") -> None:
+    """Raise unless g - z'' [m/s^2] is positive: the rope cannot push."""
+    lowest = float(np.min(hanging, initial=np.inf))
+    if not lowest > 0.0:
+        raise ValueError(f"g - z'' must be above 0 for a taut rope, got {lowest:.4g} m/s^2{place}")
 
 
 @dataclass(frozen=True)
 class CraneRope:
-    """Straight rope from the load to the point where it leaves the drum.
+    """Straight rope from the load to its point of tangency at the drum.
 
     Attributes
     ----------
@@ -29,7 +36,7 @@ class CraneRope:
     gravity : float
         g [m/s^2].
     order : int
-        Highest derivative of the load that is read: 2.
+        Highest derivative of the load that is used: 2.
     """
 
     drum_radius: float
@@ -37,12 +44,12 @@ class CraneRope:
     order: ClassVar[int] = 2
 
     def top(self, jet: Array) -> Array:
-        """Point (D + b cos theta, -b sin theta) at which the rope leaves the drum.
+        """Point of tangency (D + b cos theta, -b sin theta) at the drum.
 
         Parameters
         ----------
         jet : ndarray, shape (order + 1, 2, ...)
-            Derivatives of x and z, to order 2 at least.
+            Derivatives of x and z, at least up to order 2.
 
         Returns
         -------
@@ -54,14 +61,13 @@ class CraneRope:
             If g - z'' is not above 0 somewhere: the rope cannot push.
         """
         across, hanging = jet[2, 0], self.gravity - jet[2, 1]
-        if not np.min(hanging, initial=np.inf) > 0.0:
-            raise ValueError(f"g - z'' must be above 0 for a taut rope, got {np.min(hanging):.4g} m/s^2")
+        check_taut(hanging)
         lean = across / np.hypot(across, hanging)
         over = jet[0, 0] + across / hanging * (jet[0, 1] - self.drum_radius * lean)
         return np.stack([over, self.drum_radius * lean])
 
     def slopes(self, plan: Trajectory) -> Array:
-        """Bounds of |d top/d entry| over the jets of a plan.
+        """Bounds of the partial derivatives of `top` over a plan.
 
         Parameters
         ----------
@@ -71,7 +77,7 @@ class CraneRope:
         Returns
         -------
         ndarray, shape (3, 2)
-            Row nu, column axis: of the nu-th derivative of that axis.
+            Entry (nu, axis): with respect to the nu-th derivative of that axis.
 
         Raises
         ------
@@ -80,11 +86,7 @@ class CraneRope:
         """
         b, fall = self.drum_radius, plan.extrema(2)
         low = self.gravity - float(fall.maximum[1])
-        if not low > 0.0:
-            raise ValueError(
-                f"g - z'' must be above 0 for a taut rope, got {low:.4g} m/s^2 "
-                f"at {fall.time_max[1]:.4g} s (tension T <= 0)"
-            )
+        check_taut(low, f" at {fall.time_max[1]:.4g} s (tension T <= 0)")
         depth, across = float(plan.peak()[1]), float(max(-fall.minimum[0], fall.maximum[0]))
         lean = across / math.hypot(across, low)
         # With h = g - z'': top = (x + z x''/h - b x''^2/(h S), b x''/S), term by term.
