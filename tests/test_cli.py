@@ -151,7 +151,7 @@ def test_plan_of_a_study_with_one_plan_keeps_the_name_given(study, tmp_path, cap
         (["plan.c", "--dt", "0.1"], r"dt must not be given for \.c \(only for .*\), got 0\.1"),
         (["plan.json", "--dt", "0.1"], r"dt must not be given for \.json, which holds the plans themselves"),
         (["plan.csv", "--dt", "0"], r"dt must be finite and above 0, got 0\.0"),
-        (["plan.csv", "--dt", "1e-300"], r"dt must leave at most 100000000 samples, .*"),
+        (["plan.csv", "--dt", "1e-300"], r"dt must give at most 100000000 samples, .*"),
     ],
 )
 def test_plan_says_what_is_wrong_in_one_line(arguments, message, study, tmp_path, capsys):

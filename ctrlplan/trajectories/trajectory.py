@@ -635,7 +635,10 @@ class Trajectory(Displayed, Fields, ABC):
         return export_plan(self, path, Options(dt, timepts, derivatives, flat))
 
     def to_csv(self, path: str | os.PathLike[str], timepts: ArrayLike | None = None, order: int = 2) -> None:
-        """Write as CSV, whatever the file name; .gz, .bz2 and .xz are compressed. See `export`."""
+        """Write to a CSV file of any name; as `export` for .csv.
+
+        Files named .gz, .bz2 and .xz are compressed.
+        """
         from ctrlplan.trajectories.export import Options
         from ctrlplan.trajectories.export.csv_table import write_csv
 

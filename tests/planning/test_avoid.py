@@ -325,8 +325,6 @@ def test_a_path_much_longer_than_the_shortest_way_is_said():
     x, z = plan(5.0).tolist()
     message = r"the path found is (\S+) long, (\S+) times the shortest path around obstacles"
     with pytest.warns(UserWarning, match=message) as caught:
-        UserWarning, match=r"the path found is (\S+) long, (\S+) times the shortest path around obstacles"
-    ) as caught:
         found = avoid(plan, [Disc((x, z), 0.5)]).plan
     path = found(np.linspace(0.0, 20.0, 200_001))
     length = float(np.hypot(*np.diff(path)).sum())

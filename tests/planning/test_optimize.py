@@ -659,7 +659,7 @@ def test_bad_values_are_rejected(arguments, message):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"derivative": "3"}, "derivative must be a whole number"),
+        ({"derivative": "3"}, "derivative must be an integer"),
         ({"weights": ["a", "b"]}, r"weights\[0\] must be a number, got"),
         ({"waypoints": [1, 2]}, r"waypoints\[0\] must be a Waypoint, got int"),
     ],

@@ -233,7 +233,7 @@ def test_degree_and_smooth(spline):
             with pytest.raises(ValueError, match=f"{name} must be an integer of at least 1, got {wrong}"):
                 spline(POINTS, **{"degree": 9, name: wrong})
         for wrong in ("3", [3], 1j):
-            with pytest.raises((TypeError, ValueError), match=f"{name} must be a whole number"):
+            with pytest.raises((TypeError, ValueError), match=f"{name} must be an integer"):
                 spline(POINTS, **{"degree": 9, name: wrong})
 
 

@@ -205,7 +205,7 @@ def test_effort_must_be_one_number_a_joint(tmp_path):
         def states_and_inputs(self, plan, timepts):
             return np.zeros((1, len(timepts))), np.zeros((1, len(timepts)))
 
-    with pytest.raises(ValueError, match=r"inputs of the flat system must be as many as axes .* 2, got 1: u"):
+    with pytest.raises(ValueError, match=r"inputs of the flat system must be one per axis .* 2, got 1: u"):
         plan.export(tmp_path / "plan.yaml", flat=OneInput())
 
 
@@ -462,7 +462,7 @@ def test_an_unknown_ending_names_those_that_are_known(tmp_path):
     [
         (".csv", {"dt": 0.1, "timepts": [0.0]}, "dt and timepts must not be given together, got both"),
         (".csv", {"dt": 0.0}, "dt must be finite and above 0, got 0"),
-        (".csv", {"dt": 1e-9}, "dt must leave at most 100000000 samples, got 2e\\+09 with dt = 1e-09 s"),
+        (".csv", {"dt": 1e-9}, "dt must give at most 100000000 samples, got 2e\\+09 with dt = 1e-09 s"),
         (".csv", {"timepts": 0.1}, "timepts must be sample times of shape"),
         (".csv", {"derivatives": -1}, "derivatives must be a whole number from 0, got -1"),
         (".c", {"dt": 0.1}, r"dt must not be given for \.c \(only for \.csv.*\), got 0.1"),

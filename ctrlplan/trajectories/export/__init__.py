@@ -1,4 +1,4 @@
-"""Plans and responses as files of other programs: one module a format, one table of endings."""
+"""Export of plans and responses to files of other programs: one module per format."""
 
 from ctrlplan.trajectories.export.endings import ENDINGS, check_options, ending_of, export_plan, export_table
 from ctrlplan.trajectories.export.formats import FlatMaps, Format, Options, Table, TableFormat, sampled

@@ -1,4 +1,4 @@
-"""Plans as C99 source and header, without allocation or library."""
+"""Plans as C99 source and header, without memory allocation or libraries."""
 
 from __future__ import annotations
 
@@ -32,18 +32,18 @@ extern "C" {
 #define @UPPER@_START @START@
 #define @UPPER@_END @END@
 
-/* Position and derivatives, jet[k][axis] the k-th, at a time [s]. The first position is held before the start,
- * the last after the end. */
+/* Position and derivatives, jet[k][axis] the k-th, at a time [s]. Constant at the initial position before
+ * the start, and at the final one after the end. */
 void @NAME@_jet(double t, double jet[@UPPER@_DERIVATIVES + 1][@UPPER@_AXES]);
 
 /* Segment at a time [s], from 0; the first before the start, the last after the end. */
 int @NAME@_segment(double t);
 
-/* Beginning of a segment [s]. */
+/* Start of a segment [s]. */
 double @NAME@_segment_start(int segment);
 
-/* The same jet in single precision, at a time s [s] since the beginning of a segment. A segment that does not exist
- * counts as the nearest one, and a time outside of it continues the polynomial at that end. */
+/* The same jet in single precision, at a time s [s] since the start of a segment. A segment number out of range is
+ * clipped, and a time outside of the segment extrapolates the polynomial at that end. */
 void @NAME@_jetf(int segment, float s, float jet[@UPPER@_DERIVATIVES + 1][@UPPER@_AXES]);
 
 #ifdef __cplusplus
@@ -62,7 +62,7 @@ _SOURCE = """\
 #define DEGREE @DEGREE@
 #define CELLS @CELLS@
 
-/* Of each segment: beginning [s], first cell, and cells by second and inverse radius of a cell [1/s]. */
+/* Of each segment: start [s], first cell, cells per second and inverse radius of a cell [1/s]. */
 static const double starts[SEGMENTS] = @STARTS@;
 static const int firsts[SEGMENTS + 1] = @FIRSTS@;
 static const double rates[SEGMENTS] = @RATES@;
@@ -70,7 +70,7 @@ static const double inverses[SEGMENTS] = @INVERSES@;
 static const float rates_f[SEGMENTS] = @RATES_F@;
 static const float inverses_f[SEGMENTS] = @INVERSES_F@;
 
-/* Of each cell: centre [s] from the beginning of its segment, and coefficients of the powers of
+/* Of each cell: centre [s] from the start of its segment, and coefficients of the powers of
  * (time - centre) / radius, the highest first. */
 static const double centres[CELLS] = @CENTRES@;
 static const float centres_f[CELLS] = @CENTRES_F@;
@@ -147,10 +147,10 @@ class C99(Format):
     """Header and source in one folder: ``NAME_jet(t, jet)`` for a file called ``NAME.c``.
 
     Polynomials are centred in their cell. A variant in single precision takes a
-    segment and the time since its beginning.
+    segment and the time since its start.
     """
 
-    takes = ("derivatives",)
+    accepted = ("derivatives",)
 
     def files(self, plan: Trajectory, path: Path, options: Options) -> Files:
         """Contents by path; as `Format.files`."""
@@ -174,7 +174,7 @@ class C99(Format):
 
 
 def _numbers(plan: Trajectory, derivatives: int) -> dict[str, str]:
-    """What the plan as a whole has."""
+    """Entries of the plan as a whole."""
     held = np.zeros((3, derivatives + 1, plan.naxes))
     held[0, 0], held[1], held[2, 0] = plan.initial, plan.jet(plan.end, derivatives), plan.final
     return {
@@ -204,7 +204,7 @@ def _entries(found: list[Cells]) -> dict[str, str]:
 
 
 def _single(plan: Trajectory, found: list[Cells]) -> dict[str, str]:
-    """Tables in single precision, about centres and with radii that have it themselves."""
+    """Tables in single precision, about centres and with radii rounded to it."""
     degree = max(cells.coefficients.shape[2] for cells in found) - 1
     with np.errstate(over="ignore", under="ignore"):
         inverses = np.array([1.0 / cells.radius for cells in found]).astype(np.float32)
@@ -234,7 +234,7 @@ def _padded(tables: Iterable[Array], degree: int) -> Array:
 
 
 def _array(values: object, single: bool = False) -> str:
-    """Nested initialiser of C, from which every bit returns."""
+    """Nested initialiser of C, exact to every bit."""
     if isinstance(values, np.ndarray) and values.ndim > 1:
         return "{\n" + ",\n".join(_array(row, single) for row in values) + "}"
     numbers = np.asarray(values).tolist()
@@ -242,5 +242,5 @@ def _array(values: object, single: bool = False) -> str:
 
 
 def _filled(text: str, entries: dict[str, str]) -> str:
-    """Text with the entries in their places."""
+    """Text with the placeholders replaced by entries."""
     return re.sub(r"@(\w+?)@", lambda found: entries[found[1]], text)

@@ -31,12 +31,12 @@ from ctrlplan.trajectories.files import signal_names, signal_rows
 from ctrlplan.trajectories.trajectory import Trajectory
 
 _TOLERANCE = 1e-6
-"""Error of the position between points, in parts of its range, where no points were given."""
+"""Error of the position between points relative to its range, if no times are given."""
 
 _ORDERS = np.arange(3)
 _HERMITE = np.array([1.0 / 46080.0, math.sqrt(5.0) / 30000.0, 1.0 / 1920.0])
 _JUMP = np.array([0.01728, 0.0678, 1.0])
-"""Largest values of u^3 (1 - u)^2 / 2 on [0, 1], of its derivative (rounded up) and of its second derivative."""
+"""Maxima of u^3 (1 - u)^2 / 2 on [0, 1], of its derivative (rounded up) and of its second derivative."""
 
 
 class Cam(NamedTuple):
@@ -47,7 +47,7 @@ class Cam(NamedTuple):
     error: Array  # (3, naxes)
 
     def stated(self, plan: Trajectory) -> str:
-        """The error in words."""
+        """Description of the error."""
         pairs = zip(signal_names(plan.labels, 2), self.error.T.ravel().tolist(), strict=True)
         bounds = ", ".join(f"{plain(name)} {error:.3g}" for name, error in pairs)
         return f"error between points, with polynomials of degree 5, at most: {bounds}"
@@ -56,7 +56,7 @@ class Cam(NamedTuple):
 class CamCSV(Format):
     """Table with columns master, x, x_d1, x_d2, ...; its first line, after #, states the error between points."""
 
-    takes = ("dt", "timepts")
+    accepted = ("dt", "timepts")
 
     def files(self, plan: Trajectory, path: Path, options: Options) -> Files:
         """Contents by path; as `Format.files`."""
@@ -69,19 +69,19 @@ class CamCSV(Format):
 class CamST(Format):
     """Structured text for CODESYS SoftMotion: a list of global variables with an MC_CAM_REF for each axis.
 
-    Cams are of the kind XYVA (byType 3), whose points are an array of SMC_CAMXYVA
-    with master position dX, slave position dY and its derivatives dV and dA by the
+    Cams are of the type XYVA (byType 3), whose points are an array of SMC_CAMXYVA
+    with master position dX, slave position dY and its derivatives dV and dA with respect to the
     master position. The text is the content of a global variable list.
     """
 
-    takes = ("dt", "timepts")
+    accepted = ("dt", "timepts")
 
     def files(self, plan: Trajectory, path: Path, options: Options) -> Files:
         """Contents by path; as `Format.files`."""
         cam = cam_of(with_duration(plan, ".cam.st"), options)
         count = cam.times.size
         if count > _ELEMENTS:
-            raise ValueError(f"a cam of CODESYS must have at most {_ELEMENTS} points, got {count}; give fewer timepts")
+            raise ValueError(f"a cam of CODESYS must have at most {_ELEMENTS} points, got {count}; reduce timepts")
         lines = [f"(* {cam.stated(plan)} *)", "VAR_GLOBAL"]
         names = [re.sub(r"[\W_]+", "_", f"cam_{label}", flags=re.ASCII).rstrip("_") for label in plan.labels]
         for axis, name in enumerate(names):
@@ -102,7 +102,7 @@ _ELEMENTS = 32767  # nElements is an INT
 
 
 def cam_of(plan: Trajectory, options: Options) -> Cam:
-    """Points at the breakpoints and the times given, or as many as `_TOLERANCE` needs.
+    """Points at the breakpoints and the given times, or as many as `_TOLERANCE` requires.
 
     Raises
     ------
@@ -133,7 +133,7 @@ def cam_of(plan: Trajectory, options: Options) -> Cam:
         times = np.union1d(wanted if options.dt is None else np.minimum(wanted, plan.end), plan.breakpoints)
     if times[0] < plan.start or times[-1] > plan.end:
         raise ValueError(
-            f"timepts of a cam must lie between {plan.start:g} s and {plan.end:g} s, where the plan is, got "
+            f"timepts of a cam must lie between the plan's start {plan.start:g} s and end {plan.end:g} s, got "
             f"{times[0]:g} s to {times[-1]:g} s"
         )
     return Cam(times, plan.jet(times, 2), _error(plan, times, peaks, [(j.time, j.label, j.size) for j in inner]))

@@ -1,7 +1,7 @@
 r"""Plans as polynomials in cells of their segments, with a bound of the error.
 
 In a cell of radius r about an anchor the plan is replaced by its Taylor
-polynomial of degree n. By Taylor's theorem derivative k of what is left out is at most
+polynomial of degree n. By Taylor's theorem derivative k of the remainder is at most
 
 .. math:: \max|y^{(n + 1)}|\,\frac{r^{n + 1 - k}}{(n + 1 - k)!},
 
@@ -26,32 +26,32 @@ from ctrlplan.trajectories.extrema import stationary_times
 from ctrlplan.trajectories.trajectory import Trajectory
 
 DEGREE = 15
-"""Highest degree of the polynomials."""
+"""Maximum degree of the polynomials."""
 
 HIGHEST = 8
 """Highest derivative for which their error is bounded."""
 
 _CELLS = 4096  # of one segment
 _UNIT = 0.5 * float(np.finfo(float).eps)
-_GROWTH = 4.0  # size of the terms that may cancel, in peaks of the derivative
+_GROWTH = 4.0  # magnitude of terms that may cancel, relative to the peak of the derivative
 
 
 @dataclass(frozen=True)
 class Cells:
-    """Polynomials that stand for one segment of a plan.
+    """Polynomials of one segment of a plan, by cells.
 
     Attributes
     ----------
     start : float
-        Beginning of the segment [s].
+        Start of the segment [s].
     edges : ndarray, shape (ncells + 1,)
-        Ends of the cells, from the beginning of the segment [s].
+        Ends of the cells, from the start of the segment [s].
     anchors : ndarray, shape (ncells,)
-        Local origin of each cell, from the beginning of the segment [s].
+        Local origin of each cell, from the start of the segment [s].
     radius : float
-        Largest distance from the anchor [s].
+        Maximum distance from the anchor [s].
     coefficients : ndarray, shape (ncells, naxes, degree + 1)
-        Of the powers of (local time / radius), the lowest first.
+        Coefficients of the powers of (local time / radius), the lowest first.
     error : ndarray, shape (derivatives + 1, naxes)
         Bound of the error of each derivative, given exact derivatives at the anchors.
     """
@@ -80,11 +80,11 @@ def cells_of(plan: Trajectory, derivatives: int, *, centred: bool) -> list[Cells
     Parameters
     ----------
     plan : Trajectory
-        With a duration.
+        Plan with a duration.
     derivatives : int
-        Highest derivative for which cells are short enough.
+        Highest derivative with an error bound.
     centred : bool
-        Whether cells have their anchor at the centre, or at their beginning.
+        Whether cells have their anchor at the centre, or at their start.
 
     Raises
     ------
@@ -121,7 +121,7 @@ def _cells(plan: Trajectory, segment: int, peaks: Array, centred: bool) -> Cells
     k = np.arange(len(peaks))
     count = 1
     while True:
-        # Times are rounded as they will be where the cells are used.
+        # Times are rounded as in the use of the cells.
         edges = start + (end - start) * (np.arange(count + 1) / count) - start
         edges[-1] = end - start
         anchors = 0.5 * (edges[:-1] + edges[1:]) if centred else edges[:-1]
@@ -137,7 +137,7 @@ def _cells(plan: Trajectory, segment: int, peaks: Array, centred: bool) -> Cells
 
 
 def _terms(sizes: Array, count: int) -> Array:
-    """Sums (count, naxes) of the terms of each derivative, where they are largest."""
+    """Maximum sums (count, naxes) of the terms of each derivative."""
     rows = []
     for k in range(count):
         i = np.arange(sizes.shape[2])

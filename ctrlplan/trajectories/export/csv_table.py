@@ -1,4 +1,4 @@
-"""Tables as CSV: one line of names, then one line a time."""
+"""Tables as CSV: a header line, then one line per time."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ _FORMULA = ("=", "+", "-", "@", "\t", "\r")
 
 
 class CSV(TableFormat):
-    """Comma-separated values; every bit of a number returns.
+    """Comma-separated values, exact to every bit.
 
-    An apostrophe stands before names that a spreadsheet would take for a formula.
+    Names that a spreadsheet would read as a formula get an apostrophe as prefix.
     """
 
     def encoded(self, table: Table) -> str:

@@ -27,7 +27,7 @@ ENDINGS: dict[str, Format] = {
     ".cam.st": CamST(),
     ".c": C99(),
 }
-"""Formats by the ending of the file's name; of several that fit, the longest counts."""
+"""Formats by the ending of the file's name; the longest match applies."""
 
 
 def export_plan(plan: Trajectory, path: str | os.PathLike[str], options: Options) -> tuple[Path, ...]:
@@ -41,11 +41,13 @@ def export_plan(plan: Trajectory, path: str | os.PathLike[str], options: Options
 
 
 def check_options(options: Options, ending: str) -> None:
-    """Reject options that a format does not have."""
+    """Raise for options that a format does not have."""
     for name in options.given():
-        if name not in ENDINGS[ending].takes:
-            takes = ", ".join(e for e, f in ENDINGS.items() if name in f.takes)
-            raise ValueError(f"{name} must not be given for {ending} (only for {takes}), got {getattr(options, name)}")
+        if name not in ENDINGS[ending].accepted:
+            endings = ", ".join(e for e, f in ENDINGS.items() if name in f.accepted)
+            raise ValueError(
+                f"{name} must not be given for {ending} (only for {accepted}), got {getattr(options, name)}"
+            )
 
 
 def export_table(table: Table, path: str | os.PathLike[str]) -> Path:

@@ -1,4 +1,4 @@
-"""What a file format of exported plans must define, and what it is given."""
+"""Interface of the file formats of exported plans."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Files = Mapping[Path, str | bytes]
 
 
 class FlatMaps(Protocol):
-    """Flat system, as far as exports use it."""
+    """Protocol of flat systems for exports."""
 
     state_labels: list[str]
     input_labels: list[str]
@@ -42,7 +42,7 @@ class Table:
     names : tuple of str
         Names of the signals, without the time.
     rows : ndarray, shape (nsignals, ntime)
-        Their values.
+        Values of the signals.
     """
 
     times: Array
@@ -53,8 +53,9 @@ class Table:
     def of(cls, times: Array, signals: Mapping[str, tuple[Sequence[str], Array]]) -> Table:
         """Table of groups of signals, each with names and rows.
 
-        A name that an earlier group, or the time, has gets its own group's name
-        before it: ``state.y`` of a state named as the output y.
+        A name that an earlier group contains, or the name of the time, gets the
+        name of its group as prefix: ``state.y`` for a state with the name of the
+        output y.
         """
         names: list[str] = []
         for group, (own, _) in signals.items():
@@ -107,14 +108,14 @@ class Options:
         return tuple(name for name, value in vars(Options()).items() if getattr(self, name) is not value)
 
     def times(self, start: float, end: float) -> Array:
-        """Sample times of an interval: 1001 from start to end unless a period or times were given."""
+        """Sample times of an interval; default: 1001 from start to end."""
         if self.timepts is not None:
             return sample_times(self.timepts)
         if self.dt is None:
             return np.linspace(start, end, 1001)
         count = (end - start) / self.dt
         if count > _SAMPLES:
-            raise ValueError(f"dt must leave at most {_SAMPLES} samples, got {count:.4g} with dt = {self.dt:g} s")
+            raise ValueError(f"dt must give at most {_SAMPLES} samples, got {count:.4g} with dt = {self.dt:g} s")
         return start + self.dt * np.arange(math.ceil(count * (1.0 - 1e-12)) + 1, dtype=float)
 
 
@@ -124,16 +125,16 @@ _SAMPLES = 100_000_000
 class Format(ABC):
     """A file format of plans.
 
-    A new format must define `files`, and `takes` where it has options; it is
+    A new format must define `files`, and `accepted` if it has options; it is
     added to the table ``ENDINGS`` of endings.py.
 
     Attributes
     ----------
-    takes : tuple of str, class variable
-        Options that the format has.
+    accepted : tuple of str, class variable
+        Options of the format.
     """
 
-    takes: ClassVar[tuple[str, ...]] = ()
+    accepted: ClassVar[tuple[str, ...]] = ()
 
     @abstractmethod
     def files(self, plan: Trajectory, path: Path, options: Options) -> Files:
@@ -142,27 +143,27 @@ class Format(ABC):
         Parameters
         ----------
         plan : Trajectory
-            What is exported.
+            Plan to be exported.
         path : Path
-            The file that was named.
+            Path of the file.
         options : Options
-            Of those in `takes`; the others have their defaults.
+            Options, of which those not in `accepted` have their defaults.
 
         Raises
         ------
         ValueError
-            If the format cannot hold this plan.
+            If the format does not support this plan.
         """
 
 
 class TableFormat(Format):
-    """A file format of sampled signals, of plans and responses; a new one must define `encoded`."""
+    """A file format of sampled signals of plans and responses; a new format must define `encoded`."""
 
-    takes = ("dt", "timepts", "derivatives", "flat")
+    accepted = ("dt", "timepts", "derivatives", "flat")
 
     @abstractmethod
     def encoded(self, table: Table) -> str | bytes:
-        """Content of the file that holds a table."""
+        """Content of the file of a table."""
 
     def files(self, plan: Trajectory, path: Path, options: Options) -> Files:
         """Contents by path; as `Format.files`."""
@@ -181,7 +182,7 @@ def sampled(plan: Trajectory, options: Options) -> Table:
 
 
 def sample_times(timepts: ArrayLike) -> Array:
-    """Sample times (ntime,), which a lone sampling period is not."""
+    """Sample times (ntime,), checked; a sampling period is rejected."""
     times = checked_timepts(timepts)
     if times.ndim != 1:
         got = f"the scalar {times:g}" if times.ndim == 0 else f"shape {times.shape}"
@@ -194,16 +195,16 @@ def sample_times(timepts: ArrayLike) -> Array:
 
 
 def with_duration(plan: Trajectory, ending: str) -> Trajectory:
-    """The plan, once it is found to have segments."""
+    """The plan, checked to have a duration."""
     if not plan.duration:
         raise ValueError(f"a plan written as {ending} must have a duration, got a step")
     return plan
 
 
 def decimal(value: float) -> str:
-    """Number with a decimal point, as YAML and structured text read it, from which every bit returns."""
+    """Number with a decimal point, as YAML and structured text require, exact to every bit."""
     if not math.isfinite(value):
-        raise ValueError(f"numbers written must be finite, got {value}")
+        raise ValueError(f"numbers in the file must be finite, got {value}")
     mantissa, e, exponent = repr(float(value)).partition("e")
     return mantissa + ("" if "." in mantissa else ".0") + e + exponent
 
@@ -214,5 +215,5 @@ def decimals(values: Sequence[float] | Array) -> str:
 
 
 def plain(name: str) -> str:
-    """Name that can stand in a comment of any language."""
+    """Name that is valid in a comment of any language."""
     return re.sub(r"[^\w .-]", "_", name, flags=re.ASCII)

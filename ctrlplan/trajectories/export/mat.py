@@ -14,8 +14,8 @@ class MAT(TableFormat):
     """MAT file (level 5): ``time``, and each signal as a structure with time.
 
     A structure has the fields ``time`` (ntime, 1), ``signals.values`` (ntime, 1)
-    and ``signals.dimensions``, as the Simulink block From Workspace takes it.
-    In names, what MATLAB does not allow is replaced by an underscore.
+    and ``signals.dimensions``, as the Simulink block From Workspace requires.
+    Characters of names that MATLAB does not allow are replaced by underscores.
     """
 
     def encoded(self, table: Table) -> bytes:

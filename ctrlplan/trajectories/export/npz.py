@@ -1,4 +1,4 @@
-"""Tables as arrays of numpy, one a signal."""
+"""Tables as numpy arrays, one per signal."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class NPZ(TableFormat):
     def encoded(self, table: Table) -> bytes:
         """Content of the file; as `TableFormat.encoded`."""
         data = io.BytesIO()
-        # Not by numpy.savez, whose own arguments could not be names of signals.
+        # Not by numpy.savez, whose arguments cannot be names of signals.
         with zipfile.ZipFile(data, "w") as archive:
             for name, row in zip(("time", *table.names), (table.times, *table.rows), strict=True):
                 with archive.open(f"{name}.npy", "w", force_zip64=True) as member:

@@ -17,12 +17,12 @@ class PPolyJSON(Format):
     """JSON with the arrays of `scipy.interpolate.PPoly`.
 
     Entries: ``labels``; ``x``, times of the cells' ends [s], shape (ncells + 1,);
-    ``c``, coefficients of the powers of the time since a cell's beginning, the
+    ``c``, coefficients of the powers of the time since the start of a cell, the
     highest first, shape (degree + 1, ncells, naxes); ``error``, by signal, the
-    bound of its distance from the plan, given that plan's exact derivatives.
+    bound of the distance from the plan, given its exact derivatives.
     """
 
-    takes = ("derivatives",)
+    accepted = ("derivatives",)
 
     def files(self, plan: Trajectory, path: Path, options: Options) -> Files:
         """Contents by path; as `Format.files`."""

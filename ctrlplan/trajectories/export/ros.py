@@ -1,4 +1,4 @@
-"""Plans as messages of ROS."""
+"""Plans as ROS messages."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class JointTrajectory(Format):
     nanoseconds. ``effort`` are the inputs of the flat system, in their order.
     """
 
-    takes = ("dt", "timepts", "derivatives", "flat")
+    accepted = ("dt", "timepts", "derivatives", "flat")
 
     def files(self, plan: Trajectory, path: Path, options: Options) -> Files:
         """Contents by path; as `Format.files`."""
@@ -39,7 +39,7 @@ class JointTrajectory(Format):
             values["effort"] = options.flat.states_and_inputs(plan, times)[1]
             if len(values["effort"]) != plan.naxes:
                 raise ValueError(
-                    f"inputs of the flat system must be as many as axes in a JointTrajectory, {plan.naxes}, got "
+                    f"inputs of the flat system must be one per axis in a JointTrajectory, {plan.naxes}, got "
                     f"{len(values['effort'])}: {', '.join(options.flat.input_labels)}"
                 )
         lines = [f"joint_names: [{', '.join(map(_quoted, plan.labels))}]", "points:" if times.size else "points: []"]
