@@ -464,7 +464,7 @@ def test_an_unknown_ending_names_those_that_are_known(tmp_path):
         (".csv", {"dt": 0.0}, "dt must be finite and above 0, got 0"),
         (".csv", {"dt": 1e-9}, "dt must give at most 100000000 samples, got 2e\\+09 with dt = 1e-09 s"),
         (".csv", {"timepts": 0.1}, "timepts must be sample times of shape"),
-        (".csv", {"derivatives": -1}, "derivatives must be a whole number from 0, got -1"),
+        (".csv", {"derivatives": -1}, "derivatives must be an integer of at least 0, got -1"),
         (".c", {"dt": 0.1}, r"dt must not be given for \.c \(only for \.csv.*\), got 0.1"),
         (".ppoly.json", {"timepts": [0.0]}, r"timepts must not be given for \.ppoly\.json"),
         (".c", {"flat": FLAT["crane"][1]}, r"flat must not be given for \.c"),

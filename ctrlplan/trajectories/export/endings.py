@@ -46,7 +46,7 @@ def check_options(options: Options, ending: str) -> None:
         if name not in ENDINGS[ending].accepted:
             endings = ", ".join(e for e, f in ENDINGS.items() if name in f.accepted)
             raise ValueError(
-                f"{name} must not be given for {ending} (only for {accepted}), got {getattr(options, name)}"
+                f"{name} must not be given for {ending} (only for {endings}), got {getattr(options, name)}"
             )
 
 
