@@ -1,4 +1,4 @@
-"""What print and Jupyter show of an object: one description, rendered as text and as HTML."""
+"""Descriptions of objects, rendered as text for print and as HTML for Jupyter."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from itertools import pairwise
 from typing import TypeAlias
 
 WIDTH = 99
-"""Columns of a text."""
+"""Maximum width of a text in columns."""
 
 ROWS = 8
-"""Rows that a table has at most, where there may be many."""
+"""Maximum number of rows of a long table."""
 
 _LONGEST = 46
-"""Columns that a cell takes at most."""
+"""Maximum width of a cell in columns."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class Facts:
     Attributes
     ----------
     rows : sequence of (str, str)
-        Name and value; a row without a value is left out.
+        Name and value; a row without a value is omitted.
     """
 
     rows: Sequence[tuple[str, str]]
@@ -41,7 +41,7 @@ class Table:
     Attributes
     ----------
     caption : str
-        What it shows.
+        Caption of the table.
     heads : sequence of str
         Headings of the columns.
     rows : sequence of sequence of str
@@ -58,16 +58,16 @@ class Table:
 
 @dataclass(frozen=True)
 class Figure:
-    """A small figure, which the HTML has in addition to the text.
+    """A small figure, shown in HTML only.
 
     Attributes
     ----------
     caption : str
-        What it shows.
+        Caption of the figure.
     nrows : int
         Number of axes, one above the other.
     draw : callable
-        Draws in an array of axes (nrows,).
+        Function that draws in an array of axes (nrows,).
     """
 
     caption: str
@@ -80,7 +80,7 @@ Part: TypeAlias = str | Facts | Table | Figure
 
 
 class Displayed:
-    """Base of the objects that describe themselves.
+    """Base class of objects with a description.
 
     A class must define `_describe`, which yields a title in one line and then the
     parts of the description. ``repr`` is the title with the name of the class,
@@ -111,7 +111,7 @@ def title_of(shown: Displayed) -> str:
 
 
 def in_line(value: object) -> str:
-    """Value of any kind as a text, without a table."""
+    """Value of any type as text, without tables."""
     return repr(value) if isinstance(value, Displayed) else str(value)
 
 
@@ -121,7 +121,7 @@ def number(value: float, unit: str = "") -> str:
     Parameters
     ----------
     value : float
-        nan is "n/a", infinity "inf", or "never" where it is a time.
+        nan is "n/a", infinity "inf", or "never" for times.
     unit : str, optional
         Unit of the value.
     """
@@ -133,23 +133,23 @@ def number(value: float, unit: str = "") -> str:
 
 
 def counted(count: int, word: str) -> str:
-    """A number with its noun, in the plural where it is one."""
+    """A number with its noun in the singular or plural."""
     return f"{count} {word}" if count == 1 else f"{count} {word}s"
 
 
 def shortened(rows: Sequence[Sequence[str]]) -> list[Sequence[str]]:
-    """Rows of a table, those in the middle of many replaced by one of dots."""
+    """Rows of a table, with dots instead of middle ones if there are many."""
     if len(rows) <= ROWS:
         return list(rows)
     return [*rows[: ROWS - 2], ["..."] * len(rows[0]), rows[-1]]
 
 
-# Control characters, overrides of the direction of writing, halves of surrogate pairs (of file names), no characters.
+# Control characters, direction overrides, lone surrogates (of file names), noncharacters.
 _UNREADABLE = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udfff\ufffe\uffff]")
 
 
 def readable(text: str) -> str:
-    """Text with a replacement for every character that cannot be seen or written."""
+    """Text with unprintable characters replaced."""
     return _UNREADABLE.sub("\N{REPLACEMENT CHARACTER}", text)
 
 
@@ -180,7 +180,7 @@ def _facts_lines(facts: Facts) -> list[str]:
 
 
 def _table_lines(table: Table) -> list[str]:
-    """Table with as many columns side by side as fit, the others below under the same first column."""
+    """Lines of a table; columns that do not fit follow below with the same first column."""
     marked = {j for _, j in table.best}
     grid = [[_cell(head) for head in table.heads]]
     for i, row in enumerate(table.rows):
@@ -203,7 +203,7 @@ def _table_lines(table: Table) -> list[str]:
 
 
 def _wrapped(words: Sequence[str], width: int) -> list[str]:
-    """Lines of words, those that are too long broken."""
+    """Lines of words; words that are too long are broken."""
     lines = [""]
     for word in words:
         joined = f"{lines[-1]} {word}" if lines[-1] else word
@@ -218,12 +218,12 @@ def _wrapped(words: Sequence[str], width: int) -> list[str]:
 
 
 def _line(text: str) -> str:
-    """Text in one line, as it can be seen."""
+    """Printable text in one line."""
     return " ".join(readable(text).split())
 
 
 def _cell(text: str) -> str:
-    """Text of a cell, the middle of a very long one left out."""
+    """Text of a cell, without the middle of a very long one."""
     line = _line(text)
     if _width(line) <= _LONGEST:
         return line
@@ -232,7 +232,7 @@ def _cell(text: str) -> str:
 
 
 def _width(text: str) -> int:
-    """Columns that a text takes: two for a wide letter, none for an accent."""
+    """Width of a text in columns: two for a wide letter, none for an accent."""
     if text.isascii():
         return len(text)
     return sum(

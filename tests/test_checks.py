@@ -23,7 +23,7 @@ NAMELESS = {"checked_labels", "default_labels"}
 
 
 @pytest.mark.parametrize("check", [CHECKS[name] for name in sorted(set(CHECKS) - NAMELESS)])
-def test_every_check_takes_the_value_and_then_its_name(check):
+def test_the_parameters_of_every_check_are_value_and_name(check):
     assert list(inspect.signature(check).parameters)[1] == "name"
 
 

@@ -86,7 +86,7 @@ CHAINS = [
 
 
 @pytest.mark.parametrize("chain", CHAINS, ids=["library", "command"])
-def test_importing_loads_only_what_it_needs(chain):
+def test_an_import_loads_only_what_is_required(chain):
     steps = (
         f"import {what}\nloaded = {without!r} & set(sys.modules)\nassert not loaded, ({what!r}, loaded)\n"
         for what, without in chain
@@ -94,7 +94,7 @@ def test_importing_loads_only_what_it_needs(chain):
     fresh("import sys\n" + "".join(steps))
 
 
-def test_names_are_loaded_when_they_are_asked_for():
+def test_names_are_loaded_on_first_use():
     fresh(
         "import sys, ctrlplan as cp\n"
         "cp.Waypoint\n"

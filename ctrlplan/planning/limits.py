@@ -136,7 +136,7 @@ class Bound:
 
 
 def limit_words(limit: object) -> str:
-    """A limit in words, in any of the forms that `margins` accepts; of several axes one after the other."""
+    """Description of a limit in any form that `margins` accepts, axis by axis."""
     if isinstance(limit, Limits):
         return _range(*_sides(limit.low, limit.high))
     given = np.array(limit, dtype=object)
@@ -232,7 +232,7 @@ class Margins(Displayed):
         yield self.table()
 
     def table(self) -> Table:
-        """Table with a row a limit, as print shows it."""
+        """Table with one row per limit, as print shows it."""
         rows = [
             (
                 row.bound.name,

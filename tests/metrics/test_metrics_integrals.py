@@ -1,4 +1,4 @@
-"""Integrals of errors and controls: closed forms, the start of the clock, how they scale."""
+"""Integrals of errors and controls: closed forms, the reference time, scaling."""
 
 from math import exp
 
@@ -21,7 +21,7 @@ def test_exponential_error():
     assert metrics.itae(t, e) == pytest.approx(1 - 6 * exp(-5), abs=1e-9)
 
 
-def test_the_clock_of_itae_starts_where_it_is_told():
+def test_itae_starts_at_the_reference_time():
     """On the error 1 from 2 to 6 s; before the start nothing counts."""
     t = np.linspace(2, 6, 9)
     one = np.ones(9)
@@ -43,7 +43,7 @@ def test_sums_over_axes_and_rows():
 
 
 def test_bang_bang_control_costs_its_height():
-    """A switch from one limit to the other: the cubic through it would lose two thirds of an interval."""
+    """A switch from one limit to the other: the cubic through it would miss two thirds of an interval."""
     t = np.linspace(0, 2, 41)
     u = np.where(t < 1, 3.0, -3.0)
     assert metrics.effort(t, u) == pytest.approx(18, rel=1e-14)

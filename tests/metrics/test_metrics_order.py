@@ -30,7 +30,7 @@ def slope(errors):
 
 
 def worst(metric, exact, grid):
-    """Return, for each count of samples, the greatest error over many beginnings and durations."""
+    """Return, for each count of samples, the maximum error over many start times and durations."""
     spans = list(zip(STARTS, STARTS + LENGTHS, strict=True))
     return [max(abs(metric(grid(a, b, count)) - exact(a, b)) for a, b in spans) for count in COUNTS]
 

@@ -48,7 +48,7 @@ def test_three_samples_are_a_parabola_and_two_a_line():
 
 @pytest.mark.parametrize("at", range(1, 20))
 def test_a_jump_costs_what_the_samples_say(at):
-    """No swing beside the jump; the integrals are the trapezoidal rule's."""
+    """No oscillation next to the jump; the integrals are those of the trapezoidal rule."""
     t = np.arange(20.0)
     y = np.where(t >= at, 3.0, -1.0)
     assert metrics.total_variation(t, y) == 4.0

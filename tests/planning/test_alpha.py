@@ -96,7 +96,7 @@ def test_the_polynomial_is_best_where_it_is_known_to_be(name, alpha, value):
     ("name", "alpha", "value"),
     [("peak_jerk", 1.98, 39.39), ("peak_snap", 1.48, 231.46), ("squared_snap", 1.818, 30363.7)],
 )
-def test_trigonometric_splines_win_on_jerk_and_snap(name, alpha, value):
+def test_trigonometric_splines_have_smaller_peak_jerk_and_snap(name, alpha, value):
     found = cp.choose_alpha(REST, name)
     assert found.alpha == pytest.approx(alpha, abs=0.005)
     assert found.value == pytest.approx(value, rel=2e-4)
@@ -106,7 +106,7 @@ def test_trigonometric_splines_win_on_jerk_and_snap(name, alpha, value):
     assert abs(near[values.argmin()] - found.alpha) <= 0.002
 
 
-def test_crane_path_is_least_to_a_millionth_of_its_length():
+def test_crane_path_is_minimal_to_a_millionth_of_its_length():
     found = cp.choose_alpha(OBSTACLE, "path")
     alphas = np.concatenate([np.linspace(0, 6.27, 150), np.linspace(found.alpha - 0.05, found.alpha + 0.05, 41)])
     paths = brute(OBSTACLE, "path", alphas)
@@ -116,11 +116,11 @@ def test_crane_path_is_least_to_a_millionth_of_its_length():
     assert not found.tied
 
 
-def test_crane_wandering_is_the_same_choice():
-    path, wander = cp.choose_alpha(OBSTACLE, "path"), cp.choose_alpha(OBSTACLE, "wandering")
-    assert wander.alpha == pytest.approx(path.alpha, abs=1e-6)
-    assert wander.value == pytest.approx(path.value / POLYLINE - 1, abs=1e-9)
-    assert wander.blow_up > path.alpha
+def test_excess_length_gives_the_same_choice_for_the_crane():
+    path, excess = cp.choose_alpha(OBSTACLE, "path"), cp.choose_alpha(OBSTACLE, "wandering")
+    assert excess.alpha == pytest.approx(path.alpha, abs=1e-6)
+    assert excess.value == pytest.approx(path.value / POLYLINE - 1, abs=1e-9)
+    assert excess.blow_up > path.alpha
 
 
 @pytest.mark.slow
@@ -147,7 +147,7 @@ def check_global(seed, family, name, count):
     found = cp.choose_alpha(waypoints, name, family=family)
     alphas = np.linspace(0.0, found.alphas[-1], count)
     values = brute(waypoints, name, alphas, family, 401)
-    # The best few are looked at closely; what samples miss by then is below 1e-6.
+    # The best few are refined; samples then miss less than 1e-6.
     for k in np.argsort(values)[:3]:
         plan = family(waypoints, alpha=float(alphas[k]))
         exact = length(plan) if name == "path" else naive(plan, name, 20_001)
@@ -172,7 +172,7 @@ def test_many_random_waypoints_have_no_better_alpha(seed, name):
 
 
 @pytest.mark.parametrize("name", ["path", "wandering"])
-def test_straight_moves_tie_and_take_the_least_jerk(name):
+def test_straight_moves_tie_and_the_jerk_is_minimised(name):
     straight = [Waypoint(0, [0, 0], 0, 0), Waypoint(2, [3, 4], 0, 0)]
     found = cp.choose_alpha(straight, name)
     assert found.tied
@@ -181,16 +181,16 @@ def test_straight_moves_tie_and_take_the_least_jerk(name):
     assert found.blow_up > pi
 
 
-def test_a_tie_takes_the_least_jerk_among_the_tied_alone():
-    # Equal from 2 to 3 only: at rest the squared jerk rises with alpha, so that the least is at 2.
+def test_a_tie_minimises_the_jerk_among_the_minimisers():
+    # Equal from 2 to 3 only: at rest the squared jerk rises with alpha, so that the minimum is at 2.
     found = cp.choose_alpha(REST, lambda plan: max(2.0 - plan.alpha, 0.0, plan.alpha - 3.0))
     assert found.tied
     assert found.value == pytest.approx(0.0, abs=1e-7)
     assert found.alpha == pytest.approx(2.0, abs=1e-6)
 
 
-def test_a_tie_of_all_is_solved_for_the_least_jerk():
-    # With four entries at the ends and a jerk at one of them the least is inside.
+def test_a_tie_of_all_is_solved_for_the_minimum_jerk():
+    # With four entries at the ends and a jerk at one of them the minimum is inside.
     waypoints = [Waypoint(0, 0, 0, 0, 0), Waypoint(1, 1, 0, 0, 40.0)]
     found = cp.choose_alpha(waypoints, lambda plan: 1.0)
     jerk = cp.choose_alpha(waypoints, "squared_jerk")
@@ -198,7 +198,7 @@ def test_a_tie_of_all_is_solved_for_the_least_jerk():
     assert SquaredDerivative(3)(found.plan) == pytest.approx(jerk.value, rel=1e-9)
 
 
-def test_a_move_that_stays_takes_no_path():
+def test_a_constant_plan_has_no_path():
     found = cp.choose_alpha([Waypoint(0, [1, 2], 0), Waypoint(3, [1, 2], 0)])
     assert (found.alpha, found.value, found.tied) == (0.0, 0.0, True)
 
@@ -440,7 +440,7 @@ def test_a_choice_stands_for_its_alpha():
     start=st.sampled_from([0.0, -3.0, 1e3]),
     name=st.sampled_from(["path", "peak_jerk", "squared_jerk"]),
 )
-def test_neither_size_nor_clock_moves_the_choice(size, duration, start, name):
+def test_neither_size_nor_time_unit_changes_the_choice(size, duration, start, name):
     rate = 16.0 / duration
     other = [
         Waypoint(start * duration + w.time / rate, *(size * rate**k * row for k, row in enumerate(w.jet)))
@@ -449,7 +449,7 @@ def test_neither_size_nor_clock_moves_the_choice(size, duration, start, name):
     ours, theirs = cp.choose_alpha(OBSTACLE, name), cp.choose_alpha(other, name)
     nu = {"path": 0, "peak_jerk": 3, "squared_jerk": 5}[name]
     power = 2 if name == "squared_jerk" else 1
-    # Where the objective is least it is flat: alpha is known to the root of what its values are.
+    # The objective is flat at its minimum: the error of alpha is the square root of that of its values.
     assert theirs.alpha == pytest.approx(ours.alpha, abs=1e-4)
     assert theirs.value == pytest.approx(ours.value * size**power * rate**nu, rel=1e-8)
 

@@ -63,9 +63,9 @@ def check(plan, found, obstacles, *, gap, load=0.0, crane=None, points=4):
             for thing in obstacles:
                 assert np.min(naive(thing, *along)) >= gap - 1e-9
     assert (found.start, found.end, found.labels) == (plan.start, plan.end, plan.labels)
-    kept = [w for w in found.waypoints if w in plan.waypoints]
+    preserved = [w for w in found.waypoints if w in plan.waypoints]
     added = [w for w in found.waypoints if w not in plan.waypoints]
-    assert tuple(kept) == plan.waypoints
+    assert tuple(preserved) == plan.waypoints
     assert 1 <= len(added) <= points
     assert all(len(w.jet) == 1 for w in added)
     for w in plan.waypoints:
@@ -82,7 +82,7 @@ def test_the_wall_of_the_paper_is_passed_without_its_via_points(family):
     assert type(found) is type(plan)
     assert found.alpha == plan.alpha
     assert clearance(found, obstacles, load=0.5, rope=Crane().rope(), required=0.3).certified
-    # Over the wall, and without wandering: up to one height, and down.
+    # Over the wall without extra reversals: up to one height, and down.
     z = found(np.linspace(0.0, 16.0, 2001))[1]
     assert np.count_nonzero(np.diff(np.sign(np.diff(z)[np.abs(np.diff(z)) > 1e-6]))) <= 3
     assert 5.0 < z.min() < 5.7
@@ -111,7 +111,7 @@ def test_it_moves_no_farther_than_it_must():
     assert 2.68 < found(8.0)[1] <= 2.7
 
 
-def test_among_several_ways_the_least_rough_is_taken():
+def test_among_several_paths_that_of_minimum_roughness_is_chosen():
     """Two mirrored problems have mirrored answers, though their shortest way is found on the other side."""
     obstacles = [Disc((10.0, 5.2), 2.0), Disc((7.0, 1.6), 1.0)]
     mirrored = [Disc((10.0, 4.8), 2.0), Disc((7.0, 8.4), 1.0)]
@@ -207,7 +207,7 @@ def test_a_waypoint_as_near_as_allowed_is_no_hindrance():
         cp.PiecewiseSpline(ACROSS, alpha=1.0),
     ],
 )
-def test_options_of_the_plan_are_kept(plan):
+def test_options_of_the_plan_are_preserved(plan):
     found = avoid(plan, [Disc((10.0, 5.2), 2.0)], clearance=0.5).plan
     check(plan, found, [Disc((10.0, 5.2), 2.0)], gap=0.5)
     assert type(found) is type(plan)
@@ -281,7 +281,7 @@ def test_a_waypoint_too_near_is_rejected(obstacle, message):
         avoid(cp.PolySpline(ACROSS), [Disc((10.0, 0.0), 1.0), obstacle], clearance=0.4, load=0.3)
 
 
-def test_a_rope_that_hangs_too_near_at_rest_is_rejected():
+def test_a_rope_too_near_at_rest_is_rejected():
     message = r"the rope must have a clearance of 0.4 at each waypoint, got 0.25 from obstacles\[0\] at waypoints\[1\]"
     with pytest.raises(ValueError, match=message):
         avoid(cp.PolySpline(ACROSS), [Disc((21.0, 2.0), 0.75)], clearance=0.4, rope=Crane().rope())

@@ -132,7 +132,7 @@ def test_a_rope_from_above_is_cut_by_what_the_load_passes_below():
     assert above.part == "rope"
 
 
-def test_a_load_without_size_hangs_where_its_rope_ends():
+def test_a_point_load_is_at_the_end_of_its_rope():
     found = clearance(ACROSS, [HalfPlane((0.0, 1.0), 7.0)], rope=Plumb())
     assert found.minimum == pytest.approx(2.0, abs=1e-14)
     assert 2.0 - 1e-3 < found.lower <= 2.0
@@ -252,7 +252,7 @@ def test_distances_that_are_no_numbers_are_rejected():
 
 @pytest.mark.parametrize("seed", range(10))
 def test_a_bound_is_not_rounded_upwards(seed):
-    """On a line run evenly beside a wall the bound is exact, and all samples are alike, but for rounding."""
+    """On a line at constant speed along a wall the bound is exact, and all samples are equal up to rounding."""
     rng = np.random.default_rng(seed)
     angle, offset, far = rng.uniform(0.0, 2.0 * np.pi), rng.normal(), 10.0 ** rng.uniform(-2.0, 4.0)
     normal, along = np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])

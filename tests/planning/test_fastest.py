@@ -57,7 +57,7 @@ def crane_signals(plan, count=COUNT):
 
 
 def excess(signals, limits):
-    """Greatest excess beyond limits (low, high), as a fraction of half their distance."""
+    """Maximum excess beyond limits (low, high), as a fraction of half their distance."""
     found = []
     for name, (low, high) in limits.items():
         scale = 0.5 * (high - low)
@@ -71,7 +71,7 @@ def runs(durations, inside):
     return [(durations[a], durations[b - 1]) for a, b in edges.reshape(-1, 2)]
 
 
-# The shape held: closed forms
+# Fixed shape: closed forms
 
 
 @pytest.mark.parametrize(
@@ -171,7 +171,7 @@ def test_closed_form_scales(size, duration, shift, limits):
     plan = (size * MOVE).retime(duration).shift(shift)
     found = fastest(plan, {"y_d1": limits[0], "y_d2": limits[1]})
     expected = max(15 / 8 * size / limits[0], sqrt(10 / sqrt(3) * size / limits[1]))
-    # The clock of a plan far from 0 is known to a rounding of where it starts.
+    # The times of a plan far from 0 have the rounding of its start.
     assert found.duration == pytest.approx(expected, rel=1e-11 + 1e-14 * abs(shift) / min(expected, duration))
 
 
@@ -184,7 +184,7 @@ def test_wider_limits_by_a_power(nu, factor):
     assert theirs == pytest.approx(ours * factor ** (-1 / nu), rel=1e-11)
 
 
-# The shape held: quantities of a plant
+# Fixed shape: quantities of a plant
 
 
 CRANE_LIMITS = {
@@ -240,7 +240,7 @@ def test_crane_does_not_depend_on_the_duration_given():
 
 
 @pytest.mark.slow
-def test_what_the_plant_refuses_is_told():
+def test_the_reason_of_the_plant_is_given():
     found = fastest(HOIST, {"T": (0, None)}, CRANE)
     # The crane can follow only below g - z'' = 0, which no limit says.
     fall = derivative(HOIST, 2)[1].max()
@@ -392,9 +392,9 @@ CLOSED = {
     "two rounds": CYCLE.then(CYCLE),
     "multiple": -3.0 * CYCLE,
     "stacked": cp.stack([CYCLE, TURNING], labels=["a", "b", "c"]),
-    "from a turning point": TURNING,
+    "from a reversal": TURNING,
     "through waypoints": cp.PiecewiseSpline(LOOP),
-    "on another clock": cp.Retimed(CYCLE, cp.PolySpline([Waypoint(0, 0, 2.0), Waypoint(2, 3, 2.0)])),
+    "with another time law": cp.Retimed(CYCLE, cp.PolySpline([Waypoint(0, 0, 2.0), Waypoint(2, 3, 2.0)])),
 }
 
 
@@ -604,7 +604,7 @@ PROFILES = {
 
 @pytest.mark.parametrize("name", PROFILES)
 def test_plans_of_every_kind_are_retimed(name):
-    """With the shape held the speed scales with the reciprocal of the duration."""
+    """With fixed shape the speed scales with the reciprocal of the duration."""
     plan = PROFILES[name]
     found = fastest(plan, {"velocity": 0.8})
     peak = np.abs(plan(np.linspace(plan.start, plan.end, 200_001), 1)).max()

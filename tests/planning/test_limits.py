@@ -239,9 +239,9 @@ def test_quantities_of_a_plant():
     by_plant, by_function = margins(HOIST, limits, CRANE), margins(HOIST, limits, CRANE.quantities)
     assert str(by_plant) == str(by_function)
     x, z = HOIST.jet(np.linspace(0, 15, 100_001), 2).transpose(1, 0, 2)
-    hang = CRANE.gravity - z[2]
-    tension, theta = 500 * np.hypot(x[2], hang), np.arctan2(-x[2], hang)
-    rope = (z[0] * np.hypot(x[2], hang) - 0.25 * x[2]) / hang
+    hoist = CRANE.gravity - z[2]
+    tension, theta = 500 * np.hypot(x[2], hoist), np.arctan2(-x[2], hoist)
+    rope = (z[0] * np.hypot(x[2], hoist) - 0.25 * x[2]) / hoist
     found = rows(by_plant)
     assert abs(found["theta"].value) == pytest.approx(np.abs(theta).max(), rel=1e-8)
     assert found["T"].value == pytest.approx(tension.max(), rel=1e-10)
@@ -374,7 +374,7 @@ def test_unknown_names(name):
         margins(MOVE, {name: 1.0})
 
 
-def test_unknown_names_beside_quantities():
+def test_unknown_names_in_addition_to_quantities():
     with pytest.raises(ValueError, match=r"or quantities \(D, R, theta, T, F, C, ...\), got 'Q'"):
         margins(HOIST, {"Q": 1.0}, CRANE)
 
@@ -417,12 +417,12 @@ def test_jumps_would_make_a_signal_infinite(entries, name, below, jumping):
         assert margins(plan, {f"y_d{order}": 1e6}).satisfied
 
 
-def test_a_force_needs_a_smooth_plan():
+def test_a_force_requires_a_smooth_plan():
     with pytest.raises(ValueError, match="limits of F require a plan that is continuous up to derivative 3"):
         margins(cp.PolySpline(nominal_waypoints(3)), {"F": 1e6}, CRANE)
 
 
-def test_only_the_limited_axis_needs_to_be_smooth():
+def test_only_the_limited_axis_must_be_smooth():
     points = [Waypoint.from_jets(0, x=[0, 0], z=[0] * 4), Waypoint.from_jets(2, x=[1, 0], z=[1, 0, 0, 0])]
     plan = cp.PolySpline(points)
     assert margins(plan, {"z_d3": 1e3}).satisfied
@@ -452,7 +452,7 @@ def test_margins_scale_with_size_and_time(size, duration, limits):
 
 @settings(max_examples=6)
 @given(shift=st.floats(-1e4, 1e4), factor=sizes)
-def test_margins_move_with_the_clock_and_limits_with_the_signal(shift, factor):
+def test_margins_shift_with_time_and_limits_with_the_signal(shift, factor):
     limits = {"x_d1": 3.0, "z_d2": (-1.0, 2.0)}
     ours = rows(margins(OBSTACLE, limits))
     theirs = rows(margins((factor * OBSTACLE).shift(shift), {"x_d1": 3.0 * factor, "z_d2": (-factor, 2.0 * factor)}))

@@ -153,20 +153,20 @@ def test_costs_are_integrals(name, nu):
     assert SquaredDerivative(nu)(plan) == pytest.approx(expected, rel=1e-10)
 
 
-def test_wandering_is_the_path_beyond_the_polyline():
+def test_excess_length_is_relative_to_the_polyline():
     plan = PLANS["trigonometric"]
     polyline = sum(np.linalg.norm(b - a) for a, b in zip(JETS[:, 0], JETS[1:, 0], strict=False))
     path = integral(plan, lambda t: float(np.linalg.norm(plan.jet(t, 1)[1])))
     assert plan_excess_length(plan) == pytest.approx(path / polyline - 1, rel=1e-7)
 
 
-def test_a_straight_move_does_not_wander():
+def test_a_straight_move_has_no_excess_length():
     assert plan_excess_length(cp.PolySpline([Waypoint(0, [0, 3], 0, 0), Waypoint(2, [3, -1], 0, 0)])) == pytest.approx(
         0.0, abs=1e-14
     )
 
 
-def test_wandering_is_undefined_without_a_polyline():
+def test_excess_length_is_undefined_without_a_polyline():
     still = cp.PolySpline([Waypoint(0, 1, 0), Waypoint(1, 1, 0)])
     assert np.isnan(plan_excess_length(still))
     assert np.isnan(
@@ -175,7 +175,7 @@ def test_wandering_is_undefined_without_a_polyline():
 
 
 @pytest.mark.parametrize("objective", [plan_length, PeakDerivative(1), SquaredDerivative(3)])
-def test_a_step_takes_no_path(objective):
+def test_a_step_has_no_path(objective):
     assert objective(cp.Step(2.0)) == 0.0
 
 
@@ -208,7 +208,7 @@ def test_scales_of_amplitude_and_time(factor, duration, shift, name):
     rate = plan.duration / duration
     assert plan_length(other) == pytest.approx(factor * plan_length(plan), rel=1e-8)
     for nu in (1, 3):
-        # The clock of a plan that starts late is known to a rounding of that start.
+        # The times of a plan that starts late have the rounding of that start.
         slack = 1e-9 + 1e-13 * abs(shift) / duration
         assert PeakDerivative(nu)(other) == pytest.approx(factor * rate**nu * PeakDerivative(nu)(plan), rel=slack)
         expected = factor**2 * rate ** (2 * nu - 1) * SquaredDerivative(nu)(plan)

@@ -38,7 +38,7 @@ def naive(thing, point):
 
 
 def naive_segment(thing, p, q):
-    """Least of the naive distances on a segment: convex along it, so that thirds can be thrown away."""
+    """Minimum of the naive distances on a segment by ternary search, as they are convex along it."""
     low, high = 0.0, 1.0
     while high - low > 1e-14:
         a, b = low + (high - low) / 3.0, high - (high - low) / 3.0
@@ -76,7 +76,7 @@ def test_distance_is_that_of_the_nearest_point_of_the_boundary(thing):
 
 
 @ALL
-def test_segment_distance_is_the_least_on_the_segment(thing):
+def test_segment_distance_is_the_minimum_on_the_segment(thing):
     rng = np.random.default_rng(2)
     p, q = rng.uniform(-6.0, 14.0, (2, 2, 150))
     q[:, :20] = p[:, :20]

@@ -1,4 +1,4 @@
-"""Free entries and times: least squared derivative, against exact and independent solutions."""
+"""Free entries and times: minimum squared derivative, against exact and independent solutions."""
 
 import itertools
 import math
@@ -137,7 +137,7 @@ def test_free_end_accelerations_have_the_known_costs():
 
 
 @pytest.mark.parametrize("n", [2, 3, 8, 40])
-def test_least_acceleration_is_the_natural_cubic_spline(n):
+def test_minimum_acceleration_is_the_natural_cubic_spline(n):
     rng = np.random.default_rng(n)
     times, values = np.cumsum(rng.uniform(0.1, 2.0, n)), rng.normal(size=(n, 2))
     found = optimize_waypoints([Waypoint(t, v) for t, v in zip(times, values, strict=True)], 2)
@@ -151,7 +151,7 @@ def test_least_acceleration_is_the_natural_cubic_spline(n):
 
 
 @pytest.mark.parametrize("n", [2, 3, 8, 40])
-def test_least_acceleration_with_end_velocities_is_the_clamped_cubic_spline(n):
+def test_minimum_acceleration_with_end_velocities_is_the_clamped_cubic_spline(n):
     rng = np.random.default_rng(n)
     times, values, (first, last) = np.cumsum(rng.uniform(0.1, 2.0, n)), rng.normal(size=n), rng.normal(size=2)
     points = [Waypoint(t, v) for t, v in zip(times, values, strict=True)]
@@ -168,7 +168,7 @@ def test_least_acceleration_with_end_velocities_is_the_clamped_cubic_spline(n):
 
 @pytest.mark.parametrize("ends", ["natural", "clamped"])
 @pytest.mark.parametrize("k", [3, 4])
-def test_least_jerk_and_snap_are_the_splines_of_twice_the_order(k, ends):
+def test_minimum_jerk_and_snap_are_the_splines_of_twice_the_order(k, ends):
     rng = np.random.default_rng(k)
     times, values, at_ends = np.cumsum(rng.uniform(0.5, 1.5, 8)), rng.normal(size=8), rng.normal(size=(2, k - 1))
     points = [Waypoint(t, v) for t, v in zip(times, values, strict=True)]
@@ -246,7 +246,7 @@ def test_one_short_segment_costs_what_rounded_entries_cost(k, tolerance):
 
 
 def single_polynomial_cost(times, table, k, size):
-    """Least cost of one polynomial of `size` coefficients through the entries of one axis, with 60 digits."""
+    """Minimum cost of one polynomial of `size` coefficients through the entries of one axis, with 60 digits."""
     with mp.workdps(60):
         span = [mp.mpf(float(t)) - mp.mpf(float(times[0])) for t in times]
         rows, right = [], []
@@ -267,7 +267,7 @@ def single_polynomial_cost(times, table, k, size):
 
 
 @pytest.mark.parametrize(("n", "k", "order"), [(3, 3, 2), (4, 4, 3), (5, 3, 3), (8, 3, 2)])
-def test_one_polynomial_is_the_least_of_its_degree(n, k, order):
+def test_one_polynomial_is_the_minimum_of_its_degree(n, k, order):
     rng = np.random.default_rng(n)
     times = np.cumsum(rng.uniform(0.5, 1.5, n))
     table = random_table(rng, n, k, 1)
@@ -339,7 +339,7 @@ def test_no_free_entry_can_be_moved_to_advantage(seed, k, n, options):
             else:
                 plan = PiecewiseSpline(points, **options)
             costs.append(energy(plan, k))
-        # A parabola with its least value in the middle: the cost is the same on both sides of it.
+        # A parabola with its minimum in the middle: the cost is the same on both sides of it.
         assert min(costs) >= found.cost * (1 - 1e-12)
         assert costs[1] == pytest.approx(costs[0], rel=1e-8)
 
@@ -456,10 +456,10 @@ def test_data_of_a_polynomial_of_zero_cost_leave_the_shortest_choice(options):
 
 
 def test_the_shortest_choice_is_in_units_of_the_duration():
-    # y = u^2 + c u (1 - u) through (0, 0), (1, 1): |(c, 2 - c)|^2 + 2 (2 - 2 c)^2 is least at c = 1 + 0.
+    # y = u^2 + c u (1 - u) through (0, 0), (1, 1): |(c, 2 - c)|^2 + 2 (2 - 2 c)^2 is minimal at c = 1 + 0.
     at_rest = optimize_waypoints([Waypoint(0, 0, None, 2), Waypoint(1, 1)], 3)
     assert at_rest.unique  # three data determine the quadratic
-    # y = a + b u with velocity b alone: the constant of least a^2 + (a + b)^2.
+    # y = a + b u with velocity b alone: the constant that minimises a^2 + (a + b)^2.
     drift = optimize_waypoints([Waypoint(0, FREE, 3.0), Waypoint(10, FREE)], 2, order=1)
     np.testing.assert_allclose([w.jet[:, 0] for w in drift], [[-15, 3], [15, 3]], rtol=1e-13)
     assert not drift.unique
@@ -518,7 +518,7 @@ def test_points_on_a_line_are_passed_by_the_minimum_jerk_move(single, scale):
 
 
 @pytest.mark.parametrize("weights", [None, [4.0, 0.25]])
-def test_least_velocity_is_even_speed_along_the_polyline(weights):
+def test_minimum_velocity_is_constant_speed_along_the_polyline(weights):
     corners = np.array([[0.0, 0.0], [3.0, 4.0], [3.0, 5.0], [0.0, 1.0], [0.5, 1.0]])
     points = [Waypoint(t, corner) for t, corner in zip([1, 2, 3, 4, 7], corners, strict=True)]
     found = optimize_waypoints(points, 1, free_times=True, weights=weights)
@@ -737,7 +737,7 @@ def test_a_short_inner_segment_is_right_or_says_what_it_costs(gap, order):
 
 
 @pytest.mark.parametrize("seed", range(12))
-def test_no_digits_are_lost_without_a_word(seed):
+def test_inaccuracy_is_warned_of(seed):
     """Random points, some very near, some far from the origin: without a word six digits of the cost are right."""
     rng = np.random.default_rng(seed)
     gaps = 10.0 ** rng.uniform(-(seed % 9), 0.0, rng.integers(2, 6))
@@ -749,7 +749,7 @@ def test_no_digits_are_lost_without_a_word(seed):
         assert found.cost == pytest.approx(minimum_jerk(times, positions), rel=1e-6)
 
 
-def test_the_estimate_of_what_is_lost():
+def test_the_estimate_of_the_error():
     """Where a warning is given the cost is as near to the true one as the warning says."""
     told = []
     for gap in np.geomspace(1e-4, 3e-7, 14):
@@ -774,23 +774,23 @@ def test_the_estimate_of_what_is_lost():
         (np.cumsum([0.0, 1.0, 1e-3, 1.0]), [0.0, 1.0, 1.001, 2.0]),
     ],
 )
-def test_nothing_is_said_where_digits_are_kept(times, positions):
+def test_no_warning_if_the_cost_is_accurate(times, positions):
     found, word = optimum_or_word(times, positions)
     assert not word
     size = np.ptp(positions) ** 2 / (times[-1] - times[0]) ** 5
-    # Beside a cost that is 0, what a rounding of the positions costs.
+    # Relative to a cost of 0: the effect of rounding of the positions.
     rounding = (1e-13 * np.abs(positions).max() / np.diff(times).min() ** 2.5) ** 2
     assert found.cost == pytest.approx(minimum_jerk(times, positions), rel=1e-6, abs=1e-12 * size + rounding)
 
 
-def test_digits_lost_far_from_the_origin():
+def test_rounding_far_from_the_origin():
     """A move of a millimetre at 1e12, where numbers are 0.1 mm apart."""
     found, word = optimum_or_word([0.0, 1.0, 2.0], [1e12, 1e12 + 1e-3, 1e12])
     assert found is None
     assert "use an origin nearer to the positions" in word
 
 
-def test_a_single_spline_through_near_points_loses_digits_too():
+def test_a_single_spline_through_near_points_is_inaccurate_as_well():
     points = [Waypoint(t, math.sin(9.0 * t), 9.0 * math.cos(9.0 * t), 0.0) for t in (0.0, 0.5, 0.5 + 1e-6, 1.0)]
     with pytest.raises(ValueError, match="the cost must be resolved in double precision, got an estimated relative"):
         optimize_waypoints(points, single=True)

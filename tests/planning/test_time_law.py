@@ -1,4 +1,4 @@
-"""The path held: the same points on another clock, within limits, against the trapezoid in closed form."""
+"""Fixed path: another time law under limits, against the trapezoid in closed form."""
 
 from functools import cache
 from math import sqrt
@@ -29,7 +29,7 @@ LIMITS = {"velocity": 2.0, "acceleration": 0.8}
 
 @cache
 def found_on_path(name):
-    """Fastest plan on one of the paths, which several tests look at."""
+    """Fastest plan on one of the paths, for several tests."""
     return fastest(PLANS[name], LIMITS, hold="path")
 
 
@@ -42,7 +42,7 @@ def move(kind, distance=1.0, shift=0.0):
 
 
 def trapezoid(distance, velocity, acceleration):
-    """Least time from rest to rest within limits of velocity and acceleration."""
+    """Minimum time from rest to rest under limits of velocity and acceleration."""
     if distance * acceleration <= velocity**2:
         return 2 * sqrt(distance / acceleration)
     return distance / velocity + velocity / acceleration
@@ -52,14 +52,14 @@ def sampled(plan, order, count=COUNT):
     return plan.jet(np.linspace(plan.start, plan.end, count), order)
 
 
-def clock(plan):
+def law_of(plan):
     assert isinstance(plan, Retimed)
     return plan.law
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", PLANS)
-def test_limits_hold_and_no_time_is_lost_to_the_shape(name):
+def test_limits_are_satisfied_and_the_duration_does_not_exceed_that_of_fixed_shape(name):
     plan = PLANS[name]
     shape, path = fastest(plan, LIMITS), found_on_path(name)
     assert path.duration <= shape.duration
@@ -80,11 +80,11 @@ def test_limits_hold_and_no_time_is_lost_to_the_shape(name):
 def test_the_path_is_the_same(name):
     plan = PLANS[name]
     found = found_on_path(name).plan
-    law = clock(found)
+    law = law_of(found)
     passed = law(np.linspace(found.start, found.end, 2001))
     assert (np.diff(passed) > 0).all()
     assert [passed[0], passed[-1]] == pytest.approx([found.plan.start, found.plan.end], rel=1e-12, abs=1e-12)
-    # The clock leads through the plan in parts of its duration, whatever duration that was given.
+    # The time law is relative to the duration of the given plan.
     parts = np.clip((passed - passed[0]) / (passed[-1] - passed[0]), 0.0, 1.0)
     expected = plan(plan.start + parts * plan.duration)
     points = found(np.linspace(found.start, found.end, 2001))
@@ -92,14 +92,14 @@ def test_the_path_is_the_same(name):
 
 
 @pytest.mark.parametrize("name", ["obstacle", "there and back"])
-def test_the_clock_runs_forwards_all_the_time(name):
-    law = clock(found_on_path(name).plan)
+def test_the_time_law_is_increasing(name):
+    law = law_of(found_on_path(name).plan)
     rate = law(np.linspace(law.start, law.end, COUNT), 1)
     assert rate.min() > 0.0
 
 
-def test_the_clock_has_four_continuous_derivatives():
-    law = clock(found_on_path("obstacle").plan)
+def test_the_time_law_has_four_continuous_derivatives():
+    law = law_of(found_on_path("obstacle").plan)
     inner = law.breakpoints[1:-1]
     right, left = law.jet(inner, 4)[:, 0], law.jet(inner, 4, left=True)[:, 0]
     size = np.abs(sampled(law, 4, 2001)[:, 0]).max(axis=1)
@@ -169,8 +169,8 @@ def crane_force(plan):
     """F along a plan of the load, with D of (15b) differentiated numerically on samples of its closed form."""
     t = np.linspace(plan.start, plan.end, 20_001)
     x, z = plan.jet(t, 2).transpose(1, 0, 2)
-    hang = 9.81 - z[2]
-    trolley = x[0] - (0.25 * np.hypot(x[2], hang) - z[0] * x[2]) / hang
+    hoist = 9.81 - z[2]
+    trolley = x[0] - (0.25 * np.hypot(x[2], hoist) - z[0] * x[2]) / hoist
     step = t[1] - t[0]
     rate = (trolley[:-4] - 8 * trolley[1:-3] + 8 * trolley[3:-1] - trolley[4:]) / (12 * step)
     second = (-trolley[:-4] + 16 * trolley[1:-3] - 30 * trolley[2:-2] + 16 * trolley[3:-1] - trolley[4:]) / (
@@ -180,12 +180,12 @@ def crane_force(plan):
 
 
 @pytest.mark.parametrize("force", [30e3, pytest.param(2e3, marks=pytest.mark.slow)])
-def test_crane_forces_hold_on_the_new_clock(force):
+def test_crane_forces_are_within_limits_with_the_new_time_law(force):
     limits = {"F": force, "C": (-3e3, 1e3), "theta": 0.5}
     shape, path = fastest(HOIST, limits, CRANE), fastest(HOIST, limits, CRANE, hold="path")
     assert path.duration < 0.95 * shape.duration
     found = crane_force(path.plan)
-    # Finite differences of a force lose the last digits to rounding.
+    # Finite differences of a force have rounding errors.
     assert np.abs(found).max() == pytest.approx(force, rel=1e-3)
     assert path.active.bound.name == "F"
     assert path.active.fraction == pytest.approx(0.0, abs=1e-9)
@@ -220,7 +220,7 @@ def test_position_limits_stay_what_they_are():
         fastest(plan, {"x": (0, 19), "x_d1": 2.0}, hold="path")
 
 
-def test_the_plan_is_saved_with_its_clock(tmp_path):
+def test_the_plan_is_saved_with_its_time_law(tmp_path):
     found = found_on_path("nominal").plan
     found.save(tmp_path / "plan.json")
     again = cp.load_trajectory(tmp_path / "plan.json")
@@ -231,7 +231,7 @@ def test_the_plan_is_saved_with_its_clock(tmp_path):
 @pytest.mark.slow
 @settings(max_examples=5)
 @given(size=st.floats(1e-3, 1e3), duration=st.floats(1e-3, 1e3), start=st.sampled_from([0.0, -50.0, 100.0]))
-def test_neither_units_nor_clock_change_what_is_fastest(size, duration, start):
+def test_the_fastest_plan_is_invariant_under_units_and_time_shifts(size, duration, start):
     plan = (size * move("quintic")).retime(duration).shift(start)
     limits = {"y_d1": size * 1.0, "y_d2": size * 1.0}
     found = fastest(plan, limits, hold="path")

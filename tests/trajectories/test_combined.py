@@ -111,7 +111,7 @@ def test_labels_of_combinations():
     assert x.then(1.0 * Step(3.0, initial=1.0)).labels == ("x",)
 
 
-def test_stack_puts_axes_side_by_side():
+def test_stack_combines_axes():
     t = off_breakpoints(MOVE, WAVE, SEGMENTS)
     both = stack([MOVE, WAVE, SEGMENTS])
     assert isinstance(both, Stacked)
@@ -139,8 +139,8 @@ def test_then_shifts_the_other():
     assert [w.time for w in joined.waypoints] == [0.0, 1.0, 3.0]
 
 
-def test_then_from_any_clock():
-    """What begins at 1e9 s is joined to what ends at 0.7 s as well as its clock allows, and moves with it."""
+def test_then_from_any_start_time():
+    """A plan from 1e9 s is joined to one that ends at 0.7 s up to the rounding of its times, and shifts with it."""
     rng = np.random.default_rng(1)
     for start in rng.uniform(-2, 2, 50) * 10.0 ** rng.integers(0, 10, 50):
         end = rng.uniform(0.01, 1)
@@ -149,8 +149,8 @@ def test_then_from_any_clock():
         joined = first.then(second)
         assert joined.breakpoints[1] == end
         t = np.linspace(0, 1, 11)
-        clock = 4 * np.spacing(abs(start) + 1)
-        np.testing.assert_allclose(joined(end + t), second(start + t), rtol=0, atol=1e-13 + 3 * clock)
+        resolution = 4 * np.spacing(abs(start) + 1)
+        np.testing.assert_allclose(joined(end + t), second(start + t), rtol=0, atol=1e-13 + 3 * resolution)
         for moved in (joined.shift(1e6 * end), joined.shift(1e6 * end).shift(-1e6 * end), joined.retime(777 * end)):
             assert moved.initial == 0.0
             assert moved.final == pytest.approx(2.0, rel=1e-8)
@@ -159,7 +159,7 @@ def test_then_from_any_clock():
 
 @pytest.mark.parametrize("alpha", [0.0, 1.0, 3.0])
 def test_a_plan_that_returns_to_zero_can_be_continued(alpha):
-    """Its last position is 0 to rounding, which is no reason to refuse what starts at 0."""
+    """Its last position is 0 to rounding, which is no reason to reject a plan that starts at 0."""
     rng = np.random.default_rng(0)
     for value in rng.normal(size=20):
         home = waypoints([0.0, 0.3, 1.0], [[value, 1.0], [2.0], [0.0, 0.5]])
@@ -269,7 +269,7 @@ def test_nested_combinations_move_as_one():
 
 
 def test_breakpoints_that_differ_by_rounding():
-    """0.1 + 0.2 is not 0.3: a segment of 5e-17 s is no trouble."""
+    """0.1 + 0.2 is not 0.3: a segment of 5e-17 s is valid."""
     a = PiecewiseSpline(waypoints([0.0, 0.3, 1.0], [[0.0, 0.0], [1.0, 2.0], [0.0, 0.0]]))
     b = PiecewiseSpline(waypoints([0.0, 0.1 + 0.2, 1.0], [[0.0, 0.0], [2.0, 0.0], [1.0, 0.0]]))
     total = a + b

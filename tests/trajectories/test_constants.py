@@ -55,7 +55,7 @@ def test_integral_of_squared_jerk(alpha, cost):
     assert 0.5 * weights @ jerk**2 == pytest.approx(cost, abs=0.51)
 
 
-def test_least_peak_jerk_and_snap():
+def test_minimum_peak_jerk_and_snap():
     assert TrigSpline(REST, alpha=1.98).peak(3)[0] == pytest.approx(39.39, abs=5.1e-3)
     assert min(TrigSpline(REST, alpha=a).peak(4)[0] for a in np.arange(1.0, 3.0, 0.1)) < 240
 

@@ -77,8 +77,8 @@ def test_explicit_gamma_and_spare_harmonics():
     assert np.mean(smooth(t, 2) ** 2) < np.mean(TrigSpline.cyclic(waypoints(times, jets), period)(t, 2) ** 2)
 
 
-def test_the_least_rough_closed_plan():
-    """Over whole periods harmonics are orthogonal: least sum (k^smooth c_k)^2 under the constraints, in closed form."""
+def test_the_smoothest_closed_plan():
+    """Over whole periods harmonics are orthogonal: minimum of sum (k^smooth c_k)^2 in closed form."""
     times, jets, period, degree, smooth = [0.0, 0.3, 0.55], [[0.0], [1.0], [-1.0]], 1.0, 6, 2
     plan = TrigSpline.cyclic(waypoints(times, jets), period, degree=degree, smooth=smooth)
     gamma = 2 * np.pi * np.mean(times)

@@ -103,7 +103,7 @@ def loaded_or_rejected(data):
 
 @settings(max_examples=400, deadline=None)
 @given(st.data())
-def test_one_entry_replaced_or_lost(data):
+def test_one_entry_replaced_or_missing(data):
     damaged = copy.deepcopy(data.draw(st.sampled_from(SAVED)))
     for _ in range(data.draw(st.integers(1, 2))):
         where = data.draw(st.sampled_from(sorted(places(damaged), key=str)))
@@ -137,7 +137,7 @@ def test_any_json_in_any_place(saved, value, data):
 
 @settings(max_examples=200, deadline=None)
 @given(st.sampled_from(SAVED), st.data())
-def test_bytes_lost_or_changed(saved, data):
+def test_bytes_missing_or_changed(saved, data):
     text = bytearray(json.dumps(saved).encode())
     for _ in range(data.draw(st.integers(1, 3))):
         at = data.draw(st.integers(0, len(text) - 1))

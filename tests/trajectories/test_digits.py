@@ -152,7 +152,7 @@ def test_a_far_origin_costs_no_digit_of_what_moves(offset, alpha):
         assert np.abs(moved(t) - offset - near(t)).max() <= 2 * np.spacing(offset)
 
 
-def test_where_no_digits_can_be_kept_their_loss_is_stated():
+def test_a_loss_of_accuracy_is_stated():
     """Free entries are no triangle, and these close waypoints leave a smooth plan only by their differences."""
     rows = [[0, 0, 0, 0], [1, None, 0, 0], [1, None, 0, 0], [0, 0, 0, 0]]
     with pytest.raises(ValueError, match=r"got an estimated loss of \d\S*; waypoints so close .* move them apart"):
@@ -240,7 +240,7 @@ def test_sine_and_cosine_of_many_digits():
 @pytest.mark.parametrize("gap", [1e-5, 1e-7, 1e-10])
 @pytest.mark.parametrize("alpha", [6.28, 6.2831853, 2.0 * np.pi * (1.0 - 2e-16)])
 def test_a_waypoint_near_the_end_is_near_the_start_too(alpha, gap):
-    """On the circle: products of alpha and times near a whole turn lose the digits of their sine."""
+    """On the circle: products of alpha and times near a whole turn have inaccurate sines."""
     for times, jets in (
         ([0.0, 1.0, 4.0 - gap, 4.0], [[1.0, 0.0, 0.0], [2.0], [1.1], [1.0, 0.0, 0.0]]),
         ([0.0, gap, 2.0, 4.0], [[1.0, 0.0], [2.0], [1.1], [5.0, 0.0]]),

@@ -77,28 +77,28 @@ def test_any_duration_is_right_or_rejected(name, exponent):
 @pytest.mark.parametrize("dt", [1e300, -1e300, 1e17, 3e15, 1e13, 1e11, 1e9 / 3])
 @pytest.mark.filterwarnings("ignore:intervals of the plan must be representable")
 def test_any_shift_is_right_or_rejected(name, dt):
-    """To what the clock resolves there, as long as that is below 1e-3 of an interval."""
+    """Up to the resolution of times there, as long as that is below 1e-3 of an interval."""
     plan = PLANS[name]
     moved, said = attempt(lambda: plan.shift(dt))
     if moved is None:
         assert "increase strictly" in said or "intervals" in said or "acceleration phase" in said
         return
-    clock = np.spacing(abs(dt) + plan.duration)
+    resolution = np.spacing(abs(dt) + plan.duration)
     part = np.linspace(0.05, 0.95, 7)
     before, after = plan.start + part * plan.duration, moved.start + part * moved.duration
     speed = np.max(plan.peak(1))
-    assert np.abs(moved(after) - plan(before)).max() <= 1e-2 * np.max(plan.peak(0)) + 4 * clock * speed
+    assert np.abs(moved(after) - plan(before)).max() <= 1e-2 * np.max(plan.peak(0)) + 4 * resolution * speed
 
 
-def test_what_a_late_clock_costs_is_stated():
+def test_the_rounding_of_late_times_is_stated():
     plan = PiecewiseSpline([Waypoint(0, 0, 0), Waypoint(0.003, 1, 3), Waypoint(1, 0, 0)])
     at = 1.7e9  # seconds since 1970: 0.003 s is 12,582.9 units in the last place
-    lost = abs(Fraction(at + 0.003) - Fraction(at) - Fraction(0.003)) / Fraction(0.003)
+    error = abs(Fraction(at + 0.003) - Fraction(at) - Fraction(0.003)) / Fraction(0.003)
     with pytest.warns(UserWarning, match="must be representable, got an error of") as caught:
         moved = plan.shift(at)
     said = float(str(caught[0].message).split("error of ")[1].split(" ")[0])
     assert caught[0].filename == __file__
-    assert said == pytest.approx(float(lost), rel=0.1)
+    assert said == pytest.approx(float(error), rel=0.1)
     with pytest.raises(ValueError, match=r"intervals of the plan must be representable, got an error of 0\.0?\d+ of"):
         plan.shift(1e4 * at)
     with pytest.raises(ValueError, match="intervals of the plan must be representable"):

@@ -110,7 +110,7 @@ def test_a_sampling_period_reaches_the_end(dt, last, tmp_path):
     np.testing.assert_array_equal(read_csv(tmp_path / "plan.csv")["time"], 0.5 + dt * np.arange(last + 1))
 
 
-def test_mat_has_the_structure_that_from_workspace_takes(tmp_path):
+def test_mat_has_the_structure_that_from_workspace_requires(tmp_path):
     path = tmp_path / "plan.mat"
     PLANE.export(path, timepts=[0.5, 1.0, 2.5], derivatives=0)
     signal = loadmat(path)["x"][0, 0]
@@ -326,7 +326,7 @@ def test_the_bound_of_coarse_cells_holds_and_is_no_larger_than_needed(centred, m
         assert 0.25 * found.error[nu, 0] <= error <= found.error[nu, 0]
 
 
-def test_cells_are_as_many_as_floating_point_needs():
+def test_cells_are_as_many_as_floating_point_requires():
     """To the unit roundoff: twice as many would change nothing, half as many are not enough."""
     (found,) = cells.cells_of(_Sine(20.0), 0, centred=True)
     count, unit = found.anchors.size, 0.5 * EPS
@@ -379,7 +379,7 @@ def test_a_cam_is_within_the_stated_error_of_the_plan(arguments, tmp_path):
         assert error >= 0.1 * stated[name]
 
 
-def test_points_of_a_cam_are_as_many_as_the_position_needs(tmp_path):
+def test_points_of_a_cam_are_as_many_as_the_position_requires(tmp_path):
     TURNED.export(tmp_path / "plan.cam.csv")
     extrema = TURNED.extrema()
     wanted = 1e-6 * float(extrema.maximum[0] - extrema.minimum[0])

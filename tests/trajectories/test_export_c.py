@@ -92,7 +92,7 @@ def test_each_derivative_is_that_of_python(pair):
     assert (error <= allowed).all()
 
 
-def test_single_precision_takes_a_segment_and_its_time(pair):
+def test_single_precision_by_segment_and_time(pair):
     plan, compiled = pair
     durations = np.diff(plan.breakpoints)
     segments = RNG.integers(0, durations.size, 5_000)

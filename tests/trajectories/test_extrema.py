@@ -212,7 +212,7 @@ def test_kinked_functions(name, harmonic):
 
 
 def test_a_kink_of_minimum_jerk():
-    """max(y, 1 - y) is least, 1/2, where y crosses it in the middle."""
+    """max(y, 1 - y) has the minimum 1/2 where y crosses it in the middle."""
     found = MOVE.extrema_of(lambda jet: np.maximum(jet[0, 0], 1 - jet[0, 0]), 0)
     assert found.minimum[0] == pytest.approx(0.5, abs=1e-8)
     assert found.time_min[0] == pytest.approx(1.0, abs=1e-8)
@@ -301,7 +301,7 @@ def test_rough_functions_against_dense_samples(seed):
         scale = max(-found.minimum[0], found.maximum[0])
         assert samples.min() >= found.minimum[0] - 1e-9 * scale
         assert samples.max() <= found.maximum[0] + 1e-9 * scale
-        # At a jump one of the sides is met, to the resolution of the clock; a cusp is as steep as its cube root.
+        # At a jump one of the limits is attained, up to the resolution of times; a cusp is as steep as its cube root.
         near = found.time_max[0] + 1e-13 * plan.duration * np.arange(-40, 41)
         assert of_jet(plan.jet(np.clip(near, plan.start, plan.end), 1)).max() >= found.maximum[0] - 1e-4 * scale
 

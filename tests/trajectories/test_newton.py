@@ -124,7 +124,7 @@ def test_fourier_coefficients_of_equation_2(pattern, alpha):
 
 
 def test_fourier_has_a_row_for_every_axis():
-    """12 + 2 sin(tau - pi/2) beside a constant plus a whole harmonic."""
+    """12 + 2 sin(tau - pi/2) compared with a constant plus a full harmonic."""
     points = [Waypoint.from_jets(0.0, x=[10.0], z=[3.0]), Waypoint.from_jets(2.0, x=[11.0], z=[3.0, 1.0])]
     plan = TrigSpline(points, alpha=np.pi / 3, gamma=[np.pi / 2, None])
     found = plan.fourier()

@@ -67,7 +67,7 @@ def test_free_velocities_and_accelerations_give_the_minimum_jerk_spline(n):
         np.testing.assert_allclose(plan(t, nu), spline(t, nu), rtol=0, atol=1e-10 * np.abs(spline(t, nu)).max())
 
 
-def test_the_minimum_jerk_spline_costs_least():
+def test_the_minimum_jerk_spline_has_the_minimum_cost():
     """Any other choice of the free velocities and accelerations has a greater int jerk^2."""
     times, jets = inner_only(np.random.default_rng(2), 4, 3)
     plan = PiecewiseSpline(waypoints(times, jets))
@@ -181,7 +181,7 @@ def test_what_is_not_determined_is_rejected(jets):
         PiecewiseSpline(waypoints([0.0, 1.0, 2.0], jets))
 
 
-def test_what_is_not_determined_stays_so_beside_a_short_segment():
+def test_undetermined_entries_remain_so_next_to_a_short_segment():
     with pytest.raises(ValueError, match="must be determined by the prescribed ones; prescribe more"):
         PiecewiseSpline(waypoints([0.0, 1.0, 1.0 + 1e-7, 2.0], [[None], [None], [None], [None]]))
     with pytest.raises(ValueError, match="must be determined by the prescribed ones; prescribe more"):

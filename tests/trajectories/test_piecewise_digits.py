@@ -124,7 +124,7 @@ def test_several_axes_and_entries_given_inside():
     check(times, rows, 4, 1.0)
 
 
-def test_data_of_a_smooth_motion_give_it_back_beside_a_short_segment():
+def test_data_of_a_smooth_motion_reproduce_it_next_to_a_short_segment():
     """Points of a septic polynomial, its ends prescribed to order 3: minimum snap through them is the polynomial."""
     motion = np.polynomial.Polynomial([1.0, -2.0, 0.5, 3.0, -1.0, 0.25, 0.5, -0.125])
     times = [0.0, 1.0, 1.0 + 2.0**-12, 2.0]

@@ -13,7 +13,7 @@ from ctrlplan.trajectories import SCurve, Trapezoid, trajectory_from_dict
 
 SIZES = st.floats(-3.0, 3.0).map(lambda x: 10.0**x)
 ENDS = st.tuples(st.floats(-1e3, 1e3), st.floats(-1e3, 1e3)).filter(lambda pair: abs(pair[0] - pair[1]) > 1e-3)
-CLOCKS = st.sampled_from([0.0, 1.0, -7.3, 1e4])
+STARTS = st.sampled_from([0.0, 1.0, -7.3, 1e4])
 
 
 def phases(d, v, a, j):
@@ -133,11 +133,11 @@ def test_jets_are_those_of_the_integrated_acceleration(d, v, a):
 
 
 @settings(max_examples=50)
-@given(ENDS, SIZES, SIZES, SIZES, CLOCKS)
-@example((0.0, 30.0), 1.0, 1.0, 1.0 + 7e-14, -7.3)  # a segment that the clock does not resolve
+@given(ENDS, SIZES, SIZES, SIZES, STARTS)
+@example((0.0, 30.0), 1.0, 1.0, 1.0 + 7e-14, -7.3)  # a segment below the resolution of times
 @example((0.0, 2.0), 1.0 - 4e-15, 1.0, 1.0, -7.3)
 def test_limits_are_met_and_one_of_them_is_reached(ends, v, a, j, time):
-    """Whatever the clock; and what should be continuous is, to rounding."""
+    """For any start time; and with continuity up to rounding."""
     final, initial = ends
     minimum = 1e-11 * (abs(time) + abs(final - initial) / v + v / a + a / j)
     assume(min(v / a, a / j) > minimum)
@@ -147,7 +147,7 @@ def test_limits_are_met_and_one_of_them_is_reached(ends, v, a, j, time):
     ):
         used = [plan.peak(nu)[0] / limit for nu, limit in zip(range(1, highest + 1), (v, a, j), strict=False)]
         assert max(used) <= 1.0 + 2e-15
-        # Segments are lengthened to the next number of the clock, not more.
+        # Segments are lengthened to the next floating-point time, not more.
         tick = math.ulp(max(abs(plan.start), abs(plan.end)))
         assert max(used) >= 1.0 - 2e-15 - 8.0 * tick / np.diff(plan.breakpoints).min()
         assert plan.start == time
@@ -158,7 +158,7 @@ def test_limits_are_met_and_one_of_them_is_reached(ends, v, a, j, time):
 
 
 @pytest.mark.parametrize("time", [0.0, -3.7, 1e3, 1e6, 1e9])
-def test_a_late_clock_costs_neither_continuity_nor_limits(time):
+def test_a_late_start_preserves_continuity_and_limits(time):
     plan = SCurve([3.0, 1.0], velocity=1.0, acceleration=0.7, jerk=2.0, time=time)
     left, right = (plan.jet(plan.breakpoints[1:-1], 2, left=side)[:, 0] for side in (True, False))
     assert np.abs(left - right).max() <= 1e-15

@@ -1,4 +1,4 @@
-"""Plans on another clock: closed forms, composite functions in fifty digits, breakpoints and what they separate."""
+"""Plans with another time law: closed forms, composite functions in fifty digits, breakpoints."""
 
 import itertools
 import json
@@ -82,7 +82,7 @@ def test_a_linear_law_is_a_change_of_duration(plan, start, duration):
     np.testing.assert_allclose(again.breakpoints, wanted.breakpoints, rtol=1e-14)
     t = np.setdiff1d(np.linspace(start - 1.0, start + duration + 1.0, 61), wanted.breakpoints)
     size = np.abs(wanted.jet(t, 4)).max(axis=2, keepdims=True)
-    # A late clock has lost digits of its times.
+    # Late times are rounded.
     assert (np.abs(again.jet(t, 4) - wanted.jet(t, 4)) <= 1e-12 * size * max(1.0, start / 20.0)).all()
 
 
@@ -195,10 +195,10 @@ def test_those_of_the_law_are_there_too_and_once():
 
 @settings(max_examples=30)
 @given(st.lists(st.floats(0.05, 1.0), min_size=2, max_size=5), st.lists(st.floats(0.05, 1.0), min_size=1, max_size=4))
-def test_breakpoints_against_roots_of_polynomials(path, clock):
+def test_breakpoints_against_roots_of_polynomials(path, steps):
     """The law as a PPoly of scipy, solved by it."""
     knots = np.cumsum([0.0, *path])
-    times = np.cumsum([1.0, *clock])
+    times = np.cumsum([1.0, *steps])
     values = np.linspace(knots[0], knots[-1], len(times)) ** 2 / knots[-1]
     rates = np.full(len(times), 0.2 * (knots[-1] / (times[-1] - times[0])))
     law = PiecewiseSpline([Waypoint(t, v, r) for t, v, r in zip(times, values, rates, strict=True)])
@@ -267,7 +267,7 @@ def test_laws_one_after_the_other():
 
 
 def test_a_law_that_rests_for_an_instant():
-    """1 + u^3 about its point of rest, where Newton's method alone would stall: a breakpoint there, and one beside."""
+    """1 + u^3 about its stationary point, where Newton's method alone would stall: a breakpoint there and nearby."""
     law = PolySpline([Waypoint(-1.0, 0.0, 3.0), Waypoint(1.0, 2.0, 3.0)])
     np.testing.assert_allclose(law(np.array([-0.5, 0.5])), [0.875, 1.125], rtol=1e-15)
     path = PiecewiseSpline([Waypoint(t, p, 0.0) for t, p in [(0.0, 0.0), (1.0, 1.0), (1.001, 0.5), (2.0, 3.0)]])
@@ -291,7 +291,7 @@ def test_many_times_are_as_good_as_few():
 
 
 def test_extrema_are_those_of_the_composite():
-    """Peak velocity of minimum jerk on the clock t^2, by setting the derivative of 2 t p'(t^2) to 0 in closed form."""
+    """Peak velocity of minimum jerk with the time law t^2, in closed form: the derivative of 2 t p'(t^2) is 0."""
     plan = Retimed(PolySpline([Waypoint(1.0, 0, 0, 0), Waypoint(4.0, 1, 0, 0)]), SQUARE)
     t = np.roots(np.polynomial.Polynomial([4.0, 0.0, -25.0, 0.0, 9.0]).coef[::-1]).real  # u = (t^2 - 1)/3
     t = t[(t > 1.0) & (t < 2.0)]

@@ -1,4 +1,4 @@
-"""Many times at once: uniform, sorted and arbitrary ones agree with the jets taken a few at a time."""
+"""Many times in one call: uniform, sorted and arbitrary ones agree with the jets at a few times."""
 
 import tracemalloc
 
@@ -34,7 +34,7 @@ def random_plan(size, alpha, kind=TrigSpline, naxes=1):
 
 
 def swinging(size):
-    """The Chebyshev polynomial of the highest degree: of all polynomials its Taylor terms cancel most."""
+    """The Chebyshev polynomial of the highest degree, with the largest cancellation of Taylor terms."""
     x = np.cos(np.pi * np.arange(size - 1, -1, -1) / (size - 1))
     return PolySpline([Waypoint(t, (-1.0) ** i) for i, t in enumerate(x)])
 
@@ -44,7 +44,7 @@ def few_at_a_time(plan, t, order):
 
 
 def disagreement(plan, t, order=2, tolerance=1e-13):
-    """Greatest difference from the jets themselves; 1 is the tolerance plus what the rounding of times allows."""
+    """Maximum difference from the jets themselves; 1 is the tolerance plus what the rounding of times allows."""
     got = plan.jet(t, order)
     picked = np.unique(np.concatenate([np.arange(0, t.size, max(1, t.size // 3000)), np.arange(t.size - 30, t.size)]))
     exact = few_at_a_time(plan, t[picked], order + 1)

@@ -1,4 +1,4 @@
-"""`Trajectory.series` at numbers and at symbols of CasADi: every exported kind, and what is made of them."""
+"""`Trajectory.series` at numbers and at symbols of CasADi: every exported class, and combinations."""
 
 import inspect
 import math
@@ -111,7 +111,7 @@ def traced(plan, order, symbol="SX"):
 
 
 def sizes(plan, order):
-    """Greatest of each coefficient over the moments: (naxes, order + 1)."""
+    """Maximum of each coefficient over the times: (naxes, order + 1)."""
     return np.abs([coefficients(plan, t, order) for t in moments(plan)]).max(axis=0)
 
 

@@ -101,8 +101,8 @@ def test_none_is_left_at_the_design_point(omega, zeta, derivatives):
 
 @modes
 @pytest.mark.parametrize("derivatives", [0, 1, 2])
-def test_beside_it_the_residual_grows_with_the_next_power(omega, zeta, derivatives):
-    """Derivatives up to the order asked for are 0, the next one is not: the slope says so."""
+def test_near_it_the_residual_grows_with_the_next_power(omega, zeta, derivatives):
+    """Derivatives up to the given order are 0, the next one is not, as the slope shows."""
     shaper = Shaper.zvd(omega, zeta, derivatives)
     step = 1e-3 * (1.0 - zeta)
     for off in ((step, 0.0), (-step, 0.0), (0.0, step)):
@@ -137,8 +137,8 @@ def test_residual_as_singer_and_seering_write_it(impulses, mode):
 def test_residual_is_what_an_oscillator_keeps_of_a_shaped_step(omega, zeta, detuning):
     """Of a unit step the vibration begins with the amplitude 1/sqrt(1 - zeta^2)."""
     for shaper in (Shaper.zv(omega, zeta), Shaper.zvd(omega, zeta), Shaper([0.1, 0.3, 0.9], [0.5, 0.7, -0.2])):
-        kept = amplitude(shaper(Step(1.0)), detuning * omega, zeta) * math.sqrt(1.0 - zeta**2)
-        assert kept == pytest.approx(float(shaper.residual(detuning * omega, zeta)), rel=1e-11, abs=1e-14)
+        preserved = amplitude(shaper(Step(1.0)), detuning * omega, zeta) * math.sqrt(1.0 - zeta**2)
+        assert preserved == pytest.approx(float(shaper.residual(detuning * omega, zeta)), rel=1e-11, abs=1e-14)
 
 
 @modes
@@ -315,9 +315,7 @@ MADE_OF_SHAPED = {
     "stacked": stack([SPLINE, SHAPED], labels=["a", "b"]),
     "selected": stack([SPLINE, SHAPED], labels=["a", "b"]).select("b"),
     "joined": PolySpline([Waypoint(0.0, 0.0), Waypoint(1.0, 1.0)]).then(SHAPED),
-    "on a shifted clock": Retimed(
-        SHAPED, PolySpline([Waypoint(1.0, 0.5), Waypoint(SHAPED.duration + 1.0, SHAPED.end)])
-    ),
+    "shifted in time": Retimed(SHAPED, PolySpline([Waypoint(1.0, 0.5), Waypoint(SHAPED.duration + 1.0, SHAPED.end)])),
     "read from a file": trajectory_from_dict(SHAPED.to_dict()),
     "shifted": SHAPED.shift(7.0),
 }
@@ -335,7 +333,7 @@ def test_a_shaped_plan_is_not_retimed(name, factor):
 
 
 @pytest.mark.parametrize("name", MADE_OF_SHAPED)
-def test_a_shaped_plan_is_shifted_and_kept_in_its_duration(name):
+def test_a_shaped_plan_can_be_shifted_but_not_retimed(name):
     plan = MADE_OF_SHAPED[name]
     t = np.linspace(plan.start - 0.1, plan.end + 0.1, 58)
     for moved in (
@@ -385,8 +383,8 @@ def test_what_retiming_would_do_to_a_shaper(wrong):
     assert scaled.residual(6.0) == pytest.approx(abs(math.cos(0.5 * math.pi * wrong)), rel=1e-12)
 
 
-def test_delays_that_the_clock_cannot_hold_are_said():
-    """Times near 2^48 s are 1/16 s apart, near 2^35 s 8 us: a delay of pi/3 s loses a part of that."""
+def test_delays_that_are_not_representable_are_reported():
+    """Times near 2^48 s are 1/16 s apart, near 2^35 s 8 us: a delay of pi/3 s is rounded by a part of that."""
     shaper = Shaper.zv(3.0)
 
     def late(start):

@@ -21,7 +21,7 @@ DATA = {
 
 
 def minimum(times, jets, degree, alpha, smooth):
-    """Naive, in 60 digits: the conditions of Lagrange for least int (y^(smooth))^2 under the constraints."""
+    """Naive, in 60 digits: the conditions of Lagrange for the minimum of int (y^(smooth))^2 under the constraints."""
     given = [(t, k, v) for t, jet in zip(times, jets, strict=True) for k, v in enumerate(jet) if v is not None]
     with mp.workdps(60):
         space = Space(times, [t for t, _, _ in given], degree, alpha)
@@ -85,7 +85,7 @@ def cost(plan, smooth):
 @pytest.mark.parametrize("alpha", [0.0, 2.0, 5.5])
 @pytest.mark.parametrize("data", DATA)
 @pytest.mark.parametrize("extra", [1, 3])
-def test_the_least_rough_of_all_that_meet_the_waypoints(data, alpha, smooth, extra):
+def test_the_smoothest_of_all_through_the_waypoints(data, alpha, smooth, extra):
     times, jets = DATA[data]
     count = sum(v is not None for jet in jets for v in jet)
     degree = (count + 1) // 2 + extra if alpha else count - 1 + 2 * extra
@@ -104,7 +104,7 @@ def test_the_least_rough_of_all_that_meet_the_waypoints(data, alpha, smooth, ext
 
 @pytest.mark.parametrize("alpha", [0.0, 3.0])
 def test_every_change_that_keeps_the_waypoints_costs_more(alpha):
-    """The cost is quadratic: least where both directions of every free function raise it alike."""
+    """The cost is quadratic: at its minimum both directions of every free function increase it equally."""
     times, jets = DATA["through points"]
     degree, smooth = (7 if alpha else 12), 3
     plan = TrigSpline(waypoints(times, jets), alpha=alpha, degree=degree, smooth=smooth)
@@ -127,7 +127,7 @@ def test_every_change_that_keeps_the_waypoints_costs_more(alpha):
 
 
 def test_the_polynomial_minimises_what_it_is_known_to():
-    """Rest to rest of m entries is the least int (y^(m))^2 of all: spare degrees change nothing."""
+    """The rest-to-rest move with m entries minimises int (y^(m))^2: additional degrees have no effect."""
     for m in (2, 3, 4):
         points = waypoints([0.0, 1.0], [[0.0] * m, [1.0] + [0.0] * (m - 1)])
         t = np.linspace(0, 1, 21)

@@ -101,7 +101,7 @@ def test_a_closed_plan_is_checked_over_its_whole_round():
     assert np.ptp(plan(np.linspace(0, 1, 1001))) > 6.0
 
 
-def test_what_derivatives_ask_for_is_no_swing():
+def test_the_extrapolation_of_derivatives_is_no_swing():
     """A throw up and down: its height is v T/4, of waypoints at one position."""
     for speed in (1e-3, 1.0, 1e6):
         PolySpline([Waypoint(0, 5, speed), Waypoint(2, 5, -speed)])

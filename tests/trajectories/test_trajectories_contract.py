@@ -165,7 +165,7 @@ def test_ends_are_held(plan):
 
 @every
 def test_limits_at_breakpoints(plan):
-    """The right limit and, on request, the left one: what is 1e-9 s beside, to the next derivative times that."""
+    """The right limit and, on request, the left one: the value 1e-9 s away, up to the next derivative times that."""
     size = np.maximum(sizes(plan, 3)[1:], 1.0)
     for t in plan.breakpoints:
         last = t == plan.end and plan.duration
@@ -211,7 +211,7 @@ def test_retime_scales_jets_by_powers(plan):
 
 
 @every
-def test_shift_moves_the_clock(plan):
+def test_shift_moves_the_times(plan):
     late = plan.shift(10.5)
     np.testing.assert_allclose(late.breakpoints, plan.breakpoints + 10.5, rtol=1e-15)
     t = np.setdiff1d(times(plan), plan.breakpoints)

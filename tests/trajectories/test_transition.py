@@ -38,7 +38,7 @@ def to_rest(order, horizon, alpha, s, highest):
 @pytest.mark.parametrize("alpha", ALPHAS)
 @pytest.mark.parametrize("order", [0, 1, 2, 3, 4])
 def test_the_plan_is_that_of_the_direct_solution(order, alpha):
-    """Equations (2), (3) by plain linear algebra; horizons of any size, two axes at once."""
+    """Equations (2), (3) by plain linear algebra; horizons of any size, two axes."""
     rng = np.random.default_rng(order)
     for horizon in (1e-3, 0.7, 40.0):
         scale = horizon ** -np.arange(order + 1.0)
@@ -121,7 +121,7 @@ def test_fitted_again_with_its_frequency_and_gamma_a_spline_is_itself(alpha, lat
     assert off(alpha=rate * left) > 1e-7
 
 
-def test_with_alpha_kept_the_plan_moves_by_a_small_part():
+def test_with_constant_alpha_the_plan_changes_slightly():
     """0.1 to 2 % of the move, at fixed alpha."""
     plan = TrigSpline([Waypoint(0, 0, 0, 0), Waypoint(1, 1, 0, 0)], alpha=2.0)
     now = 0.3
@@ -131,7 +131,7 @@ def test_with_alpha_kept_the_plan_moves_by_a_small_part():
 
 
 @pytest.mark.parametrize("alpha", [1.0, 3.0, 5.0])
-def test_an_odd_number_of_constraints_needs_the_frequency_only(alpha):
+def test_an_odd_number_of_constraints_requires_the_frequency_only(alpha):
     plan = TrigSpline([Waypoint(0.0, 0.0, 0.5, 1.0), Waypoint(2.0, 1.0, 0.0)], alpha=alpha)
     now = 0.6
     jet = plan.jet(now, 2)[:, 0]
@@ -279,7 +279,7 @@ def test_bad_input(arguments, message):
         Transition(*arguments)
 
 
-def test_a_radius_needs_a_period():
+def test_a_radius_requires_a_period():
     with pytest.raises(ValueError, match="period must be finite and above 0, got 0"):
         Transition(2, 1.0).radius(0)
 
