@@ -66,7 +66,7 @@ WORDS = (
     Word("worth", "benefit", r"worth", r"worth"),
     Word("rival", "baseline", r"rivals?", r"rivals?"),
     Word("needs, takes", "required duration, duration", r"(?<=\w )takes? \d|needs? \d", r"needs|takes"),
-    Word("kept", "satisfied", r"(limits?|bands?|constraints?|required)( is| are| was| were)?( not)? kept", r"kept"),
+    Word("kept", "satisfied", r"(limits?|constraints?|required)( is| are| was| were)?( not)? kept", r"kept"),
     Word(
         "win, lose",
         "best, worst",
@@ -76,7 +76,13 @@ WORDS = (
     ),
     Word("let", "limit, allow", r"(does not|do not|which|that) lets?"),
     Word("lost", "nan, missing", r"(inputs?|signals?|measurements?|samples?) (is |are |was |were )?lost", r"lost"),
-    Word("clock", "time law, time scaling", r"clocks?|laws? of time", r"clocks?", r"(wall|plc|cpu|system) clocks?"),
+    Word(
+        "clock",
+        "time law, time scaling",
+        r"clocks?|laws? of time",
+        r"clocks?",
+        r"(wall|plc|cpu|system|monotonic) clocks?",
+    ),
     Word("come to rest sooner", "too slow for", r"comes? to rest sooner"),
     Word("for ever", "for all future times", r"for ?ever", r"forever"),
     Word("in any case", "otherwise, always", r"in any case"),
@@ -85,7 +91,12 @@ WORDS = (
     Word("hang on", "depend on", r"hangs? on", r"hangs?"),
     Word("look at", "evaluate", r"look(s|ed|ing)? at", r"looked"),
     Word("make of", "states and inputs", r"mak(es?|ing) of|made of (it|them)"),
-    Word("afterwards", "residual, after the move", r"afterwards|on the way", r"afterwards"),
+    Word(
+        "afterwards",
+        "residual, after the move",
+        r"(sway|error|vibration|deviation)s? afterwards|on the way",
+        r"afterwards",
+    ),
     Word("wander", "excess path length", r"wander(s|ed|ing)?", r"wander(s|ed|ing)?"),
     Word("turning point", "reversal", r"turning points?"),
     Word("still law, trouble", "set-point law, scenario", r"still laws?|generator laws?|troubles?", r"troubles?"),
@@ -168,7 +179,9 @@ def in_module(path):
 
 
 def in_template(path):
-    """Each word found in the text of a template, line by line, without its tags."""
+    """Each word found in the text of a template, line by line, without its tags; none in scripts."""
+    if path.suffixes == [".js", ".html"]:
+        return []
     rows = re.sub(r"<[^<>]*>|\{[%#].*?[%#]\}|\{\{.*?\}\}", " ", path.read_text(encoding="utf-8")).splitlines()
     return [("string", word, line, row) for line, row in enumerate(rows, 1) for word in in_text(row)]
 
