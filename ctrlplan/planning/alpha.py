@@ -129,7 +129,8 @@ def choose_alpha(
     waypoints : iterable of Waypoint
         Prescribed positions and derivatives.
     objective : str or callable, optional
-        Objective to be minimised: "path" (length), "wandering", "peak_velocity",
+        Objective to be minimised: "path" (length), "wandering" (excess path
+        length relative to the waypoint polyline), "peak_velocity",
         "peak_acceleration", "peak_jerk", "peak_snap", "squared_velocity", ...,
         "squared_snap", an objective such as ``PeakDerivative(5)``, or any
         function of a plan that returns a number. Axes must have the same unit.

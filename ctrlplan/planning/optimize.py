@@ -108,7 +108,7 @@ def optimize_waypoints(
 
     Free entries of the waypoints up to `order` are computed in closed form to
     minimise the integral of the squared derivative: minimum jerk, minimum snap.
-    If the optimum is not unique (two positions alone do not determine a quadratic
+    If the optimum is not unique (two positions alone leave a quadratic free
     under minimum jerk), it is that of minimum norm, of entries in units of the
     plan's duration, and `Optimum.unique` is False.
 

@@ -41,9 +41,9 @@ class PiecewiseSpline(WaypointSpline):
     """Piecewise spline, one function per segment between waypoints.
 
     Let K - 1 be the highest order that is prescribed for an axis. An entry of
-    order j < K that is free at an inner waypoint is determined by continuity of
-    its conjugate, the derivative of order 2K - 1 - j. For alpha = 0 this is the
-    interpolant that minimises int (y^(K))^2: the cubic spline if velocities are
+    order j < K that is free at an inner waypoint is continuous there, and so is its
+    conjugate, the derivative of order 2K - 1 - j, which determines it. For alpha = 0
+    this is the interpolant that minimises int (y^(K))^2: the cubic spline if velocities are
     free between prescribed ones, the minimum-jerk spline if velocities and
     accelerations are. Free entries at the ends lower the degree of the first and
     last segment. Derivatives that no waypoint prescribes may jump.
