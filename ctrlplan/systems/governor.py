@@ -41,7 +41,11 @@ class Admission(Protocol):
         """States of the loop, as it labels them."""
 
     def fraction(self, x: Array, v: Array, r: Array) -> float:
-        """Largest kappa in [0, 1] for which v + kappa (r - v), held from state x on, is admissible; nan if none is."""
+        """Largest admissible fraction of the way from v to r.
+
+        Largest kappa in [0, 1] for which v + kappa (r - v), held constant from
+        state x, is admissible; nan if there is none.
+        """
 
 
 class Governor(ct.NonlinearIOSystem):  # type: ignore[misc]
@@ -94,7 +98,7 @@ class Governor(ct.NonlinearIOSystem):  # type: ignore[misc]
         self._count = len(outputs)
 
     def sample(self, t: float, x: Array, u: Array, params: Params) -> Array:
-        """States after a sample: the reference moved by the admissible fraction."""
+        """States after a sample, with the reference moved."""
         n = self._count
         if not np.isfinite(u).all():
             return np.array([*x[:n], 0.0, 0.0, 1.0])

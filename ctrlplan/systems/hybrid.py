@@ -48,7 +48,7 @@ class SampleHold(ct.NonlinearIOSystem):  # type: ignore[misc]
         self._inner = block.nstates or 0
 
     def sample(self, t: float, x: Array, u: Array, params: Params) -> Array:
-        """States after a sample: the next states of the block, and the held outputs."""
+        """States after a sample: those of the block, then held outputs."""
         own = None if isinstance(self.block, ct.StateSpace) else params
         state = x[: self._inner]
         outputs = np.ravel(self.block.output(t, state, u, own))
@@ -94,7 +94,7 @@ def sample_hold(
     outputs: Sequence[str] | str | None = None,
     name: str | None = None,
 ) -> SampleHold:
-    """Discrete-time block for a continuous loop, its outputs held between samples.
+    """Discrete-time block for a continuous loop, with held outputs.
 
     python-control does not connect discrete and continuous systems. It connects
     the block that is returned, and `ctrlplan.simulate` runs the loop from sample

@@ -68,9 +68,9 @@ def accelerations(
 
 
 def energy(crane: CraneParameters, state: ArrayLike) -> Array:
-    """Mechanical energy [J] of states (6, ...), with zero potential at z = 0.
+    """Mechanical energy [J] of states (6, ...).
 
-    The speed of the drum is R'/b, with `rope_wrap` R'/b - theta'.
+    The potential energy is 0 at z = 0. The speed of the drum is R'/b, with `rope_wrap` R'/b - theta'.
     """
     values = np.asarray(state, dtype=float)
     m, trolley, inertia, b, _, _, g = crane.numbers()
