@@ -36,7 +36,7 @@ def highest_torque(x, r):
 
 
 def by_bisection(x, high):
-    """Greatest step from 0 whose torque stays below a limit, by runs made here."""
+    """Largest step from 0 whose torque stays below a limit, by runs made here."""
     low, maximum = 0.0, 3.0
     while maximum - low > 1e-4:
         middle = 0.5 * (low + maximum)

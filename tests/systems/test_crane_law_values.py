@@ -96,7 +96,7 @@ def test_options_given_with_a_name_are_those_of_the_law(name, law, options):
 
 
 def test_options_that_change_nothing_would_be_silent():
-    """The load's own error under two options differs, so that neither is lost on the way."""
+    """The load's own error under two options differs, so that both take effect."""
     slow, fast = (outputs(crane_loop(CRANE, plan(3), LoadFeedbackLaw(load_bandwidth=w))) for w in (0.2, 2.0))
     assert np.abs(slow - fast).max() > 1e-4
 

@@ -148,7 +148,7 @@ def test_a_plan_without_duration_cannot_shrink():
 
 @pytest.mark.parametrize("moment", [1e6, -1e6, 123.456])
 def test_absolute_times(moment):
-    """The same run later, to what a clock of that size can tell."""
+    """The same run later, to the resolution of times of that size."""
     goal, t = steps((3.2, 1.5)), np.linspace(-1.0, 12.0, 131)
     here = cp.simulate(cp.create_replanner_iosystem(PLAN, 0.4, goal_derivatives=0, offset=0.1), t, goal)
     plan = PLAN.shift(moment)
@@ -264,7 +264,7 @@ def test_joined_to_a_plant_by_names():
 
 
 def test_two_replanners_in_one_loop():
-    """Each its own clock, axis and name."""
+    """Each with its own period, axis and name."""
     blocks = [
         cp.create_replanner_iosystem(cp.PolySpline(REST, labels=["a"]), 0.5, order=1, goal_derivatives=0, name="first"),
         cp.create_replanner_iosystem(
@@ -295,7 +295,7 @@ def test_a_run_can_be_made_again():
     assert np.array_equal(cp.simulate(replanner, t, cp.Step(2.0, 1.0, 3.0)).outputs, first.outputs)
 
 
-def test_jets_above_the_order_are_put_out_too():
+def test_jets_above_the_order_are_output_too():
     """derivatives above and below `order`: the plan's own where nothing was fitted."""
     t = np.linspace(0.0, 9.99, 31)
     many = cp.simulate(cp.create_replanner_iosystem(PLAN, 0.5, order=1, derivatives=4), t)
