@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import NoReturn, Protocol, runtime_checkable
+from functools import partial
+from typing import Protocol, runtime_checkable
 
 import control as ct
 import numpy as np
@@ -14,8 +15,8 @@ from ctrlplan._checks import checked_finite, checked_names, checked_vector
 from ctrlplan._types import Array, EventName, Params, System, Value
 from ctrlplan.systems.admissible import AdmissibleSet, Limits
 from ctrlplan.systems.exposed import state_signals
-from ctrlplan.systems.hybrid import raise_not_standalone
-from ctrlplan.traits import DeclaredTrait, declare
+from ctrlplan.systems.hybrid import SampledBlock, state_signal
+from ctrlplan.traits import declare
 
 
 @runtime_checkable
@@ -48,7 +49,7 @@ class Admission(Protocol):
         """
 
 
-class Governor(ct.NonlinearIOSystem):  # type: ignore[misc]
+class Governor(SampledBlock):
     """Reference governor; made by `create_governor_iosystem`.
 
     Attributes
@@ -60,9 +61,6 @@ class Governor(ct.NonlinearIOSystem):  # type: ignore[misc]
     initial : ndarray, shape (nreferences,)
         Reference before the first sample.
     """
-
-    period = DeclaredTrait[float]()
-    offset = DeclaredTrait[float]()
 
     def __init__(
         self,
@@ -91,8 +89,12 @@ class Governor(ct.NonlinearIOSystem):  # type: ignore[misc]
             sample=self.sample,
             feedthrough=False,  # between samples
             watched={
-                EventName(f"{name}: no admissible reference, previous one held"): (_infeasible, -math.inf, 0.5),
-                EventName(f"{name}: nan at the input, reference held"): (_nan_input, -math.inf, 0.5),
+                EventName(f"{name}: no admissible reference, previous one held"): (
+                    partial(state_signal, -2),
+                    -math.inf,
+                    0.5,
+                ),
+                EventName(f"{name}: nan at the input, reference held"): (partial(state_signal, -1), -math.inf, 0.5),
             },
         )
         self._count = len(outputs)
@@ -112,9 +114,6 @@ class Governor(ct.NonlinearIOSystem):  # type: ignore[misc]
 
     def _held(self, t: float, x: Value, u: Value, params: Params) -> Value:
         return np.array([x[k] + value for k, value in enumerate(self.initial.tolist())])
-
-    def _no_rates(self, t: float, x: Value, u: Value, params: Params) -> NoReturn:
-        raise_not_standalone(self.name, "is sampled")
 
 
 def create_governor_iosystem(
@@ -263,11 +262,3 @@ def _admission(loop: System, dt: float | None, limits: Limits | None, options: d
             f"{given} must be given with a linear loop only, got a {type(loop).__name__}, which has its own"
         )
     return loop
-
-
-def _infeasible(t: Value, x: Value, u: Value, params: Params) -> Value:
-    return x[-2]
-
-
-def _nan_input(t: Value, x: Value, u: Value, params: Params) -> Value:
-    return x[-1]
