@@ -279,7 +279,9 @@ def _check_autonomous(prepared: Prepared) -> None:
     if prepared.is_discrete:
         raise ValueError(f"system must be continuous, got {prepared.name} with dt = {prepared.dt}")
     if prepared.network is None:
-        raise ValueError(f"system must be one that ctrlplan runs itself, but {prepared.unsupported}")
+        raise ValueError(
+            f"system must be supported without python-control's own simulation, but {prepared.unsupported}"
+        )
     for block in prepared.network.blocks:
         if block.plan is not None or block.traits.breakpoints:
             raise ValueError(f"system must not depend on time, got the plan or breakpoints of the block {block.name}")

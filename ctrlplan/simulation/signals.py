@@ -101,7 +101,7 @@ class TimeSignal(Protocol):
         """Number of signals."""
 
     def analytic_at(self, moment: float, origin: float, s: Array) -> Array:
-        """Values (nsignals, ntime) at origin + s of the analytic functions that hold at `moment`."""
+        """Values (nsignals, ntime) at origin + s of the analytic functions that are valid at `moment`."""
 
     def bounds(self, moment: float, left: float, right: float) -> tuple[Array, Array]:
         """Minima and maxima (nsignals,) between two times without a breakpoint in between; infinite if unknown.

@@ -28,18 +28,18 @@ class Admission(Protocol):
     Attributes
     ----------
     references : sequence of str
-        Inputs of the loop that are governed.
+        Labels of the governed inputs of the loop.
     states : sequence of str
-        States of the loop, as it labels them.
+        Labels of the states of the loop.
     """
 
     @property
     def references(self) -> Sequence[str]:
-        """Inputs of the loop that are governed."""
+        """Labels of the governed inputs of the loop."""
 
     @property
     def states(self) -> Sequence[str]:
-        """States of the loop, as it labels them."""
+        """Labels of the states of the loop."""
 
     def fraction(self, x: Array, v: Array, r: Array) -> float:
         """Largest admissible fraction of the way from v to r.
@@ -136,16 +136,16 @@ def create_governor_iosystem(
     Every period the reference v moves towards the command r,
     v+ = v + kappa (r - v), by the largest kappa in [0, 1] for which the loop,
     with v+ held constant, satisfies its limits for all future times. An
-    admissible command passes unchanged, kappa = 1. Where nothing is admissible,
-    not even the present reference, or an input is not finite, v is held, and a
-    run by `ctrlplan.simulate` records it as an event. Direct feedthrough of the
+    admissible command passes unchanged, kappa = 1. If no reference is
+    admissible, not even the present one, or an input is not finite, v is held
+    and `ctrlplan.simulate` records an event. Direct feedthrough of the
     reference, as through the derivative of the error in a PID, makes every step
     small: take the derivative of the output, or connect
     `create_command_filter_iosystem` after the governor.
 
     States: the references as offsets from `initial`, ``<reference>_offset``;
     fraction, the last kappa, 0 where v was held; infeasible and nan_input, 1 while
-    nothing is admissible or an input is not finite. Inputs: the commands,
+    no reference is admissible or an input is not finite. Inputs: the commands,
     ``<reference>_cmd``, then the states of the loop as `expose_states` names
     them, ``<state>_state``. Outputs: the references, by the loop's names, held
     between samples.
@@ -196,7 +196,7 @@ def create_governor_iosystem(
 
     Examples
     --------
-    A step for which the loop would need five times the available control:
+    A step for which the loop would require five times the available control:
 
     >>> import control as ct
     >>> import numpy as np

@@ -218,7 +218,9 @@ class _Horizons:
             self._minimum = _minimum_horizon(min_horizon, period, whole)
             return
         if min_horizon is not None:
-            raise ValueError(f'min_horizon must go with horizon = "shrinking", got {min_horizon} with {whole:g} s')
+            raise ValueError(
+                f'min_horizon must be given with horizon = "shrinking" only, got {min_horizon} with {whole:g} s'
+            )
         self.step = self.whole.evaluation(period, order)
         radius = self.whole.radius(period)
         if not radius < 1.0:
@@ -491,7 +493,9 @@ def _checked_trigger(
         raise ValueError('goal_derivatives must be given for trigger = "goal", got None')
     if trigger != "deviation":
         if threshold is not None:
-            raise ValueError(f'threshold must go with trigger = "deviation", got {threshold} with {trigger!r}')
+            raise ValueError(
+                f'threshold must be given with trigger = "deviation" only, got {threshold} with {trigger!r}'
+            )
         return trigger, 0.0
     if measured is None:
         raise ValueError('measured must be given for trigger = "deviation", got None')

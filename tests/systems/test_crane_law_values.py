@@ -189,5 +189,7 @@ def test_a_user_s_law_is_checked():
 
 def test_limits_go_with_the_pids():
     for law in (DynamicLaw(), FeedforwardLaw()):
-        with pytest.raises(ValueError, match="limits must go with a law that uses the PIDs"):
+        with pytest.raises(
+            ValueError, match="force_limits and torque_limits must be given with a law that uses the PIDs"
+        ):
             crane_loop(CRANE, plan(), law, force_limits=(-1.0, 1.0))

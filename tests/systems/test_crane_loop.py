@@ -266,7 +266,7 @@ def test_a_plan_the_rope_cannot_follow_is_rejected(law):
 def test_what_does_not_go_together_is_rejected():
     with pytest.raises(ValueError, match="law must be one of setpoint, generator"):
         crane_loop(Crane(), plan_of(3), "pid")
-    with pytest.raises(ValueError, match="limits must go with a law that uses the PIDs"):
+    with pytest.raises(ValueError, match="force_limits and torque_limits must be given with a law that uses the PIDs"):
         crane_loop(Crane(), plan_of(5), "dynamic", force_limits=(-1, 1))
     with pytest.raises(ValueError, match="poles"):
         crane_loop(Crane(), plan_of(5), "dynamic", poles=(1, -1, -1, -1))

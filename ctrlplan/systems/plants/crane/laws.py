@@ -24,7 +24,7 @@ class Law(ABC):
 
     A new law is a frozen dataclass whose fields are its options. It must define
 
-    - `name`, `order`, `continuity`, and `outputs` where they are not the
+    - `name`, `order`, `continuity`, and `outputs` if they are not the
       references of the PIDs,
     - `build`, which returns the block.
 

@@ -123,7 +123,7 @@ def solved(
 
 
 def load(b: float, state: Quantity) -> tuple[Quantity, Quantity, Quantity, Quantity]:
-    """x, z and their rates of a state, b the radius of the drum."""
+    """x, z and their derivatives for a state, with the drum radius b."""
     d, r, theta, d_rate, r_rate, rate = (state[i] for i in range(6))
     s, c = np.sin(theta), np.cos(theta)
     x, z = r * s + d + b * c, r * c - b * s
