@@ -1,51 +1,50 @@
-"""Responses of loops: exact where they are linear, compiled where they can be, otherwise by Python.
+"""Simulation of loops: exact for linear ones, compiled where possible, otherwise by Python.
 
-`simulate` takes the systems that `control.input_output_response` takes,
-unmodified, and returns a `SimulationResponse`: python-control's
-`TimeResponseData` with the method that ran, the reason for it, and the events
-of the run.
+`simulate` accepts the systems of `control.input_output_response`, unmodified, and
+returns a `SimulationResponse`: the `TimeResponseData` of python-control with the
+method used, the reason for it, and the events of the run.
 
 =========  ==========================================  =========================================
-method     applies to                                  how
+method     applies to                                  algorithm
 =========  ==========================================  =========================================
-exact      linear loops, nested at will, with plans,   one matrix exponential for each segment
-           constants or samples as inputs              of an input; the error is that of rounding
+exact      linear loops with any nesting; plans,       one matrix exponential for each segment
+           constants or samples as inputs              of an input; the error is rounding
 compiled   nonlinear loops whose blocks can be traced  blocks traced with CasADi symbols, compared
            (``pip install "ctrlplan[fast]"``)          with Python, and integrated by CVODES with
                                                        the exact Jacobian
-python     blocks that cannot be traced                flattened, each block called once a step,
+python     blocks that cannot be traced                flattened, one call of each block per step,
                                                        LSODA from breakpoint to breakpoint
 =========  ==========================================  =========================================
 
-A discrete controller joins a continuous loop through
-`ctrlplan.sample_hold`; a delay is a block that stores its past input, not a
-rational approximation; algebraic loops are solved, and named where they have no
-solution. `ctrlplan.Event` records where a signal leaves a range, and may end
-the run there. Limits of actuators are recorded without one.
+A discrete controller is connected to a continuous loop by
+`ctrlplan.sample_hold`. A delay is a block that stores its past input, not a
+rational approximation. Algebraic loops are solved; if there is no solution, the
+error names their blocks. `ctrlplan.Event` records when a signal leaves its limits
+and may end the run. Limits of actuator blocks are recorded without it.
 
-What a run guarantees, and what it requires:
+Properties and requirements:
 
-- Inputs reach blocks exactly. Errors stay below 1e-6 of the range of each
+- Input signals reach blocks exactly. Errors stay below 1e-6 of the range of each
   output at default tolerances, whatever its unit; otherwise
   ``response.reason`` gives the estimated error and the tolerance that suffices.
-- Declare a pulse or a switch in t inside a block of your own:
+- A pulse or a switch in t inside a user's block must be declared:
   ``cp.declare(block, breakpoints=[2.0, 3.0])``. In compiled blocks undeclared
-  ones are found. A block that Python runs and that reads t is evaluated at least
-  once between two sample times: a shorter pulse must be declared.
-- A loop that slides along a switch, is random or grows without bound ends with
-  an error that names block and time, after 60,000 evaluations of its equations
-  and 300 a segment; the error says how to smooth or sample the switch.
+  ones are found. A block run by Python that reads t is evaluated at least once
+  between two sample times, so that only shorter pulses must be declared.
+- A loop that slides along a discontinuity, is random or diverges ends with an
+  error that names block and time, after 60,000 evaluations of its equations plus
+  300 per segment; the message states how to smooth or sample the discontinuity.
 - A system with states and dt = None is simulated as continuous-time, with a
-  warning. Linear responses warn where rounding of the matrices alone changes an
-  output by more than 1e-6.
-- Trial calls leave the memory of a block and the global random generators as
-  they were, provided that no other thread draws.
+  warning. Linear responses warn if rounding errors of the matrices change an
+  output by more than 1e-6 of its magnitude.
+- Trial calls restore the memory of a block and the global random generators,
+  provided that no other thread uses the generators.
 - ``timeout=`` of `ctrlplan.sweep` and `ctrlplan.monte_carlo` limits each value
   or draw; finished results are kept on Ctrl-C and when a worker process dies.
 
 Examples
 --------
-The crane with limited force; the run ends where the rope becomes slack:
+Crane with limited force; an event ends the run if the rope becomes slack:
 
 >>> import numpy as np
 >>> import ctrlplan as cp

@@ -118,8 +118,8 @@ class BuiltForms:
 
     def for_any(self, names: Iterable[str]) -> BuiltForms:
         """Forms that are valid for all values of given parameters."""
-        wanted = frozenset(names)
-        return BuiltForms(entry for entry in self.forms if entry.names == wanted and not entry.constants)
+        requested = frozenset(names)
+        return BuiltForms(entry for entry in self.forms if entry.names == requested and not entry.constants)
 
     def _known(self, params: Params) -> BuiltForm | None:
         return next((entry for entry in self.forms if entry.fits(params)), None)

@@ -335,8 +335,8 @@ class CompiledSolver:
             try:
                 with _passing_interruptions():
                     found = _called(integrator, (start, np.empty(0), p), state.size, self._report)
-                wanted = found[:, np.searchsorted(outputs, relative)]
-                return scales.shift[:, None] + scales.scale[:, None] * wanted
+                outputs_at_grid = found[:, np.searchsorted(outputs, relative)]
+                return scales.shift[:, None] + scales.scale[:, None] * outputs_at_grid
             except RuntimeError as error:
                 code = re.search(r"CV_\w+", str(error))
                 why = _FAILURES.get(code.group() if code else "", "the equations could not be evaluated")

@@ -119,7 +119,10 @@ def equilibrium_state(system: System | Prepared, position: ArrayLike) -> Array:
 
 
 def unstable_poles(system: System | Prepared) -> NDArray[np.complex128]:
-    """Poles in the right half plane of a linear continuous system; empty for others."""
+    """Poles of a linear continuous system in the right half plane.
+
+    Empty for other systems.
+    """
     try:
         poles = np.linalg.eigvals(_form(system).a).astype(complex)
     except NotLinearError:
@@ -153,8 +156,8 @@ def _linear_equilibrium(
     """
     state = np.where(free, 0.0, start)
     inner = a[np.ix_(free, free)]
-    wanted = -(supplied + a @ state)[free]
-    found, left = _scaled_solution(inner, wanted)
+    right_side = -(supplied + a @ state)[free]
+    found, left = _scaled_solution(inner, right_side)
     if left > _LINEAR_RESIDUAL:
         return None
     idle = null_space(inner)
@@ -171,10 +174,10 @@ def _scaled_solution(matrix: Array, right: Array) -> tuple[Array, float]:
     rows = 1.0 / np.where(rows > 0.0, rows, 1.0)
     columns = np.abs(rows[:, None] * matrix).max(axis=0, initial=0.0)
     columns = 1.0 / np.where(columns > 0.0, columns, 1.0)
-    scaled, wanted = rows[:, None] * matrix * columns, rows * right
-    found = np.linalg.lstsq(scaled, wanted, rcond=None)[0]
-    size = max(float(np.abs(found).max(initial=0.0)), float(np.abs(wanted).max(initial=0.0)))
-    left = float(np.abs(scaled @ found - wanted).max(initial=0.0))
+    scaled, right_side = rows[:, None] * matrix * columns, rows * right
+    found = np.linalg.lstsq(scaled, right_side, rcond=None)[0]
+    size = max(float(np.abs(found).max(initial=0.0)), float(np.abs(right_side).max(initial=0.0)))
+    left = float(np.abs(scaled @ found - right_side).max(initial=0.0))
     return columns * found, left / size if size else 0.0
 
 

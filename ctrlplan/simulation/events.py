@@ -101,7 +101,10 @@ class Occurrence:
 
 
 def what_happened(name: str) -> str:
-    """Event in words: as its block declares it, or that the signal left its limits."""
+    """Event in words, as its block declares it.
+
+    For other events: that the signal left its limits.
+    """
     if isinstance(name, EventName):
         return f"{name} {name.words}" if name.words else str(name)
     return f"{name} left its limits"

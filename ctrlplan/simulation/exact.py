@@ -50,7 +50,7 @@ _NUMBERS = 2**17
 
 Jet = Callable[[float, float, Array, int], Array]
 """(moment, origin, s, order) -> derivatives (order + 1, ninputs, ntime) at origin + s
-of the analytic functions that hold at `moment`."""
+of the analytic functions that are valid at `moment`."""
 
 
 def exact_states(

@@ -300,17 +300,17 @@ class Network:
         known = np.zeros(self.nsignals, dtype=bool)
         known[self.time_rows] = True
         feeds_on = _dependencies(self, feeds)
-        wanted = _reached(feeds_on, needed)
+        required = _reached(feeds_on, needed)
         steps: list[Step] = []
-        while not known[wanted].all():
-            ready = ~known & wanted & np.all(~feeds_on | known, axis=1)
+        while not known[required].all():
+            ready = ~known & required & np.all(~feeds_on | known, axis=1)
             if ready.any():
                 for i, place in enumerate(self.outputs):
                     if ready[place].any():
                         steps.append(Step((i,)))
                 known |= ready
                 continue
-            rows = _first_loop(feeds_on, ~known & wanted)
+            rows = _first_loop(feeds_on, ~known & required)
             steps.append(Step(self._owners(rows), rows))
             known[rows] = True
         return steps
@@ -505,12 +505,12 @@ def _dependencies(network: Network, feeds: Sequence[NDArray[np.bool_]]) -> NDArr
 
 def _reached(depends: NDArray[np.bool_], needed: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Required signals, and those they depend on."""
-    wanted = needed.copy()
+    required = needed.copy()
     while True:
-        more = wanted | depends[wanted].any(axis=0)
-        if (more == wanted).all():
-            return wanted
-        wanted = more
+        more = required | depends[required].any(axis=0)
+        if (more == required).all():
+            return required
+        required = more
 
 
 def _first_loop(depends: NDArray[np.bool_], open_: NDArray[np.bool_]) -> NDArray[np.intp]:

@@ -362,11 +362,9 @@ def equations_of(job: Job, network: Network) -> Interpreted | None:
 def _accuracy_note(attempt: Attempt[S]) -> str:
     """Note on uncertain outputs with the tolerance that suffices; empty if there are none."""
     job, run, solver, scales = attempt.job, attempt.run, attempt.solver, attempt.scales
-    some = np.unique(np.linspace(0, run.times.size - 1, VISITED).astype(int))
-    t, x = run.times[some], run.states[:, some]
+    t, x, time_values = attempt.visited()
     if not x.size or not np.isfinite(x).all():
         return ""
-    time_values = signal_values(attempt.time_signals, t)
     own = scales.uncertainty(run.states, job.rtol) * attempt.growth / attempt.tighter
     uncertainty, count = own + attempt.drift, len(job.prepared.output_labels)
     worst, ranges = output_uncertainty(

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ctrlplan._checks import Range, checked_finite, checked_limits
+from ctrlplan._checks import Range, check_signals, checked_finite, checked_limits
 from ctrlplan._display import Displayed, Facts, Part, Table, number
 from ctrlplan._types import Array, Frozen, Params, System
 from ctrlplan.simulation import methods
@@ -138,8 +138,8 @@ class Predictor(Displayed, Frozen):
         if not prepared.input_labels:
             raise ValueError(f"{prepared.name} must have an input to govern, got none")
         governed = tuple(prepared.input_labels if references is None else references)
-        _check_known(governed, prepared.input_labels, "references", "inputs")
-        _check_known(tuple(limits), prepared.output_labels, "limits", "outputs")
+        check_signals(governed, prepared.input_labels, "references", "input")
+        check_signals(tuple(limits), prepared.output_labels, "limits", "output")
         for label, value, maximum in (("margin", margin, 0.5), ("resolution", resolution, 1.0)):
             if not 0.0 < float(value) < maximum:
                 raise ValueError(f"{label} must lie in (0, {maximum:g}), got {value}")
@@ -279,19 +279,11 @@ def _check_autonomous(prepared: Prepared) -> None:
     if prepared.is_discrete:
         raise ValueError(f"system must be continuous, got {prepared.name} with dt = {prepared.dt}")
     if prepared.network is None:
-        raise ValueError(f"system must be one that ctrlplan runs itself, but {prepared.unsupported}")
+        raise ValueError(
+            f"system must be supported without python-control's own simulation, but {prepared.unsupported}"
+        )
     for block in prepared.network.blocks:
         if block.plan is not None or block.traits.breakpoints:
             raise ValueError(f"system must not depend on time, got the plan or breakpoints of the block {block.name}")
         if block.delay is not None:
             raise ValueError(f"system must have a finite number of states, got the delay of the block {block.name}")
-
-
-def _check_known(given: tuple[str, ...], known: list[str], name: str, what: str) -> None:
-    if not given:
-        raise ValueError(f"{name} must not be empty")
-    for label in given:
-        if label not in known:
-            raise ValueError(f"{name} must be among the {what} {', '.join(known) or '(none)'}, got {label!r}")
-    if len(set(given)) < len(given):
-        raise ValueError(f"{name} must not name one of the {what} twice, got {', '.join(given)}")

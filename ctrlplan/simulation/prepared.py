@@ -96,7 +96,10 @@ class Prepared(Displayed):
 
     @property
     def stated(self) -> Array | None:
-        """Initial states that the system or its blocks declare, nan for the others; None if none is declared."""
+        """Declared initial state.
+
+        nan for states of blocks that declare none; None if no block does.
+        """
         return self._stated if self.system is None else stated_states(self.system)
 
     @property
@@ -111,11 +114,14 @@ class Prepared(Displayed):
 
     @property
     def has_blocks(self) -> bool:
-        """Whether the blocks of python-control are available: not in a form from another process."""
+        """Whether the blocks are available.
+
+        They are not in a form that was sent from another process.
+        """
         return self.network is not None and bool(self.network.blocks)
 
     def time_signals(self, inputs: list[TimeSignal], first: float) -> list[TimeSignal]:
-        """Input signals, then the outputs of blocks that are functions of time, in order."""
+        """Input signals, then outputs of blocks that are functions of time."""
         sources, found = iter(self._sources), list(inputs)
         for block in self._blocks():
             if block.plan is not None:
@@ -128,7 +134,7 @@ class Prepared(Displayed):
     def compiled(
         self, params: Params, time_signals: list[TimeSignal], first: float, state: Array, trials: bool = True
     ) -> Compiled:
-        """Compiled form for given parameters, built once for all their values.
+        """Compiled form, built once for all values of the parameters.
 
         Raises
         ------
@@ -146,13 +152,14 @@ class Prepared(Displayed):
         return self._built_forms.form(params, build)
 
     def discard(self, form: Compiled, why: str) -> DisagreementError:
-        """Discard a compiled form that disagrees with Python; returns the error to raise."""
+        """Error to raise for a compiled form that is wrong; it is discarded."""
         return self._built_forms.discard(form, why)
 
     def detached(self, names: Iterable[str] = ()) -> Prepared:
-        """Same form without the blocks of python-control, for other processes and for many runs.
+        """Same form without the blocks of python-control.
 
-        The compiled form is no longer compared with Python.
+        For other processes and for many runs; the compiled form is no longer
+        compared with Python.
 
         Raises
         ------
@@ -169,7 +176,10 @@ class Prepared(Displayed):
         return other
 
     def reads(self, name: str, value: Value, initial_state: ArrayLike | None = None) -> bool:
-        """Whether a block has a parameter, or reads one of that name near the initial state."""
+        """Whether a block has or reads a parameter.
+
+        Reading is determined by calls near the initial state.
+        """
         network = self.network
         if network is None or not network.blocks or any(name in block.params for block in network.blocks):
             return True
@@ -296,7 +306,10 @@ def prepare(system: System | Prepared) -> Prepared:
 
 
 def prepared_form(system: System | Prepared) -> Prepared:
-    """Cached form of a system, or a new one if its connections, parameters or blocks have changed."""
+    """Cached form of a system, rebuilt if it has changed.
+
+    Changes are those of connections, parameters and blocks.
+    """
     if isinstance(system, Prepared) and system.original is None:
         return system
     with BUILDING:  # no other thread makes trial calls of a block
@@ -309,12 +322,18 @@ def prepared_form(system: System | Prepared) -> Prepared:
 
 
 def stated_start(system: System | Prepared) -> Array | None:
-    """Initial state that a system or its blocks declare, 0 for other blocks; None if none is declared."""
+    """Declared initial state of a system.
+
+    0 for states of blocks that declare none; None if no block does.
+    """
     return _filled(stated_states(system))
 
 
 def stated_states(system: System | Prepared) -> Array | None:
-    """Initial state that a system or its blocks declare, nan for other blocks; None if none is declared."""
+    """Declared initial state of a system.
+
+    nan for states of blocks that declare none; None if no block does.
+    """
     if isinstance(system, Prepared):
         return system.stated
     own = traits_of(system).initial_state
@@ -329,7 +348,7 @@ def stated_states(system: System | Prepared) -> Array | None:
 
 
 def state_space(system: System) -> System:
-    """State-space form of a transfer function; other systems unchanged."""
+    """State-space form of a transfer function, or the same system."""
     if not isinstance(system, ct.TransferFunction):
         return system
     return ct.ss(system, name=system.name, inputs=system.input_labels, outputs=system.output_labels)

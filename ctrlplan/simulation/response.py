@@ -90,10 +90,11 @@ class SimulationResponse(Displayed, ct.TimeResponseData):  # type: ignore[misc] 
         self.method, self.reason, self.events = method, reason, list(events)
 
     def export(self, path: str | os.PathLike[str]) -> Path:
-        """Write times and signals, in the format of the path's ending: .csv, .mat or .npz.
+        """Write times and signals to a file, in the format of its ending.
 
-        Columns are the outputs, inputs and states by their labels. A label that
-        an earlier signal has gets ``input.`` or ``state.`` before it.
+        The endings are .csv, .mat and .npz. Columns are the outputs, inputs and
+        states by their labels, with the prefix ``input.`` or ``state.`` for a
+        label of an earlier signal.
 
         Parameters
         ----------

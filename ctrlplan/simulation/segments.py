@@ -212,8 +212,8 @@ def integrate(
             reach = 0.5 * (right - left)
             continue
         segments.append((left, series))
-        wanted = np.isin(grid, inside)
-        known.append((np.append(left, grid[wanted]), np.column_stack([x, found[:, wanted]])))
+        requested = np.isin(grid, inside)
+        known.append((np.append(left, grid[requested]), np.column_stack([x, found[:, requested]])))
         before, x = x, schedule.sample(equations, right, found[:, -1])
         left, reach = right, min(longest, 2.0 * reach)
         if stops_after is not None and stops_after(np.append(segments[-1][0], grid), np.column_stack([before, found])):

@@ -101,7 +101,7 @@ class TimeSignal(Protocol):
         """Number of signals."""
 
     def analytic_at(self, moment: float, origin: float, s: Array) -> Array:
-        """Values (nsignals, ntime) at origin + s of the analytic functions that hold at `moment`."""
+        """Values (nsignals, ntime) at origin + s of the analytic functions that are valid at `moment`."""
 
     def bounds(self, moment: float, left: float, right: float) -> tuple[Array, Array]:
         """Minima and maxima (nsignals,) between two times without a breakpoint in between; infinite if unknown.
@@ -159,14 +159,13 @@ class SampledSignal:
 
     def analytic_at(self, moment: float, origin: float, s: Array) -> Array:
         """Values of the straight line that contains `moment`."""
-        left = min(max(int(np.searchsorted(self.times, moment)) - 1, 0), self.times.size - 2)
-        (t0, t1), (v0, v1) = self.times[left : left + 2], self.values[left : left + 2]
+        line = self._line(moment)
+        (t0, t1), (v0, v1) = self.times[line], self.values[line]
         return (v0 + (v1 - v0) * ((origin - t0 + s) / (t1 - t0)))[None]
 
     def bounds(self, moment: float, left: float, right: float) -> tuple[Array, Array]:
         """Bounds by the samples at both ends of a straight line."""
-        start = min(max(int(np.searchsorted(self.times, moment)) - 1, 0), self.times.size - 2)
-        return _ordered(self.values[None, start : start + 2])
+        return _ordered(self.values[None, self._line(moment)])
 
     def at(self, times: Array) -> Array:
         """Interpolated values."""
@@ -174,6 +173,11 @@ class SampledSignal:
         first, second = self.values[after - 1], self.values[after]
         found = np.interp(times, self.times, self.values)
         return np.clip(found, np.minimum(first, second), np.maximum(first, second))[None]
+
+    def _line(self, moment: float) -> slice:
+        """Indices of the samples at both ends of the line that contains `moment`."""
+        left = min(max(int(np.searchsorted(self.times, moment)) - 1, 0), self.times.size - 2)
+        return slice(left, left + 2)
 
 
 def input_signals(labels: Sequence[str], inputs: Inputs, times: Array) -> list[TimeSignal]:

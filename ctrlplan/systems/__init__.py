@@ -1,10 +1,10 @@
-"""Blocks that python-control interconnects: plans, laws and plants.
+"""Blocks for python-control interconnections: sources, controllers and plants.
 
-Every ``create_*_iosystem`` takes what it requires first and the rest by
-keyword: ``inputs=``, ``outputs=`` and ``name=`` as in python-control. Blocks
-that follow a plan have ``labels=`` and ``suffix=`` instead: a plan joins a loop
-by its labels, so give it those of the inputs that it is for
-(``labels=["r"]``), or give the source a suffix.
+The required arguments of every ``create_*_iosystem`` come first; all others are
+keywords: ``inputs=``, ``outputs=`` and ``name=`` as in python-control. Blocks of a
+plan have ``labels=`` and ``suffix=`` instead: `control.interconnect` connects a
+plan by its labels, so it must have those of the inputs (``labels=["r"]``), or the
+source a suffix.
 
 Off line: `create_source_iosystem` (a plan with its derivatives),
 `create_flat_iosystem` (flat control), `create_feedforward_iosystem` (its linear
@@ -12,32 +12,32 @@ feedforward), `create_pid_iosystem`, `create_saturation_iosystem`,
 `create_delay_iosystem`, `create_command_filter_iosystem`, `sample_hold`
 (discrete blocks in continuous loops), and the plants and loops of `plants`.
 
-On line, a block in the place of the plan responds to what is not known before the run:
+On line, in place of the source of the plan:
 
 `create_replanner_iosystem`
-    Fits the plan again every period, from the reference to a goal that moves,
-    or from what is measured. Without a disturbance the plan is unchanged; each
-    fit adds a correction in the family of the plan. A period, horizon and alpha
-    of which the map from fit to fit is unstable are an error that gives its
-    spectral radius. While a goal is out of reach, or a measurement is nan, the
-    last valid plan is followed, and an event is recorded. A fit from what is
-    measured is feedback: it requires a loop that follows the plan between fits.
-    A fit takes 10 to 20 microseconds for two axes and jets of order 2.
+    Refits the plan every period, from the reference to a moving goal, or from
+    measurements. Without a disturbance the plan is unchanged; each fit adds a
+    correction of the same spline family. If the map from fit to fit is unstable
+    with the given period, horizon and alpha, an error gives its spectral radius.
+    If the goal is out of reach or a measurement is nan, the last valid plan
+    stays in force and an event is recorded. A fit from measurements is feedback:
+    the loop must follow the plan between fits. A fit takes 10 to 20 microseconds
+    for two axes and jets of order 2.
 `create_governor_iosystem`
     Reference governor: moves the reference towards the command by the largest
-    step for which the loop satisfies its limits for all future times. Of linear
-    loops by an `AdmissibleSet`, computed once, between the samples too; of
-    nonlinear loops by a `ctrlplan.Predictor`, which simulates the loop ahead.
+    step for which the loop satisfies its limits for all future times, also
+    between samples. Linear loops use an `AdmissibleSet`, computed once; nonlinear
+    loops a `ctrlplan.Predictor`, which predicts the response by simulation.
 `create_time_scaling_iosystem`
-    Time scaling: the plan slows as an error grows or an actuator comes near its
-    limit, and then catches up. The path does not change.
+    Time scaling: slows the plan down as an error grows or an actuator approaches
+    its limit, and makes up the delay afterwards. The path does not change.
 
-``ctrlplan online`` compares them on a crane in four scenarios: a gust, a payload
-twice as heavy, a goal that moves on the way, too little force.
+``ctrlplan online`` compares them on a crane in four scenarios: a gust, twice the
+payload, a goal that changes during the move, and limited force.
 
 Examples
 --------
-A governor keeps the control of a linear loop within its limits:
+A governor limits the control signal of a linear loop:
 
 >>> import control as ct
 >>> import numpy as np

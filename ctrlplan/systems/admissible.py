@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import linprog
 
-from ctrlplan._checks import Range, checked_finite, checked_limits, checked_number
+from ctrlplan._checks import Range, check_signals, checked_finite, checked_limits, checked_number
 from ctrlplan._display import Displayed, Facts, Part, counted
 from ctrlplan._types import Array, System
 from ctrlplan.systems.output_cells import Problem, elevated, erosion, output_cells, seen_directions
@@ -226,20 +226,11 @@ def _problem(
     governed = (
         tuple(label for label in inputs if label not in disturbances) if references is None else tuple(references)
     )
-    if not governed:
-        raise ValueError(f"references must name at least one input of {loop.name}, got none")
-    for name, given, known in (
-        ("references", governed, inputs),
-        ("disturbances", tuple(disturbances), [label for label in inputs if label not in governed]),
-        ("limits", tuple(limits), outputs),
-    ):
-        for label in given:
-            if label not in known:
-                raise ValueError(f"{name} must be among {', '.join(known) or 'no signals'}, got {label!r}")
-    if len(set(governed)) < len(governed):
-        raise ValueError(f"references must not name an input twice, got {', '.join(governed)}")
-    if not limits:
-        raise ValueError("limits must name at least one output, got none")
+    check_signals(governed, inputs, "references", "input")
+    if disturbances:
+        others = [label for label in inputs if label not in governed]
+        check_signals(tuple(disturbances), others, "disturbances", "input")
+    check_signals(tuple(limits), outputs, "limits", "output")
     a, b, c, d = _matrices(loop)
     poles = np.linalg.eigvals(a)
     if poles.size and not poles.real.max() < -1e-9 * np.abs(poles).max():

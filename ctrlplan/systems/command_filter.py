@@ -108,7 +108,7 @@ def create_command_filter_iosystem(
 
 
 def command_filter_gains(bandwidth: float, order: int) -> tuple[float, ...]:
-    """Gains of a plan's derivatives that cancel the lag of a command filter.
+    """Gains of a plan's derivatives, inverse of a command filter.
 
     With the weighted sum of the derivatives as the command, the output of
     `create_command_filter_iosystem` is the plan.

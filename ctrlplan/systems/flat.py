@@ -148,8 +148,8 @@ def create_flat_iosystem(
         flag, first = [], 0
         for row, sigma in zip(measured, gains, strict=True):
             r = len(sigma)
-            wanted = u[first : first + r + 1]
-            v = wanted[r] - sum(sigma[k] * (row[k] - wanted[k]) for k in range(r))
+            desired = u[first : first + r + 1]
+            v = desired[r] - sum(sigma[k] * (row[k] - desired[k]) for k in range(r))
             flag.append(np.array([*row[:r], v]))
             first += r + 1
         return plant.reverse(flag)[1]
@@ -177,7 +177,7 @@ def create_flat_iosystem(
 
 
 def hurwitz_coefficients(poles: Sequence[complex], count: int, where: str = "") -> tuple[float, ...]:
-    """Coefficients of the monic polynomial with these roots, lowest first.
+    """Coefficients of a monic polynomial with given stable roots.
 
     Parameters
     ----------
@@ -191,7 +191,8 @@ def hurwitz_coefficients(poles: Sequence[complex], count: int, where: str = "") 
     Returns
     -------
     tuple of float
-        sigma_0, ..., sigma_(count - 1) of s^count + sum of sigma_k s^k.
+        sigma_0, ..., sigma_(count - 1) of s^count + sum of sigma_k s^k, lowest
+        order first.
 
     Raises
     ------

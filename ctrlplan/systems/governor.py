@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import NoReturn, Protocol, runtime_checkable
+from functools import partial
+from typing import Protocol, runtime_checkable
 
 import control as ct
 import numpy as np
@@ -14,8 +15,8 @@ from ctrlplan._checks import checked_finite, checked_names, checked_vector
 from ctrlplan._types import Array, EventName, Params, System, Value
 from ctrlplan.systems.admissible import AdmissibleSet, Limits
 from ctrlplan.systems.exposed import state_signals
-from ctrlplan.systems.hybrid import raise_not_standalone
-from ctrlplan.traits import DeclaredTrait, declare
+from ctrlplan.systems.hybrid import SampledBlock, state_signal
+from ctrlplan.traits import declare
 
 
 @runtime_checkable
@@ -27,24 +28,28 @@ class Admission(Protocol):
     Attributes
     ----------
     references : sequence of str
-        Inputs of the loop that are governed.
+        Labels of the governed inputs of the loop.
     states : sequence of str
-        States of the loop, as it labels them.
+        Labels of the states of the loop.
     """
 
     @property
     def references(self) -> Sequence[str]:
-        """Inputs of the loop that are governed."""
+        """Labels of the governed inputs of the loop."""
 
     @property
     def states(self) -> Sequence[str]:
-        """States of the loop, as it labels them."""
+        """Labels of the states of the loop."""
 
     def fraction(self, x: Array, v: Array, r: Array) -> float:
-        """Largest kappa in [0, 1] for which v + kappa (r - v), held from state x on, is admissible; nan if none is."""
+        """Largest admissible fraction of the way from v to r.
+
+        Largest kappa in [0, 1] for which v + kappa (r - v), held constant from
+        state x, is admissible; nan if there is none.
+        """
 
 
-class Governor(ct.NonlinearIOSystem):  # type: ignore[misc]
+class Governor(SampledBlock):
     """Reference governor; made by `create_governor_iosystem`.
 
     Attributes
@@ -56,9 +61,6 @@ class Governor(ct.NonlinearIOSystem):  # type: ignore[misc]
     initial : ndarray, shape (nreferences,)
         Reference before the first sample.
     """
-
-    period = DeclaredTrait[float]()
-    offset = DeclaredTrait[float]()
 
     def __init__(
         self,
@@ -87,14 +89,18 @@ class Governor(ct.NonlinearIOSystem):  # type: ignore[misc]
             sample=self.sample,
             feedthrough=False,  # between samples
             watched={
-                EventName(f"{name}: no admissible reference, previous one held"): (_infeasible, -math.inf, 0.5),
-                EventName(f"{name}: nan at the input, reference held"): (_nan_input, -math.inf, 0.5),
+                EventName(f"{name}: no admissible reference, previous one held"): (
+                    partial(state_signal, -2),
+                    -math.inf,
+                    0.5,
+                ),
+                EventName(f"{name}: nan at the input, reference held"): (partial(state_signal, -1), -math.inf, 0.5),
             },
         )
         self._count = len(outputs)
 
     def sample(self, t: float, x: Array, u: Array, params: Params) -> Array:
-        """States after a sample: the reference moved by the admissible fraction."""
+        """States after a sample, with the reference moved."""
         n = self._count
         if not np.isfinite(u).all():
             return np.array([*x[:n], 0.0, 0.0, 1.0])
@@ -108,9 +114,6 @@ class Governor(ct.NonlinearIOSystem):  # type: ignore[misc]
 
     def _held(self, t: float, x: Value, u: Value, params: Params) -> Value:
         return np.array([x[k] + value for k, value in enumerate(self.initial.tolist())])
-
-    def _no_rates(self, t: float, x: Value, u: Value, params: Params) -> NoReturn:
-        raise_not_standalone(self.name, "is sampled")
 
 
 def create_governor_iosystem(
@@ -133,16 +136,16 @@ def create_governor_iosystem(
     Every period the reference v moves towards the command r,
     v+ = v + kappa (r - v), by the largest kappa in [0, 1] for which the loop,
     with v+ held constant, satisfies its limits for all future times. An
-    admissible command passes unchanged, kappa = 1. Where nothing is admissible,
-    not even the present reference, or an input is not finite, v is held, and a
-    run by `ctrlplan.simulate` records it as an event. Direct feedthrough of the
+    admissible command passes unchanged, kappa = 1. If no reference is
+    admissible, not even the present one, or an input is not finite, v is held
+    and `ctrlplan.simulate` records an event. Direct feedthrough of the
     reference, as through the derivative of the error in a PID, makes every step
     small: take the derivative of the output, or connect
     `create_command_filter_iosystem` after the governor.
 
     States: the references as offsets from `initial`, ``<reference>_offset``;
     fraction, the last kappa, 0 where v was held; infeasible and nan_input, 1 while
-    nothing is admissible or an input is not finite. Inputs: the commands,
+    no reference is admissible or an input is not finite. Inputs: the commands,
     ``<reference>_cmd``, then the states of the loop as `expose_states` names
     them, ``<state>_state``. Outputs: the references, by the loop's names, held
     between samples.
@@ -193,7 +196,7 @@ def create_governor_iosystem(
 
     Examples
     --------
-    A step for which the loop would need five times the available control:
+    A step for which the loop would require five times the available control:
 
     >>> import control as ct
     >>> import numpy as np
@@ -259,11 +262,3 @@ def _admission(loop: System, dt: float | None, limits: Limits | None, options: d
             f"{given} must be given with a linear loop only, got a {type(loop).__name__}, which has its own"
         )
     return loop
-
-
-def _infeasible(t: Value, x: Value, u: Value, params: Params) -> Value:
-    return x[-2]
-
-
-def _nan_input(t: Value, x: Value, u: Value, params: Params) -> Value:
-    return x[-1]

@@ -15,7 +15,23 @@ from ctrlplan._types import Array, Params, System, Value
 from ctrlplan.traits import DeclaredTrait, declare
 
 
-class SampleHold(ct.NonlinearIOSystem):  # type: ignore[misc]
+class SampledBlock(ct.NonlinearIOSystem):  # type: ignore[misc]
+    """Block without state derivatives, sampled by `ctrlplan.simulate`.
+
+    Attributes
+    ----------
+    period, offset : float
+        Sample times are offset, offset + period, ... [s] after the start of a run.
+    """
+
+    period = DeclaredTrait[float]()
+    offset = DeclaredTrait[float]()
+
+    def _no_rates(self, t: float, x: Value, u: Value, params: Params) -> NoReturn:
+        raise_not_standalone(self.name, "is sampled")
+
+
+class SampleHold(SampledBlock):
     """Discrete block in a continuous loop; made by `sample_hold`.
 
     Attributes
@@ -27,8 +43,6 @@ class SampleHold(ct.NonlinearIOSystem):  # type: ignore[misc]
     """
 
     block = DeclaredTrait[ct.InputOutputSystem]()
-    period = DeclaredTrait[float]()
-    offset = DeclaredTrait[float]()
 
     def __init__(
         self, block: System, period: float, offset: float, inputs: list[str], outputs: list[str], name: str
@@ -48,7 +62,7 @@ class SampleHold(ct.NonlinearIOSystem):  # type: ignore[misc]
         self._inner = block.nstates or 0
 
     def sample(self, t: float, x: Array, u: Array, params: Params) -> Array:
-        """States after a sample: the next states of the block, and the held outputs."""
+        """States after a sample: those of the block, then held outputs."""
         own = None if isinstance(self.block, ct.StateSpace) else params
         state = x[: self._inner]
         outputs = np.ravel(self.block.output(t, state, u, own))
@@ -57,9 +71,6 @@ class SampleHold(ct.NonlinearIOSystem):  # type: ignore[misc]
 
     def _held(self, t: float, x: Value, u: Value, params: Params) -> Value:
         return x[self._inner :]
-
-    def _no_rates(self, t: float, x: Value, u: Value, params: Params) -> NoReturn:
-        raise_not_standalone(self.name, "is sampled")
 
 
 class Delay(ct.NonlinearIOSystem):  # type: ignore[misc]
@@ -94,7 +105,7 @@ def sample_hold(
     outputs: Sequence[str] | str | None = None,
     name: str | None = None,
 ) -> SampleHold:
-    """Discrete-time block for a continuous loop, its outputs held between samples.
+    """Discrete-time block for a continuous loop, with held outputs.
 
     python-control does not connect discrete and continuous systems. It connects
     the block that is returned, and `ctrlplan.simulate` runs the loop from sample
@@ -217,6 +228,11 @@ def create_delay_iosystem(
     if len(given) != len(delayed) or not given:
         raise ValueError(f"outputs must be as many as inputs, {len(given)}, got {len(delayed)}")
     return Delay(seconds, checked_vector(initial, "initial", len(given)), given, delayed, name)
+
+
+def state_signal(row: int, t: Value, x: Value, u: Value, params: Params) -> Value:
+    """State of a block as a signal with declared limits."""
+    return x[row]
 
 
 def raise_not_standalone(name: str, why: str) -> NoReturn:

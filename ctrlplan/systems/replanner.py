@@ -6,7 +6,7 @@ import itertools
 import math
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import Literal, NoReturn, get_args
+from typing import Literal, get_args
 
 import control as ct
 import numpy as np
@@ -14,9 +14,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from ctrlplan._checks import check_kind, checked_count, checked_finite, real_array
 from ctrlplan._types import Array, EventName, Params, Value
-from ctrlplan.systems.hybrid import raise_not_standalone
+from ctrlplan.systems.hybrid import SampledBlock, state_signal
 from ctrlplan.systems.source import axis_signals, create_source_iosystem
-from ctrlplan.traits import DeclaredTrait, declare
+from ctrlplan.traits import declare
 from ctrlplan.trajectories import Trajectory
 from ctrlplan.trajectories.extrema import stationary_times
 from ctrlplan.trajectories.files import signal_names
@@ -218,7 +218,9 @@ class _Horizons:
             self._minimum = _minimum_horizon(min_horizon, period, whole)
             return
         if min_horizon is not None:
-            raise ValueError(f'min_horizon must go with horizon = "shrinking", got {min_horizon} with {whole:g} s')
+            raise ValueError(
+                f'min_horizon must be given with horizon = "shrinking" only, got {min_horizon} with {whole:g} s'
+            )
         self.step = self.whole.evaluation(period, order)
         radius = self.whole.radius(period)
         if not radius < 1.0:
@@ -287,11 +289,8 @@ class _Signals:
         return [axis * each + k for axis in range(naxes) for k in range(self.output_order + 1)]
 
 
-class _Correction(ct.NonlinearIOSystem):  # type: ignore[misc]
+class _Correction(SampledBlock):
     """Jets of a plan plus those of the last fitted transition."""
-
-    period = DeclaredTrait[float]()
-    offset = DeclaredTrait[float]()
 
     def __init__(
         self,
@@ -324,8 +323,8 @@ class _Correction(ct.NonlinearIOSystem):  # type: ignore[misc]
             samples_first=True,  # the measurement may have direct feedthrough from the reference
             feedthrough=signals.feedthrough,
             watched={
-                EventName(f"{name}: nan at the input"): (partial(_state, _NAN_INPUT), -math.inf, 0.5),
-                EventName(f"{name}: goal out of reach"): (partial(_state, _UNREACHABLE), -math.inf, 0.5),
+                EventName(f"{name}: nan at the input"): (partial(state_signal, _NAN_INPUT), -math.inf, 0.5),
+                EventName(f"{name}: goal out of reach"): (partial(state_signal, _UNREACHABLE), -math.inf, 0.5),
             },
         )
         self._plan, self._horizons, self._signals, self._trigger, self._limits = (
@@ -465,19 +464,12 @@ class _Correction(ct.NonlinearIOSystem):  # type: ignore[misc]
             found.append([value * live * math.factorial(k) + after_end[k] for k, value in enumerate(row)])
         return found
 
-    def _no_rates(self, t: float, x: Value, u: Value, params: Params) -> NoReturn:
-        raise_not_standalone(self.name, "is sampled")
-
 
 def _without_rounding(jet: Array, scale: Array, size: float) -> Array:
     """Jet with derivatives of the size of rounding errors replaced by 0."""
     small = np.abs(jet * scale) <= 1e-9 * max(size, float(np.abs(jet[0]).max()))
     small[0] = False
     return np.where(small, 0.0, jet)
-
-
-def _state(row: int, t: Value, x: Value, u: Value, params: Params) -> Value:
-    return x[row]
 
 
 def _minimum_horizon(given: float | None, period: float, whole: float) -> float:
@@ -501,7 +493,9 @@ def _checked_trigger(
         raise ValueError('goal_derivatives must be given for trigger = "goal", got None')
     if trigger != "deviation":
         if threshold is not None:
-            raise ValueError(f'threshold must go with trigger = "deviation", got {threshold} with {trigger!r}')
+            raise ValueError(
+                f'threshold must be given with trigger = "deviation" only, got {threshold} with {trigger!r}'
+            )
         return trigger, 0.0
     if measured is None:
         raise ValueError('measured must be given for trigger = "deviation", got None')

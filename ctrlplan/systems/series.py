@@ -129,11 +129,11 @@ class Taylor:
         return Taylor(divide(self._with(other)[1], self.terms))
 
     def sin(self) -> Taylor:
-        """Sine, as `numpy.sin` calls it."""
+        """Sine; called by `numpy.sin`."""
         return Taylor(sincos(self.terms)[0])
 
     def cos(self) -> Taylor:
-        """Cosine, as `numpy.cos` calls it."""
+        """Cosine; called by `numpy.cos`."""
         return Taylor(sincos(self.terms)[1])
 
     __radd__ = __add__

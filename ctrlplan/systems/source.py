@@ -17,7 +17,7 @@ from ctrlplan.trajectories.files import signal_names, signal_rows
 
 
 class PlanSource(ct.NonlinearIOSystem):  # type: ignore[misc]
-    """Source of a plan and its derivatives; made by `create_source_iosystem`.
+    """Source of a plan; made by `create_source_iosystem`.
 
     Attributes
     ----------

@@ -157,8 +157,8 @@ def create_time_scaling_iosystem(
 
     def update(t: Value, x: Value, u: Value, params: Params) -> Array:
         free = np.fmin(np.fmax(1.0 + x[0] / horizon, minimum), maximum)
-        wanted = minimum + (1.0 - severity(t, x, u)) * (free - minimum)
-        slow = [1.0 - wanted, *(x[k] for k in range(1, n + 1))]
+        rate = minimum + (1.0 - severity(t, x, u)) * (free - minimum)
+        slow = [1.0 - rate, *(x[k] for k in range(1, n + 1))]
         return np.array([x[n], *(w * (slow[k] - slow[k + 1]) for k in range(n))])
 
     def out(t: Value, x: Value, u: Value, params: Params) -> Array:

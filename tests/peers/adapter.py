@@ -151,7 +151,7 @@ def _initial_state(function, system, options):
 
 
 def _as_called(function, ours, rows, options):
-    """The response at the wanted times, with the form that the call asked for."""
+    """The response at the wanted times, in the form of the call."""
     # A system without states: python-control's nonlinear function shows none, its linear one an array of no rows.
     hidden = ours.x is not None and ours.x.size == 0 and function == "input_output_response"
     states = None if ours.x is None or hidden else ours.x[:, rows]

@@ -1,4 +1,4 @@
-"""The time limit of a run, on a clock of the tests' own: every look at it takes a second."""
+"""Time limit of a run, with a clock that advances by a second at every reading."""
 
 import threading
 from itertools import count

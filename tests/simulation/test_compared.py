@@ -22,7 +22,7 @@ def oscillator(force, name="wrong"):
 
 
 def is_symbol(value):
-    """Whether a function is being traced, which a block must not ask: so that a trace is wrong on purpose."""
+    """Whether a function is being traced, which a block must not test; here to make a trace wrong on purpose."""
     return not isinstance(value, float)
 
 
@@ -40,7 +40,7 @@ def beyond_a_clip(x):
 
 
 def at_the_peak(x):
-    """Without a switch in the trace: the branch is lost in it."""
+    """Without a switch in the trace: the branch is missing in it."""
     try:
         stiff = bool(x[0] > 9.0)
     except TypeError:

@@ -15,7 +15,7 @@ RISE = np.polynomial.Polynomial([0, 0, 0, 0, 0, 126, -420, 540, -315, 70])
 
 
 def gap(found, exact):
-    """Greatest difference, each row relative to its own greatest value."""
+    """Largest difference, each row relative to its own largest value."""
     found, exact = np.atleast_2d(np.asarray(found)), np.atleast_2d(exact)
     assert found.shape == exact.shape
     return float((np.abs(found - exact).max(axis=1) / np.abs(exact).max(axis=1)).max())
@@ -444,7 +444,7 @@ def test_actuators_and_controllers_trace(block):
     assert cp.simulate(block, T, cp.stack([LANE] * block.ninputs, block.input_labels), method="compiled").nstates >= 0
 
 
-def test_a_feedforward_traces_beside_what_is_not_linear():
+def test_a_feedforward_traces_next_to_what_is_not_linear():
     command = cp.create_feedforward_iosystem(cp.plants.integrator_lag_loop(4.0))
     plan = cp.PolySpline([cp.Waypoint(1, 0, 0, 0), cp.Waypoint(2, 1, 0, 0)], labels=["y"])
     bent = ct.nlsys(None, lambda t, x, u, p: u**3, inputs="y", outputs="cubed", name="bent", dt=0)

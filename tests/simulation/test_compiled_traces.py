@@ -250,7 +250,7 @@ def test_traces_that_are_wrong_far_from_the_start(name):
 
 
 def test_a_branch_that_is_taken_between_the_visited_states():
-    """A stop at 9.9 of an oscillation of 10, looked at where it passes the middle: no symbol may go through float."""
+    """A stop at 9.9 of an oscillation of 10, evaluated at its zero crossing: no symbol may be converted to float."""
     rate = rates_with(stop_at(9.9))
     block = ct.nlsys(rate, None, inputs=0, outputs=2, states=2, name="stop")
     states = tight(lambda t, x: rate(t, x, None, None), OSCILLATION, [0.0, 10.0])

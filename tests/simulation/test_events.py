@@ -117,7 +117,7 @@ def test_states_inputs_and_functions(method):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_samples_are_straight_between_the_crossings_too(method):
-    """A ramp however it is sampled: y = t - 1 + exp(-t) from 0, and a plan beside it where there are two inputs."""
+    """A ramp however it is sampled: y = t - 1 + exp(-t) from 0, and a plan next to it where there are two inputs."""
     times = np.array([0.0, 0.7, 1.9, 2.0, 5.0])
     exact = brentq(lambda t: t - 1 + math.exp(-t) - 2.5, 3, 5, xtol=1e-14)
     events = [Event("y", high=2.5, stop=True), Event("r", high=1.3)]
@@ -141,7 +141,7 @@ def test_an_output_hides_an_input_of_the_same_name():
 
 @pytest.mark.parametrize("method", METHODS)
 def test_limits_touched_at_the_beginning(method):
-    """On a limit is inside; what leaves at once does so at the first instant, what goes in is no crossing."""
+    """On a limit is inside; leaving at the start counts at the first time, entering is no crossing."""
     integrator = ct.ss(0.0, 1.0, 1.0, 0.0, inputs="r", outputs="y")
     leaving = cp.simulate(integrator, [2.0, 5.0], 1.0, 1.0, method=method, events=[Event("y", low=-3.0, high=1.0)])
     assert [(o.kind, o.time) for o in leaving.events] == [("above", 2.0)]

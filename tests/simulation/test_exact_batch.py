@@ -1,4 +1,4 @@
-"""Exact states of many systems at once, at even and uneven times, and between samples of the input."""
+"""Exact states of many systems together, at even and uneven times, and between samples of the input."""
 
 import control as ct
 import mpmath as mp
@@ -12,7 +12,7 @@ from ctrlplan.simulation.exact import exact_states, sampled_states
 from ctrlplan.simulation.linear import NotLinearError, linear_form, linear_forms
 
 SMALL = 1e-11
-"""What is promised, relative to the greatest value of each signal."""
+"""Error bound, relative to the largest value of each signal."""
 GAINS = [1e-3, 0.25, 0.26, 1.0, 5.0, 40.0, 1e3, 1e5]
 REST = ([0.4, 1.7], [[[0.5, 0.0, 0.0], [2.0, 0.0, 0.0]]])
 SPEED = ([-0.2, 0.9, 2.0], [[[0.0], [0.3, 2.0, -1.0], [-1.0, 4.0, 3.0]]])
@@ -124,13 +124,13 @@ def test_systems_without_states():
 
 
 def test_even_samples_with_gaps_before_and_after():
-    """A burst of even samples far from both ends of a leg: it is no even leg."""
+    """A burst of even samples far from both ends of a segment: it is no even segment."""
     plan, signals = both([0.0, 30.0], REST[1], 1.0)
     t = np.concatenate([[-1.0], np.linspace(17.3, 17.4, 101), [40.0]])
     check([lag_loop(5.0), lag_loop(300.0)], plan, signals, t, some=[0, 1, 50, 101, 102])
 
 
-def test_a_stiff_system_beside_a_slow_one():
+def test_a_stiff_system_next_to_a_slow_one():
     plan, signals = both(*REST, 1.0)
     systems = [
         ([[-fast, 0.0], [slow, -slow]], [[fast], [0.0]], [[0.0, 1.0]], [[0.0]])
@@ -228,7 +228,7 @@ def test_random_samples_into_random_systems(even, seed):
 
 
 @pytest.mark.parametrize("stiffness", [1e3, 1e6])
-def test_samples_into_a_slow_mode_beside_a_fast_one(stiffness):
+def test_samples_into_a_slow_mode_next_to_a_fast_one(stiffness):
     rng = np.random.default_rng(3)
     a, b = np.array([[-stiffness, 0.0], [0.03, -0.03]]), np.array([[stiffness], [0.0]])
     t, u = np.linspace(0.0, 30.0, 61), rng.normal(size=61)
@@ -239,14 +239,14 @@ def test_samples_into_a_slow_mode_beside_a_fast_one(stiffness):
 @pytest.mark.parametrize("bend", [1.0, 1.3])
 @pytest.mark.parametrize("numbers", [2**20, 5000])
 def test_a_ramp_at_many_samples(bend, numbers, monkeypatch):
-    # x' = -x + t: x = t - 1 + exp(-t), whatever the times, and however many are taken at once.
+    # x' = -x + t: x = t - 1 + exp(-t), whatever the times, and however many are computed together.
     monkeypatch.setattr(exact, "_NUMBERS", numbers)
     t = 20.0 * np.linspace(0.0, 1.0, 20_001) ** bend
     found = sampled_states(np.array([[-1.0]]), np.array([[1.0]]), t[None], t, np.zeros(1))[0]
     assert np.abs(found - (t - 1 + np.exp(-t))).max() <= 1e-13
 
 
-def test_beside_forced_response():
+def test_next_to_forced_response():
     """Which takes its input for linear between even samples, too."""
     rng = np.random.default_rng(5)
     system = ct.ss([[0.0, 1.0], [-4.0, -0.6]], [[0.0, 0.5], [1.0, 0.0]], np.eye(2), np.zeros((2, 2)))

@@ -96,7 +96,7 @@ def hump(a, duration):
 
 
 def rounded(a, states, duration):
-    """What rounding costs that carries states (n, count) step by step, of the exact solution at even times.
+    """Rounding errors of a step-by-step propagation of states (n, count), relative to the exact solution at even times.
 
     A step rounds the n + 1 products of its change of the state, their sum and the new state, each by
     half an ulp; what it has rounded grows from there by the exponential of the time that is left.
@@ -128,7 +128,7 @@ def reference(a, b, derivatives, duration, count, start, seed=0):
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("duration", [0.125, 16.0])
-def test_no_more_digits_are_lost_than_half_an_ulp_of_the_matrix_costs(kind, duration):
+def test_the_loss_of_digits_is_that_of_half_an_ulp_of_the_matrix(kind, duration):
     rng = np.random.default_rng([len(kind), int(8 * duration)])
     a = KINDS[kind](rng)
     b, start = rng.normal(size=(len(a), 1)), rng.normal(size=len(a))

@@ -1,4 +1,4 @@
-"""Exact responses at the ends of the range of numbers: fast and slow poles, overflow, and digits that are lost."""
+"""Exact responses at the ends of the range of numbers: fast and slow poles, overflow, and loss of digits."""
 
 import warnings
 
@@ -14,7 +14,7 @@ from ctrlplan.simulation import equilibrium_state
 from ctrlplan.simulation.exact import exact_states, matrix_product, sampled_states
 
 SMALL = 1e-11
-"""What is promised, relative to the greatest value of each signal."""
+"""Error bound, relative to the largest value of each signal."""
 REST = ([0.4, 1.7], [[[0.5, 0.0, 0.0], [2.0, 0.0, 0.0]]])
 LATE = ([1.0, 2.0], [[[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]])
 STIFF = {
@@ -128,7 +128,7 @@ def test_what_is_beyond_the_range_says_so():
 
 
 def test_a_stiff_loop_rests_where_its_slow_states_do():
-    # By hand, x1 = x2 = 1; beside 1e18 a rate of 1 is no integrator.
+    # By hand, x1 = x2 = 1; next to 1e18 a rate of 1 is no integrator.
     assert np.abs(equilibrium_state(ct.ss([[-1e18, 0], [1, -1]], [[1e18], [0]], [[0, 1]], 0), 1.0) - 1.0).max() <= 1e-12
     # A slow integrator behind them that is not at rest at 1: there is no rest.
     loop = ct.ss([[-1e18, 0, 0], [1, -1, 0], [0, 1e-9, 0]], [[1e18], [0], [0]], [[0, 0, 1]], 0)
@@ -242,7 +242,7 @@ def test_zero_times_infinity_is_zero():
     assert np.array_equal(stack, np.stack([found, found]))
 
 
-# Digits that are lost
+# Loss of digits
 
 
 @pytest.mark.parametrize(

@@ -167,7 +167,7 @@ def test_a_discrete_block_without_feedthrough_delays_by_a_sample(method):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_sampled_blocks_in_a_loop_at_one_instant(method):
-    """u = r + w/2 and w = u/2 at once: u = 4 r/3."""
+    """u = r + w/2 and w = u/2: u = 4 r/3."""
     one = cp.sample_hold(gain([1.0, 0.5], ["r", "w"], "u", "one"), 0.5)
     two = cp.sample_hold(gain(0.5, "u", "w", "two"), 0.5)
     loop = ct.interconnect([one, two], inputs="r", outputs=["u", "w"])
@@ -271,7 +271,7 @@ def test_what_the_peer_says_to_such_a_loop():
 
 
 @pytest.mark.parametrize("system", ["sampled", "delayed"])
-def test_the_exact_method_refuses_them(system):
+def test_the_exact_method_rejects_them(system):
     block = cp.sample_hold(gain(1.0, "r", "y", "b"), 0.5) if system == "sampled" else cp.create_delay_iosystem(0.5)
     with pytest.raises(ValueError, match=r'method "exact".*block (b is sampled|delay is a delay)'):
         cp.simulate(block, [0.0, 1.0], 1.0, method="exact")
@@ -388,7 +388,7 @@ def test_two_delays_without_a_common_measure(method):
 
 
 def method_of_steps(rate, delays, initial, end, times):
-    """Scalar x' = rate(t, x, pasts), constant before 0: dense output of one leg is the past of the next."""
+    """Scalar x' = rate(t, x, pasts), constant before 0: dense output of one segment is the past of the next."""
     marks = {0.0, end}
     for _ in range(12):
         marks |= {t + d for t in marks for d in delays if t + d < end}
@@ -446,7 +446,7 @@ def test_a_bent_loop_with_two_delays(method):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_a_delay_in_a_saturated_loop(method):
-    """x' = sat(2 (1 - x(t - 0.6))) within 0.8: bends inside of legs."""
+    """x' = sat(2 (1 - x(t - 0.6))) within 0.8: bends inside of segments."""
     late = cp.create_delay_iosystem(0.6, inputs="x", outputs="seen")
     law = gain([2.0, -2.0], ["r", "seen"], "u_cmd", "law")
     integrator = ct.ss(0.0, 1.0, 1.0, 0.0, inputs="u", outputs="x", name="integrator")
@@ -475,7 +475,7 @@ def test_a_delayed_plan_is_the_plan_later(delay, alpha, method):
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_what_is_put_out_before_anything_has_come_through(method):
+def test_what_is_output_before_anything_has_come_through(method):
     late = cp.create_delay_iosystem(0.7, inputs=["a", "b"], outputs=["c", "d"], initial=[3.0, -2.0])
     times = np.array([0.0, 0.3, 0.7 - 1e-9, 0.7 + 1e-9, 1.0, 2.0])
     found = cp.simulate(late, times, {"a": 1.0, "b": cp.Step(5.0, time=0.2)}, method=method)
@@ -500,7 +500,7 @@ def test_a_jump_passes_at_its_time(method):
 
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("jump", [0.0, 0.1, 0.73])
-def test_jumps_that_go_round_for_ever(jump, method):
+def test_jumps_that_go_round_indefinitely(jump, method):
     """y = -y(t - 1)/2 + r has no state; the step is back at half its size every second."""
     late = cp.create_delay_iosystem(1.0, inputs="y", outputs="past")
     adder = gain([1.0, -0.5], ["r", "past"], "y", "adder")
@@ -537,8 +537,8 @@ def test_two_rounds_without_a_common_measure():
 @pytest.mark.parametrize("method", METHODS)
 def test_a_sampled_law_whose_control_comes_late(method):
     """u = -x/2 taken every 0.5 s comes 0.2 s later: straight lines, their slopes one behind the other."""
-    law = cp.sample_hold(gain(-0.5, "x", "asked", "law"), 0.5)
-    late = cp.create_delay_iosystem(0.2, inputs="asked", outputs="u")
+    law = cp.sample_hold(gain(-0.5, "x", "u_cmd", "law"), 0.5)
+    late = cp.create_delay_iosystem(0.2, inputs="u_cmd", outputs="u")
     integrator = ct.ss(0.0, 1.0, 1.0, 0.0, inputs="u", outputs="x", name="integrator")
     loop = ct.interconnect([integrator, late, law], inputs=0, outputs="x")
     times = np.round(0.1 * np.arange(51), 9)

@@ -43,7 +43,7 @@ def recorder(count):
 
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("value", [1.0, 0.1, -7.3e-9, 3.0, 1e300])
-def test_a_constant_beside_a_signal_that_moves_is_exact(value, method):
+def test_a_constant_next_to_a_signal_that_moves_is_exact(value, method):
     found = cp.simulate(gate(value), T, {"enable": value, "r": PLAN}, method=method)
     assert np.abs(found.outputs - lag_response(PLAN, T)).max() < 1e-7
 

@@ -1,4 +1,4 @@
-"""Signals that depend on one another at once: closed solutions, Newton's iteration, and loops without a solution."""
+"""Algebraic loops: closed solutions, Newton's iteration, and loops without a solution."""
 
 import math
 
@@ -68,7 +68,7 @@ def test_a_linear_loop(through, method):
 
 @pytest.mark.parametrize("method", NUMERICAL)
 @pytest.mark.parametrize("through", [0.5, 7.0])
-def test_a_linear_loop_beside_what_is_not_linear(through, method):
+def test_a_linear_loop_next_to_what_is_not_linear(through, method):
     found = cp.simulate(around(through, behind(), outputs=("y",)), T, None, [0.3], method=method, **TIGHT)
     y = around_exactly(through, 0.3)[0]
     assert found.method == method
@@ -110,7 +110,7 @@ def test_a_loop_across_the_levels(method):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_a_loop_inside_a_loop_with_states(method):
-    """u = k (r - x) - u/2 at once, x' = u: x goes to 1 at the rate k/1.5."""
+    """u = k (r - x) - u/2 and x' = u: x goes to 1 at the rate k/1.5."""
     law = gain([2.0, -2.0, -0.5], ["r", "x", "u"], "u", "law")
     plant = ct.ss(0.0, 1.0, 1.0, 0.0, inputs="u", outputs="x", name="plant")
     loop = ct.interconnect([law, plant, source()], inputs=0, outputs=["x", "u"])
@@ -130,7 +130,7 @@ def test_two_loops_apart(method):
 
 @pytest.mark.parametrize("method", NUMERICAL)
 def test_a_loop_whose_gain_is_a_parameter(method):
-    """u = r - k u and x' = u: one form for all k, its loop solved anew."""
+    """u = r - k u and x' = u: one form for all k, its loop solved again."""
     law = static(lambda t, x, u, p: u[:1] - p["k"] * u[1:], ["r", "u"], "u", "law", k=1.0)
     plant = ct.ss(0.0, 1.0, 1.0, 0.0, inputs="u", outputs="x", name="plant")
     ready = cp.prepare(ct.interconnect([law, plant, source()], inputs=0, outputs=["x", "u"]))
@@ -165,7 +165,7 @@ def test_what_only_looks_like_a_loop(method):
 
 
 def gated(rate_of_clock, out):
-    """The gate comes first of all blocks; what it lets through is 2 r, from a block behind it."""
+    """The gate is the first of the blocks; it passes 2 r, from a later block."""
     gate = ct.nlsys(
         lambda t, x, u, p: np.array([rate_of_clock + 0.0 * x[0]]), out, inputs="u", outputs="g", states=1, name="gate"
     )
@@ -192,7 +192,7 @@ def test_feedthrough_that_opens_with_time(method):
 
 @pytest.mark.parametrize("method", NUMERICAL)
 def test_a_loop_that_closes_later(method):
-    """u = r - a(t) u through a static block that is idle until 1 s, beside a loop that is always closed."""
+    """u = r - a(t) u through a static block that is idle until 1 s, next to a loop that is always closed."""
     idle = static(lambda t, x, u, p: np.fmax(t - 1.0, 0.0) * u, "u", "f", "idle")
     adder = gain([1.0, -1.0], ["r", "f"], "u", "adder")
     always = gain([1.0, -0.5], ["r", "v"], "v", "always")
@@ -329,7 +329,7 @@ def test_a_singular_linear_loop_that_is_run_exactly():
 
 
 @pytest.mark.parametrize("method", ["auto", *NUMERICAL])
-def test_a_singular_linear_loop_beside_what_is_not_linear(method):
+def test_a_singular_linear_loop_next_to_what_is_not_linear(method):
     with pytest.raises((RuntimeError, ValueError), match=r"algebraic loop.*error, plant") as caught:
         cp.simulate(around(-1.0, behind("far")), T, method=method)
     assert "far" not in str(caught.value)
@@ -360,7 +360,7 @@ def test_a_loop_that_loses_its_solution_on_the_way(method):
         cp.simulate(loop, T, method=method)
 
 
-# Levels that put out their own inputs
+# Levels with inputs among their outputs
 
 
 def lower():
@@ -376,7 +376,7 @@ def lower():
 
 
 @pytest.mark.parametrize("method", NUMERICAL)
-def test_an_input_that_is_put_out(method):
+def test_an_input_that_is_output(method):
     """u = r - 2 x into x' = -x^3 + u, read at the block's input."""
     bent = ct.nlsys(lambda t, x, u, p: -(x**3) + u, None, inputs="u", outputs="y", states=1, name="bent")
     loop = ct.interconnect(
@@ -393,7 +393,7 @@ def test_an_input_that_is_put_out(method):
 
 
 @pytest.mark.parametrize("method", NUMERICAL)
-def test_a_wire_back_to_a_level_that_puts_out_its_input(method):
+def test_a_wire_back_to_a_level_that_outputs_its_input(method):
     """a = r + a/2: a is twice r, and the other output its cube."""
     loop = ct.interconnect(
         [lower()],

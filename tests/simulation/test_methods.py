@@ -311,7 +311,7 @@ def test_a_loop_that_appears_later_leaves_nothing_behind():
 
 
 def test_threads_run_one_system_as_one_thread_does():
-    def driven(k):
+    def planned_loop(k):
         return ct.nlsys(
             lambda t, x, u, p: np.array([x[1], -p["k"] * np.sin(x[0]) - 0.1 * x[1] + u[0]]),
             None,
@@ -324,12 +324,12 @@ def test_threads_run_one_system_as_one_thread_does():
 
     values = np.linspace(1.0, 3.0, 12).tolist()
     times = np.linspace(0.0, 3.0, 31)
-    shared = driven(1.0)
+    shared = planned_loop(1.0)
 
     def run(k, system):
         return cp.simulate(system, times, 0.3, [0.5, 0.0], params={"k": k})
 
-    expected = [run(k, driven(1.0)) for k in values]
+    expected = [run(k, planned_loop(1.0)) for k in values]
     barrier = threading.Barrier(4)
 
     def started(k):

@@ -36,7 +36,7 @@ def highest_torque(x, r):
 
 
 def by_bisection(x, high):
-    """Greatest step from 0 whose torque stays below a limit, by runs made here."""
+    """Largest step from 0 whose torque stays below a limit, by runs made here."""
     low, maximum = 0.0, 3.0
     while maximum - low > 1e-4:
         middle = 0.5 * (low + maximum)
@@ -183,14 +183,14 @@ GOOD = {"limits": {"torque": (-1.0, 1.0)}, "horizon": 5.0}
     ("given", "message"),
     [
         ({"limits": {"force": (-1, 1)}}, "limits must be among the outputs angle, torque, got 'force'"),
-        ({"limits": {}}, "limits must not be empty"),
+        ({"limits": {}}, "limits must name at least one output"),
         ({"limits": {"torque": (2, 1)}}, "limits of torque must increase, got 2 and 1"),
         ({"limits": {"torque": (-math.inf, math.inf)}}, "must contain a finite one"),
         ({"limits": {"torque": -3.0}}, "limits of torque must be finite and above 0, got -3.0"),
         ({"horizon": 0.0}, "horizon must be finite and above 0, got 0.0"),
         ({"references": ["q"]}, "references must be among the inputs r, got 'q'"),
-        ({"references": []}, "references must not be empty"),
-        ({"references": ["r", "r"]}, "references must not name one of the inputs twice"),
+        ({"references": []}, "references must name at least one input"),
+        ({"references": ["r", "r"]}, "references must not name an input twice"),
         ({"margin": 0.5}, r"margin must lie in \(0, 0.5\), got 0.5"),
         ({"resolution": 0.0}, r"resolution must lie in \(0, 1\), got 0.0"),
         ({"count": 5}, "count must be a whole number from 20 to 100000, got 5"),

@@ -33,7 +33,7 @@ def decayed(k, start=1.0):
     return start / np.sqrt(1 + 2 * k * start**2 * T)
 
 
-def driven():
+def planned_loop():
     """x' = -w x + w r, y = x^3."""
     return ct.nlsys(
         lambda t, x, u, p: p["w"] * (u - x),
@@ -42,7 +42,7 @@ def driven():
         outputs="y",
         states=1,
         params={"w": 1.0},
-        name="driven",
+        name="planned_loop",
     )
 
 
@@ -51,7 +51,7 @@ def driven():
 
 @pytest.mark.parametrize("method", ["auto", "compiled", "python"])
 def test_equal_results_compiled_and_interpreted(method):
-    system = driven()
+    system = planned_loop()
     ready = prepare(system)
     assert isinstance(ready, Prepared)
     assert prepare(ready) is ready
@@ -290,7 +290,7 @@ def test_the_forms_that_are_kept_do_not_grow_without_bound():
         changed.params["k"] = k
         simulate(changed, T[:2], None, 1.0)
     assert len(prepared_module._FORMS) <= prepared_module._CACHE_SIZE
-    ready = prepare(driven())
+    ready = prepare(planned_loop())
     for k in range(20):
         with pytest.warns(UserWarning, match=f"params 'p{k}' is read by no block"):
             simulate(ready, T[:2], 1.0, params={f"p{k}": 1.0})
@@ -331,7 +331,7 @@ def test_a_linear_form_with_samples_after_a_run_with_them():
 
 @pytest.mark.parametrize("options", [{}, {"method": "compiled"}, {"params": {"w": 2.0}}], ids=str)
 def test_a_compiled_form_goes_to_another_process_and_back(options):
-    ready = prepare(driven())
+    ready = prepare(planned_loop())
     here = simulate(ready, T, PLAN, 0.2, **options)
     arrived = sent(sent(ready))
     there = simulate(arrived, T, PLAN, 0.2, **options)
@@ -344,7 +344,7 @@ def test_a_compiled_form_goes_to_another_process_and_back(options):
 
 
 def test_other_values_of_the_parameters_in_another_process():
-    ready = prepare(driven())
+    ready = prepare(planned_loop())
     simulate(ready, T, PLAN, params={"w": 2.0})
     arrived = sent(ready)
     for w in (1.0, 4.0):
@@ -361,8 +361,8 @@ def test_other_values_of_the_parameters_in_another_process():
     ids=str,
 )
 def test_what_a_form_without_its_blocks_cannot_do(options, match):
-    """Never wrong numbers: what it was not compiled for is refused."""
-    ready = prepare(driven())
+    """No wrong numbers: parameters that it was not compiled for are rejected."""
+    ready = prepare(planned_loop())
     simulate(ready, T, PLAN)
     with pytest.raises(ValueError, match=match):
         simulate(sent(ready), T, PLAN, **options)
@@ -425,7 +425,7 @@ def ends(ready, level):
 
 @pytest.mark.slow
 def test_a_pool_of_processes():
-    forms = [prepare(driven()), prepare(ct.ss(-1.0, 1.0, 1.0, 0.0))]
+    forms = [prepare(planned_loop()), prepare(ct.ss(-1.0, 1.0, 1.0, 0.0))]
     expected = [[ends(ready, level) for level in (1.0, 2.0)] for ready in forms]
     exact = -math.expm1(-2.0)
     assert np.abs(np.array(expected) - [[exact**3, 8 * exact**3], [exact, 2 * exact]]).max() <= 1e-7
@@ -450,7 +450,7 @@ def if_on_a_state():
 @pytest.mark.parametrize(
     ("system", "run"),
     [
-        (driven(), False),
+        (planned_loop(), False),
         (if_on_a_state(), True),
         (cp.create_delay_iosystem(0.5), True),
         (cp.sample_hold(ct.ss([], [], [], [[1.0]], name="held", dt=None), 0.5), True),
@@ -555,16 +555,16 @@ def test_each_block_is_called_once_a_step():
         calls[name] = 0
     simulate(ready, [0.0, 50.0], None, 1.0, method="python")
     assert calls["rates"] > 100
-    # Beside the steps, a few calls to find out what depends on what, and to report.
+    # In addition to the steps, a few calls for feedthrough and for the outputs.
     assert all(0 <= calls[name] - calls["rates"] <= 50 for name in ("first", "second"))
 
 
 def test_auto_takes_the_first_method_that_can_be_taken():
     assert simulate(cp.plants.integrator_lag_loop(5.0), T, PLAN).method == "exact"
-    assert simulate(driven(), T, PLAN).method == "compiled"
+    assert simulate(planned_loop(), T, PLAN).method == "compiled"
     assert simulate(if_on_a_state(), T, None, 1.0).method == "python"
     for method, system, inputs in (
-        ("exact", driven(), PLAN),
+        ("exact", planned_loop(), PLAN),
         ("compiled", if_on_a_state(), None),
     ):
         with pytest.raises(ValueError, match=rf'method "{method}"'):
@@ -601,7 +601,7 @@ def ending():
 
 @pytest.mark.parametrize("method", ["auto", "compiled", "python"])
 def test_equations_that_are_not_defined_beyond_an_instant(method):
-    """Nothing may be put out for what is not there."""
+    """Nothing may be output for what is not there."""
     with np.errstate(all="ignore"), pytest.raises(RuntimeError, match="must reach 3 s"):
         simulate(ending(), [0.0, 1.0, 3.0], None, 1.0, method=method)
 

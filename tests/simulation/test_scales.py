@@ -154,7 +154,7 @@ def test_outputs_that_cancel_say_how_uncertain_they_are():
 
 
 def test_an_absolute_tolerance_given_is_absolute():
-    """A number is taken as it is, for every state: what moves by less than it is not resolved, as asked for."""
+    """A number is the absolute tolerance of every state: motion below it is not resolved."""
     t = np.linspace(0, 0.04, 201)
     plan = 1e-6 * cp.PolySpline([cp.Waypoint(0, 0, 0, 0), cp.Waypoint(0.02, 1, 0, 0)])
     rough, fine = (cp.simulate(stage(1e-6, "tf"), t, plan, atol=atol, method="python") for atol in (1e-3, None))

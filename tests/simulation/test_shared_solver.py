@@ -1,4 +1,4 @@
-"""LSODA of older scipy has one state for all threads: a run beside another takes another solver, to the same result."""
+"""LSODA of older scipy has one state for all threads: concurrent runs use another solver, with the same result."""
 
 from concurrent.futures import ThreadPoolExecutor
 

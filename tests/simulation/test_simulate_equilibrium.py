@@ -92,7 +92,7 @@ def test_poles_of_the_lag_loop(gain, poles):
 
 
 def test_a_pair_in_the_right_half_plane():
-    # s^2 - 2 s + 10 = (s - 1 - 3 i)(s - 1 + 3 i), beside a stable pole
+    # s^2 - 2 s + 10 = (s - 1 - 3 i)(s - 1 + 3 i), next to a stable pole
     found = unstable_poles(ct.ss([[2, -10, 0], [1, 0, 0], [0, 0, -1]], [[1], [0], [1]], [[0, 1, 1]], 0))
     assert np.allclose(sorted(found, key=lambda p: p.imag), [1 - 3j, 1 + 3j])
     assert found.dtype == complex
@@ -106,8 +106,8 @@ def test_poles_on_the_axis_are_not_in_the_half_plane():
 def test_poles_of_a_loop_with_a_plan_inside():
     plan = cp.PolySpline([cp.Waypoint(0, 0, 0), cp.Waypoint(1, 1, 0)], labels=["r"])
     loop = cp.plants.integrator_lag_loop(-2.0)
-    driven = ct.interconnect([cp.create_source_iosystem(plan), loop], inputs=0, outputs=["y"])
-    assert np.allclose(unstable_poles(driven), [1.0])
+    planned_loop = ct.interconnect([cp.create_source_iosystem(plan), loop], inputs=0, outputs=["y"])
+    assert np.allclose(unstable_poles(planned_loop), [1.0])
 
 
 def test_poles_of_what_is_not_linear_are_not_known():

@@ -69,11 +69,11 @@ def test_inputs(system, inputs, match, method):
 
 
 def test_a_system_without_inputs_takes_none():
-    driven = ct.interconnect([cp.create_source_iosystem(PLAN), LOOP], inputs=0, outputs=["y"])
+    planned_loop = ct.interconnect([cp.create_source_iosystem(PLAN), LOOP], inputs=0, outputs=["y"])
     with pytest.raises(ValueError, match="inputs must be among none, got 'r'"):
-        cp.simulate(driven, T, {"r": PLAN})
+        cp.simulate(planned_loop, T, {"r": PLAN})
     with pytest.raises(ValueError, match="inputs must have 0 axes"):
-        cp.simulate(driven, T, PLAN)
+        cp.simulate(planned_loop, T, PLAN)
 
 
 @pytest.mark.parametrize("method", ["exact", "python"])

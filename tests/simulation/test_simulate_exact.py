@@ -16,7 +16,7 @@ import ctrlplan as cp
 
 ALPHAS = [0.0, 1e-9, 1e-4, 1.0, 5.0]
 SMALL = 1e-11
-"""What is promised, relative to the greatest value of each signal."""
+"""Error bound, relative to the largest value of each signal."""
 
 
 def random_axes(rng, counts, pace):
@@ -63,7 +63,7 @@ def test_random_plans_on_random_systems(alpha, seed):
 @pytest.mark.parametrize("alpha", [0.0, 1e-2, 1.0, 4.0])
 @pytest.mark.parametrize(("npoints", "nentries"), [(4, 3), (6, 2), (8, 3), (12, 2)])
 def test_many_constraints(npoints, nentries, alpha):
-    # One analytic leg with as many turns as waypoints: its Taylor series about any one point cancels over the others.
+    # One analytic segment with as many turns as waypoints: a Taylor series about one point cancels at the others.
     rng = np.random.default_rng(npoints)
     times = np.linspace(0.0, 16.0, npoints) + np.append(0.0, rng.uniform(-0.3, 0.3, npoints - 1))
     axes = [[[x, *rng.uniform(-0.2, 0.2, nentries - 1)] for x in rng.uniform(0, 5, npoints)]]
@@ -104,7 +104,7 @@ def kinds(alpha):
         "sum with a step": (speed + cp.Step(-0.5, 0.25, time=1.3), [s + step(-0.5, 0.25, 1.3)]),
         "difference of a multiple": (move - 0.75 * speed, [m + (-0.75) * s]),
         "join": (move.then(rest).then(back), [m.then(r).then(b)]),
-        "joined legs": (segments.then(back.shift(7.0)), [p.then(b)]),
+        "joined segments": (segments.then(back.shift(7.0)), [p.then(b)]),
         "sum of joins": (move.then(rest) + segments.then(back), [m.then(r) + p.then(b)]),
         "stack": (cp.stack([move, segments, speed], labels=["a", "b", "c"]), [m, p, s]),
         "stack with a step": (cp.stack([rest, cp.Step(1.0, time=0.77)], ["a", "b"]), [r, step(1.0, 0.0, 0.77)]),
@@ -186,7 +186,7 @@ def test_an_unstable_loop_that_leaves_the_range_of_numbers():
 
 @pytest.mark.parametrize("stiffness", [1e3, 1e4, 1e6])
 @pytest.mark.parametrize("duration", [1.0, 10.0, 100.0])
-def test_a_slow_mode_beside_a_fast_one(stiffness, duration):
+def test_a_slow_mode_next_to_a_fast_one(stiffness, duration):
     """A fast actuator in front of a slow plant: what the fast mode demands must not blur the slow one."""
     rng = np.random.default_rng(8)
     for slow in (1.0, 0.3, 0.03, 1e-3):
@@ -221,17 +221,17 @@ def test_a_chain_of_integrators_gives_back_the_plan():
     chain = ct.ss(
         np.eye(3, k=1), [[0], [0], [1]], np.eye(3), np.zeros((3, 1)), inputs="axis0_d3", outputs=["p", "v", "a"]
     )
-    driven = ct.interconnect([source, chain], inputs=0, outputs=["p", "v", "a"], warn_duplicate=False, ignore_outputs=[
+    loop = ct.interconnect([source, chain], inputs=0, outputs=["p", "v", "a"], warn_duplicate=False, ignore_outputs=[
         "axis0", "axis0_d1", "axis0_d2"
     ])  # fmt: skip
     t = np.linspace(0.0, 2.5, 61)
-    found = cp.simulate(driven, t, initial_state=plan.jet(0.0, 2)[:, 0], method="exact")
+    found = cp.simulate(loop, t, initial_state=plan.jet(0.0, 2)[:, 0], method="exact")
     assert gap(found.states, plan.jet(t, 2)[:, 0]) <= 1e-12
 
 
 @pytest.mark.parametrize("alpha", ALPHAS[::2])
-def test_beside_a_tight_numerical_integration(alpha):
-    """A second opinion that shares nothing with the first: DOP853 at 1e-13, started anew at each breakpoint."""
+def test_next_to_a_tight_numerical_integration(alpha):
+    """An independent solution: DOP853 at 1e-13, restarted at each breakpoint."""
     move, _ = both(*MOVE, alpha)
     plan = cp.stack([move.shift(0.8), cp.Step(1.0, time=2.0) + move], labels=["a", "b"])
     a = np.array([[0.0, 1.0, 0.0], [-4.0, -0.6, 1.0], [0.3, 0.0, -2.0]])
@@ -350,7 +350,7 @@ def test_twenty_thousand_samples_at_once():
 
 
 def test_an_hour_of_rest_costs_no_digit():
-    # The state at the plan's start is carried over one leg of 3600 s, and over another one after the end.
+    # The initial state is propagated over one segment of 3600 s, and over another one after the end.
     plan, signals = both([3600.3, 3601.6], REST[1], 1.0)
     matrices = [[0.0, 1.0], [-9.0, -1e-4]], [[0.0], [9.0]], [[1.0, 0.0]], [[0.0]]
     t = np.concatenate([[0.0, 1800.0, 3600.0], np.linspace(3600.2, 3603.0, 15), [5000.0, 7200.0]])

@@ -1,4 +1,4 @@
-"""What may drive a system: trajectories, numbers, samples, by name or all at once."""
+"""Inputs of a system: trajectories, numbers and samples, by name or all together."""
 
 import control as ct
 import numpy as np
@@ -88,7 +88,7 @@ def test_samples_at_odd_times():
     assert np.abs(found.outputs - (t - 1 + np.exp(-t))).max() <= 1e-9
 
 
-def test_a_plan_beside_samples():
+def test_a_plan_next_to_samples():
     samples = np.random.default_rng(1).normal(size=T.size)
     found = cp.simulate(SYSTEM, T, {"r": PLAN, "d": samples}, START, rtol=1e-11, atol=1e-13)
     planned = response(A, B, C, D, [R, constant(0.0)], T, START)[0]
@@ -151,8 +151,8 @@ def test_a_scalar_initial_state_is_for_all_states():
 
 @pytest.mark.parametrize("method", ["compiled", "python"])
 @pytest.mark.parametrize("count", [301, pytest.param(1501, marks=pytest.mark.slow)])
-def test_many_samples_beside_a_plan_that_comes_to_rest(count, method):
-    """Close to rest a plan's derivatives are rounding beside the plan: no leg is halved for them without end."""
+def test_many_samples_next_to_a_plan_that_comes_to_rest(count, method):
+    """Near zero velocity the derivatives of a plan are rounding errors: no segment is halved for them without end."""
     t = np.linspace(0.0, 6.0, count)
     move = [cp.Waypoint(0, 0, 0, 0), cp.Waypoint(4, 1, 0, 0)]
     source = cp.create_source_iosystem(cp.PolySpline(move, labels=["x"]), 2)

@@ -69,16 +69,18 @@ def test_the_command_that_makes_the_lag_loop_exact():
     plan = named(both(*MOVE, 1.0)[0], "x")
     source = cp.create_source_iosystem(plan, derivatives=2)
     command = ct.ss([], [], [], [[1.0, 1 / k, 1 / k]], inputs=["x", "x_d1", "x_d2"], outputs=["r"], name="command")
-    driven = ct.interconnect([source, command, cp.plants.integrator_lag_loop(k)], inputs=0, outputs=["y"])
-    found = cp.simulate(driven, T, method="exact")
+    planned_loop = ct.interconnect([source, command, cp.plants.integrator_lag_loop(k)], inputs=0, outputs=["y"])
+    found = cp.simulate(planned_loop, T, method="exact")
     assert np.abs(found.outputs - plan(T)).max() <= 1e-12
 
 
 def test_a_source_inside_is_as_good_as_an_input():
     plan, signals = both(*MOVE, 1.0)
     loop = cp.plants.integrator_lag_loop(5.0, ["y", "u", "e"])
-    driven = ct.interconnect([cp.create_source_iosystem(named(plan, "r")), loop], inputs=0, outputs=["y", "u", "e"])
-    found = cp.simulate(driven, T, initial_state=[0.1, -0.4], method="exact")
+    planned_loop = ct.interconnect(
+        [cp.create_source_iosystem(named(plan, "r")), loop], inputs=0, outputs=["y", "u", "e"]
+    )
+    found = cp.simulate(planned_loop, T, initial_state=[0.1, -0.4], method="exact")
     assert found.method == "exact"
     assert gap(found.outputs, response(*lag_loop(5.0), signals, T, [0.1, -0.4])[0]) <= 1e-11
 
@@ -112,11 +114,11 @@ def test_several_axes_with_derivatives_each():
     b = [[1.0, -2.0, 0.3, 0.5, 1.5, -0.7], [0.2, 0.4, -0.6, 3.0, -1.0, 2.0]]
     c, d = [[1.0, 0.0], [1.0, -1.0]], [[0.0, 1.0, 2.0, -3.0, 0.5, 0.25], [5.0, 0.0, -1.0, 0.0, 1.0, 1.5]]
     plant = ct.ss([[-1.0, 0.5], [0.0, -3.0]], b, c, d, inputs=source.output_labels, outputs=["p", "q"], name="plant")
-    driven = ct.interconnect([plant, source], inputs=0, outputs=["p", "q"])
+    planned_loop = ct.interconnect([plant, source], inputs=0, outputs=["p", "q"])
     signals = [xs, xs.derivative(), xs.derivative().derivative(), zs, zs.derivative(), zs.derivative().derivative()]
     outputs, states = response([[-1.0, 0.5], [0.0, -3.0]], b, c, d, signals, T, [0.5, -0.5])
     for method, allowed in (("exact", 1e-11), ("python", 1e-6)):
-        found = cp.simulate(driven, T, None, [0.5, -0.5], method=method)
+        found = cp.simulate(planned_loop, T, None, [0.5, -0.5], method=method)
         assert gap(found.outputs, outputs) <= allowed
         assert gap(found.states, states) <= allowed
     alone = cp.simulate(source, T).outputs
@@ -215,8 +217,8 @@ def test_large_gains_in_a_row_are_no_algebraic_loop(gains):
     ]
     total = float(np.prod(gains))
     plant = ct.ss(-1.0, 1.0 / total, 5.0, 0.0, inputs=f"s{len(gains)}", outputs="y", name="plant")
-    driven = ct.interconnect([source, error, *chain, plant], inputs=0, outputs=["y"])
-    found = cp.simulate(driven, T, method="exact")
+    planned_loop = ct.interconnect([source, error, *chain, plant], inputs=0, outputs=["y"])
+    found = cp.simulate(planned_loop, T, method="exact")
     assert gap(found.outputs, response([[-6.0]], [[1.0]], [[5.0]], [[0.0]], signals, T)[0]) <= 1e-11
 
 

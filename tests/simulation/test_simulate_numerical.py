@@ -108,13 +108,13 @@ def test_a_plan_that_starts_late_from_rest_is_not_skipped(start, place):
     if place == "input":
         found = cp.simulate(loop, t, plan, method="python")
     else:
-        driven = ct.interconnect(
+        planned_loop = ct.interconnect(
             [cp.create_source_iosystem(cp.stack([plan], labels=["r"])), loop], inputs=0, outputs=["y"]
         )
         if place == "nested block":
             behind = ct.ss([], [], [], [[1.0]], inputs="y", outputs="z", name="wire")
-            driven = ct.interconnect([driven, behind], inputs=0, outputs=["z"])
-        found = cp.simulate(driven, t, method="python")
+            planned_loop = ct.interconnect([planned_loop, behind], inputs=0, outputs=["z"])
+        found = cp.simulate(planned_loop, t, method="python")
     exact = response(*lag_loop(5.0), signals, t)[0][0]
     assert np.abs(exact).max() > 0.1
     assert np.abs(found.outputs - exact).max() <= 1e-7
@@ -126,10 +126,10 @@ def test_jumps_between_samples(place):
     loop = cp.plants.integrator_lag_loop(5.0)
     if place == "block":
         source = cp.create_source_iosystem(cp.stack([plan], labels=["r"]))
-        driven, inputs = ct.interconnect([source, loop], inputs=0, outputs=["y"]), None
+        planned_loop, inputs = ct.interconnect([source, loop], inputs=0, outputs=["y"]), None
     else:
-        driven, inputs = loop, plan
-    found = cp.simulate(driven, T, inputs, method="python", rtol=1e-10, atol=1e-12)
+        planned_loop, inputs = loop, plan
+    found = cp.simulate(planned_loop, T, inputs, method="python", rtol=1e-10, atol=1e-12)
     w, exact = np.sqrt(4.75), 0.0
     for height, jump in ((1.0, 0.777), (-2.0, 1.234), (1.5, 3.0)):
         s = np.maximum(T - jump, 0.0)
@@ -182,8 +182,8 @@ def test_a_saturated_loop(plan):
 
 def test_a_plan_inside_a_nonlinear_loop():
     plan = cp.stack([both(*MOVE, 1.0)[0].shift(2.0)], labels=["r"])
-    driven = ct.interconnect([cp.create_source_iosystem(plan), saturated()], inputs=0, outputs=["y", "u"])
-    found, given = cp.simulate(driven, T), cp.simulate(saturated(), T, plan)
+    planned_loop = ct.interconnect([cp.create_source_iosystem(plan), saturated()], inputs=0, outputs=["y", "u"])
+    found, given = cp.simulate(planned_loop, T), cp.simulate(saturated(), T, plan)
     states = tight(saturated_rate, plan, T, [0.0, 0.0])
     assert found.method == given.method == "compiled"
     assert np.abs(found.states - states).max() <= 1e-6
@@ -234,7 +234,7 @@ def test_params_that_a_linear_loop_has_no_use_for():
 
 
 def test_a_solution_that_ends_is_said_with_its_time():
-    """x' = x^2 from 1 is 1/(1 - t): there is nothing at 2 s, and no solver may try for ever."""
+    """x' = x^2 from 1 is 1/(1 - t): there is nothing at 2 s, and every solver must terminate."""
     calls = 0
 
     def rate(t, x, u, params):

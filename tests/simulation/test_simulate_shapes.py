@@ -16,9 +16,11 @@ A = np.array([[-1.0, 2.0], [0.0, -3.0]])
 TIGHT = {"rtol": 1e-6, "atol": 1e-8}
 
 
-def driven(outputs):
+def planned_loop(outputs):
     loop = cp.plants.integrator_lag_loop(5.0, outputs)
-    return ct.interconnect([cp.create_source_iosystem(PLAN), loop], inputs=0, outputs=list(outputs), name="driven")
+    return ct.interconnect(
+        [cp.create_source_iosystem(PLAN), loop], inputs=0, outputs=list(outputs), name="planned_loop"
+    )
 
 
 def loop_of_three():
@@ -45,8 +47,8 @@ SYSTEMS = {
     "two in, one out": (ct.ss(A, np.eye(2), [[1, 1]], [[0, 2]], name="miso"), TWO),
     "two in, two out": (ct.ss(A, [[1, 2], [0, 1]], np.eye(2), 0, inputs=["f", "g"], name="mimo"), TWO),
     "interconnected": (loop_of_three(), PLAN),
-    "one out, no inputs": (driven(["y"]), None),
-    "two out, no inputs": (driven(["u", "y"]), None),
+    "one out, no inputs": (planned_loop(["y"]), None),
+    "two out, no inputs": (planned_loop(["u", "y"]), None),
     "bent, one in, one out": (bent(1, 1), PLAN),
     "bent, two in, two out": (bent(2, 2), TWO),
     "bent, no inputs": (bent(0, 1), None),
@@ -116,7 +118,7 @@ def test_order(name, method):
 
 @pytest.mark.parametrize("outputs", [["y"], ["u", "y"]])
 def test_two_words_for_the_same_response(outputs):
-    found = cp.simulate(driven(outputs), T)
+    found = cp.simulate(planned_loop(outputs), T)
     assert np.array_equal(found.y.reshape(found.outputs.shape), found.outputs)
     assert np.array_equal(found.x, found.states)
     assert np.array_equal(found.t, T)

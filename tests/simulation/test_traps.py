@@ -27,7 +27,7 @@ def from_plan(plan, *blocks, outputs=("y",), derivatives=0):
 
 
 def test_a_late_plan_is_skipped_by_the_peer_and_not_here():
-    # x' = -x + r: after the pulse x is exp(-t) times the integral of exp(s) r(s), by Gauss's formula on its two legs.
+    # x' = -x + r: after the pulse x is exp(-t) times the integral of exp(s) r(s), by Gauss quadrature by segments.
     plan = late_pulse(500.0)
     lag = ct.ss(-1.0, 1.0, 1.0, 0.0, inputs="r", outputs="y", name="lag")
     loop = from_plan(plan, lag)
@@ -47,7 +47,7 @@ def test_a_late_plan_is_skipped_by_the_peer_and_not_here():
 
 @pytest.mark.parametrize("method", NUMERICAL)
 def test_a_late_plan_into_a_bent_block_is_not_skipped(method):
-    """The same pulse at once and after a rest of ten minutes ends in the same state."""
+    """The same pulse immediately and after ten minutes at rest ends in the same state."""
     bent = ct.nlsys(lambda t, x, u, p: -np.tanh(x) + 9 * u, None, inputs="r", outputs="y", states=1, name="bent")
     late, soon = from_plan(late_pulse(600.0), bent), from_plan(late_pulse(0.0), bent)
     after = np.array([0.2, 0.5, 1.0])
@@ -59,7 +59,7 @@ def test_a_late_plan_into_a_bent_block_is_not_skipped(method):
     assert np.abs(peer.outputs).max() == 0.0
 
 
-# 2. Static blocks are first asked at zero inputs
+# 2. Static blocks are first evaluated at zero inputs
 
 
 def dividing():

@@ -268,7 +268,7 @@ def test_what_is_written_and_never_read_does_not_matter(monkeypatch, log):
     assert len(traces) == 2  # without parameters of the run, and with
 
 
-def test_a_gain_beside_a_counter_still_counts():
+def test_a_gain_next_to_a_counter_still_counts():
     update, _ = log_beside_a_gain()
     system = block(update, params={"k": 1.0})
     for gain in (1.0, 3.0, 1.0):

@@ -111,7 +111,7 @@ def test_a_discrete_loop_with_a_memory(order):
         ),
     ]
     loop = ct.interconnect([blocks[i] for i in order], inputs="r", outputs=["u", "y"])
-    for _ in range(2):  # the memory begins anew with a new block, not with a new run
+    for _ in range(2):  # the memory begins again with a new block, not with a new run
         found = cp.simulate(loop, STEPS, 1.0)
     assert np.abs(found.outputs - recursion(3, True)).max() < 1e-14
 

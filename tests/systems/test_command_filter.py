@@ -29,7 +29,7 @@ def test_each_output_is_a_power_of_s_times_the_filter(w, derivatives, order):
 
 @cases
 def test_all_poles_lie_at_the_bandwidth_and_there_is_no_zero(w, derivatives, order):
-    """Characteristic polynomial (s + w)^n by the binomials, and nothing at once from input to output."""
+    """Characteristic polynomial (s + w)^n by the binomials, and no direct feedthrough."""
     block = cp.create_command_filter_iosystem(w, derivatives, order)
     wanted = [math.comb(order, k) * w**k for k in range(order + 1)]
     assert np.abs(np.poly(block.A) / wanted - 1).max() <= 1e-12
@@ -58,7 +58,7 @@ def test_the_answer_to_a_step_is_the_gamma_distribution(w, derivatives, order):
 
 
 def test_outputs_are_derivatives_of_one_another_after_jumps_of_the_command():
-    """Exactly: the integral of each by an integrator beside it, in one run over three steps."""
+    """Exactly: the integral of each by an integrator in the same run, over three steps."""
     block = cp.create_command_filter_iosystem(3.0, 3, outputs="r")
     chains = [ct.ss(0, 1, 1, 0, inputs=f"r_d{k}", outputs=f"i{k}", name=f"chain{k}") for k in (1, 2, 3)]
     names = ["r", "r_d1", "r_d2", "r_d3"]
@@ -73,7 +73,7 @@ def test_outputs_are_derivatives_of_one_another_after_jumps_of_the_command():
 
 
 @pytest.mark.parametrize("order", [2, 3, 5])
-def test_the_first_derivative_not_put_out_may_jump_and_none_before_it(order):
+def test_the_first_derivative_not_output_may_jump_and_none_before_it(order):
     """At a step of height 1, derivative n jumps by w^n and those below do not."""
     w, h = 2.0, 1e-6
     block = cp.create_command_filter_iosystem(w, order - 1)
@@ -156,7 +156,7 @@ def test_without_the_lead_it_does_not():
     assert np.abs(found - plan(t)).max() > 0.5
 
 
-def test_a_filter_that_starts_beside_the_plan_comes_to_it_by_its_own_poles():
+def test_a_filter_that_starts_next_to_the_plan_comes_to_it_by_its_own_poles():
     """The difference is the free answer of the filter: for n = 2, (1 + w t) exp(-w t) of the first offset."""
     plan = cp.PolySpline([cp.Waypoint(0.0, 1, 0, 0, 0), cp.Waypoint(2.0, 3, 0, 0, 0)], labels=["y"])
     t, w = np.linspace(0, 4, 41), 3.0

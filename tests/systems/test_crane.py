@@ -455,7 +455,7 @@ def test_plans_next_to_the_limits_pass():
 
 @pytest.mark.parametrize("width", [1e-2, 1e-4])
 def test_a_narrow_violation_between_samples_is_found(width):
-    """One leg of many, far narrower than any sampling of the whole."""
+    """One segment of many, far narrower than any sampling of the whole."""
     twitch = 15.0 * width**2 / (10 / math.sqrt(3))  # peak acceleration 15 m/s^2
     falling = segment(5, (0, 5), (1, 5)).then(segment(width, (1, 5), (1, 5 + twitch), 5)).then(
         segment(5, (1, 5 + twitch), (2, 5), 5 + width)
@@ -531,7 +531,7 @@ def test_pids_need_a_bandwidth(bandwidth):
             pid(bandwidth)
 
 
-def test_reverse_map_refuses_what_has_no_answer():
+def test_reverse_map_rejects_what_has_no_answer():
     with pytest.raises(ValueError, match="order at least 2"):
         Crane().quantities(np.zeros((2, 2)))
     with pytest.raises(ValueError, match="jet must have shape"):

@@ -96,7 +96,7 @@ def test_options_given_with_a_name_are_those_of_the_law(name, law, options):
 
 
 def test_options_that_change_nothing_would_be_silent():
-    """The load's own error under two options differs, so that neither is lost on the way."""
+    """The load's own error under two options differs, so that both take effect."""
     slow, fast = (outputs(crane_loop(CRANE, plan(3), LoadFeedbackLaw(load_bandwidth=w))) for w in (0.2, 2.0))
     assert np.abs(slow - fast).max() > 1e-4
 
@@ -189,5 +189,7 @@ def test_a_user_s_law_is_checked():
 
 def test_limits_go_with_the_pids():
     for law in (DynamicLaw(), FeedforwardLaw()):
-        with pytest.raises(ValueError, match="limits must go with a law that uses the PIDs"):
+        with pytest.raises(
+            ValueError, match="force_limits and torque_limits must be given with a law that uses the PIDs"
+        ):
             crane_loop(CRANE, plan(), law, force_limits=(-1.0, 1.0))

@@ -1,4 +1,4 @@
-"""The crane's laws as blocks: names, formulas, finite at zero, and what they refuse."""
+"""The crane's laws as blocks: names, formulas, finite at zero, and rejected arguments."""
 
 import math
 
@@ -85,7 +85,7 @@ def test_generator_puts_the_drives_where_the_load_hangs_as_planned(u):
 
 @given(REFERENCES, st.floats(-20, 20), st.floats(-2, 2), st.floats(0.1, 3), st.floats(0.5, 1.5))
 @settings(max_examples=50)
-def test_load_feedback_asks_for_the_acceleration_of_the_law(u, dx, dv, w, zeta):
+def test_load_feedback_commands_the_acceleration_of_the_law(u, dx, dv, w, zeta):
     block = create_load_feedback_iosystem(CRANE, w, zeta)
     found = block.output(0.0, [], [*u, u[0] + dx, u[1] + dv])
     requested = u[2] - 2 * zeta * w * dv - w**2 * dx
@@ -146,7 +146,7 @@ def test_load_feedback_needs_positive_numbers(name, value):
         create_load_feedback_iosystem(CRANE, **{name: value})
 
 
-def test_feedforward_refuses_what_would_push_the_rope():
+def test_feedforward_rejects_what_would_push_the_rope():
     u = np.zeros(10)
     u[7] = 9.6
     with pytest.raises(ValueError, match=r"g - z'' must be above 0 for a taut rope, got -0\.1"):

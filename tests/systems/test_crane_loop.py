@@ -1,4 +1,4 @@
-"""Closed loops of the crane against a right-hand side written by hand, their poles, and what they refuse."""
+"""Closed loops of the crane against a right-hand side written by hand, their poles, and what they reject."""
 
 import math
 import re
@@ -85,7 +85,7 @@ def test_step_saturates_the_drives_and_slackens_the_rope():
     assert found.C.max() == 1e3
     assert found.T.min() < 0
     free = run(crane_loop(Crane(), plan, "setpoint"), np.linspace(0, 0.01, 3))
-    assert free.F[0] > 30e3  # without limits it is asked for more
+    assert free.F[0] > 30e3  # without limits the command is larger
 
 
 # The whole law and its open-loop half
@@ -266,7 +266,7 @@ def test_a_plan_the_rope_cannot_follow_is_rejected(law):
 def test_what_does_not_go_together_is_rejected():
     with pytest.raises(ValueError, match="law must be one of setpoint, generator"):
         crane_loop(Crane(), plan_of(3), "pid")
-    with pytest.raises(ValueError, match="limits must go with a law that uses the PIDs"):
+    with pytest.raises(ValueError, match="force_limits and torque_limits must be given with a law that uses the PIDs"):
         crane_loop(Crane(), plan_of(5), "dynamic", force_limits=(-1, 1))
     with pytest.raises(ValueError, match="poles"):
         crane_loop(Crane(), plan_of(5), "dynamic", poles=(1, -1, -1, -1))

@@ -111,7 +111,7 @@ def test_with_the_rope_on_the_drum_they_are_lagranges(mechanics, state, inputs):
 
 @WRAPS
 def test_the_block_does_what_the_equations_say(mechanics, wrap):
-    """Rates and outputs under F, C and wind; params of a run overrule the mass for the wind too."""
+    """Rates and outputs under F, C and wind; parameters of a run override the mass for the wind too."""
     crane = Crane(**ODD, rope_wrap=wrap)
     block = crane.iosystem(wind=True)
     assert block.input_labels == ["F", "C", "wind"]
@@ -315,7 +315,7 @@ def test_wind_from_outside_is_the_same_as_the_trajectory(blown, law, method):
 
 
 def test_in_a_steady_wind_feedback_settles_with_the_rope_aslant():
-    """theta to atan(W/(m g)), T to hypot(m g, W), F to -W; still x is off by what the law's acceleration asks for."""
+    """theta to atan(W/(m g)), T to hypot(m g, W), F to -W; but x deviates by the acceleration that the law commands."""
     loop = crane_loop(Crane(), move(), "load_feedback", wind=cp.Step(400.0, time=2.0))
     found = cp.simulate(loop, np.linspace(0, 60, 61))
     last = dict(zip(found.output_labels, np.asarray(found.outputs)[:, -1], strict=True))
@@ -363,24 +363,24 @@ def test_the_plans_source_as_the_reference_is_the_plain_loop(law, method):
 
 
 @pytest.mark.parametrize("law", ["generator", "dynamic"])
-def test_an_unhurried_clock_as_the_reference_is_the_plain_loop(law):
+def test_an_unhurried_time_scaling_as_the_reference_is_the_plain_loop(law):
     """Errors that never come: the same as the source, to the solver's tolerance."""
     plan, order = move(4), 4 if law == "dynamic" else 2
-    clock = cp.create_time_scaling_iosystem(plan, order, errors={"x": (50.0, 100.0)}, suffix="_ref")
-    own = crane_loop(Crane(), plan, law, reference=[clock])
+    scaling = cp.create_time_scaling_iosystem(plan, order, errors={"x": (50.0, 100.0)}, suffix="_ref")
+    own = crane_loop(Crane(), plan, law, reference=[scaling])
     plain = crane_loop(Crane(), plan, law)
     assert own.nstates == plain.nstates + order + 1
     first, second = (np.asarray(cp.simulate(loop, TIMES, rtol=1e-10, atol=1e-12).outputs) for loop in (own, plain))
     assert np.abs((first - second) / np.maximum(np.abs(second).max(axis=1, keepdims=True), 1e-3)).max() <= 1e-6
 
 
-def test_a_slowed_clock_on_the_crane_keeps_the_path_and_the_load_nearer_its_reference():
-    """A plan too hasty for its drives: with the clock the load's error from the reference is less than half."""
+def test_a_slowed_time_scaling_on_the_crane_keeps_the_path_and_the_load_nearer_its_reference():
+    """A plan too hasty for its drives: with the time scaling the load's error from the reference is less than half."""
     plan = move(2, ((0.0, 0.0, 10.0), (6.0, 20.0, 9.0)))
     limits = {"force_limits": (-15e3, 15e3)}
-    clock = cp.create_time_scaling_iosystem(plan, 2, errors={"x": (0.05, 0.5)}, suffix="_ref", fastest=1.0)
+    scaling = cp.create_time_scaling_iosystem(plan, 2, errors={"x": (0.05, 0.5)}, suffix="_ref", fastest=1.0)
     runs = {}
-    for name, options in (("plain", {}), ("slowed", {"reference": [clock]})):
+    for name, options in (("plain", {}), ("slowed", {"reference": [scaling]})):
         found = cp.simulate(crane_loop(Crane(), plan, **limits, **options), np.linspace(0, 40, 401))
         runs[name] = dict(zip(found.output_labels, np.asarray(found.outputs), strict=True))
     error = {name: np.abs(run["x"] - run["x_ref"])[:150].max() for name, run in runs.items()}

@@ -1,4 +1,4 @@
-"""Systems that put out their states, against the plain ones."""
+"""Systems with their states among the outputs, compared with the plain ones."""
 
 import control as ct
 import numpy as np
@@ -162,7 +162,7 @@ def test_what_is_rejected():
         cp.expose_states(Own(lambda t, x, u, p: -x, None, inputs=1, outputs=1, states=1, name="own"))
 
 
-def test_a_block_that_puts_out_its_states_may_be_exposed_inside():
+def test_a_block_that_outputs_its_states_may_be_exposed_inside():
     inner = cp.expose_states(pendulum())
     law = ct.ss([], [], [], [[3.0, -3.0, -1.0]], inputs=["r", "y", "rate_state"], outputs="u", name="law")
     plain = ct.interconnect([law, inner], inputs="r", outputs=["y", "angle_state"], name="loop")

@@ -1,4 +1,4 @@
-"""The law (9)-(11): closed loops are chains of integrators, whatever the plant; what is no such plant is refused."""
+"""The law (9)-(11): closed loops are chains of integrators, whatever the plant; other plants are rejected."""
 
 import math
 
@@ -230,7 +230,7 @@ LOOPS = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("error", [0.0, 0.2], ids=["on the plan", "beside the plan"])
+@pytest.mark.parametrize("error", [0.0, 0.2], ids=["on the plan", "off the plan"])
 @pytest.mark.parametrize(("plant", "poles"), LOOPS.values(), ids=list(LOOPS))
 def test_closed_loops_are_chains_of_integrators(plant, poles, error):
     naxes, order = len(poles), len(poles[0])
@@ -272,7 +272,7 @@ def linear_plant():
         outputs="y",
         name="linear",
     )
-    # Its states put out, so that the law finds them.
+    # Its states output, so that the law finds them.
     measured = ct.ss(system.A, system.B, np.eye(3), 0, states=3, inputs="F", outputs=["a", "b", "c"], name="measured")
     return system, measured
 
@@ -324,7 +324,7 @@ def test_it_agrees_with_python_controls_own_simulation():
     assert np.abs(found.outputs - peer.outputs).max() < 1e-6
 
 
-def test_along_a_plan_of_python_controls_own_it_puts_out_the_inputs():
+def test_along_a_plan_of_python_controls_own_it_outputs_the_inputs():
     plant = flexible_joint()
     law = create_flat_iosystem(plant, POLES)
     (x0, u0), (xf, uf) = (plant.reverse([array(y, 0, 0, 0, 0)]) for y in (0.0, 1.0))
@@ -337,7 +337,7 @@ def test_along_a_plan_of_python_controls_own_it_puts_out_the_inputs():
 
 @settings(max_examples=50)
 @given(st.lists(st.floats(-3, 3), min_size=4, max_size=4), st.lists(st.floats(-3, 3), min_size=5, max_size=5))
-def test_the_last_derivative_is_what_the_law_asks_for(x, reference):
+def test_the_last_derivative_is_what_the_law_commands(x, reference):
     # The definition, at any state and reference: y'''' = y_d'''' - sum sigma_k (y^(k) - y_d^(k)).
     plant = flexible_joint()
     law = LAW_OF_JOINT
@@ -558,7 +558,7 @@ def test_other_plants_are_rejected_with_the_reason(plant, reason):
 
 
 def test_the_aircraft_of_this_file_is_flat():
-    # So that it is refused for what it is and not for a slip above.
+    # So that it is rejected for this reason and not for a mistake above.
     rng = np.random.default_rng(0)
     for _ in range(5):
         flag = list(rng.normal(size=(2, 5)))

@@ -91,10 +91,10 @@ def test_the_motor_obeys_newton_kirchhoff_and_the_balance_of_power():
     assert sp.expand(p["inertia"] * rates[1] + p["friction"] * speed - p["motor_constant"] * current) == 0
     drop = p["inductance"] * rates[2] + p["resistance"] * current + p["motor_constant"] * speed
     assert sp.expand(drop - voltage) == 0
-    # What the source gives is stored, or lost in resistance and friction: nothing is made between coil and shaft.
+    # The supplied energy is stored or dissipated in resistance and friction: the conversion to torque is lossless.
     stored = (p["inertia"] * speed**2 + p["inductance"] * current**2) / 2
-    lost = p["resistance"] * current**2 + p["friction"] * speed**2
-    assert sp.expand(along(stored, x, rates) - voltage * current + lost) == 0
+    dissipated = p["resistance"] * current**2 + p["friction"] * speed**2
+    assert sp.expand(along(stored, x, rates) - voltage * current + dissipated) == 0
 
 
 def test_the_joint_obeys_lagrange():

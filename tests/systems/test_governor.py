@@ -85,7 +85,7 @@ def test_limits_hold_whatever_a_bounded_disturbance_does():
 
 @pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_every_sample_takes_the_largest_fraction(seed):
-    """The law, written out in the test, on states that a matrix exponential carries from sample to sample."""
+    """The law, written out in the test, on states propagated from sample to sample by a matrix exponential."""
     rng = np.random.default_rng(50 + seed)
     loop, _, found, whole = random_governed(rng)
     m, n, dt = loop.ninputs, loop.nstates, found.dt
@@ -122,7 +122,7 @@ def test_what_is_admissible_passes_unchanged(plan):
     times = 0.05 * np.arange(161)
     found = cp.simulate(lag_loop(), times, {"r_cmd": plan})
     assert np.array_equal(found.states[1], np.ones(161))
-    # A plan is known to a rounding error; the reference is not even that far from what was asked for.
+    # A plan is known to a rounding error; the reference is closer than that to the command.
     assert np.abs(found.outputs[2] - plan(times)).max() <= np.spacing(1.0)
     assert found.events == []
 

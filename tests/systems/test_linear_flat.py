@@ -121,7 +121,7 @@ def test_what_the_message_says_leads_the_output_to_its_final_value():
 
 
 def test_a_fast_zero_is_one():
-    """1 ms beside time constants of seconds changes the output by little, and not to rounding."""
+    """1 ms next to time constants of seconds changes the output by little, and not to rounding."""
     _, message, _ = told([1e-3, 1.0], [6.0, 5.0, 1.0, 0.0])
     assert "y = 0.166667 z + 0.000166667 z_d1," in message
 

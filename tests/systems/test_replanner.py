@@ -76,7 +76,10 @@ BAD = [
     ({"min_horizon": 0.1}, "min_horizon must lie between dt, 0.5 s, and the plan's duration, 10 s, got 0.1 s"),
     ({"min_horizon": 10.1}, "min_horizon must lie between dt, 0.5 s, and the plan's duration, 10 s, got 10.1 s"),
     ({"min_horizon": -1.0}, "min_horizon must be finite and above 0, got -1.0"),
-    ({"min_horizon": 1.0, "horizon": 2.0}, 'min_horizon must go with horizon = "shrinking", got 1.0 with 2 s'),
+    (
+        {"min_horizon": 1.0, "horizon": 2.0},
+        'min_horizon must be given with horizon = "shrinking" only, got 1.0 with 2 s',
+    ),
     ({"trigger": "always"}, "trigger must be one of period, deviation, goal, got 'always'"),
     ({"trigger": "goal"}, 'goal_derivatives must be given for trigger = "goal", got None'),
     ({"trigger": "deviation"}, 'measured must be given for trigger = "deviation", got None'),
@@ -88,7 +91,7 @@ BAD = [
         {"trigger": "deviation", "measured": 0, "suffix": "_r", "threshold": 0.0},
         "threshold must be finite and above 0, got 0.0",
     ),
-    ({"threshold": 0.1}, "threshold must go with trigger = \"deviation\", got 0.1 with 'period'"),
+    ({"threshold": 0.1}, "threshold must be given with trigger = \"deviation\" only, got 0.1 with 'period'"),
     ({"measured": 3, "suffix": "_r"}, "measured must be at most order, 2, got 3"),
     ({"measured": -1, "suffix": "_r"}, "measured must be an integer of at least 0, got -1"),
     ({"goal_derivatives": 3}, "goal_derivatives must be at most order, 2, got 3"),
@@ -148,7 +151,7 @@ def test_a_plan_without_duration_cannot_shrink():
 
 @pytest.mark.parametrize("moment", [1e6, -1e6, 123.456])
 def test_absolute_times(moment):
-    """The same run later, to what a clock of that size can tell."""
+    """The same run later, to the resolution of times of that size."""
     goal, t = steps((3.2, 1.5)), np.linspace(-1.0, 12.0, 131)
     here = cp.simulate(cp.create_replanner_iosystem(PLAN, 0.4, goal_derivatives=0, offset=0.1), t, goal)
     plan = PLAN.shift(moment)
@@ -264,7 +267,7 @@ def test_joined_to_a_plant_by_names():
 
 
 def test_two_replanners_in_one_loop():
-    """Each its own clock, axis and name."""
+    """Each with its own period, axis and name."""
     blocks = [
         cp.create_replanner_iosystem(cp.PolySpline(REST, labels=["a"]), 0.5, order=1, goal_derivatives=0, name="first"),
         cp.create_replanner_iosystem(
@@ -295,7 +298,7 @@ def test_a_run_can_be_made_again():
     assert np.array_equal(cp.simulate(replanner, t, cp.Step(2.0, 1.0, 3.0)).outputs, first.outputs)
 
 
-def test_jets_above_the_order_are_put_out_too():
+def test_jets_above_the_order_are_output_too():
     """derivatives above and below `order`: the plan's own where nothing was fitted."""
     t = np.linspace(0.0, 9.99, 31)
     many = cp.simulate(cp.create_replanner_iosystem(PLAN, 0.5, order=1, derivatives=4), t)

@@ -133,7 +133,7 @@ def test_a_run_that_begins_too_late_for_a_fit_needs_none(name):
 
 @pytest.mark.parametrize("moment", [1e6, -1e6])
 def test_a_conveyor_met_in_absolute_time(moment):
-    """A clock of 1e6 s has 1e-10 s to tell: no false event from it."""
+    """Times of 1e6 s have a resolution of 1e-10 s: no false event from it."""
     goal = conveyor(2.0, 0.3, at=0.0)
     replanner = cp.create_replanner_iosystem(PLAN.shift(moment), 0.5, goal_derivatives=1)
     found = cp.simulate(replanner, moment + RUN, {"x_goal": goal["x_goal"].shift(moment), "x_goal_d1": 0.3})

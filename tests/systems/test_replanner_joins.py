@@ -85,7 +85,7 @@ NODES = 22
 
 
 def segments(edges, nodes=NODES):
-    """Chebyshev times inside each leg, none at its ends."""
+    """Chebyshev times inside each segment, none at its ends."""
     cosines = np.cos(np.pi * (np.arange(nodes)[::-1] + 0.5) / nodes)
     return np.array([0.5 * (a + b) + 0.5 * (b - a) * cosines for a, b in itertools.pairwise(edges)])
 
@@ -94,7 +94,7 @@ def segments(edges, nodes=NODES):
 @pytest.mark.parametrize("alpha", [0.0, 2.0])
 @pytest.mark.parametrize("order", [0, 1, 2, 3, 4])
 def test_no_derivative_jumps_and_each_is_that_of_the_one_before(order, alpha, horizon):
-    """From the outputs of a run alone: each leg as a Chebyshev series, taken to its ends and differentiated."""
+    """From the outputs of a run alone: each segment as a Chebyshev series, taken to its ends and differentiated."""
     rng = np.random.default_rng(10 * order + int(alpha))
     ends = [[0.0] * (order + 1), [1.0] + [0.0] * order]
     plan = cp.TrigSpline(
@@ -110,7 +110,7 @@ def test_no_derivative_jumps_and_each_is_that_of_the_one_before(order, alpha, ho
     found = cp.simulate(replanner, flat, goal)
     outputs = found.outputs.reshape(order + 1, -1)
     assert state_of(found, "fits")[-1] >= 2
-    values = outputs[:, np.searchsorted(flat, times)]  # order, leg, node
+    values = outputs[:, np.searchsorted(flat, times)]  # order, segment, node
     cosines = np.cos(np.pi * (np.arange(NODES)[::-1] + 0.5) / NODES)
     series = np.linalg.solve(chebyshev.chebvander(cosines, NODES - 1), values.reshape(-1, NODES).T)
     begins, finishes = (chebyshev.chebval(z, series).reshape(order + 1, -1) for z in (-1.0, 1.0))
@@ -120,7 +120,7 @@ def test_no_derivative_jumps_and_each_is_that_of_the_one_before(order, alpha, ho
     # A sample at an edge counts to what follows; no derivative jumps, so either limit is it.
     assert (np.abs(outputs[:, np.searchsorted(flat, edges[1:-1])] - begins[:, 1:]).max(axis=1) <= 1e-9 * size).all()
     slopes = chebyshev.chebval(cosines, chebyshev.chebder(series) * 2.0 / 0.25).reshape(order + 1, -1, NODES)
-    # What follows from rounding: NODES^2 times the last digit over the leg.
+    # What follows from rounding: NODES^2 times the last digit over the segment.
     assert (
         np.abs(slopes[:-1] - values[1:]).max(axis=(1, 2), initial=0.0) <= 1e-9 * (size[1:] + size[:-1] / 0.25)
     ).all()

@@ -27,7 +27,7 @@ from ctrlplan import Waypoint
 
 
 def grid_peaks(found, order):
-    """Greatest magnitudes of the derivatives 0 to `order` in a record of one axis."""
+    """Largest magnitudes of the derivatives 0 to `order` in a record of one axis."""
     return np.abs(found.outputs[: order + 1]).max(axis=1)
 
 
@@ -109,7 +109,7 @@ def test_each_axis_has_its_limit():
 
 @pytest.mark.parametrize("trigger", ["period", "goal"])
 def test_limits_hold_where_the_correction_ends_before_the_plan(trigger):
-    """Fixed horizon: at its end the goal's change stays on top of a plan that still goes on."""
+    """Fixed horizon: at its end the change of the goal is added to a plan that continues."""
     replanner = cp.create_replanner_iosystem(
         PLAN, 0.5, horizon=1.0, goal_derivatives=0, trigger=trigger, limits={0: 1.2}
     )
@@ -150,15 +150,15 @@ def test_a_plan_that_breaks_its_limits_says_which_by_how_much_and_when():
         cp.create_replanner_iosystem(two, 0.5, limits={1: [0.2, 0.3]})
 
 
-# Lost values
+# nan in the inputs
 
 
 def gap(source, sink, name, begin, end):
-    """Sensor that puts out nan for a while."""
+    """Sensor that outputs nan for a while."""
 
     def seen(t, x, u, params):
-        lost = (t > begin) * (t < end)
-        return np.array([np.where(lost, np.nan, value) for value in u])
+        missing = (t > begin) * (t < end)
+        return np.array([np.where(missing, np.nan, value) for value in u])
 
     return ct.nlsys(None, seen, inputs=source, outputs=sink, name=name, dt=0)
 
@@ -184,7 +184,7 @@ def test_a_sensor_that_fails_for_a_while(method):
     assert len(found.events) == 2
     fits = np.flatnonzero(np.diff(state_of(found, "fits"), prepend=0.0))
     assert np.allclose(t[fits], [0, 0.5, 1, 1.5, 2, 2.5, 3, 5.5, 6, 6.5, 7, 7.5, 8, 8.5, 9])
-    # Held: one polynomial from 3 s to the goal, found from what came out before anything was lost.
+    # Held: one polynomial from 3 s to the goal, found from the outputs before the first nan.
     x0, v0 = (float(found.outputs[k, t.searchsorted(3.0 - 1e-9)]) for k in (1, 2))
     held = (t >= 3.0 - 1e-9) & (t < 5.45)
     coefficients = np.polynomial.Polynomial.fit(t[held], found.outputs[1, held], 5)
@@ -195,7 +195,7 @@ def test_a_sensor_that_fails_for_a_while(method):
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_a_goal_that_is_lost_for_a_while(method):
+def test_a_goal_that_is_nan_for_a_while(method):
     """Between 3.3 and 5.2 s: the goal of before is kept, the one of afterwards taken up."""
     replanner = cp.create_replanner_iosystem(PLAN, 0.5, goal_derivatives=0)
     loop = ct.interconnect(
@@ -214,7 +214,7 @@ def test_a_goal_that_is_lost_for_a_while(method):
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
-def test_what_is_not_finite_is_lost_and_holds_everything(value):
+def test_values_that_are_not_finite_leave_the_plan_unchanged(value):
     replanner = cp.create_replanner_iosystem(PLAN, 0.5, measured=0, goal_derivatives=0, suffix="_r")
     core = replanner.syslist[1]
     before = core.sample(1.0, np.zeros(core.nstates), signals(PLAN, replanner, 1.0, goal=[[1.3]]), {})

@@ -84,7 +84,7 @@ def test_a_plant_that_passes_the_reference_on_at_once():
 
 
 def test_an_acceleration_that_is_commanded_and_measured():
-    """A double integrator driven by x_r_d2: its acceleration depends on the reference at once."""
+    """A double integrator driven by x_r_d2: its acceleration has direct feedthrough from the reference."""
     replanner = cp.create_replanner_iosystem(PLAN, 0.25, measured=2, suffix="_r")
     plant = ct.ss(
         [[0, 1], [0, 0]],

@@ -101,7 +101,7 @@ def test_what_is_not_a_plan(function, plan):
         function(plan)
 
 
-# Beside python-control's own functions
+# Next to python-control's own functions
 
 
 def lag(gain=5.0, signal="r"):
@@ -110,12 +110,12 @@ def lag(gain=5.0, signal="r"):
 
 
 def test_interconnect_joins_it_by_name():
-    driven = ct.interconnect([cp.create_source_iosystem(SINGLE), lag()], inputs=0, outputs=["y"])
-    assert driven.nstates == 2
-    assert driven.ninputs == 0
-    assert driven.connect_map.tolist() == [[1.0, 0.0]]
-    assert np.abs(driven.dynamics(1.2, [0.3, 0.1], []) - [-0.3 - 0.5 + 5 * SINGLE(1.2), 0.3]).max() <= 1e-15
-    assert driven.output(1.2, [0.3, 0.1], []).tolist() == [0.1]
+    planned_loop = ct.interconnect([cp.create_source_iosystem(SINGLE), lag()], inputs=0, outputs=["y"])
+    assert planned_loop.nstates == 2
+    assert planned_loop.ninputs == 0
+    assert planned_loop.connect_map.tolist() == [[1.0, 0.0]]
+    assert np.abs(planned_loop.dynamics(1.2, [0.3, 0.1], []) - [-0.3 - 0.5 + 5 * SINGLE(1.2), 0.3]).max() <= 1e-15
+    assert planned_loop.output(1.2, [0.3, 0.1], []).tolist() == [0.1]
 
 
 def test_interconnect_takes_derivatives_and_several_axes():
@@ -129,9 +129,9 @@ def test_interconnect_takes_derivatives_and_several_axes():
 
 @pytest.mark.parametrize("method", ["RK45", "DOP853", "LSODA", "Radau"])
 def test_input_output_response_runs_it(method):
-    driven = ct.interconnect([cp.create_source_iosystem(SINGLE), lag()], inputs=0, outputs=["y"])
+    planned_loop = ct.interconnect([cp.create_source_iosystem(SINGLE), lag()], inputs=0, outputs=["y"])
     found = ct.input_output_response(
-        driven, T, solve_ivp_method=method, solve_ivp_kwargs={"rtol": 1e-6, "atol": 1e-8, "max_step": 0.1}
+        planned_loop, T, solve_ivp_method=method, solve_ivp_kwargs={"rtol": 1e-6, "atol": 1e-8, "max_step": 0.1}
     )
     # Superposition over a staircase: the response to the plan is the integral of the step response times its slope.
     s = np.linspace(0.5, 1.5, 2001)

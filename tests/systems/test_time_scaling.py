@@ -20,7 +20,7 @@ U = {"u": (-1.0, 1.0)}
 
 
 def identity(duration=10.0):
-    """y = t: the block puts out sigma itself, sigma', ..."""
+    """y = t: the block outputs sigma itself, sigma', ..."""
     return cp.PolySpline([cp.Waypoint(0.0, 0.0), cp.Waypoint(duration, duration)], labels=["sigma"])
 
 
@@ -131,7 +131,7 @@ TIMES = np.unique(np.append(np.linspace(-0.5, 6.0, 66), [1.0, 1.5, 2.0, 4.0]))
 @pytest.mark.parametrize("derivatives", [0, 2, 4])
 @every_kind
 def test_at_the_zero_state_the_block_is_the_plan_at_the_time_and_goes_with_it(kind, derivatives):
-    """Before the start, at every breakpoint and after the end: 1e-12 of the greatest value, and no state moves."""
+    """Before the start, at every breakpoint and after the end: 1e-12 of the largest value, and no state moves."""
     plan = KINDS[kind]
     block = cp.create_time_scaling_iosystem(plan, derivatives, limits=U, bandwidth=3.0)
     zero = np.zeros(block.nstates)
@@ -143,7 +143,7 @@ def test_at_the_zero_state_the_block_is_the_plan_at_the_time_and_goes_with_it(ki
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_with_nothing_wrong_a_run_puts_out_the_plan_at_rate_1(method):
+def test_with_nothing_wrong_a_run_outputs_the_plan_at_rate_1(method):
     plan = KINDS["polynomial"]
     found = alone(plan, 3, np.linspace(0, 6, 61), 0.4, method)
     wanted = plan.jet(np.linspace(0, 6, 61), 3).transpose(1, 0, 2)
@@ -153,7 +153,7 @@ def test_with_nothing_wrong_a_run_puts_out_the_plan_at_rate_1(method):
     assert np.abs(found.lag).max() <= 1e-12
 
 
-# The clock: closed forms of its lags
+# The time scaling: closed forms of its lags
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 4])
@@ -164,15 +164,15 @@ def test_at_the_largest_severity_the_rate_falls_as_equal_lags_do(n):
     fallen = (1 - minimum) * gammainc(n, w * t)
     assert np.abs(found.rate - (1 - fallen)).max() <= 1e-9
     # Of the integral of the incomplete gamma function: t P(n, wt) - (n/w) P(n + 1, wt).
-    lost = (1 - minimum) * (t * gammainc(n, w * t) - n / w * gammainc(n + 1, w * t))
-    assert np.abs(found.lag - lost).max() <= 1e-9
-    assert np.abs(found.jets[0, 0] - (t - lost)).max() <= 1e-9
+    delay = (1 - minimum) * (t * gammainc(n, w * t) - n / w * gammainc(n + 1, w * t))
+    assert np.abs(found.lag - delay).max() <= 1e-9
+    assert np.abs(found.jets[0, 0] - (t - delay)).max() <= 1e-9
     assert np.abs(found.jets[0, 1] - (1 - fallen)).max() <= 1e-9
 
 
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("n", [1, 2, 3])
-def test_the_clock_slows_and_catches_up_as_its_formula_says(n, method):
+def test_the_time_scaling_slows_and_catches_up_as_its_formula_says(n, method):
     """Against the formula of the docstring by scipy: severities 0, 0.4, 1, 0.2, 0."""
     w, t = 6.0, np.linspace(0, 12, 121)
     severity = ([0.0, 0.4, 1.0, 0.2, 0.0], [1.0, 2.0, 3.5, 5.0])
@@ -211,7 +211,7 @@ def test_catch_up_is_the_time_constant_of_the_lag():
 
 @pytest.fixture(scope="module")
 def slowed():
-    """A plan of two axes, derivatives 0 to 4, on a clock that slows twice and catches up."""
+    """A plan of two axes, derivatives 0 to 4, on a time scaling that slows twice and catches up."""
     times = np.linspace(0.0, 16.0, 3201)
     u = pulses((2.0, 1.0), (4.0, -0.3), (5.0, -0.7), (7.0, 0.8), (7.5, -0.8))
     plan = cp.PolySpline(
@@ -223,8 +223,8 @@ def slowed():
     return plan, times, alone(plan, 4, times, u, bandwidth=5.0, fastest=1.4)
 
 
-def test_jets_are_those_of_the_plan_composed_with_the_clock(slowed):
-    """By sympy's derivatives of f(s(t)) to order 4, the plan's own in closed form and the clock's by its lags."""
+def test_jets_are_those_of_the_plan_composed_with_the_time_scaling(slowed):
+    """By sympy's derivatives of f(s(t)) to order 4, those of the plan in closed form and those of s by its lags."""
     _, _, found = slowed
     tau = (found.sigma - 0.5) / 8.0
     inside = (tau > 0) & (tau < 1)
@@ -261,13 +261,13 @@ def test_each_output_is_the_integral_of_the_next(slowed, k):
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_integrators_behind_the_outputs_put_out_the_outputs_before(method):
+def test_integrators_behind_the_outputs_output_the_outputs_before(method):
     """In one run, so to the solver's tolerance: the integral of output k + 1 is output k, for k = 0 to 3."""
     plan = rest((0.0, 0.0), (6.0, 1.0), labels=["x"])
     names = ["x", "x_d1", "x_d2", "x_d3", "x_d4"]
-    clock = cp.create_time_scaling_iosystem(plan, 4, limits=U, margin=0.25, bandwidth=4.0)
+    scaling = cp.create_time_scaling_iosystem(plan, 4, limits=U, margin=0.25, bandwidth=4.0)
     chains = [ct.ss(0, 1, 1, 0, inputs=name, outputs=f"i_{name}", name=f"int_{name}") for name in names[1:]]
-    loop = ct.interconnect([clock, *chains], inputs=["u"], outputs=[*names, *(f"i_{name}" for name in names[1:])])
+    loop = ct.interconnect([scaling, *chains], inputs=["u"], outputs=[*names, *(f"i_{name}" for name in names[1:])])
     u = pulses((1.0, 0.9), (2.5, -0.9), (3.0, 1.0), (3.3, -1.0))
     found = cp.simulate(loop, np.linspace(0, 10, 101), {"u": u}, method=method, rtol=1e-10, atol=1e-11)
     outputs = np.asarray(found.outputs)
@@ -324,8 +324,8 @@ MARGINAL = {2: 2.0, 3: 8.0 / 9.0}
 
 
 @pytest.mark.parametrize("n", MARGINAL)
-def test_a_catch_up_with_which_the_lag_would_swing_for_ever_is_rejected(n):
-    """At the bound by Routh's criterion: just below it is refused, just above it the lag settles above `slowest`."""
+def test_a_catch_up_with_which_the_lag_would_swing_indefinitely_is_rejected(n):
+    """At the bound by Routh's criterion: just below it is rejected, just above it the lag settles above `slowest`."""
     w = 10.0
     bound = 1.0 / (w * MARGINAL[n])
     with pytest.raises(
@@ -340,7 +340,7 @@ def test_a_catch_up_with_which_the_lag_would_swing_for_ever_is_rejected(n):
 
 
 def test_with_slowest_0_the_plan_may_stand_still_and_goes_on():
-    t = np.linspace(0, 90, 901)  # 19 s are lost, at half a second a second
+    t = np.linspace(0, 90, 901)  # 19 s of delay, at half a second per second
     found = alone(identity(20.0), 2, t, pulses((1.0, 1.0), (20.0, -1.0)), bandwidth=5.0, slowest=0.0, fastest=1.5)
     stood = (t > 10) & (t < 20)
     assert np.ptp(found.sigma[stood]) <= 1e-8
@@ -390,7 +390,7 @@ def test_with_fastest_1_the_lag_is_kept():
 
 
 @every_kind
-def test_a_plan_of_every_kind_runs_compiled_behind_a_slowed_clock(kind):
+def test_a_plan_of_every_kind_runs_compiled_behind_a_slowed_time_scaling(kind):
     """Value, rate and acceleration by the chain rule on the plan's own numbers at sigma, which comes by hand."""
     plan, w = KINDS[kind], 4.0
     t = np.linspace(0.0, 8.0, 81) + 1e-4  # no sample at a break
@@ -455,13 +455,13 @@ LATE = {
 @pytest.mark.parametrize(
     ("case", "fastest"), [*((case, 1.0) for case in LATE), ("one move, late", 1.02), ("cubics", 1.02)]
 )
-def test_no_move_behind_a_slowed_clock_is_skipped(case, fastest, method):
-    """All at rest for long before a short move, which comes later than planned: its integral must still be its own."""
+def test_no_move_behind_a_slowed_time_scaling_is_skipped(case, fastest, method):
+    """At rest for long before a short move, which starts later than planned: the integral must be that of the move."""
     plan = cp.stack([LATE[case]], labels=["x"])
     options = {"bandwidth": 20.0, "fastest": fastest, "catch_up": 300.0}
-    clock = cp.create_time_scaling_iosystem(plan, 2, limits=U, **options)
+    scaling = cp.create_time_scaling_iosystem(plan, 2, limits=U, **options)
     chain = ct.ss(0, 1, 1, 0, inputs=["x_d1"], outputs=["p"], name="chain")
-    loop = ct.interconnect([clock, chain], inputs=["u"], outputs=["x", "p", "x_d2"])
+    loop = ct.interconnect([scaling, chain], inputs=["u"], outputs=["x", "p", "x_d2"])
     found = cp.simulate(loop, np.linspace(0, 42, 43), {"u": pulses((0.0, 1.0), (9.0, -1.0))}, method=method)
     x, p, _ = np.asarray(found.outputs)
     assert np.asarray(found.states)[0, 30] > 4.0
@@ -470,10 +470,10 @@ def test_no_move_behind_a_slowed_clock_is_skipped(case, fastest, method):
 
 
 def test_a_short_segment_in_a_long_run_costs_no_hundred_thousand_segments():
-    """The step that a clock allows its solver is that of whole moves: here of 1 s and 59 s, a millisecond between."""
+    """The longest step is that of whole moves, here of 1 s and 59 s, a millisecond apart."""
     points = [cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1, 0, 0), cp.Waypoint(1.001, 1, 0, 0), cp.Waypoint(60, 2, 0, 0)]
-    clock = cp.create_time_scaling_iosystem(cp.PiecewiseSpline(points), 2, limits=U)
-    assert 0.1 <= cp.traits_of(clock).longest <= 1.0
+    scaling = cp.create_time_scaling_iosystem(cp.PiecewiseSpline(points), 2, limits=U)
+    assert 0.1 <= cp.traits_of(scaling).longest <= 1.0
 
 
 # What it is
@@ -569,7 +569,7 @@ SHAPED = cp.Shaper.zv(6.0)(ONE)
     ],
 )
 def test_a_shaped_plan_is_rejected_wherever_it_stands(plan):
-    """A clock that slows stretches the delays between the impulses, which are times of the mode."""
+    """Slowing down stretches the delays between the impulses, which depend on the period of the mode."""
     with pytest.raises(
         ValueError, match=r"plan must not be shaped, got a shaped plan of .* give the plan before it is shaped"
     ):

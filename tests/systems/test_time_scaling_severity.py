@@ -15,7 +15,7 @@ import ctrlplan as cp
 
 
 def severity_of(block, u, t=0.0, slowest=0.1):
-    """From the beginning of the first lag at the zero state, where the rate asked for is 1 - severity (1 - slowest)."""
+    """From the beginning of the first lag at the zero state, where the commanded rate is 1 - severity (1 - slowest)."""
     w = 1.0
     return block.dynamics(t, np.zeros(block.nstates), u)[1] / w / (1 - slowest)
 
@@ -95,10 +95,10 @@ def test_an_input_that_is_no_number(value):
 
 @pytest.mark.parametrize("cause", [{"errors": {"x": (0.1, 0.5)}}, {"limits": {"x": (-2, 2)}}], ids=["errors", "limits"])
 @pytest.mark.parametrize("method", ["auto", "python"])
-def test_a_sensor_that_is_lost_for_a_while_does_not_end_the_run(method, cause):
-    """What is measured is nan from 1 s to 2 s: the clock goes on at rate 1, and the run to its end."""
+def test_a_sensor_that_outputs_nan_for_a_while_does_not_end_the_run(method, cause):
+    """The measurement is nan from 1 s to 2 s: the rate is 1, and the run reaches its end."""
     plan = rest((0, 0), (4, 1), labels=["x"])
-    clock = cp.create_time_scaling_iosystem(plan, 1, suffix="_ref", bandwidth=5.0, **cause)
+    scaling = cp.create_time_scaling_iosystem(plan, 1, suffix="_ref", bandwidth=5.0, **cause)
     sensor = ct.nlsys(
         None,
         lambda t, x, u, params: np.array([np.where((t >= 1.0) * (t < 2.0), np.nan, u[0])]),
@@ -107,7 +107,7 @@ def test_a_sensor_that_is_lost_for_a_while_does_not_end_the_run(method, cause):
         name="sensor",
     )
     cp.declare(sensor, breakpoints=np.array([1.0, 2.0]))
-    loop = ct.interconnect([clock, sensor], inputs=0, outputs=["x_ref", "x_ref_d1", "x"])
+    loop = ct.interconnect([scaling, sensor], inputs=0, outputs=["x_ref", "x_ref_d1", "x"])
     t = np.linspace(0, 6, 61)
     found = cp.simulate(loop, t, method=method)
     assert found.time[-1] == 6.0
@@ -142,7 +142,7 @@ CLOCKS = {
 
 
 def by_hand(name, t):
-    """The same loop from its equations: clock, PID with back calculation, mass."""
+    """The same loop from its equations: time scaling, PID with back calculation, mass."""
     chosen = CLOCKS[name]
     w, horizon = chosen["bandwidth"], 4.0 / chosen["bandwidth"]
     rise = Polynomial([0, 0, 0, 10, -15, 6])
@@ -185,8 +185,8 @@ def saturated():
     found = {"plain": cp.simulate(plain, LOOP_TIMES)}
     for name, chosen in CLOCKS.items():
         for method in METHODS:
-            clock = cp.create_time_scaling_iosystem(PLAN, 0, suffix="_ref", **chosen)
-            found[name, method] = cp.simulate(saturating(clock), LOOP_TIMES, method=method, rtol=1e-9, atol=1e-11)
+            scaling = cp.create_time_scaling_iosystem(PLAN, 0, suffix="_ref", **chosen)
+            found[name, method] = cp.simulate(saturating(scaling), LOOP_TIMES, method=method, rtol=1e-9, atol=1e-11)
     return found
 
 
@@ -205,19 +205,19 @@ def test_a_saturating_loop_against_its_equations_by_hand(saturated, name, method
 
 
 @pytest.mark.parametrize("name", CLOCKS)
-def test_a_slowed_clock_spares_a_saturating_loop_most_of_its_tracking_error(saturated, name):
+def test_a_slowed_time_scaling_spares_a_saturating_loop_most_of_its_tracking_error(saturated, name):
     plain, found = (np.asarray(saturated[key].outputs) for key in ("plain", (name, "compiled")))
-    assert np.abs(plain[2]).max() == pytest.approx(MAXIMUM, abs=1e-9)  # the plan asks for too much
+    assert np.abs(plain[2]).max() == pytest.approx(MAXIMUM, abs=1e-9)  # the plan requires too much force
     assert np.abs(plain[1] - plain[0]).max() > 0.5
     assert np.abs(found[1] - found[0]).max() < 0.2 * np.abs(plain[1] - plain[0]).max()
     assert abs(found[0, -1] - 4.0) <= 1e-3
 
 
 def test_a_free_mass_that_saturates_in_braking_is_spared_error_and_overshoot():
-    """Acceleration of 10/sqrt 3 times 4/2.5^2 = 3.7 m/s^2 at 2.5 N; the clock slows for errors, default bandwidth."""
+    """Acceleration of 10/sqrt 3 times 4/2.5^2 = 3.7 m/s^2 at 2.5 N; slowed down by errors, default bandwidth."""
     free = {"gains": (16.0, 8.0, 8.0, 0.02), "maximum": 2.5, "damping": 0.0}
-    clock = cp.create_time_scaling_iosystem(PLAN, 0, errors={"x": (0.02, 0.2)}, suffix="_ref")
-    sources = (cp.create_source_iosystem(PLAN, suffix="_ref"), clock)
+    scaling = cp.create_time_scaling_iosystem(PLAN, 0, errors={"x": (0.02, 0.2)}, suffix="_ref")
+    sources = (cp.create_source_iosystem(PLAN, suffix="_ref"), scaling)
     plain, found = (np.asarray(cp.simulate(saturating(s, **free), LOOP_TIMES).outputs) for s in sources)
     assert np.abs(found[1] - found[0]).max() < 0.8 * np.abs(plain[1] - plain[0]).max()
     assert found[0].max() - 4.0 < 0.8 * (plain[0].max() - 4.0)

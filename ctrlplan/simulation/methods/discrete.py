@@ -81,18 +81,18 @@ def _sampling_instants(times: Array, dt: float | bool) -> Array:
     steps = (times - times[0]) / period
     if steps[-1] > _MAX_STEPS:
         raise ValueError(f"timepts must span at most {_MAX_STEPS:g} periods of a discrete system, got {steps[-1]:.3g}")
-    wanted = np.round(steps)
-    off = np.abs(steps - wanted)
+    requested = np.round(steps)
+    off = np.abs(steps - requested)
     if off.max() > _OFF_INSTANT + rounding / period:
         at = float(times[off.argmax()])
         raise ValueError(
             f"timepts must be whole periods of {period:g} s apart in a discrete system, got {at:g} s, "
             f"{off.max():.2g} periods off"
         )
-    if np.any(np.diff(wanted) < 1.0):
+    if np.any(np.diff(requested) < 1.0):
         raise ValueError(f"timepts must be at least a period of {period:g} s apart in a discrete system, got less")
-    instants: Array = times[0] + period * np.arange(wanted[-1] + 1.0)
-    instants[wanted.astype(int)] = times
+    instants: Array = times[0] + period * np.arange(requested[-1] + 1.0)
+    instants[requested.astype(int)] = times
     return instants
 
 

@@ -95,8 +95,8 @@ def _warn_of_uncertainty(job: Job, outputs: Array, others: Array, floor: Array) 
         warnings.warn(
             f"outputs {names} of {job.prepared.name} are uncertain by {percent:.3g} % of their size: "
             f"rounding errors in the system's matrices change them by that much over {span:g} s; "
-            "shorten the run, remove modes that are so fast or so unstable, or choose states (a modal or balanced "
-            "realization) in which the matrix is closer to a normal one",
+            "shorten the run, remove very fast or very unstable modes, or choose states (a modal or balanced "
+            "realization) for which the matrix is closer to normal",
             UserWarning,
             stacklevel=outside_stacklevel(),
         )

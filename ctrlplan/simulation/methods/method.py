@@ -91,5 +91,6 @@ def recorded(job: Job, methods: Sequence[Method]) -> Record:
             job = fresh
         reasons.setdefault(method.name, reason)
         why = job.reason or reason
-    requirement = "must be given a system that it applies to"
-    raise NotApplicableError("; ".join(f'method "{name}" {requirement}, but {why}' for name, why in reasons.items()))
+    raise NotApplicableError(
+        "; ".join(f'method "{name}" must apply to the system, but {why}' for name, why in reasons.items())
+    )

@@ -19,7 +19,7 @@ def dc_motor(
     friction: float = 0.1,
     name: str = "dc_motor",
 ) -> FlatSystem:
-    r"""DC motor from armature voltage to angle, a flat system of order 3.
+    r"""DC motor with armature inductance, a flat system of order 3.
 
     .. math:: J \ddot\varphi + b \dot\varphi = K i, \qquad L \dot i + R i + K \dot\varphi = V
 

@@ -14,7 +14,7 @@ from ctrlplan._types import Array
 
 
 def integrator_lag_loop(gain: float, outputs: Sequence[str] = ("y",)) -> ct.InterconnectedSystem:
-    """Linear loop of the paper's section 2: k/(s^2 + s) in unity feedback.
+    """Unity feedback of k/(s^2 + s), the loop of the paper's section 2.
 
     States: those of the plant, ``plant_x[0]`` and ``plant_x[1]``. Inputs: r.
     Outputs: y, or those in `outputs`.

@@ -12,9 +12,10 @@ _UNITS = dict(zip((*POSITIVE, *FRICTIONS), ("kg", "kg", "kg m^2", "m", "m/s^2", 
 
 
 class Crane(CraneParameters, Displayed):
-    """Crane with trolley, drum and load: equations, flat maps and loops.
+    """Crane with trolley, drum and a load on a rope.
 
-    z points down. Equation numbers in the methods refer to the paper.
+    Equations, flat maps, linear models and PIDs are methods. z points down.
+    Equation numbers in the methods refer to the paper.
 
     Parameters
     ----------

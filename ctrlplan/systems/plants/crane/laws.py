@@ -24,7 +24,7 @@ class Law(ABC):
 
     A new law is a frozen dataclass whose fields are its options. It must define
 
-    - `name`, `order`, `continuity`, and `outputs` where they are not the
+    - `name`, `order`, `continuity`, and `outputs` if they are not the
       references of the PIDs,
     - `build`, which returns the block.
 
@@ -107,7 +107,7 @@ class SetpointLaw(Law):
 
 @dataclass(frozen=True)
 class GeneratorLaw(Law):
-    """Reference generator of figure 3; block `create_generator_iosystem`."""
+    """Reference generator, figure 3; block `create_generator_iosystem`."""
 
     name = "generator"
     order = 2
@@ -152,7 +152,7 @@ class LoadFeedbackLaw(Law):
         checked_finite(self.damping, "damping", above=0.0)
 
     def build(self, crane: CraneParameters) -> ct.NonlinearIOSystem:
-        """Block from the jets of order 2 and the load's x to D_ref and R_ref."""
+        """Block from jets of order 2 and x to D_ref and R_ref."""
         return blocks.create_load_feedback_iosystem(crane, self.load_bandwidth, self.damping)
 
 
@@ -185,7 +185,7 @@ class DynamicLaw(Law):
         object.__setattr__(self, "poles", tuple(self.poles))
 
     def build(self, crane: CraneParameters) -> ct.NonlinearIOSystem:
-        """Block from the jets of order 4 and the crane's outputs to F and C."""
+        """Block from jets of order 4 and outputs of the crane to F and C."""
         return blocks.create_dynamic_law_iosystem(crane, self.poles)
 
 

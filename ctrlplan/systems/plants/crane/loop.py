@@ -122,7 +122,9 @@ def crane_loop(
         blocks.append(linear.trolley_pid(crane, bandwidth, tf, limits=force_limits))
         blocks.append(linear.hoist_pid(crane, bandwidth, tf, limits=torque_limits))
     elif force_limits is not None or torque_limits is not None:
-        raise ValueError(f"limits must go with a law that uses the PIDs, got law {chosen.name!r}")
+        raise ValueError(
+            f"force_limits and torque_limits must be given with a law that uses the PIDs, got {chosen.name!r}"
+        )
     blocks.append(model.iosystem(crane, wind=wind is not None or "wind" in inputs))
     _check_fed(reference or (), blocks, inputs)
     outputs = [*model.OUTPUTS, *_ACTUATED, *(label + "_ref" for label in FLAT_LABELS)]

@@ -68,9 +68,9 @@ def accelerations(
 
 
 def energy(crane: CraneParameters, state: ArrayLike) -> Array:
-    """Mechanical energy [J] of states (6, ...), with zero potential at z = 0.
+    """Mechanical energy [J] of states (6, ...).
 
-    The speed of the drum is R'/b, with `rope_wrap` R'/b - theta'.
+    The potential energy is 0 at z = 0. The speed of the drum is R'/b, with `rope_wrap` R'/b - theta'.
     """
     values = np.asarray(state, dtype=float)
     m, trolley, inertia, b, _, _, g = crane.numbers()
@@ -123,7 +123,7 @@ def solved(
 
 
 def load(b: float, state: Quantity) -> tuple[Quantity, Quantity, Quantity, Quantity]:
-    """x, z and their rates of a state, b the radius of the drum."""
+    """x, z and their derivatives for a state, with the drum radius b."""
     d, r, theta, d_rate, r_rate, rate = (state[i] for i in range(6))
     s, c = np.sin(theta), np.cos(theta)
     x, z = r * s + d + b * c, r * c - b * s
