@@ -166,7 +166,7 @@ def test_plan_says_the_path_on_stdout_and_progress_on_stderr(name, study, tmp_pa
     assert main(["plan", str(study), "--out", str(out)]) == 0
     said = capsys.readouterr()
     assert said.out.splitlines() == [str(out)]
-    assert said.err.splitlines() == ["ctrlplan: plans of wall"]
+    assert said.err.splitlines() == ["ctrlplan: writing the plans of wall"]
     assert [p.name for p in out.parent.iterdir() if p != study] == [out.name]
 
 
@@ -198,7 +198,7 @@ def test_report_writes_a_page_and_its_results(reported):
 
 def test_report_says_its_progress_on_stderr(reported):
     _, done = reported
-    assert done.stderr.splitlines() == ["ctrlplan: study wall", "ctrlplan: report"]
+    assert done.stderr.splitlines() == ["ctrlplan: running study wall", "ctrlplan: writing the report"]
 
 
 def test_results_have_the_stable_keys_and_the_numbers_of_compare(reported):
@@ -301,7 +301,7 @@ def test_a_reader_who_has_left_is_no_error(study, tmp_path):
     command = [sys.executable, "-m", "ctrlplan", "plan", str(study), "--out", str(tmp_path / "plan.csv")]
     done = subprocess.run(command, stdout=writing, stderr=subprocess.PIPE, text=True, check=False)
     os.close(writing)
-    assert (done.returncode, done.stderr) == (0, "ctrlplan: plans of wall\n")
+    assert (done.returncode, done.stderr) == (0, "ctrlplan: writing the plans of wall\n")
     assert (tmp_path / "plan.csv").exists()
 
 
@@ -311,7 +311,7 @@ def test_a_terminal_without_room_is_no_error(study, tmp_path):
     with open("/dev/full", "w") as full:
         command = [sys.executable, "-m", "ctrlplan", "plan", str(study), "--out", str(tmp_path / "plan.csv")]
         done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
-    assert (done.returncode, done.stderr) == (0, "ctrlplan: plans of wall\n")
+    assert (done.returncode, done.stderr) == (0, "ctrlplan: writing the plans of wall\n")
 
 
 @pytest.mark.skipif(os.name == "nt", reason="names of files are texts there")
@@ -323,7 +323,7 @@ def test_a_file_name_that_is_no_text_is_a_name(tmp_path, capsys):
         pytest.skip("the file system does not take this name")
     assert main(["plan", str(path), "--out", str(tmp_path / "plan.json")]) == 0
     said = capsys.readouterr().err
-    assert said.splitlines() == [r"ctrlplan: plans of caf\udce9 \x1b[31m"]
+    assert said.splitlines() == [r"ctrlplan: writing the plans of caf\udce9 \x1b[31m"]
     assert main(["plan", f"{path}x", "--out", str(tmp_path / "plan.json")]) == 2
     assert len(capsys.readouterr().err.splitlines()) == 1
 

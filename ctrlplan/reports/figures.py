@@ -183,7 +183,7 @@ def plot_responses(comparison: Comparison, *, ax: AxesLike | None = None) -> Con
 def plot_sweep(
     sweep: Sweep, names: Sequence[str] = ("settling_time", "overshoot_error"), *, ax: AxesLike | None = None
 ) -> ControlPlot:
-    """Metrics over the parameter, lines broken where a settling time jumps.
+    """Metrics versus the parameter, with gaps where a settling time is discontinuous.
 
     Parameters
     ----------
@@ -298,14 +298,14 @@ def plot_plane(
     limit_label: str = "limit",
     ax: AxesLike | None = None,
 ) -> ControlPlot:
-    """Settling time against overshoot on the error, a point for each value.
+    """Settling time versus overshoot on the tracking error, one point per value.
 
     Parameters
     ----------
     sweep : Sweep
         With the metrics "settling_time" and "overshoot_error".
     numbered : mapping of str to mapping of float to (float, float), optional
-        Plan, value of the parameter, place: values that are written beside
+        Plan, value of the parameter, offset: values that are written next to
         their points, so far to the right and up [pt].
     limit : (float, float), optional
         Settling time [s] and overshoot [%] of a point to be marked.
@@ -343,7 +343,7 @@ def plot_plane(
     if numbered:
         add_title(axes, as_text(f"numbers at the circles: {sweep.parameter}"))
     drawing.label_x(f"settling time ±{100.0 * sweep.band:g} % [s]")
-    label_y(axes, "overshoot on the error [%]")
+    label_y(axes, "overshoot on the tracking error [%]")
     axes.set_xlim(left=0.0)
     axes.set_ylim(-4.0, 108.0)
     return drawing.finish()
@@ -353,7 +353,7 @@ _LIMIT_POINT = "#E69F00"
 
 
 def _number_point(axes: Axes, sweep: Sweep, plan: str, value: float, place: Place, colour: str) -> None:
-    """Circle at the point of a value, and the value beside it."""
+    """Circle at the point of a value, with the value as label."""
     at = int(np.argmin(np.abs(sweep.values - value)))
     if not np.isclose(sweep.values[at], value, rtol=1e-9, atol=0.0):
         near = f"{sweep.values[at]:g} is the nearest"
@@ -489,8 +489,8 @@ def _times(plan: Trajectory, start: float | None = None, end: float | None = Non
     first, last = plan.start if start is None else start, plan.end if end is None else end
     margin = 0.06 * (last - first) or 0.5
     t = np.linspace(first - margin, last + margin, 1001)
-    beside = [np.nextafter(plan.breakpoints, side) for side in (-np.inf, np.inf)]
-    return np.unique(np.concatenate([t, plan.breakpoints, *beside]))
+    near = [np.nextafter(plan.breakpoints, side) for side in (-np.inf, np.inf)]
+    return np.unique(np.concatenate([t, plan.breakpoints, *near]))
 
 
 def _broken(t: Array, values: Array, plan: Trajectory) -> Array:
@@ -507,7 +507,7 @@ def _broken(t: Array, values: Array, plan: Trajectory) -> Array:
 
 
 def _with_gaps(x: Array, y: Array) -> tuple[Array, Array]:
-    """Curve with a nan where a settling time jumps."""
+    """Curve with nan where a settling time is discontinuous."""
     where = np.flatnonzero(settling_jumps(x, y)) + 1
     return np.insert(x, where, 0.5 * (x[where - 1] + x[where])), np.insert(y, where, np.nan)
 

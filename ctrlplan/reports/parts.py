@@ -17,12 +17,11 @@ class Picture:
     Attributes
     ----------
     key : str
-        Id of the figure within its study; one that is there already gets a
-        number.
+        Id of the figure within its study; a number is added to a repeated one.
     plot : control.ControlPlot
-        As plotting functions return it.
+        Figure, as returned by the plotting functions.
     caption : str
-        What is seen, in a sentence or two.
+        Caption, one or two sentences.
     """
 
     key: str
@@ -32,16 +31,16 @@ class Picture:
 
 @dataclass(frozen=True)
 class Svg:
-    """A figure that is an SVG element already, with its caption.
+    """A figure as an SVG element, with its caption.
 
     Attributes
     ----------
     key : str
         As of `Picture`.
     svg : Markup
-        The element, which is put into the page as it is.
+        The element.
     caption : str
-        What is seen, in a sentence or two.
+        Caption, one or two sentences.
     """
 
     macro: ClassVar[str] = "picture"
@@ -59,8 +58,8 @@ class Text:
     words : str
         The text.
     hint : bool
-        Whether it says how to read what follows: printed small, and not on
-        paper.
+        Whether it explains how to read what follows: in small type on the
+        screen, omitted in print.
     """
 
     macro: ClassVar[str] = "text"
@@ -91,7 +90,7 @@ class Animation:
     data : Markup
         As `ctrlplan.reports.crane_figures.animation_data` returns it.
     caption : str
-        What is seen.
+        Caption.
     key : str
         As of `Picture`.
     """
@@ -111,9 +110,9 @@ class Head:
     text : str
         The heading.
     words : bool
-        Whether the column has sentences: aligned to the left, and broken.
+        Whether the column contains text: left-aligned, with line breaks.
     unit : bool
-        Whether the column has units: aligned to the left, and grey.
+        Whether the column contains units: left-aligned, grey.
     """
 
     text: str
@@ -128,14 +127,14 @@ class Cell:
     Attributes
     ----------
     text : str
-        What stands in it.
+        Content.
     mark : {"", "better", "worse", "reference"}
-        Whether it is better or worse than the others, or the one that the
-        others are compared with.
+        Whether the value is better or worse than others, or the reference of
+        the comparison.
     meaning : str
-        What the mark means, for readers who do not see it.
+        Meaning of the mark, for screen readers.
     order : str or None
-        Number by which a column that can be sorted is sorted: empty for none,
+        Sort key in a sortable column, as a number: empty for none,
         "1e999" for infinite.
     """
 
@@ -147,7 +146,7 @@ class Cell:
 
 @dataclass(frozen=True)
 class Table:
-    """A table: a heading a column, the first of which names the rows.
+    """A table whose first column names the rows.
 
     Attributes
     ----------
@@ -172,22 +171,22 @@ class Table:
     def __post_init__(self) -> None:
         for place, row in enumerate(self.rows):
             if len(row) != len(self.heads):
-                raise ValueError(f"rows[{place}] must have {len(self.heads)} cells, one a heading, got {len(row)}")
+                raise ValueError(f"rows[{place}] must have {len(self.heads)} cells, one per heading, got {len(row)}")
 
     @property
     def columns(self) -> list[Head]:
-        """Headings, all as such."""
+        """Headings of the columns."""
         return [head if isinstance(head, Head) else Head(head) for head in self.heads]
 
     @property
     def lines(self) -> list[list[Cell]]:
-        """Cells, all as such."""
+        """Rows of cells."""
         return [[cell if isinstance(cell, Cell) else Cell(cell) for cell in row] for row in self.rows]
 
 
 @dataclass(frozen=True)
 class Plan:
-    """Column of a table of metrics: the plan, its colour in the figures, and a sign beside its name."""
+    """Column of a table of metrics: name, colour in the figures, and a sign after the name."""
 
     name: str
     colour: str
@@ -196,7 +195,7 @@ class Plan:
 
 @dataclass(frozen=True)
 class MetricRow:
-    """Row of a table of metrics: a cell a plan."""
+    """Row of a table of metrics: one cell per plan."""
 
     title: str
     unit: str
@@ -205,7 +204,7 @@ class MetricRow:
 
 @dataclass(frozen=True)
 class MetricsTable:
-    """Metrics by plan, sorted by a column where its heading is clicked.
+    """Metrics by plan, sortable by column.
 
     Attributes
     ----------
@@ -228,7 +227,7 @@ Block: TypeAlias = Picture | Svg | Text | Items | Animation | Table | MetricsTab
 
 @dataclass(frozen=True)
 class Part:
-    """What a section becomes on a page.
+    """Contents of a section on the page.
 
     Attributes
     ----------
@@ -237,10 +236,10 @@ class Part:
     heading : str
         Heading above them.
     below : bool
-        Whether it stands below the metrics of the study, not above them.
+        Whether the part is below the metrics of the study instead of above.
     nominal : bool
-        Whether it shows the spread of what the metrics of the study are the
-        nominal values of.
+        Whether the part shows quantiles over draws, for which the metrics of
+        the study are the nominal values.
     """
 
     blocks: Iterable[Block]

@@ -1,4 +1,4 @@
-"""Figures of what was chosen: alpha, durations under limits, plans beside their rivals."""
+"""Figures of planning: choice of alpha, durations within limits, comparison with baselines."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ _LIMIT = "#8a3c00"
 
 
 def plot_alpha_choice(choice: AlphaChoice, *, ax: AxesLike | None = None) -> ControlPlot:
-    """Objective over alpha up to where it blows up, the choice marked.
+    """Objective versus alpha up to the value where it diverges, with the choice marked.
 
     Parameters
     ----------
     choice : AlphaChoice
-        What is drawn.
+        The choice.
     ax : Axes, optional
         Where to draw; None: an empty current figure, or a new one.
 
@@ -62,7 +62,7 @@ def plot_alpha_choice(choice: AlphaChoice, *, ax: AxesLike | None = None) -> Con
         axes.set_yscale("log")
     axes.set_xlim(0.0, 2.0 * np.pi)
     if choice.blow_up < 2.0 * np.pi:
-        axes.axvspan(choice.blow_up, 2.0 * np.pi, color=shade(0.133), label="blows up")
+        axes.axvspan(choice.blow_up, 2.0 * np.pi, color=shade(0.133), label="diverges")
     drawing.label_x("alpha [rad] (0: polynomial)")
     label_y(axes, as_text(choice.objective.replace("_", " ")))
     return drawing.finish()
@@ -71,12 +71,12 @@ def plot_alpha_choice(choice: AlphaChoice, *, ax: AxesLike | None = None) -> Con
 def plot_limits(
     plan: Trajectory, limited: Limited, units: Mapping[str, str] | None = None, *, ax: AxesLike | None = None
 ) -> ControlPlot:
-    """Every limited signal of a plan over time, with its limits and where it comes nearest to them.
+    """Limited signals of a plan versus time, with their limits and the points of minimum margin.
 
     Parameters
     ----------
     plan : Trajectory
-        What is drawn, from its start to its end.
+        The plan, drawn from its start to its end.
     limited : Limited
         Its limits.
     units : mapping of str to str, optional
@@ -102,7 +102,7 @@ def plot_limits(
         axes.plot(margin.time, margin.value, "o", color=_LIMIT, markersize=marker_size(5))
         span = float(np.ptp(row)) or abs(float(row[0])) or 1.0
         for side in (bound.low, bound.high):
-            # A limit far away would flatten the curve: it is named in the title instead.
+            # A distant limit would flatten the curve; the title gives its value.
             if np.isfinite(side) and min(abs(side - row.min()), abs(side - row.max())) < 1.5 * span:
                 axes.axhline(side, color=_LIMIT, linestyle=(0, (4, 2)), linewidth=line_width(0.65))
         label_y(axes, with_unit(bound.name, (units or {}).get(bound.name)))
@@ -114,7 +114,7 @@ def plot_limits(
 def plot_baselines(
     comparison: Comparison, *, known: Mapping[str, Style] | None = None, ax: AxesLike | None = None
 ) -> ControlPlot:
-    """References above the responses of the loop to them, an axis a column, and the controls below.
+    """References, responses of the loop and controls, with one column per axis.
 
     Parameters
     ----------
@@ -162,7 +162,7 @@ def plot_baselines(
 
 
 def _clip(axes: Axes, comparison: Comparison, control: str) -> None:
-    """Leave out the control of a step where it is far beyond the others: they would be flat lines."""
+    """Clip the control of a step if it is much larger than the others."""
     peaks = {
         name: float(np.abs(np.asarray(response.outputs)[list(response.output_labels).index(control)]).max())
         for name, response in comparison.responses.items()
@@ -175,4 +175,4 @@ def _clip(axes: Axes, comparison: Comparison, control: str) -> None:
     others = max(peaks.values(), default=0.0)
     if others and step > 4.0 * others:
         axes.set_ylim(-1.3 * others, 1.3 * others)
-        add_title(axes, as_text(f"the {highest} asks for {step:.3g}"))
+        add_title(axes, as_text(f"{highest}: peak {step:.3g}, clipped"))

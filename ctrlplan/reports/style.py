@@ -1,9 +1,9 @@
-"""How figures look: colours that a colour-blind reader tells apart, and line styles besides.
+"""Style of figures: colours for colour-blind readers, and line styles in addition.
 
-Every figure obeys the user's rcParams and is known to pyplot, as those of
-python-control are. Figures of a page are drawn inside `page_style` instead:
-with settings of their own, so that the same results give the same page, and
-unknown to pyplot, which would keep them.
+Figures use the rcParams of the user and are registered with pyplot, like those
+of python-control. Figures of a page are drawn inside `page_style`: with fixed
+settings, so that equal results give equal pages, and not registered with
+pyplot.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Linear loops that differ in numbers alone, solved together."""
+"""Linear loops of the same structure, solved together."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from ctrlplan.trajectories import Trajectory
 
 @dataclass(frozen=True, eq=False)
 class Linear:
-    """A linear loop as it was when it was built: a builder may change it for the next value.
+    """Matrices of a linear loop, copied: a builder may modify the loop for the next value.
 
     Attributes
     ----------
@@ -38,7 +38,7 @@ class Linear:
     starts: dict[str, Array]
 
     def fits(self, other: Linear) -> bool:
-        """Whether two loops differ in numbers alone."""
+        """Whether two loops have the same structure."""
         same = (getattr(self.form, name).shape == getattr(other.form, name).shape for name in "abcd")
         return self.labels == other.labels and all(same)
 
@@ -52,7 +52,7 @@ def numbers_of(
     controls: Sequence[str] | None = None,
     initial_state: ArrayLike | None = None,
 ) -> Linear | None:
-    """Numbers of a linear loop; None where it must be run by itself.
+    """Matrices of a linear loop; None if it must be run separately.
 
     Parameters
     ----------
@@ -79,12 +79,12 @@ def numbers_of(
             starts = dict.fromkeys(held, state)
         else:
             starts = {name: equilibrium_state(system, position) for name, position in held.items()}
-    except (AttributeError, TypeError, ValueError):  # what is wrong is said where the loop is run by itself
+    except (AttributeError, TypeError, ValueError):  # reported when the loop is run separately
         return None
     if initial_state is None and not _at_rest(form, starts, held):
-        return None  # which is to be said of the loop concerned
+        return None  # reported when the loop is run separately
     if any(form.sensitivity(duration)):
-        return None  # `simulate` says which digits are lost
+        return None  # `simulate` warns about the loss of digits
     return Linear(tuple(system.output_labels), tracked, acting, form, starts)
 
 
@@ -101,7 +101,7 @@ def _at_rest(form: LinearForm, starts: Mapping[str, Array], held: Mapping[str, A
 def outputs_together(
     loops: Sequence[Linear], names: Sequence[str], plans: Mapping[str, Trajectory], times: Array
 ) -> tuple[dict[str, Array], NDArray[np.bool_]]:
-    """Outputs of loops that fit each other, and whether each is unstable.
+    """Outputs of loops of the same structure, and whether each is unstable.
 
     Parameters
     ----------
@@ -135,6 +135,6 @@ def _outputs(form: LinearForm, rows: list[int], plan: Trajectory, times: Array, 
         for k, row in enumerate(rows):
             if form.d[:, row].any():
                 out[:, k] += form.d[:, row] @ plan.jet(times, 0)[0]
-    if not np.isfinite(out[..., -1]).all():  # what has left the range of numbers does not come back
+    if not np.isfinite(out[..., -1]).all():  # after an overflow
         out[np.isnan(out)] = np.inf
     return out

@@ -35,7 +35,7 @@ PLANNED = "trigonometric"
 
 OWN_LIMITS = (
     "The limits are not those of a plant: they are the peak velocity, acceleration and jerk of the polynomial through "
-    "these waypoints, which therefore needs exactly the time of the waypoints. Other limits give other durations."
+    "these waypoints, whose minimum duration is therefore that of the waypoints. Other limits give other durations."
 )
 """What must be said where limits are the polynomial's own peaks."""
 

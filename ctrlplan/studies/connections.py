@@ -1,4 +1,4 @@
-"""Whether a reference reaches the outputs that should follow it."""
+"""Check that references are connected to the outputs that follow them."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from ctrlplan.simulation import prepared_form
 from ctrlplan.simulation.network import Block, Network
 from ctrlplan.trajectories import Trajectory
 
-_LOOKS = np.array([0.0, 0.0312, 0.1234, 0.25, 0.3456, 0.5, 0.6543, 0.75, 0.8765, 1.0])
-"""Where two plans are compared, as fractions of the duration of one."""
+_FRACTIONS = np.array([0.0, 0.0312, 0.1234, 0.25, 0.3456, 0.5, 0.6543, 0.75, 0.8765, 1.0])
+"""Times at which two plans are compared, as fractions of the duration."""
 
 
 def check_reached(system: System, outputs: Sequence[str], plan: Trajectory | None = None) -> None:
-    """Reject a loop in which a reference reaches nothing.
+    """Raise if a reference has no effect on the outputs that follow it.
 
-    What depends on what is read off the wiring and the matrices of linear
-    blocks; a block that is not linear passes on every input.
+    Dependence is determined from the connections and from the matrices of
+    linear blocks; every output of a nonlinear block depends on every input.
 
     Parameters
     ----------
@@ -30,14 +30,14 @@ def check_reached(system: System, outputs: Sequence[str], plan: Trajectory | Non
     outputs : sequence of str
         Outputs that follow the plan.
     plan : Trajectory, optional
-        The reference, where a block inside the loop may be its source.
+        The reference, if a block inside the loop may be its source.
 
     Raises
     ------
     ValueError
-        If an input of the loop, or an axis of the plan inside, reaches none of
-        `outputs`, another source inside reaches no output at all, or an input
-        for a derivative of a source is connected to nothing.
+        If an input of the loop, or an axis of a plan inside, affects none of
+        `outputs`, another source inside affects no output at all, or an input
+        for a derivative of a source is not connected.
     """
     network = prepared_form(system).network
     if network is None or not network.blocks:
@@ -47,7 +47,7 @@ def check_reached(system: System, outputs: Sequence[str], plan: Trajectory | Non
     seen = _reaching(network, np.any(network.read != 0.0, axis=0))
     idle = [label for label, reaches in zip(system.input_labels or (), followed, strict=False) if not reaches]
     if idle:
-        raise _unconnected(system, network, f"input {', '.join(idle)} that reaches none of {', '.join(outputs)}")
+        raise _unconnected(system, network, f"input {', '.join(idle)} that affects none of {', '.join(outputs)}")
     carried = np.zeros(0 if plan is None else plan.naxes, dtype=bool)
     used, sources = carried.copy(), []
     for block, place in zip(network.blocks, network.outputs, strict=True):
@@ -64,38 +64,38 @@ def check_reached(system: System, outputs: Sequence[str], plan: Trajectory | Non
                 sources.append(block.name)
             elif not seen[signals].any():
                 names = ", ".join(block.system.output_labels[axis * width : (axis + 1) * width])
-                raise _unconnected(system, network, f"{names} of block {block.name} that reach no output")
+                raise _unconnected(system, network, f"{names} of block {block.name} that affect no output")
     _check_derivatives(system, network)
     if plan is not None and np.any(carried & ~used):
         axes = ", ".join(np.array(plan.labels)[carried & ~used])
-        what = f"{axes} of block {', '.join(dict.fromkeys(sources))} that reaches none of {', '.join(outputs)}"
+        what = f"{axes} of block {', '.join(dict.fromkeys(sources))} that affects none of {', '.join(outputs)}"
         raise _unconnected(system, network, what)
 
 
 def _check_derivatives(system: System, network: Network) -> None:
-    """Reject an input for a derivative of a reference that no source outputs: it would be 0."""
+    """Raise if an input for a derivative of a reference is not connected: it would be 0."""
     known = {
         _plain(label) for block in network.blocks if block.plan is not None for label in block.system.output_labels
     }
     for block, label in _open_inputs(network):
         if _plain(label) in known:
-            what = f"{block}.{label}, to which nothing is connected: give the source more derivatives"
+            what = f"{block}.{label} unconnected; give the source more derivatives"
             raise ValueError(f"references must be connected in the loop {system.name}, got {what}")
 
 
 def _plain(label: str) -> str:
-    """Label of a signal without that of its derivative."""
+    """Label of a signal without the suffix of a derivative."""
     return re.sub(r"_d[0-9]+$", "", label)
 
 
 def _unconnected(system: System, network: Network, what: str) -> ValueError:
     left = [f"{block}.{label}" for block, label in _open_inputs(network)]
-    to_do = f"; inputs of blocks that nothing is connected to: {', '.join(left)}" if left else ""
+    to_do = f"; unconnected inputs of blocks: {', '.join(left)}" if left else ""
     return ValueError(f"references must be connected in the loop {system.name}, got {what}{to_do}")
 
 
 def _open_inputs(network: Network) -> Iterator[tuple[str, str]]:
-    """Inputs of blocks (block, label) that are connected to no signal, and so 0."""
+    """Unconnected inputs of blocks (block, label), which are 0."""
     for block, place in zip(network.blocks, network.inputs, strict=True):
         for label, row in zip(block.system.input_labels or (), network.wire[place], strict=True):
             if not row.any():
@@ -103,26 +103,26 @@ def _open_inputs(network: Network) -> Iterator[tuple[str, str]]:
 
 
 def _reaching(network: Network, wanted: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Which signals some others depend on, in time."""
+    """Signals on which others depend, directly or through states."""
     found = wanted.copy()
     depends = [_depends(block) for block in network.blocks]
     while True:
         before = np.count_nonzero(found)
         for block, outs, ins in zip(depends, network.outputs, network.inputs, strict=True):
-            needed = block[found[outs]].any(axis=0)
-            found |= np.any(network.wire[ins][needed] != 0.0, axis=0)
+            required = block[found[outs]].any(axis=0)
+            found |= np.any(network.wire[ins][required] != 0.0, axis=0)
         if np.count_nonzero(found) == before:
             return found
 
 
 def _depends(block: Block) -> NDArray[np.bool_]:
-    """Which outputs of a block depend on which inputs, directly or through states, (noutputs, ninputs)."""
+    """Dependence of outputs on inputs of a block, directly or through states, (noutputs, ninputs)."""
     if block.delay is not None:  # signal by signal
         return np.eye(block.system.noutputs, dtype=bool)
     if not block.linear:
         return np.ones((block.system.noutputs, block.system.ninputs or 0), dtype=bool)
     a, b, c, d = (np.asarray(getattr(block.system, name)) != 0.0 for name in "ABCD")
-    if not len(a) and not d.any():  # a gain that is 0 now, and connected
+    if not len(a) and not d.any():  # a connected gain that is 0
         return np.ones(d.shape, dtype=bool)
     moved = b
     for _ in range(len(a)):
@@ -131,10 +131,10 @@ def _depends(block: Block) -> NDArray[np.bool_]:
 
 
 def _same_axes(plan: Trajectory, source: Trajectory, axis: int) -> NDArray[np.bool_]:
-    """Which axes of a plan an axis of a source is."""
+    """Axes of a plan that are equal to an axis of a source."""
     if source is plan:
         return np.arange(plan.naxes) == axis
-    t = plan.start + _LOOKS * (plan.duration or 1.0)
+    t = plan.start + _FRACTIONS * (plan.duration or 1.0)
     mine, other = plan.jet(t, 0)[0], source.jet(t, 0)[0, axis]
     size = np.abs(mine).max(axis=1)
     return np.asarray(np.all(np.abs(mine - other) <= 1e-12 * size[:, None], axis=1) & (np.ptp(mine, axis=1) > 0.0))

@@ -54,6 +54,7 @@ from ctrlplan.studies.sections import (
     Section,
 )
 from ctrlplan.studies.study import Study
+from ctrlplan.studies.units import scientific
 from ctrlplan.systems.plants import LAWS, crane_loop
 from ctrlplan.systems.plants.crane.laws import Law, LawName, as_law
 from ctrlplan.trajectories import PiecewiseSpline, PolySpline, Step, Trajectory, TrigSpline, Waypoint
@@ -106,9 +107,9 @@ def crane_nominal_study(progress: bool = True) -> Study:
             f"pole pair is at {grows.real:+.5f} ± {abs(grows.imag):.3f}j 1/s: with the PID controllers of this study "
             "the sway is not damped but grows slowly, because of the integral action. Feedback of the load position "
             f"x moves the slowest pole to {damped.real:.2f} 1/s, and the sway is damped. The figure shows both cases.",
-            f"The complete control law (9)-(11), with dynamic extension, follows a plan with ten constraints per axis "
-            f"with a peak tracking error of {whole['error_travel']:.1g} m on the nominal model. Its feedforward part "
-            "alone does the same, but cannot correct deviations from the nominal model.",
+            "The complete control law (9)-(11), with dynamic extension, follows a plan with ten constraints per axis "
+            f"with a peak tracking error of {scientific(whole['error_travel'], 1)} m on the nominal model. Its "
+            "feedforward part alone does the same, but cannot correct deviations from the nominal model.",
             *fastest_notes(limited),
         ),
         sections=_nominal_sections(points, limited),
@@ -184,7 +185,7 @@ def crane_obstacle_study(progress: bool = True) -> Study:
         "polynomial": (PolySpline(points), {}),
         "trigonometric": (TrigSpline(points, alpha=4.0), {}),
         "piecewise": (PiecewiseSpline(points), {}),
-        "via points chosen": (_avoiding(PolySpline([points[0], points[-1]])), {}),
+        "optimized via points": (_avoiding(PolySpline([points[0], points[-1]])), {}),
     }
     found = _compared(plans, points, 30.0, "Crane, obstacle (simulation 3)")
     rows = found.metrics
@@ -214,8 +215,8 @@ def crane_obstacle_study(progress: bool = True) -> Study:
             f"tracking error is {1e3 * rows['piecewise']['error_travel']:.2g} mm.",
             f"The paper prescribes A and B. If they are optimized instead, for a load of {LOAD_RADIUS:g} m radius, its "
             f"rope, and a clearance of {MARGIN:g} m, the via points are "
-            f"{_via_points(found.plans['via points chosen'])}, and the path length is "
-            f"{rows['via points chosen']['path_length']:.2f} m. {clearance_note(found.plans)}",
+            f"{_via_points(found.plans['optimized via points'])}, and the path length is "
+            f"{rows['optimized via points']['path_length']:.2f} m. {clearance_note(found.plans)}",
             _step_note(found),
             _limits_note(found),
         ),

@@ -1,4 +1,4 @@
-"""What of many draws is kept: metrics, quantiles of signals, and failures."""
+"""Results of many draws: metrics, quantiles of signals, failures."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from ctrlplan.studies.ensemble import LEVELS, Failure
 from ctrlplan.studies.executing import Failed
 
 _SAMPLES = 1001
-"""Times at which bands are kept, at most."""
+"""Maximum number of times of the bands."""
 
 Outcome: TypeAlias = dict[str, tuple[dict[str, float], dict[str, Array]] | Failed]
-"""By plan: metrics, and signals at the times of the bands; or what went wrong."""
+"""By plan: metrics, and signals at the times of the bands; or the failure."""
 
 
 class DrawResults:
-    """What of all draws is kept.
+    """Results of all draws.
 
     Parameters
     ----------
@@ -29,7 +29,7 @@ class DrawResults:
     times : ndarray, shape (ntime,)
         Sample times [s].
     mixed : collection of str
-        Metrics of signals that differ in unit, of which there is no worst.
+        Metrics over signals in different units, which have no common maximum.
     """
 
     def __init__(self, count: int, times: Array, mixed: Collection[str]) -> None:
@@ -42,14 +42,14 @@ class DrawResults:
         self._count = count
 
     def add(self, k: int, params: dict[str, float], outcome: Outcome | Failed) -> None:
-        """One draw, or what went wrong with it."""
+        """Add the outcome of one draw."""
         self.finished += 1
         if isinstance(outcome, Failed):
             self.failures.append(Failure(k, params, outcome.message))
             return
-        wrong = [found.message for found in outcome.values() if isinstance(found, Failed)]
-        if len(wrong) == len(outcome) and len(set(wrong)) == 1:
-            self.failures.append(Failure(k, params, wrong[0]))
+        messages = [found.message for found in outcome.values() if isinstance(found, Failed)]
+        if len(messages) == len(outcome) and len(set(messages)) == 1:
+            self.failures.append(Failure(k, params, messages[0]))
             return
         for plan, found in outcome.items():
             if isinstance(found, Failed):
@@ -66,12 +66,12 @@ class DrawResults:
                 known[name][k, : curve.size] = curve
 
     def bands(self) -> dict[str, dict[str, Array]]:
-        """Quantiles over the draws that were run."""
+        """Quantiles over the draws that ran."""
         return {plan: {name: _quantiles(rows) for name, rows in found.items()} for plan, found in self._signals.items()}
 
 
 def _quantiles(rows: Array) -> Array:
-    """Quantiles (nlevels, ntime) over rows, of which those that an event ended are nan from there on."""
+    """Quantiles (nlevels, ntime) over rows, which are nan after an event that ended the run."""
     out = np.full((len(LEVELS), rows.shape[1]), np.nan)
     known = ~np.isnan(rows)
     for full in (True, False):
@@ -83,5 +83,5 @@ def _quantiles(rows: Array) -> Array:
 
 
 def band_samples(times: Array) -> NDArray[np.intp]:
-    """Samples at which bands are kept."""
+    """Indices of the samples of the bands."""
     return np.unique(np.linspace(0, times.size - 1, min(times.size, _SAMPLES)).round().astype(np.intp))

@@ -30,10 +30,10 @@ def draws(count: int, seed: int = 0, **distributions: Distribution) -> dict[str,
     count : int
         Number of draws.
     seed : int, optional
-        Of the generator; each parameter has a stream of its own, so that
-        another parameter changes none of the others.
+        Seed of the generator. Each parameter has a separate random stream, so
+        that adding a parameter does not change the others.
     **distributions
-        By the parameter's name: (low, high) of a uniform distribution, or a
+        By name of the parameter: (low, high) of a uniform distribution, or a
         frozen distribution of `scipy.stats`.
 
     Returns
@@ -46,7 +46,7 @@ def draws(count: int, seed: int = 0, **distributions: Distribution) -> dict[str,
     ValueError
         If `count` is not above 0, or low is above high.
     TypeError
-        If something is no distribution.
+        If a distribution is of another type.
 
     Examples
     --------
@@ -64,7 +64,7 @@ def draws(count: int, seed: int = 0, **distributions: Distribution) -> dict[str,
         elif np.shape(distribution) == (2,):
             low, high = (float(end) for end in distribution)
             if not -np.inf < low <= high < np.inf:
-                raise ValueError(f"{name} must be drawn from low to high, both finite, got {low} and {high}")
+                raise ValueError(f"{name} must have finite limits low <= high, got {low} and {high}")
             values = rng.uniform(low, high, count)
         else:
             raise TypeError(f"{name} must be (low, high) or a distribution of scipy.stats, got {distribution!r}")

@@ -1,4 +1,4 @@
-"""Where many runs are made, here or on an executor: one bar, one interruption, one account of what is lost."""
+"""Execution of many runs, in this process or on an executor: progress, interruption, failures."""
 
 from __future__ import annotations
 
@@ -28,107 +28,107 @@ R = TypeVar("R")
 R_co = TypeVar("R_co", covariant=True)
 
 _POLL = 0.02
-"""Time between two looks at futures without callbacks [s]."""
+"""Polling interval of futures without callbacks [s]."""
 
-_POLL_BESIDE_CALLBACKS = 0.5
-"""The same where callbacks tell of what is done: they may be lost with a connection."""
+_POLL_WITH_CALLBACKS = 0.5
+"""Polling interval of futures with callbacks [s]; a callback may not arrive if a connection fails."""
 
 _CACHED = 2
-"""Shared values that a thread keeps."""
+"""Number of shared values that a thread caches."""
 
 
 class Future(Protocol[R_co]):
-    """Result of a call that is not there yet; what else a future has is used where it is found."""
+    """Pending result of a call; further methods of a future are used if present."""
 
     def result(self) -> R_co:
-        """Result of the call, or what it raised."""
+        """Return the result of the call, or raise its exception."""
 
 
 class Executor(Protocol):
-    """Where tasks run: `concurrent.futures.Executor` and whatever submits as it does."""
+    """Object that runs tasks, such as `concurrent.futures.Executor`."""
 
     def submit(self, function: Callable[[T], R], argument: T, /) -> Future[R]:
-        """Future of a call."""
+        """Submit a call and return its future."""
 
 
 @dataclass(frozen=True)
 class Failed:
-    """Why a task has no result.
+    """Failure of a task.
 
     Attributes
     ----------
     message : str
-        What was raised, with its type.
+        Message of the exception, with its type.
     error : Exception
-        What to raise where nothing else was found. It comes from another
-        process as a RuntimeError where it cannot be pickled.
-    lost : bool
-        Whether the executor raised it: the task may not have run at all.
+        The exception. From another process, a RuntimeError in place of one
+        that cannot be pickled.
+    by_executor : bool
+        Whether the executor raised it; the task may not have run at all.
     """
 
     message: str
     error: Exception
-    lost: bool = False
+    by_executor: bool = False
 
     @classmethod
-    def of(cls, error: BaseException, lost: bool = False) -> Failed:
-        """What was raised; SystemExit, which would end the caller, as a RuntimeError."""
+    def of(cls, error: BaseException, by_executor: bool = False) -> Failed:
+        """Failure with an exception; SystemExit becomes a RuntimeError."""
         message = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
-        return cls(message, error if isinstance(error, Exception) else RuntimeError(message), lost)
+        return cls(message, error if isinstance(error, Exception) else RuntimeError(message), by_executor)
 
     def __reduce__(self) -> tuple[object, ...]:
-        """Without an error that cannot be sent: it would bring down a whole pool."""
+        """Pickle without an exception that cannot be pickled, which would break a whole pool."""
         error = self.error
         try:
-            sound = type(pickle.loads(pickle.dumps(error))) is type(error)  # noqa: S301 (made a moment ago)
-        except Exception:  # whatever an exception's own constructor makes of it
-            sound = False
-        return Failed, (self.message, error if sound else RuntimeError(self.message), self.lost)
+            picklable = type(pickle.loads(pickle.dumps(error))) is type(error)  # noqa: S301 (pickled here)
+        except Exception:  # of the constructor of an exception
+            picklable = False
+        return Failed, (self.message, error if picklable else RuntimeError(self.message), self.by_executor)
 
 
 @dataclass
 class Account(Generic[R]):
-    """Results found, and what went wrong, by the number of the task.
+    """Results and failures by the number of the task.
 
     Attributes
     ----------
     found : dict of int to result or Failed
         In the order of completion.
     interrupted : bool
-        Whether Ctrl-C ended it; tasks that were not reached are then missing.
+        Whether Ctrl-C ended the execution; tasks that did not run are missing.
     """
 
     found: dict[int, R | Failed] = field(default_factory=dict)
     interrupted: bool = False
 
     def in_order(self) -> dict[int, R | Failed]:
-        """What was found, in the order of the tasks."""
+        """Results and failures, in the order of the tasks."""
         return dict(sorted(self.found.items()))
 
-    def raise_if_all_lost(self, what: str) -> None:
-        """Raise what the executor says, where it has run nothing.
+    def raise_if_none_ran(self, what: str) -> None:
+        """Raise the exception of the executor if it ran no task.
 
         Parameters
         ----------
         what : str
-            What was sent to it, for the message.
+            What was sent to the executor, for the message.
 
         Raises
         ------
         ValueError
-            If that cannot be sent to other processes.
+            If it cannot be sent to other processes.
         Exception
-            What else the executor raised.
+            Any other exception of the executor.
         """
-        lost = [found.error for found in self.found.values() if isinstance(found, Failed) and found.lost]
-        if self.interrupted or not lost or len(lost) < len(self.found):
+        errors = [found.error for found in self.found.values() if isinstance(found, Failed) and found.by_executor]
+        if self.interrupted or not errors or len(errors) < len(self.found):
             return
-        if isinstance(lost[0], pickle.PicklingError | TypeError | AttributeError):
+        if isinstance(errors[0], pickle.PicklingError | TypeError | AttributeError):
             raise ValueError(
-                f"{what} must go to other processes, but {lost[0]}; give a function that builds it at the top level "
-                "of a module, or an executor that sends any function (dask, loky) or needs none sent (threads)"
-            ) from lost[0]
-        raise lost[0]
+                f"{what} must be picklable for other processes, got {errors[0]}; give a function that builds it at "
+                "the top level of a module, or an executor that pickles any function (dask, loky) or uses threads"
+            ) from errors[0]
+        raise errors[0]
 
 
 def checked_executor(executor: Executor | None) -> Executor | None:
@@ -144,7 +144,7 @@ def checked_executor(executor: Executor | None) -> Executor | None:
     kind = f"{type(executor).__module__}.{type(executor).__qualname__}"
     if hasattr(executor, "apply_async"):
         raise TypeError(
-            f"executor must have submit, got {kind}, which never tells of a worker that dies; "
+            f"executor must have submit, got {kind}, which does not report a worker that dies; "
             "use concurrent.futures.ProcessPoolExecutor or ThreadPoolExecutor"
         )
     given = f"the class {executor.__qualname__} itself" if isinstance(executor, type) else f"{executor!r:.80}"
@@ -167,15 +167,15 @@ def checked_timeout(timeout: object) -> float | None:
 
 
 def tried(run: Callable[[T], R], task: T, timeout: float | None = None) -> R | Failed:
-    """Result of a task, or what went wrong; Ctrl-C alone is raised."""
+    """Result of a task, or its failure; only KeyboardInterrupt is raised."""
     _raise_if_pressed()
     outcome: R | Failed
     try:
         with time_limit(timeout):
             outcome = run(task)
-    except (Exception, SystemExit) as error:  # whatever a user's function does
+    except (Exception, SystemExit) as error:  # of a user's function
         outcome = Failed.of(error)
-    _raise_if_pressed()  # a solver or a block may have taken Ctrl-C for an error of its own, and gone on without
+    _raise_if_pressed()  # a solver or a block may have caught the KeyboardInterrupt
     return outcome
 
 
@@ -187,14 +187,14 @@ def gathered(
     Parameters
     ----------
     outcomes : generator of (int, result or Failed)
-        Number and outcome of each task; it makes the runs. Interrupted, it may
-        yield what is ready.
+        Runs the tasks, and yields the number and outcome of each. After an
+        interruption it may yield further finished outcomes.
     count : int
-        How many there are.
+        Number of tasks.
     label : str
-        What the bar is called.
+        Label of the progress bar.
     progress : bool
-        Whether a bar is shown on stderr.
+        Whether a progress bar is shown on stderr.
     """
     account: Account[R] = Account()
     with _counting_interruptions() as pressed, _bar(count, label, progress) as advance:
@@ -211,7 +211,7 @@ def gathered(
 
 
 def _ready(outcomes: Generator[tuple[int, R], None, None]) -> Iterator[tuple[int, R]]:
-    """What a generator yields when it is interrupted; nothing if that is what ended it."""
+    """Outcomes that a generator yields after an interruption."""
     try:
         yield outcomes.throw(KeyboardInterrupt)
         yield from outcomes
@@ -234,23 +234,23 @@ def executed(
     run : callable
         Maps a task to its result.
     tasks : sequence
-        What it is called with.
+        Arguments of `run`.
     executor : object with ``submit``, or None
-        Where it runs; None is this process.
+        Where the tasks run; None for this process.
     timeout : float or None
         Time limit of a run [s].
     label : str
-        What the bar is called.
+        Label of the progress bar.
     progress : bool
-        Whether a bar is shown on stderr.
+        Whether a progress bar is shown on stderr.
 
     Notes
     -----
     Futures are taken as they complete where they have ``add_done_callback`` or
     ``done``, and in the order of submission where they have ``result`` alone.
-    What an executor loses is not run again. On Ctrl-C, and whenever this
-    function raises, tasks that have not begun are cancelled; the others are
-    finished by the executor.
+    Tasks that an executor does not finish are not run again. On Ctrl-C, and
+    whenever this function raises, tasks that have not begun are cancelled; the
+    executor finishes the others.
     """
     if executor is None:
         here = ((k, tried(run, task, timeout)) for k, task in enumerate(tasks))
@@ -275,37 +275,37 @@ def executed(
             account.found |= _results({k: future for k, future in done.items() if k not in account.found})
     finally:
         _cancel(futures)
-        futures.clear()  # an executor keeps what somebody may still ask for
+        futures.clear()  # an executor keeps results that are still referenced
     return account
 
 
 class Shared(Generic[T]):
-    """Value that many tasks need, made once in each thread that runs some of them.
+    """Value shared by many tasks, unpickled once per thread.
 
     Parameters
     ----------
     value : object
-        Pickled once, if it can be; by the executor for each task otherwise.
+        Pickled once if possible; otherwise by the executor for each task.
     """
 
     def __init__(self, value: T) -> None:
         self._value, self._key = value, uuid4().hex
         try:
             data = pickle.dumps(value)
-        except Exception:  # whatever pickle meets in a user's object: the executor may know better
+        except Exception:  # of a user's object; the executor may be able to pickle it
             data = b""
-        # What stands in __main__ goes by its name in pickle, which another process may not know.
+        # pickle refers to objects of __main__ by name, which another process may not have.
         self._data = b"" if b"__main__" in data else data
 
     def __reduce__(self) -> tuple[object, ...]:
         return _received, (self._key, self._data, None if self._data else self._value)
 
     def made(self, make: Callable[[T], R]) -> R:
-        """What is made of the value, in this thread: kept, so that no two threads share it."""
+        """Result of `make` for the value, cached per thread."""
         return _cache().get(self._key, lambda: make(self._own()))
 
     def _own(self) -> T:
-        return pickle.loads(self._data) if self._data else self._value  # noqa: S301 (its own)
+        return pickle.loads(self._data) if self._data else self._value  # noqa: S301 (pickled here)
 
 
 def _received(key: str, data: bytes, value: T) -> Shared[T]:
@@ -318,7 +318,7 @@ _HERE = threading.local()
 
 
 def _cache() -> Lru[str, Any]:
-    """What this thread has made of shared values."""
+    """Cache of this thread."""
     if not hasattr(_HERE, "cache"):
         _HERE.cache = Lru(_CACHED)
     cache: Lru[str, Any] = _HERE.cache
@@ -326,14 +326,14 @@ def _cache() -> Lru[str, Any]:
 
 
 _PRESSED: ContextVar[Sequence[int]] = ContextVar("pressed", default=())
-"""Signals of Ctrl-C since runs are made."""
+"""Signals of Ctrl-C since the runs began."""
 
 
 @contextmanager
 def _counting_interruptions() -> Iterator[Sequence[int]]:
-    """Context in which Ctrl-C is remembered: KeyboardInterrupt is lost where it is raised in a callback.
+    """Context that records Ctrl-C, since a KeyboardInterrupt raised in a callback may be swallowed.
 
-    As `asyncio.run` does, in the main thread and where nobody else handles it.
+    Like `asyncio.run`: in the main thread only, and only with the default handler.
     """
     pressed: list[int] = []
     here = threading.current_thread() is threading.main_thread()
@@ -341,12 +341,12 @@ def _counting_interruptions() -> Iterator[Sequence[int]]:
         yield pressed
         return
 
-    def remember(number: int, frame: FrameType | None) -> None:
+    def record(number: int, frame: FrameType | None) -> None:
         pressed.append(number)
         signal.default_int_handler(number, frame)
 
     token = _PRESSED.set(pressed)
-    signal.signal(signal.SIGINT, remember)
+    signal.signal(signal.SIGINT, record)
     try:
         yield pressed
     finally:
@@ -371,30 +371,30 @@ def _bar(count: int, label: str, progress: bool) -> Iterator[Callable[[], object
 def _submit(
     run: Callable[[T], R], tasks: Sequence[T], executor: Executor, futures: dict[int, Future[R]]
 ) -> dict[int, Failed]:
-    """Hand out all tasks; those that the executor does not take, and why."""
+    """Submit all tasks; return those that the executor rejects, with the reason."""
     for k, task in enumerate(tasks):
         try:
             futures[k] = executor.submit(run, task)
-        except (Exception, SystemExit) as error:  # whatever an executor says: it is broken, or cannot send the task
-            return dict.fromkeys(range(k, len(tasks)), Failed.of(error, lost=True))
+        except (Exception, SystemExit) as error:  # of the executor: it is broken, or cannot send the task
+            return dict.fromkeys(range(k, len(tasks)), Failed.of(error, by_executor=True))
     return {}
 
 
 def _completed(futures: dict[int, Future[R]]) -> Iterator[tuple[int, R | Failed]]:
-    """Outcomes as they complete; a future is dropped then, so that an executor need not keep its result."""
+    """Outcomes as they complete; each future is then released, so that its result can be freed."""
     done: SimpleQueue[int] = SimpleQueue()
-    tells = all(hasattr(future, "add_done_callback") for future in futures.values())
-    if not tells and not all(hasattr(future, "done") for future in futures.values()):
+    notifies = all(hasattr(future, "add_done_callback") for future in futures.values())
+    if not notifies and not all(hasattr(future, "done") for future in futures.values()):
         for k in list(futures):
             yield k, _outcome(futures[k])
             del futures[k]
         return
     for k, future in futures.items():
-        if tells and hasattr(future, "add_done_callback"):
+        if notifies and hasattr(future, "add_done_callback"):
             future.add_done_callback(lambda _, k=k: done.put(k))
     while futures:
         try:
-            ready = [done.get(timeout=_POLL_BESIDE_CALLBACKS if tells else _POLL)]
+            ready = [done.get(timeout=_POLL_WITH_CALLBACKS if notifies else _POLL)]
         except Empty:
             ready = [k for k, future in futures.items() if _is_done(future)]
         _raise_if_pressed()
@@ -405,16 +405,16 @@ def _completed(futures: dict[int, Future[R]]) -> Iterator[tuple[int, R | Failed]
 
 
 def _outcome(future: Future[R]) -> R | Failed:
-    """Result of a future, or why the executor has none."""
+    """Result of a future, or the failure of the executor."""
     try:
         return future.result()
     except (Exception, SystemExit, CancelledError) as error:  # a worker died, or the result cannot be read
-        _raise_if_pressed()  # which workers may have heard as well
-        return Failed.of(error.with_traceback(None), lost=True)  # which would keep the future
+        _raise_if_pressed()  # which the workers receive as well
+        return Failed.of(error.with_traceback(None), by_executor=True)  # a traceback would keep the future alive
 
 
 def _results(futures: dict[int, Future[R]]) -> dict[int, R]:
-    """Results of futures that are done; what went wrong while all was interrupted is no failure of a task."""
+    """Results of finished futures; exceptions after an interruption are not failures of tasks."""
     found = {}
     for k, future in futures.items():
         with suppress(Exception, CancelledError):
@@ -426,7 +426,7 @@ def _results(futures: dict[int, Future[R]]) -> dict[int, R]:
 def _cancel(futures: Mapping[int, Future[object]]) -> None:
     for future in futures.values():
         if not _is_done(future) and hasattr(future, "cancel"):
-            with suppress(Exception):  # a task that cannot be cancelled must not keep the others
+            with suppress(Exception):  # the other tasks must still be cancelled
                 future.cancel()
 
 

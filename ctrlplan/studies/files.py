@@ -1,8 +1,8 @@
-"""A user's own study, stated in a TOML file.
+"""A user's study, described by a TOML file.
 
 ``ctrlplan report STUDY.toml --out DIR`` runs a study and writes ``index.html``,
-which opens offline, and ``results.json``; ``ctrlplan plan STUDY.toml --out
-plan.csv`` (or ``.json``) writes the trajectories alone. A complete file:
+which can be read off line, and ``results.json``; ``ctrlplan plan STUDY.toml --out
+plan.csv`` (or ``.json``) writes only the trajectories. A complete file:
 
 .. code-block:: toml
 
@@ -39,9 +39,9 @@ Kinds of loops:
   "generator", "load_feedback", "dynamic", "feedforward"), ``force_limits``,
   ``torque_limits``, and any parameter of `ctrlplan.plants.Crane`
   (``load_mass = 800.0``, ...).
-- ``"python:module:function"``: a function declared to return a loop, ``def
-  build() -> control.InputOutputSystem``. Such a file is code: running the study
-  runs the module. ``ctrlplan plan`` runs nothing of it.
+- ``"python:module:function"``: a function annotated to return a loop, ``def
+  build() -> control.InputOutputSystem``. Running such a study file
+  executes the module; ``ctrlplan plan`` does not.
 
 Families of plans: trigonometric, polynomial, piecewise, step, s_curve,
 trapezoid, or ``"python:module:Class"``, a class derived from
@@ -79,20 +79,20 @@ __all__ = ["StudyError", "StudyFile", "build_loop", "load_study"]
 
 @dataclass(frozen=True)
 class StudyFile:
-    """What a study file states.
+    """Contents of a study file.
 
     Attributes
     ----------
     path : pathlib.Path
         The file.
     name, title : str
-        Key and heading.
+        Key in ``results.json``, and heading of the page.
     t_end : float
-        Time at which the runs end [s].
+        End of the simulation [s].
     samples : int
         Number of sample times.
     waypoints : tuple of Waypoint
-        What the plans meet.
+        Waypoints of the plans.
     plans : dict of str to Trajectory
         The plans by name.
     loop : dict
@@ -100,7 +100,7 @@ class StudyFile:
     units : dict of str to str
         Units by label.
     benefit : bool
-        Whether the report compares planning with its baselines.
+        Whether the report contains the benefit of planning.
     experiment : dict
         The table [experiment]: further fields of `Experiment` by name.
     """
@@ -130,7 +130,7 @@ class StudyFile:
         fields_of, choices = kind.experiment(self.loop, self.waypoints, self.experiment, self.path)
         try:
             experiment = Experiment(self.plans, self.timepts(loop), waypoints=self.waypoints, **fields_of)
-            with np.errstate(over="ignore", invalid="ignore"):  # a run that leaves all bounds says so itself
+            with np.errstate(over="ignore", invalid="ignore"):  # a diverging run is reported by the simulation
                 found = experiment.run(loop)
                 comparison = comparison_of(experiment, found, self.units, self.parameters(), self.title)
                 if self.benefit:
@@ -142,12 +142,14 @@ class StudyFile:
             raise
         except (ValueError, TypeError, RuntimeError) as error:
             raise StudyError(f"{self.path}: loop: {error}") from error
-        except Exception as error:  # whatever a loop of the user's own raises with every plan
-            raise StudyError(f"{self.path}: loop: must run, got {type(error).__name__}: {error}") from error
+        except Exception as error:  # of a user's own loop
+            raise StudyError(
+                f"{self.path}: loop: simulation must not fail, got {type(error).__name__}: {error}"
+            ) from error
         return kind.study(self.name, self.title, comparison)
 
     def timepts(self, loop: System | Builder) -> NDArray[np.float64]:
-        """Sample times: those asked for and the waypoints', or the periods of a discrete loop."""
+        """Sample times: evenly spaced, with those of the waypoints, or multiples of the period of a discrete loop."""
         start = self.waypoints[0].time
         dt = getattr(loop, "dt", None)
         if dt:
@@ -158,18 +160,18 @@ class StudyFile:
         return np.union1d(np.linspace(start, self.t_end, self.samples), [w.time for w in self.waypoints])
 
     def parameters(self) -> dict[str, object]:
-        """What the report says about how it was made."""
+        """Parameters of the study, for the report."""
         stated = stated_kind(self.loop, Reader(self.path)).parameters(self.loop)
         loop = {f"loop {key}": value for key, value in stated.items()}
         plans: dict[str, object] = {f"plan {name}": _described(plan) for name, plan in self.plans.items()}
         points: dict[str, object] = {f"waypoint {i}": repr(w) for i, w in enumerate(self.waypoints)}
         run = f"{self.waypoints[0].time:g} to {self.t_end:g} s, {self.samples} samples"
-        return loop | plans | points | {"run": run}
+        return loop | plans | points | {"simulated time": run}
 
 
 _ENTRIES = ("title", "t_end", "samples", "benefit", "worth", "units", "experiment", "loop", "plans", "waypoints")
 _EXPERIMENT = ("start", "band", "outputs", "controls", "initial_state", "params", "events", "measures")
-"""Fields of `Experiment` that the table [experiment] may state; the others have entries of their own."""
+"""Fields of `Experiment` in the table [experiment]; other fields have separate entries."""
 
 
 def load_study(path: str | os.PathLike[str]) -> StudyFile:
@@ -187,7 +189,7 @@ def load_study(path: str | os.PathLike[str]) -> StudyFile:
     Raises
     ------
     StudyError
-        With one line: what must hold, what was given, where.
+        With a message of one line: the condition, the value given, and the place in the file.
     """
     source = Path(path)
     data = _parsed(source)
@@ -207,7 +209,7 @@ def load_study(path: str | os.PathLike[str]) -> StudyFile:
     if not isinstance(title, str):
         raise reader.error("title", f"must be a string, got {got(title)}")
     benefit = reader.benefit(data)
-    units = reader.table(data, "units", needed=False)
+    units = reader.table(data, "units", required=False)
     for label, unit in units.items():
         if not isinstance(unit, str):
             raise reader.error(f"units.{label}", f"must be a string, got {got(unit)}")
@@ -223,14 +225,14 @@ def load_study(path: str | os.PathLike[str]) -> StudyFile:
 
 
 _MEMORY = 2.0**30
-"""Bytes that a run and its page may take, as far as the number of samples decides."""
+"""Memory limit [bytes] of a run and its page, as a function of the number of samples."""
 
 _ONCE, _EACH, _BASELINES = 750, 450, 8
-"""Bytes a sample, as measured with a crane: once, and for each plan; and how many plans a benefit report adds."""
+"""Measured memory per sample [bytes], fixed and per plan; and the number of plans that a benefit adds."""
 
 
 def _check_memory(samples: float, plans: int, benefit: bool, place: str) -> None:
-    """Raise where the samples of all plans would take more memory than a study may."""
+    """Raise if the samples of all plans exceed the memory limit."""
     each = _ONCE + _EACH * (plans + _BASELINES * benefit)
     if samples * each > _MEMORY:
         raise StudyError(
@@ -240,7 +242,7 @@ def _check_memory(samples: float, plans: int, benefit: bool, place: str) -> None
 
 
 _LARGEST = 2**20
-"""Bytes of a study file at most: it is written by hand."""
+"""Maximum size of a study file [bytes]."""
 
 
 def _parsed(source: Path) -> Data:
@@ -249,22 +251,22 @@ def _parsed(source: Path) -> Data:
         with source.open("rb") as file:
             content = file.read(_LARGEST + 1)
         if len(content) > _LARGEST:
-            raise StudyError(f"{source}: a study file must have at most {_LARGEST} bytes, got more")
+            raise StudyError(f"{source}: study file must have at most {_LARGEST} bytes, got more")
         return tomllib.loads(content.decode("utf-8"))
     except FileNotFoundError:
-        raise StudyError(f"{source}: a study file must exist, got no such file") from None
+        raise StudyError(f"{source}: study file must exist, got no such file") from None
     except (OSError, UnicodeDecodeError) as error:
-        raise StudyError(f"{source}: a study file must be readable, got {error}") from None
+        raise StudyError(f"{source}: study file must be readable, got {error}") from None
     except StudyError:
         raise
     except RecursionError:
-        raise StudyError(f"{source}: must be valid TOML, got lists or tables nested too deep") from None
+        raise StudyError(f"{source}: must be valid TOML, got lists or tables nested too deeply") from None
     except ValueError as error:  # invalid TOML, or a number too long to read
         raise StudyError(f"{source}: must be valid TOML, got {error}") from None
 
 
 class _FileReader(Reader):
-    """Checks the tables of a whole file."""
+    """Reader of the tables of a study file."""
 
     def waypoints(self, data: Data) -> tuple[Waypoint, ...]:
         loop = data.get("loop")
@@ -287,9 +289,9 @@ class _FileReader(Reader):
             raise self.error("waypoints", error) from None
 
     def benefit(self, data: Data) -> bool:
-        """Whether planning is compared with its baselines; "worth" is the former name of the entry."""
+        """Whether the report contains the benefit of planning; "worth" is the former name of the entry."""
         if "worth" in data and "benefit" in data:
-            raise self.error("worth", "must not be given beside benefit, got both")
+            raise self.error("worth", "must not be given together with benefit, got both")
         key = "worth" if "worth" in data else "benefit"
         value = data.get(key, False)
         if not isinstance(value, bool):
@@ -300,18 +302,20 @@ class _FileReader(Reader):
 
     def experiment(self, data: Data, plans: dict[str, Trajectory], span: tuple[float, float]) -> Data:
         """The table [experiment], checked as `Experiment` does."""
-        found = dict(self.table(data, "experiment", needed=False))
+        found = dict(self.table(data, "experiment", required=False))
         self.known(found, _EXPERIMENT, "experiment")
         events = found.get("events", [])
         if not isinstance(events, list) or not all(isinstance(table, dict) for table in events):
-            raise self.error("experiment.events", f"must be tables, each with a signal, got {got(events)}")
+            raise self.error("experiment.events", f"must be a list of tables with the entry signal, got {got(events)}")
         for key in ("start", "band"):
             if key in found:
                 self.number(found, key, f"experiment.{key}", default=None)
         for table in events:
             self.known(table, [entry.name for entry in fields(Event)], "experiment.events")
             if not isinstance(table.get("signal"), str):
-                raise self.error("experiment.events", f"must have a signal, the label of one, got {got(table)}")
+                raise self.error(
+                    "experiment.events", f"must have the entry signal, the label of a signal, got {got(table)}"
+                )
         try:
             if events:
                 found["events"] = [Event(**table) for table in events]
@@ -321,7 +325,7 @@ class _FileReader(Reader):
         return found
 
     def family(self, family: object, place: str) -> type[FromWaypoints] | None:
-        """Kind of trajectory that a family names; None for one of `_FREE_FAMILIES`."""
+        """Class of a family of trajectories; None for one of `_FREE_FAMILIES`."""
         known = families()
         if isinstance(family, str):
             if family in _FREE_FAMILIES:
@@ -341,7 +345,7 @@ class _FileReader(Reader):
             kind = self.family(family, f"{place}.family")
             name = table.get("name", family if kind is None else family_name(kind))
             if not isinstance(name, str) or not name or name in plans:
-                raise self.error(f"{place}.name", f"must be a name of its own, got {got(name)}")
+                raise self.error(f"{place}.name", f"must be a unique name, got {got(name)}")
             choices = () if kind is None else kind.options
             self.known(table, ("name", "family", *choices), place)
             chosen = {key: self.choice(table, key, f"{place}.{key}") for key in choices if key in table}
@@ -353,41 +357,39 @@ class _FileReader(Reader):
                 )
             except (ValueError, TypeError) as error:
                 raise self.error(place, error) from None
-            except Exception as error:  # whatever a kind of the user's own raises
-                raise self.error(place, f"must make a plan, got {type(error).__name__}: {error}") from error
+            except Exception as error:  # of a user's own class
+                raise self.error(place, f"construction must not fail, got {type(error).__name__}: {error}") from error
         return plans or standard_plans(waypoints)
 
 
 _FREE_FAMILIES: dict[str, Callable[[tuple[Waypoint, ...]], Trajectory]] = {
     "step": lambda waypoints: standard_plans(waypoints)["step"],
 }
-"""Families that are not splines through waypoints, and have no options: plan by name."""
+"""Families without options that are not splines through waypoints."""
 
 
 def _kind_of_module(family: str, path: Path, place: str) -> type[FromWaypoints]:
-    """Kind of trajectory that a module defines: beside the study file, or of an installed package."""
+    """Class of trajectories in a module next to the study file or in an installed package."""
     try:
         kind = named_in_module(family, path.resolve().parent)
-    except (Exception, SystemExit) as error:  # whatever a user's own module does must end in one line
+    except (Exception, SystemExit) as error:  # of a user's own module
         raise StudyError(
-            f"{path}: {place}: must name a module and a class in it, got {family!r}: "
+            f"{path}: {place}: must name a class of a module, got {family!r}: "
             f"{type(error).__name__}: {one_line(str(error), 300)}"
         ) from None
     if not (inspect.isclass(kind) and issubclass(kind, FromWaypoints)) or inspect.isabstract(kind):
         what = kind.__name__ if inspect.isclass(kind) else type(kind).__name__
-        raise StudyError(
-            f"{path}: {place}: {family!r} must be made from waypoints, a class derived from WaypointSpline, got {what}"
-        )
+        raise StudyError(f"{path}: {place}: {family!r} must be a class derived from WaypointSpline, got {what}")
     return kind
 
 
 def _made(kind: type[FromWaypoints], waypoints: tuple[Waypoint, ...], family: str, chosen: Data) -> Trajectory:
-    """Plan of a kind with the options chosen, of which none that it needs may be missing."""
+    """Plan of a family with its options; ValueError if a required option is missing."""
     parameters = inspect.signature(kind).parameters
     for name in kind.options:
         if name not in chosen and name in parameters and parameters[name].default is inspect.Parameter.empty:
             known = ", a number in [0, 2 pi)" if name == "alpha" else ""
-            raise ValueError(f"a plan of the family {family} needs {name}{known}, got none")
+            raise ValueError(f"a plan of the family {family} requires {name}{known}, got none")
     return kind.from_waypoints(waypoints, **chosen)
 
 

@@ -1,4 +1,4 @@
-"""Limits that the actuators of a loop declare, for the figures."""
+"""Limits declared by the actuators of a loop, for the figures."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ def limits_of(loop: System) -> dict[str, tuple[float, float]]:
     Parameters
     ----------
     loop : control system
-        Of which PIDs and saturations, in networks inside as well, declare what
-        they limit.
+        Loop with PID controllers and saturations, also inside nested networks,
+        that declare their limits.
 
     Returns
     -------
     dict of str to (float, float)
         Minimum and maximum in the unit of the output; one may be infinite.
-        Outputs without limits are left out.
+        Outputs without limits are omitted.
     """
     found: dict[str, tuple[float, float]] = {}
     for block in getattr(loop, "syslist", None) or ():

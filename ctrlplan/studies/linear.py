@@ -15,6 +15,7 @@ from ctrlplan.studies.running import Builder
 from ctrlplan.studies.sections import PlanCurves, Plane, Responses, SweepCurves
 from ctrlplan.studies.study import Study
 from ctrlplan.studies.sweep import Sweep, settling_jumps, sweep
+from ctrlplan.studies.units import scientific
 from ctrlplan.systems import create_feedforward_iosystem, create_source_iosystem
 from ctrlplan.systems.plants import integrator_lag_loop
 from ctrlplan.trajectories import PolySpline, Step, Trajectory, TrigSpline, Waypoint
@@ -187,9 +188,9 @@ def _notes(comparison: Comparison, swept: Sweep) -> list[str]:
         f"k = {gains[later].max():.3g}; the paper states k = 10."
         if later.any()
         else "The trigonometric plan settles earlier than the step at every gain.",
-        f"With feedforward of the derivatives of the plan, reference input r + (r'' + r')/k in place of r, the "
-        f"tracking error of the same loop is {_digits(comparison.metrics[FED])} at k = 5: flatness-based control of a "
-        "linear plant.",
+        "With feedforward of the derivatives of the plan (input r + (r'' + r')/k in place of r), the tracking error "
+        f"of the same loop at k = 5 is {_digits(comparison.metrics[FED])}. This is flatness-based control of a linear "
+        "plant.",
         "The quintic polynomial and the trigonometric spline have similar results, as the paper predicts. The "
         f"polynomial settles earlier {_shares(gains, poly['settling_time'] < trig['settling_time'])}. The benefit "
         "comes from planning, not from the type of spline.",
@@ -222,7 +223,7 @@ def _shares(gains: Array, where: NDArray[np.bool_]) -> str:
 def _digits(found: dict[str, float]) -> str:
     """Peak error of a plan from 0 to 1, in words."""
     worst = max(found["overshoot_error"], found["lag_error"]) / 100.0
-    return "at rounding level" if worst < 1e-12 else f"at most {worst:.1g}"
+    return "at rounding level" if worst < 1e-12 else f"at most {scientific(worst, 1)}"
 
 
 def _enters_band(plan: Trajectory) -> float:

@@ -1,4 +1,4 @@
-"""Kinds of loops that a study file may state: one class a kind, one entry of `LOOP_KINDS`."""
+"""Kinds of loops in study files: one class per kind, and one entry of `LOOP_KINDS`."""
 
 from __future__ import annotations
 
@@ -29,16 +29,16 @@ from ctrlplan.trajectories import Trajectory, Waypoint
 
 
 class LoopKind(ABC):
-    """A kind of loop: what its table [loop] states, how it is built, and what its study shows.
+    """Kind of loop: entries of its table [loop], construction, and sections of its study.
 
     Attributes
     ----------
     entries : tuple of str
-        Entries of [loop] besides ``kind``.
+        Entries of [loop] in addition to ``kind``.
     axes : tuple of str
-        Labels of waypoints that come first, in whatever order a file has them.
+        Labels of waypoints that come first, in any order of the file.
     signals : tuple of str or None
-        Signals besides the axes that may have a unit; None for any name.
+        Signals that may have a unit, in addition to the axes; None for any name.
     """
 
     entries: ClassVar[tuple[str, ...]] = ()
@@ -47,33 +47,33 @@ class LoopKind(ABC):
 
     @abstractmethod
     def build(self, table: Data, path: Path) -> System | Builder:
-        """Loop, or builder of a loop for each plan; StudyError if it cannot be built."""
+        """Loop, or a function that builds a loop for each plan; StudyError if that is not possible."""
 
     def check(self, table: Data, reader: Reader) -> None:
-        """Raise StudyError where the table is wrong, and complete it by its defaults."""
+        """Check the table and add its defaults; StudyError if it is wrong."""
         reader.known(table, ("kind", *self.entries), "loop")
 
     def experiment(self, table: Data, waypoints: Sequence[Waypoint], stated: Data, path: Path) -> tuple[Data, Choices]:
-        """Fields of the experiment, and how the benefit of planning is judged."""
+        """Fields of the experiment, and options of the benefit of planning."""
         return stated, Choices()
 
     def parameters(self, table: Data) -> Data:
-        """What the report says of the loop."""
+        """Parameters of the loop, for the report."""
         return dict(table)
 
     def study(self, name: str, title: str, comparison: Comparison) -> Study:
-        """Study of the comparison, with the sections that a loop of this kind has."""
+        """Study of the comparison, with the sections of this kind of loop."""
         return Study(name, title, comparison, notes=comparison.notes)
 
 
 class LinearLoop(LoopKind):
-    """num/den behind a gain, in unity feedback."""
+    """Transfer function num/den with a gain, in unity feedback."""
 
     entries = ("num", "den", "gain")
     signals = ("y", "u", "e")
 
     def check(self, table: Data, reader: Reader) -> None:
-        """Numbers of num, den and gain, and a loop that can be built."""
+        """Check num, den and gain, and that the loop can be built."""
         super().check(table, reader)
         for key in ("num", "den"):
             table[key] = reader.numbers(table, key, f"loop.{key}")
@@ -89,18 +89,18 @@ class LinearLoop(LoopKind):
 
 
 class CraneLoop(LoopKind):
-    """The crane under one of its laws."""
+    """The crane with one of its control laws."""
 
     entries = ("law", "force_limits", "torque_limits", *(entry.name for entry in fields(Crane)))
     axes = ("x", "z")
 
     def check(self, table: Data, reader: Reader) -> None:
-        """A crane and a law that can be built."""
+        """Check that crane and law can be built."""
         super().check(table, reader)
         self.build(table, reader.path)
 
     def build(self, table: Data, path: Path) -> System | Builder:
-        """Loop of each plan: steps, shaped or not, go to the drives as at rest, every other plan through the law."""
+        """Loop of each plan: steps, shaped or not, with the set-point law, all other plans with the given law."""
         crane = self._crane(table, path)
         try:
             law = as_law(table.get("law", "generator"))
@@ -117,10 +117,10 @@ class CraneLoop(LoopKind):
         return build
 
     def experiment(self, table: Data, waypoints: Sequence[Waypoint], stated: Data, path: Path) -> tuple[Data, Choices]:
-        """Judged by sway, and against shaped references and smoother polynomials."""
+        """With metrics of the sway, and with shaped references and smoother polynomials as baselines."""
         labels = waypoints[0].labels or ()
         if set(labels) != set(self.axes):
-            raise StudyError(f"{path}: waypoints: a crane's axes must be x and z (down), got {', '.join(labels)}")
+            raise StudyError(f"{path}: waypoints: axes of a crane must be x and z (down), got {', '.join(labels)}")
         crane = self._crane(table, path)
         depth = float(np.mean([point.position[labels.index("z")] for point in waypoints]))
         measures = CRANE_MEASURES | {"load": LOAD}
@@ -137,7 +137,7 @@ class CraneLoop(LoopKind):
         )
 
     def parameters(self, table: Data) -> Data:
-        """With the defaults of the crane and its law."""
+        """With the defaults of the crane and of its law."""
         own = {key: value for key, value in table.items() if key in _OF_CRANE}
         stated = {"kind": "crane", "law": "generator", "force_limits": "none", "torque_limits": "none"} | table
         return stated | {entry.name: own.get(entry.name, entry.default) for entry in fields(Crane)}
@@ -158,17 +158,17 @@ _OF_CRANE = tuple(entry.name for entry in fields(Crane))
 
 
 class LoopOfModule(LoopKind):
-    """The loop that a function of a module returns, called only where it is declared to return one."""
+    """Loop returned by a function of a module, which must be annotated to return one."""
 
     def build(self, table: Data, path: Path) -> System | Builder:
-        """What the function returns."""
+        """Loop returned by the function."""
         kind = table["kind"]
         try:
             function = named_in_module(kind, path.resolve().parent)
             _check_declared(function)
             loop: object = function()  # type: ignore[operator]
-        except (Exception, SystemExit) as error:  # whatever a user's own module does must end in one line
-            must = f"must name a module and a function in it, such as {_SIGNATURE}"
+        except (Exception, SystemExit) as error:  # of a user's own module
+            must = f"must name a function of a module, such as {_SIGNATURE}"
             raise StudyError(
                 f"{path}: loop.kind: {must}, got {kind!r}: {type(error).__name__}: {one_line(str(error), 300)}"
             ) from None
@@ -178,26 +178,25 @@ class LoopOfModule(LoopKind):
 
 
 LOOP_KINDS: dict[str, LoopKind] = {"linear": LinearLoop(), "crane": CraneLoop()}
-"""Kinds of loops by the name that ``kind`` gives.
+"""Kinds of loops by the entry ``kind``.
 
-Besides, "python:module:function": a function next to the study file or of an
-installed package, which takes nothing and is declared to return a loop by its
-return annotation, ``def build() -> control.InputOutputSystem``. A study file
-that names one is code: whoever runs the study runs the module.
-The same holds of a family of plans "python:module:Class", a class derived from
-`WaypointSpline`.
+A further kind is "python:module:function": a function without arguments, in a
+module next to the study file or in an installed package, whose return
+annotation is a control system: ``def build() -> control.InputOutputSystem``.
+Running such a study file executes the module. The same is true of a family of
+plans "python:module:Class", a class derived from `WaypointSpline`.
 """
 
 
 def loop_kind(kind: object) -> LoopKind | None:
-    """Kind of loop that an entry ``kind`` names; None where it names none."""
+    """Kind of loop of an entry ``kind``; None if it is unknown."""
     if reference(kind) is not None:
         return LoopOfModule()
     return LOOP_KINDS.get(kind) if isinstance(kind, str) else None
 
 
 def build_loop(table: Data, path: Path) -> System | Builder:
-    """Loop that the checked table [loop] of a study file states.
+    """Loop of the checked table [loop] of a study file.
 
     Raises
     ------
@@ -208,7 +207,7 @@ def build_loop(table: Data, path: Path) -> System | Builder:
 
 
 def stated_kind(table: Data, reader: Reader) -> LoopKind:
-    """Kind of the table [loop]; StudyError where there is none of its name."""
+    """Kind of the table [loop]; StudyError if it is unknown."""
     kind = loop_kind(table.get("kind"))
     if kind is None:
         names = ", ".join([*LOOP_KINDS, '"python:module:function"'])
@@ -220,19 +219,19 @@ _SIGNATURE = "def build() -> control.InputOutputSystem:"
 
 
 def _check_declared(function: object) -> None:
-    """Raise where a callable is not a function that takes nothing and is declared to return a control system."""
+    """Raise if an object is not a function without arguments that is annotated to return a control system."""
     if not callable(function) or inspect.isclass(function) or not inspect.isfunction(inspect.unwrap(function)):
-        raise TypeError(f"what is called must be a function of Python, got {type(function).__name__}")
+        raise TypeError(f"object must be a Python function, got {type(function).__name__}")
     try:
         signature = inspect.signature(function, eval_str=True)
     except NameError as error:
-        raise TypeError(f"its annotations must have a meaning where the module runs, got {error}") from None
+        raise TypeError(f"annotations must be defined in the module, got {error}") from None
     spare = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
-    needed = [p.name for p in signature.parameters.values() if p.default is p.empty and p.kind not in spare]
-    if needed:
-        raise TypeError(f"the function must take nothing, got one that needs {', '.join(needed)}")
+    required = [p.name for p in signature.parameters.values() if p.default is p.empty and p.kind not in spare]
+    if required:
+        raise TypeError(f"function must have no required arguments, got {', '.join(required)}")
     declared = signature.return_annotation
     kinds = get_args(declared) if isinstance(declared, UnionType) or get_origin(declared) is Union else (declared,)
     if not all(inspect.isclass(kind) and issubclass(kind, ct.InputOutputSystem) for kind in kinds):
         got = "none" if declared is signature.empty else declared
-        raise TypeError(f"its return annotation must be a class of control systems, got {got}")
+        raise TypeError(f"return annotation must be a class of control systems, got {got}")

@@ -297,7 +297,7 @@ MEASURES = {
         "Total variation of the control", "{u}", "control", lambda seen: metrics.total_variation(seen.t, seen.u)
     ),
     "wandering": Measure(
-        "Excess path length (path length / waypoint polyline − 1)",
+        "Excess path length",
         "",
         "path",
         _smooth(lambda seen: metrics.wandering(seen.t, seen.path, seen.points)),

@@ -272,7 +272,7 @@ class _Built:
     ) -> Account[Outcome]:
         drawn = [_draw(table, k) for k in range(_count(table))]
         account = executed(partial(_of_build, self.build, experiment), drawn, executor, timeout, "draws", progress)
-        account.raise_if_all_lost("the loop")
+        account.raise_if_none_ran("the loop")
         return account
 
 
@@ -334,7 +334,7 @@ class _Prepared:
         if executor is not None:
             run = partial(_elsewhere, Shared(sent), experiment)
         account = executed(run, drawn, executor, timeout, "draws", progress)
-        account.raise_if_all_lost("the loop")
+        account.raise_if_none_ran("the loop")
         return account if light is None else _by_python(account, self.forms, experiment, drawn, timeout, progress)
 
 

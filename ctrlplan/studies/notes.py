@@ -35,7 +35,7 @@ def how_measured(signals: Signals, band: float) -> dict[str, object]:
     ]
     how: dict[str, object] = {"settling band": f"{100 * band:g} %"}
     if several:
-        how["metrics"] = f"{', '.join(several)}; signals in different units are listed separately"
+        how["metrics"] = f"{' and '.join(several)}; signals in different units are listed separately"
     return how
 
 

@@ -1,4 +1,4 @@
-"""The references that are compared: by name, or the standard set through waypoints."""
+"""References of a comparison: given by name, or the standard set through waypoints."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from ctrlplan.trajectories import PiecewiseSpline, PolySpline, Step, Trajectory,
 def waypoints_given(
     points: object, name: str = "plans", kinds: str = "a mapping of names to trajectories, or waypoints"
 ) -> tuple[Waypoint, ...]:
-    """Waypoints, alone or in the place of plans; what they are called and must be, for messages.
+    """Waypoints, given as such or in place of plans; `name` and `kinds` are for messages.
 
     Raises
     ------
     TypeError
-        If they are plans without names, or nothing of the kind.
+        If they are neither waypoints nor named plans.
     """
     found: list[Waypoint] = []
     for point in points if isinstance(points, Iterable) else (points,):
@@ -26,23 +26,23 @@ def waypoints_given(
 
 
 def standard_plans(waypoints: Iterable[Waypoint], alpha: float = 1.0) -> dict[str, Trajectory]:
-    """Plans that a designer would compare through the same waypoints.
+    """Standard set of plans through the same waypoints.
 
     Parameters
     ----------
     waypoints : iterable of Waypoint
         Two or more.
     alpha : float, optional
-        Shape parameter of the trigonometric one [rad].
+        Shape parameter of the trigonometric plan [rad].
 
     Returns
     -------
     dict of str to Trajectory
-        step (from the first position to the last, at the start), polynomial,
+        step (from the first to the last position, at the start), polynomial,
         trigonometric, piecewise.
     """
     points = tuple(waypoints)
-    polynomial = PolySpline(points, warn=False)  # one of the baselines, however it swings
+    polynomial = PolySpline(points, warn=False)  # a baseline, even if it oscillates between the waypoints
     return {
         "step": Step(polynomial.final, polynomial.initial, polynomial.start, polynomial.labels),
         "polynomial": polynomial,
@@ -52,7 +52,7 @@ def standard_plans(waypoints: Iterable[Waypoint], alpha: float = 1.0) -> dict[st
 
 
 def references_of(plans: Mapping[str, Trajectory] | Iterable[Waypoint], alpha: float = 1.0) -> dict[str, Trajectory]:
-    """The references by name: those given, or the standard set through waypoints.
+    """References by name: the given plans, or the standard set through waypoints.
 
     Raises
     ------
@@ -67,7 +67,7 @@ def references_of(plans: Mapping[str, Trajectory] | Iterable[Waypoint], alpha: f
 def _checked_plans(plans: Mapping[str, Trajectory]) -> dict[str, Trajectory]:
     references = dict(plans)
     if not references:
-        raise ValueError("plans must hold at least one trajectory, got none")
+        raise ValueError("plans must contain at least one trajectory, got none")
     naxes = None
     for name, plan in references.items():
         if not isinstance(plan, Trajectory):

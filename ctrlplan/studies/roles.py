@@ -1,4 +1,4 @@
-"""What a plan is in a comparison, and whether its loop is stable: values, which no name and no sentence carries."""
+"""Role of a plan in a comparison, and stability of its loop."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from ctrlplan.trajectories import Trajectory
 
 
 class Role(Enum):
-    """What a plan is in a comparison.
+    """Role of a plan in a comparison.
 
     Attributes
     ----------
     STEP
-        A reference whose position jumps: a step, shaped or not. It satisfies no
-        limit on a derivative.
+        A reference with a discontinuous position: a step, shaped or not. It
+        violates every limit on a derivative.
     BASELINE
         A plan with which the planned references are compared.
     PLANNED
@@ -29,16 +29,16 @@ class Role(Enum):
 
 
 class Stability(Enum):
-    """What is known of the stability of the loops of a comparison.
+    """Stability of the loops of a comparison, as far as it is known.
 
     Attributes
     ----------
     STABLE
         No loop has a pole in the right half plane.
     UNSTABLE
-        The loop of every plan has one: nothing settles.
+        The loop of every plan has one, and no output settles.
     MIXED
-        The loops of some plans have one.
+        The loops of some plans have one, and others do not.
     UNKNOWN
         No loop is known to be unstable, and one or more are not linear and
         continuous.
@@ -51,12 +51,12 @@ class Stability(Enum):
 
 
 def role_of(plan: Trajectory) -> Role:
-    """Role of a plan by itself: a step, or planned."""
+    """Role of a plan without a comparison: step or planned."""
     return Role.STEP if plan.jumps(0) else Role.PLANNED
 
 
 def stability_of(runs: Collection[Run]) -> Stability:
-    """Stability of the loops of some runs."""
+    """Stability of the loops of several runs."""
     unstable = [run.is_unstable for run in runs]
     if any(unstable):
         return Stability.UNSTABLE if all(unstable) else Stability.MIXED

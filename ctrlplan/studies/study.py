@@ -1,4 +1,4 @@
-"""A comparison with what a report says around it."""
+"""A comparison with text and sections for a report."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:  # comparisons and ensembles make studies of themselves for th
 
 @dataclass(frozen=True, repr=False)
 class Study(Displayed):
-    """A comparison with what a report says around it.
+    """A comparison with text and sections for a report.
 
     Attributes
     ----------
@@ -24,19 +24,19 @@ class Study(Displayed):
     title : str
         Heading.
     comparison : Comparison
-        What was compared; its metrics are on the page.
+        The comparison, whose metrics the page shows.
     summary : str
-        What the study is, in a paragraph.
+        Description of the study, one paragraph.
     notes : tuple of str
-        Findings, one sentence or two each; where a claim fails they say so.
+        Findings, one or two sentences each.
     sections : tuple of Section
-        What the page shows around the metrics, in order: see
+        Further contents of the page, in order: see
         `ctrlplan.studies.sections`.
 
     Raises
     ------
     TypeError
-        If a section is of no type of sections.
+        If a section is not an instance of `Section`.
     """
 
     name: str
@@ -66,8 +66,7 @@ class Study(Displayed):
         Raises
         ------
         ValueError
-            If two sections, or a section and the comparison, have data under
-            one key.
+            If two sections, or a section and the comparison, use the same key.
         """
         data: dict[str, object] = {**self.comparison.results()}
         for place, section in enumerate(self.sections):
@@ -75,7 +74,7 @@ class Study(Displayed):
             twice = ", ".join(key for key in found if key in data)
             if twice:
                 raise ValueError(
-                    f"sections of study {self.name} must have keys of their own in results.json, got {twice} again "
+                    f"sections of study {self.name} must have unique keys in results.json, got {twice} again "
                     f"from sections[{place}], {type(section).__name__}"
                 )
             data |= found

@@ -277,7 +277,7 @@ def sweep(
     else:
         run = partial(_built, build, experiment, units)
         account = executed(run, points.tolist(), executor, timeout, parameter, progress)
-        account.raise_if_all_lost("build")
+        account.raise_if_none_ran("build")
     found = _swept(parameter, points, account)
     roles = {name: role_of(experiment.plans[name]) for name in found.metrics}
     found = replace(found, roles=roles, band=experiment.band)

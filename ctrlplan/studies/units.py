@@ -1,4 +1,4 @@
-"""Units and sizes of the metrics of a comparison: which signals share them, and what counts as rounding."""
+"""Units and scales of the metrics of a comparison."""
 
 from __future__ import annotations
 
@@ -12,13 +12,25 @@ from ctrlplan._types import System
 from ctrlplan.studies.measures import Measure, Run, checked_names
 from ctrlplan.trajectories import Trajectory
 
+
+def superscript(exponent: int | str) -> str:
+    """An exponent in superscript digits."""
+    return str(exponent).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
+
+
+def scientific(value: float, digits: int = 4) -> str:
+    """A value with a power of ten, rounded to significant digits."""
+    mantissa, exponent = f"{value:.{digits - 1}e}".split("e")
+    return f"{mantissa}·10{superscript(int(exponent))}".replace("-", "−")
+
+
 ROUNDING = 1e-6
-"""Difference of two values of a metric that is rounding, relative to the scale of the metric."""
+"""Difference of two values of a metric that counts as rounding, relative to the scale of the metric."""
 
 
 @dataclass(frozen=True)
 class Signals:
-    """Signals that a comparison measures.
+    """Signals of a comparison that are measured.
 
     Attributes
     ----------
@@ -29,9 +41,9 @@ class Signals:
     units : dict of str to str
         Units by label, where known.
     spans, peaks : dict of str to float
-        Largest range of a plan on each axis, largest magnitude of each control.
+        Maximum range of a plan on each axis, and peak of each control.
     run_time, move_time : float
-        Longest time measured, and of a plan [s].
+        Maximum of the times measured, and of the durations of the plans [s].
     """
 
     axes: dict[str, str]
@@ -43,7 +55,7 @@ class Signals:
     move_time: float = 0.0
 
     def of_axes(self) -> dict[str, str]:
-        """Unit of each axis: that of its label, or of its output."""
+        """Unit of each axis, by its label or its output."""
         return {axis: self.units.get(axis, self.units.get(output, "")) for axis, output in self.axes.items()}
 
     def of_controls(self) -> dict[str, str]:
@@ -51,7 +63,7 @@ class Signals:
         return {name: self.units.get(name, "") for name in self.controls}
 
     def separate(self, unit: str) -> dict[str, str]:
-        """Units of the signals in whose unit a measure is, where they are known to differ; empty where not."""
+        """Units of the signals of a measure if they are known to differ; otherwise empty."""
         units = self.of_axes() if "{y}" in unit else self.of_controls() if "{u}" in unit else {}
         return units if len(set(filter(None, units.values()))) > 1 else {}
 
@@ -59,7 +71,7 @@ class Signals:
 def signals_of_runs(
     plans: Mapping[str, Trajectory], runs: Mapping[str, Run], units: dict[str, str], since: float
 ) -> Signals:
-    """The signals measured, with their units and sizes."""
+    """Signals measured, with their units and scales."""
     axes = next(iter(plans.values())).labels
     last = list(runs.values())[-1]
     extrema = [plan.extrema() for plan in plans.values()]
@@ -76,7 +88,7 @@ def signals_of_runs(
 
 
 def _peak_of(run: Run, name: str) -> float:
-    """Largest finite magnitude of a control."""
+    """Peak of a control over its finite samples."""
     row = run.rows((name,))[0]
     return float(np.abs(row[np.isfinite(row)]).max(initial=0.0))
 
@@ -84,9 +96,9 @@ def _peak_of(run: Run, name: str) -> float:
 def listed_measures(
     metrics: dict[str, dict[str, float]], measures: Mapping[str, Measure], signals: Signals
 ) -> dict[str, Measure]:
-    """Measures as they are shown.
+    """Measures as shown in tables.
 
-    Of signals that differ in unit there is no worst: its value becomes nan in
+    A maximum over signals in different units is not defined: it becomes nan in
     `metrics`, and a measure of each signal is shown in its place.
     """
     listed: dict[str, Measure] = {}
@@ -104,10 +116,10 @@ def listed_measures(
 
 
 def scales_of(measures: Mapping[str, Measure], signals: Signals) -> dict[str, float]:
-    """Size of each metric by what it is measured in; none where that does not say.
+    """Scale of each metric by its unit; without an entry if the unit has no scale.
 
-    The range of the plan for an output, the peak for a control, the time of the
-    run for a time, 100 for a percentage.
+    The range of the plan for an output, the peak for a control, the simulated
+    time for a time, 100 for a percentage.
     """
     found: dict[str, float] = {}
     for name, measure in measures.items():
@@ -119,9 +131,9 @@ def scales_of(measures: Mapping[str, Measure], signals: Signals) -> dict[str, fl
 
 
 def in_units(unit: str, y: str, u: str) -> str:
-    """A measure's unit in those of output and control; empty where one that it needs is not known.
+    """Unit of a measure in those of output and control; empty if a required one is unknown.
 
-    A unit that is a product, a quotient or a power stands in brackets: the
+    A unit that is a product, a quotient or a power is put in parentheses: the
     effort of a control in deg/s is in (deg/s)^2 s.
     """
     known = {"{y}": y, "{u}": u}
@@ -129,7 +141,7 @@ def in_units(unit: str, y: str, u: str) -> str:
         return ""
     compound = {place: bool(set(own) & set(" /*·^²³")) and unit != place for place, own in known.items()}
     shown = {place: f"({own})" if compound[place] else own for place, own in known.items()}
-    # In one pass, since what stands for one of them is a user's text.
+    # In one pass, since a unit is a text of the user.
     return re.sub(r"\{[yu]\}", lambda place: shown[place[0]], unit)
 
 
@@ -141,7 +153,7 @@ def checked_units(
     Raises
     ------
     TypeError
-        If they are no mapping of str to str.
+        If they are not a mapping of str to str.
     ValueError
         If a label is unknown; the known ones are in the message.
     """
@@ -167,7 +179,7 @@ def _signals(system: System) -> Iterator[str]:
 
 
 def _size(unit: str, signals: Signals, label: str | None) -> float:
-    """Size of a metric in a unit, of one signal or of the largest; nan where the unit does not say."""
+    """Scale of a metric with a unit, for one signal or the largest; nan if the unit has no scale."""
     span, peak = (
         np.float64(known.get(label or "", max(known.values(), default=0.0))) for known in (signals.spans, signals.peaks)
     )
@@ -178,13 +190,13 @@ def _size(unit: str, signals: Signals, label: str | None) -> float:
             "%": 100.0,
             "{y}": span,
             "{y} s": span * t,
-            "{y}^2 s": ROUNDING * span**2 * t,  # the square of rounding, in a metric that is a square
+            "{y}^2 s": ROUNDING * span**2 * t,  # rounding squared, for a metric that is a square
             "{y} s^2": span * t**2,
             "{y}^2/s^5": span**2 / np.float64(move) ** 5,
             "{u}": peak,
             "{u}^2 s": peak**2 * t,
         }
-    # A measure of one's own may name the unit itself.
+    # A user's measure may contain the unit itself.
     for template in () if unit in sizes else sizes:
         for axis, y in signals.of_axes().items():
             if unit and in_units(template, y, "") == unit:

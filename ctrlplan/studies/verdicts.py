@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from ctrlplan._renamed import FormerAttribute
 from ctrlplan.studies.roles import Stability
-from ctrlplan.studies.units import ROUNDING, in_units
+from ctrlplan.studies.units import ROUNDING, in_units, scientific, superscript
 
 if TYPE_CHECKING:  # comparisons show their verdicts
     from ctrlplan.studies.comparison import Comparison
@@ -117,11 +117,6 @@ def unit_in(comparison: Comparison, unit: str) -> str:
     return in_units(re.sub(r"\^(-?\d+)", lambda power: superscript(power[1]), unit), y, u)
 
 
-def superscript(exponent: int | str) -> str:
-    """An exponent in superscript digits."""
-    return str(exponent).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
-
-
 def number(value: float, unit: str = "") -> str:
     """A value with four significant digits; a word or a sign for an infinite or undefined one."""
     if math.isnan(value):
@@ -133,20 +128,14 @@ def number(value: float, unit: str = "") -> str:
     if 1e-3 <= abs(value) < 1e5:
         digits = max(0, 3 - math.floor(math.log10(abs(value))))
         return f"{value:.{digits}f}".replace("-", "−")
-    return _scientific(value)
-
-
-def _scientific(value: float) -> str:
-    """A value with four significant digits and a power of ten."""
-    mantissa, exponent = f"{value:.3e}".split("e")
-    return f"{mantissa}·10{superscript(int(exponent))}".replace("-", "−")
+    return scientific(value)
 
 
 def _verdict(key: str, title: str, unit: str, values: dict[str, float], rounding: float) -> Verdict:
     minimum, maximum = min(values.values()), max(values.values())
     if _equal(minimum, maximum, rounding):
         apart = maximum - minimum if minimum < maximum else 0.0
-        size = number(apart) if apart >= _ZERO else _scientific(apart)
+        size = number(apart) if apart >= _ZERO else scientific(apart)
         within = f", within {size}{f' {unit}' if unit else ''}" if apart else ""
         sentence = f"{title}: equal for {_listed(tuple(values))}{within}."
         return Verdict(key, title, unit, (), (), minimum, maximum, sentence)

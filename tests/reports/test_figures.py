@@ -519,7 +519,7 @@ def test_every_measure_can_be_swept_and_drawn(swept):
 def test_figure_1_is_the_plane_of_settling_and_overshoot(swept):
     (axes,) = axes_of(plot_plane(swept, limit=STEP_LIMIT))
     assert axes.get_xlabel() == "settling time ±2 % [s]"
-    assert axes.get_ylabel() == "overshoot on the error [%]"
+    assert axes.get_ylabel() == "overshoot on the tracking error [%]"
     (star,) = (line for line in axes.lines if line.get_marker() == "*")
     assert tuple(star.get_xydata()[0]) == STEP_LIMIT == pytest.approx((7.824, 100.0), rel=1e-5)
     dots = [line for line in axes.lines if line.get_marker() == "." and len(line.get_xdata()) == swept.values.size]

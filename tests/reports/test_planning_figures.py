@@ -57,7 +57,7 @@ def test_the_objective_is_drawn_where_it_is_below_its_blow_up(choice):
 
 def test_the_legend_names_the_choice_and_where_plans_blow_up(choice):
     drawn = plot_alpha_choice(choice)
-    assert labels(drawn) == [f"alpha = {choice.alpha:.4g} rad", "blows up"]
+    assert labels(drawn) == [f"alpha = {choice.alpha:.4g} rad", "diverges"]
     (band,) = drawn.axes[0, 0].patches
     shown = drawn.axes[0, 0].transData.inverted().transform(band.get_window_extent().corners())[:, 0]
     assert shown.min() == pytest.approx(choice.blow_up, rel=1e-9)
@@ -183,7 +183,7 @@ def test_a_step_does_not_flatten_what_the_others_ask_for(compared):
     assert step > 4 * others
     low, high = control.get_ylim()
     assert -low == high == pytest.approx(1.3 * others)
-    assert control.get_title(loc="left") == "the step asks for 100"
+    assert control.get_title(loc="left") == "step: peak 100, clipped"
 
 
 def test_a_step_is_found_by_its_role_and_not_by_its_name(compared):
@@ -203,7 +203,7 @@ def test_a_step_is_found_by_its_role_and_not_by_its_name(compared):
     one, again = plot_baselines(compared), plot_baselines(other)
     assert [line.get_color() for line in one.lines[0, 0]] == [line.get_color() for line in again.lines[0, 0]]
     assert one.axes[2, 0].get_ylim() == again.axes[2, 0].get_ylim()
-    assert again.axes[2, 0].get_title(loc="left") == "the polynomial asks for 100"
+    assert again.axes[2, 0].get_title(loc="left") == "polynomial: peak 100, clipped"
 
 
 def test_baselines_of_two_axes_stand_side_by_side():

@@ -37,7 +37,7 @@ def linear(reproduced):
 def test_only_paths_on_stdout_and_progress_on_stderr(reproduced):
     assert reproduced.out.splitlines() == [str(reproduced.folder / n) for n in ("index.html", "results.json")]
     assert sorted(p.name for p in reproduced.folder.iterdir()) == ["index.html", "results.json"]
-    assert "ctrlplan: study linear" in reproduced.err.splitlines()
+    assert "ctrlplan: running study linear" in reproduced.err.splitlines()
     assert "Traceback" not in reproduced.err
     assert "Warning" not in reproduced.err
 
@@ -105,7 +105,7 @@ def test_figure_1_draws_the_limit_point_and_every_gain_asked_for(reproduced):
     for gain in ("1", "5", "20", "100", "1000"):
         assert gain in comments
     assert "settling time ±2 % [s]" in comments
-    assert "overshoot on the error [%]" in comments
+    assert "overshoot on the tracking error [%]" in comments
 
 
 def test_the_plans_overshoot_least_where_the_loop_is_stiff(linear):

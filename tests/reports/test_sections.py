@@ -180,9 +180,7 @@ def test_sections_must_be_sections(section, got, compared):
 
 def test_each_key_of_the_results_is_given_once(compared, swept):
     twice = Study("it", "It", compared, sections=(Plane(swept), SweepCurves(swept)))
-    with pytest.raises(
-        ValueError, match=r"keys of their own in results.json, got sweep again from sections\[1\], Swee"
-    ):
+    with pytest.raises(ValueError, match=r"unique keys in results.json, got sweep again from sections\[1\], Swee"):
         twice.results()
     once = Study("it", "It", compared, sections=(Plane(swept), SweepCurves(swept, in_results=())))
     assert once.results()["sweep"] == swept.results(("overshoot_error", "settling_time"))
@@ -191,7 +189,7 @@ def test_each_key_of_the_results_is_given_once(compared, swept):
 
 
 def test_a_row_has_a_cell_for_each_heading():
-    with pytest.raises(ValueError, match=r"rows\[1\] must have 2 cells, one a heading, got 1"):
+    with pytest.raises(ValueError, match=r"rows\[1\] must have 2 cells, one per heading, got 1"):
         Table(["plan", "value"], [["a", "b"], ["c"]])
 
 

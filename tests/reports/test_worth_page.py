@@ -140,11 +140,11 @@ def test_without_units_there_are_no_brackets(shown, study):
 
 
 def test_all_baselines_are_in_the_table_of_the_section(study, page):
-    (beside,) = tables(page, "baselines")
-    assert titles(beside) == ["metric", "unit", *study.comparison.benefit.comparison.plans]
+    (table,) = tables(page, "baselines")
+    assert titles(table) == ["metric", "unit", *study.comparison.benefit.comparison.plans]
     expected = {"step", "trapezoid", "S-curve", "shaped step", "quintic (minimum jerk)"}
-    assert expected <= set(titles(beside))
-    found = {row[0]: row[2:] for row in rows(beside)}
+    assert expected <= set(titles(table))
+    found = {row[0]: row[2:] for row in rows(table)}
     metrics = study.comparison.benefit.comparison.metrics
     for title, key in (("Settling time", "settling_time"), ("Peak control", "control_peak")):
         for text, values in zip(found[title], metrics.values(), strict=True):

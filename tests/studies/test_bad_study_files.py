@@ -8,7 +8,7 @@ from study_text import Verbatim, to_toml, valid
 
 from ctrlplan.cli import main
 
-RULE = re.compile(r"\b(must|needs?)\b.*\bgot\b")
+RULE = re.compile(r"\b(must|requires?)\b.*\bgot\b")
 
 
 def changed(*path, to):
@@ -233,7 +233,10 @@ WRONG = {
     "function that ends Python": (module(f"{DECLARED}    raise SystemExit(0)\n"), ["loop", "NAME", "SystemExit"]),
     "module that ends Python": (module("raise SystemExit(0)\n"), ["loop", "NAME", "SystemExit"]),
     "function that says too much": (module(f"{DECLARED}    raise ValueError('x' * 100_000)\n"), ["loop", "NAME"]),
-    "function that wants more": (module(DECLARED.replace("()", "(gain)") + "    pass\n"), ["NAME", "needs gain"]),
+    "function that wants more": (
+        module(DECLARED.replace("()", "(gain)") + "    pass\n"),
+        ["NAME", "no required arguments, got gain"],
+    ),
     "no function": (module("build = 3\n"), ["loop", "NAME"]),
     "function without a loop": (module(f"{DECLARED}    return None\n"), ["loop", "NAME", "NoneType"]),
     "function without its data": (module(f"{DECLARED}    return open('nowhere.csv')\n"), ["loop", "nowhere.csv"]),
@@ -280,7 +283,11 @@ def refused(arguments, capsys):
     assert main([str(a) for a in arguments]) == 2
     said = capsys.readouterr()
     assert said.out == ""
-    lines = [line for line in said.err.splitlines() if not re.match(r"ctrlplan: (study|plans of) \w+$", line)]
+    lines = [
+        line
+        for line in said.err.splitlines()
+        if not re.match(r"ctrlplan: (running study|writing the plans of) \w+$", line)
+    ]
     assert len(lines) == 1, lines
     return lines[0]
 

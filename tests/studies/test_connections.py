@@ -49,16 +49,16 @@ def test_the_same_loop_with_one_name_runs_and_follows():
 @UNUSED
 @pytest.mark.parametrize("derivatives", [0, 1])
 def test_a_derivative_that_the_law_reads_and_nothing_puts_out(derivatives):
-    with pytest.raises(ValueError, match=rf"got flat_law.y_ref_d{derivatives + 1}, .*give the source more derivatives"):
+    with pytest.raises(ValueError, match=rf"y_ref_d{derivatives + 1} unconnected; give the source more"):
         cp.compare(lambda name, plan: flat_loop(plan, ["y"], derivatives), {"move": move("y")}, T)
 
 
 @UNUSED
 def test_an_input_that_reaches_no_output():
     idle = ct.ss([[-1.0, 0.0], [0.0, -2.0]], [[1.0], [0.0]], [[0.0, 1.0]], 0.0, inputs="r", outputs="y", name="idle")
-    with pytest.raises(ValueError, match="input r that reaches none of y"):
+    with pytest.raises(ValueError, match="input r that affects none of y"):
         cp.compare(idle, {"move": move("r")}, T)
-    with pytest.raises(ValueError, match="input r that reaches none of y"):
+    with pytest.raises(ValueError, match="input r that affects none of y"):
         cp.sweep(lambda value: idle, [1.0, 2.0], {"move": move("r")}, T, progress=False)
 
 
@@ -79,7 +79,7 @@ def test_one_of_two_axes_that_reaches_nothing():
         return built
 
     assert "iae" in cp.compare(build(["r_a", "r_b"]), {"both": plan}, T).metrics["both"]
-    with pytest.raises(ValueError, match="got r_b of block plan that reaches none of y_a, y_b"):
+    with pytest.raises(ValueError, match="got r_b of block plan that affects none of y_a, y_b"):
         cp.compare(build(["r_a", "other"]), {"both": plan}, T)
 
 
@@ -92,7 +92,7 @@ def test_a_reference_that_only_a_record_reads():
         source = cp.create_source_iosystem(plan, suffix="_ref")
         return ct.interconnect([source, lag], inputs=0, outputs=["y", "x_ref"])
 
-    with pytest.raises(ValueError, match="got x of block plan that reaches none of y"):
+    with pytest.raises(ValueError, match="got x of block plan that affects none of y"):
         cp.compare(build, {"move": move("x")}, T, outputs=["y"])
 
 
@@ -119,7 +119,7 @@ def test_a_disturbance_that_is_connected_to_nothing():
         return built
 
     assert "iae" in cp.compare(build("d"), {"move": move("r")}, T).metrics["move"]
-    with pytest.raises(ValueError, match=r"got gust of block push that reach no output; .* lag\.d"):
+    with pytest.raises(ValueError, match=r"got gust of block push that affect no output; .* lag\.d"):
         cp.compare(build("gust"), {"move": move("r")}, T)
 
 

@@ -108,7 +108,7 @@ def test_callables_of_installed_modules_are_not_called(kind, study):
 @pytest.mark.parametrize("kind", ["python:../declared_here:build", "python:/tmp/declared_here:build", "python:.x:y"])
 def test_a_module_is_a_name_and_no_path(kind, study):
     stated, mark = study(CALLED["in words"], kind)
-    with pytest.raises(StudyError, match="must be names"):
+    with pytest.raises(StudyError, match="must be identifiers"):
         stated.run()
     assert not mark.exists()
 

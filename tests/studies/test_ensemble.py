@@ -69,7 +69,7 @@ def test_the_count_is_a_whole_number_from_1(count):
     "ends", [(2, 1), (math.nan, 1), (0, math.nan), (0, math.inf), (-math.inf, math.inf), (-math.inf, 0)]
 )
 def test_low_is_not_above_high_and_both_are_finite(ends):
-    with pytest.raises(ValueError, match="mass must be drawn from low to high, both finite, got"):
+    with pytest.raises(ValueError, match="mass must have finite limits low <= high, got"):
         cp.draws(3, mass=ends)
 
 

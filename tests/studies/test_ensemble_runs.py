@@ -210,9 +210,9 @@ def test_a_parameter_that_counts_only_beyond_a_limit_is_run_too(tau):
 
 def test_the_notes_tell_of_failures(exploded):
     assert list(exploded.notes())[:3] == [
-        "4 draws of k 0.01 to 0.5; the responses below are those of the loop's own parameters.",
-        f"1 draws failed; the first, with k = 0.5: {exploded.failures[0].message}",
-        "A draw that failed is in no band and no quantile.",
+        "4 draws: k 0.01 to 0.5. The responses below are those of the loop's own parameters.",
+        f"1 of 4 draws failed. The first, with k = 0.5: {exploded.failures[0].message}",
+        "Failed draws are excluded from bands and quantiles.",
     ]
 
 
@@ -251,7 +251,7 @@ def test_what_an_executor_found_before_an_interruption_is_kept(found):
     curves = lag_response(LAGS["tau"][:n], TIMES)
     for plan in PLANS:
         np.testing.assert_allclose(result.bands[plan]["y"], np.quantile(curves[plan], LEVELS, axis=0), atol=1e-7)
-    assert f"The run was interrupted: {21 - n} draws were not reached." in result.notes()
+    assert f"The run was interrupted; {21 - n} draws were not run." in result.notes()
     assert result.failures == ()
 
 

@@ -148,7 +148,7 @@ def test_what_is_no_executor_is_rejected_before_a_loop_is_built(executor, said, 
 
 
 def test_a_multiprocessing_pool_is_rejected_before_a_loop_is_built():
-    said = "got multiprocessing.pool.ThreadPool, which never tells of a worker that dies; use concurrent.futures"
+    said = "got multiprocessing.pool.ThreadPool, which does not report a worker that dies; use concurrent.futures"
     with ThreadPool(1) as pool, pytest.raises(TypeError, match=said):
         swept(not_to_be_built, executor=pool)
 
@@ -184,9 +184,13 @@ def drawn_by_python():
 
 
 def test_what_cannot_be_sent_is_said_in_the_executors_words():
-    with pytest.raises(ValueError, match=r"build must go to other processes, but .*lambda.*; give a function that"):
+    with pytest.raises(
+        ValueError, match=r"build must be picklable for other processes, got .*lambda.*; give a function that"
+    ):
         swept(lambda rate: lag(rate), executor=Pickling())
-    with pytest.raises(ValueError, match=r"the loop must go to other processes, but lag must be linear or compiled"):
+    with pytest.raises(
+        ValueError, match=r"the loop must be picklable for other processes, got lag must be linear or compiled"
+    ):
         cp.monte_carlo(drawn_by_python(), {"tau": [0.5]}, PLANS, TIMES, executor=Pickling(), progress=False)
 
 
@@ -205,8 +209,8 @@ def test_an_error_that_cannot_be_pickled_is_still_told_of():
     failed = pickle.loads(pickle.dumps(Failed.of(OddError("1 and 2"))))
     assert failed.message == "OddError: 1 and 2"
     assert type(failed.error) is RuntimeError
-    same = pickle.loads(pickle.dumps(Failed.of(ZeroDivisionError("by 0"), lost=True)))
-    assert (same.message, type(same.error), same.lost) == ("ZeroDivisionError: by 0", ZeroDivisionError, True)
+    same = pickle.loads(pickle.dumps(Failed.of(ZeroDivisionError("by 0"), by_executor=True)))
+    assert (same.message, type(same.error), same.by_executor) == ("ZeroDivisionError: by 0", ZeroDivisionError, True)
 
 
 # What an executor loses

@@ -291,7 +291,7 @@ def test_a_killed_worker_loses_nothing_that_was_finished_and_nothing_runs_in_its
     assert found["drawn"].count(found["parent"]) == 3  # the nominal loop, and two draws compared with Python
     assert not values["interrupted"]
     assert not draws["interrupted"]
-    assert found["lambda"].startswith("build must go to other processes, but ")
+    assert found["lambda"].startswith("build must be picklable for other processes, got ")
 
 
 PROCESSES = """

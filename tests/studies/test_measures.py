@@ -144,7 +144,7 @@ def test_signals_that_are_not_known_to_differ_have_a_worst(units):
 def test_the_report_says_that_figures_are_the_worst_of_the_axes():
     said = two_axes().parameters["metrics"]
     assert "maximum over the outputs x, theta" in said
-    assert "maximum over the controls F, M" in said
+    assert " and maximum over the controls F, M" in said
     assert "metrics" not in cp.compare(loop(5.0), MOVE, T).parameters
 
 

@@ -150,13 +150,13 @@ def test_a_spline_of_a_users_own_can_be_asked_for(by, stated, tmp_path, kinds):
 @pytest.mark.parametrize(
     ("family", "message"),
     [
-        ("python:mine_natural:Nothing", "must name a module and a class in it.*AttributeError"),
+        ("python:mine_natural:Nothing", "must name a class of a module.*AttributeError"),
         ("python:mine_natural:np", "derived from WaypointSpline, got module"),
         ("python:mine_natural:Polynomial", "derived from WaypointSpline, got Polynomial"),
         ("python:mine_natural:WaypointSpline", "derived from WaypointSpline, got WaypointSpline"),
-        ("python:nowhere_at_all:Heavy", "must name a module and a class in it.*nowhere_at_all"),
-        ("python:a b:Heavy", "must be names"),
-        ("python:mine_natural:Broken", "must make a plan, got KeyError: 'lost'"),
+        ("python:nowhere_at_all:Heavy", "must name a class of a module.*nowhere_at_all"),
+        ("python:a b:Heavy", "must be identifiers"),
+        ("python:mine_natural:Broken", "construction must not fail, got KeyError: 'lost'"),
     ],
 )
 def test_a_kind_that_cannot_be_made_says_why(family, message, stated, tmp_path, kinds):
@@ -174,9 +174,9 @@ def test_a_kind_that_cannot_be_made_says_why(family, message, stated, tmp_path, 
         (
             {"family": "s_curve", "velocity": 3.0, "acceleration": 2.0},
             REST,
-            "a plan of the family s_curve needs jerk, got none",
+            "a plan of the family s_curve requires jerk, got none",
         ),
-        ({"family": "trapezoid", "velocity": 3.0, "acceleration": 2.0}, None, "one waypoint to one other, got 3"),
+        ({"family": "trapezoid", "velocity": 3.0, "acceleration": 2.0}, None, "must have exactly two waypoints, got 3"),
         ({"family": "s_curve", **PROFILE, "velocity": 1.0}, REST, "within the 16 s between its waypoints, got 2"),
         (
             {"family": "s_curve", **PROFILE, "velocity": [1.0, 2.0]},

@@ -83,7 +83,7 @@ def refused_or_run(text):
             said = str(error)
             assert said.startswith(f"{path}: ")
             assert len(said.splitlines()) == 1
-            assert re.search(r"\b(must|needs?)\b.*\b(got|give)\b", said), said
+            assert re.search(r"\b(must|requires?)\b.*\b(got|give)\b", said), said
             assert len(said) < 2000
             return
         assert study.comparison.metrics
