@@ -85,6 +85,7 @@ _EXPORTS = {
         "load_trajectory",
         "stack",
         "trajectory_from_dict",
+        "waypoints_from_csv",
     ),
     "planning": (
         "AlphaChoice",
