@@ -69,11 +69,16 @@ def waypoints_from_csv(
     >>> points[2]
     Waypoint.from_jets(4.75, x=[3.0], z=[10.5])
     """
+    rate = None if speed is None else checked_finite(speed, "speed", above=0.0)
+    if isinstance(time, bool) or not isinstance(time, Column | None):
+        raise TypeError(f"time must be the name or the number of a column, or None, got {time!r:.80}")
+    if columns is not None and not isinstance(columns, Sequence):
+        raise TypeError(f"columns must be names or numbers of columns, got {columns!r:.80}")
     table = _Table(Path(path))
-    when = table.time_column(time, speed is not None)
-    if when is not None and speed is not None:
+    when = table.time_column(time, rate is not None)
+    if when is not None and rate is not None:
         raise ValueError(
-            f"speed must not be given for a file with times, got {speed:g} and the column {table.name(when)}; "
+            f"speed must not be given for a file with times, got {rate:g} and the column {table.name(when)}; "
             f"pass time=None and the columns of the axes"
         )
     if columns is None:
@@ -85,7 +90,7 @@ def waypoints_from_csv(
     used = [column for column in chosen if column != when]
     if not used:
         raise ValueError(f"{path} must have a column of positions, got one of times only; pass time=None if it is none")
-    times = table.increasing(when) if when is not None else table.travelled(used, speed)
+    times = table.increasing(when) if when is not None else table.travelled(used, rate or 1.0)
     if table.header is None:
         return [Waypoint(t, row) for t, row in zip(times, table.values[:, used].tolist(), strict=True)]
     jets = _jets([table.header[column] for column in used], used)
@@ -152,13 +157,12 @@ class _Table:
                 )
         return times
 
-    def travelled(self, columns: list[int], speed: float | None) -> list[float]:
+    def travelled(self, columns: list[int], speed: float) -> list[float]:
         """Times of the lines at a speed along the chords of the positions."""
-        rate = 1.0 if speed is None else checked_finite(speed, "speed", above=0.0)
         positions = columns
         if self.header is not None:
             positions = [jet[0] for jet in _jets([self.header[column] for column in columns], columns).values()]
-        steps = np.sqrt((np.diff(self.values[:, positions], axis=0) ** 2).sum(axis=1)) / rate
+        steps = np.sqrt((np.diff(self.values[:, positions], axis=0) ** 2).sum(axis=1)) / speed
         for k, step in enumerate(steps.tolist(), 1):
             if not 0.0 < step < math.inf:
                 raise ValueError(

@@ -16,7 +16,7 @@ from trajectory_oracle import Direct, waypoints
 import ctrlplan as cp
 from ctrlplan.flatness import FlatSystem
 from ctrlplan.trajectories import Trajectory, Waypoint
-from ctrlplan.trajectories.export import ENDINGS, cam, cells
+from ctrlplan.trajectories.export import ENDINGS, TableFormat, cam, cells
 
 PLANE = cp.PolySpline(
     [Waypoint.from_jets(0.5, x=[0, 0, 0], z=[10, 0, 0]), Waypoint.from_jets(2.5, x=[3, 0, 0], z=[8, 0, 0])]
@@ -446,11 +446,29 @@ def test_names_in_structured_text_are_those_of_the_language(tmp_path):
         TURNED.export(tmp_path / "no.cam.st", timepts=np.linspace(0, 3, 40001))
 
 
+# A format of one's own
+
+
+class _Lines(TableFormat):
+    """One line a signal."""
+
+    def encoded(self, table):
+        return "".join(f"{name} {row[-1]}\n" for name, row in zip(table.names, table.rows, strict=True))
+
+
+def test_a_format_of_ones_own_is_one_class_and_one_entry(tmp_path, monkeypatch):
+    monkeypatch.setitem(ENDINGS, ".lines", _Lines())
+    PLANE.export(tmp_path / "plan.lines", derivatives=0)
+    assert (tmp_path / "plan.lines").read_text() == "x 3.0\nz 8.0\n"
+    cp.simulate(cp.create_source_iosystem(PLANE), [0.5, 2.5]).export(tmp_path / "run.lines")
+    assert (tmp_path / "run.lines").read_text() == "x 3.0\nz 8.0\n"
+
+
 # Requests that cannot be met
 
 
 def test_an_unknown_ending_names_those_that_are_known(tmp_path):
-    for name in ("plan.txt", "plan", "plan.csv.zip", "plan.json"):
+    for name in ("plan.txt", "plan", "plan.csv.zip", "plan.json", ".csv"):
         with pytest.raises(ValueError, match=r"path must end in one of \.csv, \.mat.*, got .*" + re.escape(name)):
             PLANE.export(tmp_path / name)
     PLANE.export(tmp_path / "PLAN.CSV", derivatives=0)
@@ -464,7 +482,7 @@ def test_an_unknown_ending_names_those_that_are_known(tmp_path):
         (".csv", {"dt": 0.0}, "dt must be finite and above 0, got 0"),
         (".csv", {"dt": 1e-9}, "dt must give at most 100000000 samples, got 2e\\+09 with dt = 1e-09 s"),
         (".csv", {"timepts": 0.1}, "timepts must be sample times of shape"),
-        (".csv", {"derivatives": -1}, "derivatives must be a whole number from 0, got -1"),
+        (".csv", {"derivatives": -1}, "derivatives must be an integer of at least 0, got -1"),
         (".c", {"dt": 0.1}, r"dt must not be given for \.c \(only for \.csv.*\), got 0.1"),
         (".ppoly.json", {"timepts": [0.0]}, r"timepts must not be given for \.ppoly\.json"),
         (".c", {"flat": FLAT["crane"][1]}, r"flat must not be given for \.c"),

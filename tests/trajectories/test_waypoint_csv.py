@@ -140,6 +140,20 @@ def test_arguments_that_do_not_fit_the_file(options, message, read):
         read("t,x\n0,1\n1,2\n", **options)
 
 
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"time": 2.0}, "time must be the name or the number of a column, or None, got 2.0"),
+        ({"time": True}, "time must be the name or the number of a column, or None, got True"),
+        ({"columns": 1}, "columns must be names or numbers of columns, got 1"),
+        ({"speed": "2"}, "speed must be a number, got '2'"),
+    ],
+)
+def test_arguments_of_other_kinds(options, message, read):
+    with pytest.raises(TypeError, match=message):
+        read("0,1\n1,2\n", **options)
+
+
 def test_names_need_a_header(read):
     with pytest.raises(ValueError, match="must have a header with 'x', got numbers; give columns by number"):
         read("0,1\n1,2\n", columns=["x"])

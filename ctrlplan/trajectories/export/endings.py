@@ -66,7 +66,7 @@ def ending_of(path: Path, endings: Iterable[str], name: str = "path") -> str:
     ValueError
         If it has none of them.
     """
-    fitting = [ending for ending in endings if path.name.lower().endswith(ending)]
+    fitting = [ending for ending in endings if path.name.lower().endswith(ending) and path.name.lower() != ending]
     if not fitting:
         raise ValueError(f"{name} must end in one of {', '.join(endings)}, got {path}")
     return max(fitting, key=len)
