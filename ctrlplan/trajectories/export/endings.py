@@ -44,9 +44,9 @@ def check_options(options: Options, ending: str) -> None:
     """Raise for options that a format does not have."""
     for name in options.given():
         if name not in ENDINGS[ending].accepted:
-            endings = ", ".join(e for e, f in ENDINGS.items() if name in f.accepted)
+            accepting = ", ".join(e for e, f in ENDINGS.items() if name in f.accepted)
             raise ValueError(
-                f"{name} must not be given for {ending} (only for {accepted}), got {getattr(options, name)}"
+                f"{name} must not be given for {ending} (only for {accepting}), got {getattr(options, name)}"
             )
 
 
