@@ -209,6 +209,18 @@ def test_effort_must_be_one_number_a_joint(tmp_path):
         plan.export(tmp_path / "plan.yaml", flat=OneInput())
 
 
+def test_effort_that_is_not_finite_is_not_written(tmp_path):
+    class Singular:
+        state_labels, input_labels = ["x"], ["u"]
+
+        def states_and_inputs(self, plan, timepts):
+            return np.zeros((1, len(timepts))), np.full((1, len(timepts)), np.nan)
+
+    with pytest.raises(ValueError, match="numbers in the file must be finite, got nan"):
+        TURNED.export(tmp_path / "plan.yaml", flat=Singular())
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_what_a_flat_system_rejects_is_not_written(tmp_path):
     step = cp.Step([1.0, 2.0], labels=["x", "z"])
     with pytest.raises(ValueError, match="plan must be continuous up to derivative 3"):
