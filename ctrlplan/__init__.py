@@ -10,8 +10,9 @@ Plan a move
     SCurve, Trapezoid, Step   moves with limited jerk, with limited acceleration, without limits
     Shaper                    input shaping of any plan, against a known mode
     stack                     plans of single axes as one plan
+    waypoints_from_csv        waypoints from a table, with times or at a speed
     load_trajectory, trajectory_from_dict    stored plans
-    Trajectory                what all plans have: values, derivatives, extrema, plot, save, algebra
+    Trajectory                what all plans have: values, derivatives, extrema, plot, save, export, algebra
     WaypointSpline            base class of a spline of your own
 Choose what is left free
     choose_alpha              shape by an objective: PeakDerivative, SquaredDerivative -> AlphaChoice
@@ -85,6 +86,7 @@ _EXPORTS = {
         "load_trajectory",
         "stack",
         "trajectory_from_dict",
+        "waypoints_from_csv",
     ),
     "planning": (
         "AlphaChoice",

@@ -53,7 +53,7 @@ from __future__ import annotations
 import inspect
 import os
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 
@@ -71,7 +71,7 @@ from ctrlplan.studies.plans import standard_plans
 from ctrlplan.studies.reading import Reader, StudyError, got, named_in_module, one_line, reference
 from ctrlplan.studies.running import Builder, System
 from ctrlplan.studies.study import Study
-from ctrlplan.trajectories import PolySpline, Trajectory, TrigSpline, Waypoint
+from ctrlplan.trajectories import PolySpline, Trajectory, TrigSpline, Waypoint, waypoints_from_csv
 from ctrlplan.trajectories.waypoint_spline import FromWaypoints, families, family_name
 
 __all__ = ["StudyError", "StudyFile", "build_loop", "load_study"]
@@ -272,6 +272,8 @@ class _FileReader(Reader):
         loop = data.get("loop")
         kind = loop_kind(loop.get("kind")) if isinstance(loop, dict) else None
         first = () if kind is None else kind.axes
+        if isinstance(data.get("waypoints"), str | dict):
+            return self.waypoints_of_csv(data["waypoints"], first)
         points = []
         for i, table in enumerate(self.tables(data, "waypoints")):
             place = f"waypoints[{i}]"
@@ -286,6 +288,26 @@ class _FileReader(Reader):
         try:
             return PolySpline(points, warn=False).waypoints
         except ValueError as error:
+            raise self.error("waypoints", error) from None
+
+    def waypoints_of_csv(self, stated: str | Data, first: Sequence[str]) -> tuple[Waypoint, ...]:
+        """Waypoints of a CSV file, named by its path or by a table with the arguments of `waypoints_from_csv`."""
+        table: Data = {"csv": stated} if isinstance(stated, str) else stated
+        self.known(table, ("csv", "time", "columns", "speed"), "waypoints")
+        if not isinstance(table.get("csv"), str):
+            raise self.error("waypoints.csv", f"must be the path of a CSV file, got {got(table.get('csv'))}")
+        options: Data = {key: value for key, value in table.items() if key != "csv"}
+        try:
+            points = waypoints_from_csv(self.path.parent / table["csv"], **options)
+            labels = points[0].labels
+            if labels is not None:
+                order = sorted(range(len(labels)), key=lambda k: (*first, labels[k]).index(labels[k]))
+                names = tuple(labels[k] for k in order)
+                points = [Waypoint.from_array(w.time, w.jet[:, order], names) for w in points]
+            return PolySpline(points, warn=False).waypoints
+        except OSError as error:
+            raise self.error("waypoints", f"must be a file that can be read, got {error}") from None
+        except (ValueError, TypeError) as error:
             raise self.error("waypoints", error) from None
 
     def benefit(self, data: Data) -> bool:

@@ -25,6 +25,7 @@ from ctrlplan.trajectories.trajectory import Trajectory
 from ctrlplan.trajectories.transition import Transition
 from ctrlplan.trajectories.trigonometric import FourierCoefficients, TrigSpline
 from ctrlplan.trajectories.waypoint import Waypoint
+from ctrlplan.trajectories.waypoint_csv import waypoints_from_csv
 from ctrlplan.trajectories.waypoint_spline import WaypointSpline
 
 __all__ = [
@@ -53,4 +54,5 @@ __all__ = [
     "load_trajectory",
     "stack",
     "trajectory_from_dict",
+    "waypoints_from_csv",
 ]

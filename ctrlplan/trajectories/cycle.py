@@ -18,7 +18,12 @@ def on_cycle(plan: Trajectory, dt: float, limits: Mapping[str, object] | None = 
     """Plan whose duration and waypoints are on a cycle; as `Trajectory.on_cycle`."""
     dt = checked_finite(dt, "dt", above=0.0)
     if isinstance(plan, Joined):
-        parts = [on_cycle(part, dt, limits) for part in plan.parts]
+        parts: list[Trajectory] = []
+        for k, part in enumerate(plan.parts):
+            try:
+                parts.append(on_cycle(part, dt, limits))
+            except ValueError as error:
+                raise ValueError(f"parts[{k}] of a joined plan: {error}") from None
         same = all(part is before for part, before in zip(parts, plan.parts, strict=True))
         return plan if same else Joined(parts)
     if not plan.duration:

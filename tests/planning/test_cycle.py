@@ -179,9 +179,15 @@ def test_a_segment_that_no_duration_helps_is_named():
         cp.PiecewiseSpline(points, warn=False).on_cycle(0.1, {"y": cp.Limits(high=1.01)})
 
 
+def test_the_part_of_a_joined_plan_is_named():
+    way = cp.PiecewiseSpline([rest(0, 0.0), Waypoint(1.0, 1.0, 0.5, 0.0), rest(2, 0.0)])
+    with pytest.raises(ValueError, match=r"parts\[1\] of a joined plan: y_d1 must stay within ±0.4, .* waypoints\[1\]"):
+        cp.PolySpline([rest(0, 1.0), rest(9, 0.0)]).then(way).on_cycle(0.1, {"velocity": 0.4})
+
+
 def test_a_limit_needs_the_continuity_of_margins():
     corner = cp.PiecewiseSpline([Waypoint(0, 0, 0), Waypoint(1, 1, 0), Waypoint(2, 0, 0)])
-    with pytest.raises(ValueError, match="y_d3 is limited, which needs a plan continuous up to derivative 2"):
+    with pytest.raises(ValueError, match="limits of y_d3 require a plan that is continuous up to derivative 2"):
         corner.on_cycle(0.1, {"y_d3": 10.0})
 
 

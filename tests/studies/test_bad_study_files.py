@@ -77,6 +77,10 @@ WRONG = {
     "waypoints are a number": (valid(waypoints=3), ["waypoints", "3"]),
     "waypoints are a table": (valid(waypoints={"time": 0.0, "x": REST}), ["waypoints"]),
     "waypoints are numbers": (valid(waypoints=[1.0, 2.0]), ["waypoints"]),
+    "no such CSV file": (valid(waypoints="none.csv"), ["waypoints", "none.csv"]),
+    "a CSV file without a path": (valid(waypoints={"csv": 3}), ["waypoints.csv", "3"]),
+    "a CSV file with another entry": (valid(waypoints={"csv": "none.csv", "alpha": 3}), ["waypoints", "'alpha'"]),
+    "a study file as CSV": (valid(waypoints="study.toml"), ["waypoints", "line"]),
     "repeated times": (points((0.0, REST), (6.0, [5.0]), (6.0, END)), ["waypoints[2].time", "6.0"]),
     "unsorted times": (points((0.0, REST), (16.0, END), (6.0, [5.0])), ["waypoints[2].time", "6.0", "16.0"]),
     "no time": (without("waypoints", 1, "time"), ["waypoints[1].time", "none"]),
@@ -367,7 +371,7 @@ def test_an_out_folder_whose_files_cannot_be_replaced_gets_neither(capsys, tmp_p
 def test_an_out_file_of_another_kind(name, capsys, tmp_path):
     (tmp_path / "study.toml").write_text(to_toml(valid()))
     line = refused(["plan", tmp_path / "study.toml", "--out", tmp_path / name], capsys)
-    assert "--out must end in .csv or .json, got" in line
+    assert "--out must end in one of .json, .csv, .mat," in line
     assert name in line
     assert [p.name for p in tmp_path.iterdir()] == ["study.toml"]
 

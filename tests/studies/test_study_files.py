@@ -246,6 +246,28 @@ def test_the_family_may_be_the_name(stated):
     assert list(found) == ["mine", "step"]
 
 
+@pytest.mark.parametrize(
+    ("waypoints", "text"),
+    [
+        ("path.csv", "t,x,x_d1,x_d2\n0,0,0,0\n6,5,1,0\n16,20,0,0\n"),
+        ({"csv": "path.csv", "time": "time", "columns": ["x", "x_d1", "x_d2"]},
+         "n;time;x;x_d1;x_d2\n1;0,0;0;0;0\n2;6,0;5;1;0\n3;16,0;20;0;0\n"),
+    ],
+)  # fmt: skip
+def test_waypoints_may_be_those_of_a_csv_file(waypoints, text, stated, tmp_path):
+    """Its path counts from the study file."""
+    (tmp_path / "path.csv").write_text(text)
+    assert stated(valid(waypoints=waypoints)).waypoints == stated(valid()).waypoints
+
+
+def test_waypoints_of_a_csv_file_at_a_speed(stated, tmp_path):
+    (tmp_path / "path.csv").write_text("z,x\n10,0\n6,3\n")
+    data = valid(waypoints={"csv": "path.csv", "speed": 2.0}, units={}, plans=[{"family": "piecewise"}])
+    assert [w.time for w in stated(data).waypoints] == [0.0, 2.5]
+    crane = valid(waypoints={"csv": "path.csv", "speed": 2.0}, units={}, loop={"kind": "crane"})
+    assert stated(crane).waypoints[1].labels == ("x", "z")
+
+
 def test_several_axes_keep_their_order_and_their_own_jets(stated):
     data = valid(
         units={},

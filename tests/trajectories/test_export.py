@@ -16,7 +16,7 @@ from trajectory_oracle import Direct, waypoints
 import ctrlplan as cp
 from ctrlplan.flatness import FlatSystem
 from ctrlplan.trajectories import Trajectory, Waypoint
-from ctrlplan.trajectories.export import ENDINGS, cam, cells
+from ctrlplan.trajectories.export import ENDINGS, TableFormat, cam, cells
 
 PLANE = cp.PolySpline(
     [Waypoint.from_jets(0.5, x=[0, 0, 0], z=[10, 0, 0]), Waypoint.from_jets(2.5, x=[3, 0, 0], z=[8, 0, 0])]
@@ -207,6 +207,18 @@ def test_effort_must_be_one_number_a_joint(tmp_path):
 
     with pytest.raises(ValueError, match=r"inputs of the flat system must be one per axis .* 2, got 1: u"):
         plan.export(tmp_path / "plan.yaml", flat=OneInput())
+
+
+def test_effort_that_is_not_finite_is_not_written(tmp_path):
+    class Singular:
+        state_labels, input_labels = ["x"], ["u"]
+
+        def states_and_inputs(self, plan, timepts):
+            return np.zeros((1, len(timepts))), np.full((1, len(timepts)), np.nan)
+
+    with pytest.raises(ValueError, match="numbers in the file must be finite, got nan"):
+        TURNED.export(tmp_path / "plan.yaml", flat=Singular())
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_what_a_flat_system_rejects_is_not_written(tmp_path):
@@ -410,7 +422,7 @@ def test_what_no_cam_can_hold(ending, tmp_path):
     ):
         with pytest.raises(ValueError, match=message):
             plan.export(path)
-    with pytest.raises(ValueError, match=r"timepts of a cam must lie between 0 s and 3 s.*got -1 s to 3 s"):
+    with pytest.raises(ValueError, match=r"timepts of a cam must lie between .* 0 s and end 3 s, got -1 s to 3 s"):
         TURNED.export(path, timepts=[-1.0, 2.0])
     with pytest.raises(ValueError, match=f"derivatives must not be given for {re.escape(ending)}"):
         TURNED.export(path, derivatives=3)
@@ -446,11 +458,29 @@ def test_names_in_structured_text_are_those_of_the_language(tmp_path):
         TURNED.export(tmp_path / "no.cam.st", timepts=np.linspace(0, 3, 40001))
 
 
+# A format of one's own
+
+
+class _Lines(TableFormat):
+    """One line a signal."""
+
+    def encoded(self, table):
+        return "".join(f"{name} {row[-1]}\n" for name, row in zip(table.names, table.rows, strict=True))
+
+
+def test_a_format_of_ones_own_is_one_class_and_one_entry(tmp_path, monkeypatch):
+    monkeypatch.setitem(ENDINGS, ".lines", _Lines())
+    PLANE.export(tmp_path / "plan.lines", derivatives=0)
+    assert (tmp_path / "plan.lines").read_text() == "x 3.0\nz 8.0\n"
+    cp.simulate(cp.create_source_iosystem(PLANE), [0.5, 2.5]).export(tmp_path / "run.lines")
+    assert (tmp_path / "run.lines").read_text() == "x 3.0\nz 8.0\n"
+
+
 # Requests that cannot be met
 
 
 def test_an_unknown_ending_names_those_that_are_known(tmp_path):
-    for name in ("plan.txt", "plan", "plan.csv.zip", "plan.json"):
+    for name in ("plan.txt", "plan", "plan.csv.zip", "plan.json", ".csv"):
         with pytest.raises(ValueError, match=r"path must end in one of \.csv, \.mat.*, got .*" + re.escape(name)):
             PLANE.export(tmp_path / name)
     PLANE.export(tmp_path / "PLAN.CSV", derivatives=0)

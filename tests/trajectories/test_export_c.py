@@ -39,26 +39,38 @@ PLANS = {
 }
 
 
-class Compiled:
-    """Functions of an exported plan."""
+LOOP = """
+#include "plan.h"
 
-    def __init__(self, plan, folder, derivatives, name="plan"):
+void jets(const double *times, int count, double out[][PLAN_DERIVATIVES + 1][PLAN_AXES])
+{
+    for (int i = 0; i < count; i++) {
+        plan_jet(times[i], out[i]);
+    }
+}
+"""
+
+
+class Compiled:
+    """Functions of an exported plan, with a loop over times."""
+
+    def __init__(self, plan, folder, derivatives):
         self.shape = (derivatives + 1, plan.naxes)
-        source, header = plan.export(folder / f"{name}.c", derivatives=derivatives)
-        assert header == folder / f"{name}.h"
-        library = folder / f"{name}.so"
-        subprocess.run([GCC, *FLAGS, "-shared", "-fPIC", source, "-o", library], check=True)
-        code = ctypes.CDLL(str(library))
-        self._jet, self._jetf = getattr(code, f"{name}_jet"), getattr(code, f"{name}_jetf")
-        self._jet.argtypes = [ctypes.c_double, ctypes.c_void_p]
+        source, header = plan.export(folder / "plan.c", derivatives=derivatives)
+        assert header == folder / "plan.h"
+        (folder / "loop.c").write_text(LOOP)
+        subprocess.run([GCC, *FLAGS, "-shared", "-fPIC", source, "loop.c", "-o", "plan.so"], cwd=folder, check=True)
+        code = ctypes.CDLL(str(folder / "plan.so"))
+        self._jets, self._jetf, self.segment, self.segment_start = (
+            getattr(code, name) for name in ("jets", "plan_jetf", "plan_segment", "plan_segment_start")
+        )
+        self._jets.argtypes = [ctypes.c_void_p, ctypes.c_int, ctypes.c_void_p]
         self._jetf.argtypes = [ctypes.c_int, ctypes.c_float, ctypes.c_void_p]
-        self.segment, self.segment_start = getattr(code, f"{name}_segment"), getattr(code, f"{name}_segment_start")
         self.segment.argtypes, self.segment_start.restype = [ctypes.c_double], ctypes.c_double
 
     def jet(self, times):
         out = np.empty((len(times), *self.shape))
-        for t, row in zip(times.tolist(), out, strict=True):
-            self._jet(t, row.ctypes.data)
+        self._jets(times.ctypes.data, len(times), out.ctypes.data)
         return out.transpose(1, 2, 0)
 
     def jetf(self, segments, s):

@@ -17,7 +17,8 @@ from ctrlplan.trajectories.trajectory import Trajectory
 _HEADER = """\
 /* Plan from @START@ s to @END@ s; axes in this order: @LABELS@.
  *
- * Polynomials of degree @DEGREE@ in @CELLS@ cells. Bound of their distance from the plan:
+ * Polynomials of degree @DEGREE@ in @CELLS@ cells. Bound of their error, added to the rounding of the plan's own
+ * values:
 @ERRORS@ */
 #ifndef @UPPER@_H
 #define @UPPER@_H

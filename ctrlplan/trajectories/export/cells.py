@@ -8,11 +8,13 @@ polynomial of degree n. By Taylor's theorem derivative k of the remainder is at 
 with the maximum over the segment; it is 0 where the segment is a polynomial of
 degree n. Evaluated by Horner's rule in floating point, derivative k adds at most
 
-.. math:: (4 n + 6)\,u \sum_{i \ge k} \frac{i!}{(i - k)!}\,\frac{|c_i|}{r^k},
+.. math:: (5 n + 2 k + 6)\,u \sum_{i \ge k} \frac{i!}{(i - k)!}\,\frac{|c_i|}{r^k},
 
-with the coefficients c_i of the local time in parts of r, unit roundoff u
-(Higham, Accuracy and Stability of Numerical Algorithms, 5.1) and the rounding of
-the local time included. Cells are halved until both are near u times the peak of derivative k.
+with the coefficients c_i of the powers of the local time divided by r and the
+unit roundoff u: 2 n for Horner's rule (Higham, Accuracy and Stability of
+Numerical Algorithms, 5.1), 3 n for the local time, the rest for coefficients and
+powers of r. The rounding of the plan's own values is not included. Cells are
+halved until both are near u times the peak of derivative k.
 """
 
 from __future__ import annotations
@@ -132,7 +134,8 @@ def _cells(plan: Trajectory, segment: int, peaks: Array, centred: bool) -> Cells
         fine = (left <= _UNIT * peaks).all() and (terms <= _GROWTH * peaks).all()
         shortest = np.diff(edges).min()
         if fine or count >= _CELLS or shortest <= 16.0 * np.spacing(max(abs(start), abs(end))):
-            return Cells(start, edges, anchors, radius, coefficients, left + (4 * degree + 6) * _UNIT * terms)
+            rounding = (5 * degree + 2 * k[:, None] + 6) * _UNIT
+            return Cells(start, edges, anchors, radius, coefficients, left + rounding * terms)
         count *= 2
 
 

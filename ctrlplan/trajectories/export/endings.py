@@ -44,9 +44,9 @@ def check_options(options: Options, ending: str) -> None:
     """Raise for options that a format does not have."""
     for name in options.given():
         if name not in ENDINGS[ending].accepted:
-            endings = ", ".join(e for e, f in ENDINGS.items() if name in f.accepted)
+            accepting = ", ".join(e for e, f in ENDINGS.items() if name in f.accepted)
             raise ValueError(
-                f"{name} must not be given for {ending} (only for {endings}), got {getattr(options, name)}"
+                f"{name} must not be given for {ending} (only for {accepting}), got {getattr(options, name)}"
             )
 
 
@@ -66,7 +66,7 @@ def ending_of(path: Path, endings: Iterable[str], name: str = "path") -> str:
     ValueError
         If it has none of them.
     """
-    fitting = [ending for ending in endings if path.name.lower().endswith(ending)]
+    fitting = [ending for ending in endings if path.name.lower().endswith(ending) and path.name.lower() != ending]
     if not fitting:
         raise ValueError(f"{name} must end in one of {', '.join(endings)}, got {path}")
     return max(fitting, key=len)

@@ -1,0 +1,239 @@
+"""Waypoints from tables of text."""
+
+from __future__ import annotations
+
+import csv
+import math
+import os
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from ctrlplan._checks import checked_finite
+from ctrlplan.trajectories.waypoint import Waypoint
+
+Column = str | int
+"""A column by its name in the header, or by its number from 0."""
+
+
+def waypoints_from_csv(
+    path: str | os.PathLike[str],
+    *,
+    time: Column | None = "t",
+    columns: Sequence[Column] | None = None,
+    speed: float | None = None,
+) -> list[Waypoint]:
+    r"""Waypoints from a CSV file.
+
+    Cells are separated by semicolons if the first line has one, where decimal
+    commas are allowed, otherwise by commas. Text after # is a comment. The first
+    line may be a header. Columns named x and x_d1, x_d2, ... are the position of
+    axis x and its derivatives, as `Trajectory.export` writes them.
+
+    Parameters
+    ----------
+    path : str or path
+        File to be read, UTF-8.
+    time : str, int or None, optional
+        Column of the times [s]. Without a header the first column, unless a
+        number is given. None: the file has no times.
+    columns : sequence of str or int, optional
+        Columns that are read; default: all others.
+    speed : float, optional
+        Speed of the path from waypoint to waypoint [unit of the axes per s],
+        for files without times. Default: 1, so that times are chord lengths.
+
+    Returns
+    -------
+    list of Waypoint
+
+    Raises
+    ------
+    OSError
+        If the file cannot be read.
+    ValueError
+        With the number of the line, if a cell is empty, not a number or not
+        finite, a line has too few or too many cells, or times do not increase;
+        if a column is unknown, or `speed` is given for a file with times.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     path = Path(folder, "path.csv")
+    ...     size = path.write_text("x; z  # of the load [m]\n0; 10\n3; 6\n3; 10,5\n")
+    ...     points = waypoints_from_csv(path, speed=2.0)
+    >>> points[2]
+    Waypoint.from_jets(4.75, x=[3.0], z=[10.5])
+    """
+    rate = None if speed is None else checked_finite(speed, "speed", above=0.0)
+    if isinstance(time, bool) or not isinstance(time, Column | None):
+        raise TypeError(f"time must be the name or the number of a column, or None, got {time!r:.80}")
+    if columns is not None and not isinstance(columns, Sequence):
+        raise TypeError(f"columns must be names or numbers of columns, got {columns!r:.80}")
+    table = _Table(Path(path))
+    when = table.time_column(time, rate is not None)
+    if when is not None and rate is not None:
+        raise ValueError(
+            f"speed must not be given for a file with times, got {rate:g} and the column {table.name(when)}; "
+            f"pass time=None and the columns of the axes"
+        )
+    if columns is None:
+        chosen = list(range(table.width))
+    else:
+        chosen = [table.column(column) for column in ([columns] if isinstance(columns, str) else columns)]
+        if len(set(chosen)) < len(chosen):
+            raise ValueError(f"columns must differ from each other, got {', '.join(map(table.name, chosen))}")
+    used = [column for column in chosen if column != when]
+    if not used:
+        raise ValueError(f"{path} must have a column of positions, got one of times only; pass time=None if it is none")
+    times = table.increasing(when) if when is not None else table.travelled(used, rate or 1.0)
+    if table.header is None:
+        return [Waypoint(t, row) for t, row in zip(times, table.values[:, used].tolist(), strict=True)]
+    jets = _jets([table.header[column] for column in used], used)
+    return [
+        Waypoint.from_jets(t, **{label: row[jet].tolist() for label, jet in jets.items()})
+        for t, row in zip(times, table.values, strict=True)
+    ]
+
+
+class _Table:
+    """Numbers of a file, with its header and the numbers of its lines."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        rows = self._rows()
+        if not rows:
+            raise ValueError(f"{path} must have lines of numbers, got none")
+        self.header = self._header(*rows[0])
+        self.lines = [line for line, _ in rows[self.header is not None :]]
+        self.width = len(rows[0][1])
+        if not self.lines:
+            raise ValueError(f"{path} must have lines of numbers, got a header only")
+        self.values = np.array([self._numbers(*row) for row in rows[self.header is not None :]])
+
+    def name(self, column: int) -> str:
+        """A column in words."""
+        return repr(self.header[column]) if self.header else f"number {column}"
+
+    def column(self, column: Column) -> int:
+        """Number of a column."""
+        if isinstance(column, int) and not isinstance(column, bool):
+            if 0 <= column < self.width:
+                return column
+            raise ValueError(f"{self.path} must have a column {column}, got {self.width} columns, from 0")
+        if self.header is None:
+            raise ValueError(f"{self.path} must have a header with {column!r}, got numbers; give columns by number")
+        if column not in self.header:
+            raise ValueError(f"{self.path} must have a column {column!r}, got {', '.join(self.header)}")
+        return self.header.index(column)
+
+    def time_column(self, time: Column | None, timed: bool) -> int | None:
+        """Column of the times, None if there is none; `timed` says that times follow from a speed."""
+        if time is None or isinstance(time, int):
+            return None if time is None else self.column(time)
+        if self.header is None:
+            return None if timed else 0
+        if time in self.header:
+            return self.header.index(time)
+        similar = [name for name in self.header if re.fullmatch(r"t(ime)?(\W.*|_s)?", name, re.IGNORECASE)]
+        if time != "t" or similar:
+            found = f", got {', '.join(self.header)}"
+            hint = f"; pass time={similar[0]!r}" if similar else "; pass time=None where there is none"
+            raise ValueError(f"{self.path} must have the column {time!r} of times{found}{hint}")
+        return None
+
+    def increasing(self, column: int) -> list[float]:
+        """Times of the lines."""
+        times: list[float] = self.values[:, column].tolist()
+        for k in range(1, len(times)):
+            if not times[k] > times[k - 1]:
+                raise ValueError(
+                    f"{self._place(k)}: times must increase strictly, got {times[k]:g} after {times[k - 1]:g} in line "
+                    f"{self.lines[k - 1]}"
+                )
+        return times
+
+    def travelled(self, columns: list[int], speed: float) -> list[float]:
+        """Times of the lines at a speed along the chords of the positions."""
+        positions = columns
+        if self.header is not None:
+            positions = [jet[0] for jet in _jets([self.header[column] for column in columns], columns).values()]
+        steps = np.sqrt((np.diff(self.values[:, positions], axis=0) ** 2).sum(axis=1)) / speed
+        for k, step in enumerate(steps.tolist(), 1):
+            if not 0.0 < step < math.inf:
+                raise ValueError(
+                    f"{self._place(k)}: positions must differ from those before, by which times are counted, got "
+                    f"those of line {self.lines[k - 1]}; add a column of times"
+                )
+        return [0.0, *np.cumsum(steps).tolist()]
+
+    def _rows(self) -> list[tuple[int, list[str]]]:
+        """Numbers and cells of the lines that have any."""
+        try:
+            text = self.path.read_text(encoding="utf-8-sig")
+        except UnicodeDecodeError as error:
+            raise ValueError(f"{self.path} must be text in UTF-8, got {error}") from None
+        lines = [(k, line.partition("#")[0].strip()) for k, line in enumerate(text.split("\n"), 1)]
+        lines = [(k, line) for k, line in lines if line]
+        self.semicolons = bool(lines) and ";" in lines[0][1]
+        delimiter = ";" if self.semicolons else ","
+        try:
+            return [(k, [c.strip() for c in next(csv.reader([line], delimiter=delimiter))]) for k, line in lines]
+        except csv.Error as error:
+            raise ValueError(f"{self.path} must be a table, got {error}") from None
+
+    def _header(self, line: int, cells: list[str]) -> list[str] | None:
+        """Names of the columns, None if the first line has numbers."""
+        numeric = [self._number(cell) is not None for cell in cells]
+        if all(numeric):
+            return None
+        if any(numeric) or "" in cells or len(set(cells)) < len(cells):
+            raise ValueError(
+                f"{self.path}, line {line}: the first line must be numbers or different names, got {', '.join(cells)}"
+            )
+        return cells
+
+    def _numbers(self, line: int, cells: list[str]) -> list[float]:
+        """Finite numbers of a line."""
+        place = f"{self.path}, line {line}"
+        if len(cells) != self.width:
+            raise ValueError(f"{place}: must have {self.width} cells as the first line, got {len(cells)}")
+        found = []
+        for column, cell in enumerate(cells):
+            number = self._number(cell)
+            if number is None or not math.isfinite(number):
+                got = repr(cell) if cell else "an empty cell"
+                raise ValueError(f"{place}: column {self.name(column)} must be a finite number, got {got}")
+            found.append(number)
+        return found
+
+    def _number(self, cell: str) -> float | None:
+        """Number in a cell, None if it is something else."""
+        try:
+            return None if "_" in cell else float(cell.replace(",", ".") if self.semicolons else cell)
+        except ValueError:
+            return None
+
+    def _place(self, row: int) -> str:
+        return f"{self.path}, line {self.lines[row]}"
+
+
+def _jets(names: list[str], columns: list[int]) -> dict[str, list[int]]:
+    """Columns of each axis: its position, then its derivatives as far as they follow without a gap."""
+    where = dict(zip(names, columns, strict=True))
+    jets: dict[str, list[int]] = {}
+    for name, column in where.items():
+        label, _, order = name.rpartition("_d")
+        if not (order.isdecimal() and label in where):
+            jets[name] = [column]
+            k = 1
+            while (derivative := f"{name}_d{k}") in where:
+                jets[name].append(where[derivative])
+                k += 1
+        elif order != "1" and (lower := f"{label}_d{int(order) - 1}") not in where:
+            raise ValueError(f"columns must have {lower} where they have {name}, got {', '.join(names)}")
+    return jets
