@@ -255,8 +255,9 @@ _STYLE = (
     ".ctrlplan-shown div{overflow-x:auto}"
     ".ctrlplan-shown table{border-collapse:collapse;margin:.5em 0}"
     ".ctrlplan-shown caption{caption-side:top;text-align:left;padding:.2em 0;color:inherit;white-space:nowrap}"
-    ".ctrlplan-shown td,.ctrlplan-shown th{text-align:right;padding:.15em .6em;color:inherit;background:none;white-space:nowrap}"
-    ".ctrlplan-shown th:first-child{text-align:left;padding-left:0;white-space:normal;min-width:6em}.ctrlplan-shown tbody th{font-weight:normal}"
+    ".ctrlplan-shown td,.ctrlplan-shown th{text-align:right;padding:.15em .6em;color:inherit;background:none}"
+    ".ctrlplan-shown td,.ctrlplan-shown th{white-space:nowrap}.ctrlplan-shown tbody th{font-weight:normal}"
+    ".ctrlplan-shown th:first-child{text-align:left;padding-left:0;white-space:normal;min-width:6em}"
     ".ctrlplan-shown thead th{border-bottom:1px solid currentColor}"
     ".ctrlplan-shown figure{margin:.5em 0}.ctrlplan-shown svg{max-width:100%;height:auto}"
 )

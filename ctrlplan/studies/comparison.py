@@ -20,7 +20,7 @@ from ctrlplan._types import Params
 from ctrlplan.simulation import Event, SimulationResponse, signal_table
 from ctrlplan.studies.experiment import Experiment, Measured
 from ctrlplan.studies.limits import limits_of
-from ctrlplan.studies.measures import MEASURES, Measure, leading_metrics, shown_measures
+from ctrlplan.studies.measures import MEASURES, Measure, leading_metrics, short_title, shown_measures
 from ctrlplan.studies.notes import how_measured, mark_of, notes_of
 from ctrlplan.studies.plans import references_of, waypoints_given
 from ctrlplan.studies.roles import Role, Stability, role_of, stability_of
@@ -28,7 +28,7 @@ from ctrlplan.studies.running import Builder, System
 from ctrlplan.studies.sections import AnimatedCrane, PlanCurves, Responses, Section
 from ctrlplan.studies.study import Study
 from ctrlplan.studies.units import Signals, checked_units, listed_measures, scales_of, signals_of_runs
-from ctrlplan.studies.verdicts import unit_of, verdicts
+from ctrlplan.studies.verdicts import summary, unit_of, verdicts
 from ctrlplan.trajectories import Trajectory, Waypoint
 from ctrlplan.trajectories.export import Table as SampledTable
 from ctrlplan.trajectories.export import export_table
@@ -129,7 +129,8 @@ class Comparison(Displayed):
             ]
         )
         yield self.metric_table()
-        yield from self.notes
+        yield summary(self)
+        yield from (note for note in self.notes if note != summary(self))
         for verb, reasons in (("", self.marks), ("failed: ", self.failures)):
             for plan, reason in reasons.items():
                 yield f"{plan}: {verb}{reason}"
@@ -155,7 +156,7 @@ class Comparison(Displayed):
         left = len(listed) - len(names)
         more = f"; {left} more in .metrics" if left else ""
         caption = f"Metrics{' (* best)' if best else ''}{more}"
-        rows = [[self.measures[name].title, *cells[name]] for name in names]
+        rows = [[short_title(name, self.measures[name]), *cells[name]] for name in names]
         return Table(caption, ("metric", "unit", *self.metrics), rows, frozenset(best))
 
     def _rounded(self, value: float, name: str) -> float:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ctrlplan._display import Displayed, Facts, Part, Table, counted, number
 from ctrlplan.studies.comparison import Comparison, finite_or_none
-from ctrlplan.studies.measures import leading_metrics
+from ctrlplan.studies.measures import leading_metrics, short_title
 from ctrlplan.studies.sections import Bands, DrawTable, PlanCurves
 from ctrlplan.studies.study import Study
 from ctrlplan.studies.units import ROUNDING
@@ -114,7 +114,7 @@ class Ensemble(Displayed):
                     cells[name].append(middle if low == high else f"{middle} ({low} to {high})")
         names = leading_metrics(cells)
         caption = "Median of each metric (5 % to 95 % of the draws)"
-        rows = [[measures[name].title, *cells[name]] for name in names]
+        rows = [[short_title(name, measures[name]), *cells[name]] for name in names]
         return Table(caption, ("metric", "unit", *self.metrics), rows)
 
     @property

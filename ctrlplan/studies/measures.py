@@ -356,6 +356,11 @@ def leading_metrics(cells: Mapping[str, Sequence[str]]) -> list[str]:
     return [name for name in cells if name in chosen]
 
 
+def short_title(name: str, measure: Measure) -> str:
+    """Title of a metric in a short table, without the definition in brackets that some of `MEASURES` have."""
+    return measure.title.partition(" (")[0] if name in MEASURES else measure.title
+
+
 def _rank(name: str) -> int:
     """Place of a metric among those that a short table shows, whichever signal it is of."""
     known = max((key for key in MEASURES if name == key or name.startswith(f"{key}_")), key=len, default="")

@@ -30,7 +30,7 @@ from ctrlplan.studies.executing import (
     tried,
 )
 from ctrlplan.studies.experiment import Experiment, Metrics
-from ctrlplan.studies.measures import MEASURES, Measure, leading_metrics
+from ctrlplan.studies.measures import MEASURES, Measure, leading_metrics, short_title
 from ctrlplan.studies.roles import Role, role_of
 from ctrlplan.studies.running import Builder, System, is_builder
 from ctrlplan.trajectories import Trajectory, Waypoint
@@ -100,7 +100,10 @@ class Sweep(Displayed):
                 known = column[~np.isnan(column)]
                 low, high = (number(float(f(known)), unit) if known.size else "n/a" for f in (np.min, np.max))
                 cells[name].append(low if low == high else f"{low} to {high}")
-        rows = [[MEASURES[name].title if name in MEASURES else name, *cells[name]] for name in leading_metrics(cells)]
+        rows = [
+            [short_title(name, MEASURES[name]) if name in MEASURES else name, *cells[name]]
+            for name in leading_metrics(cells)
+        ]
         return Table("Metrics over all values, minimum to maximum", ("metric", "unit", *self.metrics), rows)
 
     def to_pandas(self) -> pd.DataFrame:
