@@ -224,6 +224,7 @@ def test_html_is_accessible(name):
     assert len(drawings) == tags.count("svg") == (name in DRAWN)
     assert all(attributes["aria-label"] for attributes in drawings)
     assert "script" not in tags
+    assert tags.count("style") == 1  # of an element inside a drawing it would hold for the whole page
     outside = re.sub(r"<svg.*</svg>", "", html, flags=re.DOTALL)
     assert not re.search(r"#[0-9a-f]{3,6}\b|rgb|(white|black)(?!-)", outside)  # colours are those of the page around
 
