@@ -422,6 +422,14 @@ def test_a_sweep_and_an_ensemble_show_the_range_of_their_metrics():
     assert row[2].startswith(f"{middle:.4g} (")
 
 
+def test_no_more_metrics_of_an_ensemble_are_sorted_than_are_shown(monkeypatch):
+    computed = []
+    found, quantiles = made("Ensemble"), cp.Ensemble.quantiles
+    monkeypatch.setattr(cp.Ensemble, "quantiles", lambda self, name: computed.append(name) or quantiles(self, name))
+    assert len(rows(str(found))) > 8
+    assert 8 <= len(computed) < len(found.nominal.measures)
+
+
 def test_a_response_shows_method_reason_signals_and_events():
     found = made("SimulationResponse")
     text = " ".join(str(found).split())

@@ -20,7 +20,7 @@ from ctrlplan._types import Params
 from ctrlplan.simulation import Event, SimulationResponse, signal_table
 from ctrlplan.studies.experiment import Experiment, Measured
 from ctrlplan.studies.limits import limits_of
-from ctrlplan.studies.measures import MEASURES, Measure, leading_metrics, short_title, shown_measures
+from ctrlplan.studies.measures import MEASURES, Measure, leading_metrics, shown_measures
 from ctrlplan.studies.notes import how_measured, mark_of, notes_of
 from ctrlplan.studies.plans import references_of, waypoints_given
 from ctrlplan.studies.roles import Role, Stability, role_of, stability_of
@@ -138,30 +138,25 @@ class Comparison(Displayed):
     def metric_table(self) -> Table:
         """Metrics as print shows them, eight at most, the best value of each marked."""
         listed = {name: one for name, one in self.measures.items() if any(name in row for row in self.metrics.values())}
-        cells = {
-            name: [
-                unit_of(self, name),
-                *(number(self._rounded(row.get(name, math.nan), name), measure.unit) for row in self.metrics.values()),
-            ]
-            for name, measure in listed.items()
-        }
-        names = leading_metrics(cells)
+        rows = leading_metrics(listed, self._cells)
         first = {verdict.key: verdict.best for verdict in verdicts(self)}
         best = [
-            (i, j + 2)
-            for i, name in enumerate(names)
-            for j, plan in enumerate(self.metrics)
+            (i, j)
+            for i, name in enumerate(rows)
+            for j, plan in enumerate(self.metrics, 2)
             if plan in first.get(name, ())
         ]
-        left = len(listed) - len(names)
+        left = len(listed) - len(rows)
         more = f"; {left} more in .metrics" if left else ""
         caption = f"Metrics{' (* best)' if best else ''}{more}"
-        rows = [[short_title(name, self.measures[name]), *cells[name]] for name in names]
-        return Table(caption, ("metric", "unit", *self.metrics), rows, frozenset(best))
+        return Table(caption, ("metric", "unit", *self.metrics), list(rows.values()), frozenset(best))
 
-    def _rounded(self, value: float, name: str) -> float:
-        """Value of a metric, 0 where that is what it differs from by rounding."""
-        return 0.0 if abs(value) <= 1e-9 * self.scales.get(name, 0.0) else value
+    def _cells(self, name: str, measure: Measure) -> list[str]:
+        """Unit and values of a metric; 0 where that is what a value differs from by rounding."""
+        rounding = 1e-9 * self.scales.get(name, 0.0)
+        values = [row.get(name, math.nan) for row in self.metrics.values()]
+        values = [0.0 if abs(value) <= rounding else value for value in values]
+        return [unit_of(self, name), *(number(value, measure.unit) for value in values)]
 
     def to_pandas(self) -> pd.DataFrame:
         """Metrics as a table, one row a metric, one column a plan."""
