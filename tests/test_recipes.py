@@ -234,6 +234,7 @@ class Phase(Section):
             "from ctrlplan.studies.study import Study",
             "from ctrlplan.studies.sections import Phase",
         ),
+        ("reports/sections.py", "from functools import singledispatch", "import numpy as np"),
         (
             "reports/sections.py",
             "# Cranes and loops",

@@ -61,8 +61,10 @@ def _ink(axes: Axes) -> None:
 
 
 def _own_ids(text: str) -> str:
-    """SVG element with ids that are no others' in the page, and that depend on the drawing alone."""
-    text = re.sub(r"<!--.*?-->\s*", "", text[text.index("<svg") :], flags=re.DOTALL)
+    """SVG element in one line, with ids and a style that concern no other in the page and depend on the drawing."""
+    text = re.sub(r"<!--.*?-->|<style.*?</style>", "", text[text.index("<svg") :], flags=re.DOTALL)
+    text = re.sub(r"\s+", " ", text).replace("> <", "><").replace("<defs></defs>", "")
+    text = text.replace("<svg ", '<svg style="stroke-linejoin:round;stroke-linecap:butt" ', 1)
     ids = {name: str(k) for k, name in enumerate(re.findall(r'\bid="([^"]+)"', text))}
     reference = re.compile(r'(\bid="|url\(#|href="#)([^")]+)')
     numbered = reference.sub(lambda found: f"{found[1]}{ids.get(found[2], found[2])}", text)

@@ -126,12 +126,12 @@ class SimulationResponse(Displayed, ct.TimeResponseData):  # type: ignore[misc] 
                 ("states", ", ".join(self.state_labels or ())),
             ]
         )
-        rows = [
-            (label, *(number(float(value)) for value in (row.min(), row.max(), row[-1])))
-            for label, row in zip(self.output_labels or (), self.y.reshape(-1, self.t.size), strict=False)
-            if row.size
-        ]
-        if rows:
+        if self.y.size and self.output_labels:
+            values = self.y.reshape(len(self.output_labels), -1)
+            rows = [
+                (label, *(number(float(value)) for value in (row.min(), row.max(), row[-1])))
+                for label, row in zip(self.output_labels, values, strict=True)
+            ]
             yield Table("Outputs", ("output", "minimum", "maximum", "final value"), shortened(rows))
         for event in self.events[:ROWS]:
             yield f"Event at {event}"

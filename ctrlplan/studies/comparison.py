@@ -28,7 +28,7 @@ from ctrlplan.studies.running import Builder, System
 from ctrlplan.studies.sections import AnimatedCrane, PlanCurves, Responses, Section
 from ctrlplan.studies.study import Study
 from ctrlplan.studies.units import Signals, checked_units, listed_measures, scales_of, signals_of_runs
-from ctrlplan.studies.verdicts import unit_of, verdicts
+from ctrlplan.studies.verdicts import summary, unit_of, verdicts
 from ctrlplan.trajectories import Trajectory, Waypoint
 from ctrlplan.trajectories.export import Table as SampledTable
 from ctrlplan.trajectories.export import export_table
@@ -129,7 +129,8 @@ class Comparison(Displayed):
             ]
         )
         yield self.metric_table()
-        yield from self.notes
+        yield summary(self)
+        yield from (note for note in self.notes if note != summary(self))
         for verb, reasons in (("", self.marks), ("failed: ", self.failures)):
             for plan, reason in reasons.items():
                 yield f"{plan}: {verb}{reason}"
@@ -137,30 +138,25 @@ class Comparison(Displayed):
     def metric_table(self) -> Table:
         """Metrics as print shows them, eight at most, the best value of each marked."""
         listed = {name: one for name, one in self.measures.items() if any(name in row for row in self.metrics.values())}
-        cells = {
-            name: [
-                unit_of(self, name),
-                *(number(self._rounded(row.get(name, math.nan), name), measure.unit) for row in self.metrics.values()),
-            ]
-            for name, measure in listed.items()
-        }
-        names = leading_metrics(cells)
+        rows = leading_metrics(listed, self._cells)
         first = {verdict.key: verdict.best for verdict in verdicts(self)}
         best = [
-            (i, j + 2)
-            for i, name in enumerate(names)
-            for j, plan in enumerate(self.metrics)
+            (i, j)
+            for i, name in enumerate(rows)
+            for j, plan in enumerate(self.metrics, 2)
             if plan in first.get(name, ())
         ]
-        left = len(listed) - len(names)
+        left = len(listed) - len(rows)
         more = f"; {left} more in .metrics" if left else ""
         caption = f"Metrics{' (* best)' if best else ''}{more}"
-        rows = [[self.measures[name].title, *cells[name]] for name in names]
-        return Table(caption, ("metric", "unit", *self.metrics), rows, frozenset(best))
+        return Table(caption, ("metric", "unit", *self.metrics), list(rows.values()), frozenset(best))
 
-    def _rounded(self, value: float, name: str) -> float:
-        """Value of a metric, 0 where that is what it differs from by rounding."""
-        return 0.0 if abs(value) <= 1e-9 * self.scales.get(name, 0.0) else value
+    def _cells(self, name: str, measure: Measure) -> list[str]:
+        """Unit and values of a metric; 0 where that is what a value differs from by rounding."""
+        rounding = 1e-9 * self.scales.get(name, 0.0)
+        values = [row.get(name, math.nan) for row in self.metrics.values()]
+        values = [0.0 if abs(value) <= rounding else value for value in values]
+        return [unit_of(self, name), *(number(value, measure.unit) for value in values)]
 
     def to_pandas(self) -> pd.DataFrame:
         """Metrics as a table, one row a metric, one column a plan."""

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ctrlplan._display import Displayed, Facts, Part, Table, counted, number
 from ctrlplan.studies.comparison import Comparison, finite_or_none
-from ctrlplan.studies.measures import leading_metrics
+from ctrlplan.studies.measures import Measure, leading_metrics
 from ctrlplan.studies.sections import Bands, DrawTable, PlanCurves
 from ctrlplan.studies.study import Study
 from ctrlplan.studies.units import ROUNDING
@@ -105,17 +105,18 @@ class Ensemble(Displayed):
 
     def metric_table(self) -> Table:
         """Median and 5 to 95 % range of the metrics over the draws, as print shows them, eight at most."""
-        measures, cells = self.nominal.measures, {}
-        for name, measure in measures.items():
-            if any(name in row for row in self.metrics.values()):
-                cells[name] = [unit_of(self.nominal, name)]
-                for quantiles in self.quantiles(name).values():
-                    low, _, middle, _, high = (number(value, measure.unit) for value in quantiles.tolist())
-                    cells[name].append(middle if low == high else f"{middle} ({low} to {high})")
-        names = leading_metrics(cells)
-        caption = "Median of each metric (5 % to 95 % of the draws)"
-        rows = [[measures[name].title, *cells[name]] for name in names]
-        return Table(caption, ("metric", "unit", *self.metrics), rows)
+        measures = self.nominal.measures.items()
+        known = {name: one for name, one in measures if any(name in row for row in self.metrics.values())}
+        rows = list(leading_metrics(known, self._cells).values())
+        return Table("Median of each metric (5 % to 95 % of the draws)", ("metric", "unit", *self.metrics), rows)
+
+    def _cells(self, name: str, measure: Measure) -> list[str]:
+        """Unit of a metric, and its median and range for each plan."""
+        cells = [unit_of(self.nominal, name)]
+        for quantiles in self.quantiles(name).values():
+            low, _, middle, _, high = (number(value, measure.unit) for value in quantiles.tolist())
+            cells.append(middle if low == high else f"{middle} ({low} to {high})")
+        return cells
 
     @property
     def ndraws(self) -> int:

@@ -339,21 +339,33 @@ _LEADING = (
 )
 
 
-def leading_metrics(cells: Mapping[str, Sequence[str]]) -> list[str]:
-    """Names of the metrics that a short table shows: measures of one's own, then those that matter first.
+def leading_metrics(
+    measures: Mapping[str, Measure], cells_of: Callable[[str, Measure], Sequence[str]]
+) -> dict[str, list[str]]:
+    """Rows of a short table by the metric's name: measures of one's own, then those that matter first, eight at most.
 
     Parameters
     ----------
-    cells : mapping of str to sequence of str
-        Row of the table by the metric's name, in the order in which metrics are
-        shown. Rows that repeat another one, or hold nothing, are left out.
+    measures : mapping of str to Measure
+        In the order in which they are shown.
+    cells_of : callable
+        Maps a name and its measure to cells: the unit, then a value for each
+        plan. Rows that repeat another one, or hold no value, are left out.
     """
-    rows: dict[tuple[str, ...], str] = {}
-    for name, row in sorted(cells.items(), key=lambda item: _rank(item[0])):
+    found: dict[tuple[str, ...], str] = {}
+    for name in sorted(measures, key=_rank):
+        row = tuple(cells_of(name, measures[name]))
         if any(cell != "n/a" for cell in row[1:]):
-            rows.setdefault(tuple(row), name)
-    chosen = list(rows.values())[:ROWS]
-    return [name for name in cells if name in chosen]
+            found.setdefault(row, name)
+        if len(found) == ROWS:
+            break
+    rows = {name: [_short_title(name, measures[name]), *row] for row, name in found.items()}
+    return {name: rows[name] for name in measures if name in rows}
+
+
+def _short_title(name: str, measure: Measure) -> str:
+    """Title of a metric without the definition in brackets that some of `MEASURES` have."""
+    return measure.title.partition(" (")[0] if name in MEASURES else measure.title
 
 
 def _rank(name: str) -> int:

@@ -91,17 +91,20 @@ class Sweep(Displayed):
 
     def metric_table(self) -> Table:
         """Minimum and maximum of the metrics over the values, as print shows them, eight at most."""
-        cells = {}
-        for name in dict.fromkeys(name for row in self.metrics.values() for name in row):
-            unit = MEASURES[name].unit if name in MEASURES else ""
-            cells[name] = ["" if "{" in unit else unit]
-            for plan in self.metrics:
-                column = self._column(plan, name)
-                known = column[~np.isnan(column)]
-                low, high = (number(float(f(known)), unit) if known.size else "n/a" for f in (np.min, np.max))
-                cells[name].append(low if low == high else f"{low} to {high}")
-        rows = [[MEASURES[name].title if name in MEASURES else name, *cells[name]] for name in leading_metrics(cells)]
+        names = dict.fromkeys(name for row in self.metrics.values() for name in row)
+        measures = {name: MEASURES.get(name, Measure(name)) for name in names}
+        rows = list(leading_metrics(measures, self._cells).values())
         return Table("Metrics over all values, minimum to maximum", ("metric", "unit", *self.metrics), rows)
+
+    def _cells(self, name: str, measure: Measure) -> list[str]:
+        """Unit of a metric where it is known, and its range for each plan."""
+        cells = ["" if "{" in measure.unit else measure.unit]
+        for plan in self.metrics:
+            column = self._column(plan, name)
+            known = column[~np.isnan(column)]
+            low, high = (number(float(f(known)), measure.unit) if known.size else "n/a" for f in (np.min, np.max))
+            cells.append(low if low == high else f"{low} to {high}")
+        return cells
 
     def to_pandas(self) -> pd.DataFrame:
         """Table of one row a value; columns plan and metric."""
