@@ -11,7 +11,7 @@ Plan a move
     Shaper                    input shaping of any plan, against a known mode
     stack                     plans of single axes as one plan
     load_trajectory, trajectory_from_dict    stored plans
-    Trajectory                what all plans have: values, derivatives, extrema, plot, save, algebra
+    Trajectory                what all plans have: values, derivatives, extrema, algebra, plot, save, export
     WaypointSpline            base class of a spline of your own
 Choose what is left free
     choose_alpha              shape by an objective: PeakDerivative, SquaredDerivative -> AlphaChoice

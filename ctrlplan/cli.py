@@ -42,7 +42,7 @@ _PLAN_OUT = (
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog="ctrlplan", description="Plan the reference that a closed loop should follow, and show what that is worth."
+        prog="ctrlplan", description="Planned references for control loops, and reports of what they gain over a step."
     )
     parser.add_argument("--version", action="version", version=f"ctrlplan {ctrlplan.__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")

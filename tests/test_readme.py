@@ -96,7 +96,8 @@ def test_the_package_is_cited_by_its_version():
 def test_the_program_has_twelve_lines(ran):
     assert len(PROGRAM.splitlines()) == 12
     _, said, folder = ran
-    assert "step, planned" in said
+    for title in ("Settling time", "Overshoot on the final value"):
+        assert re.search(rf"^ *{title} .*\*$", said, re.MULTILINE)  # the best value marked
     assert (folder / "servo.html").stat().st_size > 10_000
 
 
