@@ -9,6 +9,7 @@ from pathlib import Path
 import control as ct
 import numpy as np
 import pytest
+from readme_figure import figure
 
 import ctrlplan as cp
 from ctrlplan.cli import main
@@ -125,6 +126,15 @@ def test_the_metrics_of_the_program_are_those_of_the_transfer_function(ran):
         assert round(np.abs(u).max()) == int(volts)
 
 
+def test_its_figure_is_drawn_of_the_program(ran):
+    names = ran[0]
+    left, right = figure().axes
+    for axes, system in ((left, names["loop"]), (right, ct.feedback(names["C"], names["P"]))):
+        drawn = [line.get_ydata() for line in axes.lines if line.get_linewidth() > 1.5]
+        for line, plan in zip(drawn, (cp.Step(1.0), names["plan"]), strict=True):
+            np.testing.assert_array_equal(line, cp.simulate(system, names["t"], plan).outputs)
+
+
 # Its table of jobs
 
 
@@ -178,7 +188,8 @@ def test_a_mode_that_is_known():
 
 def test_segments_are_shorter_than_the_best_trigonometric_spline():
     stated = re.search(
-        r"segments are ([\d.]+) m long, the best trigonometric spline ([\d.]+) m", section("When planning does not pay")
+        r"segments is ([\d.]+) m long,\s+that of the best trigonometric spline ([\d.]+) m",
+        section("When planning does not pay"),
     )
     points = obstacle_waypoints()
     lengths = plan_length(cp.PiecewiseSpline(points)), cp.choose_alpha(points, "path").value
