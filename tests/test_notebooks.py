@@ -9,6 +9,7 @@ import pytest
 pytest.importorskip("nbformat")
 pytest.importorskip("nbclient")
 import nbformat
+from words import in_text
 
 from notebooks import FOLDER, Tolerance, code_cells, differences, executed, same_texts, stored_form, texts
 
@@ -92,6 +93,11 @@ def test_it_has_a_title_and_text(notebook):
     assert notebook.cells[0].cell_type == "markdown"
     assert notebook.cells[0].source.startswith("# ")
     assert sum(cell.cell_type == "markdown" for cell in notebook.cells) >= 4
+
+
+def test_it_is_in_the_words_of_the_field(notebook):
+    found = [(word.word, row) for cell in notebook.cells for row in cell.source.splitlines() for word in in_text(row)]
+    assert not found
 
 
 def test_the_first_is_six_cells():
