@@ -9,6 +9,7 @@ import pytest
 pytest.importorskip("nbformat")
 pytest.importorskip("nbclient")
 import nbformat
+from words import in_text
 
 from notebooks import FOLDER, Tolerance, code_cells, differences, executed, same_texts, stored_form, texts
 
@@ -50,6 +51,7 @@ def test_it_shows_what_it_does(notebook):
 
 def test_no_errors_warnings_times_or_addresses_are_stored(notebook):
     said = [text for cell in code_cells(notebook) for text in texts(cell)]
+    assert not [text for text in said if re.search(r": False\b", text)]  # a comparison that failed
     assert not [text for text in said if text.startswith("stderr:") or "Traceback" in text]
     assert not [text for text in said if re.search(r"0x[0-9a-f]{6}|Wall time|CPU times", text)]
 
@@ -91,6 +93,11 @@ def test_it_has_a_title_and_text(notebook):
     assert notebook.cells[0].cell_type == "markdown"
     assert notebook.cells[0].source.startswith("# ")
     assert sum(cell.cell_type == "markdown" for cell in notebook.cells) >= 4
+
+
+def test_it_is_in_the_words_of_the_field(notebook):
+    found = [(word.word, row) for cell in notebook.cells for row in cell.source.splitlines() for word in in_text(row)]
+    assert not found
 
 
 def test_the_first_is_six_cells():

@@ -9,6 +9,7 @@ from pathlib import Path
 import control as ct
 import numpy as np
 import pytest
+from readme_figure import figure
 
 import ctrlplan as cp
 from ctrlplan.cli import main
@@ -96,7 +97,8 @@ def test_the_package_is_cited_by_its_version():
 def test_the_program_has_twelve_lines(ran):
     assert len(PROGRAM.splitlines()) == 12
     _, said, folder = ran
-    assert "step, planned" in said
+    for title in ("Settling time", "Overshoot on the final value"):
+        assert re.search(rf"^ *{title} .*\*$", said, re.MULTILINE)  # the best value marked
     assert (folder / "servo.html").stat().st_size > 10_000
 
 
@@ -122,6 +124,15 @@ def test_the_metrics_of_the_program_are_those_of_the_transfer_function(ran):
         percent, volts = re.search(rf"{plan}: (\d+) % overshoot, (\d+) V", words).groups()
         assert round(100.0 * (y.max() - 1.0)) == int(percent)
         assert round(np.abs(u).max()) == int(volts)
+
+
+def test_its_figure_is_drawn_of_the_program(ran):
+    names = ran[0]
+    left, right = figure().axes
+    for axes, system in ((left, names["loop"]), (right, ct.feedback(names["C"], names["P"]))):
+        drawn = [line.get_ydata() for line in axes.lines if line.get_linewidth() > 1.5]
+        for line, plan in zip(drawn, (cp.Step(1.0), names["plan"]), strict=True):
+            np.testing.assert_array_equal(line, cp.simulate(system, names["t"], plan).outputs)
 
 
 # Its table of jobs
@@ -177,7 +188,8 @@ def test_a_mode_that_is_known():
 
 def test_segments_are_shorter_than_the_best_trigonometric_spline():
     stated = re.search(
-        r"segments are ([\d.]+) m long, the best trigonometric spline ([\d.]+) m", section("When planning does not pay")
+        r"segments is ([\d.]+) m long,\s+that of the best trigonometric spline ([\d.]+) m",
+        section("When planning does not pay"),
     )
     points = obstacle_waypoints()
     lengths = plan_length(cp.PiecewiseSpline(points)), cp.choose_alpha(points, "path").value

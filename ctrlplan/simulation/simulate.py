@@ -131,6 +131,11 @@ def simulate(
         response noticeably; or if a block overrides the equations of its class:
         `control.input_output_response` is then used, with the same tolerances.
 
+    See Also
+    --------
+    ctrlplan.simulation : The methods, and what a run guarantees and requires.
+    ctrlplan.prepare : The built form of a system, for many runs.
+
     Notes
     -----
     Constant inputs reach the blocks to the last bit; samples and plans stay

@@ -10,17 +10,15 @@ from pathlib import Path
 
 import control as ct
 import matplotlib as mpl
+import matplotlib.pyplot as plt
 
 import ctrlplan as cp
-
-mpl.use("svg")
-import matplotlib.pyplot as plt
 
 ROOT = Path(__file__).parents[2]
 FILE = ROOT / "notebooks" / "step_versus_planned.svg"
 STEP, PLANNED, REFERENCE = "#D55E00", "#0072B2", "#777777"  # of Okabe and Ito, told apart by colour-blind readers
 SUPPLY = 24.0  # V
-STYLE = {"font.size": 9.0, "axes.spines.top": False, "axes.spines.right": False, "svg.hashsalt": "ctrlplan"}
+STYLE = {"font.size": 9.0, "axes.spines.top": False, "axes.spines.right": False}
 
 
 def program():
@@ -60,6 +58,7 @@ def figure():
 
 
 def main():
+    mpl.use("svg")
     with mpl.rc_context({"svg.hashsalt": "ctrlplan"}):
         figure().savefig(FILE, metadata={"Date": None})
     print(FILE)
