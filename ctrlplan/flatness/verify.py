@@ -323,6 +323,6 @@ def _check_reverse(plant: FlatPlant, probe: Probe, names: Sequence[str], sizes: 
             if not equal.all():
                 k = int(equal.argmin())
                 raise ValueError(
-                    f"reverse must be the inverse of forward, got {got[k]:.6g} after both as derivative "
-                    f"{k} of flat output {name} of a flag with {given[k]:.6g}"
+                    f"reverse must be the inverse of forward, got {got[k]:.6g} as derivative {k} of "
+                    f"flat output {name} for a flag with {given[k]:.6g}"
                 )
