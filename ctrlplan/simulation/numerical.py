@@ -212,7 +212,7 @@ class Attempt(Generic[S]):
             self.equations,
             self.solver,
             self.time_signals,
-            with_event_times(job.times, self.watched, self._slope),
+            with_event_times(job.times, self.watched, self._initial_slope),
             job.state,
             resolution=10.0 * job.rtol,
             marks=marks,
@@ -346,12 +346,12 @@ class Attempt(Generic[S]):
         seen = self._snapshot(t, x)
         return any(entry.side(entry.value(seen)).any() for entry in self.watched if entry.stop)
 
-    def _slope(self) -> Array:
-        equations, job = self.equations, self.job
-        if equations is None:
-            return np.zeros((0, 0))
-        time_values = signal_values(self.time_signals, job.times[:1])[:, 0]
-        return _slope(lambda x: equations.rates(job.first, x, time_values), job.state)
+    def _initial_slope(self) -> Array:
+        """Jacobian by the states at the start of the run; nan where blocks raise."""
+        t, n = self.job.times[:1], self.job.state.size
+        with np.errstate(all="ignore"):
+            values = signal_values(self.time_signals, t)
+            return np.asarray(self.on_trial(self.solver.slopes, t, self.job.state[:, None], values, (-1, n, n))[0])
 
 
 def equations_of(job: Job, network: Network) -> Interpreted | None:
@@ -382,14 +382,3 @@ def _accuracy_note(attempt: Attempt[S]) -> str:
         what = "depend on small fractions of large states"
     advice = f"rtol = {needed:.0e} suffices" if needed > 1e-12 / scales.relative.min() else "no tolerance suffices"
     return f"outputs {names} {what} and are uncertain by about {float(part.max()):.1g} of their range: {advice}"
-
-
-def _slope(rates: Callable[[Array], Array], state: Array) -> Array:
-    """Jacobian by the states, by finite differences."""
-    steps = 1e-6 * (1.0 + np.abs(state))
-    with np.errstate(all="ignore"):
-        before = rates(state)
-        columns = [
-            (rates(state + step * unit) - before) / step for step, unit in zip(steps, np.eye(state.size), strict=True)
-        ]
-    return np.array(columns).T.reshape(state.size, state.size)

@@ -595,7 +595,7 @@ def test_a_reverse_that_does_not_undo_forward_is_rejected():
         lambda flag, params: (flag[0][:2], flag[0][2:] + 0.01 * flag[0][1]),
     ):
         with pytest.raises(
-            ValueError, match=r"^reverse must be the inverse of forward, got .* flat output x for a flag with"
+            ValueError, match=r"^reverse must be the inverse of forward, got .* flat output x of a flag with"
         ):
             create_flat_iosystem(double_integrator(reverse=reverse), [-1, -2])
     with pytest.raises(ValueError, match=r"^reverse must return 2 states and 1 inputs, got 1 and 1"):
@@ -610,8 +610,11 @@ def test_a_reverse_that_does_not_undo_forward_is_rejected():
     ("forward", "message"),
     [
         (lambda x, u, params: [array(x[0])], r"got lengths \[1\]"),
-        (lambda x, u, params: [array(x[0], u[0]), array(x[1], u[0])], r"return one flag per input, 1, .* got lengths"),
-        (lambda x, u, params: [np.zeros(3 + (x[0] > 0))], "of constant length"),
+        (
+            lambda x, u, params: [array(x[0], u[0]), array(x[1], u[0])],
+            r"one flag per input, 1, .* got lengths \[2, 2\]",
+        ),
+        (lambda x, u, params: [np.zeros(3 + (x[0] > 0))], r"of constant length, got lengths \[4\]"),
         (lambda x, u, params: [array(x[0], x[1], np.nan)], "be finite in some of the random states, got .*nan"),
     ],
     ids=["too short", "too many", "of varying length", "not a number"],
