@@ -1,4 +1,4 @@
-"""Figures of cranes: sketch, signals, paths, motion, and an animation that plays offline."""
+"""Figures of cranes: sketch, signals, paths, motion, animation."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from ctrlplan.reports.style import (
     AxesLike,
     Drawing,
+    Style,
     add_title,
     as_text,
     font_size,
@@ -29,7 +30,7 @@ from ctrlplan.reports.style import (
 from ctrlplan.studies.comparison import Comparison
 from ctrlplan.studies.measures import signals_of
 from ctrlplan.studies.roles import Role
-from ctrlplan.studies.sections import AnimatedCrane, Wall
+from ctrlplan.studies.sections import AnimatedCrane, Place, Wall
 from ctrlplan.trajectories import TrigSpline
 
 Array = NDArray[np.float64]
@@ -90,7 +91,7 @@ def plot_sketch(*, ax: AxesLike | None = None) -> ControlPlot:
 
 
 def plot_time(comparison: Comparison, *, ax: AxesLike | None = None) -> ControlPlot:
-    """Load, error, sway and controls over time.
+    """Load, tracking error, sway and controls versus time.
 
     Parameters
     ----------
@@ -130,7 +131,7 @@ def plot_time(comparison: Comparison, *, ax: AxesLike | None = None) -> ControlP
 
 
 def plot_step(comparison: Comparison, *, ax: AxesLike | None = None) -> ControlPlot:
-    """Controls of a step with the limits of its own loop, and the rope it leaves slack.
+    """Controls, rope tension and sway of a step, with the limits of its loop.
 
     Parameters
     ----------
@@ -176,14 +177,14 @@ def plot_step(comparison: Comparison, *, ax: AxesLike | None = None) -> ControlP
 
 
 def plot_paths(comparison: Comparison, wall: Wall = None, *, ax: AxesLike | None = None) -> ControlPlot:
-    """Paths of the load in the plane, z down, with the obstacle.
+    """Paths of the load in the plane (z down), with an obstacle.
 
     Parameters
     ----------
     comparison : Comparison
         Of cranes.
     wall : ((float, float), (float, float)) or None
-        An obstacle to draw: its sides in x and in z [m].
+        Obstacle to draw: limits in x and in z [m].
     ax : Axes, optional
         Where to draw; None: an empty current figure, or a new one.
 
@@ -196,16 +197,13 @@ def plot_paths(comparison: Comparison, wall: Wall = None, *, ax: AxesLike | None
     (axes,) = drawing.column
     styles = plan_styles(comparison, axes)
     if wall:
-        (left, right), (top, ground) = wall
-        axes.add_patch(Rectangle((left, top), right - left, ground - top, color=shade(0.267), zorder=0))
-        axes.text(0.5 * (left + right), 0.5 * (top + ground), "wall", ha="center", fontsize=font_size(9))
+        axes.text(*_draw_wall(axes, wall, 0.267), "wall", ha="center", fontsize=font_size(9))
     last = _ends(comparison)[1]
     for name in _moving(comparison):  # steps take no path
         signals = _signals(comparison, name)
-        way = signals["t"] <= last
-        thin = {"color": styles[name]["color"], "linewidth": line_width(0.45), "alpha": 0.6}
-        axes.plot(*_planned(comparison, name, signals["t"][way]), **thin)
-        axes.plot(signals["x"][way], signals["z"][way], **styles[name])
+        move = signals["t"] <= last
+        axes.plot(*_planned(comparison, name, signals["t"][move]), **_thin(styles[name]))
+        axes.plot(signals["x"][move], signals["z"][move], **styles[name])
     for text, place in _named_places(comparison).items():
         axes.plot(*place, "o", color=shade(0.73), mfc=axes.get_facecolor(), zorder=5)
         axes.annotate(text, place, xytext=(6, -10), textcoords="offset points", fontsize=font_size(9))
@@ -215,17 +213,29 @@ def plot_paths(comparison: Comparison, wall: Wall = None, *, ax: AxesLike | None
     return drawing.finish()
 
 
+def _thin(style: Style) -> Style:
+    """Style of a reference, in the colour of its response."""
+    return {"color": style["color"], "linewidth": line_width(0.45), "alpha": 0.6}
+
+
+def _draw_wall(axes: Axes, wall: tuple[Place, Place], grey: float) -> Place:
+    """Draw an obstacle, and return its centre."""
+    (left, right), (top, ground) = wall
+    axes.add_patch(Rectangle((left, top), right - left, ground - top, color=shade(grey), zorder=0))
+    return 0.5 * (left + right), 0.5 * (top + ground)
+
+
 def plot_motion(
     comparison: Comparison, wall: Wall = None, steps: int = 13, *, ax: AxesLike | None = None
 ) -> ControlPlot:
-    """Trolley, rope and load at equal time steps, for the first two plans without jumps.
+    """Trolley, rope and load at equal time intervals, for the first two plans without jumps.
 
     Parameters
     ----------
     comparison : Comparison
         Of cranes.
     wall : ((float, float), (float, float)) or None
-        An obstacle to draw: its sides in x and in z [m].
+        Obstacle to draw: limits in x and in z [m].
     steps : int, optional
         Number of times.
     ax : array of Axes, shape (nplans,), optional
@@ -243,8 +253,7 @@ def plot_motion(
     for name, axes in zip(names, drawing.column, strict=True):
         signals = _signals(comparison, name)
         if wall:
-            (left, right), (top, ground) = wall
-            axes.add_patch(Rectangle((left, top), right - left, ground - top, color=shade(0.2), zorder=0))
+            _draw_wall(axes, wall, 0.2)
         axes.axhline(0.0, color=shade(0.4), linewidth=line_width(1.25))
         colour = plan_styles(comparison, axes)[name]["color"]
         axes.plot(signals["x"], signals["z"], color=colour, linewidth=line_width(0.5))
@@ -272,7 +281,7 @@ def _crane_at(axes: Axes, signals: dict[str, Array], t: float, colour: str) -> N
 
 
 def plot_online(comparison: Comparison, *, ax: AxesLike | None = None) -> ControlPlot:
-    """Load, reference in force, distance from the goal, sway and force of each way to run one plan.
+    """Load, reference, distance from the goal, sway and force of each control scheme.
 
     Parameters
     ----------
@@ -295,8 +304,7 @@ def plot_online(comparison: Comparison, *, ax: AxesLike | None = None) -> Contro
         signals = _signals(comparison, name)
         x, z = _across_and_down(comparison, plan.labels, plan.final)
         distance = np.hypot(signals["x"] - x, signals["z"] - z)
-        thin = {"color": styles[name]["color"], "linewidth": line_width(0.45), "alpha": 0.6}
-        rows[0].plot(signals["t"], signals["x_ref"], **thin)
+        rows[0].plot(signals["t"], signals["x_ref"], **_thin(styles[name]))
         for axes, values in zip(rows, (signals["x"], distance, signals["theta"], signals["F"] / 1e3), strict=True):
             axes.plot(signals["t"], values, **styles[name])
     for axes, label in zip(rows, labels, strict=True):
@@ -308,27 +316,27 @@ def plot_online(comparison: Comparison, *, ax: AxesLike | None = None) -> Contro
 
 
 _FRAMES = 20_000
-"""Frames of an animation at most; longer runs have fewer a second."""
+"""Maximum number of frames of an animation; longer runs have a lower frame rate."""
 
 
 def animation_data(comparison: Comparison, wall: Wall = None, shown: str = "", rate: float = 12.0) -> Markup:
-    """JSON for the animation, safe inside HTML: each plan at equal time steps, up to where it is finite.
+    """Data of the animation as JSON for HTML: each plan at equal time intervals, while its signals are finite.
 
     Entries: plans {name: [D, R, theta]}, the radius b of the drum (by plan where
     cranes differ), frames per second, wall, the view: left, top, width, height,
-    and the number of the plan that is shown at first.
+    and the number of the plan shown first.
 
     Parameters
     ----------
     comparison : Comparison
         Of cranes.
     wall : ((float, float), (float, float)) or None, optional
-        An obstacle to draw: its sides in x and in z [m].
+        Obstacle to draw: limits in x and in z [m].
     shown : str, optional
-        The plan that is shown at first; unless given, the first trigonometric
-        one, or else the first that is no step.
+        Plan shown first; unless given, the first trigonometric plan, or else
+        the first plan that is not a step.
     rate : float, optional
-        Frames per second, fewer in runs of more than half an hour.
+        Frames per second; lower for runs of more than half an hour.
 
     Raises
     ------
@@ -348,8 +356,8 @@ def animation_data(comparison: Comparison, wall: Wall = None, shown: str = "", r
     rate = min(rate, _FRAMES / max(longest, 1.0))
     for name in comparison.plans:
         signals = _signals(comparison, name)
-        sound = np.isfinite([signals[k] for k in AnimatedCrane.signals]).all(axis=0)
-        end = sound.size if sound.all() else int(np.argmin(sound))
+        finite = np.isfinite([signals[k] for k in AnimatedCrane.signals]).all(axis=0)
+        end = finite.size if finite.all() else int(np.argmin(finite))
         if not end:
             continue
         t = signals["t"][:end]
@@ -374,14 +382,14 @@ def animation_data(comparison: Comparison, wall: Wall = None, shown: str = "", r
 
 
 def _rounded(values: Array) -> list[float]:
-    """Values to five digits of the largest one."""
+    """Values rounded to five digits of the largest one."""
     size = float(np.max(np.abs(values), initial=0.0))
     found: list[float] = np.round(values, 4 - math.floor(math.log10(size)) if size > 0.0 else 0).tolist()
     return found
 
 
 def _view(comparison: Comparison, corners: list[Array]) -> list[float]:
-    """Left, top, width and height of what an animation shows: every waypoint, and loads that do not fly away."""
+    """Left, top, width and height of the view of an animation: waypoints and paths, within bounds."""
     first, last = _ends(comparison)
     paths = [_planned(comparison, name, np.linspace(first, last, 201)) for name in comparison.plans]
     low, high = (
@@ -396,7 +404,7 @@ def _view(comparison: Comparison, corners: list[Array]) -> list[float]:
     room = 0.1 * float(np.max(high - low))
     left, top = (low - room).tolist()
     width, height = (high - low + 2.0 * room).tolist()
-    # Neither a strip nor a tower: the figure has the width of the page.
+    # Limit the aspect ratio: the figure has the width of the page.
     height = max(height, 0.6 * width)
     left, width = left - max(0.0, 0.4 * height - 0.5 * width), max(width, 0.8 * height)
     return _rounded(np.array([left, top, width, height]))
@@ -408,7 +416,7 @@ def _signals(comparison: Comparison, name: str) -> dict[str, Array]:
 
 
 def _rope_top(signals: dict[str, Array]) -> Array:
-    """Point (2, ntime) at which the rope leaves the drum: of the crane that was simulated, whatever its drum."""
+    """Point (2, ntime) at which the rope leaves the drum, from the signals of the simulated crane."""
     across, down = np.sin(signals["theta"]), np.cos(signals["theta"])
     return np.stack([signals["x"] - signals["R"] * across, signals["z"] - signals["R"] * down])
 
@@ -422,12 +430,12 @@ def _drum_radius(signals: dict[str, Array]) -> float:
 
 
 def _moving(comparison: Comparison) -> list[str]:
-    """Plans that are no steps."""
+    """Plans that are not steps."""
     return [name for name, role in roles_of(comparison).items() if role is not Role.STEP]
 
 
 def _ends(comparison: Comparison) -> tuple[float, float]:
-    """Times of the first and the last waypoint, or of the plans where none are known."""
+    """Times of the first and the last waypoint, or start and end of the plans without waypoints."""
     if comparison.waypoints:
         return comparison.waypoints[0].time, comparison.waypoints[-1].time
     plans = comparison.plans.values()
@@ -441,13 +449,13 @@ def _planned(comparison: Comparison, name: str, t: Array) -> Array:
 
 
 def _across_and_down(comparison: Comparison, labels: Sequence[str], rows: Array) -> Array:
-    """Rows called x and z, or followed by the outputs x and z, in this order; nan where there are none."""
+    """Rows of x and z, by their labels or by the outputs that follow them; nan if there are none."""
     named = dict(zip(comparison.outputs, rows, strict=False)) | dict(zip(labels, rows, strict=True))
     return np.stack([named.get(label, np.full(rows.shape[1:], np.nan)) for label in ("x", "z")])
 
 
 def _named_places(comparison: Comparison) -> dict[str, tuple[float, float]]:
-    """Positions of the waypoints: start, A, B, ..., goal; those given in part are left out."""
+    """Positions of the waypoints: start, A, B, ..., goal; incomplete ones are omitted."""
     points = comparison.waypoints
     names = ["start", *map(_letters_of, range(len(points) - 2)), "goal"][: len(points)]
     found = {}

@@ -33,7 +33,7 @@ from ctrlplan.studies.verdicts import summary, verdicts
 
 
 def write_page(studies: Sequence[Study], path: str | os.PathLike[str], title: str) -> Path:
-    """Write studies as one HTML page that opens offline.
+    """Write studies as one self-contained HTML page.
 
     Parameters
     ----------
@@ -52,7 +52,7 @@ def write_page(studies: Sequence[Study], path: str | os.PathLike[str], title: st
     Raises
     ------
     OSError
-        If it cannot be written; nothing is left behind.
+        If it cannot be written; no partial output remains.
     """
     target = Path(path)
     if target.suffix not in (".html", ".htm"):
@@ -61,12 +61,12 @@ def write_page(studies: Sequence[Study], path: str | os.PathLike[str], title: st
 
 
 def write_report(studies: Sequence[Study], folder: str | os.PathLike[str], title: str) -> list[Path]:
-    """Write ``index.html`` and ``results.json`` into a folder, which is made if need be.
+    """Write ``index.html`` and ``results.json`` into a folder, which is created if necessary.
 
     Raises
     ------
     OSError
-        If the folder cannot be written; nothing is left behind.
+        If the folder cannot be written; no partial output remains.
     """
     target = Path(folder)
     results = {"studies": {study.name: study.results() for study in studies}}
@@ -79,12 +79,12 @@ def write_report(studies: Sequence[Study], folder: str | os.PathLike[str], title
 
 
 def write_all(texts: Mapping[Path, str | bytes]) -> list[Path]:
-    """Write files, of which none is replaced before all are on the disk; their folders are made if need be.
+    """Write files, replacing none before all are on the disk; folders are created if necessary.
 
     Raises
     ------
     OSError
-        If one cannot be written; nothing is left behind.
+        If one cannot be written; no partial output remains.
     """
     contents: dict[_files.PathLike, str | bytes] = dict(texts.items())
     made: list[Path] = []
@@ -95,9 +95,9 @@ def write_all(texts: Mapping[Path, str | bytes]) -> list[Path]:
                 folder.mkdir(exist_ok=True)
                 made.append(folder)
         _files.write_all(contents)
-    except BaseException:  # an interruption as well
+    except BaseException:  # including KeyboardInterrupt
         for folder in reversed(made):
-            with contextlib.suppress(OSError):  # somebody else has written there
+            with contextlib.suppress(OSError):  # not empty
                 folder.rmdir()
         raise
     return list(texts)
@@ -122,17 +122,17 @@ def render_page(studies: Sequence[Study], title: str) -> str:
 
 
 class CraneAnimation:
-    """Animation of a crane's comparison that a notebook plays, offline as well.
+    """Animation of a comparison of cranes for notebooks.
 
     Parameters
     ----------
     comparison : Comparison
         Of loops made by `crane_loop`.
     wall : ((float, float), (float, float)), optional
-        An obstacle to draw: its sides in x and in z [m].
+        Obstacle to draw: limits in x and in z [m].
     shown : str, optional
-        The plan that is shown at first; unless given, the first trigonometric
-        one, or else the first that is no step.
+        Plan shown first; unless given, the first trigonometric plan, or else
+        the first plan that is not a step.
 
     Raises
     ------
@@ -172,19 +172,19 @@ def _environment() -> Environment:
 
 
 def _readable(value: object) -> object:
-    """What is put into the page: of a text every character that can be seen and written."""
+    """Text for the page, without characters that cannot be displayed or encoded."""
     return readable(value) if type(value) is str else value
 
 
 def _script(name: str) -> Markup:
-    """A script of the page, which has no names in it: what it works on stands in the elements as text."""
+    """A script of the page; it contains no user data."""
     loader = _environment().loader
     assert loader is not None  # noqa: S101 (for the type)
     return Markup(loader.get_source(_environment(), name)[0])  # noqa: S704 (our own script)
 
 
 def _policy(script: str) -> str:
-    """Content security policy of the page: its own script and styles, and nothing from outside."""
+    """Content security policy of the page: its script and styles, no external resources."""
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     return (
         f"default-src 'none'; script-src 'sha256-{digest}'; style-src 'unsafe-inline'; img-src data:; "
@@ -199,14 +199,14 @@ class _Shown:
     Attributes
     ----------
     study : Study
-        What is shown.
+        The study.
     id : str
-        Id of its section: the study's name as far as an id can hold it.
+        Id of its section, derived from the name of the study.
     ids : tuple of str
-        Every id in it, its own included.
+        All ids of the section.
     parts : tuple of Part
-        Its sections, and what planning gains where the comparison has that;
-        the figures as SVG elements, with their ids as keys.
+        Its sections, with the benefit of planning if the comparison has one;
+        figures as SVG elements, with their ids as keys.
     """
 
     study: Study
@@ -231,7 +231,7 @@ class _Shown:
 
     @property
     def summary(self) -> str:
-        """How often each plan is best and worst."""
+        """Number of metrics in which each plan is best and worst."""
         return summary(self.study.comparison)
 
     @property
@@ -241,7 +241,7 @@ class _Shown:
 
     @property
     def parameters(self) -> dict[str, str]:
-        """How the comparison was made."""
+        """Parameters of the comparison."""
         return {name: in_line(value) for name, value in self.study.comparison.parameters.items()}
 
     @property
@@ -251,7 +251,7 @@ class _Shown:
 
 
 def _shown(study: Study, taken: Collection[str]) -> _Shown:
-    """A study with its figures drawn, under ids that no other on the page has."""
+    """A study with its figures drawn, with ids that are unique on the page."""
     sections: list[Section | Benefit] = list(study.sections)
     if study.comparison.benefit is not None:
         sections.append(study.comparison.benefit)
@@ -275,7 +275,7 @@ _Keyed = (Picture, Svg, Animation)
 
 
 def _drawn(block: Picture | Svg | Animation, name: str, key: str) -> Svg | Animation:
-    """A figure with its id on the page for a key, a plot as an SVG element."""
+    """A figure with its id as key, and a plot as an SVG element."""
     if isinstance(block, Picture):
         svg = Markup(to_svg(block.plot.figure, f"{name}.{key}"))  # noqa: S704 (our own drawing)
         return Svg(f"{name}-{key}", svg, block.caption)
@@ -283,7 +283,7 @@ def _drawn(block: Picture | Svg | Animation, name: str, key: str) -> Svg | Anima
 
 
 def _numbered(stem: str, taken: Callable[[str], bool]) -> str:
-    """A name, with the first number at which it is free where it is taken."""
+    """A name, with a number added if it is taken."""
     name, count = stem, 1
     while taken(name):
         count += 1

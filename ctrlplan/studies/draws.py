@@ -55,7 +55,7 @@ def draws(count: int, seed: int = 0, **distributions: Distribution) -> dict[str,
     True
     """
     if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
-        raise ValueError(f"count must be a whole number from 1, got {count!r}")
+        raise ValueError(f"count must be an integer of at least 1, got {count!r}")
     found = {}
     for name, distribution in distributions.items():
         rng = np.random.default_rng([seed, *name.encode()])

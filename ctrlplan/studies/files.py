@@ -204,7 +204,7 @@ def load_study(path: str | os.PathLike[str]) -> StudyFile:
     kind.check(loop, reader)
     samples = reader.number(data, "samples", "samples", default=4001.0)
     if samples != int(samples) or samples < 2:
-        raise reader.error("samples", f"must be a whole number, 2 or more, got {samples:g}")
+        raise reader.error("samples", f"must be an integer of at least 2, got {samples:g}")
     title = data.get("title", source.stem)
     if not isinstance(title, str):
         raise reader.error("title", f"must be a string, got {got(title)}")

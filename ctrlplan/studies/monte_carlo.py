@@ -1,4 +1,4 @@
-"""One comparison for each of many draws of a loop's parameters."""
+"""Comparisons over many draws of the parameters of a loop."""
 
 from __future__ import annotations
 
@@ -40,8 +40,13 @@ from ctrlplan.trajectories import Trajectory, Waypoint
 Forms: TypeAlias = Mapping[str, System]
 """The loop of each plan."""
 
+Draw: TypeAlias = dict[str, float]
+"""Parameters of one draw by name."""
+
+_Task: TypeAlias = tuple[Callable[[Draw], Outcome], "Forms | None"]
+
 _STAND_INS = 20
-"""Draws of which the first that runs stands for a nominal loop that does not."""
+"""Number of draws tried in place of a nominal loop that does not run."""
 
 
 def monte_carlo(
@@ -64,38 +69,28 @@ def monte_carlo(
     progress: bool = True,
     timeout: float | None = None,
 ) -> Ensemble:
-    """Compare plans in a loop for each of many draws of its parameters.
+    """Compare plans in a loop for many draws of its parameters.
 
-    A draw that cannot be run, whose worker process dies, that takes too long,
-    or that calls ``sys.exit`` is recorded in `Ensemble.failures` with the
-    reason; the others are kept. Ctrl-C ends the runs: what is finished is
-    returned with a warning, and tasks that have not begun are cancelled; an
-    executor finishes those that have. A second Ctrl-C, or one before the first
-    draw, raises KeyboardInterrupt.
+    Failures and interruptions are treated as in `sweep`: failed draws are
+    recorded in `Ensemble.failures`.
 
     Parameters
     ----------
     loop : control system or callable
-        A loop whose blocks read the parameters that are drawn; it is prepared
-        once for all draws. Or a function whose parameters are named as the
-        draws: it is called with one of each by keyword and returns a loop. Any
-        other callable maps a plan's name and the plan to a loop, as in
-        `compare`, whose blocks read the parameters.
+        A loop with the drawn parameters in the ``params`` of its blocks; it is
+        prepared once for all draws. Or a function whose arguments have the
+        names of the draws: it is called with a value of each by keyword and
+        returns a loop. Any other callable maps the name of a plan and the plan
+        to a loop, as in `compare`, with the parameters in its blocks.
     draws : mapping of str to array_like, shape (ndraws,)
         Values of each parameter, as the function `draws` makes them.
     plans, timepts
         As for `compare`.
     waypoints, start, band, outputs, controls, initial_state, params, events, measures : optional
-        As in `Experiment`; a parameter that is drawn overrides that of `params`.
-    units : mapping of str to str, optional
-        Units by label, as for `compare`.
-    executor : concurrent.futures.Executor or alike, optional
-        Where the draws run, as for `sweep`. Other processes need a loop that
-        can be compiled, or a function that the executor can send.
-    progress : bool, optional
-        Show a bar on stderr.
-    timeout : float, optional
-        Time limit of one draw [s], as for `sweep`.
+        As in `Experiment`; a drawn parameter overrides that of `params`.
+    units, executor, progress, timeout : optional
+        As for `sweep`. Other processes require a loop that can be compiled, or a
+        function that the executor can pickle.
 
     Returns
     -------
@@ -106,14 +101,14 @@ def monte_carlo(
     TypeError
         If `executor` has no ``submit``.
     ValueError
-        If draws are not as many of each parameter, are not finite, or are of a
-        parameter that no block reads. What the nominal loop raises is raised
-        where it is an error of the arguments, or where no draw can be run.
+        If the numbers of draws differ, a draw is not finite, or no block reads
+        a parameter. An exception of the nominal loop is raised if an argument
+        causes it, or if no draw runs.
 
     Warns
     -----
     UserWarning
-        If Ctrl-C ended it.
+        If Ctrl-C ended the runs.
 
     Examples
     --------
@@ -143,13 +138,18 @@ def monte_carlo(
     )
     drawn_loop: _Drawn = _Built(loop) if _is_of_draws(loop, table) else _Prepared.of(loop, experiment, table)
     nominal, nominal_draw = _nominal(drawn_loop, experiment, table, units, timeout)
-    account = drawn_loop.account(experiment, table, executor, timeout, progress)
+    drawn = [_draw(table, k) for k in range(_count(table))]
+    task, again = drawn_loop.task(experiment, drawn, executor is not None, timeout)
+    account = executed(task, drawn, executor, timeout, "draws", progress)
+    account.raise_if_none_ran("the loop")
+    if again is not None:
+        account = _by_python(account, again, experiment, drawn, timeout, progress)
     shown = shown_measures(experiment.measures, list(nominal.metrics.values()))
     results = DrawResults(_count(table), experiment.timepts, shown.keys() - nominal.measures.keys())
     for k, outcome in account.in_order().items():
-        results.add(k, _draw(table, k), outcome)
+        results.add(k, drawn[k], outcome)
     if account.interrupted:
-        text = f"monte_carlo was interrupted: {results.finished} of {_count(table)} draws are kept"
+        text = f"monte_carlo was interrupted: {results.finished} of {_count(table)} draws are returned"
         warnings.warn(text, UserWarning, stacklevel=outside_stacklevel())
     return Ensemble(
         nominal,
@@ -168,7 +168,7 @@ def _checked_draws(draws: Mapping[str, ArrayLike]) -> dict[str, Array]:
     table = {name: np.atleast_1d(real_array(values, f"draws[{name!r}]")) for name, values in draws.items()}
     sizes = {name: values.shape for name, values in table.items()}
     if not table or len(set(sizes.values())) != 1 or any(len(shape) != 1 or not shape[0] for shape in sizes.values()):
-        raise ValueError(f"draws must hold as many values of each parameter, at least one, got shapes {sizes}")
+        raise ValueError(f"draws must have equally many values of each parameter, at least one, got shapes {sizes}")
     for name, values in table.items():
         if not np.isfinite(values).all():
             raise ValueError(f"draws must be finite, got {values[~np.isfinite(values)][0]} of {name!r}")
@@ -179,26 +179,26 @@ def _count(table: dict[str, Array]) -> int:
     return next(iter(table.values())).size
 
 
-def _draw(table: dict[str, Array], k: int) -> dict[str, float]:
+def _draw(table: dict[str, Array], k: int) -> Draw:
     return {name: float(values[k]) for name, values in table.items()}
 
 
 def _is_of_draws(loop: object, table: dict[str, Array]) -> TypeGuard[Callable[..., System]]:
-    """Whether a function takes the draws by keyword; one that takes neither these nor a plan is an error."""
+    """Whether a function takes the draws by keyword; ValueError if it takes neither these nor a plan."""
     if not is_builder(loop):
         return False
     try:
         signature = inspect.signature(loop)
-    except (TypeError, ValueError):  # of some built-in functions nothing is known
+    except (TypeError, ValueError):  # of some built-in functions
         return False
     named = set(signature.parameters)
     if set(table) <= named and _binds(signature, **dict.fromkeys(table, 0.0)):
         return True
     if not _binds(signature, "", None) or set(list(signature.parameters)[:2]) & set(table):
         raise ValueError(
-            "loop must be a control system whose blocks read the parameters, a function whose parameters are named "
-            f"as the draws ({', '.join(table)}), or a function of a plan's name and the plan, got {loop!r:.80} with "
-            f"the parameters {', '.join(signature.parameters) or 'none'}"
+            "loop must be a control system whose blocks read the parameters, a function whose arguments have the names "
+            f"of the draws ({', '.join(table)}), or a function of a plan's name and the plan, got {loop!r:.80} with "
+            f"the arguments {', '.join(signature.parameters) or 'none'}"
         )
     return False
 
@@ -214,7 +214,7 @@ def _binds(signature: inspect.Signature, *arguments: object, **named: object) ->
 def _outcome(
     forms: Callable[[str], System | Builder], experiment: Experiment, plans: Iterable[str], params: Params | None
 ) -> Outcome:
-    """One draw, plan by plan: one may succeed where another fails."""
+    """Outcome of one draw, by plan."""
     wanted = experiment.timepts[band_samples(experiment.timepts)]
 
     def measured(plan: str) -> tuple[dict[str, float], dict[str, Array]]:
@@ -233,20 +233,13 @@ class _Drawn(Protocol):
 
     @property
     def complete(self) -> bool:
-        """Whether it has parameters of its own."""
+        """Whether it can be run without a draw."""
 
-    def nominal(self, params: dict[str, float] | None) -> tuple[System | Builder, dict[str, float] | None]:
-        """Loop with its own parameters or those of a draw, and parameters for its blocks."""
+    def nominal(self, params: Draw | None) -> tuple[System | Builder, Draw | None]:
+        """Loop for its nominal parameters or those of a draw, and parameters of its blocks."""
 
-    def account(
-        self,
-        experiment: Experiment,
-        table: dict[str, Array],
-        executor: Executor | None,
-        timeout: float | None,
-        progress: bool,
-    ) -> Account[Outcome]:
-        """Outcomes of all draws."""
+    def task(self, experiment: Experiment, drawn: list[Draw], elsewhere: bool, timeout: float | None) -> _Task:
+        """Function of a draw, for this process or for others; and forms that run it again if the solver fails."""
 
 
 @dataclass(frozen=True)
@@ -259,38 +252,28 @@ class _Built:
     def complete(self) -> bool:
         return _binds(inspect.signature(self.build))
 
-    def nominal(self, params: dict[str, float] | None) -> tuple[System | Builder, dict[str, float] | None]:
+    def nominal(self, params: Draw | None) -> tuple[System | Builder, Draw | None]:
         return self.build(**(params or {})), None
 
-    def account(
-        self,
-        experiment: Experiment,
-        table: dict[str, Array],
-        executor: Executor | None,
-        timeout: float | None,
-        progress: bool,
-    ) -> Account[Outcome]:
-        drawn = [_draw(table, k) for k in range(_count(table))]
-        account = executed(partial(_of_build, self.build, experiment), drawn, executor, timeout, "draws", progress)
-        account.raise_if_none_ran("the loop")
-        return account
+    def task(self, experiment: Experiment, drawn: list[Draw], elsewhere: bool, timeout: float | None) -> _Task:
+        return partial(_of_build, self.build, experiment), None
 
 
-def _of_build(build: Callable[..., System], experiment: Experiment, params: dict[str, float]) -> Outcome:
+def _of_build(build: Callable[..., System], experiment: Experiment, params: Draw) -> Outcome:
     loop = build(**params)
     return _outcome(lambda name: loop, experiment, experiment.plans, None)
 
 
 @dataclass(frozen=True)
 class _Prepared:
-    """A loop that is prepared once, and whose blocks read the parameters.
+    """A loop that is prepared once, with the parameters in its blocks.
 
     Attributes
     ----------
     loop : control system or callable
-        As it was given.
+        The loop as given.
     forms : dict of str to Prepared
-        Its form by plan: one for all, or one of each loop that a function builds.
+        Prepared loop by plan: the same for all, or one for each loop of a function.
     """
 
     loop: System | Builder
@@ -310,40 +293,28 @@ class _Prepared:
         _check_read(forms, table, experiment.initial_state)
         return cls(loop, forms)
 
-    def nominal(self, params: dict[str, float] | None) -> tuple[System | Builder, dict[str, float] | None]:
+    def nominal(self, params: Draw | None) -> tuple[System | Builder, Draw | None]:
         return (lambda name, plan: self.forms[name]), params
 
-    def account(
-        self,
-        experiment: Experiment,
-        table: dict[str, Array],
-        executor: Executor | None,
-        timeout: float | None,
-        progress: bool,
-    ) -> Account[Outcome]:
-        drawn = [_draw(table, k) for k in range(_count(table))]
-        # Compiled for these parameters, and compared with Python, here: the first draw, and a random one.
+    def task(self, experiment: Experiment, drawn: list[Draw], elsewhere: bool, timeout: float | None) -> _Task:
+        # Compiled and compared with Python in this process, for the first draw and a random one.
         here = partial(_of_forms, self.forms, experiment)
         for k in sorted({0, int(np.random.default_rng(0).integers(len(drawn)))}):
             tried(here, drawn[k], timeout)
-        light = _light(self.forms, table)
-        sent: Forms | Builder = self.forms if light is None else light
-        if light is None and is_builder(self.loop):
-            sent = self.loop
-        run = partial(_of_forms, light or self.forms, experiment)
-        if executor is not None:
-            run = partial(_elsewhere, Shared(sent), experiment)
-        account = executed(run, drawn, executor, timeout, "draws", progress)
-        account.raise_if_none_ran("the loop")
-        return account if light is None else _by_python(account, self.forms, experiment, drawn, timeout, progress)
+        light = _light(self.forms, drawn[0])
+        again = None if light is None else self.forms
+        if not elsewhere:
+            return partial(_of_forms, light or self.forms, experiment), again
+        sent: Forms | Builder = light or (self.loop if is_builder(self.loop) else self.forms)
+        return partial(_elsewhere, Shared(sent), experiment), again
 
 
-def _of_forms(forms: Forms, experiment: Experiment, params: dict[str, float]) -> Outcome:
+def _of_forms(forms: Forms, experiment: Experiment, params: Draw) -> Outcome:
     return _outcome(lambda name: forms[name], experiment, experiment.plans, params)
 
 
-def _elsewhere(shared: Shared[Forms | Builder], experiment: Experiment, params: dict[str, float]) -> Outcome:
-    """One draw, in another process or thread."""
+def _elsewhere(shared: Shared[Forms | Builder], experiment: Experiment, params: Draw) -> Outcome:
+    """Outcome of one draw in another process or thread."""
 
     def forms(given: Forms | Builder) -> Forms:
         if isinstance(given, Mapping):
@@ -360,9 +331,9 @@ def _nominal(
     units: Mapping[str, str] | None,
     timeout: float | None,
 ) -> tuple[Comparison, int | None]:
-    """The loop with its own parameters; or, where that does not run, with those of the first draw that does."""
+    """Comparison at the nominal parameters or, if these do not run, at those of the first draw that does."""
 
-    def compared(params: dict[str, float] | None) -> Comparison:
+    def compared(params: Draw | None) -> Comparison:
         form, of_blocks = loop.nominal(params)
         own = (
             experiment if of_blocks is None else replace(experiment, params={**(experiment.params or {}), **of_blocks})
@@ -374,16 +345,18 @@ def _nominal(
         return own, None
     if own is not None and not isinstance(own.error, ArithmeticError | RuntimeError | TypeError | KeyError):
         raise own.error
-    why = "the loop's own parameters do not run" if own is not None else "the loop has no parameters of its own"
+    why = (
+        "the loop does not run with its nominal parameters" if own is not None else "the loop has no nominal parameters"
+    )
     for k in range(min(_STAND_INS, _count(table))):
         params = _draw(table, k)
         found = tried(compared, params, timeout)
         if not isinstance(found, Failed):
             values = ", ".join(f"{name} = {value:.4g}" for name, value in params.items())
-            return replace(found, notes=(*found.notes, f"Nominal is draw {k} ({values}): {why}.")), k
+            return replace(found, notes=(*found.notes, f"The nominal loop is draw {k} ({values}), because {why}.")), k
         own = own or found
     assert own is not None  # noqa: S101 (there is a draw, and it failed)
-    own.error.add_note("with the loop's own parameters, and with the first draws")
+    own.error.add_note("with the nominal parameters of the loop, and with the first draws")
     raise own.error
 
 
@@ -391,11 +364,11 @@ def _by_python(
     account: Account[Outcome],
     forms: Forms,
     experiment: Experiment,
-    drawn: list[dict[str, float]],
+    drawn: list[Draw],
     timeout: float | None,
     progress: bool,
 ) -> Account[Outcome]:
-    """Plans and draws with which CVODES failed, run again by the loop itself in this process, in Python if need be."""
+    """Outcomes, with plans and draws for which CVODES failed run again in this process, if necessary in Python."""
     failed = {
         k: [plan for plan, one in outcome.items() if _of_solver(one)]
         for k, outcome in account.in_order().items()
@@ -419,29 +392,29 @@ def _by_python(
 
 
 def _check_read(forms: Mapping[str, Prepared], table: dict[str, Array], start: ArrayLike | None) -> None:
-    """Reject a parameter that no block has or reads."""
+    """Raise if a parameter is not read by any block."""
     for name, values in table.items():
 
         def reads(form: Prepared, name: str = name, value: float = float(values[0])) -> bool:
             return form.reads(name, value, start)
 
         found = [tried(reads, form) for form in forms.values()]
-        if any(isinstance(one, Failed) or one for one in found):  # what ends in an error of a block may be its own
+        if any(isinstance(one, Failed) or one for one in found):  # an error in a block is reported by its run
             continue
         form = next(iter(forms.values()))
         way = (
-            f"{form.name} is linear, and its matrices have no parameters: give a function of {', '.join(table)} that "
-            "returns a loop in its place"
+            f"{form.name} is linear, with constant matrices; give a function of {', '.join(table)} that returns a loop "
+            "in its place"
             if form.linear is not None
-            else "a linear block has none, and others have those of python-control's params="
+            else "linear blocks have no parameters; those of nonlinear blocks are given by params= of python-control"
         )
-        raise ValueError(f"draws must be of parameters of a block, got {name!r}, which none reads; {way}")
+        raise ValueError(f"draws must be of parameters of a block, got {name!r}, which no block reads; {way}")
 
 
-def _light(forms: Mapping[str, Prepared], table: dict[str, Array]) -> dict[str, Prepared] | None:
-    """Forms without python-control's blocks, for many runs and for other processes; None where there are none."""
+def _light(forms: Mapping[str, Prepared], params: Collection[str]) -> dict[str, Prepared] | None:
+    """Forms without python-control's blocks, for many runs and for other processes; None if there are none."""
     try:
-        return {name: form.detached(table) for name, form in forms.items()}
+        return {name: form.detached(params) for name, form in forms.items()}
     except TypeError:
         return None
 

@@ -1,7 +1,8 @@
-"""One plan through one loop: the one function that runs."""
+"""Simulation of one plan in one loop."""
 
 from __future__ import annotations
 
+import re
 import warnings
 from collections.abc import Callable, Sequence
 from typing import TypeAlias, TypeGuard
@@ -21,6 +22,9 @@ System: TypeAlias = "ct.InputOutputSystem | Prepared"
 """A loop."""
 Builder: TypeAlias = Callable[[str, Trajectory], System]
 """Function of a plan's name and the plan that returns a loop."""
+
+_CONTROL = re.compile("u")
+"""Labels of controls unless they are given: python-control calls the inputs of a plant u."""
 
 
 def run_plan(
@@ -50,7 +54,7 @@ def run_plan(
     times : ndarray, shape (ntime,)
         Sample times [s].
     axes : tuple of str
-        Labels by which the outputs that follow the plan are found.
+        Labels of the outputs that follow the plan, if the loop has them.
     last : float
         Time of the last waypoint [s].
 
@@ -63,10 +67,10 @@ def run_plan(
     tracked, acting = _tracked(system, outputs, axes), acting_outputs(system, controls)
     check_reached(system, tracked, plan)
     state, doubt = initial_state, ""
-    if state is None and times.ndim == 1 and times.size and np.isfinite(times).all():  # otherwise simulate says so
+    if state is None and times.ndim == 1 and times.size and np.isfinite(times).all():  # otherwise simulate raises
         rows = [system.output_labels.index(label) for label in tracked]
         state, why = equilibrium_at(system, plan, float(times[0]), rows, params)
-        doubt = f"With {name}, {_doubt(plan, times, state, why)}." if why else ""
+        doubt = f"{name}: {_doubt(plan, times, state, why)}." if why else ""
     inputs, start = (plan if system.ninputs else None), (0.0 if state is None else state)
     try:
         response = simulate(system, times, inputs, initial_state=start, params=params, events=events)
@@ -82,43 +86,43 @@ def run_plan(
 
 
 def _unstable(system: System) -> NDArray[np.complex128] | None:
-    """Poles in the right half plane; None where the loop is not linear, and none are known."""
+    """Poles in the right half plane; None if the loop is nonlinear and none are known."""
     poles = unstable_poles(system)
     return poles if poles.size or prepared_form(system).linear is not None else None
 
 
 def _doubt(plan: Trajectory, times: Array, state: Array, why: str) -> str:
     held = ", ".join(f"{value:.4g}" for value in plan.jet(times[:1], 0, left=True)[0, :, 0])
-    where = "the start that blocks state" if np.any(state) else "the zero state"
+    where = "the initial state of its blocks" if np.any(state) else "the zero state"
     return (
-        f"no equilibrium of the loop is known with the plan held at its first position {held}: {why}. The run starts "
-        f"at {where}; give initial_state= where it should start elsewhere"
+        f"no equilibrium of the loop was found with the plan held at its first position {held}: {why}. The run starts "
+        f"at {where}; give initial_state= for another one"
     )
 
 
 def is_builder(loop: object) -> TypeGuard[Callable[..., System]]:
-    """Whether something is a function that returns a loop; systems can be called as well."""
+    """Whether an object is a function that returns a loop; systems are callable as well."""
     return callable(loop) and not hasattr(loop, "output_labels")
 
 
 def check_has_inputs(loop: System) -> System:
-    """Reject a loop that has no input for a plan."""
+    """Raise if a loop has no input for a plan."""
     if not loop.ninputs:
         raise ValueError(
-            "loop must have inputs for the plans, got one without; give a function of name and plan that returns "
-            "a loop where the plan is a block inside"
+            "loop must have inputs for the plans, got none; for a loop that contains the plan as a block, give a "
+            "function of name and plan that returns it"
         )
     return loop
 
 
 def tracked_outputs(loop: System, outputs: Sequence[str] | None, plan: Trajectory) -> tuple[str, ...]:
-    """Outputs that follow a plan: as given, those named like its axes, or the first ones.
+    """Outputs that follow a plan: those given, those named like its axes, or the first ones.
 
     Raises
     ------
     ValueError
-        If they are not as many as the axes, one is unknown, or an input of the
-        loop reaches none of them.
+        If their number differs from that of the axes, one is unknown, or an
+        input of the loop affects none of them.
     TypeError
         If they are a string.
     """
@@ -128,9 +132,9 @@ def tracked_outputs(loop: System, outputs: Sequence[str] | None, plan: Trajector
 
 
 def acting_outputs(loop: System, controls: Sequence[str] | None) -> tuple[str, ...]:
-    """Outputs that are controls: as given, or those whose names begin with u."""
+    """Outputs that are controls: those given, or those whose names begin with u."""
     if controls is None:
-        return tuple(name for name in loop.output_labels if name.startswith("u"))
+        return tuple(filter(_CONTROL.match, loop.output_labels))
     return _known(loop, controls, "controls")
 
 

@@ -1,7 +1,7 @@
-"""Sections of a study: what its page shows around the metrics, as data.
+"""Sections of a study: contents of its page in addition to the metrics, as data.
 
-Each section is a small frozen class. `ctrlplan.reports.draw` draws it by its
-type; nothing here draws.
+Each section is a small frozen class, which `ctrlplan.reports.draw` draws
+according to its type.
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ if TYPE_CHECKING:  # comparisons and ensembles make studies of themselves for th
     from ctrlplan.studies.sweep import Sweep
 
 Wall: TypeAlias = tuple[tuple[float, float], tuple[float, float]] | None
-"""An obstacle of a crane: its sides in x and in z (down) [m]; None for none."""
+"""Obstacle of a crane: limits in x and in z (down) [m]; None for no obstacle."""
 
 Place: TypeAlias = tuple[float, float]
-"""Where a text stands relative to its point, right and up [pt]."""
+"""Offset of a label from its point, right and up [pt]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Section:
-    """Section of a study: a new type is a subclass, and a function that draws it.
+    """Section of a study; a new type is a subclass and a function that draws it.
 
     Attributes
     ----------
     caption : str
-        Caption of its figure, in place of the one that its type has.
+        Caption of its figure, in place of the default of its type.
 
     Examples
     --------
@@ -63,7 +63,7 @@ class Section:
     caption: str = ""
 
     def results(self) -> dict[str, object]:
-        """Plain data for ``results.json``, by key: nothing, unless a type has data of its own."""
+        """Plain data for ``results.json``, by key; empty by default."""
         return {}
 
 
@@ -103,7 +103,7 @@ class Curves(Section):
     log : bool
         Whether the y axis is logarithmic.
     paired : bool
-        Whether each two curves belong together, in one colour.
+        Whether consecutive curves form pairs, drawn in one colour.
     key : str
         Id of the figure on the page.
     """
@@ -122,19 +122,19 @@ class Curves(Section):
 
 @dataclass(frozen=True)
 class Plane(Section):
-    """Settling time against overshoot on the error, a point for each value of a sweep.
+    """Settling time versus overshoot on the tracking error, one point per value of a sweep.
 
     Attributes
     ----------
     sweep : Sweep
         With both metrics.
     numbered : dict of str to dict of float to (float, float)
-        Plan, value of the parameter, place: values that are written beside
+        Plan, value of the parameter, offset: values that are written next to
         their points.
     limit : (float, float) or None
-        Settling time [s] and overshoot [%] of a limit point to be marked.
+        Settling time [s] and overshoot [%] of a limit point to mark.
     limit_label : str
-        What the limit point is.
+        Label of the limit point.
     """
 
     sweep: Sweep
@@ -149,7 +149,7 @@ class Plane(Section):
 
 @dataclass(frozen=True)
 class SweepCurves(Section):
-    """Metrics over the parameter of a sweep.
+    """Metrics versus the parameter of a sweep.
 
     Attributes
     ----------
@@ -158,7 +158,7 @@ class SweepCurves(Section):
     metrics : tuple of str
         Names of the metrics.
     in_results : tuple of str or None
-        Those that ``results.json`` has; all, unless given.
+        Metrics that are written to ``results.json``; all, unless given.
     """
 
     sweep: Sweep
@@ -166,7 +166,7 @@ class SweepCurves(Section):
     in_results: tuple[str, ...] | None = None
 
     def results(self) -> dict[str, object]:
-        """The metrics that are kept, over the parameter."""
+        """The metrics of `in_results`, over the parameter."""
         names = self.metrics if self.in_results is None else self.in_results
         return {"sweep": self.sweep.results(names)} if names else {}
 
@@ -186,7 +186,7 @@ class Bands(Section):
 
 @dataclass(frozen=True)
 class DrawTable(Section):
-    """Quantiles of metrics over draws, whose nominal loop is that of the study.
+    """Quantiles of metrics over draws; the nominal loop is that of the study.
 
     Attributes
     ----------
@@ -219,14 +219,14 @@ class FastestMove(Section):
 
 @dataclass(frozen=True)
 class ClaimTable(Section):
-    """Whether the trigonometric path is optimal.
+    """Check whether the trigonometric path is optimal.
 
     Attributes
     ----------
     claim : tuple of str
-        What was found, in sentences.
+        Findings, one sentence or more each.
     grids : tuple of Grid
-        The numbers over alpha and duration that show it.
+        Metrics over alpha and duration.
     """
 
     claim: tuple[str, ...]
@@ -250,7 +250,7 @@ class LoopBlocks(Section):
     loop : control.InterconnectedSystem
         The loop.
     titles : dict of str to str
-        What is written in place of a block's name.
+        Titles in place of the names of blocks.
     """
 
     loop: ct.InterconnectedSystem
@@ -259,60 +259,54 @@ class LoopBlocks(Section):
 
 @dataclass(frozen=True)
 class CraneTime(Section):
-    """Load, error, sway and controls of cranes over time."""
+    """Load, tracking error, sway and controls of cranes versus time."""
 
 
 @dataclass(frozen=True)
 class CraneStep(Section):
-    """Controls, tension and sway of a crane for a step, with the limits of its loop."""
+    """Controls, rope tension and sway of a crane for a step, with the limits of its loop."""
 
 
 @dataclass(frozen=True)
 class CraneOnline(Section):
-    """Load, distance from the goal, sway and force of cranes over time."""
+    """Load, distance from the goal, sway and force of cranes versus time."""
 
 
 @dataclass(frozen=True)
-class CranePaths(Section):
-    """Paths of the load in the plane.
+class CraneScene(Section):
+    """Section that shows cranes in the plane.
 
     Attributes
     ----------
     wall : ((float, float), (float, float)) or None
-        An obstacle.
+        Obstacle to draw.
     """
 
     wall: Wall = None
 
 
 @dataclass(frozen=True)
-class CraneMotion(Section):
-    """Trolley, rope and load at equal time steps.
-
-    Attributes
-    ----------
-    wall : ((float, float), (float, float)) or None
-        An obstacle.
-    """
-
-    wall: Wall = None
+class CranePaths(CraneScene):
+    """Paths of the load in the plane."""
 
 
 @dataclass(frozen=True)
-class AnimatedCrane(Section):
+class CraneMotion(CraneScene):
+    """Trolley, rope and load at equal time intervals."""
+
+
+@dataclass(frozen=True)
+class AnimatedCrane(CraneScene):
     """Animation of trolley, rope and load.
 
     Attributes
     ----------
-    wall : ((float, float), (float, float)) or None
-        An obstacle.
     shown : str
-        The plan that is shown at first; unless given, the first trigonometric
-        one, or else the first that is no step.
+        Plan shown first; unless given, the first trigonometric plan, or else
+        the first plan that is not a step.
     """
 
     signals: ClassVar[tuple[str, ...]] = ("x", "z", "D", "R", "theta")
-    """Outputs that the loops must have: load, trolley, length and angle of the rope."""
+    """Required outputs of the loops: load, trolley, length and angle of the rope."""
 
-    wall: Wall = None
     shown: str = ""

@@ -1,4 +1,4 @@
-"""One comparison for each value of a parameter."""
+"""Comparisons over the values of a parameter."""
 
 from __future__ import annotations
 
@@ -46,24 +46,24 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, repr=False)
 class Sweep(Displayed):
-    """Metrics of every plan over a parameter; made by `sweep`.
+    """Metrics of all plans over a parameter, as returned by `sweep`.
 
     Attributes
     ----------
     parameter : str
-        Name of what was varied.
+        Name of the parameter.
     values : ndarray, shape (nvalues,)
         Its values, increasing.
     metrics : dict of str to dict of str to ndarray
-        Plan, metric, (nvalues,); nan where a value failed.
+        Values of each metric by plan, shape (nvalues,); nan for failed values.
     failures : tuple of Failure
-        Values that could not be run, and why; `Failure.draw` is the value's index.
+        Failed values, with the reason; `Failure.draw` is the index of the value.
     interrupted : bool
-        Whether Ctrl-C ended the sweep: values that it did not reach are then missing.
+        Whether Ctrl-C ended the sweep; values that did not run are missing.
     roles : dict of str to Role
-        What each plan is, where known.
+        Role of each plan, if known.
     band : float
-        Settling band, relative to the range of the plan.
+        Half width of the settling band, relative to the range of the plan.
     """
 
     parameter: str
@@ -107,7 +107,7 @@ class Sweep(Displayed):
         return cells
 
     def to_pandas(self) -> pd.DataFrame:
-        """Table of one row a value; columns plan and metric."""
+        """Table with one row per value, and columns by plan and metric."""
         import pandas as pd
 
         columns = {(plan, name): row for plan, rows in self.metrics.items() for name, row in rows.items()}
@@ -124,7 +124,7 @@ class Sweep(Displayed):
         return {self.parameter: self.values.tolist()} | rows
 
     def merged(self, other: Sweep) -> Sweep:
-        """Both sweeps in one, in order of the values; nan where one has not a metric of the other."""
+        """Union of two sweeps, in order of the values; nan if one lacks a metric of the other."""
         values = np.concatenate([self.values, other.values])
         order = np.argsort(values, kind="stable")
         place = np.argsort(order)
@@ -148,12 +148,12 @@ class Sweep(Displayed):
     def plot(
         self, names: Sequence[str] = ("settling_time", "overshoot_error"), *, ax: AxesLike | None = None
     ) -> ControlPlot:
-        """Metrics over the parameter.
+        """Plot metrics versus the parameter.
 
         Parameters
         ----------
         names : sequence of str, optional
-            Metrics, an axes each.
+            Metrics, one axes each.
         ax : array of Axes, shape (number of metrics,), optional
             Where to draw; None: an empty current figure, or a new one.
 
@@ -190,42 +190,41 @@ def sweep(
 ) -> Sweep:
     """Compare plans in a loop for each value of a parameter.
 
-    A value that cannot be run, whose worker process dies, that takes too long,
-    or that calls ``sys.exit`` is recorded in `Sweep.failures` with the reason;
-    the others are kept. Ctrl-C ends the sweep: what is finished is returned
-    with a warning, and tasks that have not begun are cancelled; an executor
-    finishes those that have. A second Ctrl-C raises KeyboardInterrupt.
+    A value whose run raises an exception, calls ``sys.exit``, exceeds the time
+    limit or loses its worker process is recorded in `Sweep.failures` with the
+    reason, and the sweep continues. Ctrl-C ends the sweep: finished results are
+    returned with a warning, and tasks that have not begun are cancelled; an
+    executor finishes those that have. A second Ctrl-C, or one before the first
+    result of `monte_carlo`, raises KeyboardInterrupt.
 
     Parameters
     ----------
     build : callable
-        Maps a value to a loop, as `compare` takes it.
+        Maps a value to a loop, as for `compare`.
     values : array_like, shape (nvalues,)
         Values of the parameter, increasing.
     plans, timepts
         As for `compare`.
     parameter : str, optional
-        Name of what is varied.
+        Name of the parameter.
     waypoints, start, band, outputs, controls, initial_state, params, events, measures : optional
         As in `Experiment`.
     units : mapping of str to str, optional
-        Units by label, as for `compare`: of signals that differ in unit there
-        is no worst, which becomes nan.
+        Units by label, as for `compare`. A maximum over signals in different
+        units is not defined and becomes nan.
     executor : concurrent.futures.Executor or alike, optional
-        Where the comparisons run: anything with ``submit`` whose result has
+        Where the comparisons run: an object with ``submit`` whose result has
         ``result``, as of `dask.distributed`, `loky` or `mpi4py.futures`; not a
-        `multiprocessing.Pool`. Results are taken as they complete. Other
-        processes need a `build` that the executor can send. Without an
-        executor, linear loops that differ in numbers alone are solved and
-        measured together, which is faster by far.
+        `multiprocessing.Pool`. Other processes require a `build` that the
+        executor can pickle. Without an executor, linear loops of the same
+        structure are solved and measured together, which is much faster.
     progress : bool, optional
-        Show a bar on stderr.
+        Whether a progress bar is shown on stderr.
     timeout : float, optional
         Time limit of one value [s]. It is checked between evaluations of the
-        loop's equations, of a compiled loop between the segments of a run (from
-        breakpoint to breakpoint): a function of yours that never returns is not
-        stopped, and a compiled segment is finished. Linear loops are solved in
-        closed form, and have no limit.
+        equations of the loop, and in a compiled loop between breakpoints. A
+        user's function that does not return is not stopped. Linear loops are
+        solved in closed form, without a time limit.
 
     Returns
     -------
@@ -234,15 +233,15 @@ def sweep(
     Raises
     ------
     TypeError
-        If `executor` has no ``submit``, or `build` is no function.
+        If `executor` has no ``submit``, or `build` is not a function.
     ValueError
-        If the values are not finite or do not increase. What a comparison
-        raises at every value is raised, SystemExit as a RuntimeError.
+        If the values are not finite or do not increase. If all values fail, the
+        first exception is raised, SystemExit as a RuntimeError.
 
     Warns
     -----
     UserWarning
-        If Ctrl-C ended it.
+        If Ctrl-C ended the sweep.
 
     See Also
     --------
@@ -260,7 +259,7 @@ def sweep(
     executor, timeout = checked_executor(executor), checked_timeout(timeout)
     points = _checked_values(values)
     if not is_builder(build):
-        raise TypeError(f"build must be a function from a value to a loop, got {type(build).__name__}")
+        raise TypeError(f"build must be a function of a value that returns a loop, got {type(build).__name__}")
     experiment = Experiment(
         plans,
         timepts,
@@ -285,8 +284,8 @@ def sweep(
     roles = {name: role_of(experiment.plans[name]) for name in found.metrics}
     found = replace(found, roles=roles, band=experiment.band)
     if found.interrupted:
-        kept = f"{found.values.size} of {points.size} values are kept"
-        warnings.warn(f"the sweep was interrupted: {kept}", UserWarning, stacklevel=outside_stacklevel())
+        text = f"the sweep was interrupted: {found.values.size} of {points.size} values are returned"
+        warnings.warn(text, UserWarning, stacklevel=outside_stacklevel())
     return found
 
 
@@ -332,10 +331,10 @@ def _built(
 
 
 _SAMPLES = 2**19
-"""Samples of a signal of all the loops that are run together, at most."""
+"""Maximum number of samples of a signal over all loops that are solved together."""
 
 _FIRST = 4
-"""Loops that are run together at first; then twice as many each time, so that an interruption loses little."""
+"""Number of loops solved together at first; doubled each time, so that an interruption discards few results."""
 
 
 def _outcomes(
@@ -345,9 +344,9 @@ def _outcomes(
     units: Mapping[str, str] | None,
     timeout: float | None,
 ) -> Generator[tuple[int, Metrics | Failed], None, None]:
-    """Outcome of each value, of many at once where their loops are linear and differ in numbers alone.
+    """Outcome of each value; linear loops of the same structure are solved together.
 
-    The first of these is run by itself, which checks what depends on the loop.
+    The first of these is run separately, which checks the arguments for the loop.
     """
     waiting: dict[int, Linear] = {}
     checked, size = False, _FIRST
@@ -358,7 +357,7 @@ def _outcomes(
         try:
             found = (experiment.run_alike(list(waiting.values())) or []) if waiting else []
             yield from ((k, one.metrics) for k, one in zip(waiting, found, strict=True))
-        except Exception:  # one of them, which is found so
+        except Exception:  # of one of them: run each separately
             for k in waiting:
                 yield k, tried(partial(_built, build, experiment, units), values[k], timeout)
         waiting.clear()
@@ -380,17 +379,17 @@ def _outcomes(
             if len(waiting) >= size:
                 yield from together()
         yield from together()
-    except KeyboardInterrupt:  # what has been built is soon measured
+    except KeyboardInterrupt:  # results of the loops already built
         yield from together()
         raise
 
 
 def settling_jumps(values: Array, settling: Array, slope: float = 3.0) -> NDArray[np.bool_]:
-    """Between which neighbouring values of a gain a settling time jumps: shape (nvalues - 1,).
+    """Whether a settling time jumps between neighbouring values of a gain, shape (nvalues - 1,).
 
-    Between jumps it changes about as fast as the period of the oscillation,
-    with the power -1/2 of the gain; a jump is a change of more than 0.5 % with
-    a power of more than `slope`.
+    Between jumps the settling time varies like the period of the oscillation,
+    with the power -1/2 of the gain. A jump is a change of more than 0.5 % with a
+    power of more than `slope`.
     """
     found = np.zeros(values.size - 1, dtype=bool)
     usable = np.isfinite(settling) & (settling > 0.0) & (values > 0.0)

@@ -12,6 +12,9 @@ from ctrlplan._types import System
 from ctrlplan.studies.measures import Measure, Run, checked_names
 from ctrlplan.trajectories import Trajectory
 
+UNIT_SCALES = {"%": 100.0}
+"""Scales of metrics in units that do not depend on signals."""
+
 
 def superscript(exponent: int | str) -> str:
     """An exponent in superscript digits."""
@@ -187,7 +190,7 @@ def _size(unit: str, signals: Signals, label: str | None) -> float:
     with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
         sizes = {
             "s": t,
-            "%": 100.0,
+            **UNIT_SCALES,
             "{y}": span,
             "{y} s": span * t,
             "{y}^2 s": ROUNDING * span**2 * t,  # rounding squared, for a metric that is a square

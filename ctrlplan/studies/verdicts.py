@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from ctrlplan._renamed import FormerAttribute
 from ctrlplan.studies.roles import Stability
-from ctrlplan.studies.units import ROUNDING, in_units, scientific, superscript
+from ctrlplan.studies.units import ROUNDING, UNIT_SCALES, in_units, scientific, superscript
 
 if TYPE_CHECKING:  # comparisons show their verdicts
     from ctrlplan.studies.comparison import Comparison
@@ -69,7 +69,7 @@ def verdicts(comparison: Comparison) -> list[Verdict]:
         whole = {plan: rows for plan, rows in comparison.metrics.items() if plan not in comparison.stopped}
         values = {plan: rows[key] for plan, rows in whole.items() if key in rows and not math.isnan(rows[key])}
         if len(values) > 1:
-            scale = comparison.scales.get(key, 100.0 if measure.unit == "%" else math.nan)
+            scale = comparison.scales.get(key, UNIT_SCALES.get(measure.unit, math.nan))
             rounding = _ROUNDING if math.isnan(scale) else ROUNDING * scale
             found.append(_verdict(key, measure.title, unit_of(comparison, key), values, rounding))
     return found

@@ -54,7 +54,7 @@ def _lag_out(t, x, u, params):
     [{}, {"tau": []}, {"tau": [[1.0, 2.0]]}, {"tau": [1.0, 2.0], "other": [1.0]}, {"tau": [1.0, 2.0], "other": 1.0}],
 )
 def test_there_are_as_many_draws_of_each_parameter(params):
-    with pytest.raises(ValueError, match="draws must hold as many values of each parameter, at least one, got shapes"):
+    with pytest.raises(ValueError, match="draws must have equally many values of each parameter, at least one, got shapes"):
         run(lag(), params)
 
 
@@ -66,7 +66,7 @@ def test_draws_are_finite(value):
 
 @pytest.mark.parametrize("loop", [lag, lag_by_python])
 def test_a_parameter_that_no_block_reads_is_refused(loop):
-    with pytest.raises(ValueError, match="draws must be of parameters of a block, got 'tua', which none reads"):
+    with pytest.raises(ValueError, match="draws must be of parameters of a block, got 'tua', which no block reads"):
         run(loop(), {"tau": [1.0, 2.0], "tua": [1.0, 2.0]})
 
 
@@ -82,8 +82,8 @@ def test_a_parameter_that_no_block_reads_is_refused(loop):
 )
 def test_a_linear_loop_has_no_parameters_and_the_error_says_what_has(loop):
     said = (
-        "draws must be of parameters of a block, got 'gain', which none reads; .* is linear, and its matrices have no "
-        "parameters: give a function of gain that returns a loop in its place"
+        "draws must be of parameters of a block, got 'gain', which no block reads; .* is linear, with constant matrices; "
+        "give a function of gain that returns a loop in its place"
     )
     with pytest.raises(ValueError, match=said):
         run(loop, {"gain": [1.0, 2.0]})
@@ -92,7 +92,7 @@ def test_a_linear_loop_has_no_parameters_and_the_error_says_what_has(loop):
 @pytest.mark.parametrize("build", [lambda gain: None, lambda mass, friction: None, cp.plants.integrator_lag_loop])
 def test_a_function_of_the_parameters_is_not_taken_for_one_of_a_plan(build):
     table = {"gain": [1.0, 2.0], "mass": [1.0, 2.0], "friction": [1.0, 2.0]}
-    said = "loop must be a control system whose blocks read the parameters, a function whose parameters are named as"
+    said = "loop must be a control system whose blocks read the parameters, a function whose arguments have the names"
     with pytest.raises(ValueError, match=said):
         run(build, table)
 
@@ -196,7 +196,7 @@ def test_a_disturbance_that_comes_later_is_a_parameter():
 def test_a_loop_without_inputs_is_refused_as_in_a_comparison():
     source = cp.create_source_iosystem(PLANS["ramp"])
     loop = ct.interconnect([source, lag()], [["lag.r", "plan.y"]], outlist=["lag.y"], outputs="y", name="loop")
-    with pytest.raises(ValueError, match="loop must have inputs for the plans, got one without"):
+    with pytest.raises(ValueError, match="loop must have inputs for the plans, got none"):
         run(loop, {"tau": [0.5, 1.0]})
 
 

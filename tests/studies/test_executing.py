@@ -406,7 +406,7 @@ def interrupted_at(k, build):
 @pytest.mark.parametrize("build", [lag, bent])
 @pytest.mark.parametrize("k", [0, 1, 3, 5])
 def test_an_interruption_returns_every_value_that_was_finished(build, k):
-    with pytest.warns(UserWarning, match=f"the sweep was interrupted: {k} of 6 values are kept"):
+    with pytest.warns(UserWarning, match=f"the sweep was interrupted: {k} of 6 values are returned"):
         found = swept(interrupted_at(k, build))
     assert found.interrupted
     assert found.values.tolist() == RATES[:k]
@@ -479,7 +479,7 @@ def test_an_interrupted_wait_keeps_what_is_finished_behind_a_slow_task(monkeypat
 
     monkeypatch.setattr(executing, "SimpleQueue", Interrupts)
     executor = Cancelled({2, 3, 5})
-    with pytest.warns(UserWarning, match="interrupted: 3 of 6 values are kept"):
+    with pytest.warns(UserWarning, match="interrupted: 3 of 6 values are returned"):
         found = swept(lag, executor=executor)
     assert found.interrupted
     check(found, [1.5, 2.0, 3.0])

@@ -228,13 +228,13 @@ def test_signals_keep_what_is_finished_in_this_process_and_in_threads(tmp_path):
         assert one["settling"] == settling(values)
         assert one["interrupted"]
         assert one["failures"] == []
-        assert one["said"] == [f"the sweep was interrupted: {len(values)} of 40 values are kept"]
+        assert one["said"] == [f"the sweep was interrupted: {len(values)} of 40 values are returned"]
     draws = found["draws"]
     tau = np.linspace(0.5, 1.5, 20)
     assert draws["settling"][:7] == pytest.approx(np.log(50.0) * tau[:7], rel=1e-4)
     assert draws["settling"][7:] == [None] * 13
     assert (draws["interrupted"], draws["finished"], draws["failures"]) == (True, 7, [])
-    assert draws["said"] == ["monte_carlo was interrupted: 7 of 20 draws are kept"]
+    assert draws["said"] == ["monte_carlo was interrupted: 7 of 20 draws are returned"]
     assert found["handler"]
     assert found["again"] == "returned"  # one signal alone, while tasks are handed out
     assert found["twice"] == found["twice at once"] == "raised"

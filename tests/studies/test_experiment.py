@@ -332,7 +332,7 @@ def test_a_function_of_the_draws_builds_a_loop_for_each(executor):
     expected = 100 * np.exp(-0.5 * np.pi / np.sqrt(gains - 0.25))
     np.testing.assert_allclose(found.metrics["step"]["overshoot_error"], expected, rtol=1e-5)
     assert found.nominal_draw == 0
-    assert "the loop has no parameters of its own" in found.nominal.notes[-1]
+    assert "the loop has no nominal parameters" in found.nominal.notes[-1]
     given = cp.monte_carlo(lambda gain=2.0: build(gain), {"gain": gains}, plans, times, progress=False)
     assert given.nominal_draw is None
     own = 100 * math.exp(-0.5 * math.pi / math.sqrt(1.75))

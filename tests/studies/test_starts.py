@@ -264,7 +264,7 @@ LOST = {
 def test_where_no_equilibrium_is_found_that_is_said(kind):
     times = np.arange(0.0, 12.5, 0.5)
     build = lambda name, plan: joined(plan, LOST[kind]())  # noqa: E731
-    with pytest.warns(UserWarning, match=r"With move, no equilibrium .* first position 10: .*give initial_state="):
+    with pytest.warns(UserWarning, match=r"move: no equilibrium .* first position 10: .*give initial_state="):
         found = compared(build, times=times)
     (note,) = [note for note in found.notes if "equilibrium" in note]
     assert "initial_state=" in note
