@@ -20,24 +20,24 @@ _STEPS = 100
 
 
 def lengthened(plan: Trajectory, dt: float, counts: Array, limits: Mapping[str, object]) -> Trajectory:
-    """Plan whose segments last as many further cycles as the limits need.
+    """Plan whose segments are lengthened by cycles until the limits are satisfied.
 
     Parameters
     ----------
     plan : Trajectory
-        With a duration.
+        Plan with a duration.
     dt : float
         Cycle time [s].
     counts : ndarray, shape (nsegments,)
-        Cycles of each segment at least.
+        Minimum number of cycles of each segment.
     limits : mapping
         Limits on derivatives, as for `fastest`.
 
     Raises
     ------
     ValueError
-        If a waypoint prescribes more than a limit, or a segment violates one
-        whatever its duration.
+        If a waypoint prescribes a value beyond a limit, or no duration of a segment
+        satisfies the limits.
     """
     limited = Limited(plan, limits)
     limited.check_smooth(plan)
@@ -63,17 +63,17 @@ def lengthened(plan: Trajectory, dt: float, counts: Array, limits: Mapping[str, 
     if isinstance(plan, WaypointSpline) and segment + 1 < len(plan.waypoints):
         where += f", from waypoints[{segment}] to waypoints[{segment + 1}],"
     raise ValueError(
-        f"{where} must keep {bounds[row].name} {bounds[row].range}, got an excess of {excess[row, segment]:.3g} of "
-        f"it even in {knots[segment + 1] - knots[segment]:.4g} s; no number of cycles of {dt:g} s was found that "
-        f"satisfies the limits"
+        f"{where} must keep {bounds[row].name} {bounds[row].range}, got a relative excess of "
+        f"{excess[row, segment]:.3g} with a duration of {knots[segment + 1] - knots[segment]:.4g} s; no number of "
+        f"cycles of {dt:g} s was found that satisfies the limits"
     )
 
 
 def _check_waypoints(waypoints: Sequence[Waypoint], bounds: Sequence[Bound]) -> None:
-    """Reject what a waypoint prescribes beyond a limit, which no duration changes."""
+    """Raise for a derivative that a waypoint prescribes beyond a limit."""
     for i, point in enumerate(waypoints):
         for bound in bounds:
-            value = point.jet[bound.order : bound.order + 1, bound.axis]  # empty, or nan, where it is free
+            value = point.jet[bound.order : bound.order + 1, bound.axis]  # empty or nan if free
             if (bound.excess(value) > _TOLERANCE).any():
                 raise ValueError(
                     f"{bound.name} must stay {bound.range}, got {value.item():g}, which waypoints[{i}] prescribes at "

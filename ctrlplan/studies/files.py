@@ -2,7 +2,8 @@
 
 ``ctrlplan report STUDY.toml --out DIR`` runs a study and writes ``index.html``,
 which can be read off line, and ``results.json``; ``ctrlplan plan STUDY.toml --out
-plan.csv`` (or ``.json``) writes only the trajectories. A complete file:
+plan.csv`` writes only the trajectories, as ``.json`` or in a format of
+`ctrlplan.Trajectory.export`. A complete file:
 
 .. code-block:: toml
 
@@ -31,6 +32,10 @@ plan.csv`` (or ``.json``) writes only the trajectories. A complete file:
     [[waypoints]]
     time = 16.0
     x = [20.0, 0.0, 0.0]
+
+Waypoints may instead be those of a CSV file, which `ctrlplan.waypoints_from_csv`
+reads: ``waypoints = "path.csv"`` above the first table, or ``waypoints = {csv =
+"path.csv", time = "time", columns = ["x"]}``; ``speed`` if it has no times.
 
 Kinds of loops:
 

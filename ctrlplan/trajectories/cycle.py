@@ -1,4 +1,4 @@
-"""Plans on the cycle of a drive: every segment lasts a whole number of cycles."""
+"""Plans whose segments last a whole number of cycles of a drive."""
 
 from __future__ import annotations
 
@@ -63,14 +63,14 @@ def moved(plan: Trajectory, dt: float, counts: Array) -> Trajectory:
         cycles = (time - plan.start) / dt
         if abs(cycles - round(cycles)) * dt > 2.0 * near:
             raise ValueError(
-                f"waypoints of a {type(plan).__name__} must be on the cycle once its duration is, got one at "
-                f"{time:.9g} s, {cycles:.6g} cycles of {dt:g} s after the start; put its parts on the cycle first"
+                f"waypoints of a {type(plan).__name__} must be on the cycle after its duration is rounded up, got one "
+                f"at {time:.9g} s, {cycles:.6g} cycles of {dt:g} s after the start; put its parts on the cycle first"
             )
     return plan
 
 
 def _inner_times(plan: Trajectory) -> Iterator[float]:
-    """Times of the waypoints of a plan and of those that it is made of."""
+    """Times of the waypoints of a plan and of its parts."""
     yield from (w.time for w in plan.waypoints)
     for part in getattr(plan, "parts", ()):
         yield from _inner_times(part)

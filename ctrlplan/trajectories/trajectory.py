@@ -487,10 +487,10 @@ class Trajectory(Displayed, Fields, ABC):
     def on_cycle(self, dt: float, limits: Mapping[str, object] | None = None) -> Trajectory:
         """Plan whose segments last a whole number of cycles of a drive.
 
-        The start stays. Between waypoints each duration is rounded up to cycles;
-        values and derivatives that waypoints prescribe stay. A plan without
-        waypoints, as a profile, is retimed as a whole; joined plans are put on the
-        cycle one by one.
+        The start and the values and derivatives of waypoints do not change. The
+        duration between waypoints is rounded up to whole cycles. A plan without
+        waypoints, such as a profile, is retimed as a whole; each part of a joined
+        plan is treated separately.
 
         Parameters
         ----------
@@ -498,20 +498,21 @@ class Trajectory(Displayed, Fields, ABC):
             Cycle time [s].
         limits : mapping, optional
             Limits on derivatives, as for `ctrlplan.fastest`. Segments that violate
-            them get further cycles until they are satisfied over the whole plan.
+            a limit are lengthened by further cycles until all limits are satisfied
+            over the whole plan.
 
         Returns
         -------
         Trajectory
-            Of the same kind; the plan itself where it is on the cycle already.
+            Plan of the same class; the same object if it is on the cycle already.
 
         Raises
         ------
         ValueError
-            If `dt` is not above 0, waypoints cannot be moved on their own (of a sum
-            whose parts are not on the cycle), a shaped plan would change its
-            duration, a waypoint prescribes more than a limit, or a segment violates
-            a limit whatever its duration.
+            If `dt` is not positive; if the waypoints of a sum or another
+            combination are not on the cycle after retiming; if the duration of a
+            shaped plan would change; if a waypoint prescribes a value beyond a
+            limit; if no duration of a segment satisfies the limits.
 
         Examples
         --------
@@ -589,7 +590,8 @@ class Trajectory(Displayed, Fields, ABC):
         =============== ============================================================
 
         The master position of a cam is the time. Cams, polynomials and C state a
-        bound of their error. `save` writes the plan itself.
+        bound of their error. The function of ``move.c`` is ``move_jet(t, jet)``.
+        `save` writes the plan itself.
 
         Parameters
         ----------

@@ -27,23 +27,23 @@ def waypoints_from_csv(
 ) -> list[Waypoint]:
     r"""Waypoints from a CSV file.
 
-    Cells are separated by semicolons if the first line has one, where decimal
-    commas are allowed, otherwise by commas. Text after # is a comment. The first
-    line may be a header. Columns named x and x_d1, x_d2, ... are the position of
-    axis x and its derivatives, as `Trajectory.export` writes them.
+    Cells are separated by semicolons if the first line contains one, and decimal
+    commas are then allowed; otherwise by commas. Text after # is a comment. The
+    first line may be a header. Columns named x, x_d1, x_d2, ... are the position
+    and the derivatives of axis x, as `Trajectory.export` writes them.
 
     Parameters
     ----------
     path : str or path
         File to be read, UTF-8.
     time : str, int or None, optional
-        Column of the times [s]. Without a header the first column, unless a
-        number is given. None: the file has no times.
+        Column of the times [s]; without a header the first column, unless a
+        number is given. None if the file has no times.
     columns : sequence of str or int, optional
-        Columns that are read; default: all others.
+        Columns to be read; default: all others.
     speed : float, optional
-        Speed of the path from waypoint to waypoint [unit of the axes per s],
-        for files without times. Default: 1, so that times are chord lengths.
+        Speed along the chords between waypoints [unit of the axes per s], for
+        files without times. Default: 1, so that times are chord lengths.
 
     Returns
     -------
@@ -101,7 +101,7 @@ def waypoints_from_csv(
 
 
 class _Table:
-    """Numbers of a file, with its header and the numbers of its lines."""
+    """Numeric table with its header and line numbers."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -116,7 +116,7 @@ class _Table:
         self.values = np.array([self._numbers(*row) for row in rows[self.header is not None :]])
 
     def name(self, column: int) -> str:
-        """A column in words."""
+        """Description of a column."""
         return repr(self.header[column]) if self.header else f"number {column}"
 
     def column(self, column: Column) -> int:
@@ -132,7 +132,7 @@ class _Table:
         return self.header.index(column)
 
     def time_column(self, time: Column | None, timed: bool) -> int | None:
-        """Column of the times, None if there is none; `timed` says that times follow from a speed."""
+        """Column of the times, None if there is none; `timed` if a speed is given."""
         if time is None or isinstance(time, int):
             return None if time is None else self.column(time)
         if self.header is None:
@@ -166,13 +166,13 @@ class _Table:
         for k, step in enumerate(steps.tolist(), 1):
             if not 0.0 < step < math.inf:
                 raise ValueError(
-                    f"{self._place(k)}: positions must differ from those before, by which times are counted, got "
-                    f"those of line {self.lines[k - 1]}; add a column of times"
+                    f"{self._place(k)}: positions must differ from those of the line before, from which the time "
+                    f"is computed, got those of line {self.lines[k - 1]}; add a column of times"
                 )
         return [0.0, *np.cumsum(steps).tolist()]
 
     def _rows(self) -> list[tuple[int, list[str]]]:
-        """Numbers and cells of the lines that have any."""
+        """Line numbers and cells of all lines that are not empty."""
         try:
             text = self.path.read_text(encoding="utf-8-sig")
         except UnicodeDecodeError as error:
@@ -187,7 +187,7 @@ class _Table:
             raise ValueError(f"{self.path} must be a table, got {error}") from None
 
     def _header(self, line: int, cells: list[str]) -> list[str] | None:
-        """Names of the columns, None if the first line has numbers."""
+        """Names of the columns; None if the first line contains numbers."""
         numeric = [self._number(cell) is not None for cell in cells]
         if all(numeric):
             return None
@@ -212,7 +212,7 @@ class _Table:
         return found
 
     def _number(self, cell: str) -> float | None:
-        """Number in a cell, None if it is something else."""
+        """Number in a cell; None if it is not a number."""
         try:
             return None if "_" in cell else float(cell.replace(",", ".") if self.semicolons else cell)
         except ValueError:
@@ -223,7 +223,7 @@ class _Table:
 
 
 def _jets(names: list[str], columns: list[int]) -> dict[str, list[int]]:
-    """Columns of each axis: its position, then its derivatives as far as they follow without a gap."""
+    """Columns of each axis: its position, then its derivatives."""
     where = dict(zip(names, columns, strict=True))
     jets: dict[str, list[int]] = {}
     for name, column in where.items():

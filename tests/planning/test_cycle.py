@@ -172,8 +172,8 @@ def test_a_segment_that_no_duration_helps_is_named():
     """Through 0, 1, 0 a natural path rises above 1 between prescribed speeds, however slow the rest is."""
     points = [rest(0, 0.0), Waypoint(1.0, 1.0, 0.5, 0.0), rest(2, 0.0)]
     message = (
-        r"segment 1, from waypoints\[1\] to waypoints\[2\], must keep y at most 1.01, got an excess of .* of it "
-        r"even in .* s; no number of cycles of 0.1 s was found that satisfies the limits"
+        r"segment 1, from waypoints\[1\] to waypoints\[2\], must keep y at most 1.01, got a relative excess of .* "
+        r"with a duration of .* s; no number of cycles of 0.1 s was found that satisfies the limits"
     )
     with pytest.raises(ValueError, match=message):
         cp.PiecewiseSpline(points, warn=False).on_cycle(0.1, {"y": cp.Limits(high=1.01)})
@@ -193,7 +193,7 @@ def test_a_limit_needs_the_continuity_of_margins():
 
 def test_waypoints_of_a_sum_cannot_be_moved():
     wave = cp.TrigSpline([rest(0, 0.0), Waypoint(0.33, 1.0), rest(1.0, 0.0)], alpha=1.0, warn=False)
-    with pytest.raises(ValueError, match=r"waypoints of a Sum must be on the cycle.*got one at 0.33 s, 3.3 cycles"):
+    with pytest.raises(ValueError, match=r"waypoints of a Sum must be on the cycle .*got one at 0.33 s, 3.3 cycles"):
         (wave + wave).on_cycle(0.1)
     on = wave.on_cycle(0.1)
     both = 2.0 * on + on

@@ -105,7 +105,10 @@ def test_a_name_like_that_of_a_derivative_is_an_axis_where_the_axis_is_missing(r
         ("t;x\n0;1.234,5\n", "line 2: column 'x' must be a finite number, got '1.234,5'"),
         ("t,x\n0,1\n2,1\n# back\n1,1\n", "line 5: times must increase strictly, got 1 after 2 in line 3"),
         ("t,x\n0,1\n2,1\n2,1\n", "line 4: times must increase strictly, got 2 after 2 in line 3"),
-        ("x,z\n0,1\n2,1\n2,1\n", "line 4: positions must differ from those before, .* got those of line 3; add a"),
+        (
+            "x,z\n0,1\n2,1\n2,1\n",
+            "line 4: positions must differ from those of the line before, .* got those of line 3",
+        ),
         ("t,x\n0,1\n1,2a\n2,3b\n", "line 3: column 'x' must be a finite number, got '2a'"),
         ("0,1a\n1,2\n", "line 1: the first line must be numbers or different names, got 0, 1a"),
         ("t,x,x\n0,1,2\n", "line 1: the first line must be numbers or different names, got t, x, x"),
