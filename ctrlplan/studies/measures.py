@@ -453,7 +453,7 @@ SETTLING_TIMES = ("settling_time", "tracking_settling_time")
 
 
 def _rows(signals: Array) -> list[Array]:
-    """Rows (nrows, ntime) that are measured at once: all signals of one loop, or one signal of all loops."""
+    """Rows (nrows, ntime) that are measured together: all signals of one loop, or one signal of all loops."""
     return [signals[0]] if len(signals) == 1 else list(signals.swapaxes(0, 1))
 
 

@@ -72,7 +72,7 @@ WORDS = (
         "best, worst",
         r"wins?|loses?|winners?|losers?",
         r"wins?|loses?|winners?|losers?",
-        r"loses? (its |their |all |some )?(digits?|accuracy|precision)",
+        r"loses? (a |its |their |all |some )?(digits?|accuracy|precision)",
     ),
     Word("let", "limit, allow", r"(does not|do not|which|that) lets?"),
     Word("lost", "nan, missing", r"(inputs?|signals?|measurements?|samples?) (is |are |was |were )?lost", r"lost"),
@@ -81,7 +81,7 @@ WORDS = (
         "time law, time scaling",
         r"clocks?|laws? of time",
         r"clocks?",
-        r"(wall|plc|cpu|system|monotonic) clocks?",
+        r"(wall|plc|cpu|system|monotonic)[- ]clocks?",
     ),
     Word("come to rest sooner", "too slow for", r"comes? to rest sooner"),
     Word("for ever", "for all future times", r"for ?ever", r"forever"),
@@ -103,8 +103,8 @@ WORDS = (
     Word("as it likes", "unknown but bounded", r"as (it|they|he|one) likes?"),
     Word("get through", "fail", r"(get|gets|got) through"),
 )
-FIXED = ("wandering", "turning_points")
-"""Names of metrics that scripts use and that remain; in prose they are quoted."""
+FIXED = ("wandering", "turning_points", "worth", "rivals")
+"""Names of metrics, and keys of study files and results, that scripts use and that remain; in prose they are quoted."""
 
 _QUOTED = re.compile(rf"^(?:{'|'.join(FIXED)})$|[\"'`]({'|'.join(FIXED)})[\"'`]|\b({'|'.join(FIXED)})(?=\(|$)", re.M)
 _PROSE = [re.compile(rf"\b(?:{word.prose})\b") for word in WORDS]

@@ -71,7 +71,7 @@ def _run(job: Job, form: LinearForm) -> Record:
     states = states_at(times, job.state)
     growing, fast, nonnormal = form.sensitivity(float(times[-1] - times[0]))
     if growing or fast or nonnormal:
-        # A common factor of all entries changes phases most; for a nonnormal matrix the entries change independently.
+        # A common factor of all entries mainly changes phases; for a nonnormal matrix the entries change independently.
         signs = np.random.default_rng(0).choice([-1.0, 1.0], form.a.shape) if nonnormal else np.ones_like(form.a)
         nearly = states_at(times, job.state, form.a * (1.0 + 2.0**-50 * signs))
         values = signal_values(time_signals, times)
