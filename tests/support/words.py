@@ -72,7 +72,7 @@ WORDS = (
         "best, worst",
         r"wins?|loses?|winners?|losers?",
         r"wins?|loses?|winners?|losers?",
-        r"loses? (a |its |their |all |some )?(digits?|accuracy|precision)",
+        r"loses? (a |its |their |all |some )?(digits?|accuracy|precision|worker)",
     ),
     Word("let", "limit, allow", r"(does not|do not|which|that) lets?"),
     Word("lost", "nan, missing", r"(inputs?|signals?|measurements?|samples?) (is |are |was |were )?lost", r"lost"),
