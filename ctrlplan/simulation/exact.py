@@ -402,7 +402,7 @@ def _products(a: Array, b: Array) -> tuple[Array, NDArray[np.intp]]:
         sizes = np.abs(products)[..., :n].sum(axis=2).max(axis=2)
         roots = sizes ** (1.0 / np.arange(1.0, _POWERS + 2.0)[:, None])
         root = np.maximum(roots[:-1], roots[1:]).min(axis=0)
-        # The bounds prevent overflow of the products and underflow of their rounding errors.
+        # The bounds prevent overflow of the products and of scaled rounding errors.
         saved = np.floor(-np.log2(np.clip(root, 2.0**-50, 1.0))) * (np.abs(b).max(axis=(1, 2), initial=0.0) < 1e200)
         saved = np.minimum(saved, halvings)
         halvings, factor = halvings - saved, 2.0 ** saved[:, None, None]

@@ -1,9 +1,9 @@
-"""python-control's `input_output_response` and `forced_response`, answered by `ctrlplan.simulate`.
+"""python-control's `input_output_response` and `forced_response`, computed by `ctrlplan.simulate`.
 
-The two functions take their arguments in many forms; here each form is turned
-into what `simulate` takes: sample times, inputs (ninputs, ntime), one initial
-state. Nothing is computed here but the linear interpolation of samples that
-python-control documents.
+The two functions accept their arguments in many forms; each form is converted
+here to that of `simulate`: sample times, inputs (ninputs, ntime), one initial
+state. Only the linear interpolation of samples that python-control documents is
+computed here.
 """
 
 from __future__ import annotations
@@ -45,9 +45,9 @@ def options_of(function, args, kwargs):
 
 
 def response(function, system, options, times=None):
-    """Answer of ctrlplan to a call of python-control's function.
+    """Response by ctrlplan to a call of a function of python-control.
 
-    `times` are those of python-control's answer, for calls that leave them to its solver.
+    `times` are those of python-control's response, for calls that leave them to its solver.
     """
     if function == "forced_response" and not isinstance(system, (list, tuple, ct.StateSpace, ct.TransferFunction)):
         function = "input_output_response"
@@ -77,7 +77,7 @@ def response(function, system, options, times=None):
 
 
 def _check_solver(options):
-    """Options of scipy's solver have no meaning here; a contradiction between them is an error all the same."""
+    """Options of scipy's solver have no meaning here; a contradiction between them is still an error."""
     solver = options.get("solve_ivp_kwargs") or {}
     if options.get("solve_ivp_method") and options.get("method"):
         raise ValueError("the solver's method was given twice")
@@ -86,7 +86,7 @@ def _check_solver(options):
 
 
 def _inputs(function, system, options):
-    """Sample times and inputs as `simulate` takes them."""
+    """Sample times and inputs in the form of `simulate`."""
     samples, signals = options.get("timepts"), options.get("inputs", 0.0)
     if signals is None:
         signals = 0.0
@@ -105,7 +105,7 @@ def _inputs(function, system, options):
 
 
 def _rows(element, samples):
-    """An element of a list of inputs: samples, or numbers that hold for all times."""
+    """An element of a list of inputs: samples, or numbers for all times."""
     element = np.asarray(element)
     if element.ndim and element.shape[-1] == samples.size:
         return element
@@ -115,7 +115,7 @@ def _rows(element, samples):
 
 
 def _wanted_times(system, options, samples, times):
-    """Times at which the answer is wanted."""
+    """Times of the response."""
     wanted = options.get("evaluation_times", "T")
     if isinstance(wanted, str):
         wanted = (options.get("solve_ivp_kwargs") or {}).get("t_eval", samples)
@@ -126,7 +126,7 @@ def _wanted_times(system, options, samples, times):
 
 
 def _on_all_times(samples, signals, wanted):
-    """All times of inputs and answer, and the inputs there."""
+    """All times of inputs and response, and the inputs at these times."""
     if np.array_equal(samples, wanted):
         return samples, signals
     timepts = np.union1d(samples, wanted)
@@ -151,8 +151,8 @@ def _initial_state(function, system, options):
 
 
 def _as_called(function, ours, rows, options):
-    """The response at the wanted times, in the form of the call."""
-    # A system without states: python-control's nonlinear function shows none, its linear one an array of no rows.
+    """Response at the requested times, in the form of the call."""
+    # Without states python-control's nonlinear function returns None, its linear one an array without rows.
     hidden = ours.x is not None and ours.x.size == 0 and function == "input_output_response"
     states = None if ours.x is None or hidden else ours.x[:, rows]
     return ct.TimeResponseData(

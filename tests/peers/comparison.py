@@ -1,4 +1,4 @@
-"""What differs between two answers of one call, and a more accurate answer of python-control."""
+"""Differences of two responses to one call, and a more accurate response of python-control."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ AGREEMENT = 1e-6
 """Largest difference, relative to the range of each signal."""
 
 ROUNDING = 1e-13
-"""Largest difference relative to the largest signal of the call: what rounding leaves of signals that do not move."""
+"""Largest difference relative to the largest signal of the call: rounding errors of signals that are constant."""
 
 TIGHT = (
     {"method": "LSODA", "rtol": 1e-10},
     {"method": "DOP853", "rtol": 1e-12},
     {"method": "Radau", "rtol": 1e-9},
 )
-"""Solvers of python-control's own second answer, with steps no longer than the spacing of samples."""
+"""Solvers of the second response by python-control, with steps no longer than the spacing of samples."""
 
 MAXIMUM_STEPS = 20_000
-"""Steps after which one of them is given up."""
+"""Maximum number of steps of one of them."""
 
 
 def differences(ours, reference):
-    """What differs, as (field, text, size) with the size relative to what is allowed; empty where the two agree."""
+    """Differences as (field, text, size), with the size relative to the tolerance; empty if the two agree."""
     if isinstance(reference, list) or isinstance(ours, list):
         if not isinstance(reference, list) or not isinstance(ours, list) or len(ours) != len(reference):
             return [("kind", f"{type(ours).__name__} for {type(reference).__name__}", np.inf)]
@@ -59,7 +59,7 @@ def differences(ours, reference):
 
 
 def _of_failures(ours, reference):
-    """What differs where an answer is an exception."""
+    """Difference if a response is an exception."""
     if isinstance(reference, Exception):
         if not isinstance(ours, Exception):
             return [("raises", f"answered, where python-control raises {_named(reference)}", np.inf)]
@@ -74,7 +74,7 @@ def _of_failures(ours, reference):
 
 
 def _shape(response, name):
-    """Shape of a signal as its property shows it; a response without states has none."""
+    """Shape of a signal by its property; None for the states of a response without states."""
     raw = getattr(response, {"outputs": "y", "states": "x", "inputs": "u"}[name])
     return None if raw is None else np.shape(getattr(response, name))
 
@@ -84,7 +84,7 @@ def _named(error):
 
 
 def _of_signals(name, mine, theirs, largest):
-    """Signals that differ, of one kind."""
+    """Signals of one kind that differ."""
     found = []
     if mine.size == 0:
         return found
@@ -117,7 +117,7 @@ def _same(mine, theirs):
 
 
 def better_answers(originals, function, system, options, first):
-    """More accurate answers of python-control, one by one; none where its first has no error but that of rounding."""
+    """More accurate responses of python-control, one by one; none if its first has only rounding errors."""
     if not isinstance(first, ct.TimeResponseData) or first.x is None or not ct.isctime(system) or not first.success:
         return
     if function == "forced_response" and isinstance(system, (ct.StateSpace, ct.TransferFunction)):
@@ -144,12 +144,12 @@ def better_answers(originals, function, system, options, first):
 
 
 def _whole(originals, system, options, solver):
-    """Answer in one run."""
+    """Response in one run."""
     return originals["input_output_response"](system, solve_ivp_kwargs=solver | {"events": _limit()}, **options)
 
 
 def _from_sample_to_sample(originals, system, options, solver, first):
-    """Answer that begins again at each sample: a solver that passes a kink of an input takes many small steps there."""
+    """Response restarted at each sample: a solver requires many small steps at a kink of an input."""
     states, outputs, limit = [first.x[:, 0]], [first.y[:, 0]], _limit()
     for k in range(first.t.size - 1):
         part = originals["input_output_response"](
@@ -176,7 +176,7 @@ def _has_kinks(response):
 
 
 def _limit():
-    """An event that never comes, and ends a run of too many steps."""
+    """An event that does not occur, but ends a run of too many steps."""
     steps = count()
 
     def limit(_time, _state):

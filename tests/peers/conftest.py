@@ -1,4 +1,4 @@
-"""The whole comparison runs only where it is chosen by ``-m peers``: it takes minutes, and is its own step of CI."""
+"""The whole comparison runs only with ``-m peers``: it takes minutes and is a separate step of CI."""
 
 import pytest
 

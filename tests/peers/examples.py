@@ -1,4 +1,4 @@
-"""python-control's examples as tests, for a run by pytest in a process of its own: one a script or notebook."""
+"""python-control's examples as tests in a separate process of pytest, one for each script or notebook."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ EXAMPLES = sorted(path.name for path in FOLDER.iterdir() if path.suffix in (".py
 
 
 def code_of(notebook):
-    """Code cells without the lines that only IPython runs."""
+    """Code cells without the lines for IPython."""
     cells = [c["source"] for c in json.loads(notebook.read_text(encoding="utf-8"))["cells"] if c["cell_type"] == "code"]
     for source in cells:
         text = source if isinstance(source, str) else "".join(source)

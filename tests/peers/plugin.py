@@ -1,9 +1,9 @@
-"""pytest plugin: every call of python-control's two functions is made of ctrlplan too, and what differs is recorded.
+"""pytest plugin: calls of the two functions of python-control are repeated with ctrlplan and compared.
 
-The test goes on with python-control's own answer: so the course of an
-optimiser, and with it the number and names of the calls after, are the same
-whatever ctrlplan answers. Loaded by ``-p`` in a process of its own; the
-folder of the record is the environment variable CTRLPLAN_PEERS.
+The test continues with the response of python-control, so that the iterations of
+an optimiser, and the number and names of later calls, do not depend on ctrlplan.
+Loaded by ``-p`` in a separate process; the environment variable CTRLPLAN_PEERS
+contains the folder of the record.
 """
 
 # ruff: noqa: NPY002 (python-control's tests draw from numpy's global generator)
@@ -42,7 +42,7 @@ LONGEST = (
 
 
 class Recorder:
-    """Calls of one process: how many, and which differ."""
+    """Calls of one process: their number, and which differ."""
 
     def __init__(self, folder):
         self.originals = {name: getattr(ct, name) for name in FUNCTIONS}
@@ -68,7 +68,7 @@ class Recorder:
             file.write(json.dumps(entry) + "\n")
 
     def call(self, function, system, args, kwargs):
-        """Answer of python-control, after ctrlplan's was compared with it.
+        """Response of python-control, after comparison with that of ctrlplan.
 
         Calls that blocks make while python-control runs them are calls too, as those of a predictive controller; those
         that blocks make while ctrlplan does are not, nor those by which one of the functions hands a system to the
@@ -103,7 +103,7 @@ class Recorder:
         return answer
 
     def compare(self, number, function, system, args, kwargs, answer, random):
-        """Record what differs from python-control's answer.
+        """Record differences from the response of python-control.
 
         A call that repeats one of the test to the last bit, answer included, as an optimiser's finite differences do,
         differs where that one did.
@@ -126,14 +126,14 @@ class Recorder:
         self.record(number, function, system, found)
 
     def record(self, number, function, system, found):
-        """Write what differs in a call."""
+        """Write the differences of a call."""
         if found:
             entry = {"test": self.test, "call": number, "function": function, "system": type(system).__name__}
             entry["differs"] = [[field, text] for field, text, _ in found]
             self.write(entry)
 
     def differences(self, function, options, system, ours, answer):
-        """What differs, in signals from the best of python-control's answers."""
+        """Differences, in signals from the most accurate response of python-control."""
         found = differences(ours, answer)
         signals = [entry for entry in found if entry[0] in ("outputs", "states")]
         if not signals or any(entry[0] in ("inputs", "times") for entry in found):
@@ -148,7 +148,7 @@ class Recorder:
 
 
 def _digest(*values):
-    """A call and its answer in a few bytes."""
+    """Hash of a call and its response."""
     digest = hashlib.sha256()
     for value in values:
         if isinstance(value, ct.TimeResponseData):
@@ -164,7 +164,7 @@ def _digest(*values):
 
 
 def patch(recorder):
-    """Put the two functions of every module of control that has them in the recorder's hands."""
+    """Replace the two functions in every module of control by the recorder."""
     for module in ("flatsys", "matlab", "optimal", "phaseplot"):
         importlib.import_module(f"control.{module}")
     for name in FUNCTIONS:
@@ -188,7 +188,7 @@ def pytest_configure(config):
 
 
 def pytest_collection_modifyitems(config, items):
-    """Keep the sample: of each file the tests whose name's CRC-32 a number divides; the longest first."""
+    """Select the sample: of each file the tests whose name's CRC-32 a number divides; the longest first."""
     sample = json.loads(os.environ.get("CTRLPLAN_PEERS_SAMPLE", "{}"))
     items[:] = [item for item in items if zlib.crc32(_name(item).encode()) % sample.get(item.path.name, 1) == 0]
     items.sort(key=lambda item: [not _name(item).startswith(name) for name in LONGEST])

@@ -4,9 +4,9 @@ The test files are those of the installed package, the examples those of its
 source distribution. They run in a process of their own with the plugin of
 this folder, which makes each call of `input_output_response` and
 `forced_response` with ctrlplan too (`adapter`) and records what differs
-(`comparison`). What may differ stands in exceptions.toml, by test and call.
+(`comparison`). Accepted differences are listed in exceptions.toml, by test and call.
 
-The whole is its own step of CI, ``python3 -m pytest tests/peers -m peers``; the
+The whole is a separate step of CI, ``python3 -m pytest tests/peers -m peers``; the
 everyday run takes the sample stated at `SAMPLE`.
 """
 
@@ -33,18 +33,18 @@ VERSION = metadata.version("control")
 TABLE = tomllib.loads((HERE / "exceptions.toml").read_text(encoding="utf-8"))
 
 KINDS, CALLS = 15, 72
-"""Kinds and calls that may differ, at most."""
+"""Maximum number of kinds and calls that may differ."""
 
 SAMPLE = {"timeresp_test.py": 5, "iosys_test.py": 5, "nlsys_test.py": 2, "trdata_test.py": 3, "interconnect_test.py": 5}
 """Everyday run: of each file the tests whose name's CRC-32 this number divides."""
 
 OF_DOCUMENTATION = "docstrings_test.py"
-"""Reads docstrings alone, by a package that need not be here."""
+"""Tests of docstrings only, by a package that may be missing."""
 
 SAME_ROUNDING = {"OPENBLAS_CORETYPE": "Nehalem"} if platform.machine() in ("x86_64", "AMD64") else {}
 """The OpenBLAS kernel that every such processor runs.
 
-An optimiser that does not converge takes another course, with other calls, after another rounding error: with kernels
+An optimiser that does not converge makes other calls after a different rounding error: with kernels
 for AVX-512 one test makes 21 calls more, in two of which a car turns thousands of times.
 """
 
@@ -74,13 +74,13 @@ def listed(table):
 
 
 def without_wide_instructions():
-    """Names of the instructions found in this processor that not every one has: numpy rounds otherwise with them."""
+    """Names of the instructions found in this processor that not every one has: numpy rounds differently with them."""
     found = np.show_config("dicts").get("SIMD Extensions", {}).get("found", [])
     return " ".join([*os.environ.get("NPY_DISABLE_CPU_FEATURES", "").split(), *found])
 
 
 def run(folder, *arguments, **environment):
-    """Calls by test, and those that differ with what does, of a run of pytest in a process of its own."""
+    """Calls by test, and those that differ, of a separate process of pytest."""
     record = folder / "record"
     record.mkdir()
     paths = [str(HERE), str(Path(cp.__file__).parent.parent), os.environ.get("PYTHONPATH", "")]
@@ -124,7 +124,7 @@ def show_cost(spent, calls):
 
 
 def check(calls, differing, table=TABLE):
-    """Fail where an unlisted call differs, and where a listed one agrees or is not made any more."""
+    """Fail if an unlisted call differs, or a listed one agrees or is no longer made."""
     known = {key: kind for key, kind in listed(table).items() if key[0] in calls}
     summary = f"{sum(calls.values())} calls in {len(calls)} tests, {len(differing)} differ ({versions()})"
     print(summary)

@@ -58,7 +58,7 @@ def test_the_outer_limit_stands_after_the_inner_one():
 
 
 def test_every_run_has_the_whole_time():
-    """Each takes more than half of it."""
+    """Each run requires more than half of the limit."""
     seen = []
     loop = lag(lambda t, x, u, params: seen.append(t) or float(u[0]) - x)
     cp.simulate(loop, TIMES, cp.Step(1.0), method="python")

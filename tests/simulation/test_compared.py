@@ -1,4 +1,4 @@
-"""Where a compiled form is compared with Python: both sides of its switches, peaks, and not more than it may cost."""
+"""States at which a compiled form is compared with Python: both sides of switches and peaks, at bounded cost."""
 
 import casadi
 import control as ct
@@ -27,7 +27,7 @@ def is_symbol(value):
 
 
 def beyond_a_switch(x):
-    """Stop at 9: right up to there, and of the wrong stiffness beyond."""
+    """Stop at 9: correct up to there, with a wrong stiffness beyond."""
     return np.where(x[0] > 9.0, -(20.0 if is_symbol(x[0]) else 40.0) * (x[0] - 9.0), 0.0)
 
 
@@ -122,7 +122,7 @@ def test_a_batch_is_compared_in_the_first_runs_and_in_random_ones(monkeypatch):
 
 
 def test_both_sides_of_every_switch_come_first():
-    """A switch that changes often does not take the places of one that changes once."""
+    """A switch that changes often does not displace one that changes once."""
     sides = np.ones((2, 1000))
     sides[0, 1::2] = -1.0
     sides[1, 700:] = -1.0

@@ -1,4 +1,4 @@
-"""Compiled loops against right-hand sides written by hand, integrated as tightly as numbers allow."""
+"""Compiled loops compared with hand-written right-hand sides, integrated with the smallest tolerances."""
 
 import math
 from functools import cache
@@ -327,7 +327,7 @@ def test_a_pvtol_that_hovers(method):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_a_saturated_loop(method):
-    """x'' = -x' + sat(4 (r - x) - 2 x'), the plan fast enough for both limits."""
+    """x'' = -x' + sat(4 (r - x) - 2 x'), with a plan that reaches both limits."""
     plan = cp.PolySpline([cp.Waypoint(0.5, 0, 0, 0), cp.Waypoint(1.5, 3, 0, 0)], labels=["r"])
     law = ct.ss([], [], [], [[4.0, -4.0, -2.0]], inputs=["r", "x", "v"], outputs="u_cmd", name="law", dt=None)
     plant = ct.ss([[0, 1], [0, -1]], [[0], [1]], np.eye(2), 0, inputs="u", outputs=["x", "v"], name="plant")
@@ -348,7 +348,7 @@ def test_a_saturated_loop(method):
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("tracking_time", [None, 0.3])
 def test_a_limited_pid_with_its_anti_windup(method, tracking_time):
-    """A step of 3 on 1/(s + 1)^2 behind limits that hold it back; integral and filter as states."""
+    """A step of 3 on 1/(s + 1)^2 with limits; integral and filter as states."""
     kp, ki, kd, tf, limits = 6.0, 5.0, 2.0, 0.05, (-0.5, 4.0)
     pid = cp.create_pid_iosystem(kp, ki, kd, tf, bias=0.2, limits=limits, tracking_time=tracking_time)
     plant = ct.ss([[-1, 1], [0, -1]], [[0], [1]], [[1, 0]], 0, inputs="u", outputs="y", name="plant")

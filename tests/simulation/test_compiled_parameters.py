@@ -1,4 +1,4 @@
-"""Compiled loops: one form for all values of parameters, and which block's parameters count."""
+"""Compiled loops: one form for all values of parameters, and precedence of parameters."""
 
 import warnings
 
@@ -26,7 +26,7 @@ def cubic(**params):
 
 
 def counted(monkeypatch):
-    """How often blocks are traced."""
+    """Number of traces of blocks."""
     calls = []
     plain = traced_module.traced
     monkeypatch.setattr(traced_module, "traced", lambda block, *args: calls.append(block.name) or plain(block, *args))
@@ -156,11 +156,11 @@ def test_a_parameter_that_no_block_reads():
     assert np.abs(found.states[0] - 1 / np.sqrt(1 + 4 * T)).max() <= 1e-6
 
 
-# Whose parameter counts
+# Precedence of parameters
 
 
 def nested(inner=None, middle=None, outer=None):
-    """A cubic decay, two floors down, each floor with parameters of its own."""
+    """A cubic decay nested two levels deep, each level with its own parameters."""
     block = cubic(**{"k": 1.0, "c": 1.0, **(inner or {})})
     wire = ct.ss([], [], [], [[1.0]], inputs="y[0]", outputs="z", name="wire", dt=None)
     options = {} if middle is None else {"params": middle}

@@ -1,4 +1,4 @@
-"""Compiled loops: what cannot be traced, traces that hold in part only, and what happens without CasADi."""
+"""Compiled loops: untraceable blocks, traces that are valid only in part, and a missing CasADi."""
 
 import math
 from functools import cache
@@ -12,7 +12,7 @@ from scipy.special import expit
 import ctrlplan as cp
 from ctrlplan.symbolic import extra
 
-# What cannot be traced is run by Python, or right all the same
+# Blocks that cannot be traced: run by Python, or correct nevertheless
 
 
 def zeros_and_entries(t, x, u, p):
@@ -104,7 +104,7 @@ PENDULUM = [
 
 
 def right_or_python(block, times, initial, states, allowed=1e-6):
-    """What must hold of any block: compiled and right, or run by Python, its name in the reason."""
+    """For any block: compiled with a correct result, or run by Python with its name in the reason."""
     found = cp.simulate(block, times, None, initial)
     assert np.abs(found.states - states).max() <= allowed
     if found.method == "python":
@@ -160,7 +160,7 @@ FUNCTIONS = {
 
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_functions_of_a_state(name):
-    """x' = -f(x) through a bend, from 2 down."""
+    """x' = -f(x) through a kink, from 2."""
     function = FUNCTIONS[name]
     block = ct.nlsys(
         lambda t, x, u, p: np.array([-function(x[0])]), None, inputs=0, outputs=1, states=1, name=f"bent_{name[:5]}"
@@ -190,7 +190,7 @@ def test_a_random_number_is_no_constant():
 
 
 def test_a_block_that_remembers_its_arguments():
-    """A memory that only saves work must not hand a symbol to a run, nor a number of another state."""
+    """A cache must not return a symbol in a run, nor a number of another state."""
     known = {}
 
     def rate(t, x, u, p):
@@ -204,7 +204,7 @@ def test_a_block_that_remembers_its_arguments():
 
 
 def test_a_block_that_remembers_its_last_answer():
-    """A hysteresis is written so: what Python does with it is the only right answer, and no trace is."""
+    """A hysteresis: only the run by Python is correct, and no trace."""
     memory = {"on": 1.0}
 
     def rate(t, x, u, p):
@@ -217,7 +217,7 @@ def test_a_block_that_remembers_its_last_answer():
     assert "relay" in found.reason
 
 
-# Traces that are right near the start alone
+# Traces that are correct only near the start
 
 OSCILLATION = np.pi * np.arange(13)
 
@@ -272,7 +272,7 @@ def test_a_branch_of_time_between_the_visited_states():
 
 
 def test_a_table_with_the_state_as_its_key():
-    """A dictionary that knows one value exactly reached, and a default: a symbol is never in it."""
+    """A dictionary with one exact value and a default: a symbol is never a key."""
     table = {0.0: 3.0}
 
     def out(t, x, u, p):

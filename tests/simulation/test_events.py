@@ -1,4 +1,4 @@
-"""Crossings of limits against closed forms, by every method, and runs that end there."""
+"""Crossings of limits compared with closed forms, by every method, and runs that end there."""
 
 import math
 
@@ -136,7 +136,7 @@ def test_an_output_hides_an_input_of_the_same_name():
     assert told(found) == [("s", "below")]
 
 
-# Beginnings, jumps and narrow places
+# Starts, jumps and short crossings
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -221,7 +221,7 @@ def test_a_stop_that_is_not_reached_changes_nothing(method):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_coming_back_does_not_stop_a_run(method):
-    """A run that begins outside of the limits of a stop has nowhere to go; one that may begin there comes in."""
+    """A run that starts outside the limits of a stop ends at once; without the stop it enters them."""
     found = cp.simulate(LAG, T, None, 2.0, method=method, events=[Event("y", high=1.0)])
     assert told(found) == [("y", "above"), ("y", "inside")]
     assert found.time.size == T.size
@@ -235,7 +235,7 @@ def test_coming_back_does_not_stop_a_run(method):
 @pytest.mark.parametrize("method", ["compiled", "python", "auto"])
 @pytest.mark.parametrize("level", [2.0, 100.0, 1e6])
 def test_a_stop_before_the_solution_ends(level, method):
-    """x' = x^2 from 1 is 1/(1 - t): nothing is there at 2 s, but the run ends before."""
+    """x' = x^2 from 1 is 1/(1 - t): no solution at 2 s, but the run ends before."""
     escaping = ct.nlsys(lambda t, x, u, p: x**2, None, inputs=0, outputs="y", states=1, name="escaping")
     with np.errstate(all="ignore"):
         found = cp.simulate(

@@ -29,7 +29,7 @@ def run(systems, plan, times, initial=None, **options):
 
 
 def check(systems, plan, signals, times, initial=None, some=None, tolerance=SMALL):
-    """Every system of the batch against its own closed form, at some of the samples, the first among them."""
+    """Every system of the batch compared with its closed form, at some samples including the first."""
     found = run(systems, plan, times, initial)
     some = np.arange(len(times)) if some is None else np.asarray(some)
     for i, matrices in enumerate(systems):

@@ -1,4 +1,4 @@
-"""The exact method where a matrix is far from normal: its exponential grows for a while, and its squares cancel.
+"""The exact method for matrices far from normal: transient growth, and cancellation in squares.
 
 The reference is mpmath's exponential at 60 digits, of the same floating-point
 matrices with the input as states of their own. An error is held against what
@@ -25,7 +25,7 @@ QUINTIC = [0.0, 0.0, 0.0, 60.0, -360.0, 720.0]
 
 
 def turned(rng, a):
-    """The matrix in other orthogonal states, so that no sum in its powers is free of cancellation."""
+    """The matrix in other orthogonal coordinates, so that every sum in its powers has cancellation."""
     q, _ = np.linalg.qr(rng.normal(size=a.shape))
     return q @ a @ q.T
 
@@ -114,7 +114,7 @@ def rounded(a, states, duration):
 
 
 def reference(a, b, derivatives, duration, count, start, seed=0):
-    """Solution and the error that it may have, one number."""
+    """Solution and its error bound."""
     args = (a, b, derivatives, duration, count, start)
     exact, rng = solution(*args), np.random.default_rng(seed)
     with mp.workdps(60):
@@ -188,7 +188,7 @@ def test_inputs_of_very_different_size_keep_their_digits():
         assert np.abs(found - exact).max() <= bound
 
 
-# What cannot be kept is said
+# Warnings of lost accuracy
 
 
 def simulated(a, b, t):
@@ -211,7 +211,7 @@ def test_digits_that_a_matrix_far_from_normal_loses_are_said(gain, count):
     assert len(said) == 1
     # A draw of signs has the size of the root of a sum of n^2 squares; rounding that of the sum, at most n times more.
     assert said[0] >= 0.25 / 6.0 * min(error, 1.0)
-    assert "closer to a normal one" in texts[0]
+    assert "for which the matrix is closer to normal" in texts[0]
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -130,12 +130,12 @@ def test_what_is_beyond_the_range_says_so():
 def test_a_stiff_loop_rests_where_its_slow_states_do():
     # By hand, x1 = x2 = 1; next to 1e18 a rate of 1 is no integrator.
     assert np.abs(equilibrium_state(ct.ss([[-1e18, 0], [1, -1]], [[1e18], [0]], [[0, 1]], 0), 1.0) - 1.0).max() <= 1e-12
-    # A slow integrator behind them that is not at rest at 1: there is no rest.
+    # A slow integrator after them that is not in equilibrium at 1: there is no equilibrium.
     loop = ct.ss([[-1e18, 0, 0], [1, -1, 0], [0, 1e-9, 0]], [[1e18], [0], [0]], [[0, 0, 1]], 0)
     assert equilibrium_state(loop, 1.0).tolist() == [0.0, 0.0, 0.0]
 
 
-# Growth beyond the range of numbers
+# Overflow
 
 
 @pytest.mark.parametrize(
@@ -177,7 +177,7 @@ def test_growth_from_a_tiny_state_is_followed_to_the_last_number(count, power):
             states_of([[rate]], [[1.0]], cp.Step(0.0), t, [1e-300])[0],
             sampled_states(np.array([[rate]]), np.ones((1, 1)), np.zeros((1, count)), t, np.array([1e-300]))[0],
         ):
-            # Rounding of the rate alone changes growth by eps rate t.
+            # Rounding of the rate changes growth by eps rate t.
             assert np.abs(found / exact - 1.0).max() <= 1e-11
 
 
@@ -250,7 +250,7 @@ def test_zero_times_infinity_is_zero():
     [(1e5, False), (1e8, False), (1e12, True), (1e16, True)],
 )
 def test_a_phase_that_doubles_do_not_hold_is_said(turns, warned):
-    """Rounding of w turns the phase by eps w t."""
+    """Rounding of w changes the phase by eps w t."""
     t = np.linspace(0.0, 1e4, 41)
     w = turns / t[-1] * 1.1
     system = ct.ss([[0.0, w], [-w, 0.0]], [[0.0], [w]], np.eye(2), 0.0, name="ringing")

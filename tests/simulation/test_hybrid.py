@@ -1,4 +1,4 @@
-"""Sampled blocks and delays in continuous loops, and loops that are discrete throughout, against steps made by hand."""
+"""Sampled blocks and delays in continuous loops, and discrete loops, compared with steps computed by hand."""
 
 import math
 from itertools import pairwise
@@ -221,7 +221,7 @@ def test_a_sampled_loop_around_a_pendulum(method):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_sampled_interconnections_and_their_parameters(method):
-    """The block is an interconnection of discrete ones, a parameter of the run goes in."""
+    """The block is an interconnection of discrete blocks with a parameter of the run."""
     a = ct.ss(0.5, 1, 1, 0, 0.5, inputs="y", outputs="w", name="a")
     b = ct.nlsys(
         lambda t, x, u, p: p["k"] * x + u,
@@ -446,7 +446,7 @@ def test_a_bent_loop_with_two_delays(method):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_a_delay_in_a_saturated_loop(method):
-    """x' = sat(2 (1 - x(t - 0.6))) within 0.8: bends inside of segments."""
+    """x' = sat(2 (1 - x(t - 0.6))) within 0.8: kinks inside segments."""
     late = cp.create_delay_iosystem(0.6, inputs="x", outputs="seen")
     law = gain([2.0, -2.0], ["r", "seen"], "u_cmd", "law")
     integrator = ct.ss(0.0, 1.0, 1.0, 0.0, inputs="u", outputs="x", name="integrator")
@@ -570,7 +570,7 @@ def test_a_run_with_a_delay_that_stops(method):
     assert np.abs(found.outputs.ravel() - [1.0, 0.5, -0.4]).max() <= 1e-7
 
 
-# Discrete throughout
+# Discrete loops
 
 
 @pytest.mark.parametrize("dt", [0.1, True])

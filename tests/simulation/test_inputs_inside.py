@@ -1,4 +1,4 @@
-"""What reaches a block inside a solver: the input itself, not a rounded image of it."""
+"""Inputs of a block inside a solver are exact, not rounded."""
 
 import control as ct
 import numpy as np
@@ -31,7 +31,7 @@ def lag_response(plan, t):
 
 
 def recorder(count):
-    """Block without effect that records what reaches it."""
+    """Block without effect that records its inputs."""
     seen = []
 
     def rates(t, x, u, params):
@@ -111,7 +111,7 @@ def test_a_delayed_signal_stays_within_the_range_of_what_was_delayed(method):
 
 
 def test_a_number_of_the_gear_is_an_index():
-    """A look-up by a planned whole number, as in python-control's cruise control."""
+    """A table look-up by a planned integer, as in the cruise control of python-control."""
     table = [40.0, 25.0, 16.0, 12.0, 10.0]
 
     def rates(t, x, u, params):

@@ -1,4 +1,4 @@
-"""Sample instants are whole multiples of a tick: what falls on one is seen by it, however its time was rounded."""
+"""Sample times are exact multiples: an event at a sample time is included, however its time was rounded."""
 
 import control as ct
 import numpy as np
@@ -76,7 +76,7 @@ def test_blocks_of_several_rates_meet_at_common_instants(method):
 
 @pytest.mark.parametrize("first", [1e9, -1e9])
 def test_a_run_that_starts_late_keeps_its_instants(first):
-    """A kilohertz a billion seconds after the zero of time: instants are a thousandth apart, not merged."""
+    """1 kHz at 1e9 s: sample times are 1 ms apart, not merged."""
     counter = ct.nlsys(
         lambda t, x, u, params: x + 1, lambda t, x, u, params: x + 1, inputs=0, outputs="n", states="n", dt=0.001
     )

@@ -17,7 +17,7 @@ pytestmark = pytest.mark.skipif(
 
 
 def fast():
-    """Pendulum of a thousand radians per second, of which a run of an hour takes far longer than any test."""
+    """Pendulum of a thousand radians per second, for which a run of an hour takes much longer than a test."""
     return ct.nlsys(lambda t, x, u, p: [x[1], -1e6 * np.sin(x[0])], inputs=0, outputs=2, states=2, name="fast")
 
 
@@ -51,7 +51,7 @@ def test_what_a_handler_raises_reaches_the_caller(error, method, alarm, capfd):
     if isinstance(error, SystemExit):
         assert caught.value.code == 3
     assert signal.getsignal(signal.SIGALRM) is handler
-    # The form runs on as before.
+    # The form can be used again.
     signal.setitimer(signal.ITIMER_REAL, 0.0)
     found = cp.simulate(system, [0.0, 0.001], None, [1.0, 0.0], method=method)
     assert np.isfinite(found.outputs).all()
@@ -87,7 +87,7 @@ def test_a_signal_while_handlers_are_exchanged_reaches_the_caller_and_leaves_the
 
 
 def test_a_handler_that_raises_nothing_is_called_and_the_run_goes_on(alarm):
-    """A timer of the user's own program: its handler runs during CVODES, and the result is as without it."""
+    """A timer of a user's program: its handler runs during CVODES, and the result does not change."""
     system, calls = fast(), []
     before = signal.getsignal(signal.SIGALRM)
     signal.signal(signal.SIGALRM, lambda number, frame: calls.append(number))

@@ -30,7 +30,7 @@ def static(function, inputs, outputs, name, **params):
 
 
 def behind(name="behind"):
-    """A block that is not linear, outside of any loop: its output is the cube of y."""
+    """A nonlinear block outside any loop: its output is the cube of y."""
     return static(lambda t, x, u, p: u**3, "y", "cubed", name)
 
 
@@ -97,7 +97,7 @@ def test_loops_of_many_signals(method):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_a_loop_across_the_levels(method):
-    """The gain is two floors down, the adder on the ground floor, the wire between them passes straight through."""
+    """The gain is nested two levels deep, the adder is at the top level, with a direct connection."""
     inside = ct.interconnect([gain(-3.0, "u", "w", "deep")], inputs=["u"], outputs=["w"], name="first")
     floor = ct.interconnect([inside, gain(0.5, "w", "y", "half")], inputs=["u"], outputs=["y", "w"], name="second")
     adder = gain([1.0, 1.0], ["r", "y"], "u", "adder")
@@ -192,7 +192,7 @@ def test_feedthrough_that_opens_with_time(method):
 
 @pytest.mark.parametrize("method", NUMERICAL)
 def test_a_loop_that_closes_later(method):
-    """u = r - a(t) u through a static block that is idle until 1 s, next to a loop that is always closed."""
+    """u = r - a(t) u through a static block that is 0 until 1 s, next to a loop that is always closed."""
     idle = static(lambda t, x, u, p: np.fmax(t - 1.0, 0.0) * u, "u", "f", "idle")
     adder = gain([1.0, -1.0], ["r", "f"], "u", "adder")
     always = gain([1.0, -0.5], ["r", "v"], "v", "always")
@@ -296,7 +296,7 @@ def test_a_loop_of_two_signals_by_iteration():
 
 
 def test_a_loop_that_is_not_linear_with_states_in_it():
-    """A lag whose output passes the input through a bend: y = x + 0.5 sin(u), u = 1 - y."""
+    """A lag with nonlinear feedthrough: y = x + 0.5 sin(u), u = 1 - y."""
     bent = ct.nlsys(
         lambda t, x, u, p: -x + u,
         lambda t, x, u, p: x + 0.5 * np.sin(u),
@@ -320,7 +320,7 @@ def test_a_loop_that_is_not_linear_with_states_in_it():
 
 
 def test_a_singular_linear_loop_that_is_run_exactly():
-    """y = x - u and u = r - y: the blocks of the loop are named, those around it are not."""
+    """y = x - u and u = r - y: the message names the blocks of the loop only."""
     far = ct.ss(-1.0, 1.0, 1.0, 0.0, inputs="y", outputs="z", name="far")
     for method in ("auto", "exact"):
         with pytest.raises(ValueError, match=r"algebraic loop.*error, plant") as caught:
@@ -337,7 +337,7 @@ def test_a_singular_linear_loop_next_to_what_is_not_linear(method):
 
 @pytest.mark.parametrize("method", ["auto", "python"])
 def test_a_loop_without_a_solution(method):
-    """u = 1 + u^2 has none; another loop, which has one, is not blamed."""
+    """u = 1 + u^2 has none; another loop, which has one, is not named."""
     square = static(lambda t, x, u, p: 1.0 + u**2, "u", "v", "square")
     wire = gain(1.0, "v", "u", "wire")
     good = gain([1.0, -0.5], ["r", "w"], "w", "good")

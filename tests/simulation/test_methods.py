@@ -1,4 +1,4 @@
-"""Methods as objects: a new one is a class and a line, "auto" is the first without a reason."""
+"""Methods as objects: a new one is a class and a line; "auto" is the first that applies."""
 
 import copy
 import inspect
@@ -66,7 +66,7 @@ class RK4:
 
 
 class Never:
-    """A method that always has a reason, or finds one while it runs."""
+    """A method that never applies, or turns out not to apply during the run."""
 
     name = "never"
 
@@ -284,7 +284,7 @@ def test_a_warning_of_an_exact_run_is_at_the_callers_line():
     assert caught[0].filename == __file__
 
 
-# The same call takes the same way
+# Equal calls use equal methods
 
 
 def switching():
@@ -346,7 +346,7 @@ def test_threads_run_one_system_as_one_thread_does():
 
 @pytest.mark.parametrize("prepared", [False, True])
 def test_threads_trace_a_block_with_a_log_once(monkeypatch, prepared):
-    """A block that writes a log: while one thread traces it, no other takes what is in the log for a change."""
+    """A block that writes a log: while one thread traces it, the log is not a change for another thread."""
     from ctrlplan.symbolic import tracing
 
     traces, plain = [], tracing.traced

@@ -1,4 +1,4 @@
-"""Discrete systems: python-control's own response, driven by the plan's samples."""
+"""Discrete systems: the response by python-control to the samples of the plan."""
 
 import control as ct
 import numpy as np
@@ -83,7 +83,7 @@ def test_the_exact_method_is_for_continuous_systems():
         cp.simulate(ct.ss(0.5, 1.0, 1.0, 0.0, DT, name="held"), T, PLAN, method="exact")
 
 
-# Time without a unit, and the clock
+# Unspecified sampling time, and sample times
 
 
 def halving(dt, **names):
@@ -127,7 +127,7 @@ def test_uneven_times_without_a_sampling_time():
 
 def test_no_timebase():
     t = np.linspace(0.0, 2.0, 5)
-    # Without states there is nothing to tell continuous from discrete.
+    # Without states continuous and discrete systems do not differ.
     assert (cp.simulate(ct.ss([], [], [], 2.0, None), t, 1.0).outputs == 2.0).all()
     bent = ct.nlsys(None, lambda t, x, u, p: u**2, inputs=1, outputs=1, dt=None)
     assert (cp.simulate(bent, t, 3.0).outputs == 9.0).all()
@@ -165,8 +165,8 @@ def test_single_precision_times_are_instants():
         (0.1, 0.1001 * np.arange(11), "whole periods of 0.1 s apart"),
         (0.1, 0.02 * np.arange(6), "whole periods of 0.1 s apart"),
         (0.1, [0.0, 1e-9, 0.1], "at least a period of 0.1 s apart"),
-        (1e-3, 1e13 + np.arange(4.0), "tell instants 0.001 s apart, got times up to 1e"),
-        (1e-3, [0.0, 1e9], "span 1e.08 periods of a discrete system at most"),
+        (1e-3, 1e13 + np.arange(4.0), "resolve sample times 0.001 s apart, got times up to 1e"),
+        (1e-3, [0.0, 1e9], "span at most 1e.08 periods of a discrete system, got 1e.12"),
     ],
 )
 def test_times_that_are_no_instants(dt, times, match):

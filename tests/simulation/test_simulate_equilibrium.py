@@ -1,4 +1,4 @@
-"""Where a loop rests while its inputs are held, and the poles that will not let it."""
+"""Equilibrium of a loop with constant inputs, and its unstable poles."""
 
 import control as ct
 import numpy as np
@@ -11,7 +11,7 @@ T = np.linspace(0.0, 10.0, 21)
 
 
 def rests(system, position, state):
-    """The state found stays: held inputs leave every state where it is, in many time constants."""
+    """With constant inputs the state does not change over many time constants."""
     held = cp.Step(position, initial=position)
     found = simulate(system, T, held, state, method="exact").states
     return np.abs(found - np.asarray(state)[:, None]).max() <= 1e-9 * max(1.0, np.abs(state).max())
@@ -33,7 +33,7 @@ def test_the_order_of_outputs_does_not_move_the_rest(outputs):
 
 @pytest.mark.parametrize("gain", [1.0, 4.0, 99.0])
 def test_a_loop_with_an_offset(gain):
-    # gain/(s + 1) in unity feedback holds gain/(1 + gain), not 1: the rest it has is that one.
+    # gain/(s + 1) in unity feedback has the equilibrium gain/(1 + gain), not 1.
     system = cp.plants.unity_feedback_loop([1.0], [1.0, 1.0], gain)
     state = equilibrium_state(system, 1.0)
     assert np.abs(state - gain / (1 + gain)).max() <= 1e-9
@@ -41,7 +41,7 @@ def test_a_loop_with_an_offset(gain):
 
 
 def test_of_many_rests_the_one_where_outputs_are_the_inputs():
-    # Two open integrators rest anywhere while nothing drives them: x' = 0 w; y = x.
+    # Two integrators without input are in equilibrium anywhere: x' = 0 w; y = x.
     system = ct.ss(np.zeros((2, 2)), np.zeros((2, 2)), np.eye(2), np.zeros((2, 2)))
     assert np.abs(equilibrium_state(system, [2.0, -3.0]) - [2.0, -3.0]).max() <= 1e-12
 
@@ -50,7 +50,7 @@ def test_two_axes():
     rng = np.random.default_rng(0)
     a, b = rng.normal(size=(4, 4)) - 4 * np.eye(4), rng.normal(size=(4, 2))
     c = rng.normal(size=(2, 4))
-    gain = np.linalg.inv(c @ -np.linalg.solve(a, b))  # so that outputs rest at the inputs
+    gain = np.linalg.inv(c @ -np.linalg.solve(a, b))  # so that the outputs equal the inputs
     system = ct.ss(a, b @ gain, c, np.zeros((2, 2)))
     state = equilibrium_state(system, [1.5, -0.5])
     assert np.abs(state + np.linalg.solve(a, b @ gain @ [1.5, -0.5])).max() <= 1e-9
@@ -59,7 +59,7 @@ def test_two_axes():
 
 
 def test_where_there_is_no_rest_the_state_is_zero():
-    # x' = w never rests while w is held at 1.
+    # x' = w has no equilibrium for w = 1.
     assert equilibrium_state(ct.ss(0.0, 1.0, 1.0, 0.0), 1.0).tolist() == [0.0]
 
 

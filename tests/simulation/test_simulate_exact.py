@@ -1,4 +1,4 @@
-"""The exact method against closed forms in 250 digits: plans of every kind, loops of every temper."""
+"""The exact method compared with closed forms in 250 digits: plans of every kind, and various loops."""
 
 from functools import cache
 from itertools import pairwise
@@ -187,7 +187,7 @@ def test_an_unstable_loop_that_leaves_the_range_of_numbers():
 @pytest.mark.parametrize("stiffness", [1e3, 1e4, 1e6])
 @pytest.mark.parametrize("duration", [1.0, 10.0, 100.0])
 def test_a_slow_mode_next_to_a_fast_one(stiffness, duration):
-    """A fast actuator in front of a slow plant: what the fast mode demands must not blur the slow one."""
+    """A fast actuator before a slow plant: the fast mode must not reduce the accuracy of the slow one."""
     rng = np.random.default_rng(8)
     for slow in (1.0, 0.3, 0.03, 1e-3):
         matrices = [[-stiffness, 0.0], [slow, -slow]], [[stiffness], [0.0]], [[0.0, 1.0]], [[0.0]]
@@ -255,7 +255,7 @@ def test_next_to_a_tight_numerical_integration(alpha):
     assert gap(found, np.hstack(rows)) <= SMALL
 
 
-# What holds for every plan and system
+# Properties of all plans and systems
 
 
 @st.composite

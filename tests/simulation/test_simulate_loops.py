@@ -18,7 +18,7 @@ def named(plan, *labels):
 
 
 def follower(plan):
-    """u = r'' + KD (r' - v) + KP (r - p) with the plan inside, one floor down; the plant is p'' = u + d."""
+    """u = r'' + KD (r' - v) + KP (r - p) with the plan nested one level deep; the plant is p'' = u + d."""
     source = cp.create_source_iosystem(named(plan, "r"), derivatives=2)
     law = ct.ss(
         [], [], [], [[KP, KD, 1.0, -KP, -KD]], inputs=["r", "r_d1", "r_d2", "p", "v"], outputs=["u"], name="law"
@@ -175,7 +175,7 @@ def test_a_loop_around_a_plant_with_feedthrough(gain):
 
 
 def algebraic(plan, through, outputs=("y", "u")):
-    """Unity feedback around y = x + through u, x' = -x + 2 u, driven by a plan inside."""
+    """Unity feedback around y = x + through u, x' = -x + 2 u, with a plan inside."""
     source = cp.create_source_iosystem(named(plan, "r"))
     error = ct.summing_junction(inputs=["r", "-y"], output="u", name="error")
     plant = ct.ss(-1.0, 2.0, 1.0, through, inputs="u", outputs="y", name="plant")

@@ -1,4 +1,4 @@
-"""The numerical method: linear systems against closed forms, nonlinear ones against a tight run from break to break."""
+"""The numerical method: linear systems against closed forms, nonlinear ones against an accurate run by segments."""
 
 from functools import cache
 from itertools import pairwise
@@ -101,7 +101,7 @@ def test_the_tolerance_is_obeyed():
 @pytest.mark.parametrize("place", ["input", "block", "nested block"])
 @pytest.mark.parametrize("start", [30.0, 1000.0])
 def test_a_plan_that_starts_late_from_rest_is_not_skipped(start, place):
-    """A solver whose steps have grown over a long rest jumps over a plan of a fifth of a second."""
+    """A solver whose steps have grown during a long dwell skips a plan of 0.2 s."""
     plan, signals = both([start, start + 0.1, start + 0.2], [[[0.0, 0.0], [1.0], [0.0, 0.0]]], 1.0)
     loop = cp.plants.integrator_lag_loop(5.0)
     t = np.append(0.0, start + np.linspace(0, 3, 31))
@@ -225,7 +225,7 @@ def test_params_reach_outputs_and_inner_blocks():
 
 
 def test_params_that_a_linear_loop_has_no_use_for():
-    # python-control's own response takes them without a word; a misspelt one would go unseen.
+    # python-control accepts them silently; a misspelt one would not be noticed.
     plan, signals = both(*MOVE, 1.0)
     with pytest.warns(UserWarning, match="params 'k' is read by no block of loop"):
         found = cp.simulate(cp.plants.integrator_lag_loop(5.0), T, plan, params={"k": 1.0})
@@ -249,7 +249,7 @@ def test_a_solution_that_ends_is_said_with_its_time():
         cp.simulate(escaping, [0.0, 0.5, 2.0], None, 1.0)
 
 
-# What is said about the choice
+# Reason of the choice
 
 
 def test_the_reason_names_what_ran_and_why():

@@ -1,4 +1,4 @@
-"""A compiled form belongs to all that its functions refer to; what cannot be followed is run by Python."""
+"""A compiled form depends on all objects of its functions; functions that cannot be analysed are run by Python."""
 
 import collections
 import collections.abc
@@ -476,7 +476,7 @@ def test_one_form_while_nothing_changes(monkeypatch):
     assert len(traces) == 1
 
 
-# What cannot be followed
+# Functions that cannot be analysed
 
 
 def with_random_numbers():
@@ -614,7 +614,7 @@ def test_an_import_inside_a_package_is_followed():
 
 
 class Unwilling:
-    """Object that cannot be looked into."""
+    """Object without accessible contents."""
 
     __slots__ = ("__weakref__",)
 

@@ -1,4 +1,4 @@
-"""Loops that switch, slide, stick, are random or blow up: a result, or an error with block and time, in few calls."""
+"""Loops with switching, sliding, friction, noise or divergence: a result, or an error with block and time."""
 
 import control as ct
 import numpy as np
@@ -77,7 +77,7 @@ def test_an_infinite_slope_names_its_block(method):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_a_smoothed_switch_runs(method):
-    """What the error offers works: the sliding value of u is 0.3, in closed form atanh."""
+    """The replacement in the error message works: the sliding value of u is 0.3, in closed form atanh."""
     block, _ = counted(lambda t, x, u: [-np.tanh(x[0] / 1e-3) + 0.3], name="slider")
     found = cp.simulate(block, np.linspace(0, 5, 6), 0.0, [1.0], method=method)
     assert abs(found.outputs[-1] - 1e-3 * np.arctanh(0.3)) < 1e-9
@@ -137,7 +137,7 @@ def test_a_relay_that_switches_without_sliding_runs(method):
 
 
 def test_a_long_run_is_no_stall():
-    """Far more evaluations than are reviewed, of an oscillation without a fault: nothing is said."""
+    """Far more evaluations than are reviewed, of a regular oscillation: no message."""
     block, count = counted(lambda t, x, u: [x[1], -x[0] * abs(x[0]) ** 0.0], 2, "oscillator")
     found = cp.simulate(block, np.linspace(0, 400, 5), 0.0, [1.0, 0.0], method="python", rtol=1e-9)
     assert count[0] > _EVALUATIONS / 10

@@ -1,4 +1,4 @@
-"""Pulses and switches in t inside a user's block are not passed over, declared or not."""
+"""Pulses and switches in t inside a user's block are not skipped, declared or not."""
 
 import warnings
 
@@ -14,7 +14,7 @@ METHODS = ["compiled", "python"]
 
 
 def pulsed(pulse, name="pulsed"):
-    """x' = pulse(t) - x: from rest, so that a solver sees nothing until the pulse begins."""
+    """x' = pulse(t) - x: from equilibrium, so that the derivative is 0 until the pulse."""
     return ct.nlsys(lambda t, x, u, params: [pulse(t) - x[0]], inputs=0, outputs="x", states="x", name=name)
 
 

@@ -185,7 +185,7 @@ def test_what_is_equal_to_no_number():
     assert x[0] != "text"
 
 
-# Nothing is left changed
+# Nothing remains changed
 
 T = np.linspace(0.0, 3.0, 16)
 PLAN = cp.PolySpline([cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1, 0, 0)], labels=["r"])
@@ -217,7 +217,7 @@ def attributes_of_casadi():
 
 
 class Looking:
-    """Factor -1 that looks at CasADi where it is used."""
+    """Factor -1 that depends on the state of CasADi."""
 
     before = attributes_of_casadi()
 

@@ -1,4 +1,4 @@
-"""What python-control's own runs do to plans, loops and blocks, and what is done here: both are shown."""
+"""Differences between simulations by python-control and by this package for plans, loops and blocks."""
 
 import warnings
 
@@ -132,7 +132,7 @@ def test_blocks_that_agree_on_a_parameter_need_no_warning():
 
 
 def test_samples_lose_digits_that_plans_keep():
-    """x' = r'' on 301 samples, as a trolley has it: linear in between costs 1e-4, the plan itself nothing."""
+    """x' = r'' on 301 samples, as a trolley has it: linear interpolation has an error of 1e-4, the plan itself none."""
     plan = cp.PolySpline([cp.Waypoint(0, 0, 0, 0), cp.Waypoint(15, 20, 0, 0)], labels=["r"])
     names = ["r", "r_d1", "r_d2"]
     second = ct.ss([[0, 1], [0, 0]], [[0] * 3, [0, 0, 1]], [[1, 0]], 0, inputs=names, outputs="y", name="trolley")

@@ -1,4 +1,4 @@
-"""Trial calls of a block leave nothing behind: errors, memory, random numbers and warnings."""
+"""Trial calls of a block have no side effects: errors, memory, random numbers and warnings."""
 
 import random
 import sys
@@ -158,7 +158,7 @@ def test_a_form_is_not_made_of_a_block_with_memory(relay):
 
 
 def test_a_switch_of_memory_that_no_trial_reaches():
-    """An object array keeps what was once beyond 1000: found by what is stored, not by what it gives."""
+    """An object array stores a value above 1000: detected by the stored value, not by outputs."""
     memory = np.zeros(1, dtype=object)
 
     def update(t, x, u, p):
@@ -369,7 +369,7 @@ def test_a_function_that_cannot_read_parameters_is_not_called_to_see_whether_it_
 
 
 def test_a_parameter_of_a_block_that_must_not_be_called():
-    """Its code shows what it reads."""
+    """Its code shows its arguments."""
     generator = np.random.default_rng(0)
 
     def update(t, x, u, p):

@@ -1,4 +1,4 @@
-"""Blocks that raise or remember: trial calls leave no trace, and a run calls each function as a loop should."""
+"""Blocks that raise or have memory: trial calls have no side effects, and a run calls each function once per step."""
 
 import math
 import random
@@ -50,7 +50,7 @@ def test_a_block_that_ends_the_program_in_a_trial_does_not():
 
 
 def test_what_a_block_raises_in_the_run_reaches_the_caller():
-    """Where the loop really leaves the table, the user's own error comes, with the block and the time."""
+    """If the loop leaves the table, the user's error is raised with block and time."""
     with pytest.raises(KeyError, match="outside of the table") as caught:
         cp.simulate(ct.interconnect([raising(KeyError), lag()], inputs="e", outputs="y"), T, 2.0 * PLAN)
     assert any("in block table at" in note for note in caught.value.__notes__)

@@ -1,4 +1,4 @@
-"""The admissible set against brute force: the loop, with its reference held, on a fine grid of time."""
+"""The admissible set compared with brute force: the loop with constant reference on a fine time grid."""
 
 import math
 
@@ -11,7 +11,7 @@ from scipy.optimize import linprog
 import ctrlplan as cp
 
 MARGIN = 0.01
-SPARED = 0.1 * MARGIN  # what the set gives away, in half widths
+SPARED = 0.1 * MARGIN  # margin given up by the set, in half widths
 
 
 def first_order():
@@ -55,7 +55,7 @@ def outputs(loop, x, v, horizon=20.0, step=0.005):
 
 
 def violates(loop, limits, x, v):
-    """Whether an output leaves its limits, or is at rest nearer to them than the margin."""
+    """Whether an output violates its limits, or its steady state their margin."""
     y = outputs(loop, x, v)
     rest = loop.C @ -np.linalg.solve(loop.A, loop.B @ v) + loop.D @ v
     low, high = np.array(list(limits.values())).T

@@ -1,4 +1,4 @@
-"""What every exported block promises: read off the exports, so that a new one is tested too."""
+"""Contract of all exported blocks, by the exports, so that a new one is also tested."""
 
 import doctest
 import inspect

@@ -1,4 +1,4 @@
-"""The command filter against its transfer function and the gamma distribution; its lead; its place in a loop."""
+"""The command filter against its transfer function and the gamma distribution; its gains; in a loop."""
 
 import math
 from itertools import pairwise
@@ -101,7 +101,7 @@ def test_names():
 
 @pytest.mark.parametrize("kind", ["ramp", "sine"])
 def test_it_lags_by_n_over_w(kind):
-    """A ramp comes late by n/w to all times, a slow sine by about as much."""
+    """A ramp is delayed by n/w, a slow sine by about as much."""
     w, order, t = 5.0, 3, np.linspace(10, 14, 41)
     block = cp.create_command_filter_iosystem(w, 0, order)
     if kind == "ramp":
@@ -157,14 +157,14 @@ def test_without_the_lead_it_does_not():
 
 
 def test_a_filter_that_starts_next_to_the_plan_comes_to_it_by_its_own_poles():
-    """The difference is the free answer of the filter: for n = 2, (1 + w t) exp(-w t) of the first offset."""
+    """The difference is the free response of the filter: for n = 2, (1 + w t) exp(-w t) of the first offset."""
     plan = cp.PolySpline([cp.Waypoint(0.0, 1, 0, 0, 0), cp.Waypoint(2.0, 3, 0, 0, 0)], labels=["y"])
     t, w = np.linspace(0, 4, 41), 3.0
     found = np.asarray(cp.simulate(led(plan, w, 0, 2, ["r"]), t).outputs)
     assert np.abs(found - plan(t) + (1 + w * t) * np.exp(-w * t)).max() <= 1e-10
 
 
-# Its place in a loop
+# In a loop
 
 
 @pytest.fixture(scope="module")
@@ -186,7 +186,7 @@ def commanded():
 
 
 def test_a_loop_starts_its_filters_where_they_say(commanded):
-    """States in the order of the blocks: x, its derivatives, z, its derivatives, law and drives, then the crane's."""
+    """States in the order of the blocks: x, its derivatives, z, its derivatives, law and PIDs, then the crane's."""
     loop, _, _ = commanded
     start = dict(zip(loop.state_labels, loop.initial_state, strict=True))
     assert start["x_ref_filter_x_ref"] == 1.0
@@ -197,7 +197,7 @@ def test_a_loop_starts_its_filters_where_they_say(commanded):
 
 
 def test_references_in_a_loop_are_what_the_filters_make_of_the_commands(commanded):
-    """And before the step all is at rest: nothing of the crane moves."""
+    """Before the step the crane is in equilibrium."""
     _, t, found = commanded
     outputs = dict(
         zip(found.output_labels, np.asarray(found.outputs).reshape(len(found.output_labels), -1), strict=True)

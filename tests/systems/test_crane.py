@@ -1,4 +1,4 @@
-"""The crane: its equations against Lagrange's, its flat maps against both, its linear models, its refusals."""
+"""Crane: equations compared with Lagrange's, flat maps with both, linear models, rejected plans."""
 
 import math
 from types import SimpleNamespace
@@ -16,7 +16,7 @@ import ctrlplan as cp
 from ctrlplan.systems.plants import Crane
 
 BOTH = pytest.mark.parametrize("wrap", [False, True], ids=["paper", "wrapped"])
-# No two numbers alike: a swapped pair would show.
+# All numbers different, so that swapped ones are detected.
 ODD = {
     "load_mass": 430.0,
     "trolley_mass": 3100.0,
@@ -244,7 +244,7 @@ def test_quantities_take_a_whole_plan_at_once():
         np.testing.assert_allclose([whole[k][i] for k in single], list(single.values()), rtol=1e-12, atol=1e-9)
 
 
-# Energy and rest
+# Energy and equilibrium
 
 
 @BOTH
@@ -409,7 +409,7 @@ def test_drive_loops_have_unit_gain_at_rest():
 
 
 def segment(duration, first, last, at=0.0):
-    """Quintic from rest to rest."""
+    """Rest-to-rest quintic."""
     points = [(at, first), (at + duration, last)]
     return cp.PolySpline([cp.Waypoint.from_jets(t, x=[x, 0, 0], z=[z, 0, 0]) for t, (x, z) in points])
 

@@ -31,7 +31,7 @@ def load(crane, state):
 
 
 def along(crane, state, inputs, step, count):
-    """States at `count` multiples of a step each way, by Runge and Kutta's method on the accelerations alone."""
+    """States at `count` multiples of a step each way, by the Runge-Kutta method with the accelerations only."""
 
     def rates(x):
         return np.array([*x[3:], *crane.accelerations(x, *inputs)[:3]])
@@ -120,7 +120,7 @@ def test_it_is_the_crane():
 
 
 def test_it_takes_the_crane_s_place_in_a_loop():
-    """Between figure 3's blocks, where a feedthrough undeclared would be an algebraic loop."""
+    """Between the blocks of figure 3, where undeclared feedthrough would cause an algebraic loop."""
     crane, names = Crane(), list(OUTPUTS)
     blocks = [
         cp.create_source_iosystem(PLAN, 2, suffix="_ref"),

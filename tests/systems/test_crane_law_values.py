@@ -1,4 +1,4 @@
-"""Laws of the crane as values: one table of names, options typed and checked, a user's own law, old names."""
+"""Laws of the crane as values: one table of names, typed and checked options, a user's law, old names."""
 
 import inspect
 import pickle
@@ -74,7 +74,7 @@ def test_what_a_law_states_is_what_its_block_has(name):
 
 @each_law
 def test_options_of_a_loop_are_fields_of_the_law_by_the_same_name(name):
-    """No option is renamed on the way, and none hides in **options."""
+    """No option is renamed, and none is passed by **options."""
     parameters = inspect.signature(crane_loop).parameters
     assert len(parameters) <= 19
     assert all(p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY) for p in parameters.values())

@@ -1,4 +1,4 @@
-"""Closed loops of the crane against a right-hand side written by hand, their poles, and what they reject."""
+"""Closed loops of the crane compared with a hand-written right-hand side, their poles, rejected arguments."""
 
 import math
 import re
@@ -88,7 +88,7 @@ def test_step_saturates_the_drives_and_slackens_the_rope():
     assert free.F[0] > 30e3  # without limits the command is larger
 
 
-# The whole law and its open-loop half
+# Dynamic law and flat feedforward
 
 
 @BOTH

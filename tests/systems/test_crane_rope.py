@@ -71,7 +71,7 @@ def test_slopes_bound_every_partial_derivative_over_the_ranges_of_the_plan(crane
     point = low[:, None] + shares * (high - low)[:, None]
     partials = np.array([np.broadcast_to(row, point[0].shape) for row in symbolic_slopes(crane)(*point)])
     assert np.all(partials.max(axis=1) <= 1e-15 + (1.0 + 1e-12) * slopes[[0, 0, 2, 2], [0, 1, 0, 1]])
-    # And they are no looser than the product of two ranges' ends may make them.
+    # They are no looser than products of interval ends.
     assert np.all(slopes[[0, 0, 2], [0, 1, 0]] <= 2.0 * partials[:3].max(axis=1))
     np.testing.assert_array_equal(slopes[1], 0.0)
 

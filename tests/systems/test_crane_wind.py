@@ -17,7 +17,7 @@ from ctrlplan.systems.plants import Crane, crane_loop
 
 WRAPS = pytest.mark.parametrize("wrap", [False, True], ids=["paper", "wrapped"])
 METHODS = ("compiled", "python")
-# No two numbers alike: a swapped pair would show.
+# All numbers different, so that swapped ones are detected.
 ODD = {
     "load_mass": 430.0,
     "trolley_mass": 3100.0,
@@ -294,7 +294,7 @@ def test_a_loop_in_the_wind_against_its_equations_by_hand(blown, wrap, law, meth
     assert np.abs(states[-6:-3] - wanted[4:7]).max() <= 1e-6
     assert np.abs(states[-3:] - wanted[7:]).max() <= 1e-5
     calm = cp.simulate(crane_loop(Crane(rope_wrap=wrap), move(), law), TIMES)
-    assert np.abs(np.asarray(calm.states)[-4] - states[-4]).max() > 0.05  # the wind is no trifle to theta
+    assert np.abs(np.asarray(calm.states)[-4] - states[-4]).max() > 0.05  # the wind has a noticeable effect on theta
 
 
 @pytest.mark.parametrize("law", [law for _, law in CASES])
@@ -364,7 +364,7 @@ def test_the_plans_source_as_the_reference_is_the_plain_loop(law, method):
 
 @pytest.mark.parametrize("law", ["generator", "dynamic"])
 def test_an_unhurried_time_scaling_as_the_reference_is_the_plain_loop(law):
-    """Errors that never come: the same as the source, to the solver's tolerance."""
+    """Without errors: the same as the source, to the tolerance of the solver."""
     plan, order = move(4), 4 if law == "dynamic" else 2
     scaling = cp.create_time_scaling_iosystem(plan, order, errors={"x": (50.0, 100.0)}, suffix="_ref")
     own = crane_loop(Crane(), plan, law, reference=[scaling])
@@ -375,7 +375,7 @@ def test_an_unhurried_time_scaling_as_the_reference_is_the_plain_loop(law):
 
 
 def test_a_slowed_time_scaling_on_the_crane_keeps_the_path_and_the_load_nearer_its_reference():
-    """A plan too hasty for its drives: with the time scaling the load's error from the reference is less than half."""
+    """A plan too fast for the actuators: with the time scaling the tracking error is less than half."""
     plan = move(2, ((0.0, 0.0, 10.0), (6.0, 20.0, 9.0)))
     limits = {"force_limits": (-15e3, 15e3)}
     scaling = cp.create_time_scaling_iosystem(plan, 2, errors={"x": (0.05, 0.5)}, suffix="_ref", fastest=1.0)
@@ -391,7 +391,7 @@ def test_a_slowed_time_scaling_on_the_crane_keeps_the_path_and_the_load_nearer_i
 
 
 def test_initial_states_in_the_order_of_the_blocks():
-    """Reference blocks that start where they say, a wind without states, law and drives at 0, the crane at rest."""
+    """Reference blocks at their declared states, a wind without states, law and PIDs at 0, the crane in equilibrium."""
     plan = move()
     first, second = (
         cp.create_command_filter_iosystem(1.0, 2, inputs=f"{axis}_cmd", outputs=f"{axis}_ref") for axis in "xz"
@@ -413,7 +413,7 @@ def test_inputs_come_in_the_order_given():
 
 
 def test_a_force_from_outside_adds_to_that_of_the_drive():
-    """At rest a push on the trolley, before the drive answers: D'' = F/M_c in the first instant."""
+    """At rest a push on the trolley, before the PID responds: D'' = F/M_c in the first instant."""
     plan = move(2, ((0.0, 0.0, 10.0), (1.0, 0.0, 10.0)))
     loop = crane_loop(Crane(trolley_friction=0.0), plan, inputs=["F"])
     found = cp.simulate(loop, [0.0, 1e-3], 1000.0)

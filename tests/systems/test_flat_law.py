@@ -272,7 +272,7 @@ def linear_plant():
         outputs="y",
         name="linear",
     )
-    # Its states output, so that the law finds them.
+    # Its states are outputs, as the law requires.
     measured = ct.ss(system.A, system.B, np.eye(3), 0, states=3, inputs="F", outputs=["a", "b", "c"], name="measured")
     return system, measured
 
@@ -523,7 +523,7 @@ def test_poles_of_several_flat_outputs_are_rejected_with_their_place():
         create_flat_iosystem(chains, [-1, -2])
 
 
-# What static feedback does not linearise
+# Plants that are not linearisable by static feedback
 
 
 REJECTED = {
@@ -583,7 +583,7 @@ def test_maps_that_do_not_belong_to_the_motion_are_rejected():
     # Invertible, but the flag is not made of derivatives: the approximate flat output of the ball and beam.
     with pytest.raises(ValueError, match=r"^forward must return derivatives along the motion .* derivative 2 of .* y "):
         create_flat_iosystem(ball_and_beam(approximate=True), [-1] * 4)
-    # Without equations of motion the maps are all that there is.
+    # Without equations of motion only the maps can be checked.
     assert create_flat_iosystem(ball_and_beam(approximate=True, equations=False), [-1] * 4).ninputs == 9
     with pytest.raises(ValueError, match=r"^forward must return derivatives along the motion"):
         create_flat_iosystem(double_integrator(lambda x, u, params: [array(x[0], 2 * x[1], u[0])]), [-1, -2])

@@ -1,4 +1,4 @@
-"""Governed loops: limits at all times, nothing changed where nothing must be, and holding where nothing is known."""
+"""Governed loops: limits at all times, unchanged admissible commands, held references without valid inputs."""
 
 import math
 
@@ -66,7 +66,7 @@ def test_limits_hold_at_all_times(seed):
 
 @pytest.mark.slow
 def test_limits_hold_whatever_a_bounded_disturbance_does():
-    """One that switches from end to end at random, and one in step with the loop's own oscillation."""
+    """One that switches at random between extremes, and one at the natural frequency of the loop."""
     loop = ct.ss(
         [[0, 1], [-4, -0.8]], [[0, 0.5], [4, 1]], [[1, 0]], 0, inputs=["r", "w"], outputs="y", states=2, name="loop"
     )
@@ -154,7 +154,7 @@ def test_the_reference_before_the_first_sample():
 
 
 def test_a_sensor_that_fails_and_comes_back():
-    """The measured state is nan from 0.5 to 1 s: the reference is held and the run says so."""
+    """The measured state is nan from 0.5 to 1 s: the reference is held and events are recorded."""
     governor = cp.create_governor_iosystem(
         cp.AdmissibleSet(ct.ss([[-1.0]], [[1.0]], [[1.0]], 0, inputs="r", outputs="y", states="x"), {"y": (-9, 9)}, 0.1)
     )
@@ -205,7 +205,7 @@ def test_two_references_move_on_a_line():
 
 
 class Slowly:
-    """Admission of the user's own: a tenth of the way, whatever the state."""
+    """A user's admission: a tenth of the way at every state."""
 
     references = ("r",)
     states = ("x[0]",)

@@ -1,4 +1,4 @@
-"""Feedforward of linear loops: the exact inverse, and refusal where there is none."""
+"""Feedforward of linear loops: the exact inverse, and errors if there is none."""
 
 import control as ct
 import numpy as np
@@ -73,7 +73,7 @@ def test_without_it_the_loop_lags():
     st.floats(0.01, 100.0),
 )
 def test_the_inverse_of_any_loop_without_zeros(real, pairs, gain):
-    # Unstable ones too: their inverse is as good.
+    # Also for unstable loops.
     den = polynomial.polyfromroots([*real, *(complex(*p) for p in pairs), *(complex(a, -b) for a, b in pairs)]).real
     block = create_feedforward_iosystem(named([gain], den[::-1]))
     assert block.ninputs == den.size

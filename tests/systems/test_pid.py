@@ -77,7 +77,7 @@ def test_integral_is_led_back_with_the_tracking_time(gains, given, time):
 
 
 def test_windup_is_led_back_in_closed_form():
-    """Held at an error, the integral goes exponentially to where the total is off by Tt ki e."""
+    """With a constant error the integral converges exponentially to where the total exceeds the limit by Tt ki e."""
     block = create_pid_iosystem(2.0, 1.0, 0.0, 0.1, limits=(-5.0, 5.0), tracking_time=0.5)
     t = np.linspace(0, 6, 25)
     found = cp.simulate(block, t, {"r": 4.0}, initial_state=[0.0, 4.0], rtol=1e-11, atol=1e-12)

@@ -1,4 +1,4 @@
-"""Replanners: compiled and in Python, wrong arguments, absolute times, names, and joined to loops."""
+"""Replanners: compiled and in Python, wrong arguments, absolute times, names, and in loops."""
 
 import math
 

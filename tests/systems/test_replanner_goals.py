@@ -68,7 +68,7 @@ def test_a_goal_that_accelerates_is_followed_to_its_second_derivative():
 
 
 def test_a_plan_that_ends_in_motion_onto_the_conveyor_it_was_made_for():
-    """The goal is what the plan itself leads to: nothing to plan again, and it goes on."""
+    """The goal is the end of the plan: no fit, and the plan continues."""
     plan = cp.PolySpline([Waypoint(0, 0, 0, 0), Waypoint(10, 5, 0.5, 0)], labels=["x"])
     replanner = cp.create_replanner_iosystem(plan, 0.4, goal_derivatives=1)
     found = cp.simulate(replanner, RUN, conveyor(5.0, 0.5, at=10.0))
@@ -90,7 +90,7 @@ def test_a_plan_that_ends_in_motion_onto_another_goal(speed):
 
 
 def test_a_goal_that_passes_through_0_goes_on_as_it_was_taken_to():
-    """Rounding is no move of a goal, however small the goal."""
+    """Rounding errors are not a change of the goal, however small it is."""
     replanner = cp.create_replanner_iosystem(PLAN, 0.1, goal_derivatives=1, min_horizon=3.0)
     found = cp.simulate(replanner, RUN, conveyor(0.0, 1.0, at=9.0))
     assert np.abs(found.outputs[0, RUN > 10.0] - (RUN[RUN > 10.0] - 9.0)).max() <= 1e-9

@@ -1,4 +1,4 @@
-"""Plans made again: against splines solved for directly and scipy's polynomials, and without jumps at joins."""
+"""Refitted plans compared with directly computed splines and polynomials of scipy; continuity at fits."""
 
 import itertools
 
@@ -159,7 +159,7 @@ def test_no_jump_at_any_fit_whatever_the_goals(order, alpha, moves, seed):
 
 
 def test_a_derivative_above_the_order_does_jump():
-    """So that the tests above could fail."""
+    """Check that the tests above can fail."""
     replanner = cp.create_replanner_iosystem(PLAN, 0.5, goal_derivatives=0, derivatives=3)
     core = replanner.syslist[1]
     x = core.sample(4.0, np.zeros(core.nstates), signals(PLAN, replanner, 4.0, goal=[[2.0]]), {})

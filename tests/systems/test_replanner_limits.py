@@ -1,4 +1,4 @@
-"""Replanners: limits on the plan made again, and measurements and goals that are missing."""
+"""Replanners: limits on the refitted plan, and missing measurements and goals."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Replanners to which nothing happens: the plan is followed as it was made."""
+"""Replanners without disturbances: the plan is followed unchanged."""
 
 import control as ct
 import numpy as np

@@ -1,4 +1,4 @@
-"""The plan as a block: its outputs are the plan's jet, and python-control's own functions take it as it is."""
+"""Plan as a block: its outputs are the jet of the plan, and functions of python-control accept it."""
 
 import control as ct
 import numpy as np
@@ -105,7 +105,7 @@ def test_what_is_not_a_plan(function, plan):
 
 
 def lag(gain=5.0, signal="r"):
-    """k/(s^2 + s) in unity feedback, in python-control's words only."""
+    """k/(s^2 + s) in unity feedback, with functions of python-control only."""
     return ct.ss([[-1, -gain], [1, 0]], [[gain], [0]], [[0, 1]], 0, inputs=signal, outputs="y", name="lag")
 
 

@@ -1,4 +1,4 @@
-"""The plan's samples for control.forced_response, and what it costs that they are taken for linear in between."""
+"""Samples of a plan for control.forced_response, and the error of linear interpolation."""
 
 import control as ct
 import mpmath as mp

@@ -98,7 +98,7 @@ def composed_by_sympy(outer, inner):
     return np.array(found)
 
 
-# Nothing wrong: the plan itself
+# Without disturbance: the plan itself
 
 
 KINDS = {
@@ -183,7 +183,7 @@ def test_the_time_scaling_slows_and_catches_up_as_its_formula_says(n, method):
     assert np.abs(np.asarray(found.found.states) - hand).max() <= 1e-8
     for k, wanted in enumerate([t - hand[0], *derivatives_of_sigma(hand, w)][: n + 1]):
         assert np.abs(found.jets[0, k] - wanted).max() <= 1e-8 * max(1.0, np.abs(wanted).max())
-    # The case is no easy one: slower, then faster, and both near what is allowed.
+    # The case is demanding: slower, then faster, both near the limits.
     assert found.rate.min() < 0.5
     assert found.rate.max() > 1.15
 

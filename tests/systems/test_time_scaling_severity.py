@@ -61,7 +61,7 @@ def test_an_error_may_begin_to_count_at_once():
 
 
 def test_the_largest_severity_counts():
-    """Two actuators and two axes; each in turn is the worst, and none adds to another. Inputs in the order named."""
+    """Two actuators and two axes: the severity is the maximum, not the sum. Inputs in the order named."""
     plan = cp.stack([ONE, rest((0, 3.0), (1, 5.0), labels=["z"])])
     block = cp.create_time_scaling_iosystem(
         plan,
@@ -83,7 +83,7 @@ def test_the_largest_severity_counts():
 
 @pytest.mark.parametrize("value", [math.nan, INF, -INF])
 def test_an_input_that_is_no_number(value):
-    """What is infinite is at its limit; what is nan says nothing, and leaves the others what they are."""
+    """An infinite signal is at its limit; nan is ignored, and the others count."""
     block = cp.create_time_scaling_iosystem(ONE, limits={"a": (-1, 1), "b": (-1, 1)}, bandwidth=1.0)
     wanted = 0.0 if math.isnan(value) else 1.0
     assert severity_of(block, [value, 0.0]) == wanted
@@ -122,7 +122,7 @@ def test_a_sensor_that_outputs_nan_for_a_while_does_not_end_the_run(method, caus
 PLAN = cp.PolySpline([cp.Waypoint(0.5, 0, 0, 0), cp.Waypoint(3.0, 4.0, 0, 0)], labels=["x"])
 """4 m in 2.5 s from rest to rest: at 3 m/s at the most."""
 DAMPING, MAXIMUM = 4.0, 9.0
-"""At 3 m/s the damping alone takes 12 N."""
+"""At 3 m/s the damping force is 12 N."""
 GAINS = (64.0, 32.0, 16.0, 0.02)
 LOOP_TIMES = np.linspace(0.0, 12.0, 241)
 

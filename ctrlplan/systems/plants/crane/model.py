@@ -35,6 +35,30 @@ def iosystem(crane: CraneParameters, name: str = "crane", *, wind: bool = False)
     z_d1, D_d1, R_d1, theta_d1 and the tension T [N]. Parameters given to a
     simulation (``params={"load_mass": 1000.0}``) override those of the model
     only, as for a payload that is unknown to the controller.
+
+    Parameters
+    ----------
+    name : str, optional
+        Name of the block.
+    wind : bool, optional
+        Whether the block has the input wind.
+
+    Returns
+    -------
+    control.NonlinearIOSystem
+        In continuous time.
+
+    Examples
+    --------
+    >>> import control as ct
+    >>> import ctrlplan as cp
+    >>> crane = cp.plants.Crane()
+    >>> plant, start = crane.iosystem(), crane.equilibrium(0.0, 10.0)[0]
+    >>> pids = [crane.trolley_pid(), crane.hoist_pid()]
+    >>> loop = ct.interconnect([*pids, plant], inputs=["D_ref", "R_ref"], outputs=plant.output_labels)
+    >>> response = cp.simulate(loop, [0.0, 1.0], [-0.25, 10.0], [0.0, 0.0, 0.0, 0.0, *start])
+    >>> response.outputs["z"].round(6).tolist()
+    [10.0, 10.0]
     """
     block = ct.nlsys(
         partial(update, crane),
@@ -50,6 +74,18 @@ def iosystem(crane: CraneParameters, name: str = "crane", *, wind: bool = False)
 def equilibrium(crane: CraneParameters, x: float, z: float) -> tuple[Array, Array]:
     """Equilibrium: state and inputs (F, C) with the load at (x, z).
 
+    Parameters
+    ----------
+    x, z : float
+        Position of the load [m].
+
+    Returns
+    -------
+    state : ndarray, shape (6,)
+        D, R, theta and their derivatives.
+    inputs : ndarray, shape (2,)
+        F [N] and C [N m].
+
     Raises
     ------
     ValueError
@@ -63,7 +99,20 @@ def equilibrium(crane: CraneParameters, x: float, z: float) -> tuple[Array, Arra
 def accelerations(
     crane: CraneParameters, state: Quantity, force: Quantity, torque: Quantity, wind: Quantity = 0.0
 ) -> tuple[Quantity, Quantity, Quantity, Quantity]:
-    """D'', R'', theta'' and the tension T, solved from (13) and (14)."""
+    """D'', R'', theta'' and the tension T, solved from (13) and (14).
+
+    Parameters
+    ----------
+    state : array_like, shape (6, ...)
+        D, R [m], theta [rad] and their derivatives.
+    force, torque, wind : array_like, shape (...)
+        F [N], C [N m], and the horizontal force on the load [N].
+
+    Returns
+    -------
+    tuple of four ndarray, shape (...)
+        In m/s^2, m/s^2, rad/s^2 and N.
+    """
     return solved(crane.numbers(), crane.rope_wrap, state, force, torque, wind)
 
 
@@ -71,6 +120,16 @@ def energy(crane: CraneParameters, state: ArrayLike) -> Array:
     """Mechanical energy [J] of states (6, ...).
 
     The potential energy is 0 at z = 0. The speed of the drum is R'/b, with `rope_wrap` R'/b - theta'.
+
+    Parameters
+    ----------
+    state : array_like, shape (6, ...)
+        D, R [m], theta [rad] and their derivatives.
+
+    Returns
+    -------
+    ndarray, shape (...)
+        Kinetic and potential energy [J].
     """
     values = np.asarray(state, dtype=float)
     m, trolley, inertia, b, _, _, g = crane.numbers()
