@@ -54,7 +54,8 @@ def _lag_out(t, x, u, params):
     [{}, {"tau": []}, {"tau": [[1.0, 2.0]]}, {"tau": [1.0, 2.0], "other": [1.0]}, {"tau": [1.0, 2.0], "other": 1.0}],
 )
 def test_there_are_as_many_draws_of_each_parameter(params):
-    with pytest.raises(ValueError, match="draws must have equally many values of each parameter, at least one, got shapes"):
+    said = "draws must have equally many values of each parameter, at least one, got shapes"
+    with pytest.raises(ValueError, match=said):
         run(lag(), params)
 
 
@@ -82,8 +83,8 @@ def test_a_parameter_that_no_block_reads_is_refused(loop):
 )
 def test_a_linear_loop_has_no_parameters_and_the_error_says_what_has(loop):
     said = (
-        "draws must be of parameters of a block, got 'gain', which no block reads; .* is linear, with constant matrices; "
-        "give a function of gain that returns a loop in its place"
+        "draws must be of parameters of a block, got 'gain', which no block reads; .* is linear, with constant "
+        "matrices; give a function of gain that returns a loop in its place"
     )
     with pytest.raises(ValueError, match=said):
         run(loop, {"gain": [1.0, 2.0]})
