@@ -151,7 +151,7 @@ class Comparison(Displayed):
         return Table(caption, ("metric", "unit", *self.metrics), list(rows.values()), frozenset(best))
 
     def _cells(self, name: str, measure: Measure) -> list[str]:
-        """Unit and values of a metric; 0 where that is what a value differs from by rounding."""
+        """Unit and values of a metric; a value that differs from 0 by rounding is 0."""
         rounding = 1e-9 * self.scales.get(name, 0.0)
         values = [row.get(name, math.nan) for row in self.metrics.values()]
         values = [0.0 if abs(value) <= rounding else value for value in values]

@@ -1,4 +1,4 @@
-"""What is compared: one value that holds every check, and runs and measures loops."""
+"""Experiment: plans, times and measures, checked in one place, and applied to loops."""
 
 from __future__ import annotations
 

@@ -339,7 +339,7 @@ _LEADING = (
 def leading_metrics(
     measures: Mapping[str, Measure], cells_of: Callable[[str, Measure], Sequence[str]]
 ) -> dict[str, list[str]]:
-    """Rows of a short table by the metric's name: measures of one's own, then those that matter first, eight at most.
+    """Rows of a short table by metric: measures of the user, then the most important ones, at most eight.
 
     Parameters
     ----------
