@@ -41,23 +41,23 @@ Array = NDArray[np.float64]
 DERIVATIVES = ("position", "velocity", "acceleration", "jerk", "snap")
 
 _DERIVATIVES = 2
-"""Highest derivative drawn where a user states none and gives no axes."""
+"""Default of the highest derivative drawn."""
 
 
 def plot_trajectory(
     plan: Trajectory, derivatives: int = 2, *, ax: AxesLike | None = None, units: Sequence[str] | None = None
 ) -> ControlPlot:
-    """Position and derivatives of one trajectory stacked, waypoints marked.
+    """Position and derivatives of a trajectory, one axes each, with its waypoints.
 
     Parameters
     ----------
     plan : Trajectory
-        What is drawn, from a little before its start to a little after its end.
+        The trajectory, drawn slightly beyond its start and end.
     derivatives : int, optional
         Highest derivative drawn.
     ax : Axes or array of Axes, optional
-        Where to draw: an array of n axes gets the derivatives 0 to n - 1, one
-        axes the position only. None: an empty current figure, or a new one.
+        Where to draw: an array of n axes for the derivatives 0 to n - 1, one
+        axes for the position only. None: an empty current figure, or a new one.
     units : sequence of str, optional
         Units of the plan's axes.
 
@@ -71,7 +71,7 @@ def plot_trajectory(
     TypeError
         If `ax` is neither axes nor an array of them.
     ValueError
-        If `ax` has not one axes for each of the `derivatives` stated.
+        If the number of axes in `ax` is not that of `derivatives` plus one.
     """
     names = dict(zip(plan.labels, units, strict=True)) if units is not None else {}
     rows = derivatives + 1
@@ -94,7 +94,7 @@ def plot_trajectory(
 
 
 def plot_plans(comparison: Comparison, derivatives: int = 2, *, ax: AxesLike | None = None) -> ControlPlot:
-    """References side by side: a column an axis, a row a derivative.
+    """References and their derivatives, one column per axis and one row per derivative.
 
     Parameters
     ----------
@@ -135,7 +135,7 @@ def plot_plans(comparison: Comparison, derivatives: int = 2, *, ax: AxesLike | N
 
 
 def plot_responses(comparison: Comparison, *, ax: AxesLike | None = None) -> ControlPlot:
-    """Outputs with their references, errors, and controls over time.
+    """Outputs with their references, errors, and controls versus time.
 
     Parameters
     ----------
@@ -223,7 +223,7 @@ def plot_sweep(
 
 
 def plot_bands(ensemble: Ensemble, *, ax: AxesLike | None = None) -> ControlPlot:
-    """Quantiles over the draws of outputs, errors and controls: 5 to 95 %, 25 to 75 %, and the median.
+    """Quantiles of outputs, errors and controls over draws: 5 to 95 %, 25 to 75 %, and the median.
 
     Parameters
     ----------
@@ -244,7 +244,7 @@ def plot_bands(ensemble: Ensemble, *, ax: AxesLike | None = None) -> ControlPlot
     size = max(4.4, 2.9 * len(nominal.plans) + 0.6), 1.2 + 1.7 * len(shown)
     titles = [f"error of {signal}" if error else signal for signal, error in shown]
     drawing = Drawing(ax, (len(shown), len(nominal.plans)), size, rows=titles)
-    styles = {  # a column a plan: told apart from what that has
+    styles = {  # by plan: different from the curves of its axes
         plan: plan_styles(nominal, axes)[plan] for plan, axes in zip(nominal.plans, drawing.axes[0], strict=True)
     }
     for row, (signal, error) in zip(drawing.axes, shown, strict=True):
@@ -265,9 +265,9 @@ def plot_bands(ensemble: Ensemble, *, ax: AxesLike | None = None) -> ControlPlot
 def _plot_bands_of(
     ensemble: Ensemble, row: NDArray[np.object_], signal: str, error: bool, styles: dict[str, Style]
 ) -> None:
-    """Bands of one signal, or of its error, an axes a plan."""
+    """Bands of one signal or its error, one axes per plan."""
     nominal, t = ensemble.nominal, ensemble.timepts
-    extent = [np.array(axes.get_ylim()) for axes in row if axes.lines]  # of bands that were drawn before
+    extent = [np.array(axes.get_ylim()) for axes in row if axes.lines]  # with bands drawn before
     for axes, (plan, reference) in zip(row, nominal.plans.items(), strict=True):
         band = ensemble.bands.get(plan, {}).get(signal)
         target = reference.jet(t, 0)[0, nominal.outputs.index(signal)] if signal in nominal.outputs else None
@@ -282,7 +282,7 @@ def _plot_bands_of(
         axes.fill_between(t, band[1], band[3], color=colour, alpha=0.35, linewidth=0, label="25 to 75 %")
         axes.plot(t, band[2], color=colour, linewidth=line_width(0.7), label="median")
         extent.append(band[np.isfinite(band)])
-    # One scale a row, so that the plans can be compared.
+    # The same scale in a row, so that plans can be compared.
     if extent and np.concatenate(extent).size:
         low, high = np.min(np.concatenate(extent)), np.max(np.concatenate(extent))
         margin = 0.05 * (high - low) or 0.5
@@ -374,7 +374,7 @@ def _number_point(axes: Axes, sweep: Sweep, plan: str, value: float, place: Plac
 
 
 def plot_curves(curves: Curves, *, ax: AxesLike | None = None) -> ControlPlot:
-    """Curves over one variable.
+    """Curves versus one variable.
 
     Parameters
     ----------
@@ -406,7 +406,7 @@ def plot_curves(curves: Curves, *, ax: AxesLike | None = None) -> ControlPlot:
 def plot_blocks(
     loop: ct.InterconnectedSystem, titles: Mapping[str, str] | None = None, *, ax: AxesLike | None = None
 ) -> ControlPlot:
-    """Blocks and connections of a loop: each block to the right of those that it follows.
+    """Block diagram of a loop, with each block to the right of its predecessors.
 
     Parameters
     ----------
@@ -454,7 +454,7 @@ def _connections(loop: ct.InterconnectedSystem) -> dict[tuple[str, str], list[st
 
 
 def _places(names: Sequence[str], joined: Collection[tuple[str, str]]) -> dict[str, tuple[float, float]]:
-    """Middles of blocks: a column further right than every earlier block that they are connected to."""
+    """Centres of blocks, each one column to the right of its last predecessor."""
     columns: dict[str, int] = {}
     for name in names:
         before = [columns[source] for source, sink in joined if sink == name and source in columns]
@@ -468,7 +468,7 @@ def _places(names: Sequence[str], joined: Collection[tuple[str, str]]) -> dict[s
 
 
 def _arrow(axes: Axes, source: tuple[float, float], sink: tuple[float, float], text: str) -> None:
-    """Arrow from block to block with its signals; feedback goes around the blocks between."""
+    """Arrow from block to block with its signals; feedback passes around the blocks between."""
     (x0, y0), (x1, y1) = source, sink
     if x1 > x0:
         start, end = (x0 + 0.78, y0 + 0.15 * np.sign(y1 - y0)), (x1 - 0.78, y1 + 0.15 * np.sign(y0 - y1))
@@ -485,7 +485,7 @@ def _arrow(axes: Axes, source: tuple[float, float], sink: tuple[float, float], t
 
 
 def _times(plan: Trajectory, start: float | None = None, end: float | None = None) -> Array:
-    """Times that show a trajectory: close, beyond its ends, and on both sides of every breakpoint."""
+    """Times to draw a trajectory: dense, beyond its ends, and on both sides of every breakpoint."""
     first, last = plan.start if start is None else start, plan.end if end is None else end
     margin = 0.06 * (last - first) or 0.5
     t = np.linspace(first - margin, last + margin, 1001)
@@ -494,7 +494,7 @@ def _times(plan: Trajectory, start: float | None = None, end: float | None = Non
 
 
 def _broken(t: Array, values: Array, plan: Trajectory) -> Array:
-    """Values with a gap where a derivative jumps, so that no line is drawn through the jump."""
+    """Values with nan where a derivative jumps, so that the jump is not connected by a line."""
     out = values.copy()
     span = np.ptp(values) or 1.0
     for moment in plan.breakpoints:
@@ -513,7 +513,7 @@ def _with_gaps(x: Array, y: Array) -> tuple[Array, Array]:
 
 
 def _circles(axes: Axes, points: Sequence[tuple[float, float]], colour: str, marker: str = "o") -> None:
-    """Prescribed values, which ``legend([...])`` and python-control's own plots do not count among the curves."""
+    """Prescribed values, which ``legend([...])`` and the plots of python-control do not treat as curves."""
     if points:
         t, values = np.transpose(points)
         size, face = marker_size(5) ** 2, axes.get_facecolor()

@@ -71,7 +71,7 @@ _FOR_PAGE: ContextVar[bool] = ContextVar("for_page", default=False)
 
 @contextmanager
 def page_style() -> Iterator[None]:
-    """Draw for a page: with fixed settings whatever the user's are, in figures that pyplot does not know."""
+    """Context for figures of a page: fixed settings, not registered with pyplot."""
     token = _FOR_PAGE.set(True)
     try:
         with _house_settings():
@@ -89,7 +89,7 @@ def _house_settings(**more: object) -> Iterator[None]:
 
 
 class Drawing:
-    """Axes that a plotting function draws in: new ones, or those of the user.
+    """Axes of a plotting function: new ones, or those of the user.
 
     Parameters
     ----------
@@ -158,13 +158,13 @@ class Drawing:
             spec = axes.get_subplotspec()
             if axes in lowest or spec is None or spec.is_last_row():
                 if self._own:
-                    axes.xaxis.set_tick_params(labelbottom=True)  # above a place that is left empty as well
-                # Numbers that the user has turned off stand below other axes, and so does the label.
+                    axes.xaxis.set_tick_params(labelbottom=True)  # also above an empty place
+                # Tick labels turned off by the user are below other axes, and so is the label.
                 if not axes.get_xlabel() and axes.xaxis.get_tick_params().get("labelbottom", True):
                     axes.set_xlabel(text)
 
     def finish(self, legend: bool = True) -> Plot:
-        """What a plotting function returns, with one legend for all axes, of the labels of the first."""
+        """Return value of a plotting function, with one legend for all axes, from the labels of the first."""
         made = self._legend() if legend else None
         lines = np.empty(self.axes.shape, dtype=object)
         for index, axes, before in zip(np.ndindex(lines.shape), self.axes.flat, self._before, strict=True):
@@ -172,7 +172,7 @@ class Drawing:
         return Plot(lines, self.axes, self.figure, made)
 
     def _legend(self) -> Legend | None:
-        """Legend above all axes, where it hides no curve; inside the first where the figure has others as well."""
+        """Legend above all axes; inside the first axes if the figure has other axes as well."""
         axes = self.axes[0, 0]
         handles, labels = axes.get_legend_handles_labels()
         if not handles:
@@ -199,7 +199,7 @@ class Drawing:
 
 
 class Plot(ControlPlot):  # type: ignore[misc]
-    """`control.ControlPlot` whose title leaves the layout of its figure alone.
+    """`control.ControlPlot` whose title does not change the layout of its figure.
 
     Attributes
     ----------
@@ -221,7 +221,7 @@ class Plot(ControlPlot):  # type: ignore[misc]
             Centred on the axes, or on the figure; always the latter where the
             figure has a constrained layout.
         """
-        # Over the axes python-control would give the current figure, not this one, a tight layout.
+        # python-control would apply a tight layout to the current figure instead of this one.
         constrained = isinstance(self.figure.get_layout_engine(), ConstrainedLayoutEngine)
         super().set_plot_title(title, frame="figure" if constrained else frame)
         for legend in self.figure.legends:
@@ -230,12 +230,10 @@ class Plot(ControlPlot):  # type: ignore[misc]
 
 
 def _set_below_title(figure: Figure | SubFigure, legend: Legend) -> None:
-    """Move a legend outside the axes, and the axes, below the title of the figure: matplotlib puts both at the top."""
+    """Move a legend outside the axes, and the axes, below the title of the figure."""
     words = figure.get_suptitle()
     title = next((text for text in figure.texts if words and text.get_text() == words), None)
-    engine = (
-        figure.get_layout_engine() if isinstance(figure, Figure) else None
-    )  # a part of a figure has none of its own
+    engine = figure.get_layout_engine() if isinstance(figure, Figure) else None  # a subfigure has none
     if title is not None and isinstance(engine, ConstrainedLayoutEngine):
         below = 1.0 - title.get_window_extent().height / figure.bbox.height
         legend.set_bbox_to_anchor((0.0, 0.0, 1.0, below - 0.005), transform=figure.transSubfigure)
@@ -277,7 +275,7 @@ def _reshaped(array: NDArray[np.object_], shape: tuple[int, int], rows: Sequence
 
 
 def _empty_figure(width: float, height: float) -> Figure:
-    """Figure to draw in: the current one if it is empty, as ``plt.figure()`` leaves it, else a new one."""
+    """Figure to draw in: the current one if it is empty, otherwise a new one."""
     if _FOR_PAGE.get():
         return Figure(figsize=(width, height), layout="constrained")
     tight = mpl.rcParams["figure.autolayout"]
@@ -291,7 +289,7 @@ def _empty_figure(width: float, height: float) -> Figure:
 
 
 def _as_by_default(name: str) -> bool:
-    """Whether the user has left an rcParam at matplotlib's own value."""
+    """Whether an rcParam has the default value of matplotlib."""
     given, default = mpl.rcParams[name], mpl.rcParamsDefault[name]  # type: ignore[index]
     return list(given) == list(default)
 
@@ -300,7 +298,7 @@ def _as_by_default(name: str) -> bool:
 
 
 def line_styles(roles: Mapping[str, Role], known: Mapping[str, Style] | None = None) -> dict[str, Style]:
-    """Colour and dashes of each plan where nothing is set by a user.
+    """Default colour and dashes of each plan.
 
     The first step is black and dotted, and the first planned references have
     the main colours in order; baselines and all others have the other colours.
@@ -323,14 +321,14 @@ def line_styles(roles: Mapping[str, Role], known: Mapping[str, Style] | None = N
     styles: dict[str, Style] = {}
     for name in roles:
         colour, dashes = main[name] if name in main else (next(spare), next(dashed))
-        # Dashes over solid lines: where curves coincide both are seen.
+        # Dashes over solid lines, so that coinciding curves are both visible.
         zorder = 2.0 if dashes == "-" else 2.5
         styles[name] = {"color": colour, "linestyle": dashes, "label": legend_label(name), "zorder": zorder}
     return styles
 
 
 def roles_of(shown: Comparison | Sweep) -> dict[str, Role]:
-    """What each plan is; one of which it is not known is planned, or a step where it jumps."""
+    """Role of each plan; if it is unknown, a step for a plan that jumps, otherwise planned."""
     if isinstance(shown, Sweep):
         return {name: shown.roles.get(name, Role.PLANNED) for name in shown.metrics}
     return {name: shown.roles.get(name) or role_of(plan) for name, plan in shown.plans.items()}
@@ -354,13 +352,13 @@ def axis_styles(labels: Iterable[str], axes: Axes) -> dict[str, Style]:
 
 
 def _told_apart(styles: dict[str, Style], axes: Axes) -> dict[str, Style]:
-    """Styles with the user's colours and dashes, other than those of the curves that axes have."""
+    """Styles with colours and dashes of the user that the curves of the axes do not have."""
     drawn = [line for line in axes.lines if line.get_linestyle() != "None"]
     chosen = _users_cycle()
     used = [to_hex(line.get_color()) for line in drawn]
     colours = [props["color"] for props in chosen if "color" in props] or [*_PALETTE]
     own = not any("color" in props for props in chosen)
-    # From the second plot on, other dashes each time.
+    # Different dashes from the second plot on.
     dashes = islice(cycle(_OTHER_DASHES), max(len(drawn) - 1, 0), None)
     for i, style in enumerate(styles.values()):
         if own and style["color"] == "#000000":
@@ -381,7 +379,7 @@ def _told_apart(styles: dict[str, Style], axes: Axes) -> dict[str, Style]:
 
 
 _ALIKE = 0.25
-"""Distance of colours in the unit cube of RGB below which a reader takes one for the other: Okabe and Ito's are 0.26
+"""Distance of colours in the unit cube of RGB below which they are hard to distinguish: Okabe and Ito's are 0.26
 apart, and matplotlib's own blue and orange within 0.22 of theirs."""
 
 
@@ -390,7 +388,7 @@ def _is_like(colour: str, others: Iterable[str], distance: float = _ALIKE) -> bo
 
 
 def _another(label: str, drawn: Sequence[Line2D]) -> str:
-    """Label with a number where a curve has it already."""
+    """Label, with a number if a curve has the same one."""
     known = {line.get_label() for line in drawn}
     number = 1
     numbered = label
@@ -401,29 +399,29 @@ def _another(label: str, drawn: Sequence[Line2D]) -> str:
 
 
 def _users_cycle() -> list[Style]:
-    """Properties of curves in turn, as the user has set them; empty where they are matplotlib's own."""
+    """Property cycle of the user; empty if it is the default of matplotlib."""
     chosen = mpl.rcParams["axes.prop_cycle"]
     return [] if chosen == mpl.rcParamsDefault["axes.prop_cycle"] else list(chosen)
 
 
 def shade(weight: float) -> str:
-    """Grey between the background (0) and the text (1), dark and light as the user has them."""
+    """Grey between the background (0) and the text (1) of the user's settings."""
     text, ground = (np.array(to_rgb(mpl.rcParams[name])) for name in ("text.color", "axes.facecolor"))
     return to_hex(ground + weight * (text - ground))
 
 
 def line_width(factor: float) -> float:
-    """Part of the width of curves [pt]."""
+    """Fraction of the line width of curves [pt]."""
     return float(factor * mpl.rcParams["lines.linewidth"])
 
 
 def marker_size(points: float) -> float:
-    """Size of a marker [pt], stated for the 6 points of matplotlib's own setting."""
+    """Size of a marker [pt], relative to the default of 6 points."""
     return float(points / 6.0 * mpl.rcParams["lines.markersize"])
 
 
 def font_size(points: float) -> float:
-    """Size of a text [pt], stated for the 9 points of a page."""
+    """Size of a text [pt], relative to the 9 points of a page."""
     return float(points / 9.0 * mpl.rcParams["font.size"])
 
 
@@ -435,7 +433,7 @@ _LONGEST = 60
 
 
 def legend_label(name: str) -> str:
-    """Label of a curve for the legend: matplotlib leaves out empty ones, and those that begin with an underscore."""
+    """Label of a curve for the legend: matplotlib omits empty labels and those with a leading underscore."""
     return _HIDDEN + name if not name or name.startswith("_") else name
 
 
@@ -446,14 +444,14 @@ def label_y(axes: Axes, text: str) -> None:
 
 
 def add_title(axes: Axes, text: str) -> None:
-    """Small title on the left, below one of another text that is there."""
+    """Small title on the left, below an existing one with another text."""
     old = axes.get_title(loc="left")
     if text not in old.split("\n"):
         axes.set_title(f"{old}\n{text}" if old else text, loc="left", fontsize=font_size(8))
 
 
 def letters(text: str) -> str:
-    """Text of a user as the font of the figures can write it.
+    """Text of a user with characters that the font of the figures has.
 
     Line breaks become blanks; control characters, and letters that the font
     lacks, become their code points; the middle of a very long text is left out.
@@ -467,7 +465,7 @@ def letters(text: str) -> str:
 
 
 def as_text(text: str) -> str:
-    """Text of a user for a label or a title, in which neither matplotlib nor TeX finds a formula."""
+    """Text of a user for a label or a title, escaped for matplotlib and TeX."""
     if mpl.rcParams["text.usetex"]:
         return "".join(_TEX.get(c, c) for c in letters(text))
     return letters(text).replace("$", r"\$")
@@ -477,7 +475,7 @@ _TEX = {c: f"\\{c}" for c in "{}$&#%_"} | {"\\": r"\textbackslash{}", "^": r"\^{
 
 
 def _fonts() -> list[str]:
-    """Files of the fonts in which matplotlib looks for a letter, the first that has it writing it."""
+    """Files of the fonts in which matplotlib searches a character, in order."""
     found: list[str] = []
     for family in FontProperties().get_family():
         with suppress(ValueError):
@@ -492,21 +490,21 @@ def _glyphs(font: str) -> frozenset[int]:
 
 
 def with_unit(name: str, unit: str | None, power: str = "") -> str:
-    """Label of an axis: name [unit], both a user's text; `power` is ours and may be a formula."""
+    """Label of an axis: name [unit], both texts of the user; `power` may be a formula."""
     return f"{as_text(name)} [{as_text(unit or '')}{power}]" if unit or power else as_text(name)
 
 
 def to_svg(figure: Figure, key: str) -> str:
-    """Figure as an SVG element to stand in a page; `key` keeps its ids apart from others'."""
+    """Figure as an SVG element for a page; `key` makes its ids unique."""
     salt = re.sub(r"[^\w.-]+", "-", key)
     buffer = io.StringIO()
     with _house_settings(**{"svg.hashsalt": salt}):
         figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
     text = buffer.getvalue()
-    # Several drawings stand in one page: what they define must be their own.
+    # Ids must be unique on a page with several drawings.
     return re.sub(r'(\bid="|url\(#|href="#)', rf"\g<1>{salt}-", text[text.index("<svg") :])
 
 
 def slug(name: str) -> str:
-    """Name as a part of an id: letters, digits, hyphens and underscores alone."""
+    """Name as part of an id: only letters, digits, hyphens and underscores."""
     return re.sub(r"[^\w-]+", "-", name) or "study"

@@ -1,4 +1,4 @@
-"""Plans compared: one loop, many loops, and the paper's experiments."""
+"""Comparisons of plans in one loop or many, and the studies of the paper."""
 
 from ctrlplan.studies.benefit import Benefit, benefit
 from ctrlplan.studies.comparison import Comparison
@@ -35,7 +35,7 @@ ONLINE = {
     "online-goal": online_goal_study,
     "online-saturated": online_saturated_study,
 }
-"""Studies of what is done while the loop runs, likewise."""
+"""Studies of on-line methods by name, likewise."""
 
 __all__ = [
     "MEASURES",

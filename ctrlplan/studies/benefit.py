@@ -1,4 +1,4 @@
-"""What planning gains: a planned reference compared with its baselines under the same limits."""
+"""Benefit of planning: a planned reference compared with baselines under the same limits."""
 
 from __future__ import annotations
 
@@ -37,27 +37,27 @@ OWN_LIMITS = (
     "The limits are not those of a plant: they are the peak velocity, acceleration and jerk of the polynomial through "
     "these waypoints, whose minimum duration is therefore that of the waypoints. Other limits give other durations."
 )
-"""What must be said where limits are the polynomial's own peaks."""
+"""Note for limits that are the peaks of the polynomial."""
 
 
 @dataclass(frozen=True, repr=False)
 class Benefit(Displayed):
-    """A planned reference compared with its baselines; made by `benefit`.
+    """A planned reference compared with its baselines, as returned by `benefit`.
 
     Attributes
     ----------
     comparison : Comparison
-        Of all plans, through the same waypoints in the same time.
+        Comparison of all plans, through the same waypoints at the same times.
     limits : dict of str to object
-        Limits that all must satisfy.
+        Limits of all plans.
     required_durations : tuple of RequiredDuration
-        Minimum duration of each under these limits.
+        Minimum duration of each plan under these limits.
     grids : tuple of Grid
         Metrics of trigonometric plans and baselines over alpha and duration.
     alpha : float
         Shape parameter of the trigonometric plan [rad].
     note : str
-        What a reader must know of how it was made.
+        Note on the method, for the report.
     """
 
     comparison: Comparison
@@ -87,7 +87,7 @@ class Benefit(Displayed):
 
     @property
     def verdicts(self) -> tuple[str, ...]:
-        """What was found, in sentences."""
+        """Findings, one sentence each."""
         return (
             *([sentence_of(self.required_durations)] if self.required_durations else []),
             *(grid.verdict for grid in self.grids),
@@ -113,30 +113,29 @@ class Benefit(Displayed):
 
 @dataclass(frozen=True, kw_only=True)
 class Choices:
-    """How a benefit report is made.
+    """Options of a benefit report.
 
     Attributes
     ----------
     alpha : float or "auto"
         Shape parameter of the planned reference [rad].
     limits, quantities
-        As for `fastest`; without limits, the velocity, acceleration and jerk
-        that the polynomial needs, axis by axis.
+        As for `fastest`; by default, the peak velocity, acceleration and jerk
+        of the polynomial, by axis.
     mode : (float, float) or None
-        Frequency [rad/s] and damping ratio of the mode that shapers are made
-        for: unless given, that of the slowest complex poles where the loop is
-        linear.
+        Frequency [rad/s] and damping ratio of the mode for the input shapers;
+        by default, of the slowest complex poles of a linear loop.
     alphas : tuple of float
         Shape parameters of the tables [rad].
     factors : tuple of float
-        Durations of the tables, as multiples of the waypoints' own.
+        Durations of the tables, as multiples of that of the waypoints.
     decisive : tuple of str or None
-        Metrics of the tables: settling time and peak of the control, as far as
-        they are measured, unless given.
+        Metrics of the tables; by default, settling time and peak control, as
+        far as they are measured.
     baselines : callable or None
         Maps waypoints to further plans by name, as `smoother_polynomials` does.
     note : str
-        What a reader must know of how it was made.
+        Note on the method, for the report.
     """
 
     alpha: float | Literal["auto"] = 1.0
@@ -158,39 +157,39 @@ def benefit(
     alphas: ArrayLike | None = None,
     durations: ArrayLike | None = None,
 ) -> Benefit:
-    """Compare a planned reference with what else a designer could send.
+    """Compare a planned reference with baselines.
 
     A trigonometric plan through the waypoints of a comparison is compared with
     a step, a trapezoid, an S-curve, a shaped step, the quintic and the minimum
-    jerk plan: in the same time, and under the same limits. Everything else is
-    measured as in the comparison.
+    jerk plan: at the same duration, and under the same limits. The metrics are
+    those of the comparison.
 
     Parameters
     ----------
     comparison : Comparison
-        Made by `compare`, with waypoints. The shape of its first trigonometric
-        plan is that of the planned reference; alpha = 1 where it has none.
+        Returned by `compare`, with waypoints. The planned reference has the
+        alpha of its first trigonometric plan; alpha = 1 if there is none.
     loop : control system or callable
         As for `compare`.
     limits : mapping, optional
-        As for `fastest`; unless given, the velocity, acceleration and jerk that
-        the polynomial through the waypoints needs, axis by axis.
+        As for `fastest`; by default, the peak velocity, acceleration and jerk
+        of the polynomial through the waypoints, by axis.
     alphas : array_like, optional
-        Shape parameters of the tables [rad]; 0 to 5 unless given.
+        Shape parameters of the tables [rad]; 0 to 5 by default.
     durations : array_like, optional
-        Durations of the tables [s]; 0.75, 1, 1.5 and 2 times that of the
-        waypoints unless given.
+        Durations of the tables [s]; by default 0.75, 1, 1.5 and 2 times that of
+        the waypoints.
 
     Returns
     -------
     Benefit
-        `Comparison.with_benefit` shows it on the page of the comparison.
+        To be shown on the page of the comparison: `Comparison.with_benefit`.
 
     Raises
     ------
     ValueError
-        If the comparison has no waypoints or was not made by `compare`,
-        durations are not above 0, or as `compare` and `fastest`.
+        If the comparison has no waypoints or was not returned by `compare`, if
+        a duration is not above 0, or as for `compare` and `fastest`.
 
     Examples
     --------
@@ -206,9 +205,9 @@ def benefit(
     if not isinstance(comparison, Comparison):
         raise TypeError(f"comparison must be a Comparison, got {type(comparison).__name__}")
     if comparison.experiment is None:
-        raise ValueError("comparison must be made by compare, got one without its experiment")
+        raise ValueError("comparison must be returned by compare, got one without an experiment")
     if not comparison.waypoints:
-        raise ValueError("comparison must have waypoints, in the place of plans or as waypoints=, got none")
+        raise ValueError("comparison must have waypoints, given to compare as plans or waypoints=, got none")
     choices = Choices(
         alpha=next((plan.alpha for plan in comparison.plans.values() if isinstance(plan, TrigSpline)), 1.0),
         limits=limits,
@@ -231,16 +230,16 @@ def benefit_of(
     units: Mapping[str, str] | None = None,
     title: str = "Step versus planned",
 ) -> Benefit:
-    """Compare a planned reference with its baselines, as chosen.
+    """Compare a planned reference with its baselines, with all options.
 
     Parameters
     ----------
     experiment : Experiment
-        With waypoints, in the place of whose plans others are run.
+        Experiment with waypoints, whose plans are replaced.
     loop : control system or callable
         As for `compare`.
     choices : Choices
-        How the report is made.
+        Options of the report.
     units, title : optional
         As for `compare`.
     """
@@ -262,16 +261,16 @@ def benefit_of(
 
 @dataclass(frozen=True)
 class _Setting:
-    """A loop, and what all plans share.
+    """A loop and the settings common to all plans.
 
     Attributes
     ----------
     experiment, loop, choices
         As for `benefit_of`.
     limits : mapping
-        Limits that all must satisfy.
+        Limits of all plans.
     shaper : Shaper or None
-        What step and S-curve are shaped by.
+        Input shaper for step and S-curve.
     reference : PolySpline
         The polynomial through the waypoints.
     """
@@ -284,14 +283,14 @@ class _Setting:
     reference: PolySpline
 
     def baselines(self, points: tuple[Waypoint, ...]) -> dict[str, Trajectory]:
-        """Plans that the planned reference is compared with."""
+        """Baselines of the planned reference."""
         further = self.choices.baselines
         return baseline_plans(points, self.limits, self.shaper) | dict(further(points) if further is not None else {})
 
     def run(
         self, points: tuple[Waypoint, ...], plans: dict[str, Trajectory], measures: Chosen
     ) -> tuple[Experiment, Measured]:
-        """Run plans through waypoints; longer plans are run longer."""
+        """Run plans through waypoints; the simulated time is extended for longer plans."""
         times, late = self.experiment.timepts, points[-1].time - self.reference.end
         more = np.arange(times[-1], times[-1] + max(late, 0.0), np.median(np.diff(times)))[1:]
         experiment = replace(
@@ -304,10 +303,10 @@ class _Setting:
         return experiment, experiment.run(self.loop)
 
     def rows(self, factor: float, decisive: Sequence[str]) -> tuple[dict[str, dict[str, float]], list[str]]:
-        """Metrics of trigonometric plans, by alpha, and of baselines over another duration; names of the latter.
+        """Metrics of trigonometric plans, by alpha, and of baselines at another duration; names of the latter.
 
-        A plan for which the loop cannot be built, or whose run is ended by an
-        event, counts as worst; a baseline so ended has no value.
+        A plan whose loop cannot be built, or whose run is ended by an event,
+        is ranked last; a baseline in this case has no value.
         """
         scaled = _scaled(self.experiment.waypoints, factor)
         shapes: dict[str, Trajectory] = {f"{a:g}": TrigSpline(scaled, alpha=a, warn=False) for a in self.choices.alphas}
@@ -320,10 +319,10 @@ class _Setting:
 
 
 def _grids(setting: _Setting, found: Comparison, decisive: Sequence[str]) -> tuple[Grid, ...]:
-    """Tables over alpha and duration, one for each decisive metric."""
+    """Tables over alpha and duration, one per decisive metric."""
     alphas, factors = setting.choices.alphas, setting.choices.factors
     tables = [setting.rows(factor, decisive) for factor in factors] if decisive else []
-    names = dict.fromkeys(name for _, baselines in tables for name in baselines)  # a move can be too short to be shaped
+    names = dict.fromkeys(name for _, baselines in tables for name in baselines)  # a short move has no shaped baseline
     steps = [name for name, role in found.roles.items() if role is Role.STEP]
     steps += [name for name, plan in setting.baselines(setting.experiment.waypoints).items() if _is_step(plan)]
     return tuple(
@@ -346,7 +345,7 @@ def _is_step(plan: Trajectory) -> bool:
 
 
 def _decisive(wanted: Sequence[str] | None, found: Comparison) -> list[str]:
-    """Metrics of the tables that the loop has: without controls, none of them."""
+    """Metrics of the tables that exist for the loop."""
     if wanted is None:
         wanted = [key for key in DECISIVE if key in found.measures]
     for key in wanted:
@@ -356,14 +355,14 @@ def _decisive(wanted: Sequence[str] | None, found: Comparison) -> list[str]:
 
 
 def _only(chosen: Chosen, decisive: Sequence[str]) -> Chosen:
-    """Of the metrics wanted, those of the tables, and those that a measure of runs returns."""
+    """Metrics required for the tables, with those that measures of runs return."""
     own = [one for one in chosen or () if isinstance(one, Measure)]
     wanted = [one for one in own if one.of in ("", "run") or one.name in decisive]
     return (*wanted, *(name for name in decisive if name in MEASURES))
 
 
 def _followable(loop: System | Builder, plans: dict[str, Trajectory]) -> dict[str, Trajectory]:
-    """Plans for which a builder of loops does not raise."""
+    """Plans for which the loop can be built."""
     if not is_builder(loop):
         return plans
     found = {}
@@ -381,13 +380,13 @@ def _followable(loop: System | Builder, plans: dict[str, Trajectory]) -> dict[st
 
 
 def _scaled(points: Sequence[Waypoint], factor: float) -> tuple[Waypoint, ...]:
-    """Same waypoints over another duration, passed at speeds in proportion."""
+    """Waypoints scaled to another duration, with their derivatives."""
     start = points[0].time
     return tuple(point.scaled(start + factor * (point.time - start), 1.0 / factor) for point in points)
 
 
 def _shaper(loop: System | Builder, mode: tuple[float, float] | None) -> Shaper | None:
-    """Shaper with two zeros at a mode: the one given, or the loop's own where it is linear."""
+    """ZVD shaper for a given mode, or for that of a linear loop."""
     if mode is None:
         if is_builder(loop) or not hasattr(loop, "poles"):
             return None
@@ -395,10 +394,10 @@ def _shaper(loop: System | Builder, mode: tuple[float, float] | None) -> Shaper 
         poles = np.asarray(system.poles(), dtype=complex)
         if system.dt:
             poles = np.log(poles[poles != 0.0]) / float(system.dt)
-        swinging = poles[(poles.imag > 0.0) & (poles.real < 0.0)]
-        if not swinging.size:
+        oscillating = poles[(poles.imag > 0.0) & (poles.real < 0.0)]
+        if not oscillating.size:
             return None
-        slowest = swinging[swinging.real.argmax()]
+        slowest = oscillating[oscillating.real.argmax()]
         mode = float(abs(slowest)), float(-slowest.real / abs(slowest))
     return Shaper.zvd(*mode)
 
@@ -414,8 +413,8 @@ def _numbers(values: ArrayLike, name: str) -> Array:
 def _required_durations(
     setting: _Setting, timed: dict[str, Trajectory], planned: Trajectory, limited: Limited
 ) -> tuple[RequiredDuration, ...]:
-    """Minimum duration, under the same limits, of plans that take the time of the waypoints."""
+    """Minimum duration of each plan under the same limits."""
     bounds = derivative_limits(planned, setting.limits)
-    # Profiles are as fast as they can be, each segment by itself; shaping adds its own time to each.
+    # Profiles are as fast as possible in each segment; a shaper extends each segment.
     fast = profiles(setting.experiment.waypoints, planned.labels, bounds, setting.shaper, timed=False)
     return tuple(required_duration(name, plan, fast.get(name, plan), limited) for name, plan in timed.items())

@@ -156,7 +156,7 @@ def optimality_claim(grids: tuple[Grid, Grid]) -> tuple[str, ...]:
     polynomial = int((length.values[:, 1:] < length.values[:, :1] * (1.0 - 1e-3)).sum())
     straight = choose_alpha(nominal_waypoints())
     freer = ", ".join(f"{length:.2f} m with {freedom}" for freedom, length in _freer_paths(best.plan).items())
-    verdict = "is true in no case" if not better else f"is true in {better} of {cells} cases"
+    verdict = "is true in none of the cases" if not better else f"is true in {better} of {cells} cases"
     return (
         f"The paper calls its trigonometric path optimal. In {cells // 2} combinations of alpha and end time, compared "
         f"with minimum-jerk plans and with the shortest known plan through the same waypoints, the claim {verdict}.",

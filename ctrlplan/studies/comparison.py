@@ -1,4 +1,4 @@
-"""Several plans through one loop, side by side."""
+"""Comparison of several plans in one loop."""
 
 from __future__ import annotations
 
@@ -43,53 +43,52 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, repr=False)
 class Comparison(Displayed):
-    """Responses of a loop to several plans, with their metrics; made by `compare`.
+    """Responses of a loop to several plans, with metrics, as returned by `compare`.
 
     Attributes
     ----------
     plans : dict of str to Trajectory
         The references by name.
     responses : dict of str to SimulationResponse
-        Of the loop to each.
+        Responses of the loop by plan.
     metrics : dict of str to dict of str to float
-        Plan, metric, value: see `ctrlplan.studies.MEASURES`; inf where never
-        reached, nan where undefined.
+        Value of each metric by plan, see `ctrlplan.studies.MEASURES`; inf if
+        never reached, nan if undefined.
     outputs, controls : tuple of str
-        Outputs of the loop that follow the plan, and that are its controls.
+        Outputs of the loop that follow the plan, and outputs that are controls.
     waypoints : tuple of Waypoint
-        What the plans must meet, where known.
+        Waypoints of the plans, if known.
     units : dict of str to str
         Units of axes and controls by label.
     title : str
         Heading of figures and report.
     parameters : dict of str to object
-        What the report says about how it was made.
+        Parameters shown in the report.
     notes : tuple of str
-        What a reader must know of the loop: that it is unstable, or never settles.
+        Notes on stability, settling, events and failures.
     marks : dict of str to str
-        Plans whose metrics come with a reservation, and that reservation.
+        Notes on the metrics of single plans.
     measures : dict of str to Measure
-        How the metrics are called, in the order in which they are shown.
+        Titles and units of the metrics, in the order of the tables.
     scales : dict of str to float
-        Size of each metric in this comparison, by the range of the plans, the
-        peak of the controls and the length of the run: a difference of less
-        than 1e-6 of it is rounding. Without an entry where it is not known.
+        Scale of each metric, from the range of the plans, the peak of the
+        controls and the simulated time; a difference below 1e-6 of it counts as
+        rounding. Without an entry if it is unknown.
     stopped : dict of str to float
-        Plans whose run was ended by an event, and when [s]. Their metrics are
-        those up to then, and are not ranked.
+        Times [s] at which an event ended the run of a plan. Its metrics cover
+        the time before and are not ranked.
     benefit : Benefit or None
-        What planning gains in this loop, where the page should show it: see
-        `with_benefit`.
+        Benefit of planning, to be shown on the page: see `with_benefit`.
     failures : dict of str to str
-        Plans that could not be run, and why: they are in no other entry.
+        Reasons of plans whose run failed; these have no other entries.
     limits : dict of str to dict of str to (float, float)
-        Plan, output, (minimum, maximum): what actuators of its loop declare.
+        Limits (minimum, maximum) of outputs by plan, as declared by actuators.
     roles : dict of str to Role
-        What each plan is in the comparison.
+        Role of each plan.
     stability : Stability
-        Whether the loop is stable, as far as that is known.
+        Stability of the loops, as far as it is known.
     experiment : Experiment or None
-        What was compared, and how it was measured.
+        Plans, times and measures of the comparison.
     """
 
     plans: dict[str, Trajectory]
@@ -152,27 +151,27 @@ class Comparison(Displayed):
         return Table(caption, ("metric", "unit", *self.metrics), list(rows.values()), frozenset(best))
 
     def _cells(self, name: str, measure: Measure) -> list[str]:
-        """Unit and values of a metric; 0 where that is what a value differs from by rounding."""
+        """Unit and values of a metric; a value that differs from 0 by rounding is 0."""
         rounding = 1e-9 * self.scales.get(name, 0.0)
         values = [row.get(name, math.nan) for row in self.metrics.values()]
         values = [0.0 if abs(value) <= rounding else value for value in values]
         return [unit_of(self, name), *(number(value, measure.unit) for value in values)]
 
     def to_pandas(self) -> pd.DataFrame:
-        """Metrics as a table, one row a metric, one column a plan."""
+        """Table of metrics with one row per metric and one column per plan."""
         import pandas as pd
 
         return pd.DataFrame(self.metrics).rename_axis(index="metric", columns="plan")
 
     def results(self) -> dict[str, object]:
-        """Plain data for JSON: plans with their metrics, null where infinite or undefined."""
+        """Plain data for JSON: metrics by plan, null if infinite or undefined."""
         data: dict[str, object] = {"plans": self._plans()}
         if self.failures:
             data["failures"] = dict(self.failures)
         return data if self.benefit is None else data | {"worth": self.benefit.results()}
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write metrics, plans and parameters as JSON, whole or not at all."""
+        """Write metrics, plans and parameters as JSON; on an error no file remains."""
         plans = {name: found | {"trajectory": self.plans[name].to_dict()} for name, found in self._plans().items()}
         stated = {"title": self.title, "parameters": {k: in_line(v) for k, v in self.parameters.items()}}
         data = self.results() | {"plans": plans} | stated
@@ -218,16 +217,16 @@ class Comparison(Displayed):
         }
 
     def marked(self, marks: Mapping[str, str]) -> Comparison:
-        """Same comparison with further reservations about some plans."""
+        """Comparison with further notes on single plans."""
         both = {name: "; ".join(filter(None, (self.marks.get(name), mark))) for name, mark in marks.items()}
         return replace(self, marks=self.marks | both)
 
     def with_benefit(self, benefit: Benefit) -> Comparison:
-        """Same comparison whose page and results show what planning gains as well."""
+        """Comparison with a benefit, shown on its page and in its results."""
         return replace(self, benefit=benefit)
 
     def plot(self, ax: AxesLike | None = None) -> ControlPlot:
-        """Responses, errors and controls over time.
+        """Plot responses, errors and controls versus time.
 
         Parameters
         ----------
@@ -246,7 +245,7 @@ class Comparison(Displayed):
         return plot_responses(self, ax=ax)
 
     def sections(self) -> tuple[Section, ...]:
-        """Sections of its page: plans and responses, and the animation where all loops are cranes."""
+        """Sections of its page: plans and responses, and an animation if all loops are cranes."""
         labels = [set(response.output_labels or ()) for response in self.responses.values()]
         cranes = all(known >= set(AnimatedCrane.signals) for known in labels)
         return (PlanCurves(), Responses(), *([AnimatedCrane()] if cranes else []))
@@ -284,15 +283,15 @@ def compare(
     parameters: Mapping[str, object] | None = None,
     title: str = "Step versus planned",
 ) -> Comparison:
-    """Run several plans through a loop and measure each response.
+    """Compare the responses of a loop to several plans.
 
     Parameters
     ----------
     loop : control system or callable
-        As many inputs (the reference) as the plans have axes; or a function
-        that maps a plan's name and the plan to a loop, which may have the plan
-        as a block inside and no inputs. A plan that reaches none of the outputs
-        that follow it is an error.
+        Loop with one input (the reference) per axis of the plans; or a function
+        that maps the name of a plan and the plan to a loop, which may contain
+        the plan as a block and have no inputs. A plan that affects none of the
+        outputs that follow it is an error.
     plans : mapping of str to Trajectory, or iterable of Waypoint
         The references by name; waypoints stand for the standard set of
         `ctrlplan.studies.standard_plans`: step, polynomial, trigonometric,
@@ -304,10 +303,10 @@ def compare(
     alpha : float, optional
         Shape parameter of the standard trigonometric plan [rad].
     units : mapping of str to str, optional
-        Units of axes, outputs and controls by label. Where controls differ in
-        unit, each has its own metrics alone; so have axes.
+        Units of axes, outputs and controls by label. Controls in different
+        units have separate metrics, and so have axes.
     parameters : mapping, optional
-        What the report says of how the comparison was made.
+        Parameters shown in the report.
     title : str, optional
         Heading.
 
@@ -318,19 +317,19 @@ def compare(
     Raises
     ------
     ValueError
-        If there is no plan, plans differ in axes, a plan reaches no output that
+        If there is no plan, plans differ in axes, a plan affects no output that
         follows it, `start` or `band` is out of range, or a name in `outputs`,
         `controls`, `measures` or `units` is unknown.
     TypeError
-        If a plan is not a trajectory, or an argument is of a wrong kind.
+        If a plan is not a trajectory, or an argument has a wrong type.
     Exception
-        What the first plan's run raised, where no plan can be run. Where others
-        can be, it is recorded in `Comparison.failures`, and they are kept.
+        The exception of the first plan, if the runs of all plans fail. If some
+        fail, the reasons are in `Comparison.failures`.
 
     Warns
     -----
     UserWarning
-        If a run does not start at equilibrium, since none was found.
+        If no equilibrium was found for the start of a run.
 
     Notes
     -----
@@ -375,14 +374,14 @@ def comparison_of(
     parameters: Mapping[str, object] | None = None,
     title: str = "Step versus planned",
 ) -> Comparison:
-    """What an experiment found of a loop, with what a reader must know of it.
+    """Comparison from the results of an experiment.
 
     Parameters
     ----------
     experiment : Experiment
-        What was run.
+        The experiment.
     found : Measured
-        Its runs; metrics of signals that differ in unit become nan.
+        Its runs; metrics over signals in different units become nan.
     units, parameters, title : optional
         As for `compare`.
     """
@@ -418,12 +417,12 @@ def comparison_of(
 def shown_in_units(
     experiment: Experiment, found: Measured, units: Mapping[str, str] | None
 ) -> tuple[dict[str, Measure], Signals]:
-    """Measures as they are shown, and the signals measured; metrics without a common unit become nan.
+    """Measures as shown in tables, and signals measured; metrics without a common unit become nan.
 
     Parameters
     ----------
     experiment : Experiment
-        What was run.
+        The experiment.
     found : Measured
         Its runs and metrics.
     units : mapping or None

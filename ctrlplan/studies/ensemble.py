@@ -1,4 +1,4 @@
-"""Metrics and bands over many draws of a loop's parameters."""
+"""Metrics and bands over many draws of the parameters of a loop."""
 
 from __future__ import annotations
 
@@ -33,18 +33,18 @@ LEVELS = (0.05, 0.25, 0.5, 0.75, 0.95)
 
 @dataclass(frozen=True)
 class Failure:
-    """A draw that could not be run, or a value.
+    """Failure of a draw, or of a value of a sweep.
 
     Attributes
     ----------
     draw : int
-        Which; of a sweep over values, the index of the value.
+        Index of the draw, or of the value of a sweep.
     params : dict of str to float
-        Its parameters.
+        Parameters of the draw.
     message : str
-        What went wrong: what was raised, or how it was lost.
+        Message of the exception.
     plan : str
-        With which plan; empty where with all.
+        Plan that failed; empty if all failed.
     """
 
     draw: int
@@ -55,30 +55,30 @@ class Failure:
 
 @dataclass(frozen=True, repr=False)
 class Ensemble(Displayed):
-    """Responses of a loop to plans over draws of its parameters; made by `monte_carlo`.
+    """Responses of a loop to plans over draws of its parameters, as returned by `monte_carlo`.
 
     Attributes
     ----------
     nominal : Comparison
-        The loop with its own parameters.
+        Comparison at the nominal parameters.
     params : dict of str to ndarray, shape (ndraws,)
         The draws.
     metrics : dict of str to dict of str to ndarray, shape (ndraws,)
-        Plan, metric; nan where a draw failed or was not reached.
+        Values of each metric by plan; nan for draws that failed or did not run.
     timepts : ndarray, shape (ntime,)
         Times of the bands [s].
     bands : dict of str to dict of str to ndarray, shape (nlevels, ntime)
-        Plan, signal: quantiles over the draws, at `levels`.
+        Quantiles of each signal by plan, at `levels`.
     levels : tuple of float
-        Of the quantiles.
+        Levels of the quantiles.
     failures : tuple of Failure
-        Draws that could not be run, with their parameters.
+        Failed draws, with their parameters.
     finished : int
-        Draws run or failed; fewer than there are where the run was interrupted.
+        Number of draws that ran or failed; smaller than `ndraws` after an interruption.
     nominal_draw : int or None
-        The draw that stands for the nominal loop, where its own parameters do not run.
+        Draw in place of the nominal loop, if that does not run.
     interrupted : bool
-        Whether Ctrl-C ended the run.
+        Whether Ctrl-C ended the runs.
     """
 
     nominal: Comparison
@@ -124,7 +124,7 @@ class Ensemble(Displayed):
         return next(iter(self.params.values())).size
 
     def quantiles(self, name: str) -> dict[str, Array]:
-        """Quantiles at `levels` of a metric, by plan; draws that failed do not count."""
+        """Quantiles at `levels` of a metric, by plan, without failed draws."""
         found = {}
         for plan, rows in self.metrics.items():
             values = rows.get(name, np.empty(0))
@@ -134,7 +134,7 @@ class Ensemble(Displayed):
         return found
 
     def to_pandas(self) -> pd.DataFrame:
-        """Table of one row a draw; columns the parameters, then plan and metric."""
+        """Table with one row per draw, and columns for the parameters and for metrics by plan."""
         import pandas as pd
 
         columns = {("params", name): values for name, values in self.params.items()}
@@ -156,7 +156,7 @@ class Ensemble(Displayed):
         }
 
     def plot(self, *, ax: AxesLike | None = None) -> ControlPlot:
-        """Bands of outputs, errors and controls over time.
+        """Plot bands of outputs, errors and controls versus time.
 
         Parameters
         ----------
@@ -193,7 +193,7 @@ class Ensemble(Displayed):
     def notes(self) -> Iterator[str]:
         """Notes on the draws: ranges, failures, and the best plan by metric."""
         ranges = ", ".join(f"{k} {v.min():.4g} to {v.max():.4g}" for k, v in self.params.items())
-        whose = "the loop's own parameters" if self.nominal_draw is None else f"draw {self.nominal_draw}"
+        whose = "the nominal loop" if self.nominal_draw is None else f"draw {self.nominal_draw}"
         yield f"{self.finished} draws: {ranges}. The responses below are those of {whose}."
         if self.finished < self.ndraws:
             yield f"The run was interrupted; {self.ndraws - self.finished} draws were not run."
@@ -209,8 +209,8 @@ class Ensemble(Displayed):
     def best(self, name: str) -> dict[str, float]:
         """Share of the draws in which each plan has the smallest value of a metric.
 
-        Values that differ by rounding, a millionth of the scale of the metric
-        in the nominal loop, count as equal, and each plan with one is counted.
+        Values that differ by less than 1e-6 of the scale of the metric in the
+        nominal loop count as equal, and each of these plans is counted.
         """
         rows = {plan: found[name] for plan, found in self.metrics.items() if name in found}
         table = np.array(list(rows.values()))

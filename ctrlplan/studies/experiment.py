@@ -1,4 +1,4 @@
-"""What is compared: one value that holds every check, and runs and measures loops."""
+"""Experiment: plans, times and measures, checked in one place, and applied to loops."""
 
 from __future__ import annotations
 
@@ -36,16 +36,16 @@ Metrics = dict[str, dict[str, float]]
 
 @dataclass(frozen=True)
 class Measured:
-    """What an experiment found of one loop.
+    """Results of an experiment with one loop.
 
     Attributes
     ----------
     metrics : dict of str to dict of str to float
-        Plan, metric, value.
+        Value of each metric by plan.
     runs : dict of str to Run
-        By plan; none of loops that were run together.
+        Runs by plan; empty for loops that were solved together.
     failures : dict of str to str
-        Plans that could not be run, and why: they are in no other entry.
+        Reasons of plans whose run failed; these have no other entries.
     """
 
     metrics: Metrics
@@ -53,26 +53,26 @@ class Measured:
     failures: dict[str, str] = field(default_factory=dict)
 
     def whole(self) -> Measured:
-        """The same, where every plan could be run.
+        """Return the same results if the runs of all plans succeeded.
 
         Raises
         ------
         RuntimeError
-            If one could not, with its reason.
+            If one failed, with its reason.
         """
         if self.failures:
-            reasons = (f"{plan} could not be run: {reason}" for plan, reason in self.failures.items())
+            reasons = (f"the run of {plan} failed: {reason}" for plan, reason in self.failures.items())
             raise RuntimeError("; ".join(reasons))
         return self
 
 
 @dataclass(frozen=True, init=False, eq=False, repr=False)
 class Experiment(Displayed):
-    """Plans, the times at which loops are sampled, and what is measured of each response.
+    """Plans, sample times and measures of a comparison.
 
-    `compare`, `sweep`, `monte_carlo`, `benefit` and study files each make one,
-    and run loops by it: a field means the same in all of them, and is checked
-    here.
+    `compare`, `sweep`, `monte_carlo`, `benefit` and study files construct an
+    experiment from their arguments, which are checked here and have the same
+    meaning in all of them.
 
     Attributes
     ----------
@@ -83,30 +83,31 @@ class Experiment(Displayed):
     timepts : ndarray, shape (ntime,)
         Sample times [s]; metrics are refined between them.
     waypoints : tuple of Waypoint
-        What the plans must meet, for the metrics of the path.
+        Waypoints of the plans, for the metrics of the path.
     start : float or None
-        Time [s] from which metrics count: the earliest start of a plan unless given.
+        Start [s] of the interval of the metrics; by default, the earliest start
+        of a plan.
     band : float
         Half width of the settling band relative to the range of the plan.
     outputs : tuple of str or None
-        Outputs of the loop that follow the plan: those named like its axes,
-        otherwise the first ones, unless given.
+        Outputs of the loop that follow the plan; by default, those named like
+        its axes, otherwise the first ones.
     controls : tuple of str or None
-        Outputs that are controls: those whose names begin with u unless given.
+        Outputs that are controls; by default, those whose names begin with u.
     initial_state : array_like or None
-        State at the first sample time. Unless given, the attribute
-        ``initial_state`` of a loop or of a block is where it starts, and all
-        other states are at equilibrium with every plan held at its first
-        position; a warning says where no equilibrium is found.
+        State at the first sample time. By default, the attribute
+        ``initial_state`` of a loop or of a block, and for all other states the
+        equilibrium with the plan held at its first position, with a warning if
+        no equilibrium is found.
     params : mapping or None
         Parameters of the loop's blocks, as for `simulate`.
     events : tuple of Event or None
-        As for `simulate`; those that blocks declare unless given. A plan whose
-        run an event ends is measured up to then.
+        As for `simulate`; by default, those declared by blocks. If an event
+        ends the run of a plan, its metrics cover the time before it.
     measures : tuple of str and Measure, or None
-        What is measured: names of `ctrlplan.studies.MEASURES`, and measures of
-        one's own; all of `MEASURES` unless given. A mapping of names to
-        measures stands for these in addition to all of `MEASURES`.
+        Names of `ctrlplan.studies.MEASURES`, and measures of the user; by
+        default, all of `MEASURES`. A mapping of names to measures adds these to
+        all of `MEASURES`.
 
     Raises
     ------
@@ -114,7 +115,7 @@ class Experiment(Displayed):
         If there is no plan, plans differ in axes, `start` or `band` is out of
         range, or a measure is unknown.
     TypeError
-        If a plan is not a trajectory, or an argument is of a wrong kind.
+        If a plan is not a trajectory, or an argument has a wrong type.
 
     Examples
     --------
@@ -197,16 +198,16 @@ class Experiment(Displayed):
 
     @property
     def axes(self) -> tuple[str, ...]:
-        """Labels of the axes, those of the first plan."""
+        """Labels of the axes of the first plan."""
         return next(iter(self.plans.values())).labels
 
     @property
     def since(self) -> float:
-        """Time from which metrics count [s]."""
+        """Start of the interval of the metrics [s]."""
         return min(plan.start for plan in self.plans.values()) if self.start is None else float(self.start)
 
     def run(self, loop: System | Builder) -> Measured:
-        """Run every plan through a loop, and measure each response.
+        """Simulate a loop with every plan, and compute the metrics.
 
         Parameters
         ----------
@@ -220,8 +221,8 @@ class Experiment(Displayed):
         Raises
         ------
         Exception
-            What the first plan's run raised, where no plan can be run. Where
-            others can be, it is recorded in `Measured.failures`.
+            The exception of the first plan, if the runs of all plans fail. If
+            some fail, the reasons are in `Measured.failures`.
         """
         if not is_builder(loop):
             check_has_inputs(loop)
@@ -230,7 +231,7 @@ class Experiment(Displayed):
         return Measured(metrics, {name: run for name, (run, _) in found.items()}, failures)
 
     def run_plan(self, loop: System | Builder, name: str, params: Params | None = None) -> tuple[Run, dict[str, float]]:
-        """Run one of the plans through a loop, and measure the response.
+        """Simulate a loop with one of the plans, and compute its metrics.
 
         Parameters
         ----------
@@ -260,13 +261,13 @@ class Experiment(Displayed):
         return run, self._metrics(run)
 
     def numbers_of(self, loop: System | Builder) -> Linear | None:
-        """Numbers of a linear loop as it is now, for `run_alike`.
+        """Matrices of a linear loop, for `run_alike`.
 
         Returns
         -------
         Linear or None
-            None where the loop must be run by itself: it is not linear, it has
-            events or parameters, or a measure is one's own.
+            None if the loop must be run separately: it is nonlinear, there are
+            events or parameters, or a measure of the user.
         """
         if is_builder(loop) or self._held is None:
             return None
@@ -275,7 +276,7 @@ class Experiment(Displayed):
 
     @cached_property
     def _held(self) -> dict[str, Array] | None:
-        """First positions of the plans, where linear loops are held at first; None where none are run together."""
+        """First positions of the plans, for the equilibria of linear loops; None if loops cannot be run together."""
         times = self.timepts
         ordered = times.ndim == 1 and times.size > 1 and np.isfinite(times).all() and np.all(np.diff(times) > 0.0)
         own = any(isinstance(measure, Measure) for measure in self.measures or ())
@@ -284,18 +285,17 @@ class Experiment(Displayed):
         return {name: plan.jet(times[:1], 0, left=True)[0, :, 0] for name, plan in self.plans.items()}
 
     def run_alike(self, loops: Sequence[System | Linear]) -> list[Measured] | None:
-        """Run every plan through linear loops together, and measure the responses as `run` does.
+        """Solve linear loops together with every plan, with the same metrics as `run`.
 
         Parameters
         ----------
         loops : sequence of control systems or Linear
-            Loops that differ in numbers alone.
+            Loops of the same structure.
 
         Returns
         -------
         list of Measured, or None
-            Without runs, which are not kept. None where one of the loops must
-            be run by itself.
+            Without runs. None if one of the loops must be run separately.
         """
         numbers = [loop if isinstance(loop, Linear) else self.numbers_of(loop) for loop in loops]
         alike = [loop for loop in numbers if loop is not None]
@@ -315,10 +315,10 @@ class Experiment(Displayed):
         return [Measured(metrics) for metrics in found]
 
     def _metrics(self, run: Run) -> dict[str, float]:
-        """Metrics of a run, up to where it was ended."""
+        """Metrics of a run, up to its end."""
         wanted = wanted_measures(self.measures)
         values = run_metrics(run, wanted)
-        if np.count_nonzero(run.t >= self.since) >= 2:  # otherwise it was ended before there was anything to measure
+        if np.count_nonzero(run.t >= self.since) >= 2:  # otherwise it ended before the interval of the metrics
             unstable = np.array([run.is_unstable])
             y, u = run.rows(run.outputs)[None], run.rows(run.controls)[None]
             record = Record(run.t, y, u, self.axes, run.controls, unstable)
@@ -327,20 +327,20 @@ class Experiment(Displayed):
         return values | path_metrics(run.plan, self.waypoints, wanted)
 
     def _listed(self, kind: str) -> bool:
-        """Whether a measure of a kind is wanted."""
+        """Whether there is a measure of a kind."""
         return any(measure.of == kind for measure in wanted_measures(self.measures).values())
 
 
 def _each(
     measured: Callable[[str], tuple[Run, dict[str, float]]], names: Sequence[str]
 ) -> tuple[dict[str, tuple[Run, dict[str, float]]], dict[str, str]]:
-    """Results of all plans; and of those that fail, why. An error that meets all of them is raised."""
+    """Results by plan, and reasons of failures; if all fail, the first exception is raised."""
     results: dict[str, tuple[Run, dict[str, float]]] = {}
     errors: dict[str, Exception] = {}
     for name in names:
         try:
             results[name] = measured(name)
-        except Exception as error:  # whatever a loop does with this plan
+        except Exception as error:  # of the loop with this plan
             errors[name] = error
     if len(errors) == len(names):
         raise next(iter(errors.values()))
@@ -348,36 +348,36 @@ def _each(
 
 
 def _reason(error: Exception) -> str:
-    """Message of an error in one line; with its type where the message alone says little."""
-    told = " ".join(str(error).split())
-    speaks = told and isinstance(error, ValueError | TypeError | RuntimeError)
-    return told if speaks else f"{type(error).__name__}: {told}".rstrip(": ")
+    """Message of an exception in one line, with its type if the message is not one of ours."""
+    text = " ".join(str(error).split())
+    known = text and isinstance(error, ValueError | TypeError | RuntimeError)
+    return text if known else f"{type(error).__name__}: {text}".rstrip(": ")
 
 
 def _once(values: object) -> object:
-    """Values of an iterator, which could be read once only; anything else as it is."""
+    """Values of an iterator as a tuple; any other value unchanged."""
     return values if values is None or isinstance(values, str) or not isinstance(values, Iterable) else tuple(values)
 
 
 def _check_start(start: float | None, plans: Iterable[Trajectory], times: Array) -> None:
-    """Reject a start that is no finite time, or that leaves fewer than two sample times."""
+    """Raise if a start is not finite, or leaves fewer than two sample times."""
     since = min(plan.start for plan in plans)
     if start is not None:
         since = _number(start, "start")
         if not math.isfinite(since):
             raise ValueError(f"start must be a finite time [s], got {start!r}")
-    usable = times.ndim == 1 and times.size > 1 and np.isfinite(times).all()  # otherwise simulate says so
+    usable = times.ndim == 1 and times.size > 1 and np.isfinite(times).all()  # otherwise simulate raises
     if usable and np.count_nonzero(times >= since) < 2:
         end = float(times[-1])
         if start is None:
             raise ValueError(
-                f"timepts must reach beyond the start of the plans at {since:g} s, got {end:g} s as the last"
+                f"timepts must extend beyond the start of the plans at {since:g} s, got {end:g} s as the last"
             )
-        raise ValueError(f"start must leave two of timepts or more, which end at {end:g} s, got {start!r}")
+        raise ValueError(f"start must leave at least two of timepts, which end at {end:g} s, got {start!r}")
 
 
 def _check_band(band: float) -> None:
-    """Reject a settling band that is none."""
+    """Raise if a settling band is not a finite number above 0."""
     if not 0.0 < _number(band, "band") < math.inf:
         raise ValueError(f"band must be a finite number above 0, relative to the range of the plan, got {band!r}")
 

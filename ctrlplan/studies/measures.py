@@ -1,4 +1,4 @@
-"""What a comparison measures of each response: `MEASURES` is the only list."""
+"""Metrics of responses: `MEASURES` is their only list."""
 
 from __future__ import annotations
 
@@ -19,33 +19,33 @@ from ctrlplan.simulation import Occurrence, Prepared, SimulationResponse
 from ctrlplan.trajectories import Trajectory, Waypoint
 
 Kind = Literal["", "response", "control", "path", "run"]
-"""What a measure is of."""
+"""Argument of the function of a measure."""
 
 Function: TypeAlias = Callable[..., Any]
-"""Function of a `Tracked`, `Acting`, `Path` or `Run`, as the kind of its measure says, to a value or several."""
+"""Function of a `Tracked`, `Acting`, `Path` or `Run`, according to the kind of its measure."""
 
 _TURNED = 1e-9
-"""Net change, relative to the range of a plan, up to which the plan ends where it began."""
+"""Net change, relative to the range of a plan, below which the plan returns to its start."""
 
 
 @dataclass(frozen=True)
 class Tracked:
-    """Outputs that follow a plan, as a `Measure` of responses receives them.
+    """Outputs that follow a plan: argument of a `Measure` of responses.
 
     Attributes
     ----------
     t : ndarray, shape (ntime,)
         Sample times [s] from `start` on.
     y, reference : ndarray, shapes (naxes, ntime)
-        Outputs and the plan's positions; `y` may have more rows where the
+        Outputs and positions of the plan; `y` may have more rows if the
         reference has one.
     initial, final : ndarray, shape (naxes,)
         First and last position of the plan.
     span : ndarray, shape (naxes,)
-        Range of the plan: its maximum less its minimum.
+        Range of the plan, maximum minus minimum.
     band, start : float
-        Half width of the settling band relative to the range, and the time from
-        which metrics count [s].
+        Half width of the settling band relative to the range, and the start of
+        the interval of the metrics [s].
     """
 
     t: Array
@@ -59,20 +59,20 @@ class Tracked:
 
     @cached_property
     def error(self) -> Array:
-        """Reference less output, (naxes, ntime)."""
+        """Reference minus output, (naxes, ntime)."""
         return self.reference - self.y
 
     @cached_property
     def remainder(self) -> Array:
-        """Final position less output, (naxes, ntime)."""
+        """Final position minus output, (naxes, ntime)."""
         return self.final[:, None] - self.y
 
     @cached_property
     def origin(self) -> Array:
-        """Final position less the range, in the direction of the move: what relative metrics take for the beginning.
+        """Final position minus the range, in the direction of the move: initial value of relative metrics.
 
-        The first position of a plan without reversals. The direction is that of the net change; of a plan that ends
-        where it began, that of its farthest excursion.
+        The first position for a plan without reversals. The direction is that of the net change or, for a plan that
+        returns to its start, that of its largest excursion.
         """
         net = self.final - self.initial
         far = self.reference - self.initial[:, None]
@@ -84,7 +84,7 @@ class Tracked:
 
 @dataclass(frozen=True)
 class Acting:
-    """Controls, as a `Measure` of controls receives them: sample times [s] from `start` on, u (ncontrols, ntime)."""
+    """Controls, argument of a `Measure` of controls: sample times [s] from `start` on, u (ncontrols, ntime)."""
 
     t: Array
     u: Array
@@ -93,7 +93,7 @@ class Acting:
 
 @dataclass(frozen=True)
 class Path:
-    """A plan between its waypoints, as a `Measure` of paths receives it.
+    """A plan between its waypoints: argument of a `Measure` of paths.
 
     Attributes
     ----------
@@ -112,13 +112,13 @@ class Path:
 
     @property
     def steps(self) -> bool:
-        """Whether the position jumps: steps take no path."""
+        """Whether the position is discontinuous, so that there is no path."""
         return bool(self.plan.jumps(0))
 
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """One plan through its loop, as a `Measure` of runs receives it.
+    """Simulation of one plan in its loop: argument of a `Measure` of runs.
 
     Attributes
     ----------
@@ -127,18 +127,18 @@ class Run:
     system : control system or Prepared
         The loop.
     response : SimulationResponse
-        Its response, as of `simulate`.
+        Response of the loop, as returned by `simulate`.
     outputs, controls : tuple of str
         Outputs that follow the plan, and outputs that are controls.
     last : float
-        Time of the last waypoint [s], or the end of the plan where waypoints
-        are not known.
+        Time of the last waypoint [s], or the end of the plan without
+        waypoints.
     unstable : ndarray of complex, or None
-        Poles in the right half plane; None where the loop is not linear.
+        Poles in the right half plane; None if the loop is nonlinear.
     doubt : str
-        Why the run may not start at equilibrium; empty where it does.
+        Warning that the run may not start at equilibrium; otherwise empty.
     stop : Occurrence or None
-        Event that ended the run before its time.
+        Event that ended the run.
     """
 
     plan: Trajectory
@@ -173,28 +173,28 @@ class Run:
 
 @dataclass(frozen=True, repr=False)
 class Measure(Displayed):
-    """A metric: how it is called, and how it is computed; less is better in every one.
+    """A metric: title, unit and function. Smaller values are better for all metrics.
 
     Attributes
     ----------
     title : str
-        In words.
+        Title in tables and figures.
     unit : str
-        Unit, where ``{y}`` and ``{u}`` stand for those of output and control.
+        Unit, with ``{y}`` and ``{u}`` for the units of output and control.
     of : {"response", "control", "path", "run"} or ""
-        What `function` is given: `Tracked`, `Acting`, `Path` or `Run`. Empty
-        without a function: the measure then describes a value that a function
-        of runs returns by its name.
+        Argument of `function`: `Tracked`, `Acting`, `Path` or `Run`. Empty
+        without a function: the measure then describes a value that the function
+        of a measure of runs returns under its name.
     function : callable, optional
         Maps a `Tracked` or `Acting` to one value for each axis or control, a
         `Path` to one value, and a `Run` to one value or to a mapping of names to
         values: metrics that share their computation.
     name : str
-        Key of the metric in a comparison; its title unless given.
+        Key of the metric in a comparison; by default, the title.
 
     Examples
     --------
-    A metric of one's own is an entry of `MEASURES`, or of the ``measures`` of a comparison:
+    A metric of the user is an entry of `MEASURES`, or of the ``measures`` of a comparison:
 
     >>> import numpy as np
     >>> import ctrlplan as cp
@@ -202,7 +202,7 @@ class Measure(Displayed):
     >>> move = [cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1, 0, 0)]
     >>> loop = cp.plants.unity_feedback_loop([1.0], [1.0, 1.0], 3.0)
     >>> found = cp.compare(loop, move, np.linspace(0, 20, 401), measures={"late": late})
-    >>> round(found.metrics["step"]["late"], 9)  # 3/(s + 1) in unity feedback keeps 1/4
+    >>> round(found.metrics["step"]["late"], 9)  # 3/(s + 1) in unity feedback has a steady-state error of 1/4
     0.25
     """
 
@@ -216,10 +216,7 @@ class Measure(Displayed):
         if self.of not in get_args(Kind):
             raise ValueError(f'of must be "response", "control", "path" or "run", got {self.of!r}')
         if bool(self.of) != (self.function is not None):
-            what = "a function" if self.of else "what it is of"
-            raise ValueError(
-                f"a measure with a function must say what it is of, and the other way round, got no {what}"
-            )
+            raise ValueError(f"of and function must be given together, got only {'of' if self.of else 'function'}")
 
     def _describe(self) -> Iterator[Part]:
         yield f"Measure {self.name or self.title}"
@@ -234,7 +231,7 @@ class Measure(Displayed):
 
 
 def _smooth(function: Callable[[Path], float | Array]) -> Callable[[Path], float | Array]:
-    """A metric of a path, nan of steps, which take none."""
+    """Metric of a path, nan for steps, which have no path."""
     return lambda seen: np.nan if seen.steps else function(seen)
 
 
@@ -324,7 +321,7 @@ MEASURES = {
         "Integral of the squared jerk of the reference", "{y}^2/s^5", "path", lambda seen: jerk_cost(seen.plan)
     ),
 }
-"""The metrics of a comparison by name, in the order in which they are shown: an entry is computed, listed and shown."""
+"""The metrics of a comparison by name, in the order of the tables."""
 
 
 _LEADING = (
@@ -342,7 +339,7 @@ _LEADING = (
 def leading_metrics(
     measures: Mapping[str, Measure], cells_of: Callable[[str, Measure], Sequence[str]]
 ) -> dict[str, list[str]]:
-    """Rows of a short table by the metric's name: measures of one's own, then those that matter first, eight at most.
+    """Rows of a short table by metric: measures of the user, then the most important ones, at most eight.
 
     Parameters
     ----------
@@ -384,7 +381,7 @@ def signals_of(response: ct.TimeResponseData) -> dict[str, Array]:
 
 @dataclass(frozen=True)
 class Record:
-    """Signals of one loop with a plan, or of loops that are measured together.
+    """Signals of one loop with a plan, or of several loops.
 
     Attributes
     ----------
@@ -395,7 +392,7 @@ class Record:
     axes, controls : tuple of str
         Labels of the plan's axes, and of the controls.
     unstable : ndarray of bool, shape (nloops,)
-        Whether a loop is unstable: it never settles.
+        Whether a loop is unstable, so that it never settles.
     """
 
     t: Array
@@ -409,21 +406,21 @@ class Record:
 def signal_metrics(
     record: Record, plan: Trajectory, start: float, band: float, measures: Mapping[str, Measure]
 ) -> dict[str, Array]:
-    """Metrics of responses and controls: the one function that measures signals.
+    """Metrics of responses and controls.
 
-    Each is the worst over the axes or controls; with more than one of these
-    those of each follow, with its label behind the name.
+    Each is the maximum over the axes or controls; for more than one of these
+    it is followed by the values of each, with its label appended to the name.
 
     Parameters
     ----------
     record : Record
         The signals.
     plan : Trajectory
-        What the outputs should follow.
+        Reference of the outputs.
     start, band : float
-        Time from which metrics count [s], and the settling band.
+        Start of the interval of the metrics [s], and the settling band.
     measures : mapping of str to Measure
-        Metrics wanted.
+        Metrics to compute.
 
     Returns
     -------
@@ -449,16 +446,16 @@ def signal_metrics(
 
 
 SETTLING_TIMES = ("settling_time", "tracking_settling_time")
-"""Metrics that are infinite where the loop is unstable, however short the run, and that jump along a parameter."""
+"""Metrics that are infinite for an unstable loop, and discontinuous along a parameter."""
 
 
 def _rows(signals: Array) -> list[Array]:
-    """Rows (nrows, ntime) that are measured together: all signals of one loop, or one signal of all loops."""
+    """Rows (nrows, ntime) for one call: all signals of one loop, or one signal of all loops."""
     return [signals[0]] if len(signals) == 1 else list(signals.swapaxes(0, 1))
 
 
 def _tracked(t: Array, y: Array, plan: Trajectory, band: float, start: float) -> list[Tracked]:
-    """What a measure of responses is given for each of `_rows`."""
+    """Arguments of measures of responses, for each of `_rows`."""
     plans = [plan] if len(y) == 1 or plan.naxes == 1 else [plan.select([label]) for label in plan.labels]
     found = []
     for one, rows in zip(plans, _rows(y), strict=True):
@@ -480,12 +477,12 @@ def _table(function: Function, seen: Sequence[Tracked | Acting], nloops: int) ->
 
 
 def run_metrics(run: Run, measures: Mapping[str, Measure]) -> dict[str, float]:
-    """Metrics of a run as a whole: measures of one's own.
+    """Metrics of measures of runs.
 
     Raises
     ------
     TypeError
-        If a value is no number and no mapping of names to numbers.
+        If a value is neither a number nor a mapping of names to numbers.
     ValueError
         If a name returned is that of another metric.
     """
@@ -502,7 +499,7 @@ def run_metrics(run: Run, measures: Mapping[str, Measure]) -> dict[str, float]:
         for key, value in values.items():
             if (measures.get(key, _NONE).of and key != name) or key in MEASURES:
                 raise ValueError(
-                    f"measures[{name!r}] must return metrics by names of their own, got {key!r}, which is another's"
+                    f"measures[{name!r}] must return metrics with unique names, got {key!r}, which is another metric"
                 )
             found[key] = float(value)
     return found
@@ -511,7 +508,7 @@ def run_metrics(run: Run, measures: Mapping[str, Measure]) -> dict[str, float]:
 def path_metrics(
     plan: Trajectory, waypoints: tuple[Waypoint, ...], measures: Mapping[str, Measure] | None = None
 ) -> dict[str, float]:
-    """Metrics of the reference's own path between the waypoints that it must meet."""
+    """Metrics of the path of a reference between its waypoints."""
     points = np.array([w.position for w in waypoints]).T
     if len(waypoints) < 2 or np.isnan(points).any():
         return {}
@@ -527,25 +524,25 @@ def jerk_cost(plan: Trajectory) -> float:
 
 
 Chosen = tuple["str | Measure", ...] | None
-"""Metrics wanted: names of `MEASURES` and measures of one's own, each with its name; None for all."""
+"""Metrics to compute: names of `MEASURES` and measures of the user, each with its name; None for all."""
 
 
 def checked_measures(given: Collection[str | Measure] | Mapping[str, Measure] | None) -> Chosen:
-    """Metrics wanted, as they are given to a comparison.
+    """Metrics to compute, from the argument of a comparison.
 
     Parameters
     ----------
     given : collection of str or Measure, mapping of str to Measure, or None
-        A collection is what is measured: names of `MEASURES`, and measures of
-        one's own. A mapping is measured in addition to all of `MEASURES`.
+        A collection of names of `MEASURES` and measures of the user, or a
+        mapping that is added to all of `MEASURES`.
 
     Raises
     ------
     TypeError
-        If it is a string, or something in it is no name and no measure.
+        If it is a string, or an entry is neither a name nor a measure.
     ValueError
-        If a name is unknown or stands twice, or a measure has no function and
-        there is no measure of runs that could return it.
+        If a name is unknown or repeated, or a measure has no function and there
+        is no measure of runs that could return it.
     """
     if given is None:
         return None
@@ -581,8 +578,8 @@ def _check_own(own: list[Measure]) -> None:
     seen: set[str] = set()
     for measure in own:
         if measure.name in MEASURES or measure.name in seen:
-            whose = "every comparison has" if measure.name in MEASURES else "another has"
-            raise ValueError(f"measures must have names of their own, got {measure.name!r}, which {whose}")
+            whose = "a name of MEASURES" if measure.name in MEASURES else "repeated"
+            raise ValueError(f"measures must have unique names, got {measure.name!r}, which is {whose}")
         seen.add(measure.name)
         if not measure.of and not of_runs:
             raise ValueError(
@@ -591,7 +588,7 @@ def _check_own(own: list[Measure]) -> None:
 
 
 def wanted_measures(chosen: Chosen) -> dict[str, Measure]:
-    """Measures wanted by name, those of one's own first, the others in the order of `MEASURES`."""
+    """Measures by name, those of the user first, the others in the order of `MEASURES`."""
     if chosen is None:
         return dict(MEASURES)
     names = {one for one in chosen if isinstance(one, str)}
@@ -599,14 +596,14 @@ def wanted_measures(chosen: Chosen) -> dict[str, Measure]:
 
 
 def own_measures(chosen: Chosen) -> dict[str, Measure]:
-    """Measures of one's own by name."""
+    """Measures of the user by name."""
     return {one.name: one for one in chosen or () if isinstance(one, Measure)}
 
 
 def shown_measures(chosen: Chosen, found: Iterable[Mapping[str, float]]) -> dict[str, Measure]:
-    """Every measure of a comparison, those of one's own first.
+    """All measures of a comparison, those of the user first.
 
-    A name that a measure of runs returns and nothing describes is its own title.
+    A name that a measure of runs returns without a description becomes its title.
     """
     own = {
         name: measure
@@ -620,14 +617,14 @@ def shown_measures(chosen: Chosen, found: Iterable[Mapping[str, float]]) -> dict
 
 
 def checked_names(names: Iterable[str], known: Collection[str], what: str) -> tuple[str, ...]:
-    """Names given by a user, each among those known.
+    """Checked names, each among the known ones.
 
     Raises
     ------
     TypeError
-        If they are a string, or not names.
+        If they are a string.
     ValueError
-        If one is unknown; the known ones are in the message.
+        If one is unknown.
     """
     listed = ", ".join(known) or "none"
     if isinstance(names, str):

@@ -102,7 +102,7 @@ def online_gust_study(progress: bool = True) -> Study:
         "as a feedback.",
         "Each new plan starts at the measured load position, so the reference jumps and the force is at its limit for "
         f"{again['limited_time']:.2g} s. With feedback of the load in the control law, the peak force is "
-        f"{law['force_peak'] / 1e3:.2g} kN and the settling time {law['arrival']:.3g} s.",
+        f"{law['force_peak'] / 1e3:.2g} kN and the settling time is {law['arrival']:.3g} s.",
         f"The reference governor, with a filter in place of a plan, settles in {governed['arrival']:.3g} s. With time "
         f"scaling, which slows the plan while the tracking error is large, the settling time is "
         f"{slowed['arrival']:.3g} s.",

@@ -190,9 +190,9 @@ def sweep(
 ) -> Sweep:
     """Compare plans in a loop for each value of a parameter.
 
-    A value whose run raises an exception, calls ``sys.exit``, exceeds the time
-    limit or loses its worker process is recorded in `Sweep.failures` with the
-    reason, and the sweep continues. Ctrl-C ends the sweep: finished results are
+    A value is recorded in `Sweep.failures` with the reason if its run raises an
+    exception, calls ``sys.exit`` or exceeds the time limit, or if its worker
+    process dies; the sweep continues. Ctrl-C ends the sweep: finished results are
     returned with a warning, and tasks that have not begun are cancelled; an
     executor finishes those that have. A second Ctrl-C, or one before the first
     result of `monte_carlo`, raises KeyboardInterrupt.

@@ -632,7 +632,7 @@ def test_what_cannot_be_asked():
     without = cp.compare(loop(5.0), {"step": cp.Step(1.0)}, TIMES)
     with pytest.raises(ValueError, match=r"comparison must have waypoints, .*got none"):
         cp.benefit(without, loop(5.0))
-    with pytest.raises(ValueError, match="comparison must be made by compare"):
+    with pytest.raises(ValueError, match="comparison must be returned by compare"):
         cp.benefit(dataclasses.replace(without, experiment=None), loop(5.0))
     with pytest.raises(TypeError, match="comparison must be a Comparison, got StateSpace"):
         cp.benefit(ct.ss(loop(5.0)), loop(5.0))

@@ -149,7 +149,7 @@ def test_the_claim_is_not_true_and_the_text_gives_the_values(grids):
     text = " ".join(claim)
     assert all(mark == "worse" for grid in grids for row in grid.marks() for mark in row)
     assert "In 36 combinations of alpha and end time" in claim[0]
-    assert claim[0].endswith("the claim is true in no case.")
+    assert claim[0].endswith("the claim is true in none of the cases.")
     assert claim[-2:] == (grids[0].verdict, grids[1].verdict)
     shorter = sum(value < 0.999 * row[0] for row in grids[0].values for value in row[1:])
     assert f"shorter in {shorter} of 36 cases" in text

@@ -134,7 +134,7 @@ def test_outputs_and_controls_can_be_named():
 @pytest.mark.parametrize(
     ("plans", "options", "kind", "message"),
     [
-        ({}, {}, ValueError, "plans must hold at least one trajectory, got none"),
+        ({}, {}, ValueError, "plans must contain at least one trajectory, got none"),
         ({"a": 1.0}, {}, TypeError, r"plans\['a'\] must be a Trajectory, got float"),
         (
             {"a": cp.Step(1.0), "b": cp.Step([1.0, 2.0])},

@@ -151,16 +151,16 @@ def OF_RUNS(function):
         ({"measures": {"late": "Late"}}, TypeError, r"measures\['late'\] must be a Measure, got str"),
         ({"measures": [3]}, TypeError, "measures must be a collection of names and Measures, of .*, got 3"),
         ({"measures": 3}, TypeError, "measures must be a collection of names and Measures, of .*, got 3"),
-        ({"measures": [Measure("Late", name="iae")]}, ValueError, "names of their own, got 'iae'"),
-        ({"measures": 2 * [OF_RUNS(float)]}, ValueError, "names of their own, got 'mine', which another has"),
-        ({"measures": {"iae": Measure("Mine")}}, ValueError, "names of their own, got 'iae'"),
+        ({"measures": [Measure("Late", name="iae")]}, ValueError, "unique names, got 'iae'"),
+        ({"measures": 2 * [OF_RUNS(float)]}, ValueError, "unique names, got 'mine', which is repeated"),
+        ({"measures": {"iae": Measure("Mine")}}, ValueError, "unique names, got 'iae'"),
         ({"measures": {"late": Measure("Late")}}, ValueError, "must have a function, or come from a measure of runs"),
         (
             {"measures": [OF_RUNS(lambda run: [3.0])]},
             TypeError,
             "must return a number or a mapping of names to numbers",
         ),
-        ({"measures": [OF_RUNS(lambda run: {"iae": 3.0})]}, ValueError, "names of their own, got 'iae'"),
+        ({"measures": [OF_RUNS(lambda run: {"iae": 3.0})]}, ValueError, "unique names, got 'iae'"),
     ],
 )
 def test_names_that_are_none_are_errors_with_those_that_are(options, kind, message):

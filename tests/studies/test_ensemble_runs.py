@@ -210,7 +210,7 @@ def test_a_parameter_that_counts_only_beyond_a_limit_is_run_too(tau):
 
 def test_the_notes_tell_of_failures(exploded):
     assert list(exploded.notes())[:3] == [
-        "4 draws: k 0.01 to 0.5. The responses below are those of the loop's own parameters.",
+        "4 draws: k 0.01 to 0.5. The responses below are those of the nominal loop.",
         f"1 of 4 draws failed. The first, with k = 0.5: {exploded.failures[0].message}",
         "Failed draws are excluded from bands and quantiles.",
     ]
