@@ -54,7 +54,9 @@ def _lag_out(t, x, u, params):
     [{}, {"tau": []}, {"tau": [[1.0, 2.0]]}, {"tau": [1.0, 2.0], "other": [1.0]}, {"tau": [1.0, 2.0], "other": 1.0}],
 )
 def test_there_are_as_many_draws_of_each_parameter(params):
-    with pytest.raises(ValueError, match="draws must have equally many values of each parameter, at least one, got shapes"):
+    with pytest.raises(
+        ValueError, match="draws must have equally many values of each parameter, at least one, got shapes"
+    ):
         run(lag(), params)
 
 
