@@ -152,7 +152,7 @@ def test_a_line_runs_after_the_program(line, more, ran, tmp_path, monkeypatch):
         assert ended.value.code == 0
     else:
         exec(line, dict(ran[0]))
-    for called in re.findall(r"`help\((.*?)\)`", more):
+    for called in re.findall(r'`help\("(.*?)"\)`', more):
         assert __import__(called, fromlist=["_"]).__doc__.count("\n") > 5
 
 
