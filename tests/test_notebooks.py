@@ -156,7 +156,7 @@ def test_what_differs_from_run_to_run_is_not_stored():
 def test_html_is_compared_by_its_words():
     from nbformat.v4 import new_code_cell, new_output
 
-    shown = "<style>p {}</style><p>Settling &amp; <b>2.5</b> s</p><script>var t = 3;</script>"
+    shown = "<style>p {}</style><p>Settling &amp; <b>2.5</b> s</p><svg><text>7</text></svg><script>t = 3</script>"
     cell = new_code_cell("x", outputs=[new_output("display_data", {"text/html": shown, "text/plain": "<A>"})])
     assert texts(cell) == ["<A>", "Settling & 2.5 s"]
 

@@ -26,7 +26,7 @@ TIMEOUT = 120  # s a cell
 
 _ADDRESS = re.compile(r" at 0x[0-9a-f]+")
 _NUMBER = re.compile(r"(?<![\w.])[-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?", re.IGNORECASE)
-_UNSHOWN = re.compile(r"<(style|script)\b.*?</\1>|<!--.*?-->", re.DOTALL)
+_UNSHOWN = re.compile(r"<(style|script|svg)\b.*?</\1>|<!--.*?-->", re.DOTALL)
 
 
 @dataclass(frozen=True)
