@@ -56,7 +56,9 @@ WORDS = (
         r"least|greatest",
         r"at( the very)? least|least[- ]squares|least recently|least[- ]significant",
     ),
-    Word("most", "maximum, peak", r"most", r"most", r"at( the very)? most|most of|most recent(ly)?|most often"),
+    Word(
+        "most", "maximum, peak", r"most", r"most", r"at( the very)? most|most (of|often|recent(ly)?|important|common)"
+    ),
     Word("asked", "commanded, required", r"asks?|asked|asking", r"asks?|asked"),
     Word("put out", "output", r"puts? out|put(ting)? out", r"puts"),
     Word("driven", "input", r"driven|drives(?= by)", r"driven|drives"),
