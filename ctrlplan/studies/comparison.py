@@ -351,19 +351,7 @@ def compare(
     if not isinstance(plans, Mapping):
         waypoints = waypoints_given(plans)
         plans = references_of(waypoints, alpha)
-    experiment = Experiment(
-        plans,
-        timepts,
-        waypoints=waypoints,
-        start=start,
-        band=band,
-        outputs=outputs,
-        controls=controls,
-        initial_state=initial_state,
-        params=params,
-        events=events,
-        measures=measures,
-    )
+    experiment = Experiment.from_arguments(locals())
     return comparison_of(experiment, experiment.run(loop), units, parameters, title)
 
 

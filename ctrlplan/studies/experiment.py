@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import KW_ONLY, dataclass, field
+from dataclasses import KW_ONLY, dataclass, field, fields
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -195,6 +196,11 @@ class Experiment(Displayed):
                 ("measures", ", ".join(names) if self.measures is not None else "all of MEASURES"),
             ]
         )
+
+    @classmethod
+    def from_arguments(cls, given: Mapping[str, Any]) -> Experiment:
+        """Experiment from the arguments of a function that has all its fields, by name."""
+        return cls(**{entry.name: given[entry.name] for entry in fields(cls)})
 
     @property
     def axes(self) -> tuple[str, ...]:

@@ -123,19 +123,7 @@ def monte_carlo(
     """
     executor, timeout = checked_executor(executor), checked_timeout(timeout)
     table = _checked_draws(draws)
-    experiment = Experiment(
-        plans,
-        timepts,
-        waypoints=waypoints,
-        start=start,
-        band=band,
-        outputs=outputs,
-        controls=controls,
-        initial_state=initial_state,
-        params=params,
-        events=events,
-        measures=measures,
-    )
+    experiment = Experiment.from_arguments(locals())
     drawn_loop: _Drawn = _Built(loop) if _is_of_draws(loop, table) else _Prepared.of(loop, experiment, table)
     nominal, nominal_draw = _nominal(drawn_loop, experiment, table, units, timeout)
     drawn = [_draw(table, k) for k in range(_count(table))]

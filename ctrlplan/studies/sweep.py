@@ -260,19 +260,7 @@ def sweep(
     points = _checked_values(values)
     if not is_builder(build):
         raise TypeError(f"build must be a function of a value that returns a loop, got {type(build).__name__}")
-    experiment = Experiment(
-        plans,
-        timepts,
-        waypoints=waypoints,
-        start=start,
-        band=band,
-        outputs=outputs,
-        controls=controls,
-        initial_state=initial_state,
-        params=params,
-        events=events,
-        measures=measures,
-    )
+    experiment = Experiment.from_arguments(locals())
     if executor is None:
         outcomes = _outcomes(build, points.tolist(), experiment, units, timeout)
         account = gathered(outcomes, points.size, parameter, progress)
