@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
 from control import ControlPlot
@@ -13,12 +12,13 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Arc, Circle, FancyArrowPatch, Rectangle
 from numpy.typing import NDArray
 
+from ctrlplan.reports.path_figure import draw_paths, mark_waypoints, moving_plans, rows_of
 from ctrlplan.reports.style import (
     AxesLike,
     Drawing,
-    Style,
     add_title,
     as_text,
+    clip_steps,
     font_size,
     label_y,
     line_width,
@@ -26,14 +26,18 @@ from ctrlplan.reports.style import (
     plan_styles,
     roles_of,
     shade,
+    thin_style,
 )
 from ctrlplan.studies.comparison import Comparison
 from ctrlplan.studies.measures import signals_of
-from ctrlplan.studies.roles import Role
 from ctrlplan.studies.sections import AnimatedCrane, Place, Wall
+from ctrlplan.studies.units import superscript
 from ctrlplan.trajectories import TrigSpline
 
 Array = NDArray[np.float64]
+
+_PLANE = ("x", "z")
+"""Outputs of a crane in the plane, z down."""
 
 
 def plot_sketch(*, ax: AxesLike | None = None) -> ControlPlot:
@@ -74,7 +78,11 @@ def plot_sketch(*, ax: AxesLike | None = None) -> ControlPlot:
     arrow((-0.2, 1.15), (d, 1.15), "D", (-38, 5))
     arrow((d + 0.8, b + 0.12), (d + 1.7, b + 0.12), "F", (3, -3))
     arrow((float(load[0]), -float(load[1])), (float(load[0]), -float(load[1]) - 0.95), "m g", (5, 0))
-    axes.add_patch(Arc((d, 0.0), 1.5, 1.5, theta1=120, theta2=240, color=dark))
+    turn = np.radians(np.linspace(120.0, 240.0, 41))
+    way = np.stack([d + 0.75 * np.cos(turn), 0.75 * np.sin(turn)])
+    axes.plot(*way, color=dark, linewidth=line_width(0.65))
+    last, end = ((float(x), float(y)) for x, y in way.T[-2:])
+    axes.add_patch(FancyArrowPatch(last, end, arrowstyle="-|>", mutation_scale=12, color=dark))
     for text, place in (
         ("C", (d - 1.05, 0.0)),
         ("b", (d + 0.08, -0.32)),
@@ -106,12 +114,11 @@ def plot_time(comparison: Comparison, *, ax: AxesLike | None = None) -> ControlP
     control.ControlPlot
         Of shape (6, 1).
     """
-    names = _moving(comparison) or list(comparison.plans)
     labels = ("x [m]", "z [m]", "error [mm]", "sway [rad]", "F [kN]", "C [kN m]")
     drawing = Drawing(ax, (6, 1), (7.4, 9.4), rows=labels)
     rows = drawing.column
     styles = plan_styles(comparison, rows[0])
-    for name in names:
+    for name in comparison.plans:
         signals = _signals(comparison, name)
         t = signals["t"]
         error = np.hypot(*(np.stack([signals["x"], signals["z"]]) - _planned(comparison, name, t)))
@@ -123,11 +130,25 @@ def plot_time(comparison: Comparison, *, ax: AxesLike | None = None) -> ControlP
             axes.plot(t, values, **styles[name])
     for axes, label in zip(rows, labels, strict=True):
         label_y(axes, label)
+        if axes is not rows[2]:
+            clip_steps(axes, roles_of(comparison))
     rows[1].yaxis.set_inverted(True)
-    rows[2].set_yscale("symlog", linthresh=1.0)
-    rows[2].set_ylim(bottom=0.0)
+    _scale_error(rows[2])
     drawing.label_x("time [s]")
     return drawing.finish()
+
+
+def _scale_error(axes: Axes) -> None:
+    """Scale that is linear up to 1 mm and logarithmic above, with powers of ten in plain numbers."""
+    axes.set_yscale("symlog", linthresh=1.0, linscale=0.6)
+    top = max((float(np.nanmax(line.get_ydata(), initial=0.0)) for line in axes.lines), default=0.0)
+    decades = max(1, math.ceil(math.log10(max(min(top, 1e9), 1.0))))
+    every = 1 + decades // 6
+    ticks = [0.0, *(10.0**k for k in range(0, decades + 1, every))]
+    names = [f"{tick:g}" if tick < 1e4 else f"10{superscript(round(math.log10(tick)))}" for tick in ticks]
+    axes.set_yticks(ticks, names)
+    axes.set_yticks([], minor=True)
+    axes.set_ylim(0.0, 10.0**decades)
 
 
 def plot_step(comparison: Comparison, *, ax: AxesLike | None = None) -> ControlPlot:
@@ -151,7 +172,7 @@ def plot_step(comparison: Comparison, *, ax: AxesLike | None = None) -> ControlP
     ValueError
         If all plans are without jumps.
     """
-    moving = _moving(comparison)
+    moving = moving_plans(comparison)
     name = next((name for name in comparison.plans if name not in moving), None)
     if name is None:
         raise ValueError("a comparison must have a step for this figure, got plans without jumps alone")
@@ -195,27 +216,14 @@ def plot_paths(comparison: Comparison, wall: Wall = None, *, ax: AxesLike | None
     """
     drawing = Drawing(ax, (1, 1), (7.4, 4.6))
     (axes,) = drawing.column
-    styles = plan_styles(comparison, axes)
     if wall:
         axes.text(*_draw_wall(axes, wall, 0.267), "wall", ha="center", fontsize=font_size(9))
-    last = _ends(comparison)[1]
-    for name in _moving(comparison):  # steps take no path
-        signals = _signals(comparison, name)
-        move = signals["t"] <= last
-        axes.plot(*_planned(comparison, name, signals["t"][move]), **_thin(styles[name]))
-        axes.plot(signals["x"][move], signals["z"][move], **styles[name])
-    for text, place in _named_places(comparison).items():
-        axes.plot(*place, "o", color=shade(0.73), mfc=axes.get_facecolor(), zorder=5)
-        axes.annotate(text, place, xytext=(6, -10), textcoords="offset points", fontsize=font_size(9))
+    draw_paths(axes, comparison, _PLANE)
+    mark_waypoints(axes, comparison, _PLANE)
     drawing.label_x("x [m]")
     label_y(axes, "z [m], down")
     axes.yaxis.set_inverted(True)
     return drawing.finish()
-
-
-def _thin(style: Style) -> Style:
-    """Style of a reference, in the colour of its response."""
-    return {"color": style["color"], "linewidth": line_width(0.45), "alpha": 0.6}
 
 
 def _draw_wall(axes: Axes, wall: tuple[Place, Place], grey: float) -> Place:
@@ -247,7 +255,7 @@ def plot_motion(
     control.ControlPlot
         Of shape (nplans, 1).
     """
-    names = (_moving(comparison) or list(comparison.plans))[:2]
+    names = (moving_plans(comparison) or list(comparison.plans))[:2]
     drawing = Drawing(ax, (len(names), 1), (7.4, 3.4 * len(names)), rows=names)
     first, last = _ends(comparison)
     for name, axes in zip(names, drawing.column, strict=True):
@@ -302,9 +310,9 @@ def plot_online(comparison: Comparison, *, ax: AxesLike | None = None) -> Contro
     styles = plan_styles(comparison, rows[0])
     for name, plan in comparison.plans.items():
         signals = _signals(comparison, name)
-        x, z = _across_and_down(comparison, plan.labels, plan.final)
+        x, z = rows_of(comparison, plan.labels, plan.final, _PLANE)
         distance = np.hypot(signals["x"] - x, signals["z"] - z)
-        rows[0].plot(signals["t"], signals["x_ref"], **_thin(styles[name]))
+        rows[0].plot(signals["t"], signals["x_ref"], **thin_style(styles[name]))
         for axes, values in zip(rows, (signals["x"], distance, signals["theta"], signals["F"] / 1e3), strict=True):
             axes.plot(signals["t"], values, **styles[name])
     for axes, label in zip(rows, labels, strict=True):
@@ -319,8 +327,8 @@ _FRAMES = 20_000
 """Maximum number of frames of an animation; longer runs have a lower frame rate."""
 
 
-def animation_data(comparison: Comparison, wall: Wall = None, shown: str = "", rate: float = 12.0) -> Markup:
-    """Data of the animation as JSON for HTML: each plan at equal time intervals, while its signals are finite.
+def animation_data(comparison: Comparison, wall: Wall = None, shown: str = "", rate: float = 8.0) -> Markup:
+    """JSON for the animation, safe inside HTML: each plan at equal time steps, up to where it is finite.
 
     Entries: plans {name: [D, R, theta]}, the radius b of the drum (by plan where
     cranes differ), frames per second, wall, the view: left, top, width, height,
@@ -369,7 +377,7 @@ def animation_data(comparison: Comparison, wall: Wall = None, shown: str = "", r
     drum = next(iter(drums.values())) if one else drums
     view = _view(comparison, corners)
     trigonometric = [name for name, plan in comparison.plans.items() if isinstance(plan, TrigSpline)]
-    first = next((name for name in (shown, *trigonometric, *_moving(comparison)) if name in plans), None)
+    first = next((name for name in (shown, *trigonometric, *moving_plans(comparison)) if name in plans), None)
     data = {
         "b": drum,
         "rate": rate,
@@ -429,11 +437,6 @@ def _drum_radius(signals: dict[str, Array]) -> float:
     return float(f"{radius:.6g}")
 
 
-def _moving(comparison: Comparison) -> list[str]:
-    """Plans that are not steps."""
-    return [name for name, role in roles_of(comparison).items() if role is not Role.STEP]
-
-
 def _ends(comparison: Comparison) -> tuple[float, float]:
     """Times of the first and the last waypoint, or start and end of the plans without waypoints."""
     if comparison.waypoints:
@@ -445,28 +448,4 @@ def _ends(comparison: Comparison) -> tuple[float, float]:
 def _planned(comparison: Comparison, name: str, t: Array) -> Array:
     """Planned x and z of the load, (2, ntime)."""
     plan = comparison.plans[name]
-    return _across_and_down(comparison, plan.labels, plan.jet(t, 0)[0])
-
-
-def _across_and_down(comparison: Comparison, labels: Sequence[str], rows: Array) -> Array:
-    """Rows of x and z, by their labels or by the outputs that follow them; nan if there are none."""
-    named = dict(zip(comparison.outputs, rows, strict=False)) | dict(zip(labels, rows, strict=True))
-    return np.stack([named.get(label, np.full(rows.shape[1:], np.nan)) for label in ("x", "z")])
-
-
-def _named_places(comparison: Comparison) -> dict[str, tuple[float, float]]:
-    """Positions of the waypoints: start, A, B, ..., goal; incomplete ones are omitted."""
-    points = comparison.waypoints
-    names = ["start", *map(_letters_of, range(len(points) - 2)), "goal"][: len(points)]
-    found = {}
-    for name, point in zip(names, points, strict=True):
-        x, z = _across_and_down(comparison, point.labels or comparison.outputs, point.position).tolist()
-        if np.isfinite(x + z):
-            found[name] = (x, z)
-    return found
-
-
-def _letters_of(count: int) -> str:
-    """A, B, ..., Z, AA, AB, ..."""
-    head, last = divmod(count, 26)
-    return (_letters_of(head - 1) if head else "") + chr(ord("A") + last)
+    return rows_of(comparison, plan.labels, plan.jet(t, 0)[0], _PLANE)

@@ -18,6 +18,7 @@ from ctrlplan.reports.style import (
     add_title,
     as_text,
     axis_styles,
+    clip_steps,
     font_size,
     given_axes,
     label_y,
@@ -25,15 +26,18 @@ from ctrlplan.reports.style import (
     line_width,
     marker_size,
     plan_styles,
+    roles_of,
     shade,
+    thin_style,
     with_unit,
 )
 from ctrlplan.studies.comparison import Comparison
 from ctrlplan.studies.ensemble import Ensemble
-from ctrlplan.studies.measures import MEASURES, SETTLING_TIMES
+from ctrlplan.studies.measures import SETTLING_TIMES
+from ctrlplan.studies.roles import Role
 from ctrlplan.studies.sections import Curves, Place
 from ctrlplan.studies.sweep import Sweep, settling_jumps
-from ctrlplan.studies.units import in_units
+from ctrlplan.studies.units import in_units, output_unit, superscript
 from ctrlplan.trajectories import Trajectory
 
 Array = NDArray[np.float64]
@@ -112,7 +116,7 @@ def plot_plans(comparison: Comparison, derivatives: int = 2, *, ax: AxesLike | N
     """
     first = next(iter(comparison.plans.values()))
     rows = derivatives + 1
-    size = min(6.4 + 2.0 * (first.naxes - 1), 9.0), 1.4 + 1.6 * rows
+    size = min(6.4 + 2.0 * (first.naxes - 1), 9.0), 1.4 + 1.7 * rows
     drawing = Drawing(ax, (rows, first.naxes), size, rows=map(_derivative_word, range(rows)))
     styles = plan_styles(comparison, drawing.column[0])
     start = min(p.start for p in comparison.plans.values())
@@ -129,7 +133,8 @@ def plot_plans(comparison: Comparison, derivatives: int = 2, *, ax: AxesLike | N
         for a, axes in enumerate(row):
             given = [(w.time, w.jet[k, a]) for w in comparison.waypoints if k < len(w.jet)]
             _circles(axes, given, shade(0.73))
-            label_y(axes, _derivative_label(comparison.units.get(first.labels[a], ""), k, first.labels[a]))
+            unit = output_unit(comparison, comparison.outputs[a]) if a < len(comparison.outputs) else ""
+            label_y(axes, _derivative_label(unit, k, first.labels[a]))
     drawing.label_x("time [s]")
     return drawing.finish()
 
@@ -163,14 +168,15 @@ def plot_responses(comparison: Comparison, *, ax: AxesLike | None = None) -> Con
         reference = plan.jet(t, 0)[0]
         for a, output in enumerate(outputs):
             y = signals[labels.index(output)]
-            rows[2 * a].plot(t, reference[a], color=styles[name]["color"], linewidth=line_width(0.45), alpha=0.6)
+            rows[2 * a].plot(t, reference[a], **thin_style(styles[name]))
             rows[2 * a].plot(t, y, **styles[name])
             rows[2 * a + 1].plot(t, reference[a] - y, **styles[name])
         for c, control in enumerate(controls):
             rows[2 * len(outputs) + c].plot(t, signals[labels.index(control)], **styles[name])
-    first = next(iter(comparison.plans.values()))
+    for axes in rows:
+        clip_steps(axes, roles_of(comparison))
     for a, output in enumerate(outputs):
-        unit = comparison.units.get(first.labels[a], comparison.units.get(output, ""))
+        unit = output_unit(comparison, output)
         label_y(rows[2 * a], with_unit(output, unit))
         add_title(rows[2 * a], "output (thin: reference)")
         label_y(rows[2 * a + 1], with_unit(f"error of {output}", unit))
@@ -209,15 +215,13 @@ def plot_sweep(
             if name in SETTLING_TIMES:
                 x, y = _with_gaps(x, y)
             axes.plot(x, y, **styles[plan])
-        measure = MEASURES.get(name)
-        label_y(
-            axes, with_unit(measure.title, "" if "{" in measure.unit else measure.unit) if measure else as_text(name)
-        )
+        label_y(axes, with_unit(sweep.title_of(name), sweep.unit_of(name)))
         finite = np.concatenate([r[name][np.isfinite(r[name])] for r in sweep.metrics.values()])
         if finite.size and finite.min() > 0.0 and finite.max() > 100.0 * finite.min():
             axes.set_yscale("log")
         if sweep.values[0] > 0.0 and sweep.values[-1] > 20.0 * sweep.values[0]:
             axes.set_xscale("log")
+        clip_steps(axes, roles_of(sweep))
     drawing.label_x(as_text(sweep.parameter))
     return drawing.finish()
 
@@ -249,10 +253,7 @@ def plot_bands(ensemble: Ensemble, *, ax: AxesLike | None = None) -> ControlPlot
     }
     for row, (signal, error) in zip(drawing.axes, shown, strict=True):
         _plot_bands_of(ensemble, row, signal, error, styles)
-        label = signal
-        if signal in nominal.outputs:
-            label = next(iter(nominal.plans.values())).labels[nominal.outputs.index(signal)]
-        unit = nominal.units.get(signal, nominal.units.get(label, ""))
+        unit = output_unit(nominal, signal) if signal in nominal.outputs else nominal.units.get(signal, "")
         for axes in row:
             label_y(axes, with_unit(f"error of {signal}" if error else signal, unit))
     for axes, plan in zip(drawing.axes[0], nominal.plans, strict=True):
@@ -267,7 +268,9 @@ def _plot_bands_of(
 ) -> None:
     """Bands of one signal or its error, one axes per plan."""
     nominal, t = ensemble.nominal, ensemble.timepts
-    extent = [np.array(axes.get_ylim()) for axes in row if axes.lines]  # with bands drawn before
+    extent = [np.array(axes.get_ylim()) for axes in row if axes.lines]  # of bands that were drawn before
+    ranges: dict[str, Array] = {}
+    roles = roles_of(nominal)
     for axes, (plan, reference) in zip(row, nominal.plans.items(), strict=True):
         band = ensemble.bands.get(plan, {}).get(signal)
         target = reference.jet(t, 0)[0, nominal.outputs.index(signal)] if signal in nominal.outputs else None
@@ -281,13 +284,18 @@ def _plot_bands_of(
         axes.fill_between(t, band[0], band[4], color=colour, alpha=0.2, linewidth=0, label="5 to 95 %")
         axes.fill_between(t, band[1], band[3], color=colour, alpha=0.35, linewidth=0, label="25 to 75 %")
         axes.plot(t, band[2], color=colour, linewidth=line_width(0.7), label="median")
-        extent.append(band[np.isfinite(band)])
-    # The same scale in a row, so that plans can be compared.
+        ranges[plan] = band[np.isfinite(band)]
+    # One scale a row, so that the plans can be compared, set by those that are no steps.
+    planned = [values for plan, values in ranges.items() if roles[plan] is not Role.STEP]
+    extent += planned or list(ranges.values())
     if extent and np.concatenate(extent).size:
         low, high = np.min(np.concatenate(extent)), np.max(np.concatenate(extent))
         margin = 0.05 * (high - low) or 0.5
-        for axes in row:
+        for axes, plan in zip(row, nominal.plans, strict=True):
             axes.set_ylim(low - margin, high + margin)
+            values = ranges.get(plan, np.empty(0))
+            if values.size and max(low - values.min(), values.max() - high) > margin:
+                add_title(axes, f"peak {values[np.abs(values).argmax()]:.3g}, clipped".replace("-", "−"))
 
 
 def plot_plane(
@@ -296,6 +304,7 @@ def plot_plane(
     numbered: Mapping[str, Mapping[float, Place]] | None = None,
     limit: tuple[float, float] | None = None,
     limit_label: str = "limit",
+    further: Mapping[str, tuple[float, float]] | None = None,
     ax: AxesLike | None = None,
 ) -> ControlPlot:
     """Settling time versus overshoot on the tracking error, one point per value.
@@ -311,6 +320,8 @@ def plot_plane(
         Settling time [s] and overshoot [%] of a point to be marked.
     limit_label : str, optional
         What that point is.
+    further : mapping of str to (float, float), optional
+        Further points to be marked, by what they are.
     ax : Axes, optional
         Where to draw; None: an empty current figure, or a new one.
 
@@ -332,24 +343,33 @@ def plot_plane(
         x, gap = _with_gaps(sweep.values, ts)
         whole = styles[plan] | {"linestyle": "-", "linewidth": line_width(0.65)}
         axes.plot(gap, np.interp(x, sweep.values, overshoot), **whole)
-        axes.plot(ts, overshoot, ".", color=styles[plan]["color"], markersize=marker_size(2.5))
+        dots = {"color": styles[plan]["color"], "markersize": marker_size(2.5), "markevery": 0.006}
+        axes.plot(ts, overshoot, ".", **dots)  # values that are closer than a dot are one on a screen
     for plan, places in (numbered or {}).items():
         if plan not in sweep.metrics:
             raise ValueError(f"numbered must be of plans of the sweep ({', '.join(sweep.metrics)}), got {plan!r}")
         for value, place in places.items():
             _number_point(axes, sweep, plan, value, place, styles[plan]["color"])
     if limit is not None:
-        axes.plot(*limit, "*", label=limit_label, color=_LIMIT_POINT, markersize=marker_size(13), zorder=5)
+        _mark_point(axes, limit, limit_label)
+    for label, point in (further or {}).items():
+        _mark_point(axes, point, label)
     if numbered:
         add_title(axes, as_text(f"numbers at the circles: {sweep.parameter}"))
     drawing.label_x(f"settling time ±{100.0 * sweep.band:g} % [s]")
     label_y(axes, "overshoot on the tracking error [%]")
     axes.set_xlim(left=0.0)
-    axes.set_ylim(-4.0, 108.0)
+    axes.set_ylim(-6.0, 108.0)
     return drawing.finish()
 
 
 _LIMIT_POINT = "#E69F00"
+
+
+def _mark_point(axes: Axes, point: tuple[float, float], label: str) -> None:
+    """Star at a limit point, and what it is to the right of it."""
+    axes.plot(*point, "*", color=_LIMIT_POINT, markersize=marker_size(12), zorder=5)
+    axes.annotate(as_text(label), point, xytext=(9, -2), textcoords="offset points", fontsize=font_size(8))
 
 
 def _number_point(axes: Axes, sweep: Sweep, plan: str, value: float, place: Place, colour: str) -> None:
@@ -527,8 +547,8 @@ def _derivative_word(order: int) -> str:
 
 def _derivative_label(unit: str, order: int, name: str = "") -> str:
     word = _derivative_word(order)
-    suffix = ("" if order == 0 else "/s" if order == 1 else f"/s$^{order}$") if unit or order else ""
-    label = f"{name} {word}".strip() if name not in ("", "y") else word
+    suffix = ("" if order == 0 else "/s" if order == 1 else f"/s{superscript(order)}") if unit or order else ""
+    label = f"{name} {word}".strip()
     if not suffix:
         return with_unit(label, unit)
     return with_unit(label, in_units("{y}/", unit or "1", "").removesuffix("/"), suffix)

@@ -8,8 +8,7 @@ import hashlib
 import json
 import os
 import platform
-from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
 from functools import cache
 from importlib import metadata
 from pathlib import Path
@@ -19,30 +18,30 @@ from markupsafe import Markup
 
 import ctrlplan
 from ctrlplan import _files
-from ctrlplan._display import in_line, readable
+from ctrlplan._display import readable
 from ctrlplan.reports.crane_figures import animation_data
-from ctrlplan.reports.parts import Animation, MetricsTable, Part, Picture, Svg
-from ctrlplan.reports.sections import draw
-from ctrlplan.reports.style import page_style, slug, to_svg
-from ctrlplan.reports.tables import metrics_of
-from ctrlplan.studies.benefit import Benefit
+from ctrlplan.reports.parts import Animation, Svg
+from ctrlplan.reports.shown import Shown, shown
+from ctrlplan.reports.style import grey_levels, page_style
 from ctrlplan.studies.comparison import Comparison
-from ctrlplan.studies.sections import Section, Wall
+from ctrlplan.studies.sections import Wall
 from ctrlplan.studies.study import Study
-from ctrlplan.studies.verdicts import summary, verdicts
+from ctrlplan.studies.sweep import Sweep
 
 
-def write_page(studies: Sequence[Study], path: str | os.PathLike[str], title: str) -> Path:
-    """Write studies as one self-contained HTML page.
+def write_page(studies: Sequence[Study | Sweep], path: str | os.PathLike[str], title: str, author: str = "") -> Path:
+    """Write studies as one HTML page that opens offline.
 
     Parameters
     ----------
-    studies : sequence of Study
+    studies : sequence of Study or Sweep
         Sections of the page.
     path : str or path
         The file, or a folder for ``index.html`` in it.
     title : str
         Heading.
+    author : str, optional
+        Who made it, written below the heading.
 
     Returns
     -------
@@ -57,11 +56,11 @@ def write_page(studies: Sequence[Study], path: str | os.PathLike[str], title: st
     target = Path(path)
     if target.suffix not in (".html", ".htm"):
         target = target / "index.html"
-    return write_all({target: render_page(studies, title)})[0]
+    return write_all({target: render_page(studies, title, author)})[0]
 
 
-def write_report(studies: Sequence[Study], folder: str | os.PathLike[str], title: str) -> list[Path]:
-    """Write ``index.html`` and ``results.json`` into a folder, which is created if necessary.
+def write_report(studies: Sequence[Study], folder: str | os.PathLike[str], title: str, author: str = "") -> list[Path]:
+    """Write ``index.html`` and ``results.json`` into a folder, which is made if need be.
 
     Raises
     ------
@@ -72,7 +71,7 @@ def write_report(studies: Sequence[Study], folder: str | os.PathLike[str], title
     results = {"studies": {study.name: study.results() for study in studies}}
     return write_all(
         {
-            target / "index.html": render_page(studies, title),
+            target / "index.html": render_page(studies, title, author),
             target / "results.json": json.dumps(results, indent=1, allow_nan=False) + "\n",
         }
     )
@@ -103,19 +102,21 @@ def write_all(texts: Mapping[Path, str | bytes]) -> list[Path]:
     return list(texts)
 
 
-def render_page(studies: Sequence[Study], title: str) -> str:
+def render_page(studies: Sequence[Study | Sweep], title: str, author: str = "") -> str:
     """The page as text."""
-    shown: list[_Shown] = []
+    found: list[Shown] = []
     with page_style():
         for study in studies:
-            shown.append(_shown(study, [name for one in shown for name in one.ids]))
-    script = _script("sort.js.html")
-    if any(isinstance(block, Animation) for one in shown for part in one.parts for block in part.blocks):
+            found.append(shown(study, [name for one in found for name in one.ids]))
+    script = _script("sort.js.html") + _script("figures.js.html")
+    if any(isinstance(block, Animation) for one in found for block in one.figures):
         script += _script("animation.js.html")
     return _template("page.html").render(
         title=title,
-        studies=shown,
+        author=author,
+        studies=found,
         versions=_versions(),
+        greys=_dark_greys(found),
         script=script,
         policy=_policy(script),
     )
@@ -192,103 +193,18 @@ def _policy(script: str) -> str:
     )
 
 
-@dataclass(frozen=True)
-class _Shown:
-    """A study as the page shows it.
-
-    Attributes
-    ----------
-    study : Study
-        The study.
-    id : str
-        Id of its section, derived from the name of the study.
-    ids : tuple of str
-        All ids of the section.
-    parts : tuple of Part
-        Its sections, with the benefit of planning if the comparison has one;
-        figures as SVG elements, with their ids as keys.
-    """
-
-    study: Study
-    id: str
-    ids: tuple[str, ...]
-    parts: tuple[Part, ...]
-
-    @property
-    def above(self) -> list[Part]:
-        """Parts above the metrics."""
-        return [part for part in self.parts if not part.below]
-
-    @property
-    def below(self) -> list[Part]:
-        """Parts below the metrics."""
-        return [part for part in self.parts if part.below]
-
-    @property
-    def nominal(self) -> bool:
-        """Whether the metrics are those at nominal parameters."""
-        return any(part.nominal for part in self.parts)
-
-    @property
-    def summary(self) -> str:
-        """Number of metrics in which each plan is best and worst."""
-        return summary(self.study.comparison)
-
-    @property
-    def verdicts(self) -> list[str]:
-        """Best and worst plan of each metric, in sentences."""
-        return [verdict.sentence for verdict in verdicts(self.study.comparison)]
-
-    @property
-    def parameters(self) -> dict[str, str]:
-        """Parameters of the comparison."""
-        return {name: in_line(value) for name, value in self.study.comparison.parameters.items()}
-
-    @property
-    def table(self) -> MetricsTable:
-        """The metrics."""
-        return metrics_of(self.study.comparison)
+_INK, _GROUND = (230, 234, 235), (20, 24, 26)
+"""Text and background of a dark page, RGB."""
 
 
-def _shown(study: Study, taken: Collection[str]) -> _Shown:
-    """A study with its figures drawn, with ids that are unique on the page."""
-    sections: list[Section | Benefit] = list(study.sections)
-    if study.comparison.benefit is not None:
-        sections.append(study.comparison.benefit)
-    parts = [draw(section, study) for section in sections]
-    keys: list[str] = []
-    for block in (block for part in parts for block in part.blocks if isinstance(block, _Keyed)):
-        keys.append(_numbered(slug(block.key), lambda key: key in keys))
-    name = _numbered(slug(study.name), lambda name: not {name, *(f"{name}-{key}" for key in keys)}.isdisjoint(taken))
-    left = iter(keys)
-    drawn = [
-        replace(
-            part,
-            blocks=[_drawn(block, name, next(left)) if isinstance(block, _Keyed) else block for block in part.blocks],
-        )
-        for part in parts
-    ]
-    return _Shown(study, name, (name, *(f"{name}-{key}" for key in keys)), tuple(drawn))
-
-
-_Keyed = (Picture, Svg, Animation)
-
-
-def _drawn(block: Picture | Svg | Animation, name: str, key: str) -> Svg | Animation:
-    """A figure with its id as key, and a plot as an SVG element."""
-    if isinstance(block, Picture):
-        svg = Markup(to_svg(block.plot.figure, f"{name}.{key}"))  # noqa: S704 (our own drawing)
-        return Svg(f"{name}-{key}", svg, block.caption)
-    return replace(block, key=f"{name}-{key}")
-
-
-def _numbered(stem: str, taken: Callable[[str], bool]) -> str:
-    """A name, with a number added if it is taken."""
-    name, count = stem, 1
-    while taken(name):
-        count += 1
-        name = f"{stem}-{count}"
-    return name
+def _dark_greys(shown: Sequence[Shown]) -> dict[str, str]:
+    """Greys of the drawings on a dark page, by their names: black becomes the text, white the background."""
+    svgs = [block.svg for one in shown for block in one.figures if isinstance(block, Svg)]
+    greys = {}
+    for level in grey_levels(svgs):
+        mixed = [round(ink + (ground - ink) * level / 255) for ink, ground in zip(_INK, _GROUND, strict=True)]
+        greys[f"g{level:02x}"] = f"#{bytes(mixed).hex()}"
+    return greys
 
 
 def _versions() -> dict[str, str]:

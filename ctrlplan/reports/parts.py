@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, TypeAlias
 
@@ -40,13 +40,17 @@ class Svg:
     svg : Markup
         The element.
     caption : str
-        Caption, one or two sentences.
+        What is seen, in a sentence or two.
+    data : Markup
+        What the read-out of the page must know of it, as of
+        `ctrlplan.reports.readout.readout_data`; empty for none.
     """
 
     macro: ClassVar[str] = "picture"
     key: str
     svg: Markup
     caption: str
+    data: str = ""
 
 
 @dataclass(frozen=True)
@@ -82,6 +86,40 @@ class Items:
 
 
 @dataclass(frozen=True)
+class Pairs:
+    """Names with their values.
+
+    Attributes
+    ----------
+    rows : mapping of str to str
+        Name and value.
+    """
+
+    macro: ClassVar[str] = "pairs"
+    rows: Mapping[str, str]
+
+
+@dataclass(frozen=True)
+class Panels:
+    """Small figures side by side, or one above the other where the page is narrow, with one legend.
+
+    Attributes
+    ----------
+    pictures : sequence of Picture or Svg
+        One axes each.
+    legend : sequence of Plan
+        The curves.
+    caption : str
+        What is seen, in a sentence or two.
+    """
+
+    macro: ClassVar[str] = "panels"
+    pictures: Sequence[Picture | Svg]
+    legend: Sequence[Plan]
+    caption: str
+
+
+@dataclass(frozen=True)
 class Animation:
     """Animation of a crane.
 
@@ -112,12 +150,18 @@ class Head:
     words : bool
         Whether the column contains text: left-aligned, with line breaks.
     unit : bool
-        Whether the column contains units: left-aligned, grey.
+        Whether the column has units: aligned to the left, and grey.
+    colour : str
+        Colour of a plan's curves, for a column of a plan.
+    note : bool
+        Whether the column has notes: grey.
     """
 
     text: str
     words: bool = False
     unit: bool = False
+    colour: str = ""
+    note: bool = False
 
 
 @dataclass(frozen=True)
@@ -136,12 +180,15 @@ class Cell:
     order : str or None
         Sort key in a sortable column, as a number: empty for none,
         "1e999" for infinite.
+    colour : str
+        Colour of a plan's curves, for a row of a plan.
     """
 
     text: str
     mark: str = ""
     meaning: str = ""
     order: str | None = None
+    colour: str = ""
 
 
 @dataclass(frozen=True)
@@ -186,20 +233,22 @@ class Table:
 
 @dataclass(frozen=True)
 class Plan:
-    """Column of a table of metrics: name, colour in the figures, and a sign after the name."""
+    """Plan in a table or a legend: its name, its colour and dashes [pt] in the figures, a sign after its name."""
 
     name: str
     colour: str
     mark: str = ""
+    dashes: str = ""
 
 
 @dataclass(frozen=True)
 class MetricRow:
-    """Row of a table of metrics: one cell per plan."""
+    """Row of a table of metrics: a cell a plan, and the difference of best and worst."""
 
     title: str
     unit: str
     cells: Sequence[Cell]
+    difference: str = ""
 
 
 @dataclass(frozen=True)
@@ -222,7 +271,7 @@ class MetricsTable:
     kind: str = "metrics"
 
 
-Block: TypeAlias = Picture | Svg | Text | Items | Animation | Table | MetricsTable
+Block: TypeAlias = Picture | Svg | Text | Items | Pairs | Panels | Animation | Table | MetricsTable
 
 
 @dataclass(frozen=True)
@@ -231,7 +280,7 @@ class Part:
 
     Attributes
     ----------
-    blocks : iterable of Picture, Svg, Text, Items, Table, MetricsTable or Animation
+    blocks : iterable of Picture, Svg, Text, Items, Pairs, Panels, Table, MetricsTable or Animation
         In order.
     heading : str
         Heading above them.

@@ -1,4 +1,4 @@
-"""Figures of planning: choice of alpha, durations within limits, comparison with baselines."""
+"""Figures of what was chosen: alpha, durations within limits, plans with their baselines."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ from collections.abc import Mapping
 
 import numpy as np
 from control import ControlPlot
-from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
 from ctrlplan.planning import AlphaChoice
@@ -18,6 +17,7 @@ from ctrlplan.reports.style import (
     add_title,
     as_text,
     axis_styles,
+    clip_steps,
     label_y,
     line_width,
     marker_size,
@@ -27,7 +27,7 @@ from ctrlplan.reports.style import (
     with_unit,
 )
 from ctrlplan.studies.comparison import Comparison
-from ctrlplan.studies.roles import Role
+from ctrlplan.studies.units import output_unit
 from ctrlplan.trajectories import Trajectory
 
 Array = NDArray[np.float64]
@@ -148,31 +148,15 @@ def plot_baselines(
         for c, control in enumerate(controls):
             grid[2 + c, 0].plot(t, signals[control], **styles[name])
     for a, output in enumerate(outputs):
-        unit = comparison.units.get(output, "")
+        unit = output_unit(comparison, output)
+        clip_steps(grid[1, a], roles_of(comparison))
         label_y(grid[0, a], with_unit(f"reference of {output}", unit))
         label_y(grid[1, a], with_unit(output, unit))
     for c, control in enumerate(controls):
         label_y(grid[2 + c, 0], with_unit(control, comparison.units.get(control, "")))
-        _clip(grid[2 + c, 0], comparison, control)
+        clip_steps(grid[2 + c, 0], roles_of(comparison))
         if ax is None:
             for axes in grid[2 + c, 1:]:
                 axes.set_visible(False)
     drawing.label_x("time [s]")
     return drawing.finish()
-
-
-def _clip(axes: Axes, comparison: Comparison, control: str) -> None:
-    """Clip the control of a step if it is much larger than the others."""
-    peaks = {
-        name: float(np.abs(np.asarray(response.outputs)[list(response.output_labels).index(control)]).max())
-        for name, response in comparison.responses.items()
-    }
-    steps = [name for name, role in roles_of(comparison).items() if role is Role.STEP]
-    if not steps:
-        return
-    highest = max(steps, key=lambda name: peaks[name])
-    step = peaks.pop(highest)
-    others = max(peaks.values(), default=0.0)
-    if others and step > 4.0 * others:
-        axes.set_ylim(-1.3 * others, 1.3 * others)
-        add_title(axes, as_text(f"{highest}: peak {step:.3g}, clipped"))

@@ -24,6 +24,7 @@ from ctrlplan.reports.figures import (
     plot_sweep,
 )
 from ctrlplan.reports.parts import Animation, Block, Head, Items, Part, Picture, Table, Text
+from ctrlplan.reports.path_figure import plot_path
 from ctrlplan.reports.planning_figures import plot_baselines
 from ctrlplan.reports.style import line_styles, roles_of
 from ctrlplan.reports.tables import durations_of, grid_of, metrics_of, spread_of
@@ -45,6 +46,7 @@ from ctrlplan.studies.sections import (
     DrawTable,
     FastestMove,
     LoopBlocks,
+    Paths,
     PlanCurves,
     Plane,
     Responses,
@@ -96,6 +98,15 @@ def _(section: Responses, study: Study) -> Part:
 
 
 @draw.register
+def _(section: Paths, study: Study) -> Part:
+    caption = section.caption or (
+        "Paths of the outputs in the plane (thin: planned) up to the last waypoint"
+        f"{_without_steps(study.comparison, '; ')}."
+    )
+    return Part([Picture("paths", plot_path(study.comparison, section.obstacles), caption)])
+
+
+@draw.register
 def _(section: Curves, study: Study) -> Part:
     caption = section.caption or f"{section.y_label} versus {section.x_label}."
     return Part([Picture(section.key, plot_curves(section), caption)])
@@ -111,7 +122,13 @@ def _(section: Plane, study: Study) -> Part:
         f"Settling time versus overshoot on the tracking error for {sweep.parameter} from {sweep.values[0]:g} to "
         f"{sweep.values[-1]:g}. Curves are interrupted where the settling time is discontinuous."
     )
-    plot = plot_plane(sweep, numbered=section.numbered, limit=section.limit, limit_label=section.limit_label)
+    plot = plot_plane(
+        sweep,
+        numbered=section.numbered,
+        limit=section.limit,
+        limit_label=section.limit_label,
+        further=section.further,
+    )
     return Part([Picture("plane", plot, caption)])
 
 
@@ -226,8 +243,8 @@ def _(section: LoopBlocks, study: Study) -> Part:
 @draw.register
 def _(section: CraneTime, study: Study) -> Part:
     caption = section.caption or (
-        f"Load, tracking error, sway and controls versus time{_without_steps(study.comparison, '; ')}. The error axis "
-        "is linear up to 1 mm and logarithmic above."
+        "Load, tracking error, sway and controls versus time. The error axis is linear up to 1 mm and logarithmic "
+        "above; the step does not set the other axes."
     )
     return Part([Picture("crane-time", plot_time(study.comparison), caption)])
 

@@ -28,11 +28,13 @@ from matplotlib.font_manager import FontProperties, findfont, get_font
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.legend import Legend
 from matplotlib.lines import Line2D
+from matplotlib.transforms import Transform
 from numpy.typing import NDArray
 
 from ctrlplan.studies.comparison import Comparison
 from ctrlplan.studies.roles import Role, role_of
 from ctrlplan.studies.sweep import Sweep
+from ctrlplan.studies.units import superscript
 
 AxesLike: TypeAlias = Axes | Sequence[Axes] | NDArray[np.object_]
 """One axes, or several in a sequence or an array."""
@@ -63,7 +65,9 @@ _RC: dict[Any, Any] = {
     "grid.linewidth": 0.6,
     "lines.linewidth": 1.6,
     "legend.frameon": False,
-    "svg.fonttype": "path",
+    "font.sans-serif": ["DejaVu Sans", "Verdana", "Arial"],
+    "path.simplify_threshold": 0.25,
+    "svg.fonttype": "none",
 }
 
 _FOR_PAGE: ContextVar[bool] = ContextVar("for_page", default=False)
@@ -164,7 +168,12 @@ class Drawing:
                     axes.set_xlabel(text)
 
     def finish(self, legend: bool = True) -> Plot:
-        """Return value of a plotting function, with one legend for all axes, from the labels of the first."""
+        """What a plotting function returns, with one legend for all axes, of the labels of the first.
+
+        In new axes, plans whose curves coincide everywhere become one curve.
+        """
+        if legend and self._own:
+            merge_coincident(self.column)
         made = self._legend() if legend else None
         lines = np.empty(self.axes.shape, dtype=object)
         for index, axes, before in zip(np.ndindex(lines.shape), self.axes.flat, self._before, strict=True):
@@ -238,6 +247,112 @@ def _set_below_title(figure: Figure | SubFigure, legend: Legend) -> None:
         below = 1.0 - title.get_window_extent().height / figure.bbox.height
         legend.set_bbox_to_anchor((0.0, 0.0, 1.0, below - 0.005), transform=figure.transSubfigure)
         engine.set(rect=(0.0, 0.0, 1.0, below - 0.025))
+
+
+_APART = 2e-3
+"""Distance of two curves, relative to the height of their axes, up to which they are one on a screen."""
+
+
+def merge_coincident(axes: Sequence[Axes]) -> dict[str, list[str]]:
+    """Draw plans whose curves coincide in all axes as one curve with all their names.
+
+    Parameters
+    ----------
+    axes : sequence of Axes
+        Whose curves with equal labels belong together.
+
+    Returns
+    -------
+    dict of str to list of str
+        Labels of the plans that a curve stands for, by the label of the one
+        that stays.
+    """
+    rows = [{str(line.get_label()): line for line in one.lines if line.get_linestyle() != "None"} for one in axes]
+    rows = [{label: line for label, line in row.items() if not label.startswith("_")} for row in rows]
+    scales = [one.yaxis.get_transform() for one in axes]
+    heights = [float(np.ptp(scale.transform(one.get_ylim()))) for scale, one in zip(scales, axes, strict=True)]
+    names: dict[str, list[str]] = {}
+    for label in dict.fromkeys(label for row in rows for label in row):
+        for kept in names:
+            pairs = [(row.get(kept), row.get(label)) for row in rows]
+            if all(_coincide(*pair, scale, size) for pair, scale, size in zip(pairs, scales, heights, strict=True)):
+                names[kept].append(label)
+                for _, line in pairs:
+                    if line is not None:
+                        line.remove()
+                break
+        else:
+            names[label] = [label]
+    found = {kept: labels for kept, labels in names.items() if len(labels) > 1}
+    renamed = {label: joined_labels(labels) for labels in found.values() for label in labels}
+    for line in (line for one in axes for line in one.lines):
+        label = str(line.get_label())
+        thin = THIN * label.startswith(THIN)
+        line.set_label(thin + renamed.get(label.removeprefix(thin), label.removeprefix(thin)))
+    return found
+
+
+def joined_labels(labels: Iterable[str]) -> str:
+    """Label of a curve that stands for several plans."""
+    return " = ".join(labels)
+
+
+def _coincide(one: Line2D | None, other: Line2D | None, scale: Transform, height: float) -> bool:
+    """Whether two curves cannot be told apart on a screen; neither being there counts as well."""
+    if one is None or other is None:
+        return one is other
+    (x, a), (u, b) = one.get_data(), other.get_data()
+    if np.shape(x) != np.shape(u) or not np.array_equal(x, u):
+        return False
+    with np.errstate(all="ignore"):
+        apart = np.abs(scale.transform(np.asarray(a, dtype=float)) - scale.transform(np.asarray(b, dtype=float)))
+    return bool(np.array_equal(np.isnan(a), np.isnan(b)) and np.nanmax(apart, initial=0.0) <= _APART * height)
+
+
+_BEYOND = 0.5
+"""Part of the range of the other curves by which a step may exceed it without being clipped."""
+
+
+def clip_steps(axes: Axes, roles: Mapping[str, Role]) -> None:
+    """Scale the y axis by the curves that are no steps; the peak of a step beyond them is written above the axes.
+
+    Parameters
+    ----------
+    axes : Axes
+        Where the curves of plans have the labels of `line_styles`.
+    roles : mapping of str to Role
+        What each plan is.
+    """
+    steps = {legend_label(name): name for name, role in roles.items() if role is Role.STEP}
+    curves = [line for line in axes.lines if line.get_linestyle() != "None" and np.size(line.get_xdata()) > 2]
+    others = [line for line in curves if str(line.get_label()) not in steps]
+    scale = axes.yaxis.get_transform()
+    low, high = _range_of(others, scale)
+    span = high - low
+    if not 0.0 < span < np.inf:
+        return
+    beyond = []
+    for line in curves:
+        first, last = _range_of([line], scale)
+        if str(line.get_label()) in steps and (first < low - _BEYOND * span or last > high + _BEYOND * span):
+            values = np.asarray(line.get_ydata(), dtype=float)
+            peak = values[np.nanargmax(np.where(np.isfinite(values), np.abs(values), -1.0))]
+            beyond.append(f"{steps[str(line.get_label())]}: peak {peak:.3g}, clipped".replace("-", "−"))
+    if beyond:
+        bottom, top = scale.inverted().transform([low - 0.08 * span, high + 0.08 * span]).tolist()
+        axes.set_ylim(bottom, top)
+        add_title(axes, as_text("; ".join(beyond)))
+
+
+def _range_of(curves: Iterable[Line2D], scale: Transform) -> tuple[float, float]:
+    """Finite extent of curves on a scale; (inf, -inf) of none."""
+    with np.errstate(all="ignore"):
+        values = [scale.transform(np.asarray(line.get_ydata(), dtype=float)) for line in curves]
+    finite = [row[np.isfinite(row)] for row in values]
+    return (
+        min((float(row.min()) for row in finite if row.size), default=np.inf),
+        max((float(row.max()) for row in finite if row.size), default=-np.inf),
+    )
 
 
 def given_axes(ax: AxesLike) -> NDArray[np.object_]:
@@ -494,15 +609,81 @@ def with_unit(name: str, unit: str | None, power: str = "") -> str:
     return f"{as_text(name)} [{as_text(unit or '')}{power}]" if unit or power else as_text(name)
 
 
+def shown_label(label: str) -> str:
+    """Name of a curve by its label."""
+    return label.removeprefix(_HIDDEN)
+
+
+def thin_style(style: Style) -> Style:
+    """Style of the reference of a plan that is drawn with its response."""
+    width = line_width(0.45)
+    return {"color": style["color"], "linewidth": width, "alpha": 0.6, "label": f"{THIN}{style['label']}"}
+
+
+THIN = "_reference of "
+"""Labels of thin references begin so: matplotlib leaves labels that begin with an underscore out of legends."""
+
+
+def salt_of(key: str) -> str:
+    """Beginning of the ids of a drawing on a page."""
+    return re.sub(r"[^\w.-]+", "-", key)
+
+
 def to_svg(figure: Figure, key: str) -> str:
-    """Figure as an SVG element for a page; `key` makes its ids unique."""
-    salt = re.sub(r"[^\w.-]+", "-", key)
+    """Figure as an SVG element to stand in a page; `key` keeps its ids apart from others'.
+
+    Its greys are CSS variables, --g00 for black to --gff for white, which a
+    dark page sets.
+    """
+    salt = salt_of(key)
     buffer = io.StringIO()
     with _house_settings(**{"svg.hashsalt": salt}):
-        figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
+        figure.savefig(buffer, format="svg", metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
     text = buffer.getvalue()
-    # Ids must be unique on a page with several drawings.
-    return re.sub(r'(\bid="|url\(#|href="#)', rf"\g<1>{salt}-", text[text.index("<svg") :])
+    text = _compact(text[text.index("<svg") :])
+    text = _GREY.sub(lambda grey: f"var(--g{grey[1]}, {grey[0]})", text)
+    # Several drawings stand in one page: what they define must be their own.
+    return re.sub(r'(\bid="|url\(#|href="#)', rf"\g<1>{salt}-", text)
+
+
+def _compact(svg: str) -> str:
+    """Drawing without what is not seen: digits below a hundredth of a point, blanks, and ids that nothing refers to."""
+    # Nothing that a label says is an attribute.
+    svg = re.sub(r">([^<>]+)<", lambda text: f">{text[1].translate(_IN_TEXT)}<", svg)
+    used = {name for pair in re.findall(r'url\(#([^)]*)\)|href="#([^"]*)"', svg) for name in pair}
+    short = {name: f"d{k}" for k, name in enumerate(sorted(used - {""}))}
+
+    def renamed(found: re.Match[str]) -> str:
+        name = found[2] if _MARKED.match(found[2]) else short.get(found[2], "")
+        return f"{found[1]}{name}{found[3]}" if name else ""
+
+    svg = re.sub(r'( id=")([^"]*)(")', renamed, svg)
+    svg = re.sub(r"(url\(#)([^)]*)(\))", renamed, svg)
+    svg = re.sub(r'(href="#)([^"]*)(")', renamed, svg)
+    svg = re.sub(r'\b(?:d|x|y)="[^"]*"', lambda path: _LONG_NUMBER.sub(r"\1", path[0]), svg)
+    svg = re.sub(r'\bd="[^"]*"', lambda path: re.sub(r"\s*([MLCQz])\s*", r"\1", path[0]), svg)
+    svg = re.sub(r"\s*\n\s*", " ", re.sub(r">\s+<", "><", svg))
+    for _ in range(2):
+        svg = re.sub(r"<g>(<(?:use|path) [^>]*/>)</g>", r"\1", svg)
+    svg = svg.replace("; stroke-linecap: square", "")
+    svg = re.sub(r">1e[-−]?\d+<", lambda power: f">×10{superscript(power[0][3:-1].replace('−', '-'))}<", svg)
+    return _EQUAL_MARKS.sub(lambda run: f'<g style="{run[1]}">{run[0].replace(_style(run[1]), "")}</g>', svg)
+
+
+def _style(text: str) -> str:
+    return f' style="{text}"'
+
+
+_IN_TEXT = str.maketrans({'"': "&quot;", "#": "&#35;"})
+_EQUAL_MARKS = re.compile(r'<use [^>]*? style="([^"]*)"/>(?:<use [^>]*? style="\1"/>)+')
+_MARKED = re.compile(r"(?:curve|entry|key)-")
+_LONG_NUMBER = re.compile(r"(\.\d\d)\d+")
+_GREY = re.compile(r"#([0-9a-f]{2})\1\1\b")
+
+
+def grey_levels(svgs: Iterable[str]) -> list[int]:
+    """Grey levels (0 to 255) of the variables in drawings of `to_svg`."""
+    return sorted({int(level, 16) for svg in svgs for level in re.findall(r"var\(--g([0-9a-f]{2}),", svg)})
 
 
 def slug(name: str) -> str:

@@ -4,13 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
-from ctrlplan.reports.parts import Cell, Head, MetricRow, MetricsTable, Plan, Table
-from ctrlplan.reports.style import Style, line_styles, roles_of
+import numpy as np
+
+from ctrlplan.reports.parts import Cell, Head, MetricRow, MetricsTable, Plan, Table, Text
+from ctrlplan.reports.style import Style, line_styles, roles_of, shown_label
 from ctrlplan.studies.comparison import Comparison
 from ctrlplan.studies.ensemble import Ensemble
 from ctrlplan.studies.grids import SAME, Grid
+from ctrlplan.studies.limits import limits_used
 from ctrlplan.studies.required_durations import RequiredDuration
+from ctrlplan.studies.sweep import Sweep
+from ctrlplan.studies.units import ROUNDING
 from ctrlplan.studies.verdicts import number, unit_of, verdicts
 
 _NONE = (math.nan,) * 5
@@ -40,10 +46,119 @@ def metrics_of(comparison: Comparison, kind: str = "metrics", known: Mapping[str
             value = found.get(key, math.nan)
             mark, meaning = ("worse", "worst") if plan in worst else ("better", "best") if plan in best else ("", "")
             cells.append(Cell(number(value, measure.unit), mark, meaning, _order(value)))
-        rows.append(MetricRow(measure.title, unit_of(comparison, key), cells))
+        difference = "" if verdict is None else verdict.difference
+        rows.append(MetricRow(measure.title, unit_of(comparison, key), cells, difference))
     styles = line_styles(roles_of(comparison), known)
-    plans = [Plan(plan, styles[plan]["color"], "†" if plan in comparison.marks else "") for plan in comparison.metrics]
+    plans = [plan_of(plan, styles[plan], "†" if plan in comparison.marks else "") for plan in comparison.metrics]
     return MetricsTable(plans, rows, kind)
+
+
+_MANY = 4
+"""Plans up to which each has a column of a table, not a row."""
+
+
+def key_table_of(comparison: Comparison) -> Table:
+    """Key metrics of a comparison, with marks on the best and the worst; many plans stand in rows."""
+    whole = metrics_of(comparison)
+    listed = {row.title: row for row in whole.rows}
+    rows = []
+    for key, (title, *_) in comparison.key_metrics().items():
+        row, rounding = listed[comparison.measures[key].title], ROUNDING * comparison.scales.get(key, 0.0)
+        values = [found.get(key, math.nan) for found in comparison.metrics.values()]
+        cells = [
+            replace(cell, text="0") if abs(value) <= rounding else cell
+            for cell, value in zip(row.cells, values, strict=True)
+        ]
+        rows.append(replace(row, title=title, cells=cells))
+    return by_plan(whole.plans, rows)
+
+
+def by_plan(plans: Sequence[Plan], rows: Sequence[MetricRow]) -> Table:
+    """Table of a few metrics: metrics in rows, or plans in rows where there are many."""
+    titles = [f"{row.title} [{row.unit}]" if row.unit else row.title for row in rows]
+    told = any(row.difference for row in rows)
+    if len(plans) <= _MANY:
+        heads = [Head("metric"), *(Head(plan.name + plan.mark, colour=plan.colour) for plan in plans)]
+        lines = [[Cell(title), *row.cells] for title, row in zip(titles, rows, strict=True)]
+        if told:
+            heads.append(Head("worst to best", note=True))
+            lines = [[*line, Cell(row.difference)] for line, row in zip(lines, rows, strict=True)]
+        return Table(heads, lines, "leading")
+    lines = [
+        [Cell(plan.name + plan.mark, colour=plan.colour), *(row.cells[place] for row in rows)]
+        for place, plan in enumerate(plans)
+    ]
+    if told:
+        lines.append([Cell("worst to best"), *(Cell(row.difference, "note") for row in rows)])
+    return Table([Head("plan"), *map(Head, titles)], lines, "leading")
+
+
+def plan_of(name: str, style: Style, mark: str = "") -> Plan:
+    """Plan of a table or a legend in a style of `line_styles`."""
+    dashes = style["linestyle"]
+    pattern = "" if isinstance(dashes, str) else " ".join(f"{1.6 * part:g}" for part in dashes[1])
+    return Plan(shown_label(name), style["color"], mark, pattern)
+
+
+def extrema_of(sweep: Sweep) -> str:
+    """Range of the leading metrics of each plan over a sweep, in a sentence."""
+    table = sweep.metric_table()
+    ends = f"{number(float(sweep.values[0]))} to {number(float(sweep.values[-1]))}"
+    said = []
+    for column, plan in enumerate(sweep.metrics, 2):
+        rows = [row for row in table.rows[:3] if row[column] != "n/a"]
+        values = [f"{row[0][0].lower()}{row[0][1:]} {row[column]}{f' {row[1]}' if row[1] else ''}" for row in rows]
+        said.append(f"{plan}: {', '.join(values)}.")
+    return f"{sweep.parameter} from {ends}. {' '.join(said)}".replace("-", "−")
+
+
+_LISTED = 200
+"""Values of a sweep up to which a page lists them."""
+
+
+def values_of(sweep: Sweep) -> list[Text | Table]:
+    """Leading metrics of each plan at every value of a sweep; at some of very many values."""
+    names = sweep.key_metrics()
+    at = np.unique(np.linspace(0, sweep.values.size - 1, min(sweep.values.size, _LISTED)).round().astype(int))
+    blocks: list[Text | Table] = []
+    if at.size < sweep.values.size:
+        blocks.append(Text(f"{at.size} of {sweep.values.size} values, evenly spaced in their order.", hint=True))
+    heads = [sweep.parameter]
+    for name in names:
+        unit = sweep.unit_of(name)
+        heads.append(f"{sweep.title_of(name)} [{unit}]" if unit else sweep.title_of(name))
+    for plan, found in sweep.metrics.items():
+        rows = [
+            [f"{sweep.values[k]:.6g}", *(number(float(found[name][k])) if name in found else "–" for name in names)]
+            for k in at
+        ]
+        blocks += [Text(f"{plan}:"), Table(heads, rows, "values")]
+    return blocks
+
+
+def limits_of_runs(comparison: Comparison) -> Table | None:
+    """Declared limits of each run with their margins, the active limit of each plan first; None without limits."""
+    uses = limits_used(comparison)
+    if not uses:
+        return None
+    heads = ["plan", "signal", "permitted range", "value nearest to the limit", "time [s]", "margin", "time at limit"]
+    rows, seen = [], set[str]()
+    for use in uses:
+        active = "" if use.plan in seen else " (active)"
+        seen.add(use.plan)
+        unit = comparison.units.get(use.signal, "")
+        rows.append(
+            [
+                use.plan,
+                use.signal + active,
+                f"{number(use.low)} to {number(use.high)}{f' {unit}' if unit else ''}",
+                number(use.value),
+                number(use.time),
+                "–" if math.isnan(use.share) else f"{100.0 * use.share:.3g} %".replace("-", "−"),
+                f"{100.0 * use.at_limit:.3g} %",
+            ]
+        )
+    return Table(heads, rows, "limits")
 
 
 def spread_of(ensemble: Ensemble) -> MetricsTable:

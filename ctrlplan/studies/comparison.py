@@ -134,10 +134,14 @@ class Comparison(Displayed):
             for plan, reason in reasons.items():
                 yield f"{plan}: {verb}{reason}"
 
-    def metric_table(self) -> Table:
-        """Metrics as print shows them, eight at most, the best value of each marked."""
+    def key_metrics(self) -> dict[str, list[str]]:
+        """Rows of the key metrics by name, eight at most: those that print and pages show."""
         listed = {name: one for name, one in self.measures.items() if any(name in row for row in self.metrics.values())}
-        rows = leading_metrics(listed, self._cells)
+        return leading_metrics(listed, self._cells)
+
+    def metric_table(self) -> Table:
+        """Key metrics as print shows them, the best value of each marked."""
+        rows = self.key_metrics()
         first = {verdict.key: verdict.best for verdict in verdicts(self)}
         best = [
             (i, j)
@@ -145,7 +149,7 @@ class Comparison(Displayed):
             for j, plan in enumerate(self.metrics, 2)
             if plan in first.get(name, ())
         ]
-        left = len(listed) - len(rows)
+        left = sum(any(name in row for row in self.metrics.values()) for name in self.measures) - len(rows)
         more = f"; {left} more in .metrics" if left else ""
         caption = f"Metrics{' (* best)' if best else ''}{more}"
         return Table(caption, ("metric", "unit", *self.metrics), list(rows.values()), frozenset(best))

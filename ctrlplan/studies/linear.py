@@ -100,6 +100,7 @@ def linear_study(progress: bool = True, count: int = 241, finest: float = 1e-3) 
                 NUMBERED,
                 STEP_LIMIT,
                 "step, k → ∞",
+                {"trigonometric, k → ∞": (_enters_band(TrigSpline(WAYPOINTS, alpha=1.0)), 0.0)},
                 caption=f"Settling time versus overshoot on the tracking error for gains from {GAINS[0]:g} to "
                 f"{GAINS[1]:g} (figure 1 of the paper). Curves are interrupted where the settling time is "
                 "discontinuous.",

@@ -339,7 +339,7 @@ _LEADING = (
 def leading_metrics(
     measures: Mapping[str, Measure], cells_of: Callable[[str, Measure], Sequence[str]]
 ) -> dict[str, list[str]]:
-    """Rows of a short table by metric: measures of the user, then the most important ones, at most eight.
+    """Rows of a short table by metric: settling time, measures of the user, then the most important, at most eight.
 
     Parameters
     ----------
@@ -347,12 +347,13 @@ def leading_metrics(
         In the order in which they are shown.
     cells_of : callable
         Maps a name and its measure to cells: the unit, then a value for each
-        plan. Rows that repeat another one, or hold no value, are left out.
+        plan. Rows that repeat another one, hold no value, or are 0 for every
+        plan are omitted.
     """
     found: dict[tuple[str, ...], str] = {}
     for name in sorted(measures, key=_rank):
         row = tuple(cells_of(name, measures[name]))
-        if any(cell != "n/a" for cell in row[1:]):
+        if any(cell not in ("n/a", "0") for cell in row[1:]):
             found.setdefault(row, name)
         if len(found) == ROWS:
             break
@@ -368,6 +369,8 @@ def _short_title(name: str, measure: Measure) -> str:
 def _rank(name: str) -> int:
     """Place of a metric among those that a short table shows, whichever signal it is of."""
     known = max((key for key in MEASURES if name == key or name.startswith(f"{key}_")), key=len, default="")
+    if known == "settling_time":
+        return -2
     if not known:
         return -1
     return _LEADING.index(known) if known in _LEADING else len(_LEADING)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:  # comparisons and ensembles make studies of themselves for their pages
     import control as ct
 
-    from ctrlplan.planning import Fastest
+    from ctrlplan.planning import Fastest, Obstacle
     from ctrlplan.studies.ensemble import Ensemble
     from ctrlplan.studies.grids import Grid
     from ctrlplan.studies.sweep import Sweep
@@ -89,6 +89,19 @@ class Responses(Section):
 
 
 @dataclass(frozen=True)
+class Paths(Section):
+    """Paths of plans with two axes in their plane.
+
+    Attributes
+    ----------
+    obstacles : tuple of Obstacle
+        What the plans must keep clear of.
+    """
+
+    obstacles: tuple[Obstacle, ...] = ()
+
+
+@dataclass(frozen=True)
 class Curves(Section):
     """Curves over one variable.
 
@@ -134,13 +147,16 @@ class Plane(Section):
     limit : (float, float) or None
         Settling time [s] and overshoot [%] of a limit point to mark.
     limit_label : str
-        Label of the limit point.
+            What the limit point is.
+    further : dict of str to (float, float)
+        Further points to be marked, by what they are.
     """
 
     sweep: Sweep
     numbered: Mapping[str, Mapping[float, Place]] = field(default_factory=dict)
     limit: tuple[float, float] | None = None
     limit_label: str = "limit"
+    further: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     def results(self) -> dict[str, object]:
         """The two metrics over the parameter."""

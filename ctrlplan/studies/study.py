@@ -32,6 +32,8 @@ class Study(Displayed):
     sections : tuple of Section
         Further contents of the page, in order: see
         `ctrlplan.studies.sections`.
+    text : tuple of str
+        Free text of its author, a paragraph each.
 
     Raises
     ------
@@ -45,6 +47,7 @@ class Study(Displayed):
     summary: str = ""
     notes: tuple[str, ...] = ()
     sections: tuple[Section, ...] = (PlanCurves(), Responses())
+    text: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         given: tuple[object, ...] = tuple(self.sections)

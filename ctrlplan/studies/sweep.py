@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import warnings
 from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -30,9 +32,10 @@ from ctrlplan.studies.executing import (
     tried,
 )
 from ctrlplan.studies.experiment import Experiment, Metrics
-from ctrlplan.studies.measures import MEASURES, Measure, leading_metrics
+from ctrlplan.studies.measures import MEASURES, Measure, leading_metrics, wanted_measures
 from ctrlplan.studies.roles import Role, role_of
 from ctrlplan.studies.running import Builder, System, is_builder
+from ctrlplan.studies.units import in_units, with_superscripts
 from ctrlplan.trajectories import Trajectory, Waypoint
 
 if TYPE_CHECKING:
@@ -64,6 +67,12 @@ class Sweep(Displayed):
         Role of each plan, if known.
     band : float
         Half width of the settling band, relative to the range of the plan.
+    units : dict of str to str
+        Units of axes, outputs and controls by label.
+    axes, controls : tuple of str
+        Labels of the axes of the plans, and of the controls.
+    measures : dict of str to Measure
+        Titles and units of the metrics.
     """
 
     parameter: str
@@ -73,6 +82,22 @@ class Sweep(Displayed):
     interrupted: bool = False
     roles: dict[str, Role] = field(default_factory=dict)
     band: float = 0.02
+    units: dict[str, str] = field(default_factory=dict)
+    axes: tuple[str, ...] = ()
+    controls: tuple[str, ...] = ()
+    measures: dict[str, Measure] = field(default_factory=lambda: dict(MEASURES))
+
+    def title_of(self, name: str) -> str:
+        """Title of a metric."""
+        return self.measures[name].title if name in self.measures else name
+
+    def unit_of(self, name: str) -> str:
+        """Unit of a metric in the units of the sweep; empty where it is not known."""
+        if name not in self.measures:
+            return ""
+        known = [{self.units.get(label, "") for label in labels} for labels in (self.axes, self.controls)]
+        y, u = (found.pop() if len(found) == 1 else "" for found in known)
+        return in_units(with_superscripts(self.measures[name].unit), y, u)
 
     def _describe(self) -> Iterator[Part]:
         yield f"Sweep of {', '.join(self.metrics)} over {counted(self.values.size, 'value')} of {self.parameter}"
@@ -89,16 +114,19 @@ class Sweep(Displayed):
             first = self.failures[0]
             yield f"First failure: {self.parameter} = {number(float(self.values[first.draw]))}: {first.message}"
 
-    def metric_table(self) -> Table:
-        """Minimum and maximum of the metrics over the values, as print shows them, eight at most."""
+    def key_metrics(self) -> dict[str, list[str]]:
+        """Rows of the key metrics by name, eight at most: those that print and pages show."""
         names = dict.fromkeys(name for row in self.metrics.values() for name in row)
-        measures = {name: MEASURES.get(name, Measure(name)) for name in names}
-        rows = list(leading_metrics(measures, self._cells).values())
+        return leading_metrics({name: self.measures.get(name, Measure(name)) for name in names}, self._cells)
+
+    def metric_table(self) -> Table:
+        """Minimum and maximum of the key metrics over the values, as print shows them."""
+        rows = list(self.key_metrics().values())
         return Table("Metrics over all values, minimum to maximum", ("metric", "unit", *self.metrics), rows)
 
     def _cells(self, name: str, measure: Measure) -> list[str]:
-        """Unit of a metric where it is known, and its range for each plan."""
-        cells = ["" if "{" in measure.unit else measure.unit]
+        """Unit of a metric if it is known, and its range for each plan."""
+        cells = [self.unit_of(name)]
         for plan in self.metrics:
             column = self._column(plan, name)
             known = column[~np.isnan(column)]
@@ -140,10 +168,47 @@ class Sweep(Displayed):
         moved += [replace(failure, draw=int(place[failure.draw + self.values.size])) for failure in other.failures]
         failures = tuple(sorted(moved, key=lambda failure: failure.draw))
         interrupted = self.interrupted or other.interrupted
-        return Sweep(self.parameter, values[order], rows, failures, interrupted, self.roles | other.roles, self.band)
+        return replace(
+            self,
+            values=values[order],
+            metrics=rows,
+            failures=failures,
+            interrupted=interrupted,
+            roles=self.roles | other.roles,
+        )
 
     def _column(self, plan: str, name: str) -> Array:
         return self.metrics.get(plan, {}).get(name, np.full(self.values.size, np.nan))
+
+    def report(self, path: str | os.PathLike[str], title: str = "") -> Path:
+        """Write one self-contained HTML page and return its path.
+
+        It has the extrema of the metrics, their curves over the parameter, all
+        values in a table, and the values that failed.
+
+        Parameters
+        ----------
+        path : str or path
+            The file, or a folder for ``index.html`` in it.
+        title : str, optional
+            Heading; "Sweep over" the parameter unless given.
+
+        Returns
+        -------
+        pathlib.Path
+
+        Raises
+        ------
+        ValueError
+            If no value could be run.
+        OSError
+            If the page cannot be written; nothing is left behind.
+        """
+        from ctrlplan.reports import write_page
+
+        if not self.metrics:
+            raise ValueError("a report must have metrics, got a sweep in which every value failed; see .failures")
+        return write_page([self], path, title or f"Sweep over {self.parameter}")
 
     def plot(
         self, names: Sequence[str] = ("settling_time", "overshoot_error"), *, ax: AxesLike | None = None
@@ -269,8 +334,17 @@ def sweep(
         account = executed(run, points.tolist(), executor, timeout, parameter, progress)
         account.raise_if_none_ran("build")
     found = _swept(parameter, points, account)
-    roles = {name: role_of(experiment.plans[name]) for name in found.metrics}
-    found = replace(found, roles=roles, band=experiment.band)
+    acting, known = controls or [name for name in units or {} if name.startswith("u")], dict(units or {})
+    labels = next(iter(experiment.plans.values())).labels
+    found = replace(
+        found,
+        roles={name: role_of(experiment.plans[name]) for name in found.metrics},
+        band=experiment.band,
+        units=known,
+        axes=labels if set(labels) & set(known) else tuple(name for name in known if name not in acting),
+        controls=tuple(acting),
+        measures=wanted_measures(experiment.measures),
+    )
     if found.interrupted:
         text = f"the sweep was interrupted: {found.values.size} of {points.size} values are returned"
         warnings.warn(text, UserWarning, stacklevel=outside_stacklevel())

@@ -5,12 +5,16 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ctrlplan._types import System
 from ctrlplan.studies.measures import Measure, Run, checked_names
 from ctrlplan.trajectories import Trajectory
+
+if TYPE_CHECKING:  # comparisons use the units
+    from ctrlplan.studies.comparison import Comparison
 
 UNIT_SCALES = {"%": 100.0}
 """Scales of metrics in units that do not depend on signals."""
@@ -19,6 +23,11 @@ UNIT_SCALES = {"%": 100.0}
 def superscript(exponent: int | str) -> str:
     """An exponent in superscript digits."""
     return str(exponent).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
+
+
+def with_superscripts(unit: str) -> str:
+    """A unit with its powers, as in m^2, in superscript digits."""
+    return re.sub(r"\^(-?\d+)", lambda power: superscript(power[1]), unit)
 
 
 def scientific(value: float, digits: int = 4) -> str:
@@ -69,6 +78,12 @@ class Signals:
         """Units of the signals of a measure if they are known to differ; otherwise empty."""
         units = self.of_axes() if "{y}" in unit else self.of_controls() if "{u}" in unit else {}
         return units if len(set(filter(None, units.values()))) > 1 else {}
+
+
+def output_unit(comparison: Comparison, output: str) -> str:
+    """Unit of an output that follows a plan, by its axis or its own label; empty if it is not given."""
+    label = next(iter(comparison.plans.values())).labels[comparison.outputs.index(output)]
+    return comparison.units.get(label, comparison.units.get(output, ""))
 
 
 def signals_of_runs(

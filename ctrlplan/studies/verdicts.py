@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import math
-import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from ctrlplan._renamed import FormerAttribute
-from ctrlplan.studies.roles import Stability
-from ctrlplan.studies.units import ROUNDING, UNIT_SCALES, in_units, scientific, superscript
+from ctrlplan.studies.limits import limits_sentence
+from ctrlplan.studies.roles import Role, Stability
+from ctrlplan.studies.units import ROUNDING, UNIT_SCALES, in_units, scientific, with_superscripts
 
 if TYPE_CHECKING:  # comparisons show their verdicts
     from ctrlplan.studies.comparison import Comparison
 
-TIE = 1e-3
+TIE = 1e-2
 """Relative difference below which two values count as equal."""
 
 _ROUNDING = 1e-7
@@ -42,6 +42,9 @@ class Verdict:
         These values.
     sentence : str
         The result in words.
+    difference : str
+        Difference of best and worst: "equal" up to rounding, "within 1 %", or
+        their ratio; otherwise empty.
     """
 
     key: str
@@ -52,6 +55,7 @@ class Verdict:
     minimum: float
     maximum: float
     sentence: str
+    difference: str = ""
 
     winners, losers = FormerAttribute("best"), FormerAttribute("worst")
     least, greatest = FormerAttribute("minimum"), FormerAttribute("maximum")
@@ -94,9 +98,75 @@ def summary(comparison: Comparison) -> str:
         parts.append(f"{plan} is best in {best} and worst in {worst}")
     sentence = "; ".join(parts)
     return (
-        f"Of {len(decided)} metrics that differ between the plans, {sentence}. Values that differ by less than 0.1 %, "
-        f"or by less than 10⁻⁶ of the scale of the metric, count as equal.{ended}"
+        f"Of {len(decided)} metrics that differ between the plans, {sentence}. Values within 1 % of the better one, or "
+        f"within 10⁻⁶ of the scale of the metric, count as equal.{ended}"
     )
+
+
+_HEADLINE = (
+    ("settling_time", "arrival"),
+    ("error_travel", "error_reference", "overshoot_error"),
+    ("force_peak", "control_peak"),
+)
+"""Metrics of a headline: the first of each group that a comparison has."""
+
+
+def headline(comparison: Comparison) -> str:
+    """Settling time, error, peak control and duration of the best planned reference, and whether limits hold.
+
+    The plan is the first of those that settle within 1 % of the shortest
+    settling time; values of the step follow.
+    """
+    if is_unstable(comparison):
+        return comparison.notes[0]
+    keys = [key for group in _HEADLINE if (key := _first_of(group, comparison))]
+    ranked = [name for name in comparison.plans if name not in comparison.stopped]
+    steps = [name for name in comparison.plans if comparison.roles.get(name) is Role.STEP]
+    planned = [name for name in ranked if name not in steps] or ranked
+    parts = []
+    if planned:
+        plan = _leading_plan(comparison, planned, keys)
+        duration = comparison.plans[plan].duration
+        moved = f" (duration {duration:.4g} s)" if 0.0 < duration < math.inf else ""
+        parts.append(f"With {plan}{moved}: {_values(comparison, plan, keys)}.")
+        steps = [name for name in steps if name != plan]
+    for name in steps[:1]:
+        ended = f"not ranked, because an event ended the run at {comparison.stopped.get(name, 0.0):.4g} s"
+        parts.append(f"With {name}: {ended if name in comparison.stopped else _values(comparison, name, keys)}.")
+    return " ".join([*parts, limits_sentence(comparison)])
+
+
+def _leading_plan(comparison: Comparison, planned: list[str], keys: list[str]) -> str:
+    """First plan whose first metric is the minimum, up to what counts as equal."""
+    values = {name: comparison.metrics[name].get(keys[0], math.inf) if keys else 0.0 for name in planned}
+    best = min(values.values())
+    return next((name for name, value in values.items() if _equal(value, best, 0.0)), planned[0])
+
+
+def _first_of(group: tuple[str, ...], comparison: Comparison) -> str:
+    """First metric of a group that a plan has; of each signal where they differ in unit."""
+    for key in comparison.measures:
+        stem = next((name for name in group if key == name or key.startswith(f"{name}_")), "")
+        if stem and any(not math.isnan(found.get(key, math.nan)) for found in comparison.metrics.values()):
+            return key
+    return ""
+
+
+def _values(comparison: Comparison, plan: str, keys: list[str]) -> str:
+    """Values of a plan in words."""
+    found = []
+    for key in keys:
+        value, unit = comparison.metrics[plan].get(key, math.nan), unit_of(comparison, key)
+        title = comparison.measures[key].title
+        title = title[0].lower() + title[1:]
+        if math.isnan(value):
+            continue
+        if math.isinf(value):
+            found.append(f"no {title} within the simulated time")
+            continue
+        zero = abs(value) <= ROUNDING * comparison.scales.get(key, 0.0)
+        found.append(f"{title} {'0' if zero else number(value)}{f' {unit}' if unit else ''}")
+    return ", ".join(found) or "no metrics"
 
 
 def is_unstable(comparison: Comparison) -> bool:
@@ -114,7 +184,7 @@ def unit_in(comparison: Comparison, unit: str) -> str:
     first = next(iter(comparison.plans.values()))
     y = _shared([comparison.units.get(label, "") for label in first.labels])
     u = _shared([comparison.units.get(name, "") for name in comparison.controls])
-    return in_units(re.sub(r"\^(-?\d+)", lambda power: superscript(power[1]), unit), y, u)
+    return in_units(with_superscripts(unit), y, u)
 
 
 def number(value: float, unit: str = "") -> str:
@@ -138,22 +208,25 @@ def _verdict(key: str, title: str, unit: str, values: dict[str, float], rounding
         size = number(apart) if apart >= _ZERO else scientific(apart)
         within = f", within {size}{f' {unit}' if unit else ''}" if apart else ""
         sentence = f"{title}: equal for {_listed(tuple(values))}{within}."
-        return Verdict(key, title, unit, (), (), minimum, maximum, sentence)
+        difference = "equal" if not apart or apart <= rounding else f"within {100 * TIE:g} %"
+        return Verdict(key, title, unit, (), (), minimum, maximum, sentence, difference)
     best = tuple(plan for plan, value in values.items() if _equal(value, minimum, rounding))
     worst = tuple(plan for plan, value in values.items() if _equal(value, maximum, rounding))
     with_unit = f" {unit}" if unit else ""
     high = number(maximum, unit) + (with_unit if math.isfinite(maximum) else "")
     low = number(minimum) + with_unit
     sentence = f"{title}: best {low} ({_listed(best)}), worst {high} ({_listed(worst)})"
-    if minimum > rounding and math.isfinite(maximum) and 1.05 <= maximum / minimum < 1e4:
-        sentence += f", ratio {number(maximum / minimum)}"
-    return Verdict(key, title, unit, best, worst, minimum, maximum, sentence + ".")
+    difference = ""
+    if minimum > rounding and math.isfinite(maximum) and maximum / minimum < 1e4:
+        difference = f"ratio {maximum / minimum:.3g}"
+        sentence += f", ratio {number(maximum / minimum)}" if maximum / minimum >= 1.05 else ""
+    return Verdict(key, title, unit, best, worst, minimum, maximum, f"{sentence}.", difference)
 
 
 def _equal(one: float, other: float, rounding: float) -> bool:
     if math.isinf(one) or math.isinf(other):
         return one == other
-    return abs(one - other) <= max(TIE * max(abs(one), abs(other)), rounding)
+    return abs(one - other) <= max(TIE * min(abs(one), abs(other)), rounding)
 
 
 def _listed(names: tuple[str, ...]) -> str:

@@ -123,14 +123,22 @@ def test_bands_of_the_control_are_drawn_too(grid):
         np.testing.assert_allclose(outline(axes.collections[0]), expected[[0, 4]], atol=1e-6)
 
 
-def test_plans_share_the_scale_of_a_row_which_holds_every_band(grid):
+def test_plans_share_the_scale_of_a_row_which_the_step_does_not_set(grid):
+    """The first column is the step: where its bands leave the axes, its peak is written above them."""
+    clipped = 0
     for row in grid:
         assert row[0].get_ylim() == row[1].get_ylim()
         low, high = row[0].get_ylim()
-        for axes in row:
-            edges = np.array(outline(axes.collections[0]))
-            assert low < edges.min()
-            assert edges.max() < high
+        step, ramp = (np.array(outline(axes.collections[0])) for axes in row)
+        assert low < ramp.min()
+        assert ramp.max() < high
+        beyond = step.min() < low or step.max() > high
+        (said,) = re.findall(r"peak (\S+), clipped", row[0].get_title(loc="left")) or [""]
+        assert bool(said) == beyond
+        if beyond:
+            assert float(said) == pytest.approx(step.flat[np.abs(step).argmax()], rel=5e-3)
+            clipped += 1
+    assert clipped > 0
 
 
 def test_rows_have_scales_of_their_own(grid):
@@ -217,7 +225,7 @@ def test_the_page_has_the_table_of_draws_before_that_of_the_loop(page):
 
 
 def test_the_page_shows_bands_and_responses(page):
-    figures = {figure.attributes["id"]: figure for figure in page.all("figure")}
+    figures = {figure.attributes["id"]: figure for figure in page.all("figure") if "id" in figure.attributes}
     assert list(figures) == ["draws-bands", "draws-responses"]
     for figure in figures.values():
         assert len(list(figure.all("svg"))) == 1

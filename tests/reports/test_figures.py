@@ -99,6 +99,7 @@ SECTIONS = {
     "Bands": lambda swept, spread, crane: sections.Bands(spread),
     "PlanCurves": lambda swept, spread, crane: sections.PlanCurves(),
     "Responses": lambda swept, spread, crane: sections.Responses(),
+    "Paths": lambda swept, spread, crane: sections.Paths((cp.Disc((8.0, 8.0), 1.5),)),
     "Curves": lambda swept, spread, crane: sections.Curves("alpha [rad]", "length [m]", TIMES[1:], CURVES),
     "FastestMove": lambda swept, spread, crane: sections.FastestMove(
         cp.fastest(cp.PolySpline(MOVE), {"y_d1": 2.0, "y_d2": 9.0})
@@ -130,7 +131,7 @@ def picture(compared, swept, craned, spread):
     def of(name):
         crane = cp.plants.crane_loop(cp.plants.Crane(), craned.comparison.plans["polynomial"])
         section = SECTIONS[name](swept, spread, crane)
-        study = craned if name.startswith("Crane") else Study("it", "It", compared)
+        study = craned if name.startswith(("Crane", "Paths")) else Study("it", "It", compared)
         (found,) = (block for block in draw(section, study).blocks if isinstance(block, Picture))
         return found
 
@@ -352,18 +353,22 @@ def test_the_legend_names_every_plan_once(compared, swept):
 
 def test_labels_of_plans_carry_units(compared, two_axes):
     labels = [axes.get_ylabel() for axes in axes_of(plot_plans(compared))]
-    assert labels == ["x position [m]", "x velocity [m/s]", "x acceleration [m/s$^2$]"]
+    assert labels == ["x position [m]", "x velocity [m/s]", "x acceleration [m/s²]"]
     labels = [axes.get_ylabel() for axes in axes_of(plot_plans(two_axes, 1))]
     assert labels == ["x position [m]", "theta position [rad]", "x velocity [m/s]", "theta velocity [rad/s]"]
     assert plot_plans(compared).axes[-1, 0].get_xlabel() == "time [s]"
     labels = [axes.get_ylabel() for axes in axes_of(plot_plans(compared, 4))]
-    assert labels[3:] == ["x jerk [m/s$^3$]", "x snap [m/s$^4$]"]
+    assert labels[3:] == ["x jerk [m/s³]", "x snap [m/s⁴]"]
 
 
 def test_without_units_none_is_made_up(compared):
     loop = cp.plants.integrator_lag_loop(5.0)
     drawn = plot_plans(cp.compare(loop, MOVE, TIMES))
-    assert [axes.get_ylabel() for axes in axes_of(drawn)] == ["position", "velocity [1/s]", "acceleration [1/s$^2$]"]
+    assert [axes.get_ylabel() for axes in axes_of(drawn)] == [
+        "y position",
+        "y velocity [1/s]",
+        "y acceleration [1/s²]",
+    ]
 
 
 def test_plans_are_drawn_as_they_are(compared):
@@ -649,4 +654,4 @@ def test_derivatives_of_a_quotient_have_its_unit_in_brackets():
     """A plan in deg/s: its derivative is in (deg/s)/s, and not in deg/s/s."""
     plan = cp.PolySpline([cp.Waypoint(0, 0, 0), cp.Waypoint(1, 1, 0)])
     labels = [axes.get_ylabel() for axes in axes_of(plot_trajectory(plan, 2, units=["deg/s"]))]
-    assert labels == ["position [deg/s]", "velocity [(deg/s)/s]", "acceleration [(deg/s)/s$^2$]"]
+    assert labels == ["position [deg/s]", "velocity [(deg/s)/s]", "acceleration [(deg/s)/s²]"]

@@ -10,6 +10,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from drawings import drawn_texts
 from hostile import CONTROL, MARKUP, NOT_WRITTEN_SO, SHOWN, TEXTS, mixed, study
 
 import ctrlplan as cp
@@ -158,9 +159,8 @@ def test_the_legend_names_a_plan_by_its_letters(name):
     figure = plot_plans(named([text, "plain", "_b"])).figure
     assert [t.get_text() for t in legend(figure)] == [text, "plain", "_b"]
     assert not any(t.get_parse_math() for t in legend(figure))
-    drawn = re.findall("<!-- (.*?) -->", to_svg(figure, "it"))
-    # matplotlib writes beside its strokes what it draws: the text itself, and no formula.
-    assert text.replace("--", "- -") in drawn
+    drawn = drawn_texts(to_svg(figure, "it"))
+    assert text in drawn
     assert "_b" in drawn
 
 
@@ -190,7 +190,7 @@ def test_labels_of_axes_and_titles_are_text_as_well(name):
     found = named(["one", "two"])
     renamed = {key: cp.TrigSpline(plan.waypoints, alpha=plan.alpha, labels=[text]) for key, plan in found.plans.items()}
     figure = plot_plans(replace(found, plans=renamed, units={text: text})).figure
-    drawn = "\n".join(re.findall("<!-- (.*?) -->", to_svg(figure, "it")))
+    drawn = "\n".join(drawn_texts(to_svg(figure, "it")))
     if name in ("formula", "wrong formula", "command", "one dollar", "dollars", "underscores", "powers"):
         # The position has no power of ours in its unit, so that matplotlib draws it without its formulas.
         assert f"{text} position [{text}]" in drawn

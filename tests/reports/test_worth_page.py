@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from drawings import drawn_texts
 from linear_table import printed
 
 import ctrlplan as cp
@@ -140,11 +141,11 @@ def test_without_units_there_are_no_brackets(shown, study):
 
 
 def test_all_baselines_are_in_the_table_of_the_section(study, page):
-    (table,) = tables(page, "baselines")
-    assert titles(table) == ["metric", "unit", *study.comparison.benefit.comparison.plans]
+    (beside,) = tables(page, "baselines")
+    assert titles(beside) == ["metric", "unit", *study.comparison.benefit.comparison.plans, "worst to best"]
     expected = {"step", "trapezoid", "S-curve", "shaped step", "quintic (minimum jerk)"}
-    assert expected <= set(titles(table))
-    found = {row[0]: row[2:] for row in rows(table)}
+    assert expected <= set(titles(beside))
+    found = {row[0]: row[2:-1] for row in rows(beside)}
     metrics = study.comparison.benefit.comparison.metrics
     for title, key in (("Settling time", "settling_time"), ("Peak control", "control_peak")):
         for text, values in zip(found[title], metrics.values(), strict=True):
@@ -228,11 +229,12 @@ def test_units_are_in_the_headings_of_the_tables(page):
 
 
 def test_the_figure_of_the_baselines_names_all(html, study):
-    comments = re.findall(r"<!-- (.*?) -->", html)
+    texts = drawn_texts(html)
+    names = {name for text in texts for name in text.split(" = ")}  # of curves that coincide
     for plan in study.comparison.benefit.comparison.plans:
-        assert plan in comments
+        assert plan in names
     for label in ("reference of y [m]", "y [m]", "u [N]", "time [s]", "y_d1 [m/s]"):
-        assert label in comments
+        assert label in texts
 
 
 # Minimum duration within limits

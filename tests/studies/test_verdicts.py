@@ -44,7 +44,7 @@ def test_several_plans_may_be_best_or_worst():
 
 
 @pytest.mark.parametrize(("factor", "tied"), [(1 + 0.9 * TIE, True), (1 + 1.1 * TIE, False)])
-def test_values_within_a_thousandth_are_equal(factor, tied):
+def test_values_within_one_percent_are_equal(factor, tied):
     found = verdict(a=1.0, b=factor)
     assert (found.best == found.worst == ()) is tied
     assert ("equal for a and b" in found.sentence) is tied
@@ -97,7 +97,7 @@ def test_the_summary_counts():
     said = summary(Comparison(dict.fromkeys(found, PLAN), {}, found, outputs=("y",)))
     assert said.startswith("Of 2 metrics that differ between the plans, ")
     assert "a is best in 1 and worst in 0; b is best in 1 and worst in 0; c is best in 0 and worst in 2" in said
-    assert "0.1 %" in said
+    assert "within 1 %" in said
 
 
 def test_where_nothing_tells_them_apart_the_summary_says_so():
