@@ -135,15 +135,15 @@ class Bound:
         return _range(self.low, self.high)
 
 
-def limit_words(limit: object) -> str:
-    """Description of a limit in any form that `margins` accepts, axis by axis."""
+def limit_words(limit: object, name: str = "velocity") -> str:
+    """Description of a limit in any form that `margins` accepts, by axis for names of all axes, such as velocity."""
     if isinstance(limit, Limits):
         return _range(*_sides(limit.low, limit.high))
     given = np.array(limit, dtype=object)
     if given.ndim == 0:
         return _range(-float(given), float(given))
-    if isinstance(limit, tuple) and given.shape == (2,):
-        return _range(*map(float, _sides(*limit)))
+    if given.shape == (2,) and (isinstance(limit, tuple) or name not in ENTRIES):
+        return _range(*map(float, _sides(*given)))
     return "; ".join(limit_words(tuple(row) if np.ndim(row) else row) for row in given)
 
 

@@ -198,7 +198,7 @@ def _(section: Benefit, study: Study) -> Part:
         "alpha and duration."
     )
     caption = "References through the same waypoints in the same time, with the outputs and controls of the loop."
-    limits = "; ".join(f"{limit} {limit_words(value)}" for limit, value in section.limits.items())
+    limits = "; ".join(f"{name} {limit_words(value, name)}" for name, value in section.limits.items())
     over = (
         "Metrics over duration and alpha: ▲ better than every ranked baseline, ▽ worse than the best ranked baseline "
         "(underlined)."

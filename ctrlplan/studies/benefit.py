@@ -72,7 +72,7 @@ class Benefit(Displayed):
     def _describe(self) -> Iterator[Part]:
         baselines = counted(len(self.comparison.plans) - 1, "other reference")
         yield f"Benefit of a trigonometric plan, alpha = {number(self.alpha)} rad, compared with {baselines}"
-        yield Facts([(f"limit of {name}", limit_words(limit)) for name, limit in self.limits.items()])
+        yield Facts([(f"limit of {name}", limit_words(limit, name)) for name, limit in self.limits.items()])
         yield from self.verdicts
         without = [plan for plan in self.required_durations if math.isnan(plan.duration)]
         rows = [

@@ -304,7 +304,9 @@ def test_limits_in_words_whatever_their_form():
     assert limit_words(np.array(3.0)) == "within ±3"
     assert limit_words((-1.0, 2.5)) == "from -1 to 2.5"
     assert limit_words(cp.Limits(low=-1.0)) == "at least -1"
-    assert limit_words([1.0, 2.0]) == "within ±1; within ±2"
+    assert limit_words([1.0, 2.0]) == limit_words([1.0, 2.0], "jerk") == "within ±1; within ±2"
+    assert limit_words([None, 2.0], "y_d2") == "at most 2"
+    assert limit_words(np.array([-1.0, 2.0]), "F") == "from -1 to 2"
     assert limit_words(np.array([[-1.0, 2.0], [-3.0, 3.0]])) == "from -1 to 2; within ±3"
 
 
