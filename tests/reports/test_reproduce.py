@@ -112,7 +112,7 @@ def test_figure_1_draws_the_limit_point_and_every_gain_asked_for(reproduced):
     for gain in ("1", "5", "20", "100", "1000"):
         assert gain in texts
     assert "settling time ±2 % [s]" in texts
-    assert "overshoot on the error [%]" in texts
+    assert "overshoot on the tracking error [%]" in texts
 
 
 def test_the_plans_overshoot_least_where_the_loop_is_stiff(linear):
