@@ -185,7 +185,7 @@ def test_needs_are_shown_with_the_limit_that_is_active_and_where(study, page):
 def test_alpha_and_limits_are_said_in_words(page):
     assert "A trigonometric plan (alpha = 1 rad) is compared with" in page.words()
     assert (
-        "Minimum duration of each plan under the same limits (y_d1 within ±1.875; y_d2 within ±5.774; y_d3 within ±60):"
+        "Minimum duration of each plan under the same limits (y_d1 within ±1.875; y_d2 within ±5.7735; y_d3 within ±60):"
         in page.words()
     )
 
