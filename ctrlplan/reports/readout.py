@@ -59,12 +59,12 @@ def readout_data(figure: Figure, key: str) -> Markup:
                 "curves": curves,
             }
         )
-    entries = {
-        f"{salt}-entry-{e}": [f"{salt}-key-{e}", shown_label(str(handle.get_label()))]
+    entries = [
+        [f"{salt}-entry-{e}", f"{salt}-key-{e}", shown_label(str(handle.get_label()))]
         for legend in figure.legends
         for e, handle in enumerate(legend.legend_handles)
         if handle is not None
-    }
+    ]
     return htmlsafe_json_dumps({"axes": found, "entries": entries}) if found else Markup("")
 
 

@@ -135,10 +135,10 @@ def _(study: Study, taken: Sequence[str]) -> Shown:
     )
     folds = [
         Fold("Description and findings", _words(study)),
-        *(Fold(part.heading, tuple(part.blocks)) for part in drawn),
+        *(Fold(part.heading, tuple(part.blocks)) for part in parts if part.heading and not part.below),
         Fold(title, (Text(f"{_SIGNS} Click a column heading to sort.", hint=True), metrics_of(comparison))),
         Fold("All figures", tuple(block for part in parts if not part.heading for block in part.blocks)),
-        *(Fold(part.heading, tuple(part.blocks)) for part in parts if part.heading and not part.nominal),
+        *(Fold(part.heading, tuple(part.blocks)) for part in parts if part.heading and part.below),
         Fold("Limits", _limits(comparison)),
         Fold("Failed plans", _failures("plan", comparison.failures)),
         Fold("Parameters", (Pairs({name: in_line(value) for name, value in comparison.parameters.items()}),)),

@@ -170,9 +170,9 @@ class Drawing:
     def finish(self, legend: bool = True) -> Plot:
         """What a plotting function returns, with one legend for all axes, of the labels of the first.
 
-        In new axes, plans whose curves coincide everywhere become one curve.
+        On a page, plans whose curves coincide in all axes become one curve.
         """
-        if legend and self._own:
+        if legend and self._own and _FOR_PAGE.get():
             merge_coincident(self.column)
         made = self._legend() if legend else None
         lines = np.empty(self.axes.shape, dtype=object)

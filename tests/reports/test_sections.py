@@ -70,6 +70,11 @@ def heads(page):
     return [e.words() for e in page.all() if re.fullmatch("h[1-6]", e.tag)]
 
 
+def ids_of_figures(page):
+    """Ids of the figures in the folds."""
+    return [figure.attributes["id"] for figure in page.all("figure") if "id" in figure.attributes]
+
+
 # A user's own type
 
 
@@ -85,19 +90,19 @@ def test_a_section_of_ones_own_is_on_the_page_in_its_place(own, read):
     page = read(own[0].read_text(encoding="utf-8"))
     assert heads(page) == [
         "Mine",
-        "Findings",
+        "Description and findings",
         "Durations & <limits>",
-        "Metrics",
-        "Best and worst by metric",
+        "All metrics",
+        "All figures",
         "Parameters",
     ]
-    assert [figure.attributes["id"] for figure in page.all("figure")] == ["mine-plans", "mine-first", "mine-responses"]
+    assert ids_of_figures(page) == ["mine-first", "mine-plans", "mine-responses"]
     captions = [caption.words() for caption in page.all("figcaption")]
-    assert captions[1:] == ["The first & <best>.", "What happens."]
+    assert (captions[1], captions[3]) == ("The first & <best>.", "What happens.")
     assert "At most 1 s & <more>." in page.words()
-    assert [item.words() for item in page.all("li") if item.words().split()[0] in ("polynomial", "trigonometric")][
-        :2
-    ] == ["polynomial lasts.", "trigonometric lasts."]
+    assert [item.words() for item in page.all("li") if item.words().endswith("lasts.")] == [
+        f"{name} lasts." for name in ("step", "polynomial", "trigonometric", "piecewise")
+    ]
 
 
 def test_a_table_of_ones_own_has_its_cells_and_marks(own, read):
@@ -124,7 +129,7 @@ def test_data_of_a_section_is_in_the_results(own):
 
 def test_a_section_may_stand_below_the_metrics(compared, read):
     page = read(render_page([Study("mine", "Mine", compared, sections=(Durations(1.0, below=True),))], "Mine"))
-    assert heads(page) == ["Mine", "Metrics", "Best and worst by metric", "Durations & <limits>", "Parameters"]
+    assert heads(page) == ["Mine", "All metrics", "Durations & <limits>", "Parameters"]
 
 
 def test_sections_of_one_type_have_ids_of_their_own(compared, read):
@@ -133,7 +138,7 @@ def test_sections_of_one_type_have_ids_of_their_own(compared, read):
     page = read(render_page(studies, "It"))
     ids = [element.attributes["id"] for element in page.all() if "id" in element.attributes]
     assert len(ids) == len(set(ids))
-    assert [figure.attributes["id"] for figure in page.all("figure")][:3] == ["it-curves", "it-curves-2", "it-first"]
+    assert ids_of_figures(page)[:3] == ["it-first", "it-curves", "it-curves-2"]
 
 
 def test_a_figure_that_is_svg_already_is_put_in_as_it_is(compared, read):
@@ -145,7 +150,8 @@ def test_a_figure_that_is_svg_already_is_put_in_as_it_is(compared, read):
     def _(section: Dot, study: Study) -> Part:
         return Part([Svg("dot", reports.page.Markup('<svg viewBox="0 0 1 1"><circle r="1"/></svg>'), "A dot.")])
 
-    (figure,) = read(render_page([Study("it", "It", compared, sections=(Dot(),))], "It")).all("figure")
+    page = read(render_page([Study("it", "It", compared, sections=(Dot(),))], "It"))
+    (figure,) = (figure for figure in page.all("figure") if "panels" not in figure.attributes.get("class", ""))
     assert figure.attributes["id"] == "it-dot"
     assert [circle.attributes["r"] for circle in figure.all("circle")] == ["1"]
 
@@ -157,7 +163,7 @@ def test_a_section_of_ones_own_joins_those_of_a_study_file(tmp_path, read):
     study = load_study(tmp_path / "lag.toml").run()
     study = replace(study, sections=(*study.sections, Durations(9.0)))
     page = read(render_page([study], "Lag"))
-    assert [figure.attributes["id"] for figure in page.all("figure")] == ["lag-plans", "lag-responses", "lag-first"]
+    assert ids_of_figures(page) == ["lag-first", "lag-plans", "lag-responses"]
     assert "Durations & <limits>" in heads(page)
 
 
