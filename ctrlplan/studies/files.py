@@ -8,6 +8,8 @@ plan.csv`` writes only the trajectories, as ``.json`` or in a format of
 .. code-block:: toml
 
     title = "Over the wall"
+    author = "A. Engineer"    # optional
+    text = "For the crane of hall 3."   # optional; a list has a paragraph each
     t_end = 30.0
     samples = 4001            # optional
     benefit = true            # optional: compare with steps, profiles and minimum jerk, in the same time and limits
@@ -83,6 +85,9 @@ Further entries and tables, each optional:
 A sweep varies the plant and its law together. Draws of a crane vary the plant
 alone, whose law has the numbers of [loop]. With a function of a module the
 parameter is an argument of the function, or, in draws, a parameter of a block.
+
+Editors complete and check study files by the JSON Schema
+``ctrlplan/studies/study.schema.json``.
 """
 
 from __future__ import annotations
@@ -159,6 +164,10 @@ class StudyFile:
         The table [experiment]: further fields of `Experiment` by name.
     sweep, draws : dict or None
         The tables [sweep] and [draws].
+    author : str
+        Author of the report.
+    text : tuple of str
+        Free text of the report, a paragraph each.
     """
 
     path: Path
@@ -175,6 +184,8 @@ class StudyFile:
     experiment: Data = field(default_factory=dict)
     sweep: Data | None = None
     draws: Data | None = None
+    author: str = ""
+    text: tuple[str, ...] = ()
 
     def run(self, *, progress: bool = False, status: Callable[[str], object] = lambda text: None) -> Study:
         """Simulate and measure.
@@ -228,7 +239,7 @@ class StudyFile:
             ) from error
         study = kind.study(self.name, self.title, comparison, self.planned.wall)
         sections = (*found_sections, *study.sections)
-        return replace(study, notes=(*study.notes, *_planning_notes(self.planned)), sections=sections)
+        return replace(study, notes=(*study.notes, *_planning_notes(self.planned)), sections=sections, text=self.text)
 
     def timepts(self, loop: System | Builder) -> NDArray[np.float64]:
         """Sample times: evenly spaced, with those of the waypoints, or multiples of the period of a discrete loop."""
@@ -312,6 +323,8 @@ STUDY = Table(
             required=True,
         ),
         "title": Entry(Text(), "heading of the page"),
+        "author": Entry(Text(), "author of the report"),
+        "text": Entry(OneOf((Text(), TEXTS)), "free text at the head of the report, a list has a paragraph each"),
         "t_end": Entry(Number(), "end of the simulation [s], after the last waypoint", required=True),
         "samples": Entry(Whole(2), "number of sample times", default=4001),
         "benefit": Entry(Flag(), "compare with steps, profiles and minimum jerk", default=False),
@@ -389,6 +402,8 @@ def load_study(path: str | os.PathLike[str]) -> StudyFile:
         experiment=experiment,
         sweep=data.get("sweep"),
         draws=data.get("draws"),
+        author=data.get("author", ""),
+        text=(text,) if isinstance(text := data.get("text", []), str) else tuple(text),
     )
 
 

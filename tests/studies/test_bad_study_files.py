@@ -2,11 +2,14 @@
 
 import math
 import re
+import tomllib
 
 import pytest
+from study_schema import is_json, schema_errors, structure_error
 from study_text import Verbatim, to_toml, valid
 
 from ctrlplan.cli import main
+from ctrlplan.studies.files import StudyError, load_study
 
 RULE = re.compile(r"\b(must|requires?)\b.*\bgot\b")
 
@@ -188,6 +191,8 @@ WRONG = {
     "number longer than Python prints": (f"samples = 0x{'F' * 5000}\n" + to_toml(without("samples")), ["samples"]),
     "samples without end": (valid(samples=10**9), ["samples", "1"]),
     "title is a number": (valid(title=3), ["title", "3"]),
+    "author is a number": (valid(author=3), ["author", "3"]),
+    "text is a number": (valid(text=[3]), ["text", "[3]"]),
     "worth in words": (valid(worth="yes"), ["worth", "'yes'"]),
     "worth is a number": (valid(worth=1), ["worth", "1"]),
     "benefit in words": (valid(benefit="yes"), ["benefit", "'yes'"]),
@@ -405,6 +410,21 @@ def test_plan_refuses_it_too(name, wrong, capsys, tmp_path):
     assert "study.toml" in line
     assert RULE.search(line), line
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_the_schema_rejects_what_is_wrong_in_structure(name, wrong):
+    """And nothing that the reader accepts; numbers that JSON does not have are left to the reader."""
+    path, _ = wrong(name)
+    try:
+        data = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError):
+        return
+    rejected = structure_error(data) is not None
+    if is_json(data) or not rejected:
+        assert bool(schema_errors(data)) == rejected
+    with pytest.raises(StudyError):
+        load_study(path).run()
 
 
 def test_what_was_written_before_stays(wrong, capsys, tmp_path):
