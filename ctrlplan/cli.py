@@ -102,7 +102,7 @@ def _report(options: argparse.Namespace) -> list[Path]:
     _print_status(f"running study {study_file.name}")
     study = study_file.run()
     _print_status("writing the report")
-    return write_report([study], options.out, study_file.title)
+    return write_report([study], options.out, study_file.title, study_file.author)
 
 
 def _plan(options: argparse.Namespace) -> list[Path]:

@@ -93,7 +93,8 @@ def load_metrics(plan: Trajectory, response: ct.TimeResponseData, last: float) -
     error = np.hypot(*(load - plan.jet(t, 0)[0]))
     during, after = t <= last, t >= last
     travelled = None if plan.jumps(0) else plan.jet(np.linspace(plan.start, plan.end, 4001), 0)[0]
-    slack = float(metrics.saturation_time(t, signals["T"], 0.0, np.inf))
+    lasts = t.size > 1  # a run that an event ends at its first sample has integrals of 0
+    slack = float(metrics.saturation_time(t, signals["T"], 0.0, np.inf)) if lasts else 0.0
     return {
         "error_travel": _peak(t[during], error[during]),
         "error_after": _peak(t[after], error[after]),
@@ -105,7 +106,7 @@ def load_metrics(plan: Trajectory, response: ct.TimeResponseData, last: float) -
         "path_length": np.nan
         if travelled is None
         else float(metrics.path_length(np.linspace(plan.start, plan.end, 4001), travelled)),
-        "load_path": float(metrics.path_length(t, load)),
+        "load_path": float(metrics.path_length(t, load)) if lasts else 0.0,
     }
 
 

@@ -8,6 +8,8 @@ plan.csv`` writes only the trajectories, as ``.json`` or in a format of
 .. code-block:: toml
 
     title = "Over the wall"
+    author = "A. Engineer"    # optional
+    text = "For the crane of hall 3."   # optional; a list has a paragraph each
     t_end = 30.0
     samples = 4001            # optional
     benefit = true            # optional: compare with steps, profiles and minimum jerk, in the same time and limits
@@ -50,16 +52,50 @@ Kinds of loops:
 
 Families of plans: trigonometric, polynomial, piecewise, step, s_curve,
 trapezoid, or ``"python:module:Class"``, a class derived from
-`ctrlplan.WaypointSpline`.
+`ctrlplan.WaypointSpline`. Options of a family have the names of its arguments.
+
+Further entries and tables, each optional:
+
+.. code-block:: toml
+
+    waypoints = "path.csv"    # or {csv = "path.csv", speed = 0.5}, in place of tables
+    [limits]                  # as for ctrlplan.margins
+    velocity = 2.0            # of every axis; [2.0, 0.5] by axis
+    x_d2 = [-1.0, 0.5]        # of one signal: minimum and maximum
+    F = {high = 8e3}          # of a quantity of the crane
+    [[plans]]
+    family = "polynomial"
+    fastest = "shape"         # minimum duration under the limits; or "waypoints", "path"
+    avoid = true              # around the obstacles; plans of two axes
+    [[obstacles]]             # shapes: disc, rectangle (x, z), half_plane (normal, offset)
+    shape = "disc"
+    centre = [10.0, 5.0]
+    radius = 1.0
+    [avoid]
+    clearance = 0.3
+    load = 0.5                # radius of the load
+    rope = true               # of a crane
+    [sweep]                   # comparison over values of a number of [loop]
+    parameter = "gain"
+    values = [1.0, 5.0, 25.0] # or {low = 1.0, high = 100.0, count = 21, scale = "log"}
+    [draws]                   # comparison over random numbers of [loop]
+    count = 100
+    parameters = {gain = [2.0, 8.0]}
+
+A sweep varies the plant and its law together. Draws of a crane vary the plant
+alone, whose law has the numbers of [loop]. With a function of a module the
+parameter is an argument of the function, or, in draws, a parameter of a block.
+
+Editors complete and check study files by the JSON Schema
+``ctrlplan/studies/study.schema.json``.
 """
 
 from __future__ import annotations
 
-import inspect
 import os
 import tomllib
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, fields, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -67,17 +103,33 @@ from numpy.typing import NDArray
 
 from ctrlplan._renamed import warn_renamed
 from ctrlplan._types import Data
+from ctrlplan.planning.limits import limit_words
 from ctrlplan.simulation import Event
 from ctrlplan.studies.benefit import benefit_of
 from ctrlplan.studies.comparison import comparison_of
+from ctrlplan.studies.entries import (
+    NUMBERS,
+    TEXTS,
+    Anything,
+    Entry,
+    Flag,
+    Listed,
+    Number,
+    OneOf,
+    Table,
+    Tables,
+    Text,
+    Whole,
+)
 from ctrlplan.studies.experiment import Experiment
-from ctrlplan.studies.loops import build_loop, loop_kind, stated_kind
-from ctrlplan.studies.plans import standard_plans
-from ctrlplan.studies.reading import Reader, StudyError, got, named_in_module, one_line, reference
+from ctrlplan.studies.loops import LOOP, build_loop, loop_kind
+from ctrlplan.studies.planned import AVOID, LIMITS, OBSTACLES, PLANS, Planned, planned
+from ctrlplan.studies.reading import Reader, StudyError
 from ctrlplan.studies.running import Builder, System
+from ctrlplan.studies.sections import Bands, DrawTable, FastestMove, Section, SweepCurves
 from ctrlplan.studies.study import Study
+from ctrlplan.studies.variations import DRAWS, SWEEP, check_variations, drawn, shown_metrics, swept
 from ctrlplan.trajectories import PolySpline, Trajectory, TrigSpline, Waypoint, waypoints_from_csv
-from ctrlplan.trajectories.waypoint_spline import FromWaypoints, families, family_name
 
 __all__ = ["StudyError", "StudyFile", "build_loop", "load_study"]
 
@@ -102,12 +154,20 @@ class StudyFile:
         The plans by name.
     loop : dict
         The table [loop].
+    planned : Planned
+        What was found in planning: minimum durations, margins, clearances.
     units : dict of str to str
         Units by label.
     benefit : bool
         Whether the report contains the benefit of planning.
     experiment : dict
         The table [experiment]: further fields of `Experiment` by name.
+    sweep, draws : dict or None
+        The tables [sweep] and [draws].
+    author : str
+        Author of the report.
+    text : tuple of str
+        Free text of the report, a paragraph each.
     """
 
     path: Path
@@ -118,29 +178,55 @@ class StudyFile:
     waypoints: tuple[Waypoint, ...]
     plans: dict[str, Trajectory]
     loop: Data
+    planned: Planned
     units: dict[str, str] = field(default_factory=dict)
     benefit: bool = False
     experiment: Data = field(default_factory=dict)
+    sweep: Data | None = None
+    draws: Data | None = None
+    author: str = ""
+    text: tuple[str, ...] = ()
 
-    def run(self) -> Study:
+    def run(self, *, progress: bool = False, status: Callable[[str], object] = lambda text: None) -> Study:
         """Simulate and measure.
+
+        Parameters
+        ----------
+        progress : bool, optional
+            Show bars on stderr.
+        status : callable, optional
+            Called with a line at the start of each part.
 
         Raises
         ------
         StudyError
             If the loop does not fit the plans.
         """
-        kind = stated_kind(self.loop, Reader(self.path))
+        kind, reader = loop_kind(self.loop), Reader(self.path)
         loop = kind.build(self.loop, self.path)
         fields_of, choices = kind.experiment(self.loop, self.waypoints, self.experiment, self.path)
+        found_sections: list[Section] = [
+            FastestMove(found, caption=f"Plan {name}: limited signals, limits (dashed), and the active point (marker).")
+            for name, found in self.planned.fastest.items()
+        ]
         try:
             experiment = Experiment(self.plans, self.timepts(loop), waypoints=self.waypoints, **fields_of)
             with np.errstate(over="ignore", invalid="ignore"):  # a diverging run is reported by the simulation
                 found = experiment.run(loop)
                 comparison = comparison_of(experiment, found, self.units, self.parameters(), self.title)
+                if self.sweep is not None:
+                    status(f"running the sweep over {self.sweep['parameter']}")
+                    shown = shown_metrics(self.sweep, comparison.metrics, reader)
+                    swept_plans = swept(self.sweep, kind, self.loop, self.path, experiment, progress)
+                    found_sections.append(SweepCurves(swept_plans, shown))
+                if self.draws is not None:
+                    status(f"running {self.draws['count']} draws of {', '.join(self.draws['parameters'])}")
+                    ensemble = drawn(self.draws, kind, self.loop, self.path, experiment, progress)
+                    found_sections += [Bands(ensemble), DrawTable(ensemble)]
                 if self.benefit:
+                    status("running the baselines")
                     alphas = (plan.alpha for plan in comparison.plans.values() if isinstance(plan, TrigSpline))
-                    choices = replace(choices, alpha=next(alphas, 1.0))
+                    choices = replace(choices, alpha=next(alphas, 1.0), limits=self.planned.limits or choices.limits)
                     benefit = benefit_of(experiment, loop, choices, units=self.units)
                     comparison = comparison.with_benefit(benefit)
         except StudyError:
@@ -151,7 +237,9 @@ class StudyFile:
             raise StudyError(
                 f"{self.path}: loop: simulation must not fail, got {type(error).__name__}: {error}"
             ) from error
-        return kind.study(self.name, self.title, comparison)
+        study = kind.study(self.name, self.title, comparison, self.planned.wall)
+        sections = (*found_sections, *study.sections)
+        return replace(study, notes=(*study.notes, *_planning_notes(self.planned)), sections=sections, text=self.text)
 
     def timepts(self, loop: System | Builder) -> NDArray[np.float64]:
         """Sample times: evenly spaced, with those of the waypoints, or multiples of the period of a discrete loop."""
@@ -166,17 +254,97 @@ class StudyFile:
 
     def parameters(self) -> dict[str, object]:
         """Parameters of the study, for the report."""
-        stated = stated_kind(self.loop, Reader(self.path)).parameters(self.loop)
+        stated = loop_kind(self.loop).parameters(self.loop)
         loop = {f"loop {key}": value for key, value in stated.items()}
         plans: dict[str, object] = {f"plan {name}": _described(plan) for name, plan in self.plans.items()}
         points: dict[str, object] = {f"waypoint {i}": repr(w) for i, w in enumerate(self.waypoints)}
         run = f"{self.waypoints[0].time:g} to {self.t_end:g} s, {self.samples} samples"
-        return loop | plans | points | {"simulated time": run}
+        limits: dict[str, object] = {
+            f"limit of {name}": limit_words(limit) for name, limit in self.planned.limits.items()
+        }
+        return loop | plans | points | limits | {"simulated time": run}
 
 
-_ENTRIES = ("title", "t_end", "samples", "benefit", "worth", "units", "experiment", "loop", "plans", "waypoints")
-_EXPERIMENT = ("start", "band", "outputs", "controls", "initial_state", "params", "events", "measures")
-"""Fields of `Experiment` in the table [experiment]; other fields have separate entries."""
+_NUMBER_OR_FREE = Number(finite=False)
+_WAYPOINTS = OneOf(
+    (
+        Tables(
+            Table(
+                {"time": Entry(Number(), "time [s]", required=True)},
+                Listed(_NUMBER_OR_FREE, "a list of numbers"),
+            ),
+            minimum=2,
+        ),
+        Text(),
+        Table(
+            {
+                "csv": Entry(Text(), "path of a CSV file, relative to the study file", required=True),
+                "time": Entry(OneOf((Text(), Whole(0))), "column of the times, by name or number"),
+                "columns": Entry(
+                    Listed(OneOf((Text(), Whole(0))), "a list of names or numbers"), "columns that are read"
+                ),
+                "speed": Entry(Number(above=0.0), "speed along the path [unit/s], for files without times"),
+            }
+        ),
+    )
+)
+_LIMIT = Number(finite=False)
+_EXPERIMENT = Table(
+    {
+        "start": Entry(Number(), "time from which metrics count [s]"),
+        "band": Entry(Number(above=0.0), "half width of the settling band, relative to the range of the plan"),
+        "outputs": Entry(TEXTS, "outputs of the loop that follow the plan"),
+        "controls": Entry(TEXTS, "outputs of the loop that are controls"),
+        "initial_state": Entry(OneOf((Number(), NUMBERS)), "state at the first sample time"),
+        "params": Entry(Table({}, Anything()), "parameters of the blocks"),
+        "events": Entry(
+            Tables(
+                Table(
+                    {
+                        "signal": Entry(Text(), "label of a signal", required=True),
+                        "low": Entry(_LIMIT, "minimum"),
+                        "high": Entry(_LIMIT, "maximum"),
+                        "stop": Entry(Flag(), "end the run where the signal leaves its limits"),
+                        "name": Entry(Text(), "name of the event"),
+                    }
+                )
+            ),
+            "limits whose crossings are recorded",
+        ),
+        "measures": Entry(TEXTS, "metrics, by name"),
+    }
+)
+STUDY = Table(
+    {
+        "waypoints": Entry(
+            _WAYPOINTS,
+            "waypoints of the plans: time and, by axis, position, velocity, acceleration, ..., nan where free; or a "
+            "CSV file",
+            required=True,
+        ),
+        "title": Entry(Text(), "heading of the page"),
+        "author": Entry(Text(), "author of the report"),
+        "text": Entry(OneOf((Text(), TEXTS)), "free text at the head of the report, a list has a paragraph each"),
+        "t_end": Entry(Number(), "end of the simulation [s], after the last waypoint", required=True),
+        "samples": Entry(Whole(2), "number of sample times", default=4001),
+        "benefit": Entry(Flag(), "compare with steps, profiles and minimum jerk", default=False),
+        "worth": Entry(Flag(), "deprecated name of benefit"),
+        "loop": Entry(LOOP, "closed loop", required=True),
+        "units": Entry(Table({}, Text()), "units of axes and signals"),
+        "plans": Entry(PLANS, "plans that are compared; default: step, polynomial, trigonometric, piecewise"),
+        "limits": Entry(
+            LIMITS,
+            "limits of velocity, acceleration, jerk, snap, of a derivative of one axis (x_d1), or of a quantity of "
+            "the plant: a number, by axis [1.0, 2.0], [minimum, maximum] of one signal, or {low = ..., high = ...}",
+        ),
+        "obstacles": Entry(OBSTACLES, "obstacles in the plane of the plans, for plans of two axes"),
+        "avoid": Entry(AVOID, "how plans with avoid = true go around the obstacles"),
+        "experiment": Entry(_EXPERIMENT, "further fields of ctrlplan.Experiment"),
+        "sweep": Entry(SWEEP, "comparison over values of a parameter"),
+        "draws": Entry(DRAWS, "comparison over random parameters"),
+    }
+)
+"""Entries of a study file: names, types, ranges and meaning."""
 
 
 def load_study(path: str | os.PathLike[str]) -> StudyFile:
@@ -197,35 +365,45 @@ def load_study(path: str | os.PathLike[str]) -> StudyFile:
         With a message of one line: the condition, the value given, and the place in the file.
     """
     source = Path(path)
-    data = _parsed(source)
     reader = _FileReader(source)
-    reader.known(data, _ENTRIES, "the file")
-    waypoints = reader.waypoints(data)
-    t_end = reader.number(data, "t_end", "t_end", default=None)
+    data: Data = STUDY.read(_parsed(source), "", reader)
+    loop = data["loop"]
+    kind = loop_kind(loop)
+    waypoints = reader.waypoints(data["waypoints"], kind.axes)
+    t_end = data["t_end"]
     if not t_end > waypoints[-1].time:
         raise reader.error("t_end", f"must be after the last waypoint at {waypoints[-1].time:g} s, got {t_end:g}")
-    loop = reader.table(data, "loop")
-    kind = stated_kind(loop, reader)
-    kind.check(loop, reader)
-    samples = reader.number(data, "samples", "samples", default=4001.0)
-    if samples != int(samples) or samples < 2:
-        raise reader.error("samples", f"must be an integer of at least 2, got {samples:g}")
-    title = data.get("title", source.stem)
-    if not isinstance(title, str):
-        raise reader.error("title", f"must be a string, got {got(title)}")
+    kind.check(loop, source)
+    check_variations(data, kind, reader)
     benefit = reader.benefit(data)
-    units = reader.table(data, "units", required=False)
-    for label, unit in units.items():
-        if not isinstance(unit, str):
-            raise reader.error(f"units.{label}", f"must be a string, got {got(unit)}")
+    units = data.get("units", {})
+    for label in units:
         known = [*(waypoints[0].labels or ()), *(kind.signals or ())]
         if kind.signals is not None and label not in known:
             raise reader.error(f"units.{label}", f"must be of one of {', '.join(known)}, got {label!r}")
-    plans = reader.plans(data, waypoints)
-    _check_memory(samples, len(plans), benefit, f"{source}: samples")
-    experiment = reader.experiment(data, plans, (waypoints[0].time, t_end))
+    found = planned(data, waypoints, kind.crane(loop, source), reader)
+    for name, plan in found.plans.items():
+        if plan.end >= t_end:
+            raise reader.error("t_end", f"must be after the end of the plan {name} at {plan.end:g} s, got {t_end:g}")
+    _check_memory(data["samples"], len(found.plans), benefit, f"{source}: samples")
+    experiment = reader.experiment(data.get("experiment", {}), found.plans, (waypoints[0].time, t_end))
     return StudyFile(
-        source, source.stem, title, t_end, int(samples), waypoints, plans, loop, units, benefit, experiment
+        path=source,
+        name=source.stem,
+        title=data.get("title", source.stem),
+        t_end=t_end,
+        samples=data["samples"],
+        waypoints=waypoints,
+        plans=found.plans,
+        loop=loop,
+        planned=found,
+        units=units,
+        benefit=benefit,
+        experiment=experiment,
+        sweep=data.get("sweep"),
+        draws=data.get("draws"),
+        author=data.get("author", ""),
+        text=(text,) if isinstance(text := data.get("text", []), str) else tuple(text),
     )
 
 
@@ -271,25 +449,20 @@ def _parsed(source: Path) -> Data:
 
 
 class _FileReader(Reader):
-    """Reader of the tables of a study file."""
+    """Reader of what the tables of a study file describe, once their structure has been checked."""
 
-    def waypoints(self, data: Data) -> tuple[Waypoint, ...]:
-        loop = data.get("loop")
-        kind = loop_kind(loop.get("kind")) if isinstance(loop, dict) else None
-        first = () if kind is None else kind.axes
-        if isinstance(data.get("waypoints"), str | dict):
-            return self.waypoints_of_csv(data["waypoints"], first)
+    def waypoints(self, stated: list[Data] | str | Data, first: Sequence[str]) -> tuple[Waypoint, ...]:
+        """Waypoints of the entry `waypoints`, with the axes `first` before all others."""
+        if not isinstance(stated, list):
+            return self.waypoints_of_csv(stated, first)
         points = []
-        for i, table in enumerate(self.tables(data, "waypoints")):
-            place = f"waypoints[{i}]"
-            time = self.number(table, "time", f"{place}.time", default=None)
+        for i, table in enumerate(stated):
             labels = [label for label in first if label in table]
             labels += [label for label in table if label not in ("time", *first)]
-            jets = {label: self.numbers(table, label, f"{place}.{label}", finite=False) for label in labels}
             try:
-                points.append(Waypoint.from_jets(time, **jets))
+                points.append(Waypoint.from_jets(table["time"], **{label: table[label] for label in labels}))
             except ValueError as error:
-                raise self.error(place, error) from None
+                raise self.error(f"waypoints[{i}]", error) from None
         try:
             return PolySpline(points, warn=False).waypoints
         except ValueError as error:
@@ -298,9 +471,6 @@ class _FileReader(Reader):
     def waypoints_of_csv(self, stated: str | Data, first: Sequence[str]) -> tuple[Waypoint, ...]:
         """Waypoints of a CSV file, named by its path or by a table with the arguments of `waypoints_from_csv`."""
         table: Data = {"csv": stated} if isinstance(stated, str) else stated
-        self.known(table, ("csv", "time", "columns", "speed"), "waypoints")
-        if not isinstance(table.get("csv"), str):
-            raise self.error("waypoints.csv", f"must be the path of a CSV file, got {got(table.get('csv'))}")
         options: Data = {key: value for key, value in table.items() if key != "csv"}
         try:
             points = waypoints_from_csv(self.path.parent / table["csv"], **options)
@@ -317,107 +487,33 @@ class _FileReader(Reader):
 
     def benefit(self, data: Data) -> bool:
         """Whether the report contains the benefit of planning; "worth" is the former name of the entry."""
-        if "worth" in data and "benefit" in data:
+        if "worth" not in data:
+            return bool(data["benefit"])
+        if data["benefit"]:
             raise self.error("worth", "must not be given together with benefit, got both")
-        key = "worth" if "worth" in data else "benefit"
-        value = data.get(key, False)
-        if not isinstance(value, bool):
-            raise self.error(key, f"must be true or false, got {got(value)}")
-        if key == "worth":
-            warn_renamed(f"{self.path}: worth =", "benefit =")
-        return value
+        warn_renamed(f"{self.path}: worth =", "benefit =")
+        return bool(data["worth"])
 
-    def experiment(self, data: Data, plans: dict[str, Trajectory], span: tuple[float, float]) -> Data:
+    def experiment(self, stated: Data, plans: dict[str, Trajectory], span: tuple[float, float]) -> Data:
         """The table [experiment], checked as `Experiment` does."""
-        found = dict(self.table(data, "experiment", required=False))
-        self.known(found, _EXPERIMENT, "experiment")
-        events = found.get("events", [])
-        if not isinstance(events, list) or not all(isinstance(table, dict) for table in events):
-            raise self.error("experiment.events", f"must be a list of tables with the entry signal, got {got(events)}")
-        for key in ("start", "band"):
-            if key in found:
-                self.number(found, key, f"experiment.{key}", default=None)
-        for table in events:
-            self.known(table, [entry.name for entry in fields(Event)], "experiment.events")
-            if not isinstance(table.get("signal"), str):
-                raise self.error(
-                    "experiment.events", f"must have the entry signal, the label of a signal, got {got(table)}"
-                )
+        found = dict(stated)
         try:
-            if events:
-                found["events"] = [Event(**table) for table in events]
+            if "events" in found:
+                found["events"] = [Event(**table) for table in found["events"]]
             Experiment(plans, np.linspace(*span, 1001), **found)
         except (ValueError, TypeError) as error:
             raise self.error("experiment", error) from None
         return found
 
-    def family(self, family: object, place: str) -> type[FromWaypoints] | None:
-        """Class of a family of trajectories; None for one of `_FREE_FAMILIES`."""
-        known = families()
-        if isinstance(family, str):
-            if family in _FREE_FAMILIES:
-                return None
-            if family in known:
-                return known[family]
-            if reference(family) is not None:
-                return _kind_of_module(family, self.path, place)
-        names = ", ".join([*sorted(known), *_FREE_FAMILIES, '"python:module:Class"'])
-        raise self.error(place, f"must be one of {names}, got {got(family)}")
 
-    def plans(self, data: Data, waypoints: tuple[Waypoint, ...]) -> dict[str, Trajectory]:
-        plans: dict[str, Trajectory] = {}
-        for i, table in enumerate(self.tables(data, "plans")):
-            place = f"plans[{i}]"
-            family = table.get("family", table.get("name"))
-            kind = self.family(family, f"{place}.family")
-            name = table.get("name", family if kind is None else family_name(kind))
-            if not isinstance(name, str) or not name or name in plans:
-                raise self.error(f"{place}.name", f"must be a unique name, got {got(name)}")
-            choices = () if kind is None else kind.options
-            self.known(table, ("name", "family", *choices), place)
-            chosen = {key: self.choice(table, key, f"{place}.{key}") for key in choices if key in table}
-            try:
-                plans[name] = (
-                    _FREE_FAMILIES[str(family)](waypoints)
-                    if kind is None
-                    else _made(kind, waypoints, str(family), chosen)
-                )
-            except (ValueError, TypeError) as error:
-                raise self.error(place, error) from None
-            except Exception as error:  # of a user's own class
-                raise self.error(place, f"construction must not fail, got {type(error).__name__}: {error}") from error
-        return plans or standard_plans(waypoints)
-
-
-_FREE_FAMILIES: dict[str, Callable[[tuple[Waypoint, ...]], Trajectory]] = {
-    "step": lambda waypoints: standard_plans(waypoints)["step"],
-}
-"""Families without options that are not splines through waypoints."""
-
-
-def _kind_of_module(family: str, path: Path, place: str) -> type[FromWaypoints]:
-    """Class of trajectories in a module next to the study file or in an installed package."""
-    try:
-        kind = named_in_module(family, path.resolve().parent)
-    except (Exception, SystemExit) as error:  # of a user's own module
-        raise StudyError(
-            f"{path}: {place}: must name a class of a module, got {family!r}: "
-            f"{type(error).__name__}: {one_line(str(error), 300)}"
-        ) from None
-    if not (inspect.isclass(kind) and issubclass(kind, FromWaypoints)) or inspect.isabstract(kind):
-        what = kind.__name__ if inspect.isclass(kind) else type(kind).__name__
-        raise StudyError(f"{path}: {place}: {family!r} must be a class derived from WaypointSpline, got {what}")
-    return kind
-
-
-def _made(kind: type[FromWaypoints], waypoints: tuple[Waypoint, ...], family: str, chosen: Data) -> Trajectory:
-    """Plan of a family with its options; ValueError if a required option is missing."""
-    parameters = inspect.signature(kind).parameters
-    for name in kind.options:
-        if name not in chosen and name in parameters and parameters[name].default is inspect.Parameter.empty:
-            known = ", a number in [0, 2 pi)" if name == "alpha" else ""
-            raise ValueError(f"a plan of the family {family} requires {name}{known}, got none")
-    return kind.from_waypoints(waypoints, **chosen)
+def _planning_notes(found: Planned) -> Iterator[str]:
+    """Limits and clearances of the plans, in sentences."""
+    for name, one in found.margins.items():
+        verdict = "satisfies all limits" if one.satisfied else "violates a limit"
+        yield f"Plan {name} {verdict}. The smallest margin: {one.active}."
+    for name, clear in found.clearances.items():
+        place = f"obstacles[{clear.obstacle}] at {clear.time:.4g} s"
+        yield f"The clearance of plan {name} is {clear.minimum:.4g}, of its {clear.part} from {place}."
 
 
 def _described(plan: Trajectory) -> str:

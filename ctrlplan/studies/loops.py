@@ -5,11 +5,11 @@ from __future__ import annotations
 import inspect
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 from types import UnionType
-from typing import ClassVar, Union, get_args, get_origin
+from typing import ClassVar, TypeAlias, Union, get_args, get_origin
 
 import control as ct
 import numpy as np
@@ -19,13 +19,17 @@ from ctrlplan.studies.baselines import smoother_polynomials
 from ctrlplan.studies.benefit import Choices
 from ctrlplan.studies.comparison import Comparison
 from ctrlplan.studies.crane_setup import CRANE_MEASURES, LOAD, SLACK, marked_slack
-from ctrlplan.studies.reading import Reader, StudyError, got, is_number, named_in_module, one_line, reference
+from ctrlplan.studies.entries import NUMBERS, PAIR, Entries, Entry, Flag, Number, Table, Text, Variants
+from ctrlplan.studies.reading import Reader, StudyError, got, named_in_module, one_line, reference
 from ctrlplan.studies.running import Builder, System
-from ctrlplan.studies.sections import AnimatedCrane, CraneMotion, CranePaths, CraneTime, PlanCurves
+from ctrlplan.studies.sections import AnimatedCrane, CraneMotion, CranePaths, CraneTime, PlanCurves, Wall
 from ctrlplan.studies.study import Study
 from ctrlplan.systems.plants import LAWS, Crane, crane_loop, unity_feedback_loop
-from ctrlplan.systems.plants.crane.laws import as_law
+from ctrlplan.systems.plants.crane.laws import OLD_NAMES, as_law
 from ctrlplan.trajectories import Trajectory, Waypoint
+
+Varied: TypeAlias = "System | Builder | Callable[..., System | Builder]"
+"""A loop whose blocks read parameters, or a function of these that returns a loop."""
 
 
 class LoopKind(ABC):
@@ -33,7 +37,7 @@ class LoopKind(ABC):
 
     Attributes
     ----------
-    entries : tuple of str
+    entries : mapping of str to Entry
         Entries of [loop] in addition to ``kind``.
     axes : tuple of str
         Labels of waypoints that come first, in any order of the file.
@@ -41,7 +45,7 @@ class LoopKind(ABC):
         Signals that may have a unit, in addition to the axes; None for any name.
     """
 
-    entries: ClassVar[tuple[str, ...]] = ()
+    entries: ClassVar[Entries] = {}
     axes: ClassVar[tuple[str, ...]] = ()
     signals: ClassVar[tuple[str, ...] | None] = None
 
@@ -49,9 +53,22 @@ class LoopKind(ABC):
     def build(self, table: Data, path: Path) -> System | Builder:
         """Loop, or a function that builds a loop for each plan; StudyError if that is not possible."""
 
-    def check(self, table: Data, reader: Reader) -> None:
-        """Check the table and add its defaults; StudyError if it is wrong."""
-        reader.known(table, ("kind", *self.entries), "loop")
+    def check(self, table: Data, path: Path) -> None:  # noqa: B027 (nothing to check, unless a kind has more)
+        """Check what can be checked before planning, of a table that has been read; StudyError if it is wrong."""
+
+    def crane(self, table: Data, path: Path) -> Crane | None:
+        """Crane of the loop, if it is the loop of one."""
+        return None
+
+    def check_parameter(self, name: str, place: str, reader: Reader) -> None:
+        """Raise if there is no such parameter for [sweep] and [draws], as far as is known before the run."""
+        known = [key for key, entry in self.entries.items() if isinstance(entry.kind, Number)]
+        if name not in known:
+            raise reader.error(place, f"must be a number of [loop], one of {', '.join(known)}, got {name!r}")
+
+    def varied(self, names: Sequence[str], table: Data, path: Path) -> Varied:
+        """Function of parameters that returns a loop, or a loop whose blocks read them; for [draws]."""
+        return _of_parameters(names, lambda **values: self.build(table | values, path))
 
     def experiment(self, table: Data, waypoints: Sequence[Waypoint], stated: Data, path: Path) -> tuple[Data, Choices]:
         """Fields of the experiment, and options of the benefit of planning."""
@@ -61,24 +78,24 @@ class LoopKind(ABC):
         """Parameters of the loop, for the report."""
         return dict(table)
 
-    def study(self, name: str, title: str, comparison: Comparison) -> Study:
-        """Study of the comparison, with the sections of this kind of loop."""
+    def study(self, name: str, title: str, comparison: Comparison, wall: Wall = None) -> Study:
+        """Study of the comparison, with the sections of this kind of loop; `wall` is an obstacle to be drawn."""
         return Study(name, title, comparison, notes=comparison.notes)
 
 
 class LinearLoop(LoopKind):
     """Transfer function num/den with a gain, in unity feedback."""
 
-    entries = ("num", "den", "gain")
+    entries: ClassVar[Entries] = {
+        "num": Entry(NUMBERS, "numerator of the plant, highest power first", required=True),
+        "den": Entry(NUMBERS, "denominator of the plant, highest power first", required=True),
+        "gain": Entry(Number(), "gain of the controller", default=1.0),
+    }
     signals = ("y", "u", "e")
 
-    def check(self, table: Data, reader: Reader) -> None:
-        """Check num, den and gain, and that the loop can be built."""
-        super().check(table, reader)
-        for key in ("num", "den"):
-            table[key] = reader.numbers(table, key, f"loop.{key}")
-        table["gain"] = reader.number(table, "gain", "loop.gain", default=1.0)
-        self.build(table, reader.path)
+    def check(self, table: Data, path: Path) -> None:
+        """Check that the loop can be built."""
+        self.build(table, path)
 
     def build(self, table: Data, path: Path) -> System | Builder:
         """Loop with the outputs y and u."""
@@ -91,24 +108,30 @@ class LinearLoop(LoopKind):
 class CraneLoop(LoopKind):
     """The crane with one of its control laws."""
 
-    entries = ("law", "force_limits", "torque_limits", *(entry.name for entry in fields(Crane)))
+    entries: ClassVar[Entries] = {
+        "law": Entry(Text((*LAWS, *OLD_NAMES)), "control law"),
+        "force_limits": Entry(PAIR, "limits of the force of the trolley [N]"),
+        "torque_limits": Entry(PAIR, "limits of the torque of the drum [N m]"),
+        **{
+            entry.name: Entry(
+                Flag() if isinstance(entry.default, bool) else Number(),
+                f"parameter {entry.name} of ctrlplan.plants.Crane",
+            )
+            for entry in fields(Crane)
+        },
+    }
     axes = ("x", "z")
 
-    def check(self, table: Data, reader: Reader) -> None:
+    def check(self, table: Data, path: Path) -> None:
         """Check that crane and law can be built."""
-        super().check(table, reader)
-        self.build(table, reader.path)
+        self.build(table, path)
 
     def build(self, table: Data, path: Path) -> System | Builder:
         """Loop of each plan: steps, shaped or not, with the set-point law, all other plans with the given law."""
-        crane = self._crane(table, path)
-        try:
-            law = as_law(table.get("law", "generator"))
-        except (ValueError, TypeError):
-            raise StudyError(f"{path}: loop.law: must be one of {', '.join(LAWS)}, got {got(table['law'])}") from None
+        crane, law = self.crane(table, path), as_law(table.get("law", "generator"))
         limits = {key: table[key] for key in ("force_limits", "torque_limits") if key in table}
         for key, pair in limits.items():
-            if not (isinstance(pair, list) and len(pair) == 2 and all(map(is_number, pair)) and pair[0] < pair[1]):
+            if not pair[0] < pair[1]:
                 raise StudyError(f"{path}: loop.{key}: must be two increasing numbers, got {got(pair)}")
 
         def build(name: str, plan: Trajectory) -> System:
@@ -121,7 +144,7 @@ class CraneLoop(LoopKind):
         labels = waypoints[0].labels or ()
         if set(labels) != set(self.axes):
             raise StudyError(f"{path}: waypoints: axes of a crane must be x and z (down), got {', '.join(labels)}")
-        crane = self._crane(table, path)
+        crane = self.crane(table, path)
         depth = float(np.mean([point.position[labels.index("z")] for point in waypoints]))
         measures = CRANE_MEASURES | {"load": LOAD}
         own = [replace(measure, name=name) for name, measure in measures.items()]
@@ -142,12 +165,17 @@ class CraneLoop(LoopKind):
         stated = {"kind": "crane", "law": "generator", "force_limits": "none", "torque_limits": "none"} | table
         return stated | {entry.name: own.get(entry.name, entry.default) for entry in fields(Crane)}
 
-    def study(self, name: str, title: str, comparison: Comparison) -> Study:
+    def varied(self, names: Sequence[str], table: Data, path: Path) -> Varied:
+        """Loop of each plan, whose crane reads the parameters; its law has those of the table."""
+        return self.build(table, path)
+
+    def study(self, name: str, title: str, comparison: Comparison, wall: Wall = None) -> Study:
         """With the paths, the motion of the crane and its animation."""
-        sections = (CranePaths(), PlanCurves(), CraneTime(), CraneMotion(), AnimatedCrane())
+        sections = (CranePaths(wall=wall), PlanCurves(), CraneTime(), CraneMotion(wall=wall), AnimatedCrane(wall=wall))
         return Study(name, title, marked_slack(comparison), notes=comparison.notes, sections=sections)
 
-    def _crane(self, table: Data, path: Path) -> Crane:
+    def crane(self, table: Data, path: Path) -> Crane:
+        """Crane with the parameters of the table."""
         try:
             return Crane(**{key: value for key, value in table.items() if key in _OF_CRANE})
         except (ValueError, TypeError) as error:
@@ -161,20 +189,43 @@ class LoopOfModule(LoopKind):
     """Loop returned by a function of a module, which must be annotated to return one."""
 
     def build(self, table: Data, path: Path) -> System | Builder:
-        """Loop returned by the function."""
-        kind = table["kind"]
+        """Loop returned by the function, with parameters of a sweep as its arguments."""
+        values = {name: value for name, value in table.items() if name != "kind"}
+        return self._returned(table, self._function(table, path), path, **values)
+
+    def check_parameter(self, name: str, place: str, reader: Reader) -> None:
+        """Nothing is known before the function is."""
+
+    def varied(self, names: Sequence[str], table: Data, path: Path) -> Varied:
+        """The function, if the parameters are among its arguments; otherwise its loop, whose blocks read them."""
+        function = self._function(table, path)
+        known = inspect.signature(function).parameters
+        if not all(name in known for name in names):
+            return self._returned(table, function, path)
+        return _of_parameters(names, lambda **values: self._returned(table, function, path, **values))
+
+    def _function(self, table: Data, path: Path) -> Callable[..., object]:
         try:
-            function = named_in_module(kind, path.resolve().parent)
-            _check_declared(function)
-            loop: object = function()  # type: ignore[operator]
+            function = named_in_module(table["kind"], path.resolve().parent)
+            return _checked_function(function)
         except (Exception, SystemExit) as error:  # of a user's own module
-            must = f"must name a function of a module, such as {_SIGNATURE}"
-            raise StudyError(
-                f"{path}: loop.kind: {must}, got {kind!r}: {type(error).__name__}: {one_line(str(error), 300)}"
-            ) from None
+            raise self._wrong(table, path, error) from None
+
+    def _returned(self, table: Data, function: Callable[..., object], path: Path, **values: float) -> System:
+        try:
+            loop = function(**values)
+        except (Exception, SystemExit) as error:  # of a user's own module
+            raise self._wrong(table, path, error) from None
         if not isinstance(loop, ct.InputOutputSystem):
-            raise StudyError(f"{path}: loop.kind: {kind!r} must return a control system, got {type(loop).__name__}")
+            raise StudyError(
+                f"{path}: loop.kind: {table['kind']!r} must return a control system, got {type(loop).__name__}"
+            )
         return loop
+
+    def _wrong(self, table: Data, path: Path, error: BaseException) -> StudyError:
+        must = f"must name a function of a module, such as {_SIGNATURE}"
+        reason = f"{type(error).__name__}: {one_line(str(error), 300)}"
+        return StudyError(f"{path}: loop.kind: {must}, got {table['kind']!r}: {reason}")
 
 
 LOOP_KINDS: dict[str, LoopKind] = {"linear": LinearLoop(), "crane": CraneLoop()}
@@ -188,38 +239,43 @@ plans "python:module:Class", a class derived from `WaypointSpline`.
 """
 
 
-def loop_kind(kind: object) -> LoopKind | None:
-    """Kind of loop of an entry ``kind``; None if it is unknown."""
-    if reference(kind) is not None:
-        return LoopOfModule()
-    return LOOP_KINDS.get(kind) if isinstance(kind, str) else None
+def _of_parameters(names: Sequence[str], function: Callable[..., System | Builder]) -> Varied:
+    """Function with arguments of some names, by which `monte_carlo` knows it."""
+    keyword = inspect.Parameter.KEYWORD_ONLY
+    setattr(function, "__signature__", inspect.Signature([inspect.Parameter(name, keyword) for name in names]))  # noqa: B010
+    return function
+
+
+LOOP = Variants(
+    "kind",
+    lambda: {name: Table(kind.entries) for name, kind in LOOP_KINDS.items()},
+    'kind of loop, or "python:module:function", a function annotated to return a control system',
+    "function",
+)
+"""Table [loop]."""
+
+
+def loop_kind(table: Data) -> LoopKind:
+    """Kind of loop of a table [loop] that has been read."""
+    return LoopOfModule() if reference(table["kind"]) is not None else LOOP_KINDS[table["kind"]]
 
 
 def build_loop(table: Data, path: Path) -> System | Builder:
-    """Loop of the checked table [loop] of a study file.
+    """Loop of the table [loop] of a study file.
 
     Raises
     ------
     StudyError
         If it cannot be built.
     """
-    return stated_kind(table, Reader(path)).build(table, path)
-
-
-def stated_kind(table: Data, reader: Reader) -> LoopKind:
-    """Kind of the table [loop]; StudyError if it is unknown."""
-    kind = loop_kind(table.get("kind"))
-    if kind is None:
-        names = ", ".join([*LOOP_KINDS, '"python:module:function"'])
-        raise reader.error("loop.kind", f"must be one of {names}, got {got(table.get('kind'))}")
-    return kind
+    return loop_kind(table).build(table, path)
 
 
 _SIGNATURE = "def build() -> control.InputOutputSystem:"
 
 
-def _check_declared(function: object) -> None:
-    """Raise if an object is not a function without arguments that is annotated to return a control system."""
+def _checked_function(function: object) -> Callable[..., object]:
+    """Function without required arguments that is annotated to return a control system."""
     if not callable(function) or inspect.isclass(function) or not inspect.isfunction(inspect.unwrap(function)):
         raise TypeError(f"object must be a Python function, got {type(function).__name__}")
     try:
@@ -235,3 +291,4 @@ def _check_declared(function: object) -> None:
     if not all(inspect.isclass(kind) and issubclass(kind, ct.InputOutputSystem) for kind in kinds):
         got = "none" if declared is signature.empty else declared
         raise TypeError(f"return annotation must be a class of control systems, got {got}")
+    return function

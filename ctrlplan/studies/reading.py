@@ -8,7 +8,6 @@ import math
 import re
 import sys
 from collections.abc import Collection
-from functools import partial
 from pathlib import Path
 from types import ModuleType
 
@@ -20,6 +19,10 @@ class StudyError(ValueError):
 
     def __init__(self, message: object) -> None:
         super().__init__(one_line(str(message)))
+
+
+class StructureError(StudyError):
+    """Error in the name, the type or the range of an entry, which the JSON Schema finds as well."""
 
 
 class Reader:
@@ -38,49 +41,15 @@ class Reader:
         """Error at an entry."""
         return StudyError(f"{self.path}: {place}: {message}")
 
+    def structure(self, place: str, message: object) -> StructureError:
+        """Error in the name, the type or the range of an entry."""
+        return StructureError(f"{self.path}: {place}: {message}")
+
     def known(self, table: Data, names: Collection[str], place: str) -> None:
         """Raise if a table has an unknown entry."""
         for key in table:
             if key not in names:
-                raise self.error(place, f"entries must be among {', '.join(names)}, got {key!r}")
-
-    def table(self, data: Data, key: str, required: bool = True) -> Data:
-        """Table of an entry; an empty one if it is missing and not required."""
-        found = data.get(key)
-        if found is None and not required:
-            return {}
-        if not isinstance(found, dict):
-            raise self.error(key, f"must be a table [{key}], got {'none' if found is None else got(found)}")
-        return found
-
-    def tables(self, data: Data, key: str) -> list[Data]:
-        """List of tables of an entry; empty if it is missing."""
-        found = data.get(key, [])
-        if not isinstance(found, list) or not all(isinstance(t, dict) for t in found):
-            raise self.error(key, f"must be tables [[{key}]], got {got(found)}")
-        return found
-
-    def number(self, table: Data, key: str, place: str, default: float | None) -> float:
-        """Finite number of an entry; the default if it is missing."""
-        value = table.get(key, default)
-        if value is None or not is_number(value):
-            raise self.error(place, f"must be a finite number, got {'none' if value is None else got(value)}")
-        return float(value)
-
-    def numbers(self, table: Data, key: str, place: str, finite: bool = True) -> list[float]:
-        """List of numbers of an entry."""
-        value = table.get(key)
-        if not isinstance(value, list) or not all(is_number(v, finite) for v in value):
-            kind = "finite numbers" if finite else "numbers"
-            raise self.error(place, f"must be a list of {kind}, got {'none' if value is None else got(value)}")
-        return [float(v) for v in value]
-
-    def choice(self, table: Data, key: str, place: str) -> float | str | list[float]:
-        """Option of a plan: a number, a list with one number per axis, or a string, which the plan checks."""
-        value = table[key]
-        if isinstance(value, str):
-            return value
-        return (self.numbers if isinstance(value, list) else partial(self.number, default=None))(table, key, place)
+                raise self.structure(place, f"entries must be among {', '.join(names)}, got {key!r}")
 
 
 def reference(text: object) -> tuple[str, str] | None:

@@ -2,11 +2,14 @@
 
 import math
 import re
+import tomllib
 
 import pytest
+from study_schema import is_json, schema_errors, structure_error
 from study_text import Verbatim, to_toml, valid
 
 from ctrlplan.cli import main
+from ctrlplan.studies.files import StudyError, load_study
 
 RULE = re.compile(r"\b(must|requires?)\b.*\bgot\b")
 
@@ -49,6 +52,15 @@ REST = [0.0, 0.0, 0.0]
 END = [20.0, 0.0, 0.0]
 BIG = 10**400
 
+MOVE = [{"time": 0.0, "x": REST}, {"time": 16.0, "x": END}]
+QUICK = {"plans": [{"family": "polynomial", "fastest": "shape"}], "waypoints": MOVE}
+PLANAR = [{"time": 0.0, "x": REST, "y": REST}, {"time": 16.0, "x": END, "y": REST}]
+DISC = {"shape": "disc", "centre": [10.0, 0.5], "radius": 2.0}
+AROUND = {"plans": [{"family": "polynomial", "avoid": True}], "waypoints": PLANAR, "obstacles": [DISC], "units": {}}
+SWEPT = {"parameter": "gain", "values": [1.0, 2.0]}
+DRAWN = {"count": 3, "parameters": {"gain": [1.0, 2.0]}}
+
+
 # What is wrong -> (data or text of the file, what the line must mention beside the file itself).
 WRONG = {
     "not TOML": ("title = \n", ["TOML", "line 1"]),
@@ -71,7 +83,7 @@ WRONG = {
     "choice of another family": (changed("plans", 1, "alpha", to=1.0), ["plans[1]", "alpha"]),
     "unit of nothing": (changed("units", "q", to="m"), ["units", "q"]),
     # Waypoints
-    "no waypoints": (without("waypoints"), ["waypoints", "got 0"]),
+    "no waypoints": (without("waypoints"), ["waypoints", "got none"]),
     "empty waypoints": (valid(waypoints=[]), ["waypoints", "got 0"]),
     "one waypoint": (points((0.0, REST)), ["waypoints", "got 1"]),
     "waypoints are a number": (valid(waypoints=3), ["waypoints", "3"]),
@@ -179,6 +191,8 @@ WRONG = {
     "number longer than Python prints": (f"samples = 0x{'F' * 5000}\n" + to_toml(without("samples")), ["samples"]),
     "samples without end": (valid(samples=10**9), ["samples", "1"]),
     "title is a number": (valid(title=3), ["title", "3"]),
+    "author is a number": (valid(author=3), ["author", "3"]),
+    "text is a number": (valid(text=[3]), ["text", "[3]"]),
     "worth in words": (valid(worth="yes"), ["worth", "'yes'"]),
     "worth is a number": (valid(worth=1), ["worth", "1"]),
     "benefit in words": (valid(benefit="yes"), ["benefit", "'yes'"]),
@@ -191,10 +205,92 @@ WRONG = {
     "unknown measure": (valid(experiment={"measures": ["speed"]}), ["experiment", "measures", "'speed'"]),
     "one measure": (valid(experiment={"measures": "iae"}), ["experiment", "measures", "'iae'"]),
     "an event without a limit": (valid(experiment={"events": [{"signal": "u"}]}), ["experiment", "limit"]),
-    "an event of nothing": (valid(experiment={"events": [{"low": 1.0}]}), ["experiment.events", "signal", "'low'"]),
+    "an event of nothing": (valid(experiment={"events": [{"low": 1.0}]}), ["experiment.events[0].signal", "none"]),
     "events are numbers": (valid(experiment={"events": [1.0]}), ["experiment.events", "1.0"]),
     "units are a list": (valid(units=["m"]), ["units", "['m']"]),
     "unit is a number": (changed("units", "x", to=1.0), ["units", "1.0"]),
+    # Limits and minimum durations
+    "limits are a number": (valid(limits=3.0), ["limits", "table", "3.0"]),
+    "limit of zero": (valid(**QUICK, limits={"velocity": 0.0}), ["limits.velocity", "above 0", "0.0"]),
+    "limit in words": (valid(**QUICK, limits={"velocity": "2"}), ["limits.velocity", "'2'"]),
+    "limit of nothing": (valid(**QUICK, limits={"speed": 2.0}), ["plans[0].fastest", "speed"]),
+    "limit of another side": (valid(limits={"x_d1": {"max": 2.0}}), ["limits.x_d1", "low, high", "'max'"]),
+    "limit without sides": (valid(limits={"x_d1": {}}), ["limits.x_d1", "finite"]),
+    "limit of three numbers": (valid(limits={"x_d1": [1.0, 2.0, 3.0]}), ["limits", "x_d1"]),
+    "limit that decreases": (valid(limits={"x_d1": [2.0, -2.0]}), ["limits", "x_d1"]),
+    "fastest without limits": (valid(**QUICK), ["plans[0].fastest", "[limits]", "none"]),
+    "fastest by another name": (
+        valid(plans=[{"family": "polynomial", "fastest": "time"}], limits={"velocity": 1.0}),
+        ["plans[0].fastest", "shape, waypoints, path", "'time'"],
+    ),
+    "fastest step": (
+        valid(plans=[{"family": "step", "fastest": "shape"}], limits={"velocity": 1.0}),
+        ["plans[0].fastest", "duration"],
+    ),
+    "fastest beyond the end": (valid(**QUICK, limits={"velocity": 0.1}), ["t_end", "polynomial", "375 s"]),
+    # Obstacles
+    "obstacles are a table": (valid(obstacles={"shape": "disc"}), ["obstacles", "tables"]),
+    "obstacle without a shape": (valid(**AROUND | {"obstacles": [{"radius": 1.0}]}), ["obstacles[0].shape", "None"]),
+    "obstacle of another shape": (valid(**AROUND | {"obstacles": [DISC | {"shape": "ball"}]}), ["'ball'"]),
+    "obstacle with an unknown entry": (valid(**AROUND | {"obstacles": [DISC | {"r": 1.0}]}), ["obstacles[0]", "'r'"]),
+    "disc without a radius": (
+        valid(**AROUND | {"obstacles": [{"shape": "disc", "centre": [1.0, 2.0]}]}),
+        ["obstacles[0].radius", "none"],
+    ),
+    "disc of negative radius": (valid(**AROUND | {"obstacles": [DISC | {"radius": -1.0}]}), ["radius", "-1.0"]),
+    "rectangle that decreases": (
+        valid(**AROUND | {"obstacles": [{"shape": "rectangle", "x": [2.0, 1.0], "z": [0.0, 1.0]}]}),
+        ["obstacles[0]", "x"],
+    ),
+    "half-plane without a normal": (
+        valid(**AROUND | {"obstacles": [{"shape": "half_plane", "normal": [0.0, 0.0], "offset": 1.0}]}),
+        ["obstacles[0]", "normal"],
+    ),
+    "obstacle of one axis": (valid(obstacles=[DISC]), ["obstacles", "two axes"]),
+    "avoid nothing": (valid(plans=[{"family": "polynomial", "avoid": True}]), ["plans[0].avoid", "[[obstacles]]"]),
+    "avoid in words": (valid(plans=[{"family": "polynomial", "avoid": "yes"}]), ["plans[0].avoid", "'yes'"]),
+    "avoid with a negative clearance": (valid(**AROUND, avoid={"clearance": -1.0}), ["avoid.clearance", "-1.0"]),
+    "avoid with a rope of no crane": (valid(**AROUND, avoid={"rope": True}), ["avoid.rope", "crane"]),
+    "obstacle at a waypoint": (
+        valid(**AROUND | {"obstacles": [DISC | {"centre": [0.0, 0.0]}]}),
+        ["plans[0].avoid", "obstacle"],
+    ),
+    "avoid and another path": (
+        valid(
+            **AROUND | {"plans": [{"family": "polynomial", "avoid": True, "fastest": "waypoints"}]},
+            limits={"velocity": 9.0},
+        ),
+        ["plans[0].fastest", "'waypoints'".replace("'", '"')],
+    ),
+    # Sweeps and draws
+    "sweep is a list": (valid(sweep=[1.0]), ["sweep", "table", "[1.0]"]),
+    "sweep of nothing": (valid(sweep={"values": [1.0]}), ["sweep.parameter", "none"]),
+    "sweep of no number": (valid(sweep=SWEPT | {"parameter": "num"}), ["sweep.parameter", "gain", "'num'"]),
+    "sweep without values": (valid(sweep={"parameter": "gain"}), ["sweep.values", "none"]),
+    "sweep over no value": (valid(sweep=SWEPT | {"values": []}), ["sweep.values", "[]"]),
+    "sweep that decreases": (valid(sweep=SWEPT | {"values": [2.0, 1.0]}), ["sweep.values", "increase", "[2.0, 1.0]"]),
+    "sweep in words": (valid(sweep=SWEPT | {"values": "1 to 9"}), ["sweep.values", "'1 to 9'"]),
+    "sweep without an end": (valid(sweep=SWEPT | {"values": {"low": 1.0, "count": 3}}), ["sweep.values.high", "none"]),
+    "sweep on a log scale from 0": (
+        valid(sweep=SWEPT | {"values": {"low": 0.0, "high": 1.0, "count": 3, "scale": "log"}}),
+        ["sweep.values.low", "above 0"],
+    ),
+    "sweep of too many values": (
+        valid(sweep=SWEPT | {"values": {"low": 1.0, "high": 2.0, "count": 10**9}}),
+        ["sweep.values.count", "100000"],
+    ),
+    "sweep of an unknown metric": (valid(sweep=SWEPT | {"metrics": ["speed"]}), ["sweep.metrics", "'speed'"]),
+    "draws without a number": (valid(draws={"parameters": {"gain": [1.0, 2.0]}}), ["draws.count", "none"]),
+    "no draws": (valid(draws=DRAWN | {"count": 0}), ["draws.count", "0"]),
+    "half a draw": (valid(draws=DRAWN | {"count": 2.5}), ["draws.count", "2.5"]),
+    "draws of nothing": (valid(draws=DRAWN | {"parameters": {}}), ["draws.parameters", "none"]),
+    "draws of one number": (valid(draws=DRAWN | {"parameters": {"gain": 2.0}}), ["draws.parameters.gain", "2.0"]),
+    "draws that decrease": (valid(draws=DRAWN | {"parameters": {"gain": [2.0, 1.0]}}), ["draws.parameters.gain", "2"]),
+    "draws of an unknown parameter": (
+        valid(draws=DRAWN | {"parameters": {"mass": [1.0, 2.0]}}),
+        ["draws.parameters.mass", "gain", "'mass'"],
+    ),
+    "seed of -1": (valid(draws=DRAWN | {"seed": -1}), ["draws.seed", "-1"]),
     # The loop
     "no loop": (without("loop"), ["loop", "none"]),
     "loop is a word": (valid(loop="linear"), ["loop", "'linear'"]),
@@ -249,12 +345,9 @@ WRONG = {
         ["loop", "axes"],
     ),
 }
+OF_THE_RUN = ("unit of nothing", "empty module", "no such module", "sweep of an unknown metric")
 # What only the loop can tell is not known where only the plans are asked for.
-LOADED = [
-    name
-    for name, (case, _) in WRONG.items()
-    if not isinstance(case, tuple) and name not in ("unit of nothing", "empty module", "no such module")
-]
+LOADED = [name for name, (case, _) in WRONG.items() if not isinstance(case, tuple) and name not in OF_THE_RUN]
 
 
 @pytest.fixture
@@ -317,6 +410,21 @@ def test_plan_refuses_it_too(name, wrong, capsys, tmp_path):
     assert "study.toml" in line
     assert RULE.search(line), line
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_the_schema_rejects_what_is_wrong_in_structure(name, wrong):
+    """And nothing that the reader accepts; numbers that JSON does not have are left to the reader."""
+    path, _ = wrong(name)
+    try:
+        data = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError):
+        return
+    rejected = structure_error(data) is not None
+    if is_json(data) or not rejected:
+        assert bool(schema_errors(data)) == rejected
+    with pytest.raises(StudyError):
+        load_study(path).run()
 
 
 def test_what_was_written_before_stays(wrong, capsys, tmp_path):

@@ -5,6 +5,7 @@ import io
 import json
 import math
 import re
+import tomllib
 from contextlib import redirect_stderr, redirect_stdout
 from html.parser import HTMLParser
 from pathlib import Path
@@ -13,6 +14,7 @@ from tempfile import TemporaryDirectory
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from study_schema import is_json, schema_errors, structure_error
 from study_text import Verbatim, to_toml, valid
 
 from ctrlplan.cli import main
@@ -51,9 +53,9 @@ def places(data, path=()):
 
 
 @st.composite
-def mutated(draw):
+def mutated(draw, **more):
     """A valid file with one to three entries replaced, dropped, doubled or added."""
-    data = valid()
+    data = valid(**copy.deepcopy(more))
     data["samples"] = 41
     for _ in range(draw(st.integers(1, 3))):
         path = draw(st.sampled_from(sorted(places(data), key=repr)))
@@ -109,6 +111,27 @@ def test_mutated_text_is_run_or_refused(data):
         )
         text = text[:at] + put + text[at + data.draw(st.integers(0, 3)) :]
     refused_or_run(text)
+
+
+FURTHER = {
+    "plans": [{"family": "s_curve", "velocity": 3.0, "acceleration": [2.0], "jerk": 4.0, "fastest": "shape"}],
+    "limits": {"velocity": 2.0, "x_d2": [-1.0, 1.0], "u": {"high": 3.0}},
+    "obstacles": [{"shape": "disc", "centre": [1.0, 2.0], "radius": 0.5}],
+    "avoid": {"clearance": 0.1, "max_points": 3},
+    "sweep": {"parameter": "gain", "values": {"low": 1.0, "high": 2.0, "count": 3}},
+    "draws": {"count": 3, "parameters": {"gain": [1.0, 2.0]}},
+    "experiment": {"band": 0.05, "events": [{"signal": "u", "high": 3.0}]},
+}
+
+
+@settings(max_examples=100)
+@given(st.one_of(mutated(), mutated(**FURTHER)))
+def test_the_schema_and_the_reader_agree(data):
+    """On the structure of every file, up to numbers that JSON does not have."""
+    data = tomllib.loads(to_toml(data))
+    rejected = structure_error(data) is not None
+    if is_json(data) or not rejected:
+        assert bool(schema_errors(data)) == rejected
 
 
 @settings(max_examples=40)

@@ -215,7 +215,8 @@ LAWS: dict[str, Law] = {
 }
 """Laws with their default options, by name."""
 
-_OLD_NAMES = {"still": "setpoint"}
+OLD_NAMES = {"still": "setpoint"}
+"""Deprecated names of laws."""
 
 
 def as_law(law: Law | str) -> Law:
@@ -237,9 +238,9 @@ def as_law(law: Law | str) -> Law:
         return law
     if not isinstance(law, str):
         raise TypeError(f"law must be a Law or one of {', '.join(LAWS)}, got {law!r}")
-    if law in _OLD_NAMES:
-        warn_renamed(f'law "{law}"', f'"{_OLD_NAMES[law]}"')
-    name = _OLD_NAMES.get(law, law)
+    if law in OLD_NAMES:
+        warn_renamed(f'law "{law}"', f'"{OLD_NAMES[law]}"')
+    name = OLD_NAMES.get(law, law)
     if name not in LAWS:
         raise ValueError(f"law must be one of {', '.join(LAWS)}, got {law!r}")
     return LAWS[name]
