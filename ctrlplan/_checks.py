@@ -223,15 +223,15 @@ def checked_names(names: Sequence[str] | str, name: str, count: int | None = Non
     return given
 
 
-def check_signals(names: Sequence[str], known: Sequence[str], name: str, kind: str) -> None:
-    """Raise unless names are different ones among the known inputs or outputs (the kind), at least one."""
-    if not names:
+def check_signals(value: Sequence[str], name: str, known: Sequence[str], kind: str) -> None:
+    """Raise unless a value has different names among the known inputs or outputs (the kind), at least one."""
+    if not value:
         raise ValueError(f"{name} must name at least one {kind}, got none")
-    for label in names:
+    for label in value:
         if label not in known:
             raise ValueError(f"{name} must be among the {kind}s {', '.join(known) or '(none)'}, got {label!r}")
-    if len(set(names)) < len(names):
-        raise ValueError(f"{name} must not name an {kind} twice, got {', '.join(names)}")
+    if len(set(value)) < len(value):
+        raise ValueError(f"{name} must not name an {kind} twice, got {', '.join(value)}")
 
 
 def check_kind(value: object, name: str, kind: type, what: str = "") -> None:

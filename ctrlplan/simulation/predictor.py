@@ -138,8 +138,8 @@ class Predictor(Displayed, Frozen):
         if not prepared.input_labels:
             raise ValueError(f"{prepared.name} must have an input to govern, got none")
         governed = tuple(prepared.input_labels if references is None else references)
-        check_signals(governed, prepared.input_labels, "references", "input")
-        check_signals(tuple(limits), prepared.output_labels, "limits", "output")
+        check_signals(governed, "references", prepared.input_labels, "input")
+        check_signals(tuple(limits), "limits", prepared.output_labels, "output")
         for label, value, maximum in (("margin", margin, 0.5), ("resolution", resolution, 1.0)):
             if not 0.0 < float(value) < maximum:
                 raise ValueError(f"{label} must lie in (0, {maximum:g}), got {value}")

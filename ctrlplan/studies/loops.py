@@ -60,11 +60,11 @@ class LoopKind(ABC):
         """Crane of the loop, if it is the loop of one."""
         return None
 
-    def check_parameter(self, name: str, place: str, reader: Reader) -> None:
+    def check_parameter(self, parameter: str, place: str, reader: Reader) -> None:
         """Raise if there is no such parameter for [sweep] and [draws], as far as is known before the run."""
         known = [key for key, entry in self.entries.items() if isinstance(entry.kind, Number)]
-        if name not in known:
-            raise reader.error(place, f"must be a number of [loop], one of {', '.join(known)}, got {name!r}")
+        if parameter not in known:
+            raise reader.error(place, f"must be a number of [loop], one of {', '.join(known)}, got {parameter!r}")
 
     def varied(self, names: Sequence[str], table: Data, path: Path) -> Varied:
         """Function of parameters that returns a loop, or a loop whose blocks read them; for [draws]."""
@@ -193,7 +193,7 @@ class LoopOfModule(LoopKind):
         values = {name: value for name, value in table.items() if name != "kind"}
         return self._returned(table, self._function(table, path), path, **values)
 
-    def check_parameter(self, name: str, place: str, reader: Reader) -> None:
+    def check_parameter(self, parameter: str, place: str, reader: Reader) -> None:
         """Nothing is known before the function is."""
 
     def varied(self, names: Sequence[str], table: Data, path: Path) -> Varied:

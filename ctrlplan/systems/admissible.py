@@ -226,11 +226,11 @@ def _problem(
     governed = (
         tuple(label for label in inputs if label not in disturbances) if references is None else tuple(references)
     )
-    check_signals(governed, inputs, "references", "input")
+    check_signals(governed, "references", inputs, "input")
     if disturbances:
         others = [label for label in inputs if label not in governed]
-        check_signals(tuple(disturbances), others, "disturbances", "input")
-    check_signals(tuple(limits), outputs, "limits", "output")
+        check_signals(tuple(disturbances), "disturbances", others, "input")
+    check_signals(tuple(limits), "limits", outputs, "output")
     a, b, c, d = _matrices(loop)
     poles = np.linalg.eigvals(a)
     if poles.size and not poles.real.max() < -1e-9 * np.abs(poles).max():

@@ -595,7 +595,7 @@ def test_a_reverse_that_does_not_undo_forward_is_rejected():
         lambda flag, params: (flag[0][:2], flag[0][2:] + 0.01 * flag[0][1]),
     ):
         with pytest.raises(
-            ValueError, match=r"^reverse must be the inverse of forward, got .* flat output x of a flag with"
+            ValueError, match=r"^reverse must be the inverse of forward, got .* flat output x for a flag with"
         ):
             create_flat_iosystem(double_integrator(reverse=reverse), [-1, -2])
     with pytest.raises(ValueError, match=r"^reverse must return 2 states and 1 inputs, got 1 and 1"):
