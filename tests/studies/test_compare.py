@@ -1,9 +1,8 @@
-import re
-
 """Several plans through one loop: what is compared, how it is measured, what is told."""
 
 import html
 import json
+import re
 
 import control as ct
 import numpy as np
