@@ -16,7 +16,7 @@ from ctrlplan.simulation import simulate
 from ctrlplan.studies.comparison import Comparison, compare
 from ctrlplan.studies.crane_setup import CRANE, TORQUE_LIMITS, UNITS, DriveLimits, nominal_waypoints
 from ctrlplan.studies.measures import Measure, Run, signals_of
-from ctrlplan.studies.sections import AnimatedCrane, CraneOnline
+from ctrlplan.studies.sections import AnimatedCrane, CraneOnline, Curves
 from ctrlplan.studies.study import Study
 from ctrlplan.systems import (
     AdmissibleSet,
@@ -293,9 +293,13 @@ def _filtered_loop(wind: Trajectory | None = None, limits: DriveLimits | None = 
     )
 
 
+_SHARE, _SWAY = 0.9, 0.2
+"""Limits of the governor: share of the force limit, and sway [rad]."""
+
+
 @cache
-def _admissible(force: float) -> AdmissibleSet:
-    """Admissible set for 90 % of a force limit, of the horizontal motion linearised at the mean depth."""
+def _horizontal() -> tuple[ct.StateSpace, Array]:
+    """Horizontal motion linearised at the mean depth, and the equilibrium there in its states."""
     loop = _filtered_loop()
     rest = np.array(loop.initial_state)
     middle = 0.5 * (START[1] + 11.0)
@@ -315,14 +319,77 @@ def _admissible(force: float) -> AdmissibleSet:
         outputs=["F", "theta"],
         states=[loop.state_labels[k] for k in rows],
     )
-    limit = 0.9 * force
-    return AdmissibleSet(
-        model,
-        {"F": (-limit, limit), "theta": (-0.2, 0.2)},
-        _PERIODS["governed"],
-        margin=0.05,
-        origin=(rest[rows], 0.0),
+    return model, rest[rows]
+
+
+@cache
+def _admissible(force: float) -> AdmissibleSet:
+    """Admissible set for 90 % of a force limit, of the horizontal motion linearised at the mean depth."""
+    model, rest = _horizontal()
+    limit = _SHARE * force
+    limits = {"F": (-limit, limit), "theta": (-_SWAY, _SWAY)}
+    return AdmissibleSet(model, limits, _PERIODS["governed"], margin=0.05, origin=(rest, 0.0))
+
+
+def governor_check(response: ct.TimeResponseData, force: float) -> tuple[tuple[str, ...], Curves]:
+    """Whether the reference that a governor holds is admissible, and the force that its model predicts.
+
+    The model of the governor is evaluated at the simulated states. Where it
+    predicts a force beyond the limit and the simulated force satisfies it, no
+    reference is found although the reference held is admissible.
+
+    Parameters
+    ----------
+    response : control.TimeResponseData
+        Of the governed crane.
+    force : float
+        Limit of the trolley force [N].
+
+    Returns
+    -------
+    notes : tuple of str
+        The result in words; empty if a reference was found at every sample.
+    curves : Curves
+        Simulated and predicted force, and the limit of the governor.
+    """
+    model, rest = _horizontal()
+    t, signals, limit = np.asarray(response.time), signals_of(response), _SHARE * force
+    labels = list(response.state_labels)
+    rows = [next(k for k, label in enumerate(labels) if label.endswith(state)) for state in model.state_labels]
+    states = np.asarray(response.states)
+    predicted = np.asarray(model.C)[0] @ (states[rows] - rest[:, None])
+    curves = Curves(
+        "time [s]",
+        "trolley force [kN]",
+        t,
+        {
+            "simulated": signals["F"] / 1e3,
+            "predicted by the linear model": predicted / 1e3,
+            "limit of the governor": np.full(t.size, limit / 1e3),
+            "negative limit of the governor": np.full(t.size, -limit / 1e3),
+        },
+        key="governor-force",
+        caption="Governed crane: simulated trolley force, and the force that the linear model of the governor predicts "
+        "for the simulated states. No admissible reference is found while the prediction is beyond the limit.",
     )
+    infeasible = states[next(k for k, label in enumerate(labels) if label.endswith("governor_infeasible"))] > 0.5
+    if not infeasible.any():
+        return (), curves
+    after = t >= t[infeasible][0]
+    peaks = np.abs(signals["F"][after]).max(), np.abs(signals["theta"][after]).max()
+    held = peaks[0] <= limit and peaks[1] <= _SWAY
+    verdict = (
+        "the reference held at these times is admissible" if held else "the reference held violates a limit of the set"
+    )
+    return (
+        f"The governor finds no admissible reference for {100.0 * infeasible.mean():.0f} % of the time, first at "
+        f"{t[infeasible][0]:.3g} s, and holds the previous one. The cause is its model: the force feedback of the load "
+        "velocity is proportional to the rope length, and the model is linearised at the mean depth of 10.5 m. While "
+        f"the depth differs, the model predicts a force of up to {np.abs(predicted[after]).max() / 1e3:.3g} kN for the "
+        f"measured state (figure). In the simulation {verdict}: from then on the peak force is "
+        f"{peaks[0] / 1e3:.3g} kN with a limit of {limit / 1e3:.3g} kN, and the peak sway {peaks[1]:.2g} rad with a "
+        f"limit of {_SWAY:g} rad.",
+    ), curves
 
 
 def _compared(scenario: Scenario, title: str, what: str) -> Comparison:
@@ -379,7 +446,11 @@ def _in_time_note(limit: float) -> str:
 
 
 def _study(name: str, found: Comparison, summary: str, *notes: str) -> Study:
-    return Study(name, found.title, found, summary, (*notes, *found.notes), (CraneOnline(), AnimatedCrane()))
+    response = found.responses["governed"]
+    force = found.limits["governed"]["F"][1]
+    checked, curves = governor_check(response, force)
+    sections = (CraneOnline(), curves, AnimatedCrane())
+    return Study(name, found.title, found, summary, (*notes, *checked, *found.notes), sections)
 
 
 def _move() -> TrigSpline:

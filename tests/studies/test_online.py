@@ -78,6 +78,37 @@ def test_the_governors_model_is_the_crane_in_small_motion():
     assert 0.85 * 4e3 < force < 4e3
 
 
+@pytest.mark.slow
+def test_the_governor_misses_admissible_references_because_of_the_depth_of_its_model():
+    """Linearised at the true depth, the force is that of the simulation; at the mean depth, it is beyond the limit."""
+    force = 30e3
+    limits = {"force_limits": (-force, force), "torque_limits": studies.TORQUE_LIMITS}
+    scenario = studies.Scenario(studies._fixed_goal(), studies._move(), force=force)
+    found = cp.simulate(studies.WAYS["governed"](scenario, limits), np.linspace(0.0, 50.0, 2501))
+    notes, curves = studies.governor_check(found, force)
+    (note,) = notes
+    assert "first at 0.5 s" in note
+    assert "the reference held at these times is admissible" in note
+    signals = dict(zip(found.output_labels, found.outputs, strict=True))
+    np.testing.assert_array_equal(curves.rows["simulated"], signals["F"] / 1e3)
+    assert np.abs(signals["F"]).max() < 27e3
+    assert np.abs(signals["theta"]).max() < 0.2
+    at = int(np.searchsorted(found.time, 0.5))
+    loop = studies._filtered_loop(None, limits)
+    rows = [next(k for k, name in enumerate(found.state_labels) if name.endswith(label)) for label in loop.state_labels]
+    state = found.states[rows, at]
+    predicted = {}
+    for depth in (10.0, 10.5):
+        rest = np.array(loop.initial_state)
+        rest[-6:] = studies.CRANE.equilibrium(0.0, depth)[0]
+        rest[loop.state_labels.index("z_ref_filter_z_ref")] = depth
+        linear = ct.linearize(loop, rest, [0.0, depth])
+        predicted[depth] = (np.asarray(linear.C) @ (state - rest))[loop.output_labels.index("F")]
+    assert predicted[10.0] == pytest.approx(signals["F"][at], rel=0.05)
+    assert predicted[10.5] > 27e3
+    assert curves.rows["predicted by the linear model"][at] == pytest.approx(predicted[10.5] / 1e3, rel=1e-6)
+
+
 @pytest.fixture(scope="module")
 def found():
     return {name: study(progress=False) for name, study in ONLINE.items()}
