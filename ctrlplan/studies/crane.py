@@ -125,6 +125,7 @@ def _nominal_sections(points: tuple[Waypoint, Waypoint], limited: Fastest) -> tu
             {"plan": "path generator", "generator": "flat map (15a,b)", "trolley_pid": "PID", "hoist_pid": "PID"},
             caption="Structure of the controller (figure 3), drawn from the blocks and connections of the model.",
         ),
+        *_linear_loops(),
         CraneTime(),
         CraneStep(
             caption="Step run: force and torque with their limits (dashed), up to the time at which the rope becomes "
@@ -349,6 +350,36 @@ def _linear_loop(law: str) -> ct.StateSpace:
     row = loop.output_labels.index("theta")
     a = np.asarray(linear.A)
     return ct.ss(a, np.zeros((len(a), 1)), np.asarray(linear.C)[[row]], [[0.0]], outputs=["theta"], inputs=["none"])
+
+
+def linear_pendulum_loop(rope_length: float) -> ct.InterconnectedSystem:
+    """Trolley and pendulum at a rope length [m] with the PID of the trolley, linear, in named blocks."""
+    plant = CRANE.linear_coupled(rope_length)
+    blocks = [CRANE.trolley_pid(), *plant.syslist]
+    return ct.interconnect(blocks, inputs=["D_ref"], outputs=["D", "theta"], name="trolley_and_pendulum")
+
+
+def _linear_loops() -> tuple[LoopBlocks, LoopBlocks]:
+    """The two linearised loops of the crane: trolley with pendulum, and hoist."""
+    across, up = linear_pendulum_loop(_LENGTH), CRANE.linear_hoist_loop()
+    return (
+        LoopBlocks(
+            across,
+            {"trolley_pid": "PID", "trolley": "trolley", "pendulum": "pendulum"},
+            caption=f"Trolley loop linearised at R = {_LENGTH:g} m, with the pendulum (reference D_ref). Closed-loop "
+            f"poles: {_poles(across)} 1/s. The pair with the smallest magnitude is the sway, which the PID does not "
+            "damp.",
+        ),
+        LoopBlocks(
+            up,
+            {"hoist_pid": "PID", "hoist": "hoist with load"},
+            caption=f"Hoist loop linearised at equilibrium (reference R_ref). Closed-loop poles: {_poles(up)} 1/s.",
+        ),
+    )
+
+
+_LENGTH = 10.0
+"""Rope length of the linearised trolley loop [m]."""
 
 
 def _slowest(system: ct.StateSpace) -> complex:

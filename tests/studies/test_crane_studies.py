@@ -133,6 +133,20 @@ def nominal():
     return studies._compared(plans, points, 30.0, "Nominal")
 
 
+def test_linearised_loops_of_the_page_have_the_poles_of_the_nonlinear_loop():
+    """Linear blocks, and central differences of the whole crane with its PIDs, setpoints held."""
+    from ctrlplan.studies.crane import CRANE, linear_pendulum_loop
+
+    start = cp.Step([0.0, 10.0], [0.0, 10.0], labels=["x", "z"])
+    loop = cp.plants.crane_loop(CRANE, start, "setpoint")
+    x, step = np.array(loop.initial_state), 1e-5
+    columns = [(loop.dynamics(0.0, x + step * e, []) - loop.dynamics(0.0, x - step * e, [])) for e in np.eye(x.size)]
+    expected = np.linalg.eigvals(np.transpose(columns) / (2.0 * step))
+    found = np.concatenate([linear_pendulum_loop(10.0).poles(), CRANE.linear_hoist_loop().poles()])
+    np.testing.assert_allclose(np.sort_complex(found), np.sort_complex(expected), atol=1e-5)
+    assert [block.name for block in linear_pendulum_loop(10.0).syslist] == ["trolley_pid", "trolley", "pendulum"]
+
+
 def test_a_step_ends_where_the_rope_goes_slack(nominal):
     """The first root of the tension, by an independent look at a run that goes on."""
     plan = nominal.plans["step"]
