@@ -25,9 +25,9 @@ from ctrlplan.studies.notes import how_measured, mark_of, notes_of
 from ctrlplan.studies.plans import references_of, waypoints_given
 from ctrlplan.studies.roles import Role, Stability, role_of, stability_of
 from ctrlplan.studies.running import Builder, System
-from ctrlplan.studies.sections import AnimatedCrane, PlanCurves, Responses, Section
+from ctrlplan.studies.sections import AnimatedCrane, CranePaths, Paths, PlanCurves, Responses, Section
 from ctrlplan.studies.study import Study
-from ctrlplan.studies.units import Signals, checked_units, listed_measures, scales_of, signals_of_runs
+from ctrlplan.studies.units import Signals, checked_units, listed_measures, output_unit, scales_of, signals_of_runs
 from ctrlplan.studies.verdicts import summary, unit_of, verdicts
 from ctrlplan.trajectories import Trajectory, Waypoint
 from ctrlplan.trajectories.export import Table as SampledTable
@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     import pandas as pd
     from control import ControlPlot
 
+    from ctrlplan.planning import Obstacle
     from ctrlplan.reports.style import AxesLike
     from ctrlplan.studies.benefit import Benefit
 
@@ -248,24 +249,35 @@ class Comparison(Displayed):
 
         return plot_responses(self, ax=ax)
 
-    def sections(self) -> tuple[Section, ...]:
-        """Sections of its page: plans and responses, and an animation if all loops are cranes."""
+    def sections(self, obstacles: Iterable[Obstacle] = ()) -> tuple[Section, ...]:
+        """Sections of its page: planar paths, plans and responses, and an animation if all loops are cranes."""
         labels = [set(response.output_labels or ()) for response in self.responses.values()]
         cranes = all(known >= set(AnimatedCrane.signals) for known in labels)
-        return (PlanCurves(), Responses(), *([AnimatedCrane()] if cranes else []))
+        planar = len(self.outputs) == 2 and len({output_unit(self, output) for output in self.outputs}) == 1
+        paths = [CranePaths()] if cranes else [Paths(obstacles=tuple(obstacles))] if planar else []
+        return (*paths, PlanCurves(), Responses(), *([AnimatedCrane()] if cranes else []))
 
-    def report(self, path: str | os.PathLike[str]) -> Path:
+    def report(
+        self, path: str | os.PathLike[str], *, author: str = "", text: str = "", obstacles: Iterable[Obstacle] = ()
+    ) -> Path:
         """Write one self-contained HTML page and return its path.
 
         Parameters
         ----------
         path : str or path
             The file, or a folder for ``index.html`` in it.
+        author : str, optional
+            Author, written below the title.
+        text : str, optional
+            Paragraph of the page.
+        obstacles : iterable of Obstacle, optional
+            Obstacles in the figure of the paths of planar plans.
         """
         from ctrlplan.reports import write_page
 
-        study = Study("comparison", self.title, self, notes=self.notes, sections=self.sections())
-        return write_page([study], path, title=self.title)
+        sections, words = self.sections(obstacles), (text,) if text else ()
+        study = Study("comparison", self.title, self, notes=self.notes, sections=sections, text=words)
+        return write_page([study], path, title=self.title, author=author)
 
 
 def compare(

@@ -15,6 +15,7 @@ import control as ct
 import numpy as np
 
 from ctrlplan._types import Data
+from ctrlplan.planning import Rectangle
 from ctrlplan.studies.baselines import smoother_polynomials
 from ctrlplan.studies.benefit import Choices
 from ctrlplan.studies.comparison import Comparison
@@ -80,7 +81,8 @@ class LoopKind(ABC):
 
     def study(self, name: str, title: str, comparison: Comparison, wall: Wall = None) -> Study:
         """Study of the comparison, with the sections of this kind of loop; `wall` is an obstacle to be drawn."""
-        return Study(name, title, comparison, notes=comparison.notes)
+        obstacles = () if wall is None else (Rectangle(*wall),)
+        return Study(name, title, comparison, notes=comparison.notes, sections=comparison.sections(obstacles))
 
 
 class LinearLoop(LoopKind):

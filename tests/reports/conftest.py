@@ -17,6 +17,8 @@ import ctrlplan as cp
 
 OWN = """
 title = "Hoist & swing <fast>"
+author = "A. Hoister & <Sons>"
+text = ["Why the move is planned.", "A second & <last> paragraph."]
 t_end = 30.0
 [units]
 y = "m"

@@ -310,6 +310,15 @@ def test_titles_and_names_are_text(own, unstable, read):
     assert not list(tree.all("b"))
 
 
+def test_author_and_text_of_a_study_file_are_on_the_page(own, read):
+    tree = read(own.html)
+    (author,) = tree.all("p", class_="author")
+    assert author.words() == "A. Hoister & <Sons>"
+    (section,) = tree.all("section")
+    paragraphs = [p.words() for p in section.all("p")]
+    assert paragraphs[:2] == ["Why the move is planned.", "A second & <last> paragraph."]
+
+
 STABLE = {
     "settling_time",
     "tracking_settling_time",
