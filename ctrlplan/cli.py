@@ -1,4 +1,4 @@
-"""Command-line interface ``ctrlplan``: reproduce, online, report, plan. Study files: `ctrlplan.studies.files`."""
+"""Command-line interface ``ctrlplan``: reproduce, online, new, report, plan. Study files: `ctrlplan.studies.files`."""
 
 from __future__ import annotations
 
@@ -9,18 +9,21 @@ import sys
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 import ctrlplan
 
 if TYPE_CHECKING:
+    Add: TypeAlias = Callable[..., argparse.Action]
+
     from ctrlplan.studies.files import StudyFile
     from ctrlplan.studies.study import Study
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command and return its exit status: 0, or 2 on an error, with nothing written."""
-    options = _parser().parse_args(arguments)
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    options = _parser(given).parse_args(given)
     try:
         paths = options.run(options)
     except OSError as error:
@@ -40,33 +43,88 @@ _PLAN_OUT = (
 )
 
 
-def _parser() -> argparse.ArgumentParser:
+def _parser(given: Sequence[str]) -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="ctrlplan",
         description="Plan reference trajectories for a closed loop, and report their benefit over a step.",
+        epilog="""examples:
+  ctrlplan new crane.toml --kind crane      # a commented study file
+  ctrlplan report crane.toml --out report   # its report, report/index.html
+  ctrlplan plan crane.toml --out plan.csv   # its plans alone
+  ctrlplan COMMAND --help                   # options and an example of each command""",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"ctrlplan {ctrlplan.__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
-    reproduce = commands.add_parser("reproduce", help="run all studies of the paper and write a report")
-    reproduce.add_argument("--out", type=Path, default=Path("report"), help="output folder (default: report)")
-    reproduce.set_defaults(run=_reproduce)
+    def command(name: str, run: Callable[[argparse.Namespace], list[Path]], text: str, epilog: str) -> Add:
+        added = commands.add_parser(
+            name,
+            help=text,
+            description=f"{text[0].upper()}{text[1:]}.",
+            epilog=epilog,
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
+        added.set_defaults(run=run)
+        return added.add_argument
 
-    online = commands.add_parser("online", help="run the studies of on-line methods and write a report")
-    online.add_argument("--out", type=Path, default=Path("online"), help="output folder (default: online)")
-    online.set_defaults(run=_online)
+    add = command(
+        "reproduce",
+        _reproduce,
+        "run all studies of the paper and write a report",
+        "example:\n  ctrlplan reproduce --out report   # some minutes; then open report/index.html",
+    )
+    add("--out", type=Path, default=Path("report"), help="output folder (default: report)")
 
-    report = commands.add_parser("report", help="run the study of a study file and write a report")
-    report.add_argument("study", type=Path, help="study file (TOML)")
-    report.add_argument("--out", type=Path, default=Path("report"), help="output folder (default: report)")
-    report.set_defaults(run=_report)
+    add = command(
+        "online",
+        _online,
+        "run the studies of on-line methods and write a report",
+        "example:\n  ctrlplan online --out online   # then open online/index.html",
+    )
+    add("--out", type=Path, default=Path("online"), help="output folder (default: online)")
 
-    plan = commands.add_parser("plan", help="write the trajectories of a study file, without simulation")
-    plan.add_argument("study", type=Path, help="study file (TOML)")
-    plan.add_argument("--out", type=Path, required=True, help=_PLAN_OUT)
-    plan.add_argument("--dt", type=float, help="sampling period [s] of sampled files (default: 1001 samples)")
-    plan.set_defaults(run=_plan)
+    kinds, epilog = _new_kinds() if given[:1] == ["new"] else ((), "")
+    add = command("new", _new, "write a commented study file to start from", epilog)
+    add("out", type=Path, metavar="STUDY", help="new study file, ending in .toml; a file that exists is not replaced")
+    add("--kind", choices=kinds, default="linear", help="kind of study (default: linear)")
+
+    add = command(
+        "report",
+        _report,
+        "run the study of a study file and write a report",
+        "example:\n  ctrlplan new wall.toml --kind obstacles\n  ctrlplan report wall.toml --out report",
+    )
+    add("study", type=Path, help="study file (TOML)")
+    add("--out", type=Path, default=Path("report"), help="output folder (default: report)")
+
+    add = command(
+        "plan",
+        _plan,
+        "write the trajectories of a study file, without simulation",
+        "examples:\n  ctrlplan plan wall.toml --out plan.csv --dt 0.01\n  ctrlplan plan wall.toml --out move.c",
+    )
+    add("study", type=Path, help="study file (TOML)")
+    add("--out", type=Path, required=True, help=_PLAN_OUT)
+    add("--dt", type=float, help="sampling period [s] of sampled files (default: 1001 samples)")
     return parser
+
+
+def _new_kinds() -> tuple[tuple[str, ...], str]:
+    """Kinds of new study files, and their purposes with an example for the help."""
+    from ctrlplan.studies.new import study_kinds, study_purpose
+    from ctrlplan.studies.schema import SCHEMA
+
+    kinds = study_kinds()
+    rows = "\n".join(f"  {kind:<10} {study_purpose(kind)}" for kind in kinds)
+    example = "example:\n  ctrlplan new crane.toml --kind crane\n  ctrlplan report crane.toml --out report"
+    return kinds, f"kinds:\n{rows}\n\n{example}\n\nJSON Schema of study files for editors:\n  {SCHEMA}"
+
+
+def _new(options: argparse.Namespace) -> list[Path]:
+    from ctrlplan.studies.new import new_study
+
+    return new_study(options.out, options.kind)
 
 
 def _reproduce(options: argparse.Namespace) -> list[Path]:
@@ -87,8 +145,8 @@ def _all_of(studies: Mapping[str, Callable[..., Study]], folder: Path, title: st
     from ctrlplan.reports import write_report
 
     found = []
-    for name, study in studies.items():
-        _print_status(f"running study {name}")
+    for i, (name, study) in enumerate(studies.items()):
+        _print_status(f"running study {name} ({i + 1} of {len(studies)})")
         found.append(study(progress=sys.stderr.isatty()))
     _print_status("writing the report")
     return write_report(found, folder, title)
@@ -99,8 +157,9 @@ def _report(options: argparse.Namespace) -> list[Path]:
 
     study_file = _loaded(options.study)
     _checked_folder(options.out)
-    _print_status(f"running study {study_file.name}")
-    study = study_file.run()
+    plans = len(study_file.plans)
+    _print_status(f"running study {study_file.name} ({plans} plan{'s' * (plans > 1)})")
+    study = study_file.run(progress=sys.stderr.isatty(), status=_print_status)
     _print_status("writing the report")
     return write_report([study], options.out, study_file.title, study_file.author)
 
@@ -123,7 +182,7 @@ def _loaded(path: Path) -> StudyFile:
 
     with warnings.catch_warnings(record=True) as notices:
         warnings.simplefilter("always", FutureWarning)
-        study_file = load_study(path)
+        study_file = load_study(path, status=_print_status)
     for notice in notices:
         _print_status(str(notice.message))
     return study_file

@@ -198,7 +198,7 @@ def test_report_writes_a_page_and_its_results(reported):
 
 def test_report_says_its_progress_on_stderr(reported):
     _, done = reported
-    assert done.stderr.splitlines() == ["ctrlplan: running study wall", "ctrlplan: writing the report"]
+    assert done.stderr.splitlines() == ["ctrlplan: running study wall (3 plans)", "ctrlplan: writing the report"]
 
 
 def test_results_have_the_stable_keys_and_the_numbers_of_compare(reported):

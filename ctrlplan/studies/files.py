@@ -215,8 +215,8 @@ class StudyFile:
                 found = experiment.run(loop)
                 comparison = comparison_of(experiment, found, self.units, self.parameters(), self.title)
                 if self.sweep is not None:
-                    status(f"running the sweep over {self.sweep['parameter']}")
                     shown = shown_metrics(self.sweep, comparison.metrics, reader)
+                    status(f"running the sweep over {self.sweep['parameter']}")
                     swept_plans = swept(self.sweep, kind, self.loop, self.path, experiment, progress)
                     found_sections.append(SweepCurves(swept_plans, shown))
                 if self.draws is not None:
@@ -347,13 +347,15 @@ STUDY = Table(
 """Entries of a study file: names, types, ranges and meaning."""
 
 
-def load_study(path: str | os.PathLike[str]) -> StudyFile:
+def load_study(path: str | os.PathLike[str], *, status: Callable[[str], object] = lambda text: None) -> StudyFile:
     """Read and check a study file; nothing is simulated.
 
     Parameters
     ----------
     path : str or path
         A TOML file; its entries are listed in the docstring of this module.
+    status : callable, optional
+        Called with a line before a plan that takes time to be found.
 
     Returns
     -------
@@ -381,7 +383,7 @@ def load_study(path: str | os.PathLike[str]) -> StudyFile:
         known = [*(waypoints[0].labels or ()), *(kind.signals or ())]
         if kind.signals is not None and label not in known:
             raise reader.error(f"units.{label}", f"must be of one of {', '.join(known)}, got {label!r}")
-    found = planned(data, waypoints, kind.crane(loop, source), reader)
+    found = planned(data, waypoints, kind.crane(loop, source), reader, status)
     for name, plan in found.plans.items():
         if plan.end >= t_end:
             raise reader.error("t_end", f"must be after the end of the plan {name} at {plan.end:g} s, got {t_end:g}")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Literal, get_args, get_origin, get_type_hints
@@ -84,7 +84,13 @@ class Planned:
         return next(((box.x, box.z) for box in boxes if all(map(math.isfinite, (*box.x, *box.z)))), None)
 
 
-def planned(data: Data, waypoints: tuple[Waypoint, ...], crane: Crane | None, reader: Reader) -> Planned:
+def planned(
+    data: Data,
+    waypoints: tuple[Waypoint, ...],
+    crane: Crane | None,
+    reader: Reader,
+    status: Callable[[str], object],
+) -> Planned:
     """Plans of a study file, whose tables have been read.
 
     Parameters
@@ -98,6 +104,8 @@ def planned(data: Data, waypoints: tuple[Waypoint, ...], crane: Crane | None, re
         the clearance.
     reader : Reader
         For messages.
+    status : callable
+        Called with a line before a plan that takes time to be found.
 
     Raises
     ------
@@ -119,8 +127,10 @@ def planned(data: Data, waypoints: tuple[Waypoint, ...], crane: Crane | None, re
         if name in plans:
             raise reader.error(f"{place}.name", f"must be a unique name, got {got(name)}")
         if table.get("avoid"):
+            status(f"planning {name} around the obstacles")
             plan = task.around(plan, place)
         if "fastest" in table:
+            status(f"planning {name} in minimum time")
             found[name] = task.fastest(plan, table["fastest"], bool(table.get("avoid")), place)
             plan = found[name].plan
         plans[name] = plan

@@ -38,7 +38,7 @@ def linear(reproduced):
 def test_only_paths_on_stdout_and_progress_on_stderr(reproduced):
     assert reproduced.out.splitlines() == [str(reproduced.folder / n) for n in ("index.html", "results.json")]
     assert sorted(p.name for p in reproduced.folder.iterdir()) == ["index.html", "results.json"]
-    assert "ctrlplan: running study linear" in reproduced.err.splitlines()
+    assert "ctrlplan: running study linear (1 of 4)" in reproduced.err.splitlines()
     assert "Traceback" not in reproduced.err
     assert "Warning" not in reproduced.err
 

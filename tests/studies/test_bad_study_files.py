@@ -375,16 +375,17 @@ def wrong(tmp_path, monkeypatch):
     return write
 
 
+ANNOUNCED = re.compile(
+    r"ctrlplan: (running study \w+ \(\d plans?\)|writing the plans of \w+|planning \w+ (in minimum time|around .*))"
+)
+
+
 def refused(arguments, capsys):
     """Return the one line that a refused command says, beside what it announces."""
     assert main([str(a) for a in arguments]) == 2
     said = capsys.readouterr()
     assert said.out == ""
-    lines = [
-        line
-        for line in said.err.splitlines()
-        if not re.match(r"ctrlplan: (running study|writing the plans of) \w+$", line)
-    ]
+    lines = [line for line in said.err.splitlines() if not ANNOUNCED.fullmatch(line)]
     assert len(lines) == 1, lines
     return lines[0]
 

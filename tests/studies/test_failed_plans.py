@@ -145,7 +145,10 @@ def test_a_crane_that_cannot_follow_some_plans_is_reported_with_the_others(tmp_p
     page = (tmp_path / "out" / "index.html").read_text(encoding="utf-8")
     assert "Not ranked, since its run was ended early: polynomial, trigonometric, piecewise." in page
     assert all(f"{plan}: the run was ended: " in page for plan in ("polynomial", "trigonometric", "piecewise"))
-    assert capsys.readouterr().err.splitlines() == ["ctrlplan: running study hasty", "ctrlplan: writing the report"]
+    assert capsys.readouterr().err.splitlines() == [
+        "ctrlplan: running study hasty (2 plans)",
+        "ctrlplan: writing the report",
+    ]
 
 
 def test_what_ends_a_save_leaves_the_file_of_before(compared, tmp_path, monkeypatch):
