@@ -321,6 +321,15 @@ def test_a_plan_shows_its_waypoints_and_peaks():
     assert ["peak jerk [1/s^3]", "60"] in found
 
 
+def test_a_peak_above_a_jump_is_infinite():
+    """The acceleration of a trapezoidal profile jumps; at the ends of a plan nothing is known of the motion outside."""
+    found = rows(str(cp.Trapezoid(1.0, velocity=1.0, acceleration=2.0)))
+    assert ["peak acceleration [1/s^2]", "2"] in found
+    assert ["peak jerk [1/s^3]", "inf"] in found
+    moving = rows(str(cp.PolySpline([cp.Waypoint(0, 0), cp.Waypoint(4, 4)])))
+    assert ["peak acceleration [1/s^2]", "0"] in moving
+
+
 def test_entries_that_are_free_are_called_so():
     assert rows(str(made("Waypoint")))[-3:] == [["x", "z"], ["position", "5", "free"], ["velocity", "1", "0.5"]]
     plan = cp.TrigSpline([MOVE[0], cp.Waypoint(0.4, math.nan, 2.0), MOVE[1]], alpha=1.0, warn=False)
@@ -354,7 +363,7 @@ def test_fastest_shows_its_limits_and_the_active_one():
     found = rows(str(made("Fastest")))
     assert ["minimum duration", f"{15 / 8 / 0.5:.6g} s"] in found
     assert ["active limit", "y_d1 within ±0.5, at 1.875 s"] in found
-    assert ["y_d1", "within ±0.5", "0.5", "1.875", "nothing"] in found
+    assert ["y_d1", "within ±0.5", "0.5", "1.875", "0 %"] in found
     assert [row[:2] for row in found if row[0] == "y_d2"] == [["y_d2", "within ±2"]]
 
 

@@ -188,7 +188,7 @@ class Margin:
         """Absolute margin as text: in percent, or in the signal's unit."""
         size = abs(self.fraction)
         if size < 1e-9:
-            return "nothing"
+            return "0 %"
         lone_zero = math.isinf(self.bound.high - self.bound.low) and self.bound.scale == 1.0
         return f"{size:.4g}" if lone_zero else f"{100.0 * size:.3g} %"
 
@@ -239,7 +239,7 @@ class Margins(Displayed):
                 row.bound.range,
                 f"{row.value:.6g}",
                 f"{row.time:.6g}",
-                row.share if row.fraction >= 0.0 or row.share == "nothing" else f"-{row.share}",
+                row.share if row.fraction >= 0.0 or row.share == "0 %" else f"-{row.share}",
             )
             for row in self.rows
         ]
@@ -550,7 +550,10 @@ def _signal(name: str, values: Array, shape: tuple[int, ...]) -> Array:
     """Values of a quantity over time, checked."""
     found = np.asarray(values, dtype=float)
     if found.shape != shape:
-        raise TypeError(f"quantities must be signals of shape (ntime,), got {name} of shape {found.shape}")
+        raise TypeError(
+            f"quantities must be signals of shape (ntime,), got {name} of shape {found.shape}; derivative k of axis i "
+            "is jet[k, i]"
+        )
     return found
 
 

@@ -52,9 +52,11 @@ def quantities_of(system: Any) -> Quantities | None:
             return quantities_of_flat_system(system)
         if callable(system) and not hasattr(system, "ninputs"):  # python-control's systems are callable
             return system
+    block = not isinstance(system, type) and hasattr(system, "ninputs")
     raise TypeError(
         "system must be a flat system, a plant with a method quantities (as Crane has), or a function of a jet, got "
         f"{system.__name__ if isinstance(system, type) else type(system).__name__}"
+        + ('; for k/(s (T s + 1)): lambda jet: {"u": (jet[1, 0] + T * jet[2, 0]) / k}' if block else "")
     )
 
 

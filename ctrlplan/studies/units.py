@@ -208,11 +208,11 @@ def _size(unit: str, signals: Signals, label: str | None) -> float:
             **UNIT_SCALES,
             "{y}": span,
             "{y} s": span * t,
-            "{y}^2 s": ROUNDING * span**2 * t,  # rounding squared, for a metric that is a square
+            "{y}^2 s": ROUNDING * span**2 * t,  # the rounding of a square is that of the signal squared
             "{y} s^2": span * t**2,
             "{y}^2/s^5": span**2 / np.float64(move) ** 5,
             "{u}": peak,
-            "{u}^2 s": peak**2 * t,
+            "{u}^2 s": ROUNDING * peak**2 * t,
         }
     # A user's measure may contain the unit itself.
     for template in () if unit in sizes else sizes:

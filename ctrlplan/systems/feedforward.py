@@ -36,6 +36,10 @@ def create_feedforward_iosystem(
     feedback it is y_d + (y_d'' + y_d')/k. Errors decay with the poles of the
     loop.
 
+    The inverse of a plant alone is the feedforward of velocity, acceleration and
+    higher derivatives. Its output is added to that of the controller, whose zeros
+    then do not matter: y = y_d if the error is 0 at the start.
+
     No states. Inputs: y_ref, y_ref_d1, ... up to order n, with y the output of
     the loop, as `create_source_iosystem` names its outputs with
     ``suffix="_ref"``. Outputs: the input r of the loop, under its name.
@@ -43,7 +47,7 @@ def create_feedforward_iosystem(
     Parameters
     ----------
     loop : control.StateSpace or control.TransferFunction
-        Linear and continuous-time, with one input and one output;
+        The loop, or a plant: linear and continuous-time, with one input and one output;
         interconnections of linear blocks are accepted.
     labels : sequence of str or str, optional
         Name of the plan's axis, by default that of the output of the loop.
@@ -135,5 +139,8 @@ def _inverse(a: Array, b: Array, c: Array, d: Array) -> Array:
         hidden = null_space(basis) if order else np.eye(len(a))
         zeros = np.linalg.eigvals(hidden.T @ (a - np.outer(b, last) / gain) @ hidden)
         got = ", ".join(f"{zero:.4g}" for zero in np.real_if_close(np.sort_complex(zeros)))
-        raise ValueError(f"loop must have no finite zeros for its inverse to be a sum of derivatives, got {got}")
+        raise ValueError(
+            f"loop must have no finite zeros for its inverse to be a sum of derivatives, got {got}; if they are those "
+            "of the controller, give the plant alone and add the output of the block to that of the controller"
+        )
     return np.append(-parts / norms, 1.0) / gain + 0.0  # no -0

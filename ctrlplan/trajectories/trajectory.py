@@ -363,7 +363,11 @@ class Trajectory(Displayed, Fields, ABC):
         return _extrema.derivative_extrema(self, checked_count(nu, "nu"))
 
     def peak(self, nu: int = 0) -> Array:
-        """Maximum magnitude of the nu-th derivative, shape (naxes,)."""
+        """Maximum magnitude of the nu-th derivative, shape (naxes,).
+
+        Within the segments: impulses at jumps of a lower derivative (`jumps`) are
+        not included.
+        """
         found = self.extrema(nu)
         return np.maximum(np.abs(found.minimum), np.abs(found.maximum))
 
@@ -761,12 +765,14 @@ class Trajectory(Displayed, Fields, ABC):
         return self.naxes * max(self.breakpoints.size, len(self.waypoints)) <= 60
 
     def _peaks(self) -> list[list[str]]:
-        """Rows of a table: the peak magnitude of each derivative up to the jerk."""
+        """Rows of a table: the peak magnitude of each derivative up to the jerk, infinite where a lower one jumps."""
         rows = []
         for nu in range(1, 4 if self.duration else 1):
             try:
                 with np.errstate(over="ignore", invalid="ignore"):
-                    peaks = [number(value) for value in self.peak(nu).tolist()]
+                    jumped = {jump.label for jump in self.jumps(nu - 1) if self.start < jump.time < self.end}
+                    largest = np.where([label in jumped for label in self.labels], np.inf, self.peak(nu))
+                    peaks = [number(value) for value in largest.tolist()]
             except (ValueError, RuntimeError):  # beyond floating point, or not resolved
                 peaks = ["n/a"] * self.naxes
             rows.append([f"peak {ENTRIES[nu]} [1/s{f'^{nu}' if nu > 1 else ''}]", *peaks])

@@ -570,7 +570,7 @@ def test_report():
     text = " ".join(str(found).split())
     assert text.startswith("Fastest plan at fixed shape: 3.75 s, active limit y_d1 minimum duration 3.75 s ")
     assert "active limit y_d1 within ±0.5, at 1.875 s feasible durations from 3.75 s" in text
-    assert re.search(r"y_d1 within ±0.5 0.5 1.875 nothing y_d2 within ±2 \S+ \S+ 79.5 %$", text)
+    assert re.search(r"y_d1 within ±0.5 0.5 1.875 0 % y_d2 within ±2 \S+ \S+ 79.5 %$", text)
     assert repr(found) == "<Fastest plan at fixed shape: 3.75 s, active limit y_d1>"
     html = found._repr_html_()
     assert "<dd>3.75 s</dd>" in html

@@ -8,6 +8,7 @@ import pytest
 
 import ctrlplan as cp
 from ctrlplan.reports import render_page, summary, verdicts
+from ctrlplan.reports.tables import key_table_of
 from ctrlplan.simulation import Occurrence
 from ctrlplan.studies import MEASURES, Measure, Study
 from ctrlplan.studies.units import in_units
@@ -180,6 +181,17 @@ def test_what_is_rounding_depends_on_the_size_of_the_signals():
     (verdict,) = (v for v in verdicts(found) if v.key == "iae")
     assert verdict.best == ("a",)
     assert named("iae", 1e-9, 2e-9).best == ()
+
+
+def test_a_small_effort_next_to_that_of_a_step_is_a_value():
+    """The effort is quadratic: controls of 3e-4 and 6e-4 in 8 s, next to a control of 1, are far above rounding."""
+    plans = {"a": cp.Step(3e-4), "b": cp.Step(6e-4), "step": cp.Step(1.0)}
+    loop = ct.ss([], [], [], [[1.0], [1.0]], inputs="r", outputs=["y", "u"])
+    found = cp.compare(loop, plans, T)
+    (verdict,) = (v for v in verdicts(found) if v.key == "control_effort")
+    assert (verdict.best, verdict.minimum) == (("a",), pytest.approx(8.0 * 9e-8, rel=1e-12))
+    (row,) = (line for line in key_table_of(found).rows if line[0].text.startswith("Control effort"))
+    assert [cell.text for cell in row[1:4]] == ["7.200·10⁻⁷", "2.880·10⁻⁶", "8.000"]
 
 
 def test_two_exact_loops_tie_though_their_rounding_differs():
