@@ -36,7 +36,7 @@ from ctrlplan.studies.study import Study
 from ctrlplan.studies.sweep import Sweep
 from ctrlplan.studies.units import output_unit
 
-_SIZE = (4.4, 2.7)
+_SIZE = (4.1, 2.5)
 _COUNT = 3
 """Panels at most."""
 

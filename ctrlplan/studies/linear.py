@@ -28,7 +28,7 @@ GAINS = (0.25, 1000.0)
 TIMEPTS = np.linspace(0.0, 20.0, 8001)
 NUMBERED = {
     "step": {1.0: (-26, -4), 5.0: (-34, 12), 20.0: (-34, 0), 100.0: (-34, 0), 1000.0: (-36, 2)},
-    "trigonometric": {1.0: (26, 4), 5.0: (30, 0), 20.0: (44, 22), 100.0: (-14, 12), 1000.0: (24, 9)},
+    "trigonometric": {1.0: (26, 4), 5.0: (30, 0), 20.0: (44, 22), 100.0: (-14, 12), 1000.0: (34, 20)},
 }
 """Gains marked in figure 1, with the offsets of their labels [pt]; of two plans only, so that labels do not overlap."""
 SWEPT = ("settling_time", "overshoot_error", "control_peak", "control_effort")

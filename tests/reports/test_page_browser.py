@@ -4,7 +4,10 @@ import base64
 import json
 import math
 
+import numpy as np
 import pytest
+
+from ctrlplan.studies.files import load_study
 
 pytestmark = pytest.mark.slow
 
@@ -20,7 +23,7 @@ def window(browser):
     """A page in the browser at a width, whole, with the logs of before taken away."""
     from selenium.webdriver.support.wait import WebDriverWait
 
-    def at(written, width=1100, height=900):
+    def at(written, width=1100, height=900, opened=True):
         browser.execute_cdp_cmd(
             "Emulation.setDeviceMetricsOverride",
             {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": width < 500},
@@ -30,6 +33,8 @@ def window(browser):
         browser.get_log("performance")
         browser.get((written.folder / "index.html").as_uri())
         WebDriverWait(browser, 60).until(lambda page: page.execute_script("return document.readyState") == "complete")
+        if opened:
+            browser.execute_script("document.querySelectorAll('details').forEach(fold => { fold.open = true; })")
         return browser
 
     yield at
@@ -70,6 +75,168 @@ def test_it_is_drawn_by_the_standard_and_in_its_own_encoding(opened):
     assert chrome.title
 
 
+# One screen for each study
+
+HEIGHTS = "return Array.from(document.querySelectorAll('section')).map(s => s.getBoundingClientRect().height)"
+
+
+def test_each_study_is_one_screen_and_four_of_a_phone(window, written):
+    for width, height, highest in ((1280, 800, 800), (390, 800, 3200)):
+        chrome = window(written, width, height, opened=False)
+        heights = chrome.execute_script(HEIGHTS)
+        assert heights
+        assert max(heights) <= highest
+        if width == 1280:
+            assert chrome.execute_script("return document.documentElement.scrollHeight") < 9000
+
+
+def test_a_page_is_below_a_size(written):
+    assert len(written.html.encode()) < 1.5e6
+
+
+@pytest.mark.parametrize("width", [1280, 390])
+def test_no_table_is_wider_than_its_page(window, written, width):
+    chrome = window(written, width)
+    wide = chrome.execute_script(
+        "return Array.from(document.querySelectorAll('.scroll')).map(box => box.scrollWidth - box.clientWidth)"
+    )
+    assert wide
+    assert max(wide) <= 1
+
+
+def test_folds_are_closed_at_first_and_open_on_paper(window, shown):
+    chrome = window(shown, opened=False)
+    count = "return document.querySelectorAll('details[open]').length"
+    assert chrome.execute_script(count) == 0
+    chrome.execute_script("window.dispatchEvent(new Event('beforeprint'))")
+    assert chrome.execute_script(count) == len(chrome.find_elements("css selector", "details")) > 2
+    chrome.execute_script("window.dispatchEvent(new Event('afterprint'))")
+    assert chrome.execute_script(count) == 0
+
+
+def test_a_dark_page_is_dark_and_can_be_read(browser, window, shown):
+    browser.execute_cdp_cmd(
+        "Emulation.setEmulatedMedia", {"features": [{"name": "prefers-color-scheme", "value": "dark"}]}
+    )
+    try:
+        chrome = window(shown)
+        found = chrome.execute_script(CONTRAST)
+        assert found["seen"] > 100
+        assert found["low"] == []
+        ground = chrome.execute_script("return getComputedStyle(document.body).backgroundColor")
+        assert max(map(int, ground[4:-1].split(","))) < 60
+        filled = "document.querySelector('.drawing svg text')"
+        assert min(map(int, chrome.execute_script(f"return getComputedStyle({filled}).fill")[4:-1].split(","))) > 180
+    finally:
+        browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})
+
+
+# The read-out
+
+OUTPUT = "figure.panels .panel[id$=main-output] .drawing"
+
+
+def read_out(chrome):
+    """Lines of the read-out of the output: the time, the axes, and a value for each curve."""
+    text = chrome.execute_script(f"return document.querySelector('{OUTPUT} .readout').textContent")
+    return [line.strip() for line in text.replace("−", "-").split("\n")]
+
+
+def test_the_keyboard_reads_all_curves_at_a_time(window, own):
+    """Values of the read-out against the responses, simulated again."""
+    from selenium.webdriver.common.keys import Keys
+
+    chrome = window(own, opened=False)
+    box = chrome.find_element("css selector", OUTPUT)
+    for _ in range(41):  # the first shows the left end, each further one a hundredth of the axes
+        box.send_keys(Keys.ARROW_RIGHT)
+    first, axes, *values = read_out(chrome)
+    assert axes == "y [m]"
+    time = float(first.removeprefix("time = ").removesuffix(" s"))
+    assert 9.0 < time < 13.0
+    study = load_study(own.folder.parent / "hoist.toml").run()
+    told = {}
+    for line in values:
+        name, value = line.rsplit(": ", 1)
+        told |= dict.fromkeys(name.split(" = "), float(value))
+    assert set(told) == set(study.comparison.plans)
+    for name, value in told.items():
+        response = study.comparison.responses[name]
+        outputs = np.asarray(response.outputs)[0]
+        # Values have four digits, and curves within 1/500 of the axes are drawn as one.
+        near = outputs[np.abs(response.time - time) <= 0.02]
+        assert near.min() - 0.03 <= value <= near.max() + 0.03
+    box.send_keys(Keys.ESCAPE)
+    assert read_out(chrome) == [""]
+
+
+def test_the_pointer_reads_too(window, own):
+    from selenium.webdriver import ActionChains
+
+    chrome = window(own, opened=False)
+    box = chrome.find_element("css selector", OUTPUT)
+    ActionChains(chrome).move_to_element(box).perform()
+    assert read_out(chrome)[0].startswith("time = ")
+    assert len(chrome.find_elements("css selector", f"{OUTPUT} .cursor")) == 1
+
+
+@pytest.mark.parametrize("key", [None, "ENTER"])
+def test_an_entry_of_the_legend_hides_its_curve_and_shows_it_again(window, own, key):
+    from selenium.webdriver.common.keys import Keys
+
+    chrome = window(own, opened=False)
+    (button,) = (b for b in chrome.find_elements("css selector", ".panels .legend button") if b.text == "step")
+    shown = f"""return Array.from(document.querySelectorAll("{OUTPUT} [id*=curve-0-]")).filter(
+        curve => getComputedStyle(curve).display !== "none").length"""
+    before = chrome.execute_script(shown)
+
+    def press():
+        button.send_keys(getattr(Keys, key)) if key else button.click()
+        return chrome.execute_script(shown), button.get_attribute("aria-pressed")
+
+    assert press() == (before - 2, "false")  # the response and its thin reference
+    assert press() == (before, "true")
+
+
+def test_a_legend_inside_a_drawing_hides_its_curve_too(window, own):
+    from selenium.webdriver.common.keys import Keys
+
+    chrome = window(own)
+    entry = chrome.find_element("css selector", "[id$=responses-entry-0]")
+    assert entry.get_attribute("role") == "button"
+    assert entry.get_attribute("aria-label") == "curve step"
+    entry.send_keys(Keys.ENTER)
+    hidden = "return Array.from(document.querySelectorAll('[id*=responses-curve]')).filter(c => c.style.display).length"
+    assert chrome.execute_script(hidden) == 4  # of three axes, and a reference
+    assert entry.get_attribute("aria-pressed") == "false"
+
+
+def test_a_figure_and_its_data_open_alone(window, own):
+    """What the links lead to, read by the page itself."""
+    chrome = window(own, opened=False)
+    figure = f"document.querySelector('{OUTPUT}')"
+    content = """
+        var links = Array.from(%s.parentElement.querySelectorAll(".links a")), done = arguments[0];
+        links.forEach(link => { link.addEventListener("click", event => event.preventDefault()); link.click(); });
+        var made = links.map(link => link.href);
+        done(made);
+    """
+    hrefs = chrome.execute_async_script(content % figure)
+    assert all(href.startswith("blob:") for href in hrefs)
+    chrome.get(hrefs[0])
+    assert chrome.execute_script("return document.documentElement.tagName") == "svg"
+    assert chrome.execute_script("return document.querySelectorAll('[id*=curve-0-]').length") > 4
+
+
+def test_without_a_script_everything_is_on_the_page(own, read):
+    tree = read(own.html)
+    assert not list(tree.all(class_="readout"))
+    (legend,) = tree.all("ul", class_="legend")
+    names = {name for li in legend.all("li") for name in li.words().split(" = ")}
+    assert names == set(next(iter(own.results["studies"].values()))["plans"])
+    assert all(fold.children[0].tag == "summary" for fold in tree.all("details"))
+
+
 # Seen
 
 BOXES = """
@@ -78,6 +245,10 @@ return Array.from(document.querySelectorAll(arguments[0])).map(function (e) {
   return {left: b.left, right: b.right, width: b.width, height: b.height};
 });
 """
+
+
+FIGURES = "figure svg:not(.dashes)"
+"""All drawings, without the samples of dashes in legends."""
 
 
 @pytest.mark.parametrize("width", [1100, 390])
@@ -101,8 +272,8 @@ def test_nothing_overflows_the_page(window, written, width):
 @pytest.mark.parametrize(("width", "height"), [(1100, 200), (390, 120)])
 def test_figures_are_seen(opened, width, height):
     chrome = opened(width)
-    drawings = chrome.execute_script(BOXES, "figure svg")
-    assert len(drawings) == len(chrome.find_elements("css selector", "figure")) >= 2
+    drawings = chrome.execute_script(BOXES, FIGURES)
+    assert len(drawings) == len(chrome.find_elements("css selector", ".drawing, figure.animation")) >= 2
     for box in drawings:
         assert box["width"] > 300
         assert box["height"] > height
@@ -118,7 +289,7 @@ def test_figures_are_seen(opened, width, height):
 @pytest.mark.parametrize("width", [1280, 1100, 390])
 def test_figures_are_inside_the_window_of_a_screen(opened, width):
     chrome = opened(width)
-    for box in chrome.execute_script(BOXES, "figure svg"):
+    for box in chrome.execute_script(BOXES, FIGURES):
         assert box["right"] <= width
     cut = chrome.execute_script(
         "return Array.from(document.querySelectorAll('figure .drawing')).map(e => e.scrollWidth - e.clientWidth)"
@@ -127,7 +298,7 @@ def test_figures_are_inside_the_window_of_a_screen(opened, width):
 
 
 ENLARGED = """
-return Array.from(document.querySelectorAll("figure .drawing")).map(function (box) {
+return Array.from(document.querySelectorAll(".inside .drawing")).map(function (box) {
   var svg = box.querySelector("svg"), small = svg.getBoundingClientRect().width;
   box.focus();
   box.scrollLeft = 1e6;
@@ -159,7 +330,7 @@ def test_writing_in_figures_can_be_read(opened, width, least):
     # Axes are labelled with 9 points; the drawing's own unit is the point.
     pixels = opened(width).execute_script(
         """
-        return Array.from(document.querySelectorAll("figure svg[viewBox]")).map(
+        return Array.from(document.querySelectorAll(".drawing svg")).map(
           e => 9 * e.getBoundingClientRect().width / e.viewBox.baseVal.width);
         """
     )
@@ -335,7 +506,7 @@ def test_on_paper_hints_are_left_out_and_nothing_is_cut(opened):
     )
     assert shown
     assert set(shown) == {"none"}
-    for box in chrome.execute_script(BOXES, "figure svg"):
+    for box in chrome.execute_script(BOXES, FIGURES):
         assert box["right"] <= 718
         assert box["height"] <= 1000  # a figure is not broken, so it has to fit one page
     cut = chrome.execute_script(
