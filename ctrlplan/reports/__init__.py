@@ -14,6 +14,7 @@ from ctrlplan.reports.figures import (
 )
 from ctrlplan.reports.page import CraneAnimation, comparison_fragment, render_page, write_all, write_page, write_report
 from ctrlplan.reports.parts import Cell, Head, Items, MetricsTable, Part, Picture, Svg, Table, Text
+from ctrlplan.reports.path_figure import plot_path
 from ctrlplan.reports.planning_figures import plot_baselines
 from ctrlplan.reports.sections import draw
 from ctrlplan.studies.verdicts import Verdict, summary, verdicts
@@ -38,6 +39,7 @@ __all__ = [
     "plot_curves",
     "plot_motion",
     "plot_online",
+    "plot_path",
     "plot_paths",
     "plot_plane",
     "plot_plans",

@@ -501,7 +501,7 @@ def _arrow(axes: Axes, source: tuple[float, float], sink: tuple[float, float], t
         at = (0.5 * (x0 + x1), y1 + 0.98 * side)
     edge = shade(0.8)
     axes.add_patch(FancyArrowPatch(start, end, arrowstyle="-|>", mutation_scale=11, color=edge, connectionstyle=style))
-    axes.text(*at, text, ha="center", va="center", fontsize=font_size(8), color="#0072B2")
+    axes.text(*at, text, ha="center", va="center", fontsize=font_size(8), color=shade(0.6))
 
 
 def _times(plan: Trajectory, start: float | None = None, end: float | None = None) -> Array:

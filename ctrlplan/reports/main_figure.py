@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from itertools import islice
+from textwrap import wrap
 
 import numpy as np
 from control import ControlPlot
@@ -37,6 +38,8 @@ from ctrlplan.studies.sweep import Sweep
 from ctrlplan.studies.units import output_unit
 
 _SIZE = (4.1, 2.5)
+_LETTERS = 28
+"""Letters of a label along the height of a panel."""
 _COUNT = 3
 """Panels at most."""
 
@@ -101,6 +104,8 @@ def _panel(key: str, draw: Callable[[Axes], ControlPlot], caption: str) -> Pictu
     """One panel, whose legend is that of all."""
     figure = Figure(figsize=_SIZE, layout="constrained")
     plot = draw(figure.subplots())
+    for axes in plot.axes.flat:
+        axes.set_ylabel("\n".join(wrap(axes.get_ylabel(), _LETTERS)))
     if plot.legend is not None:
         plot.legend.remove()
     return Picture(f"main-{key}", plot, caption)

@@ -90,7 +90,7 @@ def _turns(line: Line2D) -> bool:
 
 
 def _words(label: str) -> str:
-    return label.replace(r"\$", "$")
+    return label.replace(r"\$", "$").replace("\n", " ")
 
 
 def _scale(axes: Axes, which: str) -> list[object]:
