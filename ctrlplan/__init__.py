@@ -41,6 +41,7 @@ Compare and report
     sweep                     over a parameter -> Sweep
     monte_carlo, draws        over random parameters -> Ensemble
     Experiment, Measure       what is compared, once, for many loops; a metric of your own
+    explore                   sliders for a plan and its response, in Jupyter
     metrics                   settling time, overshoot, IAE, ... as functions of (timepts, signal)
 On line
     create_replanner_iosystem       fits the plan again while the loop runs; Transition: its linear law
@@ -152,6 +153,7 @@ _EXPORTS = {
         "monte_carlo",
         "sweep",
     ),
+    "reports.explore": ("explore",),
 }
 _HOME = {name: module for module, names in _EXPORTS.items() for name in names}
 

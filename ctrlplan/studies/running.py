@@ -106,7 +106,11 @@ def is_builder(loop: object) -> TypeGuard[Callable[..., System]]:
 
 
 def check_has_inputs(loop: System) -> System:
-    """Raise if a loop has no input for a plan."""
+    """Raise if an object is no loop, or a loop without an input for a plan."""
+    if not hasattr(loop, "ninputs"):
+        raise TypeError(
+            f"loop must be a control system, or a function of name and plan that returns one, got {type(loop).__name__}"
+        )
     if not loop.ninputs:
         raise ValueError(
             "loop must have inputs for the plans, got none; for a loop that contains the plan as a block, give a "
