@@ -229,7 +229,7 @@ class Ensemble(Displayed):
             shares = self.best(name)
             title = self.nominal.measures[name].title if name in self.nominal.measures else name
             yield (
-                f"{title}, share of the draws in which each plan is best: "
+                f"{title}, share of the draws in which each plan is best, ties included: "
                 + ", ".join(f"{p} {100 * s:.0f} %" for p, s in shares.items())
                 + "."
             )
