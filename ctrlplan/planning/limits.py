@@ -470,11 +470,15 @@ class Limited:
                     yield replace(_bound(name, own, order, axis), name=named)
             else:
                 plain = [quantity for quantity in orders if "_d" not in quantity]
-                known = f", or quantities ({', '.join(plain)}, ...)" if orders else "; other names require system, and no system was given"
+                known = (
+                    f", or quantities ({', '.join(plain)}, ...)"
+                    if orders
+                    else "; other names require system, and no system was given"
+                )
                 axes = ", ".join(derivative_name(label, 1) for label in plan.labels)
                 raise ValueError(
-                    f"limits must name derivatives of an axis ({axes}, ...), or velocity, acceleration, jerk or snap for "
-                    f"all axes{known}, got {name!r}"
+                    f"limits must name derivatives of an axis ({axes}, ...), or velocity, acceleration, jerk or snap "
+                    f"for all axes{known}, got {name!r}"
                 )
 
 
