@@ -84,7 +84,10 @@ class AlphaChoice(Displayed):
                 ("alpha", f"{self.alpha:.6g} rad"),
                 ("objective", f"{objective}, {self.value:.6g}"),
                 ("at alpha = 0 (polynomial)", number(float(self.values[0]))),
-                ("ten times the minimum from", f"{number(self.blow_up)} rad" if self.blow_up < 2.0 * math.pi else ""),
+                (
+                    "above ten times the minimum from alpha =",
+                    f"{number(self.blow_up)} rad" if self.blow_up < 2.0 * math.pi else "",
+                ),
                 ("decided by", "integral of the squared jerk, at equal objective" if self.tied else ""),
                 ("plan", title_of(self.plan)),
             ]

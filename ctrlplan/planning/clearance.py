@@ -88,9 +88,10 @@ class Clearance(Displayed):
     def facts(self) -> list[tuple[str, str]]:
         """Values with their names, as print shows them."""
         x, z = self.position
+        rope = "from the rope " if self.part == "rope" else ""
         return [
             ("certified lower bound", f"{self.lower:.6g}"),
-            ("minimum found", f"{self.minimum:.6g}, {self.part} to obstacles[{self.obstacle}]"),
+            ("minimum found", f"{self.minimum:.6g}, {rope}to obstacles[{self.obstacle}]"),
             ("at", f"{self.time:.6g} s, position ({number(x)}, {number(z)})"),
             ("required", "" if self.required is None else f"{self.required:.6g}"),
         ]

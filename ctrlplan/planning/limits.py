@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 _SAMPLES = 193
+_ROUNDING = 1e-9  # fraction of a limit below which a margin is printed as 0
 _HIGHEST = 8
 """Maximum order of the derivatives with limits."""
 
@@ -186,9 +187,7 @@ class Margin:
     @property
     def share(self) -> str:
         """Absolute margin as text: in percent, or in the signal's unit."""
-        size = abs(self.fraction)
-        if size < 1e-9:
-            return "0 %"
+        size = abs(self.fraction) if abs(self.fraction) >= _ROUNDING else 0.0
         lone_zero = math.isinf(self.bound.high - self.bound.low) and self.bound.scale == 1.0
         return f"{size:.4g}" if lone_zero else f"{100.0 * size:.3g} %"
 
@@ -239,7 +238,7 @@ class Margins(Displayed):
                 row.bound.range,
                 f"{row.value:.6g}",
                 f"{row.time:.6g}",
-                row.share if row.fraction >= 0.0 or row.share == "0 %" else f"-{row.share}",
+                row.share if row.fraction > -_ROUNDING else f"-{row.share}",
             )
             for row in self.rows
         ]
@@ -471,11 +470,15 @@ class Limited:
                     yield replace(_bound(name, own, order, axis), name=named)
             else:
                 plain = [quantity for quantity in orders if "_d" not in quantity]
-                known = f", or quantities ({', '.join(plain)}, ...)" if orders else "; no system was given"
+                known = (
+                    f", or quantities ({', '.join(plain)}, ...)"
+                    if orders
+                    else "; other names require system, and no system was given"
+                )
                 axes = ", ".join(derivative_name(label, 1) for label in plan.labels)
                 raise ValueError(
-                    f"limits must name derivatives of the axes ({axes}, ...), velocity, acceleration, jerk or snap of "
-                    f"them all{known}, got {name!r}"
+                    f"limits must name derivatives of an axis ({axes}, ...), or velocity, acceleration, jerk or snap "
+                    f"for all axes{known}, got {name!r}"
                 )
 
 

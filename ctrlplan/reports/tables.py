@@ -16,7 +16,7 @@ from ctrlplan.studies.grids import SAME, Grid
 from ctrlplan.studies.limits import limits_used
 from ctrlplan.studies.required_durations import RequiredDuration
 from ctrlplan.studies.sweep import Sweep
-from ctrlplan.studies.units import ROUNDING
+from ctrlplan.studies.units import UNIT_SCALES, without_rounding
 from ctrlplan.studies.verdicts import number, unit_of, verdicts
 
 _NONE = (math.nan,) * 5
@@ -45,7 +45,8 @@ def metrics_of(comparison: Comparison, kind: str = "metrics", known: Mapping[str
         for plan, found in comparison.metrics.items():
             value = found.get(key, math.nan)
             mark, meaning = ("worse", "worst") if plan in worst else ("better", "best") if plan in best else ("", "")
-            cells.append(Cell(number(value, measure.unit), mark, meaning, _order(value)))
+            shown = number(without_rounding(value, comparison.scales.get(key, 0.0)), measure.unit)
+            cells.append(Cell(shown, mark, meaning, _order(value)))
         difference = "" if verdict is None else verdict.difference
         rows.append(MetricRow(measure.title, unit_of(comparison, key), cells, difference))
     styles = line_styles(roles_of(comparison), known)
@@ -63,13 +64,7 @@ def key_table_of(comparison: Comparison) -> Table:
     listed = {row.title: row for row in whole.rows}
     rows = []
     for key, (title, *_) in comparison.key_metrics().items():
-        row, rounding = listed[comparison.measures[key].title], ROUNDING * comparison.scales.get(key, 0.0)
-        values = [found.get(key, math.nan) for found in comparison.metrics.values()]
-        cells = [
-            replace(cell, text="0") if abs(value) <= rounding else cell
-            for cell, value in zip(row.cells, values, strict=True)
-        ]
-        rows.append(replace(row, title=title, cells=cells))
+        rows.append(replace(listed[comparison.measures[key].title], title=title))
     return by_plan(whole.plans, rows)
 
 
@@ -123,15 +118,18 @@ def values_of(sweep: Sweep) -> list[Text | Table]:
     blocks: list[Text | Table] = []
     if at.size < sweep.values.size:
         blocks.append(Text(f"{at.size} of {sweep.values.size} values, evenly spaced in their order.", hint=True))
-    heads = [sweep.parameter]
-    for name in names:
-        unit = sweep.unit_of(name)
+    heads, units = [sweep.parameter], {name: sweep.unit_of(name) for name in names}
+    for name, unit in units.items():
         heads.append(f"{sweep.title_of(name)} [{unit}]" if unit else sweep.title_of(name))
+    scales = {name: UNIT_SCALES.get(unit, 0.0) for name, unit in units.items()}
     for plan, found in sweep.metrics.items():
-        rows = [
-            [f"{sweep.values[k]:.6g}", *(number(float(found[name][k])) if name in found else "–" for name in names)]
-            for k in at
+        cells = [
+            [number(without_rounding(value, scale)) for value in found[name][at].tolist()]
+            if name in found
+            else ["–"] * at.size
+            for name, scale in scales.items()
         ]
+        rows = [[f"{sweep.values[k]:.6g}", *row] for k, row in zip(at, zip(*cells, strict=True), strict=True)]
         blocks += [Text(f"{plan}:"), Table(heads, rows, "values")]
     return blocks
 
@@ -169,9 +167,10 @@ def spread_of(ensemble: Ensemble) -> MetricsTable:
             continue
         cells = []
         for plan in nominal.metrics:
-            low, _, middle, _, high = ensemble.quantiles(key)[plan] if key in ensemble.metrics.get(plan, {}) else _NONE
-            text = f"{number(middle, measure.unit)} ({number(low, measure.unit)} to {number(high, measure.unit)})"
-            cells.append(Cell(text, order=_order(float(middle))))
+            found = ensemble.quantiles(key)[plan] if key in ensemble.metrics.get(plan, {}) else _NONE
+            shown = [number(without_rounding(value, nominal.scales.get(key, 0.0)), measure.unit) for value in found]
+            low, _, middle, _, high = shown
+            cells.append(Cell(f"{middle} ({low} to {high})", order=_order(float(found[2]))))
         rows.append(MetricRow(measure.title, unit_of(nominal, key), cells))
     styles = line_styles(roles_of(nominal))
     return MetricsTable([Plan(plan, styles[plan]["color"]) for plan in nominal.metrics], rows)

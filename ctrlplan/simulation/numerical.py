@@ -380,5 +380,9 @@ def _accuracy_note(attempt: Attempt[S]) -> str:
     what = "are differences of larger terms" if attempt.growth <= _GROWTH else "diverge from neighbouring solutions"
     if np.any(attempt.drift > own):
         what = "depend on small fractions of large states"
-    advice = f"rtol = {needed:.0e} suffices" if needed > 1e-12 / scales.relative.min() else "no tolerance suffices"
+    advice = (
+        f"rtol = {needed:.0e} suffices for {_UNCERTAIN:.0e}"
+        if needed > 1e-12 / scales.relative.min()
+        else "no tolerance suffices"
+    )
     return f"outputs {names} {what} and are uncertain by about {float(part.max()):.1g} of their range: {advice}"

@@ -16,7 +16,7 @@ from ctrlplan.studies.comparison import Comparison, finite_or_none
 from ctrlplan.studies.measures import Measure, leading_metrics
 from ctrlplan.studies.sections import Bands, DrawTable, PlanCurves
 from ctrlplan.studies.study import Study
-from ctrlplan.studies.units import ROUNDING
+from ctrlplan.studies.units import ROUNDING, without_rounding
 from ctrlplan.studies.verdicts import unit_of
 
 if TYPE_CHECKING:
@@ -112,9 +112,10 @@ class Ensemble(Displayed):
 
     def _cells(self, name: str, measure: Measure) -> list[str]:
         """Unit of a metric, and its median and range for each plan."""
-        cells = [unit_of(self.nominal, name)]
+        cells, scale = [unit_of(self.nominal, name)], self.nominal.scales.get(name, 0.0)
         for quantiles in self.quantiles(name).values():
-            low, _, middle, _, high = (number(value, measure.unit) for value in quantiles.tolist())
+            shown = [number(without_rounding(value, scale), measure.unit) for value in quantiles.tolist()]
+            low, _, middle, _, high = shown
             cells.append(middle if low == high else f"{middle} ({low} to {high})")
         return cells
 
@@ -229,7 +230,7 @@ class Ensemble(Displayed):
             shares = self.best(name)
             title = self.nominal.measures[name].title if name in self.nominal.measures else name
             yield (
-                f"{title}, share of the draws in which each plan is best: "
+                f"{title}, share of the draws in which each plan is best, ties included: "
                 + ", ".join(f"{p} {100 * s:.0f} %" for p, s in shares.items())
                 + "."
             )

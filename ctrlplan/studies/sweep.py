@@ -35,7 +35,7 @@ from ctrlplan.studies.experiment import Experiment, Metrics
 from ctrlplan.studies.measures import MEASURES, Measure, leading_metrics, wanted_measures
 from ctrlplan.studies.roles import Role, role_of
 from ctrlplan.studies.running import Builder, System, is_builder
-from ctrlplan.studies.units import in_units, with_superscripts
+from ctrlplan.studies.units import UNIT_SCALES, in_units, with_superscripts, without_rounding
 from ctrlplan.trajectories import Trajectory, Waypoint
 
 if TYPE_CHECKING:
@@ -126,11 +126,12 @@ class Sweep(Displayed):
 
     def _cells(self, name: str, measure: Measure) -> list[str]:
         """Unit of a metric if it is known, and its range for each plan."""
-        cells = [self.unit_of(name)]
+        cells, scale = [self.unit_of(name)], UNIT_SCALES.get(measure.unit, 0.0)
         for plan in self.metrics:
             column = self._column(plan, name)
             known = column[~np.isnan(column)]
-            low, high = (number(float(f(known)), measure.unit) if known.size else "n/a" for f in (np.min, np.max))
+            ends = [without_rounding(float(f(known)), scale) for f in (np.min, np.max)] if known.size else [np.nan] * 2
+            low, high = (number(end, measure.unit) for end in ends)
             cells.append(low if low == high else f"{low} to {high}")
         return cells
 

@@ -40,6 +40,11 @@ ROUNDING = 1e-6
 """Difference of two values of a metric that counts as rounding, relative to the scale of the metric."""
 
 
+def without_rounding(value: float, scale: float) -> float:
+    """Value of a metric, 0 if it differs from 0 by rounding."""
+    return 0.0 if abs(value) <= ROUNDING * scale else value
+
+
 @dataclass(frozen=True)
 class Signals:
     """Signals of a comparison that are measured.

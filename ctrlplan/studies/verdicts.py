@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from ctrlplan._renamed import FormerAttribute
 from ctrlplan.studies.limits import limits_sentence
 from ctrlplan.studies.roles import Role, Stability
-from ctrlplan.studies.units import ROUNDING, UNIT_SCALES, in_units, scientific, with_superscripts
+from ctrlplan.studies.units import ROUNDING, UNIT_SCALES, in_units, scientific, with_superscripts, without_rounding
 
 if TYPE_CHECKING:  # comparisons show their verdicts
     from ctrlplan.studies.comparison import Comparison
@@ -164,8 +164,8 @@ def _values(comparison: Comparison, plan: str, keys: list[str]) -> str:
         if math.isinf(value):
             found.append(f"no {title} within the simulated time")
             continue
-        zero = abs(value) <= ROUNDING * comparison.scales.get(key, 0.0)
-        found.append(f"{title} {'0' if zero else number(value)}{f' {unit}' if unit else ''}")
+        shown = number(without_rounding(value, comparison.scales.get(key, 0.0)))
+        found.append(f"{title} {shown}{f' {unit}' if unit else ''}")
     return ", ".join(found) or "no metrics"
 
 

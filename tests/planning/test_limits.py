@@ -372,7 +372,7 @@ def test_no_limits():
 
 @pytest.mark.parametrize("name", ["x_d1", "speed", "y_d", "y_d9", "y_d01", "", 1])
 def test_unknown_names(name):
-    with pytest.raises(ValueError, match=r"limits must name derivatives of the axes \(y_d1, .*no system was given"):
+    with pytest.raises(ValueError, match=r"limits must name derivatives of an axis \(y_d1, .*no system was given"):
         margins(MOVE, {name: 1.0})
 
 

@@ -383,3 +383,18 @@ def test_many_loops_at_once_name_and_rank_as_one():
     for options, kind in (({"measures": ["nothing"]}, ValueError), ({"measures": "iae"}, TypeError)):
         with pytest.raises(kind, match="settling_time"):
             cp.sweep(build, [0.5, 0.9], points, T, progress=False, **options)
+
+
+def test_rounding_is_shown_as_0_in_the_table_of_a_sweep():
+    """The plan's inverse is its command: y = r but for rounding, in each loop."""
+    plans = {"planned": cp.PolySpline(MOVE)}
+
+    def build(k):
+        forward = cp.create_feedforward_iosystem(loop(k, ("y",)))
+        return lambda name, plan: ct.interconnect(
+            [cp.create_source_iosystem(plan, 2, suffix="_ref"), forward, loop(k)], inputs=0, outputs=["y", "u"]
+        )
+
+    swept = cp.sweep(build, [5.0, 6.0], plans, T[::10], progress=False)
+    assert (swept.metrics["planned"]["lag_error"] > 0.0).any()
+    assert [row for row in swept.metric_table().rows if "lag" in row[0] or "Overshoot" in row[0]] == []

@@ -28,11 +28,10 @@ class CSV(TableFormat):
 
     def encoded(self, table: Table) -> str:
         """Text of the file; as `TableFormat.encoded`."""
-        text = io.StringIO(newline="")
         names = (f"'{name}" if name.startswith(_FORMULA) else name for name in table.names)
         columns = np.concatenate([table.times[None], table.rows]).T
-        np.savetxt(text, columns, fmt="%.17g", delimiter=",", header=csv_line(["time", *names]), comments="")
-        return text.getvalue()
+        rows = (",".join(map(repr, row)) for row in columns.tolist())  # the shortest decimals that read back the same
+        return "\n".join([csv_line(["time", *names]), *rows, ""])
 
 
 def csv_line(names: list[str]) -> str:
