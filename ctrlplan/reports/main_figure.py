@@ -31,8 +31,9 @@ from ctrlplan.reports.style import (
 )
 from ctrlplan.reports.tables import plan_of
 from ctrlplan.studies.comparison import Comparison
+from ctrlplan.studies.ensemble import Ensemble
 from ctrlplan.studies.measures import signals_of
-from ctrlplan.studies.sections import CraneOnline, CranePaths, CraneTime, Paths, Plane
+from ctrlplan.studies.sections import Bands, CraneOnline, CranePaths, CraneTime, Paths, Plane
 from ctrlplan.studies.study import Study
 from ctrlplan.studies.sweep import Sweep
 from ctrlplan.studies.units import output_unit
@@ -86,6 +87,9 @@ def _panels_of(study: Study) -> Iterator[tuple[str, Callable[[Axes], ControlPlot
         yield "path", lambda axes: plot_path(comparison, obstacles, ax=axes), "path of the outputs (thin: planned)"
     else:
         yield "output", lambda axes: _plot_output(comparison, axes), "output (thin: reference)"
+    bands = next((section.ensemble for section in sections if isinstance(section, Bands)), None)
+    if bands is not None:
+        yield "draws", partial(_plot_draws, bands), "tracking error over the draws: median, and 5 to 95 % (band)"
     yield "error", lambda axes: _plot_error(comparison, axes), "tracking error"
     if comparison.controls:
         yield "control", lambda axes: _plot_control(comparison, axes), "control"
@@ -132,6 +136,20 @@ def _plot_error(comparison: Comparison, ax: Axes) -> ControlPlot:
     output = comparison.outputs[0]
     label = "distance from reference" if planar else f"error of {output}"
     return _finished(drawing, comparison, with_unit(label, output_unit(comparison, output)))
+
+
+def _plot_draws(ensemble: Ensemble, ax: Axes) -> ControlPlot:
+    """Median and 5 to 95 % band of the error of the first output over the draws."""
+    comparison, t = ensemble.nominal, ensemble.timepts
+    drawing, styles = _axes_of(comparison, ax)
+    output = comparison.outputs[0]
+    for name, plan in comparison.plans.items():
+        band = ensemble.bands.get(name, {}).get(output)
+        if band is not None:
+            low, _, middle, _, high = plan.jet(t, 0)[0][0] - band[::-1]
+            ax.fill_between(t, low, high, color=styles[name]["color"], alpha=0.2, linewidth=0)
+            ax.plot(t, middle, **styles[name])
+    return _finished(drawing, comparison, with_unit(f"error of {output}", output_unit(comparison, output)))
 
 
 def _plot_control(comparison: Comparison, ax: Axes) -> ControlPlot:

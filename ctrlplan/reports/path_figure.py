@@ -26,8 +26,8 @@ from ctrlplan.studies.measures import signals_of
 from ctrlplan.studies.roles import Role
 from ctrlplan.studies.units import output_unit
 
-_GRID = 301
-"""Points along each side on which an obstacle is evaluated."""
+_GRID, _REACH = 601, 1.5
+"""Points along each side on which an obstacle is evaluated, and the distance from the paths relative to their size."""
 
 
 def is_planar(comparison: Comparison) -> bool:
@@ -125,13 +125,15 @@ def _letters_of(count: int) -> str:
 
 
 def _draw_obstacle(axes: Axes, obstacle: Obstacle) -> None:
-    """Obstacle as the set where its distance is not positive, inside the axes."""
-    axes.apply_aspect()
-    limits = [axes.get_xlim(), axes.get_ylim()]
-    grid = np.stack(np.meshgrid(*(np.linspace(*pair, _GRID) for pair in limits)))
+    """Obstacle as the set where its distance is not positive; it does not set the limits of the axes."""
+    before = axes.dataLim.frozen()
+    (left, bottom), (right, top) = before.get_points().tolist()
+    reach = _REACH * max(right - left, top - bottom)
+    ends = (left - reach, right + reach), (bottom - reach, top + reach)
+    grid = np.stack(np.meshgrid(*(np.linspace(*pair, _GRID) for pair in ends)))
     distance = obstacle.distance(grid)
     lowest = float(distance.min())
     if lowest < 0.0:
         axes.contourf(*grid, distance, levels=[2.0 * lowest, 0.0], colors=[shade(0.267)], zorder=0)
-    axes.set_xlim(limits[0])
-    axes.set_ylim(limits[1])
+    axes.dataLim.set(before)
+    axes.autoscale()

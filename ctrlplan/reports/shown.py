@@ -131,7 +131,7 @@ def _(study: Study, taken: Sequence[str]) -> Shown:
     marks = [f"† {plan}: {mark}." for plan, mark in comparison.marks.items()]
     drawn = [part for part in parts if part.nominal]
     nominal, title = (
-        ("At the nominal parameters: ", "Metrics at the nominal parameters") if drawn else ("", "All metrics")
+        ("At the nominal parameters. ", "Metrics at the nominal parameters") if drawn else ("", "All metrics")
     )
     folds = [
         Fold("Description and findings", _words(study)),

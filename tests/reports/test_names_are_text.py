@@ -14,7 +14,8 @@ from drawings import drawn_texts
 from hostile import CONTROL, MARKUP, NOT_WRITTEN_SO, SHOWN, TEXTS, mixed, study
 
 import ctrlplan as cp
-from ctrlplan.reports import CraneAnimation, comparison_fragment, plot_plans, render_page, write_page
+from ctrlplan.reports import CraneAnimation, comparison_fragment, plot_plans, render_page, shown, write_page
+from ctrlplan.reports.parts import Panels
 from ctrlplan.reports.style import to_svg
 from ctrlplan.studies import Study
 from ctrlplan.studies.sections import PlanCurves
@@ -50,8 +51,14 @@ def plain(read):
 # On the page
 
 
+@pytest.fixture
+def undrawn(monkeypatch):
+    """Pages without the main figure, for what is said of their texts alone."""
+    monkeypatch.setattr(shown, "main_figure", lambda study: Panels([], [], "Nothing is drawn here."))
+
+
 @pytest.mark.parametrize("name", TEXTS)
-def test_no_element_and_no_attribute_comes_from_a_text(name, plain, read):
+def test_no_element_and_no_attribute_comes_from_a_text(name, undrawn, plain, read):
     tree = read(render_page([study(lambda role: f"{TEXTS[name]} {role}", drawn=False)], TEXTS[name]))
     assert structure(tree) == plain(False)
     words = tree.words()
@@ -96,7 +103,7 @@ def test_a_notebook_cell_takes_them_as_text_too(name, read):
     assert list(json.loads(data.text)["plans"]) == list(other.plans)
 
 
-def test_the_policy_allows_the_script_of_the_page_and_nothing_else(read):
+def test_the_policy_allows_the_script_of_the_page_and_nothing_else(undrawn, read):
     tree = read(render_page([study(str, drawn=False)], "page"))
     (policy,) = (
         m.attributes["content"] for m in tree.all("meta") if m.attributes.get("http-equiv") == "Content-Security-Policy"
@@ -114,7 +121,7 @@ def test_the_policy_allows_the_script_of_the_page_and_nothing_else(read):
 
 
 @pytest.mark.parametrize("name", CONTROL)
-def test_a_page_with_any_character_can_be_written_and_read(name, tmp_path):
+def test_a_page_with_any_character_can_be_written_and_read(name, undrawn, tmp_path):
     path = write_page([study(lambda role: f"{TEXTS[name]} {role}", drawn=False)], tmp_path, TEXTS[name])
     text = path.read_bytes().decode("utf-8")
     assert not re.search("[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f]", text)
