@@ -264,3 +264,22 @@ def test_a_crane_whose_rope_is_slack_at_once_is_measured(loaded):
     row = study.comparison.metrics["step"]
     assert row["load_path"] == 0.0
     assert row["slack_time"] == 0.0
+
+
+def test_a_sweep_with_a_plan_without_metrics_has_a_figure_and_null(loaded, tmp_path):
+    """The step's rope is slack from the first sample on: it has no settling time for any value."""
+    points = [{"time": 0.0, "x": REST, "z": [10.0, 0, 0]}, {"time": 16.0, "x": END, "z": [11.0, 0, 0]}]
+    study = loaded(
+        loop={"kind": "crane", "force_limits": [-30e3, 30e3]},
+        plans=[{"family": "step"}, quintic()],
+        waypoints=points,
+        samples=41,
+        sweep={"parameter": "load_mass", "values": [300.0, 320.0], "metrics": ["settling_time"]},
+    ).run()
+    found = study.results()["sweep"]
+    assert found["step"] == {"settling_time": [None, None]}
+    assert all(value > 0.0 for value in found["polynomial"]["settling_time"])
+    (section,) = of_type(study, SweepCurves)
+    assert np.isnan(section.sweep.column("step", "settling_time")).all()
+    lines = section.sweep.plot(("settling_time",)).axes[0, 0].get_lines()
+    assert sum(np.isfinite(line.get_ydata()).any() for line in lines) == 1
