@@ -15,6 +15,7 @@ import ctrlplan
 
 if TYPE_CHECKING:
     Add: TypeAlias = Callable[..., argparse.Action]
+    Commands: TypeAlias = argparse._SubParsersAction[argparse.ArgumentParser]
 
     from ctrlplan.studies.files import StudyFile
     from ctrlplan.studies.study import Study
@@ -56,19 +57,29 @@ def _parser(given: Sequence[str]) -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"ctrlplan {ctrlplan.__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    _add_own_studies(commands)
+    _add_study_files(commands, given)
+    return parser
 
-    def command(name: str, run: Callable[[argparse.Namespace], list[Path]], text: str, epilog: str) -> Add:
-        added = commands.add_parser(
-            name,
-            help=text,
-            description=f"{text[0].upper()}{text[1:]}.",
-            epilog=epilog,
-            formatter_class=argparse.RawDescriptionHelpFormatter,
-        )
-        added.set_defaults(run=run)
-        return added.add_argument
 
-    add = command(
+def _command(
+    commands: Commands, name: str, run: Callable[[argparse.Namespace], list[Path]], text: str, epilog: str
+) -> Add:
+    """Add a command, with an example in its help; returned: the function that adds an argument."""
+    added = commands.add_parser(
+        name,
+        help=text,
+        description=f"{text[0].upper()}{text[1:]}.",
+        epilog=epilog,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    added.set_defaults(run=run)
+    return added.add_argument
+
+
+def _add_own_studies(commands: Commands) -> None:
+    add = _command(
+        commands,
         "reproduce",
         _reproduce,
         "run all studies of the paper and write a report",
@@ -76,7 +87,8 @@ def _parser(given: Sequence[str]) -> argparse.ArgumentParser:
     )
     add("--out", type=Path, default=Path("report"), help="output folder (default: report)")
 
-    add = command(
+    add = _command(
+        commands,
         "online",
         _online,
         "run the studies of on-line methods and write a report",
@@ -84,12 +96,15 @@ def _parser(given: Sequence[str]) -> argparse.ArgumentParser:
     )
     add("--out", type=Path, default=Path("online"), help="output folder (default: online)")
 
+
+def _add_study_files(commands: Commands, given: Sequence[str]) -> None:
     kinds, epilog = _new_kinds() if given[:1] == ["new"] else ((), "")
-    add = command("new", _new, "write a commented study file to start from", epilog)
+    add = _command(commands, "new", _new, "write a commented study file to start from", epilog)
     add("out", type=Path, metavar="STUDY", help="new study file, ending in .toml; a file that exists is not replaced")
     add("--kind", choices=kinds, default="linear", help="kind of study (default: linear)")
 
-    add = command(
+    add = _command(
+        commands,
         "report",
         _report,
         "run the study of a study file and write a report",
@@ -98,7 +113,8 @@ def _parser(given: Sequence[str]) -> argparse.ArgumentParser:
     add("study", type=Path, help="study file (TOML)")
     add("--out", type=Path, default=Path("report"), help="output folder (default: report)")
 
-    add = command(
+    add = _command(
+        commands,
         "plan",
         _plan,
         "write the trajectories of a study file, without simulation",
@@ -107,7 +123,6 @@ def _parser(given: Sequence[str]) -> argparse.ArgumentParser:
     add("study", type=Path, help="study file (TOML)")
     add("--out", type=Path, required=True, help=_PLAN_OUT)
     add("--dt", type=float, help="sampling period [s] of sampled files (default: 1001 samples)")
-    return parser
 
 
 def _new_kinds() -> tuple[tuple[str, ...], str]:

@@ -357,7 +357,7 @@ class Explorer:
             shown["error"] = str(error)
         else:
             self._plan, self._run, self._metrics = plan, run, metrics
-            known = {name: measures.get(name, Measure(name)) for name in metrics}
+            known = {name: measures[name] for name in metrics if name in measures}  # not those of each axis
             rows = leading_metrics(known, lambda name, measure: _cells(measure, metrics[name]))
             shown |= {
                 "scene": [asdict(panel) for panel in panels],

@@ -210,13 +210,14 @@ def plot_sweep(
     drawing = Drawing(ax, (len(names), 1), size, rows=names, wrap=columns)
     styles = plan_styles(sweep, drawing.column[0])
     for name, axes in zip(names, drawing.column, strict=True):
-        for plan, rows in sweep.metrics.items():
-            x, y = sweep.values, rows[name]
+        columns_of = {plan: sweep.column(plan, name) for plan in sweep.metrics}
+        for plan, row in columns_of.items():
+            x, y = sweep.values, row
             if name in SETTLING_TIMES:
                 x, y = _with_gaps(x, y)
             axes.plot(x, y, **styles[plan])
         label_y(axes, with_unit(sweep.title_of(name), sweep.unit_of(name)))
-        finite = np.concatenate([r[name][np.isfinite(r[name])] for r in sweep.metrics.values()])
+        finite = np.concatenate([row[np.isfinite(row)] for row in columns_of.values()])
         if finite.size and finite.min() > 0.0 and finite.max() > 100.0 * finite.min():
             axes.set_yscale("log")
         if sweep.values[0] > 0.0 and sweep.values[-1] > 20.0 * sweep.values[0]:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import singledispatch
 
-from ctrlplan.planning.limits import limit_words
+from ctrlplan.planning.limits import Margins, limit_words
 from ctrlplan.reports.crane_figures import (
     animation_data,
     plot_motion,
@@ -49,6 +50,7 @@ from ctrlplan.studies.sections import (
     Paths,
     PlanCurves,
     Plane,
+    PlanMargins,
     Responses,
     Section,
     SweepCurves,
@@ -158,18 +160,7 @@ def _(section: DrawTable, study: Study) -> Part:
 def _(section: FastestMove, study: Study) -> Part:
     found, units = section.fastest, study.comparison.units
     name, time = found.active.bound.name, number(found.active.time)
-    heads = [
-        Head("limit"),
-        Head("unit", unit=True),
-        Head("permitted range", words=True),
-        Head("value nearest to the limit"),
-        Head("time [s]"),
-        Head("margin"),
-    ]
-    rows = []
-    for row in found.margins:
-        unit = units.get(row.bound.name, "")
-        rows.append([row.bound.name, unit, row.bound.range, number(row.value), number(row.time), row.share])
+    table = Table(_MARGIN_HEADS, _margin_rows(found.margins, units), "margins")
     caption = section.caption or (
         "Limited signals of the fastest plan, their limits (dashed), and the point nearest to a limit (marker)."
     )
@@ -177,8 +168,40 @@ def _(section: FastestMove, study: Study) -> Part:
         f"The minimum duration is {number(found.duration)} s. The active limit is {name}, reached at {time} s. The "
         "limits are satisfied over the whole interval, not only at samples."
     )
-    blocks: list[Block] = [Text(words), Table(heads, rows, "margins"), Picture("fastest", found.plot(units), caption)]
+    blocks: list[Block] = [Text(words), table, Picture("fastest", found.plot(units), caption)]
     return Part(blocks, heading="Minimum duration within limits", below=True)
+
+
+@draw.register
+def _(section: PlanMargins, study: Study) -> Part:
+    units = study.comparison.units
+    rows = [
+        [plan, *row, "satisfied" if margin.fraction >= 0.0 else "violated"]
+        for plan, margins in section.margins.items()
+        for margin, row in zip(margins, _margin_rows(margins, units), strict=True)
+    ]
+    words = "Limits of the plans over the whole interval, not only at samples; the smallest margin of each plan first."
+    table = Table([Head("plan"), *_MARGIN_HEADS, Head("verdict", words=True)], rows, "plan-margins")
+    return Part([Text(words, hint=True), table], heading="Limits of the plans", below=True)
+
+
+_MARGIN_HEADS = (
+    Head("limit"),
+    Head("unit", unit=True),
+    Head("permitted range", words=True),
+    Head("value nearest to the limit"),
+    Head("time [s]"),
+    Head("margin"),
+)
+
+
+def _margin_rows(margins: Margins, units: Mapping[str, str]) -> list[list[str]]:
+    """A row for each limit, with the cells of `_MARGIN_HEADS`."""
+    found = []
+    for row in margins:
+        unit = units.get(row.bound.name, "")
+        found.append([row.bound.name, unit, row.bound.range, number(row.value), number(row.time), row.share])
+    return found
 
 
 @draw.register

@@ -126,7 +126,7 @@ from ctrlplan.studies.loops import LOOP, build_loop, loop_kind
 from ctrlplan.studies.planned import AVOID, LIMITS, OBSTACLES, PLANS, Planned, planned
 from ctrlplan.studies.reading import Reader, StudyError
 from ctrlplan.studies.running import Builder, System
-from ctrlplan.studies.sections import Bands, DrawTable, FastestMove, Section, SweepCurves
+from ctrlplan.studies.sections import Bands, DrawTable, FastestMove, PlanMargins, Section, SweepCurves
 from ctrlplan.studies.study import Study
 from ctrlplan.studies.variations import DRAWS, SWEEP, check_variations, drawn, shown_metrics, swept
 from ctrlplan.trajectories import PolySpline, Trajectory, TrigSpline, Waypoint, waypoints_from_csv
@@ -237,7 +237,9 @@ class StudyFile:
             raise StudyError(
                 f"{self.path}: loop: simulation must not fail, got {type(error).__name__}: {error}"
             ) from error
-        study = kind.study(self.name, self.title, comparison, self.planned.wall)
+        study = kind.study(self.name, self.title, comparison, self.planned.obstacles)
+        if self.planned.margins:
+            found_sections.append(PlanMargins(self.planned.margins))
         sections = (*found_sections, *study.sections)
         return replace(study, notes=(*study.notes, *_planning_notes(self.planned)), sections=sections, text=self.text)
 
@@ -378,11 +380,8 @@ def load_study(path: str | os.PathLike[str], *, status: Callable[[str], object] 
     kind.check(loop, source)
     check_variations(data, kind, reader)
     benefit = reader.benefit(data)
-    units = data.get("units", {})
-    for label in units:
-        known = [*(waypoints[0].labels or ()), *(kind.signals or ())]
-        if kind.signals is not None and label not in known:
-            raise reader.error(f"units.{label}", f"must be of one of {', '.join(known)}, got {label!r}")
+    if kind.signals is not None:
+        reader.check_units(data.get("units", {}), [*(waypoints[0].labels or ()), *kind.signals])
     found = planned(data, waypoints, kind.crane(loop, source), reader, status)
     for name, plan in found.plans.items():
         if plan.end >= t_end:
@@ -399,7 +398,7 @@ def load_study(path: str | os.PathLike[str], *, status: Callable[[str], object] 
         plans=found.plans,
         loop=loop,
         planned=found,
-        units=units,
+        units=data.get("units", {}),
         benefit=benefit,
         experiment=experiment,
         sweep=data.get("sweep"),
@@ -486,6 +485,12 @@ class _FileReader(Reader):
             raise self.error("waypoints", f"must be a file that can be read, got {error}") from None
         except (ValueError, TypeError) as error:
             raise self.error("waypoints", error) from None
+
+    def check_units(self, units: Data, known: Sequence[str]) -> None:
+        """Raise if a unit is that of an unknown axis or signal."""
+        for label in units:
+            if label not in known:
+                raise self.error(f"units.{label}", f"must be of one of {', '.join(known)}, got {label!r}")
 
     def benefit(self, data: Data) -> bool:
         """Whether the report contains the benefit of planning; "worth" is the former name of the entry."""

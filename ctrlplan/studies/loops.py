@@ -15,7 +15,7 @@ import control as ct
 import numpy as np
 
 from ctrlplan._types import Data
-from ctrlplan.planning import Rectangle
+from ctrlplan.planning import Obstacle, Rectangle
 from ctrlplan.studies.baselines import smoother_polynomials
 from ctrlplan.studies.benefit import Choices
 from ctrlplan.studies.comparison import Comparison
@@ -23,7 +23,7 @@ from ctrlplan.studies.crane_setup import CRANE_MEASURES, LOAD, SLACK, marked_sla
 from ctrlplan.studies.entries import NUMBERS, PAIR, Entries, Entry, Flag, Number, Table, Text, Variants
 from ctrlplan.studies.reading import Reader, StudyError, got, named_in_module, one_line, reference
 from ctrlplan.studies.running import Builder, System
-from ctrlplan.studies.sections import AnimatedCrane, CraneMotion, CranePaths, CraneTime, PlanCurves, Wall
+from ctrlplan.studies.sections import AnimatedCrane, CraneMotion, CranePaths, CraneTime, Paths, PlanCurves, Wall
 from ctrlplan.studies.study import Study
 from ctrlplan.systems.plants import LAWS, Crane, crane_loop, unity_feedback_loop
 from ctrlplan.systems.plants.crane.laws import OLD_NAMES, as_law
@@ -79,9 +79,8 @@ class LoopKind(ABC):
         """Parameters of the loop, for the report."""
         return dict(table)
 
-    def study(self, name: str, title: str, comparison: Comparison, wall: Wall = None) -> Study:
-        """Study of the comparison, with the sections of this kind of loop; `wall` is an obstacle to be drawn."""
-        obstacles = () if wall is None else (Rectangle(*wall),)
+    def study(self, name: str, title: str, comparison: Comparison, obstacles: Sequence[Obstacle] = ()) -> Study:
+        """Study of the comparison, with the sections of this kind of loop and obstacles in its paths."""
         return Study(name, title, comparison, notes=comparison.notes, sections=comparison.sections(obstacles))
 
 
@@ -171,9 +170,12 @@ class CraneLoop(LoopKind):
         """Loop of each plan, whose crane reads the parameters; its law has those of the table."""
         return self.build(table, path)
 
-    def study(self, name: str, title: str, comparison: Comparison, wall: Wall = None) -> Study:
+    def study(self, name: str, title: str, comparison: Comparison, obstacles: Sequence[Obstacle] = ()) -> Study:
         """With the paths, the motion of the crane and its animation."""
-        sections = (CranePaths(wall=wall), PlanCurves(), CraneTime(), CraneMotion(wall=wall), AnimatedCrane(wall=wall))
+        wall = next(filter(None, map(_wall, obstacles)), None)
+        further = [Paths(obstacles=tuple(obstacles))] if len(obstacles) > (wall is not None) else []
+        scenes = (CranePaths(wall=wall), PlanCurves(), CraneTime(), CraneMotion(wall=wall), AnimatedCrane(wall=wall))
+        sections = (*scenes[:1], *further, *scenes[1:])
         return Study(name, title, marked_slack(comparison), notes=comparison.notes, sections=sections)
 
     def crane(self, table: Data, path: Path) -> Crane:
@@ -182,6 +184,13 @@ class CraneLoop(LoopKind):
             return Crane(**{key: value for key, value in table.items() if key in _OF_CRANE})
         except (ValueError, TypeError) as error:
             raise StudyError(f"{path}: loop: {error}") from None
+
+
+def _wall(obstacle: Obstacle) -> Wall:
+    """Sides of a rectangle, which the scenes of a crane show; None if one is infinite or it is of another shape."""
+    if not isinstance(obstacle, Rectangle) or not all(map(math.isfinite, (*obstacle.x, *obstacle.z))):
+        return None
+    return obstacle.x, obstacle.z
 
 
 _OF_CRANE = tuple(entry.name for entry in fields(Crane))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -43,7 +42,6 @@ from ctrlplan.studies.entries import (
 )
 from ctrlplan.studies.plans import standard_plans
 from ctrlplan.studies.reading import Reader, StudyError, got, named_in_module, one_line, reference
-from ctrlplan.studies.sections import Wall
 from ctrlplan.systems.plants import Crane
 from ctrlplan.trajectories import Trajectory, Waypoint
 from ctrlplan.trajectories.waypoint import ENTRIES
@@ -76,12 +74,6 @@ class Planned:
     clearances: dict[str, Clearance]
     obstacles: tuple[Obstacle, ...]
     limits: dict[str, object]
-
-    @property
-    def wall(self) -> Wall:
-        """First rectangle with four finite sides, which the figures of a crane show."""
-        boxes = (box for box in self.obstacles if isinstance(box, Rectangle))
-        return next(((box.x, box.z) for box in boxes if all(map(math.isfinite, (*box.x, *box.z)))), None)
 
 
 def planned(

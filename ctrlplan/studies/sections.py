@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:  # comparisons and ensembles make studies of themselves for their pages
     import control as ct
 
-    from ctrlplan.planning import Fastest, Obstacle
+    from ctrlplan.planning import Fastest, Margins, Obstacle
     from ctrlplan.studies.ensemble import Ensemble
     from ctrlplan.studies.grids import Grid
     from ctrlplan.studies.sweep import Sweep
@@ -231,6 +231,27 @@ class FastestMove(Section):
     """
 
     fastest: Fastest
+
+
+@dataclass(frozen=True)
+class PlanMargins(Section):
+    """Margins of plans to their limits.
+
+    Attributes
+    ----------
+    margins : dict of str to Margins
+        By plan.
+    """
+
+    margins: Mapping[str, Margins]
+
+    def results(self) -> dict[str, object]:
+        """Value nearest to each limit, its time and the margin, by plan and limit."""
+        rows = {
+            plan: {row.bound.name: {"value": row.value, "time": row.time, "margin": row.fraction} for row in margins}
+            for plan, margins in self.margins.items()
+        }
+        return {"limits": rows}
 
 
 @dataclass(frozen=True)

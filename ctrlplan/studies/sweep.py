@@ -128,7 +128,7 @@ class Sweep(Displayed):
         """Unit of a metric if it is known, and its range for each plan."""
         cells, scale = [self.unit_of(name)], UNIT_SCALES.get(measure.unit, 0.0)
         for plan in self.metrics:
-            column = self._column(plan, name)
+            column = self.column(plan, name)
             known = column[~np.isnan(column)]
             ends = [without_rounding(float(f(known)), scale) for f in (np.min, np.max)] if known.size else [np.nan] * 2
             low, high = (number(end, measure.unit) for end in ends)
@@ -145,10 +145,10 @@ class Sweep(Displayed):
         )
 
     def results(self, names: Sequence[str]) -> dict[str, object]:
-        """Plain data for JSON: the values, and some metrics of each plan."""
+        """Plain data for JSON: the values, and some metrics of each plan, null where it has none."""
         rows = {
-            plan: {name: [finite_or_none(value) for value in found[name].tolist()] for name in names}
-            for plan, found in self.metrics.items()
+            plan: {name: [finite_or_none(value) for value in self.column(plan, name).tolist()] for name in names}
+            for plan in self.metrics
         }
         return {self.parameter: self.values.tolist()} | rows
 
@@ -162,7 +162,7 @@ class Sweep(Displayed):
             for plan in dict.fromkeys((*self.metrics, *other.metrics))
         }
         rows = {
-            plan: {name: np.concatenate([one._column(plan, name) for one in (self, other)])[order] for name in found}
+            plan: {name: np.concatenate([one.column(plan, name) for one in (self, other)])[order] for name in found}
             for plan, found in names.items()
         }
         moved = [replace(failure, draw=int(place[failure.draw])) for failure in self.failures]
@@ -178,7 +178,8 @@ class Sweep(Displayed):
             roles=self.roles | other.roles,
         )
 
-    def _column(self, plan: str, name: str) -> Array:
+    def column(self, plan: str, name: str) -> Array:
+        """Values of a metric of a plan, shape (nvalues,); nan if it has none."""
         return self.metrics.get(plan, {}).get(name, np.full(self.values.size, np.nan))
 
     def report(self, path: str | os.PathLike[str], title: str = "") -> Path:

@@ -191,6 +191,17 @@ def test_a_change_of_a_trait_changes_everything_else():
     assert found.widget.table[0][:2] == ["Settling time", f"{found.metrics['settling_time']:.4g}"]
 
 
+def test_the_table_has_the_metrics_of_all_axes_together():
+    loop = ct.append(LAG, LAG)
+    loop.set_inputs(["r1", "r2"])
+    loop.set_outputs(["x", "z"])
+    found = cp.explore(PLANAR, loop)
+    titles = [row[0] for row in found.widget.table]
+    assert titles[0] == "Settling time"
+    assert "settling_time_x" in found.metrics
+    assert not [title for title in titles if "_" in title]
+
+
 def test_values_without_a_plan_show_the_error_and_raise():
     found = cp.explore(MOVE, LAG)
     before = found.widget.numbers
@@ -337,7 +348,7 @@ def curve(page, panel, name):
     points = np.array([part.split() for part in path.replace("M", "L").split("L")[1:]], dtype=float).T
     found = []
     for ticks, places in zip((across, up), points, strict=True):
-        assert len(ticks) >= 2
+        assert 2 <= len(ticks) <= 7
         (v0, p0), (v1, p1) = ticks[0], ticks[-1]
         found.append(v0 + (places - p0) * (v1 - v0) / (p1 - p0))
     return np.array(found)

@@ -1,13 +1,17 @@
 """Study files with limits, minimum durations, obstacles, sweeps and draws, against closed forms and naive checks."""
 
+import re
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from study_text import to_toml, valid
 
 import ctrlplan as cp
+from ctrlplan.reports.page import render_page
 from ctrlplan.studies.files import load_study
 from ctrlplan.studies.reading import StudyError
-from ctrlplan.studies.sections import Bands, DrawTable, FastestMove, SweepCurves
+from ctrlplan.studies.sections import Bands, CraneScene, DrawTable, FastestMove, Paths, PlanMargins, SweepCurves
 
 REST, END = [0.0, 0.0, 0.0], [20.0, 0.0, 0.0]
 MOVE = [{"time": 0.0, "x": REST}, {"time": 16.0, "x": END}]
@@ -98,6 +102,17 @@ def test_margins_and_the_fastest_plan_are_in_the_report(loaded):
     assert any("slow violates a limit" in note for note in study.notes)  # 15/8 20/16 = 2.34 > 2
     assert any("polynomial satisfies all limits" in note for note in study.notes)
     assert study.comparison.parameters["limit of velocity"] == "within ±2"
+    (table,) = of_type(study, PlanMargins)
+    assert table.results()["limits"]["slow"] == {
+        "x_d1": {
+            "value": pytest.approx(15 / 8 * 20 / 16, rel=1e-12),
+            "time": pytest.approx(8.0, abs=1e-6),
+            "margin": pytest.approx(1.0 - 15 / 8 * 20 / 16 / 2.0, rel=1e-9),
+        }
+    }
+    page = render_page([study], "limits")
+    assert re.search(r"<td[^>]*>violated</td>", page)
+    assert re.search(r"<td[^>]*>satisfied</td>", page)
 
 
 # Obstacles
@@ -110,13 +125,26 @@ def to_rectangle(points, x, z):
     return np.hypot(across, above)
 
 
-def test_a_plan_is_led_around_the_obstacles(loaded):
+TWO_AXES = """
+import control as ct
+
+def build() -> ct.StateSpace:
+    lag = ct.ss([[-9.0]], [[9.0]], [[1.0]], [[0.0]])
+    both = ct.append(lag, lag)
+    both.set_outputs(["x", "z"])
+    return both
+"""
+
+
+def test_a_plan_is_led_around_the_obstacles(loaded, tmp_path):
+    (tmp_path / "two_axes.py").write_text(TWO_AXES)
     obstacle = {"shape": "rectangle", "x": [8.0, 12.0], "z": [-3.0, 1.0]}
     found = loaded(
         plans=[quintic(avoid=True), quintic(name="straight")],
         waypoints=PLANAR,
         obstacles=[obstacle],
         avoid={"clearance": 0.5, "load": 0.25},
+        loop={"kind": "python:two_axes:build"},
     )
     t = np.linspace(0, 16, 20001)
     around, straight = found.plans["polynomial"], found.plans["straight"]
@@ -124,7 +152,9 @@ def test_a_plan_is_led_around_the_obstacles(loaded):
     assert to_rectangle(straight(t), obstacle["x"], obstacle["z"]).min() == 0.0
     assert found.planned.clearances["polynomial"].lower >= 0.5 - 1e-9
     assert found.planned.clearances["straight"].minimum < 0.0
-    assert found.planned.wall == ((8.0, 12.0), (-3.0, 1.0))
+    study = replace(found, samples=21).run()
+    (paths,) = of_type(study, Paths)
+    assert paths.obstacles == (cp.Rectangle((8.0, 12.0), (-3.0, 1.0)),)
 
 
 def test_obstacles_have_every_shape(loaded):
@@ -136,7 +166,6 @@ def test_obstacles_have_every_shape(loaded):
     found = loaded(plans=[quintic()], waypoints=PLANAR, obstacles=shapes)
     expected = (cp.Rectangle((8, 12), (3, np.inf)), cp.Disc((10, -4), 1.0), cp.HalfPlane((0, 2), 40.0))
     assert found.planned.obstacles == expected
-    assert found.planned.wall is None
     clear = cp.clearance(found.plans["polynomial"], expected)
     assert found.planned.clearances["polynomial"].minimum == clear.minimum
 
@@ -154,6 +183,18 @@ def test_the_rope_of_a_crane_avoids_as_well(loaded):
     top = crane.rope().top(led.jet(t, crane.rope().order))
     ways = np.linspace(0.0, 1.0, 201)[:, None, None] * (top - led(t)) + led(t)
     assert np.hypot(ways[:, 0] - 10.0, ways[:, 1] - 5.0).min() - 1.0 >= 0.2 - 1e-3
+
+
+def test_the_scenes_of_a_crane_show_a_wall_and_the_paths_all_obstacles(loaded):
+    points = [{"time": 0.0, "x": REST, "z": [10.0, 0, 0]}, {"time": 16.0, "x": END, "z": [11.0, 0, 0]}]
+    wall = {"shape": "rectangle", "x": [7.0, 13.0], "z": [12.0, 13.0]}
+    setting = {"loop": {"kind": "crane"}, "waypoints": points, "plans": [quintic()], "samples": 21}
+    study = loaded(**setting, obstacles=[wall]).run()
+    assert {section.wall for section in of_type(study, CraneScene)} == {((7.0, 13.0), (12.0, 13.0))}
+    assert not of_type(study, Paths)
+    disc = {"shape": "disc", "centre": [10.0, 1.0], "radius": 0.5}
+    (paths,) = of_type(loaded(**setting, obstacles=[disc, wall]).run(), Paths)
+    assert paths.obstacles == (cp.Disc((10.0, 1.0), 0.5), cp.Rectangle((7.0, 13.0), (12.0, 13.0)))
 
 
 # Sweeps and draws
@@ -264,3 +305,22 @@ def test_a_crane_whose_rope_is_slack_at_once_is_measured(loaded):
     row = study.comparison.metrics["step"]
     assert row["load_path"] == 0.0
     assert row["slack_time"] == 0.0
+
+
+def test_a_sweep_with_a_plan_without_metrics_has_a_figure_and_null(loaded, tmp_path):
+    """The step's rope is slack from the first sample on: it has no settling time for any value."""
+    points = [{"time": 0.0, "x": REST, "z": [10.0, 0, 0]}, {"time": 16.0, "x": END, "z": [11.0, 0, 0]}]
+    study = loaded(
+        loop={"kind": "crane", "force_limits": [-30e3, 30e3]},
+        plans=[{"family": "step"}, quintic()],
+        waypoints=points,
+        samples=41,
+        sweep={"parameter": "load_mass", "values": [300.0, 320.0], "metrics": ["settling_time"]},
+    ).run()
+    found = study.results()["sweep"]
+    assert found["step"] == {"settling_time": [None, None]}
+    assert all(value > 0.0 for value in found["polynomial"]["settling_time"])
+    (section,) = of_type(study, SweepCurves)
+    assert np.isnan(section.sweep.column("step", "settling_time")).all()
+    lines = section.sweep.plot(("settling_time",)).axes[0, 0].get_lines()
+    assert sum(np.isfinite(line.get_ydata()).any() for line in lines) == 1

@@ -24,8 +24,8 @@ function shown(value) {
 }
 
 function ticks(low, high) {
-  const raw = (high - low) / 4, unit = Math.pow(10, Math.floor(Math.log10(raw)));
-  const step = [1, 2, 5, 10].find((factor) => factor * unit >= raw) * unit, found = [];
+  const raw = (high - low) / 2.5, unit = Math.pow(10, Math.floor(Math.log10(raw)));
+  const step = [5, 2, 1].find((factor) => factor * unit <= raw * (1 + 1e-9)) * unit, found = [];
   for (let k = Math.ceil(low / step - 1e-9); k * step <= high + 1e-9 * step; k += 1) { found.push(k * step); }
   return found;
 }
