@@ -37,6 +37,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
+_NEW = "new"
+
 _PLAN_OUT = (
     "output file: .json (plans), .csv, .mat, .npz (samples), .yaml (ROS JointTrajectory), .cam.csv, .cam.st (cams), "
     ".ppoly.json (polynomials) or .c (C99)"
@@ -84,8 +86,8 @@ def _parser(given: Sequence[str]) -> argparse.ArgumentParser:
     )
     add("--out", type=Path, default=Path("online"), help="output folder (default: online)")
 
-    kinds, epilog = _new_kinds() if given[:1] == ["new"] else ((), "")
-    add = command("new", _new, "write a commented study file to start from", epilog)
+    kinds, epilog = _new_kinds() if given[:1] == [_NEW] else ((), "")
+    add = command(_NEW, _new, "write a commented study file to start from", epilog)
     add("out", type=Path, metavar="STUDY", help="new study file, ending in .toml; a file that exists is not replaced")
     add("--kind", choices=kinds, default="linear", help="kind of study (default: linear)")
 

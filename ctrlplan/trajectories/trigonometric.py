@@ -225,7 +225,9 @@ class FourierCoefficients:
         return (self[axis] for axis in range(len(self)))
 
 
-def chosen_alpha(alpha: float | str, points: tuple[Waypoint, ...], family: Callable[..., Any], **options: Any) -> float:
+def chosen_alpha(
+    alpha: float | Literal["auto"], points: tuple[Waypoint, ...], family: Callable[..., Any], **options: Any
+) -> float:
     """Shape parameter in [0, 2 pi); "auto" is that of the shortest path."""
     if not isinstance(alpha, str):
         return checked_alpha(alpha)
