@@ -525,7 +525,7 @@ class Trajectory(Displayed, Fields, ABC):
         >>> move.on_cycle(0.3).end, move.on_cycle(0.3, {"velocity": 1.0}).end
         (1.2, 2.1)
         """
-        from ctrlplan.trajectories.cycle import on_cycle
+        from ctrlplan.trajectories.chosen import on_cycle
 
         return on_cycle(self, dt, limits)
 
