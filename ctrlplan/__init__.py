@@ -157,12 +157,15 @@ _EXPORTS = {
 }
 _HOME = {name: module for module, names in _EXPORTS.items() for name in names}
 
-__all__ = sorted([*_HOME, "metrics"])
+_FOLDERS = frozenset({"metrics"})
+"""Folders that are public as a whole."""
+
+__all__ = sorted([*_HOME, *_FOLDERS])
 
 
 def __getattr__(name: str) -> Any:
-    if name == "metrics":
-        return import_module("ctrlplan.metrics")
+    if name in _FOLDERS:
+        return import_module(f"ctrlplan.{name}")
     if name not in _HOME:
         raise AttributeError(f"module 'ctrlplan' has no attribute {name!r}")
     return getattr(import_module(f"ctrlplan.{_HOME[name]}"), name)

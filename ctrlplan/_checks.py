@@ -50,13 +50,13 @@ def real_array(values: ArrayLike, name: str) -> Array:
     given: Any = values
     if _has_mask(given):
         raise ValueError(f"{name} must have no masked values, got some; fill or drop them first")
-    units = getattr(given, "units", None) or getattr(given, "unit", None)
     try:
         array = np.asarray(given)
     except ValueError:
         raise ValueError(f"{name} must be an array, got rows of different lengths") from None
-    if array.dtype.kind in "mM" or (units is not None and str(units) not in ("", "dimensionless")):
-        what = f"values in {units}" if array.dtype.kind not in "mM" else f"values of type {array.dtype}"
+    unit = _unit(given)
+    if array.dtype.kind in "mM" or unit:
+        what = f"values in {unit}" if array.dtype.kind not in "mM" else f"values of type {array.dtype}"
         raise TypeError(f"{name} must be plain numbers (times in seconds), got {what}; convert them first")
     if array.dtype.kind == "O":
         try:
@@ -111,7 +111,7 @@ def one_number(value: object, name: str, rule: str = "a number") -> float:
     wrong = TypeError(f"{name} must be {rule}, got {value!r:.80}")
     if isinstance(value, _NO_NUMBERS) or bool(getattr(given, "ndim", False)) or np.ma.is_masked(given):
         raise wrong
-    if getattr(getattr(given, "dtype", None), "kind", "f") not in "iufO" or _has_unit(given):
+    if getattr(getattr(given, "dtype", None), "kind", "f") not in "iufO" or _unit(given):
         raise wrong
     try:
         return float(given)
@@ -247,9 +247,13 @@ def _has_mask(values: Any) -> bool:
     return bool(np.ma.is_masked(values))
 
 
-def _has_unit(value: Any) -> bool:
-    unit = getattr(value, "units", None) or getattr(value, "unit", None)
-    return unit is not None and str(unit) not in ("", "dimensionless")
+def _unit(value: Any) -> str:
+    """Unit of a quantity of pint or astropy; empty if it has none or is dimensionless."""
+    unit = str(getattr(value, "units", None) or getattr(value, "unit", None) or "")
+    return "" if unit in _NO_UNIT else unit
+
+
+_NO_UNIT = frozenset({"dimensionless"})
 
 
 def _check_kinds(values: Any, name: str) -> None:

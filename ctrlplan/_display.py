@@ -17,6 +17,12 @@ WIDTH = 99
 ROWS = 8
 """Maximum number of rows of a long table."""
 
+MISSING = "n/a"
+"""Text of nan."""
+
+_INFINITE = {"s": "never"}
+"""Text of infinity by unit, where it is not inf."""
+
 _LONGEST = 46
 """Maximum width of a cell in columns."""
 
@@ -126,9 +132,9 @@ def number(value: float, unit: str = "") -> str:
         Unit of the value.
     """
     if math.isnan(value):
-        return "n/a"
+        return MISSING
     if math.isinf(value):
-        return "never" if unit == "s" and value > 0.0 else f"{value:g}"
+        return _INFINITE.get(unit, "inf") if value > 0.0 else "-inf"
     return f"{value:.0f}" if 1e4 <= abs(value) < 1e6 else f"{value + 0.0:.4g}"
 
 

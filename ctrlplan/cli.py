@@ -38,6 +38,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
+_NEW = "new"
+
 _PLAN_OUT = (
     "output file: .json (plans), .csv, .mat, .npz (samples), .yaml (ROS JointTrajectory), .cam.csv, .cam.st (cams), "
     ".ppoly.json (polynomials) or .c (C99)"
@@ -98,8 +100,8 @@ def _add_own_studies(commands: Commands) -> None:
 
 
 def _add_study_files(commands: Commands, given: Sequence[str]) -> None:
-    kinds, epilog = _new_kinds() if given[:1] == ["new"] else ((), "")
-    add = _command(commands, "new", _new, "write a commented study file to start from", epilog)
+    kinds, epilog = _new_kinds() if given[:1] == [_NEW] else ((), "")
+    add = _command(commands, _NEW, _new, "write a commented study file to start from", epilog)
     add("out", type=Path, metavar="STUDY", help="new study file, ending in .toml; a file that exists is not replaced")
     add("--kind", choices=kinds, default="linear", help="kind of study (default: linear)")
 

@@ -246,6 +246,10 @@ class DeclaredTrait(Generic[T]):
         declare(block, **{self._name: value})
 
 
+_OF_ANY_SYSTEM = frozenset({"initial_state"})
+"""Traits that interconnections and linear systems have as well."""
+
+
 def _check_kind(system: ct.InputOutputSystem, traits: Mapping[str, object], label: str) -> None:
     """Raise if a trait has no effect on a system of this type."""
     if isinstance(system, ct.NonlinearIOSystem) and not isinstance(system, ct.InterconnectedSystem | ct.StateSpace):
@@ -254,7 +258,7 @@ def _check_kind(system: ct.InputOutputSystem, traits: Mapping[str, object], labe
         raise TypeError(f"system must be a control system, got {type(system).__name__}")
     inner = isinstance(system, ct.InterconnectedSystem)
     for name in traits:
-        if name != "initial_state":
+        if name not in _OF_ANY_SYSTEM:
             what = "an interconnection: declare it for its block" if inner else "a linear system: use a nonlinear block"
             raise TypeError(f"{name} has no effect on {label}, {what}")
 

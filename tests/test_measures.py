@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from pathlib import Path
 
 import measures
 import pytest
@@ -97,6 +98,31 @@ def printed(request, tmp_path_factory):
 )
 def test_each_number_is_the_one_counted_by_hand(printed, what, number):
     assert f"| {what} | {number} |" in printed.splitlines()
+
+
+@pytest.mark.parametrize(
+    ("code", "kind", "file"),
+    [
+        ('array.dtype.kind in "iuf"', "others' word", "a.py"),
+        ('event.kind == "fall"', "string", "a.py"),
+        ('method == "reduce"', "others' word", "a.py"),
+        ('method == "exact"', "string", "a.py"),
+        ('ufunc == "reduce"', "string", "a.py"),
+        ('name.startswith("_")', "others' word", "a.py"),
+        ('name.startswith("_d")', "string", "a.py"),
+        ('line != "\\n"', "others' word", "a.py"),
+        ('cell != "0"', "string", "a.py"),
+        ('str(annotation).startswith("ClassVar")', "others' word", "a.py"),
+        ('str(annotation).startswith("Array")', "string", "a.py"),
+        ('east_asian_width(letter) in "WF"', "others' word", "a.py"),
+        ('name in ("only", "measure")', "others' word", "former.py"),
+        ('name in ("only", "measure")', "string", "a.py"),
+        ('name == "step"', "name of a plan", "a.py"),
+    ],
+)
+def test_words_of_others_are_told_from_those_of_the_package(code, kind, file):
+    (found,) = measures.switches([measures.Module(Path(file), code)])
+    assert found.kind == kind
 
 
 def test_each_place_is_listed(printed):

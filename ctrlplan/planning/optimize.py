@@ -32,10 +32,10 @@ from scipy.optimize import minimize
 from ctrlplan._checks import checked_count, checked_finite, checked_labels
 from ctrlplan._display import Displayed, Facts, Figure, Part, counted, number, title_of
 from ctrlplan.trajectories import Joined, PiecewiseSpline, PolySpline, Trajectory, TrigSpline, Waypoint
+from ctrlplan.trajectories.chosen import checked_alpha
 from ctrlplan.trajectories.common import FACTORIALS, Array, readonly
 from ctrlplan.trajectories.newton import NewtonSystem
 from ctrlplan.trajectories.newton_spline import given_entries
-from ctrlplan.trajectories.trigonometric import checked_alpha
 from ctrlplan.trajectories.waypoint import entry_name, waypoint_table
 from ctrlplan.trajectories.waypoint_spline import checked_waypoints
 

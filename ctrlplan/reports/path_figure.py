@@ -80,11 +80,14 @@ def draw_paths(axes: Axes, comparison: Comparison, outputs: tuple[str, str]) -> 
         axes.plot(*(signals[output][way] for output in outputs), **styles[name])
 
 
+_GOAL = "goal"
+
+
 def mark_waypoints(axes: Axes, comparison: Comparison, outputs: tuple[str, str]) -> None:
     """Waypoints with their names."""
     for text, place in named_places(comparison, outputs).items():
         axes.plot(*place, "o", color=shade(0.73), mfc=axes.get_facecolor(), zorder=5)
-        offset, side = ((-6.0, -10.0), "right") if text == "goal" else ((6.0, -10.0), "left")
+        offset, side = ((-6.0, -10.0), "right") if text == _GOAL else ((6.0, -10.0), "left")
         axes.annotate(text, place, xytext=offset, textcoords="offset points", ha=side, fontsize=font_size(9))
 
 
@@ -109,7 +112,7 @@ def rows_of(comparison: Comparison, labels: Sequence[str], rows: Array, outputs:
 def named_places(comparison: Comparison, outputs: tuple[str, str]) -> dict[str, tuple[float, float]]:
     """Positions of the waypoints: start, A, B, ..., goal; those given in part are left out."""
     points = comparison.waypoints
-    names = ["start", *map(_letters_of, range(len(points) - 2)), "goal"][: len(points)]
+    names = ["start", *map(_letters_of, range(len(points) - 2)), _GOAL][: len(points)]
     found = {}
     for name, point in zip(names, points, strict=True):
         x, z = rows_of(comparison, point.labels or comparison.outputs, point.position, outputs).tolist()

@@ -6,6 +6,7 @@ import numpy as np
 from jinja2.utils import htmlsafe_json_dumps
 from markupsafe import Markup
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.scale import SymmetricalLogTransform
@@ -52,8 +53,8 @@ def readout_data(figure: Figure, key: str) -> Markup:
                     round(float(value), 3)
                     for value in (box.x0 * width, (1.0 - box.y1) * height, box.width * width, box.height * height)
                 ],
-                "x": _scale(axes, "x"),
-                "y": _scale(axes, "y"),
+                "x": _scale(axes.xaxis),
+                "y": _scale(axes.yaxis),
                 "label": [_words(axes.get_xlabel() or "time [s]"), _words(axes.get_ylabel())],
                 "path": any(_turns(line) for line in _curves(axes)),
                 "curves": curves,
@@ -93,10 +94,9 @@ def _words(label: str) -> str:
     return label.replace(r"\$", "$").replace("\n", " ")
 
 
-def _scale(axes: Axes, which: str) -> list[object]:
+def _scale(axis: Axis) -> list[object]:
     """Limits at the lower left and the upper right, kind of scale, and its parameters."""
-    axis = axes.xaxis if which == "x" else axes.yaxis
-    first, last = (float(limit) for limit in (axes.get_xlim() if which == "x" else axes.get_ylim()))
+    first, last = (float(limit) for limit in axis.get_view_interval())
     transform = axis.get_transform()
     if isinstance(transform, SymmetricalLogTransform):
         return [first, last, "symlog", float(transform.linthresh), float(transform.linscale)]

@@ -45,7 +45,8 @@ Style: TypeAlias = dict[str, Any]
 Dashes: TypeAlias = str | tuple[int, tuple[float, ...]]
 
 # Okabe and Ito's colours.
-_STEP: tuple[str, Dashes] = ("#000000", (0, (1, 1)))
+_BLACK = "#000000"
+_STEP: tuple[str, Dashes] = (_BLACK, (0, (1, 1)))
 _PLANS: tuple[tuple[str, Dashes], ...] = (
     ("#0072B2", (0, (5, 1.5))),
     ("#D55E00", "-"),
@@ -476,7 +477,7 @@ def _told_apart(styles: dict[str, Style], axes: Axes) -> dict[str, Style]:
     # Different dashes from the second plot on.
     dashes = islice(cycle(_OTHER_DASHES), max(len(drawn) - 1, 0), None)
     for i, style in enumerate(styles.values()):
-        if own and style["color"] == "#000000":
+        if own and style["color"] == _BLACK:
             style["color"] = shade(1.0)
         if not own or (drawn and _is_like(style["color"], used)):
             distance = _ALIKE if own else 0.02

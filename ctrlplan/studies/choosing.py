@@ -36,7 +36,7 @@ from ctrlplan.studies.crane_setup import (
     obstacle_waypoints,
 )
 from ctrlplan.studies.experiment import Experiment
-from ctrlplan.studies.grids import Grid
+from ctrlplan.studies.grids import Grid, Mark
 from ctrlplan.systems.plants import LAWS, crane_loop
 from ctrlplan.trajectories import PiecewiseSpline, Trajectory, TrigSpline, Waypoint
 
@@ -151,7 +151,7 @@ def optimality_claim(grids: tuple[Grid, Grid]) -> tuple[str, ...]:
     best = choose_alpha(obstacle_waypoints())
     baseline, shortest = length.best(row)
     bound = float(length.baselines[_POLYLINE][row])
-    better = sum(marks[1:].count("better") for grid in grids for marks in grid.marks())
+    better = sum(marks[1:].count(Mark.BETTER) for grid in grids for marks in grid.marks())
     cells = sum(grid.values[:, 1:].size for grid in grids)
     polynomial = int((length.values[:, 1:] < length.values[:, :1] * (1.0 - 1e-3)).sum())
     straight = choose_alpha(nominal_waypoints())

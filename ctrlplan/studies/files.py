@@ -472,9 +472,10 @@ class _FileReader(Reader):
     def waypoints_of_csv(self, stated: str | Data, first: Sequence[str]) -> tuple[Waypoint, ...]:
         """Waypoints of a CSV file, named by its path or by a table with the arguments of `waypoints_from_csv`."""
         table: Data = {"csv": stated} if isinstance(stated, str) else stated
-        options: Data = {key: value for key, value in table.items() if key != "csv"}
+        options = dict(table)
+        source = self.path.parent / options.pop("csv")
         try:
-            points = waypoints_from_csv(self.path.parent / table["csv"], **options)
+            points = waypoints_from_csv(source, **options)
             labels = points[0].labels
             if labels is not None:
                 order = sorted(range(len(labels)), key=lambda k: (*first, labels[k]).index(labels[k]))

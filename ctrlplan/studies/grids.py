@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from enum import StrEnum
 
 import numpy as np
 
@@ -15,8 +15,13 @@ from ctrlplan.studies.units import ROUNDING
 SAME = 1e-3
 """Relative difference up to which values count as equal."""
 
-Mark = Literal["", "better", "worse"]
-"""Whether a plan is better than every baseline, worse than the best baseline, or neither."""
+
+class Mark(StrEnum):
+    """How a plan compares with the best baseline."""
+
+    EQUAL = ""
+    BETTER = "better"
+    WORSE = "worse"
 
 
 @dataclass(frozen=True)
@@ -75,8 +80,8 @@ class Grid:
             return f"{self.title}: no baseline has a value to compare with."
         marks = self.marks()
         cells = [(i, j) for i in range(len(marks)) for j in range(self.alphas.size) if self.alphas[j] > 0.0]
-        better = [(i, j) for i, j in cells if marks[i][j] == "better"]
-        worse = sum(marks[i][j] == "worse" for i, j in cells)
+        better = [(i, j) for i, j in cells if marks[i][j] is Mark.BETTER]
+        worse = sum(marks[i][j] is Mark.WORSE for i, j in cells)
         names = list(dict.fromkeys(self.best(i)[0] for i in range(self.durations.size)))
         found = (
             f"{self.title}: of {len(cells)} trigonometric plans, {len(better)} are better and {worse} are worse than "
@@ -91,9 +96,9 @@ class Grid:
 
 def _mark(value: float, baseline: float, rounding: float = 0.0) -> Mark:
     if math.isnan(value) or math.isnan(baseline) or value == baseline:
-        return ""
+        return Mark.EQUAL
     if math.isfinite(value - baseline) and abs(value - baseline) <= max(
         SAME * max(abs(value), abs(baseline)), rounding
     ):
-        return ""
-    return "better" if value < baseline else "worse"
+        return Mark.EQUAL
+    return Mark.BETTER if value < baseline else Mark.WORSE

@@ -201,7 +201,8 @@ class LoopOfModule(LoopKind):
 
     def build(self, table: Data, path: Path) -> System | Builder:
         """Loop returned by the function, with parameters of a sweep as its arguments."""
-        values = {name: value for name, value in table.items() if name != "kind"}
+        values = dict(table)
+        del values["kind"]
         return self._returned(table, self._function(table, path), path, **values)
 
     def check_parameter(self, parameter: str, place: str, reader: Reader) -> None:

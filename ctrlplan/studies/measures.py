@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctrlplan import metrics
-from ctrlplan._display import ROWS, Displayed, Facts, Part
+from ctrlplan._display import MISSING, ROWS, Displayed, Facts, Part, number
 from ctrlplan._types import Array
 from ctrlplan.planning import SquaredDerivative
 from ctrlplan.simulation import Occurrence, Prepared, SimulationResponse
@@ -324,8 +324,12 @@ MEASURES = {
 """The metrics of a comparison by name, in the order of the tables."""
 
 
+_EMPTY = frozenset({MISSING, number(0.0)})
+"""Cells of metrics that have no value or are 0."""
+
 _LEADING = (
     "settling_time",
+    "",
     "tracking_settling_time",
     "overshoot_error",
     "overshoot_final",
@@ -353,7 +357,7 @@ def leading_metrics(
     found: dict[tuple[str, ...], str] = {}
     for name in sorted(measures, key=_rank):
         row = tuple(cells_of(name, measures[name]))
-        if any(cell not in ("n/a", "0") for cell in row[1:]):
+        if any(cell not in _EMPTY for cell in row[1:]):
             found.setdefault(row, name)
         if len(found) == ROWS:
             break
@@ -369,10 +373,6 @@ def _short_title(name: str, measure: Measure) -> str:
 def _rank(name: str) -> int:
     """Place of a metric among those that a short table shows, whichever signal it is of."""
     known = max((key for key in MEASURES if name == key or name.startswith(f"{key}_")), key=len, default="")
-    if known == "settling_time":
-        return -2
-    if not known:
-        return -1
     return _LEADING.index(known) if known in _LEADING else len(_LEADING)
 
 

@@ -9,17 +9,18 @@ from pathlib import Path
 from ctrlplan.studies.reading import StudyError, one_line
 
 _FOLDER = Path(__file__).with_name("templates")
+_STUDY = "study.toml"
+_FIRST = "linear"
 
 
 def study_kinds() -> tuple[str, ...]:
     """Kinds of study files, by the folders that hold them; the first is that of a linear loop."""
-    names = sorted(folder.name for folder in _FOLDER.iterdir())
-    return ("linear", *(name for name in names if name != "linear"))
+    return tuple(sorted((folder.name for folder in _FOLDER.iterdir()), key=lambda name: (name != _FIRST, name)))
 
 
 def study_purpose(kind: str) -> str:
     """What a kind is for: the first line of its file."""
-    return _text(_FOLDER / kind / "study.toml").partition("\n")[0].removeprefix("# ")
+    return _text(_FOLDER / kind / _STUDY).partition("\n")[0].removeprefix("# ")
 
 
 def new_study(path: Path, kind: str) -> list[Path]:
@@ -44,9 +45,9 @@ def new_study(path: Path, kind: str) -> list[Path]:
     """
     if path.suffix != ".toml":
         raise StudyError(f"a study file must end in .toml, got {path}")
-    texts = {path: _text(_FOLDER / kind / "study.toml").replace("FILE", shlex.quote(one_line(path.name)))}
+    texts = {path: _text(_FOLDER / kind / _STUDY).replace("FILE", shlex.quote(one_line(path.name)))}
     for source in sorted((_FOLDER / kind).iterdir()):
-        if source.name != "study.toml":
+        if source.name != _STUDY:
             texts[path.with_name(source.name.removesuffix(".in"))] = _text(source)
     written: list[Path] = []
     try:

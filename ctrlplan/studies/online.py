@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 
@@ -355,7 +355,7 @@ def governor_check(response: ct.TimeResponseData, force: float) -> tuple[tuple[s
     model, rest = _horizontal()
     t, signals, limit = np.asarray(response.time), signals_of(response), _SHARE * force
     labels = list(response.state_labels)
-    rows = [next(k for k, label in enumerate(labels) if label.endswith(state)) for state in model.state_labels]
+    rows = [_row(labels, state) for state in model.state_labels]
     states = np.asarray(response.states)
     predicted = np.asarray(model.C)[0] @ (states[rows] - rest[:, None])
     curves = Curves(
@@ -372,7 +372,7 @@ def governor_check(response: ct.TimeResponseData, force: float) -> tuple[tuple[s
         caption="Governed crane: simulated trolley force, and the force that the linear model of the governor predicts "
         "for the simulated states. No admissible reference is found while the prediction is beyond the limit.",
     )
-    infeasible = states[next(k for k, label in enumerate(labels) if label.endswith("governor_infeasible"))] > 0.5
+    infeasible = states[_row(labels, "governor_infeasible")] > 0.5
     if not infeasible.any():
         return (), curves
     after = t >= t[infeasible][0]
@@ -390,6 +390,11 @@ def governor_check(response: ct.TimeResponseData, force: float) -> tuple[tuple[s
         f"{peaks[0] / 1e3:.3g} kN with a limit of {limit / 1e3:.3g} kN, and the peak sway {peaks[1]:.2g} rad with a "
         f"limit of {_SWAY:g} rad.",
     ), curves
+
+
+def _row(labels: Sequence[str], state: str) -> int:
+    """Row of the state of a block by the end of its label, which the block's name precedes."""
+    return next(k for k, label in enumerate(labels) if label.endswith(state))
 
 
 def _compared(scenario: Scenario, title: str, what: str) -> Comparison:

@@ -52,10 +52,10 @@ def plan_files(study: StudyFile, path: Path, options: Options) -> dict[Path, str
         If the format cannot hold the plans.
     """
     ending = plan_ending(path, options)
-    if ending == ".json":
+    form = ENDINGS.get(ending)
+    if form is None:  # .json, which is none of the formats of a single plan
         data = {name: plan.to_dict() for name, plan in study.plans.items()}
         return {path: json.dumps(data, indent=1, allow_nan=False) + "\n"}
-    form = ENDINGS[ending]
     if isinstance(form, TableFormat):
         try:
             return {path: form.encoded(_table(study, options))}

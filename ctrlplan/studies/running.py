@@ -23,7 +23,7 @@ System: TypeAlias = "ct.InputOutputSystem | Prepared"
 Builder: TypeAlias = Callable[[str, Trajectory], System]
 """Function of a plan's name and the plan that returns a loop."""
 
-_CONTROL = re.compile("u")
+CONTROL = re.compile("u")
 """Labels of controls unless they are given: python-control calls the inputs of a plant u."""
 
 
@@ -138,7 +138,7 @@ def tracked_outputs(loop: System, outputs: Sequence[str] | None, plan: Trajector
 def acting_outputs(loop: System, controls: Sequence[str] | None) -> tuple[str, ...]:
     """Outputs that are controls: those given, or those whose names begin with u."""
     if controls is None:
-        return tuple(filter(_CONTROL.match, loop.output_labels))
+        return tuple(filter(CONTROL.match, loop.output_labels))
     return _known(loop, controls, "controls")
 
 

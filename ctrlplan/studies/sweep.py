@@ -34,7 +34,7 @@ from ctrlplan.studies.executing import (
 from ctrlplan.studies.experiment import Experiment, Metrics
 from ctrlplan.studies.measures import MEASURES, Measure, leading_metrics, wanted_measures
 from ctrlplan.studies.roles import Role, role_of
-from ctrlplan.studies.running import Builder, System, is_builder
+from ctrlplan.studies.running import CONTROL, Builder, System, is_builder
 from ctrlplan.studies.units import UNIT_SCALES, in_units, with_superscripts, without_rounding
 from ctrlplan.trajectories import Trajectory, Waypoint
 
@@ -336,7 +336,7 @@ def sweep(
         account = executed(run, points.tolist(), executor, timeout, parameter, progress)
         account.raise_if_none_ran("build")
     found = _swept(parameter, points, account)
-    acting, known = controls or [name for name in units or {} if name.startswith("u")], dict(units or {})
+    acting, known = controls or [*filter(CONTROL.match, units or {})], dict(units or {})
     labels = next(iter(experiment.plans.values())).labels
     found = replace(
         found,

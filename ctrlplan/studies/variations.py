@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -16,12 +18,18 @@ from ctrlplan.studies.monte_carlo import monte_carlo
 from ctrlplan.studies.reading import Reader, got
 from ctrlplan.studies.sweep import Sweep, sweep
 
+_SPACINGS: dict[str, tuple[Callable[..., object], float]] = {
+    "linear": (np.linspace, -math.inf),
+    "log": (np.geomspace, 0.0),
+}
+"""Function of each spacing, and the bound below its values."""
+
 _GRID = Table(
     {
         "low": Entry(Number(), "first value", required=True),
         "high": Entry(Number(), "last value", required=True),
         "count": Entry(Whole(2, 100_000), "number of values", required=True),
-        "scale": Entry(Text(("linear", "log")), "spacing of the values", default="linear"),
+        "scale": Entry(Text((*_SPACINGS,)), "spacing of the values", default="linear"),
     }
 )
 SWEEP = Table(
@@ -64,7 +72,7 @@ def check_variations(data: Data, kind: LoopKind, reader: Reader) -> None:
     if "sweep" in data:
         table = data["sweep"]
         kind.check_parameter(table["parameter"], "sweep.parameter", reader)
-        if isinstance(table["values"], dict) and table["values"]["scale"] == "log" and not table["values"]["low"] > 0.0:
+        if isinstance(table["values"], dict) and not table["values"]["low"] > _SPACINGS[table["values"]["scale"]][1]:
             raise reader.error("sweep.values.low", f"must be above 0 on a log scale, got {table['values']['low']:g}")
         values = _values(table["values"])
         if not values.size or np.any(np.diff(values) <= 0.0):
@@ -124,5 +132,4 @@ def _fields(experiment: Experiment) -> Data:
 def _values(values: Data | list[float]) -> Array:
     if isinstance(values, list):
         return np.array(values)
-    spaced = np.geomspace if values["scale"] == "log" else np.linspace
-    return np.asarray(spaced(values["low"], values["high"], values["count"]))
+    return np.asarray(_SPACINGS[values["scale"]][0](values["low"], values["high"], values["count"]))

@@ -19,13 +19,16 @@ _PURE = frozenset(
 )
 """Modules whose functions depend only on their arguments and closures."""
 
+_RANDOM = "numpy.random"
+"""Module among them whose functions do not."""
+
 HIDDEN = frozenset(str.split("open input eval exec globals locals __import__ compile id breakpoint"))
 """Built-in functions whose results are not functions of their arguments."""
 
 
 def is_pure(module: object) -> bool:
     """Whether functions of a module depend only on their arguments and closures."""
-    return isinstance(module, str) and module.partition(".")[0] in _PURE and not module.startswith("numpy.random")
+    return isinstance(module, str) and module.partition(".")[0] in _PURE and not module.startswith(_RANDOM)
 
 
 def inherits_from_library(kind: type) -> bool:
@@ -42,7 +45,7 @@ def is_impure(kind: type) -> bool:
 
 def is_impure_module(module: str) -> bool:
     """Whether functions of a module do not depend only on their arguments."""
-    return module.partition(".")[0] in _IMPURE or module.startswith("numpy.random")
+    return module.partition(".")[0] in _IMPURE or module.startswith(_RANDOM)
 
 
 def written_in_python(kind: type) -> bool:

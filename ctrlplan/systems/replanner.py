@@ -6,7 +6,7 @@ import itertools
 import math
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import Literal, get_args
+from typing import Literal, NamedTuple, get_args
 
 import control as ct
 import numpy as np
@@ -246,6 +246,13 @@ class _Horizons:
         return transition(self.order, self._end - t, self.rate * (self._end - t))
 
 
+class _TriggerOver(NamedTuple):
+    """Condition of a fit, and the deviation above which it holds."""
+
+    kind: Trigger
+    threshold: float
+
+
 class _Signals:
     """Names and indices of inputs and outputs."""
 
@@ -298,7 +305,7 @@ class _Correction(SampledBlock):
         horizons: _Horizons,
         offset: float,
         signals: _Signals,
-        trigger: tuple[Trigger, float],
+        trigger: _TriggerOver,
         limits: tuple[tuple[int, Array], ...],
         name: str,
     ) -> None:
@@ -376,12 +383,11 @@ class _Correction(SampledBlock):
         return after
 
     def _is_due(self, moved: bool, t: float, x: Array, begins: Array) -> bool:
-        trigger, threshold = self._trigger
-        if moved or trigger == "goal":
+        if moved or self._trigger.kind == "goal":
             return moved
-        if trigger == "deviation":
+        if self._trigger.kind == "deviation":
             off = begins[0] - self._jets(t, x, 0)[0]
-            return math.hypot(*off.tolist()) > threshold
+            return math.hypot(*off.tolist()) > self._trigger.threshold
         # From the reference to the same goal over the remaining time the fit would be the same plan.
         return self._signals.measured is not None or not self._horizons.shrinking
 
@@ -484,9 +490,7 @@ def _minimum_horizon(given: float | None, period: float, whole: float) -> float:
     return minimum
 
 
-def _checked_trigger(
-    trigger: Trigger, threshold: float | None, measured: int | None, goal: int | None
-) -> tuple[Trigger, float]:
+def _checked_trigger(trigger: Trigger, threshold: float | None, measured: int | None, goal: int | None) -> _TriggerOver:
     if trigger not in get_args(Trigger):
         raise ValueError(f"trigger must be one of {', '.join(get_args(Trigger))}, got {trigger!r}")
     if trigger == "goal" and goal is None:
@@ -496,12 +500,12 @@ def _checked_trigger(
             raise ValueError(
                 f'threshold must be given with trigger = "deviation" only, got {threshold} with {trigger!r}'
             )
-        return trigger, 0.0
+        return _TriggerOver(trigger, 0.0)
     if measured is None:
         raise ValueError('measured must be given for trigger = "deviation", got None')
     if threshold is None:
         raise ValueError('threshold must be given for trigger = "deviation", got None')
-    return trigger, checked_finite(threshold, "threshold", above=0.0)
+    return _TriggerOver(trigger, checked_finite(threshold, "threshold", above=0.0))
 
 
 def _checked_limits(plan: Trajectory, limits: Mapping[int, ArrayLike] | None) -> tuple[tuple[int, Array], ...]:

@@ -2,42 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 
 import numpy as np
 
-from ctrlplan._checks import checked_finite
-from ctrlplan.trajectories.combined import Joined, is_shaped
+from ctrlplan.trajectories.combined import is_shaped
 from ctrlplan.trajectories.common import Array
 from ctrlplan.trajectories.trajectory import Trajectory
 from ctrlplan.trajectories.waypoint import Waypoint
 from ctrlplan.trajectories.waypoint_spline import WaypointSpline
-
-
-def on_cycle(plan: Trajectory, dt: float, limits: Mapping[str, object] | None = None) -> Trajectory:
-    """Plan whose duration and waypoints are on a cycle; as `Trajectory.on_cycle`."""
-    dt = checked_finite(dt, "dt", above=0.0)
-    if isinstance(plan, Joined):
-        parts: list[Trajectory] = []
-        for k, part in enumerate(plan.parts):
-            try:
-                parts.append(on_cycle(part, dt, limits))
-            except ValueError as error:
-                raise ValueError(f"parts[{k}] of a joined plan: {error}") from None
-        same = all(part is before for part, before in zip(parts, plan.parts, strict=True))
-        return plan if same else Joined(parts)
-    if not plan.duration:
-        return plan
-    knots = knots_of(plan)
-    rounding = 4.0 * np.spacing(np.abs(knots).max()) / dt
-    counts = np.ceil(np.diff(knots) / dt * (1.0 - 4.0 * np.finfo(float).eps) - rounding).clip(min=1.0)
-    if counts.sum() > 2.0**53:
-        raise ValueError(f"dt must divide the plan into fewer than 2^53 cycles, got {dt:g} s in {plan.duration:g} s")
-    if limits is None:
-        return moved(plan, dt, counts)
-    from ctrlplan.planning.cycle import lengthened
-
-    return lengthened(plan, dt, counts, limits)
 
 
 def knots_of(plan: Trajectory) -> Array:

@@ -14,13 +14,14 @@ from ctrlplan._checks import checked_labels
 from ctrlplan._display import number
 from ctrlplan._renamed import warn_renamed
 from ctrlplan._types import Data, Value
+from ctrlplan.trajectories.chosen import chosen_alpha
 from ctrlplan.trajectories.common import FACTORIALS, Array, mapped_time, readonly, times_powers
 from ctrlplan.trajectories.conjugate_digits import Ends, conjugate_digits
 from ctrlplan.trajectories.newton import NEARLY_CLOSED, NewtonSystem
 from ctrlplan.trajectories.newton_spline import NewtonSpline, given_entries
 from ctrlplan.trajectories.polynomial import PolySpline
 from ctrlplan.trajectories.swing import warn_of_swing
-from ctrlplan.trajectories.trigonometric import TrigSpline, chosen_alpha
+from ctrlplan.trajectories.trigonometric import TrigSpline
 from ctrlplan.trajectories.waypoint import Waypoint
 from ctrlplan.trajectories.waypoint_spline import WaypointSpline, checked_waypoints, same_axes, same_times
 

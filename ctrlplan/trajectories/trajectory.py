@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ctrlplan._checks import checked_count, checked_finite, checked_number, checked_timepts, one_number
-from ctrlplan._display import Displayed, Facts, Figure, Part, Table, number
+from ctrlplan._display import MISSING, Displayed, Facts, Figure, Part, Table, number
 from ctrlplan._renamed import warn_renamed
 from ctrlplan._types import Data, Value
 from ctrlplan.trajectories import extrema as _extrema
@@ -525,7 +525,7 @@ class Trajectory(Displayed, Fields, ABC):
         >>> move.on_cycle(0.3).end, move.on_cycle(0.3, {"velocity": 1.0}).end
         (1.2, 2.1)
         """
-        from ctrlplan.trajectories.cycle import on_cycle
+        from ctrlplan.trajectories.chosen import on_cycle
 
         return on_cycle(self, dt, limits)
 
@@ -774,7 +774,7 @@ class Trajectory(Displayed, Fields, ABC):
                     largest = np.where([label in jumped for label in self.labels], np.inf, self.peak(nu))
                     peaks = [number(value) for value in largest.tolist()]
             except (ValueError, RuntimeError):  # beyond floating point, or not resolved
-                peaks = ["n/a"] * self.naxes
+                peaks = [MISSING] * self.naxes
             rows.append([f"peak {ENTRIES[nu]} [1/s{f'^{nu}' if nu > 1 else ''}]", *peaks])
         return rows
 

@@ -12,10 +12,10 @@ from numpy.typing import ArrayLike, NDArray
 from ctrlplan._checks import checked_count, checked_finite, real_array
 from ctrlplan._display import Displayed, Facts, Part, number
 from ctrlplan._types import Value
+from ctrlplan.trajectories.chosen import checked_alpha
 from ctrlplan.trajectories.common import FACTORIALS, Array, derivative_scale
 from ctrlplan.trajectories.fields import Fields
 from ctrlplan.trajectories.newton import NewtonSystem, newton_series, pair_series
-from ctrlplan.trajectories.trigonometric import checked_alpha
 
 
 class Transition(Displayed, Fields):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, Self
 
@@ -11,6 +11,7 @@ import numpy as np
 
 from ctrlplan._checks import checked_finite, one_number
 from ctrlplan._types import Data
+from ctrlplan.trajectories.chosen import chosen_alpha
 from ctrlplan.trajectories.common import Array
 from ctrlplan.trajectories.newton import NewtonSystem
 from ctrlplan.trajectories.newton_spline import NewtonSpline, Options, checked_degree
@@ -223,27 +224,6 @@ class FourierCoefficients:
 
     def __iter__(self) -> Iterator[FourierCoefficients]:
         return (self[axis] for axis in range(len(self)))
-
-
-def chosen_alpha(alpha: float | str, points: tuple[Waypoint, ...], family: Callable[..., Any], **options: Any) -> float:
-    """Shape parameter in [0, 2 pi); "auto" is that of the shortest path."""
-    if not isinstance(alpha, str):
-        return checked_alpha(alpha)
-    if alpha != "auto":
-        raise ValueError(f'alpha must lie in [0, 2 pi) or be "auto", got {alpha!r}')
-    from ctrlplan.planning.alpha import choose_alpha
-
-    return choose_alpha(points, family=family, warn=False, **options).alpha
-
-
-def checked_alpha(alpha: float | str) -> float:
-    """Shape parameter in [0, 2 pi)."""
-    if isinstance(alpha, str):
-        raise ValueError(f"alpha must be a number in [0, 2 pi) here, got {alpha!r}")
-    value = one_number(alpha, "alpha", "a number in [0, 2 pi)")
-    if not 0.0 <= value < 2.0 * math.pi:
-        raise ValueError(f"alpha must lie in [0, 2 pi), got {value}")
-    return value
 
 
 def _checked_gamma(gamma: float | Sequence[float | None] | None, naxes: int) -> float | list[float | None] | None:

@@ -17,11 +17,14 @@ from ctrlplan.trajectories.waypoint import Waypoint
 Column = str | int
 """A column by its name in the header, or by its number from 0."""
 
+_TIME = "t"
+"""Column of the times that a file need not have."""
+
 
 def waypoints_from_csv(
     path: str | os.PathLike[str],
     *,
-    time: Column | None = "t",
+    time: Column | None = _TIME,
     columns: Sequence[Column] | None = None,
     speed: float | None = None,
 ) -> list[Waypoint]:
@@ -140,7 +143,7 @@ class _Table:
         if time in self.header:
             return self.header.index(time)
         similar = [name for name in self.header if re.fullmatch(r"t(ime)?(\W.*|_s)?", name, re.IGNORECASE)]
-        if time != "t" or similar:
+        if time != _TIME or similar:
             found = f", got {', '.join(self.header)}"
             hint = f"; pass time={similar[0]!r}" if similar else "; pass time=None where there is none"
             raise ValueError(f"{self.path} must have the column {time!r} of times{found}{hint}")
@@ -234,6 +237,6 @@ def _jets(names: list[str], columns: list[int]) -> dict[str, list[int]]:
             while (derivative := f"{name}_d{k}") in where:
                 jets[name].append(where[derivative])
                 k += 1
-        elif order != "1" and (lower := f"{label}_d{int(order) - 1}") not in where:
+        elif name != f"{label}_d1" and (lower := f"{label}_d{int(order) - 1}") not in where:
             raise ValueError(f"columns must have {lower} where they have {name}, got {', '.join(names)}")
     return jets

@@ -31,8 +31,20 @@ NAMES_OF_PLANS = {
 }
 """Names that standard plans and baselines have had."""
 
-OTHERS = re.compile(r"(\bdtype\.kind|\bopname|__name__|__module__|\.suffix|\bsolver\.status|\.get_linestyle\(\))$")
-"""What takes words that others have fixed: kinds of arrays, byte code, names of classes, endings of files."""
+OTHERS = re.compile(
+    r"(\bopname|__name__|__module__|\.suffix|\bsolver\.status|\.get_linestyle\(\)|\beast_asian_width\(\w+\))$"
+)
+"""What takes words that others have fixed: byte code, names of classes, endings of files, results of libraries."""
+
+KINDS = re.compile(r"\bkind\b")
+LETTERS = set("biufcmMOSUV")
+"""``dtype.kind`` of numpy, which is one of these letters."""
+
+UFUNC_METHODS = {"__call__", "reduce", "accumulate", "outer"}
+"""What numpy passes to ``__array_ufunc__`` as `method`."""
+
+FORMER = {"_renamed.py", "former.py"}
+"""Modules of deprecated names, which are strings because nothing has them any more."""
 
 LAYOUT = {tokenize.NEWLINE, tokenize.NL, tokenize.INDENT, tokenize.DEDENT, tokenize.COMMENT, tokenize.ENDMARKER}
 Function = ast.FunctionDef | ast.AsyncFunctionDef
@@ -262,8 +274,9 @@ def switches(modules):
     dictionary with strings as keys that is indexed where it is written.
     "Literal": what is compared is an argument, variable or field annotated
     with ``Literal`` (mypy checks its values); "name of a plan": one of
-    `NAMES_OF_PLANS` is among the strings; "others' word": a word of Python,
-    numpy, scipy or the file system (`OTHERS`); "string": any other.
+    `NAMES_OF_PLANS` is among the strings; "others' word": a word that is not
+    the package's own, by `_is_others`, or a deprecated name in a module that
+    warns of it (`FORMER`); "string": any other.
     """
     aliases, fields = _literal_names(modules)
     for module in modules:
@@ -285,17 +298,39 @@ def _switches_below(module, node, known, aliases, fields):
         declared = (isinstance(subject, ast.Name) and subject.id in known) or (
             isinstance(subject, ast.Attribute) and subject.attr in fields
         )
-        kind = "Literal" if declared else _kind(ast.unparse(subject), values)
+        kind = _kind(ast.unparse(subject), values, module, declared)
         line = module.text.splitlines()[node.lineno - 1].strip()
         yield Switch(module.place(node), kind, line)
     for child in ast.iter_child_nodes(node):
         yield from _switches_below(module, child, known, aliases, fields)
 
 
-def _kind(subject, values):
-    if NAMES_OF_PLANS & set(values):
-        return "name of a plan"
-    return "others' word" if OTHERS.search(subject) else "string"
+def _kind(subject, values, module, declared):
+    if _is_others(subject, values):
+        return "others' word"
+    if declared:
+        return "Literal"
+    if module.path.name in FORMER:
+        return "others' word"
+    return "name of a plan" if NAMES_OF_PLANS & set(values) else "string"
+
+
+def _is_others(subject, values):
+    """Whether strings are words that others have fixed.
+
+    What Python, numpy, scipy, Unicode and the file system return (`OTHERS`);
+    letters of ``dtype.kind``; methods of numpy's functions; ``ClassVar`` of an
+    annotation; and signs without a letter or a digit: the underscore of
+    Python's private names and matplotlib's hidden labels, its solid line, an
+    end of line, a quote.
+    """
+    return (
+        OTHERS.search(subject) is not None
+        or (KINDS.search(subject) is not None and set("".join(values)) <= LETTERS)
+        or (subject == "method" and set(values) <= UFUNC_METHODS)
+        or (subject.startswith("str(annotation)") and values == ["ClassVar"])
+        or not any(letter.isalnum() for value in values for letter in value)
+    )
 
 
 # Sizes

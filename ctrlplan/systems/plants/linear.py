@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
+from typing import Literal, get_args
 
 import control as ct
 import numpy as np
@@ -12,8 +13,11 @@ from numpy.typing import ArrayLike
 from ctrlplan._checks import checked_finite
 from ctrlplan._types import Array
 
+Output = Literal["y", "u", "e"]
+"""Output of a loop: the plant's, the control signal, the error."""
 
-def integrator_lag_loop(gain: float, outputs: Sequence[str] = ("y",)) -> ct.InterconnectedSystem:
+
+def integrator_lag_loop(gain: float, outputs: Sequence[Output] = ("y",)) -> ct.InterconnectedSystem:
     """Unity feedback of k/(s^2 + s), the loop of the paper's section 2.
 
     States: those of the plant, ``plant_x[0]`` and ``plant_x[1]``. Inputs: r.
@@ -47,7 +51,7 @@ def integrator_lag_loop(gain: float, outputs: Sequence[str] = ("y",)) -> ct.Inte
 
 
 def unity_feedback_loop(
-    num: ArrayLike, den: ArrayLike, gain: float = 1.0, outputs: Sequence[str] = ("y",)
+    num: ArrayLike, den: ArrayLike, gain: float = 1.0, outputs: Sequence[Output] = ("y",)
 ) -> ct.InterconnectedSystem | ct.StateSpace:
     """Plant num/den with proportional gain in unity feedback.
 
@@ -86,16 +90,16 @@ def unity_feedback_loop(
     return _interconnected(tuple(above.tolist()), tuple(below.tolist()), gain, tuple(outputs))
 
 
-def _checked(gain: float, outputs: Sequence[str]) -> float:
+def _checked(gain: float, outputs: Sequence[Output]) -> float:
     gain = checked_finite(gain, "gain")
     for output in outputs:
-        if output not in ("y", "u", "e"):
+        if output not in get_args(Output):
             raise ValueError(f'outputs must be of "y", "u", "e", got {output!r}')
     return gain
 
 
 def _interconnected(
-    num: tuple[float, ...], den: tuple[float, ...], gain: float, outputs: tuple[str, ...]
+    num: tuple[float, ...], den: tuple[float, ...], gain: float, outputs: tuple[Output, ...]
 ) -> ct.InterconnectedSystem:
     """Loop of three blocks, interconnected once for all gains: python-control requires a millisecond for that."""
     wired = _wired(num, den, outputs)
@@ -118,12 +122,12 @@ def _wired(num: tuple[float, ...], den: tuple[float, ...], outputs: tuple[str, .
     return ct.interconnect(blocks, inputs="r", outputs=list(outputs), name="loop")
 
 
-def _direct_loop(plant: ct.StateSpace, gain: float, outputs: Sequence[str]) -> ct.StateSpace:
+def _direct_loop(plant: ct.StateSpace, gain: float, outputs: Sequence[Output]) -> ct.StateSpace:
     """Loop around a plant with direct feedthrough, which `control.interconnect` cannot close."""
     return ct.ss(*_closed(plant, gain, outputs), inputs="r", outputs=list(outputs), name="loop")
 
 
-def _closed(plant: ct.StateSpace, gain: float, outputs: Sequence[str]) -> tuple[Array, Array, Array, Array]:
+def _closed(plant: ct.StateSpace, gain: float, outputs: Sequence[Output]) -> tuple[Array, Array, Array, Array]:
     """Exact matrices of the closed loop; python-control computes them by finite differences."""
     a, b, c, d = (np.asarray(m) for m in (plant.A, plant.B, plant.C, plant.D))
     through = 1.0 / (1.0 + gain * d[0, 0])

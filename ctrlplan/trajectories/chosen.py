@@ -1,0 +1,67 @@
+"""What planning chooses for a trajectory: its shape parameter, its duration in cycles.
+
+The only module of this folder that imports from a later step, where planning is required.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any, Literal
+
+import numpy as np
+
+from ctrlplan._checks import checked_finite, one_number
+from ctrlplan.trajectories.combined import Joined
+from ctrlplan.trajectories.cycle import knots_of, moved
+from ctrlplan.trajectories.trajectory import Trajectory
+from ctrlplan.trajectories.waypoint import Waypoint
+
+
+def chosen_alpha(
+    alpha: float | Literal["auto"], points: tuple[Waypoint, ...], family: Callable[..., Any], **options: Any
+) -> float:
+    """Shape parameter in [0, 2 pi); "auto" is that of the shortest path."""
+    if not isinstance(alpha, str):
+        return checked_alpha(alpha)
+    if alpha != "auto":
+        raise ValueError(f'alpha must lie in [0, 2 pi) or be "auto", got {alpha!r}')
+    from ctrlplan.planning.alpha import choose_alpha
+
+    return choose_alpha(points, family=family, warn=False, **options).alpha
+
+
+def checked_alpha(alpha: float | str) -> float:
+    """Shape parameter in [0, 2 pi)."""
+    if isinstance(alpha, str):
+        raise ValueError(f"alpha must be a number in [0, 2 pi) here, got {alpha!r}")
+    value = one_number(alpha, "alpha", "a number in [0, 2 pi)")
+    if not 0.0 <= value < 2.0 * math.pi:
+        raise ValueError(f"alpha must lie in [0, 2 pi), got {value}")
+    return value
+
+
+def on_cycle(plan: Trajectory, dt: float, limits: Mapping[str, object] | None = None) -> Trajectory:
+    """Plan whose duration and waypoints are on a cycle; as `Trajectory.on_cycle`."""
+    dt = checked_finite(dt, "dt", above=0.0)
+    if isinstance(plan, Joined):
+        parts: list[Trajectory] = []
+        for k, part in enumerate(plan.parts):
+            try:
+                parts.append(on_cycle(part, dt, limits))
+            except ValueError as error:
+                raise ValueError(f"parts[{k}] of a joined plan: {error}") from None
+        same = all(part is before for part, before in zip(parts, plan.parts, strict=True))
+        return plan if same else Joined(parts)
+    if not plan.duration:
+        return plan
+    knots = knots_of(plan)
+    rounding = 4.0 * np.spacing(np.abs(knots).max()) / dt
+    counts = np.ceil(np.diff(knots) / dt * (1.0 - 4.0 * np.finfo(float).eps) - rounding).clip(min=1.0)
+    if counts.sum() > 2.0**53:
+        raise ValueError(f"dt must divide the plan into fewer than 2^53 cycles, got {dt:g} s in {plan.duration:g} s")
+    if limits is None:
+        return moved(plan, dt, counts)
+    from ctrlplan.planning.cycle import lengthened
+
+    return lengthened(plan, dt, counts, limits)
