@@ -334,7 +334,9 @@ def _nominal(
     if own is not None and not isinstance(own.error, ArithmeticError | RuntimeError | TypeError | KeyError):
         raise own.error
     why = (
-        "the loop does not run with its nominal parameters" if own is not None else "the loop has no nominal parameters"
+        "the loop does not run with its nominal parameters"
+        if own is not None
+        else "the loop has no nominal parameters (default values of its function)"
     )
     for k in range(min(_STAND_INS, _count(table))):
         params = _draw(table, k)

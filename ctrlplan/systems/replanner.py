@@ -69,7 +69,7 @@ def create_replanner_iosystem(
     feedback: the reference jumps to the measured state, and the error of a
     controller is reset. It is stable if the loop follows the plan between fits:
     with a period not below the response time of the loop, or with a controller
-    that uses the derivatives. With a PID and a shorter period the load drifts.
+    that uses the derivatives. With a PID and a shorter period the output drifts.
     Between fits the output is the plan in continuous time. The block runs in
     `ctrlplan.simulate` only.
 

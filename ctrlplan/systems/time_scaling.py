@@ -79,7 +79,7 @@ def create_time_scaling_iosystem(
         For axes by their names in the block: tracking error at which the rate
         begins to decrease, and at which it is `slowest`. Errors respond later
         and more smoothly than limits; which of them is better depends on the
-        loop. If a limit is known in advance, `retime` the plan.
+        loop. If a limit is known in advance, use `fastest`.
     bandwidth : float, optional
         w [rad/s] of each lag, by default 10 divided by the duration of the plan.
         The force y_d' sigma'' required for slowing down grows with it.

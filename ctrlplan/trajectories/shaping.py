@@ -92,7 +92,7 @@ class Shaper(Displayed, Fields):
         Parameters
         ----------
         frequency : float
-            Undamped natural frequency [rad/s], above 0.
+            Undamped natural frequency [rad/s], above 0: 2 pi times that in Hz.
         damping : float, optional
             Damping ratio in [0, 1).
 
@@ -115,7 +115,7 @@ class Shaper(Displayed, Fields):
         Parameters
         ----------
         frequency : float
-            Undamped natural frequency [rad/s], above 0.
+            Undamped natural frequency [rad/s], above 0: 2 pi times that in Hz.
         damping : float, optional
             Damping ratio in [0, 1).
         derivatives : int, optional
