@@ -51,7 +51,7 @@ class SampledTable:
 
     @classmethod
     def of(cls, times: Array, signals: Mapping[str, tuple[Sequence[str], Array]]) -> SampledTable:
-        """SampledTable of groups of signals, each with names and rows.
+        """Table of groups of signals, each with names and rows.
 
         A name that an earlier group contains, or the name of the time, gets the
         name of its group as prefix: ``state.y`` for a state with the name of the
