@@ -16,7 +16,7 @@ from scipy.optimize import minimize
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
-from ctrlplan._checks import checked_count, checked_finite
+from ctrlplan._checks import check_kind, checked_count, checked_finite
 from ctrlplan._display import Displayed, Facts, Figure, Part, title_of
 from ctrlplan._renamed import warn_renamed
 from ctrlplan.planning.clearance import Clearance, Rope, checked_obstacles, checked_rope
@@ -308,8 +308,7 @@ def _roughness(t: Array, jet: Array, size: float) -> Array:
 
 
 def _checked_plan(plan: Trajectory) -> Trajectory:
-    if not isinstance(plan, Trajectory):
-        raise TypeError(f"plan must be a Trajectory, got {type(plan).__name__}")
+    check_kind(plan, "plan", Trajectory)
     if plan.naxes != 2:
         raise ValueError(f"a plan among obstacles must have two axes, got {plan.naxes}")
     if not plan.duration:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeGuard
 
 import numpy as np
 
-from ctrlplan._checks import checked_limits
+from ctrlplan._checks import check_kind, checked_limits
 from ctrlplan._display import Displayed, Part, Table, counted
 from ctrlplan._renamed import warn_renamed
 from ctrlplan.planning.quantities import Quantities, System, quantities_of, system_given
@@ -331,8 +331,7 @@ class Limited:
             raise TypeError(f"plan must be a Trajectory (the attribute plan of a result), got {plan!r:.60}")
         if not plan.duration:
             raise ValueError("a plan under limits must have a duration, got a step")
-        if not isinstance(limits, Mapping):
-            raise TypeError(f"limits must be a mapping of names to limits, got {type(limits).__name__}")
+        check_kind(limits, "limits", Mapping, "a mapping of names to limits")
         self._quantities = quantities_of(system)
         self.bounds = tuple(self._bounds(plan, limits))
         if not self.bounds:

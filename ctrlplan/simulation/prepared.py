@@ -10,6 +10,7 @@ import control as ct
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ctrlplan._checks import check_kind
 from ctrlplan._display import Displayed, Facts, Part, counted
 from ctrlplan._lru import BUILDING, Lru
 from ctrlplan._types import Array, Params, System, Value
@@ -360,8 +361,7 @@ def _filled(stated: Array | None) -> Array | None:
 
 
 def _checked_system(system: System) -> System:
-    if not isinstance(system, ct.InputOutputSystem):
-        raise TypeError(f"system must be a control system, got {type(system).__name__}")
+    check_kind(system, "system", ct.InputOutputSystem, "a control system")
     states = 0 if isinstance(system, ct.TransferFunction) else system.nstates
     sizes = {"states": states, "inputs": system.ninputs, "outputs": system.noutputs}
     unknown = [name for name, size in sizes.items() if size is None]

@@ -12,8 +12,7 @@ from numpy.typing import ArrayLike
 from ctrlplan._display import ROWS, Displayed, Facts, Part, Table, number, shortened
 from ctrlplan._types import Array
 from ctrlplan.simulation.events import Occurrence
-from ctrlplan.trajectories.export import Table as SampledTable
-from ctrlplan.trajectories.export import export_table
+from ctrlplan.trajectories.export import SampledTable, export_table
 
 
 class SimulationResponse(Displayed, ct.TimeResponseData):  # type: ignore[misc] # python-control has no types

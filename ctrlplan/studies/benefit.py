@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ctrlplan._checks import real_array
+from ctrlplan._checks import check_kind, real_array
 from ctrlplan._display import Displayed, Facts, Part, Table, counted, number
 from ctrlplan._renamed import FormerAttribute
 from ctrlplan._types import Array
@@ -202,8 +202,7 @@ def benefit(
     >>> settles["shaped step"] < settles["trigonometric"] < settles["step"]
     True
     """
-    if not isinstance(comparison, Comparison):
-        raise TypeError(f"comparison must be a Comparison, got {type(comparison).__name__}")
+    check_kind(comparison, "comparison", Comparison)
     if comparison.experiment is None:
         raise ValueError("comparison must be returned by compare, got one without an experiment")
     if not comparison.waypoints:

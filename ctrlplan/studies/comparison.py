@@ -30,8 +30,7 @@ from ctrlplan.studies.study import Study
 from ctrlplan.studies.units import Signals, checked_units, listed_measures, output_unit, scales_of, signals_of_runs
 from ctrlplan.studies.verdicts import summary, unit_of, verdicts
 from ctrlplan.trajectories import Trajectory, Waypoint
-from ctrlplan.trajectories.export import Table as SampledTable
-from ctrlplan.trajectories.export import export_table
+from ctrlplan.trajectories.export import SampledTable, export_table
 
 if TYPE_CHECKING:
     import pandas as pd

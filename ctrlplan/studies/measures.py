@@ -230,9 +230,9 @@ class Measure(Displayed):
         )
 
 
-def _smooth(function: Callable[[Path], float | Array]) -> Callable[[Path], float | Array]:
-    """Metric of a path, nan for steps, which have no path."""
-    return lambda seen: np.nan if seen.steps else function(seen)
+def _of_path(metric: Callable[[Array, Array, Array], float | Array]) -> Callable[[Path], float | Array]:
+    """Metric of a path and its waypoints; nan for steps, which have no path."""
+    return lambda seen: np.nan if seen.steps else metric(seen.t, seen.path, seen.points)
 
 
 MEASURES = {
@@ -293,29 +293,11 @@ MEASURES = {
     "control_variation": Measure(
         "Total variation of the control", "{u}", "control", lambda seen: metrics.total_variation(seen.t, seen.u)
     ),
-    "wandering": Measure(
-        "Excess path length",
-        "",
-        "path",
-        _smooth(lambda seen: metrics.wandering(seen.t, seen.path, seen.points)),
-    ),
-    "excess_variation": Measure(
-        "Excess total variation",
-        "",
-        "path",
-        _smooth(lambda seen: metrics.excess_variation(seen.t, seen.path, seen.points)),
-    ),
-    "turning_points": Measure(
-        "Extra reversals",
-        "",
-        "path",
-        _smooth(lambda seen: metrics.turning_points(seen.t, seen.path, seen.points)),
-    ),
+    "wandering": Measure("Excess path length", "", "path", _of_path(metrics.wandering)),
+    "excess_variation": Measure("Excess total variation", "", "path", _of_path(metrics.excess_variation)),
+    "turning_points": Measure("Extra reversals", "", "path", _of_path(metrics.turning_points)),
     "outside_box": Measure(
-        "Peak distance outside the waypoints' bounding box",
-        "{y}",
-        "path",
-        _smooth(lambda seen: metrics.outside_box(seen.t, seen.path, seen.points)),
+        "Peak distance outside the waypoints' bounding box", "{y}", "path", _of_path(metrics.outside_box)
     ),
     "reference_jerk": Measure(
         "Integral of the squared jerk of the reference", "{y}^2/s^5", "path", lambda seen: jerk_cost(seen.plan)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ctrlplan.studies.files import StudyError, StudyFile
-from ctrlplan.trajectories.export import ENDINGS, Options, Table, TableFormat, check_options, ending_of
+from ctrlplan.trajectories.export import ENDINGS, Options, SampledTable, TableFormat, check_options, ending_of
 from ctrlplan.trajectories.files import signal_names, signal_rows
 
 
@@ -77,7 +77,7 @@ def plan_files(study: StudyFile, path: Path, options: Options) -> dict[Path, str
     return found
 
 
-def _table(study: StudyFile, options: Options) -> Table:
+def _table(study: StudyFile, options: Options) -> SampledTable:
     """Samples of all plans, waypoints included unless a period was given."""
     start, end = study.waypoints[0].time, study.waypoints[-1].time
     times = options.times(start, end)
@@ -89,4 +89,4 @@ def _table(study: StudyFile, options: Options) -> Table:
         for signal in signal_names(plan.labels, options.derivatives)
     ]
     rows = [signal_rows(plan, times, options.derivatives) for plan in study.plans.values()]
-    return Table(times, tuple(names), np.concatenate(rows))
+    return SampledTable(times, tuple(names), np.concatenate(rows))

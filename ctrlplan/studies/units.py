@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ctrlplan._checks import check_kind
 from ctrlplan._types import System
 from ctrlplan.studies.measures import Measure, Run, checked_names
 from ctrlplan.trajectories import Trajectory
@@ -182,8 +183,7 @@ def checked_units(
     """
     if units is None:
         return {}
-    if not isinstance(units, Mapping):
-        raise TypeError(f"units must be a mapping of labels to units, got {type(units).__name__}")
+    check_kind(units, "units", Mapping, "a mapping of labels to units")
     known = dict.fromkeys(label for plan in plans for label in plan.labels)
     known |= dict.fromkeys(label for system in systems for label in _signals(system))
     checked_names([name for name in units if re.sub(r"_d[0-9]+$", "", str(name)) not in known], known, "units")

@@ -22,7 +22,21 @@ Operation: TypeAlias = Callable[..., Value]
 _LN2 = math.log(2.0)
 
 
-class Symbol:
+class _Traced:
+    """What numpy's functions call instead of themselves."""
+
+    __slots__ = ()
+
+    def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Value, **kwargs: Value) -> Value:
+        return _by_elements(ufunc, method, inputs, kwargs)
+
+    def __array_function__(
+        self, function: Value, types: Value, args: Iterable[Value], kwargs: Mapping[str, Value]
+    ) -> Value:
+        return _by_function(function, args, kwargs)
+
+
+class Symbol(_Traced):
     """Scalar CasADi expression with the operators and functions of a numpy scalar.
 
     Attributes
@@ -46,31 +60,15 @@ class Symbol:
     def __bool__(self) -> NoReturn:
         raise TypeError("a branch on a signal or parameter cannot be traced; use np.where")
 
-    def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Value, **kwargs: Value) -> Value:
-        return _by_elements(ufunc, method, inputs, kwargs)
-
-    def __array_function__(
-        self, function: Value, types: Value, args: Iterable[Value], kwargs: Mapping[str, Value]
-    ) -> Value:
-        return _by_function(function, args, kwargs)
-
     def clip(self, low: Value = None, high: Value = None) -> Value:
         """Value clipped to limits."""
         return _clip(self, low, high)
 
 
-class SymbolArray(np.ndarray[tuple[int, ...], np.dtype[np.object_]]):
+class SymbolArray(_Traced, np.ndarray[tuple[int, ...], np.dtype[np.object_]]):
     """Array of symbols and numbers."""
 
     __array_priority__ = 2000.0
-
-    def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Value, **kwargs: Value) -> Value:
-        return _by_elements(ufunc, method, inputs, kwargs)
-
-    def __array_function__(
-        self, function: Value, types: Value, args: Iterable[Value], kwargs: Mapping[str, Value]
-    ) -> Value:
-        return _by_function(function, args, kwargs)
 
 
 def symbol_array(column: ca.SX) -> SymbolArray:

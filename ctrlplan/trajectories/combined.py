@@ -16,8 +16,8 @@ from ctrlplan.trajectories.files import trajectory_from_dict
 from ctrlplan.trajectories.trajectory import Trajectory
 
 
-class _Combined(Trajectory):
-    """Trajectory of several parts; a subclass defines how their jets combine."""
+class _OfParts(Trajectory):
+    """Trajectory of several parts."""
 
     parts: tuple[Trajectory, ...]
     initial: Array
@@ -35,16 +35,28 @@ class _Combined(Trajectory):
         }
 
     @classmethod
-    def from_dict(cls, data: Data) -> Self:
-        """Trajectory from the plain data of `to_dict`."""
-        parts = _checked_parts(trajectory_from_dict(part) for part in data["parts"])
-        return cls._of(parts, tuple(data["labels"]))
-
-    @classmethod
     def _of(cls, parts: tuple[Trajectory, ...], labels: tuple[str, ...]) -> Self:
         self = cls.__new__(cls)
         self._set(parts, labels)
         return self
+
+    @abstractmethod
+    def _set(self, parts: tuple[Trajectory, ...], labels: tuple[str, ...]) -> None:
+        """Set the fields."""
+
+    def map_time(self, origin: float, target: float, rate: float) -> Self:
+        """Same path at other times; as `Trajectory.map_time`."""
+        return self._of(tuple(part.map_time(origin, target, rate) for part in self.parts), self.labels)
+
+
+class _Combined(_OfParts):
+    """Trajectory of several parts at the same time; a subclass defines how their jets combine."""
+
+    @classmethod
+    def from_dict(cls, data: Data) -> Self:
+        """Trajectory from the plain data of `to_dict`."""
+        parts = _checked_parts(trajectory_from_dict(part) for part in data["parts"])
+        return cls._of(parts, tuple(data["labels"]))
 
     def _set(self, parts: tuple[Trajectory, ...], labels: tuple[str, ...]) -> None:
         with np.errstate(over="ignore", invalid="ignore"):
@@ -65,10 +77,6 @@ class _Combined(Trajectory):
     @abstractmethod
     def _combine(self, values: list[Array]) -> Array:
         """Jets, or constant positions, of the combination from those of the parts (axes second to last)."""
-
-    def map_time(self, origin: float, target: float, rate: float) -> Self:
-        """Same path at other times; as `Trajectory.map_time`."""
-        return self._of(tuple(part.map_time(origin, target, rate) for part in self.parts), self.labels)
 
     def _sample(self, t: Array, low: int, high: int, left: bool) -> Array:
         out = super()._sample(t, low, high, left)
@@ -213,7 +221,7 @@ class Scaled(_Combined):
         return self.factor * values[0]
 
 
-class Joined(Trajectory):
+class Joined(_OfParts):
     """Sequence of trajectories; returned by `then`.
 
     Parameters
@@ -229,9 +237,6 @@ class Joined(Trajectory):
         trajectory plus the rounding of positions.
     """
 
-    parts: tuple[Trajectory, ...]
-    initial: Array
-    final: Array
     _segments: list[tuple[Trajectory, int]]  # for each segment the part and the part's segment number
 
     def __init__(self, parts: Iterable[Trajectory]) -> None:
@@ -246,12 +251,6 @@ class Joined(Trajectory):
     def without_shift(cls, parts: Sequence[Trajectory]) -> Self:
         """Sequence of trajectories at their own times."""
         return cls._of(tuple(parts), parts[0].labels)
-
-    @classmethod
-    def _of(cls, parts: tuple[Trajectory, ...], labels: tuple[str, ...]) -> Self:
-        self = cls.__new__(cls)
-        self._set(parts, labels)
-        return self
 
     def _set(self, parts: tuple[Trajectory, ...], labels: tuple[str, ...]) -> None:
         times, segments = [parts[0].start], []
@@ -271,14 +270,6 @@ class Joined(Trajectory):
             _segments=segments,
         )
 
-    def _has_quick_peaks(self) -> bool:
-        return super()._has_quick_peaks() and all(part._has_quick_peaks() for part in self.parts)
-
-    def to_dict(self) -> Data:
-        """Plain data that `trajectory_from_dict` reads."""
-        parts = [part.to_dict() for part in self.parts]
-        return {"type": "Joined", "parts": parts, "labels": list(self.labels)}
-
     @classmethod
     def from_dict(cls, data: Data) -> Self:
         """Trajectory from the plain data of `to_dict`."""
@@ -286,10 +277,6 @@ class Joined(Trajectory):
         for before, after in pairwise(_same_axes(parts)):
             _check_join(before, after)
         return cls._of(parts, tuple(data["labels"]))
-
-    def map_time(self, origin: float, target: float, rate: float) -> Self:
-        """Same path at other times; as `Trajectory.map_time`."""
-        return self._of(tuple(part.map_time(origin, target, rate) for part in self.parts), self.labels)
 
     def _sample(self, t: Array, low: int, high: int, left: bool) -> Array:
         out = super()._sample(t, low, high, left)

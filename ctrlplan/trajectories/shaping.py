@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import comb
 
-from ctrlplan._checks import checked_count, checked_finite, finite_vector, new_numbers
+from ctrlplan._checks import check_kind, checked_count, checked_finite, finite_vector, new_numbers
 from ctrlplan._display import Displayed, Facts, Part, Table, counted, number, shortened
 from ctrlplan.trajectories.combined import Sum
 from ctrlplan.trajectories.common import Array, readonly
@@ -167,8 +167,7 @@ class Shaper(Displayed, Fields):
         UserWarning
             If rounding changes the delays by more than 1e-6 of the duration.
         """
-        if not isinstance(plan, Trajectory):
-            raise TypeError(f"plan must be a Trajectory, got {type(plan).__name__}")
+        check_kind(plan, "plan", Trajectory)
         parts = [plan.shift(delay) for delay in self.delays.tolist()]
         delayed = np.array([part.start for part in parts]) - plan.start
         loss = float((np.abs(delayed - self.delays) / (self.duration or 1.0)).max())
@@ -184,8 +183,7 @@ class Shaper(Displayed, Fields):
 
     def then(self, other: Shaper) -> Shaper:
         """Convolution of two shapers, for two modes."""
-        if not isinstance(other, Shaper):
-            raise TypeError(f"other must be a Shaper, got {type(other).__name__}")
+        check_kind(other, "other", Shaper)
         delays = np.add.outer(self.delays, other.delays).ravel()
         order = np.argsort(delays, kind="stable")
         delays, weights = delays[order], np.outer(self.weights, other.weights).ravel()[order]

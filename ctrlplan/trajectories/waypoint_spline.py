@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from typing import Any, ClassVar, Self
 
+from ctrlplan._checks import check_kind
 from ctrlplan._types import Data
 from ctrlplan.trajectories.common import mapped_time
 from ctrlplan.trajectories.trajectory import Trajectory
@@ -203,8 +204,7 @@ def family_name(kind: type[FromWaypoints]) -> str:
 
 def checked_waypoints(waypoints: Iterable[Waypoint], minimum: int = 2) -> tuple[Waypoint, ...]:
     """Waypoints as a tuple: a minimum number, with equal axes, at increasing times."""
-    if not isinstance(waypoints, Iterable):
-        raise TypeError(f"waypoints must be a sequence of Waypoint, got {type(waypoints).__name__}")
+    check_kind(waypoints, "waypoints", Iterable, "a sequence of Waypoint")
     points = tuple(waypoints)
     if len(points) < minimum:
         number = {1: "one waypoint", 2: "two waypoints"}[minimum]

@@ -26,7 +26,7 @@ import numpy as np
 from ctrlplan._types import Array
 from ctrlplan.trajectories.export.cells import segment_peak
 from ctrlplan.trajectories.export.csv_table import CSV
-from ctrlplan.trajectories.export.formats import Files, Format, Options, Table, decimal, plain, with_duration
+from ctrlplan.trajectories.export.formats import Files, Format, Options, SampledTable, decimal, plain, with_duration
 from ctrlplan.trajectories.files import signal_names, signal_rows
 from ctrlplan.trajectories.trajectory import Trajectory
 
@@ -62,7 +62,7 @@ class CamCSV(Format):
         """Contents by path; as `Format.files`."""
         cam = cam_of(with_duration(plan, ".cam.csv"), options)
         names = tuple(signal_names(plan.labels, 2))
-        table = CSV().encoded(Table(cam.times, names, signal_rows(plan, cam.times, 2)))
+        table = CSV().encoded(SampledTable(cam.times, names, signal_rows(plan, cam.times, 2)))
         return {path: f"# {cam.stated(plan)}\nmaster" + table.removeprefix("time")}
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from ctrlplan._files import write_bytes
-from ctrlplan.trajectories.export.formats import Options, Table, TableFormat, sampled
+from ctrlplan.trajectories.export.formats import Options, SampledTable, TableFormat, sampled
 from ctrlplan.trajectories.trajectory import Trajectory
 
 _FORMULA = ("=", "+", "-", "@", "\t", "\r")
@@ -26,7 +26,7 @@ class CSV(TableFormat):
     Names that a spreadsheet would read as a formula get an apostrophe as prefix.
     """
 
-    def encoded(self, table: Table) -> str:
+    def encoded(self, table: SampledTable) -> str:
         """Text of the file; as `TableFormat.encoded`."""
         names = (f"'{name}" if name.startswith(_FORMULA) else name for name in table.names)
         columns = np.concatenate([table.times[None], table.rows]).T

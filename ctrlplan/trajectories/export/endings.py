@@ -10,7 +10,7 @@ from ctrlplan._files import write_all
 from ctrlplan.trajectories.export.c import C99
 from ctrlplan.trajectories.export.cam import CamCSV, CamST
 from ctrlplan.trajectories.export.csv_table import CSV
-from ctrlplan.trajectories.export.formats import Format, Options, Table, TableFormat
+from ctrlplan.trajectories.export.formats import Format, Options, SampledTable, TableFormat
 from ctrlplan.trajectories.export.mat import MAT
 from ctrlplan.trajectories.export.npz import NPZ
 from ctrlplan.trajectories.export.ppoly import PPolyJSON
@@ -50,7 +50,7 @@ def check_options(options: Options, ending: str) -> None:
             )
 
 
-def export_table(table: Table, path: str | os.PathLike[str]) -> Path:
+def export_table(table: SampledTable, path: str | os.PathLike[str]) -> Path:
     """Write signals in the format of the path's ending, one of those for sampled signals."""
     place = Path(path)
     tables = {ending: format_ for ending, format_ in ENDINGS.items() if isinstance(format_, TableFormat)}

@@ -32,7 +32,7 @@ class FlatMaps(Protocol):
 
 
 @dataclass(frozen=True)
-class Table:
+class SampledTable:
     """Signals at common times.
 
     Attributes
@@ -50,7 +50,7 @@ class Table:
     rows: Array
 
     @classmethod
-    def of(cls, times: Array, signals: Mapping[str, tuple[Sequence[str], Array]]) -> Table:
+    def of(cls, times: Array, signals: Mapping[str, tuple[Sequence[str], Array]]) -> SampledTable:
         """Table of groups of signals, each with names and rows.
 
         A name that an earlier group contains, or the name of the time, gets the
@@ -162,7 +162,7 @@ class TableFormat(Format):
     accepted = ("dt", "timepts", "derivatives", "flat")
 
     @abstractmethod
-    def encoded(self, table: Table) -> str | bytes:
+    def encoded(self, table: SampledTable) -> str | bytes:
         """Content of the file of a table."""
 
     def files(self, plan: Trajectory, path: Path, options: Options) -> Files:
@@ -170,15 +170,15 @@ class TableFormat(Format):
         return {path: self.encoded(sampled(plan, options))}
 
 
-def sampled(plan: Trajectory, options: Options) -> Table:
+def sampled(plan: Trajectory, options: Options) -> SampledTable:
     """Times, each axis with its derivatives, and states and inputs of a flat system."""
     times = options.times(plan.start, plan.end)
     axes = (signal_names(plan.labels, options.derivatives), signal_rows(plan, times, options.derivatives))
     if options.flat is None:
-        return Table(times, tuple(axes[0]), axes[1])
+        return SampledTable(times, tuple(axes[0]), axes[1])
     states, inputs = options.flat.states_and_inputs(plan, times)
     flat = {"state": (options.flat.state_labels, states), "input": (options.flat.input_labels, inputs)}
-    return Table.of(times, {"axis": axes, **flat})
+    return SampledTable.of(times, {"axis": axes, **flat})
 
 
 def sample_times(timepts: ArrayLike) -> Array:

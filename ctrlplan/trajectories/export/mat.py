@@ -7,7 +7,7 @@ import re
 
 from scipy.io import savemat
 
-from ctrlplan.trajectories.export.formats import Table, TableFormat
+from ctrlplan.trajectories.export.formats import SampledTable, TableFormat
 
 
 class MAT(TableFormat):
@@ -18,7 +18,7 @@ class MAT(TableFormat):
     Characters of names that MATLAB does not allow are replaced by underscores.
     """
 
-    def encoded(self, table: Table) -> bytes:
+    def encoded(self, table: SampledTable) -> bytes:
         """Content of the file; as `TableFormat.encoded`."""
         time = table.times[:, None]
         variables: dict[str, object] = {"time": time}

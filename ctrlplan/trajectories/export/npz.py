@@ -7,13 +7,13 @@ import zipfile
 
 from numpy.lib.format import write_array
 
-from ctrlplan.trajectories.export.formats import Table, TableFormat
+from ctrlplan.trajectories.export.formats import SampledTable, TableFormat
 
 
 class NPZ(TableFormat):
     """Archive for `numpy.load`: ``time`` and each signal by its name, shape (ntime,)."""
 
-    def encoded(self, table: Table) -> bytes:
+    def encoded(self, table: SampledTable) -> bytes:
         """Content of the file; as `TableFormat.encoded`."""
         data = io.BytesIO()
         # Not by numpy.savez, whose arguments cannot be names of signals.
