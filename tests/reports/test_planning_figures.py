@@ -135,7 +135,7 @@ def test_the_fastest_plan_draws_its_limits():
     found = cp.fastest(cp.PolySpline(PATH), {"velocity": 2.0, "x_d2": (-8.0, 6.0)})
     drawn = found.plot({"x_d1": "m/s", "z_d1": "m/s", "x_d2": "m/s²"})
     assert [axes.get_ylabel() for axes in drawn.axes.flat] == ["x_d1 [m/s]", "z_d1 [m/s]", "x_d2 [m/s²]"]
-    assert any("; nothing left" in axes.get_title(loc="left") for axes in drawn.axes.flat)
+    assert any("; 0 % left" in axes.get_title(loc="left") for axes in drawn.axes.flat)
     for axes, (low, high) in zip(drawn.axes.flat, [(-2, 2), (-2, 2), (-8, 6)], strict=True):
         row = axes.lines[0].get_ydata()
         assert low * (1 + 1e-9) <= row.min() < row.max() <= high * (1 + 1e-9)

@@ -247,7 +247,7 @@ def test_the_active_limit_and_the_margins_of_the_others(page):
     left = 100 * (100 - peak) / 150
     at = 0.75 * (0.5 + 3**0.5 / 6)
     assert rows(table) == [
-        ["y_d1", "m/s", "within ±2.5", "2.500", "0.3750", "nothing"],
+        ["y_d1", "m/s", "within ±2.5", "2.500", "0.3750", "0 %"],
         ["y_d2", "", "from -100 to 200", f"−{peak:.2f}", f"{at:.4f}", f"{left:.3g} %"],
     ]
 
