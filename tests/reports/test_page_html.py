@@ -137,9 +137,9 @@ def test_the_table_has_what_results_have(written, page):
                     assert cell.attributes["data-order"] in ("", "1e999")
                 else:
                     assert float(cell.attributes["data-order"]) == value
-                    # A value below 1e-6 of its scale, which is 100 for a percentage, is rounding and shown as 0.
+                    # A value below 1e-6 of its scale is rounding and shown as 0: 100 %, and moves of 1 m and more.
                     known = [found["metrics"].get(key) or 0.0 for found in study["plans"].values()]
-                    scale = 100.0 if next(row.all("td")).words() == "%" else max(known)
+                    scale = {"%": 100.0, "m": 1.0}.get(next(row.all("td")).words(), max(known))
                     rounding = 1e-6 * scale if text == "0" else 0.0
                     assert number(text) == pytest.approx(value, rel=5e-4, abs=max(rounding, 1e-9))
 
