@@ -48,7 +48,7 @@ On line
     create_governor_iosystem        reference within limits; AdmissibleSet (linear), Predictor (nonlinear)
     create_time_scaling_iosystem    slows the plan as an error grows
 Without Python
-    ``ctrlplan reproduce``, ``ctrlplan report STUDY.toml``, ``ctrlplan plan``: see `ctrlplan.studies.files`
+    ``ctrlplan new STUDY.toml``, ``ctrlplan report``, ``ctrlplan plan``: see `ctrlplan.studies.files`
 Old names, which warn
     command_lead, flat_quantities
 

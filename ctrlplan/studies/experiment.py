@@ -22,6 +22,7 @@ from ctrlplan.studies.measures import (
     Record,
     Run,
     checked_measures,
+    move_end,
     path_metrics,
     run_metrics,
     signal_metrics,
@@ -249,7 +250,6 @@ class Experiment(Displayed):
             Parameters of the loop's blocks in addition to those of the experiment.
         """
         plan = self.plans[name]
-        last = self.waypoints[-1].time if self.waypoints else plan.end
         merged = self.params if params is None else {**(self.params or {}), **params}
         run = run_plan(
             loop,
@@ -257,7 +257,7 @@ class Experiment(Displayed):
             plan,
             self.timepts,
             axes=self.axes,
-            last=last,
+            last=move_end(plan, self.waypoints),
             outputs=self.outputs,
             controls=self.controls,
             initial_state=self.initial_state,

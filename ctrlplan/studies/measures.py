@@ -100,7 +100,7 @@ class Path:
     plan : Trajectory
         The plan.
     t : ndarray, shape (ntime,)
-        Times [s] from the first waypoint to the last.
+        Times [s] from the first waypoint to the last (`move_end`).
     path, points : ndarray, shapes (naxes, ntime) and (naxes, nwaypoints)
         Positions of the plan, and of the waypoints.
     """
@@ -131,8 +131,8 @@ class Run:
     outputs, controls : tuple of str
         Outputs that follow the plan, and outputs that are controls.
     last : float
-        Time of the last waypoint [s], or the end of the plan without
-        waypoints.
+        Time at which the plan reaches the last waypoint [s] (`move_end`), or
+        its end without waypoints.
     unstable : ndarray of complex, or None
         Poles in the right half plane; None if the loop is nonlinear.
     doubt : str
@@ -497,10 +497,24 @@ def path_metrics(
     points = np.array([w.position for w in waypoints]).T
     if len(waypoints) < 2 or np.isnan(points).any():
         return {}
-    t = np.linspace(waypoints[0].time, waypoints[-1].time, 2001)
+    t = np.linspace(waypoints[0].time, move_end(plan, waypoints), 2001)
     seen = Path(plan, t, plan.jet(t, 0)[0], points)
     wanted = MEASURES if measures is None else measures
     return {name: float(function(seen)) for name, function in _functions("path", wanted)}
+
+
+def move_end(plan: Trajectory, waypoints: Sequence[Waypoint]) -> float:
+    """Time at which a plan reaches its last waypoint [s].
+
+    The time of the waypoint, or the end of a plan that is elsewhere at that time and
+    ends later, such as one that `fastest` has slowed down.
+    """
+    if not waypoints:
+        return plan.end
+    last, away = waypoints[-1].time, plan(waypoints[-1].time) - waypoints[-1].position
+    size = np.abs([w.position for w in waypoints])
+    elsewhere = bool(np.any(np.abs(away) > 1e-6 * np.nanmax(size, axis=0, initial=0.0)))
+    return plan.end if elsewhere and last < plan.end < np.inf else last
 
 
 def jerk_cost(plan: Trajectory) -> float:

@@ -9,6 +9,7 @@ from study_text import to_toml, valid
 
 import ctrlplan as cp
 from ctrlplan.reports.page import render_page
+from ctrlplan.studies.crane_setup import load_metrics
 from ctrlplan.studies.files import load_study
 from ctrlplan.studies.reading import StudyError
 from ctrlplan.studies.sections import Bands, CraneScene, DrawTable, FastestMove, Paths, PlanMargins, SweepCurves
@@ -113,6 +114,22 @@ def test_margins_and_the_fastest_plan_are_in_the_report(loaded):
     page = render_page([study], "limits")
     assert re.search(r"<td[^>]*>violated</td>", page)
     assert re.search(r"<td[^>]*>satisfied</td>", page)
+
+
+def test_a_plan_slower_than_its_waypoints_is_measured_to_its_end(loaded):
+    """Straight in one axis: its path has the length of the polyline, and its load moves until the end of the plan."""
+    setting = {"plans": [quintic(fastest="shape")], "limits": {"velocity": 1.0}, "t_end": 50.0, "samples": 501}
+    found = loaded(**setting).run().comparison  # 37.5 s in place of 16 s
+    assert found.metrics["polynomial"]["wandering"] == pytest.approx(0.0, abs=1e-9)
+    points = [{"time": 0.0, "x": REST, "z": [10.0, 0, 0]}, {"time": 16.0, "x": END, "z": [11.0, 0, 0]}]
+    found = loaded(**setting, loop={"kind": "crane"}, waypoints=points).run().comparison
+    plan, row = found.plans["polynomial"], found.metrics["polynomial"]
+    assert plan.end == pytest.approx(37.5, rel=1e-9)
+    own = load_metrics(plan, found.responses["polynomial"], plan.end)
+    assert {name: row[name] for name in ("error_travel", "error_after", "sway_after")} == {
+        name: own[name] for name in ("error_travel", "error_after", "sway_after")
+    }
+    assert load_metrics(plan, found.responses["polynomial"], 16.0)["sway_after"] > 1.5 * row["sway_after"]
 
 
 # Obstacles

@@ -192,7 +192,7 @@ def named_by_others(draw):
 TAGS = {*("html", "head", "meta", "link", "title", "style", "body", "header", "main", "section", "footer", "script")}
 TAGS |= {*("h1", "h2", "h3", "p", "ul", "li", "dl", "dt", "dd", "a", "nav", "figure", "figcaption", "div", "span")}
 TAGS |= {*("table", "thead", "tbody", "tr", "th", "td", "button", "svg", "metadata", "g", "path", "use", "defs")}
-TAGS |= {"clippath", "rect"}
+TAGS |= {"clippath", "rect", "text", "details", "summary"}
 
 
 class Tags(HTMLParser):

@@ -2,7 +2,7 @@
 
 ``python3 tests/support/distribution.py`` requires `build` and `twine`. In the
 new environment, from a folder of its own, the command must give its version,
-and the first program of the README must run: the README as the wheel carries
+write and run a study file, and the first program of the README must run: the README as the wheel carries
 it, which is what a package index shows.
 """
 
@@ -55,7 +55,10 @@ def main():
         venv.create(place, with_pip=True)
         python = place / ("Scripts" if os.name == "nt" else "bin") / "python"
         run(str(python), "-m", "pip", "install", "-q", str(wheel[0]), cwd=work)
-        version = run(str(python.with_name("ctrlplan")), "--version", cwd=work).split()[-1]
+        command = str(python.with_name("ctrlplan"))
+        version = run(command, "--version", cwd=work).split()[-1]
+        run(command, "new", "own.toml", "--kind", "python", cwd=work)
+        run(command, "report", "own.toml", "--out", "own", cwd=work)
         text = PROGRAM.format(prefix=str(place), version=version, readme=str(ROOT / "README.md"))
         print(run(str(python), "-c", text, cwd=work), end="")
         print(f"{source[0].name} and {wheel[0].name}: installed, and run")
