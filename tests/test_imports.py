@@ -16,7 +16,7 @@ every = pytest.mark.parametrize("file", sorted(TREES))
 PROTOCOLS = {"_repr_html_", "_replace"}
 """Names that other libraries look for, or that are public in spite of their underscore, as those of named tuples."""
 
-FOREIGN = {"sys._getframe", "functools._lru_cache_wrapper"}
+FOREIGN = {"sys._getframe", "functools._lru_cache_wrapper", "argparse._SubParsersAction"}
 """Names of Python itself that have no public equivalent."""
 
 SHOWING = {"plot", "report", "_repr_html_"}

@@ -118,11 +118,24 @@ def test_each_number_is_the_one_counted_by_hand(printed, what, number):
         ('name in ("only", "measure")', "others' word", "former.py"),
         ('name in ("only", "measure")', "string", "a.py"),
         ('name == "step"', "name of a plan", "a.py"),
+        ('flag != "CV_TOO_MUCH_WORK"', "others' word", "a.py"),
+        ('flag != "TOO_MUCH_WORK"', "string", "a.py"),
     ],
 )
 def test_words_of_others_are_told_from_those_of_the_package(code, kind, file):
     (found,) = measures.switches([measures.Module(Path(file), code)])
     assert found.kind == kind
+
+
+def test_strings_behind_constants_are_found_where_they_are_defined_and_where_they_are_imported():
+    first = measures.Module(
+        Path("ctrlplan/first.py"), 'WORD = "word"\nCOUNT = 3\nseen = name == WORD or size == COUNT\n'
+    )
+    text = "from ctrlplan.first import WORD\nif name.startswith(WORD):\n    pass\nWORD = other\n"
+    second = measures.Module(Path("ctrlplan/second.py"), text)
+    found = [(switch.place, switch.kind) for switch in measures.named_switches([first, second])]
+    assert found == [("ctrlplan/first.py:3", "named string"), ("ctrlplan/second.py:2", "named string")]
+    assert not list(measures.switches([first, second]))
 
 
 def test_each_place_is_listed(printed):

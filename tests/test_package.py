@@ -1,6 +1,7 @@
 """The package as a whole: what importing it costs, what it shows, and that every name is where it is said to be."""
 
 import ast
+import dataclasses
 import importlib
 import inspect
 import pkgutil
@@ -212,6 +213,41 @@ def test_every_public_function_and_class_is_described(name):
         if inspect.isfunction(thing) or inspect.isclass(thing):
             first = inspect.getdoc(thing).splitlines()[0]
             assert re.match(r"[A-Z(].*[.:]$", first) or first.endswith(","), f"{name}.{export}: {first}"
+
+
+# Not for users: what printing renders, and what other folders of the package read.
+INTERNAL = {"Table", "Linear", "TimeSignal", "DisagreementError", "Limited", "NewtonSpline"}
+
+
+def results_of(thing):
+    """Classes of the package that a function returns, or that fields and public methods of a class have."""
+    things = [inspect.unwrap(thing)]
+    annotations = [getattr(things[0], "__annotations__", {}).get("return", "")] if inspect.isfunction(things[0]) else []
+    if inspect.isclass(thing):
+        annotations += [text for name, text in inspect.get_annotations(thing).items() if name[0] != "_"]
+        methods = [getattr(m, "__func__", m) for name, m in vars(thing).items() if name[0] != "_"]
+        annotations += [m.__annotations__.get("return", "") for m in methods if inspect.isfunction(m)]
+    known = vars(sys.modules[things[0].__module__])
+    found = [known.get(word) for text in annotations for word in re.findall(r"[A-Za-z_]\w*", str(text))]
+    return {kind for kind in found if inspect.isclass(kind) and kind.__module__.startswith("ctrlplan.")}
+
+
+@pytest.mark.parametrize("name", [name for name in cp.__all__ if name not in ("metrics", "plants")])
+def test_results_and_what_they_consist_of_are_public(name):
+    modules = [cp, *map(importlib.import_module, SUBPACKAGES)]
+    public = {id(getattr(module, export)) for module in modules for export in module.__all__}
+    missing = {kind.__name__ for kind in results_of(getattr(cp, name)) if id(kind) not in public}
+    assert missing <= INTERNAL
+
+
+@pytest.mark.parametrize("name", SUBPACKAGES)
+def test_every_field_of_a_result_is_described(name):
+    module = importlib.import_module(name)
+    for kind in (getattr(module, export) for export in module.__all__):
+        if isinstance(kind, type) and dataclasses.is_dataclass(kind):
+            words = set(re.findall(r"\w+", " ".join(base.__doc__ or "" for base in kind.__mro__)))
+            given = {field.name for field in dataclasses.fields(kind) if field.name[0] != "_"}
+            assert given <= words, f"{name}.{kind.__name__}"
 
 
 def test_subpackages_are_those_of_the_map():

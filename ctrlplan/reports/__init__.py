@@ -2,6 +2,7 @@
 
 from ctrlplan import _renamed
 from ctrlplan.reports.crane_figures import plot_motion, plot_online, plot_paths, plot_sketch, plot_step, plot_time
+from ctrlplan.reports.explore import Explorer
 from ctrlplan.reports.figures import (
     plot_bands,
     plot_blocks,
@@ -22,6 +23,7 @@ from ctrlplan.studies.verdicts import Verdict, summary, verdicts
 __all__ = [
     "Cell",
     "CraneAnimation",
+    "Explorer",
     "Head",
     "Items",
     "MetricsTable",

@@ -81,13 +81,15 @@ def draw_paths(axes: Axes, comparison: Comparison, outputs: tuple[str, str]) -> 
 
 
 _GOAL = "goal"
+_PLACES = {_GOAL: ((-6.0, -10.0), "right")}
+"""Offset [pt] and alignment of a name where they are not those of the others."""
 
 
 def mark_waypoints(axes: Axes, comparison: Comparison, outputs: tuple[str, str]) -> None:
     """Waypoints with their names."""
     for text, place in named_places(comparison, outputs).items():
         axes.plot(*place, "o", color=shade(0.73), mfc=axes.get_facecolor(), zorder=5)
-        offset, side = ((-6.0, -10.0), "right") if text == _GOAL else ((6.0, -10.0), "left")
+        offset, side = _PLACES.get(text, ((6.0, -10.0), "left"))
         axes.annotate(text, place, xytext=offset, textcoords="offset points", ha=side, fontsize=font_size(9))
 
 

@@ -8,7 +8,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from ctrlplan._display import MISSING
 from ctrlplan.reports.parts import Cell, Head, MetricRow, MetricsTable, Plan, Table, Text
 from ctrlplan.reports.style import Style, line_styles, roles_of, shown_label
 from ctrlplan.studies.comparison import Comparison
@@ -98,11 +97,11 @@ def plan_of(name: str, style: Style, mark: str = "") -> Plan:
 
 def extrema_of(sweep: Sweep) -> str:
     """Range of the leading metrics of each plan over a sweep, in a sentence."""
-    table = sweep.metric_table()
+    leading = list(sweep.key_metrics().items())[:3]
     ends = f"{number(float(sweep.values[0]))} to {number(float(sweep.values[-1]))}"
     said = []
     for column, plan in enumerate(sweep.metrics, 2):
-        rows = [row for row in table.rows[:3] if row[column] != MISSING]
+        rows = [row for name, row in leading if not np.isnan(sweep.column(plan, name)).all()]
         values = [f"{row[0][0].lower()}{row[0][1:]} {row[column]}{f' {row[1]}' if row[1] else ''}" for row in rows]
         said.append(f"{plan}: {', '.join(values)}.")
     return f"{sweep.parameter} from {ends}. {' '.join(said)}".replace("-", "−")

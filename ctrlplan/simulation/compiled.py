@@ -38,9 +38,8 @@ _FEW_STEPS = 2_000
 _CLOSE = 129
 """Number of output times in the second attempt."""
 
-_TOO_MANY = "too many steps are required"
 _FAILURES = {
-    "CV_TOO_MUCH_WORK": _TOO_MANY,
+    "CV_TOO_MUCH_WORK": "too many steps are required",
     "CV_ERR_FAILURE": "the error test fails at the minimum step size",
     "CV_CONV_FAILURE": "the nonlinear iteration does not converge at the minimum step size",
     "CV_FIRST_RHSFUNC_ERR": "the derivatives of the states are not finite at its start",
@@ -339,8 +338,9 @@ class CompiledSolver:
                 return scales.shift[:, None] + scales.scale[:, None] * outputs_at_grid
             except RuntimeError as error:
                 code = re.search(r"CV_\w+", str(error))
-                why = _FAILURES.get(code.group() if code else "", "the equations could not be evaluated")
-                if why != _TOO_MANY or allowed == max_steps:
+                flag = code.group() if code else ""
+                why = _FAILURES.get(flag, "the equations could not be evaluated")
+                if flag != "CV_TOO_MUCH_WORK" or allowed == max_steps:
                     break
         raise SolverError(f"the solver must reach {right:g} s from {left:g} s, but the segment fails: {why}")
 

@@ -4,11 +4,12 @@ from ctrlplan.studies.benefit import Benefit, benefit
 from ctrlplan.studies.comparison import Comparison
 from ctrlplan.studies.crane import crane_first_order_study, crane_nominal_study, crane_obstacle_study
 from ctrlplan.studies.draws import draws
-from ctrlplan.studies.ensemble import Ensemble
-from ctrlplan.studies.experiment import Experiment
+from ctrlplan.studies.ensemble import Ensemble, Failure
+from ctrlplan.studies.experiment import Experiment, Measured
 from ctrlplan.studies.former import compare, sweep
+from ctrlplan.studies.grids import Grid
 from ctrlplan.studies.linear import linear_study
-from ctrlplan.studies.measures import MEASURES, Measure
+from ctrlplan.studies.measures import MEASURES, Acting, Measure, Path, Run, Tracked
 from ctrlplan.studies.monte_carlo import monte_carlo
 from ctrlplan.studies.online import (
     online_goal_study,
@@ -17,7 +18,9 @@ from ctrlplan.studies.online import (
     online_saturated_study,
 )
 from ctrlplan.studies.plans import standard_plans
+from ctrlplan.studies.required_durations import RequiredDuration
 from ctrlplan.studies.roles import Role, Stability
+from ctrlplan.studies.sections import Section
 from ctrlplan.studies.study import Study
 from ctrlplan.studies.sweep import Sweep
 
@@ -41,15 +44,24 @@ __all__ = [
     "MEASURES",
     "ONLINE",
     "PAPER",
+    "Acting",
     "Benefit",
     "Comparison",
     "Ensemble",
     "Experiment",
+    "Failure",
+    "Grid",
     "Measure",
+    "Measured",
+    "Path",
+    "RequiredDuration",
     "Role",
+    "Run",
+    "Section",
     "Stability",
     "Study",
     "Sweep",
+    "Tracked",
     "benefit",
     "compare",
     "crane_first_order_study",

@@ -252,7 +252,7 @@ def benefit_of(
     own, ran = setting.run(points, plans, experiment.measures)
     found = comparison_of(own, ran, units, title=title)
     roles = {name: Role.BASELINE if role is Role.PLANNED else role for name, role in found.roles.items()}
-    found = replace(found, roles={name: Role.PLANNED if name == PLANNED else role for name, role in roles.items()})
+    found = replace(found, roles=roles | {PLANNED: Role.PLANNED})
     grids = _grids(setting, found, _decisive(choices.decisive, found))
     note = choices.note if choices.limits is not None else " ".join(filter(None, (choices.note, OWN_LIMITS)))
     return Benefit(found, held, _required_durations(setting, plans, planned, limited), grids, planned.alpha, note)

@@ -84,7 +84,17 @@ class Tracked:
 
 @dataclass(frozen=True)
 class Acting:
-    """Controls, argument of a `Measure` of controls: sample times [s] from `start` on, u (ncontrols, ntime)."""
+    """Controls: argument of a `Measure` of controls.
+
+    Attributes
+    ----------
+    t : ndarray, shape (ntime,)
+        Sample times [s] from `start` on.
+    u : ndarray, shape (ncontrols, ntime)
+        Controls.
+    start : float
+        Time [s] from which it is measured.
+    """
 
     t: Array
     u: Array

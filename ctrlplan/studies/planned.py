@@ -133,14 +133,15 @@ def planned(
 
 # Families
 
-_STEP = "step"
-"""Family of steps, which is made of the goal alone."""
-
 
 def _tables() -> dict[str, Table]:
     """Entries of a plan by family."""
-    own = {name: _table(kind) for name, kind in sorted(families().items())}
-    return own | {_STEP: Table(_COMMON)}
+    return {name: Table(_COMMON) if kind is None else _table(kind) for name, kind in _kinds().items()}
+
+
+def _kinds() -> dict[str, type[FromWaypoints] | None]:
+    """Class of each family; None for a step, which has the goal alone."""
+    return {**dict(sorted(families().items())), "step": None}
 
 
 def _table(kind: type[FromWaypoints]) -> Table:
@@ -202,14 +203,14 @@ def _plan(table: Data, waypoints: tuple[Waypoint, ...], place: str, reader: Read
         own = _table(kind)
         entries = {"family": Entry(Text(), ""), **own.entries}
         table = Table(entries).read(table, place, reader)
-    elif family != _STEP:
-        kind = families()[family]
+    else:
+        kind = _kinds()[family]
     name = table.get("name", family if kind is None else family_name(kind))
     if not name:
         raise reader.error(f"{place}.name", f"must be a unique name, got {got(name)}")
     try:
         if kind is None:
-            return name, standard_plans(waypoints)[_STEP]
+            return name, standard_plans(waypoints)["step"]
         return name, kind.from_waypoints(waypoints, **{key: table[key] for key in kind.options if key in table})
     except (ValueError, TypeError) as error:
         raise reader.error(place, error) from None

@@ -35,7 +35,9 @@ class Options(NamedTuple):
 
     def given(self) -> Data:
         """Options that determine the plan and differ from their defaults."""
-        return {k: v for k, v in self._replace(warn=True)._asdict().items() if v != self._field_defaults[k]}
+        values = self._asdict()
+        del values["warn"]
+        return {k: v for k, v in values.items() if v != self._field_defaults[k]}
 
 
 class NewtonSpline(WaypointSpline):
@@ -244,7 +246,9 @@ class NewtonSpline(WaypointSpline):
             "waypoints": [w.to_dict() for w in self.waypoints],
             "labels": list(self.labels),
         }
-        return data | self._options._replace(labels=None).given()
+        options = self._options.given()
+        options.pop("labels", None)
+        return data | options
 
     def _facts(self) -> list[tuple[str, str]]:
         return [*super()._facts(), ("alpha", f"{number(self.alpha)} rad" if self.alpha else "")]

@@ -361,6 +361,7 @@ def test_the_animation_plays_the_crane_that_was_simulated(browser, tmp_path):
     (choose,) = browser.find_elements("css selector", "figure.animation select")
     browser.execute_script("arguments[0].selectedIndex = 0; arguments[0].dispatchEvent(new Event('change'))", choose)
     assert browser.execute_script(PARTS)["plan"] == "polynomial"
+    browser.execute_script("document.querySelectorAll('details').forEach(folded => { folded.open = true; })")
     browser.find_element("css selector", "figure.animation .play").click()
     for _ in range(10_000):
         moved = browser.execute_script(PARTS)

@@ -40,6 +40,9 @@ KINDS = re.compile(r"\bkind\b")
 LETTERS = set("biufcmMOSUV")
 """``dtype.kind`` of numpy, which is one of these letters."""
 
+FLAG = re.compile(r"CV_[A-Z_]+|numpy\.random|#000000")
+"""Return flags of CVODES, a module of numpy, a colour of matplotlib."""
+
 UFUNC_METHODS = {"__call__", "reduce", "accumulate", "outer"}
 """What numpy passes to ``__array_ufunc__`` as `method`."""
 
@@ -206,7 +209,7 @@ class Switch:
     """A place where the program's way depends on a string that is written there."""
 
     place: str
-    kind: str  # "Literal", "name of a plan", "others' word" or "string"
+    kind: str  # "Literal", "name of a plan", "others' word", "string" or "named string"
     text: str
 
 
@@ -266,6 +269,50 @@ def _switched(node):
     return None
 
 
+def _named_strings(module):
+    """Constants of a module that are strings, by name."""
+    return {
+        target.id: node.value.value
+        for node in module.tree.body
+        if isinstance(node, ast.Assign) and _strings(ast.Tuple([node.value])) is not None
+        for target in node.targets
+        if isinstance(target, ast.Name)
+    }
+
+
+class _Spelled(ast.NodeTransformer):
+    """Puts strings in place of the constants that hold them."""
+
+    def __init__(self, known):
+        self.known = known
+
+    def visit_Name(self, node):
+        value = self.known.get(node.id) if isinstance(node.ctx, ast.Load) else None
+        return node if value is None else ast.copy_location(ast.Constant(value), node)
+
+
+def named_switches(modules):
+    """Places that compare with a string that a constant of a module holds, by its name; as of `switches`.
+
+    A constant that is used in several places is how a module marks what
+    another library carries for it (labels of matplotlib's artists), or the
+    name of its own part (an output, a file, a family), which stands once.
+    """
+    constants = {".".join(module.path.with_suffix("").parts): _named_strings(module) for module in modules}
+    for module in modules:
+        own = dict(constants[".".join(module.path.with_suffix("").parts)])
+        for node in module.tree.body:
+            if isinstance(node, ast.ImportFrom):
+                found = constants.get(node.module, {})
+                own |= {alias.asname or alias.name: found[alias.name] for alias in node.names if alias.name in found}
+        before = {(found.lineno, found.col_offset) for found in ast.walk(module.tree) if _switched(found)}
+        for node in ast.walk(_Spelled(own).visit(ast.parse(module.text))):
+            if not (found := _switched(node)) or (node.lineno, node.col_offset) in before:
+                continue
+            if not _is_others(ast.unparse(found[0]), found[1]):
+                yield Switch(module.place(node), "named string", module.text.splitlines()[node.lineno - 1].strip())
+
+
 def switches(modules):
     """Places that compare with strings written there, by what they compare.
 
@@ -319,7 +366,7 @@ def _is_others(subject, values):
     """Whether strings are words that others have fixed.
 
     What Python, numpy, scipy, Unicode and the file system return (`OTHERS`);
-    letters of ``dtype.kind``; methods of numpy's functions; ``ClassVar`` of an
+    letters of ``dtype.kind``; what `FLAG` lists; methods of numpy's functions; ``ClassVar`` of an
     annotation; and signs without a letter or a digit: the underscore of
     Python's private names and matplotlib's hidden labels, its solid line, an
     end of line, a quote.
@@ -327,6 +374,7 @@ def _is_others(subject, values):
     return (
         OTHERS.search(subject) is not None
         or (KINDS.search(subject) is not None and set("".join(values)) <= LETTERS)
+        or all(map(FLAG.fullmatch, values))
         or (subject == "method" and set(values) <= UFUNC_METHODS)
         or (subject.startswith("str(annotation)") and values == ["ClassVar"])
         or not any(letter.isalnum() for value in values for letter in value)
@@ -375,7 +423,7 @@ def measured(root):
     given = sorted(signatures(modules), key=lambda row: -row[0])
     functions, classes = ([row for row in given if row[5] is one] for one in (False, True))
     exempt, upwards = imports_upwards(root)
-    found = list(switches(modules))
+    found = [*switches(modules), *named_switches(modules)]
     kinds = Counter(switch.kind for switch in found)
     long = sorted((row for row in lengths(modules) if row[0] > MOST_LINES), reverse=True)
     untyped = [row for row in given if row[3]]
@@ -403,6 +451,7 @@ def measured(root):
         ),
         ("switches on names of plans", kinds["name of a plan"], _listed(found, "name of a plan")),
         ("switches on other strings", kinds["string"], _listed(found, "string")),
+        ("switches on strings that a constant holds", kinds["named string"], _listed(found, "named string")),
         ("switches on words of Python, numpy, scipy, files", kinds["others' word"], _listed(found, "others' word")),
         ("switches on `Literal`", kinds["Literal"], _listed(found, "Literal")),
         (f"functions of more than {MOST_LINES} lines", len(long), _named(long)),

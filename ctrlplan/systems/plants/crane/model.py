@@ -22,9 +22,8 @@ from ctrlplan.traits import declare
 
 Params = Mapping[str, float] | None
 
-_TENSION = "T"
 STATES = ("D", "R", "theta", "D_d1", "R_d1", "theta_d1")
-OUTPUTS = ("x", "z", "D", "R", "theta", "x_d1", "z_d1", "D_d1", "R_d1", "theta_d1", _TENSION)
+OUTPUTS = ("x", "z", "D", "R", "theta", "x_d1", "z_d1", "D_d1", "R_d1", "theta_d1", "T")
 
 
 def iosystem(crane: CraneParameters, name: str = "crane", *, wind: bool = False) -> ct.NonlinearIOSystem:
@@ -156,7 +155,9 @@ def output(crane: CraneParameters, t: float, state: Array, inputs: Array, params
 
 def feedthrough(ninputs: int) -> NDArray[np.bool_]:
     """Direct feedthrough (noutputs, ninputs): from forces and torque to the tension only."""
-    return np.array([[label == _TENSION] * ninputs for label in OUTPUTS])
+    found = np.zeros((len(OUTPUTS), ninputs), dtype=bool)
+    found[OUTPUTS.index("T")] = True
+    return found
 
 
 def solved(
