@@ -273,6 +273,10 @@ class CompiledSolver:
         self.switches: list[float] = []
         self._report = self._count if equations.compared.is_expected else None
 
+    def perturbed(self, states: Array) -> Array:
+        """States (nstates, ntime) moved by the tolerance of a step, up and down in turn."""
+        return self._scales.perturbed(states, *self._tolerances)
+
     def signals(self, times: Array, states: Array, time_values: Array) -> Array:
         """All signals (nsignals, ntime) of the network."""
         return self.form.signals(times, states, time_values, self._p)

@@ -307,6 +307,10 @@ class InterpretedSolver:
         scales = self._scales
         return np.asarray(self._equations.rates(t, scales.shift + scales.scale * z, time_values) / scales.scale)
 
+    def perturbed(self, states: Array) -> Array:
+        """States (nstates, ntime) moved by the tolerance of a step, up and down in turn."""
+        return self._scales.perturbed(states, self._rtol, self._atol)
+
     def signals(self, times: Array, states: Array, time_values: Array) -> Array:
         """All signals (nsignals, ntime) of the network."""
         return self._equations.all_signals(times, states, time_values)

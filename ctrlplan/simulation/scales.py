@@ -119,6 +119,12 @@ class Scales:
             return None
         return replace(self, shift=shift, scale=np.minimum(scale, np.where(small, self.scale, np.inf)))
 
+    def perturbed(self, states: Array, rtol: Array | float, atol: float) -> Array:
+        """States (nstates, ntime) moved by the tolerance of a step, up and down in turn."""
+        relative = np.reshape(np.asarray(rtol, dtype=float), (-1, 1))
+        step = relative * np.abs(states - self.shift[:, None]) + atol * self.scale[:, None]
+        return np.asarray(states + in_turn(states.shape) * (step + 4.0 * np.spacing(np.abs(states))))
+
     def uncertainty(self, states: Array, rtol: float) -> Array:
         """Estimated error (nstates,) of the states of a run if errors do not grow."""
         size = np.abs(states - self.shift[:, None]).max(axis=1, initial=0.0)
@@ -142,6 +148,11 @@ class Scales:
         close = np.where(loose & (size > 0.0), np.maximum(_OWN * size, _NOISE * noise), np.inf)
         scale = np.minimum(self.scale, close)
         return replace(self, scale=scale, relative=np.where(loose | (not by_state), _CLOSER, self.relative))
+
+
+def in_turn(shape: tuple[int, ...]) -> Array:
+    """Signs of neighbouring entries that differ."""
+    return np.asarray(2.0 * (np.indices(shape).sum(axis=0) % 2) - 1.0)
 
 
 def output_uncertainty(outputs: Callable[[Array], Array], states: Array, uncertainty: Array) -> tuple[Array, Array]:

@@ -17,6 +17,7 @@ from ctrlplan._types import Array
 from ctrlplan.simulation.budget import check
 from ctrlplan.simulation.interpreted import Interpreted, SolverError
 from ctrlplan.simulation.network import Network
+from ctrlplan.simulation.scales import in_turn
 from ctrlplan.simulation.signals import (
     RESOLVED,
     Series,
@@ -58,6 +59,9 @@ _MARKS = 20_000
 
 class Solver(Protocol):
     """Integrator of the states over a segment."""
+
+    def perturbed(self, states: Array) -> Array:
+        """States (nstates, ntime) moved by the tolerance of a step, up and down in turn."""
 
     def advance(self, series: Series, left: float, grid: Array, state: Array) -> Array:
         """States (nstates, ngrid) at times of a segment; the last is its end."""
@@ -194,7 +198,9 @@ def integrate(
         if memory.delays or not (span and span[-1].right >= right):
             until = right if memory.delays else schedule.fixed_after(left)
             accuracy = resolution if memory.delays else RESOLVED
-            span = _resolved(time_signals, 0.5 * (left + right), left, until, accuracy, rounding)
+            span = _resolved(
+                time_signals, 0.5 * (left + right), left, until, accuracy, np.maximum(rounding, memory.rounding)
+            )
         series = next(s for s in span if left < s.right)
         right = min(right, series.right)
         inside = times[slice(*np.searchsorted(times, [left, right]))]
@@ -251,7 +257,13 @@ def _resolved(
 
 
 class _Memory:
-    """Stored inputs of the delays, segment by segment."""
+    """Stored inputs of the delays, segment by segment.
+
+    Attributes
+    ----------
+    rounding : ndarray, shape (nsignals,)
+        Rounding errors of all time signals: so far, of the delayed ones; otherwise 0.
+    """
 
     def __init__(self, network: Network, solver: Solver, time_signals: Sequence[TimeSignal], resolution: float) -> None:
         blocks = network.blocks_with("delay")
@@ -260,6 +272,13 @@ class _Memory:
         self._wires, self._time_rows = [network.wire[network.inputs[i]] for i in blocks], network.time_rows
         self._solver, self._resolution = solver, resolution
         self.delays = [signal.delay for signal in self._time_signals]
+        ends = np.cumsum([signal.width for signal in time_signals], dtype=int)
+        self._rows = [
+            slice(end - signal.width, end)
+            for signal, end in zip(time_signals, ends.tolist(), strict=True)
+            if isinstance(signal, DelayedSignal)
+        ]
+        self.rounding: Array = np.zeros(sum(signal.width for signal in time_signals))
 
     def nodes(self, left: float, right: float) -> Array:
         """Times of a segment at which states are required."""
@@ -270,13 +289,38 @@ class _Memory:
         if not self._time_signals:
             return True
         nodes = self.nodes(left, right)
-        w = self._solver.signals(nodes, states[:, np.searchsorted(grid, nodes)], series.at(nodes))
-        pieces = [chebyshev_coefficients(fed(w)) for fed in self._fed]
-        if right - left > _SHORTEST * min(self.delays) and any(_unresolved(p, self._resolution) for p in pieces):
-            return False
+        x, time_values = states[:, np.searchsorted(grid, nodes)], series.at(nodes)
+        values = self._values(nodes, x, time_values)
+        # A signal that dies away after a jump retains the rounding errors of its terms.
+        self._raise_rounding([_ROUNDINGS * np.finfo(float).eps * np.abs(rows).max(axis=1) for rows in values])
+        pieces = [chebyshev_coefficients(rows) for rows in values]
+        if right - left > _SHORTEST * min(self.delays) and self._unresolved(pieces):
+            # Shorter segments do not reduce what the states' tolerances leave.
+            try:
+                near = self._values(nodes, self._solver.perturbed(x), _rounded(time_values))
+            except Exception:  # outside the domain of a block
+                return False
+            self._raise_rounding([np.abs(b - a).max(axis=1) for a, b in zip(values, near, strict=True)])
+            if self._unresolved(pieces):
+                return False
         for signal, piece, wire in zip(self._time_signals, pieces, self._wires, strict=True):
             signal.record(Series(left, right, piece, *_combined_bounds(wire, self._time_rows, series)))
         return True
+
+    def _values(self, times: Array, states: Array, time_values: Array) -> list[Array]:
+        """Inputs (width, ntime) of each delay."""
+        w = self._solver.signals(times, states, time_values)
+        return [fed(w) for fed in self._fed]
+
+    def _raise_rounding(self, errors: list[Array]) -> None:
+        for rows, error in zip(self._rows, errors, strict=True):
+            self.rounding[rows] = np.maximum(self.rounding[rows], np.where(np.isfinite(error), error, 0.0))
+
+    def _unresolved(self, pieces: list[Array]) -> bool:
+        return any(
+            _unresolved(piece, self._resolution, self.rounding[rows])
+            for piece, rows in zip(pieces, self._rows, strict=True)
+        )
 
 
 class _Schedule:
@@ -406,6 +450,12 @@ def apart(times: list[float]) -> list[float]:
     return [*distinct, times[-1]]
 
 
-def _unresolved(coefficients: Array, resolution: float) -> bool:
+def _rounded(values: Array) -> Array:
+    """Values (nrows, ntime) with other last digits, larger and smaller in turn."""
+    return np.asarray(values * (1.0 + _ROUNDINGS * np.finfo(float).eps * in_turn(values.shape)))
+
+
+def _unresolved(coefficients: Array, resolution: float, rounding: Array) -> bool:
     size = np.abs(coefficients)
-    return bool(np.any(size[:, -3:] > resolution * size.max(axis=1, keepdims=True) + 1e-300))
+    allowed = np.maximum(resolution * size.max(axis=1), rounding)
+    return bool(np.any(size[:, -3:] > allowed[:, None] + 1e-300))

@@ -1,11 +1,20 @@
 """Loops with switching, sliding, friction, noise or divergence: a result, or an error with block and time."""
 
 import control as ct
+import mpmath as mp
 import numpy as np
 import pytest
 
 import ctrlplan as cp
-from ctrlplan.simulation.interpreted import _A_SEGMENT, _CALLS, _EVALUATIONS, _PASSING, _REVIEWED
+from ctrlplan.simulation.compiled import CompiledSolver
+from ctrlplan.simulation.interpreted import (
+    _A_SEGMENT,
+    _CALLS,
+    _EVALUATIONS,
+    _PASSING,
+    _REVIEWED,
+    InterpretedSolver,
+)
 
 METHODS = ["auto", "python"]
 DOCUMENTED = _EVALUATIONS + _REVIEWED + _CALLS + _PASSING + 10 * _A_SEGMENT
@@ -158,3 +167,37 @@ def test_an_algebraic_loop_without_a_solution_ends_soon():
     with pytest.raises(RuntimeError, match=r"algebraic loop of the blocks square, wire .* at 0 s"):
         cp.simulate(loop, [0.0, 1.0])
     assert count[0] < 20_000
+
+
+# A signal of a delay that dies away keeps the rounding errors of its terms
+
+
+def integrator_with_delay(offset):
+    """Loop y' = r - y(t - 0.5), from equilibrium at an offset."""
+    plant = ct.nlsys(lambda t, x, u, params: [u[0]], lambda t, x, u, params: x, inputs="d", outputs="y", states=1)
+    delay = cp.create_delay_iosystem(0.5, inputs="e", outputs="d")
+    error = ct.summing_junction(["r", "-y"], "e")
+    return ct.interconnect([plant, delay, error], inputs="r", outputs=["y"])
+
+
+def method_of_steps(t):
+    """Unit step response from rest, e = r - y and y' = e(t - 0.5): sum of (-1)^k (t - (k + 1)/2)^(k + 1)/(k + 1)!."""
+    with mp.workdps(60):
+        terms = range(int(2 * t))
+        return float(sum((-1) ** k * (mp.mpf(t) - mp.mpf(k + 1) / 2) ** (k + 1) / mp.factorial(k + 1) for k in terms))
+
+
+@pytest.mark.parametrize("method", ["compiled", "python"])
+@pytest.mark.parametrize(("offset", "height"), [(0.0, 1.0), (1e4, 1e-3)])
+def test_a_delayed_signal_that_dies_away_takes_no_more_segments(method, offset, height, monkeypatch):
+    solver = {"compiled": CompiledSolver, "python": InterpretedSolver}[method]
+    advance, segments = solver.advance, []
+    monkeypatch.setattr(solver, "advance", lambda self, *args: segments.append(args[1]) or advance(self, *args))
+    t = np.linspace(0.0, 60.0, 121)
+    found = cp.simulate(
+        integrator_with_delay(offset), t, cp.Step(offset + height, offset), [offset], method=method
+    ).outputs
+    expected = offset + height * np.array([method_of_steps(s) for s in t])
+    assert np.abs(found - expected).max() <= 1e-6 * height
+    late, early = sum(s >= 30.0 for s in segments), sum(s < 30.0 for s in segments)
+    assert late <= 2 * early
