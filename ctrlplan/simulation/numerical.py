@@ -144,7 +144,10 @@ def _with_closer_states(attempt: Attempt[S], fresh: Job) -> Attempt[S]:
         return attempt
     try:
         scales = attempt.scales.with_closer_states(
-            attempt.run.states, loose, attempt.noise(), attempt.solver.relative_by_state
+            attempt.run.states,
+            loose,
+            attempt.noise(),
+            attempt.solver.evaluations if attempt.solver.relative_by_state else None,
         )
         again = Attempt(fresh, attempt.method, scales)
         again.solver.count()

@@ -47,6 +47,9 @@ _ADDED = 0.3
 _CLOSER = 1e-3
 """Fraction of the relative tolerance for large states whose absolute error affects others."""
 
+_STEPS = 1000
+"""Evaluations of a run above which its other states are integrated more closely as well: errors of steps accumulate."""
+
 _OWN = 0.1
 """Maximum scale of such a state, relative to its magnitude."""
 
@@ -130,7 +133,9 @@ class Scales:
         size = np.abs(states - self.shift[:, None]).max(axis=1, initial=0.0)
         return _ADDED * (rtol * self.relative * size + self.atol * self.scale)
 
-    def with_closer_states(self, states: Array, loose: NDArray[np.bool_], noise: Array, by_state: bool) -> Scales:
+    def with_closer_states(
+        self, states: Array, loose: NDArray[np.bool_], noise: Array, evaluations: int | None
+    ) -> Scales:
         """Scales with tighter tolerances for large states whose absolute error affects others.
 
         Parameters
@@ -141,13 +146,15 @@ class Scales:
             States whose relative tolerance is too large for others.
         noise : ndarray, shape (nstates,)
             Rounding error of each derivative times the duration.
-        by_state : bool
-            Whether the solver has relative tolerances by state; otherwise all states get the smaller one.
+        evaluations : int or None
+            Evaluations of the run, if the solver has relative tolerances by state; otherwise all states get the
+            smaller one.
         """
         size = np.abs(states - self.shift[:, None]).max(axis=1, initial=0.0)
         close = np.where(loose & (size > 0.0), np.maximum(_OWN * size, _NOISE * noise), np.inf)
         scale = np.minimum(self.scale, close)
-        return replace(self, scale=scale, relative=np.where(loose | (not by_state), _CLOSER, self.relative))
+        others = max(_CLOSER, min(1.0, _STEPS / (evaluations or 1)))
+        return replace(self, scale=scale, relative=np.where(loose | (evaluations is None), _CLOSER, others))
 
 
 def in_turn(shape: tuple[int, ...]) -> Array:
