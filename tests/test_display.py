@@ -471,7 +471,7 @@ def test_objects_as_parameters_of_a_report_stay_in_one_line(tmp_path):
 
 
 def test_a_new_kind_of_trajectory_is_shown_by_what_it_inherits():
-    class Ramp(cp.Trajectory):
+    class RampOfAUser(cp.Trajectory):
         def __init__(self):
             self._set_fields(labels=("y",), breakpoints=np.array([0.0, 2.0]))
 
@@ -482,14 +482,14 @@ def test_a_new_kind_of_trajectory_is_shown_by_what_it_inherits():
             return self
 
         def to_dict(self):
-            return {"type": "Ramp"}
+            return {"type": "RampOfAUser"}
 
         @classmethod
         def from_dict(cls, data):
             return cls()
 
-    assert rows(str(Ramp()))[0] == ["Ramp of y from 0 s to 2 s"]
-    assert ["peak velocity [1/s]", "3"] in rows(str(Ramp()))
+    assert rows(str(RampOfAUser()))[0] == ["RampOfAUser of y from 0 s to 2 s"]
+    assert ["peak velocity [1/s]", "3"] in rows(str(RampOfAUser()))
 
 
 # Numbers

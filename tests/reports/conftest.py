@@ -187,7 +187,8 @@ class Reader(HTMLParser):
         self.open.pop()
 
     def handle_data(self, data):
-        for element in self.open:
+        # A script is no text of what is around it.
+        for element in self.open[-1:] if self.open[-1].tag in ("script", "style") else self.open:
             element.text += data
 
 

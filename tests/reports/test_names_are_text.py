@@ -32,9 +32,35 @@ def seen(text):
     )
 
 
+DRAWN = {
+    "svg",
+    "g",
+    "defs",
+    "style",
+    "path",
+    "use",
+    "text",
+    "tspan",
+    "rect",
+    "clippath",
+    "circle",
+    "line",
+    "polyline",
+    "desc",
+}
+"""Elements of drawings."""
+
+
 def structure(tree):
-    """Tags with the names of their attributes, the strokes of drawings left out."""
-    return [(e.tag, *e.attributes) for e in tree.all() if e.tag not in ("use", "g", "path", "defs", "clippath")]
+    """Tags with the names of their attributes; a drawing, whose texts are laid out by their lengths, is one tag."""
+    found = []
+    for child in tree.children:
+        if child.tag == "svg":
+            assert {e.tag for e in child.all()} <= DRAWN
+            found.append((child.tag,))
+        else:
+            found.extend([(child.tag, *child.attributes), *structure(child)])
+    return found
 
 
 @pytest.fixture(scope="module")
@@ -241,6 +267,7 @@ def opened(browser, tmp_path):
 
 
 def check(chrome):
+    chrome.execute_script("document.querySelectorAll('details').forEach(fold => { fold.open = true; })")
     for choose in chrome.find_elements("css selector", "figure.animation select"):
         for option in choose.find_elements("css selector", "option"):
             option.click()

@@ -133,7 +133,7 @@ def test_a_draw_counts_for_the_plans_that_get_through():
     assert [(failure.draw, failure.plan) for failure in found.failures] == [(2, "large")]
     assert any("The nominal loop is draw 0 (g = 0), because " in note for note in found.nominal.notes)
     assert found.nominal_draw == 0
-    assert "the responses below are those of draw 0." in next(found.notes())
+    assert "The responses below are those of draw 0." in next(found.notes())
 
 
 def test_reprs_are_short():
