@@ -1,8 +1,8 @@
 """A plan whose run fails is recorded with its reason, and the others are kept."""
 
 import json
-import re
 import os
+import re
 
 import control as ct
 import numpy as np
