@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -147,7 +148,13 @@ def _kinds() -> dict[str, type[FromWaypoints] | None]:
 def _table(kind: type[FromWaypoints]) -> Table:
     """Entries of a plan of one family."""
     entries = {name: _option(kind, name) for name in kind.options}
-    return Table(_COMMON | entries, shipped=kind.__module__.startswith("ctrlplan."))
+    return Table(_COMMON | entries, shipped=is_shipped(kind))
+
+
+def is_shipped(kind: type) -> bool:
+    """Whether a class is one of this package: a name of its module, and not of an example in a docstring."""
+    module = kind.__module__
+    return module.startswith("ctrlplan.") and getattr(sys.modules.get(module), kind.__name__, None) is kind
 
 
 def _option(kind: type[FromWaypoints], name: str) -> Entry:
