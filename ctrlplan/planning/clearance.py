@@ -11,7 +11,7 @@ import numpy as np
 
 from ctrlplan._checks import checked_finite, checked_number
 from ctrlplan._display import Displayed, Facts, Part, number
-from ctrlplan._renamed import warn_renamed
+from ctrlplan._renamed import FormerAttribute
 from ctrlplan.planning.obstacles import Obstacle
 from ctrlplan.trajectories import Trajectory
 from ctrlplan.trajectories.common import Array
@@ -73,11 +73,7 @@ class Clearance(Displayed):
     required: float | None
     certified: bool | None
 
-    @property
-    def least(self) -> float:
-        """Deprecated name of `minimum`."""
-        warn_renamed("Clearance.least", "minimum")
-        return self.minimum
+    least = FormerAttribute("minimum")
 
     def _describe(self) -> Iterator[Part]:
         verdict = {True: "satisfied", False: "violated", None: ""}[self.certified]

@@ -14,7 +14,7 @@ from scipy.optimize import brentq
 
 from ctrlplan._checks import checked_pair
 from ctrlplan._display import Displayed, Facts, Figure, Part
-from ctrlplan._renamed import warn_renamed
+from ctrlplan._renamed import FormerAttribute
 from ctrlplan.planning.limits import Limited, Margin, Margins
 from ctrlplan.planning.quantities import System, system_given
 from ctrlplan.planning.scalar_search import bisected, scan
@@ -75,11 +75,7 @@ class Fastest(Displayed):
         """The smallest margin, of the active limit without `rejection`."""
         return self.margins.active
 
-    @property
-    def refusal(self) -> str:
-        """Deprecated name of `rejection`."""
-        warn_renamed("Fastest.refusal", "rejection")
-        return self.rejection
+    refusal = FormerAttribute("rejection")
 
     def _describe(self) -> Iterator[Part]:
         active = "" if self.rejection else self.active.bound.name

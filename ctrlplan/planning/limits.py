@@ -12,7 +12,7 @@ import numpy as np
 
 from ctrlplan._checks import check_kind, checked_limits
 from ctrlplan._display import Displayed, Part, Table, counted
-from ctrlplan._renamed import warn_renamed
+from ctrlplan._renamed import FormerAttribute
 from ctrlplan.planning.quantities import Quantities, System, quantities_of, system_given
 from ctrlplan.trajectories import Trajectory, derivative_name
 from ctrlplan.trajectories.common import Array
@@ -214,11 +214,7 @@ class Margins(Displayed):
         """Whether all limits are satisfied over the whole plan."""
         return self.active.fraction >= 0.0
 
-    @property
-    def hold(self) -> bool:
-        """Deprecated name of `satisfied`."""
-        warn_renamed("Margins.hold", "satisfied")
-        return self.satisfied
+    hold = FormerAttribute("satisfied")
 
     def __iter__(self) -> Iterator[Margin]:
         return iter(self.rows)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ctrlplan._checks import checked_labels
 from ctrlplan._display import number
-from ctrlplan._renamed import warn_renamed
+from ctrlplan._renamed import FormerAttribute
 from ctrlplan._types import Data, Value
 from ctrlplan.trajectories.chosen import chosen_alpha
 from ctrlplan.trajectories.common import FACTORIALS, Array, mapped_time, readonly, times_powers
@@ -117,11 +117,7 @@ class PiecewiseSpline(WaypointSpline):
         )
         self._check_swing()
 
-    @property
-    def legs(self) -> tuple[NewtonSpline, ...]:
-        """Deprecated name of `segments`."""
-        warn_renamed("PiecewiseSpline.legs", "segments")
-        return self.segments
+    legs = FormerAttribute("segments")
 
     def with_values(self, waypoints: Iterable[Waypoint]) -> Self:
         """Plan with the same times and shape through new values.
