@@ -35,6 +35,7 @@ Simulate
     prepare                   the built form, for many runs -> Prepared
     Event                     a limit whose crossing is recorded or ends the run -> Occurrence
     SolverError               raised where an integrator fails
+    read_log                  measured signals of a machine, for a Comparison, as a response
 Compare and report
     compare                   plans in one loop, with metrics, figures and a page -> Comparison
     benefit                   planning against steps, profiles and shaped steps -> Benefit
@@ -138,6 +139,7 @@ _EXPORTS = {
         "SimulationResponse",
         "SolverError",
         "prepare",
+        "read_log",
         "simulate",
     ),
     "studies": (
