@@ -11,10 +11,12 @@ Before its start a plan holds its first position, after its end the last, with
 all derivatives zero. Times are in seconds, signals are (channel, time).
 """
 
+from ctrlplan.trajectories.clipped import Clipped
 from ctrlplan.trajectories.combined import Joined, Scaled, Selected, Stacked, Sum, stack
 from ctrlplan.trajectories.continuity import Jump
 from ctrlplan.trajectories.extrema import Bounds, Extrema
 from ctrlplan.trajectories.files import derivative_name, load_trajectory, trajectory_from_dict
+from ctrlplan.trajectories.motion_profile import MotionProfile
 from ctrlplan.trajectories.piecewise import PiecewiseSpline
 from ctrlplan.trajectories.polynomial import PolySpline
 from ctrlplan.trajectories.profiles import SCurve, Trapezoid
@@ -30,10 +32,12 @@ from ctrlplan.trajectories.waypoint_spline import WaypointSpline
 
 __all__ = [
     "Bounds",
+    "Clipped",
     "Extrema",
     "FourierCoefficients",
     "Joined",
     "Jump",
+    "MotionProfile",
     "PiecewiseSpline",
     "PolySpline",
     "Retimed",
