@@ -8,7 +8,8 @@ Plan a move
     TrigSpline, PolySpline    one spline through all waypoints: trigonometric, polynomial (alpha = 0)
     PiecewiseSpline           one spline for each segment, continuous in the derivatives left free
     SCurve, Trapezoid, Step   moves with limited jerk, with limited acceleration, without limits
-    Shaper                    input shaping of any plan, against a known mode
+    Shaper                    input shaping of any plan, against known modes or a measured spectrum
+    residual_spectrum         vibration that a plan leaves in a mode, by frequency; residual_plot draws it
     stack                     plans of single axes as one plan
     waypoints_from_csv        waypoints from a table, with times or at a speed
     load_trajectory, trajectory_from_dict    stored plans
@@ -86,6 +87,7 @@ _EXPORTS = {
         "Waypoint",
         "WaypointSpline",
         "load_trajectory",
+        "residual_spectrum",
         "stack",
         "trajectory_from_dict",
         "waypoints_from_csv",
@@ -156,6 +158,7 @@ _EXPORTS = {
         "sweep",
     ),
     "reports.explore": ("explore",),
+    "reports.vibration_figures": ("residual_plot",),
 }
 _HOME = {name: module for module, names in _EXPORTS.items() for name in names}
 

@@ -20,7 +20,9 @@ from ctrlplan.trajectories.motion_profile import MotionProfile
 from ctrlplan.trajectories.piecewise import PiecewiseSpline
 from ctrlplan.trajectories.polynomial import PolySpline
 from ctrlplan.trajectories.profiles import SCurve, Trapezoid
+from ctrlplan.trajectories.residual import residual_spectrum
 from ctrlplan.trajectories.retimed import Retimed
+from ctrlplan.trajectories.shaper_factor import ShaperFactor
 from ctrlplan.trajectories.shaping import Shaper
 from ctrlplan.trajectories.step import Step
 from ctrlplan.trajectories.trajectory import Trajectory
@@ -45,6 +47,7 @@ __all__ = [
     "Scaled",
     "Selected",
     "Shaper",
+    "ShaperFactor",
     "Stacked",
     "Step",
     "Sum",
@@ -56,6 +59,7 @@ __all__ = [
     "WaypointSpline",
     "derivative_name",
     "load_trajectory",
+    "residual_spectrum",
     "stack",
     "trajectory_from_dict",
     "waypoints_from_csv",
