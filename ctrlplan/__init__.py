@@ -33,7 +33,7 @@ Build the loop
     declare, traits_of        what the simulation must know of a block of your own -> BlockTraits
 Simulate
     simulate                  response of any python-control system -> SimulationResponse; exact if linear
-    prepare                   the built form, for many runs -> Prepared
+    prepare                   the built form, for many runs -> Prepared; .start(dt): step by step -> Stepper
     Event                     a limit whose crossing is recorded or ends the run -> Occurrence
     SolverError               raised where an integrator fails
     read_log                  measured signals of a machine, for a Comparison, as a response
@@ -140,6 +140,7 @@ _EXPORTS = {
         "Prepared",
         "SimulationResponse",
         "SolverError",
+        "Stepper",
         "prepare",
         "read_log",
         "simulate",

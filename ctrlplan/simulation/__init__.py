@@ -67,6 +67,7 @@ from ctrlplan.simulation.predictor import Predictor
 from ctrlplan.simulation.prepared import Prepared, prepare, prepared_form, state_space, stated_start
 from ctrlplan.simulation.response import SimulationResponse, signal_table
 from ctrlplan.simulation.simulate import simulate
+from ctrlplan.simulation.stepper import Stepper
 
 __all__ = [
     "Event",
@@ -75,6 +76,7 @@ __all__ = [
     "Prepared",
     "SimulationResponse",
     "SolverError",
+    "Stepper",
     "equilibrium_at",
     "equilibrium_state",
     "prepare",
