@@ -18,6 +18,7 @@ from ctrlplan.simulation.loop_form import LoopForm, Rows
 from ctrlplan.simulation.loop_response import LoopResponse
 from ctrlplan.simulation.plan_cells import PlanCells
 from ctrlplan.simulation.prepared import Prepared, prepared_form
+from ctrlplan.simulation.shape_family import LoopSignal, ShapeFamily
 from ctrlplan.trajectories import Trajectory
 
 _FRACTIONS = np.array([0.0, 0.0312, 0.1234, 0.25, 0.3456, 0.5, 0.6543, 0.75, 0.8765, 1.0])
@@ -152,6 +153,10 @@ class AlongPlan:
         same = plan is self.plan
         cells, start = (self.cells, self.start) if same else (PlanCells(plan, self.form.order + 2), self.rest_at(plan))
         return ExactResponse(Motion(self.form, cells, plan.duration, start), self.signals, plan.start)
+
+    def shapes(self, chosen: Sequence[LoopSignal]) -> ShapeFamily:
+        """Signals as functions of the duration of the plan, with its shape fixed."""
+        return ShapeFamily(self.form, self.signals, self.cells, self.start, chosen)
 
 
 def loop_quantities(loop: System | Prepared, *, tail: float | None = None) -> LoopQuantities:
