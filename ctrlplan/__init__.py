@@ -20,6 +20,7 @@ Choose what is left free
     fastest                   minimum duration under limits -> Fastest, with a time law Retimed
     Limits, Region            limits on one side, of a rate, of an RMS, over time; a region of two signals
     margins                   how near a plan is to its limits, and when -> Margins
+    loop_quantities           signals of a loop along a plan, for limits on them
     avoid, clearance          around Rectangle, Disc, HalfPlane -> Avoidance, Clearance: certified
 Build the loop
     create_source_iosystem    plan as a block with outputs y, y_d1, ...; source_samples: the same as arrays
@@ -138,6 +139,7 @@ _EXPORTS = {
         "Prepared",
         "SimulationResponse",
         "SolverError",
+        "loop_quantities",
         "prepare",
         "simulate",
     ),
