@@ -19,8 +19,9 @@ Choose what is left free
     choose_alpha              shape by an objective: PeakDerivative, SquaredDerivative -> AlphaChoice
     optimize_waypoints        derivatives and times at via points, by minimum jerk or snap -> Optimum
     fastest                   minimum duration under limits -> Fastest, with a time law Retimed
-    Limits                    limits that are one-sided
+    Limits, Region            limits on one side, of a rate, of an RMS, over time; a region of two signals
     margins                   how near a plan is to its limits, and when -> Margins
+    loop_quantities           signals of a loop along a plan, for limits on them
     avoid, clearance          around Rectangle, Disc, HalfPlane -> Avoidance, Clearance: certified
 Build the loop
     create_source_iosystem    plan as a block with outputs y, y_d1, ...; source_samples: the same as arrays
@@ -104,6 +105,7 @@ _EXPORTS = {
         "Optimum",
         "PeakDerivative",
         "Rectangle",
+        "Region",
         "SquaredDerivative",
         "avoid",
         "choose_alpha",
@@ -141,6 +143,7 @@ _EXPORTS = {
         "SimulationResponse",
         "SolverError",
         "Stepper",
+        "loop_quantities",
         "prepare",
         "read_log",
         "simulate",

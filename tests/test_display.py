@@ -81,6 +81,7 @@ MADE = {
     "Stepper": lambda: cp.prepare(swept(5.0)).start(0.1),
     "Prepared": lambda: cp.prepare(swept(5.0)),
     "Rectangle": lambda: cp.Rectangle((0.0, 1.0), (0.0, 1.0)),
+    "Region": lambda: cp.Region(("speed", "torque"), [(0, 3), (100, 0), (0, -3), (-100, 0)]),
     "Retimed": lambda: cp.Retimed(quintic(), cp.PolySpline([cp.Waypoint(0, 0), cp.Waypoint(2, 1)])),
     "SCurve": lambda: cp.SCurve(1.0, velocity=1.0, acceleration=2.0, jerk=10.0),
     "Shaper": lambda: cp.Shaper.zvd(2.0, 0.05),

@@ -41,9 +41,10 @@ Examples
 from ctrlplan import _renamed
 from ctrlplan.planning.alpha import AlphaChoice, choose_alpha
 from ctrlplan.planning.avoid import Avoidance, avoid
+from ctrlplan.planning.bounds import Bound, Limits, Region
 from ctrlplan.planning.clearance import Clearance, Rope, clearance
 from ctrlplan.planning.fastest import Fastest, fastest
-from ctrlplan.planning.limits import Bound, Limits, Margin, Margins, margins
+from ctrlplan.planning.limits import Margin, Margins, margins
 from ctrlplan.planning.objectives import OBJECTIVES, PeakDerivative, SquaredDerivative, plan_excess_length, plan_length
 from ctrlplan.planning.obstacles import Disc, HalfPlane, Obstacle, Rectangle
 from ctrlplan.planning.optimize import Optimum, optimize_waypoints
@@ -64,6 +65,7 @@ __all__ = [
     "Optimum",
     "PeakDerivative",
     "Rectangle",
+    "Region",
     "Rope",
     "SquaredDerivative",
     "avoid",

@@ -6,7 +6,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from ctrlplan.planning.limits import Bound, Limited
+from ctrlplan.planning.bounds import Bound
+from ctrlplan.planning.limits import Limited
 from ctrlplan.trajectories import Trajectory, Waypoint, WaypointSpline
 from ctrlplan.trajectories.common import Array
 from ctrlplan.trajectories.cycle import knots_of, moved
@@ -40,6 +41,7 @@ def lengthened(plan: Trajectory, dt: float, counts: Array, limits: Mapping[str, 
         satisfies the limits.
     """
     limited = Limited(plan, limits)
+    limited.check_constant("limits of a plan on a cycle")
     limited.check_smooth(plan)
     bounds = limited.bounds
     _check_waypoints(plan.waypoints, bounds)

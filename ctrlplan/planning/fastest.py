@@ -219,6 +219,7 @@ def fastest(
     if hold == "waypoints":
         return _searched(_Replanned(plan, limited), span or _around(plan.duration), hold, endless=False)
     if hold == "path":
+        limited.check_constant('limits with hold="path"')
         _check_open(plan)
     uniform = fastest_within(plan, limited, span)
     if hold == "shape":
@@ -249,14 +250,13 @@ class _Scaled:
 
     def __init__(self, plan: Trajectory, limited: Limited) -> None:
         self._plan, self.limited = plan, limited
-        self._jet = limited.sampled(plan)
-        self._powers = np.arange(limited.order + 1)[:, None, None]
+        self._samples = limited.sampled(plan)
 
     def plan(self, duration: float) -> Trajectory:
         return self._plan.retime(duration)
 
     def excess(self, duration: float) -> float:
-        return self.limited.excess(self._jet * (self._plan.duration / duration) ** self._powers)
+        return self.limited.excess(self._samples.retimed(duration))
 
 
 class _Replanned:
@@ -284,33 +284,32 @@ def fastest_within(plan: Trajectory, limited: Limited, span: tuple[float, float]
     scaled = _Scaled(plan, limited)
     _check_rest(plan, limited)
     minimum = _closed_form(plan, limited)
-    if limited.derivatives_only and span is None:
+    if limited.derivatives_only and limited.is_constant and span is None:
         if not minimum:
             raise ValueError("limits must include one that a shorter plan would violate, got none")
         found = _satisfying(limited, plan.retime, minimum)
         return Fastest(found, limited.margins(found), ((found.duration, math.inf),), "shape", limited)
+    if limited.may_end:
+        return _searched(scaled, span or _around(plan.duration), "shape", endless=False)
     return _searched(scaled, span or _span(scaled, plan.duration, minimum), "shape", endless=True)
 
 
 def _check_rest(plan: Trajectory, limited: Limited) -> None:
     """Raise for limits of positions and quantities that are violated at every duration."""
-    still = limited.at_rest(plan)
-    for bound, values in zip(limited.bounds, limited.values(still), strict=True):
-        worst = int(bound.excess(values).argmax())
-        if bound.excess(values)[worst] > 0.0:
-            place = zip(plan.labels, still[0, :, worst].tolist(), strict=True)
-            where = ", ".join(f"{label} = {value:.4g}" for label, value in place)
-            raise ValueError(
-                f"limits must be satisfied at rest, at any duration, got {bound.name} = {values[worst]:.6g} at rest "
-                f"at {where}, where it must be {bound.range}"
-            )
+    for bound, value, position in limited.violated_at_rest(plan):
+        places = zip(plan.labels, position.tolist(), strict=True)
+        where = ", ".join(f"{label} = {place:.4g}" for label, place in places)
+        raise ValueError(
+            f"limits must be satisfied at rest, at any duration, got {bound.name} = {value:.6g} at rest "
+            f"at {where}, where it must be {bound.range}"
+        )
 
 
 def _closed_form(plan: Trajectory, limited: Limited) -> float:
     """Minimum duration for limits of derivatives, T_0 max_k (peak_k/limit_k)^(1/k)."""
     minimum = 0.0
     for bound in limited.bounds:
-        if bound.axis is not None and bound.order:
+        if bound.axis is not None and bound.order and bound.is_constant:
             extrema = plan.extrema(bound.order)
             sides = (
                 (float(extrema.maximum[bound.axis]), bound.high, float(extrema.time_max[bound.axis])),
@@ -398,6 +397,13 @@ def _feasible_edge(
         good, bad, step = good + step, good, 8.0 * step
         if (good - inside) * step > 0.0:
             good = inside
+    step = bad - good
+    while (
+        exact(bad) <= 0.0 and (outside - bad) * step > 0.0
+    ):  # a root mean square of samples may be above the exact one
+        good, bad, step = bad, bad + step, 8.0 * step
+        if (outside - bad) * step < 0.0:
+            bad = outside
     while math.isinf(exact(bad)) and abs(bad - good) > 1e-13 * good:  # infeasible for the plant: there is no root
         middle = 0.5 * (good + bad)
         good, bad = (middle, bad) if exact(middle) <= 0.0 else (good, middle)

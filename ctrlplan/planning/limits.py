@@ -5,155 +5,31 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from numbers import Real
-from typing import TYPE_CHECKING, Any, TypeGuard
+from itertools import pairwise
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ctrlplan._checks import check_kind, checked_limits
+from ctrlplan._checks import check_kind
 from ctrlplan._display import Displayed, Part, Table, counted
 from ctrlplan._renamed import FormerAttribute
-from ctrlplan.planning.quantities import Quantities, System, quantities_of, system_given
+from ctrlplan.planning.bounds import Bound
+from ctrlplan.planning.naming import Naming
+from ctrlplan.planning.quantities import System, loop_of, quantities_of, system_given
+from ctrlplan.planning.window import mean_square, window
 from ctrlplan.trajectories import Trajectory, derivative_name
 from ctrlplan.trajectories.common import Array
-from ctrlplan.trajectories.extrema import function_extrema
-from ctrlplan.trajectories.waypoint import ENTRIES
+from ctrlplan.trajectories.extrema import Extrema, function_extrema
 
 if TYPE_CHECKING:
     import pandas as pd
 
 _SAMPLES = 193
 _ROUNDING = 1e-9  # fraction of a limit below which a margin is printed as 0
-_HIGHEST = 8
-"""Maximum order of the derivatives with limits."""
-
-
-@dataclass(frozen=True)
-class Limits:
-    """Limits of one signal, for `fastest` and `margins`.
-
-    Short forms are a number above 0, 5.0 for ``Limits(-5.0, 5.0)``, and a pair
-    (minimum, maximum), with None for a side without limit.
-
-    Parameters
-    ----------
-    low, high : float, optional
-        Minimum and maximum, in the unit of the signal; None or infinite for no
-        limit.
-
-    Raises
-    ------
-    ValueError
-        If neither is finite, one is nan, or `high` is not above `low`.
-    TypeError
-        If one is not a number.
-
-    Examples
-    --------
-    >>> import ctrlplan as cp
-    >>> move = cp.PolySpline([cp.Waypoint(0, 0, 0, 0), cp.Waypoint(2, 1, 0, 0)])
-    >>> cp.margins(move, {"y_d1": cp.Limits(high=1.0)})
-    <Margins of 1 limit: y_d1 at most 1: 0.9375 at 1 s, 0.0625 left>
-    """
-
-    low: float | None = None
-    high: float | None = None
-
-    def __post_init__(self) -> None:
-        low, high, _ = checked_limits(_sides(self.low, self.high), "Limits")
-        object.__setattr__(self, "low", None if math.isinf(low) else low)
-        object.__setattr__(self, "high", None if math.isinf(high) else high)
-
-    @classmethod
-    def of(cls, limit: object, name: str) -> Limits:
-        """Limits from an object of this class or a short form.
-
-        Parameters
-        ----------
-        limit : Limits, float or (float, float)
-            Limits or short form.
-        name : str
-            Name of the signal, for messages.
-
-        Raises
-        ------
-        ValueError, TypeError
-            As the constructor; if a lone number is not above 0 and finite.
-        """
-        if isinstance(limit, Limits):
-            return limit
-        if _is_listed(limit):
-            if len(limit) != 2:
-                raise ValueError(f"limits of {name} must be a number or a pair, got {limit!r}")
-            limit = _sides(*limit)
-        elif isinstance(limit, bool) or not isinstance(limit, Real | np.ndarray):
-            raise TypeError(f"limits of {name} must be a number or a pair, got {limit!r}")
-        return cls(*checked_limits(limit, f"limits of {name}")[:2])
-
-    def bound(self, name: str, order: int, axis: int | None) -> Bound:
-        """Limits of a signal that depends on derivatives up to an order."""
-        low, high, scale = checked_limits(_sides(self.low, self.high), f"limits of {name}")
-        return Bound(name, low, high, scale, order, axis)
-
-
-@dataclass(frozen=True)
-class Bound:
-    """Limits of one signal of a plan.
-
-    Attributes
-    ----------
-    name : str
-        Derivative of an axis (x_d1), or a quantity of the plant.
-    low, high : float
-        Minimum and maximum; one may be infinite.
-    scale : float
-        Scale of margins: half the distance of the limits, or the magnitude of a
-        single limit.
-    order : int
-        Highest derivative that the signal depends on.
-    axis : int or None
-        Axis of a derivative; None for a quantity.
-    slack : float
-        Tolerance of the excess for rounding; above 0 if the limit is attained
-        at rest, and thus at every duration.
-    """
-
-    name: str
-    low: float
-    high: float
-    scale: float
-    order: int
-    axis: int | None = None
-    slack: float = 0.0
-
-    def excess(self, values: Array) -> Array:
-        """Violation by values, relative to the scale; negative inside."""
-        return np.maximum(values - self.high, self.low - values) / self.scale - self.slack
-
-    @property
-    def range(self) -> str:
-        """The limits in words."""
-        return _range(self.low, self.high)
-
-
-def limit_words(limit: object, name: str = "velocity") -> str:
-    """Description of a limit in any form that `margins` accepts, by axis for names of all axes, such as velocity."""
-    if isinstance(limit, Limits):
-        return _range(*_sides(limit.low, limit.high))
-    given = np.array(limit, dtype=object)
-    if given.ndim == 0:
-        return _range(-float(given), float(given))
-    if given.shape == (2,) and (isinstance(limit, tuple) or name not in ENTRIES):
-        return _range(*map(float, _sides(*given)))
-    return "; ".join(limit_words(tuple(row) if np.ndim(row) else row) for row in given)
-
-
-def _range(low: float, high: float) -> str:
-    if math.isinf(low):
-        return f"at most {high:g}"
-    if math.isinf(high):
-        return f"at least {low:g}"
-    return f"within ±{high:g}" if low == -high else f"from {low:g} to {high:g}"
+_FAR = 100.0
+"""Distance from limits over time, in their scale, beyond which it is not resolved."""
+_RATE_STEP = 0.02
+"""Step of the differences for rates, relative to the time in which a jet changes."""
 
 
 @dataclass(frozen=True)
@@ -177,7 +53,12 @@ class Margin:
     fraction: float
 
     def __str__(self) -> str:
-        return f"{self.bound.name} {self.bound.range}: {self.value:.6g} at {self.time:.6g} s, {self.room}"
+        at = "" if self.bound.kind == "rms" else f" at {self.time:.6g} s"
+        return f"{self.bound.name} {self.bound.range}: {self.value:.6g}{at}, {self.room}"
+
+    def of(self, bound: Bound) -> bool:
+        """Whether it is the margin of a bound."""
+        return replace(self.bound, low=bound.low, high=bound.high) == bound
 
     @property
     def room(self) -> str:
@@ -246,17 +127,9 @@ class Margins(Displayed):
         """Table with one row per limit: low, high, value, time, margin."""
         import pandas as pd
 
-        table = {
-            row.bound.name: {
-                "low": row.bound.low,
-                "high": row.bound.high,
-                "value": row.value,
-                "time": row.time,
-                "margin": row.fraction,
-            }
-            for row in self.rows
-        }
-        return pd.DataFrame(table).T.rename_axis(index="limit")
+        table = [(row.bound.low, row.bound.high, row.value, row.time, row.fraction) for row in self.rows]
+        names = pd.Index([row.bound.name for row in self.rows], name="limit")
+        return pd.DataFrame(table, names, ["low", "high", "value", "time", "margin"])
 
 
 def margins(
@@ -316,38 +189,102 @@ class UndeterminedError(ValueError):
     """A signal is not determined by the plan because the plant's maps are singular."""
 
 
+@dataclass(frozen=True)
+class Sampled:
+    """Samples of a plan, for the search of a duration.
+
+    Attributes
+    ----------
+    jet : ndarray, shape (order + 1, naxes, ntime)
+        Jet at the samples.
+    fractions : ndarray, shape (ntime,)
+        Times relative to the duration, 0 at the start.
+    weights : ndarray, shape (ntime,)
+        Weights of a mean over the plan.
+    duration : float
+        Duration [s].
+    """
+
+    jet: Array
+    fractions: Array
+    weights: Array
+    duration: float
+
+    def retimed(self, duration: float) -> Sampled:
+        """Samples of the same shape with another duration."""
+        powers = np.arange(len(self.jet))[:, None, None]
+        return replace(self, jet=self.jet * (self.duration / duration) ** powers, duration=duration)
+
+
 class Limited:
     """Limits for the evaluation of many plans with the same axes.
 
     Parameters are those of `margins`, for one of the plans.
     """
 
-    def __init__(self, plan: Trajectory, limits: Mapping[str, object], system: System | None = None) -> None:
+    def __init__(
+        self, plan: Trajectory, limits: Mapping[str, object], system: System | None = None, tail: float | None = None
+    ) -> None:
         if not isinstance(plan, Trajectory):
             raise TypeError(f"plan must be a Trajectory (the attribute plan of a result), got {plan!r:.60}")
         if not plan.duration:
             raise ValueError("a plan under limits must have a duration, got a step")
         check_kind(limits, "limits", Mapping, "a mapping of names to limits")
-        self._quantities = quantities_of(system)
-        self.bounds = tuple(self._bounds(plan, limits))
+        self._start, self._duration = plan.start, plan.duration
+        self.loop = loop_of(system, tail)
+        self._quantities = None if self.loop is not None else quantities_of(system)
+        self.bounds = tuple(Naming(plan, self._quantities, self.loop).bounds(limits))
         if not self.bounds:
             raise ValueError("limits must name at least one signal, got none")
-        self.order = max(bound.order for bound in self.bounds)
+        self._local = [k for k, bound in enumerate(self.bounds) if not bound.in_loop]
+        self.order = max((self.bounds[k].order for k in self._local), default=0)
         self.derivatives_only = all(bound.axis is not None for bound in self.bounds)
+        self.is_constant = all(bound.is_constant and not bound.in_loop for bound in self.bounds)
+        self.bounds = tuple(self._scaled(bound) for bound in self.bounds)
         self.bounds = tuple(self._slackened(plan))
 
-    def sampled(self, plan: Trajectory) -> Array:
-        """Jet (order + 1, naxes, ntime) at samples of every segment, its ends included."""
+    @property
+    def loop_bounds(self) -> tuple[Bound, ...]:
+        """Limits of signals of a loop."""
+        return tuple(bound for bound in self.bounds if bound.in_loop)
+
+    @property
+    def may_end(self) -> bool:
+        """Whether a limit may be violated at long durations although it is satisfied at rest."""
+        return any(b.period is not None or (not b.is_constant and _of_motion(b)) for b in self.bounds)
+
+    def check_constant(self, what: str) -> None:
+        """Raise for limits that are not the same at every time of a plan."""
+        for bound in self.bounds:
+            if bound.in_loop or not bound.is_constant:
+                kind = (
+                    "a signal of a loop"
+                    if bound.in_loop
+                    else "an rms"
+                    if bound.kind == "rms"
+                    else "an interval of time"
+                )
+                raise ValueError(f"{what} must be local in time, got those of {bound.name}, of {kind}")
+
+    def sampled(self, plan: Trajectory) -> Sampled:
+        """Samples of every segment, its ends included."""
         edges, inside = plan.breakpoints, np.linspace(0.0, 1.0, _SAMPLES)[1:-1]
-        times = (edges[:-1, None] + np.diff(edges)[:, None] * inside).ravel()
-        return np.concatenate(
-            [plan.jet(edges[1:], self.order, left=True), plan.jet(edges[:-1], self.order), plan.jet(times, self.order)],
-            axis=2,
-        )
+        lengths = np.diff(edges)
+        times = (edges[:-1, None] + lengths[:, None] * inside).ravel()
+        jet = [
+            plan.jet(edges[1:], self.order, left=True),
+            plan.jet(edges[:-1], self.order),
+            plan.jet(times, self.order),
+        ]
+        simpson = np.where(np.arange(1, _SAMPLES - 1) % 2, 4.0, 2.0) / (3.0 * (_SAMPLES - 1))
+        ends = lengths / (3.0 * (_SAMPLES - 1))
+        weights = np.concatenate([ends, ends, (lengths[:, None] * simpson).ravel()]) / plan.duration
+        fractions = (np.concatenate([edges[1:], edges[:-1], times]) - plan.start) / plan.duration
+        return Sampled(np.concatenate(jet, axis=2), fractions, weights, plan.duration)
 
     def values(self, jet: Array) -> Array:
-        """Limited signals (nbounds, ntime) of a jet (order + 1, naxes, ntime)."""
-        rows = self._rows(jet)
+        """Limited signals (nbounds, ntime) of a jet (order + 1, naxes, ntime); 0 for those of a loop."""
+        rows = self._rows(jet, self._local)
         if not jet[1:].any():  # at rest, which is no statement about plans that move
             return rows
         for row, b in zip(rows, self.bounds, strict=True):
@@ -360,27 +297,78 @@ class Limited:
                 )
         return rows
 
-    def _rows(self, jet: Array) -> Array:
+    def _rows(self, jet: Array, chosen: Sequence[int]) -> Array:
         """Limited signals, nan where the plan does not determine them."""
-        found = {} if self.derivatives_only or self._quantities is None else self._quantities(jet)
-        rows = np.empty((len(self.bounds), jet.shape[2]))
-        for row, b in zip(rows, self.bounds, strict=True):
-            row[:] = jet[b.order, b.axis] if b.axis is not None else _signal(b.name, found[b.name], row.shape)
+        rows = np.zeros((len(self.bounds), jet.shape[2]))
+        kinds = {self.bounds[k].kind == "rate" and self.bounds[k].axis is None for k in chosen}
+        signals = self._signals(jet) if False in kinds else {}
+        rates = self._rates(jet) if True in kinds else {}
+        for k in chosen:
+            b = self.bounds[k]
+            found = rates if b.kind == "rate" else signals
+            for signal, factor in b.terms:
+                row = jet[signal.order, signal.axis] if signal.axis is not None else found[signal.name]
+                rows[k] += factor * _signal(signal.name, row, rows.shape[1:])
         return rows
 
-    def excess(self, jet: Array) -> float:
-        """Maximum excess over a sampled jet; inf if the plan is infeasible for the plant."""
+    def _signals(self, jet: Array) -> Mapping[str, Array]:
+        return {} if self.derivatives_only or self._quantities is None else self._quantities(jet)
+
+    def _rates(self, jet: Array) -> dict[str, Array]:
+        """Time derivatives of the quantities, by central differences of order 8 along the tangent of the jet."""
+        low, up = jet[:-1], jet[1:]
+        step = _RATE_STEP * _time_scale(jet)
+        found: dict[str, Array] = {}
+        for k, weight in enumerate((4.0 / 5.0, -1.0 / 5.0, 4.0 / 105.0, -1.0 / 280.0), 1):
+            ahead, behind = (self._signals(low + sign * k * step * up) for sign in (1.0, -1.0))
+            for name in ahead:
+                change = weight * (np.asarray(ahead[name]) - np.asarray(behind[name])) / step
+                found[name] = found.get(name, 0.0) + change
+        return found
+
+    def excess(self, samples: Sampled) -> float:
+        """Maximum excess over samples, without limits of a loop; inf if the plan is infeasible for the plant."""
+        if not self._local:
+            return -math.inf
         try:
-            values = self.values(jet)
+            values = self.values(samples.jet)
         except ValueError:  # infeasible for the plant, such as a rope under compression
             return math.inf
-        worst = max(float(b.excess(row).max()) for b, row in zip(self.bounds, values, strict=True))
+        times = self._start + self._duration * samples.fractions
+        worst = max(self._excess_of(self.bounds[k], values[k], times, samples) for k in self._local)
         return math.inf if math.isnan(worst) else worst
+
+    def _excess_of(self, bound: Bound, row: Array, times: Array, samples: Sampled) -> float:
+        if bound.kind != "rms":
+            return float(bound.excess(row, times).max())
+        mean = float(samples.weights @ row**2)
+        if bound.period is not None:
+            if samples.duration > bound.period:
+                return math.inf
+            last = (
+                samples.jet[:, :, [int(samples.fractions.argmax())]] * (np.arange(len(samples.jet)) == 0)[:, None, None]
+            )
+            after = float(self._rows(last, [self.bounds.index(bound)]).max()) ** 2
+            mean = after + (mean - after) * samples.duration / bound.period
+        return float(bound.excess(np.sqrt([mean])).max())
+
+    def shown(self, plan: Trajectory, times: Array) -> Array:
+        """Limited signals (nbounds, ntime) over a plan for a figure; of a root mean square that up to each time."""
+        rows = self.values(plan.jet(times, self.order)).copy()
+        for row, b in zip(rows, self.bounds, strict=True):
+            if b.kind == "rms":
+                steps = np.diff(times, prepend=times[0])
+                row[:] = np.sqrt(np.cumsum(steps * row**2) / (b.period or plan.duration))
+        return rows
+
+    def sides(self, bound: Bound, plan: Trajectory, times: Array) -> tuple[Array, Array]:
+        """Minimum and maximum (ntime,) of a signal at times of a plan; infinite where no limit applies."""
+        return bound.sides(self._start + (times - plan.start) * self._duration / plan.duration)
 
     def rejection(self, plan: Trajectory) -> str:
         """Reason for which a plan is infeasible for the plant; empty if it is feasible."""
         try:
-            self.values(self.sampled(plan))
+            self.values(self.sampled(plan).jet)
         except ValueError as rejection:
             return str(rejection)
         return ""
@@ -394,20 +382,95 @@ class Limited:
 
     def margins(self, plan: Trajectory) -> Margins:
         """Margins over a whole plan."""
-        derived = [(b, b.axis) for b in self.bounds if b.axis is not None]
-        extrema = {order: plan.extrema(order) for order in {b.order for b, _ in derived}}
-        rows = [
-            _margin(b, e.minimum[axis], e.maximum[axis], e.time_min[axis], e.time_max[axis])
-            for b, axis in derived
-            for e in [extrema[b.order]]
-        ]
-        others = [k for k, b in enumerate(self.bounds) if b.axis is None]
+        rows = [*self._local_margins(plan), *self._loop_margins(plan)]
+        return Margins(tuple(sorted(rows, key=lambda row: row.fraction)))
+
+    def _local_margins(self, plan: Trajectory) -> Iterator[Margin]:
+        """Margins of derivatives and quantities."""
+        constant = [k for k in self._local if self.bounds[k].is_constant]
+        derived = [self.bounds[k] for k in constant if self.bounds[k].axis is not None]
+        extrema = {order: plan.extrema(order) for order in {b.order for b in derived}}
+        for b in derived:
+            yield _axis_margin(b, extrema[b.order])
+        others = [k for k in constant if self.bounds[k].axis is None]
         if others:
             scales = [self.bounds[k].scale for k in others]  # no relative tolerance for a quantity near 0
             found = function_extrema(plan, lambda jet: self.values(jet)[others], self.order, scales)
             columns = zip(found.minimum, found.maximum, found.time_min, found.time_max, strict=True)
-            rows += [_margin(self.bounds[k], *column) for k, column in zip(others, columns, strict=True)]
-        return Margins(tuple(sorted(rows, key=lambda row: row.fraction)))
+            for k, column in zip(others, columns, strict=True):
+                yield _margin(self.bounds[k], *column)
+        for k in self._local:
+            if self.bounds[k].kind == "rms":
+                yield self._rms_margin(plan, k)
+            elif not self.bounds[k].is_constant:
+                yield self._margin_over_time(plan, k)
+
+    def _margin_over_time(self, plan: Trajectory, k: int) -> Margin:
+        """Margin to limits that apply in an interval or change with time."""
+        b = self.bounds[k]
+        rate = self._duration / plan.duration
+        span = self._interval(b, plan)
+        own = (self._start + (span[0] - plan.start) * rate, rate)
+        table = [] if b.profile is None else [plan.start + (t - self._start) / rate for t in b.profile.times]
+        part = window(plan, span, own, table)
+        if b.profile is None and b.axis is not None:
+            return _axis_margin(b, part.extrema(b.order))
+
+        def excess(jet: Array) -> Array:
+            row = self._rows(jet[:, :-1], [k])[k]
+            low, high = b.sides(np.clip(jet[0, -1], *(b.interval or (-math.inf, math.inf))))
+            return np.maximum(np.stack([low - row, row - high]) / b.scale, -_FAR)
+
+        found = function_extrema(part, excess, self.order, 1.0)
+        worst = int(found.maximum.argmax())
+        time = float(found.time_max[worst])
+        there = b.at(float(np.clip(own[0] + (time - span[0]) * rate, *(b.interval or (-math.inf, math.inf)))))
+        fraction = float(found.maximum[worst]) - b.slack
+        value = (there.low, there.high)[worst] + (-1.0, 1.0)[worst] * float(found.maximum[worst]) * b.scale
+        return Margin(there, value, time, -fraction)
+
+    def _interval(self, bound: Bound, plan: Trajectory) -> tuple[float, float]:
+        """Interval [s] of a plan in which limits apply, in the plan's time."""
+        given = bound.interval
+        if given is None:
+            return plan.start, plan.end
+        first, last = (plan.start + (t - self._start) * plan.duration / self._duration for t in given)
+        if not bound.in_loop:
+            first, last = max(first, plan.start), min(last, plan.end)
+        if not first < last:
+            raise ValueError(
+                f"limits of {bound.name} must apply in an interval that overlaps the plan, from {self._start:g} to "
+                f"{self._start + self._duration:g} s, got {given[0]:g} to {given[1]:g} s"
+            )
+        return first, last
+
+    def _rms_margin(self, plan: Trajectory, k: int) -> Margin:
+        """Margin of a root mean square of a derivative or quantity."""
+        b = self.bounds[k]
+        square = mean_square(plan, lambda jet: self._rows(jet, [k])[k], self.order)
+        if b.period is not None:
+            _check_period(b, plan)
+            held = np.zeros((self.order + 1, plan.naxes, 1))
+            held[0] = plan.final[:, None]
+            after = float(self._rows(held, [k])[k, 0]) ** 2
+            square = after + (square - after) * plan.duration / b.period
+        return _rms_margin(b, math.sqrt(square), plan)
+
+    def _loop_margins(self, plan: Trajectory) -> Iterator[Margin]:
+        """Margins of signals of a loop."""
+        if self.loop is None or not self.loop_bounds:
+            return
+        response = self.loop.quantities_of(plan)
+        for b in self.loop_bounds:
+            if b.kind == "rms":
+                if b.period is not None:
+                    _check_period(b, plan)
+                yield _rms_margin(b, response.rms(b.terms[0][0].name, b.period), plan)
+                continue
+            weights = {signal.name: factor for signal, factor in b.terms}
+            during = None if b.interval is None else self._interval(b, plan)
+            e = response.extremes(weights, during=during, rate=b.kind == "rate")
+            yield _margin(b, e.low, e.high, e.time_low, e.time_high)
 
     def check_smooth(self, plan: Trajectory) -> None:
         """Raise for a jump of a derivative that makes a limited signal infinite.
@@ -416,132 +479,93 @@ class Limited:
         there is not 0: then it is the continuation of a motion.
         """
         moving = {t for t in (plan.start, plan.end) if plan.jet(t, 1, left=t > plan.start)[1].any()}
-        for bound in self.bounds:
+        for k in self._local:
+            bound = self.bounds[k]
+            axes = {plan.labels[signal.axis] for signal, _ in bound.terms if signal.axis is not None}
+            first, last = (-math.inf, math.inf) if bound.interval is None else self._interval(bound, plan)
             for jump in plan.jumps(bound.order - 1) if bound.order else ():
-                if jump.time not in moving and (bound.axis is None or plan.labels[bound.axis] == jump.label):
+                inside = jump.time not in moving and first <= jump.time <= last
+                if inside and (len(axes) < len(bound.terms) or jump.label in axes):
                     what = "position" if jump.order == 0 else derivative_name(jump.label, jump.order)
                     raise ValueError(
                         f"limits of {bound.name} require a plan that is continuous up to derivative {bound.order - 1} "
                         f"(and at rest before and after), got {what} that jumps by {jump.size:.4g} at {jump.time:g} s"
                     )
 
-    def at_rest(self, plan: Trajectory) -> Array:
-        """Jet at samples of the plan with zero derivatives."""
-        return self.sampled(plan) * (np.arange(self.order + 1) == 0)[:, None, None]
+    def at_rest(self, plan: Trajectory) -> Sampled:
+        """Samples of the plan with zero derivatives."""
+        samples = self.sampled(plan)
+        return replace(samples, jet=samples.jet * (np.arange(self.order + 1) == 0)[:, None, None])
+
+    def violated_at_rest(self, plan: Trajectory) -> Iterator[tuple[Bound, float, Array]]:
+        """Limits of positions and quantities that are violated at every duration, with the value and the position."""
+        still = self.at_rest(plan)
+        times = self._start + self._duration * still.fractions
+        for k, values in enumerate(self.values(still.jet)):
+            bound = self.bounds[k]
+            if bound.in_loop or bound.kind == "rms" or _of_motion(bound):
+                continue
+            excess = bound.excess(values, times)
+            worst = int(excess.argmax())
+            if excess[worst] > 0.0:
+                yield bound.at(float(times[worst])), float(values[worst]), still.jet[0, :, worst]
+
+    def _scaled(self, bound: Bound) -> Bound:
+        """Bound with the scale of limits over time."""
+        if bound.profile is None:
+            if bound.interval is not None and not bound.in_loop:
+                first, last = bound.interval
+                if last <= self._start or first >= self._start + self._duration:
+                    raise ValueError(
+                        f"during of {bound.name} must overlap the plan, from {self._start:g} to "
+                        f"{self._start + self._duration:g} s, got {first:g} to {last:g} s"
+                    )
+            return bound
+        if bound.in_loop and not bound.profile.times:
+            raise ValueError(
+                f"limits of {bound.name}, a signal of a loop, must be numbers, or values at times by along=, got a "
+                "function of time"
+            )
+        first, last = bound.interval or (self._start, self._start + self._duration)
+        times = np.union1d(np.linspace(first, last, 2001), bound.profile.times)
+        low, high = bound.profile.sides(times[(times >= first) & (times <= last)])
+        size = 0.5 * (high - low)
+        if not np.isfinite(size).any():
+            size = np.abs(np.concatenate([low, high]))
+        size = size[np.isfinite(size)]
+        if not size.size:
+            raise ValueError(f"limits of {bound.name} must contain a finite one, got none from {first:g} to {last:g} s")
+        return replace(bound, scale=float(size.max()) or 1.0)
 
     def _slackened(self, plan: Trajectory) -> Iterator[Bound]:
         """The bounds, with slack where they are attained at rest."""
         try:
-            self.values(self.sampled(plan))
+            self.values(self.sampled(plan).jet)
         except UndeterminedError:  # as at any other duration
             raise
         except ValueError:  # infeasible for the plant, but possibly feasible more slowly
             pass
-        for bound, values in zip(self.bounds, self.values(self.at_rest(plan)), strict=True):
-            if np.isnan(values).any():  # a signal that is singular at rest attains no limit there
-                yield replace(bound, slack=0.0)
+        still = self.at_rest(plan)
+        times = self._start + self._duration * still.fractions
+        for bound, values in zip(self.bounds, self.values(still.jet), strict=True):
+            if bound.in_loop or bound.kind == "rms" or np.isnan(values).any():
+                yield replace(bound, slack=0.0)  # a signal that is singular at rest attains no limit there
                 continue
             rounding = 1e-12 * (1.0 + float(np.abs(values).max()) / bound.scale)
-            touched = abs(float(bound.excess(values).max())) <= rounding
+            touched = abs(float(bound.excess(values, times).max())) <= rounding
             yield replace(bound, slack=rounding if touched else 0.0)
 
-    def _bounds(self, plan: Trajectory, limits: Mapping[str, object]) -> Iterator[Bound]:
-        derivatives = {
-            derivative_name(label, k): (k, axis) for k in range(_HIGHEST + 1) for axis, label in enumerate(plan.labels)
-        }
-        orders: dict[str, int] | None = None
-        for name, limit in limits.items():
-            if name in derivatives:
-                yield _bound(name, limit, *derivatives[name])
-                continue
-            if orders is None:
-                orders = {} if self._quantities is None else _orders(self._quantities, plan)
-            if name in orders:
-                yield _bound(name, limit, orders[name], None)
-            elif name in ENTRIES:
-                order = ENTRIES.index(name)
-                for axis, own in enumerate(_by_axis(name, limit, plan.naxes)):
-                    named = derivative_name(plan.labels[axis], order)
-                    yield replace(_bound(name, own, order, axis), name=named)
-            else:
-                plain = [quantity for quantity in orders if "_d" not in quantity]
-                known = (
-                    f", or quantities ({', '.join(plain)}, ...)"
-                    if orders
-                    else "; other names require system, and no system was given"
-                )
-                axes = ", ".join(derivative_name(label, 1) for label in plan.labels)
-                raise ValueError(
-                    f"limits must name derivatives of an axis ({axes}, ...), or velocity, acceleration, jerk or snap "
-                    f"for all axes{known}, got {name!r}"
-                )
+
+def _of_motion(bound: Bound) -> bool:
+    """Whether a signal is 0 at rest: a derivative, or a rate."""
+    return bound.kind == "rate" or all(signal.axis is not None and signal.order for signal, _ in bound.terms)
 
 
-_FORMS = "a tuple (minimum, maximum) applies to every axis, a list of one number per axis gives magnitudes"
-
-
-def _by_axis(name: str, limit: object, naxes: int) -> list[object]:
-    """Limits of each axis from those of all axes."""
-    if isinstance(limit, str | Mapping) or not np.iterable(limit):
-        return [limit] * naxes
-    rows, given = list(limit), isinstance(limit, tuple)
-    flat = not any(map(np.iterable, rows))
-    if flat and len(rows) == 2 and (given or naxes == 1):
-        return [tuple(rows)] * naxes
-    if len(rows) == naxes and (not given if flat else [np.size(row) for row in rows] == [2] * naxes):
-        return rows
-    raise ValueError(
-        f"limits of {name} must be a number, a pair, or {naxes} numbers or pairs by axis, got {limit!r}; {_FORMS}"
-    )
-
-
-def _sides(low: float | None, high: float | None) -> tuple[float, float]:
-    """Both limits as numbers, infinite for None."""
-    return -math.inf if low is None else low, math.inf if high is None else high
-
-
-def _is_listed(limit: object) -> TypeGuard[Sequence[float | None]]:
-    """Whether limits are a list or array."""
-    given: Any = limit
-    return bool(np.ndim(given))
-
-
-def _bound(name: str, limit: object, order: int, axis: int | None) -> Bound:
-    try:
-        bound = Limits.of(limit, name).bound(name, order, axis)
-    except ValueError as error:
-        forms = f"; {_FORMS}" if axis is not None and not isinstance(limit, Limits) and not _is_listed(limit) else ""
-        raise ValueError(f"{error}{forms}") from None
-    if axis is not None and order and not bound.low <= 0.0 <= bound.high:
-        raise ValueError(
-            f"limits of {name} must include 0, the value at rest, got from {bound.low:g} to {bound.high:g}; {_FORMS}"
-        )
-    return bound
-
-
-def _orders(quantities: Quantities, plan: Trajectory) -> dict[str, int]:
-    """Lowest order of the jet that each quantity depends on, at rest at the start."""
-    still = np.zeros((_HIGHEST + 1, plan.naxes, 1))
-    still[0] = plan.initial[:, None]
-    orders: dict[str, int] = {}
-    rejection: Exception | None = None
-    for order in range(_HIGHEST + 1):
-        try:
-            with np.errstate(all="ignore"):
-                found = quantities(still[: order + 1])
-        except (ValueError, IndexError, KeyError) as reason:  # it depends on higher orders
-            rejection = reason
-            continue
-        if not isinstance(found, Mapping):
-            raise TypeError(f"quantities must return a mapping of names to signals, got {type(found).__name__}")
-        for name in found:
-            orders.setdefault(name, order)
-    if not orders:
-        raise ValueError(
-            f"quantities must accept jets (order + 1, {plan.naxes}, ntime) of up to {_HIGHEST} derivatives, got "
-            f"{type(rejection).__name__}: {rejection}"
-        )
-    return orders
+def _time_scale(jet: Array) -> float:
+    """Time [s] in which the entries of a jet change, by the peaks of consecutive derivatives."""
+    peaks = np.abs(jet[1:]).max(axis=(1, 2))
+    ratios = [a / b for a, b in pairwise(peaks.tolist()) if a and b]
+    return min(ratios, default=1.0)
 
 
 def _signal(name: str, values: Array, shape: tuple[int, ...]) -> Array:
@@ -553,6 +577,27 @@ def _signal(name: str, values: Array, shape: tuple[int, ...]) -> Array:
             "is jet[k, i]"
         )
     return found
+
+
+def _check_period(bound: Bound, plan: Trajectory) -> None:
+    if bound.period is not None and plan.duration > bound.period * (1.0 + 1e-12):
+        raise ValueError(
+            f"period of {bound.name} must be at least the duration of the plan, {plan.duration:g} s, got "
+            f"{bound.period:g} s"
+        )
+
+
+def _rms_margin(bound: Bound, value: float, plan: Trajectory) -> Margin:
+    fraction = (bound.high - value) / bound.scale
+    return Margin(bound, value, plan.start + (bound.period or plan.duration), fraction)
+
+
+def _axis_margin(bound: Bound, extrema: Extrema) -> Margin:
+    """Margin of a derivative of one axis."""
+    axis = 0 if bound.axis is None else bound.axis
+    columns = (extrema.minimum, extrema.maximum, extrema.time_min, extrema.time_max)
+    low, high, time_low, time_high = (float(column[axis]) for column in columns)
+    return _margin(bound, low, high, time_low, time_high)
 
 
 def _margin(bound: Bound, minimum: float, maximum: float, time_min: float, time_max: float) -> Margin:

@@ -2,14 +2,66 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol
 
 from ctrlplan._renamed import renamed_argument
+from ctrlplan.trajectories import Trajectory
 from ctrlplan.trajectories.common import Array
 
 Quantities = Callable[[Array], Mapping[str, Array]]
 """Maps a jet (order + 1, naxes, ntime) to signals (ntime,) by name."""
+
+
+class Response(Protocol):
+    """Signals of a loop along one plan; see `ctrlplan.simulation.loop_response.LoopResponse`."""
+
+    @property
+    def note(self) -> str:
+        """How it was computed."""
+
+    def extremes(
+        self, weights: Mapping[str, float], *, during: tuple[float, float] | None = None, rate: bool = False
+    ) -> Extremes:
+        """Minimum and maximum of a weighted sum of signals, and their times."""
+
+    def rms(self, name: str, period: float | None = None) -> float:
+        """Root of the mean square of a signal."""
+
+
+class Extremes(Protocol):
+    """Minimum and maximum, and their times [s]."""
+
+    @property
+    def low(self) -> float:
+        """Minimum."""
+
+    @property
+    def high(self) -> float:
+        """Maximum."""
+
+    @property
+    def time_low(self) -> float:
+        """Time of the minimum."""
+
+    @property
+    def time_high(self) -> float:
+        """Time of the maximum."""
+
+
+class Loop(Protocol):
+    """Protocol of a loop whose signals depend on the whole plan."""
+
+    @property
+    def names(self) -> Sequence[str]:
+        """Inputs, outputs and exposed states."""
+
+    @property
+    def inputs(self) -> Sequence[str]:
+        """Inputs in order."""
+
+    def quantities_of(self, plan: Trajectory) -> Response:
+        """Signals along a plan."""
 
 
 class HasQuantities(Protocol):
@@ -58,6 +110,24 @@ def quantities_of(system: Any) -> Quantities | None:
         f"{system.__name__ if isinstance(system, type) else type(system).__name__}"
         + ('; for k/(s (T s + 1)): lambda jet: {"u": (jet[1, 0] + T * jet[2, 0]) / k}' if block else "")
     )
+
+
+def loop_of(system: Any, tail: float | None = None) -> Loop | None:
+    """Signals of a loop along plans; None for a system of another kind.
+
+    Parameters
+    ----------
+    system : object
+        A loop of python-control that is not a flat system, or an object with a
+        method ``quantities_of(plan)``.
+    tail : float, optional
+        Time [s] after a plan for which a loop is simulated.
+    """
+    if system is None or isinstance(system, type):
+        return None
+    if callable(getattr(system, "quantities_of", None)):
+        return system
+    return None
 
 
 def system_given(system: System | None, quantities: System | None) -> System | None:

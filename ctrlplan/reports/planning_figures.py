@@ -93,18 +93,20 @@ def plot_limits(
     bounds = limited.bounds
     drawing = Drawing(ax, (len(bounds), 1), (6.4, 0.9 + 1.5 * len(bounds)), rows=[bound.name for bound in bounds])
     t = np.linspace(plan.start, plan.end, 2001)
-    values = limited.values(plan.jet(t, limited.order))
-    nearest = {row.bound.name: row for row in limited.margins(plan)}
-    for axes, bound, row in zip(drawing.column, bounds, values, strict=True):
+    rows = list(limited.margins(plan))
+    for axes, bound, row in zip(drawing.column, bounds, limited.shown(plan, t), strict=True):
         (style,) = axis_styles((bound.name,), axes).values()
         axes.plot(t, row, **style)
-        margin = nearest[bound.name]
-        axes.plot(margin.time, margin.value, "o", color=_LIMIT, markersize=marker_size(5))
+        margin = next(found for found in rows if found.of(bound))
+        if margin.time <= plan.end:
+            axes.plot(margin.time, margin.value, "o", color=_LIMIT, markersize=marker_size(5))
         span = float(np.ptp(row)) or abs(float(row[0])) or 1.0
-        for side in (bound.low, bound.high):
+        for side in limited.sides(bound, plan, t):
             # A distant limit would flatten the curve; the title gives its value.
-            if np.isfinite(side) and min(abs(side - row.min()), abs(side - row.max())) < 1.5 * span:
-                axes.axhline(side, color=_LIMIT, linestyle=(0, (4, 2)), linewidth=line_width(0.65))
+            near = np.minimum(np.abs(side - row.min()), np.abs(side - row.max())) < 1.5 * span
+            if (shown := np.isfinite(side) & near).any():
+                over = (t, np.where(shown, side, np.nan)) if np.ptp(side) else (t[[0, -1]], side[[0, -1]])
+                axes.plot(*over, color=_LIMIT, linestyle=(0, (4, 2)), linewidth=line_width(0.65))
         label_y(axes, with_unit(bound.name, (units or {}).get(bound.name)))
         add_title(axes, as_text(f"{bound.range}; {margin.room}"))
     drawing.label_x("time [s]")

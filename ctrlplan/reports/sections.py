@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from functools import singledispatch
 
-from ctrlplan.planning.limits import Margins, limit_words
+from ctrlplan.planning.bounds import limit_words
+from ctrlplan.planning.limits import Margins
 from ctrlplan.reports.crane_figures import (
     animation_data,
     plot_motion,

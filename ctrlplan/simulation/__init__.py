@@ -63,6 +63,8 @@ from ctrlplan.simulation.equilibrium import equilibrium_at, equilibrium_state, u
 from ctrlplan.simulation.events import Event, Occurrence, what_happened
 from ctrlplan.simulation.interpreted import SolverError
 from ctrlplan.simulation.log import read_log
+from ctrlplan.simulation.loop_quantities import LoopQuantities, loop_quantities
+from ctrlplan.simulation.loop_response import Extremes, LoopResponse
 from ctrlplan.simulation.predictor import Predictor
 from ctrlplan.simulation.prepared import Prepared, prepare, prepared_form, state_space, stated_start
 from ctrlplan.simulation.response import SimulationResponse, signal_table
@@ -71,6 +73,9 @@ from ctrlplan.simulation.stepper import Stepper
 
 __all__ = [
     "Event",
+    "Extremes",
+    "LoopQuantities",
+    "LoopResponse",
     "Occurrence",
     "Predictor",
     "Prepared",
@@ -79,6 +84,7 @@ __all__ = [
     "Stepper",
     "equilibrium_at",
     "equilibrium_state",
+    "loop_quantities",
     "prepare",
     "prepared_form",
     "read_log",

@@ -77,7 +77,7 @@ def equilibrium_at(
     held = np.concatenate([np.zeros(0), *(_held(signal, time) for signal in prepared.time_signals(given, time))])
     if prepared.linear is not None:
         form = prepared.linear
-        state = _linear_equilibrium(form.a, form.b @ held, form.c[rows], form.d[rows] @ held, target, start, free)
+        state = linear_equilibrium(form.a, form.b @ held, form.c[rows], form.d[rows] @ held, target, start, free)
         return (start, "the loop has none") if state is None else (state, "")
     try:
         try:
@@ -114,7 +114,7 @@ def equilibrium_state(system: System | Prepared, position: ArrayLike) -> Array:
     if form.b.shape[1] != held.size or not held.any():
         return np.zeros(len(form.a))
     c, d, free = form.c[: held.size], form.d[: held.size], np.ones(len(form.a), dtype=bool)
-    state = _linear_equilibrium(form.a, form.b @ held, c, d @ held, held, np.zeros(len(form.a)), free)
+    state = linear_equilibrium(form.a, form.b @ held, c, d @ held, held, np.zeros(len(form.a)), free)
     return np.zeros(len(form.a)) if state is None else state
 
 
@@ -147,7 +147,7 @@ def _held(signal: TimeSignal, time: float) -> Array:
     return jet.ravel()
 
 
-def _linear_equilibrium(
+def linear_equilibrium(
     a: Array, supplied: Array, c: Array, passed: Array, target: Array, start: Array, free: NDArray[np.bool_]
 ) -> Array | None:
     """State at which the free rows of A x + supplied are 0; None if there is none.

@@ -130,13 +130,13 @@ def sampled_states(a: Array, b: Array, samples: Array, timepts: Array, initial: 
     part = max(1, _NUMBERS // max(1, scale.size * (scale.size + terms.shape[1])))
     with np.errstate(all="ignore"):
         if even and scale.size > _CROSSOVER:
-            out[:] = _marched(state, _changes(even * a, even * b, 2), terms.T.reshape(2, len(samples), -1))[0].T
+            out[:] = _marched(state, changes_over(even * a, even * b, 2), terms.T.reshape(2, len(samples), -1))[0].T
             return (out * scale).T
         for begin in range(0, steps.size if scale.size else 0, part):
             these = slice(begin, begin + part)
             spacings, which = np.unique(steps[these], return_inverse=True)
             h = spacings[:, None, None]
-            changes = _changes(h * a, h * b, 2)
+            changes = changes_over(h * a, h * b, 2)
             change = changes[-1][which]
             forced = change[:, :, scale.size :] @ terms[these, :, None]
             found = out[begin + 1 : these.stop + 1]
@@ -188,7 +188,7 @@ def state_scale(a: Array) -> Array:
 def largest_change(a: Array, duration: float) -> float:
     """Largest magnitude in exp(a t) - 1 for t = duration, duration/2, ..., 0."""
     with np.errstate(all="ignore"):
-        changes = _changes(duration * a, np.zeros((len(a), 0)), 1)
+        changes = changes_over(duration * a, np.zeros((len(a), 0)), 1)
     return max(float(np.abs(change).max(initial=0.0)) for change in changes)
 
 
@@ -220,11 +220,11 @@ def _segment(
         factor = h ** np.arange(nterms, dtype=float) / _FACTORIALS[:nterms]
         return jet(moment, left, starts, nterms - 1) * factor[:, None, None]
 
-    ncells, nterms = _cells(lambda s, order: jet(moment, left, s, order), duration)
+    ncells, nterms = taylor_cells(lambda s, order: jet(moment, left, s, order), duration)
     per = _samples_per_cell(samples, duration, duration / ncells)
     if per:
         h = per * float(samples[-1] - samples[0]) / (samples.size - 1)
-        changes = _changes(h * a, h * b, nterms, halvings=per.bit_length() - 1)
+        changes = changes_over(h * a, h * b, nterms, halvings=per.bit_length() - 1)
         while per >= _CROSSOVER and not np.isfinite(changes[-1]).all():  # an unstable system overflows within a cell
             changes, per, h = changes[:-1], per // 2, 0.5 * h
         if per >= _CROSSOVER:
@@ -290,7 +290,7 @@ def _even_segment(
 def _part(a: Array, b: Array, nterms: int, h: float, part: float) -> Array:
     """Change of states over a fraction of a cell, from states and the input terms of the whole cell."""
     n, powers = a.shape[-1], np.repeat(part ** np.arange(nterms), b.shape[-1])
-    change: Array = _changes(part * h * a, part * h * b, nterms)[-1]
+    change: Array = changes_over(part * h * a, part * h * b, nterms)[-1]
     change[..., n:] *= powers
     return change
 
@@ -298,7 +298,7 @@ def _part(a: Array, b: Array, nterms: int, h: float, part: float) -> Array:
 def _any_segment(a: Array, b: Array, series: Array, samples: Array, state: Array) -> tuple[Array, Array]:
     """States of one system at arbitrary samples, and at the end of the segment; the unit of time is a cell."""
     n, ncells = len(a), series.shape[2]
-    changes = _changes(a, b, len(series))
+    changes = changes_over(a, b, len(series))
     states = _marched(state[None], [change[None] for change in changes], series)[0]
     end, states = states[:, -1], states[:, :-1]
     if not samples.size:
@@ -324,7 +324,7 @@ def _any_segment(a: Array, b: Array, series: Array, samples: Array, state: Array
     return found, end
 
 
-def _cells(jet: Callable[[Array, int], Array], duration: float) -> tuple[int, int]:
+def taylor_cells(jet: Callable[[Array, int], Array], duration: float) -> tuple[int, int]:
     """Number of cells in which the Taylor series of the input converges, and of its terms."""
     order = _TERMS + 7
     size = np.abs(jet(np.linspace(0.0, duration, 9), order)).max(axis=2)  # (order + 1, ninputs)
@@ -362,7 +362,7 @@ def _spacing(samples: Array, duration: float) -> float:
     return step if deviation.max() <= 4.0 * np.finfo(float).eps * duration else 0.0
 
 
-def _changes(a: Array, b: Array, nterms: int, halvings: int = 0) -> list[Array]:
+def changes_over(a: Array, b: Array, nterms: int, halvings: int = 0) -> list[Array]:
     """Change of states over ..., 1/4, 1/2, 1 units of time, with a minimum number of halvings.
 
     Matrices (..., n, n + nterms * ninputs) from states and Taylor terms of the
@@ -372,7 +372,7 @@ def _changes(a: Array, b: Array, nterms: int, halvings: int = 0) -> list[Array]:
     a digit every three squarings.
     """
     if a.ndim == 2:
-        return [change[0] for change in _changes(a[None], b[None], nterms, halvings)]
+        return [change[0] for change in changes_over(a[None], b[None], nterms, halvings)]
     products, minimum = _products(a, b)
     levels = max(halvings, int(minimum.max()))
     found = _doubled(products, minimum, nterms, levels)
@@ -610,7 +610,7 @@ def _halved(series: Array) -> tuple[Array, Array]:
 
 
 def _taylor(a: Array, b: Array, states: Array, series: Array) -> list[Array]:
-    """Taylor terms of the state over the shortest time of `_changes`."""
+    """Taylor terms of the state over the shortest time of `changes_over`."""
     terms = [states]
     for j in range(_TERMS + 1):
         following = matrix_product(a, terms[-1])

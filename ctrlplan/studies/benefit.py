@@ -14,7 +14,8 @@ from ctrlplan._checks import check_kind, real_array
 from ctrlplan._display import Displayed, Facts, Part, Table, counted, number
 from ctrlplan._renamed import FormerAttribute
 from ctrlplan._types import Array
-from ctrlplan.planning.limits import Limited, limit_words
+from ctrlplan.planning.bounds import limit_words
+from ctrlplan.planning.limits import Limited
 from ctrlplan.planning.quantities import System as Quantified
 from ctrlplan.simulation import state_space
 from ctrlplan.studies.baselines import baseline_plans, derivative_limits, peak_limits, profiles

@@ -103,7 +103,7 @@ from numpy.typing import NDArray
 
 from ctrlplan._renamed import warn_renamed
 from ctrlplan._types import Data
-from ctrlplan.planning.limits import limit_words
+from ctrlplan.planning.bounds import limit_words
 from ctrlplan.simulation import Event
 from ctrlplan.studies.benefit import benefit_of
 from ctrlplan.studies.comparison import comparison_of

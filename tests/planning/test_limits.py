@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 import ctrlplan as cp
 from ctrlplan import Waypoint
 from ctrlplan.planning import Margin, Margins, margins
-from ctrlplan.planning.limits import limit_words
+from ctrlplan.planning.bounds import limit_words
 from ctrlplan.studies.crane import CRANE, nominal_waypoints, obstacle_waypoints
 
 MOVE = cp.PolySpline([Waypoint(0, 0, 0, 0), Waypoint(1, 1, 0, 0)])

@@ -1,0 +1,211 @@
+"""Limits by name: which signal of a plan, plant or loop a name means."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+
+from ctrlplan._checks import check_kind, default_labels
+from ctrlplan.planning.bounds import Bound, Limits, Region, Signal, is_listed
+from ctrlplan.planning.quantities import Quantities
+from ctrlplan.trajectories import Trajectory, derivative_name
+from ctrlplan.trajectories.waypoint import ENTRIES
+
+_HIGHEST = 8
+"""Maximum order of the derivatives with limits."""
+
+_FORMS = "a tuple (minimum, maximum) applies to every axis, a list of one number per axis gives magnitudes"
+
+_BOTH = 'write {"plan": {...}, "loop": {...}}'
+
+
+class LoopNames(Protocol):
+    """Names of the signals of a loop, and of its inputs in order."""
+
+    @property
+    def names(self) -> Sequence[str]:
+        """Inputs, outputs and exposed states."""
+
+    @property
+    def inputs(self) -> Sequence[str]:
+        """Inputs in order."""
+
+
+@dataclass(frozen=True)
+class Naming:
+    """Meaning of names: signals of a plan, of a plant along it, and of a loop.
+
+    Attributes
+    ----------
+    plan : Trajectory
+        The plan.
+    quantities : callable or None
+        Maps a jet to signals of a plant.
+    loop : LoopNames or None
+        Names of the signals of a loop.
+    """
+
+    plan: Trajectory
+    quantities: Quantities | None = None
+    loop: LoopNames | None = None
+
+    def bounds(self, limits: Mapping[str, object]) -> Iterator[Bound]:
+        """Bounds from limits by name."""
+        if not any(isinstance(limits.get(whose), Mapping) for whose in ("plan", "loop")):
+            return self._bounds(limits, self._named)
+        return self._of_both(limits)
+
+    def _of_both(self, limits: Mapping[str, object]) -> Iterator[Bound]:
+        """Bounds from limits of plan and loop apart."""
+        others = [
+            name for name, limit in limits.items() if name not in ("plan", "loop") or not isinstance(limit, Mapping)
+        ]
+        if others:
+            raise ValueError(
+                f'limits must be by name, or {{"plan": limits by name, "loop": limits by name}}, got {others[0]!r}'
+            )
+        if "loop" in limits and self.loop is None:
+            raise ValueError('limits of "loop" must be given with a loop as system, got none')
+        for name, find in (("plan", self._of_plan), ("loop", self._of_loop)):
+            own = limits.get(name, {})
+            check_kind(own, f"limits of {name}", Mapping, "a mapping of names to limits")
+            yield from self._bounds(own, find)  # type: ignore[arg-type]
+
+    def _bounds(self, limits: Mapping[str, object], find: Callable[[str], Signal | None]) -> Iterator[Bound]:
+        for name, limit in limits.items():
+            if isinstance(limit, Region):
+                yield from limit.bounds(name, [self._known(own, find) for own in limit.signals])
+                continue
+            if name in ENTRIES and find(name) is None and find != self._of_loop:
+                order = ENTRIES.index(name)
+                for axis, own in enumerate(_by_axis(name, limit, self.plan.naxes)):
+                    signal = Signal(derivative_name(self.plan.labels[axis], order), order, axis)
+                    yield from _of_signal(name, own, signal)
+                continue
+            signal = self._known(name, find)
+            several = isinstance(limit, list | tuple) and len(limit) and all(isinstance(own, Limits) for own in limit)
+            for own in limit if several else [limit]:  # type: ignore[attr-defined]
+                yield from _of_signal(name, own, signal)
+
+    def _known(self, name: str, find: Callable[[str], Signal | None]) -> Signal:
+        found = find(name)
+        if found is not None:
+            return found
+        axes = ", ".join(derivative_name(label, 1) for label in self.plan.labels)
+        derivatives = f"derivatives of an axis ({axes}, ...), or velocity, acceleration, jerk or snap for all axes"
+        if self.loop is not None:
+            signals = f"signals of the loop ({', '.join(self.loop.names)})"
+            if find == self._of_loop:
+                raise ValueError(f"limits must name {signals}, got {name!r}")
+            raise ValueError(f"limits must name {signals}, {derivatives}, got {name!r}")
+        plain = [quantity for quantity in self._orders if "_d" not in quantity]
+        known = (
+            f", or quantities ({', '.join(plain)}, ...)"
+            if self._orders
+            else "; other names require system, and no system was given"
+        )
+        raise ValueError(f"limits must name {derivatives}{known}, got {name!r}")
+
+    def _named(self, name: str) -> Signal | None:
+        """Signal of a name: of the loop if there is one with that name."""
+        if self.loop is None or name not in self.loop.names:
+            return self._of_plan(name)
+        meant = self._derivatives.get(name)
+        if meant is not None and self.plan.labels != default_labels(self.plan.naxes):
+            inputs = list(self.loop.inputs)
+            fed = len(inputs) == self.plan.naxes and meant.order == 0 and inputs[meant.axis or 0] == name
+            if not fed:
+                raise ValueError(
+                    f"limits must say whose signal {name} is, got a name of the plan (its labels are "
+                    f"{', '.join(self.plan.labels)}) and of the loop; {_BOTH}"
+                )
+        return self._of_loop(name)
+
+    def _of_loop(self, name: str) -> Signal | None:
+        return Signal(name, loop=True) if self.loop is not None and name in self.loop.names else None
+
+    def _of_plan(self, name: str) -> Signal | None:
+        if name in self._derivatives:
+            return self._derivatives[name]
+        if name in ENTRIES:
+            return None
+        return Signal(name, self._orders[name]) if name in self._orders else None
+
+    @cached_property
+    def _derivatives(self) -> dict[str, Signal]:
+        return {
+            derivative_name(label, k): Signal(derivative_name(label, k), k, axis)
+            for k in range(_HIGHEST + 1)
+            for axis, label in enumerate(self.plan.labels)
+        }
+
+    @cached_property
+    def _orders(self) -> dict[str, int]:
+        return {} if self.quantities is None else _orders(self.quantities, self.plan)
+
+
+def _of_signal(name: str, limit: object, signal: Signal) -> Iterator[Bound]:
+    """Bounds of one signal from its limits in any form."""
+    try:
+        given = Limits.of(limit, name)
+    except ValueError as error:
+        lone = signal.axis is not None and not isinstance(limit, Limits) and not is_listed(limit)
+        raise ValueError(f"{error}{f'; {_FORMS}' if lone else ''}") from None
+    for bound in given.bounds(signal.name, signal):
+        moving = signal.axis is not None and signal.order and bound.kind == "value" and bound.is_constant
+        if moving and not bound.low <= 0.0 <= bound.high:
+            raise ValueError(
+                f"limits of {name} must include 0, the value at rest, got from {bound.low:g} to {bound.high:g}; "
+                f"{_FORMS}"
+            )
+        # The rate of a derivative is the next one, whose extrema are exact.
+        following = replace(signal, order=signal.order + 1)
+        yield (
+            replace(bound, terms=((following, 1.0),), kind="value")
+            if bound.kind == "rate" and signal.axis is not None
+            else bound
+        )
+
+
+def _by_axis(name: str, limit: object, naxes: int) -> list[object]:
+    """Limits of each axis from those of all axes."""
+    if isinstance(limit, str | Mapping) or not np.iterable(limit):
+        return [limit] * naxes
+    rows, given = list(limit), isinstance(limit, tuple)
+    flat = not any(map(np.iterable, rows))
+    if flat and len(rows) == 2 and (given or naxes == 1):
+        return [tuple(rows)] * naxes
+    if len(rows) == naxes and (not given if flat else [np.size(row) for row in rows] == [2] * naxes):
+        return rows
+    raise ValueError(
+        f"limits of {name} must be a number, a pair, or {naxes} numbers or pairs by axis, got {limit!r}; {_FORMS}"
+    )
+
+
+def _orders(quantities: Quantities, plan: Trajectory) -> dict[str, int]:
+    """Lowest order of the jet that each quantity depends on, at rest at the start."""
+    still = np.zeros((_HIGHEST + 1, plan.naxes, 1))
+    still[0] = plan.initial[:, None]
+    orders: dict[str, int] = {}
+    rejection: Exception | None = None
+    for order in range(_HIGHEST + 1):
+        try:
+            with np.errstate(all="ignore"):
+                found = quantities(still[: order + 1])
+        except (ValueError, IndexError, KeyError) as reason:  # it depends on higher orders
+            rejection = reason
+            continue
+        if not isinstance(found, Mapping):
+            raise TypeError(f"quantities must return a mapping of names to signals, got {type(found).__name__}")
+        for name in found:
+            orders.setdefault(name, order)
+    if not orders:
+        raise ValueError(
+            f"quantities must accept jets (order + 1, {plan.naxes}, ntime) of up to {_HIGHEST} derivatives, got "
+            f"{type(rejection).__name__}: {rejection}"
+        )
+    return orders

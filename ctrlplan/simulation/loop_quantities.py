@@ -1,0 +1,258 @@
+"""Signals of a loop along a plan, for limits: the loop starts at rest at the first position of the plan."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from functools import cached_property
+
+import numpy as np
+
+from ctrlplan._checks import check_kind
+from ctrlplan._display import Displayed, Facts, Part
+from ctrlplan._types import Array, System
+from ctrlplan.simulation.equilibrium import linear_equilibrium
+from ctrlplan.simulation.exact_response import ExactResponse, Motion
+from ctrlplan.simulation.linear import LinearForm
+from ctrlplan.simulation.loop_form import LoopForm, Rows
+from ctrlplan.simulation.loop_response import LoopResponse
+from ctrlplan.simulation.plan_cells import PlanCells
+from ctrlplan.simulation.prepared import Prepared, prepared_form
+from ctrlplan.simulation.shape_family import LoopSignal, ShapeFamily
+from ctrlplan.trajectories import Trajectory
+
+_FRACTIONS = np.array([0.0, 0.0312, 0.1234, 0.25, 0.3456, 0.5, 0.6543, 0.75, 0.8765, 1.0])
+"""Times at which two plans are compared, as fractions of the duration."""
+
+Fed = tuple[int, int]
+"""Axis of a plan, and order of its derivative."""
+
+
+class LoopQuantities(Displayed):
+    """Signals of a loop along a plan; returned by `loop_quantities`.
+
+    Attributes
+    ----------
+    name : str
+        Name of the loop.
+    names : tuple of str
+        Names of its signals: outputs, then inputs that have other names.
+    """
+
+    def __init__(self, loop: System | Prepared) -> None:
+        self._prepared = prepared_form(loop)
+        if self._prepared.linear is None:
+            raise TypeError(
+                f"loop must be linear and continuous, got {self._prepared.name}, where {self._prepared.not_linear}"
+            )
+        self._linear: LinearForm = self._prepared.linear
+        self.name = self._prepared.name
+        outputs = self._prepared.output_labels
+        self.names = (*outputs, *(label for label in self._prepared.input_labels if label not in outputs))
+
+    def _describe(self) -> Iterator[Part]:
+        yield f"Signals of {self.name} along a plan: {', '.join(self.names)}"
+        yield Facts([("inputs", ", ".join(self._prepared.input_labels)), ("response", "exact")])
+
+    def quantities_of(self, plan: Trajectory) -> LoopResponse:
+        """Response of the loop to a plan.
+
+        The loop starts at rest at the first position of the plan.
+
+        Parameters
+        ----------
+        plan : Trajectory
+            Plan with a duration.
+
+        Returns
+        -------
+        LoopResponse
+            With the methods ``extremes`` and ``rms``.
+
+        Raises
+        ------
+        ValueError
+            If the plan does not fit the inputs of the loop; if the loop is unstable
+            or has no equilibrium at the first position of the plan; if an
+            integrator drifts after the plan.
+        """
+        return self.along(plan).response(plan)
+
+    def along(self, plan: Trajectory) -> AlongPlan:
+        """The loop with the inputs connected to a plan, for this plan and others of the same axes."""
+        check_kind(plan, "plan", Trajectory)
+        return AlongPlan(self, plan)
+
+
+class AlongPlan:
+    """Loop whose inputs are connected to a plan and its derivatives."""
+
+    def __init__(self, quantities: LoopQuantities, plan: Trajectory) -> None:
+        linear, prepared = quantities._linear, quantities._prepared
+        fed = fed_signals(prepared.input_labels, plan, quantities.name)
+        fed += _fed_by_sources(linear, plan, quantities.name)
+        order = max((k for entry in fed if entry for k in entry[1:]), default=0)
+        pick = np.zeros((order + 1, linear.b.shape[1], plan.naxes))
+        for column, entry in enumerate(fed):
+            if entry is not None:
+                pick[entry[1], column, entry[0]] = 1.0
+        self.form = LoopForm(linear.a, linear.b @ pick, quantities.name)
+        self._linear, self._prepared, self._pick = linear, prepared, pick
+        outputs = prepared.output_labels
+        c, d = linear.c * self.form.scale, np.moveaxis(linear.d @ pick, 0, 1)
+        self.signals = {name: Rows(c[i : i + 1], d[i : i + 1]) for i, name in enumerate(outputs)}
+        for i, name in enumerate(prepared.input_labels):
+            self.signals.setdefault(name, Rows(np.zeros((1, len(linear.a))), pick[:, i][None]))
+        self.plan = plan
+
+    @cached_property
+    def cells(self) -> PlanCells:
+        """The plan in units of its duration."""
+        return PlanCells(self.plan, self.form.order + 2)
+
+    @cached_property
+    def start(self) -> Array:
+        """State at rest at the first position of the plan, in balanced coordinates."""
+        return self.rest_at(self.plan)
+
+    def rest_at(self, plan: Trajectory) -> Array:
+        """State at rest at the first position of a plan, in balanced coordinates.
+
+        Raises
+        ------
+        ValueError
+            If there is none.
+        """
+        linear, stated = self._linear, self._prepared.stated
+        given = np.full(len(linear.a), np.nan) if stated is None else stated
+        free, supplied = np.isnan(given), self._pick[0] @ plan.initial
+        rows = _tracked(self._prepared.output_labels, plan.labels)
+        state = linear_equilibrium(
+            linear.a,
+            linear.b @ supplied,
+            linear.c[rows],
+            linear.d[rows] @ supplied,
+            plan.initial,
+            np.where(free, 0.0, given),
+            free,
+        )
+        if state is not None:
+            terms = np.abs(linear.a) @ np.abs(state) + np.abs(linear.b) @ np.abs(supplied)
+            if np.any(np.abs(linear.a @ state + linear.b @ supplied) > 1e-9 * np.maximum(terms, 1e-300)):
+                state = None
+        if state is None:
+            place = ", ".join(f"{label} = {x:.4g}" for label, x in zip(plan.labels, plan.initial.tolist(), strict=True))
+            raise ValueError(
+                f"the loop must start at rest at the first position of the plan, got {self._prepared.name} without an "
+                f"equilibrium at {place}: an integrator in it has an input that is not 0 there"
+            )
+        return np.asarray(state / self.form.scale)
+
+    def response(self, plan: Trajectory) -> ExactResponse:
+        """Response to a plan with the same axes."""
+        same = plan is self.plan
+        cells, start = (self.cells, self.start) if same else (PlanCells(plan, self.form.order + 2), self.rest_at(plan))
+        return ExactResponse(Motion(self.form, cells, plan.duration, start), self.signals, plan.start)
+
+    def shapes(self, chosen: Sequence[LoopSignal]) -> ShapeFamily:
+        """Signals as functions of the duration of the plan, with its shape fixed."""
+        return ShapeFamily(self.form, self.signals, self.cells, self.start, chosen)
+
+
+def loop_quantities(loop: System | Prepared, *, tail: float | None = None) -> LoopQuantities:
+    """Signals of a loop along a plan, for limits on them.
+
+    `fastest` and `margins` call it for a loop that they are given. The plan is
+    the input of the loop, as for `simulate`: axis by axis, or by name where the
+    inputs are named after the axes; inputs r, r_d1, r_d2 are the plan r and its
+    derivatives. Inputs with other names are 0. Instead, the plan may be the
+    source of a block inside (`create_source_iosystem`).
+
+    Parameters
+    ----------
+    loop : control system or Prepared
+        Linear continuous loop, closed or open.
+    tail : float, optional
+        Time after the plan [s] over which a simulated response is considered.
+        Exact responses are considered at all times.
+
+    Returns
+    -------
+    LoopQuantities
+        With the attribute ``names`` and the method ``quantities_of(plan)``.
+
+    Raises
+    ------
+    TypeError
+        If `loop` is not a control system, or it is not linear and continuous.
+
+    Examples
+    --------
+    >>> import ctrlplan as cp
+    >>> move = cp.PolySpline([cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1, 0, 0)])
+    >>> response = cp.loop_quantities(cp.plants.integrator_lag_loop(5.0)).quantities_of(move)
+    >>> found = response.extremes({"y": 1.0})
+    >>> round(found.low, 9), round(found.high, 4), round(found.time_high, 3)
+    (0.0, 1.4445, 1.894)
+    """
+    return LoopQuantities(loop)
+
+
+def fed_signals(labels: Sequence[str], plan: Trajectory, name: str) -> list[Fed | None]:
+    """Axis of a plan and derivative at each input of a loop; None for an input that is 0.
+
+    Raises
+    ------
+    ValueError
+        If the plan does not fit.
+    """
+    if not labels:
+        return []
+    if len(labels) == plan.naxes:
+        order = plan.labels if set(plan.labels) == set(labels) else tuple(labels)
+        return [(order.index(label), 0) for label in labels]
+    parts = [re.fullmatch(r"(.*?)(?:_d([1-9][0-9]*))?", label, re.DOTALL) for label in labels]
+    found = [(part[1], int(part[2] or 0)) for part in parts if part]
+    bases = list(dict.fromkeys(base for base, _ in found))
+    if set(plan.labels) <= set(bases):
+        axes = {label: axis for axis, label in enumerate(plan.labels)}
+        return [(axes[base], k) if base in axes else None for base, k in found]
+    if len(bases) == plan.naxes:
+        return [(bases.index(base), k) for base, k in found]
+    raise ValueError(
+        f"inputs of {name} must be as many as the axes of the plan, or be named after them, such as "
+        f"{plan.labels[0]}, {plan.labels[0]}_d1 for its derivative; got the inputs {', '.join(labels)} for the "
+        f"axes {', '.join(plan.labels)}; name the axes by labels="
+    )
+
+
+def _fed_by_sources(form: LinearForm, plan: Trajectory, name: str) -> list[Fed | None]:
+    """Axis of a plan and derivative for each output of the sources inside a loop."""
+    found: list[Fed | None] = []
+    for source, high in form.sources:
+        for axis in range(source.naxes):
+            same = _same_axis(plan, source, axis)
+            if same is None:
+                raise ValueError(
+                    f"sources in {name} must be those of the plan under limits, got another plan with the axis "
+                    f"{source.labels[axis]}: its duration does not change with that of the plan"
+                )
+            found += [(same, k) for k in range(high + 1)]
+    return found
+
+
+def _same_axis(plan: Trajectory, source: Trajectory, axis: int) -> int | None:
+    """Axis of a plan that equals an axis of a source up to the duration."""
+    if source is plan:
+        return axis
+    mine = plan.jet(plan.start + _FRACTIONS * plan.duration, 0, left=True)[0]
+    other = source.jet(source.start + _FRACTIONS * source.duration, 0, left=True)[0, axis]
+    size = np.abs(mine).max(axis=1)
+    equal = np.flatnonzero(np.all(np.abs(mine - other) <= 1e-12 * size[:, None], axis=1))
+    return int(equal[0]) if equal.size else None
+
+
+def _tracked(outputs: Sequence[str], labels: Sequence[str]) -> list[int]:
+    """Indices of the outputs that follow a plan: those named like its axes, otherwise the first ones."""
+    names = labels if all(label in outputs for label in labels) else outputs[: len(labels)]
+    return [list(outputs).index(name) for name in names]

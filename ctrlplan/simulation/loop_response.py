@@ -1,0 +1,85 @@
+"""Signals of a loop along one plan: the interface of exact and simulated responses."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Extremes:
+    """Minimum and maximum of a signal of a loop along a plan, and their times.
+
+    Attributes
+    ----------
+    low, high : float
+        Minimum and maximum, in the unit of the signal.
+    time_low, time_high : float
+        Times [s] at which they are attained, of the plan; inf for the final
+        value, which is approached.
+    """
+
+    low: float
+    high: float
+    time_low: float
+    time_high: float
+
+
+class LoopResponse(ABC):
+    """Signals of a loop along one plan; returned by `LoopQuantities.quantities_of`.
+
+    A new kind of response must define `extremes` and `rms`, and have the attributes.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Names of the signals: inputs, outputs and exposed states of the loop.
+    note : str
+        How the response was computed: "exact", or "simulated at tolerance 1e-08,
+        over 4 s".
+    """
+
+    names: tuple[str, ...]
+    note: str
+
+    @abstractmethod
+    def extremes(
+        self, weights: Mapping[str, float], *, during: tuple[float, float] | None = None, rate: bool = False
+    ) -> Extremes:
+        """Minimum and maximum of a weighted sum of signals.
+
+        Parameters
+        ----------
+        weights : mapping of str to float
+            Factors by the name of a signal: one name for a signal, several for an
+            edge of a region.
+        during : (float, float), optional
+            First and last time [s], in the time of the plan. Default: all times,
+            from rest before the plan to the steady state after it.
+        rate : bool, optional
+            Of the time derivative of the sum instead, in its unit per second.
+
+        Raises
+        ------
+        ValueError
+            If a name is unknown, or the sum jumps and its derivative is requested.
+        """
+
+    @abstractmethod
+    def rms(self, name: str, period: float | None = None) -> float:
+        """Root of the mean square of a signal from the start of the plan.
+
+        Parameters
+        ----------
+        name : str
+            Signal.
+        period : float, optional
+            Length of the interval [s], dwell after the plan included. Default: the
+            duration of the plan.
+
+        Returns
+        -------
+        float
+            In the unit of the signal.
+        """
