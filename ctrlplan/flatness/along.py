@@ -130,9 +130,9 @@ def connected(maps: FlatMaps, flag: Array, p: Array, start: Array | None, name: 
 
 
 def _rates(maps: FlatMaps, z: Array, above: Array, p: Array) -> Array:
-    """z' from the derivatives of the flags."""
+    """Z' from the derivatives of the flags."""
     slopes = np.moveaxis(maps.slopes(z, p), -1, 0)
-    return np.linalg.solve(slopes, above.T[..., None])[..., 0].T
+    return np.asarray(np.linalg.solve(slopes, above.T[..., None])[..., 0].T, dtype=float)
 
 
 def _halved(maps: FlatMaps, plan: Trajectory, p: Array, times: Array, states: Array, name: str) -> Grid:

@@ -10,13 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import NoReturn
 
 import casadi as ca
 import numpy as np
 
 from ctrlplan._types import Array
-from ctrlplan.symbolic.tape import operations_on
+from ctrlplan.symbolic.taping import operations_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,9 +51,7 @@ def branch_at(expressions: Sequence[ca.SX], variables: Sequence[ca.SX], point: S
     function = ca.Function("equations", list(variables), [ca.densify(ca.vertcat(*expressions))])
     tracer = _Tracer(variables, point, name)
     column = tracer.run(function)
-    counts = np.cumsum([0, *(expression.numel() for expression in expressions)])
-    parts = tuple(column[a:b] for a, b in zip(counts[:-1], counts[1:], strict=True))
-    return Branch(parts, ca.vertcat(ca.SX(0, 1), *tracer.sides), tuple(tracer.notes))
+    return Branch(tuple(_parts(column, expressions)), ca.vertcat(ca.SX(0, 1), *tracer.sides), tuple(tracer.notes))
 
 
 class _Tracer:
@@ -73,7 +72,7 @@ class _Tracer:
         """Result of a function with its branches replaced."""
         work: dict[int, ca.SX] = {}
         out = ca.SX(function.numel_out(0), 1)
-        for k, operation, given, target in operations_on(function):
+        for k, operation, given, target in operations_of(function):
             if operation == "OUTPUT":
                 out[target[1]] = work[given[0]]
             elif operation == "INPUT":
@@ -187,6 +186,12 @@ def _short(expression: ca.SX) -> str:
     return text if len(text) <= 60 else text[:57] + "..."
 
 
+def _parts(column: ca.SX, expressions: Sequence[ca.SX]) -> list[ca.SX]:
+    """A column divided as the expressions that it was made of."""
+    ends = np.cumsum([0, *(expression.numel() for expression in expressions)]).tolist()
+    return [column[a:b] for a, b in pairwise(ends)]
+
+
 @dataclass(frozen=True, eq=False)
 class Replacement:
     """Input replaced by the value of the one function of it in the equations.
@@ -231,7 +236,7 @@ def replaced_input(
     place: dict[int, int] = {}  # work register -> instruction
     steps: list[tuple[str, int, tuple[int, ...], float]] = []
     outputs: list[tuple[int, int]] = []
-    for k, operation, arguments, target in operations_on(function):
+    for k, operation, arguments, target in operations_of(function):
         if operation == "OUTPUT":
             outputs.append((target[1], place[arguments[0]]))
             uses.setdefault(place[arguments[0]], []).append((operation, -1, ()))
@@ -262,14 +267,12 @@ def replaced_input(
     column = ca.SX(function.numel_out(0), 1)
     for row, source in outputs:
         column[row] = work[source]
-    counts = np.cumsum([0, *(expression.numel() for expression in expressions)])
     value, inverse = given, symbol
     for step in chain:
         value = step.forward(value)
     for step in reversed(chain):
         inverse = step.backward(inverse)
-    parts = [column[a:b] for a, b in zip(counts[:-1], counts[1:], strict=True)]
-    return parts, Replacement(symbol, value, inverse)
+    return _parts(column, expressions), Replacement(symbol, value, inverse)
 
 
 @dataclass(frozen=True, eq=False)

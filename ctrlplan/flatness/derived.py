@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
+from itertools import pairwise
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -11,15 +13,15 @@ from numpy.typing import ArrayLike
 from ctrlplan._checks import checked_finite, real_array
 from ctrlplan._display import Facts, Part
 from ctrlplan._lru import Lru
-from ctrlplan._types import Array, Params, System, Value
+from ctrlplan._types import Array, Params, Value
 from ctrlplan.flatness.along import Grid, check_branch, connected, grid_of, rows_of, states_along
-from ctrlplan.flatness.analysis import Analysis, analysed
-from ctrlplan.flatness.equations import Equations, FlatOutputs
-from ctrlplan.flatness.maps import FlatMaps, maps_of
-from ctrlplan.flatness.operating_point import At
+from ctrlplan.flatness.maps import FlatMaps
 from ctrlplan.flatness.system import FlatSystem
 from ctrlplan.symbolic.tape import NUMPY, Tape
 from ctrlplan.trajectories import Trajectory
+
+if TYPE_CHECKING:
+    from ctrlplan.flatness.analysis import Analysis
 
 _NEAR = 0.3
 """Distance in scales between states of two flags that are taken for neighbours."""
@@ -39,31 +41,62 @@ class DerivedFlatSystem(FlatSystem):
         what else was assumed.
     """
 
-    def __init__(self, analysis: Analysis, original: Equations, name: str) -> None:
-        equations, structure = analysis.equations, analysis.structure
-        maps = maps_of(analysis)
-        self._names = equations.parameters
-        values = equations.values.tolist()
-        outputs = Tape.of(original.variables, original.outputs)
+    def __init__(
+        self,
+        maps: FlatMaps,
+        equations: tuple[Tape, Tape],
+        analysis: Analysis,
+        *,
+        flat_labels: Sequence[str],
+        states: Sequence[str],
+        inputs: Sequence[str],
+        outputs: Sequence[str],
+        operating_point: Mapping[str, float],
+        params: Mapping[str, float],
+        notes: Sequence[str],
+        name: str,
+    ) -> None:
+        rates, measured = equations
+        self._names = tuple(params)
         super().__init__(
             self._forward,
             self._reverse,
-            partial(_evaluated, Tape.of(original.variables, original.rates), self._names),
-            partial(_evaluated, outputs, self._names),
-            orders=structure.orders,
-            flat_labels=equations.flat_labels,
-            states=equations.states,
-            inputs=equations.inputs,
-            outputs=original.output_labels,
+            partial(_evaluated, rates, self._names),
+            partial(_evaluated, measured, self._names),
+            orders=maps.orders,
+            flat_labels=flat_labels,
+            states=states,
+            inputs=inputs,
+            outputs=outputs,
             name=name,
-            params=dict(zip(self._names, values, strict=True)),
+            params=params,
         )
         self.maps = maps
-        self._outputs = outputs
-        named = zip(equations.names, [*analysis.point.x.tolist(), *analysis.point.u.tolist()], strict=True)
-        self.operating_point = dict(named)
-        self.notes = (*analysis.notes, *_assumptions(analysis, maps))
+        self._outputs = measured
+        self._analysis: Analysis | None = analysis
+        self.operating_point = dict(operating_point)
+        self.notes = tuple(notes)
         self._grids: Lru[tuple[int, bytes, bytes], tuple[Trajectory, Grid]] = Lru(8)
+
+    def __getstate__(self) -> dict[str, object]:
+        """State for a pickle: the maps, without the expressions from which laws are derived."""
+        return {**self.__dict__, "_analysis": None}
+
+    @property
+    def analysis(self) -> Analysis:
+        """Expressions of the maps.
+
+        Raises
+        ------
+        ValueError
+            If the system was read from a pickle, which does not contain them.
+        """
+        if self._analysis is None:
+            raise ValueError(
+                f"{self.name} must have its equations for a tracking law, but a pickle has the maps only; derive it "
+                "again with ctrlplan.flat_system in this process"
+            )
+        return self._analysis
 
     def _describe(self) -> Iterator[Part]:
         yield from super()._describe()
@@ -73,6 +106,13 @@ class DerivedFlatSystem(FlatSystem):
     def states_and_inputs(
         self, plan: Trajectory, timepts: ArrayLike, *, start: ArrayLike | None = None
     ) -> tuple[Array, Array]:
+        """States and inputs along a plan of the flat outputs; see `FlatSystem.states_and_inputs`.
+
+        The states are connected with the operating point, or with `start` at the
+        plan's start, and followed along the plan, also through points where a
+        map by formulas would need another branch (a car that turns round). The
+        result does not depend on the other times of a call.
+        """
         plan, times = self._along(plan, timepts, start)
         p = self._values(self.params)
         first = None if start is None else self._extended(real_array(start, "start"), plan, p)
@@ -80,9 +120,8 @@ class DerivedFlatSystem(FlatSystem):
         n = self.maps.nstates
         return z[:n].reshape(n, *times.shape), u.reshape(-1, *times.shape)
 
-    states_and_inputs.__doc__ = FlatSystem.states_and_inputs.__doc__
-
     def quantities(self, jet: ArrayLike) -> dict[str, Array]:
+        """States, inputs and outputs of the plant by name; see `FlatSystem.quantities`."""
         values, known = self._checked_jet(jet)
         below, _, last = rows_of(values, self.orders)
         p = self._values(self.params)
@@ -101,12 +140,14 @@ class DerivedFlatSystem(FlatSystem):
             }
         return found
 
-    quantities.__doc__ = FlatSystem.quantities.__doc__
-
     def _grid(self, plan: Trajectory, p: Array, start: Array | None) -> Grid:
         """Grid of a plan, kept for the next call."""
         key = (id(plan), p.tobytes(), b"" if start is None else start.tobytes())
         return self._grids.get(key, lambda: (plan, grid_of(self.maps, plan, p, start, str(self.name))))[1]
+
+    def parameter_values(self) -> Array:
+        """Default parameters in the order of the maps."""
+        return self._values(self.params)
 
     def _values(self, params: Mapping[str, float] | None) -> Array:
         """Parameters in the order of the maps."""
@@ -117,7 +158,7 @@ class DerivedFlatSystem(FlatSystem):
         """Flags of states and constant inputs."""
         rows = self.maps.forward(np.asarray(x, dtype=float), np.asarray(u, dtype=float), self._values(params))
         ends = np.cumsum([0, *(r + 1 for r in self.orders)])
-        return [rows[a:b] for a, b in zip(ends[:-1], ends[1:], strict=True)]
+        return [rows[a:b] for a, b in pairwise(ends)]
 
     def _reverse(self, flag: Sequence[ArrayLike], params: Mapping[str, float] | None = None) -> tuple[Array, Array]:
         """States and inputs of flags, connected with the operating point."""
@@ -164,34 +205,6 @@ class DerivedFlatSystem(FlatSystem):
             if not step.size or np.max(np.abs(step) / (maps.scales[maps.nstates :])) < 1e-12:
                 break
         return z
-
-
-def flat_system(
-    system: System,
-    flat_outputs: FlatOutputs | None = None,
-    *,
-    inputs: Sequence[str] | str | None = None,
-    at: At = None,
-    params: Params | None = None,
-    scales: Mapping[str, float] | None = None,
-    name: str | None = None,
-) -> FlatSystem:
-    """Flat system of a plant from its equations."""
-    if flat_outputs is None:
-        raise TypeError("flat_outputs must be given for a nonlinear system: names of outputs or states, or a function")
-    analysis, original = analysed(
-        system, flat_outputs, inputs=inputs, at=at, params=dict(params or {}), scales=dict(scales or {})
-    )
-    return DerivedFlatSystem(analysis, original, name or str(system.name))
-
-
-def _assumptions(analysis: Analysis, maps: FlatMaps) -> Iterator[str]:
-    if not analysis.point.equilibrium:
-        yield "the operating point is not an equilibrium"
-    if not np.array_equal(maps.start, analysis.structure.point[: maps.start.size]):
-        yield "the maps are singular at the operating point and start near it"
-    for held in analysis.equations.held:
-        yield f"{held} is constant, a parameter"
 
 
 def _evaluated(tape: Tape, names: Sequence[str], t: float, x: Value, u: Value, params: Params) -> Value:

@@ -1,4 +1,4 @@
-"""Equations of a plant as CasADi expressions: rates, outputs and flat outputs of its states, controls and parameters."""
+"""Equations of a plant as CasADi expressions of its states, controls and parameters."""
 
 from __future__ import annotations
 

@@ -18,7 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctrlplan._types import Array, Value
-from ctrlplan.symbolic.tape import Operations, Tape
+from ctrlplan.symbolic.tape import Operations
+from ctrlplan.symbolic.taping import tape_of
 
 Matrix = list[list[Value]]
 
@@ -50,8 +51,7 @@ class Copies:
             (self.shape[0], len(chosen)),
         )
 
-    @property
-    def T(self) -> Copies:
+    def transposed(self) -> Copies:
         """The transposed matrix."""
         return Copies(
             [list(column) for column in zip(*self.exact, strict=True)],
@@ -132,7 +132,7 @@ class Point:
 
     def __call__(self, matrix: ca.SX, scales: Array | None = None) -> Copies:
         """Matrix at the point; columns are weighted with `scales` for the comparison within a row."""
-        tape = Tape.of(self._arguments, matrix)
+        tape = tape_of(self._arguments, matrix)
         copies = []
         for digits, constant in ((_DIGITS, mpmath.mpf), (_CHANGED_DIGITS, _changed)):
             with mpmath.workdps(digits):

@@ -9,12 +9,10 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 
-import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
 from ctrlplan._types import Array
-from ctrlplan.flatness.analysis import Analysis
 from ctrlplan.symbolic.tape import Tape
 
 _SHORTEST = 2.0**-25
@@ -22,9 +20,6 @@ _SHORTEST = 2.0**-25
 
 _MOVED = 0.3
 """Distance in scales that a corrector may move."""
-
-_SINGULAR = 1e-8
-"""Smallest singular value of scaled slopes below which they count as singular."""
 
 _ITERATIONS = 12
 _CONVERGED = 1e-13
@@ -187,11 +182,11 @@ class FlatMaps:
         """State at the next flag and the slopes there; None if the step is too long."""
         with np.errstate(all="ignore"):
             try:
-                predicted = z + np.linalg.solve(slopes, goal - flag)
+                predicted: Array = z + np.linalg.solve(slopes, goal - flag)
                 found = predicted
                 for k in range(_ITERATIONS):
                     now = self.slopes(found, p)
-                    step = np.linalg.solve(now, goal - self.flags(found, p))
+                    step = np.asarray(np.linalg.solve(now, goal - self.flags(found, p)), dtype=float)
                     found = found + step
                     if not np.isfinite(found).all() or self._distance(found, predicted) > _MOVED:
                         return None
@@ -217,69 +212,6 @@ class FlatMaps:
         return SingularError(f"{name} is not determined by the flat outputs there", place)
 
 
-def maps_of(analysis: Analysis) -> FlatMaps:
-    """Maps of an analysed plant."""
-    structure, equations = analysis.structure, analysis.equations
-    z, mu, p = structure.z, structure.mu, structure.p
-    flags = ca.vertcat(*structure.flags)
-    influence = ca.jacobian(structure.last, mu)
-    nz = z.numel()
-    slopes = Tape.of((z, p), ca.jacobian(flags, z))
-    start = _regular(structure.point[:nz], structure.scales[:nz], structure.nstates, slopes, equations.values)
-    return FlatMaps(
-        orders=structure.orders,
-        nstates=structure.nstates,
-        flags=Tape.of((z, p), flags),
-        slopes=slopes,
-        last=Tape.of((z, mu, p), ca.horzcat(structure.last, influence)),
-        controls=Tape.of((z, mu, p), structure.controls),
-        rates=Tape.of((z, mu, p), structure.rates),
-        forward=Tape.of(equations.variables, _forward(analysis)),
-        held=Tape.of(equations.variables, structure.held),
-        sides=Tape.of(equations.variables, analysis.sides),
-        notes=analysis.notes,
-        names=(*equations.states, *(str(z[k].name()) for k in range(structure.nstates, nz))),
-        start=start,
-        scales=structure.scales[:nz],
-        mu=structure.point[nz:],
-        affine=not ca.depends_on(influence, mu),
-    )
-
-
-def _regular(point: Array, scales: Array, nstates: int, slopes: Tape, p: Array) -> Array:
-    """State at the operating point or, where it is singular, near it."""
-    rng = np.random.default_rng(0)
-    trials = [point]
-    for k in range(nstates, point.size):
-        trials.append(point + scales * (np.arange(point.size) == k))
-    trials += [point + 0.2 * scales * rng.uniform(-1.0, 1.0, point.size) for _ in range(20)]
-    sizes = [_regularity(slopes(trial, p) * scales) for trial in trials]
-    return trials[0] if sizes[0] > _SINGULAR else trials[int(np.argmax(sizes))]
-
-
-def _regularity(matrix: Array) -> float:
-    """Smallest singular value after scaling of the rows; 0 if entries are not finite."""
-    if not np.isfinite(matrix).all():
-        return 0.0
-    largest = np.abs(matrix).max(axis=1, keepdims=True)
-    if not largest.all():
-        return 0.0
-    return float(np.linalg.svd(matrix / largest, compute_uv=False)[-1])
-
-
-def _forward(analysis: Analysis) -> ca.SX:
-    """Flags with the controls constant, up to the order of each flat output."""
-    equations = analysis.equations
-    rows = []
-    for entry, order in zip(ca.vertsplit(equations.flat), analysis.structure.orders, strict=True):
-        value = entry
-        rows.append(value)
-        for _ in range(order):
-            value = ca.cse(ca.jtimes(value, equations.x, equations.rates))
-            rows.append(value)
-    return ca.vertcat(*rows)
-
-
 def _solved(matrix: Array, right: Array) -> Array:
     """Solutions of linear systems (m, m, ...) with right sides (m, ...); nan where a matrix is singular."""
     m = right.shape[0]
@@ -292,7 +224,7 @@ def inverses(matrices: Array) -> Array:
     """Inverses of matrices (m, m, n); nan where a matrix is singular."""
     stack = np.moveaxis(matrices, -1, 0)
     try:
-        return np.moveaxis(np.linalg.inv(stack), 0, -1)
+        return np.moveaxis(np.asarray(np.linalg.inv(stack), dtype=float), 0, -1)
     except np.linalg.LinAlgError:
         out = np.full(stack.shape, np.nan)
         for k, matrix in enumerate(stack):

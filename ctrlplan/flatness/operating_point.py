@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from ctrlplan._checks import checked_finite, real_array
 from ctrlplan._types import Array
 from ctrlplan.flatness.equations import Equations
-from ctrlplan.symbolic.tape import Tape
+from ctrlplan.symbolic.taping import tape_of
 
 At = Mapping[str, float] | tuple[ArrayLike, ArrayLike] | None
 """Values of states and inputs by name, or (x, u)."""
@@ -80,7 +80,7 @@ def found_point(equations: Equations, known: Mapping[str, float], scales: Mappin
     start = np.array([known.get(name, 0.0) for name in names])
     unit = np.array([scales.get(name, 1.0) for name in names])
     jacobian = ca.jacobian(equations.rates, ca.vertcat(equations.x, equations.u))
-    rates, slopes = Tape.of(equations.variables, equations.rates), Tape.of(equations.variables, jacobian)
+    rates, slopes = tape_of(equations.variables, equations.rates), tape_of(equations.variables, jacobian)
 
     def at(values: Array) -> tuple[Array, Array] | None:
         found = rates(values[:n], values[n:], equations.values), slopes(values[:n], values[n:], equations.values)
@@ -218,7 +218,7 @@ def _radius(expressions: ca.SX, variables: ca.SX, p: ca.SX, k: int, point: Array
         moved = ca.jacobian(moved, along) / order
         if moved.nnz() == 0:
             break
-        coefficients.append(Tape.of((along, variables, p), moved)([0.0], point, values))
+        coefficients.append(tape_of((along, variables, p), moved)([0.0], point, values))
     if len(coefficients) < 2:
         return np.inf
     rows = np.abs(np.array(coefficients))
@@ -238,7 +238,7 @@ def _radius(expressions: ca.SX, variables: ca.SX, p: ca.SX, k: int, point: Array
 
 def _balanced(equations: Equations, variables: ca.SX, point: Array, size: Array) -> tuple[Array, float]:
     """Missing scales, and the rate, from the linear terms of the rates."""
-    slopes = Tape.of((variables, equations.p), ca.jacobian(equations.rates, variables))(point, equations.values)
+    slopes = tape_of((variables, equations.p), ca.jacobian(equations.rates, variables))(point, equations.values)
     rows, columns = np.nonzero(np.isfinite(slopes) & (slopes != 0.0))
     count = size.size
     unknown = np.flatnonzero(~np.isfinite(size))

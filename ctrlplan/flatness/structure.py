@@ -18,7 +18,7 @@ import numpy as np
 
 from ctrlplan._types import Array
 from ctrlplan.flatness.generic import Copies, Point
-from ctrlplan.symbolic.tape import Tape
+from ctrlplan.symbolic.taping import tape_of
 
 _LEAST_VARIATION = 0.02
 """Variation of a pivot's determinant above which the smaller region is not looked at."""
@@ -335,7 +335,7 @@ class _Algorithm:
         mixed = combined @ kept if others else ca.SX.zeros(rank)
         combination, inverse = old + mixed, w - mixed
         self.rounds.append(Round(tuple(rows), tuple(len(flag) for flag in self.flags), combination, first, idle, w))
-        exact = Tape.of((self.column, self.inputs, self.plant.p), combination)(
+        exact = tape_of((self.column, self.inputs, self.plant.p), combination)(
             self.centre[:nz], self.centre[nz:], self.plant.values
         )
         held = [self._held(combination[k]) for k in range(rank)]
@@ -373,7 +373,7 @@ class _Algorithm:
         if len(candidates) == 1:
             return candidates[0]
         slopes = ca.jacobian(ca.vertcat(*(self.highest[j] for j in rows)), self.inputs)
-        tape = Tape.of((self.column, self.inputs, self.plant.p), slopes)
+        tape = tape_of((self.column, self.inputs, self.plant.p), slopes)
         sizes = np.abs(influence.numbers() * self.scale[nz:]).max(axis=1)
         best: list[float] = []
         for region in (0.5, 0.15, 0.05, 0.005):
@@ -396,8 +396,9 @@ class _Algorithm:
         rng = np.random.default_rng(0)
         direction = rng.uniform(0.1, 0.2, self.centre.size) * rng.choice([-1.0, 1.0], self.centre.size)
         nz = len(self.z)
-        tape = Tape.of(
-            (self.column, self.inputs, self.plant.p), ca.vertcat(self.rates, *self.highest, *sum(self.flags, []))
+        tape = tape_of(
+            (self.column, self.inputs, self.plant.p),
+            ca.vertcat(self.rates, *self.highest, *(entry for flag in self.flags for entry in flag)),
         )
         for _ in range(12):
             values = self.centre + direction * self.scale

@@ -5,11 +5,9 @@ A tape needs no CasADi to be evaluated, and can be pickled.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cache
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 
-import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -51,41 +49,6 @@ class Tape:
     results: tuple[int, ...]
     shape: tuple[int, int]
 
-    @classmethod
-    def of(cls, arguments: Sequence[ca.SX], result: ca.SX) -> Tape:
-        """Tape of an expression as a function of columns of symbols, common subexpressions evaluated once."""
-        return cls.of_function(ca.Function("tape", list(arguments), [ca.densify(ca.cse(result))]))
-
-    @classmethod
-    def of_function(cls, function: ca.Function) -> Tape:
-        """Tape of a function of SX symbols with one result."""
-        names = operation_names()
-        place: dict[int, int] = {}
-        instructions: list[Instruction] = []
-        results = [-1] * function.numel_out(0)
-        rows, columns = function.sparsity_out(0).get_triplet()
-        nrows = function.size1_out(0)
-        for k in range(function.n_instructions()):
-            kind, given, target = (
-                function.instruction_id(k),
-                function.instruction_input(k),
-                function.instruction_output(k),
-            )
-            if kind == ca.OP_OUTPUT:
-                nonzero = target[1]
-                results[rows[nonzero] + nrows * columns[nonzero]] = place[given[0]]
-                continue
-            if kind == ca.OP_CONST:
-                found = Instruction("CONST", (), float(function.instruction_constant(k)))
-            elif kind == ca.OP_INPUT:
-                found = Instruction("INPUT", tuple(given))
-            else:
-                found = Instruction(names[kind], tuple(place[g] for g in given))
-            instructions.append(found)
-            place[target[0]] = len(instructions) - 1
-        sizes = tuple(function.numel_in(i) for i in range(function.n_in()))
-        return cls(sizes, _with_last_reads(instructions, set(results)), tuple(results), function.size_out(0))
-
     def __call__(self, *arguments: ArrayLike) -> Array:
         """Result for arguments (entries, ...): shape (rows, columns, ...), or (rows, ...) of a column."""
         given = [np.asarray(value, dtype=float) for value in arguments]
@@ -102,7 +65,7 @@ class Tape:
 
     def evaluated(
         self,
-        arguments: Sequence[Sequence[Value]],
+        arguments: Sequence[Value],
         operations: Operations,
         constant: Callable[[float], Value] = lambda value: value,
     ) -> list[Value]:
@@ -110,7 +73,7 @@ class Tape:
 
         Parameters
         ----------
-        arguments : sequence of sequences
+        arguments : sequence of sequences or arrays
             Entries of each argument.
         operations : mapping
             Function of each operation.
@@ -129,38 +92,6 @@ class Tape:
                 for place in step.last_reads:  # their memory is used again
                     values[place] = None
         return values
-
-
-def _with_last_reads(instructions: list[Instruction], results: set[int]) -> tuple[Instruction, ...]:
-    """Instructions with the places that they read last."""
-    seen = set(results)
-    out: list[Instruction] = []
-    for step in reversed(instructions):
-        if step.operation in ("INPUT", "CONST"):
-            out.append(step)
-            continue
-        new = tuple(sorted(set(step.arguments) - seen))
-        seen.update(new)
-        out.append(replace(step, last_reads=new))
-    return tuple(reversed(out))
-
-
-@cache
-def operation_names() -> dict[int, str]:
-    """Names of CasADi's operations by their numbers."""
-    return {getattr(ca, name): name[3:] for name in dir(ca) if name.startswith("OP_")}
-
-
-def operations_on(function: ca.Function) -> Iterator[tuple[int, str, tuple[int, ...], tuple[int, ...]]]:
-    """Number, name, arguments and result places of each instruction of a function of SX symbols."""
-    names = operation_names()
-    for k in range(function.n_instructions()):
-        yield (
-            k,
-            names[function.instruction_id(k)],
-            tuple(function.instruction_input(k)),
-            tuple(function.instruction_output(k)),
-        )
 
 
 NUMPY: Operations = {
