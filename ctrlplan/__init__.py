@@ -153,6 +153,7 @@ _EXPORTS = {
         "monte_carlo",
         "sweep",
     ),
+    "flatness": ("DerivedFlatSystem", "FlatSystem", "NotFlatError", "flat_system"),
     "reports.explore": ("explore",),
 }
 _HOME = {name: module for module, names in _EXPORTS.items() for name in names}

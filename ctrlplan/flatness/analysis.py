@@ -115,6 +115,7 @@ def _with_functions(
         scales=sizes,
         rate=rate,
         values=equations.values,
+        equilibrium=point.equilibrium,
     )
     return plant, tuple(replaced)
 

@@ -228,7 +228,7 @@ def replaced_input(
         Its value at the operating point.
     """
     function = ca.Function(
-        "equations", [*variables, given], [ca.densify(ca.vertcat(ca.SX(0, 1), *map(ca.cse, expressions)))]
+        "equations", [*variables, given], [ca.densify(ca.cse(ca.vertcat(ca.SX(0, 1), *expressions)))]
     )
     position = len(variables)
     work: dict[int, ca.SX] = {}

@@ -22,7 +22,7 @@ def maps_of(analysis: Analysis) -> FlatMaps:
     flags = ca.vertcat(*structure.flags)
     influence = ca.jacobian(structure.last, mu)
     nz = z.numel()
-    slopes = tape_of((z, p), ca.jacobian(flags, z))
+    slopes = tape_of((z, p), ca.jacobian(flags, z), matrix=True)
     start = _regular(structure.point[:nz], structure.scales[:nz], structure.nstates, slopes, equations.values)
     return FlatMaps(
         orders=structure.orders,

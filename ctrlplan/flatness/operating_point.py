@@ -80,7 +80,7 @@ def found_point(equations: Equations, known: Mapping[str, float], scales: Mappin
     start = np.array([known.get(name, 0.0) for name in names])
     unit = np.array([scales.get(name, 1.0) for name in names])
     jacobian = ca.jacobian(equations.rates, ca.vertcat(equations.x, equations.u))
-    rates, slopes = tape_of(equations.variables, equations.rates), tape_of(equations.variables, jacobian)
+    rates, slopes = tape_of(equations.variables, equations.rates), tape_of(equations.variables, jacobian, matrix=True)
 
     def at(values: Array) -> tuple[Array, Array] | None:
         found = rates(values[:n], values[n:], equations.values), slopes(values[:n], values[n:], equations.values)
@@ -93,11 +93,13 @@ def found_point(equations: Equations, known: Mapping[str, float], scales: Mappin
         balanced = bool((np.abs(found[0]) <= _SAME * (np.abs(found[1]) @ (np.abs(start) + 0.1 * unit))).all())
         return OperatingPoint(start[:n], start[n:], balanced)
     nearest: Array | None = None
+    smallest = np.inf
     for trial in _starts(start, free, unit):
-        solved, balanced = _equilibrium(at, trial, free, unit)
-        if balanced and solved is not None:
+        solved, size = _equilibrium(at, trial, free, unit)
+        if solved is not None and size == 0.0:
             return OperatingPoint(solved[:n], solved[n:], True)
-        nearest = solved if nearest is None else nearest
+        if solved is not None and size < 0.01 * smallest:
+            nearest, smallest = solved, size
     if known and nearest is not None:  # in motion, as a car at a given speed
         return OperatingPoint(nearest[:n], nearest[n:], False)
     raise ValueError(
@@ -118,27 +120,27 @@ def _starts(start: Array, free: NDArray[np.bool_], unit: Array) -> Iterator[Arra
 
 def _equilibrium(
     at: Callable[[Array], tuple[Array, Array] | None], values: Array, free: NDArray[np.bool_], unit: Array
-) -> tuple[Array | None, bool]:
-    """Point of smallest rates by least-norm Newton steps from a start, and whether the rates are 0 there."""
+) -> tuple[Array | None, float]:
+    """Point of smallest rates by least-norm Newton steps from a start, and their size, 0 for an equilibrium."""
     found = at(values)
     if found is None:
-        return None, False
+        return None, np.inf
     for _ in range(_ITERATIONS):
         residual, slopes = found
         weight = np.abs(slopes) @ (np.abs(values) + 0.1 * unit)
         weight = np.where(weight > 0.0, weight, 1.0)
         size = _size(residual / weight)
         if size <= 1e-14:
-            return _tidied(at, values, free, unit), True
+            return _tidied(at, values, free, unit), 0.0
         step = np.zeros(values.size)
         scaled = (slopes / weight[:, None])[:, free] * unit[free]
         step[free] = -unit[free] * (np.linalg.pinv(scaled) @ (residual / weight))
         step /= max(1.0, float(np.max(np.abs(step) / (0.5 * np.abs(values) + 0.2 * unit))))
         nearer = _shortened(at, values, step, weight, size)
         if nearer is None:
-            return (_tidied(at, values, free, unit), True) if size <= _SAME else (values, False)
+            return (_tidied(at, values, free, unit), 0.0) if size <= _SAME else (values, size)
         values, found = nearer
-    return values, False
+    return values, size
 
 
 def _shortened(
@@ -238,7 +240,9 @@ def _radius(expressions: ca.SX, variables: ca.SX, p: ca.SX, k: int, point: Array
 
 def _balanced(equations: Equations, variables: ca.SX, point: Array, size: Array) -> tuple[Array, float]:
     """Missing scales, and the rate, from the linear terms of the rates."""
-    slopes = tape_of((variables, equations.p), ca.jacobian(equations.rates, variables))(point, equations.values)
+    slopes = tape_of((variables, equations.p), ca.jacobian(equations.rates, variables), matrix=True)(
+        point, equations.values
+    )
     rows, columns = np.nonzero(np.isfinite(slopes) & (slopes != 0.0))
     count = size.size
     unknown = np.flatnonzero(~np.isfinite(size))

@@ -15,28 +15,16 @@ from itertools import combinations
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import eigvals
 
 from ctrlplan._types import Array
+from ctrlplan.flatness.errors import NotFlatError
 from ctrlplan.flatness.generic import Copies, Point
 from ctrlplan.symbolic.taping import tape_of
 
 _LEAST_VARIATION = 0.02
 """Variation of a pivot's determinant above which the smaller region is not looked at."""
-
-
-class NotFlatError(ValueError):
-    """A plant is not flat for the given outputs; the message says why.
-
-    Attributes
-    ----------
-    internal : int
-        Dimension of the internal dynamics that the outputs do not determine; 0 if
-        the outputs depend on each other.
-    """
-
-    def __init__(self, message: str, internal: int = 0) -> None:
-        super().__init__(message)
-        self.internal = internal
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,6 +134,8 @@ class Plant:
         Rate of the dynamics [1/s].
     values : ndarray
         Parameters.
+    equilibrium : bool
+        Whether the operating point is one.
     """
 
     name: str
@@ -162,6 +152,7 @@ class Plant:
     scales: Array
     rate: float
     values: Array
+    equilibrium: bool
 
 
 def structure_of(plant: Plant) -> Structure:
@@ -233,10 +224,11 @@ class _Algorithm:
         """Differentiate each flat output until a control appears."""
         for j, flag in enumerate(self.flags):
             while not self._depends(self.highest[j]):
-                flag.append(self.highest[j])
+                # A dependence that is generically 0 is removed from the expression.
+                flag.append(ca.substitute(self.highest[j], self.inputs, ca.DM(self.centre[len(self.z) :])))
                 if len(flag) > len(self.z):
                     self._raise_dependent()
-                self.highest[j] = ca.cse(ca.jtimes(self.highest[j], self.column, self.rates))
+                self.highest[j] = ca.cse(ca.jtimes(flag[-1], self.column, self.rates))
 
     def _depends(self, expression: ca.SX) -> bool:
         """Whether an expression depends on a control."""
@@ -415,7 +407,8 @@ class _Algorithm:
         if missing:
             raise NotFlatError(
                 f"{plant.name} is not flat for the outputs {', '.join(plant.labels)}: they do not determine "
-                f"{missing} of its states (internal dynamics of dimension {missing})",
+                f"{missing} of its states (internal dynamics of dimension {missing}{self._stability(missing)})"
+                f"{self._none_at_all()}",
                 missing,
             )
         return Structure(
@@ -433,6 +426,78 @@ class _Algorithm:
             point=self.centre,
             scales=self.scale,
         )
+
+    def _stability(self, missing: int) -> str:
+        """Stability of the internal dynamics, linearised at the operating point: the zeros there."""
+        plant = self.plant
+        if self.n != len(self.z) or not plant.equilibrium:
+            return ""
+        zeros = zeros_at(plant)
+        if zeros is None or zeros.size != missing:
+            return ""
+        shown = ", ".join(f"{zero.real:.4g}{f'{zero.imag:+.4g}j' if zero.imag else ''}" for zero in zeros)
+        largest = max(1.0, float(np.abs(zeros).max()))
+        if (zeros.real < -1e-9 * largest).all():
+            return (
+                f", stable at the operating point: poles {shown}; control by linearisation of these outputs is possible"
+            )
+        if (zeros.real > 1e-9 * largest).any():
+            return f", unstable at the operating point with the poles {shown}"
+        return f", poles {shown} at the operating point"
+
+    def _none_at_all(self) -> str:
+        """Whether no other output is flat either, which is known for one control."""
+        if self.plant.mu.numel() == 1 and not _has_flat_output(self.plant):
+            return "; no output of this plant is flat"
+        return ""
+
+
+def zeros_at(plant: Plant) -> NDArray[np.complex128] | None:
+    """Invariant zeros of the linearisation at the operating point; None if it is singular."""
+    n, m = plant.z.numel(), plant.mu.numel()
+    both = ca.vertcat(plant.z, plant.mu)
+    tape = tape_of((plant.z, plant.mu, plant.p), ca.jacobian(ca.vertcat(plant.rates, plant.flat), both))
+    matrix = tape(plant.point[:n], plant.point[n:], plant.values)
+    if not np.isfinite(matrix).all():
+        return None
+    size = np.concatenate([plant.scales[:n], plant.scales[n:]])
+    rows = np.concatenate([plant.scales[:n] * plant.rate, np.ones(m)])
+    pencil = matrix * size / rows[:, None]
+    peaks = np.abs(pencil[n:]).max(axis=1, keepdims=True)
+    if not peaks.all():
+        return None
+    pencil[n:] /= peaks
+    found = eigvals(pencil, np.diag([1.0] * n + [0.0] * m), homogeneous_eigvals=True)
+    top, bottom = found
+    finite = np.abs(bottom) > 1e-8 * np.abs(top)
+    return np.sort_complex(top[finite] / bottom[finite] * plant.rate)
+
+
+def _has_flat_output(plant: Plant) -> bool:
+    """Whether a plant with one control, affine in it, has a flat output: by Lie brackets (Jakubczyk, Respondek)."""
+    slope = ca.jacobian(plant.rates, plant.mu)
+    if ca.depends_on(slope, plant.mu):
+        return True  # not decided
+    drift = ca.substitute(plant.rates, plant.mu, 0.0)
+    n = plant.z.numel()
+    algorithm = _Algorithm(plant)
+    fields = [slope]
+    for _ in range(n - 1):
+        fields.append(_bracket(drift, fields[-1], plant.z))
+    weights = 1.0 / plant.scales[:n]
+
+    def rank(columns: Sequence[ca.SX]) -> int:
+        return algorithm.at(ca.horzcat(*columns).T, weights).rank()
+
+    if rank(fields) < n:
+        return False
+    brackets = [_bracket(first, second, plant.z) for first, second in combinations(fields[: n - 1], 2)]
+    return n < 3 or all(rank([*fields[: n - 1], bracket]) == n - 1 for bracket in brackets)
+
+
+def _bracket(first: ca.SX, second: ca.SX, z: ca.SX) -> ca.SX:
+    """Lie bracket of two vector fields."""
+    return ca.cse(ca.jtimes(second, z, first) - ca.jtimes(first, z, second))
 
 
 def _without_zeros(matrix: ca.SX, generic: Callable[[ca.SX], Copies]) -> ca.SX:

@@ -42,12 +42,15 @@ class Tape:
         Position of each entry of the result, column by column; -1 for 0.
     shape : tuple of int
         Rows and columns of the result.
+    matrix : bool
+        Whether a result of one column keeps its second axis.
     """
 
     sizes: tuple[int, ...]
     instructions: tuple[Instruction, ...]
     results: tuple[int, ...]
     shape: tuple[int, int]
+    matrix: bool = False
 
     def __call__(self, *arguments: ArrayLike) -> Array:
         """Result for arguments (entries, ...): shape (rows, columns, ...), or (rows, ...) of a column."""
@@ -59,7 +62,7 @@ class Tape:
         for k, place in enumerate(self.results):
             if place >= 0:
                 out[k] = values[place]
-        if self.shape[1] == 1:
+        if self.shape[1] == 1 and not self.matrix:
             return out
         return out.reshape(self.shape[1], self.shape[0], *trailing).swapaxes(0, 1)
 

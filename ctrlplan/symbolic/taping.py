@@ -11,8 +11,11 @@ import casadi as ca
 from ctrlplan.symbolic.tape import Instruction, Tape
 
 
-def tape_of(arguments: Sequence[ca.SX], result: ca.SX) -> Tape:
-    """Tape of an expression as a function of columns of symbols, common subexpressions evaluated once."""
+def tape_of(arguments: Sequence[ca.SX], result: ca.SX, *, matrix: bool = False) -> Tape:
+    """Tape of an expression as a function of columns of symbols, common subexpressions evaluated once.
+
+    The result of one column has the shape (rows, ...), or with `matrix` (rows, 1, ...).
+    """
     function = ca.Function("tape", list(arguments), [ca.densify(ca.cse(result))])
     place: dict[int, int] = {}
     instructions: list[Instruction] = []
@@ -28,7 +31,7 @@ def tape_of(arguments: Sequence[ca.SX], result: ca.SX) -> Tape:
         instructions.append(found)
         place[target[0]] = len(instructions) - 1
     sizes = tuple(function.numel_in(i) for i in range(function.n_in()))
-    return Tape(sizes, _with_last_reads(instructions, set(results)), tuple(results), function.size_out(0))
+    return Tape(sizes, _with_last_reads(instructions, set(results)), tuple(results), function.size_out(0), matrix)
 
 
 def operations_of(function: ca.Function) -> Iterator[tuple[int, str, tuple[int, ...], tuple[int, ...]]]:
