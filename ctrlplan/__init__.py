@@ -161,6 +161,7 @@ _EXPORTS = {
         "monte_carlo",
         "sweep",
     ),
+    "flatness": ("DerivedFlatSystem", "FlatSystem", "NotFlatError", "flat_system"),
     "reports.explore": ("explore",),
     "reports.vibration_figures": ("residual_plot",),
 }
