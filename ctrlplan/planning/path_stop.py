@@ -18,7 +18,7 @@ from typing import NamedTuple, NoReturn
 import numpy as np
 from scipy.optimize import brentq
 
-from ctrlplan.planning.limits import Bound
+from ctrlplan.planning.bounds import Bound
 from ctrlplan.trajectories import Clipped, MotionProfile, Retimed, Trajectory
 from ctrlplan.trajectories.combined import is_shaped
 from ctrlplan.trajectories.common import Array

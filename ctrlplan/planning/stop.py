@@ -12,7 +12,8 @@ from numpy.typing import ArrayLike
 
 from ctrlplan._checks import checked_finite, checked_vector
 from ctrlplan._renamed import outside_stacklevel
-from ctrlplan.planning.limits import Bound, Limited
+from ctrlplan.planning.bounds import Bound
+from ctrlplan.planning.limits import Limited
 from ctrlplan.planning.path_stop import stopped_on_path
 from ctrlplan.trajectories import Clipped, Joined, MotionProfile, Step, Trajectory
 from ctrlplan.trajectories.common import Array

@@ -151,7 +151,7 @@ def held_change(a: Array, b: Array, duration: float) -> Array:
     """Matrix (nstates, nstates + ninputs): change of states over a duration, from states and constant inputs."""
     scale, a, b, _ = _balanced(a[None], b[None], np.zeros((1, len(a))))
     with np.errstate(all="ignore"):
-        change = _changes(duration * a, duration * b, 1)[-1][0] if scale.size else np.zeros((0, b.shape[2]))
+        change = changes_over(duration * a, duration * b, 1)[-1][0] if scale.size else np.zeros((0, b.shape[2]))
     change[:, : scale.size] /= scale
     return np.asarray(scale[:, None] * change)
 
