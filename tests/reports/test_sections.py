@@ -127,11 +127,13 @@ def test_data_of_a_section_is_in_the_results(own):
     assert set(data) == {"plans", "durations"}
 
 
+@pytest.mark.usefixtures("blank_drawings")
 def test_a_section_may_stand_below_the_metrics(compared, read):
     page = read(render_page([Study("mine", "Mine", compared, sections=(Durations(1.0, below=True),))], "Mine"))
     assert heads(page) == ["Mine", "All metrics", "Durations & <limits>", "Parameters"]
 
 
+@pytest.mark.usefixtures("blank_drawings")
 def test_sections_of_one_type_have_ids_of_their_own(compared, read):
     two = tuple(Curves("a", "b", TIMES, {"c": k * TIMES}, caption=f"Number {k}.") for k in (1, 2))
     studies = [Study(name, "It", compared, sections=(*two, Durations(1.0))) for name in ("it", "it-curves", "it")]
@@ -156,6 +158,7 @@ def test_a_figure_that_is_svg_already_is_put_in_as_it_is(compared, read):
     assert [circle.attributes["r"] for circle in figure.all("circle")] == ["1"]
 
 
+@pytest.mark.usefixtures("blank_drawings")
 def test_a_section_of_ones_own_joins_those_of_a_study_file(tmp_path, read):
     text = 't_end = 6.0\n[loop]\nkind = "linear"\nnum = [5.0]\nden = [1.0, 1.0, 0.0]\n'
     text += "".join(f"[[waypoints]]\ntime = {t}\ny = [{y}, 0.0, 0.0]\n" for t, y in ((0.0, 0.0), (2.0, 1.0)))

@@ -131,6 +131,7 @@ def test_a_value_of_a_sweep_at_which_a_plan_fails_is_a_failure_of_the_sweep():
     assert "far" in failure.message
 
 
+@pytest.mark.usefixtures("blank_drawings")
 @pytest.mark.slow
 def test_a_crane_that_cannot_follow_some_plans_is_reported_with_the_others(tmp_path, capsys):
     """Ten metres in 3.5 s with 2 kN and feedback of the load: the rope goes slack with every smooth plan."""

@@ -5,8 +5,9 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import assume, example, given, settings
+from hypothesis import assume, example, given
 from hypothesis import strategies as st
+from repetitions import examples
 from scipy.optimize import linprog
 
 from ctrlplan.trajectories import SCurve, Trapezoid, trajectory_from_dict
@@ -81,7 +82,7 @@ def test_segments_of_the_s_curve(d, v, a, j, segments):
         np.testing.assert_allclose(np.diff(plan.breakpoints), np.array(segments) / speed, rtol=4e-15)
 
 
-@settings(max_examples=150)
+@examples(150)
 @given(SIZES, SIZES, SIZES, SIZES)
 def test_the_duration_is_that_of_the_cases(d, v, a, j):
     assume(min(v / a, a / j) > 1e-12 * (d / v + v / a + a / j))
@@ -132,7 +133,7 @@ def test_jets_are_those_of_the_integrated_acceleration(d, v, a):
     assert not plan.jet(t, 5)[3:].any()
 
 
-@settings(max_examples=50)
+@examples(50)
 @given(ENDS, SIZES, SIZES, SIZES, STARTS)
 @example((0.0, 30.0), 1.0, 1.0, 1.0 + 7e-14, -7.3)  # a segment below the resolution of times
 @example((0.0, 2.0), 1.0 - 4e-15, 1.0, 1.0, -7.3)
