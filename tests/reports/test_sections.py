@@ -90,11 +90,11 @@ def test_a_section_of_ones_own_is_on_the_page_in_its_place(own, read):
     page = read(own[0].read_text(encoding="utf-8"))
     assert heads(page) == [
         "Mine",
-        "Description and findings",
+        "Findings",
         "Durations & <limits>",
         "All metrics",
         "All figures",
-        "Parameters",
+        "Parameters and versions",
     ]
     assert ids_of_figures(page) == ["mine-first", "mine-plans", "mine-responses"]
     captions = [caption.words() for caption in page.all("figcaption")]
@@ -130,7 +130,7 @@ def test_data_of_a_section_is_in_the_results(own):
 @pytest.mark.usefixtures("blank_drawings")
 def test_a_section_may_stand_below_the_metrics(compared, read):
     page = read(render_page([Study("mine", "Mine", compared, sections=(Durations(1.0, below=True),))], "Mine"))
-    assert heads(page) == ["Mine", "All metrics", "Durations & <limits>", "Parameters"]
+    assert heads(page) == ["Mine", "All metrics", "Durations & <limits>", "Parameters and versions"]
 
 
 @pytest.mark.usefixtures("blank_drawings")

@@ -181,15 +181,20 @@ def check_axes(plan: Trajectory) -> None:
 
 
 def _shortest_rope(crane: CraneParameters, plan: Trajectory, acceleration: Extrema) -> tuple[float, float]:
-    """Certified lower bound of R over a plan and its time; the minimum itself if it is not positive or not bounded."""
+    """Lower bound of R over a plan and a time; the minimum itself if it is not positive or not bounded."""
     g, b = crane.gravity, crane.drum_radius
+    across = float(max(-acceleration.minimum[0], acceleration.maximum[0]))
+    low, high = g - float(acceleration.maximum[1]), g - float(acceleration.minimum[1])
+    lowest = plan.extrema()
+    # R = z hypot(x'', g - z'')/(g - z'') - b x''/(g - z''), whose first quotient is at least 1.
+    if (simple := float(lowest.minimum[1]) - b * across / low) > 0.0:
+        return simple, float(lowest.time_min[1])
 
     def length(jet: Array) -> Array:
         across, hanging = jet[2, 0], g - jet[2, 1]
         return (jet[0, 1] * np.hypot(across, hanging) - b * across) / hanging
 
-    depth, across = float(plan.peak()[1]), float(max(-acceleration.minimum[0], acceleration.maximum[0]))
-    low, high = g - float(acceleration.maximum[1]), g - float(acceleration.minimum[1])
+    depth = float(plan.peak()[1])
     pull = math.hypot(across, high)
     # Bounds of dR/dz, dR/dx'' and dR/dz'' over the ranges of the plan.
     slopes = np.zeros((3, 2))
