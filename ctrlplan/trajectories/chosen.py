@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,6 +17,9 @@ from ctrlplan.trajectories.combined import Joined
 from ctrlplan.trajectories.cycle import knots_of, moved
 from ctrlplan.trajectories.trajectory import Trajectory
 from ctrlplan.trajectories.waypoint import Waypoint
+
+if TYPE_CHECKING:
+    from ctrlplan.planning.stop import StopLimits
 
 
 def chosen_alpha(
@@ -82,3 +85,10 @@ def at_velocity(
     from ctrlplan.planning import stop
 
     return stop.at_velocity(plan, time, velocity, limits, hold, synchronize)
+
+
+def stop_limits(plan: Trajectory, limits: Mapping[str, object]) -> StopLimits:
+    """Limits of a stop, checked, by axis; a plan may be a step."""
+    from ctrlplan.planning import stop
+
+    return stop.stop_limits(plan, limits)
