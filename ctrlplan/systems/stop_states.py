@@ -36,14 +36,7 @@ class StopStates(NamedTuple):
     @classmethod
     def of(cls, plan: Trajectory, limits: Mapping[str, object]) -> StopStates:
         """Stop with limits of acceleration and jerk, as of `Trajectory.stop`."""
-        found = stop_limits(plan, limits)
-        for bound in found.bounds:
-            if bound.order < 2:
-                raise ValueError(
-                    f"stop_limits must be those of acceleration and jerk, got {bound.name}: during a stop neither "
-                    "position nor velocity can be limited"
-                )
-        return cls(found.acceleration, found.jerk)
+        return cls(*stop_limits(plan, limits))
 
     @property
     def labels(self) -> list[str]:

@@ -7,19 +7,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ctrlplan._checks import checked_finite, one_number
 from ctrlplan.trajectories.combined import Joined
+from ctrlplan.trajectories.common import Array
 from ctrlplan.trajectories.cycle import knots_of, moved
 from ctrlplan.trajectories.trajectory import Trajectory
 from ctrlplan.trajectories.waypoint import Waypoint
-
-if TYPE_CHECKING:
-    from ctrlplan.planning.stop import StopLimits
 
 
 def chosen_alpha(
@@ -87,8 +85,15 @@ def at_velocity(
     return stop.at_velocity(plan, time, velocity, limits, hold, synchronize)
 
 
-def stop_limits(plan: Trajectory, limits: Mapping[str, object]) -> StopLimits:
-    """Limits of a stop, checked, by axis; a plan may be a step."""
+def stop_limits(plan: Trajectory, limits: Mapping[str, object]) -> tuple[Array, Array]:
+    """Limits of acceleration (naxes, 2) and jerk (naxes,) of a stop, without others; a plan may be a step."""
     from ctrlplan.planning import stop
 
-    return stop.stop_limits(plan, limits)
+    found = stop.stop_limits(plan, limits)
+    for bound in found.bounds:
+        if bound.order < 2:
+            raise ValueError(
+                f"stop_limits must be those of acceleration and jerk, got {bound.name}: during a stop neither position "
+                "nor velocity can be limited"
+            )
+    return found.acceleration, found.jerk
