@@ -330,9 +330,12 @@ def wrong(kind=SCurve, final=1.0, initial=0.0, **changed):
         ({"final": [1.0, 2.0], "velocity": [1.0, -2.0]}, "velocity must be above 0 and finite, got -2.0 of y2$"),
         (
             {"final": [1.0, 2.0], "velocity": [1.0] * 3},
-            r"velocity must be a scalar or of shape \(2,\), got shape \(3,\)",
+            r"velocity must be a scalar or of shape \(2,\), or pairs of shape \(2, 2\), got shape \(3,\)",
         ),
-        ({"velocity": [[1.0]]}, r"velocity must be a scalar or of shape \(1,\), got shape \(1, 1\)"),
+        (
+            {"velocity": [[1.0]]},
+            r"velocity must be a scalar or of shape \(1,\), or pairs of shape \(1, 2\), got shape \(1, 1\)",
+        ),
         ({"final": 0.0}, r"final must differ from initial by a finite length, got \[0.0\] after \[0.0\]"),
         ({"final": 1e308, "initial": -1e308}, "final must differ from initial by a finite length"),
         ({"final": math.nan}, "final must be finite"),
