@@ -56,7 +56,7 @@ def flat_system(crane: CraneParameters, name: str = "crane") -> FlatSystem:
         name=name,
         quantities=partial(quantities, crane),
     )
-    return declare(system, feedthrough=model.feedthrough(2))
+    return declare(system, feedthrough=model.feedthrough(model.OUTPUTS, 2))
 
 
 def quantities(crane: CraneParameters, jet: ArrayLike) -> dict[str, Array]:
@@ -95,7 +95,8 @@ def forward(
     state = [Taylor(value[None]) for value in given]
     force, torque = (np.asarray(value, dtype=float) for value in u)
     for _ in range(3):  # each iteration gives one more derivative of the accelerations
-        second = model.solved(numbers, crane.rope_wrap, state, force, torque, 0.0)[:3]
+        trolley = model.by_force(numbers, state, force)
+        second = model.solved(numbers, crane.rope_wrap, state, trolley, torque, 0.0)[:3]
         rates = [Taylor.integral(start, rate) for start, rate in zip(given[3:], second, strict=True)]
         state = [Taylor.integral(start, rate) for start, rate in zip(given[:3], rates, strict=True)] + rates
     return [series.to_jet(position.terms) for position in model.load(numbers[3], state)[:2]]
