@@ -62,7 +62,7 @@ Crane with limited force; an event ends the run if the rope becomes slack:
 from ctrlplan.simulation.equilibrium import equilibrium_at, equilibrium_state, unstable_poles
 from ctrlplan.simulation.events import Event, Occurrence, what_happened
 from ctrlplan.simulation.interpreted import SolverError
-from ctrlplan.simulation.log import read_log
+from ctrlplan.simulation.log import measured_response, read_log
 from ctrlplan.simulation.predictor import Predictor
 from ctrlplan.simulation.prepared import Prepared, prepare, prepared_form, state_space, stated_start
 from ctrlplan.simulation.response import SimulationResponse, signal_table
@@ -77,6 +77,7 @@ __all__ = [
     "SolverError",
     "equilibrium_at",
     "equilibrium_state",
+    "measured_response",
     "prepare",
     "prepared_form",
     "read_log",
