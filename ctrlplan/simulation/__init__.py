@@ -65,6 +65,7 @@ from ctrlplan.simulation.interpreted import SolverError
 from ctrlplan.simulation.log import read_log
 from ctrlplan.simulation.loop_quantities import LoopQuantities, loop_quantities
 from ctrlplan.simulation.loop_response import Extremes, LoopResponse
+from ctrlplan.simulation.log import measured_response, read_log
 from ctrlplan.simulation.predictor import Predictor
 from ctrlplan.simulation.prepared import Prepared, prepare, prepared_form, state_space, stated_start
 from ctrlplan.simulation.response import SimulationResponse, signal_table
@@ -85,6 +86,7 @@ __all__ = [
     "equilibrium_at",
     "equilibrium_state",
     "loop_quantities",
+    "measured_response",
     "prepare",
     "prepared_form",
     "read_log",
