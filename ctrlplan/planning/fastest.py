@@ -12,11 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
-from ctrlplan._checks import checked_pair
+from ctrlplan._checks import checked_finite, checked_pair
 from ctrlplan._display import Displayed, Facts, Figure, Part
 from ctrlplan._renamed import FormerAttribute
-from ctrlplan.planning.limits import Limited, Margin, Margins
-from ctrlplan.planning.quantities import System, system_given
+from ctrlplan.planning.limits import Limited, Margin, Margins, Sampled
+from ctrlplan.planning.loop_fastest import LoopProblem
+from ctrlplan.planning.quantities import System, shapes_given, system_given
 from ctrlplan.planning.scalar_search import bisected, scan
 from ctrlplan.planning.time_law import with_fast_time_law
 from ctrlplan.trajectories import Trajectory, WaypointSpline
@@ -55,6 +56,9 @@ class Fastest(Displayed):
         is active; otherwise empty.
     searched : (float, float)
         Interval of durations [s] of the search.
+    statement : str
+        What is known of shorter durations, for limits on signals of a loop;
+        otherwise empty.
     """
 
     plan: Trajectory
@@ -64,6 +68,7 @@ class Fastest(Displayed):
     limited: Limited
     rejection: str = ""
     searched: tuple[float, float] = (0.0, math.inf)
+    statement: str = ""
 
     @property
     def duration(self) -> float:
@@ -89,7 +94,8 @@ class Fastest(Displayed):
             [
                 ("minimum duration", f"{self.duration:.6g} s"),
                 ("active limit", f"{active} {self.active.bound.range}, at {self.active.time:.6g} s" if active else ""),
-                ("feasible durations", f"{sets}, the end of the search" if cut else sets),
+                ("feasible durations", "" if self.statement else f"{sets}, the end of the search" if cut else sets),
+                ("shorter durations", self.statement),
                 ("shorter plans rejected", self.rejection),
             ]
         )
@@ -124,6 +130,7 @@ def fastest(
     *,
     hold: Hold = "shape",
     durations: tuple[float, float] | None = None,
+    resolution: float = 1e-3,
     quantities: System | None = None,
 ) -> Fastest:
     """Plan of minimum duration under limits.
@@ -137,7 +144,8 @@ def fastest(
         Plan to be retimed, with a duration.
     limits, system
         Limits of derivatives, and of quantities of a system (a flat system, a
-        `Crane`, or a function of the jet), as for `margins`.
+        `Crane`, or a function of the jet) or of signals of a loop, as for
+        `margins`.
     hold : {"shape", "waypoints", "path"}, optional
         Property that is preserved. "shape": time is scaled uniformly, and the
         derivatives with it, including those at the ends. "waypoints": the times
@@ -149,6 +157,9 @@ def fastest(
         Interval of durations [s] of the search. Default: from 1/64 of the minimum
         that was found (of the plan's duration for "waypoints") to 64 times the
         plan's duration.
+    resolution : float, optional
+        Spare, relative to the range of a limit, up to which feasible durations
+        may be missed, for limits on signals of a linear loop.
     quantities : optional
         Deprecated name of `system`.
 
@@ -182,6 +193,18 @@ def fastest(
     of derivatives exactly, of quantities to the tolerance of `margins`, and up to
     rounding where a limit is attained at rest. Inside the intervals of
     `Fastest.feasible` limits were evaluated at samples only.
+
+    Limits on signals of a linear continuous loop, with fixed shape, are evaluated
+    with the exact response over all times, from rest at the first position of the
+    plan. At a fixed fraction of the plan, and at a fixed time after it, a signal
+    is a smooth function of the logarithm of the duration, and moments of the
+    loop's impulse responses bound its curvature. Between two durations the excess
+    over a limit is at least the chord minus this bound; intervals in which that is
+    positive are excluded, others are halved. No shorter duration of the search
+    satisfies every limit with a spare above `resolution`, as
+    `Fastest.statement` says; longer durations are not searched. With
+    hold="waypoints", and for other loops, the limits are evaluated at 24 durations
+    per octave.
 
     With fixed path the plan is not exactly time-optimal. The rate of the time law
     is a spline with 16 knots in the time of the given plan, not along its path, so
@@ -221,6 +244,8 @@ def fastest(
     if hold == "path":
         limited.check_constant('limits with hold="path"')
         _check_open(plan)
+    elif limited.loop_bounds:
+        return _fastest_in_loop(plan, limited, span, checked_finite(resolution, "resolution", above=0.0))
     uniform = fastest_within(plan, limited, span)
     if hold == "shape":
         return uniform
@@ -228,6 +253,25 @@ def fastest(
     law = with_fast_time_law(uniform.plan.shift(-plan.start), limited).shift(plan.start)
     retimed = fastest_within(law, limited, span)
     return replace(min(retimed, uniform, key=lambda found: found.duration), hold=hold)
+
+
+def _fastest_in_loop(
+    plan: Trajectory, limited: Limited, span: tuple[float, float] | None, resolution: float
+) -> Fastest:
+    """Plan of minimum duration with fixed shape under limits on signals of a loop."""
+    _check_rest(plan, limited)
+    minimum = _closed_form(plan, limited)
+    shapes = shapes_given(limited.loop)
+    if shapes is None:
+        return _searched(_Scaled(plan, limited), span or _around(max(plan.duration, minimum)), "shape", endless=False)
+    shortest, searched = LoopProblem(plan, limited, shapes, resolution).shortest(span, minimum)
+    found = _satisfying(limited, plan.retime, shortest)
+    statement = (
+        f"no duration from {searched[0]:.4g} s to {shortest:.6g} s satisfies every limit with a spare above "
+        f"{resolution:g} of its range"
+    )
+    feasible = ((found.duration, found.duration),)
+    return Fastest(found, limited.margins(found), feasible, "shape", limited, "", searched, statement)
 
 
 def _check_open(plan: Trajectory) -> None:
@@ -256,7 +300,7 @@ class _Scaled:
         return self._plan.retime(duration)
 
     def excess(self, duration: float) -> float:
-        return self.limited.excess(self._samples.retimed(duration))
+        return _excess(self.limited, self._samples.retimed(duration), lambda: self.plan(duration))
 
 
 class _Replanned:
@@ -276,7 +320,14 @@ class _Replanned:
         return retimed.through(given.scaled(moved.time, 1.0) for given, moved in pairs)
 
     def excess(self, duration: float) -> float:
-        return self.limited.excess(self.limited.sampled(self.plan(duration)))
+        plan = self.plan(duration)
+        return _excess(self.limited, self.limited.sampled(plan), lambda: plan)
+
+
+def _excess(limited: Limited, samples: Sampled, plan: Callable[[], Trajectory]) -> float:
+    """Excess over samples of a plan; with limits on signals of a loop also that of its response."""
+    found = limited.excess(samples)
+    return max(found, limited.exact_excess(plan())) if limited.loop_bounds and found <= 0.0 else found
 
 
 def fastest_within(plan: Trajectory, limited: Limited, span: tuple[float, float] | None = None) -> Fastest:

@@ -10,13 +10,14 @@ no duration in between satisfies all limits; otherwise the interval is halved.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
+from ctrlplan.planning.quantities import ShapesOf
 from ctrlplan.trajectories.common import Array
 
 _PER_OCTAVE = 12
@@ -33,22 +34,6 @@ _EXCHANGES = 12
 
 _NONE = -1e6
 """Excess of a sample without limit."""
-
-
-class Family(Protocol):
-    """Signals of a loop along a plan of fixed shape; see `ctrlplan.simulation.shape_family.ShapeFamily`."""
-
-    def samples(self, durations: Array) -> Array:
-        """Values (ndurations, nsignals, nsamples)."""
-
-    def curvature(self, low: Array, high: Array) -> Array:
-        """Bounds (nintervals, nsignals) of the second derivative by the logarithm of the duration."""
-
-    def extremes(self, duration: float) -> tuple[Array, Array, Array, Array]:
-        """Minima, maxima (nsignals,) and their times [s] since the start."""
-
-    def value(self, duration: float, signal: int, time: float) -> tuple[float, float]:
-        """Minimum and maximum of a signal at a time [s] since the start."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,13 +75,16 @@ class DurationSearch:
 
     Parameters
     ----------
-    family : Family
+    family : ShapesOf
         Signals as functions of the duration.
     sides : Sides
         Their limits.
     resolution : float
         Spare, relative to the range of a limit: intervals of feasible durations in
         which no duration has more for all limits may be missed.
+    others : callable, optional
+        Maps a duration to the excess over further limits, which are evaluated where
+        those of the signals are satisfied.
 
     Attributes
     ----------
@@ -104,9 +92,11 @@ class DurationSearch:
         Number of durations whose samples were computed.
     """
 
-    def __init__(self, family: Family, sides: Sides, resolution: float) -> None:
-        self._family, self._sides, self._resolution = family, sides, resolution
-        self._exact: dict[float, tuple[Array, Array]] = {}
+    def __init__(
+        self, family: ShapesOf, sides: Sides, resolution: float, others: Callable[[float], float] | None = None
+    ) -> None:
+        self._family, self._sides, self._resolution, self._others = family, sides, resolution, others
+        self._exact: dict[float, tuple[Array, Array, float]] = {}
         self.evaluated = 0
 
     @property
@@ -116,7 +106,12 @@ class DurationSearch:
 
     def worst(self, duration: float) -> float:
         """Maximum excess at a duration, from exact extrema."""
-        return float(self._excesses(duration)[0].max())
+        excess, _, others = self._excesses(duration)
+        return max(float(excess.max(initial=-math.inf)), others)
+
+    def nearest(self, low: float, high: float) -> float:
+        """Duration between two with the smallest excess, of those with exact extrema."""
+        return min(((self.worst(d), d) for d in self._exact if low <= d <= high), default=(0.0, high))[1]
 
     def shortest(self, low: float, high: float) -> float | None:
         """Minimum feasible duration between two; None if there is none."""
@@ -128,12 +123,14 @@ class DurationSearch:
                 return found
         return None
 
-    def _excesses(self, duration: float) -> tuple[Array, Array]:
-        """Excess of each side (nsides,) and its time [s] since the start."""
+    def _excesses(self, duration: float) -> tuple[Array, Array, float]:
+        """Excess of each side (nsides,) and its time [s] since the start; excess over the other limits."""
         if duration not in self._exact:
             low, high, time_low, time_high = self._family.extremes(duration)
             times = np.where(self._sides.sign > 0.0, time_high[self._sides.signal], time_low[self._sides.signal])
-            self._exact[duration] = self._sides.worst(low, high), times
+            excess = self._sides.worst(low, high)
+            others = -math.inf if self._others is None else self._others(duration)
+            self._exact[duration] = excess, times, others
         return self._exact[duration]
 
     def _in_block(self, durations: Array) -> float | None:
@@ -169,7 +166,7 @@ class DurationSearch:
     def _first_feasible(self, block: _Block, places: NDArray[np.intp]) -> float:
         """Smallest of some durations whose samples and exact extrema satisfy all limits; inf if there is none."""
         seen = [d for d in block.durations[places][block.tops[places] <= 0.0].tolist() if d not in self._exact]
-        known = [d for d, (excess, _) in self._exact.items() if excess.max() <= 0.0]
+        known = [d for d in self._exact if self.worst(d) <= 0.0]
         for duration in sorted(seen)[:_TESTS]:
             if duration < min(known, default=math.inf) and self.worst(duration) <= 0.0:
                 known.append(duration)
@@ -191,12 +188,14 @@ class DurationSearch:
         first, last = block.pairs(np.array([left]), None)
         for _ in range(_EXCHANGES):
             least, where = _lowest(first, last)
-            if least[0] > (0.0 if _ else -0.75 * self._resolution) and least[0] > -0.75 * self._resolution:
+            if least[0] > -0.75 * self._resolution and (least[0] > 0.0 or _):
                 return math.inf
             duration = float(ends[0] * (ends[1] / ends[0]) ** where[0])
-            excess, times = self._excesses(duration)
-            if excess.max() <= 0.0:
+            excess, times, _others = self._excesses(duration)
+            if self.worst(duration) <= 0.0:
                 return duration
+            if excess.max() <= 0.0:
+                return math.inf
             for side in np.flatnonzero(excess > 0.0).tolist():
                 own = [self._excess_at(float(end), side, float(times[side]), duration) for end in ends]
                 first, last = np.append(first, [[own[0]]], axis=1), np.append(last, [[own[1]]], axis=1)
@@ -219,7 +218,7 @@ class DurationSearch:
             for d, top in zip(block.durations.tolist(), block.tops.tolist(), strict=True)
             if d < feasible and top > 0.0
         ]
-        outside += [d for d, (excess, _) in self._exact.items() if d < feasible and excess.max() > 0.0]
+        outside += [d for d in self._exact if d < feasible and self.worst(d) > 0.0]
         if not outside:
             return feasible
         low = max(outside)

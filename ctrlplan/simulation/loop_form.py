@@ -190,7 +190,7 @@ class LoopForm:
         """
         constant, projection = self.settling(position)
         if self.integrators:
-            right, left = self.split[:2]
+            left = self.split[1]
             drift = self.nilpotent @ (left @ state) + left @ self.b[0] @ position
             terms = np.abs(self.nilpotent).sum() * scale + np.abs(left) @ np.abs(self.b[0]) @ np.abs(position)
             if np.any(np.abs(drift) > 1e-8 * (terms + 1e-300)):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 
 import numpy as np
@@ -77,6 +77,23 @@ class LoopQuantities(Displayed):
             integrator drifts after the plan.
         """
         return self.along(plan).response(plan)
+
+    def shapes_of(
+        self, plan: Trajectory, signals: Sequence[tuple[Mapping[str, float], bool, tuple[float, float] | None]]
+    ) -> ShapeFamily:
+        """Signals along plans of the shape of one, as functions of the duration.
+
+        Parameters
+        ----------
+        plan : Trajectory
+            Plan with a duration.
+        signals : sequence of (mapping of str to float, bool, (float, float) or None)
+            Weighted sums of signals by name, whether their time derivatives are
+            meant, and the part of the plan as fractions of its duration.
+        """
+        along = self.along(plan)
+        chosen = [LoopSignal(*one) for one in signals]
+        return ShapeFamily(along.form, along.signals, along.cells, along.start, chosen)
 
     def along(self, plan: Trajectory) -> AlongPlan:
         """The loop with the inputs connected to a plan, for this plan and others of the same axes."""
@@ -153,10 +170,6 @@ class AlongPlan:
         same = plan is self.plan
         cells, start = (self.cells, self.start) if same else (PlanCells(plan, self.form.order + 2), self.rest_at(plan))
         return ExactResponse(Motion(self.form, cells, plan.duration, start), self.signals, plan.start)
-
-    def shapes(self, chosen: Sequence[LoopSignal]) -> ShapeFamily:
-        """Signals as functions of the duration of the plan, with its shape fixed."""
-        return ShapeFamily(self.form, self.signals, self.cells, self.start, chosen)
 
 
 def loop_quantities(loop: System | Prepared, *, tail: float | None = None) -> LoopQuantities:

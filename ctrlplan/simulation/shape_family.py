@@ -97,9 +97,12 @@ class ShapeFamily:
         else:
             self.final = self.rows.static(plan.final, form.settled(state, plan.final, 0.0))
 
+    def curvature(self, low: Array, high: Array) -> Array:
+        """Bounds (nintervals, nsignals) of the second derivative by the logarithm of the duration, for intervals."""
+        return self._curvature(low, high)
+
     @cached_property
-    def curvature(self) -> Curvature:
-        """Bounds of the second derivative of the signals by the logarithm of the duration."""
+    def _curvature(self) -> Curvature:
         return Curvature(self.form, self.rows, self.plan)
 
     def extremes(self, duration: float) -> tuple[Array, Array, Array, Array]:
@@ -138,7 +141,7 @@ class ShapeFamily:
         whole = form.order > 0 or rows.order > 0 or form.integrators > 0 or any(one.during for one in self.chosen)
         if whole:
             return low, high, np.full(len(rows.c), math.inf)
-        sizes = self.curvature.envelope.largest(0, np.zeros(1))[0]
+        sizes = self._curvature.envelope.largest(0, np.zeros(1))[0]
         return low, high, np.asarray(sizes @ (2.0 * plan.peak(1)))
 
     def samples(self, durations: Array) -> Array:
