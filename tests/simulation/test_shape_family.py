@@ -62,7 +62,7 @@ def test_curvature_bound_by_differences(plan, seed):
 
 
 def test_envelope_and_its_moments_by_quadrature():
-    """The bound of a second-order impulse response is at least its magnitude, and its moments are those of the monotone bound."""
+    """The bound of an impulse response is at least its magnitude; its moments are those of a monotone bound."""
     rng = np.random.default_rng(1)
     loop = random_loop(rng, damping=0.1)
     along = cp.loop_quantities(system_of(loop)).along(QUINTIC)
