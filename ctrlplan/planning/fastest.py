@@ -29,8 +29,6 @@ if TYPE_CHECKING:
 
 Hold = Literal["shape", "waypoints", "path"]
 """Property of a plan that `fastest` preserves."""
-_PER_OCTAVE = 24
-"""Number of durations per octave at which limits are evaluated."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -124,6 +122,7 @@ def fastest(
     *,
     hold: Hold = "shape",
     durations: tuple[float, float] | None = None,
+    tail: float | None = None,
     quantities: System | None = None,
 ) -> Fastest:
     """Plan of minimum duration under limits.
@@ -136,8 +135,8 @@ def fastest(
     plan : Trajectory
         Plan to be retimed, with a duration.
     limits, system
-        Limits of derivatives, and of quantities of a system (a flat system, a
-        `Crane`, or a function of the jet), as for `margins`.
+        Limits of derivatives, of quantities of a system (a flat system, a `Crane`,
+        or a function of the jet), or of signals of a loop, as for `margins`.
     hold : {"shape", "waypoints", "path"}, optional
         Property that is preserved. "shape": time is scaled uniformly, and the
         derivatives with it, including those at the ends. "waypoints": the times
@@ -149,6 +148,8 @@ def fastest(
         Interval of durations [s] of the search. Default: from 1/64 of the minimum
         that was found (of the plan's duration for "waypoints") to 64 times the
         plan's duration.
+    tail : float, optional
+        Time after the plan [s] for which a loop is simulated, as for `margins`.
     quantities : optional
         Deprecated name of `system`.
 
@@ -166,7 +167,9 @@ def fastest(
         limited signal is infinite at a jump of a lower derivative. If the plan is
         shaped (`Shaper`), since another duration would change the delays. If the
         plan is closed and in motion at its ends and `hold` is "path", since the
-        velocities at the ends would differ.
+        velocities at the ends would differ. If limits of a loop are violated in
+        its steady state, or `hold` is "path", which requires limits that are
+        local in time.
     RuntimeError
         If a quantity is not resolved because it is noisy or oscillates.
 
@@ -182,6 +185,11 @@ def fastest(
     of derivatives exactly, of quantities to the tolerance of `margins`, and up to
     rounding where a limit is attained at rest. Inside the intervals of
     `Fastest.feasible` limits were evaluated at samples only.
+
+    Limits of signals of a loop are evaluated by its response to each plan, at 12
+    durations per octave, with the same refinement. A feasible interval that is
+    shorter than these, and is not preceded by a decrease of the violation, may
+    be missed.
 
     With fixed path the plan is not exactly time-optimal. The rate of the time law
     is a spline with 16 knots in the time of the given plan, not along its path, so
@@ -208,7 +216,7 @@ def fastest(
     """
     if hold not in get_args(Hold):
         raise ValueError(f"hold must be one of {', '.join(get_args(Hold))}, got {hold!r}")
-    limited = Limited(plan, limits, system_given(system, quantities))
+    limited = Limited(plan, limits, system_given(system, quantities), tail)
     limited.check_smooth(plan)
     extrema = plan.extrema()
     if not (extrema.maximum - extrema.minimum > 1e-14 * plan.peak()).any():
@@ -216,6 +224,8 @@ def fastest(
     span = None if durations is None else checked_pair(durations, "durations")
     if span is not None and not (span[0] > 0.0 and math.isfinite(span[1])):
         raise ValueError(f"durations must be above 0 and finite, got {span[0]:g} to {span[1]:g}")
+    if limited.loop_bounds:
+        return _fastest_in_loop(plan, limited, hold, span)
     if hold == "waypoints":
         return _searched(_Replanned(plan, limited), span or _around(plan.duration), hold, endless=False)
     if hold == "path":
@@ -248,6 +258,8 @@ def _check_open(plan: Trajectory) -> None:
 class _Scaled:
     """Plans of fixed shape as a function of duration: jets are scaled by powers."""
 
+    per_octave = 24
+
     def __init__(self, plan: Trajectory, limited: Limited) -> None:
         self._plan, self.limited = plan, limited
         self._samples = limited.sampled(plan)
@@ -261,6 +273,8 @@ class _Scaled:
 
 class _Replanned:
     """Plans with fixed derivatives at the waypoints as a function of duration."""
+
+    per_octave = 24
 
     def __init__(self, plan: Trajectory, limited: Limited) -> None:
         if not isinstance(plan, WaypointSpline):
@@ -292,6 +306,31 @@ def fastest_within(plan: Trajectory, limited: Limited, span: tuple[float, float]
     if limited.may_end:
         return _searched(scaled, span or _around(plan.duration), "shape", endless=False)
     return _searched(scaled, span or _span(scaled, plan.duration, minimum), "shape", endless=True)
+
+
+class _InLoop:
+    """Plans under limits that include those of signals of a loop."""
+
+    per_octave = 12
+
+    def __init__(self, family: _Scaled | _Replanned) -> None:
+        self.plan, self.limited, self._own = family.plan, family.limited, family.excess
+
+    def excess(self, duration: float) -> float:
+        own = self._own(duration)
+        return own if math.isinf(own) and own > 0.0 else max(own, self.limited.loop_excess(self.plan(duration)))
+
+
+def _fastest_in_loop(plan: Trajectory, limited: Limited, hold: Hold, span: tuple[float, float] | None) -> Fastest:
+    """Plan of minimum duration under limits of signals of a loop, by a scan of durations."""
+    if hold == "path":
+        limited.check_constant('limits with hold="path"')
+    _check_rest(plan, limited)
+    limited.check_ends(plan)
+    family = _InLoop(_Scaled(plan, limited) if hold == "shape" else _Replanned(plan, limited))
+    if span is None:
+        span = _span(family, plan.duration, _closed_form(plan, limited) if hold == "shape" else 0.0)
+    return _searched(family, span, hold, endless=False)
 
 
 def _check_rest(plan: Trajectory, limited: Limited) -> None:
@@ -331,7 +370,7 @@ def _around(duration: float) -> tuple[float, float]:
     return duration / 64.0, 64.0 * duration
 
 
-def _span(scaled: _Scaled, duration: float, minimum: float) -> tuple[float, float]:
+def _span(scaled: _Scaled | _InLoop, duration: float, minimum: float) -> tuple[float, float]:
     """Interval of durations of the search, from violated to satisfied limits."""
     excess, high = scaled.excess, max(duration, minimum)
     for _ in range(60):
@@ -348,11 +387,11 @@ def _span(scaled: _Scaled, duration: float, minimum: float) -> tuple[float, floa
     return max(low, 0.999 * minimum), 1.01 * high
 
 
-def _searched(family: _Scaled | _Replanned, span: tuple[float, float], hold: Hold, endless: bool) -> Fastest:
+def _searched(family: _Scaled | _Replanned | _InLoop, span: tuple[float, float], hold: Hold, endless: bool) -> Fastest:
     """Plan of minimum duration, and all feasible durations; `endless` if every slower plan is feasible."""
     limited = family.limited
     exact = cache(lambda duration: limited.exact_excess(family.plan(duration)))
-    count = max(9, math.ceil(_PER_OCTAVE * math.log2(span[1] / span[0])))
+    count = max(9, math.ceil(family.per_octave * math.log2(span[1] / span[0])))
     durations, excess = scan(family.excess, np.geomspace(*span, count), 0.0)
     feasible = []
     for low, high in _runs(excess <= 0.0):
@@ -423,9 +462,11 @@ def _satisfying(limited: Limited, plan_of: Callable[[float], Trajectory], durati
     raise ValueError(f"limits must be satisfied near {duration:.6g} s, got {limited.margins(plan).active}")
 
 
-def _reject(family: _Scaled | _Replanned, durations: Array, excess: Array) -> NoReturn:
+def _reject(family: _Scaled | _Replanned | _InLoop, durations: Array, excess: Array) -> NoReturn:
     span = f"from {durations[0]:.4g} to {durations[-1]:.4g} s"
     if math.isinf(excess.min()):
+        if family.limited.loop_bounds:
+            family.limited.margins(family.plan(float(durations[-1])))  # raises the reason
         raise ValueError(f"the plan must be feasible for the plant for some duration {span}, got none")
     nearest = float(durations[int(excess.argmin())])
     worst = family.limited.margins(family.plan(nearest)).active
