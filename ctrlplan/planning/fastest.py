@@ -12,11 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
-from ctrlplan._checks import checked_pair
+from ctrlplan._checks import checked_finite, checked_pair
 from ctrlplan._display import Displayed, Facts, Figure, Part
 from ctrlplan._renamed import FormerAttribute
 from ctrlplan.planning.limits import Limited, Margin, Margins
-from ctrlplan.planning.quantities import System, system_given
+from ctrlplan.planning.loop_fastest import LoopProblem
+from ctrlplan.planning.quantities import System, shapes_given, system_given
 from ctrlplan.planning.scalar_search import bisected, scan
 from ctrlplan.planning.time_law import with_fast_time_law
 from ctrlplan.trajectories import Trajectory, WaypointSpline
@@ -53,6 +54,9 @@ class Fastest(Displayed):
         is active; otherwise empty.
     searched : (float, float)
         Interval of durations [s] of the search.
+    statement : str
+        What is known of shorter durations, for limits on signals of a loop;
+        otherwise empty.
     """
 
     plan: Trajectory
@@ -62,6 +66,7 @@ class Fastest(Displayed):
     limited: Limited
     rejection: str = ""
     searched: tuple[float, float] = (0.0, math.inf)
+    statement: str = ""
 
     @property
     def duration(self) -> float:
@@ -87,7 +92,8 @@ class Fastest(Displayed):
             [
                 ("minimum duration", f"{self.duration:.6g} s"),
                 ("active limit", f"{active} {self.active.bound.range}, at {self.active.time:.6g} s" if active else ""),
-                ("feasible durations", f"{sets}, the end of the search" if cut else sets),
+                ("feasible durations", "" if self.statement else f"{sets}, the end of the search" if cut else sets),
+                ("shorter durations", self.statement),
                 ("shorter plans rejected", self.rejection),
             ]
         )
@@ -123,6 +129,7 @@ def fastest(
     hold: Hold = "shape",
     durations: tuple[float, float] | None = None,
     tail: float | None = None,
+    resolution: float = 1e-3,
     quantities: System | None = None,
 ) -> Fastest:
     """Plan of minimum duration under limits.
@@ -135,8 +142,9 @@ def fastest(
     plan : Trajectory
         Plan to be retimed, with a duration.
     limits, system
-        Limits of derivatives, of quantities of a system (a flat system, a `Crane`,
-        or a function of the jet), or of signals of a loop, as for `margins`.
+        Limits of derivatives, and of quantities of a system (a flat system, a
+        `Crane`, or a function of the jet) or of signals of a loop, as for
+        `margins`.
     hold : {"shape", "waypoints", "path"}, optional
         Property that is preserved. "shape": time is scaled uniformly, and the
         derivatives with it, including those at the ends. "waypoints": the times
@@ -150,6 +158,9 @@ def fastest(
         plan's duration.
     tail : float, optional
         Time after the plan [s] for which a loop is simulated, as for `margins`.
+    resolution : float, optional
+        Spare, relative to the range of a limit, up to which feasible durations
+        may be missed, for limits on signals of a linear loop.
     quantities : optional
         Deprecated name of `system`.
 
@@ -186,10 +197,20 @@ def fastest(
     rounding where a limit is attained at rest. Inside the intervals of
     `Fastest.feasible` limits were evaluated at samples only.
 
-    Limits of signals of a loop are evaluated by its response to each plan, at 12
-    durations per octave, with the same refinement. A feasible interval that is
-    shorter than these, and is not preceded by a decrease of the violation, may
-    be missed.
+    Limits on signals of a linear continuous loop, with fixed shape, are evaluated
+    with the exact response over all times, from rest at the first position of the
+    plan. At a fixed fraction of the plan, and at a fixed time after it, a signal
+    is a smooth function of the logarithm of the duration, and moments of the
+    loop's impulse responses bound its curvature. Between two durations the excess
+    over a limit is at least the chord minus this bound; intervals in which that is
+    positive are excluded, others are halved. No shorter duration of the search
+    satisfies every limit with a spare above `resolution`, as
+    `Fastest.statement` says; longer durations are not searched.
+
+    With hold="waypoints", and for other loops, limits on signals of a loop are
+    evaluated by its response at 12 durations per octave, with the same refinement
+    as those of quantities. A feasible interval that is shorter than these, and is
+    not preceded by a decrease of the violation, may be missed.
 
     With fixed path the plan is not exactly time-optimal. The rate of the time law
     is a spline with 16 knots in the time of the given plan, not along its path, so
@@ -225,7 +246,8 @@ def fastest(
     if span is not None and not (span[0] > 0.0 and math.isfinite(span[1])):
         raise ValueError(f"durations must be above 0 and finite, got {span[0]:g} to {span[1]:g}")
     if limited.loop_bounds:
-        return _fastest_in_loop(plan, limited, hold, span)
+        spare = checked_finite(resolution, "resolution", above=0.0)
+        return _fastest_in_loop(plan, limited, hold, span, spare)
     if hold == "waypoints":
         return _searched(_Replanned(plan, limited), span or _around(plan.duration), hold, endless=False)
     if hold == "path":
@@ -238,6 +260,29 @@ def fastest(
     law = with_fast_time_law(uniform.plan.shift(-plan.start), limited).shift(plan.start)
     retimed = fastest_within(law, limited, span)
     return replace(min(retimed, uniform, key=lambda found: found.duration), hold=hold)
+
+
+def _fastest_in_loop(
+    plan: Trajectory, limited: Limited, hold: Hold, span: tuple[float, float] | None, resolution: float
+) -> Fastest:
+    """Plan of minimum duration under limits on signals of a loop."""
+    if hold == "path":
+        limited.check_constant('limits with hold="path"')
+    _check_rest(plan, limited)
+    minimum = _closed_form(plan, limited) if hold == "shape" else 0.0
+    shapes = shapes_given(limited.loop)
+    if shapes is None or hold == "waypoints":
+        limited.check_ends(plan)
+        family = _InLoop(_Scaled(plan, limited) if hold == "shape" else _Replanned(plan, limited))
+        return _searched(family, span or _span(family, plan.duration, minimum), hold, endless=False)
+    shortest, searched = LoopProblem(plan, limited, shapes, resolution).shortest(span, minimum)
+    found = _satisfying(limited, plan.retime, shortest)
+    statement = (
+        f"no duration from {searched[0]:.4g} s to {shortest:.6g} s satisfies every limit with a spare above "
+        f"{resolution:g} of its range"
+    )
+    feasible = ((found.duration, found.duration),)
+    return Fastest(found, limited.margins(found), feasible, "shape", limited, "", searched, statement)
 
 
 def _check_open(plan: Trajectory) -> None:
@@ -319,18 +364,6 @@ class _InLoop:
     def excess(self, duration: float) -> float:
         own = self._own(duration)
         return own if math.isinf(own) and own > 0.0 else max(own, self.limited.loop_excess(self.plan(duration)))
-
-
-def _fastest_in_loop(plan: Trajectory, limited: Limited, hold: Hold, span: tuple[float, float] | None) -> Fastest:
-    """Plan of minimum duration under limits of signals of a loop, by a scan of durations."""
-    if hold == "path":
-        limited.check_constant('limits with hold="path"')
-    _check_rest(plan, limited)
-    limited.check_ends(plan)
-    family = _InLoop(_Scaled(plan, limited) if hold == "shape" else _Replanned(plan, limited))
-    if span is None:
-        span = _span(family, plan.duration, _closed_form(plan, limited) if hold == "shape" else 0.0)
-    return _searched(family, span, hold, endless=False)
 
 
 def _check_rest(plan: Trajectory, limited: Limited) -> None:

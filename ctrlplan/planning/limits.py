@@ -594,7 +594,11 @@ class Limited:
         still = self.at_rest(plan)
         times = self._start + self._duration * still.fractions
         for bound, values in zip(self.bounds, self.values(still.jet), strict=True):
-            if bound.in_loop or bound.kind == "rms" or np.isnan(values).any():
+            if bound.in_loop:
+                sides = [abs(side) for side in (bound.low, bound.high) if math.isfinite(side)]
+                yield replace(bound, slack=1e-12 * (1.0 + max(sides, default=0.0) / bound.scale))
+                continue
+            if bound.kind == "rms" or np.isnan(values).any():
                 yield replace(bound, slack=0.0)  # a signal that is singular at rest attains no limit there
                 continue
             rounding = 1e-12 * (1.0 + float(np.abs(values).max()) / bound.scale)

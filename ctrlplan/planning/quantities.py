@@ -67,6 +67,42 @@ class Loop(Protocol):
         """Signals along a plan; extrema of a simulated one may be those of samples."""
 
 
+class ShapesOf(Protocol):
+    """Signals of a loop along plans of one shape; see `ctrlplan.simulation.shape_family.ShapeFamily`."""
+
+    @property
+    def before(self) -> Array:
+        """Values (nsignals,) at rest before the plan."""
+
+    @property
+    def final(self) -> Array:
+        """Values (nsignals,) in steady state after it, nan where they depend on the duration."""
+
+    def step(self) -> tuple[Array, Array, Array]:
+        """Minima and maxima for a step, and rates by which those of a short plan differ per second."""
+
+    def samples(self, durations: Array) -> Array:
+        """Values (ndurations, nsignals, nsamples)."""
+
+    def curvature(self, low: Array, high: Array) -> Array:
+        """Bounds (nintervals, nsignals) of the second derivative by the logarithm of the duration."""
+
+    def extremes(self, duration: float) -> tuple[Array, Array, Array, Array]:
+        """Minima, maxima (nsignals,) and their times [s] since the start."""
+
+    def value(self, duration: float, signal: int, time: float) -> tuple[float, float]:
+        """Minimum and maximum of a signal at a time [s] since the start."""
+
+
+class Shapes(Protocol):
+    """Protocol of a loop with a fast response to plans of one shape."""
+
+    def shapes_of(
+        self, plan: Trajectory, signals: Sequence[tuple[Mapping[str, float], bool, tuple[float, float] | None]]
+    ) -> ShapesOf:
+        """Weighted sums of signals, or their rates, within fractions of the plan, as functions of its duration."""
+
+
 class HasQuantities(Protocol):
     """Protocol of plants whose signals are functions of the jet of a plan, such as a flat system or a crane."""
 
@@ -134,6 +170,11 @@ def loop_of(system: Any, tail: float | None = None) -> Loop | None:
     from ctrlplan.simulation.loop_quantities import loop_quantities
 
     return loop_quantities(system, tail=tail)
+
+
+def shapes_given(loop: Any) -> Shapes | None:
+    """The loop, if its response to plans of one shape is known as a function of the duration."""
+    return loop if callable(getattr(loop, "shapes_of", None)) else None
 
 
 def system_given(system: System | None, quantities: System | None) -> System | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,13 +30,13 @@ class _Part:
     """Cells of one length.
 
     Starts [s] since the start of the plan, states (nstates, ncells) there, Taylor terms (nterms, naxes, ncells) of the
-    plan (none after its end), and the interval of time to which the cells belong.
+    plan, and the interval of time to which the cells belong.
     """
 
     level: int
     starts: Array
     states: Array
-    terms: Array | None
+    terms: Array
     first: float
     last: float
 
@@ -76,22 +76,10 @@ class Motion:
 
     def tail(self, rows: Rows) -> Iterator[tuple[Cells, Array]]:
         """Outputs after the plan, with bounds (nrows,) of their distance from the final values after each part."""
-        form, final = self.form, rows.static(self.plan.final, self.settled)
-        starts, levels = form.tail_schedule
-        state, first, count = self.end - self.settled, 0, _FIRST
-        while first < levels.size:
-            own = slice(first, first + count)
-            changes = {level: form.kernel(level).end[:, : form.nstates] for level in np.unique(levels[own]).tolist()}
-            states = _marched(state, changes, levels[own])
-            state, first, count = states[:, -1], first + count, 2 * count
-            parts = []
-            for level in changes:
-                of_level = levels[own] == level
-                begin = self.duration + starts[own][of_level]
-                parts.append(_Part(level, begin, states[:, :-1][:, of_level], None, self.duration, math.inf))
-            found = joined([_cells(form, rows, part) for part in parts])
-            found.series[0] += final[:, None]
-            yield found, form.decay_bounds(rows.c, state[:, None])[:, 0]
+        final = rows.static(self.plan.final, self.settled)
+        for cells, bounds in free_cells(self.form, rows.c, (self.end - self.settled)[:, None]):
+            cells.series[0] += final[:, None]
+            yield replace(cells, starts=self.duration + cells.starts), bounds
 
     def _segment(self, k: int, state: Array) -> Array:
         """Add the cells of a segment of the plan; return the state at its end."""
@@ -100,13 +88,13 @@ class Motion:
         starts, levels = form.schedule(length, segment.cell * self.duration)
         terms = np.empty((NTERMS + self.plan.order, form.naxes, starts.size))
         changes: dict[int, Array] = {}
-        forced = np.empty((n, starts.size))
+        forced = np.empty((starts.size, n))
         for level in np.unique(levels).tolist():
             own, end = levels == level, form.kernel(level).end
             terms[:, :, own] = segment.series(starts[own] / self.duration, 2.0**level / self.duration, len(terms))
             changes[level] = end[:, :n]
-            forced[:, own] = end[:, n:] @ terms[: NTERMS + form.order, :, own].reshape(-1, np.count_nonzero(own))
-        states = _marched(state, changes, levels, forced)
+            forced[own] = (end[:, n:] @ terms[: NTERMS + form.order, :, own].reshape(-1, np.count_nonzero(own))).T
+        states = _marched(state, changes, levels, forced).T
         for level in changes:
             own = levels == level
             begin = left + starts[own]
@@ -117,7 +105,44 @@ class Motion:
         last = _Part(int(levels[-1]), starts[-1:], states[:, -2:-1], terms[:, :, -1:], 0.0, length)
         nodes = _states_at_nodes(form, np.eye(n), last)[:, :, 0]
         basis = np.cos(np.arange(NODES) * math.acos(min(1.0, max(-1.0, 2.0 * rest - 1.0))))
-        return np.asarray(transform(nodes.T) @ basis)
+        return np.asarray(basis @ _series(nodes))
+
+
+def free_cells(form: LoopForm, c: Array, states: Array) -> Iterator[tuple[Cells, Array]]:
+    """Outputs c e^(A s) x of a loop without input, in more and more cells.
+
+    Parameters
+    ----------
+    form : LoopForm
+        The loop.
+    c : ndarray, shape (nrows, nstates)
+        Output matrix.
+    states : ndarray, shape (nstates, ncolumns)
+        Initial states x, without a part of the integrators.
+
+    Yields
+    ------
+    Cells
+        Of nrows * ncolumns signals, the columns of a row together.
+    ndarray, shape (nrows * ncolumns,)
+        Bounds of their magnitudes at all later times.
+    """
+    (nrows, n), m = c.shape, states.shape[1]
+    starts, levels = form.tail_schedule
+    first, count = 0, _FIRST
+    while first < levels.size:
+        own = levels[first : first + count]
+        kernels = {level: form.kernel(level) for level in np.unique(own).tolist()}
+        marched = _marched(states, {level: kernel.end[:, :n] for level, kernel in kernels.items()}, own)
+        parts = []
+        for level, kernel in kernels.items():
+            of_level, size = np.flatnonzero(own == level), 2.0**level
+            known = marched[of_level].transpose(1, 2, 0).reshape(n, -1)
+            nodes = (np.matmul(c @ kernel.nodes[:, :, :n], known) + c @ known).reshape(NODES, nrows * m, -1)
+            edge = np.ones(of_level.size)
+            parts.append(Cells(starts[first + of_level], size * edge, _series(nodes), -edge, edge))
+        states, first, count = marched[-1], first + count, 2 * count
+        yield joined(parts), form.decay_bounds(c, states).ravel()
 
 
 class ExactResponse(LoopResponse):
@@ -267,37 +292,41 @@ def _seen(cells: Cells, values: Array) -> tuple[Array, Array]:
 def _marched(
     state: Array, changes: Mapping[int, Array], levels: NDArray[np.intp], forced: Array | None = None
 ) -> Array:
-    """States (nstates, ncells + 1) at the starts of cells and at the end of the last."""
-    found = np.empty((levels.size + 1, state.size))
+    """States (ncells + 1, nstates, ...) at the starts of cells and at the end of the last."""
+    found = np.empty((levels.size + 1, *state.shape))
     found[0] = state
     for k, level in enumerate(levels.tolist()):
         change = changes[level] @ state
         if forced is not None:
-            change += forced[:, k]
+            change += forced[k]
         state = found[k + 1] = state + change
-    return found.T
+    return found
 
 
 def _states_at_nodes(form: LoopForm, c: Array, part: _Part) -> Array:
     """Combinations c of states (NODES, nrows, ncells) at the nodes of cells."""
     kernel, n = form.kernel(part.level).nodes, form.nstates
     nodes: Array = np.matmul(c @ kernel[:, :, :n], part.states) + c @ part.states
-    if part.terms is not None:
-        nodes += np.matmul(c @ kernel[:, :, n:], part.terms[: NTERMS + form.order].reshape(-1, part.starts.size))
+    nodes += np.matmul(c @ kernel[:, :, n:], part.terms[: NTERMS + form.order].reshape(-1, part.starts.size))
     return nodes
 
 
 def _cells(form: LoopForm, rows: Rows, part: _Part) -> Cells:
     """Outputs in cells of one length as series."""
     nodes, length = _states_at_nodes(form, rows.c, part), 2.0**part.level
-    if part.terms is not None:
-        for k in range(rows.order + 1):
-            if rows.d[:, k].any():
-                j = np.arange(len(part.terms) - k)
-                factor = _FACTORIALS[j + k] / _FACTORIALS[j] / length**k
-                own = np.tensordot(SIGMA[:, None] ** j * factor, part.terms[k:], axes=1)
-                nodes += np.matmul(rows.d[:, k], own)
-    series = np.moveaxis(transform(np.moveaxis(nodes, 0, -1)), -1, 0)
+    for k in range(rows.order + 1):
+        if rows.d[:, k].any():
+            j = np.arange(len(part.terms) - k)
+            factor = _FACTORIALS[j + k] / _FACTORIALS[j] / length**k
+            nodes += np.matmul(rows.d[:, k], np.tensordot(SIGMA[:, None] ** j * factor, part.terms[k:], axes=1))
     low = np.maximum(-1.0, 2.0 * (part.first - part.starts) / length - 1.0)
     high = np.minimum(1.0, 2.0 * (part.last - part.starts) / length - 1.0)
-    return Cells(part.starts, np.full(part.starts.size, length), series, low, high)
+    return Cells(part.starts, np.full(part.starts.size, length), _series(nodes), low, high)
+
+
+def _series(nodes: Array) -> Array:
+    """Chebyshev series of values (NODES, ...) at nodes."""
+    return np.asarray(np.tensordot(_TO_SERIES, nodes, axes=1))
+
+
+_TO_SERIES = transform(np.eye(NODES)).T

@@ -188,20 +188,23 @@ class LoopForm:
         ValueError
             If an integrator drifts, since its input is not zero.
         """
-        right, left, stable, stable_left = self.split
-        forced = self.b[0] @ position
-        found = stable @ np.linalg.solve(stable_left @ self.a @ stable, -(stable_left @ forced))
+        constant, projection = self.settling(position)
         if self.integrators:
-            own = left @ state
-            drift = self.nilpotent @ own + left @ forced
+            left = self.split[1]
+            drift = self.nilpotent @ (left @ state) + left @ self.b[0] @ position
             terms = np.abs(self.nilpotent).sum() * scale + np.abs(left) @ np.abs(self.b[0]) @ np.abs(position)
             if np.any(np.abs(drift) > 1e-8 * (terms + 1e-300)):
                 raise ValueError(
                     f"the input of an integrator of {self.name} must be 0 at the end of the plan, got a drift of its "
                     f"state: limits on signals of the loop are not satisfied at all later times"
                 )
-            found = found + right @ own
-        return np.asarray(found)
+        return np.asarray(constant + projection @ state)
+
+    def settling(self, position: Array) -> tuple[Array, Array]:
+        """State x1 and matrix P: the loop approaches x1 + P x from a state x, with the plan at a position."""
+        right, left, stable, stable_left = self.split
+        forced = stable_left @ self.b[0] @ position
+        return stable @ np.linalg.solve(stable_left @ self.a @ stable, -forced), right @ left
 
     def decay_bounds(self, c: Array, states: Array) -> Array:
         """Bounds (nrows, nstates_given) of |c e^(A s) x| for all s >= 0, for states without integrator part."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 
 import numpy as np
@@ -18,6 +18,7 @@ from ctrlplan.simulation.loop_inputs import Fed, fed_signals, same_axis, tracked
 from ctrlplan.simulation.loop_response import LoopResponse
 from ctrlplan.simulation.plan_cells import PlanCells
 from ctrlplan.simulation.prepared import Prepared, prepared_form
+from ctrlplan.simulation.shape_family import LoopSignal, ShapeFamily
 from ctrlplan.simulation.simulated_response import SimulatedQuantities
 from ctrlplan.trajectories import Trajectory
 
@@ -78,6 +79,23 @@ class LoopQuantities(Displayed):
             integrator drifts after the plan.
         """
         return self.along(plan).response(plan)
+
+    def shapes_of(
+        self, plan: Trajectory, signals: Sequence[tuple[Mapping[str, float], bool, tuple[float, float] | None]]
+    ) -> ShapeFamily:
+        """Signals along plans of the shape of one, as functions of the duration.
+
+        Parameters
+        ----------
+        plan : Trajectory
+            Plan with a duration.
+        signals : sequence of (mapping of str to float, bool, (float, float) or None)
+            Weighted sums of signals by name, whether their time derivatives are
+            meant, and the part of the plan as fractions of its duration.
+        """
+        along = self.along(plan)
+        chosen = [LoopSignal(*one) for one in signals]
+        return ShapeFamily(along.form, along.signals, along.cells, along.start, chosen)
 
     def along(self, plan: Trajectory) -> AlongPlan:
         """The loop with the inputs connected to a plan, for this plan and others of the same axes."""
@@ -195,7 +213,7 @@ def loop_quantities(loop: System | Prepared, *, tail: float | None = None) -> Lo
     >>> response = cp.loop_quantities(cp.plants.integrator_lag_loop(5.0)).quantities_of(move)
     >>> found = response.extremes({"y": 1.0})
     >>> round(found.low, 9), round(found.high, 4), round(found.time_high, 3)
-    (0.0, 1.4445, 1.894)
+    (0.0, 1.4445, 1.96)
     """
     prepared = prepared_form(loop)
     return LoopQuantities(prepared) if prepared.linear is not None else SimulatedQuantities(prepared, tail)

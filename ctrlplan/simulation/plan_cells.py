@@ -59,6 +59,12 @@ class Segment:
         found[:high] = moved.transpose(1, 2, 0) * ratio[:, None, None]
         return found
 
+    def jet(self, s: Array, order: int, derivatives: int) -> Array:
+        """Jets (order + 1, naxes (derivatives + 1), ntime) of the position, then of each derivative."""
+        found = self.series(s, 1.0, order + derivatives + 1)
+        found *= _FACTORIALS[: order + derivatives + 1, None, None]
+        return np.concatenate([found[k : k + order + 1] for k in range(derivatives + 1)], axis=1)
+
 
 class PlanCells:
     """Taylor polynomials of a plan in units of its duration, segment by segment.
@@ -106,18 +112,6 @@ class PlanCells:
         terms = found * (cell ** np.arange(count) / _FACTORIALS[:count])[:, None, None]
         used = int(np.flatnonzero(np.abs(terms).reshape(count, -1).any(axis=1)).max(initial=0)) + 1
         return Segment(left, length, terms[:used])
-
-    def jet(self, moment: float, origin: float, s: Array, order: int) -> Array:
-        """Jets (order + 1, naxes (self.order + 1), ntime) of the position, then of each derivative."""
-        segment = self.segments[self.index(moment)]
-        high = order + self.order
-        terms = segment.series(s + (origin - segment.left), 1.0, high + 1)
-        found = terms * _FACTORIALS[: high + 1, None, None]
-        return np.concatenate([found[k : k + order + 1] for k in range(self.order + 1)], axis=1)
-
-    def index(self, moment: float) -> int:
-        """Segment that contains a time."""
-        return int(np.clip(np.searchsorted(self.edges, moment, side="right") - 1, 0, len(self.segments) - 1))
 
     def jump(self, order: int) -> Array:
         """Jumps (naxes, nsegments + 1) of a derivative at the ends of the segments, rounding removed."""

@@ -1,0 +1,237 @@
+"""Responses of a loop to a plan of fixed shape, as functions of its duration."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from ctrlplan._types import Array
+from ctrlplan.simulation.cell_extrema import extrema_of_cells, joined
+from ctrlplan.simulation.exact import exact_states
+from ctrlplan.simulation.exact_response import Motion, extremes_of, free_cells, rate_rows, weighted
+from ctrlplan.simulation.impulse_envelope import Curvature
+from ctrlplan.simulation.loop_form import LoopForm, Rows
+from ctrlplan.simulation.plan_cells import PlanCells, Segment
+
+_SAMPLES = 256
+"""Number of samples along a plan."""
+
+_PER_SEGMENT = 36
+"""Minimum number of samples of a segment: fewer are not propagated together for all durations."""
+
+_TAIL_CELLS = 40
+"""Number of cells after the plan in which samples are taken."""
+
+_PER_CELL = 16
+"""Number of intervals of such a cell between samples."""
+
+_STACK = 64
+"""Number of durations that are propagated together."""
+
+
+@dataclass(frozen=True)
+class LoopSignal:
+    """Weighted sum of signals of a loop, or its time derivative, within a part of the plan.
+
+    Attributes
+    ----------
+    weights : mapping of str to float
+        Factors by the name of a signal.
+    rate : bool
+        Whether its time derivative is meant.
+    during : (float, float) or None
+        First and last time as fractions of the duration, 0 at the start of the
+        plan; None for all times.
+    """
+
+    weights: Mapping[str, float]
+    rate: bool = False
+    during: tuple[float, float] | None = None
+
+
+class ShapeFamily:
+    """Signals of a loop along a plan of fixed shape, as functions of its duration.
+
+    Parameters
+    ----------
+    form : LoopForm
+        The loop.
+    signals : mapping of str to Rows
+        Signals of the loop by name.
+    plan : PlanCells
+        The plan in units of its duration.
+    state : ndarray, shape (nstates,)
+        State at rest at the start of the plan.
+    chosen : sequence of LoopSignal
+        The signals that are considered.
+
+    Attributes
+    ----------
+    before : ndarray, shape (nsignals,)
+        Values at rest before the plan.
+    final : ndarray, shape (nsignals,)
+        Values after the plan, nan where they depend on the duration.
+    """
+
+    def __init__(
+        self,
+        form: LoopForm,
+        signals: Mapping[str, Rows],
+        plan: PlanCells,
+        state: Array,
+        chosen: Sequence[LoopSignal],
+    ) -> None:
+        self.form, self.plan, self.state, self.chosen = form, plan, state, tuple(chosen)
+        each = []
+        for one in chosen:
+            row = weighted(signals, one.weights)
+            each.append(rate_rows(form, row, plan, " + ".join(one.weights)) if one.rate else row)
+        self.rows = _stacked(each)
+        self.before = self.rows.static(plan.initial, state)
+        if form.integrators:
+            self.final = np.full(len(each), np.nan)
+        else:
+            self.final = self.rows.static(plan.final, form.settled(state, plan.final, 0.0))
+
+    def curvature(self, low: Array, high: Array) -> Array:
+        """Bounds (nintervals, nsignals) of the second derivative by the logarithm of the duration, for intervals."""
+        return self._curvature(low, high)
+
+    @cached_property
+    def _curvature(self) -> Curvature:
+        return Curvature(self.form, self.rows, self.plan)
+
+    def extremes(self, duration: float) -> tuple[Array, Array, Array, Array]:
+        """Minima, maxima (nsignals,) and their times [s] since the start, over all times, for a duration."""
+        motion = Motion(self.form, self.plan, duration, self.state)
+        found = np.empty((4, len(self.chosen)))
+        for during in {one.during for one in self.chosen}:
+            own = [i for i, one in enumerate(self.chosen) if one.during == during]
+            rows = Rows(self.rows.c[own], self.rows.d[own])
+            span = None if during is None else (during[0] * duration, during[1] * duration)
+            found[:, own] = extremes_of(motion, rows, during=span)
+        return found[0], found[1], found[2], found[3]
+
+    def value(self, duration: float, signal: int, time: float) -> tuple[float, float]:
+        """Values just before and after a time [s] since the start; after the plan the time is absolute."""
+        motion = Motion(self.form, self.plan, duration, self.state)
+        row = Rows(self.rows.c[signal : signal + 1], self.rows.d[signal : signal + 1])
+        low, high, *_ = extremes_of(motion, row, during=(time, time))
+        return float(low[0]), float(high[0])
+
+    def step(self) -> tuple[Array, Array, Array]:
+        """Minima and maxima (nsignals,) for a step, and how much per second of duration a plan may differ.
+
+        The rates are infinite for signals to which derivatives of the plan contribute.
+        """
+        form, plan, rows = self.form, self.plan, self.rows
+        final = form.settled(self.state, plan.final, math.inf)
+        values = np.stack([self.before, rows.static(plan.final, final)], axis=1)
+        parts = []
+        for cells, bounds in free_cells(form, rows.c, (self.state - final)[:, None]):
+            cells.series[0] += values[:, 1:]
+            parts.append(cells)
+            if np.all(bounds <= 1e-6 * np.ptp(values, axis=1)):
+                break
+        low, high, *_ = extrema_of_cells(joined(parts), values, np.array([0.0, math.inf]))
+        whole = form.order > 0 or rows.order > 0 or form.integrators > 0 or any(one.during for one in self.chosen)
+        if whole:
+            return low, high, np.full(len(rows.c), math.inf)
+        sizes = self._curvature.envelope.largest(0, np.zeros(1))[0]
+        return low, high, np.asarray(sizes @ (2.0 * plan.peak(1)))
+
+    def samples(self, durations: Array) -> Array:
+        """Values (ndurations, nsignals, nsamples) at fixed fractions of the plan, and at fixed times after it.
+
+        nan outside of the part of the plan that is considered.
+        """
+        parts = [self._samples(durations[k : k + _STACK]) for k in range(0, durations.size, _STACK)]
+        return np.concatenate(parts)
+
+    def _samples(self, durations: Array) -> Array:
+        form, plan = self.form, self.plan
+        grid, t = self._grid, durations[:, None, None]
+        b = np.concatenate([t ** (1 - k) * form.b[k] for k in range(form.order + 1)], axis=2)
+
+        state = np.broadcast_to(self.state, (durations.size, form.nstates))
+        parts = []
+        for segment, s in zip(plan.segments, grid.times, strict=True):
+
+            def jet(moment: float, origin: float, s: Array, order: int, segment: Segment = segment) -> Array:
+                return segment.jet(origin + s, order, form.order)
+
+            states = exact_states(t * form.a, b, jet, (), s, state)
+            state = states[:, :, -1]
+            parts.append(self.rows.c @ states)
+        along = np.concatenate(parts, axis=2)
+        for k, values in enumerate(grid.direct):
+            along += values / t**k
+        end = state
+        constant, projection = form.settling(plan.final)
+        settled = constant + end @ projection.T
+        offset = (settled @ self.rows.c.T + self.rows.d[:, 0] @ plan.final)[:, :, None]
+        moments, table = self._tail
+        after = ((end - settled) @ table.T).reshape(durations.size, len(self.chosen), -1) + offset
+        found = np.concatenate([along, after, offset], axis=2)
+        for i, one in enumerate(self.chosen):
+            if one.during is not None:
+                tau = np.empty((durations.size, found.shape[2]))
+                tau[:, : grid.fractions.size], tau[:, -1] = grid.fractions, math.inf
+                tau[:, grid.fractions.size : -1] = 1.0 + moments / durations[:, None]
+                found[:, i][(tau < one.during[0]) | (tau > one.during[1])] = math.nan
+        return found
+
+    @cached_property
+    def _grid(self) -> _Grid:
+        """Samples along the plan: evenly spaced in each segment, both ends included."""
+        rows, times, fractions, direct = self.rows, [], [], []
+        factors = np.array([math.factorial(k) for k in range(rows.order + 1)])[:, None, None]
+        for segment in self.plan.segments:
+            count = max(_PER_SEGMENT, 5 * segment.terms.shape[2], round(_SAMPLES * segment.length))
+            s = segment.length * np.arange(count + 1) / count
+            times.append(s)
+            fractions.append(segment.left + s)
+            jet = segment.series(s, 1.0, rows.order + 1) * factors
+            direct.append([rows.d[:, k] @ jet[k] for k in range(rows.order + 1)])
+        return _Grid(times, np.concatenate(fractions), np.concatenate(direct, axis=2))
+
+    @cached_property
+    def _tail(self) -> tuple[Array, Array]:
+        """Times after the plan of samples, and the matrix (nsignals * nsamples, nstates) of their deviations."""
+        n, count = self.form.nstates, 0
+        moments, tables = [np.zeros(0)], [np.zeros((len(self.chosen), 0, n))]
+        x = np.cos(np.pi * np.arange(_PER_CELL, -1, -1) / _PER_CELL)
+        for cells, _ in free_cells(self.form, self.rows.c, np.eye(n)):
+            basis = np.cos(np.arange(len(cells.series)) * np.arccos(x)[:, None])
+            values = np.tensordot(basis, cells.series, axes=1)
+            values = values.reshape(x.size, -1, n, cells.starts.size).transpose(1, 3, 0, 2)
+            tables.append(values.reshape(len(self.chosen), -1, n))
+            moments.append((cells.starts[:, None] + 0.5 * (1.0 + x) * cells.lengths[:, None]).ravel())
+            count += cells.starts.size
+            if count >= _TAIL_CELLS:
+                break
+        return np.concatenate(moments), np.concatenate(tables, axis=1).reshape(-1, n)
+
+
+@dataclass(frozen=True, eq=False)
+class _Grid:
+    """Samples along a plan.
+
+    Times since the start of each segment, fractions (nsamples,) of the plan, and direct contributions (order + 1,
+    nsignals, nsamples) of each derivative of the plan, in units of its duration.
+    """
+
+    times: list[Array]
+    fractions: Array
+    direct: Array
+
+
+def _stacked(parts: Sequence[Rows]) -> Rows:
+    """Rows of several parts together."""
+    order = max(rows.d.shape[1] for rows in parts)
+    d = [np.pad(rows.d, ((0, 0), (0, order - rows.d.shape[1]), (0, 0))) for rows in parts]
+    return Rows(np.concatenate([rows.c for rows in parts]), np.concatenate(d))
