@@ -15,7 +15,7 @@ from scipy.optimize import brentq
 from ctrlplan._checks import checked_finite, checked_pair
 from ctrlplan._display import Displayed, Facts, Figure, Part
 from ctrlplan._renamed import FormerAttribute
-from ctrlplan.planning.limits import Limited, Margin, Margins, Sampled
+from ctrlplan.planning.limits import Limited, Margin, Margins
 from ctrlplan.planning.loop_fastest import LoopProblem
 from ctrlplan.planning.quantities import System, shapes_given, system_given
 from ctrlplan.planning.scalar_search import bisected, scan
@@ -30,8 +30,6 @@ if TYPE_CHECKING:
 
 Hold = Literal["shape", "waypoints", "path"]
 """Property of a plan that `fastest` preserves."""
-_PER_OCTAVE = 24
-"""Number of durations per octave at which limits are evaluated."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -130,6 +128,7 @@ def fastest(
     *,
     hold: Hold = "shape",
     durations: tuple[float, float] | None = None,
+    tail: float | None = None,
     resolution: float = 1e-3,
     quantities: System | None = None,
 ) -> Fastest:
@@ -157,6 +156,8 @@ def fastest(
         Interval of durations [s] of the search. Default: from 1/64 of the minimum
         that was found (of the plan's duration for "waypoints") to 64 times the
         plan's duration.
+    tail : float, optional
+        Time after the plan [s] for which a loop is simulated, as for `margins`.
     resolution : float, optional
         Spare, relative to the range of a limit, up to which feasible durations
         may be missed, for limits on signals of a linear loop.
@@ -177,7 +178,9 @@ def fastest(
         limited signal is infinite at a jump of a lower derivative. If the plan is
         shaped (`Shaper`), since another duration would change the delays. If the
         plan is closed and in motion at its ends and `hold` is "path", since the
-        velocities at the ends would differ.
+        velocities at the ends would differ. If limits of a loop are violated in
+        its steady state, or `hold` is "path", which requires limits that are
+        local in time.
     RuntimeError
         If a quantity is not resolved because it is noisy or oscillates.
 
@@ -202,9 +205,12 @@ def fastest(
     over a limit is at least the chord minus this bound; intervals in which that is
     positive are excluded, others are halved. No shorter duration of the search
     satisfies every limit with a spare above `resolution`, as
-    `Fastest.statement` says; longer durations are not searched. With
-    hold="waypoints", and for other loops, the limits are evaluated at 24 durations
-    per octave.
+    `Fastest.statement` says; longer durations are not searched.
+
+    With hold="waypoints", and for other loops, limits on signals of a loop are
+    evaluated by its response at 12 durations per octave, with the same refinement
+    as those of quantities. A feasible interval that is shorter than these, and is
+    not preceded by a decrease of the violation, may be missed.
 
     With fixed path the plan is not exactly time-optimal. The rate of the time law
     is a spline with 16 knots in the time of the given plan, not along its path, so
@@ -231,7 +237,7 @@ def fastest(
     """
     if hold not in get_args(Hold):
         raise ValueError(f"hold must be one of {', '.join(get_args(Hold))}, got {hold!r}")
-    limited = Limited(plan, limits, system_given(system, quantities))
+    limited = Limited(plan, limits, system_given(system, quantities), tail)
     limited.check_smooth(plan)
     extrema = plan.extrema()
     if not (extrema.maximum - extrema.minimum > 1e-14 * plan.peak()).any():
@@ -239,13 +245,14 @@ def fastest(
     span = None if durations is None else checked_pair(durations, "durations")
     if span is not None and not (span[0] > 0.0 and math.isfinite(span[1])):
         raise ValueError(f"durations must be above 0 and finite, got {span[0]:g} to {span[1]:g}")
+    if limited.loop_bounds:
+        spare = checked_finite(resolution, "resolution", above=0.0)
+        return _fastest_in_loop(plan, limited, hold, span, spare)
     if hold == "waypoints":
         return _searched(_Replanned(plan, limited), span or _around(plan.duration), hold, endless=False)
     if hold == "path":
         limited.check_constant('limits with hold="path"')
         _check_open(plan)
-    elif limited.loop_bounds:
-        return _fastest_in_loop(plan, limited, span, checked_finite(resolution, "resolution", above=0.0))
     uniform = fastest_within(plan, limited, span)
     if hold == "shape":
         return uniform
@@ -256,14 +263,18 @@ def fastest(
 
 
 def _fastest_in_loop(
-    plan: Trajectory, limited: Limited, span: tuple[float, float] | None, resolution: float
+    plan: Trajectory, limited: Limited, hold: Hold, span: tuple[float, float] | None, resolution: float
 ) -> Fastest:
-    """Plan of minimum duration with fixed shape under limits on signals of a loop."""
+    """Plan of minimum duration under limits on signals of a loop."""
+    if hold == "path":
+        limited.check_constant('limits with hold="path"')
     _check_rest(plan, limited)
-    minimum = _closed_form(plan, limited)
+    minimum = _closed_form(plan, limited) if hold == "shape" else 0.0
     shapes = shapes_given(limited.loop)
-    if shapes is None:
-        return _searched(_Scaled(plan, limited), span or _around(max(plan.duration, minimum)), "shape", endless=False)
+    if shapes is None or hold == "waypoints":
+        limited.check_ends(plan)
+        family = _InLoop(_Scaled(plan, limited) if hold == "shape" else _Replanned(plan, limited))
+        return _searched(family, span or _span(family, plan.duration, minimum), hold, endless=False)
     shortest, searched = LoopProblem(plan, limited, shapes, resolution).shortest(span, minimum)
     found = _satisfying(limited, plan.retime, shortest)
     statement = (
@@ -292,6 +303,8 @@ def _check_open(plan: Trajectory) -> None:
 class _Scaled:
     """Plans of fixed shape as a function of duration: jets are scaled by powers."""
 
+    per_octave = 24
+
     def __init__(self, plan: Trajectory, limited: Limited) -> None:
         self._plan, self.limited = plan, limited
         self._samples = limited.sampled(plan)
@@ -300,11 +313,13 @@ class _Scaled:
         return self._plan.retime(duration)
 
     def excess(self, duration: float) -> float:
-        return _excess(self.limited, self._samples.retimed(duration), lambda: self.plan(duration))
+        return self.limited.excess(self._samples.retimed(duration))
 
 
 class _Replanned:
     """Plans with fixed derivatives at the waypoints as a function of duration."""
+
+    per_octave = 24
 
     def __init__(self, plan: Trajectory, limited: Limited) -> None:
         if not isinstance(plan, WaypointSpline):
@@ -320,14 +335,7 @@ class _Replanned:
         return retimed.through(given.scaled(moved.time, 1.0) for given, moved in pairs)
 
     def excess(self, duration: float) -> float:
-        plan = self.plan(duration)
-        return _excess(self.limited, self.limited.sampled(plan), lambda: plan)
-
-
-def _excess(limited: Limited, samples: Sampled, plan: Callable[[], Trajectory]) -> float:
-    """Excess over samples of a plan; with limits on signals of a loop also that of its response."""
-    found = limited.excess(samples)
-    return max(found, limited.exact_excess(plan())) if limited.loop_bounds and found <= 0.0 else found
+        return self.limited.excess(self.limited.sampled(self.plan(duration)))
 
 
 def fastest_within(plan: Trajectory, limited: Limited, span: tuple[float, float] | None = None) -> Fastest:
@@ -343,6 +351,19 @@ def fastest_within(plan: Trajectory, limited: Limited, span: tuple[float, float]
     if limited.may_end:
         return _searched(scaled, span or _around(plan.duration), "shape", endless=False)
     return _searched(scaled, span or _span(scaled, plan.duration, minimum), "shape", endless=True)
+
+
+class _InLoop:
+    """Plans under limits that include those of signals of a loop."""
+
+    per_octave = 12
+
+    def __init__(self, family: _Scaled | _Replanned) -> None:
+        self.plan, self.limited, self._own = family.plan, family.limited, family.excess
+
+    def excess(self, duration: float) -> float:
+        own = self._own(duration)
+        return own if math.isinf(own) and own > 0.0 else max(own, self.limited.loop_excess(self.plan(duration)))
 
 
 def _check_rest(plan: Trajectory, limited: Limited) -> None:
@@ -382,7 +403,7 @@ def _around(duration: float) -> tuple[float, float]:
     return duration / 64.0, 64.0 * duration
 
 
-def _span(scaled: _Scaled, duration: float, minimum: float) -> tuple[float, float]:
+def _span(scaled: _Scaled | _InLoop, duration: float, minimum: float) -> tuple[float, float]:
     """Interval of durations of the search, from violated to satisfied limits."""
     excess, high = scaled.excess, max(duration, minimum)
     for _ in range(60):
@@ -399,11 +420,11 @@ def _span(scaled: _Scaled, duration: float, minimum: float) -> tuple[float, floa
     return max(low, 0.999 * minimum), 1.01 * high
 
 
-def _searched(family: _Scaled | _Replanned, span: tuple[float, float], hold: Hold, endless: bool) -> Fastest:
+def _searched(family: _Scaled | _Replanned | _InLoop, span: tuple[float, float], hold: Hold, endless: bool) -> Fastest:
     """Plan of minimum duration, and all feasible durations; `endless` if every slower plan is feasible."""
     limited = family.limited
     exact = cache(lambda duration: limited.exact_excess(family.plan(duration)))
-    count = max(9, math.ceil(_PER_OCTAVE * math.log2(span[1] / span[0])))
+    count = max(9, math.ceil(family.per_octave * math.log2(span[1] / span[0])))
     durations, excess = scan(family.excess, np.geomspace(*span, count), 0.0)
     feasible = []
     for low, high in _runs(excess <= 0.0):
@@ -474,9 +495,11 @@ def _satisfying(limited: Limited, plan_of: Callable[[float], Trajectory], durati
     raise ValueError(f"limits must be satisfied near {duration:.6g} s, got {limited.margins(plan).active}")
 
 
-def _reject(family: _Scaled | _Replanned, durations: Array, excess: Array) -> NoReturn:
+def _reject(family: _Scaled | _Replanned | _InLoop, durations: Array, excess: Array) -> NoReturn:
     span = f"from {durations[0]:.4g} to {durations[-1]:.4g} s"
     if math.isinf(excess.min()):
+        if family.limited.loop_bounds:
+            family.limited.margins(family.plan(float(durations[-1])))  # raises the reason
         raise ValueError(f"the plan must be feasible for the plant for some duration {span}, got none")
     nearest = float(durations[int(excess.argmin())])
     worst = family.limited.margins(family.plan(nearest)).active

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ctrlplan._checks import check_kind
-from ctrlplan._display import Displayed, Part, Table, counted
+from ctrlplan._display import Displayed, Facts, Part, Table, counted
 from ctrlplan._renamed import FormerAttribute
 from ctrlplan.planning.bounds import Bound
 from ctrlplan.planning.naming import Naming
@@ -81,9 +81,12 @@ class Margins(Displayed):
     ----------
     rows : tuple of Margin
         One per limit.
+    note : str
+        How signals of a loop were computed; empty without a loop.
     """
 
     rows: tuple[Margin, ...]
+    note: str = ""
 
     @property
     def active(self) -> Margin:
@@ -105,6 +108,7 @@ class Margins(Displayed):
 
     def _describe(self) -> Iterator[Part]:
         yield f"Margins of {counted(len(self), 'limit')}: {self.active}"
+        yield Facts([("signals of the loop", self.note)])
         yield self.table()
 
     def table(self) -> Table:
@@ -133,7 +137,12 @@ class Margins(Displayed):
 
 
 def margins(
-    plan: Trajectory, limits: Mapping[str, object], system: System | None = None, *, quantities: System | None = None
+    plan: Trajectory,
+    limits: Mapping[str, object],
+    system: System | None = None,
+    *,
+    tail: float | None = None,
+    quantities: System | None = None,
 ) -> Margins:
     """Margins of a plan to limits over its whole interval.
 
@@ -141,19 +150,28 @@ def margins(
     ----------
     plan : Trajectory
         Plan with a duration.
-    limits : mapping of str to float, (float, float), Limits or array_like
-        Limits by the name of a derivative (x, x_d1, x_d2, ...) or of a quantity:
-        a number above 0 for the magnitude, a pair (minimum, maximum) with None
-        for no limit, or `Limits`. The names velocity, acceleration, jerk and
-        snap stand for the derivatives of every axis: with a number or a tuple
-        (minimum, maximum) for all axes, or with a list or array of naxes numbers
-        or of shape (naxes, 2) by axis. Limits of a derivative must include 0.
-    system : flat system, Crane or callable, optional
-        System of the limited quantities: a `control.flatsys.FlatSystem` (states
-        and inputs), a `Crane`, a plant with a method ``quantities``, or a
-        function that maps a jet (order + 1, naxes, ntime) to a mapping of names
-        to signals (ntime,). Quantities that the plan does not determine at rest
-        (heading and steering angle of a car) are nan there and rejected.
+    limits : mapping of str to float, (float, float), Limits, Region or array_like
+        Limits by the name of a derivative (x, x_d1, x_d2, ...), of a quantity, or
+        of a signal of a loop: a number above 0 for the magnitude, a pair (minimum,
+        maximum) with None for no limit, or `Limits`. The names velocity,
+        acceleration, jerk and snap stand for the derivatives of every axis: with a
+        number or a tuple (minimum, maximum) for all axes, or with a list or array
+        of naxes numbers or of shape (naxes, 2) by axis. Limits of a derivative
+        must include 0. A `Region` of two signals has any name. With a loop, a name
+        means the loop's signal; ``{"plan": {...}, "loop": {...}}`` says whose a
+        name is, which is required where an axis was given the name of another
+        signal of the loop by ``labels=``.
+    system : flat system, Crane, loop or callable, optional
+        System of the limited signals: a `control.flatsys.FlatSystem` (states and
+        inputs), a `Crane`, a plant with a method ``quantities``, a function that
+        maps a jet (order + 1, naxes, ntime) to a mapping of names to signals
+        (ntime,), or a loop (outputs and inputs; see `loop_quantities`).
+        Quantities that the plan does not determine at rest (heading and steering
+        angle of a car) are nan there and rejected.
+    tail : float, optional
+        Time after the plan [s] for which a loop that is sampled or nonlinear is
+        simulated; default: the duration of the plan. Signals of other loops are
+        exact, at all times.
     quantities : optional
         Deprecated name of `system`.
 
@@ -161,9 +179,10 @@ def margins(
     -------
     Margins
         With the attributes rows (a `Margin` per limit, the smallest first),
-        active (the smallest margin) and satisfied. Extrema of derivatives are
-        exact up to rounding, those of quantities (`Trajectory.extrema_of`) have
-        an error below 1e-9 of the larger of magnitude and limit.
+        active (the smallest margin), satisfied and note. Extrema of derivatives
+        are exact up to rounding, those of quantities (`Trajectory.extrema_of`)
+        have an error below 1e-9 of the larger of magnitude and limit, and those
+        of signals of a simulated loop below 1e-6 of their range.
 
     Raises
     ------
@@ -180,7 +199,7 @@ def margins(
     >>> cp.margins(move, {"y_d1": 1.0})
     <Margins of 1 limit: y_d1 within ±1: 0.9375 at 1 s, 6.25 % left>
     """
-    limited = Limited(plan, limits, system_given(system, quantities))
+    limited = Limited(plan, limits, system_given(system, quantities), tail)
     limited.check_smooth(plan)
     return limited.margins(plan)
 
@@ -379,11 +398,39 @@ class Limited:
             return -self.margins(plan).active.fraction
         except ValueError:
             return math.inf
+        except RuntimeError:
+            if not self.loop_bounds:
+                raise
+            return math.inf  # a loop that cannot be simulated, such as one that diverges
+
+    def loop_excess(self, plan: Trajectory) -> float:
+        """Maximum excess of signals of a loop, for a simulated one by samples."""
+        try:
+            return -min(row.fraction for row in self._loop_margins(plan, refined=False))
+        except (ValueError, RuntimeError):
+            return math.inf
+
+    def check_ends(self, plan: Trajectory) -> None:
+        """Raise for limits of a loop that are violated before the plan or in steady state, whatever its duration."""
+        if self.loop is None:
+            return
+        response = self.loop.quantities_of(plan)
+        for b in self.loop_bounds:
+            if b.kind != "value" or not b.is_constant:
+                continue
+            pairs = zip(("at the start", "in steady state"), response.ends(b.weights), strict=True)
+            for when, value in pairs:
+                if b.excess(np.array([value]))[0] > 1e-9:
+                    raise ValueError(
+                        f"limits must be satisfied {when}, at any duration, got {b.name} = {value:.6g} where it must "
+                        f"be {b.range}"
+                    )
 
     def margins(self, plan: Trajectory) -> Margins:
         """Margins over a whole plan."""
         rows = [*self._local_margins(plan), *self._loop_margins(plan)]
-        return Margins(tuple(sorted(rows, key=lambda row: row.fraction)))
+        note = "" if self.loop is None or not self.loop_bounds else self.loop.note
+        return Margins(tuple(sorted(rows, key=lambda row: row.fraction)), note)
 
     def _local_margins(self, plan: Trajectory) -> Iterator[Margin]:
         """Margins of derivatives and quantities."""
@@ -456,20 +503,19 @@ class Limited:
             square = after + (square - after) * plan.duration / b.period
         return _rms_margin(b, math.sqrt(square), plan)
 
-    def _loop_margins(self, plan: Trajectory) -> Iterator[Margin]:
+    def _loop_margins(self, plan: Trajectory, refined: bool = True) -> Iterator[Margin]:
         """Margins of signals of a loop."""
         if self.loop is None or not self.loop_bounds:
             return
-        response = self.loop.quantities_of(plan)
+        response = self.loop.quantities_of(plan, refined=refined)
         for b in self.loop_bounds:
             if b.kind == "rms":
                 if b.period is not None:
                     _check_period(b, plan)
                 yield _rms_margin(b, response.rms(b.terms[0][0].name, b.period), plan)
                 continue
-            weights = {signal.name: factor for signal, factor in b.terms}
             during = None if b.interval is None else self._interval(b, plan)
-            e = response.extremes(weights, during=during, rate=b.kind == "rate")
+            e = response.extremes(b.weights, during=during, rate=b.kind == "rate")
             yield _margin(b, e.low, e.high, e.time_low, e.time_high)
 
     def check_smooth(self, plan: Trajectory) -> None:

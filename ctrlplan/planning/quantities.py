@@ -16,10 +16,6 @@ Quantities = Callable[[Array], Mapping[str, Array]]
 class Response(Protocol):
     """Signals of a loop along one plan; see `ctrlplan.simulation.loop_response.LoopResponse`."""
 
-    @property
-    def note(self) -> str:
-        """How it was computed."""
-
     def extremes(
         self, weights: Mapping[str, float], *, during: tuple[float, float] | None = None, rate: bool = False
     ) -> Extremes:
@@ -27,6 +23,9 @@ class Response(Protocol):
 
     def rms(self, name: str, period: float | None = None) -> float:
         """Root of the mean square of a signal."""
+
+    def ends(self, weights: Mapping[str, float]) -> tuple[float, float]:
+        """Values at rest before the plan and in steady state after it; nan if not known."""
 
 
 class Extremes(Protocol):
@@ -60,8 +59,12 @@ class Loop(Protocol):
     def inputs(self) -> Sequence[str]:
         """Inputs in order."""
 
-    def quantities_of(self, plan: Trajectory) -> Response:
-        """Signals along a plan."""
+    @property
+    def note(self) -> str:
+        """How the signals are computed."""
+
+    def quantities_of(self, plan: Trajectory, *, refined: bool = True) -> Response:
+        """Signals along a plan; extrema of a simulated one may be those of samples."""
 
 
 class ShapesOf(Protocol):
@@ -146,11 +149,9 @@ def quantities_of(system: Any) -> Quantities | None:
             return quantities_of_flat_system(system)
         if callable(system) and not hasattr(system, "ninputs"):  # python-control's systems are callable
             return system
-    block = not isinstance(system, type) and hasattr(system, "ninputs")
     raise TypeError(
-        "system must be a flat system, a plant with a method quantities (as Crane has), or a function of a jet, got "
-        f"{system.__name__ if isinstance(system, type) else type(system).__name__}"
-        + ('; for k/(s (T s + 1)): lambda jet: {"u": (jet[1, 0] + T * jet[2, 0]) / k}' if block else "")
+        "system must be a flat system, a plant with a method quantities (as Crane has), a loop, or a function of a "
+        f"jet, got {system.__name__ if isinstance(system, type) else type(system).__name__}"
     )
 
 
@@ -169,7 +170,12 @@ def loop_of(system: Any, tail: float | None = None) -> Loop | None:
         return None
     if callable(getattr(system, "quantities_of", None)):
         return system
-    return None
+    flat = callable(getattr(system, "quantities", None)) or (hasattr(system, "forward") and hasattr(system, "reverse"))
+    if flat or not hasattr(system, "ninputs"):
+        return None
+    from ctrlplan.simulation.loop_quantities import loop_quantities
+
+    return loop_quantities(system, tail=tail)
 
 
 def shapes_given(loop: Any) -> Shapes | None:
