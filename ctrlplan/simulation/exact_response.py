@@ -197,7 +197,7 @@ class ExactResponse(LoopResponse):
         """Values before the plan and in steady state after it; see `LoopResponse`."""
         rows, motion = self._sum(weights), self._motion
         before, after = rows.static(motion.plan.initial, motion.start), rows.static(motion.plan.final, motion.settled)
-        return float(before[0]), float(after[0])
+        return float(before[0]), math.nan if motion.form.integrators else float(after[0])
 
     def _sum(self, weights: Mapping[str, float]) -> Rows:
         for name in weights:
