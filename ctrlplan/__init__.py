@@ -8,7 +8,8 @@ Plan a move
     TrigSpline, PolySpline    one spline through all waypoints: trigonometric, polynomial (alpha = 0)
     PiecewiseSpline           one spline for each segment, continuous in the derivatives left free
     SCurve, Trapezoid, Step   moves with limited jerk, with limited acceleration, without limits
-    Shaper                    input shaping of any plan, against a known mode
+    Shaper                    input shaping of any plan, against known modes or a measured spectrum
+    residual_spectrum         vibration that a plan leaves in a mode, by frequency; residual_plot draws it
     stack                     plans of single axes as one plan
     waypoints_from_csv        waypoints from a table, with times or at a speed
     load_trajectory, trajectory_from_dict    stored plans
@@ -33,9 +34,10 @@ Build the loop
     declare, traits_of        what the simulation must know of a block of your own -> BlockTraits
 Simulate
     simulate                  response of any python-control system -> SimulationResponse; exact if linear
-    prepare                   the built form, for many runs -> Prepared
+    prepare                   the built form, for many runs -> Prepared; .start(dt): step by step -> Stepper
     Event                     a limit whose crossing is recorded or ends the run -> Occurrence
     SolverError               raised where an integrator fails
+    read_log                  measured signals of a machine, for a Comparison, as a response
 Compare and report
     compare                   plans in one loop, with metrics, figures and a page -> Comparison
     benefit                   planning against steps, profiles and shaped steps -> Benefit
@@ -86,6 +88,7 @@ _EXPORTS = {
         "Waypoint",
         "WaypointSpline",
         "load_trajectory",
+        "residual_spectrum",
         "stack",
         "trajectory_from_dict",
         "waypoints_from_csv",
@@ -139,8 +142,10 @@ _EXPORTS = {
         "Prepared",
         "SimulationResponse",
         "SolverError",
+        "Stepper",
         "loop_quantities",
         "prepare",
+        "read_log",
         "simulate",
     ),
     "studies": (
@@ -156,7 +161,9 @@ _EXPORTS = {
         "monte_carlo",
         "sweep",
     ),
+    "flatness": ("DerivedFlatSystem", "FlatSystem", "NotFlatError", "flat_system"),
     "reports.explore": ("explore",),
+    "reports.vibration_figures": ("residual_plot",),
 }
 _HOME = {name: module for module, names in _EXPORTS.items() for name in names}
 

@@ -78,6 +78,7 @@ MADE = {
     "PiecewiseSpline": lambda: cp.PiecewiseSpline([*MOVE, cp.Waypoint(3, 0, 0, 0)]),
     "PolySpline": quintic,
     "Predictor": lambda: cp.Predictor(pendulum(), {"angle": (-1.0, 1.0)}, 10.0),
+    "Stepper": lambda: cp.prepare(swept(5.0)).start(0.1),
     "Prepared": lambda: cp.prepare(swept(5.0)),
     "Rectangle": lambda: cp.Rectangle((0.0, 1.0), (0.0, 1.0)),
     "Region": lambda: cp.Region(("speed", "torque"), [(0, 3), (100, 0), (0, -3), (-100, 0)]),

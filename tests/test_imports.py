@@ -138,4 +138,5 @@ def test_every_exception_of_the_import_contract_is_one_that_is_named():
                 "ctrlplan.planning.quantities -> ctrlplan.flatness.quantities",  # the adapter
                 "ctrlplan.trajectories.chosen -> ctrlplan.planning.alpha",  # TrigSpline(alpha="auto")
                 "ctrlplan.trajectories.chosen -> ctrlplan.planning.cycle",  # on_cycle(dt, limits)
+                "ctrlplan.trajectories.chosen -> ctrlplan.planning.stop",  # stop(time, limits)
             )

@@ -1,5 +1,8 @@
 """Differential flatness: states and inputs as functions of flat outputs."""
 
+from ctrlplan.flatness.derived import DerivedFlatSystem
+from ctrlplan.flatness.deriving import flat_system
+from ctrlplan.flatness.errors import NotFlatError
 from ctrlplan.flatness.system import FlatSystem
 
-__all__ = ["FlatSystem"]
+__all__ = ["DerivedFlatSystem", "FlatSystem", "NotFlatError", "flat_system"]

@@ -14,13 +14,14 @@ constants differ by orders of magnitude.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from fractions import Fraction
 from typing import NamedTuple
 
 import control.flatsys as fs
 import numpy as np
 
-from ctrlplan._types import Array, Value
+from ctrlplan._types import Array, System, Value
 
 Matrix = list[list[Fraction]]
 
@@ -141,3 +142,109 @@ def _fractions(matrix: Value) -> Matrix:
 
 def _floats(rows: Matrix) -> Array:
     return np.array([[float(value) for value in row] for row in rows])
+
+
+def brunovsky_outputs(system: System, columns: Sequence[int]) -> tuple[Array, bool]:
+    """Flat outputs of a linear system, and whether its own outputs are flat.
+
+    Parameters
+    ----------
+    system : control.StateSpace
+        In continuous time.
+    columns : sequence of int
+        The inputs that are controls.
+
+    Returns
+    -------
+    rows : ndarray, shape (ncontrols, nstates)
+        Flat outputs as functions of the states, from the controllability indices.
+    own : bool
+        Whether the outputs of the system are as many as controls and without
+        invariant zeros: then they are flat themselves.
+
+    Raises
+    ------
+    ValueError
+        If the system is not controllable with these inputs.
+    """
+    a, b = _fractions(system.A), _fractions(np.asarray(system.B)[:, list(columns)])
+    n, m = len(a), len(columns)
+    blocks: list[list[list[Fraction]]] = [[] for _ in range(m)]
+    basis: list[list[Fraction]] = []
+    latest = [[row[j] for row in b] for j in range(m)]
+    active = list(range(m))
+    while active:
+        for j in list(active):
+            if _rank([*basis, latest[j]]) > len(basis):
+                basis.append(latest[j])
+                blocks[j].append(latest[j])
+                latest[j] = [_dot(row, latest[j]) for row in a]
+            else:
+                active.remove(j)
+    if len(basis) < n:
+        raise ValueError(
+            f"a linear system must be controllable to be flat, got {system.name} with {n - len(basis)} states on which "
+            f"its inputs have no effect"
+        )
+    if any(not block for block in blocks):
+        raise ValueError(f"inputs of {system.name} must be independent, got columns of B that are not")
+    ordered = [vector for block in blocks for vector in block]
+    rows, last = [], -1
+    for block in blocks:
+        last += len(block)
+        right = [Fraction(int(k == last)) for k in range(n)]
+        rows.append(_solution(ordered, right, str(system.name)))
+    return _floats(rows), _has_no_zeros(system, columns)
+
+
+def _rank(vectors: Matrix) -> int:
+    rows = [list(vector) for vector in vectors]
+    rank = 0
+    for column in range(len(rows[0])):
+        pivot = next((i for i in range(rank, len(rows)) if rows[i][column]), None)
+        if pivot is None:
+            continue
+        rows[rank], rows[pivot] = rows[pivot], rows[rank]
+        for i in range(rank + 1, len(rows)):
+            if rows[i][column]:
+                factor = rows[i][column] / rows[rank][column]
+                rows[i] = [value - factor * other for value, other in zip(rows[i], rows[rank], strict=True)]
+        rank += 1
+    return rank
+
+
+def _has_no_zeros(system: System, columns: Sequence[int]) -> bool:
+    """Whether a square system has no finite invariant zeros, generically: the determinant of its pencil is constant."""
+    a, c = (np.asarray(part, dtype=float) for part in (system.A, system.C))
+    b, d = (np.asarray(part, dtype=float)[:, list(columns)] for part in (system.B, system.D))
+    if len(c) != len(columns):
+        return False
+    n = len(a)
+    left = _fractions(np.block([[a, b], [c, d]]))
+    size = n + len(c)
+
+    def determinant(s: int) -> Fraction:
+        rows = [[value - s * int(i == j and i < n) for j, value in enumerate(row)] for i, row in enumerate(left)]
+        return _determinant(rows, size)
+
+    # A polynomial of degree at most n is constant where n + 1 of its values are equal.
+    values = [determinant(s) for s in range(n + 1)]
+    scale = max(map(abs, values))
+    return bool(scale) and all(abs(value - values[0]) <= _NOTHING * scale for value in values)
+
+
+def _determinant(matrix: Matrix, size: int) -> Fraction:
+    rows = [list(row) for row in matrix]
+    value = Fraction(1)
+    for k in range(size):
+        pivot = next((i for i in range(k, size) if rows[i][k]), None)
+        if pivot is None:
+            return Fraction(0)
+        if pivot != k:
+            rows[k], rows[pivot], value = rows[pivot], rows[k], -value
+        value *= rows[k][k]
+        for i in range(k + 1, size):
+            if rows[i][k]:
+                factor = rows[i][k] / rows[k][k]
+                rows[i] = [entry - factor * other for entry, other in zip(rows[i], rows[k], strict=True)]
+    return value

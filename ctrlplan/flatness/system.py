@@ -176,14 +176,7 @@ class FlatSystem(Displayed, fs.FlatSystem):  # type: ignore[misc]
             below r_j jumps between the times, `start` has a wrong shape, or the
             maps are singular. The message states the signal and the time.
         """
-        plan = self._matched(plan)
-        times = checked_timepts(timepts)
-        if not np.isfinite(times).all():
-            raise ValueError("timepts must be finite, got inf")
-        if start is not None and real_array(start, "start").shape != (self.nstates,):
-            raise ValueError(f"start must have the shape ({self.nstates},), got {np.shape(start)}")
-        if times.size:
-            self._check_smooth(plan, float(times.min()), float(times.max()))
+        plan, times = self._along(plan, timepts, start)
         jet = plan.jet(times, max(self.orders))
         x, u = self.reverse([jet[: r + 1, j] for j, r in enumerate(self.orders)], self.params)
         for labels, rows in ((self.state_labels, x), (self.input_labels, u)):
@@ -213,6 +206,13 @@ class FlatSystem(Displayed, fs.FlatSystem):  # type: ignore[misc]
         """
         if self._own_quantities is not None:
             return self._own_quantities(jet)
+        values, known = self._checked_jet(jet)
+        x, u = self.reverse([values[: r + 1, j] for j, r in enumerate(self.orders)], self.params)
+        found = dict(zip(self.state_labels, np.asarray(x), strict=True))
+        return found | dict(zip(self.input_labels, np.asarray(u), strict=True)) if known else found
+
+    def _checked_jet(self, jet: ArrayLike) -> tuple[Array, bool]:
+        """Jet up to the highest order, and whether its last derivatives are known; unknown ones are 0."""
         values = real_array(jet, "jet")
         highest, count = max(self.orders), len(self.orders)
         if values.ndim < 2 or len(values) < highest or values.shape[1] != count:
@@ -223,9 +223,19 @@ class FlatSystem(Displayed, fs.FlatSystem):  # type: ignore[misc]
         known = len(values) > highest
         if not known:  # states do not depend on the last derivatives
             values = np.concatenate([values, np.zeros((1, *values.shape[1:]))])
-        x, u = self.reverse([values[: r + 1, j] for j, r in enumerate(self.orders)], self.params)
-        found = dict(zip(self.state_labels, np.asarray(x), strict=True))
-        return found | dict(zip(self.input_labels, np.asarray(u), strict=True)) if known else found
+        return values, known
+
+    def _along(self, plan: Trajectory, timepts: ArrayLike, start: ArrayLike | None) -> tuple[Trajectory, Array]:
+        """Plan in the order of the flat outputs, and times, checked."""
+        plan = self._matched(plan)
+        times = checked_timepts(timepts)
+        if not np.isfinite(times).all():
+            raise ValueError("timepts must be finite, got inf")
+        if start is not None and real_array(start, "start").shape != (self.nstates,):
+            raise ValueError(f"start must have the shape ({self.nstates},), got {np.shape(start)}")
+        if times.size:
+            self._check_smooth(plan, float(times.min()), float(times.max()))
+        return plan, times
 
     def _matched(self, plan: Trajectory) -> Trajectory:
         """Plan with the axes in the order of the flat outputs."""

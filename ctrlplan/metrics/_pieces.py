@@ -10,6 +10,10 @@ kink makes one of the two curvatures large, and the cubic would then oscillate b
 essentially non-oscillatory schemes (Harten et al., 1987, doi 10.1016/0021-9991(87)90031-3) the smoother side is
 used: :math:`c_k` is limited to a multiple of its neighbours, with the smaller curvature. For smooth signals the effect
 of the limit is of fourth order too, so that the order of the metrics is preserved.
+
+At the start of a record and after a jump or a kink, the curvature is known from later samples only. A response begins
+there, with dynamics that samples as far apart as its time constants do not show. An extremum before monotone samples,
+from the extrapolated curvature alone, is therefore no overshoot of a response.
 """
 
 from collections.abc import Callable, Iterator
@@ -37,7 +41,10 @@ NOWHERE = np.empty(0, dtype=np.intp)
 
 @dataclass(frozen=True)
 class Pieces:
-    """Cubics :math:`a + b s + c s^2 + d s^3`, 0 <= s <= 1, of m intervals, each array of shape (m,)."""
+    """Cubics :math:`a + b s + c s^2 + d s^3`, 0 <= s <= 1, of m intervals, each array of shape (m,).
+
+    `jump` marks intervals with a jump, `begins` those before monotone samples from which they are extrapolated.
+    """
 
     begin: Array
     step: Array
@@ -47,6 +54,7 @@ class Pieces:
     d: Array
     end: Array
     jump: NDArray[np.bool_]
+    begins: NDArray[np.bool_]
 
     def __getitem__(self, chosen: NDArray[np.generic] | tuple[NDArray[np.generic] | slice, ...]) -> "Pieces":
         """Return the pieces of some of the intervals."""
@@ -173,8 +181,8 @@ def maximum(t: Array, f: Array) -> float:
     return float(maxima(t, f[None])[0])
 
 
-def maxima(t: Array, f: Array) -> Array:
-    """Return the maximum of each of several signals (nrows, ntime)."""
+def maxima(t: Array, f: Array, extrapolated: bool = True) -> Array:
+    """Return the maximum of each of several signals (nrows, ntime), of all intervals or without those that begin."""
     top, bulges = f.max(axis=1), Bulges(t)
     near = [  # nan is included, as it cannot be excluded
         np.flatnonzero(~(np.maximum(row[:-1], row[1:]) + bulges(row) <= peak)) if np.isfinite(peak) else NOWHERE
@@ -182,7 +190,8 @@ def maxima(t: Array, f: Array) -> Array:
     ]
     chosen, rows = gathered(near)
     p = pieces(t, f, chosen, rows)
-    np.fmax.at(top, rows, np.fmax.reduce(p(p.cuts()), axis=0))
+    inner = np.fmax.reduce(p(p.cuts()), axis=0)
+    np.fmax.at(top, rows, inner if extrapolated else np.where(p.begins, -np.inf, inner))
     return top
 
 
@@ -197,20 +206,25 @@ def _cubics(t: Array, f: Array) -> Pieces:
     slope = rise / step
     curvature = _finite(np.diff(slope) / (t[..., 2:] - t[..., :-2]))
     if t.shape[-1] > 3:
-        bow, twist, jump = _shapes(t, curvature)
+        bow, twist, jump, begins = _shapes(t, curvature)
         if jump.any():
             jump &= _steep(slope)
     else:
         bow = np.repeat(curvature, 2, axis=-1) if t.shape[-1] == 3 else np.zeros_like(rise)
         twist, jump = np.zeros_like(rise), np.zeros(rise.shape, dtype=np.bool_)
+        begins = np.zeros_like(jump)
     square = step * step
     bow *= square
     twist *= square * step
-    return Pieces(t[..., :-1], step, f[..., :-1], rise - bow, bow - twist, twist, f[..., 1:], jump)
+    begins[..., :-1] &= rise[..., :-1] * rise[..., 1:] > 0
+    return Pieces(t[..., :-1], step, f[..., :-1], rise - bow, bow - twist, twist, f[..., 1:], jump, begins)
 
 
-def _shapes(t: Array, d: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Return the bracket of each cubic at the interval's start, its slope, and whether it was mainly cut."""
+def _shapes(t: Array, d: Array) -> tuple[Array, Array, NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return the bracket of each cubic at its start, its slope, whether it was mainly cut, and whether it begins.
+
+    A cubic begins if its curvature is that of the samples after the interval only.
+    """
     span = t[..., 3:] - t[..., :-3]
     change, left, right, size = np.diff(d), d[..., :-1], d[..., 1:], np.abs(d)
     third = _finite(change / span)
@@ -228,6 +242,8 @@ def _shapes(t: Array, d: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
     share = np.divide(cut, c, out=np.ones_like(c), where=c != 0)
     base[at], twist[at] = np.where(across, share * one, nearer), cut
     broken[at] = np.abs(c - cut) > np.abs(c) / 2
+    begins = np.zeros_like(steady)
+    begins[at] = ~across & (np.abs(one) > np.abs(other))
     bow = base + (t[..., 1:-2] - t[..., :-3]) * twist
 
     # An outer interval has the four samples of its neighbour and one side only: its curvature is reduced by what was
@@ -244,7 +260,13 @@ def _shapes(t: Array, d: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
     (first, begin, jump), (last, ending, drop) = outer
     first = first - (t[..., 2] - t[..., 0]) * begin
     last = last + (t[..., -2] - t[..., -3]) * ending
-    return _between(first, bow, last), _between(begin, twist, ending), _between(jump, broken, drop)
+    first_begins = np.ones_like(jump)
+    return (
+        _between(first, bow, last),
+        _between(begin, twist, ending),
+        _between(jump, broken, drop),
+        _between(first_begins, begins, ~first_begins),
+    )
 
 
 def _neighbours(third: Array, at: tuple[NDArray[np.intp], ...]) -> tuple[Array, Array]:

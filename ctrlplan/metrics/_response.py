@@ -133,7 +133,8 @@ def overshoot(
     .. math:: 100\,\max\bigl(0, \max_t \operatorname{sgn}(y_f - y_0)\,(y(t) - r(t))\bigr) / |y_f - y_0|
 
     With a `reference` r this is the overshoot on the error of section 2 of the paper; without, r is the final value.
-    Peaks are those of the interpolating cubics, with an error of fourth order in the sample spacing.
+    Peaks are those of the interpolating cubics, with an error of fourth order in the sample spacing. Where a response
+    begins, at the first sample or after a jump, a peak before monotone samples is not extrapolated.
 
     Parameters
     ----------
@@ -279,5 +280,5 @@ def _excess(
     with np.errstate(**QUIET):
         ahead = response - followed
         ahead *= side * np.sign(change)[..., None]
-        excess = maxima(t, ahead.reshape(-1, t.size)).reshape(lead)
+        excess = maxima(t, ahead.reshape(-1, t.size), extrapolated=False).reshape(lead)
         return plain(np.where(change == 0, np.nan, 100 * np.maximum(excess, 0.0) / np.abs(change)), lead)

@@ -15,7 +15,7 @@ from ctrlplan.planning.quantities import Shapes
 from ctrlplan.trajectories import Trajectory
 from ctrlplan.trajectories.common import Array
 
-_DOUBLINGS = 60
+_DOUBLINGS = 40
 """Maximum number of times by which the duration is doubled until all limits are satisfied."""
 
 _OCTAVES = 6
@@ -68,21 +68,31 @@ class LoopProblem:
 
     def _span(self, minimum: float) -> tuple[float, float]:
         """Durations between which the shortest feasible one lies."""
-        least = self._excluded()
-        high = max(self._plan.duration, minimum, least)
+        least = max(self._excluded(), minimum)
+        high = max(self._plan.duration, least)
         feasible = self.search.worst(high) <= 0.0
-        while feasible and 0.5 * high > max(minimum, least) and self.search.worst(0.5 * high) <= 0.0:
+        while feasible and 0.5 * high > least and self.search.worst(0.5 * high) <= 0.0:
             high *= 0.5
-            if high < 1e-12 * self._plan.duration:
-                raise ValueError("limits must include one that a shorter plan would violate, got none")
+            self._check_not_instant(high)
         for _ in range(_DOUBLINGS):
-            if feasible:
+            if feasible or self._is_too_slow(high):
                 break
             high *= 2.0
             feasible = self.search.worst(high) <= 0.0
         else:
-            self._reject(max(least, minimum), high)
-        return max(least, minimum) or high / 2.0**_OCTAVES, high
+            self._reject(least, high)
+        low = least or high
+        while not least and (low == high or self.search.worst(low) <= 0.0):
+            low /= 2.0**_OCTAVES
+            self._check_not_instant(low)
+        return low, high
+
+    def _check_not_instant(self, duration: float) -> None:
+        if duration < 1e-12 * self._plan.duration:
+            raise ValueError(
+                f"limits must include one that a shorter plan would violate, got none: a plan of {duration:.3g} s "
+                "satisfies all of them; pass durations=(low, high) for a search between two durations"
+            )
 
     def _excluded(self) -> float:
         """Duration [s] below which a limit is violated, since the response differs too little from that to a step."""
@@ -91,15 +101,24 @@ class LoopProblem:
             found = self.sides.worst(low, high) * self.sides.scale / rates[self.sides.signal]
         return float(np.where(np.isfinite(found), found, 0.0).max(initial=0.0))
 
+    def _is_too_slow(self, duration: float) -> bool:
+        """Whether no longer plan is feasible, since the static response to the plan violates a limit."""
+        excess = self.sides.worst(*self._family.static()) * self.sides.scale
+        distance = self._family.from_static(np.array([duration]))[0, self.sides.signal]
+        return bool(np.any(excess > distance))
+
     def _excess_of_others(self, duration: float) -> float:
         return self._limited.exact_excess(self._plan.retime(duration))
 
     def _reject(self, low: float, high: float) -> NoReturn:
         nearest = self.search.nearest(low, high)
         worst = self._limited.margins(self._plan.retime(nearest)).active
+        further = "for a wider search pass durations=(low, high)"
+        if self._is_too_slow(high):
+            further = "longer plans violate the limits as well, since the static response to the path does"
         raise ValueError(
             f"limits must be satisfied for some duration from {low:.4g} to {high:.4g} s, got none; nearest at "
-            f"{nearest:.4g} s: {worst}; for a wider search pass durations=(low, high)"
+            f"{nearest:.4g} s: {worst}; {further}"
         )
 
 

@@ -81,6 +81,12 @@ class ShapesOf(Protocol):
     def step(self) -> tuple[Array, Array, Array]:
         """Minima and maxima for a step, and rates by which those of a short plan differ per second."""
 
+    def static(self) -> tuple[Array, Array]:
+        """Minima and maxima (nsignals,) that the signals approach for long durations, nan if there are none."""
+
+    def from_static(self, durations: Array) -> Array:
+        """Bounds (ndurations, nsignals) of the distance from the signals that are approached for long durations."""
+
     def samples(self, durations: Array) -> Array:
         """Values (ndurations, nsignals, nsamples)."""
 

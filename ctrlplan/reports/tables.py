@@ -16,7 +16,7 @@ from ctrlplan.studies.grids import SAME, Grid
 from ctrlplan.studies.limits import limits_used
 from ctrlplan.studies.required_durations import RequiredDuration
 from ctrlplan.studies.sweep import Sweep
-from ctrlplan.studies.units import UNIT_SCALES, without_rounding
+from ctrlplan.studies.units import own_scale, without_rounding
 from ctrlplan.studies.verdicts import number, unit_of, verdicts
 
 _NONE = (math.nan,) * 5
@@ -121,7 +121,7 @@ def values_of(sweep: Sweep) -> list[Text | Table]:
     heads, units = [sweep.parameter], {name: sweep.unit_of(name) for name in names}
     for name, unit in units.items():
         heads.append(f"{sweep.title_of(name)} [{unit}]" if unit else sweep.title_of(name))
-    scales = {name: UNIT_SCALES.get(unit, 0.0) for name, unit in units.items()}
+    scales = {name: own_scale(sweep.measures[name]) for name in names}
     for plan, found in sweep.metrics.items():
         cells = [
             [number(without_rounding(value, scale)) for value in found[name][at].tolist()]

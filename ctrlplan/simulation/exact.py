@@ -147,6 +147,15 @@ def sampled_states(a: Array, b: Array, samples: Array, timepts: Array, initial: 
     return (out * scale).T
 
 
+def held_change(a: Array, b: Array, duration: float) -> Array:
+    """Matrix (nstates, nstates + ninputs): change of states over a duration, from states and constant inputs."""
+    scale, a, b, _ = _balanced(a[None], b[None], np.zeros((1, len(a))))
+    with np.errstate(all="ignore"):
+        change = changes_over(duration * a, duration * b, 1)[-1][0] if scale.size else np.zeros((0, b.shape[2]))
+    change[:, : scale.size] /= scale
+    return np.asarray(scale[:, None] * change)
+
+
 def matrix_product(left: Array, right: Array) -> Array:
     """Matrix product in which 0 times inf is 0 and undefined results are infinite.
 

@@ -18,7 +18,7 @@ from ctrlplan.simulation.events import Snapshot, Watched
 from ctrlplan.simulation.interpreted import Interpreted, SolverError
 from ctrlplan.simulation.job import Job, Record, fresh_job, with_event_times
 from ctrlplan.simulation.network import Network
-from ctrlplan.simulation.scales import PASSES, Scales, Tolerances, effects, output_uncertainty, remaining
+from ctrlplan.simulation.scales import PASSES, Scales, Tolerances, effects, output_uncertainty, remaining, rounding_of
 from ctrlplan.simulation.segments import Run, Solver, integrate, known_before
 from ctrlplan.simulation.signals import TimeSignal, breakpoints_of, signal_values
 from ctrlplan.symbolic.isolation import untouched
@@ -319,13 +319,9 @@ class Attempt(Generic[S]):
     def noise(self) -> Array:
         """Rounding errors of the derivatives along the run, times its duration."""
         t, x, time_values = self.visited()
-        rng = np.random.default_rng(0)
-        plain, found = self.on_trial(self.solver.rates, t, x, time_values, (len(x), -1)), np.zeros(len(x))
-        for _ in range(3):
-            near = x * (1.0 + np.finfo(float).eps * rng.choice([-1.0, 1.0], x.shape))
-            apart = np.abs(self.on_trial(self.solver.rates, t, near, time_values, (len(x), -1)) - plain)
-            found = np.maximum(found, np.where(np.isfinite(apart), apart, 0.0).max(axis=1, initial=0.0))
-        return found * float(self.run.times[-1] - self.run.times[0])
+        duration = float(self.run.times[-1] - self.run.times[0])
+        shape = (len(x), -1)
+        return duration * rounding_of(lambda near: self.on_trial(self.solver.rates, t, near, time_values, shape), x)
 
     def visited(self) -> tuple[Array, Array, Array]:
         """Some times and states of the run, and the values of the functions of time."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -28,6 +28,7 @@ from ctrlplan.traits import traits_of
 
 if TYPE_CHECKING:
     from ctrlplan.simulation.compiled import Compiled
+    from ctrlplan.simulation.stepper import Stepper
     from ctrlplan.symbolic.tracing import Trace
 
 _CACHE_SIZE = 16
@@ -155,6 +156,63 @@ class Prepared(Displayed):
     def discard(self, form: Compiled, why: str) -> DisagreementError:
         """Error to raise for a compiled form that is wrong; it is discarded."""
         return self._built_forms.discard(form, why)
+
+    def start(
+        self,
+        dt: float,
+        initial_state: ArrayLike | None = None,
+        *,
+        time: float = 0.0,
+        params: Mapping[str, object] | None = None,
+        rtol: float = 1e-8,
+    ) -> Stepper:
+        """Stepper: simulation one step at a time, with inputs that are held over each step.
+
+        Parameters
+        ----------
+        dt : float
+            Length of a step [s]; for a discrete system a multiple of its period.
+            If that is unspecified (dt = True), a step is one sample.
+        initial_state : array_like, shape (nstates,), float or None, optional
+            As for `simulate`: None is the declared initial state, 0 where none is.
+        time : float, optional
+            Start time [s], from which plans and samples of discrete blocks run.
+        params : mapping, optional
+            Parameters of the blocks.
+        rtol : float, optional
+            Relative tolerance of the numerical solvers, as for `simulate`.
+
+        Returns
+        -------
+        Stepper
+            With ``step(inputs)``, ``outputs(inputs)``, ``time`` and ``state``.
+
+        Raises
+        ------
+        TypeError
+            If a number is of the wrong type, or only python-control can evaluate a
+            block.
+        ValueError
+            If `dt` is not above 0, too small for the times, or no multiple of the
+            period of a discrete system; or if the state does not fit.
+
+        Warns
+        -----
+        UserWarning
+            If a system with states has no timebase (dt = None): it is stepped as
+            continuous-time.
+
+        Examples
+        --------
+        >>> import control as ct
+        >>> import ctrlplan as cp
+        >>> stepper = cp.prepare(ct.tf([1], [1, 1])).start(0.1)
+        >>> float(stepper.step(1.0)[0].round(6))  # 1 - exp(-0.1)
+        0.095163
+        """
+        from ctrlplan.simulation.stepper import started  # it imports this module
+
+        return started(prepared_form(self), dt, initial_state, time, params, rtol)
 
     def detached(self, names: Iterable[str] = ()) -> Prepared:
         """Same form without the blocks of python-control.

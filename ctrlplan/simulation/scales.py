@@ -162,6 +162,16 @@ def in_turn(shape: tuple[int, ...]) -> Array:
     return np.asarray(2.0 * (np.indices(shape).sum(axis=0) % 2) - 1.0)
 
 
+def rounding_of(rates: Callable[[Array], Array], states: Array) -> Array:
+    """Largest change (nstates,) of derivatives by the last digits of states (nstates, npoints)."""
+    rng = np.random.default_rng(0)
+    plain, found = rates(states), np.zeros(len(states))
+    for _ in range(3):
+        apart = np.abs(rates(states * (1.0 + np.finfo(float).eps * rng.choice([-1.0, 1.0], states.shape))) - plain)
+        found = np.maximum(found, np.where(np.isfinite(apart), apart, 0.0).max(axis=1, initial=0.0))
+    return np.asarray(found)
+
+
 def output_uncertainty(outputs: Callable[[Array], Array], states: Array, uncertainty: Array) -> tuple[Array, Array]:
     """Uncertainty of outputs from that of the states, and the outputs' ranges, shapes (noutputs,).
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import heapq
 from bisect import bisect_right
 from collections.abc import Callable, Sequence
+from copy import copy
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import partial
@@ -89,6 +90,20 @@ class DelayedSignal:
         self._pieces.append(piece)
         self._ends.append(piece.right)
 
+    @property
+    def length(self) -> int:
+        """Number of stored pieces."""
+        return len(self._pieces)
+
+    def shorten(self, length: int) -> None:
+        """Remove all but the first pieces."""
+        del self._pieces[length:], self._ends[length:]
+
+    def forget(self, now: float) -> None:
+        """Remove the pieces that are not read after a time."""
+        old = bisect_right(self._ends, now - self.delay - self.tolerance)
+        del self._pieces[:old], self._ends[:old]
+
     def analytic_at(self, moment: float, origin: float, s: Array) -> Array:
         """Stored values; segments end at their breakpoints."""
         return self.at(origin + s)
@@ -149,6 +164,7 @@ def integrate(
     resolution: float,
     marks: Sequence[float] = (),
     stops_after: Callable[[Array, Array], bool] | None = None,
+    course: Course | None = None,
 ) -> Run:
     """Run a network over increasing times.
 
@@ -166,9 +182,12 @@ def integrate(
         Relative accuracy of the stored signals of delays.
     marks : sequence of float, optional
         Further times [s] at which equations switch.
-    pause : callable, optional
+    stops_after : callable, optional
         Maps the times and states of a segment to whether the run may end after
         it; segments are then short.
+    course : Course, optional
+        Former runs that this one continues. Samples that are due at its end
+        belong to the next run.
 
     Raises
     ------
@@ -176,16 +195,21 @@ def integrate(
         If the solver fails or a state is not finite; the message gives the time.
     """
     first, last = float(times[0]), float(times[-1])
-    memory = _Memory(network, solver, time_signals, resolution)
-    endless = equations is not None and network.delays_feed_delays(equations.feeds)
-    hops = _MARKS if endless else _HOPS
-    marks = [*breakpoints_of(time_signals), *network.breakpoints, *marks]
-    schedule = _Schedule(network, time_signals, _fixed(marks, first, last, memory.delays, hops), first, last)
+    ends = course is None
+    if course is None:
+        course = Course(network, solver, time_signals, (first, last), resolution)
+        endless = equations is not None and network.delays_feed_delays(equations.feeds)
+        hops = _MARKS if endless else _HOPS
+        marks = [*breakpoints_of(time_signals), *network.breakpoints, *marks]
+        course.prolong(_fixed(marks, first, last, course.memory.delays, hops), first, last)
+        course.add_rounding(np.union1d(np.linspace(first, last, 257), course.schedule.marks))
+    else:
+        course.prolong(apart([first, *marks, last])[1:-1], first, last)
+    memory, schedule, rounding = course.memory, course.schedule, course.rounding
     longest = _longest(network, memory.delays, last - first)
     if stops_after is not None:
         longest = min(longest, (last - first) / 64.0)
     shortest = 1e-9 * (last - first) if stops_after is not None else np.inf
-    rounding = _rounding(time_signals, np.union1d(np.linspace(first, last, 257), schedule.marks))
     known: list[tuple[Array, Array]] = []  # times and states of each segment, without its end
     segments: list[tuple[float, Series]] = []
     span: list[Series] = []
@@ -220,12 +244,60 @@ def integrate(
         segments.append((left, series))
         requested = np.isin(grid, inside)
         known.append((np.append(left, grid[requested]), np.column_stack([x, found[:, requested]])))
-        before, x = x, schedule.sample(equations, right, found[:, -1])
+        before, x = x, found[:, -1]
+        if ends or right < last:
+            x = schedule.sample(equations, right, x)
         left, reach = right, min(longest, 2.0 * reach)
         if stops_after is not None and stops_after(np.append(segments[-1][0], grid), np.column_stack([before, found])):
             break
     known.append((np.array([left]), x[:, None]))
     return Run(np.concatenate([t for t, _ in known]), np.concatenate([s for _, s in known], axis=1), segments)
+
+
+class Course:
+    """What a run hands on to the next one that continues it.
+
+    Attributes
+    ----------
+    memory : _Memory
+        Stored inputs of the delays.
+    schedule : _Schedule
+        Breakpoints and sample times.
+    rounding : ndarray, shape (nsignals,)
+        Rounding errors of the signals that are functions of time.
+    """
+
+    def __init__(
+        self,
+        network: Network,
+        solver: Solver,
+        time_signals: Sequence[TimeSignal],
+        span: tuple[float, float],
+        resolution: float,
+    ) -> None:
+        self._time_signals = time_signals
+        self.memory = _Memory(network, solver, time_signals, resolution)
+        self.schedule = _Schedule(network, time_signals, *span)
+        self.rounding: Array = np.zeros(sum(signal.width for signal in time_signals))
+
+    def prolong(self, fixed: list[float], first: float, last: float) -> None:
+        """Continue to a later end, with the breakpoints before it."""
+        self.schedule.prolong(fixed, first, last)
+
+    def add_rounding(self, times: Array) -> None:
+        """Include the rounding errors of the signals at given times, of the size of those of their largest values."""
+        largest = np.abs(known_before(self._time_signals, times)).max(axis=1, initial=0.0)
+        errors = _ROUNDINGS * np.finfo(float).eps * np.where(np.isfinite(largest), largest, 0.0)
+        self.rounding = np.maximum(self.rounding, errors)
+
+    def state(self) -> tuple[SampleTimes, list[int]]:
+        """Sample times and lengths of the stored signals, for `restore`."""
+        return self.schedule.samples.copy(), self.memory.lengths()
+
+    def restore(self, state: tuple[SampleTimes, list[int]]) -> None:
+        """Return to an earlier state."""
+        self.schedule.samples = state[0].copy()
+        self.memory.shorten(state[1])
 
 
 def _longest(network: Network, delays: list[float], duration: float) -> float:
@@ -237,12 +309,6 @@ def _longest(network: Network, delays: list[float], duration: float) -> float:
         )
     declared = min((block.traits.longest for block in network.blocks), default=np.inf)
     return min(longest, max(declared, duration / _SEGMENTS))
-
-
-def _rounding(time_signals: Sequence[TimeSignal], times: Array) -> Array:
-    """Rounding errors of signals (nsignals,), of the size of those of their largest values."""
-    largest = np.abs(known_before(time_signals, times)).max(axis=1)
-    return np.asarray(_ROUNDINGS * np.finfo(float).eps * np.where(np.isfinite(largest), largest, 0.0))
 
 
 def _resolved(
@@ -283,6 +349,20 @@ class _Memory:
     def nodes(self, left: float, right: float) -> Array:
         """Times of a segment at which states are required."""
         return chebyshev_times(left, right, _WIDTH) if self._time_signals else np.empty(0)
+
+    def lengths(self) -> list[int]:
+        """Number of stored pieces of each delay."""
+        return [signal.length for signal in self._time_signals]
+
+    def shorten(self, lengths: list[int]) -> None:
+        """Remove the pieces that were stored since."""
+        for signal, length in zip(self._time_signals, lengths, strict=True):
+            signal.shorten(length)
+
+    def forget(self, now: float) -> None:
+        """Remove what is not read after a time."""
+        for signal in self._time_signals:
+            signal.forget(now)
 
     def record(self, left: float, right: float, series: Series, grid: Array, states: Array) -> bool:
         """Store a segment; False if it must be shorter to resolve its signals."""
@@ -331,27 +411,16 @@ class _Schedule:
     considered equal; the sample then reads the values after it.
     """
 
-    def __init__(
-        self, network: Network, time_signals: Sequence[TimeSignal], fixed: list[float], first: float, last: float
-    ) -> None:
-        self._fixed = [*fixed, last]
-        latest = max(abs(first), abs(last))
-        self._tolerance = max(4.0 * np.finfo(float).eps * latest, _TOLERANCE * (last - first))
+    def __init__(self, network: Network, time_signals: Sequence[TimeSignal], first: float, last: float) -> None:
         self._time_signals = time_signals
-        for signal in time_signals:
-            if isinstance(signal, DelayedSignal):
-                signal.tolerance = self._tolerance
-        self._samples: list[tuple[Fraction, int]] = []
-        self._periods: dict[int, Fraction] = {}
+        self.prolong([], first, last)
         for i in network.blocks_with("period"):
-            traits = network.blocks[i].traits
-            if float(traits.period or 0.0) < 4.0 * self._tolerance:
+            if float(network.blocks[i].period or 0.0) < 4.0 * self._tolerance:
                 raise ValueError(
-                    f"the period of {network.blocks[i].name} must exceed the rounding of times up to {latest:g} s, "
-                    f"got {traits.period:g} s"
+                    f"the period of {network.blocks[i].name} must exceed the rounding of times up to "
+                    f"{max(abs(first), abs(last)):g} s, got {network.blocks[i].period:g} s"
                 )
-            self._periods[i] = _fraction(traits.period or 0.0)
-            heapq.heappush(self._samples, (_fraction(first) + _fraction(traits.offset), i))
+        self.samples = SampleTimes(network, first)
 
     @property
     def marks(self) -> list[float]:
@@ -361,7 +430,7 @@ class _Schedule:
     def following(self, t: float) -> float:
         """The next time after t."""
         due = self.fixed_after(t)
-        sample = float(self._samples[0][0]) if self._samples else np.inf
+        sample = float(self.samples.next)
         return sample if sample <= min(due + self._tolerance, self._fixed[-1]) else due
 
     def fixed_after(self, t: float) -> float:
@@ -376,24 +445,74 @@ class _Schedule:
 
     def sample(self, equations: Interpreted | None, t: float, x: Array) -> Array:
         """State after the samples of all blocks that are due at t."""
-        due = []
-        while self._samples and float(self._samples[0][0]) <= t + self._tolerance:
-            instant, i = self._samples[0]
-            heapq.heapreplace(self._samples, (instant + self._periods[i], i))
-            due.append(i)
+        due = self.samples.due(t + self._tolerance)
         if not due or equations is None:
             return x
-        seen = [signal.at(np.array([self._after(signal, t)])) for signal in self._time_signals]
-        return equations.sampled(tuple(sorted(due)), t, x, np.concatenate([np.zeros((0, 1)), *seen])[:, 0])
+        return equations.sampled(due, t, x, values_after(self._time_signals, t, self._tolerance))
 
-    def _after(self, signal: TimeSignal, t: float) -> float:
-        """Time at which a signal is evaluated: its breakpoint if the two differ by rounding."""
-        marks = signal.breakpoints
+    def prolong(self, fixed: list[float], first: float, last: float) -> None:
+        """Continue to a later end, with the breakpoints up to it."""
+        self._fixed = [*fixed, last]
+        self._tolerance = time_tolerance(first, last)
+        for signal in self._time_signals:
+            if isinstance(signal, DelayedSignal):
+                signal.tolerance = self._tolerance
+
+
+class SampleTimes:
+    """Times offset + k period at which discrete blocks are sampled, as fractions.
+
+    Attributes
+    ----------
+    next : Fraction or float
+        Time of the next sample [s]; infinite if there is none.
+    """
+
+    def __init__(self, network: Network, first: float) -> None:
+        blocks = network.blocks_with("period")
+        traits = {i: network.blocks[i].traits for i in blocks}
+        self._periods = {i: as_fraction(traits[i].period or 0.0) for i in blocks}
+        self._times = [(as_fraction(first) + as_fraction(traits[i].offset), i) for i in blocks]
+        heapq.heapify(self._times)
+
+    @property
+    def next(self) -> Fraction | float:
+        """Time of the next sample [s]; infinite if there is none."""
+        return self._times[0][0] if self._times else np.inf
+
+    def due(self, until: float) -> tuple[int, ...]:
+        """Blocks with samples up to a time, which are then past."""
+        found = []
+        while self._times and float(self._times[0][0]) <= until:
+            instant, i = self._times[0]
+            heapq.heapreplace(self._times, (instant + self._periods[i], i))
+            found.append(i)
+        return tuple(sorted(found))
+
+    def copy(self) -> SampleTimes:
+        """Same times, which advance separately."""
+        other = copy(self)
+        other._times = list(self._times)
+        return other
+
+
+def values_after(time_signals: Sequence[TimeSignal], t: float, tolerance: float) -> Array:
+    """Signals (nsignals,) at a time, after a breakpoint that differs from it by rounding."""
+
+    def moment(marks: Array) -> float:
         k = int(np.searchsorted(marks, t))
-        return float(marks[k]) if k < len(marks) and marks[k] - t <= self._tolerance else t
+        return float(marks[k]) if k < len(marks) and marks[k] - t <= tolerance else t
+
+    seen = [signal.at(np.array([moment(signal.breakpoints)])) for signal in time_signals]
+    return np.asarray(np.concatenate([np.zeros((0, 1)), *seen])[:, 0])
 
 
-def _fraction(seconds: float) -> Fraction:
+def time_tolerance(first: float, last: float) -> float:
+    """Difference of two times of a run [s] up to which they are considered equal."""
+    return max(4.0 * np.finfo(float).eps * max(abs(first), abs(last)), _TOLERANCE * (last - first))
+
+
+def as_fraction(seconds: float) -> Fraction:
     """Fraction with a small denominator that a number represents; otherwise its exact value."""
     simple = Fraction(seconds).limit_denominator(_DENOMINATOR)
     return simple if abs(float(simple) - seconds) <= 1e-15 * abs(seconds) else Fraction(seconds)

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from ctrlplan._checks import real_array
 from ctrlplan._renamed import outside_stacklevel
-from ctrlplan._types import Array, System
+from ctrlplan._types import Array, Params, System
 from ctrlplan.simulation import methods
 from ctrlplan.simulation.budget import begin_run
 from ctrlplan.simulation.events import Events, Occurrence, Watched, crossings
@@ -161,9 +161,8 @@ def simulate(
     chosen = methods.named(methods.METHODS, method)
     if method != "auto":
         job = replace(job, reason=f'method "{method}" was requested')
-    _warn_of_unread(job)
-    if job.prepared.dt is None and job.prepared.nstates:
-        warnings.warn(_NO_TIMEBASE.format(job.prepared.name), UserWarning, stacklevel=outside_stacklevel())
+    warn_of_unread(job.prepared, job.params)
+    warn_of_timebase(job.prepared)
     return response_to(job, chosen)
 
 
@@ -192,7 +191,7 @@ def checked_job(
             raise ValueError(f"{label} must be a finite number above 0, got {value!r}")
     prepared = prepared_form(system)
     signals = input_signals(prepared.input_labels, inputs, times)
-    state = _checked_state(prepared, initial_state)
+    state = checked_state(prepared, initial_state)
     return Job(prepared, times, signals, state, dict(params or {}), rtol, atol, events, prepared.network)
 
 
@@ -205,15 +204,34 @@ def response_to(job: Job, chosen: Sequence[Method]) -> SimulationResponse:
         return _response(fresh, methods.recorded(replace(fresh, trials=False), chosen))
 
 
-def _warn_of_unread(job: Job) -> None:
+def checked_state(prepared: Prepared, initial_state: ArrayLike | None) -> Array:
+    """Initial state (nstates,) as given, declared or 0."""
+    if initial_state is None:
+        initial_state = 0.0 if prepared.initial_state is None else prepared.initial_state
+    state = real_array(initial_state, "initial_state")
+    count = prepared.nstates
+    if state.ndim and state.shape != (count,):
+        raise ValueError(f"initial_state must be a scalar or have {count} entries, got shape {state.shape}")
+    if not np.isfinite(state).all():
+        raise ValueError(f"initial_state must be finite, got {initial_state!r}")
+    return np.broadcast_to(state, (count,)).copy()
+
+
+def warn_of_unread(prepared: Prepared, params: Params) -> None:
     """Warn of parameters that no block reads, probably misspelt."""
-    for name, value in job.params.items():
-        if np.ndim(value) == 0 and not job.prepared.reads(name, value):
+    for name, value in params.items():
+        if np.ndim(value) == 0 and not prepared.reads(name, value):
             warnings.warn(
-                f"params {name!r} is read by no block of {job.prepared.name}",
+                f"params {name!r} is read by no block of {prepared.name}",
                 UserWarning,
                 stacklevel=outside_stacklevel(),
             )
+
+
+def warn_of_timebase(prepared: Prepared) -> None:
+    """Warn of a system with states and without a timebase."""
+    if prepared.dt is None and prepared.nstates:
+        warnings.warn(_NO_TIMEBASE.format(prepared.name), UserWarning, stacklevel=outside_stacklevel())
 
 
 def _response(job: Job, record: Record) -> SimulationResponse:
@@ -260,15 +278,3 @@ def _occurrences(record: Record) -> list[Occurrence]:
 def _value_at(record: Record, entry: Watched, k: int, t: float) -> float:
     """Signal of an event at a time between times[k] and times[k + 1] of a record."""
     return float(entry.value(record.snapshot(np.array([t]), record.state_at(k, t)[:, None]))[0])
-
-
-def _checked_state(prepared: Prepared, initial_state: ArrayLike | None) -> Array:
-    if initial_state is None:
-        initial_state = 0.0 if prepared.initial_state is None else prepared.initial_state
-    state = real_array(initial_state, "initial_state")
-    count = prepared.nstates
-    if state.ndim and state.shape != (count,):
-        raise ValueError(f"initial_state must be a scalar or have {count} entries, got shape {state.shape}")
-    if not np.isfinite(state).all():
-        raise ValueError(f"initial_state must be finite, got {initial_state!r}")
-    return np.broadcast_to(state, (count,)).copy()

@@ -319,7 +319,8 @@ def compare(
         Shape parameter of the standard trigonometric plan [rad].
     units : mapping of str to str, optional
         Units of axes, outputs and controls by label. Controls in different
-        units have separate metrics, and so have axes.
+        units, or of which some have none, have separate metrics, and so have
+        axes.
     parameters : mapping, optional
         Parameters shown in the report.
     title : str, optional

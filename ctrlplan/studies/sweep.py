@@ -32,10 +32,17 @@ from ctrlplan.studies.executing import (
     tried,
 )
 from ctrlplan.studies.experiment import Experiment, Metrics
-from ctrlplan.studies.measures import MEASURES, Measure, leading_metrics, wanted_measures
+from ctrlplan.studies.measures import MEASURES, Measure, leading_metrics, shown_measures, wanted_measures
 from ctrlplan.studies.roles import Role, role_of
 from ctrlplan.studies.running import CONTROL, Builder, System, is_builder
-from ctrlplan.studies.units import UNIT_SCALES, in_units, with_superscripts, without_rounding
+from ctrlplan.studies.units import (
+    Signals,
+    in_units,
+    listed_measures,
+    own_scale,
+    with_superscripts,
+    without_rounding,
+)
 from ctrlplan.trajectories import Trajectory, Waypoint
 
 if TYPE_CHECKING:
@@ -116,8 +123,8 @@ class Sweep(Displayed):
 
     def key_metrics(self) -> dict[str, list[str]]:
         """Rows of the key metrics by name, eight at most: those that print and pages show."""
-        names = dict.fromkeys(name for row in self.metrics.values() for name in row)
-        return leading_metrics({name: self.measures.get(name, Measure(name)) for name in names}, self._cells)
+        listed = {name: one for name, one in self.measures.items() if any(name in row for row in self.metrics.values())}
+        return leading_metrics(listed, self._cells)
 
     def metric_table(self) -> Table:
         """Minimum and maximum of the key metrics over the values, as print shows them."""
@@ -126,7 +133,7 @@ class Sweep(Displayed):
 
     def _cells(self, name: str, measure: Measure) -> list[str]:
         """Unit of a metric if it is known, and its range for each plan."""
-        cells, scale = [self.unit_of(name)], UNIT_SCALES.get(measure.unit, 0.0)
+        cells, scale = [self.unit_of(name)], own_scale(measure)
         for plan in self.metrics:
             column = self.column(plan, name)
             known = column[~np.isnan(column)]
@@ -336,17 +343,7 @@ def sweep(
         account = executed(run, points.tolist(), executor, timeout, parameter, progress)
         account.raise_if_none_ran("build")
     found = _swept(parameter, points, account)
-    acting, known = controls or [*filter(CONTROL.match, units or {})], dict(units or {})
-    labels = next(iter(experiment.plans.values())).labels
-    found = replace(
-        found,
-        roles={name: role_of(experiment.plans[name]) for name in found.metrics},
-        band=experiment.band,
-        units=known,
-        axes=labels if set(labels) & set(known) else tuple(name for name in known if name not in acting),
-        controls=tuple(acting),
-        measures=wanted_measures(experiment.measures),
-    )
+    found = _described(found, experiment, dict(units or {}))
     if found.interrupted:
         text = f"the sweep was interrupted: {found.values.size} of {points.size} values are returned"
         warnings.warn(text, UserWarning, stacklevel=outside_stacklevel())
@@ -374,6 +371,32 @@ def _swept(parameter: str, points: Array, account: Account[Metrics]) -> Sweep:
                 row.setdefault(name, np.full(reached.size, np.nan))[i] = value
     failures = tuple(Failure(i, {parameter: float(reached[i])}, failed.message) for i, failed in errors)
     return Sweep(parameter, reached, rows, failures, account.interrupted)
+
+
+def _described(found: Sweep, experiment: Experiment, units: dict[str, str]) -> Sweep:
+    """Sweep with the roles of its plans, and with titles and units of its metrics as a comparison lists them."""
+    names = [dict.fromkeys(row, 0.0) for row in found.metrics.values()]
+    acting = experiment.controls or _controls_in(names, experiment) or tuple(filter(CONTROL.match, units))
+    labels = experiment.axes
+    axes = labels if set(labels) & set(units) else tuple(name for name in units if name not in acting)
+    outputs = axes if len(axes) == len(labels) else labels
+    signals = Signals(dict(zip(labels, outputs, strict=True)), acting, units)
+    return replace(
+        found,
+        roles={name: role_of(experiment.plans[name]) for name in found.metrics},
+        band=experiment.band,
+        units=units,
+        axes=outputs,
+        controls=acting,
+        measures=listed_measures({}, shown_measures(experiment.measures, names), signals),
+    )
+
+
+def _controls_in(names: Iterable[Iterable[str]], experiment: Experiment) -> tuple[str, ...]:
+    """Controls by the names of their metrics, which several controls have each; empty for fewer."""
+    stems = [f"{name}_" for name, one in wanted_measures(experiment.measures).items() if one.of == "control"]
+    found = (key.removeprefix(stem) for row in names for key in row for stem in stems if key.startswith(stem))
+    return tuple(dict.fromkeys(found))
 
 
 def _metrics(experiment: Experiment, units: Mapping[str, str] | None, loop: System | Builder) -> Metrics:

@@ -37,6 +37,11 @@ def scientific(value: float, digits: int = 4) -> str:
     return f"{mantissa}·10{superscript(int(exponent))}".replace("-", "−")
 
 
+def own_scale(measure: Measure) -> float:
+    """Scale of a metric that does not depend on signals: of a percentage, or of a ratio of lengths; otherwise 0."""
+    return 1.0 if measure.of == "path" and not measure.unit else UNIT_SCALES.get(measure.unit, 0.0)
+
+
 ROUNDING = 1e-6
 """Difference of two values of a metric that counts as rounding, relative to the scale of the metric."""
 
@@ -81,9 +86,9 @@ class Signals:
         return {name: self.units.get(name, "") for name in self.controls}
 
     def separate(self, unit: str) -> dict[str, str]:
-        """Units of the signals of a measure if they are known to differ; otherwise empty."""
+        """Units of the signals of a measure unless all are equal, or all unknown; otherwise empty."""
         units = self.of_axes() if "{y}" in unit else self.of_controls() if "{u}" in unit else {}
-        return units if len(set(filter(None, units.values()))) > 1 else {}
+        return units if len(set(units.values())) > 1 else {}
 
 
 def output_unit(comparison: Comparison, output: str) -> str:
@@ -147,8 +152,7 @@ def scales_of(measures: Mapping[str, Measure], signals: Signals) -> dict[str, fl
     """
     found: dict[str, float] = {}
     for name, measure in measures.items():
-        size = 1.0 if measure.of == "path" and not measure.unit else _size(measure.unit, signals, None)
-        found |= {name: size}
+        found |= {name: own_scale(measure) or _size(measure.unit, signals, None)}
         for label in signals.separate(measure.unit):
             found[f"{name}_{label}"] = _size(measure.unit, signals, label)
     return {name: size for name, size in found.items() if 0.0 < size < np.inf}

@@ -9,7 +9,15 @@ from typing import TYPE_CHECKING
 from ctrlplan._renamed import FormerAttribute
 from ctrlplan.studies.limits import limits_sentence
 from ctrlplan.studies.roles import Role, Stability
-from ctrlplan.studies.units import ROUNDING, UNIT_SCALES, in_units, scientific, with_superscripts, without_rounding
+from ctrlplan.studies.units import (
+    ROUNDING,
+    UNIT_SCALES,
+    in_units,
+    output_unit,
+    scientific,
+    with_superscripts,
+    without_rounding,
+)
 
 if TYPE_CHECKING:  # comparisons show their verdicts
     from ctrlplan.studies.comparison import Comparison
@@ -181,8 +189,7 @@ def unit_of(comparison: Comparison, key: str) -> str:
 
 def unit_in(comparison: Comparison, unit: str) -> str:
     """Unit of a measure in the units of a comparison."""
-    first = next(iter(comparison.plans.values()))
-    y = _shared([comparison.units.get(label, "") for label in first.labels])
+    y = _shared([output_unit(comparison, output) for output in comparison.outputs])
     u = _shared([comparison.units.get(name, "") for name in comparison.controls])
     return in_units(with_superscripts(unit), y, u)
 

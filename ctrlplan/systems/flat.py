@@ -11,9 +11,14 @@ from collections.abc import Sequence
 import control as ct
 import control.flatsys as fs
 import numpy as np
+from numpy.typing import ArrayLike
 
+from ctrlplan._checks import checked_labels
 from ctrlplan._renamed import former_signature
 from ctrlplan._types import Params, Value
+from ctrlplan.flatness import FlatSystem
+from ctrlplan.flatness.derived import DerivedFlatSystem
+from ctrlplan.flatness.deriving import flat_system
 from ctrlplan.flatness.verify import (
     check_linearises,
     checked_plant,
@@ -23,7 +28,8 @@ from ctrlplan.flatness.verify import (
     random_probes,
     warn_of_output,
 )
-from ctrlplan.trajectories import derivative_name
+from ctrlplan.systems.derived_laws import create_derived_law, references
+from ctrlplan.systems.poles import checked_gains
 
 
 @former_signature("name", renamed={"flat_system": "flat"})
@@ -31,6 +37,9 @@ def create_flat_iosystem(
     flat: fs.FlatSystem,
     poles: Sequence[Value],
     *,
+    quasi_static: bool = False,
+    integral: bool = False,
+    start: ArrayLike | None = None,
     labels: Sequence[str] | str | None = None,
     suffix: str = "_ref",
     name: str = "flat_law",
@@ -46,20 +55,42 @@ def create_flat_iosystem(
     y_j^(r_j). The closed loop consists of chains of r_j integrators, in which
     the tracking errors satisfy the linear equation with the poles p_j.
 
-    No states. Inputs: for each flat output its references, y_ref, y_ref_d1, ...
+    A plant that static feedback does not linearise (`FlatSystem.extension` above 0)
+    gets a law with the states of the extension, w1, ..., which follow w' as the
+    maps give it for v; or, with `quasi_static`, a law without states, which
+    computes w from the states of the plant, the references, and the error
+    equations of the outputs that are closed at a lower order.
+
+    Inputs: for each flat output its references, y_ref, y_ref_d1, ...
     up to order r_j for one called y, as `create_source_iosystem` names its
     outputs with ``suffix="_ref"``; then the states of the plant by name.
-    Outputs: the inputs of the plant by name, such as u.
+    Outputs: the inputs of the plant by name, such as u. States: those of the extension
+    and, with `integral`, the integrals of the errors.
 
     Parameters
     ----------
     flat : control.flatsys.FlatSystem
-        Continuous-time plant that is linearisable by static feedback. The flag of
-        flat output j has r_j + 1 entries, of which y_j, ..., y_j^(r_j - 1) are
-        functions of the state only; the sum of all r_j is the number of states.
+        Continuous-time plant, as `flat_system` returns it, or with maps of its own.
+        These must linearise the plant by static feedback: the flag of flat output j
+        has r_j + 1 entries, of which y_j, ..., y_j^(r_j - 1) are functions of the
+        state only, and the sum of all r_j is the number of states. Otherwise, and
+        for the other options, the law is derived from its equations (extra
+        ``fast``), which must be functions of numpy.
     poles : sequence of sequences of complex
-        r_j poles [rad/s] for each flat output, closed under conjugation, with
-        negative real parts; a single sequence for a single flat output.
+        Poles [rad/s] of the tracking error of each flat output, closed under
+        conjugation, with negative real parts; a single sequence for a single flat
+        output. As many as its order r_j, or with `quasi_static` as many as the
+        order at which it is closed (their sum is the number of states of the
+        plant; an error states the numbers); one more with `integral`.
+    quasi_static : bool, optional
+        Whether the law has no states of the extension. It is singular at more
+        states than the law with them (heading at 90 degrees of a vehicle, for
+        example). Default False.
+    integral : bool, optional
+        Whether the law contains the integral of each error, so that a constant
+        disturbance leaves no constant error. Default False.
+    start : array_like, shape (extension,), optional
+        Initial states of the extension. Default: those at the operating point.
     labels : sequence of str or str, optional
         Names of the flat outputs. Default: the names of the plant's outputs if
         these are the flat outputs and have names, otherwise y, or y1, y2, ...
@@ -71,7 +102,7 @@ def create_flat_iosystem(
     Returns
     -------
     control.NonlinearIOSystem
-        Static, of any time base.
+        In continuous time; static, of any time base, without states.
 
     Raises
     ------
@@ -79,9 +110,10 @@ def create_flat_iosystem(
         If `flat` is not a `control.flatsys.FlatSystem`, or poles or labels have
         the wrong type.
     ValueError
-        If `flat` is not linearisable by static feedback: a derivative below the
-        last depends on an input (the message says which), the decoupling matrix
-        is singular, or the flags are too short; if `forward`, `reverse` and the
+        If the maps of `flat` do not linearise it by static feedback, and its
+        equations give no law either: a derivative below the last depends on an
+        input (the message says which), the decoupling matrix is singular, or the
+        flags are too short; if `forward`, `reverse` and the
         equations of the plant are inconsistent; or if poles or labels are
         wrong.
 
@@ -124,6 +156,21 @@ def create_flat_iosystem(
     >>> bool(abs(found.outputs - plan(found.time)).max() < 1e-7)
     True
     """
+    derived = _derived(flat, quasi_static or integral)
+    if derived is not None:
+        names = derived.flat_labels if labels is None else checked_labels(labels, len(derived.flat_labels))
+        return create_derived_law(
+            derived,
+            poles,
+            quasi_static=quasi_static,
+            integral=integral,
+            start=start,
+            labels=names,
+            suffix=suffix,
+            name=name,
+        )
+    if start is not None:
+        raise ValueError(f"start must be None for {flat.name}, whose law has no states of an extension")
     plant = checked_plant(flat, "flat")
     if labels is None:
         warn_of_output(flat)
@@ -133,18 +180,16 @@ def create_flat_iosystem(
     planned = planned_probes(plant, probes[0].orders)
     check_linearises(plant, planned, names)
     orders = probes[0].orders
-    gains = _gains(poles, orders)
-    references = [
-        derivative_name(label + suffix, k) for label, r in zip(names, orders, strict=True) for k in range(r + 1)
-    ]
+    gains = checked_gains(poles, orders)
+    wanted = references(names, orders, suffix)
     states = list(plant.system.state_labels)
-    if shared := sorted(set(references) & set(states)):
+    if shared := sorted(set(wanted) & set(states)):
         raise ValueError(f"labels and suffix must not give references the names of states, got {', '.join(shared)}")
     idle = np.zeros(plant.ninputs)
 
     def law(t: float, x: Value, u: Value, params: Params) -> Value:
         # Entries of the flag below the last derivative do not depend on the input.
-        measured = plant.forward(u[len(references) :], idle)
+        measured = plant.forward(u[len(wanted) :], idle)
         flag, first = [], 0
         for row, sigma in zip(measured, gains, strict=True):
             r = len(sigma)
@@ -165,69 +210,26 @@ def create_flat_iosystem(
             moved[i] = u[i] + idles * at
         return [value * (1.0 - idles) for value in law(t, x, moved, params)]
 
-    zero = np.zeros(len(references) + plant.nstates)
+    zero = np.zeros(len(wanted) + plant.nstates)
     return ct.nlsys(
         None,
         law_off_zero if finite_rows(law, 0.0, None, zero, {}) is None else law,
-        inputs=[*references, *states],
+        inputs=[*wanted, *states],
         outputs=list(plant.system.input_labels),
         dt=None,
         name=name,
     )
 
 
-def hurwitz_coefficients(poles: Sequence[complex], count: int, where: str = "") -> tuple[float, ...]:
-    """Coefficients of a monic polynomial with given stable roots.
-
-    Parameters
-    ----------
-    poles : sequence of complex
-        Roots [rad/s], closed under conjugation, with negative real parts.
-    count : int
-        Required number of poles.
-    where : str, optional
-        Place of the poles, appended to error messages: `` in poles[1]``.
-
-    Returns
-    -------
-    tuple of float
-        sigma_0, ..., sigma_(count - 1) of s^count + sum of sigma_k s^k, lowest
-        order first.
-
-    Raises
-    ------
-    TypeError
-        If poles are not numbers.
-    ValueError
-        If their number is not `count`, or they are not closed under conjugation,
-        not finite or not stable.
-
-    Examples
-    --------
-    >>> hurwitz_coefficients([-1, -2 + 1j, -2 - 1j], 3)
-    (5.0, 9.0, 5.0)
-    """
-    given = np.asarray(poles)
-    if given.dtype.kind not in "iufc":
-        raise TypeError(f"poles must be numbers, got {poles!r}{where}")
-    if given.shape != (count,):
-        raise ValueError(f"poles must be as many as the order of the flat output, {count}, got {given.tolist()}{where}")
-    if not np.isfinite(given).all() or not (given.real < 0.0).all():
-        raise ValueError(f"poles must be finite with negative real parts, got {given.tolist()}{where}")
-    # A polynomial is real exactly where its roots are closed under conjugation.
-    coefficients = np.atleast_1d(np.poly(given))
-    if (np.abs(coefficients.imag) > 1e-9 * np.poly(-np.abs(given))).any():
-        raise ValueError(f"poles must be closed under conjugation, got {given.tolist()}{where}")
-    return tuple(coefficients.real[:0:-1].tolist())
-
-
-def _gains(poles: Value, orders: Sequence[int]) -> list[tuple[float, ...]]:
-    """Coefficients of each flat output's polynomial."""
-    if not np.iterable(poles):
-        raise TypeError(f"poles must be one sequence for each flat output, got {poles!r}")
-    rows = list(poles)
-    if len(orders) == 1 and all(np.ndim(row) == 0 for row in rows):
-        return [hurwitz_coefficients(rows, orders[0])]
-    if len(rows) != len(orders):
-        raise ValueError(f"poles must be one sequence for each of {len(orders)} flat outputs, got {len(rows)}")
-    return [hurwitz_coefficients(p, r, f" in poles[{j}]") for j, (p, r) in enumerate(zip(rows, orders, strict=True))]
+def _derived(flat: fs.FlatSystem, options: bool) -> DerivedFlatSystem | None:
+    """Flat system for which the law is derived from equations; None for static maps of its own."""
+    if isinstance(flat, DerivedFlatSystem):
+        return flat
+    extended = isinstance(flat, FlatSystem) and flat.extension > 0
+    if not (extended or options):
+        return None
+    plant = checked_plant(flat, "flat")
+    names = flat.flat_labels if isinstance(flat, FlatSystem) else ()
+    if names and set(names) <= {*flat.output_labels, *flat.state_labels}:
+        return flat_system(flat, names)
+    return flat_system(flat, lambda x, u, params: [row[0] for row in plant.forward(x, u)])

@@ -11,14 +11,18 @@ Before its start a plan holds its first position, after its end the last, with
 all derivatives zero. Times are in seconds, signals are (channel, time).
 """
 
+from ctrlplan.trajectories.clipped import Clipped
 from ctrlplan.trajectories.combined import Joined, Scaled, Selected, Stacked, Sum, stack
 from ctrlplan.trajectories.continuity import Jump
 from ctrlplan.trajectories.extrema import Bounds, Extrema
 from ctrlplan.trajectories.files import derivative_name, load_trajectory, trajectory_from_dict
+from ctrlplan.trajectories.motion_profile import MotionProfile
 from ctrlplan.trajectories.piecewise import PiecewiseSpline
 from ctrlplan.trajectories.polynomial import PolySpline
 from ctrlplan.trajectories.profiles import SCurve, Trapezoid
+from ctrlplan.trajectories.residual import residual_spectrum
 from ctrlplan.trajectories.retimed import Retimed
+from ctrlplan.trajectories.shaper_factor import ShaperFactor
 from ctrlplan.trajectories.shaping import Shaper
 from ctrlplan.trajectories.step import Step
 from ctrlplan.trajectories.trajectory import Trajectory
@@ -30,10 +34,12 @@ from ctrlplan.trajectories.waypoint_spline import WaypointSpline
 
 __all__ = [
     "Bounds",
+    "Clipped",
     "Extrema",
     "FourierCoefficients",
     "Joined",
     "Jump",
+    "MotionProfile",
     "PiecewiseSpline",
     "PolySpline",
     "Retimed",
@@ -41,6 +47,7 @@ __all__ = [
     "Scaled",
     "Selected",
     "Shaper",
+    "ShaperFactor",
     "Stacked",
     "Step",
     "Sum",
@@ -52,6 +59,7 @@ __all__ = [
     "WaypointSpline",
     "derivative_name",
     "load_trajectory",
+    "residual_spectrum",
     "stack",
     "trajectory_from_dict",
     "waypoints_from_csv",

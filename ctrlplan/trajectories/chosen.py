@@ -1,4 +1,4 @@
-"""What planning chooses for a trajectory: its shape parameter, its duration in cycles.
+"""What planning chooses for a trajectory: its shape parameter, its duration in cycles, its stop under limits.
 
 The only module of this folder that imports from a later step, where planning is required.
 """
@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ctrlplan._checks import checked_finite, one_number
 from ctrlplan.trajectories.combined import Joined
@@ -65,3 +66,19 @@ def on_cycle(plan: Trajectory, dt: float, limits: Mapping[str, object] | None = 
     from ctrlplan.planning.cycle import lengthened
 
     return lengthened(plan, dt, counts, limits)
+
+
+def stopped(plan: Trajectory, time: float, limits: Mapping[str, object], synchronize: Any) -> Trajectory:
+    """Plan until a time, then to rest; as `Trajectory.stop`."""
+    from ctrlplan.planning import stop
+
+    return stop.stopped(plan, time, limits, synchronize)
+
+
+def at_velocity(
+    plan: Trajectory, time: float, velocity: ArrayLike, limits: Mapping[str, object], hold: float, synchronize: Any
+) -> Trajectory:
+    """Plan until a time, then to a constant velocity; as `Trajectory.to_velocity`."""
+    from ctrlplan.planning import stop
+
+    return stop.at_velocity(plan, time, velocity, limits, hold, synchronize)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
 
 FACTORIALS: Array = np.array([float(math.factorial(k)) for k in range(171)])
 FACTORIALS.flags.writeable = False

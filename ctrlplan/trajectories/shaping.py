@@ -5,18 +5,34 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Iterator
-from typing import Self
+from functools import reduce
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import comb
 
-from ctrlplan._checks import check_kind, checked_count, checked_finite, finite_vector, new_numbers
+from ctrlplan._checks import check_kind, checked_finite, finite_vector, new_numbers
 from ctrlplan._display import Displayed, Facts, Part, Table, counted, number, shortened
 from ctrlplan.trajectories.combined import Sum
 from ctrlplan.trajectories.common import Array, readonly
 from ctrlplan.trajectories.fields import Fields
+from ctrlplan.trajectories.shaper_factor import (
+    ShaperFactor,
+    checked_damping,
+    ei_factor,
+    fitted_factor,
+    mzv_factor,
+    residual_of,
+    three_hump_factor,
+    two_hump_factor,
+    zvd_factor,
+)
 from ctrlplan.trajectories.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from control import ControlPlot
+
+    from ctrlplan.reports.style import AxesLike
 
 
 class Shaper(Displayed, Fields):
@@ -37,6 +53,9 @@ class Shaper(Displayed, Fields):
     ----------
     delays, weights : ndarray, shape (nimpulses,)
         The arguments; the sum of the weights is 1 up to rounding.
+    factors : tuple of ShaperFactor
+        Designs for single modes of which the shaper is the convolution; empty if
+        its impulses were given.
 
     Raises
     ------
@@ -65,6 +84,7 @@ class Shaper(Displayed, Fields):
 
     delays: Array
     weights: Array
+    factors: tuple[ShaperFactor, ...]
 
     def __init__(self, delays: ArrayLike, weights: ArrayLike) -> None:
         times, parts = (
@@ -79,7 +99,7 @@ class Shaper(Displayed, Fields):
         total = math.fsum(parts)
         if abs(total - 1.0) > 1e-12:
             raise ValueError(f"weights must sum to 1, got {total}")
-        self._set_fields(delays=readonly(times), weights=readonly(parts / total))
+        self._set_fields(delays=readonly(times), weights=readonly(parts / total), factors=())
 
     @classmethod
     def zv(cls, frequency: float, damping: float = 0.0) -> Self:
@@ -126,13 +146,159 @@ class Shaper(Displayed, Fields):
         ValueError
             If an argument is out of range.
         """
-        omega = checked_finite(frequency, "frequency", above=0.0)
-        zeta, count = float(_checked_damping(damping)), checked_count(derivatives, "derivatives") + 1
-        root = math.sqrt(1.0 - zeta**2)
-        decay = math.exp(-zeta * math.pi / root)
-        orders = np.arange(count + 1)
-        weights = comb(count, orders) * decay**orders / (1.0 + decay) ** count
-        return cls(orders * (math.pi / (omega * root)), weights)
+        return cls._of(zvd_factor(frequency, damping, derivatives))
+
+    @classmethod
+    def mzv(cls, frequency: float, damping: float = 0.0) -> Self:
+        r"""Modified zero-vibration (MZV) shaper for one mode.
+
+        Three impulses, three eighths of a period apart, with the weights 1,
+        :math:`\sqrt 2 k`, :math:`k^2` up to a factor, k the decay of the mode
+        over one delay. The residual vibration is 0 at the mode, and the curve is
+        flatter than that of `zv` at half the additional duration of `zvd`.
+
+        Parameters
+        ----------
+        frequency : float
+            Undamped natural frequency [rad/s], above 0: 2 pi times that in Hz.
+        damping : float, optional
+            Damping ratio in [0, 1).
+
+        Raises
+        ------
+        ValueError
+            If an argument is out of range.
+        """
+        return cls._of(mzv_factor(frequency, damping))
+
+    @classmethod
+    def ei(cls, frequency: float, damping: float = 0.0, tolerance: float = 0.05) -> Self:
+        r"""Extra-insensitive (EI) shaper for one mode.
+
+        Three impulses whose residual vibration at an undamped mode is the
+        tolerance V, for which
+        the range of frequencies below V is wider than that of `zvd` of the same
+        duration. The weights are (1 + V)/4, (1 - V)/2, (1 + V)/4 times the powers
+        1, K, :math:`K^2` of the decay over half a period, normalised: with
+        damping the residual vibration is below the tolerance.
+
+        Parameters
+        ----------
+        frequency : float
+            Undamped natural frequency [rad/s], above 0: 2 pi times that in Hz.
+        damping : float, optional
+            Damping ratio in [0, 1).
+        tolerance : float, optional
+            V, in (0, 1).
+
+        Raises
+        ------
+        ValueError
+            If an argument is out of range.
+
+        References
+        ----------
+        Singhose, Seering and Singer, Residual vibration reduction using vector
+        diagrams to generate shaped inputs, ASME J. Mechanical Design 116, 1994.
+        """
+        return cls._of(ei_factor(frequency, damping, tolerance))
+
+    @classmethod
+    def two_hump_ei(cls, frequency: float, damping: float = 0.0, tolerance: float = 0.05) -> Self:
+        """Two-hump extra-insensitive shaper of four impulses.
+
+        The residual vibration is 0 at the mode and reaches the tolerance on both
+        sides of it. The duration is one and a half periods.
+
+        Parameters
+        ----------
+        frequency : float
+            Undamped natural frequency [rad/s], above 0: 2 pi times that in Hz.
+        damping : float, optional
+            Damping ratio in [0, 1).
+        tolerance : float, optional
+            Height of the humps without damping, in (0, 1).
+
+        Raises
+        ------
+        ValueError
+            If an argument is out of range.
+
+        References
+        ----------
+        Singhose, Porter, Tuttle and Singer, Vibration reduction using multi-hump
+        input shapers, ASME J. Dynamic Systems, Measurement, and Control 119, 1997.
+        """
+        return cls._of(two_hump_factor(frequency, damping, tolerance))
+
+    @classmethod
+    def three_hump_ei(cls, frequency: float, damping: float = 0.0, tolerance: float = 0.05) -> Self:
+        """Three-hump extra-insensitive shaper of five impulses.
+
+        The residual vibration reaches the tolerance at an undamped mode and on
+        both sides of it. The duration is two periods.
+
+        Parameters
+        ----------
+        frequency : float
+            Undamped natural frequency [rad/s], above 0: 2 pi times that in Hz.
+        damping : float, optional
+            Damping ratio in [0, 1).
+        tolerance : float, optional
+            Height of the humps without damping, in (0, 1).
+
+        Raises
+        ------
+        ValueError
+            If an argument is out of range.
+
+        References
+        ----------
+        As for `two_hump_ei`.
+        """
+        return cls._of(three_hump_factor(frequency, damping, tolerance))
+
+    @classmethod
+    def fit(cls, frequencies: ArrayLike, response: ArrayLike, *, tolerance: float = 0.05, damping: float = 0.1) -> Self:
+        r"""Shortest shaper for a measured spectrum.
+
+        Of all kinds (ZV, MZV, ZVD, ZVDD, EI, two-hump and three-hump EI) the one of
+        the shortest duration with
+
+        .. math:: \max_i |G(\omega_i)|\,V(\omega_i) \le \varepsilon \max_i |G(\omega_i)|,
+
+        V the residual vibration. No shaper attenuates frequencies far below the
+        mode: the spectrum must be one of vibrations, such as that of a measured
+        acceleration, without static part. Intervals of frequencies narrower than
+        1e-7 of the frequency are not searched.
+
+        Parameters
+        ----------
+        frequencies : array_like, shape (nfrequencies,)
+            Frequencies of the spectrum [rad/s], above 0.
+        response : array_like, shape (nfrequencies,)
+            Magnitudes of the spectrum, at least 0, in any unit.
+        tolerance : float, optional
+            Largest vibration relative to that without a shaper, in (0, 1), also
+            the tolerance of the EI shapers.
+        damping : float, optional
+            Damping ratio of the modes, in [0, 1).
+
+        Raises
+        ------
+        ValueError
+            If an argument is out of range, or no kind meets the tolerance.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> omega = np.linspace(20.0, 120.0, 501)
+        >>> spectrum = 1.0 / np.abs(60.0**2 - omega**2 + 6j * omega)
+        >>> found = Shaper.fit(omega, spectrum)
+        >>> bool((found.residual(omega, 0.1) * spectrum).max() <= 0.05 * spectrum.max())
+        True
+        """
+        return cls._of(fitted_factor(frequencies, response, tolerance, damping))
 
     @property
     def duration(self) -> float:
@@ -189,7 +355,47 @@ class Shaper(Displayed, Fields):
         delays, weights = delays[order], np.outer(self.weights, other.weights).ravel()[order]
         # Delays that differ by the rounding of sums are one impulse.
         first = np.flatnonzero(np.diff(delays, prepend=-1.0) > 8.0 * np.finfo(float).eps * delays[-1])
-        return Shaper(delays[first], np.add.reduceat(weights, first))
+        joined = Shaper(delays[first], np.add.reduceat(weights, first))
+        # An unknown part leaves the modes unknown.
+        known = self.factors and other.factors
+        return joined._with_fields(factors=self.factors + other.factors) if known else joined
+
+    def on_grid(self, dt: float) -> Shaper:
+        """Shaper with impulses at multiples of a controller's period.
+
+        Each delay of the design is replaced by three impulses at 0, k dt and
+        (k + 1) dt with the same effect on the mode, k dt <= delay < (k + 1) dt.
+        Residual vibrations at the design modes are unchanged, zeros of any order
+        remain, and no weight is negative. The duration grows by at most one period
+        for each delay.
+
+        Parameters
+        ----------
+        dt : float
+            Period of the controller [s], at most the shortest delay: half a period
+            of the mode (three eighths for MZV).
+
+        Returns
+        -------
+        Shaper
+
+        Raises
+        ------
+        ValueError
+            If no mode is known, because the impulses were given, or `dt` is not
+            above 0 or too long.
+
+        Examples
+        --------
+        >>> shaper = Shaper.zv(2.0, 0.1).on_grid(0.1)
+        >>> (shaper.delays / 0.1).round(12).tolist(), bool(shaper.residual(2.0, 0.1) < 1e-15)
+        ([0.0, 15.0, 16.0], True)
+        """
+        period = checked_finite(dt, "dt", above=0.0)
+        self._check_factors("on_grid")
+        taps = reduce(np.convolve, [factor.on_grid(period) for factor in self.factors])
+        kept = np.flatnonzero(taps)
+        return Shaper(period * kept, taps[kept])._with_fields(factors=self.factors)
 
     def residual(self, frequency: ArrayLike, damping: ArrayLike = 0.0) -> Array:
         r"""Residual vibration of a mode, relative to that of one impulse.
@@ -218,24 +424,72 @@ class Shaper(Displayed, Fields):
         ValueError
             If an argument is out of range.
         """
-        omega, zeta = new_numbers(frequency, "frequency"), _checked_damping(damping)
+        omega, zeta = new_numbers(frequency, "frequency"), checked_damping(damping)
         if not np.all((omega >= 0.0) & (omega < math.inf)):
             raise ValueError(f"frequency must be at least 0 and finite, got {frequency!r}")
-        mode = omega * (zeta + 1j * np.sqrt(1.0 - zeta**2))
-        left: Array = np.abs(np.exp(mode[..., None] * (self.delays - self.delays[-1])) @ self.weights)
-        return left
+        return residual_of(self.delays, self.weights, omega, zeta)
+
+    def plot(
+        self, frequencies: ArrayLike, *, response: ArrayLike | None = None, ax: AxesLike | None = None
+    ) -> ControlPlot:
+        """Plot the residual vibration over frequency.
+
+        The damping ratio is the lowest of the design modes, 0 if none is known;
+        the design frequencies are marked.
+
+        Parameters
+        ----------
+        frequencies : array_like, shape (nfrequencies,)
+            Frequencies [rad/s], at least 0, increasing.
+        response : array_like, shape (nfrequencies,), optional
+            Magnitudes of a measured spectrum, drawn below, without the shaper and
+            multiplied by its residual vibration.
+        ax : Axes or array of Axes, optional
+            Axes to plot in, two with `response`. Default: the current figure if it
+            is empty, otherwise a new one.
+
+        Returns
+        -------
+        control.ControlPlot
+            With `figure`, `axes` and `lines`, of shape (1, 1) or (2, 1).
+
+        Raises
+        ------
+        TypeError
+            If `ax` is neither axes nor an array of them.
+        ValueError
+            If frequencies do not increase, or the response has another length.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> from ctrlplan.trajectories import Shaper
+        >>> drawn = Shaper.ei(10.0, 0.05).plot(np.linspace(0.0, 20.0, 201))
+        >>> drawn.axes.shape
+        (1, 1)
+        """
+        from ctrlplan.reports.vibration_figures import plot_shaper
+
+        return plot_shaper(self, frequencies, response, ax=ax)
+
+    @classmethod
+    def _of(cls, factor: ShaperFactor) -> Self:
+        """Shaper of one factor."""
+        delays = factor.delay * np.arange(len(factor.weights))
+        return cls(delays, factor.weights)._with_fields(factors=(factor,))
+
+    def _check_factors(self, name: str) -> None:
+        """Raise if the modes for which the shaper is designed are not known."""
+        if not self.factors:
+            raise ValueError(
+                f"{name} must be called on a shaper whose modes are known, got one of given impulses; use Shaper.zv, "
+                "zvd, mzv, ei, two_hump_ei, three_hump_ei or fit, joined by then"
+            )
 
     def _describe(self) -> Iterator[Part]:
         yield f"Shaper of {counted(self.delays.size, 'impulse')} over {self.duration:g} s"
-        yield Facts([("added to the duration", f"{self.duration:.6g} s")])
+        modes = [(f.kind, f"{f.frequency:.6g} rad/s, damping {f.damping:g}") for f in self.factors]
+        yield Facts([("added to the duration", f"{self.duration:.6g} s"), *modes])
         impulses = zip(self.delays.tolist(), self.weights.tolist(), strict=True)
         rows = [(str(k + 1), f"{delay:.6g}", number(weight)) for k, (delay, weight) in enumerate(impulses)]
         yield Table("Impulses", ("", "delay [s]", "weight"), shortened(rows))
-
-
-def _checked_damping(damping: ArrayLike) -> Array:
-    """Damping ratios in [0, 1), checked."""
-    zeta = new_numbers(damping, "damping")
-    if not np.all((zeta >= 0.0) & (zeta < 1.0)):
-        raise ValueError(f"damping must lie in [0, 1), got {damping!r}")
-    return zeta

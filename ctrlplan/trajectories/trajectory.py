@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
 from numbers import Real
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -561,6 +561,122 @@ class Trajectory(Displayed, Fields, ABC):
         from ctrlplan.trajectories.combined import Joined
 
         return Joined((self, other))
+
+    def stop(
+        self,
+        time: float,
+        limits: Mapping[str, object],
+        *,
+        synchronize: Literal["time", "path"] | None = "time",
+    ) -> Trajectory:
+        """Plan until a time, then to rest in minimum time.
+
+        The position of the stop is free. Up to `time` the plan is unchanged; from
+        its position, velocity and acceleration at that time it is brought to rest
+        with limited acceleration and jerk. At a jump of the plan the state is that
+        before the jump.
+
+        Parameters
+        ----------
+        time : float
+            Beginning of the stop [s], within the plan.
+        limits : mapping
+            Limits of acceleration and jerk, as for `ctrlplan.fastest`:
+            ``{"acceleration": (-2.0, 1.0), "jerk": 10.0}`` for all axes, lists by
+            axis, or names such as ``x_d2``. The jerk is one number. Limits of
+            velocities and positions cannot be enforced; a warning states what
+            exceeds them.
+        synchronize : {"time", "path"} or None, optional
+            "time": all axes come to rest together, at the time of the slowest one.
+            None: each axis in its own minimum time. "path": on the path of the plan,
+            by a time law with limited jerk, the shortest one of three phases,
+            possibly after a delay; if the path ends first, the plan is at rest
+            there.
+
+        Returns
+        -------
+        Trajectory
+            The plan itself if it is at rest at its end already.
+
+        Raises
+        ------
+        ValueError
+            If the time is outside of the plan; a limit is missing or wrong; the plan
+            has no duration; with "path", if the plan is shaped (`Shaper`), or ends
+            in motion before it can be stopped.
+
+        Warns
+        -----
+        UserWarning
+            If the state at `time` exceeds a limit, or will unavoidably. The message
+            states the excess. The acceleration is then brought back with maximum
+            jerk.
+
+        Examples
+        --------
+        >>> import ctrlplan as cp
+        >>> move = cp.PolySpline([cp.Waypoint(0, 0, 0, 0), cp.Waypoint(4, 10, 0, 0)], labels="x")
+        >>> stopped = move.stop(2.0, {"acceleration": 5.0, "jerk": 20.0})
+        >>> stopped.end, stopped(stopped.end, 1), stopped.final
+        (3.1875, array(0.), array([7.78320312]))
+        """
+        from ctrlplan.trajectories.chosen import stopped
+
+        return stopped(self, time, limits, synchronize)
+
+    def to_velocity(
+        self,
+        time: float,
+        velocity: ArrayLike,
+        limits: Mapping[str, object],
+        *,
+        hold: float = 0.0,
+        synchronize: Literal["time"] | None = "time",
+    ) -> Trajectory:
+        """Plan until a time, then to a constant velocity.
+
+        The change has minimum duration; the position is free. The plan then ends in
+        motion, and `then` continues it.
+
+        Parameters
+        ----------
+        time : float
+            Beginning of the change [s], within the plan.
+        velocity : array_like, scalar or shape (naxes,)
+            Final velocity [unit of the axis per s], within the limits.
+        limits : mapping
+            Limits of acceleration and jerk, as for `stop`.
+        hold : float, optional
+            Time [s] for which the velocity is held, at least 0.
+        synchronize : {"time"} or None, optional
+            Whether all axes reach their velocity at the same time, or each in its
+            own minimum time.
+
+        Returns
+        -------
+        Trajectory
+
+        Raises
+        ------
+        ValueError
+            As `stop`; if the velocity exceeds a limit.
+
+        Warns
+        -----
+        UserWarning
+            As `stop`.
+
+        Examples
+        --------
+        >>> import ctrlplan as cp
+        >>> move = cp.PolySpline([cp.Waypoint(0, 0, 0, 0), cp.Waypoint(4, 10, 0, 0)])
+        >>> slow = move.to_velocity(2.0, 1.0, {"acceleration": 5.0, "jerk": 20.0}, hold=1.0)
+        >>> slow(slow.end, 1)
+        array(1.)
+        """
+        from ctrlplan.trajectories.chosen import at_velocity
+
+        return at_velocity(self, time, velocity, limits, hold, synchronize)
 
     def select(self, labels: Sequence[str]) -> Trajectory:
         """Trajectory of some axes by name, in the given order."""

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ctrlplan._checks import checked_finite, default_labels, new_numbers
-from ctrlplan._display import Displayed, Part, Table, number, shortened
+from ctrlplan._display import Displayed, Part, Table, counted, number, shortened
 from ctrlplan._types import Data
 from ctrlplan.trajectories.common import Array, readonly, times_powers
 from ctrlplan.trajectories.fields import Fields
@@ -232,7 +232,7 @@ def waypoint_table(waypoints: Sequence[Waypoint], labels: Sequence[str]) -> Tabl
             cells.append(", ".join(map(_prescribed, jet[:given])))
         rows.append([f"{point.time:.6g}", *cells])
     names = ", ".join(map(entry_name, range(count)))
-    return Table(f"{len(waypoints)} waypoints: {names}", ("time [s]", *labels), shortened(rows))
+    return Table(f"{counted(len(waypoints), 'waypoint')}: {names}", ("time [s]", *labels), shortened(rows))
 
 
 def entry_name(order: int) -> str:

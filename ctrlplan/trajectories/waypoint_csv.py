@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import csv
 import math
 import os
-import re
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 
 from ctrlplan._checks import checked_finite
+from ctrlplan._types import Array
+from ctrlplan.trajectories.columns import Column, CsvColumns
 from ctrlplan.trajectories.waypoint import Waypoint
-
-Column = str | int
-"""A column by its name in the header, or by its number from 0."""
 
 _TIME = "t"
 """Column of the times that a file need not have."""
@@ -77,8 +73,9 @@ def waypoints_from_csv(
         raise TypeError(f"time must be the name or the number of a column, or None, got {time!r:.80}")
     if columns is not None and not isinstance(columns, Sequence):
         raise TypeError(f"columns must be names or numbers of columns, got {columns!r:.80}")
-    table = _Table(Path(path))
-    when = table.time_column(time, rate is not None)
+    table = CsvColumns(path)
+    values = table.numbers(range(table.width))
+    when = _time_column(table, time, rate is not None)
     if when is not None and rate is not None:
         raise ValueError(
             f"speed must not be given for a file with times, got {rate:g} and the column {table.name(when)}; "
@@ -93,136 +90,45 @@ def waypoints_from_csv(
     used = [column for column in chosen if column != when]
     if not used:
         raise ValueError(f"{path} must have a column of positions, got one of times only; pass time=None if it is none")
-    times = table.increasing(when) if when is not None else table.travelled(used, rate or 1.0)
+    times = table.increasing(when).tolist() if when is not None else _travelled(table, values, used, rate or 1.0)
     if table.header is None:
-        return [Waypoint(t, row) for t, row in zip(times, table.values[:, used].tolist(), strict=True)]
+        return [Waypoint(t, row) for t, row in zip(times, values[:, used].tolist(), strict=True)]
     jets = _jets([table.header[column] for column in used], used)
     return [
         Waypoint.from_jets(t, **{label: row[jet].tolist() for label, jet in jets.items()})
-        for t, row in zip(times, table.values, strict=True)
+        for t, row in zip(times, values, strict=True)
     ]
 
 
-class _Table:
-    """Numeric table with its header and line numbers."""
+def _time_column(table: CsvColumns, time: Column | None, timed: bool) -> int | None:
+    """Column of the times, None if there is none; `timed` if a speed is given."""
+    if time is None or isinstance(time, int):
+        return None if time is None else table.column(time)
+    if table.header is None:
+        return None if timed else 0
+    if time in table.header:
+        return table.header.index(time)
+    similar = table.named_like_times()
+    if time != _TIME or similar:
+        found = f", got {', '.join(table.header)}"
+        hint = f"; pass time={similar[0]!r}" if similar else "; pass time=None where there is none"
+        raise ValueError(f"{table.title} must have the column {time!r} of times{found}{hint}")
+    return None
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        rows = self._rows()
-        if not rows:
-            raise ValueError(f"{path} must have lines of numbers, got none")
-        self.header = self._header(*rows[0])
-        self.lines = [line for line, _ in rows[self.header is not None :]]
-        self.width = len(rows[0][1])
-        if not self.lines:
-            raise ValueError(f"{path} must have lines of numbers, got a header only")
-        self.values = np.array([self._numbers(*row) for row in rows[self.header is not None :]])
 
-    def name(self, column: int) -> str:
-        """Description of a column."""
-        return repr(self.header[column]) if self.header else f"number {column}"
-
-    def column(self, column: Column) -> int:
-        """Number of a column."""
-        if isinstance(column, int) and not isinstance(column, bool):
-            if 0 <= column < self.width:
-                return column
-            raise ValueError(f"{self.path} must have a column {column}, got {self.width} columns, from 0")
-        if self.header is None:
-            raise ValueError(f"{self.path} must have a header with {column!r}, got numbers; give columns by number")
-        if column not in self.header:
-            raise ValueError(f"{self.path} must have a column {column!r}, got {', '.join(self.header)}")
-        return self.header.index(column)
-
-    def time_column(self, time: Column | None, timed: bool) -> int | None:
-        """Column of the times, None if there is none; `timed` if a speed is given."""
-        if time is None or isinstance(time, int):
-            return None if time is None else self.column(time)
-        if self.header is None:
-            return None if timed else 0
-        if time in self.header:
-            return self.header.index(time)
-        similar = [name for name in self.header if re.fullmatch(r"t(ime)?(\W.*|_s)?", name, re.IGNORECASE)]
-        if time != _TIME or similar:
-            found = f", got {', '.join(self.header)}"
-            hint = f"; pass time={similar[0]!r}" if similar else "; pass time=None where there is none"
-            raise ValueError(f"{self.path} must have the column {time!r} of times{found}{hint}")
-        return None
-
-    def increasing(self, column: int) -> list[float]:
-        """Times of the lines."""
-        times: list[float] = self.values[:, column].tolist()
-        for k in range(1, len(times)):
-            if not times[k] > times[k - 1]:
-                raise ValueError(
-                    f"{self._place(k)}: times must increase strictly, got {times[k]:g} after {times[k - 1]:g} in line "
-                    f"{self.lines[k - 1]}"
-                )
-        return times
-
-    def travelled(self, columns: list[int], speed: float) -> list[float]:
-        """Times of the lines at a speed along the chords of the positions."""
-        positions = columns
-        if self.header is not None:
-            positions = [jet[0] for jet in _jets([self.header[column] for column in columns], columns).values()]
-        steps = np.sqrt((np.diff(self.values[:, positions], axis=0) ** 2).sum(axis=1)) / speed
-        for k, step in enumerate(steps.tolist(), 1):
-            if not 0.0 < step < math.inf:
-                raise ValueError(
-                    f"{self._place(k)}: positions must differ from those of the line before, from which the time "
-                    f"is computed, got those of line {self.lines[k - 1]}; add a column of times"
-                )
-        return [0.0, *np.cumsum(steps).tolist()]
-
-    def _rows(self) -> list[tuple[int, list[str]]]:
-        """Line numbers and cells of all lines that are not empty."""
-        try:
-            text = self.path.read_text(encoding="utf-8-sig")
-        except UnicodeDecodeError as error:
-            raise ValueError(f"{self.path} must be text in UTF-8, got {error}") from None
-        lines = [(k, line.partition("#")[0].strip()) for k, line in enumerate(text.split("\n"), 1)]
-        lines = [(k, line) for k, line in lines if line]
-        self.semicolons = bool(lines) and ";" in lines[0][1]
-        delimiter = ";" if self.semicolons else ","
-        try:
-            return [(k, [c.strip() for c in next(csv.reader([line], delimiter=delimiter))]) for k, line in lines]
-        except csv.Error as error:
-            raise ValueError(f"{self.path} must be a table, got {error}") from None
-
-    def _header(self, line: int, cells: list[str]) -> list[str] | None:
-        """Names of the columns; None if the first line contains numbers."""
-        numeric = [self._number(cell) is not None for cell in cells]
-        if all(numeric):
-            return None
-        if any(numeric) or "" in cells or len(set(cells)) < len(cells):
+def _travelled(table: CsvColumns, values: Array, columns: list[int], speed: float) -> list[float]:
+    """Times of the lines at a speed along the chords of the positions."""
+    positions = columns
+    if table.header is not None:
+        positions = [jet[0] for jet in _jets([table.header[column] for column in columns], columns).values()]
+    steps = np.sqrt((np.diff(values[:, positions], axis=0) ** 2).sum(axis=1)) / speed
+    for k, step in enumerate(steps.tolist(), 1):
+        if not 0.0 < step < math.inf:
             raise ValueError(
-                f"{self.path}, line {line}: the first line must be numbers or different names, got {', '.join(cells)}"
+                f"{table.title}, {table.spot(k)}: positions must differ from those of the line before, from which the "
+                f"time is computed, got those of {table.spot(k - 1)}; add a column of times"
             )
-        return cells
-
-    def _numbers(self, line: int, cells: list[str]) -> list[float]:
-        """Finite numbers of a line."""
-        place = f"{self.path}, line {line}"
-        if len(cells) != self.width:
-            raise ValueError(f"{place}: must have {self.width} cells as the first line, got {len(cells)}")
-        found = []
-        for column, cell in enumerate(cells):
-            number = self._number(cell)
-            if number is None or not math.isfinite(number):
-                got = repr(cell) if cell else "an empty cell"
-                raise ValueError(f"{place}: column {self.name(column)} must be a finite number, got {got}")
-            found.append(number)
-        return found
-
-    def _number(self, cell: str) -> float | None:
-        """Number in a cell; None if it is not a number."""
-        try:
-            return None if "_" in cell else float(cell.replace(",", ".") if self.semicolons else cell)
-        except ValueError:
-            return None
-
-    def _place(self, row: int) -> str:
-        return f"{self.path}, line {self.lines[row]}"
+    return [0.0, *np.cumsum(steps).tolist()]
 
 
 def _jets(names: list[str], columns: list[int]) -> dict[str, list[int]]:

@@ -2,6 +2,7 @@
 
 from math import acos, exp, pi, sqrt
 
+import control as ct
 import numpy as np
 import pytest
 from hypothesis import given
@@ -142,6 +143,29 @@ def test_overshoot_on_the_error_is_against_the_reference():
     assert metrics.lag(t, t + error, 5, 0, reference=t) == pytest.approx(4, rel=1e-12)
     assert metrics.overshoot(t, -t + error, -5, 0, reference=-t) == pytest.approx(4, rel=1e-12)
     assert metrics.overshoot(t, t + error, 5, 0) == 0.0
+
+
+@pytest.mark.parametrize("late", [0, 30], ids=["from the first sample", "after a hold"])
+@pytest.mark.parametrize(
+    "poles",
+    [
+        (50.0, 50.0, 50.0),
+        (10.0, 10.0, 10.0),
+        (54.1, 157.4, 36.9),
+        (9.54, 18.7, 222.7),
+        (9.77, 13.1, 139.0),
+        (100.0, 30.0),
+    ],
+    ids=lambda poles: ", ".join(f"{p:g}" for p in poles),
+)
+def test_no_lag_is_above_the_step_however_coarse_the_samples(poles, late):
+    """The error of a step through lags falls from its first value, 100 %; spacing up to the time constants."""
+    lags = ct.ss(ct.zpk([], [-p for p in poles], np.prod(poles)))
+    y = ct.step_response(lags, np.arange(100) * 0.01).outputs
+    t, y = np.arange(100 + late) * 0.01, np.concatenate([np.zeros(late), y])
+    assert metrics.lag(t, y, 1, 0, reference=np.where(np.arange(t.size) < late, 0.0, 1.0)) == pytest.approx(
+        100.0, abs=1e-9
+    )
 
 
 def test_divergence_overshoots_on_its_own_side():

@@ -19,7 +19,7 @@ from matplotlib.colors import to_hex, to_rgb
 import ctrlplan as cp
 from ctrlplan.planning import AlphaChoice
 from ctrlplan.planning.limits import Limited
-from ctrlplan.reports import crane_figures, figures, planning_figures, render_page
+from ctrlplan.reports import crane_figures, figures, planning_figures, render_page, vibration_figures
 from ctrlplan.reports.style import as_text, page_style
 from ctrlplan.studies import Study
 from ctrlplan.studies.ensemble import Ensemble
@@ -28,6 +28,7 @@ from ctrlplan.studies.sections import Curves, PlanCurves, Responses
 MOVE = [cp.Waypoint(0, 0, 0, 0), cp.Waypoint(2, 1, 0, 0)]
 ACROSS = [cp.Waypoint.from_jets(0, x=[0, 0, 0], z=[10, 0, 0]), cp.Waypoint.from_jets(2, x=[20, 0, 0], z=[11, 0, 0])]
 T = np.linspace(0.0, 2.0, 41)
+OMEGA = np.linspace(1.0, 20.0, 96)
 PLAN, SMOOTH = cp.PolySpline(MOVE), cp.TrigSpline(MOVE, alpha=2.0)
 LIMITS = {"y_d1": 1.0, "y_d2": 2.0}
 
@@ -94,6 +95,9 @@ PLOTS = {
     "comparison.plot": (lambda **k: compared().plot(**k), (3, 1)),
     "sweep.plot": (lambda **k: swept().plot(**k), (2, 1)),
     "ensemble.plot": (lambda **k: spread().plot(**k), (3, 3)),
+    "shaper.plot": (lambda **k: cp.Shaper.ei(9.0, 0.1).plot(OMEGA, response=OMEGA, **k), (2, 1)),
+    "residual_plot": (lambda **k: cp.residual_plot(PLAN, OMEGA, loop=ct.tf([1.0], [1.0, 1.0]), **k), (2, 1)),
+    "plot_shaper": (lambda **k: vibration_figures.plot_shaper(cp.Shaper.zv(9.0), OMEGA, **k), (1, 1)),
     "plot_trajectory": (lambda **k: figures.plot_trajectory(PLAN, **k), (3, 1)),
     "plot_plans": (lambda **k: figures.plot_plans(craned(), 1, **k), (2, 2)),
     "plot_responses": (lambda **k: figures.plot_responses(compared(), **k), (3, 1)),
@@ -113,7 +117,14 @@ PLOTS = {
     "plot_online": (lambda **k: crane_figures.plot_online(craned(), **k), (4, 1)),
 }
 DRAWINGS = {"plot_sketch", "plot_blocks", "plot_motion"}  # of things: not curves in the user's colours
-SAME = {"plot_trajectory", "plot_responses", "plot_bands", "plot_alpha_choice", "plot_limits"}  # as a method's
+SAME = {
+    "plot_trajectory",
+    "plot_responses",
+    "plot_bands",
+    "plot_alpha_choice",
+    "plot_limits",
+    "plot_shaper",
+}  # as a method's
 every = pytest.mark.parametrize("name", PLOTS)
 
 
@@ -122,9 +133,9 @@ def test_every_plot_is_tested_here():
     twice = {name for name in vars(figures) if name.startswith("plot_") and hasattr(crane_figures, name)}
     functions = {
         f"{module.__name__.split('.')[-1]}.{name}" if name in twice else name
-        for module in (figures, crane_figures, planning_figures)
+        for module in (figures, crane_figures, planning_figures, vibration_figures)
         for name, value in vars(module).items()
-        if name.startswith("plot_") and value.__module__ == module.__name__
+        if name.startswith(("plot_", "residual_plot")) and value.__module__ == module.__name__
     }
     assert not twice
     assert functions == {name for name in PLOTS if "." not in name}
@@ -138,6 +149,7 @@ def test_every_plot_is_tested_here():
         "Comparison.plot",
         "Sweep.plot",
         "Ensemble.plot",
+        "Shaper.plot",
     }
 
 

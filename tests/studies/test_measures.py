@@ -135,7 +135,48 @@ def test_signals_of_different_units_are_not_ranked_together():
     assert not {v.key for v in verdicts(found)} & {"control_effort", "iae"}
 
 
-@pytest.mark.parametrize("units", [None, {"x": "m", "theta": "m", "F": "N", "M": "N"}, {"F": "N"}])
+def test_signals_with_and_without_a_unit_are_not_ranked_together():
+    found = two_axes({"F": "N"})
+    for row in found.metrics.values():
+        assert math.isnan(row["control_effort"])
+        assert row["iae"] == max(row["iae_x"], row["iae_theta"])
+    assert (unit_of(found, "control_effort_F"), unit_of(found, "control_effort_M")) == ("N² s", "")
+    titles = [row[:2] for row in found.metric_table().rows]
+    assert ["Control effort (F)", "N² s"] in titles
+    assert ["Control effort (M)", ""] in titles
+
+
+@pytest.mark.parametrize("label", ["y", "y[0]"], ids=["of the axis", "of the output"])
+def test_the_unit_of_an_output_is_that_of_its_metrics(label):
+    """Also of an output that no axis is named like."""
+    units = {"iae": "m s", "ise_final": "m² s", "itae": "m s²", "reference_jerk": "m²/s⁵", "outside_box": "m"}
+    closed = ct.feedback(ct.tf([5.0], [1.0, 1.0, 0.0]))
+    found = cp.compare(closed, MOVE, T, units={label: "m"})
+    assert {name: unit_of(found, name) for name in units} == units
+    assert ["IAE of the tracking error", "m s"] in [row[:2] for row in found.metric_table().rows]
+    swept = cp.sweep(lambda k: ct.feedback(k * closed), [0.5, 1.0], MOVE, T, units={label: "m"}, progress=False)
+    assert {name: swept.unit_of(name) for name in units} == units
+
+
+@pytest.mark.parametrize("known", [True, False], ids=["units", "no units"])
+def test_a_sweep_lists_controls_as_a_comparison_does(known):
+    units = {"x": "m", "theta": "rad", "F": "N", "M": "N m"} if known else None
+    found, plans = two_axes(units), two_axes().plans
+
+    def system(k):
+        gains = [[k, 0], [0, k], [3.0 * k, 0], [0, 500.0 * k]]
+        return ct.ss([], [], [], gains, inputs=["rx", "rt"], outputs=["x", "theta", "F", "M"])
+
+    swept = cp.sweep(system, [0.5, 1.0], plans, T, units=units, controls=["F", "M"], progress=False)
+    for name in ("control_effort_F", "control_effort_M", "iae_x") if known else ("control_effort", "iae"):
+        assert swept.title_of(name) == found.measures[name].title
+        assert swept.unit_of(name) == unit_of(found, name)
+    rows = [row[:2] for row in swept.metric_table().rows]
+    assert (["Control effort (M)", "(N m)² s"] if known else ["Control effort", ""]) in rows
+    assert not any("_" in title for title, _ in rows)
+
+
+@pytest.mark.parametrize("units", [None, {"x": "m", "theta": "m", "F": "N", "M": "N"}])
 def test_signals_that_are_not_known_to_differ_have_a_worst(units):
     for row in two_axes(units).metrics.values():
         assert row["control_peak"] == pytest.approx(100.0, rel=1e-9)

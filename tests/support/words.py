@@ -17,6 +17,7 @@ import re
 import tokenize
 from collections import Counter
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -110,6 +111,7 @@ FIXED = ("wandering", "turning_points", "worth", "rivals")
 
 _QUOTED = re.compile(rf"^(?:{'|'.join(FIXED)})$|[\"'`]({'|'.join(FIXED)})[\"'`]|\b({'|'.join(FIXED)})(?=\(|$)", re.M)
 _PROSE = [re.compile(rf"\b(?:{word.prose})\b") for word in WORDS]
+_ANY = re.compile(rf"\b(?:{'|'.join(word.prose for word in WORDS)})\b")
 _ALLOWED = [re.compile(rf"\b(?:{word.allowed})\b") if word.allowed else None for word in WORDS]
 _NAMES = [re.compile(rf"(?:{word.names})") if word.names else None for word in WORDS]
 
@@ -117,6 +119,8 @@ _NAMES = [re.compile(rf"(?:{word.names})") if word.names else None for word in W
 def in_text(text):
     """Words of the list in a text, once for each time they occur."""
     plain = re.sub(r"[\s_]+", " ", _QUOTED.sub("", text)).lower()
+    if not _ANY.search(plain):
+        return []
     found = []
     for word, pattern, allowed in zip(WORDS, _PROSE, _ALLOWED, strict=True):
         rest = allowed.sub("", plain) if allowed else plain
@@ -124,6 +128,7 @@ def in_text(text):
     return found
 
 
+@cache  # a module has the same names many times
 def in_name(name):
     """Words of the list that are parts of a name."""
     if name in FIXED:

@@ -42,6 +42,11 @@ ARGUMENTS = {
     "acceleration": lambda: 0.8,
     "jerk": lambda: 1.1,
     "plan": lambda: trajectories.PiecewiseSpline(POINTS),
+    "start": lambda: -0.7,
+    "end": lambda: 1.2,
+    "breakpoints": lambda: [0.5, 1.25, 2.0],
+    "values": lambda: [[1.0, -3.0], [0.5, 0.0]],
+    "start_state": lambda: [[1.0, 2.0], [0.5, -1.0], [0.1, 0.0]],
     "law": lambda: trajectories.PolySpline([Waypoint(3.0, -1.0, 0.7), Waypoint(4.0, 0.1), Waypoint(7.5, 2.0, 0.3)]),
 }
 

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 
 import numpy as np
 
 from ctrlplan._renamed import outside_stacklevel
 from ctrlplan._types import Array
 from ctrlplan.simulation.events import Snapshot
-from ctrlplan.simulation.exact import exact_states, sampled_states
+from ctrlplan.simulation.exact import Jet, exact_states, sampled_states
 from ctrlplan.simulation.job import Job, Record, with_event_times
 from ctrlplan.simulation.linear import LinearForm
 from ctrlplan.simulation.prepared import Prepared
 from ctrlplan.simulation.signals import PlanSignal, SampledSignal, signal_values
+from ctrlplan.trajectories import Trajectory
 
 _UNCERTAIN = 1e-6
 """Uncertainty of an output, relative to its magnitude, above which it is reported."""
@@ -49,10 +51,7 @@ def _run(job: Job, form: LinearForm) -> Record:
     watched = job.watched()
     times = with_event_times(job.times, watched, lambda: form.a)
 
-    def jet(moment: float, origin: float, s: Array, order: int) -> Array:
-        rows = [plan.segment_jet_at(moment, origin, s, order + high) for plan, high in plans]
-        signals = [_derivatives(row, high, order) for row, (_, high) in zip(rows, plans, strict=True)]
-        return np.concatenate(signals, axis=1) if signals else np.zeros((order + 1, 0, s.size))
+    jet = jet_of(plans)
 
     def snapshot(t: Array, x: Array) -> Snapshot:
         values = signal_values(time_signals, t)
@@ -79,6 +78,17 @@ def _run(job: Job, form: LinearForm) -> Record:
         _warn_of_uncertainty(job, form.outputs(states, values), form.outputs(nearly, values), floor)
     _warn_of_undefined(job, form, times, states)
     return Record(times, states, snapshot, interpolate, watched, Exact.name, "linear and continuous")
+
+
+def jet_of(plans: Sequence[tuple[Trajectory, int]]) -> Jet:
+    """Jets of plans with their derivatives up to given orders, as inputs of `exact_states`."""
+
+    def jet(moment: float, origin: float, s: Array, order: int) -> Array:
+        rows = [plan.segment_jet_at(moment, origin, s, order + high) for plan, high in plans]
+        signals = [_derivatives(row, high, order) for row, (_, high) in zip(rows, plans, strict=True)]
+        return np.concatenate(signals, axis=1) if signals else np.zeros((order + 1, 0, s.size))
+
+    return jet
 
 
 def _warn_of_uncertainty(job: Job, outputs: Array, others: Array, floor: Array) -> None:

@@ -16,9 +16,9 @@ import numpy as np
 from ctrlplan._checks import checked_finite, checked_labels, checked_names
 from ctrlplan._renamed import former_signature, warn_renamed
 from ctrlplan._types import Array, Value
-from ctrlplan.systems.flat import hurwitz_coefficients
 from ctrlplan.systems.plants.crane.flatness import checked_formulas
 from ctrlplan.systems.plants.crane.parameters import CraneParameters
+from ctrlplan.systems.poles import hurwitz_coefficients
 from ctrlplan.systems.series import Quantity
 from ctrlplan.trajectories.files import signal_names
 

@@ -11,9 +11,9 @@ import control as ct
 
 from ctrlplan._checks import checked_finite
 from ctrlplan._renamed import warn_renamed
-from ctrlplan.systems.flat import hurwitz_coefficients
 from ctrlplan.systems.plants.crane import blocks
 from ctrlplan.systems.plants.crane.parameters import CraneParameters
+from ctrlplan.systems.poles import hurwitz_coefficients
 
 LawName = Literal["setpoint", "generator", "load_feedback", "dynamic", "feedforward"]
 

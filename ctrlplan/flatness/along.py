@@ -1,0 +1,243 @@
+"""States and controls along a plan of the flat outputs.
+
+The states are followed along a grid of the plan, which depends on the plan only;
+between the nodes they are interpolated and refined, all times at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from ctrlplan._types import Array
+from ctrlplan.flatness.maps import FlatMaps, SingularError, inverses
+from ctrlplan.trajectories import Trajectory
+
+_INTERVALS = 48
+"""Intervals of the first grid."""
+
+_PREDICTED = 3e-4
+"""Error of the interpolation in scales above which an interval is halved."""
+
+_DEEPEST = 24
+"""Number of halvings of an interval."""
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """Extended states along a plan.
+
+    Attributes
+    ----------
+    times : ndarray, shape (n,)
+        Nodes, from the start to the end of the plan.
+    states, rates : ndarray, shape (nz, n)
+        States at the nodes, and their derivatives from the right.
+    rates_before : ndarray, shape (nz, n)
+        Derivatives from the left.
+    inverses : ndarray, shape (nz, nz, n)
+        Inverses of the Jacobians of the flags.
+    """
+
+    times: Array
+    states: Array
+    rates: Array
+    rates_before: Array
+    inverses: Array
+
+    def interpolated(self, t: Array) -> tuple[Array, Array]:
+        """States (nz, n) and inverse Jacobians (nz, nz, n) at times between the nodes.
+
+        States by cubic Hermite polynomials, inverses linearly.
+        """
+        k = np.clip(np.searchsorted(self.times, t, side="right") - 1, 0, self.times.size - 2)
+        a, b = self.times[k], self.times[k + 1]
+        states = _hermite(
+            t,
+            a,
+            b,
+            *(
+                rows[:, i]
+                for rows, i in ((self.states, k), (self.states, k + 1), (self.rates, k), (self.rates_before, k + 1))
+            ),
+        )
+        part = (t - a) / (b - a)
+        return states, (1.0 - part) * self.inverses[:, :, k] + part * self.inverses[:, :, k + 1]
+
+
+def flag_at(plan: Trajectory, orders: tuple[int, ...], t: Array) -> tuple[Array, Array, Array]:
+    """Flags without the last entries (nz, n), their derivatives, and the last entries (m, n)."""
+    jet = plan.jet(t, max(orders))
+    return rows_of(jet, orders)
+
+
+def rows_of(jet: Array, orders: tuple[int, ...]) -> tuple[Array, Array, Array]:
+    """Entries of a jet (order + 1, m, ...) as flags, their derivatives, and the last entries."""
+    below = np.concatenate([jet[:r, j] for j, r in enumerate(orders)])
+    above = np.concatenate([jet[1 : r + 1, j] for j, r in enumerate(orders)])
+    return below, above, np.stack([jet[r, j] for j, r in enumerate(orders)])
+
+
+def grid_of(maps: FlatMaps, plan: Trajectory, p: Array, start: Array | None, name: str) -> Grid:
+    """Grid of extended states along a plan, connected with a start.
+
+    Raises
+    ------
+    ValueError
+        With the time and the state that the flat outputs do not determine.
+    """
+    first, last = float(plan.start), float(plan.end)
+    if last <= first:  # a plan at rest
+        last = first + 1.0
+    nodes = np.union1d(np.linspace(first, last, _INTERVALS + 1), [t for t in plan.breakpoints if first < t < last])
+    z = connected(maps, flag_at(plan, maps.orders, nodes[:1])[0][:, 0], p, start, name, first)
+    states = [z]
+    flags = flag_at(plan, maps.orders, nodes)[0]
+
+    def way(t: float) -> Array:
+        return flag_at(plan, maps.orders, np.array([t]))[0][:, 0]
+
+    for k, (a, b) in enumerate(zip(nodes[:-1].tolist(), nodes[1:].tolist(), strict=True)):
+        near = maps.followed_simply(states[-1], flags[:, k], flags[:, k + 1], p)
+        if near is None:
+            try:
+                near = maps.followed(states[-1], way, p, a, b)
+            except SingularError as error:
+                raise ValueError(
+                    f"states of {name} must be determined along the plan, but {error} at {error.position:.6g} s"
+                ) from None
+        states.append(near)
+    return _halved(maps, plan, p, nodes, np.array(states).T, name)
+
+
+def connected(maps: FlatMaps, flag: Array, p: Array, start: Array | None, name: str, time: float) -> Array:
+    """State of a flag, connected with the operating point or a given state by a straight line of flags."""
+    z = maps.start if start is None else start
+    origin = maps.flags(z, p)
+
+    def way(s: float) -> Array:
+        return origin + s * (flag - origin) if s < 1.0 else flag
+
+    try:
+        return maps.followed(z, way, p)
+    except SingularError as error:
+        raise ValueError(
+            f"states of {name} at {time:.6g} s must be connected with the operating point, but {error}, "
+            f"{100.0 * error.position:.3g} % of the way; give start= or another operating point at="
+        ) from None
+
+
+def _rates(maps: FlatMaps, z: Array, above: Array, p: Array) -> Array:
+    """Z' from the derivatives of the flags."""
+    slopes = np.moveaxis(maps.slopes(z, p), -1, 0)
+    return np.asarray(np.linalg.solve(slopes, above.T[..., None])[..., 0].T, dtype=float)
+
+
+def _halved(maps: FlatMaps, plan: Trajectory, p: Array, times: Array, states: Array, name: str) -> Grid:
+    """Grid with intervals halved until the interpolation predicts their middles."""
+    scale = maps.scales[:, None]
+    for _ in range(_DEEPEST):
+        rates, before = _both_rates(maps, plan, p, times, states)
+        middle = 0.5 * (times[:-1] + times[1:])
+        predicted = _hermite(middle, times[:-1], times[1:], states[:, :-1], states[:, 1:], rates[:, :-1], before[:, 1:])
+        found, good = maps.refined(predicted, flag_at(plan, maps.orders, middle)[0], p)
+        error = np.max(np.abs(found - predicted) / scale, axis=0)
+        split = ~good | ~(error <= _PREDICTED)
+        if not split.any():
+            return Grid(times, states, rates, before, inverses(maps.slopes(states, p)))
+        new = np.flatnonzero(split)
+        extra = found[:, new]
+        for i in np.flatnonzero(~good[new]):
+            k = int(new[i])
+            extra[:, i] = _middle(maps, plan, p, float(times[k]), float(middle[k]), states[:, k], name)
+        order = np.argsort(np.concatenate([times, middle[new]]), kind="stable")
+        times = np.concatenate([times, middle[new]])[order]
+        states = np.concatenate([states, extra], axis=1)[:, order]
+    raise ValueError(
+        f"states of {name} must be determined along the plan, but they change without bound near "
+        f"{float(middle[new[0]]):.6g} s"
+    )
+
+
+def _middle(maps: FlatMaps, plan: Trajectory, p: Array, a: float, b: float, z: Array, name: str) -> Array:
+    try:
+        return maps.followed(z, lambda t: flag_at(plan, maps.orders, np.array([t]))[0][:, 0], p, a, b)
+    except SingularError as error:
+        raise ValueError(
+            f"states of {name} must be determined along the plan, but {error} at {error.position:.6g} s"
+        ) from None
+
+
+def _both_rates(maps: FlatMaps, plan: Trajectory, p: Array, times: Array, states: Array) -> tuple[Array, Array]:
+    """Derivatives of the states from the right and from the left."""
+    above = flag_at(plan, maps.orders, times)[1]
+    rates = _rates(maps, states, above, p)
+    # The highest derivative may jump at a breakpoint: from the left by a time that is less by rounding.
+    earlier = np.nextafter(times, -np.inf)
+    earlier[0] = times[0]
+    before = _rates(maps, states, flag_at(plan, maps.orders, earlier)[1], p)
+    return rates, before
+
+
+def _hermite(t: Array, a: Array, b: Array, za: Array, zb: Array, ra: Array, rb: Array) -> Array:
+    """Cubic Hermite polynomials between states at a and b."""
+    h = b - a
+    s = (t - a) / h
+    return (
+        (1.0 + 2.0 * s) * (1.0 - s) ** 2 * za
+        + s * (1.0 - s) ** 2 * h * ra
+        + s**2 * (3.0 - 2.0 * s) * zb
+        + s**2 * (s - 1.0) * h * rb
+    )
+
+
+def states_along(
+    maps: FlatMaps, grid: Callable[[], Grid], plan: Trajectory, t: Array, p: Array, name: str
+) -> tuple[Array, Array]:
+    """Extended states (nz, n) and controls of the plant (m, n) at times (n,).
+
+    Raises
+    ------
+    ValueError
+        With the time at which states are not determined, or an operation that is
+        not smooth leaves its branch.
+    """
+    below, _, last = flag_at(plan, maps.orders, t)
+    known = grid()
+    inside = np.clip(t, known.times[0], known.times[-1])
+    near, slopes = known.interpolated(inside)
+    z, found = maps.refined(near, below, p, slopes)
+    for k in np.flatnonzero(~found):
+        z[:, k] = _followed_from_grid(maps, known, plan, p, float(t[k]), below[:, k], name)
+    u = maps.inputs_of(z, last, p)[1]
+    check_branch(maps, z[: maps.nstates], u, p, t, name)
+    return z, u
+
+
+def _followed_from_grid(
+    maps: FlatMaps, grid: Grid, plan: Trajectory, p: Array, t: float, flag: Array, name: str
+) -> Array:
+    """State at a time that interpolation does not reach: before the start, after the end, or near a singular point."""
+    k = int(np.clip(np.searchsorted(grid.times, t) - 1, 0, grid.times.size - 1))
+    z = grid.states[:, k] if t < grid.times[-1] else grid.states[:, -1]
+    origin = maps.flags(z, p)
+    try:
+        return maps.followed(z, lambda s: origin + s * (flag - origin) if s < 1.0 else flag, p)
+    except SingularError as error:
+        raise ValueError(f"states of {name} must be determined along the plan, but {error} at {t:.6g} s") from None
+
+
+def check_branch(maps: FlatMaps, x: Array, u: Array, p: Array, t: Array, name: str) -> None:
+    """Raise if an operation that is not smooth leaves the branch of the operating point."""
+    if not maps.notes:
+        return
+    sides = maps.sides(x, u, p)
+    wrong = ~(sides > 0.0)
+    if wrong.any():
+        row, k = (int(v) for v in np.argwhere(wrong)[0])
+        raise ValueError(
+            f"equations of {name} must stay on the branch of the operating point ({maps.notes[row]}), got another one "
+            f"at {float(t[k]):.6g} s"
+        )

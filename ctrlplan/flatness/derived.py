@@ -1,0 +1,213 @@
+"""Flat systems derived from the equations of a plant and the names of its flat outputs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ctrlplan._checks import checked_finite, real_array
+from ctrlplan._display import Facts, Part
+from ctrlplan._lru import Lru
+from ctrlplan._types import Array, Params, Value
+from ctrlplan.flatness.along import Grid, check_branch, connected, grid_of, rows_of, states_along
+from ctrlplan.flatness.maps import FlatMaps
+from ctrlplan.flatness.system import FlatSystem
+from ctrlplan.symbolic.tape import NUMPY, Tape
+from ctrlplan.trajectories import Trajectory
+
+if TYPE_CHECKING:
+    from ctrlplan.flatness.analysis import Analysis
+
+_NEAR = 0.3
+"""Distance in scales between states of two flags that are taken for neighbours."""
+
+
+class DerivedFlatSystem(FlatSystem):
+    """Flat system whose maps follow from its equations; returned by `flat_system`.
+
+    Attributes
+    ----------
+    maps : FlatMaps
+        The maps, evaluated by numpy.
+    operating_point : dict of str to float
+        States and inputs at which the branches of the equations were chosen.
+    notes : tuple of str
+        Operations that are not smooth, with the branch that was chosen, and
+        what else was assumed.
+    """
+
+    def __init__(
+        self,
+        maps: FlatMaps,
+        equations: tuple[Tape, Tape],
+        analysis: Analysis,
+        *,
+        flat_labels: Sequence[str],
+        states: Sequence[str],
+        inputs: Sequence[str],
+        outputs: Sequence[str],
+        operating_point: Mapping[str, float],
+        params: Mapping[str, float],
+        notes: Sequence[str],
+        name: str,
+    ) -> None:
+        rates, measured = equations
+        self._names = tuple(params)
+        super().__init__(
+            self._forward,
+            self._reverse,
+            partial(_evaluated, rates, self._names),
+            partial(_evaluated, measured, self._names),
+            orders=maps.orders,
+            flat_labels=flat_labels,
+            states=states,
+            inputs=inputs,
+            outputs=outputs,
+            name=name,
+            params=params,
+        )
+        self.maps = maps
+        self._outputs = measured
+        self._analysis: Analysis | None = analysis
+        self.operating_point = dict(operating_point)
+        self.notes = tuple(notes)
+        self._grids: Lru[tuple[int, bytes, bytes], tuple[Trajectory, Grid]] = Lru(8)
+
+    def __getstate__(self) -> dict[str, object]:
+        """State for a pickle: the maps, without the expressions from which laws are derived."""
+        return {**self.__dict__, "_analysis": None}
+
+    @property
+    def analysis(self) -> Analysis:
+        """Expressions of the maps.
+
+        Raises
+        ------
+        ValueError
+            If the system was read from a pickle, which does not contain them.
+        """
+        if self._analysis is None:
+            raise ValueError(
+                f"{self.name} must have its equations for a tracking law, but a pickle has the maps only; derive it "
+                "again with ctrlplan.flat_system in this process"
+            )
+        return self._analysis
+
+    def _describe(self) -> Iterator[Part]:
+        yield from super()._describe()
+        at = ", ".join(f"{name} = {value:.6g}" for name, value in self.operating_point.items())
+        yield Facts([("operating point", at), *(("note", note) for note in self.notes)])
+
+    def states_and_inputs(
+        self, plan: Trajectory, timepts: ArrayLike, *, start: ArrayLike | None = None
+    ) -> tuple[Array, Array]:
+        """States and inputs along a plan of the flat outputs; see `FlatSystem.states_and_inputs`.
+
+        The states are connected with the operating point, or with `start` at the
+        plan's start, and followed along the plan, also through points where a
+        map by formulas would need another branch (a car that turns round). The
+        result does not depend on the other times of a call.
+        """
+        plan, times = self._along(plan, timepts, start)
+        p = self._values(self.params)
+        first = None if start is None else self._extended(real_array(start, "start"), plan, p)
+        z, u = states_along(self.maps, partial(self._grid, plan, p, first), plan, times.ravel(), p, str(self.name))
+        n = self.maps.nstates
+        return z[:n].reshape(n, *times.shape), u.reshape(-1, *times.shape)
+
+    def quantities(self, jet: ArrayLike) -> dict[str, Array]:
+        """States, inputs and outputs of the plant by name; see `FlatSystem.quantities`."""
+        values, known = self._checked_jet(jet)
+        below, _, last = rows_of(values, self.orders)
+        p = self._values(self.params)
+        trailing = below.shape[1:]
+        z = self._states(below.reshape(len(below), -1), p)
+        n = self.maps.nstates
+        found = {name: row.reshape(trailing) for name, row in zip(self.state_labels, z[:n], strict=True)}
+        if known:
+            u = self.maps.inputs_of(z, last.reshape(len(last), -1), p)[1]
+            found |= {name: row.reshape(trailing) for name, row in zip(self.input_labels, u, strict=True)}
+            rows = self._outputs(z[:n], u, p[:, None])
+            found |= {
+                name: np.broadcast_to(row, z.shape[1:]).reshape(trailing)
+                for name, row in zip(self.output_labels, rows, strict=True)
+                if name not in found
+            }
+        return found
+
+    def _grid(self, plan: Trajectory, p: Array, start: Array | None) -> Grid:
+        """Grid of a plan, kept for the next call."""
+        key = (id(plan), p.tobytes(), b"" if start is None else start.tobytes())
+        return self._grids.get(key, lambda: (plan, grid_of(self.maps, plan, p, start, str(self.name))))[1]
+
+    def parameter_values(self) -> Array:
+        """Default parameters in the order of the maps."""
+        return self._values(self.params)
+
+    def _values(self, params: Mapping[str, float] | None) -> Array:
+        """Parameters in the order of the maps."""
+        given = {**self.params, **(params or {})}
+        return np.array([checked_finite(given[name], f"params[{name!r}]") for name in self._names], dtype=float)
+
+    def _forward(self, x: ArrayLike, u: ArrayLike, params: Mapping[str, float] | None = None) -> list[Array]:
+        """Flags of states and constant inputs."""
+        rows = self.maps.forward(np.asarray(x, dtype=float), np.asarray(u, dtype=float), self._values(params))
+        ends = np.cumsum([0, *(r + 1 for r in self.orders)])
+        return [rows[a:b] for a, b in pairwise(ends)]
+
+    def _reverse(self, flag: Sequence[ArrayLike], params: Mapping[str, float] | None = None) -> tuple[Array, Array]:
+        """States and inputs of flags, connected with the operating point."""
+        rows = [np.asarray(row, dtype=float) for row in flag]
+        below = np.concatenate([row[:r] for row, r in zip(rows, self.orders, strict=True)])
+        last = np.stack([row[r] for row, r in zip(rows, self.orders, strict=True)])
+        p = self._values(params)
+        z = self._states(below.reshape(len(below), -1), p)
+        u = self.maps.inputs_of(z, last.reshape(len(last), -1), p)[1]
+        check_branch(self.maps, z[: self.maps.nstates], u, p, np.full(z.shape[1], np.nan), str(self.name))
+        trailing = below.shape[1:]
+        return z[: self.maps.nstates].reshape(-1, *trailing), u.reshape(-1, *trailing)
+
+    def _states(self, flags: Array, p: Array) -> Array:
+        """Extended states (nz, n) of flags (nz, n): the first from the operating point, then neighbour by neighbour."""
+        maps = self.maps
+        z = np.full(flags.shape, np.nan)
+        if not flags.shape[1]:
+            return z
+        left = np.arange(flags.shape[1])
+        near = maps.start
+        while left.size:
+            k = int(left[0])
+            near = connected(maps, flags[:, k], p, near, str(self.name), np.nan)
+            z[:, k] = near
+            left = left[1:]
+            trial, found = maps.refined(np.repeat(near[:, None], left.size, axis=1), flags[:, left], p)
+            close = found & (np.max(np.abs(trial - near[:, None]) / maps.scales[:, None], axis=0) < _NEAR)
+            z[:, left[close]] = trial[:, close]
+            left = left[~close]
+        return z
+
+    def _extended(self, state: Array, plan: Trajectory, p: Array) -> Array:
+        """Extended state at the start of a plan for a given state of the plant."""
+        maps = self.maps
+        jet = plan.jet(np.array([plan.start]), max(self.orders))
+        flag = rows_of(jet, self.orders)[0][:, 0]
+        z = np.concatenate([state, maps.start[maps.nstates :]])
+        # The states of the extension that are nearest to the flag.
+        for _ in range(50):
+            slopes = maps.slopes(z, p)[:, maps.nstates :]
+            step = np.linalg.lstsq(slopes, flag - maps.flags(z, p), rcond=None)[0] if slopes.size else np.empty(0)
+            z[maps.nstates :] += step
+            if not step.size or np.max(np.abs(step) / (maps.scales[maps.nstates :])) < 1e-12:
+                break
+        return z
+
+
+def _evaluated(tape: Tape, names: Sequence[str], t: float, x: Value, u: Value, params: Params) -> Value:
+    """Result of a tape as a function of a block, of numbers or symbols."""
+    values = tape.evaluated((x, u, [params[name] for name in names]), NUMPY)
+    return np.array([values[k] if k >= 0 else 0.0 for k in tape.results])

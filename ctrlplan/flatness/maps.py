@@ -1,0 +1,233 @@
+"""Maps of a flat plant from its structure: states and controls of a flag by Newton's method, connected with a start.
+
+Evaluated by numpy for many flags at once, without CasADi.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctrlplan._types import Array
+from ctrlplan.symbolic.tape import Tape
+
+_SHORTEST = 2.0**-25
+"""Smallest part of a way, or of an interval, that is tried."""
+
+_MOVED = 0.3
+"""Distance in scales that a corrector may move."""
+
+_ITERATIONS = 12
+_CONVERGED = 1e-13
+"""Newton step in scales after which one more step reaches rounding."""
+
+
+class SingularError(ValueError):
+    """The states are not determined by a flag.
+
+    Attributes
+    ----------
+    position : float
+        Place on the way, as far as states were found.
+    """
+
+    def __init__(self, message: str, position: float) -> None:
+        super().__init__(message)
+        self.position = position
+
+
+@dataclass(frozen=True, eq=False)
+class FlatMaps:
+    """Flags of extended states, and their inverse.
+
+    Attributes
+    ----------
+    orders : tuple of int
+        Highest derivative of each flat output.
+    nstates : int
+        Number of states of the plant; those of the extension follow.
+    flags, slopes : Tape
+        y_j^(i), i < r_j, of all flat outputs as functions of (z, p), and their Jacobian.
+    last : Tape
+        y_j^(r_j) as functions of (z, mu, p), and their Jacobian by mu: (m, 1 + m).
+    controls : Tape
+        Controls of the plant as functions of (z, mu, p).
+    rates : Tape
+        z' as functions of (z, mu, p).
+    forward : Tape
+        Flags of (x, u, p) with u constant, up to the order r_j.
+    held : Tape
+        States of the extension as functions of (x, u, p) with u constant.
+    sides : Tape
+        Functions of (x, u, p) that are positive on the branch of the equations.
+    notes : tuple of str
+        Operation of each side.
+    names : tuple of str
+        Names of the entries of z.
+    start : ndarray
+        z at the operating point, or near it where that is singular.
+    scales : ndarray
+        Scales of z.
+    mu : ndarray
+        Controls of the extended plant at the start.
+    affine : bool
+        Whether `last` is affine in mu.
+    """
+
+    orders: tuple[int, ...]
+    nstates: int
+    flags: Tape
+    slopes: Tape
+    last: Tape
+    controls: Tape
+    rates: Tape
+    forward: Tape
+    held: Tape
+    sides: Tape
+    notes: tuple[str, ...]
+    names: tuple[str, ...]
+    start: Array
+    scales: Array
+    mu: Array
+    affine: bool
+
+    def flag_of(self, z: Array, p: Array) -> Array:
+        """Flags without their last entries, (nz, ...)."""
+        return self.flags(z, p)
+
+    def inputs_of(self, z: Array, last: Array, p: Array) -> tuple[Array, Array]:
+        """Controls of the extended plant and of the plant for the highest derivatives, (m, ...)."""
+        m = self.mu.size
+        mu = np.broadcast_to(self.mu.reshape(-1, *(1,) * (z.ndim - 1)), (m, *z.shape[1:])).copy()
+        for _ in range(1 if self.affine else _ITERATIONS):
+            rows = self.last(z, mu, p)
+            step = _solved(rows[:, 1:], last - rows[:, 0])
+            mu += step
+            if not step.size or np.nanmax(np.abs(step) / (1e-300 + np.abs(mu)), initial=0.0) < 1e-14:
+                break
+        return mu, self.controls(z, mu, p)
+
+    def refined(self, z: Array, flag: Array, p: Array, inverse: Array | None = None) -> tuple[Array, NDArray[np.bool_]]:
+        """States z (nz, n) of flags (nz, n) from states near them, and whether they were found.
+
+        `inverse`, (nz, nz, n), are the inverses of the slopes there, or near them.
+        """
+        with np.errstate(all="ignore"):
+            inverse = inverses(self.slopes(z, p)) if inverse is None else inverse
+            scale = self.scales[:, None]
+            before = np.full(z.shape[1], np.inf)
+            for k in range(_ITERATIONS):
+                step = np.einsum("ijn,jn->in", inverse, flag - self.flags(z, p))
+                z = z + step
+                size = np.max(np.abs(step) / (scale + np.abs(z)), axis=0)
+                if (size < _CONVERGED).all() or (k > 4 and (size >= 0.5 * before).all()):
+                    break
+                if k % 5 == 4:  # slow: the slopes have changed
+                    inverse = inverses(self.slopes(z, p))
+                before = size
+            found = np.isfinite(size) & (size < 1e-9)
+        return z, found
+
+    def followed(
+        self, z: Array, way: Callable[[float], Array], p: Array, first: float = 0.0, last: float = 1.0
+    ) -> Array:
+        """State at the end of a way of flags, connected with the state at its start.
+
+        Parameters
+        ----------
+        z : ndarray, shape (nz,)
+            State at the start.
+        way : callable
+            Flag (nz,) at a place between `first` and `last`.
+        p : ndarray
+            Parameters.
+
+        Raises
+        ------
+        SingularError
+            If the states are not determined somewhere on the way.
+        """
+        place, step = first, last - first
+        flag = way(first)
+        slopes = self.slopes(z, p)
+        sign = np.linalg.slogdet(slopes)[0]
+        while place < last:
+            step = min(step, last - place)
+            goal = way(place + step)
+            found = self._stepped(z, goal, flag, slopes, sign, p)
+            if found is None:
+                step *= 0.5
+                if step < _SHORTEST * (last - first):
+                    raise self._singular(z, slopes, place)
+                continue
+            z, slopes = found
+            flag = goal
+            place = last if place + step >= last else place + step
+            step *= 2.0
+        return z
+
+    def followed_simply(self, z: Array, flag: Array, goal: Array, p: Array) -> Array | None:
+        """State at the next flag if one step reaches it; otherwise None."""
+        slopes = self.slopes(z, p)
+        found = self._stepped(z, goal, flag, slopes, float(np.linalg.slogdet(slopes)[0]), p)
+        return None if found is None else found[0]
+
+    def _stepped(
+        self, z: Array, goal: Array, flag: Array, slopes: Array, sign: float, p: Array
+    ) -> tuple[Array, Array] | None:
+        """State at the next flag and the slopes there; None if the step is too long."""
+        with np.errstate(all="ignore"):
+            try:
+                predicted: Array = z + np.linalg.solve(slopes, goal - flag)
+                found = predicted
+                for k in range(_ITERATIONS):
+                    now = self.slopes(found, p)
+                    step = np.asarray(np.linalg.solve(now, goal - self.flags(found, p)), dtype=float)
+                    found = found + step
+                    if not np.isfinite(found).all() or self._distance(found, predicted) > _MOVED:
+                        return None
+                    if self._distance(step, 0.0) < _CONVERGED or (k > 3 and self._distance(step, 0.0) < 1e-11):
+                        break
+                else:
+                    return None
+            except np.linalg.LinAlgError:
+                return None
+            now = self.slopes(found, p)
+            same = np.linalg.slogdet(now)[0] == sign and self._distance(predicted, z) < 10.0 * _MOVED
+        return (found, now) if same else None
+
+    def _distance(self, z: Array, other: Array | float) -> float:
+        return float(np.max(np.abs(z - other) / self.scales))
+
+    def _singular(self, z: Array, slopes: Array, place: float) -> SingularError:
+        """Error that names the entry of z that is not determined."""
+        scaled = slopes * self.scales
+        scaled = scaled / np.maximum(np.abs(scaled).max(axis=1, keepdims=True), 1e-300)
+        weak = np.linalg.svd(scaled)[2][-1] if np.isfinite(scaled).all() else np.abs(z) / self.scales
+        name = self.names[int(np.argmax(np.abs(weak)))]
+        return SingularError(f"{name} is not determined by the flat outputs there", place)
+
+
+def _solved(matrix: Array, right: Array) -> Array:
+    """Solutions of linear systems (m, m, ...) with right sides (m, ...); nan where a matrix is singular."""
+    m = right.shape[0]
+    trailing = right.shape[1:]
+    inverse = inverses(np.broadcast_to(matrix, (m, m, *trailing)).reshape(m, m, -1))
+    return np.einsum("ijn,jn->in", inverse, right.reshape(m, -1)).reshape(right.shape)
+
+
+def inverses(matrices: Array) -> Array:
+    """Inverses of matrices (m, m, n); nan where a matrix is singular."""
+    stack = np.moveaxis(matrices, -1, 0)
+    try:
+        return np.moveaxis(np.asarray(np.linalg.inv(stack), dtype=float), 0, -1)
+    except np.linalg.LinAlgError:
+        out = np.full(stack.shape, np.nan)
+        for k, matrix in enumerate(stack):
+            with suppress(np.linalg.LinAlgError):
+                out[k] = np.linalg.inv(matrix)
+        return np.moveaxis(out, 0, -1)

@@ -1,0 +1,164 @@
+"""Tracking laws of flat plants that are derived from equations: with a dynamic extension, or quasi-static."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import control as ct
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ctrlplan._checks import check_signals, checked_range, finite_vector
+from ctrlplan._types import Array, Params, Value
+from ctrlplan.flatness.derived import DerivedFlatSystem
+from ctrlplan.symbolic.tape import NUMPY, Tape
+from ctrlplan.systems.poles import checked_gains
+from ctrlplan.traits import declare
+from ctrlplan.trajectories import derivative_name
+
+InputLimits = Mapping[str, tuple[float, float]]
+"""Lower and upper limits of inputs of a plant by name."""
+
+_RECOVERY = 0.1
+"""Time constant with which the extension follows saturated inputs, in those of the fastest pole."""
+
+
+def create_derived_law(
+    flat: DerivedFlatSystem,
+    poles: Value,
+    *,
+    quasi_static: bool,
+    integral: bool,
+    start: ArrayLike | None,
+    labels: Sequence[str],
+    suffix: str,
+    name: str,
+    limits: InputLimits | None = None,
+) -> ct.NonlinearIOSystem:
+    """Tracking law of a flat plant from its equations; see `create_flat_iosystem`."""
+    from ctrlplan.flatness.feedback import law_with_states, law_without_states, pole_counts
+
+    analysis = flat.analysis
+    counts = pole_counts(analysis, quasi_static, str(flat.name))
+    gains = checked_gains(poles, [count + int(integral) for count in counts])
+    bounds = _bounds(limits, flat)
+    if quasi_static:
+        law = law_without_states(analysis, gains, integral, str(flat.name))
+    else:
+        recover = (
+            None if bounds is None else _RECOVERY / float(np.abs(np.concatenate(list(map(np.ravel, poles)))).max())
+        )
+        law = law_with_states(analysis, gains, integral, recover)
+    first = _initial(flat, start, law.extension)
+    return _block(
+        flat,
+        law.control,
+        law.rates,
+        np.concatenate([first, np.zeros(len(labels) * integral)]),
+        bounds,
+        labels,
+        suffix,
+        integral,
+        name,
+    )
+
+
+def references(labels: Sequence[str], orders: Sequence[int], suffix: str) -> list[str]:
+    """Names of the references of flat outputs with their derivatives."""
+    return [derivative_name(label + suffix, k) for label, r in zip(labels, orders, strict=True) for k in range(r + 1)]
+
+
+def _block(
+    flat: DerivedFlatSystem,
+    control: Tape,
+    rates: Tape,
+    initial: Array,
+    bounds: tuple[Array, Array] | None,
+    labels: Sequence[str],
+    suffix: str,
+    integral: bool,
+    name: str,
+) -> ct.NonlinearIOSystem:
+    wanted = references(labels, flat.orders, suffix)
+    states = list(flat.state_labels)
+    if shared := sorted(set(wanted) & set(states)):
+        raise ValueError(f"labels and suffix must not give references the names of states, got {', '.join(shared)}")
+    p = flat.parameter_values().tolist()
+    count, extension = len(wanted), initial.size - len(labels) * integral
+    regular = _regular_arguments(flat, count, extension, initial.size)
+
+    def arguments(x: Value, u: Value) -> tuple[Value, Value, Value, Value, Value]:
+        # Blocks are first evaluated with all inputs zero, where many plants are singular: then the law is evaluated at
+        # a regular point and multiplied by 0. Without a branch, so that it can be traced.
+        idles = math.prod(value == 0.0 for value in u)
+        given = [value + idles * at for value, at in zip([*u, *x], regular, strict=True)]
+        return given[:count], given[count : count + len(states)], given[count + len(states) :], p, 1.0 - idles
+
+    def applied(x: Value, u: Value) -> tuple[list[Value], tuple[Value, Value, Value, Value, Value]]:
+        given = arguments(x, u)
+        values = _results(control, given[:4])
+        if bounds is not None:
+            values = [
+                np.minimum(np.maximum(value, low), high) for value, low, high in zip(values, *bounds, strict=True)
+            ]
+        return values, given
+
+    def output(t: float, x: Value, u: Value, params: Params) -> Value:
+        values, given = applied(x, u)
+        return [value * given[4] for value in values]
+
+    def update(t: float, x: Value, u: Value, params: Params) -> Value:
+        values, given = applied(x, u)
+        return [value * given[4] for value in _results(rates, (*given[:4], values))]
+
+    own = [f"{name}_w{k + 1}" for k in range(extension)]
+    own += [f"{name}_{label}_integral" for label in labels] if integral else []
+    block = ct.nlsys(
+        update if own else None,
+        output,
+        states=own or None,
+        inputs=[*wanted, *states],
+        outputs=list(flat.input_labels),
+        dt=0 if own else None,
+        name=name,
+    )
+    return declare(block, initial_state=initial) if own else block
+
+
+def _results(tape: Tape, arguments: Sequence[Value]) -> list[Value]:
+    with np.errstate(all="ignore"):
+        values = tape.evaluated(arguments, NUMPY)
+    return [values[k] if k >= 0 else 0.0 for k in tape.results]
+
+
+def _regular_arguments(flat: DerivedFlatSystem, count: int, extension: int, own: int) -> list[float]:
+    """References, states of the plant and of the law at which the maps are regular."""
+    maps = flat.maps
+    below = maps.flags(maps.start, flat.parameter_values())
+    rows, first = [], 0
+    for r in maps.orders:
+        rows += [*below[first : first + r].tolist(), 0.0]
+        first += r
+    law = maps.start[maps.nstates :].tolist() if extension else []
+    return [*rows[:count], *maps.start[: maps.nstates].tolist(), *law, *[0.0] * (own - extension)]
+
+
+def _initial(flat: DerivedFlatSystem, start: ArrayLike | None, extension: int) -> Array:
+    """States of the extension at the beginning."""
+    if start is None:
+        return flat.maps.start[flat.maps.nstates :][:extension].copy()
+    found = finite_vector(start, "start", str(extension))
+    if found.size != extension:
+        raise ValueError(f"start must be {extension} states of the extension, got {found.size}")
+    return found
+
+
+def _bounds(limits: InputLimits | None, flat: DerivedFlatSystem) -> tuple[Array, Array] | None:
+    if limits is None:
+        return None
+    names = list(flat.input_labels)
+    check_signals(tuple(limits), "limits", tuple(names), "input")
+    pairs = {name: checked_range(pair, f"limits[{name!r}]") for name, pair in limits.items()}
+    low, high = (np.array([pairs.get(name, (-np.inf, np.inf))[k] for name in names]) for k in (0, 1))
+    return low, high
