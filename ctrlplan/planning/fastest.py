@@ -96,6 +96,7 @@ class Fastest(Displayed):
                 ("feasible durations", "" if self.statement else f"{sets}, the end of the search" if cut else sets),
                 ("shorter durations", self.statement),
                 ("shorter plans rejected", self.rejection),
+                ("ranges of parameters", self.margins.coverage),
             ]
         )
         yield self.margins.table()
@@ -131,6 +132,7 @@ def fastest(
     durations: tuple[float, float] | None = None,
     tail: float | None = None,
     resolution: float = 1e-3,
+    params: Mapping[str, object] | None = None,
     quantities: System | None = None,
 ) -> Fastest:
     """Plan of minimum duration under limits.
@@ -162,6 +164,9 @@ def fastest(
     resolution : float, optional
         Margin relative to the range of a limit, for limits on signals of a linear
         loop: shorter feasible durations may be missed if none has a larger one.
+    params : mapping of str to float or (float, float), optional
+        Values or ranges of parameters of `system`, as for `margins`: limits are
+        satisfied for the worst ones.
     quantities : optional
         Deprecated name of `system`.
 
@@ -238,16 +243,30 @@ def fastest(
     """
     if hold not in get_args(Hold):
         raise ValueError(f"hold must be one of {', '.join(get_args(Hold))}, got {hold!r}")
-    limited = Limited(plan, limits, system_given(system, quantities), tail)
+    span = None if durations is None else checked_pair(durations, "durations")
+    if span is not None and not (span[0] > 0.0 and math.isfinite(span[1])):
+        raise ValueError(f"durations must be above 0 and finite, got {span[0]:g} to {span[1]:g}")
+    spare, chosen = checked_finite(resolution, "resolution", above=0.0), system_given(system, quantities)
+    if not params:
+        return fastest_under(plan, Limited(plan, limits, chosen, tail), hold, span, spare)
+    from ctrlplan.planning.parameters import Family
+    from ctrlplan.planning.robust import fastest_over
+
+    if hold == "path":
+        raise ValueError('hold must be "shape" or "waypoints" with ranges of parameters, got "path"')
+    return fastest_over(plan, limits, Family.of(chosen, params), hold, span, tail, spare)
+
+
+def fastest_under(
+    plan: Trajectory, limited: Limited, hold: Hold, span: tuple[float, float] | None, resolution: float
+) -> Fastest:
+    """Plan of minimum duration, for precomputed limits; arguments as for `fastest`."""
     limited.check_smooth(plan)
     extrema = plan.extrema()
     if not (extrema.maximum - extrema.minimum > 1e-14 * plan.peak()).any():
         raise ValueError(f"plan must move, got constant axes: {plan!r}")
-    span = None if durations is None else checked_pair(durations, "durations")
-    if span is not None and not (span[0] > 0.0 and math.isfinite(span[1])):
-        raise ValueError(f"durations must be above 0 and finite, got {span[0]:g} to {span[1]:g}")
     if limited.loop_bounds:
-        return _fastest_in_loop(plan, limited, hold, span, checked_finite(resolution, "resolution", above=0.0))
+        return _fastest_in_loop(plan, limited, hold, span, resolution)
     if hold == "waypoints":
         return _searched(_Replanned(plan, limited), span or _around(plan.duration), hold, endless=False)
     if hold == "path":
@@ -320,20 +339,26 @@ class _Replanned:
     per_octave = 24
 
     def __init__(self, plan: Trajectory, limited: Limited) -> None:
-        if not isinstance(plan, WaypointSpline):
-            raise TypeError(
-                f'plan must be a WaypointSpline, such as PolySpline, for hold="waypoints", '
-                f'got a {type(plan).__name__}; use hold="shape" or "path"'
-            )
-        self._plan, self.limited = plan.quiet(), limited
+        self._plan: Trajectory = plan.quiet() if isinstance(plan, WaypointSpline) else plan
+        self.limited = limited
 
     def plan(self, duration: float) -> Trajectory:
-        retimed = self._plan.retime(duration)
-        pairs = zip(self._plan.waypoints, retimed.waypoints, strict=True)
-        return retimed.through(given.scaled(moved.time, 1.0) for given, moved in pairs)
+        return replanned(self._plan, duration)
 
     def excess(self, duration: float) -> float:
         return self.limited.excess(self.limited.sampled(self.plan(duration)))
+
+
+def replanned(plan: Trajectory, duration: float) -> Trajectory:
+    """Plan of another duration with the derivatives of the waypoints preserved."""
+    if not isinstance(plan, WaypointSpline):
+        raise TypeError(
+            f'plan must be a WaypointSpline, such as PolySpline, for hold="waypoints", got a {type(plan).__name__}; '
+            'use hold="shape" or "path"'
+        )
+    retimed = plan.retime(duration)
+    pairs = zip(plan.waypoints, retimed.waypoints, strict=True)
+    return retimed.through(given.scaled(moved.time, 1.0) for given, moved in pairs)
 
 
 def fastest_within(plan: Trajectory, limited: Limited, span: tuple[float, float] | None = None) -> Fastest:

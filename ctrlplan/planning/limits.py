@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
@@ -45,16 +45,24 @@ class Margin:
     fraction : float
         Distance to the limit as a fraction of the scale; negative if the limit
         is violated.
+    parameters : mapping of str to float
+        Worst parameters within their ranges; empty without ranges.
+    coverage : str
+        How the worst parameters were found: "proved", "sampled, 312 points, corners
+        and interior", or empty without ranges.
     """
 
     bound: Bound
     value: float
     time: float
     fraction: float
+    parameters: Mapping[str, float] = field(default_factory=dict)
+    coverage: str = ""
 
     def __str__(self) -> str:
         at = "" if self.bound.kind == "rms" else f" at {self.time:.6g} s"
-        return f"{self.bound.name} {self.bound.range}: {self.value:.6g}{at}, {self.room}"
+        where = f" with {_listed(self.parameters)}" if self.parameters else ""
+        return f"{self.bound.name} {self.bound.range}: {self.value:.6g}{at}{where}, {self.room}"
 
     def of(self, bound: Bound) -> bool:
         """Whether it is the margin of a bound."""
@@ -83,10 +91,15 @@ class Margins(Displayed):
         One per limit.
     note : str
         How signals of a loop were computed; empty without a loop.
+    coverage : str
+        How ranges of parameters were covered: "proved", if all worst cases are
+        certain, otherwise "sampled, 312 points, corners and interior"; empty
+        without ranges.
     """
 
     rows: tuple[Margin, ...]
     note: str = ""
+    coverage: str = ""
 
     @property
     def active(self) -> Margin:
@@ -108,12 +121,18 @@ class Margins(Displayed):
 
     def _describe(self) -> Iterator[Part]:
         yield f"Margins of {counted(len(self), 'limit')}: {self.active}"
-        yield Facts([("signals of the loop", self.note)])
+        yield Facts(
+            [
+                ("signals of the loop", self.note),
+                ("ranges of parameters", self.coverage),
+                ("worst parameters", _listed(self.active.parameters)),
+            ]
+        )
         yield self.table()
 
     def table(self) -> Table:
         """Table with one row per limit, as print shows it."""
-        rows = [
+        rows: list[tuple[str, ...]] = [
             (
                 row.bound.name,
                 row.bound.range,
@@ -123,9 +142,11 @@ class Margins(Displayed):
             )
             for row in self.rows
         ]
-        return Table(
-            "Margins over the whole plan, the smallest first", ("signal", "limits", "value", "time [s]", "margin"), rows
-        )
+        heads: tuple[str, ...] = ("signal", "limits", "value", "time [s]", "margin")
+        if self.coverage:
+            heads += ("worst parameters",)
+            rows = [(*cells, _listed(row.parameters)) for cells, row in zip(rows, self.rows, strict=True)]
+        return Table("Margins over the whole plan, the smallest first", heads, rows)
 
     def to_pandas(self) -> pd.DataFrame:
         """Table with one row per limit: low, high, value, time, margin."""
@@ -142,6 +163,7 @@ def margins(
     system: System | None = None,
     *,
     tail: float | None = None,
+    params: Mapping[str, object] | None = None,
     quantities: System | None = None,
 ) -> Margins:
     """Margins of a plan to limits over its whole interval.
@@ -172,6 +194,10 @@ def margins(
         Time after the plan [s] for which a loop that is sampled or nonlinear is
         simulated; default: the duration of the plan. Signals of other loops are
         exact, at all times.
+    params : mapping of str to float or (float, float), optional
+        Values, or ranges (minimum, maximum), of parameters of `system`, which must
+        then be a plant that has them by name (`Crane`), or a function that takes
+        them by keyword and returns a loop or a flat system.
     quantities : optional
         Deprecated name of `system`.
 
@@ -182,15 +208,29 @@ def margins(
         active (the smallest margin), satisfied and note. Extrema of derivatives
         are exact up to rounding, those of quantities (`Trajectory.extrema_of`)
         have an error below 1e-9 of the larger of magnitude and limit, and those
-        of signals of a simulated loop below 1e-6 of their range.
+        of signals of a simulated loop below 1e-6 of their range. With ranges of
+        parameters each row is that of the worst parameters, with the attributes
+        parameters and coverage.
 
     Raises
     ------
     ValueError
         If a limit is not positive or does not increase, a name is unknown, or a
-        limited signal is infinite at a jump of a lower derivative.
+        limited signal is infinite at a jump of a lower derivative. If a parameter
+        is unknown, or its range does not increase.
+    TypeError
+        If `system` has no parameters, or returns neither a loop nor a flat system.
     RuntimeError
         If a quantity is not resolved because it is noisy or oscillates.
+
+    Notes
+    -----
+    A signal that is affine or linear fractional in each parameter, with the others
+    fixed and no pole in the range, has its worst value at a corner of the ranges.
+    Where the operations that compute a quantity show this, its margin is that of
+    the worst corner, and "proved". Otherwise it is "sampled": at the corners, the
+    centre and a Latin hypercube, 256 points in all, and from the worst six by a
+    pattern search. Signals of closed loops are always sampled.
 
     Examples
     --------
@@ -198,10 +238,28 @@ def margins(
     >>> move = cp.PolySpline([cp.Waypoint(0, 0, 0, 0), cp.Waypoint(2, 1, 0, 0)])
     >>> cp.margins(move, {"y_d1": 1.0})
     <Margins of 1 limit: y_d1 within ±1: 0.9375 at 1 s, 6.25 % left>
+
+    A load that is known to 20 %:
+
+    >>> rest = [0.0] * 4
+    >>> start = cp.Waypoint.from_jets(0, x=[0, *rest], z=[10, *rest])
+    >>> goal = cp.Waypoint.from_jets(15, x=[20, *rest], z=[8, *rest])
+    >>> lift = cp.PolySpline([start, goal])
+    >>> found = cp.margins(lift, {"F": 5e3}, cp.plants.Crane(), params={"load_mass": (400, 600)})
+    >>> found.active.parameters, found.coverage
+    ({'load_mass': 600.0}, 'proved')
     """
+    if params:
+        from ctrlplan.planning.parameters import Family, margins_over
+
+        return margins_over(plan, limits, Family.of(system_given(system, quantities), params), tail)
     limited = Limited(plan, limits, system_given(system, quantities), tail)
     limited.check_smooth(plan)
     return limited.margins(plan)
+
+
+def _listed(parameters: Mapping[str, float]) -> str:
+    return ", ".join(f"{name} = {value:.6g}" for name, value in parameters.items())
 
 
 class UndeterminedError(ValueError):
@@ -343,6 +401,17 @@ class Limited:
             for name in ahead:
                 change = weight * (np.asarray(ahead[name]) - np.asarray(behind[name])) / step
                 found[name] = found.get(name, 0.0) + change
+        return found
+
+    def excesses(self, plan: Trajectory, samples: Sampled) -> Array:
+        """Excess (nbounds,) over each limit: over samples, and of signals of a loop by its response."""
+        values, times = self.values(samples.jet), self._start + self._duration * samples.fractions
+        found = np.empty(len(self.bounds))
+        for k in self._local:
+            found[k] = self._excess_of(self.bounds[k], values[k], times, samples)
+        rows = list(self._loop_margins(plan, refined=False))
+        for k, row in zip([k for k, b in enumerate(self.bounds) if b.in_loop], rows, strict=True):
+            found[k] = -row.fraction
         return found
 
     def excess(self, samples: Sampled) -> float:

@@ -204,7 +204,7 @@ class DurationSearch:
     def _in_interval(self, block: _Block, left: int) -> float | None:
         """A feasible duration between two neighbours; inf if none has a larger margin than the resolution.
 
-        None if that is not known. Exact extrema at the most favourable duration complete the samples.
+        None if that is not known. Exact extrema at the minimum of the chords complete the samples.
         """
         ends = block.durations[left : left + 2]
         first, last = block.pairs(np.array([left]), None)
