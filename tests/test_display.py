@@ -60,6 +60,7 @@ MADE = {
     "Benefit": lambda: cp.benefit(comparison(), swept(5.0), alphas=[1.0], durations=[1.0]),
     "BlockTraits": lambda: cp.traits_of(cp.create_source_iosystem(quintic(), 2)),
     "Clearance": lambda: cp.clearance(cp.PolySpline(PLANE), [cp.Disc((10.0, 3.0), 1.0)], required=1.5),
+    "Clipped": lambda: cp.Clipped(quintic(), 0.0, 0.5),
     "Comparison": comparison,
     "Crane": cp.plants.Crane,
     "Disc": lambda: cp.Disc((10.0, 0.0), 1.0),
@@ -73,6 +74,7 @@ MADE = {
     "Margins": lambda: cp.margins(quintic(), {"y_d1": 1.0, "y_d2": (-5.0, 8.0)}),
     "Measure": lambda: cp.Measure("Error at the end", "{y}", "response", lambda seen: seen.error[:, -1]),
     "Occurrence": lambda: cp.Occurrence(1.5, "u", "above"),
+    "MotionProfile": lambda: cp.MotionProfile([0.0, 2.0], [[-0.5]], [[3.0], [1.0]], labels="x"),
     "Optimum": lambda: cp.optimize_waypoints([MOVE[0], cp.Waypoint(0.5, 2), MOVE[1]]),
     "PeakDerivative": lambda: cp.PeakDerivative(3),
     "PiecewiseSpline": lambda: cp.PiecewiseSpline([*MOVE, cp.Waypoint(3, 0, 0, 0)]),
@@ -99,7 +101,17 @@ MADE = {
 }  # fmt: skip
 """One object of each class."""
 
-PLANS = {"PiecewiseSpline", "PolySpline", "Retimed", "SCurve", "Step", "Trapezoid", "TrigSpline"}
+PLANS = {
+    "Clipped",
+    "MotionProfile",
+    "PiecewiseSpline",
+    "PolySpline",
+    "Retimed",
+    "SCurve",
+    "Step",
+    "Trapezoid",
+    "TrigSpline",
+}
 IN_JUPYTER = {
     "Waypoint",
     "Comparison",
