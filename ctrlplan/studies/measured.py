@@ -75,6 +75,14 @@ class MeasuredRun:
     left_out: tuple[str, ...] = ()
     failures: dict[str, str] = field(default_factory=dict)
 
+    @property
+    def aligned(self) -> SimulationResponse:
+        """The log with its own samples in the time of the plan."""
+        signals = signals_of(self.log)
+        t = np.asarray(self.log.time) - self.offset
+        reason = f"{t.size} samples, {self.offset:.6g} s earlier than logged"
+        return measured_response(t, np.array([*signals.values()]), list(signals), reason, f"Measured with {self.plan}")
+
     def sentences(self) -> Iterator[str]:
         """What a reader of the metrics must know."""
         yield self.resampling

@@ -58,6 +58,8 @@ from ctrlplan.systems.command_filter import command_filter_gains, command_lead, 
 from ctrlplan.systems.exposed import expose_states, state_signals
 from ctrlplan.systems.feedforward import create_feedforward_iosystem
 from ctrlplan.systems.flat import create_flat_iosystem
+from ctrlplan.systems.feedforward_fit import FeedforwardFit, fit_feedforward
+from ctrlplan.systems.flat import create_flat_iosystem, hurwitz_coefficients
 from ctrlplan.systems.governor import Admission, Governor, create_governor_iosystem
 from ctrlplan.systems.hybrid import Delay, SampleHold, create_delay_iosystem, sample_hold
 from ctrlplan.systems.pid import create_pid_iosystem
@@ -73,6 +75,7 @@ __all__ = [
     "AdmissibleSet",
     "Admission",
     "Delay",
+    "FeedforwardFit",
     "Governor",
     "Law",
     "PlanSource",
@@ -92,6 +95,7 @@ __all__ = [
     "create_source_iosystem",
     "create_time_scaling_iosystem",
     "expose_states",
+    "fit_feedforward",
     "flat_quantities",
     "hurwitz_coefficients",
     "plants",
