@@ -57,9 +57,8 @@ from ctrlplan.systems.admissible import AdmissibleSet
 from ctrlplan.systems.command_filter import command_filter_gains, command_lead, create_command_filter_iosystem
 from ctrlplan.systems.exposed import expose_states, state_signals
 from ctrlplan.systems.feedforward import create_feedforward_iosystem
-from ctrlplan.systems.flat import create_flat_iosystem
 from ctrlplan.systems.feedforward_fit import FeedforwardFit, fit_feedforward
-from ctrlplan.systems.flat import create_flat_iosystem, hurwitz_coefficients
+from ctrlplan.systems.flat import create_flat_iosystem
 from ctrlplan.systems.governor import Admission, Governor, create_governor_iosystem
 from ctrlplan.systems.hybrid import Delay, SampleHold, create_delay_iosystem, sample_hold
 from ctrlplan.systems.pid import create_pid_iosystem
