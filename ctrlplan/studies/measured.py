@@ -90,9 +90,9 @@ class MeasuredRun:
             yield f"its time is {abs(self.offset):.6g} s {self._order} than that of the plan, as given"
         else:
             size, error = 1e3 * abs(self.offset), 1e3 * self.standard_error
-            digits = min(max(1 - math.floor(math.log10(error)), 0), 6)
+            digits = min(max(1 - math.floor(math.log10(error)), 0), 4)
             yield (
-                f"its time is {size:.{digits}f} ± {error:.{digits}f} ms (standard error) {self._order} than that of "
+                f"its time is {size:.{digits}f} ± {error:.2g} ms (standard error) {self._order} than that of "
                 f"the plan, found from the {self.by} {', '.join(self.signals)} compared with {self.compared}"
             )
         if self.by in ("output", "control"):

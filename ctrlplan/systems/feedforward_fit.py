@@ -37,6 +37,8 @@ _THRESHOLD = 0.02
 """Velocity relative to its peak below which samples are left out: static friction is unknown there."""
 _LONGEST_DELAY = 0.5
 """Longest delay that is searched for [s], at most a tenth of the log."""
+_REACH = 0.8
+"""Periods of the cutoff frequency around a standstill that are left out: the filter mixes in what is unknown there."""
 _STEPS = 20
 """Steps of the Gauss-Newton method at most."""
 _COARSE = 1000
@@ -403,14 +405,14 @@ class _Data:
         every = 1
         if isinstance(motion, SampledMotion):
             # Minimum of the neighbourhood that the filter mixes.
-            reach = round(0.5 / motion.cutoff / self._dt)
+            reach = round(_REACH / motion.cutoff / self._dt)
             self._moving = t, minimum_filter1d(np.abs(jet[1]), 2 * reach + 1, mode="nearest")
             quiet = np.where(np.abs(jet[1]) > self.threshold, jet, 0.0 * jet)
             for name in names:
                 if name in _FILTERED or name in functions:
                     values = _term(name, functions, quiet if name in _FILTERED else jet)
                     self._columns[name] = FilteredColumn(t, np.broadcast_to(values, t.shape), motion)
-            every = max(int(1.0 / (4.0 * motion.cutoff * self._dt)), 1)  # filtered signals vary no faster
+            every = max(int(1.0 / (2.0 * motion.cutoff * self._dt)), 1)  # filtered noise is white at this rate
         self.t, self.u = t[::every], motion.smooth(control)[::every]
 
     def at(self, delay: float) -> tuple[Array, NDArray[np.bool_]]:
