@@ -30,6 +30,8 @@ Term: TypeAlias = str | tuple[str, Function]
 
 _ORDERS = {"static": 1, "velocity": 1, "acceleration": 2, "jerk": 3, "gravity": 0}
 """Derivative of the position that each term depends on."""
+TERMS = tuple(_ORDERS)
+"""Names of terms that are not functions of the user."""
 _FILTERED = frozenset({"static"})
 """Terms that are not linear in the position."""
 
@@ -133,6 +135,15 @@ class FeedforwardFit(Displayed):
         ]
         yield Table("Gains", ("term", "gain", "standard error", "95 % from", "to"), rows)
         yield from self.notes
+
+    def results(self) -> dict[str, object]:
+        """Plain data for JSON."""
+        return {
+            "gains": dict(self.gains),
+            "intervals": {name: list(interval) for name, interval in self.intervals.items()},
+            "delay": self.delay,
+            "delay_error": self.delay_error if math.isfinite(self.delay_error) else None,
+        }
 
     @property
     def order(self) -> int:
