@@ -29,6 +29,7 @@ Build the loop
     create_pid_iosystem       PID with limits and anti-windup
     create_saturation_iosystem, create_delay_iosystem    limits of an actuator, transport delay
     create_flat_iosystem      flat control of a flat plant; create_feedforward_iosystem: of a linear loop
+    fit_feedforward           feedforward gains and delay from a log -> FeedforwardFit
     sample_hold               discrete block in a continuous loop; expose_states: states among the outputs
     create_shaper_iosystem    input shaping of an operator's commands, also for a measured frequency
     create_command_filter_iosystem    filter with derivative outputs; command_filter_gains: its feedforward
@@ -120,6 +121,7 @@ _EXPORTS = {
     ),
     "systems": (
         "AdmissibleSet",
+        "FeedforwardFit",
         "Law",
         "command_filter_gains",
         "command_lead",
@@ -135,6 +137,7 @@ _EXPORTS = {
         "create_source_iosystem",
         "create_time_scaling_iosystem",
         "expose_states",
+        "fit_feedforward",
         "flat_quantities",
         "plants",
         "sample_hold",

@@ -53,6 +53,12 @@ def pendulum():
     )  # fmt: skip
 
 
+def logged_move():
+    t = np.linspace(0.0, 1.0, 501)
+    jet = quintic().jet(t, 1)[:, 0]
+    return cp.read_log({"time": t, "u": 2.0 * jet[1], "y": 0.9 * jet[0]})
+
+
 MADE = {
     "AdmissibleSet": lambda: cp.AdmissibleSet(first_order(), {"u": (-1.0, 1.0)}, 0.1),
     "AlphaChoice": lambda: cp.choose_alpha(MOVE, "peak_jerk"),
@@ -68,6 +74,7 @@ MADE = {
     "Event": lambda: cp.Event("u", low=0.0),
     "Experiment": lambda: cp.Experiment(MOVE, TIMES, measures=["iae"]),
     "Fastest": lambda: cp.fastest(quintic(), {"y_d1": 0.5, "y_d2": 2.0}),
+    "FeedforwardFit": lambda: cp.fit_feedforward(logged_move(), quintic(), terms=["velocity", ("spring", np.sin)]),
     "FlatSystem": lambda: cp.plants.Crane().flat_system(),
     "HalfPlane": lambda: cp.HalfPlane((0.0, 1.0), 2.0),
     "Limits": lambda: cp.Limits(high=1.0),
@@ -123,7 +130,17 @@ IN_JUPYTER = {
     "Margins",
     "Clearance",
 }
-IN_JUPYTER |= {*PLANS, "Crane", "FlatSystem", "Avoidance", "Benefit", "SimulationResponse", "Experiment", "Shaper"}
+IN_JUPYTER |= {
+    *PLANS,
+    "Crane",
+    "FlatSystem",
+    "Avoidance",
+    "Benefit",
+    "SimulationResponse",
+    "Experiment",
+    "Shaper",
+    "FeedforwardFit",
+}
 DRAWN = {*PLANS, "Fastest", "Optimum", "AlphaChoice", "Avoidance"}
 
 every = pytest.mark.parametrize("name", sorted(MADE))

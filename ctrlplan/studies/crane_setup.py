@@ -138,7 +138,9 @@ def marked_slack(found: Comparison) -> Comparison:
         if any(event.name == SLACK.name and event.stop for event in found.responses[name].events)
     }
     found = found.marked(ended)
-    slack = {name: values["slack_time"] for name, values in found.metrics.items() if values["slack_time"] > 0.0}
+    slack = {
+        name: values["slack_time"] for name, values in found.metrics.items() if values.get("slack_time", 0.0) > 0.0
+    }
     return found.marked(
         {
             name: f"the rope is slack for {time:.2g} s, and the model is not valid for a slack rope"
