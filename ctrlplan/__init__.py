@@ -27,6 +27,8 @@ Build the loop
     create_source_iosystem    plan as a block with outputs y, y_d1, ...; source_samples: the same as arrays
     create_pid_iosystem       PID with limits and anti-windup
     create_saturation_iosystem, create_delay_iosystem    limits of an actuator, transport delay
+    flat_system               flat system of a plant, from its equations -> DerivedFlatSystem, NotFlatError
+    FlatSystem                flat system from maps of your own
     create_flat_iosystem      flat control of a flat plant; create_feedforward_iosystem: of a linear loop
     sample_hold               discrete block in a continuous loop; expose_states: states among the outputs
     create_command_filter_iosystem    filter with derivative outputs; command_filter_gains: its feedforward

@@ -62,6 +62,7 @@ MADE = {
     "Clearance": lambda: cp.clearance(cp.PolySpline(PLANE), [cp.Disc((10.0, 3.0), 1.0)], required=1.5),
     "Comparison": comparison,
     "Crane": cp.plants.Crane,
+    "DerivedFlatSystem": lambda: cp.flat_system(cp.plants.dc_motor(), "angle"),
     "Disc": lambda: cp.Disc((10.0, 0.0), 1.0),
     "Ensemble": lambda: cp.monte_carlo(swept, cp.draws(4, gain=(1.0, 9.0)), {"a": quintic()}, TIMES, progress=False),
     "Event": lambda: cp.Event("u", low=0.0),

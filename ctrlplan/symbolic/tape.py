@@ -1,4 +1,4 @@
-"""Instruction lists of CasADi functions, evaluated by numpy for many points at once, or by mpmath.
+"""Instruction lists of CasADi functions, evaluated by numpy for arrays of points, or by mpmath.
 
 A tape needs no CasADi to be evaluated, and can be pickled.
 """
