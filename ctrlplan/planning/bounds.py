@@ -421,6 +421,11 @@ class Bound:
         return signal.axis if not others and factor == 1.0 and self.kind != "rms" else None
 
     @property
+    def weights(self) -> dict[str, float]:
+        """Factors by the name of a signal."""
+        return {signal.name: factor for signal, factor in self.terms}
+
+    @property
     def in_loop(self) -> bool:
         """Whether a signal of a loop is limited."""
         return self.terms[0][0].loop

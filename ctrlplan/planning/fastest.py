@@ -12,11 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
-from ctrlplan._checks import checked_pair
+from ctrlplan._checks import checked_finite, checked_pair
 from ctrlplan._display import Displayed, Facts, Figure, Part
 from ctrlplan._renamed import FormerAttribute
 from ctrlplan.planning.limits import Limited, Margin, Margins
-from ctrlplan.planning.quantities import System, system_given
+from ctrlplan.planning.loop_fastest import LoopProblem, bounds_of_values
+from ctrlplan.planning.quantities import System, shapes_given, system_given
 from ctrlplan.planning.scalar_search import bisected, scan
 from ctrlplan.planning.time_law import with_fast_time_law
 from ctrlplan.trajectories import Trajectory, WaypointSpline
@@ -29,8 +30,6 @@ if TYPE_CHECKING:
 
 Hold = Literal["shape", "waypoints", "path"]
 """Property of a plan that `fastest` preserves."""
-_PER_OCTAVE = 24
-"""Number of durations per octave at which limits are evaluated."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -45,7 +44,8 @@ class Fastest(Displayed):
         Margins of all limits over the whole plan, the active one first.
     feasible : tuple of (float, float)
         Intervals of feasible durations [s], increasing. The last end is inf if
-        every longer duration is feasible, otherwise the end of the search.
+        every longer duration is feasible, otherwise the end of the search. With
+        `statement` only the minimum duration.
     hold : str
         Property that was preserved: "shape", "waypoints" or "path".
     limited : Limited
@@ -55,6 +55,9 @@ class Fastest(Displayed):
         is active; otherwise empty.
     searched : (float, float)
         Interval of durations [s] of the search.
+    statement : str
+        What is known of shorter durations, for limits on signals of a loop;
+        otherwise empty.
     """
 
     plan: Trajectory
@@ -64,6 +67,7 @@ class Fastest(Displayed):
     limited: Limited
     rejection: str = ""
     searched: tuple[float, float] = (0.0, math.inf)
+    statement: str = ""
 
     @property
     def duration(self) -> float:
@@ -89,8 +93,10 @@ class Fastest(Displayed):
             [
                 ("minimum duration", f"{self.duration:.6g} s"),
                 ("active limit", f"{active} {self.active.bound.range}, at {self.active.time:.6g} s" if active else ""),
-                ("feasible durations", f"{sets}, the end of the search" if cut else sets),
+                ("feasible durations", "" if self.statement else f"{sets}, the end of the search" if cut else sets),
+                ("shorter durations", self.statement),
                 ("shorter plans rejected", self.rejection),
+                ("ranges of parameters", self.margins.coverage),
             ]
         )
         yield self.margins.table()
@@ -124,6 +130,9 @@ def fastest(
     *,
     hold: Hold = "shape",
     durations: tuple[float, float] | None = None,
+    tail: float | None = None,
+    resolution: float = 1e-3,
+    params: Mapping[str, object] | None = None,
     quantities: System | None = None,
 ) -> Fastest:
     """Plan of minimum duration under limits.
@@ -137,7 +146,8 @@ def fastest(
         Plan to be retimed, with a duration.
     limits, system
         Limits of derivatives, and of quantities of a system (a flat system, a
-        `Crane`, or a function of the jet), as for `margins`.
+        `Crane`, or a function of the jet) or of signals of a loop, as for
+        `margins`.
     hold : {"shape", "waypoints", "path"}, optional
         Property that is preserved. "shape": time is scaled uniformly, and the
         derivatives with it, including those at the ends. "waypoints": the times
@@ -149,6 +159,14 @@ def fastest(
         Interval of durations [s] of the search. Default: from 1/64 of the minimum
         that was found (of the plan's duration for "waypoints") to 64 times the
         plan's duration.
+    tail : float, optional
+        Time after the plan [s] for which a loop is simulated, as for `margins`.
+    resolution : float, optional
+        Margin relative to the range of a limit, for limits on signals of a linear
+        loop: shorter feasible durations may be missed if none has a larger one.
+    params : mapping of str to float or (float, float), optional
+        Values or ranges of parameters of `system`, as for `margins`: limits are
+        satisfied for the worst ones.
     quantities : optional
         Deprecated name of `system`.
 
@@ -166,7 +184,9 @@ def fastest(
         limited signal is infinite at a jump of a lower derivative. If the plan is
         shaped (`Shaper`), since another duration would change the delays. If the
         plan is closed and in motion at its ends and `hold` is "path", since the
-        velocities at the ends would differ.
+        velocities at the ends would differ. If limits of a loop are violated in
+        its steady state, or `hold` is "path", which requires limits that are
+        local in time.
     RuntimeError
         If a quantity is not resolved because it is noisy or oscillates.
 
@@ -182,6 +202,21 @@ def fastest(
     of derivatives exactly, of quantities to the tolerance of `margins`, and up to
     rounding where a limit is attained at rest. Inside the intervals of
     `Fastest.feasible` limits were evaluated at samples only.
+
+    Limits on signals of a linear continuous loop, with fixed shape, are evaluated
+    with the exact response over all times, from rest at the first position of the
+    plan. At a fixed fraction of the plan, and at a fixed time after it, a signal
+    is a smooth function of the logarithm of the duration, and moments of the
+    loop's impulse responses bound its curvature. Between two durations the excess
+    over a limit is at least the chord minus this bound; intervals in which that is
+    positive are excluded, others are halved. No shorter duration of the search
+    satisfies every limit with a margin above `resolution`, as
+    `Fastest.statement` says; longer durations are not searched.
+
+    With hold="waypoints", and for other loops, limits on signals of a loop are
+    evaluated by its response at 12 durations per octave, with the same refinement
+    as those of quantities. A feasible interval that is shorter than these, and is
+    not preceded by a decrease of the violation, may be missed.
 
     With fixed path the plan is not exactly time-optimal. The rate of the time law
     is a spline with 16 knots in the time of the given plan, not along its path, so
@@ -208,14 +243,30 @@ def fastest(
     """
     if hold not in get_args(Hold):
         raise ValueError(f"hold must be one of {', '.join(get_args(Hold))}, got {hold!r}")
-    limited = Limited(plan, limits, system_given(system, quantities))
+    span = None if durations is None else checked_pair(durations, "durations")
+    if span is not None and not (span[0] > 0.0 and math.isfinite(span[1])):
+        raise ValueError(f"durations must be above 0 and finite, got {span[0]:g} to {span[1]:g}")
+    spare, chosen = checked_finite(resolution, "resolution", above=0.0), system_given(system, quantities)
+    if not params:
+        return fastest_under(plan, Limited(plan, limits, chosen, tail), hold, span, spare)
+    from ctrlplan.planning.parameters import Family
+    from ctrlplan.planning.robust import fastest_over
+
+    if hold == "path":
+        raise ValueError('hold must be "shape" or "waypoints" with ranges of parameters, got "path"')
+    return fastest_over(plan, limits, Family.of(chosen, params), hold, span, tail, spare)
+
+
+def fastest_under(
+    plan: Trajectory, limited: Limited, hold: Hold, span: tuple[float, float] | None, resolution: float
+) -> Fastest:
+    """Plan of minimum duration, for precomputed limits; arguments as for `fastest`."""
     limited.check_smooth(plan)
     extrema = plan.extrema()
     if not (extrema.maximum - extrema.minimum > 1e-14 * plan.peak()).any():
         raise ValueError(f"plan must move, got constant axes: {plan!r}")
-    span = None if durations is None else checked_pair(durations, "durations")
-    if span is not None and not (span[0] > 0.0 and math.isfinite(span[1])):
-        raise ValueError(f"durations must be above 0 and finite, got {span[0]:g} to {span[1]:g}")
+    if limited.loop_bounds:
+        return _fastest_in_loop(plan, limited, hold, span, resolution)
     if hold == "waypoints":
         return _searched(_Replanned(plan, limited), span or _around(plan.duration), hold, endless=False)
     if hold == "path":
@@ -228,6 +279,27 @@ def fastest(
     law = with_fast_time_law(uniform.plan.shift(-plan.start), limited).shift(plan.start)
     retimed = fastest_within(law, limited, span)
     return replace(min(retimed, uniform, key=lambda found: found.duration), hold=hold)
+
+
+def _fastest_in_loop(
+    plan: Trajectory, limited: Limited, hold: Hold, span: tuple[float, float] | None, resolution: float
+) -> Fastest:
+    """Plan of minimum duration under limits on signals of a loop."""
+    if hold == "path":
+        limited.check_constant('limits with hold="path"')
+    _check_rest(plan, limited)
+    minimum = _closed_form(plan, limited) if hold == "shape" else 0.0
+    limited.check_ends(plan)
+    shapes = shapes_given(limited.loop)
+    if shapes is None or hold == "waypoints" or not bounds_of_values(limited):
+        family = _InLoop(_Scaled(plan, limited) if hold == "shape" else _Replanned(plan, limited))
+        return _searched(family, span or _span(family, plan.duration, minimum), hold, endless=False)
+    problem = LoopProblem(plan, limited, shapes, resolution)
+    shortest, searched = problem.shortest(span, minimum)
+    found = _satisfying(limited, plan.retime, shortest)
+    feasible = ((found.duration, found.duration),)
+    statement = problem.statement(*searched)
+    return Fastest(found, limited.margins(found), feasible, "shape", limited, "", searched, statement)
 
 
 def _check_open(plan: Trajectory) -> None:
@@ -248,6 +320,8 @@ def _check_open(plan: Trajectory) -> None:
 class _Scaled:
     """Plans of fixed shape as a function of duration: jets are scaled by powers."""
 
+    per_octave = 24
+
     def __init__(self, plan: Trajectory, limited: Limited) -> None:
         self._plan, self.limited = plan, limited
         self._samples = limited.sampled(plan)
@@ -262,21 +336,29 @@ class _Scaled:
 class _Replanned:
     """Plans with fixed derivatives at the waypoints as a function of duration."""
 
+    per_octave = 24
+
     def __init__(self, plan: Trajectory, limited: Limited) -> None:
-        if not isinstance(plan, WaypointSpline):
-            raise TypeError(
-                f'plan must be a WaypointSpline, such as PolySpline, for hold="waypoints", '
-                f'got a {type(plan).__name__}; use hold="shape" or "path"'
-            )
-        self._plan, self.limited = plan.quiet(), limited
+        self._plan: Trajectory = plan.quiet() if isinstance(plan, WaypointSpline) else plan
+        self.limited = limited
 
     def plan(self, duration: float) -> Trajectory:
-        retimed = self._plan.retime(duration)
-        pairs = zip(self._plan.waypoints, retimed.waypoints, strict=True)
-        return retimed.through(given.scaled(moved.time, 1.0) for given, moved in pairs)
+        return replanned(self._plan, duration)
 
     def excess(self, duration: float) -> float:
         return self.limited.excess(self.limited.sampled(self.plan(duration)))
+
+
+def replanned(plan: Trajectory, duration: float) -> Trajectory:
+    """Plan of another duration with the derivatives of the waypoints preserved."""
+    if not isinstance(plan, WaypointSpline):
+        raise TypeError(
+            f'plan must be a WaypointSpline, such as PolySpline, for hold="waypoints", got a {type(plan).__name__}; '
+            'use hold="shape" or "path"'
+        )
+    retimed = plan.retime(duration)
+    pairs = zip(plan.waypoints, retimed.waypoints, strict=True)
+    return retimed.through(given.scaled(moved.time, 1.0) for given, moved in pairs)
 
 
 def fastest_within(plan: Trajectory, limited: Limited, span: tuple[float, float] | None = None) -> Fastest:
@@ -292,6 +374,19 @@ def fastest_within(plan: Trajectory, limited: Limited, span: tuple[float, float]
     if limited.may_end:
         return _searched(scaled, span or _around(plan.duration), "shape", endless=False)
     return _searched(scaled, span or _span(scaled, plan.duration, minimum), "shape", endless=True)
+
+
+class _InLoop:
+    """Plans under limits that include those of signals of a loop."""
+
+    per_octave = 12
+
+    def __init__(self, family: _Scaled | _Replanned) -> None:
+        self.plan, self.limited, self._own = family.plan, family.limited, family.excess
+
+    def excess(self, duration: float) -> float:
+        own = self._own(duration)
+        return own if math.isinf(own) and own > 0.0 else max(own, self.limited.loop_excess(self.plan(duration)))
 
 
 def _check_rest(plan: Trajectory, limited: Limited) -> None:
@@ -331,7 +426,7 @@ def _around(duration: float) -> tuple[float, float]:
     return duration / 64.0, 64.0 * duration
 
 
-def _span(scaled: _Scaled, duration: float, minimum: float) -> tuple[float, float]:
+def _span(scaled: _Scaled | _InLoop, duration: float, minimum: float) -> tuple[float, float]:
     """Interval of durations of the search, from violated to satisfied limits."""
     excess, high = scaled.excess, max(duration, minimum)
     for _ in range(60):
@@ -348,11 +443,11 @@ def _span(scaled: _Scaled, duration: float, minimum: float) -> tuple[float, floa
     return max(low, 0.999 * minimum), 1.01 * high
 
 
-def _searched(family: _Scaled | _Replanned, span: tuple[float, float], hold: Hold, endless: bool) -> Fastest:
+def _searched(family: _Scaled | _Replanned | _InLoop, span: tuple[float, float], hold: Hold, endless: bool) -> Fastest:
     """Plan of minimum duration, and all feasible durations; `endless` if every slower plan is feasible."""
     limited = family.limited
     exact = cache(lambda duration: limited.exact_excess(family.plan(duration)))
-    count = max(9, math.ceil(_PER_OCTAVE * math.log2(span[1] / span[0])))
+    count = max(9, math.ceil(family.per_octave * math.log2(span[1] / span[0])))
     durations, excess = scan(family.excess, np.geomspace(*span, count), 0.0)
     feasible = []
     for low, high in _runs(excess <= 0.0):
@@ -423,9 +518,11 @@ def _satisfying(limited: Limited, plan_of: Callable[[float], Trajectory], durati
     raise ValueError(f"limits must be satisfied near {duration:.6g} s, got {limited.margins(plan).active}")
 
 
-def _reject(family: _Scaled | _Replanned, durations: Array, excess: Array) -> NoReturn:
+def _reject(family: _Scaled | _Replanned | _InLoop, durations: Array, excess: Array) -> NoReturn:
     span = f"from {durations[0]:.4g} to {durations[-1]:.4g} s"
     if math.isinf(excess.min()):
+        if family.limited.loop_bounds:
+            family.limited.margins(family.plan(float(durations[-1])))  # raises the reason
         raise ValueError(f"the plan must be feasible for the plant for some duration {span}, got none")
     nearest = float(durations[int(excess.argmin())])
     worst = family.limited.margins(family.plan(nearest)).active

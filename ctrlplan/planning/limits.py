@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ctrlplan._checks import check_kind
-from ctrlplan._display import Displayed, Part, Table, counted
+from ctrlplan._display import Displayed, Facts, Part, Table, counted
 from ctrlplan._renamed import FormerAttribute
 from ctrlplan.planning.bounds import Bound
 from ctrlplan.planning.naming import Naming
@@ -45,16 +45,24 @@ class Margin:
     fraction : float
         Distance to the limit as a fraction of the scale; negative if the limit
         is violated.
+    parameters : mapping of str to float
+        Worst parameters within their ranges; empty without ranges.
+    coverage : str
+        How the worst parameters were found: "proved", "sampled, 312 points, corners
+        and interior", or empty without ranges.
     """
 
     bound: Bound
     value: float
     time: float
     fraction: float
+    parameters: Mapping[str, float] = field(default_factory=dict)
+    coverage: str = ""
 
     def __str__(self) -> str:
         at = "" if self.bound.kind == "rms" else f" at {self.time:.6g} s"
-        return f"{self.bound.name} {self.bound.range}: {self.value:.6g}{at}, {self.room}"
+        where = f" with {_listed(self.parameters)}" if self.parameters else ""
+        return f"{self.bound.name} {self.bound.range}: {self.value:.6g}{at}{where}, {self.room}"
 
     def of(self, bound: Bound) -> bool:
         """Whether it is the margin of a bound."""
@@ -81,9 +89,17 @@ class Margins(Displayed):
     ----------
     rows : tuple of Margin
         One per limit.
+    note : str
+        How signals of a loop were computed; empty without a loop.
+    coverage : str
+        How ranges of parameters were covered: "proved", if all worst cases are
+        certain, otherwise "sampled, 312 points, corners and interior"; empty
+        without ranges.
     """
 
     rows: tuple[Margin, ...]
+    note: str = ""
+    coverage: str = ""
 
     @property
     def active(self) -> Margin:
@@ -105,11 +121,18 @@ class Margins(Displayed):
 
     def _describe(self) -> Iterator[Part]:
         yield f"Margins of {counted(len(self), 'limit')}: {self.active}"
+        yield Facts(
+            [
+                ("signals of the loop", self.note),
+                ("ranges of parameters", self.coverage),
+                ("worst parameters", _listed(self.active.parameters)),
+            ]
+        )
         yield self.table()
 
     def table(self) -> Table:
         """Table with one row per limit, as print shows it."""
-        rows = [
+        rows: list[tuple[str, ...]] = [
             (
                 row.bound.name,
                 row.bound.range,
@@ -119,9 +142,11 @@ class Margins(Displayed):
             )
             for row in self.rows
         ]
-        return Table(
-            "Margins over the whole plan, the smallest first", ("signal", "limits", "value", "time [s]", "margin"), rows
-        )
+        heads: tuple[str, ...] = ("signal", "limits", "value", "time [s]", "margin")
+        if self.coverage:
+            heads += ("worst parameters",)
+            rows = [(*cells, _listed(row.parameters)) for cells, row in zip(rows, self.rows, strict=True)]
+        return Table("Margins over the whole plan, the smallest first", heads, rows)
 
     def to_pandas(self) -> pd.DataFrame:
         """Table with one row per limit: low, high, value, time, margin."""
@@ -133,7 +158,13 @@ class Margins(Displayed):
 
 
 def margins(
-    plan: Trajectory, limits: Mapping[str, object], system: System | None = None, *, quantities: System | None = None
+    plan: Trajectory,
+    limits: Mapping[str, object],
+    system: System | None = None,
+    *,
+    tail: float | None = None,
+    params: Mapping[str, object] | None = None,
+    quantities: System | None = None,
 ) -> Margins:
     """Margins of a plan to limits over its whole interval.
 
@@ -141,19 +172,32 @@ def margins(
     ----------
     plan : Trajectory
         Plan with a duration.
-    limits : mapping of str to float, (float, float), Limits or array_like
-        Limits by the name of a derivative (x, x_d1, x_d2, ...) or of a quantity:
-        a number above 0 for the magnitude, a pair (minimum, maximum) with None
-        for no limit, or `Limits`. The names velocity, acceleration, jerk and
-        snap stand for the derivatives of every axis: with a number or a tuple
-        (minimum, maximum) for all axes, or with a list or array of naxes numbers
-        or of shape (naxes, 2) by axis. Limits of a derivative must include 0.
-    system : flat system, Crane or callable, optional
-        System of the limited quantities: a `control.flatsys.FlatSystem` (states
-        and inputs), a `Crane`, a plant with a method ``quantities``, or a
-        function that maps a jet (order + 1, naxes, ntime) to a mapping of names
-        to signals (ntime,). Quantities that the plan does not determine at rest
-        (heading and steering angle of a car) are nan there and rejected.
+    limits : mapping of str to float, (float, float), Limits, Region or array_like
+        Limits by the name of a derivative (x, x_d1, x_d2, ...), of a quantity, or
+        of a signal of a loop: a number above 0 for the magnitude, a pair (minimum,
+        maximum) with None for no limit, or `Limits`. The names velocity,
+        acceleration, jerk and snap stand for the derivatives of every axis: with a
+        number or a tuple (minimum, maximum) for all axes, or with a list or array
+        of naxes numbers or of shape (naxes, 2) by axis. Limits of a derivative
+        must include 0. A `Region` of two signals has any name. With a loop, a name
+        means the loop's signal; ``{"plan": {...}, "loop": {...}}`` says whose a
+        name is, which is required where an axis was given the name of another
+        signal of the loop by ``labels=``.
+    system : flat system, Crane, loop or callable, optional
+        System of the limited signals: a `control.flatsys.FlatSystem` (states and
+        inputs), a `Crane`, a plant with a method ``quantities``, a function that
+        maps a jet (order + 1, naxes, ntime) to a mapping of names to signals
+        (ntime,), or a loop (outputs and inputs; see `loop_quantities`).
+        Quantities that the plan does not determine at rest (heading and steering
+        angle of a car) are nan there and rejected.
+    tail : float, optional
+        Time after the plan [s] for which a loop that is sampled or nonlinear is
+        simulated; default: the duration of the plan. Signals of other loops are
+        exact, at all times.
+    params : mapping of str to float or (float, float), optional
+        Values, or ranges (minimum, maximum), of parameters of `system`, which must
+        then be a plant that has them by name (`Crane`), or a function that takes
+        them by keyword and returns a loop or a flat system.
     quantities : optional
         Deprecated name of `system`.
 
@@ -161,17 +205,32 @@ def margins(
     -------
     Margins
         With the attributes rows (a `Margin` per limit, the smallest first),
-        active (the smallest margin) and satisfied. Extrema of derivatives are
-        exact up to rounding, those of quantities (`Trajectory.extrema_of`) have
-        an error below 1e-9 of the larger of magnitude and limit.
+        active (the smallest margin), satisfied and note. Extrema of derivatives
+        are exact up to rounding, those of quantities (`Trajectory.extrema_of`)
+        have an error below 1e-9 of the larger of magnitude and limit, and those
+        of signals of a simulated loop below 1e-6 of their range. With ranges of
+        parameters each row is that of the worst parameters, with the attributes
+        parameters and coverage.
 
     Raises
     ------
     ValueError
         If a limit is not positive or does not increase, a name is unknown, or a
-        limited signal is infinite at a jump of a lower derivative.
+        limited signal is infinite at a jump of a lower derivative. If a parameter
+        is unknown, or its range does not increase.
+    TypeError
+        If `system` has no parameters, or returns neither a loop nor a flat system.
     RuntimeError
         If a quantity is not resolved because it is noisy or oscillates.
+
+    Notes
+    -----
+    A signal that is affine or linear fractional in each parameter, with the others
+    fixed and no pole in the range, has its worst value at a corner of the ranges.
+    Where the operations that compute a quantity show this, its margin is that of
+    the worst corner, and "proved". Otherwise it is "sampled": at the corners, the
+    centre and a Latin hypercube, 256 points in all, and from the worst six by a
+    pattern search. Signals of closed loops are always sampled.
 
     Examples
     --------
@@ -179,10 +238,28 @@ def margins(
     >>> move = cp.PolySpline([cp.Waypoint(0, 0, 0, 0), cp.Waypoint(2, 1, 0, 0)])
     >>> cp.margins(move, {"y_d1": 1.0})
     <Margins of 1 limit: y_d1 within ±1: 0.9375 at 1 s, 6.25 % left>
+
+    A load that is known to 20 %:
+
+    >>> rest = [0.0] * 4
+    >>> start = cp.Waypoint.from_jets(0, x=[0, *rest], z=[10, *rest])
+    >>> goal = cp.Waypoint.from_jets(15, x=[20, *rest], z=[8, *rest])
+    >>> lift = cp.PolySpline([start, goal])
+    >>> found = cp.margins(lift, {"F": 5e3}, cp.plants.Crane(), params={"load_mass": (400, 600)})
+    >>> found.active.parameters, found.coverage
+    ({'load_mass': 600.0}, 'proved')
     """
-    limited = Limited(plan, limits, system_given(system, quantities))
+    if params:
+        from ctrlplan.planning.parameters import Family, margins_over
+
+        return margins_over(plan, limits, Family.of(system_given(system, quantities), params), tail)
+    limited = Limited(plan, limits, system_given(system, quantities), tail)
     limited.check_smooth(plan)
     return limited.margins(plan)
+
+
+def _listed(parameters: Mapping[str, float]) -> str:
+    return ", ".join(f"{name} = {value:.6g}" for name, value in parameters.items())
 
 
 class UndeterminedError(ValueError):
@@ -326,6 +403,17 @@ class Limited:
                 found[name] = found.get(name, 0.0) + change
         return found
 
+    def excesses(self, plan: Trajectory, samples: Sampled) -> Array:
+        """Excess (nbounds,) over each limit: over samples, and of signals of a loop by its response."""
+        values, times = self.values(samples.jet), self._start + self._duration * samples.fractions
+        found = np.empty(len(self.bounds))
+        for k in self._local:
+            found[k] = self._excess_of(self.bounds[k], values[k], times, samples)
+        rows = list(self._loop_margins(plan, refined=False))
+        for k, row in zip([k for k, b in enumerate(self.bounds) if b.in_loop], rows, strict=True):
+            found[k] = -row.fraction
+        return found
+
     def excess(self, samples: Sampled) -> float:
         """Maximum excess over samples, without limits of a loop; inf if the plan is infeasible for the plant."""
         if not self._local:
@@ -379,11 +467,39 @@ class Limited:
             return -self.margins(plan).active.fraction
         except ValueError:
             return math.inf
+        except RuntimeError:
+            if not self.loop_bounds:
+                raise
+            return math.inf  # a loop that cannot be simulated, such as one that diverges
+
+    def loop_excess(self, plan: Trajectory) -> float:
+        """Maximum excess of signals of a loop, for a simulated one by samples."""
+        try:
+            return -min(row.fraction for row in self._loop_margins(plan, refined=False))
+        except (ValueError, RuntimeError):
+            return math.inf
+
+    def check_ends(self, plan: Trajectory) -> None:
+        """Raise for limits of a loop that are violated before the plan or in steady state, whatever its duration."""
+        if self.loop is None:
+            return
+        response = self.loop.quantities_of(plan)
+        for b in self.loop_bounds:
+            if b.kind != "value" or not b.is_constant:
+                continue
+            pairs = zip(("at the start", "in steady state"), response.ends(b.weights), strict=True)
+            for when, value in pairs:
+                if b.excess(np.array([value]))[0] > 1e-9:
+                    raise ValueError(
+                        f"limits must be satisfied {when}, at any duration, got {b.name} = {value:.6g} where it must "
+                        f"be {b.range}"
+                    )
 
     def margins(self, plan: Trajectory) -> Margins:
         """Margins over a whole plan."""
         rows = [*self._local_margins(plan), *self._loop_margins(plan)]
-        return Margins(tuple(sorted(rows, key=lambda row: row.fraction)))
+        note = "" if self.loop is None or not self.loop_bounds else self.loop.note
+        return Margins(tuple(sorted(rows, key=lambda row: row.fraction)), note)
 
     def _local_margins(self, plan: Trajectory) -> Iterator[Margin]:
         """Margins of derivatives and quantities."""
@@ -456,20 +572,19 @@ class Limited:
             square = after + (square - after) * plan.duration / b.period
         return _rms_margin(b, math.sqrt(square), plan)
 
-    def _loop_margins(self, plan: Trajectory) -> Iterator[Margin]:
+    def _loop_margins(self, plan: Trajectory, refined: bool = True) -> Iterator[Margin]:
         """Margins of signals of a loop."""
         if self.loop is None or not self.loop_bounds:
             return
-        response = self.loop.quantities_of(plan)
+        response = self.loop.quantities_of(plan, refined=refined)
         for b in self.loop_bounds:
             if b.kind == "rms":
                 if b.period is not None:
                     _check_period(b, plan)
                 yield _rms_margin(b, response.rms(b.terms[0][0].name, b.period), plan)
                 continue
-            weights = {signal.name: factor for signal, factor in b.terms}
             during = None if b.interval is None else self._interval(b, plan)
-            e = response.extremes(weights, during=during, rate=b.kind == "rate")
+            e = response.extremes(b.weights, during=during, rate=b.kind == "rate")
             yield _margin(b, e.low, e.high, e.time_low, e.time_high)
 
     def check_smooth(self, plan: Trajectory) -> None:
@@ -548,7 +663,11 @@ class Limited:
         still = self.at_rest(plan)
         times = self._start + self._duration * still.fractions
         for bound, values in zip(self.bounds, self.values(still.jet), strict=True):
-            if bound.in_loop or bound.kind == "rms" or np.isnan(values).any():
+            if bound.in_loop:
+                sides = [abs(side) for side in (bound.low, bound.high) if math.isfinite(side)]
+                yield replace(bound, slack=1e-12 * (1.0 + max(sides, default=0.0) / bound.scale))
+                continue
+            if bound.kind == "rms" or np.isnan(values).any():
                 yield replace(bound, slack=0.0)  # a signal that is singular at rest attains no limit there
                 continue
             rounding = 1e-12 * (1.0 + float(np.abs(values).max()) / bound.scale)

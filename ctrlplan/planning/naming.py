@@ -117,7 +117,8 @@ class Naming:
         meant = self._derivatives.get(name)
         if meant is not None and self.plan.labels != default_labels(self.plan.naxes):
             inputs = list(self.loop.inputs)
-            fed = len(inputs) == self.plan.naxes and meant.order == 0 and inputs[meant.axis or 0] == name
+            in_order = len(inputs) == self.plan.naxes and set(inputs) != set(self.plan.labels)
+            fed = name in inputs and (not in_order or (not meant.order and inputs[meant.axis or 0] == name))
             if not fed:
                 raise ValueError(
                     f"limits must say whose signal {name} is, got a name of the plan (its labels are "

@@ -16,10 +16,6 @@ Quantities = Callable[[Array], Mapping[str, Array]]
 class Response(Protocol):
     """Signals of a loop along one plan; see `ctrlplan.simulation.loop_response.LoopResponse`."""
 
-    @property
-    def note(self) -> str:
-        """How it was computed."""
-
     def extremes(
         self, weights: Mapping[str, float], *, during: tuple[float, float] | None = None, rate: bool = False
     ) -> Extremes:
@@ -27,6 +23,9 @@ class Response(Protocol):
 
     def rms(self, name: str, period: float | None = None) -> float:
         """Root of the mean square of a signal."""
+
+    def ends(self, weights: Mapping[str, float]) -> tuple[float, float]:
+        """Values at rest before the plan and in steady state after it; nan if not known."""
 
 
 class Extremes(Protocol):
@@ -60,8 +59,46 @@ class Loop(Protocol):
     def inputs(self) -> Sequence[str]:
         """Inputs in order."""
 
-    def quantities_of(self, plan: Trajectory) -> Response:
-        """Signals along a plan."""
+    @property
+    def note(self) -> str:
+        """How the signals are computed."""
+
+    def quantities_of(self, plan: Trajectory, *, refined: bool = True) -> Response:
+        """Signals along a plan; extrema of a simulated one may be those of samples."""
+
+
+class ShapesOf(Protocol):
+    """Signals of a loop along plans of one shape; see `ctrlplan.simulation.shape_family.ShapeFamily`."""
+
+    def step(self) -> tuple[Array, Array, Array]:
+        """Minima and maxima for a step, and rates by which those of a short plan differ per second."""
+
+    def static(self) -> tuple[Array, Array]:
+        """Minima and maxima (nsignals,) that the signals approach for long durations, nan if there are none."""
+
+    def from_static(self, durations: Array) -> Array:
+        """Bounds (ndurations, nsignals) of the distance from the signals that are approached for long durations."""
+
+    def samples(self, durations: Array) -> Array:
+        """Values (ndurations, nsignals, nsamples)."""
+
+    def curvature(self, low: Array, high: Array) -> Array:
+        """Bounds (nintervals, nsignals) of the second derivative by the logarithm of the duration."""
+
+    def extremes(self, duration: float) -> tuple[Array, Array, Array, Array]:
+        """Minima, maxima (nsignals,) and their times [s] since the start."""
+
+    def value(self, duration: float, signal: int, time: float) -> tuple[float, float]:
+        """Minimum and maximum of a signal at a time [s] since the start."""
+
+
+class Shapes(Protocol):
+    """Protocol of a loop with a fast response to plans of one shape."""
+
+    def shapes_of(
+        self, plan: Trajectory, signals: Sequence[tuple[Mapping[str, float], bool, tuple[float, float] | None]]
+    ) -> ShapesOf:
+        """Weighted sums of signals, or their rates, within fractions of the plan, as functions of its duration."""
 
 
 class HasQuantities(Protocol):
@@ -104,11 +141,9 @@ def quantities_of(system: Any) -> Quantities | None:
             return quantities_of_flat_system(system)
         if callable(system) and not hasattr(system, "ninputs"):  # python-control's systems are callable
             return system
-    block = not isinstance(system, type) and hasattr(system, "ninputs")
     raise TypeError(
-        "system must be a flat system, a plant with a method quantities (as Crane has), or a function of a jet, got "
-        f"{system.__name__ if isinstance(system, type) else type(system).__name__}"
-        + ('; for k/(s (T s + 1)): lambda jet: {"u": (jet[1, 0] + T * jet[2, 0]) / k}' if block else "")
+        "system must be a flat system, a plant with a method quantities (as Crane has), a loop, or a function of a "
+        f"jet, got {system.__name__ if isinstance(system, type) else type(system).__name__}"
     )
 
 
@@ -127,7 +162,17 @@ def loop_of(system: Any, tail: float | None = None) -> Loop | None:
         return None
     if callable(getattr(system, "quantities_of", None)):
         return system
-    return None
+    flat = callable(getattr(system, "quantities", None)) or (hasattr(system, "forward") and hasattr(system, "reverse"))
+    if flat or not hasattr(system, "ninputs"):
+        return None
+    from ctrlplan.simulation.loop_quantities import loop_quantities
+
+    return loop_quantities(system, tail=tail)
+
+
+def shapes_given(loop: Any) -> Shapes | None:
+    """The loop, if its response to plans of one shape is known as a function of the duration."""
+    return loop if callable(getattr(loop, "shapes_of", None)) else None
 
 
 def system_given(system: System | None, quantities: System | None) -> System | None:

@@ -62,13 +62,14 @@ Crane with limited force; an event ends the run if the rope becomes slack:
 from ctrlplan.simulation.equilibrium import equilibrium_at, equilibrium_state, unstable_poles
 from ctrlplan.simulation.events import Event, Occurrence, what_happened
 from ctrlplan.simulation.interpreted import SolverError
-from ctrlplan.simulation.log import read_log
+from ctrlplan.simulation.log import measured_response, read_log
 from ctrlplan.simulation.loop_quantities import LoopQuantities, loop_quantities
 from ctrlplan.simulation.loop_response import Extremes, LoopResponse
 from ctrlplan.simulation.predictor import Predictor
 from ctrlplan.simulation.prepared import Prepared, prepare, prepared_form, state_space, stated_start
 from ctrlplan.simulation.response import SimulationResponse, signal_table
 from ctrlplan.simulation.simulate import simulate
+from ctrlplan.simulation.simulated_response import SimulatedQuantities
 from ctrlplan.simulation.stepper import Stepper
 
 __all__ = [
@@ -79,12 +80,14 @@ __all__ = [
     "Occurrence",
     "Predictor",
     "Prepared",
+    "SimulatedQuantities",
     "SimulationResponse",
     "SolverError",
     "Stepper",
     "equilibrium_at",
     "equilibrium_state",
     "loop_quantities",
+    "measured_response",
     "prepare",
     "prepared_form",
     "read_log",

@@ -35,7 +35,13 @@ _ITERATIONS = 40
 
 
 def equilibrium_at(
-    system: System | Prepared, plan: Trajectory, time: float, outputs: Sequence[int], params: Params | None = None
+    system: System | Prepared,
+    plan: Trajectory,
+    time: float,
+    outputs: Sequence[int],
+    params: Params | None = None,
+    *,
+    held: Sequence[float] | None = None,
 ) -> tuple[Array, str]:
     """Equilibrium of a loop at the first position of a plan.
 
@@ -56,6 +62,8 @@ def equilibrium_at(
         with these outputs closest to the position of the plan is returned.
     params : mapping, optional
         Parameters of the blocks.
+    held : sequence of float, optional
+        Values of the inputs; default: the position of the plan.
 
     Returns
     -------
@@ -71,19 +79,20 @@ def equilibrium_at(
     free = np.ones(prepared.nstates, dtype=bool) if stated is None else np.isnan(stated)
     if not free.any():
         return start, ""
-    given = input_signals(prepared.input_labels, plan if prepared.ninputs else None, np.array([time, time + 1.0]))
+    inputs = (plan if held is None else list(held)) if prepared.ninputs else None
+    given = input_signals(prepared.input_labels, inputs, np.array([time, time + 1.0]))
     target = plan.jet(np.array([time]), 0, left=True)[0, :, 0]
     rows = list(outputs)
-    held = np.concatenate([np.zeros(0), *(_held(signal, time) for signal in prepared.time_signals(given, time))])
+    values = np.concatenate([np.zeros(0), *(_held(signal, time) for signal in prepared.time_signals(given, time))])
     if prepared.linear is not None:
         form = prepared.linear
-        state = linear_equilibrium(form.a, form.b @ held, form.c[rows], form.d[rows] @ held, target, start, free)
+        state = linear_equilibrium(form.a, form.b @ values, form.c[rows], form.d[rows] @ values, target, start, free)
         return (start, "the loop has none") if state is None else (state, "")
     try:
         try:
-            return _found(_Equations(prepared, held, time, params or {}, start), rows, target, start, free)
+            return _found(_Equations(prepared, values, time, params or {}, start), rows, target, start, free)
         except FeedthroughError:  # no algebraic loop at the start, but elsewhere
-            again = _Equations(prepared, held, time, params or {}, start, trials=False)
+            again = _Equations(prepared, values, time, params or {}, start, trials=False)
             return _found(again, rows, target, start, free)
     except Exception as error:  # outside the domain of a block; a run that fails there raises the error
         return start, f"the equations cannot be evaluated ({type(error).__name__}: {error})"

@@ -193,6 +193,12 @@ class ExactResponse(LoopResponse):
             total += max(0.0, length - reached) * final**2
         return math.sqrt(total / length)
 
+    def ends(self, weights: Mapping[str, float]) -> tuple[float, float]:
+        """Values before the plan and in steady state after it; see `LoopResponse`."""
+        rows, motion = self._sum(weights), self._motion
+        before, after = rows.static(motion.plan.initial, motion.start), rows.static(motion.plan.final, motion.settled)
+        return float(before[0]), math.nan if motion.form.integrators else float(after[0])
+
     def _sum(self, weights: Mapping[str, float]) -> Rows:
         for name in weights:
             if name not in self._signals:

@@ -15,7 +15,7 @@ from ctrlplan.simulation.plan_cells import PlanCells
 _PARTS = 32
 """Number of intervals of a cell in which an impulse response is bounded by a constant."""
 
-_NEGLIGIBLE = 1e-8
+_NEGLIGIBLE = 1e-12
 """Magnitude of an impulse response, relative to its bound at 0, from which on it is bounded by a constant."""
 
 
@@ -108,6 +108,7 @@ class Curvature:
 
     def __init__(self, form: LoopForm, rows: Rows, plan: PlanCells) -> None:
         self._rows, self._orders, self._axes = rows, form.order + 1, form.naxes
+        self._decays = not form.integrators
         columns = np.moveaxis(form.b, 0, 1).reshape(form.nstates, -1)
         self.envelope = Envelope(form, rows.c, columns)
         self._peaks = np.array([plan.peak(k) for k in range(max(self._orders + 2, rows.order + 1))])
@@ -134,3 +135,20 @@ class Curvature:
         for k in range(1, self._rows.order + 1):
             found += (k**2 * np.abs(self._rows.d[:, k]) @ self._peaks[k]) / low[:, None] ** k
         return found
+
+    def from_static(self, durations: Array) -> Array:
+        """Bounds (ndurations, nrows) of the distance from the static response to the plan; inf if there is none.
+
+        The convolution of h with p(tau - s/T) - p(tau) is at most the first moment of h times the largest p'/T.
+        """
+        if not self._decays or self._jumps[0].any():
+            return np.full((durations.size, len(self._rows.c)), np.inf)
+        shape = (durations.size, len(self._rows.c), self._orders, self._axes)
+        m0, m1 = (self.envelope.moment(j, durations).reshape(shape) for j in (0, 1))
+        found = m1[:, :, 0] @ self._peaks[1] / durations[:, None]
+        for k in range(1, max(self._orders, self._rows.order + 1)):
+            size = np.abs(self._rows.d[:, k]) if k <= self._rows.order else np.zeros((shape[1], self._axes))
+            if k < self._orders:
+                size = size + m0[:, :, k]
+            found = found + (size @ self._peaks[k]) / durations[:, None] ** k
+        return np.asarray(found)

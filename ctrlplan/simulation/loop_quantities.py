@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 
 import numpy as np
@@ -15,17 +14,13 @@ from ctrlplan.simulation.equilibrium import linear_equilibrium
 from ctrlplan.simulation.exact_response import ExactResponse, Motion
 from ctrlplan.simulation.linear import LinearForm
 from ctrlplan.simulation.loop_form import LoopForm, Rows
+from ctrlplan.simulation.loop_inputs import Fed, fed_signals, same_axis, tracked
 from ctrlplan.simulation.loop_response import LoopResponse
 from ctrlplan.simulation.plan_cells import PlanCells
 from ctrlplan.simulation.prepared import Prepared, prepared_form
 from ctrlplan.simulation.shape_family import LoopSignal, ShapeFamily
+from ctrlplan.simulation.simulated_response import SimulatedQuantities
 from ctrlplan.trajectories import Trajectory
-
-_FRACTIONS = np.array([0.0, 0.0312, 0.1234, 0.25, 0.3456, 0.5, 0.6543, 0.75, 0.8765, 1.0])
-"""Times at which two plans are compared, as fractions of the duration."""
-
-Fed = tuple[int, int]
-"""Axis of a plan, and order of its derivative."""
 
 
 class LoopQuantities(Displayed):
@@ -37,6 +32,8 @@ class LoopQuantities(Displayed):
         Name of the loop.
     names : tuple of str
         Names of its signals: outputs, then inputs that have other names.
+    inputs : tuple of str
+        Names of its inputs in order.
     """
 
     def __init__(self, loop: System | Prepared) -> None:
@@ -47,14 +44,18 @@ class LoopQuantities(Displayed):
             )
         self._linear: LinearForm = self._prepared.linear
         self.name = self._prepared.name
+        self.inputs = tuple(self._prepared.input_labels)
         outputs = self._prepared.output_labels
         self.names = (*outputs, *(label for label in self._prepared.input_labels if label not in outputs))
+        self._forms: dict[tuple[Fed | None, ...], LoopForm] = {}
 
     def _describe(self) -> Iterator[Part]:
         yield f"Signals of {self.name} along a plan: {', '.join(self.names)}"
         yield Facts([("inputs", ", ".join(self._prepared.input_labels)), ("response", "exact")])
 
-    def quantities_of(self, plan: Trajectory) -> LoopResponse:
+    note = "exact, at all times"
+
+    def quantities_of(self, plan: Trajectory, *, refined: bool = True) -> LoopResponse:
         """Response of the loop to a plan.
 
         The loop starts at rest at the first position of the plan.
@@ -63,6 +64,8 @@ class LoopQuantities(Displayed):
         ----------
         plan : Trajectory
             Plan with a duration.
+        refined : bool, optional
+            No effect: extrema are exact.
 
         Returns
         -------
@@ -78,32 +81,53 @@ class LoopQuantities(Displayed):
         """
         return self.along(plan).response(plan)
 
+    def shapes_of(
+        self, plan: Trajectory, signals: Sequence[tuple[Mapping[str, float], bool, tuple[float, float] | None]]
+    ) -> ShapeFamily:
+        """Signals along plans of the shape of one, as functions of the duration.
+
+        Parameters
+        ----------
+        plan : Trajectory
+            Plan with a duration.
+        signals : sequence of (mapping of str to float, bool, (float, float) or None)
+            Weighted sums of signals by name, whether their time derivatives are
+            meant, and the part of the plan as fractions of its duration.
+        """
+        along = self.along(plan)
+        chosen = [LoopSignal(*one) for one in signals]
+        return ShapeFamily(along.form, along.signals, along.cells, along.start, chosen)
+
     def along(self, plan: Trajectory) -> AlongPlan:
         """The loop with the inputs connected to a plan, for this plan and others of the same axes."""
         check_kind(plan, "plan", Trajectory)
-        return AlongPlan(self, plan)
-
-
-class AlongPlan:
-    """Loop whose inputs are connected to a plan and its derivatives."""
-
-    def __init__(self, quantities: LoopQuantities, plan: Trajectory) -> None:
-        linear, prepared = quantities._linear, quantities._prepared
-        fed = fed_signals(prepared.input_labels, plan, quantities.name)
-        fed += _fed_by_sources(linear, plan, quantities.name)
+        fed = fed_signals(self._prepared.input_labels, plan, self.name)
+        fed += _fed_by_sources(self._linear, plan, self.name)
         order = max((k for entry in fed if entry for k in entry[1:]), default=0)
-        pick = np.zeros((order + 1, linear.b.shape[1], plan.naxes))
+        pick = np.zeros((order + 1, self._linear.b.shape[1], plan.naxes))
         for column, entry in enumerate(fed):
             if entry is not None:
                 pick[entry[1], column, entry[0]] = 1.0
-        self.form = LoopForm(linear.a, linear.b @ pick, quantities.name)
+        form = self._forms.get(tuple(fed))
+        if form is None:
+            form = self._forms[tuple(fed)] = LoopForm(self._linear.a, self._linear.b @ pick, self.name)
+        return AlongPlan(self._prepared, self._linear, form, pick, plan)
+
+
+class AlongPlan:
+    """Loop whose inputs are connected to a plan and its derivatives.
+
+    The inputs are ``pick[k] @ r^(k)``, summed over the derivatives of the plan.
+    """
+
+    def __init__(self, prepared: Prepared, linear: LinearForm, form: LoopForm, pick: Array, plan: Trajectory) -> None:
+        self.form, self.plan = form, plan
         self._linear, self._prepared, self._pick = linear, prepared, pick
         outputs = prepared.output_labels
-        c, d = linear.c * self.form.scale, np.moveaxis(linear.d @ pick, 0, 1)
+        c, d = linear.c * form.scale, np.moveaxis(linear.d @ pick, 0, 1)
         self.signals = {name: Rows(c[i : i + 1], d[i : i + 1]) for i, name in enumerate(outputs)}
         for i, name in enumerate(prepared.input_labels):
             self.signals.setdefault(name, Rows(np.zeros((1, len(linear.a))), pick[:, i][None]))
-        self.plan = plan
 
     @cached_property
     def cells(self) -> PlanCells:
@@ -126,7 +150,7 @@ class AlongPlan:
         linear, stated = self._linear, self._prepared.stated
         given = np.full(len(linear.a), np.nan) if stated is None else stated
         free, supplied = np.isnan(given), self._pick[0] @ plan.initial
-        rows = _tracked(self._prepared.output_labels, plan.labels)
+        rows = tracked(self._prepared.output_labels, plan.labels)
         state = linear_equilibrium(
             linear.a,
             linear.b @ supplied,
@@ -154,12 +178,8 @@ class AlongPlan:
         cells, start = (self.cells, self.start) if same else (PlanCells(plan, self.form.order + 2), self.rest_at(plan))
         return ExactResponse(Motion(self.form, cells, plan.duration, start), self.signals, plan.start)
 
-    def shapes(self, chosen: Sequence[LoopSignal]) -> ShapeFamily:
-        """Signals as functions of the duration of the plan, with its shape fixed."""
-        return ShapeFamily(self.form, self.signals, self.cells, self.start, chosen)
 
-
-def loop_quantities(loop: System | Prepared, *, tail: float | None = None) -> LoopQuantities:
+def loop_quantities(loop: System | Prepared, *, tail: float | None = None) -> LoopQuantities | SimulatedQuantities:
     """Signals of a loop along a plan, for limits on them.
 
     `fastest` and `margins` call it for a loop that they are given. The plan is
@@ -171,20 +191,25 @@ def loop_quantities(loop: System | Prepared, *, tail: float | None = None) -> Lo
     Parameters
     ----------
     loop : control system or Prepared
-        Linear continuous loop, closed or open.
+        Loop, closed or open. The response of a linear continuous one is exact,
+        that of others is simulated.
     tail : float, optional
-        Time after the plan [s] over which a simulated response is considered.
-        Exact responses are considered at all times.
+        Time after the plan [s] over which a simulated response is considered;
+        default: the duration of the plan. Exact responses are considered at all
+        times.
 
     Returns
     -------
-    LoopQuantities
-        With the attribute ``names`` and the method ``quantities_of(plan)``.
+    LoopQuantities or SimulatedQuantities
+        With the attributes ``names`` and ``inputs``, and the method
+        ``quantities_of(plan)``.
 
     Raises
     ------
     TypeError
-        If `loop` is not a control system, or it is not linear and continuous.
+        If `loop` is not a control system.
+    ValueError
+        If `tail` is negative, or a discrete loop has no sampling time.
 
     Examples
     --------
@@ -193,37 +218,10 @@ def loop_quantities(loop: System | Prepared, *, tail: float | None = None) -> Lo
     >>> response = cp.loop_quantities(cp.plants.integrator_lag_loop(5.0)).quantities_of(move)
     >>> found = response.extremes({"y": 1.0})
     >>> round(found.low, 9), round(found.high, 4), round(found.time_high, 3)
-    (0.0, 1.4445, 1.894)
+    (0.0, 1.4445, 1.96)
     """
-    return LoopQuantities(loop)
-
-
-def fed_signals(labels: Sequence[str], plan: Trajectory, name: str) -> list[Fed | None]:
-    """Axis of a plan and derivative at each input of a loop; None for an input that is 0.
-
-    Raises
-    ------
-    ValueError
-        If the plan does not fit.
-    """
-    if not labels:
-        return []
-    if len(labels) == plan.naxes:
-        order = plan.labels if set(plan.labels) == set(labels) else tuple(labels)
-        return [(order.index(label), 0) for label in labels]
-    parts = [re.fullmatch(r"(.*?)(?:_d([1-9][0-9]*))?", label, re.DOTALL) for label in labels]
-    found = [(part[1], int(part[2] or 0)) for part in parts if part]
-    bases = list(dict.fromkeys(base for base, _ in found))
-    if set(plan.labels) <= set(bases):
-        axes = {label: axis for axis, label in enumerate(plan.labels)}
-        return [(axes[base], k) if base in axes else None for base, k in found]
-    if len(bases) == plan.naxes:
-        return [(bases.index(base), k) for base, k in found]
-    raise ValueError(
-        f"inputs of {name} must be as many as the axes of the plan, or be named after them, such as "
-        f"{plan.labels[0]}, {plan.labels[0]}_d1 for its derivative; got the inputs {', '.join(labels)} for the "
-        f"axes {', '.join(plan.labels)}; name the axes by labels="
-    )
+    prepared = prepared_form(loop)
+    return LoopQuantities(prepared) if prepared.linear is not None else SimulatedQuantities(prepared, tail)
 
 
 def _fed_by_sources(form: LinearForm, plan: Trajectory, name: str) -> list[Fed | None]:
@@ -231,7 +229,7 @@ def _fed_by_sources(form: LinearForm, plan: Trajectory, name: str) -> list[Fed |
     found: list[Fed | None] = []
     for source, high in form.sources:
         for axis in range(source.naxes):
-            same = _same_axis(plan, source, axis)
+            same = same_axis(plan, source, axis)
             if same is None:
                 raise ValueError(
                     f"sources in {name} must be those of the plan under limits, got another plan with the axis "
@@ -239,20 +237,3 @@ def _fed_by_sources(form: LinearForm, plan: Trajectory, name: str) -> list[Fed |
                 )
             found += [(same, k) for k in range(high + 1)]
     return found
-
-
-def _same_axis(plan: Trajectory, source: Trajectory, axis: int) -> int | None:
-    """Axis of a plan that equals an axis of a source up to the duration."""
-    if source is plan:
-        return axis
-    mine = plan.jet(plan.start + _FRACTIONS * plan.duration, 0, left=True)[0]
-    other = source.jet(source.start + _FRACTIONS * source.duration, 0, left=True)[0, axis]
-    size = np.abs(mine).max(axis=1)
-    equal = np.flatnonzero(np.all(np.abs(mine - other) <= 1e-12 * size[:, None], axis=1))
-    return int(equal[0]) if equal.size else None
-
-
-def _tracked(outputs: Sequence[str], labels: Sequence[str]) -> list[int]:
-    """Indices of the outputs that follow a plan: those named like its axes, otherwise the first ones."""
-    names = labels if all(label in outputs for label in labels) else outputs[: len(labels)]
-    return [list(outputs).index(name) for name in names]

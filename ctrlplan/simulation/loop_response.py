@@ -29,7 +29,8 @@ class Extremes:
 class LoopResponse(ABC):
     """Signals of a loop along one plan; returned by `LoopQuantities.quantities_of`.
 
-    A new kind of response must define `extremes` and `rms`, and have the attributes.
+    A new kind of response must define `extremes`, `rms` and `ends`, and have the
+    attributes.
 
     Attributes
     ----------
@@ -82,4 +83,19 @@ class LoopResponse(ABC):
         -------
         float
             In the unit of the signal.
+        """
+
+    @abstractmethod
+    def ends(self, weights: Mapping[str, float]) -> tuple[float, float]:
+        """Values of a weighted sum at rest before the plan and in steady state after it.
+
+        Parameters
+        ----------
+        weights : mapping of str to float
+            Factors by the name of a signal.
+
+        Returns
+        -------
+        (float, float)
+            In the unit of the sum; nan where the steady state is not known.
         """

@@ -73,8 +73,6 @@ class ShapeFamily:
     ----------
     before : ndarray, shape (nsignals,)
         Values at rest before the plan.
-    final : ndarray, shape (nsignals,)
-        Values after the plan, nan where they depend on the duration.
     """
 
     def __init__(
@@ -92,14 +90,13 @@ class ShapeFamily:
             each.append(rate_rows(form, row, plan, " + ".join(one.weights)) if one.rate else row)
         self.rows = _stacked(each)
         self.before = self.rows.static(plan.initial, state)
-        if form.integrators:
-            self.final = np.full(len(each), np.nan)
-        else:
-            self.final = self.rows.static(plan.final, form.settled(state, plan.final, 0.0))
+
+    def curvature(self, low: Array, high: Array) -> Array:
+        """Bounds (nintervals, nsignals) of the second derivative by the logarithm of the duration, for intervals."""
+        return self._curvature(low, high)
 
     @cached_property
-    def curvature(self) -> Curvature:
-        """Bounds of the second derivative of the signals by the logarithm of the duration."""
+    def _curvature(self) -> Curvature:
         return Curvature(self.form, self.rows, self.plan)
 
     def extremes(self, duration: float) -> tuple[Array, Array, Array, Array]:
@@ -138,8 +135,34 @@ class ShapeFamily:
         whole = form.order > 0 or rows.order > 0 or form.integrators > 0 or any(one.during for one in self.chosen)
         if whole:
             return low, high, np.full(len(rows.c), math.inf)
-        sizes = self.curvature.envelope.largest(0, np.zeros(1))[0]
+        sizes = self._curvature.envelope.largest(0, np.zeros(1))[0]
         return low, high, np.asarray(sizes @ (2.0 * plan.peak(1)))
+
+    def static(self) -> tuple[Array, Array]:
+        """Minima and maxima (nsignals,) that the signals approach for long durations."""
+        form = self.form
+        if form.integrators:
+            nothing = np.full(len(self.rows.c), math.nan)
+            return nothing, nothing
+        gain = self.rows.d[:, 0] - self.rows.c @ np.linalg.solve(form.a, form.b[0])
+        values = np.concatenate([gain @ segment.jet(s, 0, 0)[0] for segment, s in self._segments], axis=1)
+        for i, one in enumerate(self.chosen):
+            if one.during is not None:
+                values[i] = np.where(
+                    (self._grid.fractions < one.during[0]) | (self._grid.fractions > one.during[1]), math.nan, values[i]
+                )
+        with np.errstate(all="ignore"):
+            low, high = np.fmin.reduce(values, axis=1), np.fmax.reduce(values, axis=1)
+        return np.asarray(low), np.asarray(high)
+
+    def from_static(self, durations: Array) -> Array:
+        """Bounds (ndurations, nsignals) of the distance from the signals that are approached for long durations."""
+        return self._curvature.from_static(durations)
+
+    @property
+    def _segments(self) -> list[tuple[Segment, Array]]:
+        """Segments of the plan with the times of their samples."""
+        return list(zip(self.plan.segments, self._grid.times, strict=True))
 
     def samples(self, durations: Array) -> Array:
         """Values (ndurations, nsignals, nsamples) at fixed fractions of the plan, and at fixed times after it.
@@ -156,7 +179,7 @@ class ShapeFamily:
 
         state = np.broadcast_to(self.state, (durations.size, form.nstates))
         parts = []
-        for segment, s in zip(plan.segments, grid.times, strict=True):
+        for segment, s in self._segments:
 
             def jet(moment: float, origin: float, s: Array, order: int, segment: Segment = segment) -> Array:
                 return segment.jet(origin + s, order, form.order)

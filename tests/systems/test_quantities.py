@@ -208,7 +208,6 @@ def test_the_old_names_warn_and_do_the_same():
 @pytest.mark.parametrize(
     ("wrong", "got"),
     [
-        (ct.tf([1], [1, 1]), r"TransferFunction; for k/\(s \(T s \+ 1\)\): lambda jet: .*"),
         (cp.plants.Crane, "Crane"),
         ({"u": 1}, "dict"),
     ],

@@ -1,0 +1,472 @@
+"""Signals of a sampled or nonlinear loop along a plan, by simulation over the move and a tail."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from functools import cached_property, reduce
+from itertools import pairwise
+from typing import NoReturn, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+
+from ctrlplan._checks import check_kind, checked_finite
+from ctrlplan._display import Displayed, Facts, Part
+from ctrlplan._types import Array, Data, System
+from ctrlplan.simulation.equilibrium import equilibrium_at
+from ctrlplan.simulation.loop_inputs import Fed, fed_signals, same_axis, tracked
+from ctrlplan.simulation.loop_response import Extremes, LoopResponse
+from ctrlplan.simulation.network import Block
+from ctrlplan.simulation.prepared import Prepared, prepared_form
+from ctrlplan.simulation.simulate import simulate
+from ctrlplan.trajectories import Step, Trajectory
+
+_RTOL = 1e-10
+"""Relative tolerance of the runs."""
+
+_SAMPLES = 1000
+"""Number of samples over the duration of a plan."""
+
+_FINE = 33
+"""Number of samples between the neighbours of a sample near an extremum."""
+
+_MOST = 24
+"""Maximum number of samples near which an extremum is refined."""
+
+_BEFORE = 1e-9
+"""Time before a jump at which a signal is sampled, relative to the duration of the plan."""
+
+_PERIODS = (2, 4, 8, 16, 32, 64)
+"""Numbers of periods of a cyclic plan, until its last two have the same mean square."""
+
+
+class SimulatedQuantities(Displayed):
+    """Signals of a sampled or nonlinear loop along a plan, by simulation.
+
+    Parameters
+    ----------
+    loop : control system or Prepared
+        The loop.
+    tail : float, optional
+        Time [s] after the plan that is simulated; default: the plan's duration.
+
+    Attributes
+    ----------
+    name : str
+        Name of the loop.
+    names : tuple of str
+        Names of its signals: outputs, then inputs that have other names.
+    inputs : tuple of str
+        Names of its inputs in order.
+    """
+
+    def __init__(self, loop: System | Prepared, tail: float | None = None) -> None:
+        self._prepared = prepared_form(loop)
+        self._tail = None if tail is None else checked_finite(tail, "tail", minimum=0.0)
+        self.name = self._prepared.name
+        if self._prepared.dt is True:
+            raise ValueError(f"loop must have a sampling time for limits on its signals, got {self.name} with dt=True")
+        outputs = self._prepared.output_labels
+        self.inputs = tuple(self._prepared.input_labels)
+        self.names = (*outputs, *(label for label in self.inputs if label not in outputs))
+
+    @property
+    def note(self) -> str:
+        """How signals are computed."""
+        tail = "as long as the plan" if self._tail is None else f"of {self._tail:g} s"
+        return f"simulated at tolerance {_RTOL:g}, over the move and a tail {tail}"
+
+    def _describe(self) -> Iterator[Part]:
+        yield f"Signals of {self.name} along a plan: {', '.join(self.names)}"
+        yield Facts([("inputs", ", ".join(self.inputs)), ("response", "simulated")])
+
+    def quantities_of(self, plan: Trajectory, *, refined: bool = True) -> SimulatedResponse:
+        """Response of the loop to a plan.
+
+        The loop starts at rest at the first position of the plan.
+
+        Parameters
+        ----------
+        plan : Trajectory
+            Plan with a duration.
+        refined : bool, optional
+            Whether extrema are refined by a further run. Otherwise they are those of
+            1000 samples over the plan.
+
+        Raises
+        ------
+        ValueError
+            If the plan does not fit the inputs of the loop, or no equilibrium at its
+            first position is found.
+        RuntimeError
+            If the integrator fails.
+        """
+        check_kind(plan, "plan", Trajectory)
+        return SimulatedResponse(self._prepared, plan, self._tail, refined)
+
+
+class SimulatedResponse(LoopResponse):
+    """Simulated response of a loop along one plan.
+
+    Parameters
+    ----------
+    prepared : Prepared
+        The loop.
+    plan : Trajectory
+        The plan.
+    tail : float or None
+        Time [s] after the plan.
+    refined : bool
+        Whether extrema are refined by a further run.
+    """
+
+    def __init__(self, prepared: Prepared, plan: Trajectory, tail: float | None, refined: bool = True) -> None:
+        self._prepared, self.plan, self._refined = prepared, plan, refined
+        outputs = prepared.output_labels
+        self.names = (*outputs, *(label for label in prepared.input_labels if label not in outputs))
+        self._last = plan.end + (plan.duration if tail is None else tail)
+        self.note = f"simulated at tolerance {_RTOL:g}, until {self._last - plan.end:.4g} s after the plan"
+        _check_sources(prepared, plan)
+        self._inputs = _Inputs(plan, fed_signals(prepared.input_labels, plan, prepared.name))
+        self._start = self._at_rest(plan.start, "first")
+
+    def extremes(
+        self, weights: Mapping[str, float], *, during: tuple[float, float] | None = None, rate: bool = False
+    ) -> Extremes:
+        """Minimum and maximum of a weighted sum of signals; see `LoopResponse`."""
+        if rate:
+            times, row = self._rate(weights)
+        else:
+            times, row = self._samples[0], self._sum(weights, self._samples[1])
+        first, last = (self.plan.start, self._last) if during is None else during
+        if first > self._last:
+            raise ValueError(
+                f"an interval of limits must begin before {self._last:.6g} s, where the simulation ends, got {first:g} "
+                "s; give a longer tail="
+            )
+        inside = (times >= first) & (times <= last)
+        if not rate and self._refined and not self._prepared.is_discrete:
+            ends = [t for t in (first, last) if self.plan.start <= t <= self._last]
+            more = np.concatenate([ends, *(_near_peak(times, sign * row, inside) for sign in (-1.0, 1.0))])
+            fine, values = self._run(np.unique(more))
+            times, row = np.concatenate([times, fine]), np.concatenate([row, self._sum(weights, values)])
+            by = np.argsort(times, kind="stable")
+            times, row = times[by], row[by]
+            inside = (times >= first) & (times <= last)
+        times, row = times[inside], row[inside]
+        if not row.size:
+            raise ValueError(f"an interval of limits must contain a sample of the loop, got {first:g} to {last:g} s")
+        low, high = _peak(times, -row), _peak(times, row)
+        return Extremes(-low[0], high[0], low[1], high[1])
+
+    def rms(self, name: str, period: float | None = None) -> float:
+        """Root of the mean square of a signal; see `LoopResponse`."""
+        self._sum({name: 1.0}, self._samples[1])
+        if period is None and is_cyclic(self.plan):
+            return self._cyclic_rms(name)
+        return self._rms({name: 1.0}, self.plan.start, self.plan.start + (period or self.plan.duration))
+
+    def ends(self, weights: Mapping[str, float]) -> tuple[float, float]:
+        """Values at rest before the plan and in steady state after it; see `LoopResponse`."""
+        values = []
+        for time, state, held in (
+            (self.plan.start, self._start, self._inputs.initial),
+            (self.plan.end, self._final, self._inputs.final),
+        ):
+            if state is None:
+                values.append(math.nan)
+                continue
+            step = float(self._prepared.dt) if self._prepared.is_discrete else 1e-6 * self.plan.duration
+            times = time + step * np.arange(2)
+            response = simulate(self._prepared, times, held.tolist() or None, state, rtol=_RTOL, events=())
+            signals = self._signals(response.y, np.repeat(held[:, None], 2, axis=1))
+            values.append(float(self._sum(weights, signals)[0]))
+        return values[0], values[1]
+
+    @cached_property
+    def _final(self) -> Array | None:
+        if any(block.plan is not None for block in self._blocks()):
+            return None  # a source inside is evaluated at its own time
+        try:
+            return self._at_rest(self.plan.end, "last")
+        except ValueError:  # such as an integrator, or a sampled block that is not linear
+            return None
+
+    def _blocks(self) -> Sequence[Block]:
+        return () if self._prepared.network is None else self._prepared.network.blocks
+
+    def _at_rest(self, time: float, which: str) -> Array:
+        """Equilibrium at the first or last position of the plan."""
+        first = which == "first"
+        held = (self._inputs.initial if first else self._inputs.final).tolist()
+        place = self.plan.initial if first else self.plan.final
+        rows = tracked(self._prepared.output_labels, self.plan.labels)
+        state, doubt = equilibrium_at(self._prepared, Step(place, place, time=time), time, rows, held=held)
+        if doubt:
+            position = ", ".join(f"{a} = {x:.4g}" for a, x in zip(self.plan.labels, place.tolist(), strict=True))
+            raise ValueError(
+                f"the loop must be at rest at the {which} position of the plan, got {self._prepared.name} without a "
+                f"known equilibrium at {position}: {doubt}; declare the initial state of its blocks (cp.declare)"
+            )
+        return state
+
+    @cached_property
+    def _edges(self) -> Array:
+        """Times at which signals may jump: breakpoints, and sample times of discrete blocks."""
+        start = self.plan.start
+        edges = [self.plan.breakpoints]
+        for block in self._blocks():
+            if block.period is not None:
+                first = start + float(block.traits.offset or 0.0)
+                edges.append(np.arange(first, self._last, block.period))
+        found = np.unique(np.concatenate(edges))
+        apart = np.concatenate([[True], np.diff(found) > 4.0 * _BEFORE * self.plan.duration])
+        return found[apart & (found <= self._last)]
+
+    @cached_property
+    def _samples(self) -> tuple[Array, Array]:
+        """Times and signals (nsignals, ntime)."""
+        if self._prepared.is_discrete:
+            dt = float(self._prepared.dt)
+            count = math.ceil((self._last - self.plan.start) / dt)
+            return self._run(np.array(self.plan.start + dt * np.arange(count + 1), dtype=float))
+        count = math.ceil(_SAMPLES * (self._last - self.plan.start) / self.plan.duration)
+        even = np.linspace(self.plan.start, self._last, count + 1)
+        before = self._edges[1:] - _BEFORE * self.plan.duration
+        times = np.unique(np.concatenate([even, self._edges, before]))
+        return self._run(times)
+
+    def _run(self, times: Array) -> tuple[Array, Array]:
+        """Signals (nsignals, ntime) at times, the start included if there are fewer than two."""
+        start = self.plan.start
+        wanted = times if times[0] <= start and times.size > 1 else np.union1d(times, [start, self._last])
+        inputs = self._inputs if self._prepared.ninputs else None
+        response = simulate(self._prepared, wanted, inputs, self._start, rtol=_RTOL, events=())
+        return response.t, self._signals(response.y, self._inputs.jet(response.t, 0)[0])
+
+    def _signals(self, outputs: Array, inputs: Array) -> Array:
+        """Outputs, and inputs that have other names."""
+        own = outputs.reshape(len(self._prepared.output_labels), -1)
+        further = [label not in self._prepared.output_labels for label in self._prepared.input_labels]
+        return np.concatenate([own, inputs[further]])
+
+    def _sum(self, weights: Mapping[str, float], signals: Array) -> Array:
+        row = np.zeros(signals.shape[1])
+        for name, factor in weights.items():
+            if name not in self.names:
+                raise ValueError(f"signals of the loop must be among {', '.join(self.names)}, got {name!r}")
+            row += factor * signals[self.names.index(name)]
+        return row
+
+    def _rate(self, weights: Mapping[str, float]) -> tuple[Array, Array]:
+        """Times and time derivative of a sum of signals; of a held one the change over the period."""
+        period = self._period_of(weights)
+        if period is not None:
+            times, row = self._samples[0], self._sum(weights, self._samples[1])
+            count = math.ceil((self._last - self.plan.start) / period - 1e-9)
+            instants = self.plan.start + self._offset_of(weights) + period * np.arange(count)
+            at = np.minimum(np.searchsorted(times, instants - 1e-6 * period), times.size - 1)
+            return times[at[1:]], np.diff(row[at]) / period
+        times, row = self._samples[0], self._sum(weights, self._samples[1])
+        at = np.searchsorted(times, self._edges[1:])
+        jumps = row[at] - row[at - 1]
+        if at.size and np.abs(jumps).max() > 1e-6 * np.ptp(row):
+            k = int(np.abs(jumps).argmax())
+            raise ValueError(
+                f"a signal with a limited rate must be continuous, got {' + '.join(weights)} that jumps by "
+                f"{jumps[k]:.4g} at {self._edges[1 + k]:.6g} s"
+            )
+        grids = []
+        for left, right in pairwise(np.unique([*self._edges.tolist(), self._last]).tolist()):
+            grids.append(np.linspace(left, right, 8 + math.ceil(_SAMPLES * (right - left) / self.plan.duration)))
+        fine, values = self._run(np.unique(np.concatenate(grids)))
+        row = self._sum(weights, values)
+        slopes = [
+            _slopes(row[np.searchsorted(fine, grid[0]) : np.searchsorted(fine, grid[-1]) + 1], grid[1] - grid[0])
+            for grid in grids
+        ]
+        return np.concatenate(grids), np.concatenate(slopes)
+
+    def _held_blocks(self, weights: Mapping[str, float]) -> list[tuple[float, float]]:
+        """Periods and offsets of the discrete blocks of which signals are outputs; empty if one is continuous."""
+        network, found = self._prepared.network, list[tuple[float, float]]()
+        for name in (name for name, factor in weights.items() if factor):
+            if network is None or name not in self._prepared.output_labels:
+                return []
+            row = network.read[self._prepared.output_labels.index(name)]
+            used = set(np.flatnonzero(row).tolist())
+            for block, place in zip(network.blocks, network.outputs, strict=True):
+                own = used & set(range(place.start, place.stop))
+                if own and block.period is not None:
+                    found.append((float(block.period), float(block.traits.offset or 0.0)))
+                    used -= own
+            if used:
+                return []
+        return found
+
+    def _period_of(self, weights: Mapping[str, float]) -> float | None:
+        """Sampling period of a held sum of signals; None for a continuous one."""
+        if self._prepared.is_discrete:
+            return float(self._prepared.dt)
+        found = set(self._held_blocks(weights))
+        return next(iter(found))[0] if len(found) == 1 else None
+
+    def _offset_of(self, weights: Mapping[str, float]) -> float:
+        return 0.0 if self._prepared.is_discrete else self._held_blocks(weights)[0][1]
+
+    def _rms(self, weights: Mapping[str, float], first: float, last: float) -> float:
+        """Root of the mean square between two times, with the last value after the simulation."""
+        times, row = self._samples[0], self._sum(weights, self._samples[1])
+        if self._prepared.is_discrete:
+            dt = float(self._prepared.dt)
+            held = row[times < last - 1e-9 * dt]
+            return float(np.sqrt(np.mean(held[: max(1, round((last - first) / dt))] ** 2)))
+        end = min(last, self._last)
+        total = 0.0
+        for left, right in pairwise(np.unique([first, *self._edges[self._edges < end].tolist(), end]).tolist()):
+            inside = (times >= left) & (times < right)
+            t = np.append(times[inside], right)
+            at_end = row[np.flatnonzero(inside)[-1]] if right in self._edges else np.interp(right, times, row)
+            total += _integral(t, np.append(row[inside], at_end) ** 2)
+        total += max(0.0, last - end) * row[-1] ** 2
+        return math.sqrt(total / (last - first))
+
+    def _cyclic_rms(self, name: str) -> float:
+        """Root of the mean square of a signal in the periodic steady state."""
+        before, plan = math.inf, self.plan
+        for count in _PERIODS:
+            many = reduce(lambda a, b: a.then(b), [plan] * count)
+            response = SimulatedResponse(self._prepared, many, 0.0)
+            last = response._rms({name: 1.0}, many.end - plan.duration, many.end)
+            if abs(last - before) <= 1e-7 * max(last, 1e-300):
+                return last
+            before = last
+        raise ValueError(
+            f"the loop must reach a periodic steady state for the root mean square of {name} along a cyclic plan, got "
+            f"a change of {abs(last - before):.2g} after {_PERIODS[-1]} periods of {plan.duration:g} s"
+        )
+
+
+class _Inputs(Trajectory):
+    """Inputs of a loop: axes of a plan, their derivatives, and 0."""
+
+    plan: Trajectory
+    fed: tuple[Fed | None, ...]
+    initial: Array
+    final: Array
+
+    def __init__(self, plan: Trajectory, fed: list[Fed | None]) -> None:
+        names = tuple(f"input {k + 1}" for k in range(len(fed)))
+        held = [[0.0 if f is None or f[1] else float(end[f[0]]) for f in fed] for end in (plan.initial, plan.final)]
+        self._set_fields(
+            labels=names,
+            breakpoints=plan.breakpoints,
+            plan=plan,
+            fed=tuple(fed),
+            initial=np.array(held[0]),
+            final=np.array(held[1]),
+        )
+
+    def segment_jet(self, segment: int, s: Array, order: int) -> Array:
+        """Derivatives of a segment; as `Trajectory.segment_jet`."""
+        high = max((f[1] for f in self.fed if f is not None), default=0)
+        jet = self.plan.segment_jet(segment, s, order + high)
+        found = np.zeros((order + 1, len(self.fed), s.size))
+        for row, f in enumerate(self.fed):
+            if f is not None:
+                found[:, row] = jet[f[1] : f[1] + order + 1, f[0]]
+        return found
+
+    def map_time(self, origin: float, target: float, rate: float) -> Self:
+        """Not defined."""
+        self._reject()
+
+    def to_dict(self) -> Data:
+        """Not defined."""
+        self._reject()
+
+    @classmethod
+    def from_dict(cls, data: Data) -> Trajectory:
+        """Not defined."""
+        cls._reject()
+
+    @classmethod
+    def _reject(cls) -> NoReturn:
+        raise TypeError("inputs of a loop cannot be retimed or saved")
+
+
+def is_cyclic(plan: Trajectory) -> bool:
+    """Whether a plan is closed and in motion at its ends, with equal velocities there: one period of a motion."""
+    first, last = plan.jet(plan.start, 1), plan.jet(plan.end, 1, left=True)
+    size = np.stack([np.ptp([plan.extrema().minimum, plan.extrema().maximum], axis=0), plan.peak(1)])
+    return bool(np.all(np.abs(last - first) <= 1e-9 * size) and np.any(np.abs(first[1]) > 1e-9 * size[1]))
+
+
+def _check_sources(prepared: Prepared, plan: Trajectory) -> None:
+    """Raise for a source inside of the loop that is not the plan."""
+    for block in () if prepared.network is None else prepared.network.blocks:
+        source = block.plan
+        if source is None:
+            continue
+        near = abs(source.start - plan.start) + abs(source.end - plan.end) <= 1e-9 * plan.duration
+        for axis in range(source.naxes):
+            if not near or same_axis(plan, source, axis) is None:
+                raise ValueError(
+                    f"sources in {prepared.name} must be the plan under limits, got another one with the axis "
+                    f"{source.labels[axis]} in block {block.name}; for other durations make the plan an input of the "
+                    "loop"
+                )
+
+
+def _near_peak(times: Array, values: Array, inside: NDArray[np.bool_]) -> Array:
+    """Times between the neighbours of samples near which the maximum may lie."""
+    padded = np.concatenate([values[:1], np.where(inside, values, -np.inf), values[-1:]])
+    here, left, right = padded[1:-1], padded[:-2], padded[2:]
+    local = np.flatnonzero(inside & (here >= left) & (here >= right))
+    if not local.size:
+        return np.empty(0)
+    steps = np.where(np.isfinite(left), here - left, 0.0) + np.where(np.isfinite(right), here - right, 0.0)
+    likely = local[here[local] + steps[local] >= here[local].max()]
+    likely = likely[np.argsort(-here[likely])[:_MOST]]
+    spans = [(times[max(k - 1, 0)], times[min(k + 1, times.size - 1)]) for k in likely.tolist()]
+    return np.concatenate([np.linspace(low, high, _FINE) for low, high in spans])
+
+
+def _peak(times: Array, values: Array) -> tuple[float, float]:
+    """Maximum and its time, by a parabola through three samples where these are evenly spaced."""
+    k = int(values.argmax())
+    best, at = float(values[k]), float(times[k])
+    if 0 < k < values.size - 1:
+        before, after = times[k] - times[k - 1], times[k + 1] - times[k]
+        left, right = values[k] - values[k - 1], values[k] - values[k + 1]
+        if abs(before - after) <= 1e-6 * before and left + right > 0.0 and min(left, right) >= 0.0:
+            shift = 0.5 * (left - right) / (left + right)
+            # A kink is no parabola: its neighbours fall by different amounts.
+            if abs(left - right) <= 0.9 * (left + right):
+                best, at = best + 0.125 * (left - right) ** 2 / (left + right), at + float(shift * before)
+    return best, at
+
+
+def _slopes(values: Array, step: float) -> Array:
+    """Derivative of evenly spaced samples (five or more), of order 4."""
+    found = np.empty_like(values)
+    found[2:-2] = (values[:-4] - 8.0 * values[1:-3] + 8.0 * values[3:-1] - values[4:]) / 12.0
+    for end, sign in ((values, 1.0), (values[::-1], -1.0)):
+        edge = sign * np.array([
+            (-25.0 * end[0] + 48.0 * end[1] - 36.0 * end[2] + 16.0 * end[3] - 3.0 * end[4]) / 12.0,
+            (-3.0 * end[0] - 10.0 * end[1] + 18.0 * end[2] - 6.0 * end[3] + end[4]) / 12.0,
+        ])  # fmt: skip
+        if sign > 0.0:
+            found[:2] = edge
+        else:
+            found[:-3:-1] = edge
+    return found / step
+
+
+def _integral(times: Array, values: Array) -> float:
+    """Integral of a smooth function by a cubic spline through its samples."""
+    if times.size < 4:
+        return float(np.sum(0.5 * (values[1:] + values[:-1]) * np.diff(times)))
+    return float(CubicSpline(times, values).integrate(times[0], times[-1]))
