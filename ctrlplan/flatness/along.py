@@ -6,7 +6,7 @@ between the nodes they are interpolated and refined, all times in one call.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -119,20 +119,44 @@ def grid_of(maps: FlatMaps, plan: Trajectory, p: Array, start: Array | None, nam
 
 
 def connected(maps: FlatMaps, flag: Array, p: Array, start: Array | None, name: str, time: float) -> Array:
-    """State of a flag, connected with the operating point or a given state by a straight line of flags."""
+    """State of a flag, connected with the operating point or a given state by regular flags.
+
+    The path is a straight line or, where that passes a singular point (a vehicle
+    that turns round), the first of a fixed list of detours.
+    """
     z = maps.start if start is None else start
-    origin = maps.flags(z, p)
-
-    def path(s: float) -> Array:
-        return origin + s * (flag - origin) if s < 1.0 else flag
-
     try:
-        return maps.followed(z, path, p)
+        return _straight(maps, z, flag, p)
     except SingularError as error:
+        for detour in _detours(maps.orders, maps.flags(z, p), flag):
+            try:
+                return _straight(maps, _straight(maps, z, detour, p), flag, p)
+            except SingularError:
+                continue
         raise ValueError(
-            f"states of {name} at {time:.6g} s must be connected with the operating point, but {error}, "
-            f"{100.0 * error.position:.3g} % of the distance; give start= or another operating point at="
+            f"states of {name} at {time:.6g} s must be connected with the operating point, but {error}; give start= or "
+            "another operating point at="
         ) from None
+
+
+def _straight(maps: FlatMaps, z: Array, flag: Array, p: Array) -> Array:
+    """State of a flag, connected with a state by a straight line of flags."""
+    origin = maps.flags(z, p)
+    return maps.followed(z, lambda s: origin + s * (flag - origin) if s < 1.0 else flag, p)
+
+
+def _detours(orders: tuple[int, ...], origin: Array, goal: Array) -> Iterator[Array]:
+    """Flags between two others, off the straight line by their distance in one derivative of one flat output."""
+    order = np.concatenate([np.arange(r) for r in orders])
+    distance = np.abs(goal - origin)
+    for nu in range(1, max(orders)):
+        rows = np.flatnonzero(order == nu)
+        size = float(distance[rows].max(initial=0.0))
+        for row in rows:
+            for sign in (1.0, -1.0):
+                detour = 0.5 * (origin + goal)
+                detour[row] += sign * size
+                yield detour
 
 
 def _rates(maps: FlatMaps, z: Array, above: Array, p: Array) -> Array:
@@ -254,9 +278,8 @@ def _followed_from_grid(
     """State at a time that interpolation does not reach: before the start, after the end, or near a singular point."""
     k = int(np.clip(np.searchsorted(grid.times, t) - 1, 0, grid.times.size - 1))
     z = grid.states[:, k] if t < grid.times[-1] else grid.states[:, -1]
-    origin = maps.flags(z, p)
     try:
-        return maps.followed(z, lambda s: origin + s * (flag - origin) if s < 1.0 else flag, p)
+        return _straight(maps, z, flag, p)
     except SingularError as error:
         raise ValueError(f"states of {name} must be determined along the plan, but {error} at {t:.6g} s") from None
 

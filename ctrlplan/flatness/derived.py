@@ -175,20 +175,15 @@ class DerivedFlatSystem(FlatSystem):
         """Extended states (nz, n) of flags (nz, n): the first from the operating point, then neighbour by neighbour."""
         maps = self.maps
         z = np.full(flags.shape, np.nan)
-        if not flags.shape[1]:
-            return z
-        left = np.arange(flags.shape[1])
-        near = maps.start
+        near, left = maps.start, np.arange(flags.shape[1])
         while left.size:
-            k = int(left[0])
-            near = connected(maps, flags[:, k], p, near, str(self.name), np.nan)
-            z[:, k] = near
-            left = left[1:]
-            if not left.size:
-                break
             trial, found = maps.refined(np.repeat(near[:, None], left.size, axis=1), flags[:, left], p)
             z[:, left[found]] = trial[:, found]
             left = left[~found]
+            if left.size:
+                k = int(left[0])
+                near = z[:, k] = connected(maps, flags[:, k], p, near, str(self.name), np.nan)
+                left = left[1:]
         return z
 
     def _extended(self, state: Array, plan: Trajectory, p: Array) -> Array:

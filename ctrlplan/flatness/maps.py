@@ -196,7 +196,8 @@ class FlatMaps:
                     found = found + step
                     if not np.isfinite(found).all() or self._distance(found, predicted) > _MOVED:
                         return None
-                    if self._distance(step, 0.0) < _CONVERGED or (k > 3 and self._distance(step, 0.0) < 1e-11):
+                    size = self._distance(found, found - step)
+                    if size < _CONVERGED or (k > 3 and size < 1e-11):
                         break
                 else:
                     return None
@@ -206,8 +207,9 @@ class FlatMaps:
             same = np.linalg.slogdet(now)[0] == sign and self._distance(predicted, z) < 10.0 * _MOVED
         return (found, now) if same else None
 
-    def _distance(self, z: Array, other: Array | float) -> float:
-        return float(np.max(np.abs(z - other) / self.scales))
+    def _distance(self, z: Array, other: Array) -> float:
+        """Largest difference of two states, in scales or in magnitudes where these are larger."""
+        return float(np.max(np.abs(z - other) / np.maximum(self.scales, np.maximum(np.abs(z), np.abs(other)))))
 
     def _singular(self, z: Array, place: float, p: Array) -> SingularError:
         """Error that names the entry of z that is not determined."""

@@ -5,6 +5,8 @@ A tape needs no CasADi to be evaluated, and can be pickled.
 
 from __future__ import annotations
 
+import math
+import operator
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -57,14 +59,23 @@ class Tape:
         given = [np.asarray(value, dtype=float) for value in arguments]
         trailing = np.broadcast_shapes(*(value.shape[1:] for value in given))
         out = np.zeros((len(self.results), *trailing))
-        with np.errstate(all="ignore"):
-            values = self.evaluated(given, NUMPY)
+        values = self._of_one_point(given) if not trailing else None
+        if values is None:
+            with np.errstate(all="ignore"):
+                values = self.evaluated(given, NUMPY)
         for k, place in enumerate(self.results):
             if place >= 0:
                 out[k] = values[place]
         if self.shape[1] == 1 and not self.matrix:
             return out
         return out.reshape(self.shape[1], self.shape[0], *trailing).swapaxes(0, 1)
+
+    def _of_one_point(self, arguments: list[Array]) -> list[Value] | None:
+        """Values by Python's own arithmetic, which is faster for one point; None outside of the domain."""
+        try:
+            return self.evaluated([value.tolist() for value in arguments], _PYTHON)
+        except (ArithmeticError, ValueError, KeyError):
+            return None
 
     def evaluated(
         self,
@@ -146,3 +157,20 @@ NUMPY: Operations = {
     "IF_ELSE_ZERO": lambda condition, value: np.where(condition != 0.0, value, 0.0),
 }
 """Operations on numbers and arrays."""
+
+_PYTHON: Operations = {
+    "ASSIGN": lambda x: x,
+    "ADD": operator.add,
+    "SUB": operator.sub,
+    "MUL": operator.mul,
+    "DIV": operator.truediv,
+    "NEG": operator.neg,
+    "POW": math.pow,
+    "CONSTPOW": math.pow,
+    "SQ": lambda x: x * x,
+    "TWICE": lambda x: x + x,
+    "INV": lambda x: 1.0 / x,
+    **{name.upper(): getattr(math, name) for name in str.split("exp log sqrt sin cos tan asin acos atan atan2 hypot")},
+    **{name.upper(): getattr(math, name) for name in str.split("sinh cosh tanh asinh acosh atanh log1p expm1 fabs")},
+}
+"""Smooth operations on Python's numbers, which raise outside of their domain."""
