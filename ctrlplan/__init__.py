@@ -29,6 +29,8 @@ Build the loop
     create_saturation_iosystem, create_delay_iosystem    limits of an actuator, transport delay
     flat_system               flat system of a plant, from its equations -> DerivedFlatSystem, NotFlatError
     FlatSystem                flat system from maps of your own
+    flat_candidates           which outputs are flat -> FlatCandidate
+    check_flat                maps against the equations -> FlatCheck
     create_flat_iosystem      flat control of a flat plant; create_feedforward_iosystem: of a linear loop
     sample_hold               discrete block in a continuous loop; expose_states: states among the outputs
     create_shaper_iosystem    input shaping of an operator's commands, also for a measured frequency
@@ -165,7 +167,16 @@ _EXPORTS = {
         "monte_carlo",
         "sweep",
     ),
-    "flatness": ("DerivedFlatSystem", "FlatSystem", "NotFlatError", "flat_system"),
+    "flatness": (
+        "DerivedFlatSystem",
+        "FlatCandidate",
+        "FlatCheck",
+        "FlatSystem",
+        "NotFlatError",
+        "check_flat",
+        "flat_candidates",
+        "flat_system",
+    ),
     "reports.explore": ("explore",),
     "reports.vibration_figures": ("residual_plot",),
 }

@@ -68,6 +68,8 @@ MADE = {
     "Event": lambda: cp.Event("u", low=0.0),
     "Experiment": lambda: cp.Experiment(MOVE, TIMES, measures=["iae"]),
     "Fastest": lambda: cp.fastest(quintic(), {"y_d1": 0.5, "y_d2": 2.0}),
+    "FlatCandidate": lambda: cp.flat_candidates(cp.plants.dc_motor())[0],
+    "FlatCheck": lambda: cp.check_flat(cp.plants.dc_motor()),
     "FlatSystem": lambda: cp.plants.Crane().flat_system(),
     "HalfPlane": lambda: cp.HalfPlane((0.0, 1.0), 2.0),
     "Limits": lambda: cp.Limits(high=1.0),

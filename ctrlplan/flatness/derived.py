@@ -16,7 +16,7 @@ from ctrlplan._types import Array, Params, Value
 from ctrlplan.flatness.along import Grid, check_branch, connected, grid_of, rows_of, states_along
 from ctrlplan.flatness.maps import FlatMaps
 from ctrlplan.flatness.system import FlatSystem
-from ctrlplan.symbolic.tape import NUMPY, Tape
+from ctrlplan.symbolic.tape import Tape
 from ctrlplan.trajectories import Trajectory
 
 if TYPE_CHECKING:
@@ -204,5 +204,4 @@ class DerivedFlatSystem(FlatSystem):
 
 def _evaluated(tape: Tape, names: Sequence[str], t: float, x: Value, u: Value, params: Params) -> Value:
     """Result of a tape as a function of a block, of numbers or symbols."""
-    values = tape.evaluated((x, u, [params[name] for name in names]), NUMPY)
-    return np.array([values[k] if k >= 0 else 0.0 for k in tape.results])
+    return np.array(tape.at((x, u, [params[name] for name in names])))
