@@ -28,6 +28,10 @@ Build the loop
     create_source_iosystem    plan as a block with outputs y, y_d1, ...; source_samples: the same as arrays
     create_pid_iosystem       PID with limits and anti-windup
     create_saturation_iosystem, create_delay_iosystem    limits of an actuator, transport delay
+    flat_system               flat system of a plant, from its equations -> DerivedFlatSystem, NotFlatError
+    FlatSystem                flat system from maps of your own
+    flat_candidates           which outputs are flat -> FlatCandidate
+    check_flat                maps against the equations -> FlatCheck
     create_flat_iosystem      flat control of a flat plant; create_feedforward_iosystem: of a linear loop
     fit_feedforward           feedforward gains and delay from a log -> FeedforwardFit
     sample_hold               discrete block in a continuous loop; expose_states: states among the outputs
@@ -169,7 +173,16 @@ _EXPORTS = {
         "monte_carlo",
         "sweep",
     ),
-    "flatness": ("DerivedFlatSystem", "FlatSystem", "NotFlatError", "flat_system"),
+    "flatness": (
+        "DerivedFlatSystem",
+        "FlatCandidate",
+        "FlatCheck",
+        "FlatSystem",
+        "NotFlatError",
+        "check_flat",
+        "flat_candidates",
+        "flat_system",
+    ),
     "reports.explore": ("explore",),
     "reports.vibration_figures": ("residual_plot",),
 }
