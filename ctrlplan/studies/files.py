@@ -67,6 +67,10 @@ Further entries and tables, each optional:
     family = "polynomial"
     fastest = "shape"         # minimum duration under the limits; or "waypoints", "path"
     avoid = true              # around the obstacles; plans of two axes
+    [[plans.shaper]]          # input shaper of the finished plan, one table for each mode
+    kind = "zvd"              # zv, zvd, mzv, ei, two_hump_ei, three_hump_ei
+    frequency = 6.0           # [rad/s]
+    damping = 0.05            # and tolerance = 0.05 of the ei kinds
     [[obstacles]]             # shapes: disc, rectangle (x, z), half_plane (normal, offset)
     shape = "disc"
     centre = [10.0, 5.0]
