@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ctrlplan._types import Array
 from ctrlplan.simulation.cell_extrema import Cells, extrema_of_cells, joined, mean_square
+from ctrlplan.simulation.exact import changes_over
 from ctrlplan.simulation.loop_form import NODES, NTERMS, SIGMA, LoopForm, Rows
 from ctrlplan.simulation.loop_response import Extremes, LoopResponse
 from ctrlplan.simulation.plan_cells import PlanCells
@@ -156,13 +158,16 @@ class ExactResponse(LoopResponse):
         Outputs by name, one row each.
     start : float
         Start of the plan [s].
+    cyclic : bool, optional
+        Whether the plan is one period of a motion: a root mean square over its
+        duration is then that of the periodic steady state.
     """
 
     note = "exact"
 
-    def __init__(self, motion: Motion, signals: Mapping[str, Rows], start: float) -> None:
+    def __init__(self, motion: Motion, signals: Mapping[str, Rows], start: float, cyclic: bool = False) -> None:
         self.names = tuple(signals)
-        self._motion, self._signals, self._start = motion, dict(signals), start
+        self._motion, self._signals, self._start, self._cyclic = motion, dict(signals), start, cyclic
 
     def extremes(
         self, weights: Mapping[str, float], *, during: tuple[float, float] | None = None, rate: bool = False
@@ -181,6 +186,8 @@ class ExactResponse(LoopResponse):
         length = duration if period is None else float(period)
         if not 0.0 < length < math.inf:
             raise ValueError(f"period must be above 0 and finite, got {length:g} s")
+        if period is None and self._cyclic:
+            return math.sqrt(mean_square(self._periodic.cells(rows), 0) / length)
         total = mean_square(self._motion.cells(rows).during(0.0, length), 0)
         reached = duration
         if length > duration:
@@ -198,6 +205,19 @@ class ExactResponse(LoopResponse):
         rows, motion = self._sum(weights), self._motion
         before, after = rows.static(motion.plan.initial, motion.start), rows.static(motion.plan.final, motion.settled)
         return float(before[0]), math.nan if motion.form.integrators else float(after[0])
+
+    @cached_property
+    def _periodic(self) -> Motion:
+        """Motion in the periodic steady state: the state at the end of the plan is that at its start."""
+        form, motion = self._motion.form, self._motion
+        if form.integrators:
+            raise ValueError(
+                f"the loop must have a periodic steady state for the root mean square along a cyclic plan, got "
+                f"{form.name} with a pole at 0; give the period of the root mean square"
+            )
+        change = changes_over(motion.duration * form.a, np.zeros((form.nstates, 0)), 1)[-1]
+        state = motion.start + np.linalg.solve(-change, motion.end - motion.start)
+        return Motion(form, motion.plan, motion.duration, state)
 
     def _sum(self, weights: Mapping[str, float]) -> Rows:
         for name in weights:
