@@ -14,8 +14,10 @@ from ctrlplan._types import Array
 from ctrlplan.simulation.cell_extrema import Cells, extrema_of_cells, joined, mean_square
 from ctrlplan.simulation.exact import changes_over
 from ctrlplan.simulation.loop_form import NODES, NTERMS, SIGMA, LoopForm, Rows
+from ctrlplan.simulation.loop_inputs import is_cyclic
 from ctrlplan.simulation.loop_response import Extremes, LoopResponse
 from ctrlplan.simulation.plan_cells import PlanCells
+from ctrlplan.trajectories import Trajectory
 from ctrlplan.trajectories.chebyshev import transform
 
 _REST = 1e-12
@@ -156,18 +158,15 @@ class ExactResponse(LoopResponse):
         States of the loop along the plan.
     signals : mapping of str to Rows
         Outputs by name, one row each.
-    start : float
-        Start of the plan [s].
-    cyclic : bool, optional
-        Whether the plan is one period of a motion: a root mean square over its
-        duration is then that of the periodic steady state.
+    plan : Trajectory
+        The plan.
     """
 
     note = "exact"
 
-    def __init__(self, motion: Motion, signals: Mapping[str, Rows], start: float, cyclic: bool = False) -> None:
+    def __init__(self, motion: Motion, signals: Mapping[str, Rows], plan: Trajectory) -> None:
         self.names = tuple(signals)
-        self._motion, self._signals, self._start, self._cyclic = motion, dict(signals), start, cyclic
+        self._motion, self._signals, self._plan, self._start = motion, dict(signals), plan, plan.start
 
     def extremes(
         self, weights: Mapping[str, float], *, during: tuple[float, float] | None = None, rate: bool = False
@@ -186,7 +185,7 @@ class ExactResponse(LoopResponse):
         length = duration if period is None else float(period)
         if not 0.0 < length < math.inf:
             raise ValueError(f"period must be above 0 and finite, got {length:g} s")
-        if period is None and self._cyclic:
+        if period is None and is_cyclic(self._plan):
             return math.sqrt(mean_square(self._periodic.cells(rows), 0) / length)
         total = mean_square(self._motion.cells(rows).during(0.0, length), 0)
         reached = duration

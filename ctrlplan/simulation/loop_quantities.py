@@ -14,7 +14,7 @@ from ctrlplan.simulation.equilibrium import linear_equilibrium
 from ctrlplan.simulation.exact_response import ExactResponse, Motion
 from ctrlplan.simulation.linear import LinearForm
 from ctrlplan.simulation.loop_form import LoopForm, Rows
-from ctrlplan.simulation.loop_inputs import Fed, fed_signals, is_cyclic, same_axis, tracked
+from ctrlplan.simulation.loop_inputs import Fed, fed_signals, same_axis, tracked
 from ctrlplan.simulation.loop_response import LoopResponse
 from ctrlplan.simulation.plan_cells import PlanCells
 from ctrlplan.simulation.prepared import Prepared, prepared_form
@@ -177,7 +177,7 @@ class AlongPlan:
         same = plan is self.plan
         cells, start = (self.cells, self.start) if same else (PlanCells(plan, self.form.order + 2), self.rest_at(plan))
         motion = Motion(self.form, cells, plan.duration, start)
-        return ExactResponse(motion, self.signals, plan.start, is_cyclic(plan))
+        return ExactResponse(motion, self.signals, plan)
 
 
 def loop_quantities(loop: System | Prepared, *, tail: float | None = None) -> LoopQuantities | SimulatedQuantities:
