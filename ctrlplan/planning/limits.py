@@ -665,7 +665,7 @@ class Limited:
         for bound, values in zip(self.bounds, self.values(still.jet), strict=True):
             if bound.in_loop:
                 sides = [abs(side) for side in (bound.low, bound.high) if math.isfinite(side)]
-                yield replace(bound, slack=1e-12 * (1.0 + max(sides, default=0.0) / bound.scale))
+                yield replace(bound, slack=1e-12 + 16.0 * np.finfo(float).eps * max(sides, default=0.0) / bound.scale)
                 continue
             if bound.kind == "rms" or np.isnan(values).any():
                 yield replace(bound, slack=0.0)  # a signal that is singular at rest attains no limit there

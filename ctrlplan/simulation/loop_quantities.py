@@ -160,9 +160,11 @@ class AlongPlan:
             np.where(free, 0.0, given),
             free,
         )
-        if state is not None:
-            terms = np.abs(linear.a) @ np.abs(state) + np.abs(linear.b) @ np.abs(supplied)
-            if np.any(np.abs(linear.a @ state + linear.b @ supplied) > 1e-9 * np.maximum(terms, 1e-300)):
+        if state is not None:  # states that blocks declare are not changed
+            scale, moved = self.form.scale, linear.a @ state + linear.b @ supplied
+            size = np.abs(self.form.a).sum(axis=1) * np.abs(state / scale).max(initial=0.0)
+            size += np.abs(linear.b) @ np.abs(supplied) / scale
+            if np.any(np.abs(moved / scale) > 1e-9 * size):
                 state = None
         if state is None:
             place = ", ".join(f"{label} = {x:.4g}" for label, x in zip(plan.labels, plan.initial.tolist(), strict=True))

@@ -321,3 +321,19 @@ def test_what_a_loop_must_be():
         along(LAG, QUINTIC).extremes({"z": 1.0})
     with pytest.raises(ValueError, match="period must be above 0 and finite, got -1 s"):
         along(LAG, QUINTIC).rms("y", period=-1.0)
+
+
+def test_modes_that_hardly_decay():
+    """The first oscillations after the move are the largest; a signal that would have to decay first is an error."""
+    w, damping = 100.0, 1e-8
+    loop = ct.ss(
+        [[0.0, w], [-w, -2.0 * damping * w]], [[0.0], [w]], np.eye(2), np.zeros((2, 1)), inputs="r", outputs=["y", "v"],
+        name="beam",
+    )  # fmt: skip
+    response = along(loop, QUINTIC.retime(0.1))
+    found = response.extremes({"y": 1.0})
+    times = np.linspace(0.0, 1.0, 100_001)
+    y = cp.simulate(loop, times, QUINTIC.retime(0.1)).outputs["y"]
+    assert found.high == pytest.approx(y.max(), rel=1e-6)
+    with pytest.raises(ValueError, match=r"must decay within 100000 cells .* got beam with a pole at -1e-06 ± 100j"):
+        response.extremes({"y": 1.0}, during=(1e12, 2e12))
