@@ -178,20 +178,13 @@ class SimulatedResponse(LoopResponse):
 
     def ends(self, weights: Mapping[str, float]) -> tuple[float, float]:
         """Values at rest before the plan and in steady state after it; see `LoopResponse`."""
-        values = []
-        for time, state, held in (
-            (self.plan.start, self._start, self._inputs.initial),
-            (self.plan.end, self._final, self._inputs.final),
-        ):
-            if state is None:
-                values.append(math.nan)
-                continue
-            step = float(self._prepared.dt) if self._prepared.is_discrete else 1e-6 * self.plan.duration
-            times = time + step * np.arange(2)
-            response = simulate(self._prepared, times, held.tolist() or None, state, rtol=_RTOL, events=())
-            signals = self._signals(response.y, np.repeat(held[:, None], 2, axis=1))
-            values.append(float(self._sum(weights, signals)[0]))
-        return values[0], values[1]
+        before = float(self._sum(weights, self._samples[1][:, :1])[0])
+        if self._final is None:
+            return before, math.nan
+        step = float(self._prepared.dt) if self._prepared.is_discrete else 1e-2 * self.plan.duration
+        times, held = self.plan.end + step * np.arange(2), self._inputs.final
+        response = simulate(self._prepared, times, held.tolist() or None, self._final, rtol=_RTOL, events=())
+        return before, float(self._sum(weights, self._signals(response.y[..., :1], held[:, None]))[0])
 
     @cached_property
     def _final(self) -> Array | None:
