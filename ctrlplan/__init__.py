@@ -29,6 +29,7 @@ Build the loop
     create_saturation_iosystem, create_delay_iosystem    limits of an actuator, transport delay
     create_flat_iosystem      flat control of a flat plant; create_feedforward_iosystem: of a linear loop
     sample_hold               discrete block in a continuous loop; expose_states: states among the outputs
+    create_shaper_iosystem    input shaping of an operator's commands, also for a measured frequency
     create_command_filter_iosystem    filter with derivative outputs; command_filter_gains: its feedforward
     plants                    motor, flexible joint, integrators, crane with its loops; Law: laws of the crane
     declare, traits_of        what the simulation must know of a block of your own -> BlockTraits
@@ -127,6 +128,7 @@ _EXPORTS = {
         "create_pid_iosystem",
         "create_replanner_iosystem",
         "create_saturation_iosystem",
+        "create_shaper_iosystem",
         "create_source_iosystem",
         "create_time_scaling_iosystem",
         "expose_states",

@@ -1,19 +1,47 @@
-"""One hypothesis profile for all tests: no deadline, for a loaded machine is no fault; figures; order of tests."""
+"""Hypothesis profiles without deadlines, which a loaded machine would miss; everyday cases; figures; order of tests."""
 
 import gc
 import os
 import sys
 
 import pytest
-from hypothesis import settings
+import repetitions
 
 # Matrices are small here: more threads of BLAS only wait for each other, and tests run in several processes already.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 collect_ignore = ["support"]  # no tests: what they import, under one name and not again as tests.support.NAME
 
-settings.register_profile("ctrlplan", deadline=None, derandomize=True, print_blob=True)
-settings.load_profile("ctrlplan")
+
+def everyday(config):
+    """Whether the run leaves out the slow tests."""
+    return "not slow" in config.getoption("markexpr")
+
+
+def pytest_configure(config):
+    """Fewer examples of each hypothesis in the everyday run."""
+    repetitions.load(everyday(config))
+
+
+@pytest.hookimpl(tryfirst=True)  # before -m selects
+def pytest_collection_modifyitems(items):
+    """Under ``each_value``, cases that are not needed to have each value of each parameter once are slow."""
+    families = {}
+    for item in items:
+        if item.get_closest_marker("each_value") and not item.get_closest_marker("slow"):
+            values = {(name, id(value)) for name, value in item.callspec.params.items()}
+            families.setdefault(item.nodeid.partition("[")[0], []).append((item, values))
+    for cases in families.values():
+        known, chosen = set(), set()
+        for enough in (set.isdisjoint, lambda values, known: not values <= known):  # all values new, then any of them
+            for item, values in cases:
+                if enough(values, known):
+                    known |= values
+                    chosen.add(item)
+        for item, _ in cases:
+            if item not in chosen:
+                item.add_marker("slow")
+
 
 # Imports and collected tests stay until the end: a third of the time of collection went into looking for garbage there.
 gc.disable()
@@ -21,8 +49,9 @@ gc.disable()
 
 @pytest.hookimpl(trylast=True)
 def pytest_collection_finish():
-    """Look for garbage from now on, among what is made from now on."""
+    """Look for garbage from now on, among what is made from now on, and not after each 700 objects."""
     gc.enable()
+    gc.set_threshold(50_000)
     gc.freeze()
 
 
@@ -32,6 +61,13 @@ def _no_figure_is_left_open():
     yield
     if "matplotlib.pyplot" in sys.modules:
         sys.modules["matplotlib.pyplot"].close("all")
+
+
+@pytest.fixture
+def blank_drawings(monkeypatch, pytestconfig):
+    """Pages of the everyday run with blank drawings, for tests of what is around them; the whole suite draws them."""
+    if everyday(pytestconfig):
+        monkeypatch.setattr("ctrlplan.reports.shown.to_svg", lambda figure, key: "<svg></svg>")
 
 
 @pytest.hookimpl(optionalhook=True)

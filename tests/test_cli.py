@@ -230,6 +230,7 @@ def test_files_can_be_read_by_others(reported):
     assert all(path.stat().st_mode & 0o444 == 0o444 for path in folder.iterdir())
 
 
+@pytest.mark.usefixtures("blank_drawings")
 def test_the_default_folder_is_called_report(study, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert main(["report", study.name]) == 0
@@ -328,6 +329,7 @@ def test_a_file_name_that_is_no_text_is_a_name(tmp_path, capsys):
     assert len(capsys.readouterr().err.splitlines()) == 1
 
 
+@pytest.mark.usefixtures("blank_drawings")
 @pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="names of files are texts there")
 def test_a_page_of_a_file_whose_name_is_no_text_is_written(tmp_path, capsys):

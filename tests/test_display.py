@@ -123,6 +123,11 @@ def made(name):
     return MADE[name]()
 
 
+@cache
+def html_of(name):
+    return made(name)._repr_html_()
+
+
 class Read(HTMLParser):
     """Elements of a fragment: their tags with the names of attributes, and the text of each that has one."""
 
@@ -206,8 +211,7 @@ def test_text_needs_no_figure(name, monkeypatch):
 
 @displayed
 def test_html_has_the_content_of_the_text(name):
-    found = made(name)
-    read, text = Read(found._repr_html_()), str(found)
+    read, text = Read(html_of(name)), str(made(name))
     close = "".join(text.split())
     for part in read.texts:
         assert "".join(part.split()) in close
@@ -217,7 +221,7 @@ def test_html_has_the_content_of_the_text(name):
 
 @displayed
 def test_html_is_accessible(name):
-    html = made(name)._repr_html_()
+    html = html_of(name)
     read = Read(html)
     tags = [tag for tag, _ in read.elements]
     assert tags.count("table") == tags.count("caption")
@@ -241,17 +245,17 @@ def test_figures_leave_nothing_behind(name):
     assert len(ids) == len(set(ids))
     assert {*re.findall(r'href="#([^"]+)"', html), *re.findall(r"url\(#([^)]+)\)", html)} <= set(ids)
     assert "currentColor" in html
-    assert made(name)._repr_html_() == html
+    assert html_of(name) == html
 
 
 def test_ids_of_different_figures_differ():
-    first, second = (re.findall(r'\bid="([^"]+)"', made(name)._repr_html_()) for name in ("PolySpline", "SCurve"))
+    first, second = (re.findall(r'\bid="([^"]+)"', html_of(name)) for name in ("PolySpline", "SCurve"))
     assert not set(first) & set(second)
 
 
 def test_threads_draw_as_one_does():
     names = ["PolySpline", "Comparison", "TrigSpline"] * 2
-    alone = [made(name)._repr_html_() for name in names]
+    alone = [html_of(name) for name in names]
     settings = dict(mpl.rcParams)
     with ThreadPoolExecutor(4) as pool:
         assert list(pool.map(lambda name: made(name)._repr_html_(), names)) == alone
@@ -298,11 +302,9 @@ def test_labels_of_a_plan_are_text(label):
 
 @pytest.mark.parametrize("label", ["<b>", "a & b", '"', "$x$"])
 def test_labels_in_a_figure_are_text(label):
-    plan = cp.PolySpline(PLANE, labels=[label, "z"])
-    assert (
-        Read(plan._repr_html_()).structure() == Read(cp.PolySpline(PLANE, labels=["x", "z"])._repr_html_()).structure()
-    )
-    assert label in " ".join(Read(plan._repr_html_()).texts)
+    read, plain = (Read(cp.PolySpline(PLANE, labels=[x, "z"])._repr_html_()) for x in (label, "x"))
+    assert read.structure() == plain.structure()
+    assert label in " ".join(read.texts)
 
 
 # What is said

@@ -136,6 +136,7 @@ def test_every_exception_of_the_import_contract_is_one_that_is_named():
         else:
             assert entry in (
                 "ctrlplan.planning.quantities -> ctrlplan.flatness.quantities",  # the adapter
+                "ctrlplan.planning.quantities -> ctrlplan.simulation.loop_quantities",  # the adapter, for loops
                 "ctrlplan.trajectories.chosen -> ctrlplan.planning.alpha",  # TrigSpline(alpha="auto")
                 "ctrlplan.trajectories.chosen -> ctrlplan.planning.cycle",  # on_cycle(dt, limits)
                 "ctrlplan.trajectories.chosen -> ctrlplan.planning.stop",  # stop(time, limits)

@@ -16,7 +16,7 @@ from ctrlplan._checks import checked_finite, checked_pair
 from ctrlplan._display import Displayed, Facts, Figure, Part
 from ctrlplan._renamed import FormerAttribute
 from ctrlplan.planning.limits import Limited, Margin, Margins
-from ctrlplan.planning.loop_fastest import LoopProblem
+from ctrlplan.planning.loop_fastest import LoopProblem, bounds_of_values
 from ctrlplan.planning.quantities import System, shapes_given, system_given
 from ctrlplan.planning.scalar_search import bisected, scan
 from ctrlplan.planning.time_law import with_fast_time_law
@@ -44,7 +44,8 @@ class Fastest(Displayed):
         Margins of all limits over the whole plan, the active one first.
     feasible : tuple of (float, float)
         Intervals of feasible durations [s], increasing. The last end is inf if
-        every longer duration is feasible, otherwise the end of the search.
+        every longer duration is feasible, otherwise the end of the search. With
+        `statement` only the minimum duration.
     hold : str
         Property that was preserved: "shape", "waypoints" or "path".
     limited : Limited
@@ -161,8 +162,8 @@ def fastest(
     tail : float, optional
         Time after the plan [s] for which a loop is simulated, as for `margins`.
     resolution : float, optional
-        Spare, relative to the range of a limit, up to which feasible durations
-        may be missed, for limits on signals of a linear loop.
+        Margin relative to the range of a limit, for limits on signals of a linear
+        loop: shorter feasible durations may be missed if none has a larger one.
     params : mapping of str to float or (float, float), optional
         Values or ranges of parameters of `system`, as for `margins`: limits are
         satisfied for the worst ones.
@@ -209,7 +210,7 @@ def fastest(
     loop's impulse responses bound its curvature. Between two durations the excess
     over a limit is at least the chord minus this bound; intervals in which that is
     positive are excluded, others are halved. No shorter duration of the search
-    satisfies every limit with a spare above `resolution`, as
+    satisfies every limit with a margin above `resolution`, as
     `Fastest.statement` says; longer durations are not searched.
 
     With hold="waypoints", and for other loops, limits on signals of a loop are
@@ -288,18 +289,16 @@ def _fastest_in_loop(
         limited.check_constant('limits with hold="path"')
     _check_rest(plan, limited)
     minimum = _closed_form(plan, limited) if hold == "shape" else 0.0
+    limited.check_ends(plan)
     shapes = shapes_given(limited.loop)
-    if shapes is None or hold == "waypoints":
-        limited.check_ends(plan)
+    if shapes is None or hold == "waypoints" or not bounds_of_values(limited):
         family = _InLoop(_Scaled(plan, limited) if hold == "shape" else _Replanned(plan, limited))
         return _searched(family, span or _span(family, plan.duration, minimum), hold, endless=False)
-    shortest, searched = LoopProblem(plan, limited, shapes, resolution).shortest(span, minimum)
+    problem = LoopProblem(plan, limited, shapes, resolution)
+    shortest, searched = problem.shortest(span, minimum)
     found = _satisfying(limited, plan.retime, shortest)
-    statement = (
-        f"no duration from {searched[0]:.4g} s to {shortest:.6g} s satisfies every limit with a spare above "
-        f"{resolution:g} of its range"
-    )
     feasible = ((found.duration, found.duration),)
+    statement = problem.statement(*searched)
     return Fastest(found, limited.margins(found), feasible, "shape", limited, "", searched, statement)
 
 

@@ -13,7 +13,6 @@ from ctrlplan.planning.limits import Limited
 from ctrlplan.planning.loop_search import DurationSearch, Sides
 from ctrlplan.planning.quantities import Shapes
 from ctrlplan.trajectories import Trajectory
-from ctrlplan.trajectories.common import Array
 
 _DOUBLINGS = 40
 """Maximum number of times by which the duration is doubled until all limits are satisfied."""
@@ -39,15 +38,24 @@ class LoopProblem:
 
     def __init__(self, plan: Trajectory, limited: Limited, shapes: Shapes, resolution: float) -> None:
         self._plan, self._limited = plan, limited
-        self.bounds = [b for b in limited.loop_bounds if b.kind != "rms" and b.profile is None]
-        self._others = len(self.bounds) < len(limited.bounds)
-        signals = [(_weights(b), b.kind == "rate", _during(b, plan)) for b in self.bounds]
-        self._family = shapes.shapes_of(plan, signals)
-        self.sides = _sides(self.bounds)
-        _check_ends(plan, self.bounds, self._family.before, "before the plan")
-        _check_ends(plan, self.bounds, self._family.final, "after the plan")
-        also = self._excess_of_others if self._others else None
-        self.search = DurationSearch(self._family, self.sides, resolution, also)
+        bounds = bounds_of_values(limited)
+        self._family = shapes.shapes_of(plan, [(b.weights, b.kind == "rate", _during(b, plan)) for b in bounds])
+        self._sides = _sides(bounds)
+        # Limits of derivatives and positions at all times are satisfied from a minimum duration on.
+        others = [b for b in limited.bounds if b not in bounds and not (b.is_constant and b.axis is not None)]
+        self._others = ", ".join(b.name for b in others)
+        self._search = DurationSearch(self._family, self._sides, resolution, self._excess_of_others if others else None)
+        self._resolution = resolution
+
+    def statement(self, low: float, shortest: float) -> str:
+        """What is known of durations below the shortest one that was found."""
+        found = (
+            f"no duration from {low:.4g} s to {shortest:.6g} s satisfies every limit with a margin above "
+            f"{self._resolution:g} of its range"
+        )
+        if self._others:
+            found += f"; {self._others} evaluated at durations at most {100.0 * self._search.widest:.2g} % apart"
+        return found
 
     def shortest(self, span: tuple[float, float] | None, minimum: float) -> tuple[float, tuple[float, float]]:
         """Minimum duration, and the interval of durations in which no shorter one was found.
@@ -61,7 +69,7 @@ class LoopProblem:
         """
         low, high = span or self._span(minimum)
         low = max(low, min(minimum, high))
-        found = self.search.shortest(low, high) if low < high else (high if self.search.worst(high) <= 0.0 else None)
+        found = self._search.shortest(low, high) if low < high else (high if self._search.worst(high) <= 0.0 else None)
         if found is None:
             self._reject(low, high)
         return found, (low, found)
@@ -70,19 +78,19 @@ class LoopProblem:
         """Durations between which the shortest feasible one lies."""
         least = max(self._excluded(), minimum)
         high = max(self._plan.duration, least)
-        feasible = self.search.worst(high) <= 0.0
-        while feasible and 0.5 * high > least and self.search.worst(0.5 * high) <= 0.0:
+        feasible = self._search.worst(high) <= 0.0
+        while feasible and 0.5 * high > least and self._search.worst(0.5 * high) <= 0.0:
             high *= 0.5
             self._check_not_instant(high)
         for _ in range(_DOUBLINGS):
             if feasible or self._is_too_slow(high):
                 break
             high *= 2.0
-            feasible = self.search.worst(high) <= 0.0
+            feasible = self._search.worst(high) <= 0.0
         else:
             self._reject(least, high)
         low = least or high
-        while not least and (low == high or self.search.worst(low) <= 0.0):
+        while not least and (low == high or self._search.worst(low) <= 0.0):
             low /= 2.0**_OCTAVES
             self._check_not_instant(low)
         return low, high
@@ -98,20 +106,20 @@ class LoopProblem:
         """Duration [s] below which a limit is violated, since the response differs too little from that to a step."""
         low, high, rates = self._family.step()
         with np.errstate(divide="ignore", invalid="ignore"):
-            found = self.sides.worst(low, high) * self.sides.scale / rates[self.sides.signal]
+            found = self._sides.worst(low, high) * self._sides.scale / rates[self._sides.signal]
         return float(np.where(np.isfinite(found), found, 0.0).max(initial=0.0))
 
     def _is_too_slow(self, duration: float) -> bool:
         """Whether no longer plan is feasible, since the static response to the plan violates a limit."""
-        excess = self.sides.worst(*self._family.static()) * self.sides.scale
-        distance = self._family.from_static(np.array([duration]))[0, self.sides.signal]
+        excess = self._sides.worst(*self._family.static()) * self._sides.scale
+        distance = self._family.from_static(np.array([duration]))[0, self._sides.signal]
         return bool(np.any(excess > distance))
 
     def _excess_of_others(self, duration: float) -> float:
         return self._limited.exact_excess(self._plan.retime(duration))
 
     def _reject(self, low: float, high: float) -> NoReturn:
-        nearest = self.search.nearest(low, high)
+        nearest = self._search.nearest(low, high)
         worst = self._limited.margins(self._plan.retime(nearest)).active
         further = "for a wider search pass durations=(low, high)"
         if self._is_too_slow(high):
@@ -122,8 +130,9 @@ class LoopProblem:
         )
 
 
-def _weights(bound: Bound) -> dict[str, float]:
-    return {signal.name: factor for signal, factor in bound.terms}
+def bounds_of_values(limited: Limited) -> list[Bound]:
+    """Constant limits of signals of a loop and of their rates, whose extrema are functions of the duration."""
+    return [b for b in limited.loop_bounds if b.kind != "rms" and b.profile is None]
 
 
 def _during(bound: Bound, plan: Trajectory) -> tuple[float, float] | None:
@@ -144,15 +153,3 @@ def _sides(bounds: Sequence[Bound]) -> Sides:
                 rows.append((float(k), sign, limit, scale, b.slack * b.scale / scale))
     table = np.array(rows).reshape(-1, 5)
     return Sides(table[:, 0].astype(np.intp), table[:, 1], table[:, 2], table[:, 3], table[:, 4])
-
-
-def _check_ends(plan: Trajectory, bounds: Sequence[Bound], values: Array, when: str) -> None:
-    """Raise if a limit is violated at rest, whatever the duration."""
-    for bound, value in zip(bounds, values.tolist(), strict=True):
-        if bound.interval is None and math.isfinite(value) and float(bound.excess(np.array([value]))[0]) > 0.0:
-            position = plan.initial if when.startswith("before") else plan.final
-            place = ", ".join(f"{label} = {x:.4g}" for label, x in zip(plan.labels, position.tolist(), strict=True))
-            raise ValueError(
-                f"limits must be satisfied at rest, at any duration, got {bound.name} = {value:.6g} in steady state "
-                f"{when}, at {place}, where it must be {bound.range}"
-            )

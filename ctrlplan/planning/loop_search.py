@@ -32,6 +32,18 @@ _TESTS = 3
 _EXCHANGES = 12
 """Maximum number of times at which the samples of an interval are completed by those of an exact extremum."""
 
+_CHECKS = 6
+"""Number of durations below a root whose exact extrema are computed where samples do not exclude them."""
+
+_NARROWEST = 1e-9
+"""Relative width of an interval of durations that is not halved further."""
+
+_ROUNDING = 1e-13
+"""Relative amount by which a minimum duration is increased, so that rounding violates no limit."""
+
+_MOST = 20_000
+"""Maximum number of durations whose samples are computed."""
+
 _NONE = -1e6
 """Excess of a sample without limit."""
 
@@ -80,8 +92,8 @@ class DurationSearch:
     sides : Sides
         Their limits.
     resolution : float
-        Spare, relative to the range of a limit: intervals of feasible durations in
-        which no duration has more for all limits may be missed.
+        Margin, relative to the range of a limit: intervals of feasible durations in
+        which no duration has a larger one to all limits may be missed.
     others : callable, optional
         Maps a duration to the excess over further limits, which are evaluated where
         those of the signals are satisfied.
@@ -90,6 +102,9 @@ class DurationSearch:
     ----------
     evaluated : int
         Number of durations whose samples were computed.
+    widest : float
+        Largest relative width of an interval in which the further limits were
+        evaluated at one duration only.
     """
 
     def __init__(
@@ -97,7 +112,7 @@ class DurationSearch:
     ) -> None:
         self._family, self._sides, self._resolution, self._others = family, sides, resolution, others
         self._exact: dict[float, tuple[Array, Array, float]] = {}
-        self.evaluated = 0
+        self.evaluated, self.widest = 0, 0.0
 
     @property
     def exact_runs(self) -> int:
@@ -134,27 +149,34 @@ class DurationSearch:
         return self._exact[duration]
 
     def _in_block(self, durations: Array) -> float | None:
+        """Minimum feasible duration between the first and the last of some durations; None if there is none."""
         block = _Block(durations, self._lines(durations))
         pending, best = np.arange(durations.size - 1), math.inf
         while pending.size:
             left, right = block.durations[pending], block.durations[pending + 1]
             bends = self._bends(left, right)
-            least, place = _lowest(*block.pairs(pending, bends))
-            open_ = (least <= 0.0) & (left < best)
+            open_ = (_lowest(*block.pairs(pending, bends))[0] <= 0.0) & (left < best)
             best = min(best, self._first_feasible(block, np.unique([pending[open_], pending[open_] + 1])))
-            fine = open_ & (bends.max(axis=1) <= 0.25 * self._resolution)
-            again = open_ & ~fine & (left < best)
-            for k in np.flatnonzero(fine).tolist():
+            fine, again = bends.max(axis=1) <= 0.25 * self._resolution, []
+            for k in np.flatnonzero(open_).tolist():
                 if left[k] >= best:
                     break
-                found = self._in_interval(block, int(pending[k]), float(place[k]))
-                best = min(best, found)
-            pending = self._halved(block, pending[again & (left < best)])
+                found = self._in_interval(block, int(pending[k])) if fine[k] else None
+                if found is None and right[k] > (1.0 + _NARROWEST) * left[k]:
+                    again.append(k)
+                else:
+                    best = min(best, found or math.inf)
+            pending = self._halved(block, pending[[k for k in again if left[k] < best]])
         return None if math.isinf(best) else self._edge(block, best)
 
     def _lines(self, durations: Array) -> Array:
         """Excesses (ndurations, nsides * nsamples) at samples."""
         self.evaluated += durations.size
+        if self.evaluated > _MOST:
+            raise RuntimeError(
+                f"the minimum duration must be found with {_MOST} durations, got none up to {durations[0]:.6g} s: "
+                "limits are nearly attained at many durations; pass a larger resolution, or durations=(low, high)"
+            )
         found = self._sides.excess(self._family.samples(durations))
         return np.asarray(found.reshape(durations.size, -1))
 
@@ -182,24 +204,28 @@ class DurationSearch:
         first = np.searchsorted(block.durations, middle)
         return np.sort(np.concatenate([first - 1, first]))
 
-    def _in_interval(self, block: _Block, left: int, place: float) -> float:
-        """A feasible duration between two neighbours; inf if all have at most the resolution as spare."""
+    def _in_interval(self, block: _Block, left: int) -> float | None:
+        """A feasible duration between two neighbours; inf if none has a larger margin than the resolution.
+
+        None if that is not known. Exact extrema at the minimum of the chords complete the samples.
+        """
         ends = block.durations[left : left + 2]
         first, last = block.pairs(np.array([left]), None)
-        for _ in range(_EXCHANGES):
-            least, where = _lowest(first, last)
-            if least[0] > -0.75 * self._resolution and (least[0] > 0.0 or _):
+        for exchange in range(_EXCHANGES):
+            least, place = _lowest(first, last)
+            if least[0] > 0.0 or (exchange and least[0] > -0.75 * self._resolution):
                 return math.inf
-            duration = float(ends[0] * (ends[1] / ends[0]) ** where[0])
-            excess, times, _others = self._excesses(duration)
+            duration = float(ends[0] * (ends[1] / ends[0]) ** place[0])
             if self.worst(duration) <= 0.0:
                 return duration
-            if excess.max() <= 0.0:
+            excess, times, _ = self._excesses(duration)
+            if excess.max() <= 0.0:  # another limit is violated
+                self.widest = max(self.widest, float(ends[1] / ends[0]) - 1.0)
                 return math.inf
             for side in np.flatnonzero(excess > 0.0).tolist():
                 own = [self._excess_at(float(end), side, float(times[side]), duration) for end in ends]
                 first, last = np.append(first, [[own[0]]], axis=1), np.append(last, [[own[1]]], axis=1)
-        return math.inf
+        return None
 
     def _excess_at(self, duration: float, side: int, time: float, other: float) -> float:
         """Excess of a side at the place in the plan, or the time after it, of a time at another duration."""
@@ -213,19 +239,23 @@ class DurationSearch:
 
     def _edge(self, block: _Block, feasible: float) -> float:
         """End of the interval of feasible durations below a feasible one."""
-        outside = [
-            d
-            for d, top in zip(block.durations.tolist(), block.tops.tolist(), strict=True)
-            if d < feasible and top > 0.0
-        ]
-        outside += [d for d in self._exact if d < feasible and self.worst(d) > 0.0]
-        if not outside:
-            return feasible
-        low = max(outside)
-        if self.worst(low) <= 0.0 or self.worst(feasible) == 0.0:
-            return feasible
-        root = brentq(lambda ell: self.worst(math.exp(ell)), math.log(low), math.log(feasible), xtol=1e-14, rtol=1e-14)
-        return math.exp(root)
+        while True:
+            outside = block.durations[(block.durations < feasible) & (block.tops > 0.0)].tolist()
+            outside += [d for d in self._exact if d < feasible and self.worst(d) > 0.0]
+            low = max(outside, default=feasible)
+            if low == feasible or self.worst(low) <= 0.0:
+                return min(low, feasible)
+            ends = math.log(low), math.log(feasible)
+            root = math.exp(brentq(lambda ell: self.worst(math.exp(ell)), *ends, xtol=1e-14, rtol=1e-14))
+            root *= 1.0 + _ROUNDING
+            # A root of an odd number of them: between the samples an earlier one may be missed.
+            between = np.geomspace(low, root, _CHECKS + 2)[1:-1]
+            pairs = _Block(np.array([low, root]), self._lines(np.array([low, root]))).pairs(np.zeros(1, np.intp), None)
+            if _lowest(*pairs)[0][0] > -0.75 * self._resolution:
+                return root
+            feasible = next((d for d in between.tolist() if self.worst(d) <= 0.0), math.inf)
+            if math.isinf(feasible):
+                return root
 
 
 class _Block:

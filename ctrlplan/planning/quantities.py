@@ -75,14 +75,6 @@ class Loop(Protocol):
 class ShapesOf(Protocol):
     """Signals of a loop along plans of one shape; see `ctrlplan.simulation.shape_family.ShapeFamily`."""
 
-    @property
-    def before(self) -> Array:
-        """Values (nsignals,) at rest before the plan."""
-
-    @property
-    def final(self) -> Array:
-        """Values (nsignals,) in steady state after it, nan where they depend on the duration."""
-
     def step(self) -> tuple[Array, Array, Array]:
         """Minima and maxima for a step, and rates by which those of a short plan differ per second."""
 

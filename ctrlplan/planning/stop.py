@@ -18,7 +18,7 @@ from ctrlplan.planning.path_stop import stopped_on_path
 from ctrlplan.trajectories import Clipped, Joined, MotionProfile, Step, Trajectory
 from ctrlplan.trajectories.common import Array
 from ctrlplan.trajectories.motion_profile import profile_of_phases
-from ctrlplan.trajectories.velocity_change import fastest_velocity_change, slower_velocity_change
+from ctrlplan.trajectories.velocity_change import velocity_changes
 from ctrlplan.trajectories.waypoint import ENTRIES
 
 Synchronize = Literal["time", "path"]
@@ -61,7 +61,7 @@ def stopped(
         tail: Trajectory | None = stopped_on_path(plan, moment, within.bounds)
     else:
         rest = np.zeros_like(state)
-        tail = velocity_changes(moment, state, rest, within, synchronize == "time", plan.labels)
+        tail = _changed(moment, state, rest, within, synchronize == "time", plan.labels)
     return _followed(plan, moment, tail, within)
 
 
@@ -87,7 +87,7 @@ def at_velocity(
                 f"velocity must satisfy the limits, got {final[1, bound.axis]:g} of {plan.labels[bound.axis]}, where "
                 f"{bound.name} must be {bound.range}"
             )
-    tail = velocity_changes(moment, state, final, within, synchronize == "time", plan.labels, held)
+    tail = _changed(moment, state, final, within, synchronize == "time", plan.labels, held)
     return _followed(plan, moment, tail, within)
 
 
@@ -111,7 +111,7 @@ def stop_limits(plan: Trajectory, limits: Mapping[str, object]) -> StopLimits:
     Parameters
     ----------
     plan : Trajectory
-        Plan with a duration.
+        Plan with these axes.
     limits : mapping
         Limits on derivatives, as for `fastest`: acceleration and jerk of every axis,
         and optionally velocities and positions.
@@ -121,7 +121,11 @@ def stop_limits(plan: Trajectory, limits: Mapping[str, object]) -> StopLimits:
     ValueError
         If a limit is missing or of another kind.
     """
-    bounds = Limited(plan, limits).bounds
+    ends = [plan.initial, 0.0 * plan.initial]
+    carrier = (
+        plan if plan.duration else MotionProfile([0.0, 1.0], 0.0 * plan.initial[:, None], ends, labels=plan.labels)
+    )
+    bounds = Limited(carrier, limits).bounds
     acceleration = np.full((plan.naxes, 2), np.nan)
     jerk = np.full(plan.naxes, np.nan)
     for bound in bounds:
@@ -172,7 +176,7 @@ def state_at(plan: Trajectory, time: float) -> Array:
     return state
 
 
-def velocity_changes(
+def _changed(
     time: float,
     state: Array,
     final: Array,
@@ -204,15 +208,8 @@ def velocity_changes(
     MotionProfile or None
         None if its duration is 0.
     """
-    starts = [(float(change), float(a)) for change, a in zip(final[1] - state[1], state[2], strict=True)]
-    rows = list(zip(starts, limits.acceleration.tolist(), limits.jerk.tolist(), strict=True))
-    own = [fastest_velocity_change(*start, (low, high), jerk) for start, (low, high), jerk in rows]
+    own = velocity_changes(final[1] - state[1], state[2], limits.acceleration, limits.jerk, together=together)
     longest = max(change.duration for change in own)
-    if together:
-        own = [
-            change if change.duration == longest else slower_velocity_change(*start, jerk, longest)
-            for change, (start, _, jerk) in zip(own, rows, strict=True)
-        ]
     # All end together, each with zero jerk after its own change.
     phases = [([*c.durations, longest - c.duration + hold], [*c.jerks, 0.0]) for c in own]
     free = final.copy()

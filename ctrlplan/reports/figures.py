@@ -19,6 +19,7 @@ from ctrlplan.reports.style import (
     as_text,
     axis_styles,
     clip_steps,
+    clipped_note,
     font_size,
     given_axes,
     label_y,
@@ -296,7 +297,7 @@ def _plot_bands_of(
             axes.set_ylim(low - margin, high + margin)
             values = ranges.get(plan, np.empty(0))
             if values.size and max(low - values.min(), values.max() - high) > margin:
-                add_title(axes, f"peak {values[np.abs(values).argmax()]:.3g}, clipped".replace("-", "−"))
+                add_title(axes, clipped_note(values[np.abs(values).argmax()]))
 
 
 def plot_plane(

@@ -7,10 +7,8 @@ import contextlib
 import hashlib
 import json
 import os
-import platform
 from collections.abc import Mapping, Sequence
 from functools import cache
-from importlib import metadata
 from pathlib import Path
 
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template, select_autoescape
@@ -20,7 +18,7 @@ import ctrlplan
 from ctrlplan import _files
 from ctrlplan._display import readable
 from ctrlplan.reports.crane_figures import animation_data
-from ctrlplan.reports.parts import Animation, Svg
+from ctrlplan.reports.parts import WIDTHS, Animation, Svg
 from ctrlplan.reports.shown import Shown, shown
 from ctrlplan.reports.style import grey_levels, page_style
 from ctrlplan.studies.comparison import Comparison
@@ -115,8 +113,9 @@ def render_page(studies: Sequence[Study | Sweep], title: str, author: str = "") 
         title=title,
         author=author,
         studies=found,
-        versions=_versions(),
+        version=ctrlplan.__version__,
         greys=_dark_greys(found),
+        widths=WIDTHS,
         script=script,
         policy=_policy(script),
     )
@@ -205,9 +204,3 @@ def _dark_greys(shown: Sequence[Shown]) -> dict[str, str]:
         mixed = [round(ink + (ground - ink) * level / 255) for ink, ground in zip(_INK, _GROUND, strict=True)]
         greys[f"g{level:02x}"] = f"#{bytes(mixed).hex()}"
     return greys
-
-
-def _versions() -> dict[str, str]:
-    packages = ("control", "numpy", "scipy", "matplotlib")
-    found = {"ctrlplan": ctrlplan.__version__, "Python": platform.python_version()}
-    return found | {name: metadata.version(name) for name in packages}

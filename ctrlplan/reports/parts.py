@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, TypeAlias
@@ -190,6 +191,11 @@ class Cell:
     order: str | None = None
     colour: str = ""
 
+    @property
+    def marked(self) -> str:
+        """Text with the sign of its mark."""
+        return self.text + {"better": " ▲", "worse": " ▽"}.get(self.mark, "")
+
 
 @dataclass(frozen=True)
 class Table:
@@ -230,6 +236,16 @@ class Table:
         """Rows of cells."""
         return [[cell if isinstance(cell, Cell) else Cell(cell) for cell in row] for row in self.rows]
 
+    @property
+    def layout(self) -> str:
+        """Classes in the page's style: the width below which cells of a row stand below each other, and how."""
+        heads, rows = self.columns, self.lines
+        cells = [
+            [word for line in rows for word in (line[k].text.split() if head.words else [line[k].marked])]
+            for k, head in enumerate(heads)
+        ]
+        return _layout(self.kind, [line[0].text for line in rows], [head.text for head in heads[1:]], cells[1:])
+
 
 @dataclass(frozen=True)
 class Plan:
@@ -269,6 +285,48 @@ class MetricsTable:
     plans: Sequence[Plan]
     rows: Sequence[MetricRow]
     kind: str = "metrics"
+
+    @property
+    def layout(self) -> str:
+        """As of `Table`."""
+        heads = ["unit", *(plan.name + plan.mark for plan in self.plans), "worst to best"]
+        rows = [[row.unit, *(cell.marked for cell in row.cells), row.difference] for row in self.rows]
+        cells = [[row[k] for row in rows] for k in range(len(heads))]
+        return _layout(self.kind, [row.title for row in self.rows], heads, cells)
+
+
+SHORT = 30
+"""Letters of the name of a row of a table of key metrics up to which it is not broken into lines."""
+
+_DENSE = frozenset({"grid", "baselines"})
+"""Kinds of tables in small type."""
+
+_STEP = 4
+WIDTHS = range(48, 76, _STEP)
+"""Widths of a page [rem] below which tables have their cells below each other."""
+
+_PAIR, _MANY = 24, 8
+"""Letters of a heading and its value up to which two stand side by side on a phone, and rows of a short table."""
+
+
+def _layout(kind: str, names: Sequence[str], heads: Sequence[str], columns: Sequence[Sequence[str]]) -> str:
+    """Classes of a table: its minimum width [rem] in a wide font, and whether its cells are long.
+
+    Headings, and names of rows, break between words.
+    """
+    letter, padding = (0.53, 0.65) if kind in _DENSE else (0.58, 1.25)
+    whole = [name for name in names if kind == "leading" and len(name) <= SHORT]
+    letters = [max([14.0, *map(_letters, whole), *(_letters(word) for name in names for word in name.split())])]
+    letters += [max(map(_letters, [*head.split(), *cells])) for head, cells in zip(heads, columns, strict=True)]
+    steps = math.ceil(sum(letter * count + padding for count in letters) / _STEP)
+    width = "stacked" if steps > WIDTHS[-1] // _STEP else f"w{max(_STEP * steps, WIDTHS[0])}"
+    longest = max(len(head) + max(map(len, cells), default=0) for head, cells in zip(heads, columns, strict=True))
+    return f"{width}{' listed' * (longest > _PAIR)}{' many' * (len(names) > _MANY)}"
+
+
+def _letters(text: str) -> float:
+    """Length of a text, in wide letters."""
+    return len(text) - 0.5 * sum(letter in " .,:;'|()[]ijltfr" for letter in text)
 
 
 Block: TypeAlias = Picture | Svg | Text | Items | Pairs | Panels | Animation | Table | MetricsTable

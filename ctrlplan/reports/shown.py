@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import platform
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import singledispatch
+from importlib import metadata
 from typing import overload
 
 from markupsafe import Markup
 
+import ctrlplan
 from ctrlplan._display import in_line
 from ctrlplan.reports.main_figure import main_figure, main_figure_of_sweep
 from ctrlplan.reports.parts import (
@@ -31,7 +35,7 @@ from ctrlplan.reports.style import line_styles, roles_of, slug, to_svg
 from ctrlplan.reports.tables import by_plan, extrema_of, key_table_of, limits_of_runs, metrics_of, plan_of, values_of
 from ctrlplan.studies.benefit import Benefit
 from ctrlplan.studies.comparison import Comparison
-from ctrlplan.studies.sections import Section
+from ctrlplan.studies.sections import DrawTable, Section
 from ctrlplan.studies.study import Study
 from ctrlplan.studies.sweep import Sweep
 from ctrlplan.studies.verdicts import headline
@@ -134,20 +138,20 @@ def _(study: Study, taken: Sequence[str]) -> Shown:
         ("At the nominal parameters. ", "Metrics at the nominal parameters") if drawn else ("", "All metrics")
     )
     folds = [
-        Fold("Description and findings", _words(study)),
+        Fold("Findings", _words(study)),
         *(Fold(part.heading, tuple(part.blocks)) for part in parts if part.heading and not part.below),
         Fold(title, (Text(f"{_SIGNS} Click a column heading to sort.", hint=True), metrics_of(comparison))),
         Fold("All figures", tuple(block for part in parts if not part.heading for block in part.blocks)),
         *(Fold(part.heading, tuple(part.blocks)) for part in parts if part.heading and part.below),
         Fold("Limits", _limits(comparison)),
         Fold("Failed plans", _failures("plan", comparison.failures)),
-        Fold("Parameters", (Pairs({name: in_line(value) for name, value in comparison.parameters.items()}),)),
+        Fold("Parameters and versions", _parameters(comparison.parameters)),
     ]
     return _drawn(
         Shown(
             study.name,
             study.title,
-            nominal + headline(comparison),
+            f"{nominal}{headline(comparison)}{_failed_draws(sections)}",
             study.text,
             key_table_of(comparison),
             (_SIGNS, *marks),
@@ -171,6 +175,7 @@ def _(sweep: Sweep, taken: Sequence[str]) -> Shown:
         Fold("All figures", (every,)),
         Fold("All values", tuple(values_of(sweep))),
         Fold("Failed values", _failures(sweep.parameter, failures)),
+        Fold("Versions", _parameters({})),
     ]
     return _drawn(
         Shown(
@@ -187,6 +192,15 @@ def _(sweep: Sweep, taken: Sequence[str]) -> Shown:
     )
 
 
+def _failed_draws(sections: Iterable[Section | Benefit]) -> str:
+    """Number of failed draws of a study, in a sentence."""
+    for section in sections:
+        if isinstance(section, DrawTable) and section.ensemble.failures:
+            failed = len({one.draw for one in section.ensemble.failures})
+            return f" Of {section.ensemble.finished} draws, {failed} failed."
+    return ""
+
+
 def _words(study: Study) -> tuple[Block, ...]:
     """What a study is, and what was found."""
     found: list[Block] = [Text(study.summary)] if study.summary else []
@@ -199,6 +213,17 @@ def _limits(comparison: Comparison) -> tuple[Block, ...]:
     table = limits_of_runs(comparison)
     hint = "Limits of the actuators of each loop, with the value nearest to the limit and its margin."
     return () if table is None else (Text(hint, hint=True), table)
+
+
+def _parameters(given: Mapping[str, object]) -> tuple[Block, ...]:
+    """Parameters of a study, and the versions of the packages that computed it."""
+    packages = ("control", "numpy", "scipy", "matplotlib", "casadi")
+    versions = {"ctrlplan": ctrlplan.__version__, "Python": platform.python_version()}
+    for name in packages:
+        with suppress(metadata.PackageNotFoundError):  # an extra
+            versions[name] = metadata.version(name)
+    listed = ", ".join(f"{name} {version}" for name, version in versions.items())
+    return (Pairs({name: in_line(value) for name, value in given.items()} | {"versions": listed}),)
 
 
 def _failures(what: str, reasons: Mapping[str, str]) -> tuple[Block, ...]:

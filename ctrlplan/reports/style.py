@@ -15,6 +15,7 @@ from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from functools import cache
 from itertools import cycle, islice
+from textwrap import wrap
 from typing import Any, TypeAlias
 
 import matplotlib as mpl
@@ -34,7 +35,7 @@ from numpy.typing import NDArray
 from ctrlplan.studies.comparison import Comparison
 from ctrlplan.studies.roles import Role, role_of
 from ctrlplan.studies.sweep import Sweep
-from ctrlplan.studies.units import superscript
+from ctrlplan.studies.units import scientific, superscript
 
 AxesLike: TypeAlias = Axes | Sequence[Axes] | NDArray[np.object_]
 """One axes, or several in a sequence or an array."""
@@ -338,11 +339,22 @@ def clip_steps(axes: Axes, roles: Mapping[str, Role]) -> None:
         if str(line.get_label()) in steps and (first < low - _BEYOND * span or last > high + _BEYOND * span):
             values = np.asarray(line.get_ydata(), dtype=float)
             peak = values[np.nanargmax(np.where(np.isfinite(values), np.abs(values), -1.0))]
-            beyond.append(f"{steps[str(line.get_label())]}: peak {peak:.3g}, clipped".replace("-", "−"))
+            beyond.append(f"{as_text(steps[str(line.get_label())])}: {clipped_note(peak)}")
     if beyond:
         bottom, top = scale.inverted().transform([low - 0.08 * span, high + 0.08 * span]).tolist()
         axes.set_ylim(bottom, top)
-        add_title(axes, as_text("; ".join(beyond)))
+        for note in beyond:
+            add_title(axes, "\n".join(wrap(note, _TITLE)))
+
+
+def clipped_note(peak: float) -> str:
+    """Note on a curve that is drawn only in part, with the peak that is not drawn."""
+    shown = f"{float(f'{peak:.3g}'):g}"
+    return f"peak {scientific(peak, 3) if 'e' in shown else shown}, clipped".replace("-", "−")
+
+
+_TITLE = 44
+"""Letters of a line of a title, which fits above one of two axes side by side."""
 
 
 def _range_of(curves: Iterable[Line2D], scale: Transform) -> tuple[float, float]:

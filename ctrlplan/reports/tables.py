@@ -104,6 +104,9 @@ def extrema_of(sweep: Sweep) -> str:
         rows = [row for name, row in leading if not np.isnan(sweep.column(plan, name)).all()]
         values = [f"{row[0][0].lower()}{row[0][1:]} {row[column]}{f' {row[1]}' if row[1] else ''}" for row in rows]
         said.append(f"{plan}: {', '.join(values)}.")
+    failed = [f"{sweep.values[one.draw]:.6g}" for one in sweep.failures]
+    if failed:
+        said.append(f"Failed, without values: {len(failed)} of {sweep.values.size}, first at {failed[0]}.")
     return f"{sweep.parameter} from {ends}. {' '.join(said)}".replace("-", "−")
 
 

@@ -69,6 +69,7 @@ from ctrlplan.simulation.predictor import Predictor
 from ctrlplan.simulation.prepared import Prepared, prepare, prepared_form, state_space, stated_start
 from ctrlplan.simulation.response import SimulationResponse, signal_table
 from ctrlplan.simulation.simulate import simulate
+from ctrlplan.simulation.simulated_response import SimulatedQuantities
 from ctrlplan.simulation.stepper import Stepper
 
 __all__ = [
@@ -79,6 +80,7 @@ __all__ = [
     "Occurrence",
     "Predictor",
     "Prepared",
+    "SimulatedQuantities",
     "SimulationResponse",
     "SolverError",
     "Stepper",

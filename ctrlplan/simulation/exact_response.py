@@ -5,15 +5,19 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ctrlplan._types import Array
 from ctrlplan.simulation.cell_extrema import Cells, extrema_of_cells, joined, mean_square
+from ctrlplan.simulation.exact import changes_over
 from ctrlplan.simulation.loop_form import NODES, NTERMS, SIGMA, LoopForm, Rows
+from ctrlplan.simulation.loop_inputs import is_cyclic
 from ctrlplan.simulation.loop_response import Extremes, LoopResponse
 from ctrlplan.simulation.plan_cells import PlanCells
+from ctrlplan.trajectories import Trajectory
 from ctrlplan.trajectories.chebyshev import transform
 
 _REST = 1e-12
@@ -154,15 +158,15 @@ class ExactResponse(LoopResponse):
         States of the loop along the plan.
     signals : mapping of str to Rows
         Outputs by name, one row each.
-    start : float
-        Start of the plan [s].
+    plan : Trajectory
+        The plan.
     """
 
     note = "exact"
 
-    def __init__(self, motion: Motion, signals: Mapping[str, Rows], start: float) -> None:
+    def __init__(self, motion: Motion, signals: Mapping[str, Rows], plan: Trajectory) -> None:
         self.names = tuple(signals)
-        self._motion, self._signals, self._start = motion, dict(signals), start
+        self._motion, self._signals, self._plan, self._start = motion, dict(signals), plan, plan.start
 
     def extremes(
         self,
@@ -188,6 +192,8 @@ class ExactResponse(LoopResponse):
         length = duration if period is None else float(period)
         if not 0.0 < length < math.inf:
             raise ValueError(f"period must be above 0 and finite, got {length:g} s")
+        if period is None and is_cyclic(self._plan):
+            return math.sqrt(mean_square(self._periodic.cells(rows), 0) / length)
         total = mean_square(self._motion.cells(rows).during(0.0, length), 0)
         reached = duration
         if length > duration:
@@ -204,7 +210,20 @@ class ExactResponse(LoopResponse):
         """Values before the plan and in steady state after it; see `LoopResponse`."""
         rows, motion = self._sum(weights), self._motion
         before, after = rows.static(motion.plan.initial, motion.start), rows.static(motion.plan.final, motion.settled)
-        return float(before[0]), float(after[0])
+        return float(before[0]), math.nan if motion.form.integrators else float(after[0])
+
+    @cached_property
+    def _periodic(self) -> Motion:
+        """Motion in the periodic steady state: the state at the end of the plan is that at its start."""
+        form, motion = self._motion.form, self._motion
+        if form.integrators:
+            raise ValueError(
+                f"the loop must have a periodic steady state for the root mean square along a cyclic plan, got "
+                f"{form.name} with a pole at 0; give the period of the root mean square"
+            )
+        change = changes_over(motion.duration * form.a, np.zeros((form.nstates, 0)), 1)[-1]
+        state = motion.start + np.linalg.solve(-change, motion.end - motion.start)
+        return Motion(form, motion.plan, motion.duration, state)
 
     def _sum(self, weights: Mapping[str, float]) -> Rows:
         for name in weights:

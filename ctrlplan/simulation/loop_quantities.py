@@ -47,6 +47,7 @@ class LoopQuantities(Displayed):
         self.inputs = tuple(self._prepared.input_labels)
         outputs = self._prepared.output_labels
         self.names = (*outputs, *(label for label in self._prepared.input_labels if label not in outputs))
+        self._forms: dict[tuple[Fed | None, ...], LoopForm] = {}
 
     def _describe(self) -> Iterator[Part]:
         yield f"Signals of {self.name} along a plan: {', '.join(self.names)}"
@@ -100,29 +101,33 @@ class LoopQuantities(Displayed):
     def along(self, plan: Trajectory) -> AlongPlan:
         """The loop with the inputs connected to a plan, for this plan and others of the same axes."""
         check_kind(plan, "plan", Trajectory)
-        return AlongPlan(self, plan)
-
-
-class AlongPlan:
-    """Loop whose inputs are connected to a plan and its derivatives."""
-
-    def __init__(self, quantities: LoopQuantities, plan: Trajectory) -> None:
-        linear, prepared = quantities._linear, quantities._prepared
-        fed = fed_signals(prepared.input_labels, plan, quantities.name)
-        fed += _fed_by_sources(linear, plan, quantities.name)
+        fed = fed_signals(self._prepared.input_labels, plan, self.name)
+        fed += _fed_by_sources(self._linear, plan, self.name)
         order = max((k for entry in fed if entry for k in entry[1:]), default=0)
-        pick = np.zeros((order + 1, linear.b.shape[1], plan.naxes))
+        pick = np.zeros((order + 1, self._linear.b.shape[1], plan.naxes))
         for column, entry in enumerate(fed):
             if entry is not None:
                 pick[entry[1], column, entry[0]] = 1.0
-        self.form = LoopForm(linear.a, linear.b @ pick, quantities.name)
+        form = self._forms.get(tuple(fed))
+        if form is None:
+            form = self._forms[tuple(fed)] = LoopForm(self._linear.a, self._linear.b @ pick, self.name)
+        return AlongPlan(self._prepared, self._linear, form, pick, plan)
+
+
+class AlongPlan:
+    """Loop whose inputs are connected to a plan and its derivatives.
+
+    The inputs are ``pick[k] @ r^(k)``, summed over the derivatives of the plan.
+    """
+
+    def __init__(self, prepared: Prepared, linear: LinearForm, form: LoopForm, pick: Array, plan: Trajectory) -> None:
+        self.form, self.plan = form, plan
         self._linear, self._prepared, self._pick = linear, prepared, pick
         outputs = prepared.output_labels
-        c, d = linear.c * self.form.scale, np.moveaxis(linear.d @ pick, 0, 1)
+        c, d = linear.c * form.scale, np.moveaxis(linear.d @ pick, 0, 1)
         self.signals = {name: Rows(c[i : i + 1], d[i : i + 1]) for i, name in enumerate(outputs)}
         for i, name in enumerate(prepared.input_labels):
             self.signals.setdefault(name, Rows(np.zeros((1, len(linear.a))), pick[:, i][None]))
-        self.plan = plan
 
     @cached_property
     def cells(self) -> PlanCells:
@@ -171,7 +176,8 @@ class AlongPlan:
         """Response to a plan with the same axes."""
         same = plan is self.plan
         cells, start = (self.cells, self.start) if same else (PlanCells(plan, self.form.order + 2), self.rest_at(plan))
-        return ExactResponse(Motion(self.form, cells, plan.duration, start), self.signals, plan.start)
+        motion = Motion(self.form, cells, plan.duration, start)
+        return ExactResponse(motion, self.signals, plan)
 
 
 def loop_quantities(loop: System | Prepared, *, tail: float | None = None) -> LoopQuantities | SimulatedQuantities:

@@ -73,8 +73,6 @@ class ShapeFamily:
     ----------
     before : ndarray, shape (nsignals,)
         Values at rest before the plan.
-    final : ndarray, shape (nsignals,)
-        Values after the plan, nan where they depend on the duration.
     """
 
     def __init__(
@@ -92,10 +90,6 @@ class ShapeFamily:
             each.append(rate_rows(form, row, plan, " + ".join(one.weights)) if one.rate else row)
         self.rows = _stacked(each)
         self.before = self.rows.static(plan.initial, state)
-        if form.integrators:
-            self.final = np.full(len(each), np.nan)
-        else:
-            self.final = self.rows.static(plan.final, form.settled(state, plan.final, 0.0))
 
     def curvature(self, low: Array, high: Array) -> Array:
         """Bounds (nintervals, nsignals) of the second derivative by the logarithm of the duration, for intervals."""

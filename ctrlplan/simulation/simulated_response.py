@@ -16,7 +16,7 @@ from ctrlplan._checks import check_kind, checked_finite
 from ctrlplan._display import Displayed, Facts, Part
 from ctrlplan._types import Array, Data, System
 from ctrlplan.simulation.equilibrium import equilibrium_at
-from ctrlplan.simulation.loop_inputs import Fed, fed_signals, same_axis, tracked
+from ctrlplan.simulation.loop_inputs import Fed, fed_signals, is_cyclic, same_axis, tracked
 from ctrlplan.simulation.loop_response import Extremes, LoopResponse
 from ctrlplan.simulation.network import Block
 from ctrlplan.simulation.prepared import Prepared, prepared_form
@@ -396,13 +396,6 @@ class _Inputs(Trajectory):
     @classmethod
     def _reject(cls) -> NoReturn:
         raise TypeError("inputs of a loop cannot be retimed or saved")
-
-
-def is_cyclic(plan: Trajectory) -> bool:
-    """Whether a plan is closed and in motion at its ends, with equal velocities there: one period of a motion."""
-    first, last = plan.jet(plan.start, 1), plan.jet(plan.end, 1, left=True)
-    size = np.stack([np.ptp([plan.extrema().minimum, plan.extrema().maximum], axis=0), plan.peak(1)])
-    return bool(np.all(np.abs(last - first) <= 1e-9 * size) and np.any(np.abs(first[1]) > 1e-9 * size[1]))
 
 
 def _check_sources(prepared: Prepared, plan: Trajectory) -> None:

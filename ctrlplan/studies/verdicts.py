@@ -123,10 +123,12 @@ def headline(comparison: Comparison) -> str:
     """Settling time, error, peak control and duration of the best planned reference, and whether limits hold.
 
     The plan is the first of those that settle within 1 % of the shortest
-    settling time; values of the step follow.
+    settling time; values of the step follow, and plans whose run failed or was
+    ended by an event.
     """
+    failed = (f"Failed, without values: {', '.join(comparison.failures)}.",) if comparison.failures else ()
     if is_unstable(comparison):
-        return comparison.notes[0]
+        return " ".join([comparison.notes[0], *failed])
     keys = [key for group in _HEADLINE if (key := _first_of(group, comparison))]
     ranked = [name for name in comparison.plans if name not in comparison.stopped]
     steps = [name for name in comparison.plans if comparison.roles.get(name) is Role.STEP]
@@ -138,10 +140,11 @@ def headline(comparison: Comparison) -> str:
         moved = f" (duration {duration:.4g} s)" if 0.0 < duration < math.inf else ""
         parts.append(f"With {plan}{moved}: {_values(comparison, plan, keys)}.")
         steps = [name for name in steps if name != plan]
-    for name in steps[:1]:
-        ended = f"not ranked, because an event ended the run at {comparison.stopped.get(name, 0.0):.4g} s"
-        parts.append(f"With {name}: {ended if name in comparison.stopped else _values(comparison, name, keys)}.")
-    return " ".join([*parts, limits_sentence(comparison)])
+    steps = [name for name in steps[:1] if name not in comparison.stopped]
+    parts += [f"With {name}: {_values(comparison, name, keys)}." for name in steps]
+    ended = ", ".join(f"{name} ({time:.4g} s)" for name, time in comparison.stopped.items())
+    stopped = (f"Not ranked, because an event ended the run: {ended}.",) if ended else ()
+    return " ".join([*parts, *stopped, *failed, limits_sentence(comparison)])
 
 
 def _leading_plan(comparison: Comparison, planned: list[str], keys: list[str]) -> str:

@@ -9,8 +9,9 @@ source a suffix.
 Off line: `create_source_iosystem` (a plan with its derivatives),
 `create_flat_iosystem` (flat control), `create_feedforward_iosystem` (its linear
 feedforward), `create_pid_iosystem`, `create_saturation_iosystem`,
-`create_delay_iosystem`, `create_command_filter_iosystem`, `sample_hold`
-(discrete blocks in continuous loops), and the plants and loops of `plants`.
+`create_delay_iosystem`, `create_command_filter_iosystem`,
+`create_shaper_iosystem` (input shaping of a command), `sample_hold` (discrete
+blocks in continuous loops), and the plants and loops of `plants`.
 
 On line, in place of the source of the plan:
 
@@ -64,6 +65,7 @@ from ctrlplan.systems.plants import Law
 from ctrlplan.systems.poles import hurwitz_coefficients
 from ctrlplan.systems.replanner import create_replanner_iosystem
 from ctrlplan.systems.saturation import create_saturation_iosystem
+from ctrlplan.systems.shaper import ShaperBlock, create_shaper_iosystem
 from ctrlplan.systems.source import PlanSource, create_source_iosystem, source_samples
 from ctrlplan.systems.time_scaling import create_time_scaling_iosystem
 
@@ -75,6 +77,7 @@ __all__ = [
     "Law",
     "PlanSource",
     "SampleHold",
+    "ShaperBlock",
     "command_filter_gains",
     "command_lead",
     "create_command_filter_iosystem",
@@ -85,6 +88,7 @@ __all__ = [
     "create_pid_iosystem",
     "create_replanner_iosystem",
     "create_saturation_iosystem",
+    "create_shaper_iosystem",
     "create_source_iosystem",
     "create_time_scaling_iosystem",
     "expose_states",

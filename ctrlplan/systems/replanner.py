@@ -16,6 +16,7 @@ from ctrlplan._checks import check_kind, checked_count, checked_finite, real_arr
 from ctrlplan._types import Array, EventName, Params, Value
 from ctrlplan.systems.hybrid import SampledBlock, state_signal
 from ctrlplan.systems.source import axis_signals, create_source_iosystem
+from ctrlplan.systems.stop_states import StopStates
 from ctrlplan.traits import declare
 from ctrlplan.trajectories import Trajectory
 from ctrlplan.trajectories.extrema import stationary_times
@@ -46,6 +47,7 @@ def create_replanner_iosystem(
     threshold: float | None = None,
     min_horizon: float | None = None,
     limits: Mapping[int, ArrayLike] | None = None,
+    stop_limits: Mapping[str, object] | None = None,
     derivatives: int | None = None,
     offset: float = 0.0,
     labels: Sequence[str] | str | None = None,
@@ -75,9 +77,10 @@ def create_replanner_iosystem(
 
     States: start and end of the correction [s]; nan_input, 1 if an input was not
     finite; unreachable, 1 if the goal is out of reach; fits, their number;
-    ``goal[k]``, the goal at the last fit; ``coefficient[k]``. Inputs: with
-    `goal_derivatives`, x_goal, x_goal_d1, ... of each axis x; with `measured`,
-    x, x_d1, .... Outputs: x, x_d1, ... of each axis, as `create_source_iosystem`
+    ``goal[k]``, the goal at the last fit; ``coefficient[k]``; with `stop_limits`,
+    stopped, 1 during a stop and afterwards, stop_start [s] and ``stop[k]``. Inputs:
+    with `goal_derivatives`, x_goal, x_goal_d1, ... of each axis x; with `measured`,
+    x, x_d1, ...; with `stop_limits`, stop. Outputs: x, x_d1, ... of each axis, as `create_source_iosystem`
     names them.
 
     Parameters
@@ -115,6 +118,13 @@ def create_replanner_iosystem(
         Maximum magnitude of a derivative by its order, for all axes or one for
         each, until both plan and correction end. A fit that violates a limit is
         rejected: the last one stays in force. Requires milliseconds per fit.
+    stop_limits : mapping, optional
+        Limits of acceleration and jerk, as for `Trajectory.stop`. Adds the input
+        ``stop``: at a sample at which it is above 0.5 the reference begins to stop,
+        all axes together, in minimum time, whatever the other inputs are; rest is
+        held until it falls. Then a fit leads to the goal again; where none is
+        possible (too near to the end of the plan with "shrinking", or violating
+        `limits`), rest is held further.
     derivatives : int, optional
         Highest derivative among the outputs, by default `order`.
     offset : float, optional
@@ -176,9 +186,11 @@ def create_replanner_iosystem(
     trigger_over = _checked_trigger(trigger, threshold, measured, goal_derivatives)
     limited = _checked_limits(plan, limits)
     axes = axis_signals(plan, labels, "")
-    signals = _Signals(axes, max(output_order, order), output_order, goal_derivatives, measured, suffix)
+    stop = None if stop_limits is None else StopStates.of(plan, stop_limits)
+    planned = max(output_order, order, 0 if stop is None else 2)
+    signals = _Signals(axes, planned, output_order, goal_derivatives, measured, stop is not None, suffix)
     core = _Correction(
-        plan, horizons, checked_finite(offset, "offset", minimum=0.0), signals, trigger_over, limited, name
+        plan, horizons, checked_finite(offset, "offset", minimum=0.0), signals, trigger_over, limited, stop, name
     )
     source = create_source_iosystem(plan, signals.planned, labels=axes, suffix=signals.inside, name=f"{name}_plan")
     return ct.interconnect(
@@ -263,12 +275,13 @@ class _Signals:
         output_order: int,
         goal: int | None,
         measured: int | None,
+        stop: bool,
         suffix: str,
     ) -> None:
         goals = [] if goal is None else signal_names([f"{label}_goal" for label in labels], goal)
         seen = [] if measured is None else signal_names(list(labels), measured)
         self.planned, self.output_order, self.goal, self.measured = planned, output_order, goal, measured
-        self.outer = [*goals, *seen]
+        self.outer = [*goals, *seen, *(["stop"] if stop else [])]
         self.outputs = signal_names([label + suffix for label in labels], output_order)
         self.inside = "_planned"
         while {*self.outer, *self.outputs} & {*signal_names([label + self.inside for label in labels], planned)}:
@@ -280,7 +293,8 @@ class _Signals:
                 f"suffix must make outputs differ from inputs, got {suffix!r} and {', '.join(both)} in both"
             )
         n = len(self.inner)
-        self.goal_rows, self.seen_rows = slice(n, n + len(goals)), slice(n + len(goals), n + len(self.outer))
+        self.goal_rows = slice(n, n + len(goals))
+        self.seen_rows = slice(n + len(goals), n + len(goals) + len(seen))
 
     @property
     def feedthrough(self) -> NDArray[np.bool_]:
@@ -307,12 +321,15 @@ class _Correction(SampledBlock):
         signals: _Signals,
         trigger: _TriggerOver,
         limits: tuple[tuple[int, Array], ...],
+        stop: StopStates | None,
         name: str,
     ) -> None:
         naxes, order, ngoals = plan.naxes, horizons.order, signals.goal_rows.stop - signals.goal_rows.start
         states = ["start", "end", "nan_input", "unreachable", "fits"]
         states += [f"goal[{k}]" for k in range(ngoals)]
         states += [f"coefficient[{k}]" for k in range(naxes * 2 * (order + 1))]
+        fitted = slice(5 + ngoals, len(states))
+        states += [] if stop is None else stop.labels
         super().__init__(
             self._no_rates,
             self._output,
@@ -343,7 +360,8 @@ class _Correction(SampledBlock):
         )
         self._passed, self._naxes, self._order = signals.passed, naxes, order
         self._final = plan.final.tolist()
-        self._goal, self._fitted = slice(5, 5 + ngoals), slice(5 + ngoals, len(states))
+        self._goal, self._fitted = slice(5, 5 + ngoals), fitted
+        self._stop, self._stopped = stop, slice(fitted.stop, len(states))
         extrema = plan.extrema()
         self._range = float((extrema.maximum - extrema.minimum).max())
         self._scales = [horizons.whole.horizon**k for k in range(order + 1)]
@@ -357,14 +375,20 @@ class _Correction(SampledBlock):
         """States after a fit; unchanged if none is due."""
         after = x.copy()
         after[_NAN_INPUT] = 0.0 if math.isfinite(sum(u.tolist())) else 1.0
+        if self._stop is not None and u[-1] > 0.5:
+            if not self._is_stopped(x):
+                after[self._stopped] = self._stop.begun(t, self._reference(t, x, u, 2))
+            return after
         if after[_NAN_INPUT]:
             return after
         goal = u[self._signals.goal_rows].reshape(self._naxes, -1).T
         miss = self._miss(t, x, goal)
         moved = miss > _ROUNDING
-        begins = self._deviation(t, x, u)
+        begins, resumes = self._deviation(t, x, u), self._is_stopped(x)
+        if resumes:
+            miss = self._distance(t, x, goal)
         after[_UNREACHABLE] = float(miss > _MATTERS and self._horizons.too_short(t))
-        found = self._horizons.at(t) if self._is_due(moved, t, x, begins) else None
+        found = self._horizons.at(t) if resumes or self._is_due(moved, t, x, begins) else None
         if found is None:
             return after
         jets = np.zeros((2 * (self._order + 1), self._naxes))
@@ -380,7 +404,27 @@ class _Correction(SampledBlock):
         after[_FITS] += 1.0
         after[self._goal] = goal.ravel()
         after[self._fitted] = coefficients.ravel()
+        after[self._stopped] = 0.0
         return after
+
+    def _is_stopped(self, x: Array) -> bool:
+        """Whether the reference stops or has stopped."""
+        return self._stop is not None and bool(x[self._stopped.start] > 0.5)
+
+    def _distance(self, t: float, x: Array, goal: Array) -> float:
+        """Distance of the stopped reference from the goal, relative to the move."""
+        target = goal[0] if len(goal) else self._arrival[0]
+        position = self._stop_jets(t, x, 0)[0]
+        return float(np.abs(target - position).max()) / max(self._range, float(np.abs(target).max())) or 0.0
+
+    def _stop_jets(self, t: float, x: Array, order: int) -> Array:
+        """Jet (order + 1, naxes) of the stop."""
+        return np.array([] if self._stop is None else self._stop.jets(t, x[self._stopped].tolist(), order)).T
+
+    def _reference(self, t: float, x: Array, u: Array, order: int) -> Array:
+        """Jet (order + 1, naxes) of the reference while it is not stopped."""
+        planned = u[: len(self._signals.inner)].reshape(self._naxes, -1)[:, : order + 1].T
+        return planned + np.array(self._corrections(t, x.tolist(), order)).T
 
     def _is_due(self, moved: bool, t: float, x: Array, begins: Array) -> bool:
         if moved or self._trigger.kind == "goal":
@@ -413,11 +457,18 @@ class _Correction(SampledBlock):
     def _deviation(self, t: float, x: Array, u: Array) -> Array:
         """Jet (order + 1, naxes) at the start of a fit, minus that of the plan."""
         highest = self._signals.measured
+        planned = u[: len(self._signals.inner)].reshape(self._naxes, -1).T
+        stopped = self._is_stopped(x)
+        if highest == self._order:
+            own = planned[:0]
+        elif stopped:
+            own = self._stop_jets(t, x, self._order) - planned[: self._order + 1]
+        else:
+            own = self._jets(t, x, self._order)
         if highest is None:
-            return self._jets(t, x, self._order)
-        planned = u[: len(self._signals.inner)].reshape(self._naxes, -1)[:, : highest + 1]
-        seen = (u[self._signals.seen_rows].reshape(self._naxes, -1) - planned).T
-        return seen if highest == self._order else np.concatenate([seen, self._jets(t, x, self._order)[highest + 1 :]])
+            return own
+        seen = u[self._signals.seen_rows].reshape(self._naxes, -1).T - planned[: highest + 1]
+        return np.concatenate([seen, own[highest + 1 :]])
 
     def _within_limits(self, t: float, found: Transition, coefficients: Array, goal: Array) -> bool:
         """Whether the plan with a correction satisfies the limits until the end of both."""
@@ -443,7 +494,13 @@ class _Correction(SampledBlock):
 
     def _output(self, t: Value, x: Value, u: Value, params: Params) -> Array:
         added = itertools.chain.from_iterable(self._corrections(t, x, self._signals.output_order))
-        return np.array([u[row] + value for row, value in zip(self._passed, added, strict=True)])
+        found = [u[row] + value for row, value in zip(self._passed, added, strict=True)]
+        if self._stop is not None:
+            stopped = x[self._stopped.start] > 0.5
+            states = [x[k] for k in range(self._stopped.start, self._stopped.stop)]
+            jets = itertools.chain.from_iterable(self._stop.jets(t, states, self._signals.output_order))
+            found = [value * (1.0 - stopped) + held * stopped for value, held in zip(found, jets, strict=True)]
+        return np.array(found)
 
     def _jets(self, t: float, x: Array, order: int) -> Array:
         """Jet (order + 1, naxes) of the correction."""

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from ctrlplan._checks import checked_finite, one_number
 from ctrlplan.trajectories.combined import Joined
+from ctrlplan.trajectories.common import Array
 from ctrlplan.trajectories.cycle import knots_of, moved
 from ctrlplan.trajectories.trajectory import Trajectory
 from ctrlplan.trajectories.waypoint import Waypoint
@@ -82,3 +83,17 @@ def at_velocity(
     from ctrlplan.planning import stop
 
     return stop.at_velocity(plan, time, velocity, limits, hold, synchronize)
+
+
+def stop_limits(plan: Trajectory, limits: Mapping[str, object]) -> tuple[Array, Array]:
+    """Limits of acceleration (naxes, 2) and jerk (naxes,) of a stop, without others; a plan may be a step."""
+    from ctrlplan.planning import stop
+
+    found = stop.stop_limits(plan, limits)
+    for bound in found.bounds:
+        if bound.order < 2:
+            raise ValueError(
+                f"stop_limits must be those of acceleration and jerk, got {bound.name}: during a stop neither position "
+                "nor velocity can be limited"
+            )
+    return found.acceleration, found.jerk

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, NoReturn
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.polynomial import chebyshev
@@ -71,8 +72,19 @@ class Bounds:
     time_max: float
 
 
+_KNOWN: WeakKeyDictionary[Trajectory, dict[int, Extrema]] = WeakKeyDictionary()
+"""Extrema of derivatives by plan, which is immutable, and order."""
+
+
 def derivative_extrema(plan: Trajectory, nu: int) -> Extrema:
     """Extrema of the nu-th derivative, axis by axis."""
+    known = _KNOWN.setdefault(plan, {})
+    if nu not in known:
+        known[nu] = _derivative_extrema(plan, nu)
+    return known[nu]
+
+
+def _derivative_extrema(plan: Trajectory, nu: int) -> Extrema:
     found = _Candidates()
     if nu == 0 or plan.breakpoints.size == 1:
         held = np.zeros((2, plan.naxes)) if nu else np.stack([plan.initial, plan.final])
@@ -392,7 +404,7 @@ class _Candidates:
         t, values, ends = t[by_time], values[:, by_time], ends[by_time]
         low, high = (self._first(sign * values, ends) for sign in (1.0, -1.0))
         rows = np.arange(len(values))
-        return Extrema(values[rows, low], values[rows, high], t[low], t[high])
+        return Extrema(*map(readonly, (values[rows, low], values[rows, high], t[low], t[high])))
 
     @staticmethod
     def _first(values: Array, ends: Array) -> NDArray[np.intp]:

@@ -1,17 +1,19 @@
-"""Time-optimal rest-to-rest moves: trapezoidal and S-curve profiles."""
+"""Time-optimal moves: trapezoidal and S-curve profiles."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
-from typing import Any, ClassVar, Self
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, ClassVar, Self, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ctrlplan._checks import new_numbers
+from ctrlplan._checks import checked_vector, new_numbers
 from ctrlplan._types import Data, Value
 from ctrlplan.trajectories.common import FACTORIALS, Array, mapped_time, readonly, times_powers
+from ctrlplan.trajectories.motion_profile import MotionProfile
+from ctrlplan.trajectories.moving import Problem, Ranges, Synchronize, fastest_motion, unit_move
 from ctrlplan.trajectories.step import Step
 from ctrlplan.trajectories.trajectory import Trajectory
 from ctrlplan.trajectories.waypoint import Waypoint
@@ -19,24 +21,30 @@ from ctrlplan.trajectories.waypoint_spline import FromWaypoints, checked_waypoin
 
 
 class _Profile(Trajectory, FromWaypoints):
-    """Line initial + (final - initial) s(t) from rest to rest, with acceleration, cruise and mirrored deceleration.
+    """Time-optimal move: a line from rest to rest, or a `MotionProfile`.
 
-    The acceleration phase is evaluated from the start, the deceleration phase
-    backwards from the end, so that both positions are exact. s is computed from
-    the differences of the rounded breakpoints: for any start time continuity
-    and limits hold to the last digits.
+    From rest to rest with symmetric limits it is initial + (final - initial) s(t), with
+    acceleration, cruise and mirrored deceleration. The acceleration phase is
+    evaluated from the start, the deceleration phase backwards from the end, so that
+    both positions are exact. s is computed from the differences of the rounded
+    breakpoints: for any start time continuity and limits hold to the last digits.
     """
 
     velocity: Array
     acceleration: Array
+    start_velocity: Array
+    end_velocity: Array
+    synchronize: Synchronize | None
     initial: Array
     final: Array
+    _motion: MotionProfile | None = None
     _change: Array
     _lasts: list[float]
     _taylor: list[list[float]]
     _nfall: int
 
     _names: ClassVar[tuple[str, ...]]
+    _state_names: ClassVar[tuple[str, ...]]  # velocities, then accelerations, first at the start, then at the end
     _ramp: ClassVar[Array]  # relative highest continuous derivative at both ends of each segment of the rise
 
     def to_dict(self) -> Data:
@@ -48,11 +56,18 @@ class _Profile(Trajectory, FromWaypoints):
             **{name: getattr(self, name).tolist() for name in self._names},
             "time": self.start,
             "labels": list(self.labels),
+            **({} if self._motion is None else {"synchronize": self.synchronize, "motion": self._motion.to_dict()}),
         }
 
     @classmethod
     def from_dict(cls, data: Data) -> Self:
         """Trajectory from the plain data of `to_dict`."""
+        if "motion" in data:
+            self = cls.__new__(cls)
+            motion = MotionProfile.from_dict(data["motion"])
+            limits = self._checked_limits([data[name] for name in cls._names], motion.labels)
+            self._set_motion(motion, limits, data["synchronize"])
+            return self
         ends = Step(data["final"], data["initial"], data["time"], data["labels"])
         return cls._of(ends, [data[name] for name in cls._names])
 
@@ -72,9 +87,9 @@ class _Profile(Trajectory, FromWaypoints):
             them.
         """
         start, end = _rest_to_rest(checked_waypoints(waypoints), cls.__name__)
-        found = cls._of(
-            Step(end.position, start.position, start.time, start.labels), [options[name] for name in cls._names]
-        )
+        limits = {name: options[name] for name in cls._names}
+        profile: Callable[..., Self] = cls
+        found = profile(end.position, start.position, time=start.time, labels=start.labels, **limits)
         if found.duration > (end.time - start.time) * (1.0 + 1e-9):
             raise ValueError(
                 f"limits must allow the move within the {end.time - start.time:g} s between its waypoints, "
@@ -90,9 +105,52 @@ class _Profile(Trajectory, FromWaypoints):
 
     def map_time(self, origin: float, target: float, rate: float) -> Self:
         """Same path at other times; as `Trajectory.map_time`."""
+        if self._motion is not None:
+            self_moved = type(self).__new__(type(self))
+            rows = [times_powers(getattr(self, name), rate, np.array(k)) for k, name in enumerate(self._names, 1)]
+            self_moved._set_motion(self._motion.map_time(origin, target, rate), rows, self.synchronize)
+            return self_moved
         ends = Step(self.final, self.initial, mapped_time(self.start, origin, target, rate), self.labels)
         limits = np.array([getattr(self, name) for name in self._names])
         return self._of(ends, list(times_powers(limits, rate, np.arange(1, len(limits) + 1)[:, None])))
+
+    @classmethod
+    def _checked_limits(cls, limits: Sequence[ArrayLike], labels: tuple[str, ...]) -> list[Array]:
+        """Limits by axis; the highest one has no pairs."""
+        return [
+            _checked_limit(limit, name, labels, name != "jerk") for limit, name in zip(limits, cls._names, strict=True)
+        ]
+
+    def _begin(
+        self, ends: Step, limits: Sequence[ArrayLike], states: Sequence[ArrayLike], synchronize: Synchronize | None
+    ) -> None:
+        """Set the fields: from rest to rest on a line with symmetric limits, otherwise as a motion profile."""
+        if synchronize not in (*get_args(Synchronize), None):
+            raise ValueError(f'synchronize must be "phase", "time" or None, got {synchronize!r}')
+        naxes = ends.final.size
+        rows = [checked_vector(value, name, naxes) for value, name in zip(states, self._state_names, strict=True)]
+        given = self._checked_limits(limits, ends.labels)
+        on_line = synchronize == "phase" or naxes == 1
+        if on_line and not np.any(rows) and all(limit.ndim == 1 for limit in given):
+            self._set(ends, *given)
+            return
+        ranges = Ranges(*(np.array([side(limit) for limit in given]) for side in (_low, _high)))
+        states_at = [np.array([position, *rows[k::2]]) for k, position in enumerate((ends.initial, ends.final))]
+        problem = Problem(states_at[0], states_at[1], ranges, ends.labels)
+        self._set_motion(fastest_motion(problem, ends.start, synchronize), given, synchronize)
+
+    def _set_motion(self, motion: MotionProfile, limits: Sequence[Array], synchronize: Synchronize | None) -> None:
+        states = [state for pair in zip(motion.start_state[1:], motion.end_state[1:], strict=True) for state in pair]
+        self._set_fields(
+            **dict(zip(self._names, limits, strict=True)),
+            **dict(zip(self._state_names, states, strict=True)),
+            synchronize=synchronize,
+            initial=motion.initial,
+            final=motion.final,
+            labels=motion.labels,
+            breakpoints=motion.breakpoints,
+            _motion=motion,
+        )
 
     def _set(self, ends: Step, *limits: ArrayLike) -> None:
         with np.errstate(over="ignore"):
@@ -102,10 +160,10 @@ class _Profile(Trajectory, FromWaypoints):
                 "final must differ from initial by a finite length, "
                 f"got {ends.final.tolist()} after {ends.initial.tolist()}"
             )
-        given = [_checked_limit(*pair, ends.labels) for pair in zip(limits, self._names, strict=True)]
+        given = self._checked_limits(limits, ends.labels)
         moves = change != 0.0
         with np.errstate(all="ignore"):
-            durations = _fastest(*((limit[moves] / np.abs(change[moves])).min() for limit in given))
+            durations = unit_move(*((limit[moves] / np.abs(change[moves])).min() for limit in given))
         if not np.isfinite(durations).all():
             raise ValueError(f"limits must give segments of finite durations, got {durations.tolist()} s")
         minimum = 8.0 * np.finfo(float).eps * (abs(ends.start) + durations.sum())
@@ -131,6 +189,8 @@ class _Profile(Trajectory, FromWaypoints):
         whole = before + float(lasts[len(ramp) : -len(ramp)].sum()) + after
         self._set_fields(
             **dict(zip(self._names, given, strict=True)),
+            **dict.fromkeys(self._state_names, 0.0 * ends.initial),
+            synchronize="phase",
             initial=ends.initial,
             final=ends.final,
             labels=ends.labels,
@@ -143,6 +203,8 @@ class _Profile(Trajectory, FromWaypoints):
 
     def segment_jet(self, segment: int, s: Array, order: int) -> Array:
         """Derivatives of a segment; as `Trajectory.segment_jet`."""
+        if self._motion is not None:
+            return self._motion.segment_jet(segment, s, order)
         anchor, series = self._law(segment, s, order)
         law = np.array([np.broadcast_to(row, s.shape) for row in series]) * FACTORIALS[: order + 1, None]
         out: Array = self._change[:, None] * law[:, None]
@@ -151,6 +213,8 @@ class _Profile(Trajectory, FromWaypoints):
 
     def segment_series(self, segment: int, s: Value, order: int) -> list[list[Value]]:
         """Taylor series of a segment; as `Trajectory.segment_series`."""
+        if self._motion is not None:
+            return self._motion.segment_series(segment, s, order)
         anchor, (first, *rest) = self._law(segment, s, order)
         axes = zip(anchor.tolist(), self._change.tolist(), strict=True)
         return [[position + change * first, *(change * value for value in rest)] for position, change in axes]
@@ -164,13 +228,13 @@ class _Profile(Trajectory, FromWaypoints):
 
 
 class Trapezoid(_Profile):
-    """Time-optimal rest-to-rest move with limited acceleration.
+    """Time-optimal move with limited acceleration.
 
     With limits on velocity and acceleration the velocity profile is a trapezoid,
     or a triangle if the distance is too short to reach the velocity limit.
     Several axes are synchronised on the straight line from `initial` to `final`
     in the minimum time under all limits. The acceleration jumps at every
-    breakpoint.
+    breakpoint. Both ends may be in motion.
 
     Parameters
     ----------
@@ -179,7 +243,15 @@ class Trapezoid(_Profile):
     initial : array_like, optional
         Position at the start.
     velocity, acceleration : array_like, scalar or shape (naxes,)
-        Maximum magnitudes, above 0 [unit of the axis per s, per s^2].
+        Maximum magnitudes, above 0 [unit of the axis per s, per s^2]; or pairs
+        (minimum, maximum) of shape (naxes, 2), on one axis a tuple.
+    start_velocity, end_velocity : array_like, scalar or shape (naxes,), optional
+        Velocities at both ends; by default 0.
+    synchronize : {"phase", "time"} or None, optional
+        Relation of several axes. "phase": on the straight line from `initial` to
+        `final`, which velocities and accelerations at the ends must follow. "time":
+        all axes end together, in minimum time. None: each axis in its own minimum
+        time; those that end earlier must end at rest.
     time : float, optional
         Start [s].
     labels : sequence of str, optional
@@ -187,15 +259,25 @@ class Trapezoid(_Profile):
 
     Attributes
     ----------
-    velocity, acceleration : ndarray, shape (naxes,)
+    velocity, acceleration : ndarray, shape (naxes,) or (naxes, 2)
         The limits.
+    start_velocity, end_velocity : ndarray, shape (naxes,)
+        Velocities at both ends.
+    synchronize : str or None
+        The argument.
 
     Raises
     ------
     ValueError
-        If a limit is not above 0 and finite, no axis moves, a position is not
+        If a limit is not above 0 and finite, no axis moves, a number is not
         finite, shapes differ, or floating-point times do not resolve the
-        acceleration phase.
+        acceleration phase; if a velocity at an end is beyond its limits; with "phase",
+        if it is off the straight line.
+    ImportError
+        If an end is in motion or limits differ by direction, and ruckig is not
+        installed (``pip install "ctrlplan[otg]"``).
+    RuntimeError
+        If no profile within the limits is found.
 
     Examples
     --------
@@ -205,11 +287,17 @@ class Trapezoid(_Profile):
     5.0
     >>> Trapezoid(1.0, velocity=9.0, acceleration=1.0).breakpoints
     array([0., 1., 2.])
+
+    Continued from 1 m/s, with stronger brakes:
+
+    >>> Trapezoid(3.5, velocity=2.0, acceleration=(-4.0, 1.0), start_velocity=1.0).breakpoints
+    array([0.  , 1.  , 1.75, 2.25])
     """
 
     family = "trapezoid"
     options = ("velocity", "acceleration")
     _names = options
+    _state_names = ("start_velocity", "end_velocity")
     _ramp = readonly(np.array([[0.0, 1.0]]))
 
     def __init__(
@@ -219,19 +307,24 @@ class Trapezoid(_Profile):
         *,
         velocity: ArrayLike,
         acceleration: ArrayLike,
+        start_velocity: ArrayLike = 0.0,
+        end_velocity: ArrayLike = 0.0,
+        synchronize: Synchronize | None = "phase",
         time: float = 0.0,
         labels: Sequence[str] | None = None,
     ) -> None:
-        self._set(Step(final, initial, time, labels), velocity, acceleration)
+        states = (start_velocity, end_velocity)
+        self._begin(Step(final, initial, time, labels), (velocity, acceleration), states, synchronize)
 
 
 class SCurve(_Profile):
-    """Time-optimal rest-to-rest move with limited jerk.
+    """Time-optimal move with limited jerk.
 
     With limits on velocity, acceleration and jerk the move has seven segments of
     constant jerk, or fewer if the velocity or acceleration limit is not reached.
     Several axes are synchronised on the straight line from `initial` to `final`
-    in the minimum time under all limits. The jerk jumps at every breakpoint.
+    in the minimum time under all limits. The jerk jumps at every breakpoint. Both
+    ends may be in motion.
 
     Parameters
     ----------
@@ -239,8 +332,20 @@ class SCurve(_Profile):
         Position at the end.
     initial : array_like, optional
         Position at the start.
-    velocity, acceleration, jerk : array_like, scalar or shape (naxes,)
-        Maximum magnitudes, above 0 [unit of the axis per s, per s^2, per s^3].
+    velocity, acceleration : array_like, scalar or shape (naxes,)
+        Maximum magnitudes, above 0 [unit of the axis per s, per s^2]; or pairs
+        (minimum, maximum) of shape (naxes, 2), on one axis a tuple.
+    jerk : array_like, scalar or shape (naxes,)
+        Maximum magnitude, above 0 [unit of the axis per s^3].
+    start_velocity, start_acceleration : array_like, optional
+        State at the start, scalar or of shape (naxes,); by default 0.
+    end_velocity, end_acceleration : array_like, optional
+        State at the end, scalar or of shape (naxes,); by default 0.
+    synchronize : {"phase", "time"} or None, optional
+        Relation of several axes. "phase": on the straight line from `initial` to
+        `final`, which velocities and accelerations at the ends must follow. "time":
+        all axes end together, in minimum time. None: each axis in its own minimum
+        time; those that end earlier must end at rest.
     time : float, optional
         Start [s].
     labels : sequence of str, optional
@@ -248,15 +353,30 @@ class SCurve(_Profile):
 
     Attributes
     ----------
-    velocity, acceleration, jerk : ndarray, shape (naxes,)
+    velocity, acceleration : ndarray, shape (naxes,) or (naxes, 2)
         The limits.
+    jerk : ndarray, shape (naxes,)
+        The limit.
+    start_velocity, start_acceleration : ndarray, shape (naxes,)
+        State at the start.
+    end_velocity, end_acceleration : ndarray, shape (naxes,)
+        State at the end.
+    synchronize : str or None
+        The argument.
 
     Raises
     ------
     ValueError
-        If a limit is not above 0 and finite, no axis moves, a position is not
+        If a limit is not above 0 and finite, no axis moves, a number is not
         finite, shapes differ, or floating-point times do not resolve the
-        acceleration phase.
+        acceleration phase; if a state at an end makes an excess over the limits
+        unavoidable, with the maximum jerk; with "phase", if it is off the straight
+        line.
+    ImportError
+        If an end is in motion or limits differ by direction, and ruckig is not
+        installed (``pip install "ctrlplan[otg]"``).
+    RuntimeError
+        If no profile within the limits is found.
 
     Examples
     --------
@@ -264,13 +384,21 @@ class SCurve(_Profile):
 
     >>> SCurve(4.0, velocity=1.0, acceleration=0.5, jerk=0.5).duration
     7.0
+
+    From motion at the velocity limit to rest, with v/a + a/j for the stop:
+
+    >>> round(SCurve(4.0, velocity=1.0, acceleration=0.5, jerk=0.5, start_velocity=1.0).duration, 12)
+    5.5
     """
 
     jerk: Array
+    start_acceleration: Array
+    end_acceleration: Array
 
     family = "s_curve"
     options = ("velocity", "acceleration", "jerk")
     _names = options
+    _state_names = ("start_velocity", "end_velocity", "start_acceleration", "end_acceleration")
     _ramp = readonly(np.array([[0.0, 1.0], [1.0, 1.0], [1.0, 0.0]]))
 
     def __init__(
@@ -281,10 +409,16 @@ class SCurve(_Profile):
         velocity: ArrayLike,
         acceleration: ArrayLike,
         jerk: ArrayLike,
+        start_velocity: ArrayLike = 0.0,
+        start_acceleration: ArrayLike = 0.0,
+        end_velocity: ArrayLike = 0.0,
+        end_acceleration: ArrayLike = 0.0,
+        synchronize: Synchronize | None = "phase",
         time: float = 0.0,
         labels: Sequence[str] | None = None,
     ) -> None:
-        self._set(Step(final, initial, time, labels), velocity, acceleration, jerk)
+        states = (start_velocity, end_velocity, start_acceleration, end_acceleration)
+        self._begin(Step(final, initial, time, labels), (velocity, acceleration, jerk), states, synchronize)
 
 
 def _rest_to_rest(points: tuple[Waypoint, ...], kind: str) -> tuple[Waypoint, Waypoint]:
@@ -299,16 +433,12 @@ def _rest_to_rest(points: tuple[Waypoint, ...], kind: str) -> tuple[Waypoint, Wa
     return points[0], points[1]
 
 
-def _fastest(velocity: float, acceleration: float, jerk: float = math.inf) -> Array:
-    """Segment durations of the time-optimal unit move; without a jerk limit the acceleration phase is one segment."""
-    ramp = min(acceleration / jerk, np.sqrt(velocity / jerk), np.cbrt(0.5 / jerk))
-    peak = acceleration if ramp == acceleration / jerk else jerk * ramp
-    to_limit = velocity / peak + ramp
-    halfway = 0.5 * (ramp + np.hypot(ramp, 2.0 / np.sqrt(peak)))  # acceleration over half of the distance
-    rises = min(to_limit, halfway)
-    cruise = 1.0 / velocity - to_limit if to_limit < halfway else 0.0
-    rise = [rises] if jerk == math.inf else [ramp, rises - 2.0 * ramp, ramp]
-    return np.array([*rise, cruise, *rise])
+def _low(limit: Array) -> Array:
+    return -limit if limit.ndim == 1 else limit[:, 0]
+
+
+def _high(limit: Array) -> Array:
+    return limit if limit.ndim == 1 else limit[:, 1]
 
 
 def _rise(lasts: Array, ramp: Array, order: int) -> tuple[Array, float]:
@@ -331,12 +461,23 @@ def _shifted(taylor: list[float], s: Value, order: int) -> list[Value]:
     return [*found, *[0.0] * order][: order + 1]
 
 
-def _checked_limit(limit: ArrayLike, name: str, labels: tuple[str, ...]) -> Array:
-    """Limit of each axis, checked."""
-    values = new_numbers(limit, name)
-    if values.shape not in ((), (len(labels),)):
-        raise ValueError(f"{name} must be a scalar or of shape ({len(labels)},), got shape {values.shape}")
-    for label, value in zip(labels, np.broadcast_to(values, len(labels)).tolist(), strict=True):
+def _checked_limit(limit: ArrayLike, name: str, labels: tuple[str, ...], pairs: bool) -> Array:
+    """Limit of each axis, checked: shape (naxes,), or (naxes, 2) for pairs (minimum, maximum)."""
+    values, naxes = new_numbers(limit, name), len(labels)
+    if pairs and naxes == 1 and isinstance(limit, tuple) and values.shape == (2,):
+        values = values[None]
+    if values.ndim == 2 and values.shape == (naxes, 2) and pairs:
+        for label, (low, high) in zip(labels, values.tolist(), strict=True):
+            if not -math.inf < low < 0.0 < high < math.inf:
+                raise ValueError(
+                    f"{name} must be pairs of a finite minimum below 0 and a finite maximum above 0, got {low} and "
+                    f"{high} of {label}"
+                )
+        return readonly(-values[:, 0] if (values[:, 0] == -values[:, 1]).all() else values)
+    if values.shape not in ((), (naxes,)):
+        also = f", or pairs of shape ({naxes}, 2)" if pairs else ""
+        raise ValueError(f"{name} must be a scalar or of shape ({naxes},){also}, got shape {values.shape}")
+    for label, value in zip(labels, np.broadcast_to(values, naxes).tolist(), strict=True):
         if not 0.0 < value < math.inf:
             raise ValueError(f"{name} must be above 0 and finite, got {value}{f' of {label}' if values.ndim else ''}")
-    return readonly(np.broadcast_to(values, len(labels)).copy())
+    return readonly(np.broadcast_to(values, naxes).copy())

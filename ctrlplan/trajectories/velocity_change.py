@@ -18,6 +18,8 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+from ctrlplan.trajectories.common import Array
+
 
 class VelocityChange(NamedTuple):
     """Phases of a change of velocity.
@@ -85,6 +87,37 @@ def slower_velocity_change(change: float, acceleration: float, jerk: float, dura
     rest = duration - initial / jerk
     peak = max(rise - 0.5 * initial**2 / jerk, 0.0) / rest if rest > 0.0 else 0.0
     return _phases(-1.0, sign * jerk, (initial - peak) / jerk, duration - initial / jerk, peak / jerk)
+
+
+def velocity_changes(
+    changes: Array, accelerations: Array, limits: Array, jerks: Array, *, together: bool
+) -> list[VelocityChange]:
+    """Changes of the velocities of several axes.
+
+    Parameters
+    ----------
+    changes, accelerations : ndarray, shape (naxes,)
+        Final minus initial velocities, and initial accelerations.
+    limits : ndarray, shape (naxes, 2)
+        Minimum and maximum accelerations.
+    jerks : ndarray, shape (naxes,)
+        Maximum magnitudes of the jerks.
+    together : bool
+        Whether all have the duration of the slowest one, otherwise each its own
+        minimum one.
+    """
+    starts = list(zip(changes.tolist(), accelerations.tolist(), strict=True))
+    own = [
+        fastest_velocity_change(*start, (low, high), jerk)
+        for start, (low, high), jerk in zip(starts, limits.tolist(), jerks.tolist(), strict=True)
+    ]
+    longest = max(change.duration for change in own)
+    if not together:
+        return own
+    return [
+        change if change.duration == longest else slower_velocity_change(*start, jerk, longest)
+        for change, start, jerk in zip(own, starts, jerks.tolist(), strict=True)
+    ]
 
 
 def _normalised(change: float, acceleration: float, jerk: float) -> tuple[float, float, float]:

@@ -5,8 +5,9 @@ from math import hypot, pi
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from repetitions import examples
 
 import ctrlplan as cp
 from ctrlplan import Waypoint
@@ -433,7 +434,7 @@ def test_a_choice_stands_for_its_alpha():
 
 
 @pytest.mark.slow
-@settings(max_examples=8)
+@examples(8)
 @given(
     size=st.floats(1e-6, 1e6),
     duration=st.floats(1e-6, 1e6),

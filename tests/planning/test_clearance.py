@@ -5,8 +5,9 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from repetitions import examples
 
 import ctrlplan as cp
 from ctrlplan.planning.clearance import clearance
@@ -158,7 +159,7 @@ things = st.one_of(
 )
 
 
-@settings(max_examples=10)
+@examples(10)
 @given(
     st.sampled_from(["polynomial", "trigonometric", "piecewise"]),
     st.lists(st.tuples(st.floats(0.0, 20.0), st.floats(5.0, 12.0)), min_size=2, max_size=4),

@@ -88,7 +88,7 @@ def test_first_of_each_island(span):
     at = responses(SERVO_MATRICES, QUINTIC, [found.duration], 20_000, 20_000, 0.01).max()
     assert 1.01 - 1e-6 <= at <= 1.01 + 1e-9
     assert found.statement == (
-        f"no duration from {found.searched[0]:.4g} s to {found.duration:.6g} s satisfies every limit with a spare "
+        f"no duration from {found.searched[0]:.4g} s to {found.duration:.6g} s satisfies every limit with a margin "
         "above 0.001 of its range"
     )
     assert found.statement.split(" satisfies")[0] in " ".join(str(found).split())
@@ -115,7 +115,7 @@ def test_motor_satisfies_its_limits_in_the_simulation(plan):
 
 
 def test_motor_at_shorter_durations():
-    """None of 200 shorter durations has a spare above 1e-3 of the range."""
+    """None of 200 shorter durations has a margin above 1e-3 of the range."""
     form = cp.prepare(motor_loop()).linear
     loop = (form.a, np.moveaxis(form.b[:, :, None], 1, 0), form.c, np.moveaxis(form.d[:, :, None], 1, 0))
     found = cp.fastest(MOVE, MOTOR_LIMITS, motor_loop())
@@ -140,24 +140,22 @@ def random_problem(seed, stream=21):
 def check_random(seed, count, steps, tail):
     loop, plan, limits = random_problem(seed)
     named = {"y1": tuple(limits[0]), "y2": tuple(limits[1])}
-    try:
-        found = cp.fastest(plan, named, system_of(loop))
-    except ValueError as error:
-        assert "limits must include one that a shorter plan would violate" in str(error)
-        short = responses(loop, plan, [1e-6], steps, tail)
-        assert excess(short, limits)[0] <= 0.0
+    if excess(responses(loop, plan, [1e-6], steps, tail), limits)[0] <= 0.0:  # as a step
+        with pytest.raises(ValueError, match="limits must include one that a shorter plan would violate"):
+            cp.fastest(plan, named, system_of(loop))
         return
+    found = cp.fastest(plan, named, system_of(loop))
     low = max(found.searched[0], found.duration / 300.0)
     shorter = np.geomspace(low, found.duration * (1.0 - 1e-9), count)
     below = np.concatenate(
         [excess(responses(loop, plan, part, steps, tail), limits) for part in np.array_split(shorter, -(-count // 200))]
     )
-    assert below.min() > -1e-3, "a shorter duration has a spare"
+    assert below.min() > -1e-3, "a shorter duration has a margin"
     at = excess(responses(loop, plan, [found.duration], 20_000, 20_000, 0.02), limits)[0]
     assert -1e-4 <= at <= 1e-9
 
 
-@pytest.mark.parametrize("seed", [2, 3, 4, 7])
+@pytest.mark.parametrize("seed", [2, 3, 103, 104])
 def test_random_loops(seed):
     check_random(seed, 100, 400, 1000)
 
@@ -237,5 +235,5 @@ def test_what_cannot_be_satisfied():
     with pytest.raises(ValueError, match="resolution must be"):
         cp.fastest(QUINTIC, {"y": (None, 1.01)}, SERVO, resolution=0.0)
     runaway = ct.ss([[0.3]], [[1.0]], [[1.0]], [[0.0]], inputs="r", outputs="y", name="runaway")
-    with pytest.raises(ValueError, match="runaway with a pole at 0.3"):
+    with pytest.raises(ValueError, match=r"runaway with a pole at 0\.3 in"):
         cp.fastest(QUINTIC, {"y": 2.0}, runaway)

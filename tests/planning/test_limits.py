@@ -4,8 +4,9 @@ from math import inf, sqrt
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from repetitions import examples
 
 import ctrlplan as cp
 from ctrlplan import Waypoint
@@ -442,7 +443,7 @@ def test_a_plan_that_starts_and_ends_in_motion_continues_one():
 sizes = st.floats(1e-3, 1e3)
 
 
-@settings(max_examples=12)
+@examples(12)
 @given(size=sizes, duration=sizes, limits=st.tuples(*[sizes] * 3))
 def test_margins_scale_with_size_and_time(size, duration, limits):
     plan = (size * MOVE).retime(duration)
@@ -452,7 +453,7 @@ def test_margins_scale_with_size_and_time(size, duration, limits):
         assert found[f"y_d{k}"].fraction == pytest.approx(1 - peak / limits[k - 1], rel=1e-11, abs=1e-11)
 
 
-@settings(max_examples=6)
+@examples(6)
 @given(shift=st.floats(-1e4, 1e4), factor=sizes)
 def test_margins_shift_with_time_and_limits_with_the_signal(shift, factor):
     limits = {"x_d1": 3.0, "z_d2": (-1.0, 2.0)}

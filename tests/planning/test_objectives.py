@@ -6,8 +6,9 @@ from typing import get_args
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from repetitions import examples
 from scipy.integrate import quad
 from scipy.interpolate import BPoly, PPoly
 
@@ -198,7 +199,7 @@ def test_orders_that_are_no_orders(kind, nu, error, message):
 factors = st.floats(1e-3, 1e3)
 
 
-@settings(max_examples=15)
+@examples(15)
 @given(
     factor=factors, duration=factors, shift=st.floats(-1e3, 1e3), name=st.sampled_from(["trigonometric", "piecewise"])
 )
@@ -215,7 +216,7 @@ def test_scales_of_amplitude_and_time(factor, duration, shift, name):
         assert SquaredDerivative(nu)(other) == pytest.approx(expected, rel=slack)
 
 
-@settings(max_examples=15)
+@examples(15)
 @given(angle=st.floats(-pi, pi))
 def test_a_turned_path_is_as_long(angle):
     turn = np.array([[cos(angle), -sin(angle)], [sin(angle), cos(angle)]])

@@ -6,8 +6,9 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from repetitions import examples
 
 from ctrlplan.planning.obstacles import Disc, HalfPlane, Obstacle, Rectangle
 
@@ -112,7 +113,7 @@ obstacles = st.one_of(
 )
 
 
-@settings(max_examples=300)
+@examples(300)
 @given(obstacles, pairs, pairs, pairs, pairs)
 def test_no_greater_move_of_an_end_moves_the_distance_more(thing, p, q, a, b):
     moved = abs(thing.segment_distance(p, q) - thing.segment_distance(a, b))
@@ -120,13 +121,13 @@ def test_no_greater_move_of_an_end_moves_the_distance_more(thing, p, q, a, b):
     assert abs(thing.distance(p) - thing.distance(a)) <= math.dist(p, a) + 1e-12
 
 
-@settings(max_examples=200)
+@examples(200)
 @given(obstacles, pairs, pairs, st.floats(0.0, 1.0))
 def test_no_point_of_a_segment_is_nearer(thing, p, q, share):
     assert thing.segment_distance(p, q) <= thing.distance(p + share * (q - p)) + 1e-12
 
 
-@settings(max_examples=100)
+@examples(100)
 @given(obstacles, st.floats(0.0, 5.0))
 def test_corners_keep_the_margin_and_not_much_more(thing, margin):
     corners = thing.corners(margin)

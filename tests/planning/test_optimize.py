@@ -7,8 +7,9 @@ import warnings
 import mpmath as mp
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from repetitions import examples
 from scipy.integrate import quad
 from scipy.interpolate import CubicSpline, make_interp_spline
 from scipy.optimize import brentq, minimize, minimize_scalar
@@ -203,6 +204,7 @@ PROGRAMS = [
 ]
 
 
+@pytest.mark.each_value
 @pytest.mark.parametrize(("n", "k", "order", "continuity"), PROGRAMS)
 def test_quadratic_programs_are_solved(n, k, order, continuity):
     rng = np.random.default_rng(10 * n + k)
@@ -314,7 +316,7 @@ def test_single_plans_are_what_a_search_finds(alpha):
 families = st.sampled_from([{}, {"alpha": 2.0}, {"single": True}, {"single": True, "alpha": 3.0}])
 
 
-@settings(max_examples=30)
+@examples(30)
 @given(seed=st.integers(0, 2**32 - 1), k=st.integers(1, 4), n=st.integers(2, 4), options=families)
 def test_no_free_entry_can_be_moved_to_advantage(seed, k, n, options):
     rng = np.random.default_rng(seed)
@@ -344,7 +346,7 @@ def test_no_free_entry_can_be_moved_to_advantage(seed, k, n, options):
         assert costs[1] == pytest.approx(costs[0], rel=1e-8)
 
 
-@settings(max_examples=20)
+@examples(20)
 @given(seed=st.integers(0, 2**32 - 1), exponent=st.floats(-6, 6), size=st.floats(-3, 3), options=families)
 def test_costs_scale_with_time_and_amplitude(seed, exponent, size, options):
     rng = np.random.default_rng(seed)
@@ -594,7 +596,7 @@ def test_symmetric_data_give_symmetric_times(options):
     np.testing.assert_allclose(times + times[::-1], 4.0, rtol=1e-6)
 
 
-@settings(max_examples=8)
+@examples(8)
 @given(seed=st.integers(0, 2**32 - 1), options=families)
 def test_chosen_times_are_never_worse(seed, options):
     rng = np.random.default_rng(seed)

@@ -5,8 +5,9 @@ from math import sqrt
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from repetitions import examples
 
 import ctrlplan as cp
 from ctrlplan import Waypoint
@@ -229,7 +230,7 @@ def test_the_plan_is_saved_with_its_time_law(tmp_path):
 
 
 @pytest.mark.slow
-@settings(max_examples=5)
+@examples(5)
 @given(size=st.floats(1e-3, 1e3), duration=st.floats(1e-3, 1e3), start=st.sampled_from([0.0, -50.0, 100.0]))
 def test_the_fastest_plan_is_invariant_under_units_and_time_shifts(size, duration, start):
     plan = (size * move("quintic")).retime(duration).shift(start)

@@ -1,10 +1,12 @@
 """Pages written once: a user's own study, and the paper's studies; and one browser for all of them."""
 
+import io
 import json
 import re
 import shutil
 import subprocess
 import sys
+from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from html.parser import HTMLParser
 from pathlib import Path
@@ -14,6 +16,7 @@ import pytest
 from strict import WARNINGS
 
 import ctrlplan as cp
+from ctrlplan.cli import main
 
 OWN = """
 title = "Hoist & swing <fast>"
@@ -105,7 +108,9 @@ def unstable(tmp_path_factory):
     place = tmp_path_factory.mktemp("unstable")
     text = OWN.replace("gain = 5.0", "gain = -5.0").replace('"gentle"', "\"a <b> & 'c' --> d\"")
     (place / "a strange name.toml").write_text(text, encoding="utf-8")
-    return run("unstable", place / "report", "report", place / "a strange name.toml")
+    with redirect_stdout(io.StringIO()) as out, redirect_stderr(io.StringIO()) as err:
+        assert main(["report", str(place / "a strange name.toml"), "--out", str(place / "report")]) == 0
+    return Written("unstable", place / "report", out.getvalue(), err.getvalue())
 
 
 @pytest.fixture(scope="session", params=["own", "unstable", pytest.param("reproduced", marks=pytest.mark.slow)])

@@ -239,6 +239,7 @@ def test_the_page_says_what_was_drawn(page):
     assert "failed" not in findings.words()
 
 
+@pytest.mark.usefixtures("blank_drawings")
 @pytest.mark.slow
 def test_the_page_says_what_failed(failed, read):
     study = Study("draws", "Draws", failed.nominal, notes=tuple(failed.notes()), sections=(Bands(failed),))
@@ -246,17 +247,20 @@ def test_the_page_says_what_failed(failed, read):
     assert "1 of 3 draws failed. The first, with tau = 3: ValueError: tau is too long & <slow>" in text
 
 
+@pytest.mark.usefixtures("blank_drawings")
 def test_the_report_says_what_failed(failed, tmp_path, read):
     text = read(failed.report(tmp_path / "failed.html").read_text(encoding="utf-8")).words()
     assert "1 of 3 draws failed. The first, with tau = 3: ValueError: tau is too long & <slow>" in text
     assert (tmp_path / "failed.html").exists()
 
 
+@pytest.mark.usefixtures("blank_drawings")
 def test_a_page_without_any_draw_that_was_run_is_whole(nothing, tmp_path, read):
     text = read(nothing.report(tmp_path).read_text(encoding="utf-8")).words()
     assert "2 draws failed" in text
 
 
+@pytest.mark.usefixtures("blank_drawings")
 @pytest.mark.slow
 def test_values_that_are_never_reached_are_words_that_sort_last(tmp_path, read):
     slow = cp.monte_carlo(lag(), {"tau": [0.5, 9.0, 9.5]}, PLANS, TIMES, progress=False)
@@ -271,6 +275,7 @@ def test_results_of_a_study_hold_its_draws(drawn):
     assert study.results()["draws"] == drawn.results()
 
 
+@pytest.mark.usefixtures("blank_drawings")
 def test_a_metric_of_one_plan_only_is_on_the_page(tmp_path, read):
     def last(run):
         return {"last": float(run.response.outputs[0, -1])} if run.plan is PLANS["step"] else {}

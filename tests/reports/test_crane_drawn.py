@@ -197,6 +197,7 @@ def test_a_move_that_starts_late_is_drawn_from_its_start():
 # Plans of any name
 
 
+@pytest.mark.each_value
 @pytest.mark.parametrize("kind", [sections.CranePaths, sections.CraneTime, sections.CraneMotion])
 @pytest.mark.parametrize("names", [("gentle",), ("a", "b", "c"), ("jump",), ("step",)])
 def test_plans_may_have_any_name(kind, names):

@@ -64,6 +64,17 @@ def test_a_step_beyond_the_others_is_clipped_and_its_peak_is_written():
     assert axes.get_title(loc="left") == "step: peak −300, clipped"
 
 
+def test_each_clipped_step_is_named_in_full():
+    names = ("step", "shaped step with a name that takes more than a line")
+    curves = {names[0]: [0.0, -2753.0, 1.0], names[1]: [0.0, 4.5e7, 1.0], "a": [0.0, 1.0, 2.0]}
+    axes = axes_with(**curves)
+    clip_steps(axes, dict.fromkeys(names, Role.STEP) | {"a": Role.PLANNED})
+    lines = axes.get_title(loc="left").split("\n")
+    assert lines[0] == "step: peak −2750, clipped"
+    assert " ".join(lines[1:]) == f"{names[1]}: peak 4.50·10⁷, clipped"
+    assert max(map(len, lines)) <= 44
+
+
 @pytest.mark.parametrize(
     "curves",
     [

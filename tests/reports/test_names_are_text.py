@@ -105,6 +105,7 @@ def test_nor_where_figures_are_drawn(offset, plain, read):
             assert element.attributes.get(key, "#").startswith(("#", "data:,"))
 
 
+@pytest.mark.usefixtures("blank_drawings")
 @pytest.mark.parametrize(
     "names", [("a b", "a-b", "a b"), ("", "!", "?"), ("a", "a-plans", "a-plans-2"), ("\udcff", "-")]
 )
@@ -153,14 +154,22 @@ def test_a_page_with_any_character_can_be_written_and_read(name, undrawn, tmp_pa
     assert not re.search("[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f]", text)
 
 
-@pytest.mark.parametrize("name", MARKUP)
-def test_tables_of_margins_take_them_as_text_too(name, read):
-    def told(quantity):
+@pytest.fixture(scope="module")
+def margins(read):
+    """Table of the margins of a quantity of a name."""
+
+    @cache
+    def of(quantity):
         plan = cp.PolySpline([cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1, 0, 0)])
         return read(cp.fastest(plan, {quantity: 2.0}, lambda jet: {quantity: jet[1, 0]})._repr_html_())
 
-    assert structure(told(TEXTS[name])) == structure(told("speed"))
-    assert seen(TEXTS[name]) in told(TEXTS[name]).words()
+    return of
+
+
+@pytest.mark.parametrize("name", MARKUP)
+def test_tables_of_margins_take_them_as_text_too(name, margins):
+    assert structure(margins(TEXTS[name])) == structure(margins("speed"))
+    assert seen(TEXTS[name]) in margins(TEXTS[name]).words()
 
 
 def test_units_that_look_like_a_place_for_units_are_units():

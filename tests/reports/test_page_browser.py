@@ -3,13 +3,17 @@
 import base64
 import json
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+import ctrlplan as cp
 from ctrlplan.studies.files import load_study
 
 pytestmark = pytest.mark.slow
+
+MOVE = [cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1, 0, 0)]
 
 
 @pytest.fixture(scope="module", params=["own", pytest.param("reproduced", marks=pytest.mark.slow)])
@@ -102,6 +106,59 @@ def test_no_table_is_wider_than_its_page(window, written, width):
     )
     assert wide
     assert max(wide) <= 1
+
+
+MANY = {
+    "as the reader words it": [f"trigonometric, alpha {0.3 * k:.1f} rad" for k in range(10)],
+    "of many words": [f"a trigonometric plan with a long descriptive name, number {k} of ten" for k in range(10)],
+    "of one long word": [f"{'a_very_long_name_without_a_blank' * 2}_{k}" for k in range(10)],
+}
+
+
+@pytest.fixture(scope="module", params=MANY)
+def many(request, tmp_path_factory):
+    """Page of a step and ten plans with long names."""
+    plans = {name: cp.TrigSpline(MOVE, alpha=0.3 * k) for k, name in enumerate(MANY[request.param])}
+    loop = cp.plants.integrator_lag_loop(5.0, outputs=("y", "u"))
+    found = cp.compare(loop, {"step": cp.Step(1.0)} | plans, np.linspace(0.0, 10.0, 501), waypoints=MOVE)
+    folder = tmp_path_factory.mktemp("many")
+    found.report(folder)
+    return SimpleNamespace(folder=folder, short=request.param == "as the reader words it")
+
+
+@pytest.mark.parametrize("width", [1280, 1100, 1000, 900, 800, 390])
+def test_no_table_of_many_plans_is_wider_than_its_page(window, many, width):
+    chrome = window(many, width)
+    wide = chrome.execute_script(
+        "return Array.from(document.querySelectorAll('.scroll')).map(box => box.scrollWidth - box.clientWidth)"
+    )
+    assert wide
+    assert max(wide) <= 1
+    assert chrome.execute_script("return document.documentElement.scrollWidth") <= width
+
+
+@pytest.mark.parametrize("width", [1280, 390])
+def test_a_number_is_not_broken_into_lines(window, many, width):
+    chrome = window(many, width)
+    lines = chrome.execute_script("""
+        const lines = [];
+        for (const cell of document.querySelectorAll('table.leading td, table.metrics td')) {
+          const text = Array.from(cell.childNodes).find(node => node.nodeType === 3 && !node.data.trim().includes(' '));
+          const range = document.createRange();
+          if (text && getComputedStyle(cell).display !== 'none') {
+            range.selectNodeContents(text);
+            lines.push(range.getClientRects().length);
+          }
+        }
+        return lines;""")
+    assert len(lines) > 100
+    assert set(lines) == {1}
+
+
+def test_a_study_of_eleven_plans_is_one_screen_and_four_of_a_phone(window, many):
+    for width, highest in ((1280, 800), (390, 3200)):
+        (height,) = window(many, width, 800, opened=False).execute_script(HEIGHTS)
+        assert height <= (highest if many.short else 2 * highest)  # names of three lines each
 
 
 def test_folds_are_closed_at_first_and_open_on_paper(window, shown):

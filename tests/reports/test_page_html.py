@@ -1,5 +1,6 @@
 """The page as text: whole, self-contained, and saying what the numbers say."""
 
+import platform
 import re
 import unicodedata
 from importlib import metadata
@@ -279,13 +280,18 @@ def test_best_and_worst_are_told_by_more_than_colour(page):
         assert set(labels) <= {"best", "worst", "better than every baseline", "worse than the best baseline"}
 
 
-def test_versions_are_on_the_page(page):
+def test_versions_are_in_a_fold_of_each_study(page):
     (footer,) = page.all("footer")
-    said = footer.words()
-    assert f"ctrlplan {cp.__version__}" in said
-    assert re.search(r"Python 3\.\d+\.\d+", said)
-    for package in ("control", "numpy", "scipy", "matplotlib"):
-        assert f"{package} {metadata.version(package)}" in said
+    assert f"ctrlplan {cp.__version__}" in footer.words()
+    for section in page.all("section"):
+        (fold,) = (
+            one for one in section.all("details") if next(one.all("summary")).words() == "Parameters and versions"
+        )
+        said = fold.words()
+        assert f"ctrlplan {cp.__version__}" in said
+        assert f"Python {platform.python_version()}" in said
+        for package in ("control", "numpy", "scipy", "matplotlib"):
+            assert f"{package} {metadata.version(package)}" in said
 
 
 def test_parameters_are_on_the_page(own, read):

@@ -90,11 +90,11 @@ def test_a_section_of_ones_own_is_on_the_page_in_its_place(own, read):
     page = read(own[0].read_text(encoding="utf-8"))
     assert heads(page) == [
         "Mine",
-        "Description and findings",
+        "Findings",
         "Durations & <limits>",
         "All metrics",
         "All figures",
-        "Parameters",
+        "Parameters and versions",
     ]
     assert ids_of_figures(page) == ["mine-first", "mine-plans", "mine-responses"]
     captions = [caption.words() for caption in page.all("figcaption")]
@@ -127,11 +127,13 @@ def test_data_of_a_section_is_in_the_results(own):
     assert set(data) == {"plans", "durations"}
 
 
+@pytest.mark.usefixtures("blank_drawings")
 def test_a_section_may_stand_below_the_metrics(compared, read):
     page = read(render_page([Study("mine", "Mine", compared, sections=(Durations(1.0, below=True),))], "Mine"))
-    assert heads(page) == ["Mine", "All metrics", "Durations & <limits>", "Parameters"]
+    assert heads(page) == ["Mine", "All metrics", "Durations & <limits>", "Parameters and versions"]
 
 
+@pytest.mark.usefixtures("blank_drawings")
 def test_sections_of_one_type_have_ids_of_their_own(compared, read):
     two = tuple(Curves("a", "b", TIMES, {"c": k * TIMES}, caption=f"Number {k}.") for k in (1, 2))
     studies = [Study(name, "It", compared, sections=(*two, Durations(1.0))) for name in ("it", "it-curves", "it")]
@@ -156,6 +158,7 @@ def test_a_figure_that_is_svg_already_is_put_in_as_it_is(compared, read):
     assert [circle.attributes["r"] for circle in figure.all("circle")] == ["1"]
 
 
+@pytest.mark.usefixtures("blank_drawings")
 def test_a_section_of_ones_own_joins_those_of_a_study_file(tmp_path, read):
     text = 't_end = 6.0\n[loop]\nkind = "linear"\nnum = [5.0]\nden = [1.0, 1.0, 0.0]\n'
     text += "".join(f"[[waypoints]]\ntime = {t}\ny = [{y}, 0.0, 0.0]\n" for t, y in ((0.0, 0.0), (2.0, 1.0)))

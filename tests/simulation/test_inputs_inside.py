@@ -3,8 +3,9 @@
 import control as ct
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from repetitions import examples
 from scipy.integrate import quad
 
 import ctrlplan as cp
@@ -41,6 +42,7 @@ def recorder(count):
     return ct.nlsys(rates, None, inputs=count, outputs="y", states="y", name="recorder"), seen
 
 
+@pytest.mark.each_value
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("value", [1.0, 0.1, -7.3e-9, 3.0, 1e300])
 def test_a_constant_next_to_a_signal_that_moves_is_exact(value, method):
@@ -66,7 +68,7 @@ def test_a_constant_out_of_a_plan_or_a_delay_is_exact(method):
     assert np.abs(found.outputs - lag_response(PLAN, np.maximum(t - 1.5, 0.0))).max() < 1e-7
 
 
-@settings(max_examples=25)
+@examples(25)
 @given(st.lists(st.floats(-1e3, 1e3, allow_subnormal=False), min_size=3, max_size=12), st.floats(-1e6, 1e6))
 def test_samples_stay_within_their_range_and_constants_are_bits(samples, constant):
     t = np.linspace(0.0, 1.0, len(samples))

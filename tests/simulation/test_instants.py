@@ -3,8 +3,9 @@
 import control as ct
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
+from repetitions import examples
 
 import ctrlplan as cp
 
@@ -23,6 +24,7 @@ def first_seen(system, t, inputs, method):
     return int(np.flatnonzero(outputs)[0])
 
 
+@pytest.mark.each_value
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("shift", [-1e-15, 0.0, 4 * EPS, 1e-15, 1e-13])
 @pytest.mark.parametrize("instant", [3, 6, 7])
@@ -43,7 +45,7 @@ def test_a_jump_that_arrives_at_an_instant_is_seen_by_its_sample(step, delay, me
     assert first_seen(late, t, cp.Step(1.0, time=step), method) == round(10 * (step + delay))
 
 
-@settings(max_examples=30)
+@examples(30)
 @example(1 / 44100, 2999, 3600.0)
 @given(
     st.sampled_from([0.1, 1e-3, 0.7e-3, 1 / 3, 1 / 44100, 2.0**-10, 0.3, 1.2e-3, 0.05]),

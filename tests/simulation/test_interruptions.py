@@ -39,6 +39,7 @@ def alarm():
     signal.signal(signal.SIGALRM, before)
 
 
+@pytest.mark.each_value
 @pytest.mark.parametrize("method", ["compiled", "auto", "python"])
 @pytest.mark.parametrize("error", [KeyboardInterrupt, SystemExit(3)])
 def test_what_a_handler_raises_reaches_the_caller(error, method, alarm, capfd):

@@ -1,6 +1,7 @@
 """Exact response of a loop along a plan, against closed forms, scipy's matrix exponential and 50 digits."""
 
 import math
+from functools import reduce
 
 import control as ct
 import mpmath
@@ -77,6 +78,20 @@ def test_root_mean_square_with_a_dwell():
     assert response.rms("e", period=5.0) == pytest.approx(math.sqrt(whole / 5.0), rel=1e-12)
     long = 2.0 * response.rms("r") ** 2 + 1e6 - 2.0  # the position is 1 after the move
     assert response.rms("r", period=1e6) == pytest.approx(math.sqrt(long / 1e6), rel=1e-12)
+
+
+def test_root_mean_square_of_a_cyclic_plan():
+    """In the periodic steady state, which the simulation approaches over 60 periods."""
+    plan = cp.PiecewiseSpline([Waypoint(0, 0, 2, 0), Waypoint(0.4, 0.6), Waypoint(1, 0, 2, 0)])
+    times = np.linspace(59.0, 60.0, 20_001)
+    e = cp.simulate(LAG, np.append(0.0, times), reduce(lambda a, b: a.then(b), [plan] * 60)).outputs["e"][1:]
+    exact = math.sqrt(np.trapezoid(e**2, times))
+    assert along(LAG, plan).rms("e") == pytest.approx(exact, rel=1e-7)
+    from_rest = along(LAG, plan).rms("e", period=1.0)
+    assert abs(from_rest / exact - 1.0) > 1e-4
+    tank = ct.ss([[0.0]], [[1.0]], [[1.0]], [[0.0]], inputs="r", outputs="y", name="tank")
+    with pytest.raises(ValueError, match=r"periodic steady state .* got tank with a pole at 0"):
+        along(tank, plan).rms("y")
 
 
 @pytest.mark.parametrize("seed", range(6))

@@ -53,6 +53,7 @@ def around_exactly(through, x0):
 # Linear loops
 
 
+@pytest.mark.each_value
 @pytest.mark.parametrize("through", [0.5, -0.6, 1.0, 7.0, 1e6])
 @pytest.mark.parametrize("method", METHODS)
 def test_a_linear_loop(through, method):

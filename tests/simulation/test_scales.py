@@ -52,6 +52,7 @@ def stage_by_hand():
     return plan, t, y
 
 
+@pytest.mark.each_value
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("kind", ["tf", "ss"])
 @pytest.mark.parametrize("size", [1e-9, 1e-3, 1e6])

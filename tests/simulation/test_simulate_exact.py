@@ -7,8 +7,9 @@ import control as ct
 import mpmath as mp
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from repetitions import examples
 from scipy.integrate import solve_ivp
 from simulation_oracle import both, gap, lag_loop, response, spline, step
 
@@ -44,6 +45,7 @@ def check(matrices, plan, signals, times, initial=None, tolerance=SMALL):
     assert gap(found.outputs, outputs) <= tolerance
 
 
+@pytest.mark.each_value
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("alpha", ALPHAS)
 def test_random_plans_on_random_systems(alpha, seed):
@@ -111,6 +113,7 @@ def kinds(alpha):
     }  # fmt: skip
 
 
+@pytest.mark.each_value
 @pytest.mark.parametrize("alpha", ALPHAS[::2])
 @pytest.mark.parametrize("kind", sorted(kinds(1.0)))
 def test_plans_of_every_kind(kind, alpha):
@@ -120,6 +123,7 @@ def test_plans_of_every_kind(kind, alpha):
     check(system, plan, signals, odd_times(rng, -1.0, 7.0, plan.breakpoints), [0.5, -1.0, 2.0])
 
 
+@pytest.mark.each_value
 @pytest.mark.parametrize("alpha", [0.0, 1e-9, 1.0])
 @pytest.mark.parametrize("gain", [1e-3, 0.1, 0.25, 0.26, 1.0, 5.0, 1e3, 1e4, 1e6])
 def test_the_integrator_lag_loop_at_every_gain(gain, alpha):
@@ -184,6 +188,7 @@ def test_an_unstable_loop_that_leaves_the_range_of_numbers():
     assert np.all(found[t >= 7.5] == np.inf)
 
 
+@pytest.mark.each_value
 @pytest.mark.parametrize("stiffness", [1e3, 1e4, 1e6])
 @pytest.mark.parametrize("duration", [1.0, 10.0, 100.0])
 def test_a_slow_mode_next_to_a_fast_one(stiffness, duration):
@@ -285,7 +290,7 @@ def close(found, other):
     assert np.abs(found.states - other.states).max() <= SMALL * scale
 
 
-@settings(max_examples=40)
+@examples(40)
 @given(runs(), st.floats(-3, 3))
 def test_responses_superpose(run, factor):
     system, plan, t, initial = run
@@ -298,7 +303,7 @@ def test_responses_superpose(run, factor):
     )
 
 
-@settings(max_examples=40)
+@examples(40)
 @given(runs(), st.data())
 def test_a_run_can_be_taken_up_at_any_sample(run, data):
     system, plan, t, initial = run
@@ -310,7 +315,7 @@ def test_a_run_can_be_taken_up_at_any_sample(run, data):
     assert np.abs(rest.states[:, 0] - whole.states[:, k]).max() == 0.0
 
 
-@settings(max_examples=40)
+@examples(40)
 @given(runs(), st.integers(0, 3))
 def test_a_sample_does_not_depend_on_the_others(run, seed):
     system, plan, t, initial = run
@@ -322,7 +327,7 @@ def test_a_sample_does_not_depend_on_the_others(run, seed):
     assert np.abs(sparse.states - dense.states[:, where]).max() <= SMALL * scale
 
 
-@settings(max_examples=40)
+@examples(40)
 @given(runs(), st.integers(-512, 512))
 def test_the_clock_may_start_anywhere(run, eighths):
     # Times that stay exact under the shift, so that only the simulation's own rounding is left.

@@ -5,8 +5,9 @@ import warnings
 import control as ct
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from repetitions import examples
 
 import ctrlplan as cp
 
@@ -34,6 +35,7 @@ FORMS = {
 }
 
 
+@pytest.mark.each_value
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize(("begin", "end"), [(50.0, 60.0), (33.3, 33.31), (7.0, 7.0 + 1e-6), (99.0, 99.9)])
 def test_a_pulse_of_any_width_where_the_block_is_compiled(form, begin, end):
@@ -42,6 +44,7 @@ def test_a_pulse_of_any_width_where_the_block_is_compiled(form, begin, end):
     assert np.abs(found.outputs[0] - after(t, begin, end)).max() < 1e-6 * (1.0 - np.exp(begin - end))
 
 
+@pytest.mark.each_value
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize(("begin", "end"), [(50.0, 60.0), (33.3, 33.55)])
 def test_a_pulse_longer_than_the_sample_spacing_by_python(form, begin, end):
@@ -90,7 +93,7 @@ def test_a_switch_that_time_and_a_state_decide_together():
         assert np.abs(cp.simulate(block, t, method=method).outputs[0] - expected).max() < 1e-6
 
 
-@settings(max_examples=15)
+@examples(15)
 @given(st.floats(0.05, 5.0), st.floats(0.05, 0.95))
 def test_a_train_of_pulses(period, duty):
     """Pulses by the remainder of t: the mean, after whole periods, is exact."""

@@ -497,6 +497,7 @@ def test_an_out_file_that_cannot_be_written(where, capsys, tmp_path):
     assert not list((tmp_path / "plan.csv").iterdir())
 
 
+@pytest.mark.usefixtures("blank_drawings")
 def test_a_loop_that_is_unstable_is_no_error(capsys, tmp_path):
     (tmp_path / "study.toml").write_text(to_toml(changed("loop", "gain", to=-5.0)))
     assert main(["report", str(tmp_path / "study.toml"), "--out", str(tmp_path / "out")]) == 0

@@ -379,6 +379,7 @@ def test_an_unstable_loop_is_reported_as_such(num, den, gain, pole, tmp_path):
     assert json.loads((tmp_path / "it.json").read_text())["plans"]["step"]["metrics"]["settling_time"] is None
 
 
+@pytest.mark.usefixtures("blank_drawings")
 def test_a_loop_that_leaves_the_range_of_numbers_is_reported_too(tmp_path):
     found = cp.compare(loop(-1e4), MOVE, np.linspace(0, 30, 301))
     assert found.notes
@@ -418,6 +419,7 @@ def test_where_the_planned_reference_loses_the_verdict_says_so(standard):
     assert found["overshoot_error"].worst == ("step",)
 
 
+@pytest.mark.usefixtures("blank_drawings")
 def test_a_plan_that_takes_its_time_loses_and_is_reported_so(tmp_path):
     slow = cp.TrigSpline([cp.Waypoint(0, 0, 0, 0), cp.Waypoint(15, 1, 0, 0)], alpha=1.0)
     found = cp.compare(loop(1000.0), {"step": cp.Step(1.0), "planned": slow}, np.linspace(0, 30, 6001))
@@ -482,6 +484,7 @@ def test_names_are_escaped_wherever_they_are_shown(tmp_path):
         assert "&lt;b&gt;&amp;" in text
 
 
+@pytest.mark.usefixtures("blank_drawings")
 @pytest.mark.slow
 def test_report_writes_a_page_into_a_folder_or_a_file(standard, tmp_path):
     assert standard.report(tmp_path / "new" / "folder") == tmp_path / "new" / "folder" / "index.html"

@@ -255,6 +255,7 @@ def test_what_an_executor_found_before_an_interruption_is_kept(found):
     assert result.failures == ()
 
 
+@pytest.mark.usefixtures("blank_drawings")
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:monte_carlo was interrupted:UserWarning")
 def test_an_interruption_before_anything_was_found_leaves_the_nominal_run(tmp_path):

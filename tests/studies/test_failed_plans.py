@@ -10,6 +10,8 @@ import pytest
 
 import ctrlplan as cp
 from ctrlplan.cli import main
+from ctrlplan.reports import render_page
+from ctrlplan.studies import Study
 
 TIMES = np.linspace(0.0, 3.0, 301)
 PLANS = {"far": cp.Step(2.0), "near": cp.Step(0.5), "planned": cp.PolySpline([cp.Waypoint(0, 0), cp.Waypoint(1, 0.5)])}
@@ -42,6 +44,46 @@ def test_the_reason_is_what_the_run_raised(compared):
     assert compared.failures["far"] == str(alone.value)
     assert any(compared.failures["far"] in note and "far" in note for note in compared.notes)
     assert "far failed" in repr(compared)
+
+
+def headline_of(page):
+    """Headline of the first study of a page, above all folds."""
+    (line,) = re.findall(r'<p class="headline">(.*?)</p>', page)
+    assert page.index(line) < page.index("<details>")
+    return line
+
+
+def test_the_headline_names_it(compared):
+    assert "Failed, without values: far." in headline_of(render_page([Study("one", "One", compared)], "Page"))
+
+
+def test_the_headline_names_plans_whose_runs_an_event_ended():
+    """Ramps from 0 to 1 pass 0.5 at half of their duration."""
+    ramps = {f"in {t:g} s": cp.PolySpline([cp.Waypoint(0, 0), cp.Waypoint(t, 1.0)]) for t in (1.0, 2.0)}
+    low = cp.PolySpline([cp.Waypoint(0, 0), cp.Waypoint(1, 0.4)])
+    passed = ct.ss([], [], [], [[1.0]], inputs=["r"], outputs=["y"], name="passed")
+    found = cp.compare(passed, ramps | {"low": low}, TIMES, events=[cp.Event("y", high=0.5, stop=True)])
+    said = headline_of(render_page([Study("one", "One", found)], "Page"))
+    assert "With low" in said
+    assert "Not ranked, because an event ended the run: in 1 s (0.5 s), in 2 s (1 s)." in said
+
+
+def at_rate(rate):
+    """Loop x' = r^2 + rate^2 x^2: with r = 2, x leaves every bound at t = pi/(4 rate)."""
+    return ct.nlsys(
+        lambda t, x, u, params: [u[0] ** 2 + rate**2 * x[0] ** 2], None, inputs=["r"], outputs=["y"], states=["y"]
+    )
+
+
+def test_the_headline_of_a_sweep_and_of_draws_tells_how_many_failed(tmp_path):
+    options = {"initial_state": [0.0], "progress": False}
+    far = {"far": PLANS["far"]}
+    swept = cp.sweep(at_rate, [0.01, 0.1, 1.0, 2.0], far, TIMES, parameter="rate", **options)
+    said = headline_of(swept.report(tmp_path / "swept.html").read_text(encoding="utf-8"))
+    assert said.endswith("Failed, without values: 2 of 4, first at 1.")
+    drawn = cp.monte_carlo(at_rate, {"rate": [0.01, 1.0, 2.0, 0.1]}, far, TIMES, **options)
+    said = headline_of(drawn.report(tmp_path / "drawn.html").read_text(encoding="utf-8"))
+    assert said.endswith("Of 4 draws, 2 failed.")
 
 
 def test_results_name_it_beside_the_plans(compared, tmp_path):
@@ -131,6 +173,7 @@ def test_a_value_of_a_sweep_at_which_a_plan_fails_is_a_failure_of_the_sweep():
     assert "far" in failure.message
 
 
+@pytest.mark.usefixtures("blank_drawings")
 @pytest.mark.slow
 def test_a_crane_that_cannot_follow_some_plans_is_reported_with_the_others(tmp_path, capsys):
     """Ten metres in 3.5 s with 2 kN and feedback of the load: the rope goes slack with every smooth plan."""

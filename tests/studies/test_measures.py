@@ -117,6 +117,7 @@ def two_axes(units=None, **options):
     return cp.compare(system, {"a": plan, "b": slow}, T, controls=["F", "M"], units=units, **options)
 
 
+@pytest.mark.usefixtures("blank_drawings")
 def test_signals_of_different_units_are_not_ranked_together():
     found = two_axes({"x": "m", "theta": "rad", "F": "N", "M": "N m"})
     for row in found.metrics.values():
@@ -284,6 +285,7 @@ def late(seen):
     return np.abs(seen.error[:, -1])
 
 
+@pytest.mark.usefixtures("blank_drawings")
 def test_a_metric_is_added_by_one_entry_of_the_list(monkeypatch, tmp_path):
     """The README's recipe: a function, and an entry of MEASURES; it is then computed, saved, shown and swept."""
     monkeypatch.setitem(MEASURES, "late", Measure("Error at the end", "{y}", "response", late))

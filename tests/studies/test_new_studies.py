@@ -32,6 +32,7 @@ def test_there_is_a_kind_for_each_loop_and_each_way_of_planning():
     assert study_kinds()[0] == "linear"
 
 
+@pytest.mark.usefixtures("blank_drawings")
 @pytest.mark.parametrize("kind", study_kinds())
 def test_a_new_file_is_valid_and_runs(kind, written, tmp_path, capsys):
     path, names = written(kind)
@@ -113,6 +114,7 @@ def test_an_unknown_kind_is_an_error_of_usage(tmp_path, capsys):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.usefixtures("blank_drawings")
 def test_progress_says_what_runs(written, capsys):
     written("fastest")
     assert main(["report", "mine.toml", "--out", "out"]) == 0
@@ -123,6 +125,7 @@ def test_progress_says_what_runs(written, capsys):
     ]
 
 
+@pytest.mark.usefixtures("blank_drawings")
 def test_progress_names_sweeps(written, capsys):
     written("sweep")
     assert main(["report", "mine.toml", "--out", "out"]) == 0

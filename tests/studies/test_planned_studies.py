@@ -94,6 +94,7 @@ def test_a_limit_of_the_crane_is_one_of_the_plan(loaded):
     assert np.abs(crane.quantities(jets)["F"]).max() == pytest.approx(6000.0, rel=1e-6)
 
 
+@pytest.mark.usefixtures("blank_drawings")
 def test_margins_and_the_fastest_plan_are_in_the_report(loaded):
     plans = [quintic(fastest="shape"), quintic(name="slow")]
     study = loaded(plans=plans, limits={"velocity": 2.0}, samples=41, t_end=40.0).run()

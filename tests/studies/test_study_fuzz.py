@@ -12,8 +12,9 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from repetitions import examples
 from study_schema import is_json, schema_errors, structure_error
 from study_text import Verbatim, to_toml, valid
 
@@ -93,14 +94,14 @@ def refused_or_run(text):
 
 
 @pytest.mark.slow
-@settings(max_examples=150)
+@examples(150)
 @given(mutated())
 def test_mutated_entries_are_run_or_refused(data):
     refused_or_run(to_toml(data))
 
 
 @pytest.mark.slow
-@settings(max_examples=100)
+@examples(100)
 @given(st.data())
 def test_mutated_text_is_run_or_refused(data):
     text = to_toml(valid() | {"samples": 41})
@@ -124,7 +125,7 @@ FURTHER = {
 }
 
 
-@settings(max_examples=100)
+@examples(100)
 @given(st.one_of(mutated(), mutated(**FURTHER)))
 def test_the_schema_and_the_reader_agree(data):
     """On the structure of every file, up to numbers that JSON does not have."""
@@ -134,7 +135,7 @@ def test_the_schema_and_the_reader_agree(data):
         assert bool(schema_errors(data)) == rejected
 
 
-@settings(max_examples=40)
+@examples(40)
 @given(mutated(), st.sampled_from(["csv", "json"]))
 def test_the_command_ends_with_a_file_or_with_status_2(data, suffix):
     with TemporaryDirectory() as folder:
@@ -208,10 +209,11 @@ class Tags(HTMLParser):
         self.handlers += [key for key, _ in attrs if key.startswith("on")]
 
 
+@pytest.mark.usefixtures("blank_drawings")
 # What is promised at the end of all numbers is an answer: that it overflows there is no fault.
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
 @pytest.mark.slow
-@settings(max_examples=25, deadline=None)
+@examples(25)
 @given(named_by_others())
 def test_the_report_is_a_page_without_foreign_elements_or_status_2_and_nothing(data):
     with TemporaryDirectory() as folder, redirect_stderr(io.StringIO()) as said, redirect_stdout(io.StringIO()):

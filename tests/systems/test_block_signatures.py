@@ -29,6 +29,7 @@ every = pytest.mark.parametrize("name", sorted(BLOCKS))
 PLAN = cp.PolySpline([cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1, 0, 0)], labels=["x"])
 ARGUMENTS = {
     "bandwidth": 2.0,
+    "shaper": cp.Shaper.zv(2.0),
     "block": ct.ss([[0.5]], [[1.0]], [[1.0]], [[0.0]], 0.1, inputs="e", outputs="u", states="memory", name="filter"),
     "crane": cp.plants.Crane(),
     "delay": 0.5,

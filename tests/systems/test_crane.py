@@ -7,9 +7,10 @@ import control as ct
 import numpy as np
 import pytest
 import sympy as sp
-from hypothesis import assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from numpy.polynomial import Polynomial
+from repetitions import examples
 from scipy.integrate import solve_ivp
 
 import ctrlplan as cp
@@ -117,7 +118,7 @@ INPUTS = st.tuples(st.floats(-3e4, 3e4), st.floats(-3e3, 1e3))
 
 
 @given(STATES, INPUTS)
-@settings(max_examples=60)
+@examples(60)
 def test_with_the_rope_winding_motion_is_lagranges(lagrange, state, inputs):
     crane = Crane(**ODD, rope_wrap=True)
     *second, tension = crane.accelerations(state, *inputs)
@@ -128,7 +129,7 @@ def test_with_the_rope_winding_motion_is_lagranges(lagrange, state, inputs):
 
 @BOTH
 @given(STATES, INPUTS)
-@settings(max_examples=60)
+@examples(60)
 def test_accelerations_solve_the_equations_of_motion(wrap, state, inputs):
     crane = Crane(**ODD, rope_wrap=wrap)
     expected = solved(crane, state, *inputs)
@@ -207,7 +208,7 @@ JETS = st.tuples(
 
 @BOTH
 @given(JETS)
-@settings(max_examples=100)
+@examples(100)
 def test_forward_after_reverse_is_the_identity(wrap, jets):
     crane = Crane(**ODD, rope_wrap=wrap)
     jet = np.array(jets).T

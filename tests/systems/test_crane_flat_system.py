@@ -7,8 +7,9 @@ import pickle
 import control as ct
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
+from repetitions import examples
 
 import ctrlplan as cp
 from ctrlplan.systems.plants import Crane
@@ -52,7 +53,7 @@ def along(crane, state, inputs, step, count):
 
 @BOTH
 @given(HANGING, PUSHED)
-@settings(max_examples=15)
+@examples(15)
 def test_the_flag_holds_the_load_s_derivatives_under_held_inputs(wrap, state, inputs):
     """Against a polynomial of degree 8 through the positions of the load on a path integrated here."""
     crane = Crane(**ODD, rope_wrap=wrap)
@@ -74,7 +75,7 @@ def test_the_flag_holds_the_load_s_derivatives_under_held_inputs(wrap, state, in
 
 @BOTH
 @given(HANGING, PUSHED)
-@settings(max_examples=60)
+@examples(60)
 def test_reverse_after_forward_is_the_identity(wrap, state, inputs):
     crane = Crane(**ODD, rope_wrap=wrap)
     flat, tension = crane.flat_system(), crane.accelerations(state, *inputs)[3]

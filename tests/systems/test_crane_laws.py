@@ -4,8 +4,9 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from repetitions import examples
 
 from ctrlplan.systems.plants import (
     Crane,
@@ -75,7 +76,7 @@ def assert_hangs(crane, references, x, z, x2, z2):
 
 
 @given(REFERENCES)
-@settings(max_examples=50)
+@examples(50)
 def test_generator_puts_the_drives_where_the_load_hangs_as_planned(u):
     found = create_generator_iosystem(CRANE).output(0.0, [], u)
     assert_hangs(CRANE, found, u[0], u[3], u[2], u[5])
@@ -84,7 +85,7 @@ def test_generator_puts_the_drives_where_the_load_hangs_as_planned(u):
 
 
 @given(REFERENCES, st.floats(-20, 20), st.floats(-2, 2), st.floats(0.1, 3), st.floats(0.5, 1.5))
-@settings(max_examples=50)
+@examples(50)
 def test_load_feedback_commands_the_acceleration_of_the_law(u, dx, dv, w, zeta):
     block = create_load_feedback_iosystem(CRANE, w, zeta)
     found = block.output(0.0, [], [*u, u[0] + dx, u[1] + dv])

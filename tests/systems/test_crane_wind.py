@@ -8,8 +8,9 @@ import control as ct
 import numpy as np
 import pytest
 import sympy as sp
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from repetitions import examples
 from scipy.integrate import simpson, solve_ivp
 
 import ctrlplan as cp
@@ -90,7 +91,7 @@ def solved(mechanics, crane, state, inputs):
 
 @WRAPS
 @given(STATES, INPUTS)
-@settings(max_examples=60)
+@examples(60)
 def test_accelerations_and_tension_are_newtons(mechanics, wrap, state, inputs):
     """Load, trolley and drum each by itself, the constraint differentiated by sympy."""
     crane = Crane(**ODD, rope_wrap=wrap)
@@ -100,7 +101,7 @@ def test_accelerations_and_tension_are_newtons(mechanics, wrap, state, inputs):
 
 
 @given(STATES, INPUTS)
-@settings(max_examples=60)
+@examples(60)
 def test_with_the_rope_on_the_drum_they_are_lagranges(mechanics, state, inputs):
     """The wind's generalised forces are W dx/dq."""
     crane = Crane(**ODD, rope_wrap=True)
@@ -284,6 +285,7 @@ def blown():
     return found
 
 
+@pytest.mark.each_value
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize(("wrap", "law"), CASES)
 def test_a_loop_in_the_wind_against_its_equations_by_hand(blown, wrap, law, method):
@@ -349,6 +351,7 @@ def test_a_wind_whose_axis_has_any_name_and_breakpoints_of_its_own():
 # References and initial states
 
 
+@pytest.mark.each_value
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("law", ["generator", "load_feedback", "dynamic", "feedforward", "setpoint"])
 def test_the_plans_source_as_the_reference_is_the_plain_loop(law, method):

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.polynomial import polynomial
+from repetitions import examples
 from scipy.linalg import expm
 
 import ctrlplan as cp
@@ -335,7 +336,7 @@ def test_along_a_plan_of_python_controls_own_it_outputs_the_inputs():
         assert np.abs(law.output(0.0, np.zeros(0), np.concatenate([flag, x])) - u).max() < 1e-9
 
 
-@settings(max_examples=50)
+@examples(50)
 @given(st.lists(st.floats(-3, 3), min_size=4, max_size=4), st.lists(st.floats(-3, 3), min_size=5, max_size=5))
 def test_the_last_derivative_is_what_the_law_commands(x, reference):
     # The definition, at any state and reference: y'''' = y_d'''' - sum sigma_k (y^(k) - y_d^(k)).

@@ -7,8 +7,9 @@ import control.flatsys as fs
 import numpy as np
 import pytest
 import sympy as sp
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from repetitions import examples
 
 import ctrlplan as cp
 from ctrlplan.systems.plants.dc_motor import dc_motor
@@ -149,7 +150,7 @@ def test_the_motor_as_a_polynomial_in_the_derivative():
 
 
 @each_plant
-@settings(max_examples=40)
+@examples(40)
 @given(data=st.data())
 def test_forward_after_reverse_is_the_identity(plant, data):
     entries = st.floats(-10, 10)
@@ -162,7 +163,7 @@ def test_forward_after_reverse_is_the_identity(plant, data):
 
 
 @each_plant
-@settings(max_examples=40)
+@examples(40)
 @given(data=st.data())
 def test_reverse_after_forward_is_the_identity(plant, data):
     x, u = (

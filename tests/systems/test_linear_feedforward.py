@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.polynomial import polynomial
+from repetitions import examples
 from scipy.linalg import expm
 
 import ctrlplan as cp
@@ -66,7 +67,7 @@ def test_without_it_the_loop_lags():
     assert np.abs(bare.outputs - plan(T)).max() > 0.3
 
 
-@settings(max_examples=60)
+@examples(60)
 @given(
     st.lists(st.floats(-8.0, 2.0), max_size=3),
     st.lists(st.tuples(st.floats(-5.0, 1.0), st.floats(0.1, 5.0)), max_size=2),

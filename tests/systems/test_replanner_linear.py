@@ -6,8 +6,9 @@ from functools import cache
 import control as ct
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
+from repetitions import examples
 from replanner_oracle import METHODS, REST, between, chain
 from scipy.linalg import expm
 
@@ -53,6 +54,7 @@ def unit(order, horizon):
     return (-1.0) ** np.arange(order + 1) / horizon ** np.arange(order + 1)
 
 
+@pytest.mark.each_value
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize(("order", "horizon", "alpha"), LINEAR)
 def test_at_its_samples_the_loop_is_the_power_of_a_matrix(order, horizon, alpha, method):
@@ -116,7 +118,7 @@ def radius(order, horizon, alpha, period):
     return float(np.abs(np.linalg.eigvals(map_from_fit_to_fit(order, horizon, alpha, period))).max())
 
 
-@settings(max_examples=40)
+@examples(40)
 @given(
     st.integers(0, 4),
     st.one_of(st.just(0.0), st.floats(0.1, 6.0)),

@@ -3,8 +3,9 @@
 import math
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from repetitions import examples
 
 import ctrlplan as cp
 
@@ -72,7 +73,7 @@ def test_rest_to_rest_is_smooth_as_far_as_it_prescribes(entries, alpha):
 
 
 @given(st.floats(-1e5, 1e5), st.floats(0.01, 100.0), st.floats(1e-6, 1e6))
-@settings(max_examples=50)
+@examples(50)
 def test_jumps_shift_with_time_and_scale_with_the_plan(shift, duration, factor):
     plan = factor * quintic(0.0, 1.0).retime(duration).shift(shift)
     first, last = plan.jumps(3)

@@ -7,8 +7,9 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from repetitions import examples
 
 from ctrlplan.trajectories import (
     PiecewiseSpline,
@@ -101,7 +102,7 @@ def loaded_or_rejected(data):
     assert np.isfinite(values).all()
 
 
-@settings(max_examples=400, deadline=None)
+@examples(400)
 @given(st.data())
 def test_one_entry_replaced_or_missing(data):
     damaged = copy.deepcopy(data.draw(st.sampled_from(SAVED)))
@@ -126,7 +127,7 @@ json_like = st.recursive(
 )
 
 
-@settings(max_examples=300, deadline=None)
+@examples(300)
 @given(st.sampled_from(SAVED), json_like, st.data())
 def test_any_json_in_any_place(saved, value, data):
     damaged = copy.deepcopy(saved)
@@ -135,7 +136,7 @@ def test_any_json_in_any_place(saved, value, data):
     loaded_or_rejected(value)
 
 
-@settings(max_examples=200, deadline=None)
+@examples(200)
 @given(st.sampled_from(SAVED), st.data())
 def test_bytes_missing_or_changed(saved, data):
     text = bytearray(json.dumps(saved).encode())

@@ -57,6 +57,7 @@ def exact_extrema(oracle, nu):
         return [float(v) for v in (values[low], values[high], times[low], times[high])]
 
 
+@pytest.mark.each_value
 @pytest.mark.parametrize("nu", range(4))
 @pytest.mark.parametrize("alpha", [0.0, 1.0, np.pi, 5.5])
 @pytest.mark.parametrize(
@@ -229,6 +230,7 @@ RISES = {
 }
 
 
+@pytest.mark.each_value
 @pytest.mark.parametrize("width", [1e-2, 1e-3, 1e-4])
 @pytest.mark.parametrize("name", RISES)
 def test_narrow_peaks_of_smooth_functions(name, width):
@@ -475,3 +477,13 @@ def test_a_short_segment_before_a_long_one_is_searched_as_closely():
     plan = rise.then(PolySpline([Waypoint(1, 1, 0, 0), Waypoint(1000, 2, 0, 0)]))
     found = plan.extrema_of(lambda jet: np.exp(-(((jet[0, 0] - 0.61) / 3e-4) ** 2)), 0)
     assert found.maximum[0] == pytest.approx(1.0, rel=1e-9)
+
+
+def test_extrema_are_computed_once_and_cannot_be_changed():
+    plan = TrigSpline([Waypoint(0, 0, 0, 0), Waypoint(2, 1, 0, 0)], alpha=1.0)
+    found = plan.extrema(1)
+    assert plan.extrema(1) is found
+    assert plan.peak(1) == pytest.approx(np.abs(plan(np.linspace(0, 2, 20001), 1)).max(), rel=1e-7)
+    for values in (found.minimum, found.maximum, found.time_min, found.time_max):
+        with pytest.raises(ValueError, match="read-only"):
+            values[0] = 0.0

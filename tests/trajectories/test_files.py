@@ -5,8 +5,9 @@ import json
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from repetitions import examples
 from trajectory_oracle import waypoints
 
 from ctrlplan.trajectories import (
@@ -39,7 +40,7 @@ def assert_same_bits(plan, again):
     assert again.to_dict() == plan.to_dict()
 
 
-@settings(max_examples=60)
+@examples(60)
 @given(
     st.lists(st.tuples(st.floats(1e-3, 10), st.lists(number, min_size=1, max_size=3)), min_size=2, max_size=5),
     st.floats(0, 6.28),

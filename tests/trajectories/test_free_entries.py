@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
+from repetitions import examples
 from trajectory_oracle import Direct, error, miss, waypoints
 
 from ctrlplan.trajectories import PolySpline, TrigSpline, Waypoint
@@ -25,6 +26,7 @@ PATTERNS = {
 }
 
 
+@pytest.mark.each_value
 @pytest.mark.parametrize("alpha", ALPHAS)
 @pytest.mark.parametrize("pattern", PATTERNS)
 def test_birkhoff_data(pattern, alpha):
@@ -36,6 +38,7 @@ def test_birkhoff_data(pattern, alpha):
     assert plan.degree == ((oracle.m,) if alpha else (oracle.size - 1,))
 
 
+@pytest.mark.each_value
 @pytest.mark.parametrize("alpha", [0.0, 1e-4, 1.0, 4.0, 5.0])
 @pytest.mark.parametrize("count", [4, 6, 8, 10])
 def test_many_waypoints_without_velocity(count, alpha):
@@ -115,7 +118,7 @@ def test_one_axis_that_is_singular_is_enough():
         PolySpline(points)
 
 
-@settings(max_examples=60)
+@examples(60)
 @given(st.data())
 def test_free_entries_are_met_wherever_they_are_determined(data):
     """Any mask over 3 waypoints by 3 orders that keeps the ends' positions."""

@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from repetitions import examples
 from trajectory_oracle import Direct, error, miss, waypoints
 
 from ctrlplan.trajectories import PolySpline, TrigSpline, Waypoint
@@ -34,7 +35,7 @@ def plans(draw, ndigits=4):
     return points, draw(st.one_of(st.sampled_from([0.0, 1e-12, 1e-4, 1.0, np.pi]), st.floats(1e-3, 6.2)))
 
 
-@settings(max_examples=150)
+@examples(150)
 @given(plans())
 def test_waypoints_are_met_whatever_the_plan(case):
     points, alpha = case
@@ -85,6 +86,7 @@ def jets_for(lengths, seed=3):
     return [rng.normal(size=k).tolist() for k in lengths]
 
 
+@pytest.mark.each_value
 @pytest.mark.parametrize("alpha", [0.0, 1e-3, 0.3, 1.0, np.pi, 5.0, 6.28])
 @pytest.mark.parametrize("pattern", PATTERNS)
 def test_equation_3_solved_directly(pattern, alpha):
@@ -138,6 +140,7 @@ def test_fourier_has_a_row_for_every_axis():
     np.testing.assert_allclose(plan(t), [x, z], rtol=1e-14)
 
 
+@pytest.mark.each_value
 @pytest.mark.parametrize("gamma", [-2.0, 0.0, 0.4, 1.0, 50.0])
 @pytest.mark.parametrize("alpha", [0.5, 2.0, 5.5])
 @pytest.mark.parametrize("pattern", ["two points, N 2", "rest to rest, N 6", "uneven, N 12"])
@@ -184,6 +187,7 @@ def test_alpha_next_to_a_whole_turn(gap):
     assert error(plan, Direct(times, jets, alpha, digits=150)) <= 1e-12
 
 
+@pytest.mark.each_value
 @pytest.mark.parametrize("alpha", [0.0, 1e-4, 1.0, 5.5])
 @pytest.mark.parametrize("gap", [1e-3, 1e-6, 1e-9])
 def test_waypoints_close_together(gap, alpha):

@@ -4,8 +4,9 @@ import itertools
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from repetitions import examples
 from scipy.interpolate import BPoly, CubicSpline, make_interp_spline
 from trajectory_oracle import Direct, miss, waypoints
 
@@ -141,7 +142,7 @@ def test_ends_that_prescribe_less_lower_the_degree_of_their_segments():
     assert [segment.degree for segment in PiecewiseSpline(waypoints(TIMES, JETS)).segments] == [(5,)] * 3
 
 
-@settings(max_examples=60)
+@examples(60)
 @given(
     st.lists(
         st.tuples(st.integers(20, 200), st.integers(-100, 100), st.booleans(), st.booleans()), min_size=3, max_size=8

@@ -5,8 +5,9 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import assume, example, given, settings
+from hypothesis import assume, example, given
 from hypothesis import strategies as st
+from repetitions import examples
 from scipy.optimize import linprog
 
 from ctrlplan.trajectories import SCurve, Trapezoid, trajectory_from_dict
@@ -81,7 +82,7 @@ def test_segments_of_the_s_curve(d, v, a, j, segments):
         np.testing.assert_allclose(np.diff(plan.breakpoints), np.array(segments) / speed, rtol=4e-15)
 
 
-@settings(max_examples=150)
+@examples(150)
 @given(SIZES, SIZES, SIZES, SIZES)
 def test_the_duration_is_that_of_the_cases(d, v, a, j):
     assume(min(v / a, a / j) > 1e-12 * (d / v + v / a + a / j))
@@ -132,7 +133,7 @@ def test_jets_are_those_of_the_integrated_acceleration(d, v, a):
     assert not plan.jet(t, 5)[3:].any()
 
 
-@settings(max_examples=50)
+@examples(50)
 @given(ENDS, SIZES, SIZES, SIZES, STARTS)
 @example((0.0, 30.0), 1.0, 1.0, 1.0 + 7e-14, -7.3)  # a segment below the resolution of times
 @example((0.0, 2.0), 1.0 - 4e-15, 1.0, 1.0, -7.3)
@@ -329,9 +330,12 @@ def wrong(kind=SCurve, final=1.0, initial=0.0, **changed):
         ({"final": [1.0, 2.0], "velocity": [1.0, -2.0]}, "velocity must be above 0 and finite, got -2.0 of y2$"),
         (
             {"final": [1.0, 2.0], "velocity": [1.0] * 3},
-            r"velocity must be a scalar or of shape \(2,\), got shape \(3,\)",
+            r"velocity must be a scalar or of shape \(2,\), or pairs of shape \(2, 2\), got shape \(3,\)",
         ),
-        ({"velocity": [[1.0]]}, r"velocity must be a scalar or of shape \(1,\), got shape \(1, 1\)"),
+        (
+            {"velocity": [[1.0]]},
+            r"velocity must be a scalar or of shape \(1,\), or pairs of shape \(1, 2\), got shape \(1, 1\)",
+        ),
         ({"final": 0.0}, r"final must differ from initial by a finite length, got \[0.0\] after \[0.0\]"),
         ({"final": 1e308, "initial": -1e308}, "final must differ from initial by a finite length"),
         ({"final": math.nan}, "final must be finite"),

@@ -7,8 +7,9 @@ import math
 import mpmath as mp
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from repetitions import examples
 from scipy.interpolate import PPoly
 
 from ctrlplan.trajectories import (
@@ -142,7 +143,7 @@ def test_half_turn_of_a_half_turn_to_order_5(t):
     assert (np.abs(plan.jet(t, 5)[:, 0] - wanted) <= 1e-12 * size).all()
 
 
-@settings(max_examples=50)
+@examples(50)
 @given(st.integers(0, 8), st.integers(0, 2**32))
 def test_composed_series_are_those_of_polynomials(order, seed):
     """Coefficients multiplied out by numpy."""
@@ -193,7 +194,7 @@ def test_those_of_the_law_are_there_too_and_once():
     np.testing.assert_array_equal(Retimed(path, law).breakpoints, [0.0, 2.0, 5.0])
 
 
-@settings(max_examples=30)
+@examples(30)
 @given(st.lists(st.floats(0.05, 1.0), min_size=2, max_size=5), st.lists(st.floats(0.05, 1.0), min_size=1, max_size=4))
 def test_breakpoints_against_roots_of_polynomials(path, steps):
     """The law as a PPoly of scipy, solved by it."""

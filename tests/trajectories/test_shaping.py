@@ -6,8 +6,9 @@ import pickle
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from repetitions import examples
 from scipy.integrate import trapezoid
 from scipy.linalg import expm
 
@@ -217,7 +218,7 @@ def test_a_shaped_step_is_a_staircase():
     assert jumps == [(1.0, 1.0), (2.0, 2.0), (4.0, 1.0)]
 
 
-@settings(max_examples=50)
+@examples(50)
 @given(st.floats(0.1, 50.0), st.floats(0.0, 0.99), st.integers(0, 3), st.floats(-1e6, 1e6), st.floats(-1e6, 1e6))
 def test_rounding_does_not_move_the_ends(omega, zeta, derivatives, initial, final):
     shaped = Shaper.zvd(omega, zeta, derivatives)(Step(final, initial, 2.0))

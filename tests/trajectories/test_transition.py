@@ -5,8 +5,9 @@ import math
 import mpmath as mp
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from repetitions import examples
 from scipy.interpolate import BPoly
 from trajectory_oracle import Direct
 
@@ -35,6 +36,7 @@ def to_rest(order, horizon, alpha, s, highest):
 # One transition
 
 
+@pytest.mark.each_value
 @pytest.mark.parametrize("alpha", ALPHAS)
 @pytest.mark.parametrize("order", [0, 1, 2, 3, 4])
 def test_the_plan_is_that_of_the_direct_solution(order, alpha):
@@ -181,6 +183,7 @@ def test_gains_of_polynomials_for_every_horizon(order, horizon):
     assert np.abs(Transition(order, horizon).gains() / wanted - 1.0).max() <= 1e-11
 
 
+@pytest.mark.each_value
 @pytest.mark.parametrize("alpha", [0.3, 1.0, 2.5, math.pi, 4.0, 5.5])
 @pytest.mark.parametrize("order", [0, 1, 2, 3, 4])
 def test_gains_of_trigonometric_plans(order, alpha):
@@ -220,7 +223,7 @@ def test_the_printed_radius():
     assert round(sampled_radius(2, 1.0, 3.3, 0.1), 3) == 0.961
 
 
-@settings(max_examples=40)
+@examples(40)
 @given(
     st.integers(0, 4),
     st.one_of(st.just(0.0), st.floats(0.05, 6.0)),

@@ -56,7 +56,7 @@ def flat_system(crane: CraneParameters, name: str = "crane") -> FlatSystem:
         name=name,
         quantities=partial(quantities, crane),
     )
-    return declare(system, feedthrough=model.feedthrough(2))
+    return declare(system, feedthrough=model.feedthrough(model.OUTPUTS, 2))
 
 
 def quantities(crane: CraneParameters, jet: ArrayLike) -> dict[str, Array]:
@@ -95,7 +95,8 @@ def forward(
     state = [Taylor(value[None]) for value in given]
     force, torque = (np.asarray(value, dtype=float) for value in u)
     for _ in range(3):  # each iteration gives one more derivative of the accelerations
-        second = model.solved(numbers, crane.rope_wrap, state, force, torque, 0.0)[:3]
+        trolley = model.by_force(numbers, state, force)
+        second = model.solved(numbers, crane.rope_wrap, state, trolley, torque, 0.0)[:3]
         rates = [Taylor.integral(start, rate) for start, rate in zip(given[3:], second, strict=True)]
         state = [Taylor.integral(start, rate) for start, rate in zip(given[:3], rates, strict=True)] + rates
     return [series.to_jet(position.terms) for position in model.load(numbers[3], state)[:2]]
@@ -181,15 +182,20 @@ def check_axes(plan: Trajectory) -> None:
 
 
 def _shortest_rope(crane: CraneParameters, plan: Trajectory, acceleration: Extrema) -> tuple[float, float]:
-    """Certified lower bound of R over a plan and its time; the minimum itself if it is not positive or not bounded."""
+    """Lower bound of R over a plan and a time; the minimum itself if it is not positive or not bounded."""
     g, b = crane.gravity, crane.drum_radius
+    across = float(max(-acceleration.minimum[0], acceleration.maximum[0]))
+    low, high = g - float(acceleration.maximum[1]), g - float(acceleration.minimum[1])
+    lowest = plan.extrema()
+    # R = z hypot(x'', g - z'')/(g - z'') - b x''/(g - z''), whose first quotient is at least 1.
+    if (simple := float(lowest.minimum[1]) - b * across / low) > 0.0:
+        return simple, float(lowest.time_min[1])
 
     def length(jet: Array) -> Array:
         across, hanging = jet[2, 0], g - jet[2, 1]
         return (jet[0, 1] * np.hypot(across, hanging) - b * across) / hanging
 
-    depth, across = float(plan.peak()[1]), float(max(-acceleration.minimum[0], acceleration.maximum[0]))
-    low, high = g - float(acceleration.maximum[1]), g - float(acceleration.minimum[1])
+    depth = float(plan.peak()[1])
     pull = math.hypot(across, high)
     # Bounds of dR/dz, dR/dx'' and dR/dz'' over the ranges of the plan.
     slopes = np.zeros((3, 2))

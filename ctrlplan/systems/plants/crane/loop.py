@@ -33,14 +33,22 @@ def crane_loop(
     torque_limits: Range | None = None,
     reference: Sequence[ct.InputOutputSystem] | None = None,
     wind: Trajectory | None = None,
+    drive: model.Drive = "force",
+    drive_lag: float = 0.1,
     inputs: Sequence[str] = (),
     name: str = "crane_loop",
 ) -> ct.InterconnectedSystem:
     """Closed loop of figure 3: source, control law, two PIDs, crane.
 
+    With ``drive="velocity"`` the trolley is commanded by its speed, as by an
+    operator: the input v_cmd [m/s] replaces the PID of the trolley, the speed
+    follows it with a first-order lag, and only the hoist follows the plan.
+
     States: those of source, law and PIDs, then those of the crane. Inputs: none,
-    or those in `inputs`. Outputs: those of the crane (x, z, D, R, theta, x_d1,
-    z_d1, D_d1, R_d1, theta_d1, T), F, C, x_ref and z_ref.
+    or those in `inputs`; with velocity drive v_cmd as well. Outputs: those of the
+    crane (x, z, D, R, theta, x_d1, z_d1, D_d1, R_d1, theta_d1, T), F, C, x_ref and
+    z_ref; with velocity drive also sway_frequency, sqrt(g/R) [rad/s], and v_cmd if
+    it is the output of a block.
 
     Parameters
     ----------
@@ -72,9 +80,14 @@ def crane_loop(
         ``initial_state``.
     wind : Trajectory, optional
         Horizontal force on the load [N], along x.
+    drive : {"force", "velocity"}, optional
+        What commands the trolley.
+    drive_lag : float, optional
+        Time constant of the velocity drive [s], above 0.
     inputs : sequence of str, optional
         Inputs of the loop: inputs of blocks of `reference`, and wind, if it is
-        not a trajectory.
+        not a trajectory. v_cmd is an input of a loop with velocity drive unless
+        it is an output of a block of `reference`.
     name : str, optional
         Name of the loop.
 
@@ -91,7 +104,9 @@ def crane_loop(
     ValueError
         If the law is unknown or has no such option, the crane cannot follow the
         plan, or a derivative that must be continuous for the law jumps; the
-        message gives the derivative and the time.
+        message gives the derivative and the time. With velocity drive, if the
+        law's outputs are force and torque, force limits are given, or the lag is
+        not above 0.
 
     Examples
     --------
@@ -105,6 +120,15 @@ def crane_loop(
     ['x', 'z', 'D']
     >>> law = cp.plants.LoadFeedbackLaw(load_bandwidth=0.5)
     >>> loop = cp.plants.crane_loop(cp.plants.Crane(), plan, law, force_limits=(-30e3, 30e3))
+
+    A trolley with a velocity drive under a rope of 10 m:
+
+    >>> rest = cp.Step([0.0, 10.0], [0.0, 10.0], labels=["x", "z"])
+    >>> loop = cp.plants.crane_loop(cp.plants.Crane(), rest, drive="velocity", drive_lag=0.1)
+    >>> loop.input_labels
+    ['v_cmd']
+    >>> cp.simulate(loop, [0.0, 5.0], cp.Step(0.5)).outputs["D_d1"].round(6).tolist()
+    [0.0, 0.5]
     """
     chosen = _with_options(law, {"load_bandwidth": load_bandwidth, "damping": damping, "poles": poles})
     plan = _named(plan)
@@ -117,18 +141,24 @@ def crane_loop(
     sources = [create_source_iosystem(plan, chosen.order, suffix="_ref")] if reference is None else list(reference)
     if wind is not None:
         sources.append(create_source_iosystem(stack([wind], labels=["wind"]), name="gust"))
-    blocks = [*sources, _block(chosen, crane)]
+    law_block = _block(chosen, crane)
+    blocks = [*sources, law_block]
+    by_velocity = model.checked_drive(drive, drive_lag) is not None
+    _check_limits(chosen, by_velocity, force_limits, torque_limits)
     if chosen.outputs != _ACTUATED:
-        blocks.append(linear.trolley_pid(crane, bandwidth, tf, limits=force_limits))
+        if not by_velocity:
+            blocks.append(linear.trolley_pid(crane, bandwidth, tf, limits=force_limits))
         blocks.append(linear.hoist_pid(crane, bandwidth, tf, limits=torque_limits))
-    elif force_limits is not None or torque_limits is not None:
-        raise ValueError(
-            f"force_limits and torque_limits must be given with a law that uses the PIDs, got {chosen.name!r}"
-        )
-    blocks.append(model.iosystem(crane, wind=wind is not None or "wind" in inputs))
-    _check_fed(reference or (), blocks, inputs)
+    blocks.append(model.iosystem(crane, wind=wind is not None or "wind" in inputs, drive=drive, drive_lag=drive_lag))
+    outer = list(inputs)
+    if by_velocity and _COMMAND not in outer and not any(_COMMAND in block.output_labels for block in blocks):
+        outer.append(_COMMAND)
+    _check_fed(reference or (), blocks, outer)
     outputs = [*model.OUTPUTS, *_ACTUATED, *(label + "_ref" for label in FLAT_LABELS)]
-    loop = ct.interconnect(blocks, inputs=list(inputs) or 0, outputs=outputs, name=name)
+    outputs += ["sway_frequency", *([] if _COMMAND in outer else [_COMMAND])] if by_velocity else []
+    # With a velocity drive, the trolley's reference is not used.
+    unused = {"ignore_outputs": [f"{law_block.name}.D_ref"]} if by_velocity else {}
+    loop = ct.interconnect(blocks, inputs=outer or 0, outputs=outputs, name=name, **unused)
     equilibrium = model.equilibrium(crane, float(plan.initial[0]), float(plan.initial[1]))[0]
     # The crane is the last block; the states of law and PIDs are 0 at equilibrium.
     before = [_start(block) for block in blocks[:-1]]
@@ -138,6 +168,7 @@ def crane_loop(
 
 _REFERENCES = ("D_ref", "R_ref")
 _ACTUATED = ("F", "C")
+_COMMAND = "v_cmd"
 
 
 def _with_options(law: Law | str, options: dict[str, float | Sequence[complex] | None]) -> Law:
@@ -169,6 +200,25 @@ def _block(law: Law, crane: CraneParameters) -> ct.NonlinearIOSystem:
             f"{' and '.join(sorted(missing))}"
         )
     return block
+
+
+def _check_limits(law: Law, by_velocity: bool, force_limits: Range | None, torque_limits: Range | None) -> None:
+    """Raise for limits without the PID that they limit, and for a law without the hoist's reference."""
+    if law.outputs == _ACTUATED:
+        if by_velocity:
+            raise ValueError(
+                f"law must have the outputs D_ref and R_ref with drive='velocity', got {law.name!r}, whose outputs are "
+                "force and torque; use 'generator' or 'setpoint'"
+            )
+        if force_limits is not None or torque_limits is not None:
+            raise ValueError(
+                f"force_limits and torque_limits must be given with a law that uses the PIDs, got {law.name!r}"
+            )
+    elif by_velocity and force_limits is not None:
+        raise ValueError(
+            f"force_limits must be given with drive='force', got {force_limits!r} with drive='velocity'; limit v_cmd "
+            "by create_saturation_iosystem instead"
+        )
 
 
 def _check_signals(

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import partial
+from typing import Literal
 
 import control as ct
 import numpy as np
@@ -17,16 +18,23 @@ from numpy.typing import ArrayLike, NDArray
 from ctrlplan._checks import checked_finite
 from ctrlplan._types import Array
 from ctrlplan.systems.plants.crane.parameters import CraneParameters, Numbers
+from ctrlplan.systems.plants.parameters import overridden
 from ctrlplan.systems.series import Quantity
 from ctrlplan.traits import declare
 
 Params = Mapping[str, float] | None
+Drive = Literal["force", "velocity"]
+"""What the trolley is commanded by."""
 
 STATES = ("D", "R", "theta", "D_d1", "R_d1", "theta_d1")
 OUTPUTS = ("x", "z", "D", "R", "theta", "x_d1", "z_d1", "D_d1", "R_d1", "theta_d1", "T")
+OF_VELOCITY_DRIVE = ("F", "sway_frequency")
+"""Outputs of a crane with velocity drive in addition."""
 
 
-def iosystem(crane: CraneParameters, name: str = "crane", *, wind: bool = False) -> ct.NonlinearIOSystem:
+def iosystem(
+    crane: CraneParameters, name: str = "crane", *, wind: bool = False, drive: Drive = "force", drive_lag: float = 0.1
+) -> ct.NonlinearIOSystem:
     """Nonlinear model of the crane, equations (13) and (14).
 
     States: D, R [m], theta [rad] and their derivatives D_d1, R_d1, theta_d1.
@@ -36,17 +44,32 @@ def iosystem(crane: CraneParameters, name: str = "crane", *, wind: bool = False)
     simulation (``params={"load_mass": 1000.0}``) override those of the model
     only, as for a payload that is unknown to the controller.
 
+    With a velocity drive, as a frequency converter, the input v_cmd [m/s] takes the
+    place of F: the speed of the trolley follows it with a first-order lag,
+    D'' = (v_cmd - D')/lag, whatever the load. The force F [N] that this takes and
+    the natural frequency sway_frequency = sqrt(g/R) [rad/s] are outputs.
+
     Parameters
     ----------
     name : str, optional
         Name of the block.
     wind : bool, optional
         Whether the block has the input wind.
+    drive : {"force", "velocity"}, optional
+        What commands the trolley.
+    drive_lag : float, optional
+        Time constant of the velocity drive [s], above 0; a simulation parameter
+        of that name overrides it.
 
     Returns
     -------
     control.NonlinearIOSystem
         In continuous time.
+
+    Raises
+    ------
+    ValueError
+        If `drive` is unknown, or `drive_lag` is not above 0.
 
     Examples
     --------
@@ -60,15 +83,17 @@ def iosystem(crane: CraneParameters, name: str = "crane", *, wind: bool = False)
     >>> response.outputs["z"].round(6).tolist()
     [10.0, 10.0]
     """
+    lag = checked_drive(drive, drive_lag)
+    outputs = OUTPUTS if lag is None else (*OUTPUTS, *OF_VELOCITY_DRIVE)
     block = ct.nlsys(
-        partial(update, crane),
-        partial(output, crane),
+        partial(update, crane, lag=lag),
+        partial(output, crane, lag=lag),
         states=list(STATES),
-        inputs=["F", "C", "wind"] if wind else ["F", "C"],
-        outputs=list(OUTPUTS),
+        inputs=["F" if lag is None else "v_cmd", "C", *(["wind"] if wind else [])],
+        outputs=list(outputs),
         name=name,
     )
-    return declare(block, feedthrough=feedthrough(2 + wind))
+    return declare(block, feedthrough=feedthrough(outputs, 2 + wind))
 
 
 def equilibrium(crane: CraneParameters, x: float, z: float) -> tuple[Array, Array]:
@@ -113,7 +138,8 @@ def accelerations(
     tuple of four ndarray, shape (...)
         In m/s^2, m/s^2, rad/s^2 and N.
     """
-    return solved(crane.numbers(), crane.rope_wrap, state, force, torque, wind)
+    numbers = crane.numbers()
+    return solved(numbers, crane.rope_wrap, state, by_force(numbers, state, force), torque, wind)
 
 
 def energy(crane: CraneParameters, state: ArrayLike) -> Array:
@@ -139,36 +165,64 @@ def energy(crane: CraneParameters, state: ArrayLike) -> Array:
     return kinetic - m * g * z
 
 
-def update(crane: CraneParameters, t: float, state: Array, inputs: Array, params: Params) -> Array:
+def checked_drive(drive: Drive, drive_lag: float) -> float | None:
+    """Time constant of a velocity drive [s]; None for a force."""
+    if drive not in ("force", "velocity"):
+        raise ValueError(f"drive must be 'force' or 'velocity', got {drive!r}")
+    lag = checked_finite(drive_lag, "drive_lag", above=0.0)
+    return lag if drive == "velocity" else None
+
+
+def update(
+    crane: CraneParameters, t: float, state: Array, inputs: Array, params: Params, lag: float | None = None
+) -> Array:
     """Derivatives of the states, in the form of `control.nlsys`."""
-    d2, r2, theta2, _ = solved(crane.numbers(params), crane.rope_wrap, state, *_forces(inputs))
+    d2, r2, theta2, _ = _driven(crane, lag, state, inputs, params)
     return np.array([state[3], state[4], state[5], d2, r2, theta2])
 
 
-def output(crane: CraneParameters, t: float, state: Array, inputs: Array, params: Params) -> Array:
-    """`OUTPUTS`, in the form of `control.nlsys`."""
+def output(
+    crane: CraneParameters, t: float, state: Array, inputs: Array, params: Params, lag: float | None = None
+) -> Array:
+    """`OUTPUTS`, and those of a velocity drive, in the form of `control.nlsys`."""
     numbers = crane.numbers(params)
     x, z, x_rate, z_rate = load(numbers[3], state)
-    tension = solved(numbers, crane.rope_wrap, state, *_forces(inputs))[3]
-    return np.array([x, z, state[0], state[1], state[2], x_rate, z_rate, state[3], state[4], state[5], tension])
+    d2, _, _, tension = _driven(crane, lag, state, inputs, params)
+    rows = [x, z, state[0], state[1], state[2], x_rate, z_rate, state[3], state[4], state[5], tension]
+    if lag is not None:
+        _, trolley, _, _, friction, _, gravity = numbers
+        force = trolley * d2 + friction * state[3] - tension * np.sin(state[2])
+        rows += [force, np.sqrt(gravity / state[1])]
+    return np.array(rows)
 
 
-def feedthrough(ninputs: int) -> NDArray[np.bool_]:
-    """Direct feedthrough (noutputs, ninputs): from forces and torque to the tension only."""
-    found = np.zeros((len(OUTPUTS), ninputs), dtype=bool)
-    found[OUTPUTS.index("T")] = True
+def feedthrough(outputs: tuple[str, ...], ninputs: int) -> NDArray[np.bool_]:
+    """Direct feedthrough (noutputs, ninputs): from all inputs to the tension and the force of a velocity drive."""
+    found = np.zeros((len(outputs), ninputs), dtype=bool)
+    found[[row for row, name in enumerate(outputs) if name in ("T", "F")]] = True
     return found
 
 
+def by_force(numbers: Numbers, state: Quantity, force: Quantity) -> tuple[Quantity, Quantity]:
+    """Acceleration of a trolley with the input force, as a + b T of the tension T."""
+    _, trolley, _, _, friction, _, _ = numbers
+    return (force - friction * state[3]) / trolley, np.sin(state[2]) / trolley
+
+
 def solved(
-    numbers: Numbers, rope_wrap: bool, state: Quantity, force: Quantity, torque: Quantity, wind: Quantity
+    numbers: Numbers,
+    rope_wrap: bool,
+    state: Quantity,
+    trolley: tuple[Quantity, Quantity],
+    torque: Quantity,
+    wind: Quantity,
 ) -> tuple[Quantity, Quantity, Quantity, Quantity]:
-    """D'', R'', theta'' and T for given parameters."""
-    m, trolley, inertia, b, f1, f2, g = numbers
-    _, r, theta, d_rate, r_rate, rate = (state[i] for i in range(6))
+    """D'', R'', theta'' and T for given parameters; the trolley's acceleration is a + b T."""
+    m, _, inertia, b, _, f2, g = numbers
+    _, r, theta, _, r_rate, rate = (state[i] for i in range(6))
     s, c = np.sin(theta), np.cos(theta)
     # Each acceleration is linear in T; the first equation of motion then gives T.
-    d0, d1 = (force - f1 * d_rate) / trolley, s / trolley
+    d0, d1 = trolley
     push = wind / m
     swing = push * c - g * s - 2.0 * r_rate * rate + b * rate * rate
     t0, t1 = (swing - c * d0) / r, -c * d1 / r
@@ -193,6 +247,15 @@ def load(b: float, state: Quantity) -> tuple[Quantity, Quantity, Quantity, Quant
     return x, z, x_rate, z_rate
 
 
-def _forces(inputs: Array) -> tuple[float, float, float]:
-    """F, C and the wind, 0 if it is not an input."""
-    return inputs[0], inputs[1], inputs[2] if inputs.shape[0] > 2 else 0.0
+def _driven(
+    crane: CraneParameters, lag: float | None, state: Array, inputs: Array, params: Params
+) -> tuple[Quantity, Quantity, Quantity, Quantity]:
+    """D'', R'', theta'' and T for inputs of the block; the wind is 0 if it is not an input."""
+    numbers = crane.numbers(params)
+    if lag is None:
+        trolley = by_force(numbers, state, inputs[0])
+    else:
+        (lag,) = overridden({"drive_lag": lag}, params)
+        trolley = (inputs[0] - state[3]) / lag, 0.0
+    wind = inputs[2] if inputs.shape[0] > 2 else 0.0
+    return solved(numbers, crane.rope_wrap, state, trolley, inputs[1], wind)

@@ -1,0 +1,16 @@
+"""Numbers of examples of a hypothesis test: all of them in a run of the whole suite, fewer in the everyday run."""
+
+from hypothesis import settings
+
+settings.register_profile("whole", deadline=None, derandomize=True, print_blob=True, max_examples=100)
+settings.register_profile("everyday", settings.get_profile("whole"), max_examples=25)
+
+
+def load(everyday):
+    """Load the profile of a run; before test modules are imported, whose decorators read it."""
+    settings.load_profile("everyday" if everyday else "whole")
+
+
+def examples(number):
+    """Settings of a test with so many examples in the whole suite, and in the everyday run a quarter, at least 5."""
+    return settings(max_examples=min(number, max(5, number * settings.default.max_examples // 100)))
