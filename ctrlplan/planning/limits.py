@@ -15,7 +15,7 @@ from ctrlplan._display import Displayed, Facts, Part, Table, counted
 from ctrlplan._renamed import FormerAttribute
 from ctrlplan.planning.bounds import Bound
 from ctrlplan.planning.naming import Naming
-from ctrlplan.planning.quantities import System, loop_of, quantities_of, system_given
+from ctrlplan.planning.quantities import Response, System, loop_of, quantities_of, system_given
 from ctrlplan.planning.window import mean_square, window
 from ctrlplan.trajectories import Trajectory, derivative_name
 from ctrlplan.trajectories.common import Array
@@ -583,9 +583,33 @@ class Limited:
                     _check_period(b, plan)
                 yield _rms_margin(b, response.rms(b.terms[0][0].name, b.period), plan)
                 continue
+            if b.profile is not None:
+                yield self._loop_margin_over_time(plan, b, response)
+                continue
             during = None if b.interval is None else self._interval(b, plan)
             e = response.extremes(b.weights, during=during, rate=b.kind == "rate")
             yield _margin(b, e.low, e.high, e.time_low, e.time_high)
+
+    def _loop_margin_over_time(self, plan: Trajectory, bound: Bound, response: Response) -> Margin:
+        """Margin of a signal of a loop to limits that are linear between times."""
+        if bound.profile is None:
+            raise TypeError("limits must be given over time")
+        rate = self._duration / plan.duration
+        first, last = bound.interval or (-math.inf, math.inf)
+        times = np.union1d([first, last], bound.profile.times)
+        found = []
+        for own in pairwise(times[(times >= first) & (times <= last)].tolist()):
+            low, high = bound.profile.sides(np.array(own))
+            during = (plan.start + (own[0] - self._start) / rate, plan.start + (own[1] - self._start) / rate)
+            for sign, side in ((-1.0, low), (1.0, high)):
+                if np.isfinite(side).all():
+                    e = response.extremes(bound.weights, during=during, line=(float(side[0]), float(side[1])))
+                    beyond, at = (e.high, e.time_high) if sign > 0.0 else (-e.low, e.time_low)
+                    found.append((beyond, at, sign))
+        beyond, at, sign = max(found)
+        there = bound.at(min(max(self._start + (at - plan.start) * rate, first), last))
+        value = (there.high if sign > 0.0 else there.low) + sign * beyond
+        return Margin(there, value, at, bound.slack - beyond / bound.scale)
 
     def check_smooth(self, plan: Trajectory) -> None:
         """Raise for a jump of a derivative that makes a limited signal infinite.

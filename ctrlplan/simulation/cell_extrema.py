@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.polynomial import chebyshev
@@ -50,6 +50,13 @@ class Cells:
         """Values (nrows, ncells) at one point x (ncells,) of each cell."""
         basis = np.cos(np.arange(len(self.series))[:, None] * np.arccos(np.clip(x, -1.0, 1.0)))
         return np.asarray(np.einsum("jrk,jk->rk", self.series, basis))
+
+    def without_line(self, start: float, slope: float) -> Cells:
+        """Signals minus start + slope t."""
+        series = self.series.copy()
+        series[0] -= start + slope * (self.starts + 0.5 * self.lengths)
+        series[1] -= 0.5 * slope * self.lengths
+        return replace(self, series=series)
 
     def times(self, x: Array) -> Array:
         """Times [s] of points x (ncells,)."""

@@ -169,14 +169,21 @@ class ExactResponse(LoopResponse):
         self._motion, self._signals, self._plan, self._start = motion, dict(signals), plan, plan.start
 
     def extremes(
-        self, weights: Mapping[str, float], *, during: tuple[float, float] | None = None, rate: bool = False
+        self,
+        weights: Mapping[str, float],
+        *,
+        during: tuple[float, float] | None = None,
+        rate: bool = False,
+        line: tuple[float, float] | None = None,
     ) -> Extremes:
         """Minimum and maximum of a weighted sum of signals; see `LoopResponse`."""
         rows = self._sum(weights)
         if rate:
             rows = rate_rows(self._motion.form, rows, self._motion.plan, " + ".join(weights))
         shifted = None if during is None else (during[0] - self._start, during[1] - self._start)
-        low, high, time_low, time_high = (float(row[0]) for row in extremes_of(self._motion, rows, during=shifted))
+        low, high, time_low, time_high = (
+            float(row[0]) for row in extremes_of(self._motion, rows, during=shifted, line=line)
+        )
         return Extremes(low, high, self._start + time_low, self._start + time_high)
 
     def rms(self, name: str, period: float | None = None) -> float:
@@ -257,7 +264,11 @@ def rate_rows(form: LoopForm, rows: Rows, plan: PlanCells, name: str) -> Rows:
 
 
 def extremes_of(
-    motion: Motion, rows: Rows, scale: Array | float = 0.0, during: tuple[float, float] | None = None
+    motion: Motion,
+    rows: Rows,
+    scale: Array | float = 0.0,
+    during: tuple[float, float] | None = None,
+    line: tuple[float, float] | None = None,
 ) -> tuple[Array, Array, Array, Array]:
     """Minima, maxima (nrows,) and their times [s] since the start of the plan.
 
@@ -272,6 +283,8 @@ def extremes_of(
         bounded to 1e-12 of these, or of the range of the output itself.
     during : (float, float), optional
         Interval of time [s] since the start of the plan; default: all times.
+    line : (float, float), optional
+        Values at the times of `during` of a linear function that is subtracted.
     """
     before, final = rows.static(motion.plan.initial, motion.start), rows.static(motion.plan.final, motion.settled)
     first, last = (-math.inf, math.inf) if during is None else during
@@ -299,7 +312,13 @@ def extremes_of(
         if not whole and float(cells.starts.max(initial=0.0)) <= last:
             values.append(final)
             times.append(last)
-    return extrema_of_cells(joined(parts), np.array(values).reshape(-1, len(rows.c)).T, np.array(times))
+    cells, rest = joined(parts), np.array(values).reshape(-1, len(rows.c)).T
+    if line is not None:
+        slope = (line[1] - line[0]) / (last - first)
+        times = [first if time == 0.0 else time for time in times]
+        rest = rest - (line[0] + slope * (np.array(times) - first))
+        cells = cells.without_line(line[0] - slope * first, slope)
+    return extrema_of_cells(cells, rest, np.array(times))
 
 
 def _seen(cells: Cells, values: Array) -> tuple[Array, Array]:
