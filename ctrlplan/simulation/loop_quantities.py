@@ -170,7 +170,8 @@ class AlongPlan:
             place = ", ".join(f"{label} = {x:.4g}" for label, x in zip(plan.labels, plan.initial.tolist(), strict=True))
             raise ValueError(
                 f"the loop must start at rest at the first position of the plan, got {self._prepared.name} without an "
-                f"equilibrium at {place}: an integrator in it has an input that is not 0 there"
+                f"equilibrium at {place}: an integrator has an input that is not 0 there, or a block declares another "
+                "initial state"
             )
         return np.asarray(state / self.form.scale)
 
