@@ -105,7 +105,7 @@ def extrema_of_cells(cells: Cells, values: Array, times: Array) -> tuple[Array, 
             if bound[k] <= peaks[row] + floor[row]:
                 continue
             x, value = _maximum(series[:, k], float(cells.low[cell]), float(cells.high[cell]))
-            if value > peaks[row]:
+            if value > peaks[row] + floor[row]:
                 peaks[row] = value
                 places[row] = cells.starts[cell] + 0.5 * (1.0 + x) * cells.lengths[cell]
         found.append((sign * peaks, places))

@@ -126,7 +126,8 @@ class ShapeFamily:
         The rates are infinite for signals to which derivatives of the plan contribute.
         """
         form, plan, rows = self.form, self.plan, self.rows
-        final = form.settled(self.state, plan.final, math.inf)
+        constant, projection = form.settling(plan.final)
+        final = constant + projection @ self.state
         values = np.stack([self.before, rows.static(plan.final, final)], axis=1)
         parts = []
         for cells, bounds in free_cells(form, rows.c, (self.state - final)[:, None]):

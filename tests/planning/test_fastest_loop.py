@@ -228,6 +228,31 @@ def test_no_overshoot_at_all():
     assert cp.margins(QUINTIC, {"y": (0.0, 1.0)}, loop).satisfied
 
 
+def test_integrators():
+    """A double integrator behind a lag, fed by the acceleration of the plan: the acceleration is that of the lag."""
+    a, b = np.array([[-20.0, 0, 0], [1, 0, 0], [0, 1, 0]]), np.array([[0.0, 0.0, 20.0], [0, 0, 0], [0, 0, 0]])
+    loop = ct.ss(a, b, np.eye(3), np.zeros((3, 3)), inputs=["r", "r_d1", "r_d2"], outputs=["acc", "v", "y"])
+    plan = cp.PolySpline([Waypoint(0, 2, 0, 0), Waypoint(1, 5, 0, 0)])
+    found = cp.fastest(plan, {"acc": 12.0, "y": (1.9, 5.1)}, loop)
+    lag = (a[:1, :1], np.array([[[0.0]], [[0.0]], [[20.0]]]), np.eye(1), np.zeros((1, 1, 1)))
+    durations = np.geomspace(found.searched[0], found.duration, 200)
+    peaks = np.abs(responses(lag, plan, durations, 4000, 1000)).max(axis=(1, 2))
+    assert peaks[-1] == pytest.approx(12.0, rel=1e-6)
+    assert peaks[:-1].min() > 12.0 * (1.0 - 2e-3)
+    margin = next(row for row in found.margins if row.bound.name == "y")
+    assert margin.fraction == pytest.approx(0.1 / 1.6, rel=1e-10)  # of half the range
+
+
+def test_an_integrator_of_the_plan():
+    """The level of a tank after a closed plan is proportional to the duration, and is reached at the end."""
+    tank = ct.ss([[0.0]], [[1.0]], [[1.0]], [[0.0]], inputs="r", outputs="y", name="tank")
+    plan = cp.PolySpline([Waypoint(0, 0, 0, 0), Waypoint(0.5, 1), Waypoint(1, 0, 0, 0)])
+    level = np.polynomial.legendre.leggauss(20)
+    area = float(0.5 * level[1] @ plan(0.5 + 0.5 * level[0]))
+    found = cp.fastest(plan, {"y": cp.Limits(0.3, 1.0, during=(1.0, 2.0))}, tank)
+    assert found.duration == pytest.approx(0.3 / area, rel=1e-11)
+
+
 def test_a_gain_alone():
     """Without states the signal is a multiple of the plan: its rate is limited in closed form."""
     gain = ct.ss([], [], [], [[2.0]], inputs="r", outputs="y", name="gain")
