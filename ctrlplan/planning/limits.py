@@ -15,7 +15,7 @@ from ctrlplan._display import Displayed, Facts, Part, Table, counted
 from ctrlplan._renamed import FormerAttribute
 from ctrlplan.planning.bounds import Bound
 from ctrlplan.planning.naming import Naming
-from ctrlplan.planning.quantities import System, loop_of, quantities_of, system_given
+from ctrlplan.planning.quantities import Response, System, loop_of, quantities_of, system_given
 from ctrlplan.planning.window import mean_square, window
 from ctrlplan.trajectories import Trajectory, derivative_name
 from ctrlplan.trajectories.common import Array
@@ -41,7 +41,8 @@ class Margin:
     bound : Bound
         The limits.
     value, time : float
-        Value nearest to a limit, or of maximum violation, and its time [s].
+        Value nearest to a limit, or of maximum violation, and its time [s]; inf for
+        the steady state of a loop.
     fraction : float
         Distance to the limit as a fraction of the scale; negative if the limit
         is violated.
@@ -60,9 +61,14 @@ class Margin:
     coverage: str = ""
 
     def __str__(self) -> str:
-        at = "" if self.bound.kind == "rms" else f" at {self.time:.6g} s"
+        at = "" if self.bound.kind == "rms" else f" {self.when}"
         where = f" with {_listed(self.parameters)}" if self.parameters else ""
         return f"{self.bound.name} {self.bound.range}: {self.value:.6g}{at}{where}, {self.room}"
+
+    @property
+    def when(self) -> str:
+        """Time as text."""
+        return "in steady state" if math.isinf(self.time) else f"at {self.time:.6g} s"
 
     def of(self, bound: Bound) -> bool:
         """Whether it is the margin of a bound."""
@@ -137,7 +143,7 @@ class Margins(Displayed):
                 row.bound.name,
                 row.bound.range,
                 f"{row.value:.6g}",
-                f"{row.time:.6g}",
+                "steady" if math.isinf(row.time) else f"{row.time:.6g}",
                 row.share if row.fraction > -_ROUNDING else f"-{row.share}",
             )
             for row in self.rows
@@ -583,9 +589,33 @@ class Limited:
                     _check_period(b, plan)
                 yield _rms_margin(b, response.rms(b.terms[0][0].name, b.period), plan)
                 continue
+            if b.profile is not None:
+                yield self._loop_margin_over_time(plan, b, response)
+                continue
             during = None if b.interval is None else self._interval(b, plan)
             e = response.extremes(b.weights, during=during, rate=b.kind == "rate")
             yield _margin(b, e.low, e.high, e.time_low, e.time_high)
+
+    def _loop_margin_over_time(self, plan: Trajectory, bound: Bound, response: Response) -> Margin:
+        """Margin of a signal of a loop to limits that are linear between times."""
+        if bound.profile is None:
+            raise TypeError("limits must be given over time")
+        rate = self._duration / plan.duration
+        first, last = bound.interval or (-math.inf, math.inf)
+        times = np.union1d([first, last], bound.profile.times)
+        found = []
+        for own in pairwise(times[(times >= first) & (times <= last)].tolist()):
+            low, high = bound.profile.sides(np.array(own))
+            during = (plan.start + (own[0] - self._start) / rate, plan.start + (own[1] - self._start) / rate)
+            for sign, side in ((-1.0, low), (1.0, high)):
+                if np.isfinite(side).all():
+                    e = response.extremes(bound.weights, during=during, line=(float(side[0]), float(side[1])))
+                    beyond, at = (e.high, e.time_high) if sign > 0.0 else (-e.low, e.time_low)
+                    found.append((beyond, at, sign))
+        beyond, at, sign = max(found)
+        there = bound.at(min(max(self._start + (at - plan.start) * rate, first), last))
+        value = (there.high if sign > 0.0 else there.low) + sign * beyond
+        return Margin(there, value, at, bound.slack - beyond / bound.scale)
 
     def check_smooth(self, plan: Trajectory) -> None:
         """Raise for a jump of a derivative that makes a limited signal infinite.
@@ -665,7 +695,7 @@ class Limited:
         for bound, values in zip(self.bounds, self.values(still.jet), strict=True):
             if bound.in_loop:
                 sides = [abs(side) for side in (bound.low, bound.high) if math.isfinite(side)]
-                yield replace(bound, slack=1e-12 * (1.0 + max(sides, default=0.0) / bound.scale))
+                yield replace(bound, slack=1e-12 + 16.0 * np.finfo(float).eps * max(sides, default=0.0) / bound.scale)
                 continue
             if bound.kind == "rms" or np.isnan(values).any():
                 yield replace(bound, slack=0.0)  # a signal that is singular at rest attains no limit there

@@ -38,6 +38,9 @@ _CHECKS = 6
 _NARROWEST = 1e-9
 """Relative width of an interval of durations that is not halved further."""
 
+_ROUNDING = 1e-13
+"""Relative amount by which a minimum duration is increased, so that rounding violates no limit."""
+
 _MOST = 20_000
 """Maximum number of durations whose samples are computed."""
 
@@ -244,6 +247,7 @@ class DurationSearch:
                 return min(low, feasible)
             ends = math.log(low), math.log(feasible)
             root = math.exp(brentq(lambda ell: self.worst(math.exp(ell)), *ends, xtol=1e-14, rtol=1e-14))
+            root *= 1.0 + _ROUNDING
             # A root of an odd number of them: between the samples an earlier one may be missed.
             between = np.geomspace(low, root, _CHECKS + 2)[1:-1]
             pairs = _Block(np.array([low, root]), self._lines(np.array([low, root]))).pairs(np.zeros(1, np.intp), None)

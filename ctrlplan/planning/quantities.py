@@ -17,9 +17,14 @@ class Response(Protocol):
     """Signals of a loop along one plan; see `ctrlplan.simulation.loop_response.LoopResponse`."""
 
     def extremes(
-        self, weights: Mapping[str, float], *, during: tuple[float, float] | None = None, rate: bool = False
+        self,
+        weights: Mapping[str, float],
+        *,
+        during: tuple[float, float] | None = None,
+        rate: bool = False,
+        line: tuple[float, float] | None = None,
     ) -> Extremes:
-        """Minimum and maximum of a weighted sum of signals, and their times."""
+        """Minimum and maximum of a weighted sum of signals minus a line, and their times."""
 
     def rms(self, name: str, period: float | None = None) -> float:
         """Root of the mean square of a signal."""

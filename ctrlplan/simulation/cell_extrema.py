@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.polynomial import chebyshev
@@ -51,6 +51,13 @@ class Cells:
         basis = np.cos(np.arange(len(self.series))[:, None] * np.arccos(np.clip(x, -1.0, 1.0)))
         return np.asarray(np.einsum("jrk,jk->rk", self.series, basis))
 
+    def without_line(self, start: float, slope: float) -> Cells:
+        """Signals minus start + slope t."""
+        series = self.series.copy()
+        series[0] -= start + slope * (self.starts + 0.5 * self.lengths)
+        series[1] -= 0.5 * slope * self.lengths
+        return replace(self, series=series)
+
     def times(self, x: Array) -> Array:
         """Times [s] of points x (ncells,)."""
         return np.asarray(self.starts + 0.5 * (1.0 + x) * self.lengths)
@@ -81,8 +88,8 @@ def extrema_of_cells(cells: Cells, values: Array, times: Array) -> tuple[Array, 
         Minima, maxima, and the times of both.
     """
     ends = [cells.values(x) for x in (cells.low, cells.high)]
-    every = np.concatenate([values, *ends], axis=1)
-    moments = np.concatenate([times, cells.times(cells.low), cells.times(cells.high)])
+    every = np.concatenate([*ends, values], axis=1)
+    moments = np.concatenate([cells.times(cells.low), cells.times(cells.high), times])
     floor = _TOLERANCE * np.ptp(every, axis=1) + 4e-16 * np.abs(every).max(axis=1, initial=0.0)
     spread = np.abs(cells.series[1:]).sum(axis=0)
     found = []
@@ -98,7 +105,7 @@ def extrema_of_cells(cells: Cells, values: Array, times: Array) -> tuple[Array, 
             if bound[k] <= peaks[row] + floor[row]:
                 continue
             x, value = _maximum(series[:, k], float(cells.low[cell]), float(cells.high[cell]))
-            if value > peaks[row]:
+            if value > peaks[row] + floor[row]:
                 peaks[row] = value
                 places[row] = cells.starts[cell] + 0.5 * (1.0 + x) * cells.lengths[cell]
         found.append((sign * peaks, places))

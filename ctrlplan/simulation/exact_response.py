@@ -5,15 +5,19 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ctrlplan._types import Array
 from ctrlplan.simulation.cell_extrema import Cells, extrema_of_cells, joined, mean_square
+from ctrlplan.simulation.exact import changes_over
 from ctrlplan.simulation.loop_form import NODES, NTERMS, SIGMA, LoopForm, Rows
+from ctrlplan.simulation.loop_inputs import is_cyclic
 from ctrlplan.simulation.loop_response import Extremes, LoopResponse
 from ctrlplan.simulation.plan_cells import PlanCells
+from ctrlplan.trajectories import Trajectory
 from ctrlplan.trajectories.chebyshev import transform
 
 _REST = 1e-12
@@ -154,25 +158,32 @@ class ExactResponse(LoopResponse):
         States of the loop along the plan.
     signals : mapping of str to Rows
         Outputs by name, one row each.
-    start : float
-        Start of the plan [s].
+    plan : Trajectory
+        The plan.
     """
 
     note = "exact"
 
-    def __init__(self, motion: Motion, signals: Mapping[str, Rows], start: float) -> None:
+    def __init__(self, motion: Motion, signals: Mapping[str, Rows], plan: Trajectory) -> None:
         self.names = tuple(signals)
-        self._motion, self._signals, self._start = motion, dict(signals), start
+        self._motion, self._signals, self._plan, self._start = motion, dict(signals), plan, plan.start
 
     def extremes(
-        self, weights: Mapping[str, float], *, during: tuple[float, float] | None = None, rate: bool = False
+        self,
+        weights: Mapping[str, float],
+        *,
+        during: tuple[float, float] | None = None,
+        rate: bool = False,
+        line: tuple[float, float] | None = None,
     ) -> Extremes:
         """Minimum and maximum of a weighted sum of signals; see `LoopResponse`."""
         rows = self._sum(weights)
         if rate:
             rows = rate_rows(self._motion.form, rows, self._motion.plan, " + ".join(weights))
         shifted = None if during is None else (during[0] - self._start, during[1] - self._start)
-        low, high, time_low, time_high = (float(row[0]) for row in extremes_of(self._motion, rows, during=shifted))
+        low, high, time_low, time_high = (
+            float(row[0]) for row in extremes_of(self._motion, rows, during=shifted, line=line)
+        )
         return Extremes(low, high, self._start + time_low, self._start + time_high)
 
     def rms(self, name: str, period: float | None = None) -> float:
@@ -181,6 +192,8 @@ class ExactResponse(LoopResponse):
         length = duration if period is None else float(period)
         if not 0.0 < length < math.inf:
             raise ValueError(f"period must be above 0 and finite, got {length:g} s")
+        if period is None and is_cyclic(self._plan):
+            return math.sqrt(mean_square(self._periodic.cells(rows), 0) / length)
         total = mean_square(self._motion.cells(rows).during(0.0, length), 0)
         reached = duration
         if length > duration:
@@ -198,6 +211,19 @@ class ExactResponse(LoopResponse):
         rows, motion = self._sum(weights), self._motion
         before, after = rows.static(motion.plan.initial, motion.start), rows.static(motion.plan.final, motion.settled)
         return float(before[0]), math.nan if motion.form.integrators else float(after[0])
+
+    @cached_property
+    def _periodic(self) -> Motion:
+        """Motion in the periodic steady state: the state at the end of the plan is that at its start."""
+        form, motion = self._motion.form, self._motion
+        if form.integrators:
+            raise ValueError(
+                f"the loop must have a periodic steady state for the root mean square along a cyclic plan, got "
+                f"{form.name} with a pole at 0; give the period of the root mean square"
+            )
+        change = changes_over(motion.duration * form.a, np.zeros((form.nstates, 0)), 1)[-1]
+        state = motion.start + np.linalg.solve(-change, motion.end - motion.start)
+        return Motion(form, motion.plan, motion.duration, state)
 
     def _sum(self, weights: Mapping[str, float]) -> Rows:
         for name in weights:
@@ -238,7 +264,11 @@ def rate_rows(form: LoopForm, rows: Rows, plan: PlanCells, name: str) -> Rows:
 
 
 def extremes_of(
-    motion: Motion, rows: Rows, scale: Array | float = 0.0, during: tuple[float, float] | None = None
+    motion: Motion,
+    rows: Rows,
+    scale: Array | float = 0.0,
+    during: tuple[float, float] | None = None,
+    line: tuple[float, float] | None = None,
 ) -> tuple[Array, Array, Array, Array]:
     """Minima, maxima (nrows,) and their times [s] since the start of the plan.
 
@@ -253,6 +283,8 @@ def extremes_of(
         bounded to 1e-12 of these, or of the range of the output itself.
     during : (float, float), optional
         Interval of time [s] since the start of the plan; default: all times.
+    line : (float, float), optional
+        Values at the times of `during` of a linear function that is subtracted.
     """
     before, final = rows.static(motion.plan.initial, motion.start), rows.static(motion.plan.final, motion.settled)
     first, last = (-math.inf, math.inf) if during is None else during
@@ -270,23 +302,38 @@ def extremes_of(
             more = _seen(cells, np.array([low, high]))
             low, high = more if whole else (low, high)
             small = _REST * np.maximum(scale, more[1] - more[0])
-            if float(cells.starts[-1]) > last or np.all(
+            if float(cells.starts.max()) > last or np.all(
                 bounds <= (np.maximum(np.minimum(high - final, final - low), small) if whole else small)
             ):
                 break
         else:
+            motion.form.check_settled()
             cells = parts[-1]
         if not whole and float(cells.starts.max(initial=0.0)) <= last:
             values.append(final)
             times.append(last)
-    return extrema_of_cells(joined(parts), np.array(values).reshape(-1, len(rows.c)).T, np.array(times))
+    cells, rest = joined(parts), np.array(values).reshape(-1, len(rows.c)).T
+    if line is not None:
+        slope = (line[1] - line[0]) / (last - first)
+        times = [first if time == 0.0 else time for time in times]
+        rest = rest - (line[0] + slope * (np.array(times) - first))
+        cells = cells.without_line(line[0] - slope * first, slope)
+    return extrema_of_cells(cells, rest, np.array(times))
 
 
 def _seen(cells: Cells, values: Array) -> tuple[Array, Array]:
-    """Minima and maxima (nrows,) of values (ncandidates, nrows) and of signals at the starts of cells."""
+    """Minima and maxima (nrows,) of values (ncandidates, nrows), and of signals at points of their cells."""
     if cells.starts.size:
-        values = np.concatenate([values, cells.values(cells.low).T])
+        whole = (cells.low == -1.0) & (cells.high == 1.0)
+        inside = np.tensordot(_POINTS[:, : len(cells.series)], cells.series[..., whole], axes=1)
+        values = np.concatenate(
+            [values, cells.values(cells.low).T, inside.transpose(0, 2, 1).reshape(-1, len(values.T))]
+        )
     return values.min(axis=0), values.max(axis=0)
+
+
+_POINTS = np.cos(np.pi * np.arange(17)[:, None] / 16 * np.arange(NODES))
+"""Chebyshev polynomials at points of a cell, both ends included."""
 
 
 def _marched(

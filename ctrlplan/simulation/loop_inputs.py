@@ -59,3 +59,10 @@ def tracked(outputs: Sequence[str], labels: Sequence[str]) -> list[int]:
     """Indices of the outputs that follow a plan: those named like its axes, otherwise the first ones."""
     names = labels if all(label in outputs for label in labels) else outputs[: len(labels)]
     return [list(outputs).index(name) for name in names]
+
+
+def is_cyclic(plan: Trajectory) -> bool:
+    """Whether a plan is closed and in motion at its ends, with equal velocities there: one period of a motion."""
+    first, last = plan.jet(plan.start, 1), plan.jet(plan.end, 1, left=True)
+    size = np.stack([np.ptp([plan.extrema().minimum, plan.extrema().maximum], axis=0), plan.peak(1)])
+    return bool(np.all(np.abs(last - first) <= 1e-9 * size) and np.any(np.abs(first[1]) > 1e-9 * size[1]))

@@ -46,7 +46,12 @@ class LoopResponse(ABC):
 
     @abstractmethod
     def extremes(
-        self, weights: Mapping[str, float], *, during: tuple[float, float] | None = None, rate: bool = False
+        self,
+        weights: Mapping[str, float],
+        *,
+        during: tuple[float, float] | None = None,
+        rate: bool = False,
+        line: tuple[float, float] | None = None,
     ) -> Extremes:
         """Minimum and maximum of a weighted sum of signals.
 
@@ -60,6 +65,9 @@ class LoopResponse(ABC):
             from rest before the plan to the steady state after it.
         rate : bool, optional
             Of the time derivative of the sum instead, in its unit per second.
+        line : (float, float), optional
+            Values at the times of `during` of a linear function of time that is
+            subtracted.
 
         Raises
         ------

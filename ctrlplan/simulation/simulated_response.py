@@ -16,7 +16,7 @@ from ctrlplan._checks import check_kind, checked_finite
 from ctrlplan._display import Displayed, Facts, Part
 from ctrlplan._types import Array, Data, System
 from ctrlplan.simulation.equilibrium import equilibrium_at
-from ctrlplan.simulation.loop_inputs import Fed, fed_signals, same_axis, tracked
+from ctrlplan.simulation.loop_inputs import Fed, fed_signals, is_cyclic, same_axis, tracked
 from ctrlplan.simulation.loop_response import Extremes, LoopResponse
 from ctrlplan.simulation.network import Block
 from ctrlplan.simulation.prepared import Prepared, prepared_form
@@ -133,25 +133,33 @@ class SimulatedResponse(LoopResponse):
         self._start = self._at_rest(plan.start, "first")
 
     def extremes(
-        self, weights: Mapping[str, float], *, during: tuple[float, float] | None = None, rate: bool = False
+        self,
+        weights: Mapping[str, float],
+        *,
+        during: tuple[float, float] | None = None,
+        rate: bool = False,
+        line: tuple[float, float] | None = None,
     ) -> Extremes:
         """Minimum and maximum of a weighted sum of signals; see `LoopResponse`."""
-        if rate:
-            times, row = self._rate(weights)
-        else:
-            times, row = self._samples[0], self._sum(weights, self._samples[1])
         first, last = (self.plan.start, self._last) if during is None else during
         if first > self._last:
             raise ValueError(
                 f"an interval of limits must begin before {self._last:.6g} s, where the simulation ends, got {first:g} "
                 "s; give a longer tail="
             )
-        inside = (times >= first) & (times <= last)
+
+        def without(times: Array, row: Array) -> Array:
+            if line is None:
+                return row
+            return row - (line[0] + (line[1] - line[0]) * (times - first) / (last - first))
+
+        times, row = self._rate(weights) if rate else (self._samples[0], self._sum(weights, self._samples[1]))
+        row, inside = without(times, row), (times >= first) & (times <= last)
         if not rate and self._refined and not self._prepared.is_discrete:
             ends = [t for t in (first, last) if self.plan.start <= t <= self._last]
             more = np.concatenate([ends, *(_near_peak(times, sign * row, inside) for sign in (-1.0, 1.0))])
             fine, values = self._run(np.unique(more))
-            times, row = np.concatenate([times, fine]), np.concatenate([row, self._sum(weights, values)])
+            times, row = np.concatenate([times, fine]), np.concatenate([row, without(fine, self._sum(weights, values))])
             by = np.argsort(times, kind="stable")
             times, row = times[by], row[by]
             inside = (times >= first) & (times <= last)
@@ -170,20 +178,13 @@ class SimulatedResponse(LoopResponse):
 
     def ends(self, weights: Mapping[str, float]) -> tuple[float, float]:
         """Values at rest before the plan and in steady state after it; see `LoopResponse`."""
-        values = []
-        for time, state, held in (
-            (self.plan.start, self._start, self._inputs.initial),
-            (self.plan.end, self._final, self._inputs.final),
-        ):
-            if state is None:
-                values.append(math.nan)
-                continue
-            step = float(self._prepared.dt) if self._prepared.is_discrete else 1e-6 * self.plan.duration
-            times = time + step * np.arange(2)
-            response = simulate(self._prepared, times, held.tolist() or None, state, rtol=_RTOL, events=())
-            signals = self._signals(response.y, np.repeat(held[:, None], 2, axis=1))
-            values.append(float(self._sum(weights, signals)[0]))
-        return values[0], values[1]
+        before = float(self._sum(weights, self._samples[1][:, :1])[0])
+        if self._final is None:
+            return before, math.nan
+        step = float(self._prepared.dt) if self._prepared.is_discrete else 1e-2 * self.plan.duration
+        times, held = self.plan.end + step * np.arange(2), self._inputs.final
+        response = simulate(self._prepared, times, held.tolist() or None, self._final, rtol=_RTOL, events=())
+        return before, float(self._sum(weights, self._signals(response.y[..., :1], held[:, None]))[0])
 
     @cached_property
     def _final(self) -> Array | None:
@@ -395,13 +396,6 @@ class _Inputs(Trajectory):
     @classmethod
     def _reject(cls) -> NoReturn:
         raise TypeError("inputs of a loop cannot be retimed or saved")
-
-
-def is_cyclic(plan: Trajectory) -> bool:
-    """Whether a plan is closed and in motion at its ends, with equal velocities there: one period of a motion."""
-    first, last = plan.jet(plan.start, 1), plan.jet(plan.end, 1, left=True)
-    size = np.stack([np.ptp([plan.extrema().minimum, plan.extrema().maximum], axis=0), plan.peak(1)])
-    return bool(np.all(np.abs(last - first) <= 1e-9 * size) and np.any(np.abs(first[1]) > 1e-9 * size[1]))
 
 
 def _check_sources(prepared: Prepared, plan: Trajectory) -> None:
