@@ -32,6 +32,9 @@ Build the loop
     FlatSystem                flat system from maps of your own
     flat_candidates           which outputs are flat -> FlatCandidate
     check_flat                maps against the equations -> FlatCheck
+    flat_loop                 plan, law and flat plant as one loop; laws: FlatLaw, TVLQR, Feedforward
+    create_flat_feedforward_iosystem    states and inputs along a plan, for a controller of your own
+    reference_window          states and inputs ahead, for model predictive control
     create_flat_iosystem      flat control of a flat plant; create_feedforward_iosystem: of a linear loop
     fit_feedforward           feedforward gains and delay from a log -> FeedforwardFit
     sample_hold               discrete block in a continuous loop; expose_states: states among the outputs
@@ -132,7 +135,13 @@ _EXPORTS = {
         "create_command_filter_iosystem",
         "create_delay_iosystem",
         "create_feedforward_iosystem",
+        "TVLQR",
+        "Feedforward",
+        "FlatLaw",
+        "create_flat_feedforward_iosystem",
         "create_flat_iosystem",
+        "flat_loop",
+        "reference_window",
         "create_governor_iosystem",
         "create_pid_iosystem",
         "create_replanner_iosystem",
