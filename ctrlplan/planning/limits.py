@@ -483,6 +483,7 @@ class Limited:
         """Raise for limits of a loop that are violated before the plan or in steady state, whatever its duration."""
         if self.loop is None:
             return
+        self.loop.quantities_of(plan.retime(1.25 * plan.duration))  # raises for a source inside, at its own times
         response = self.loop.quantities_of(plan)
         for b in self.loop_bounds:
             if b.kind != "value" or not b.is_constant:

@@ -161,7 +161,8 @@ class AlongPlan:
             free,
         )
         if state is not None:
-            terms = np.abs(linear.a) @ np.abs(state) + np.abs(linear.b) @ np.abs(supplied)
+            sizes = self.form.scale * np.abs(state / self.form.scale).max(initial=0.0)
+            terms = np.abs(linear.a) @ sizes + np.abs(linear.b) @ np.abs(supplied)
             if np.any(np.abs(linear.a @ state + linear.b @ supplied) > 1e-9 * np.maximum(terms, 1e-300)):
                 state = None
         if state is None:
