@@ -34,6 +34,9 @@ _COARSE = 1e-4
 _EDGE = 1e-7
 """Resolution of a minimum duration by simulated responses, relative to the duration."""
 
+_ROUNDING = 1e-14
+"""The same by exact responses."""
+
 Hold = Literal["shape", "waypoints", "path"]
 """Property of a plan that `fastest` preserves."""
 
@@ -401,6 +404,7 @@ class _InLoop:
 def _first_feasible(family: _InLoop, span: tuple[float, float], hold: Hold) -> Fastest:
     """Plan of minimum duration under limits of a loop whose runs are slow: the search ends at the first duration."""
     limited = family.limited
+    resolution = _EDGE if shapes_given(limited.loop) is None else _ROUNDING
     exact = cache(lambda duration: limited.exact_excess(family.plan(duration)))
     count = max(9, math.ceil(family.per_octave * math.log2(span[1] / span[0])))
     grid, known = np.geomspace(*span, count), 0
@@ -410,7 +414,7 @@ def _first_feasible(family: _InLoop, span: tuple[float, float], hold: Hold) -> F
         durations, excess = scan(family.excess, grid[known : k + 1], 0.0, _COARSE)
         for inside in np.flatnonzero(excess <= 0.0).tolist():
             outside = float(durations[inside - 1]) if inside else 0.0
-            found = _exact_edge(exact, family.excess, float(durations[inside]), outside)
+            found = _exact_edge(exact, family.excess, float(durations[inside]), outside, resolution)
             if found is not None:
                 statement = (
                     f"violate a limit at {family.per_octave} durations per octave from {span[0]:.4g} s on, and where "
@@ -424,7 +428,11 @@ def _first_feasible(family: _InLoop, span: tuple[float, float], hold: Hold) -> F
 
 
 def _exact_edge(
-    exact: Callable[[float], float], sampled: Callable[[float], float], inside: float, outside: float
+    exact: Callable[[float], float],
+    sampled: Callable[[float], float],
+    inside: float,
+    outside: float,
+    resolution: float,
 ) -> float | None:
     """Shortest feasible duration near one that is feasible at samples; None if none is near it."""
     if outside > 0.0 and sampled(outside) > 0.0:
@@ -436,7 +444,7 @@ def _exact_edge(
             return None
     if outside <= 0.0 or exact(outside) <= 0.0:
         return good
-    return bisected(lambda duration: exact(duration) <= 0.0, good, outside, 0.0, _EDGE)[0]
+    return bisected(lambda duration: exact(duration) <= 0.0, good, outside, 0.0, resolution)[0]
 
 
 def _check_rest(plan: Trajectory, limited: Limited) -> None:
