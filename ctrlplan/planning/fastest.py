@@ -101,7 +101,7 @@ class Fastest(Displayed):
         yield Facts(
             [
                 ("minimum duration", f"{self.duration:.6g} s"),
-                ("active limit", f"{active} {self.active.bound.range}, at {self.active.time:.6g} s" if active else ""),
+                ("active limit", f"{active} {self.active.bound.range}, {self.active.when}" if active else ""),
                 ("feasible durations", "" if self.statement else f"{sets}, the end of the search" if cut else sets),
                 ("shorter durations", self.statement),
                 ("shorter plans rejected", self.rejection),

@@ -41,7 +41,8 @@ class Margin:
     bound : Bound
         The limits.
     value, time : float
-        Value nearest to a limit, or of maximum violation, and its time [s].
+        Value nearest to a limit, or of maximum violation, and its time [s]; inf for
+        the steady state of a loop.
     fraction : float
         Distance to the limit as a fraction of the scale; negative if the limit
         is violated.
@@ -60,9 +61,14 @@ class Margin:
     coverage: str = ""
 
     def __str__(self) -> str:
-        at = "" if self.bound.kind == "rms" else f" at {self.time:.6g} s"
+        at = "" if self.bound.kind == "rms" else f" {self.when}"
         where = f" with {_listed(self.parameters)}" if self.parameters else ""
         return f"{self.bound.name} {self.bound.range}: {self.value:.6g}{at}{where}, {self.room}"
+
+    @property
+    def when(self) -> str:
+        """Time as text."""
+        return "in steady state" if math.isinf(self.time) else f"at {self.time:.6g} s"
 
     def of(self, bound: Bound) -> bool:
         """Whether it is the margin of a bound."""
@@ -137,7 +143,7 @@ class Margins(Displayed):
                 row.bound.name,
                 row.bound.range,
                 f"{row.value:.6g}",
-                f"{row.time:.6g}",
+                "steady" if math.isinf(row.time) else f"{row.time:.6g}",
                 row.share if row.fraction > -_ROUNDING else f"-{row.share}",
             )
             for row in self.rows
@@ -690,7 +696,7 @@ class Limited:
         for bound, values in zip(self.bounds, self.values(still.jet), strict=True):
             if bound.in_loop:
                 sides = [abs(side) for side in (bound.low, bound.high) if math.isfinite(side)]
-                yield replace(bound, slack=1e-12 * (1.0 + max(sides, default=0.0) / bound.scale))
+                yield replace(bound, slack=1e-12 + 16.0 * np.finfo(float).eps * max(sides, default=0.0) / bound.scale)
                 continue
             if bound.kind == "rms" or np.isnan(values).any():
                 yield replace(bound, slack=0.0)  # a signal that is singular at rest attains no limit there

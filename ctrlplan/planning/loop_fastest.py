@@ -53,7 +53,7 @@ class LoopProblem:
             f"no duration from {low:.4g} s to {shortest:.6g} s satisfies every limit with a margin above "
             f"{self._resolution:g} of its range"
         )
-        if self._others:
+        if self._search.widest:
             found += f"; {self._others} evaluated at durations at most {100.0 * self._search.widest:.2g} % apart"
         return found
 

@@ -29,7 +29,6 @@ from ctrlplan.reports.style import (
     thin_style,
 )
 from ctrlplan.studies.comparison import Comparison
-from ctrlplan.studies.measures import signals_of
 from ctrlplan.studies.sections import AnimatedCrane, Place, Wall
 from ctrlplan.studies.units import superscript
 from ctrlplan.trajectories import TrigSpline
@@ -255,7 +254,7 @@ def plot_motion(
     control.ControlPlot
         Of shape (nplans, 1).
     """
-    names = (moving_plans(comparison) or list(comparison.plans))[:2]
+    names = [name for name in moving_plans(comparison) or comparison.plans if name not in comparison.measured][:2]
     drawing = Drawing(ax, (len(names), 1), (7.4, 3.4 * len(names)), rows=names)
     first, last = _ends(comparison)
     for name, axes in zip(names, drawing.column, strict=True):
@@ -351,7 +350,7 @@ def animation_data(comparison: Comparison, wall: Wall = None, shown: str = "", r
     ValueError
         If the comparison is not of cranes, or has no plan `shown`.
     """
-    labels = [set(response.output_labels or ()) for response in comparison.responses.values()]
+    labels = [set(comparison.responses[name].output_labels) for name in comparison.simulated]
     lacking = [label for label in AnimatedCrane.signals if not all(label in known for known in labels)]
     if lacking:
         raise ValueError(f"an animation must be of a comparison of cranes, got one without {', '.join(lacking)}")
@@ -419,8 +418,7 @@ def _view(comparison: Comparison, corners: list[Array]) -> list[float]:
 
 
 def _signals(comparison: Comparison, name: str) -> dict[str, Array]:
-    response = comparison.responses[name]
-    return signals_of(response) | {"t": np.asarray(response.time)}
+    return comparison.signals(name) | {"t": np.asarray(comparison.responses[name].time)}
 
 
 def _rope_top(signals: dict[str, Array]) -> Array:

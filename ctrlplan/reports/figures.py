@@ -123,7 +123,8 @@ def plot_plans(comparison: Comparison, derivatives: int = 2, *, ax: AxesLike | N
     start = min(p.start for p in comparison.plans.values())
     end = max(p.end for p in comparison.plans.values())
     t = np.unique(np.concatenate([_times(p, start, end) for p in comparison.plans.values()]))
-    for name, plan in comparison.plans.items():
+    for name in comparison.simulated:
+        plan = comparison.plans[name]
         jet = plan.jet(t, derivatives)
         for k, row in enumerate(drawing.axes):
             if k and not plan.duration:
@@ -162,18 +163,16 @@ def plot_responses(comparison: Comparison, *, ax: AxesLike | None = None) -> Con
     rows = drawing.column
     styles = plan_styles(comparison, rows[0])
     for name, plan in comparison.plans.items():
-        response = comparison.responses[name]
-        t = np.asarray(response.time)
-        signals = np.asarray(response.outputs).reshape(-1, t.size)
-        labels = list(response.output_labels)
+        t, signals = np.asarray(comparison.responses[name].time), comparison.signals(name)
         reference = plan.jet(t, 0)[0]
         for a, output in enumerate(outputs):
-            y = signals[labels.index(output)]
-            rows[2 * a].plot(t, reference[a], **thin_style(styles[name]))
+            y = signals[output]
+            if name not in comparison.measured:
+                rows[2 * a].plot(t, reference[a], **thin_style(styles[name]))
             rows[2 * a].plot(t, y, **styles[name])
             rows[2 * a + 1].plot(t, reference[a] - y, **styles[name])
         for c, control in enumerate(controls):
-            rows[2 * len(outputs) + c].plot(t, signals[labels.index(control)], **styles[name])
+            rows[2 * len(outputs) + c].plot(t, signals[control], **styles[name])
     for axes in rows:
         clip_steps(axes, roles_of(comparison))
     for a, output in enumerate(outputs):

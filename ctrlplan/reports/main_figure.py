@@ -32,7 +32,6 @@ from ctrlplan.reports.style import (
 from ctrlplan.reports.tables import plan_of
 from ctrlplan.studies.comparison import Comparison
 from ctrlplan.studies.ensemble import Ensemble
-from ctrlplan.studies.measures import signals_of
 from ctrlplan.studies.sections import Bands, CraneOnline, CranePaths, CraneTime, Paths, Plane
 from ctrlplan.studies.study import Study
 from ctrlplan.studies.sweep import Sweep
@@ -50,7 +49,9 @@ def main_figure(study: Study) -> Panels:
     comparison = study.comparison
     pictures = [_panel(key, draw, caption) for key, draw, caption in islice(_panels_of(study), _COUNT)]
     caption = f"{'; '.join(picture.caption for picture in pictures)}."
-    return _with_legend(pictures, line_styles(roles_of(comparison)), caption[0].upper() + caption[1:])
+    return _with_legend(
+        pictures, line_styles(roles_of(comparison), measured=comparison.measured), caption[0].upper() + caption[1:]
+    )
 
 
 def main_figure_of_sweep(sweep: Sweep, names: Sequence[str]) -> Panels:
@@ -118,8 +119,9 @@ def _panel(key: str, draw: Callable[[Axes], ControlPlot], caption: str) -> Pictu
 def _plot_output(comparison: Comparison, ax: Axes) -> ControlPlot:
     drawing, styles = _axes_of(comparison, ax)
     for name, plan in comparison.plans.items():
-        signals, t = signals_of(comparison.responses[name]), np.asarray(comparison.responses[name].time)
-        ax.plot(t, plan.jet(t, 0)[0][0], **thin_style(styles[name]))
+        signals, t = comparison.signals(name), np.asarray(comparison.responses[name].time)
+        if name not in comparison.measured:
+            ax.plot(t, plan.jet(t, 0)[0][0], **thin_style(styles[name]))
         ax.plot(t, signals[comparison.outputs[0]], **styles[name])
     output = comparison.outputs[0]
     return _finished(drawing, comparison, with_unit(output, output_unit(comparison, output)))
@@ -130,7 +132,7 @@ def _plot_error(comparison: Comparison, ax: Axes) -> ControlPlot:
     drawing, styles = _axes_of(comparison, ax)
     planar = is_planar(comparison)
     for name, plan in comparison.plans.items():
-        signals, t = signals_of(comparison.responses[name]), np.asarray(comparison.responses[name].time)
+        signals, t = comparison.signals(name), np.asarray(comparison.responses[name].time)
         error = plan.jet(t, 0)[0] - np.array([signals[output] for output in comparison.outputs])
         ax.plot(t, np.hypot(*error) if planar else error[0], **styles[name])
     output = comparison.outputs[0]
@@ -156,7 +158,7 @@ def _plot_control(comparison: Comparison, ax: Axes) -> ControlPlot:
     drawing, styles = _axes_of(comparison, ax)
     control = comparison.controls[0]
     for name, response in comparison.responses.items():
-        ax.plot(np.asarray(response.time), signals_of(response)[control], **styles[name])
+        ax.plot(np.asarray(response.time), comparison.signals(name)[control], **styles[name])
     return _finished(drawing, comparison, with_unit(control, comparison.units.get(control, "")))
 
 

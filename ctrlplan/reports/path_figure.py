@@ -22,7 +22,6 @@ from ctrlplan.reports.style import (
 )
 from ctrlplan.reports.style import with_unit as labelled
 from ctrlplan.studies.comparison import Comparison
-from ctrlplan.studies.measures import signals_of
 from ctrlplan.studies.roles import Role
 from ctrlplan.studies.units import output_unit
 
@@ -75,8 +74,9 @@ def draw_paths(axes: Axes, comparison: Comparison, outputs: tuple[str, str]) -> 
         response, plan = comparison.responses[name], comparison.plans[name]
         t = np.asarray(response.time)
         way = t <= last
-        signals = signals_of(response)
-        axes.plot(*rows_of(comparison, plan.labels, plan.jet(t[way], 0)[0], outputs), **thin_style(styles[name]))
+        signals = comparison.signals(name)
+        if name not in comparison.measured:
+            axes.plot(*rows_of(comparison, plan.labels, plan.jet(t[way], 0)[0], outputs), **thin_style(styles[name]))
         axes.plot(*(signals[output][way] for output in outputs), **styles[name])
 
 

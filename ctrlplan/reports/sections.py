@@ -214,7 +214,7 @@ def _(section: ClaimTable, study: Study) -> Part:
 
 @draw.register
 def _(section: Benefit, study: Study) -> Part:
-    compared, known = section.comparison, line_styles(roles_of(study.comparison))
+    compared, known = section.comparison, line_styles(roles_of(study.comparison), measured=study.comparison.measured)
     words = (
         f"A trigonometric plan (alpha = {section.alpha:.4g} rad) is compared with other references through the same "
         "waypoints in the same time. Trapezoid and S-curve stop at every waypoint; the step jumps to the final "

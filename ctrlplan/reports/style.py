@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from functools import cache
@@ -308,7 +308,8 @@ def _coincide(one: Line2D | None, other: Line2D | None, scale: Transform, height
         return False
     with np.errstate(all="ignore"):
         apart = np.abs(scale.transform(np.asarray(a, dtype=float)) - scale.transform(np.asarray(b, dtype=float)))
-    return bool(np.array_equal(np.isnan(a), np.isnan(b)) and np.nanmax(apart, initial=0.0) <= _APART * height)
+    differs = np.max(apart, initial=0.0, where=~np.isnan(apart))
+    return bool(np.array_equal(np.isnan(a), np.isnan(b)) and differs <= _APART * height)
 
 
 _BEYOND = 0.5
@@ -425,11 +426,14 @@ def _as_by_default(name: str) -> bool:
 # Colours and dashes
 
 
-def line_styles(roles: Mapping[str, Role], known: Mapping[str, Style] | None = None) -> dict[str, Style]:
+def line_styles(
+    roles: Mapping[str, Role], known: Mapping[str, Style] | None = None, measured: Collection[str] = ()
+) -> dict[str, Style]:
     """Default colour and dashes of each plan.
 
     The first step is black and dotted, and the first planned references have
     the main colours in order; baselines and all others have the other colours.
+    Measured runs have solid lines below all others, in the other colours.
 
     Parameters
     ----------
@@ -437,20 +441,22 @@ def line_styles(roles: Mapping[str, Role], known: Mapping[str, Style] | None = N
         What each plan is.
     known : mapping of str to dict, optional
         Styles of plans that are drawn elsewhere on the page, which they keep.
+    measured : collection of str, optional
+        Names of measured runs.
     """
     main = {name: (style["color"], style["linestyle"]) for name, style in (known or {}).items() if name in roles}
     used = {colour for colour, _ in main.values()}
     free = {Role.STEP: [_STEP], Role.PLANNED: [*_PLANS], Role.BASELINE: []}
     free = {role: [look for look in looks if look[0] not in used] for role, looks in free.items()}
     for name, role in roles.items():
-        if name not in main and free[role]:
+        if name not in main and name not in measured and free[role]:
             main[name] = free[role].pop(0)
     spare, dashed = cycle([*_OTHERS, *(colour for looks in free.values() for colour, _ in looks)]), cycle(_OTHER_DASHES)
     styles: dict[str, Style] = {}
     for name in roles:
-        colour, dashes = main[name] if name in main else (next(spare), next(dashed))
+        colour, dashes = main[name] if name in main else (next(spare), "-" if name in measured else next(dashed))
         # Dashes over solid lines, so that coinciding curves are both visible.
-        zorder = 2.0 if dashes == "-" else 2.5
+        zorder = 1.5 if name in measured else 2.0 if dashes == "-" else 2.5
         styles[name] = {"color": colour, "linestyle": dashes, "label": legend_label(name), "zorder": zorder}
     return styles
 
@@ -468,7 +474,8 @@ def plan_styles(shown: Comparison | Sweep, axes: Axes, known: Mapping[str, Style
     Those of `line_styles`; in the colours of the user's cycle where one is set,
     and unlike the curves that the axes have already.
     """
-    return _told_apart(line_styles(roles_of(shown), known), axes)
+    measured = () if isinstance(shown, Sweep) else shown.measured
+    return _told_apart(line_styles(roles_of(shown), known, measured), axes)
 
 
 def axis_styles(labels: Iterable[str], axes: Axes) -> dict[str, Style]:

@@ -49,7 +49,7 @@ def metrics_of(comparison: Comparison, kind: str = "metrics", known: Mapping[str
             cells.append(Cell(shown, mark, meaning, _order(value)))
         difference = "" if verdict is None else verdict.difference
         rows.append(MetricRow(measure.title, unit_of(comparison, key), cells, difference))
-    styles = line_styles(roles_of(comparison), known)
+    styles = line_styles(roles_of(comparison), known, comparison.measured)
     plans = [plan_of(plan, styles[plan], "†" if plan in comparison.marks else "") for plan in comparison.metrics]
     return MetricsTable(plans, rows, kind)
 

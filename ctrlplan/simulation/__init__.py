@@ -62,7 +62,7 @@ Crane with limited force; an event ends the run if the rope becomes slack:
 from ctrlplan.simulation.equilibrium import equilibrium_at, equilibrium_state, unstable_poles
 from ctrlplan.simulation.events import Event, Occurrence, what_happened
 from ctrlplan.simulation.interpreted import SolverError
-from ctrlplan.simulation.log import read_log
+from ctrlplan.simulation.log import measured_response, read_log
 from ctrlplan.simulation.loop_quantities import LoopQuantities, loop_quantities
 from ctrlplan.simulation.loop_response import Extremes, LoopResponse
 from ctrlplan.simulation.predictor import Predictor
@@ -87,6 +87,7 @@ __all__ = [
     "equilibrium_at",
     "equilibrium_state",
     "loop_quantities",
+    "measured_response",
     "prepare",
     "prepared_form",
     "read_log",

@@ -88,8 +88,8 @@ def extrema_of_cells(cells: Cells, values: Array, times: Array) -> tuple[Array, 
         Minima, maxima, and the times of both.
     """
     ends = [cells.values(x) for x in (cells.low, cells.high)]
-    every = np.concatenate([values, *ends], axis=1)
-    moments = np.concatenate([times, cells.times(cells.low), cells.times(cells.high)])
+    every = np.concatenate([*ends, values], axis=1)
+    moments = np.concatenate([cells.times(cells.low), cells.times(cells.high), times])
     floor = _TOLERANCE * np.ptp(every, axis=1) + 4e-16 * np.abs(every).max(axis=1, initial=0.0)
     spread = np.abs(cells.series[1:]).sum(axis=0)
     found = []
@@ -105,7 +105,7 @@ def extrema_of_cells(cells: Cells, values: Array, times: Array) -> tuple[Array, 
             if bound[k] <= peaks[row] + floor[row]:
                 continue
             x, value = _maximum(series[:, k], float(cells.low[cell]), float(cells.high[cell]))
-            if value > peaks[row]:
+            if value > peaks[row] + floor[row]:
                 peaks[row] = value
                 places[row] = cells.starts[cell] + 0.5 * (1.0 + x) * cells.lengths[cell]
         found.append((sign * peaks, places))

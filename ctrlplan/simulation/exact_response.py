@@ -302,11 +302,12 @@ def extremes_of(
             more = _seen(cells, np.array([low, high]))
             low, high = more if whole else (low, high)
             small = _REST * np.maximum(scale, more[1] - more[0])
-            if float(cells.starts[-1]) > last or np.all(
+            if float(cells.starts.max()) > last or np.all(
                 bounds <= (np.maximum(np.minimum(high - final, final - low), small) if whole else small)
             ):
                 break
         else:
+            motion.form.check_settled()
             cells = parts[-1]
         if not whole and float(cells.starts.max(initial=0.0)) <= last:
             values.append(final)
@@ -321,10 +322,18 @@ def extremes_of(
 
 
 def _seen(cells: Cells, values: Array) -> tuple[Array, Array]:
-    """Minima and maxima (nrows,) of values (ncandidates, nrows) and of signals at the starts of cells."""
+    """Minima and maxima (nrows,) of values (ncandidates, nrows), and of signals at points of their cells."""
     if cells.starts.size:
-        values = np.concatenate([values, cells.values(cells.low).T])
+        whole = (cells.low == -1.0) & (cells.high == 1.0)
+        inside = np.tensordot(_POINTS[:, : len(cells.series)], cells.series[..., whole], axes=1)
+        values = np.concatenate(
+            [values, cells.values(cells.low).T, inside.transpose(0, 2, 1).reshape(-1, len(values.T))]
+        )
     return values.min(axis=0), values.max(axis=0)
+
+
+_POINTS = np.cos(np.pi * np.arange(17)[:, None] / 16 * np.arange(NODES))
+"""Chebyshev polynomials at points of a cell, both ends included."""
 
 
 def _marched(

@@ -15,6 +15,9 @@ from ctrlplan.simulation.plan_cells import PlanCells
 _PARTS = 32
 """Number of intervals of a cell in which an impulse response is bounded by a constant."""
 
+_CELLS = 4000
+"""Number of cells after which an impulse response is bounded by a constant."""
+
 _NEGLIGIBLE = 1e-12
 """Magnitude of an impulse response, relative to its bound at 0, from which on it is bounded by a constant."""
 
@@ -46,14 +49,14 @@ class Envelope:
         self._polynomial = powers
         columns = stable @ (stable_left @ b)
         initial = rest = form.decay_bounds(c, columns).ravel()
-        values, edges = [], [np.zeros(1)]
+        values, edges, count = [], [np.zeros(1)], 0
         ends = 0.5 - 0.5 * np.cos(np.pi * np.arange(1, _PARTS + 1) / _PARTS)
         for cells, later in free_cells(form, c, columns):
             by = np.argsort(cells.starts)
             values.append(envelope(cells, _PARTS)[::-1][:, :, by].transpose(2, 0, 1).reshape(-1, rest.size))
             edges.append((cells.starts[by, None] + cells.lengths[by, None] * ends).ravel())
-            rest = later
-            if np.all(rest <= _NEGLIGIBLE * initial):
+            rest, count = later, count + by.size
+            if count >= _CELLS or np.all(rest <= _NEGLIGIBLE * initial):
                 break
         table = np.concatenate([*values, rest[None]])
         self._values: Array = np.maximum.accumulate(table[::-1])[::-1]
@@ -109,7 +112,7 @@ class Curvature:
     def __init__(self, form: LoopForm, rows: Rows, plan: PlanCells) -> None:
         self._rows, self._orders, self._axes = rows, form.order + 1, form.naxes
         self._decays = not form.integrators
-        columns = np.moveaxis(form.b, 0, 1).reshape(form.nstates, -1)
+        columns = np.moveaxis(form.b, 0, 1).reshape(form.nstates, self._orders * self._axes)
         self.envelope = Envelope(form, rows.c, columns)
         self._peaks = np.array([plan.peak(k) for k in range(max(self._orders + 2, rows.order + 1))])
         self._jumps = np.array([np.abs(plan.jump(k)).sum(axis=1) for k in range(self._orders + 1)])

@@ -102,14 +102,32 @@ def read_log(
     times = table.increasing(when, hint) * factors.get(_TIME, 1.0)
     _check_gaps(table, times, max_gap)
     scale = np.array([factors.get(label, 1.0) for label in chosen])
+    reason, title = f"{times.size} samples of {table.title}", f"Signals of {table.title}"
+    return measured_response(times, values * scale[:, None], list(chosen), reason, title)
+
+
+def measured_response(times: Array, rows: Array, labels: Sequence[str], reason: str, title: str) -> SimulationResponse:
+    """Response of measured signals.
+
+    Parameters
+    ----------
+    times : ndarray, shape (ntime,)
+        Times [s].
+    rows : ndarray, shape (nsignals, ntime)
+        The signals.
+    labels : sequence of str
+        Their labels.
+    reason, title : str
+        What was measured, and the title of plots.
+    """
     return SimulationResponse(
         times,
-        values * scale[:, None],
+        rows,
         method="measured",
-        reason=f"{times.size} samples of {table.title}",
-        output_labels=list(chosen),
-        issiso=len(chosen) == 1,
-        title=f"Signals of {table.title}",
+        reason=reason,
+        output_labels=list(labels),
+        issiso=len(labels) == 1,
+        title=title,
     )
 
 

@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -209,6 +210,8 @@ class LoopForm:
     def decay_bounds(self, c: Array, states: Array) -> Array:
         """Bounds (nrows, nstates_given) of |c e^(A s) x| for all s >= 0, for states without integrator part."""
         stable, stable_left = self.split[2:]
+        if not stable.size:
+            return np.zeros((len(c), states.shape[1]))
         if self.condition <= _ILL:
             weights = np.linalg.solve(self._modes, (stable_left @ states).astype(complex))
             return np.asarray(np.abs(c @ stable @ self._modes) @ np.abs(weights))
@@ -237,6 +240,9 @@ class LoopForm:
         n, m = self.nstates, (self.order + 1) * self.naxes
         sigma = np.append(SIGMA, 1.0)[:, None, None]
         b = np.moveaxis(self.b, 0, 1).reshape(n, m)
+        if not n:
+            width = (NTERMS + self.order) * self.naxes
+            return Kernel(np.zeros((NODES, 0, width)), np.zeros((0, width)))
         changes = changes_over(length * sigma * self.a, length * sigma * b, NTERMS)[-1]
         own = changes[..., n:].reshape(sigma.size, n, NTERMS, self.order + 1, self.naxes)
         own = own * sigma[..., None, None] ** np.arange(NTERMS)[:, None, None]
@@ -247,11 +253,18 @@ class LoopForm:
         whole = np.concatenate([changes[..., :n], forced.reshape(sigma.size, n, -1)], axis=-1)
         return Kernel(whole[:-1], whole[-1])
 
-    def schedule(self, duration: float, longest: float) -> tuple[Array, NDArray[np.intp]]:
-        """Starts [s] and levels of the cells from a breakpoint on; the last may end after `duration`."""
+    def schedule(self, duration: float, longest: float, whole: bool = True) -> tuple[Array, NDArray[np.intp]]:
+        """Starts [s] and levels of the cells from a breakpoint on; the last may end after `duration`.
+
+        Raises
+        ------
+        ValueError
+            If there are too many, since a fast mode is hardly damped, and the `whole` duration is required.
+        """
         times, sizes = self._alive
         starts, levels, s = [], [], 0.0
         edges = [*times.tolist(), math.inf]
+        cells = 0
         for k, edge in enumerate(edges):
             until = min(edge, duration)
             if s >= until:
@@ -259,32 +272,40 @@ class LoopForm:
             limit = min(longest, _REACH / sizes[k] if sizes[k] > 0.0 else math.inf)
             level = math.floor(math.log2(limit)) if math.isfinite(limit) else math.ceil(math.log2(until))
             count = max(1, math.ceil((until - s) / 2.0**level * (1.0 - 1e-12)))
-            if count > _MOST:
-                raise ValueError(
-                    f"the response of {self.name} must be resolved by {_MOST} cells, got {count} in {until:.3g} s: "
-                    f"its fastest mode that remains has a pole of magnitude {sizes[k]:.3g} rad/s; give a shorter plan"
-                )
+            cells += count
+            if cells > _MOST and whole:
+                self.raise_unsettled()
+            count -= max(0, cells - _MOST)
             starts.append(s + 2.0**level * np.arange(count))
             levels.append(np.full(count, level))
             s += 2.0**level * count
+            if cells >= _MOST:
+                break
         return np.concatenate(starts), np.concatenate(levels)
 
     @cached_property
     def tail_schedule(self) -> tuple[Array, NDArray[np.intp]]:
-        """Starts [s] and levels of the cells after the plan, until all modes have decayed."""
+        """Starts [s] and levels of the cells after the plan, until all modes have decayed or there are too many."""
         times = self._alive[0]
         if not times.size:
             return np.zeros(0), np.zeros(0, dtype=np.intp)
-        return self.schedule(float(times[-1]), math.inf)
+        return self.schedule(float(times[-1]), math.inf, whole=False)
 
-    def with_inputs(self, b: Array) -> LoopForm:
-        """The same loop with other input matrices."""
-        found = object.__new__(LoopForm)
-        found.__dict__.update(self.__dict__ | {"b": b, "order": len(b) - 1, "naxes": b.shape[2], "_kernels": {}})
-        return found
+    def check_settled(self) -> None:
+        """Raise unless all modes have decayed within the cells after the plan."""
+        if self.tail_schedule[1].size >= _MOST:
+            self.raise_unsettled()
+
+    def raise_unsettled(self) -> NoReturn:
+        """Raise for modes that decay so slowly that their response is not evaluated to its end."""
+        slow = complex(self.poles[np.argmax(self.poles.real / np.maximum(np.abs(self.poles), 1e-300))])
+        raise ValueError(
+            f"modes of the loop must decay within {_MOST} cells of the response, got {self.name} with a pole at "
+            f"{_pole(slow)}, whose oscillation hardly decays; give the loop more damping, or leave the mode out"
+        )
 
 
-_MOST = 2_000_000
+_MOST = 100_000
 """Maximum number of cells of a response."""
 
 

@@ -160,16 +160,18 @@ class AlongPlan:
             np.where(free, 0.0, given),
             free,
         )
-        if state is not None:
-            sizes = self.form.scale * np.abs(state / self.form.scale).max(initial=0.0)
-            terms = np.abs(linear.a) @ sizes + np.abs(linear.b) @ np.abs(supplied)
-            if np.any(np.abs(linear.a @ state + linear.b @ supplied) > 1e-9 * np.maximum(terms, 1e-300)):
+        if state is not None:  # states that blocks declare are not changed
+            scale, moved = self.form.scale, linear.a @ state + linear.b @ supplied
+            size = np.abs(self.form.a).sum(axis=1) * np.abs(state / scale).max(initial=0.0)
+            size += np.abs(linear.b) @ np.abs(supplied) / scale
+            if np.any(np.abs(moved / scale) > 1e-9 * size):
                 state = None
         if state is None:
             place = ", ".join(f"{label} = {x:.4g}" for label, x in zip(plan.labels, plan.initial.tolist(), strict=True))
             raise ValueError(
                 f"the loop must start at rest at the first position of the plan, got {self._prepared.name} without an "
-                f"equilibrium at {place}: an integrator in it has an input that is not 0 there"
+                f"equilibrium at {place}: an integrator has an input that is not 0 there, or a block declares another "
+                "initial state"
             )
         return np.asarray(state / self.form.scale)
 

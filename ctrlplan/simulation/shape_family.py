@@ -29,6 +29,9 @@ _TAIL_CELLS = 40
 _PER_CELL = 16
 """Number of intervals of such a cell between samples."""
 
+_STEP_PARTS = 4
+"""Maximum number of parts of the response to a step that are evaluated."""
+
 _STACK = 64
 """Number of durations that are propagated together."""
 
@@ -118,20 +121,24 @@ class ShapeFamily:
         return float(low[0]), float(high[0])
 
     def step(self) -> tuple[Array, Array, Array]:
-        """Minima and maxima (nsignals,) for a step, and how much per second of duration a plan may differ.
+        """Attained minima and maxima (nsignals,) for a step, and by how much per second of duration a plan may differ.
 
         The rates are infinite for signals to which derivatives of the plan contribute.
         """
         form, plan, rows = self.form, self.plan, self.rows
-        final = form.settled(self.state, plan.final, math.inf)
+        constant, projection = form.settling(plan.final)
+        final = constant + projection @ self.state
         values = np.stack([self.before, rows.static(plan.final, final)], axis=1)
         parts = []
         for cells, bounds in free_cells(form, rows.c, (self.state - final)[:, None]):
             cells.series[0] += values[:, 1:]
             parts.append(cells)
-            if np.all(bounds <= 1e-6 * np.ptp(values, axis=1)):
+            # Values that are attained, not all extrema, exclude short plans.
+            if len(parts) == _STEP_PARTS or np.all(bounds <= 1e-6 * np.ptp(values, axis=1)):
                 break
-        low, high, *_ = extrema_of_cells(joined(parts), values, np.array([0.0, math.inf]))
+        low, high = values.min(axis=1), values.max(axis=1)
+        if parts:
+            low, high, *_ = extrema_of_cells(joined(parts), values, np.array([0.0, math.inf]))
         whole = form.order > 0 or rows.order > 0 or form.integrators > 0 or any(one.during for one in self.chosen)
         if whole:
             return low, high, np.full(len(rows.c), math.inf)
@@ -234,7 +241,8 @@ class ShapeFamily:
             count += cells.starts.size
             if count >= _TAIL_CELLS:
                 break
-        return np.concatenate(moments), np.concatenate(tables, axis=1).reshape(-1, n)
+        times = np.concatenate(moments)
+        return times, np.concatenate(tables, axis=1).reshape(len(self.chosen) * times.size, n)
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,6 +9,7 @@ from ctrlplan.studies.experiment import Experiment, Measured
 from ctrlplan.studies.former import compare, sweep
 from ctrlplan.studies.grids import Grid
 from ctrlplan.studies.linear import linear_study
+from ctrlplan.studies.measured import MeasuredRun
 from ctrlplan.studies.measures import MEASURES, Acting, Measure, Path, Run, Tracked
 from ctrlplan.studies.monte_carlo import monte_carlo
 from ctrlplan.studies.online import (
@@ -53,6 +54,7 @@ __all__ = [
     "Grid",
     "Measure",
     "Measured",
+    "MeasuredRun",
     "Path",
     "RequiredDuration",
     "Role",

@@ -8,7 +8,7 @@ import os
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,11 +16,12 @@ from numpy.typing import ArrayLike
 from ctrlplan._display import Displayed, Facts, Part, Table, in_line, number
 from ctrlplan._files import write_text
 from ctrlplan._renamed import FormerAttribute
-from ctrlplan._types import Params
+from ctrlplan._types import Array, Params
 from ctrlplan.simulation import Event, SimulationResponse, signal_table
 from ctrlplan.studies.experiment import Experiment, Measured
 from ctrlplan.studies.limits import limits_of
-from ctrlplan.studies.measures import MEASURES, Measure, leading_metrics, shown_measures
+from ctrlplan.studies.measured import MeasuredRun, with_measured
+from ctrlplan.studies.measures import MEASURES, Measure, leading_metrics, shown_measures, signals_of
 from ctrlplan.studies.notes import how_measured, mark_of, notes_of
 from ctrlplan.studies.plans import references_of, waypoints_given
 from ctrlplan.studies.roles import Role, Stability, role_of, stability_of
@@ -34,7 +35,7 @@ from ctrlplan.trajectories.export import SampledTable, export_table
 
 if TYPE_CHECKING:
     import pandas as pd
-    from control import ControlPlot
+    from control import ControlPlot, TimeResponseData
 
     from ctrlplan.planning import Obstacle
     from ctrlplan.reports.style import AxesLike
@@ -89,6 +90,9 @@ class Comparison(Displayed):
         Stability of the loops, as far as it is known.
     experiment : Experiment or None
         Plans, times and measures of the comparison.
+    measured : dict of str to MeasuredRun
+        Measured runs by name, which are entries of the other attributes too: see
+        `with_measured`.
     """
 
     plans: dict[str, Trajectory]
@@ -111,6 +115,7 @@ class Comparison(Displayed):
     roles: dict[str, Role] = field(default_factory=dict)
     stability: Stability = Stability.UNKNOWN
     experiment: Experiment | None = None
+    measured: dict[str, MeasuredRun] = field(default_factory=dict)
 
     worth = FormerAttribute("benefit")
 
@@ -229,6 +234,80 @@ class Comparison(Displayed):
         """Comparison with a benefit, shown on its page and in its results."""
         return replace(self, benefit=benefit)
 
+    def with_measured(
+        self, logs: Mapping[str, TimeResponseData], *, align: Literal["auto"] | str | float | None = "auto"
+    ) -> Comparison:
+        """Comparison with measured runs next to the simulated ones.
+
+        A measured run has the same metrics and is drawn in the same figures;
+        its name is that of its plan followed by "(measured)". Its samples are used
+        from the start to the end of the simulation, with linear interpolation at the
+        times of the simulation. Metrics of signals that the log does not contain
+        are omitted, and measured runs are not ranked.
+
+        Parameters
+        ----------
+        logs : mapping of str to TimeResponseData
+            Log of the machine by name of the plan that it followed, as `read_log`
+            returns it: signals have the labels of the loop's outputs, as far as
+            they are measured, and may include the command.
+        align : "auto", str, float or None, optional
+            How the time of the log is aligned with that of the plan:
+
+            - "auto": by the command where the log contains it, under the label of
+              the loop's input or of the plan's axis with _ref or _cmd; otherwise by
+              the outputs that follow the plan, compared with the simulated ones or
+              the plan, whichever fits better. Offset and plant delay cannot then be
+              told apart.
+            - name of a signal: by this signal, a command or an output of the loop.
+            - number: time of the log minus time of the plan [s].
+            - None: both times are the same.
+
+        Returns
+        -------
+        Comparison
+            With the runs in `measured`, where the offsets are with their standard
+            errors.
+
+        Raises
+        ------
+        ValueError
+            If a plan is unknown, a log has no signal of the comparison or does not
+            overlap the simulated time, or the offset cannot be found.
+        TypeError
+            If `logs` is no mapping, or an entry is no response.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> import ctrlplan as cp
+        >>> plan = cp.PolySpline([cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1, 0, 0)])
+        >>> t = np.linspace(0, 2, 2001)
+        >>> loop = cp.plants.integrator_lag_loop(100.0)
+        >>> run = cp.simulate(loop, t, plan)
+        >>> log = cp.read_log({"time": t + 7.3e-3, "y": run.outputs, "r": plan(t)})
+        >>> found = cp.compare(loop, {"quintic": plan}, t).with_measured({"quintic": log})
+        >>> list(found.metrics), round(found.measured["quintic (measured)"].offset, 6)
+        (['quintic', 'quintic (measured)'], 0.0073)
+        """
+        return with_measured(self, logs, align)
+
+    def signals(self, name: str) -> dict[str, Array]:
+        """Outputs of a run by label, with nan for those of other runs that it does not have."""
+        response = self.responses[name]
+        known = dict.fromkeys(label for one in self.responses.values() for label in one.output_labels or ())
+        return {label: np.full(np.size(response.time), np.nan) for label in known} | signals_of(response)
+
+    @property
+    def simulated(self) -> list[str]:
+        """Names of the runs that are not measured."""
+        return [name for name in self.plans if name not in self.measured]
+
+    @property
+    def ranked(self) -> list[str]:
+        """Names of the runs that are compared in the verdicts: neither measured nor ended by an event."""
+        return [name for name in self.metrics if name not in self.stopped and name not in self.measured]
+
     def plot(self, ax: AxesLike | None = None) -> ControlPlot:
         """Plot responses, errors and controls versus time.
 
@@ -250,7 +329,7 @@ class Comparison(Displayed):
 
     def sections(self, obstacles: Iterable[Obstacle] = ()) -> tuple[Section, ...]:
         """Sections of its page: planar paths, plans and responses, and an animation if all loops are cranes."""
-        labels = [set(response.output_labels or ()) for response in self.responses.values()]
+        labels = [set(self.responses[name].output_labels or ()) for name in self.simulated]
         cranes = all(known >= set(AnimatedCrane.signals) for known in labels)
         planar = len(self.outputs) == 2 and len({output_unit(self, output) for output in self.outputs}) == 1
         paths = [CranePaths()] if cranes else [Paths(obstacles=tuple(obstacles))] if planar else []
@@ -411,7 +490,7 @@ def comparison_of(
         scales=scales_of(shown_measures(experiment.measures, list(found.metrics.values())), signals),
         stopped={name: stop.time for name, stop in stopped.items()},
         failures=found.failures,
-        limits={name: limits_of(run.system) for name, run in runs.items()},
+        limits={name: limits_of(run.system) for name, run in runs.items() if run.system is not None},
         roles={name: role_of(plan) for name, plan in plans.items()},
         stability=stability_of(runs.values()),
         experiment=experiment,
@@ -433,7 +512,8 @@ def shown_in_units(
         As for `compare`.
     """
     plans = {name: experiment.plans[name] for name in found.runs}
-    known = checked_units(units, plans.values(), [run.system for run in found.runs.values()])
+    systems = [run.system for run in found.runs.values() if run.system is not None]
+    known = checked_units(units, plans.values(), systems)
     signals = signals_of_runs(plans, found.runs, known, experiment.since)
     shown = shown_measures(experiment.measures, list(found.metrics.values()))
     return listed_measures(found.metrics, shown, signals), signals

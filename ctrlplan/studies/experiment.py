@@ -322,19 +322,45 @@ class Experiment(Displayed):
 
     def _metrics(self, run: Run) -> dict[str, float]:
         """Metrics of a run, up to its end."""
+        return run_metrics(run, wanted_measures(self.measures)) | self.metrics_of_signals(run, self.axes, run.controls)
+
+    def metrics_of_signals(self, run: Run, axes: tuple[str, ...], controls: tuple[str, ...]) -> dict[str, float]:
+        """Metrics of responses, controls and path of a run, up to its end.
+
+        Parameters
+        ----------
+        run : Run
+            The run; ``run.outputs`` and ``run.controls`` may be some of those of
+            the loop.
+        axes : tuple of str
+            Axes of the plan that ``run.outputs`` follow.
+        controls : tuple of str
+            All controls of the loop. Metrics that are a maximum over signals of
+            which the run lacks one are omitted.
+        """
         wanted = wanted_measures(self.measures)
-        values = run_metrics(run, wanted)
+        values: dict[str, float] = {}
         if np.count_nonzero(run.t >= self.since) >= 2:  # otherwise it ended before the interval of the metrics
             unstable = np.array([run.is_unstable])
             y, u = run.rows(run.outputs)[None], run.rows(run.controls)[None]
-            record = Record(run.t, y, u, self.axes, run.controls, unstable)
-            found = signal_metrics(record, run.plan, self.since, self.band, wanted)
-            values |= {key: float(row[0]) for key, row in found.items()}
+            record = Record(run.t, y, u, axes, run.controls, unstable)
+            plan = run.plan if axes == run.plan.labels or not axes else run.plan.select(axes)
+            found = signal_metrics(record, plan, self.since, self.band, wanted)
+            for kind, held, every in (("response", axes, self.axes), ("control", run.controls, controls)):
+                if len(held) < len(every):
+                    found = _of_each(found, [name for name, one in wanted.items() if one.of == kind], held)
+            values = {key: float(row[0]) for key, row in found.items()}
         return values | path_metrics(run.plan, self.waypoints, wanted)
 
     def _listed(self, kind: str) -> bool:
         """Whether there is a measure of a kind."""
         return any(measure.of == kind for measure in wanted_measures(self.measures).values())
+
+
+def _of_each(found: Mapping[str, Array], names: Sequence[str], held: Sequence[str]) -> dict[str, Array]:
+    """Metrics without those over all signals: of the only signal held under its label, of several one each."""
+    alone = {name: f"{name}_{held[0]}" for name in names} if len(held) == 1 else {}
+    return {alone.get(key, key): row for key, row in found.items() if key in alone or key not in names}
 
 
 def _each(

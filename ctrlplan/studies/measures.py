@@ -134,8 +134,8 @@ class Run:
     ----------
     plan : Trajectory
         The reference.
-    system : control system or Prepared
-        The loop.
+    system : control system, Prepared or None
+        The loop; None for a measured run.
     response : SimulationResponse
         Response of the loop, as returned by `simulate`.
     outputs, controls : tuple of str
@@ -152,7 +152,7 @@ class Run:
     """
 
     plan: Trajectory
-    system: ct.InputOutputSystem | Prepared
+    system: ct.InputOutputSystem | Prepared | None
     response: SimulationResponse
     outputs: tuple[str, ...]
     controls: tuple[str, ...]

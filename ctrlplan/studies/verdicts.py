@@ -72,13 +72,13 @@ class Verdict:
 def verdicts(comparison: Comparison) -> list[Verdict]:
     """Best and worst plans of each metric that two or more plans have.
 
-    Runs that an event ended are not ranked.
+    Measured runs, and runs that an event ended, are not ranked.
     """
     found: list[Verdict] = []
     if is_unstable(comparison):
         return found  # no plan settles
     for key, measure in comparison.measures.items():
-        whole = {plan: rows for plan, rows in comparison.metrics.items() if plan not in comparison.stopped}
+        whole = {plan: comparison.metrics[plan] for plan in comparison.ranked}
         values = {plan: rows[key] for plan, rows in whole.items() if key in rows and not math.isnan(rows[key])}
         if len(values) > 1:
             scale = comparison.scales.get(key, UNIT_SCALES.get(measure.unit, math.nan))
@@ -95,12 +95,11 @@ def summary(comparison: Comparison) -> str:
     ended = (
         f" Not ranked, because an event ended the run: {', '.join(comparison.stopped)}." if comparison.stopped else ""
     )
+    ended += f" Not ranked, because measured: {', '.join(comparison.measured)}." if comparison.measured else ""
     if not decided:
         return f"No metric differs between the plans.{ended}"
     parts = []
-    for plan in comparison.plans:
-        if plan in comparison.stopped:
-            continue
+    for plan in comparison.ranked:
         best = sum(plan in v.best for v in decided)
         worst = sum(plan in v.worst for v in decided)
         parts.append(f"{plan} is best in {best} and worst in {worst}")
@@ -130,8 +129,8 @@ def headline(comparison: Comparison) -> str:
     if is_unstable(comparison):
         return " ".join([comparison.notes[0], *failed])
     keys = [key for group in _HEADLINE if (key := _first_of(group, comparison))]
-    ranked = [name for name in comparison.plans if name not in comparison.stopped]
-    steps = [name for name in comparison.plans if comparison.roles.get(name) is Role.STEP]
+    ranked = comparison.ranked
+    steps = [name for name in comparison.simulated if comparison.roles.get(name) is Role.STEP]
     planned = [name for name in ranked if name not in steps] or ranked
     parts = []
     if planned:
@@ -144,6 +143,7 @@ def headline(comparison: Comparison) -> str:
     parts += [f"With {name}: {_values(comparison, name, keys)}." for name in steps]
     ended = ", ".join(f"{name} ({time:.4g} s)" for name, time in comparison.stopped.items())
     stopped = (f"Not ranked, because an event ended the run: {ended}.",) if ended else ()
+    parts += [f"{name}: {_values(comparison, name, keys)}." for name in comparison.measured]
     return " ".join([*parts, *stopped, *failed, limits_sentence(comparison)])
 
 

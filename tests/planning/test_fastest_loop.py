@@ -179,6 +179,20 @@ def test_sum_of_signals_is_a_region():
     assert whole.duration == pytest.approx(difference.duration, rel=1e-9)
 
 
+def test_root_mean_square_with_a_value():
+    """The root mean square of the speed is that of the samples, and decides where it is violated longest."""
+    loop = ct.ss(SERVO_MATRICES[0], SERVO_MATRICES[1][0], np.eye(2), np.zeros((2, 1)), inputs="r", outputs=["y", "v"])
+    found = cp.fastest(QUINTIC, {"v": cp.Limits(rms=3.0), "y": (None, 1.05)}, loop)
+    times = np.linspace(0.0, found.duration, 100_001)
+    v = cp.simulate(loop, times, found.plan).outputs["v"]
+    assert math.sqrt(np.trapezoid(v**2, times) / found.duration) == pytest.approx(3.0, rel=1e-8)
+    assert found.active.bound.name == "RMS of v"
+    assert "RMS of v evaluated at durations at most" in found.statement
+    alone = cp.fastest(QUINTIC, {"y": (None, 1.05)}, loop)
+    assert alone.duration < found.duration
+    assert "RMS" not in alone.statement
+
+
 def test_rate_of_a_signal():
     """With the rate of the voltage limited as well, the move takes longer, and the rate is attained."""
     found = cp.fastest(SEPTIC, {"y": cp.Limits(-0.1, 1.1, rate=3.0)}, SERVO)
@@ -212,6 +226,63 @@ def test_no_overshoot_at_all():
     with pytest.raises(ValueError, match="limits must include one that a shorter plan would violate"):
         cp.fastest(QUINTIC, {"y": (0.0, 1.0)}, loop)
     assert cp.margins(QUINTIC, {"y": (0.0, 1.0)}, loop).satisfied
+
+
+def test_integrators():
+    """A double integrator behind a lag, fed by the acceleration of the plan: the acceleration is that of the lag."""
+    a, b = np.array([[-20.0, 0, 0], [1, 0, 0], [0, 1, 0]]), np.array([[0.0, 0.0, 20.0], [0, 0, 0], [0, 0, 0]])
+    loop = ct.ss(a, b, np.eye(3), np.zeros((3, 3)), inputs=["r", "r_d1", "r_d2"], outputs=["acc", "v", "y"])
+    plan = cp.PolySpline([Waypoint(0, 2, 0, 0), Waypoint(1, 5, 0, 0)])
+    found = cp.fastest(plan, {"acc": 12.0, "y": (1.9, 5.1)}, loop)
+    lag = (a[:1, :1], np.array([[[0.0]], [[0.0]], [[20.0]]]), np.eye(1), np.zeros((1, 1, 1)))
+    durations = np.geomspace(found.searched[0], found.duration, 200)
+    peaks = np.abs(responses(lag, plan, durations, 4000, 1000)).max(axis=(1, 2))
+    assert peaks[-1] == pytest.approx(12.0, rel=1e-6)
+    assert peaks[:-1].min() > 12.0 * (1.0 - 2e-3)
+    margin = next(row for row in found.margins if row.bound.name == "y")
+    assert margin.fraction == pytest.approx(0.1 / 1.6, rel=1e-10)  # of half the range
+
+
+def test_an_integrator_of_the_plan():
+    """The level of a tank after a closed plan is proportional to the duration, and is reached at the end."""
+    tank = ct.ss([[0.0]], [[1.0]], [[1.0]], [[0.0]], inputs="r", outputs="y", name="tank")
+    plan = cp.PolySpline([Waypoint(0, 0, 0, 0), Waypoint(0.5, 1), Waypoint(1, 0, 0, 0)])
+    level = np.polynomial.legendre.leggauss(20)
+    area = float(0.5 * level[1] @ plan(0.5 + 0.5 * level[0]))
+    found = cp.fastest(plan, {"y": cp.Limits(0.3, 1.0, during=(1.0, 2.0))}, tank)
+    assert found.duration == pytest.approx(0.3 / area, rel=1e-11)
+
+
+def test_a_gain_alone():
+    """Without states the signal is a multiple of the plan: its rate is limited in closed form."""
+    gain = ct.ss([], [], [], [[2.0]], inputs="r", outputs="y", name="gain")
+    found = cp.fastest(QUINTIC, {"y": cp.Limits(-1.0, 3.0, rate=3.0)}, gain)
+    assert found.duration == pytest.approx(2.0 * 15 / 8 / 3.0, rel=1e-11)
+    with pytest.raises(ValueError, match="limits must include one that a shorter plan would violate"):
+        cp.fastest(QUINTIC, {"y": (-1.0, 3.0)}, gain)
+
+
+@pytest.mark.parametrize("damping", [1e-4, 1e-6])
+def test_hardly_damped_mode(damping):
+    """The overshoot after the move is that of the undamped mode, in closed form, up to the damping."""
+    w = 100.0
+    loop = ct.ss([[0.0, w], [-w, -2.0 * damping * w]], [[0.0], [w]], [[1.0, 0.0]], [[0.0]], inputs="r", outputs="y")
+    found = cp.fastest(QUINTIC, {"y": (-0.01, 1.01)}, loop)
+
+    def amplitude(duration):  # |int r'(t) e^(i w t) dt|, of a quintic
+        t = np.linspace(0.0, duration, 20_001)
+        return abs(np.trapezoid(QUINTIC.retime(duration)(t, 1) * np.exp(1j * w * t), t))
+
+    assert amplitude(found.duration) == pytest.approx(0.01, rel=20.0 * damping + 1e-6)
+    assert found.active.bound.name == "y"
+
+
+def test_far_from_the_origin():
+    """Positions of a million with a range of 1, at a time of a million seconds."""
+    far = cp.PolySpline([Waypoint(1e6, 1e6, 0, 0), Waypoint(1e6 + 1, 1e6 + 1, 0, 0)])
+    found = cp.fastest(far, {"y": (1e6 - 1.0, 1e6 + 1.01)}, SERVO)
+    near = cp.fastest(QUINTIC, {"y": (-1.0, 1.01)}, SERVO)
+    assert found.duration == pytest.approx(near.duration, rel=1e-8)
 
 
 def test_waypoints_held():

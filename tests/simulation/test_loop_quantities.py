@@ -2,6 +2,7 @@
 
 import math
 from functools import reduce
+from itertools import pairwise
 
 import control as ct
 import mpmath
@@ -36,11 +37,10 @@ def lag_error(duration):
 def test_first_order_lag_in_closed_form():
     """The error of the lag is largest during the move, and its root mean square is an integral."""
     t, error = lag_error(2)
-    slope = sympy.lambdify(t, sympy.diff(error, t), "mpmath")
+    value, slope = (sympy.lambdify(t, sympy.diff(error, t, k), "mpmath") for k in range(2))
     with mpmath.workdps(40):
         at = mpmath.findroot(slope, 1.0)
-        peak = sympy.lambdify(t, error, "mpmath")(at)
-        square = mpmath.quad(lambda x: sympy.lambdify(t, error, "mpmath")(x) ** 2, [0, 1, 2])
+        peak, square = value(at), mpmath.quad(lambda x: value(x) ** 2, [0, 1, 2])
     response = along(LAG, QUINTIC.retime(2.0))
     found = response.extremes({"e": 1.0})
     assert found.high == pytest.approx(float(peak), rel=1e-14)
@@ -317,7 +317,48 @@ def test_what_a_loop_must_be():
         along(integrator, QUINTIC).extremes({"y": 1.0})
     with pytest.raises(ValueError, match=r"must start at rest .* got tank without an equilibrium at y = 2"):
         along(integrator, cp.PolySpline([Waypoint(0, 2, 0, 0), Waypoint(1, 3, 0, 0)]))
+    started = cp.declare(ct.ss([[-4.0]], [[4.0]], [[1.0]], [[0.0]], inputs="r", outputs="y"), initial_state=[0.5])
+    with pytest.raises(ValueError, match=r"must start at rest .* or a block declares another initial state"):
+        along(started, QUINTIC)
     with pytest.raises(ValueError, match="signals of the loop must be among y, e, r, got 'z'"):
         along(LAG, QUINTIC).extremes({"z": 1.0})
     with pytest.raises(ValueError, match="period must be above 0 and finite, got -1 s"):
         along(LAG, QUINTIC).rms("y", period=-1.0)
+
+
+def test_modes_that_hardly_decay():
+    """The first oscillations after the move are the largest; a signal that would have to decay first is an error."""
+    w, damping = 100.0, 1e-8
+    loop = ct.ss(
+        [[0.0, w], [-w, -2.0 * damping * w]], [[0.0], [w]], np.eye(2), np.zeros((2, 1)), inputs="r", outputs=["y", "v"],
+        name="beam",
+    )  # fmt: skip
+    response = along(loop, QUINTIC.retime(0.1))
+    found = response.extremes({"y": 1.0})
+    times = np.linspace(0.0, 1.0, 100_001)
+    y = cp.simulate(loop, times, QUINTIC.retime(0.1)).outputs["y"]
+    assert found.high == pytest.approx(y.max(), rel=1e-6)
+    with pytest.raises(ValueError, match=r"must decay within 100000 cells .* got beam with a pole at -1e-06 ± 100j"):
+        response.extremes({"y": 1.0}, during=(1e12, 2e12))
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_values_at_single_times(seed):
+    """An interval of no length gives the value there, to 1e-12 of the range, along the plan and after it."""
+    rng = np.random.default_rng([seed, 19])
+    loop = random_loop(rng, order=seed % 3)
+    plan = (QUINTIC, VIA, S_CURVE)[seed % 3]
+    duration = 10.0 ** rng.uniform(-1.5, 1.0)
+    steps, spacing = 64, 0.5
+    dense = responses(loop, plan, [duration], steps=steps, tail=100, spacing=spacing)[0]
+    ends = plan.breakpoints / plan.duration * duration
+    along_plan = np.concatenate([np.linspace(a, b, steps + 1) for a, b in pairwise(ends)])
+    after = duration + spacing / np.abs(np.linalg.eigvals(loop[0])).max() * np.arange(100)
+    times = np.concatenate([along_plan, after])
+    response = along(system_of(loop), plan.retime(duration))
+    for name, row in zip(("y1", "y2"), dense, strict=True):
+        inner = np.setdiff1d(np.arange(times.size), np.flatnonzero(np.isin(times, ends)))  # both sides of a jump
+        for k in rng.choice(inner, 12, replace=False):
+            found = response.extremes({name: 1.0}, during=(times[k], times[k]))
+            assert found.low == pytest.approx(row[1 + k], rel=0, abs=3e-12 * np.ptp(row))
+            assert found.high == found.low or found.high == pytest.approx(found.low, rel=0, abs=3e-12 * np.ptp(row))
