@@ -449,7 +449,10 @@ class Limited:
     def shown(self, plan: Trajectory, times: Array) -> Array:
         """Limited signals (nbounds, ntime) over a plan for a figure; of a root mean square that up to each time."""
         rows = self.values(plan.jet(times, self.order)).copy()
+        response = None if self.loop is None or not self.loop_bounds else self.loop.quantities_of(plan)
         for row, b in zip(rows, self.bounds, strict=True):
+            if b.in_loop and response is not None:
+                row[:] = response.values(b.weights, times, rate=b.kind == "rate")
             if b.kind == "rms":
                 steps = np.diff(times, prepend=times[0])
                 row[:] = np.sqrt(np.cumsum(steps * row**2) / (b.period or plan.duration))

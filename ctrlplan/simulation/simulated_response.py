@@ -181,6 +181,11 @@ class SimulatedResponse(LoopResponse):
             return self._cyclic_rms(name)
         return self._rms({name: 1.0}, self.plan.start, self.plan.start + (period or self.plan.duration))
 
+    def values(self, weights: Mapping[str, float], times: Array, *, rate: bool = False) -> Array:
+        """Weighted sum of signals during the plan; see `LoopResponse`."""
+        t, row = self._rate(weights) if rate else (self._samples[0], self._sum(weights, self._samples[1]))
+        return np.asarray(np.interp(times, t, row))
+
     def ends(self, weights: Mapping[str, float]) -> tuple[float, float]:
         """Values at rest before the plan and in steady state after it; see `LoopResponse`."""
         before = float(self._sum(weights, self._samples[1][:, :1])[0])

@@ -339,3 +339,20 @@ def test_a_source_inside_the_loop_is_the_plan():
         assert row.fraction == pytest.approx(by_name(fed)[row.bound.name].fraction, abs=1e-7)
     with pytest.raises(ValueError, match="for other durations make the plan an input of the loop"):
         fastest(TRACK, {"u": 30.0}, loop)
+
+
+@pytest.mark.parametrize("loop", [LINEAR, WRITTEN], ids=["exact", "simulated"])
+def test_a_figure_shows_the_signals_of_the_loop(loop):
+    t, signals = dense(MOVE)
+    limits = {"u": Limits(-9.0, 30.0, rate=400.0, rms=20.0), "y": (0.5, 4.0)}
+    found = fastest(MOVE, limits, loop, durations=(0.99, 1.01)) if loop is LINEAR else None
+    limited = cp.planning.limits.Limited(MOVE, limits, loop)
+    times = np.linspace(MOVE.start, MOVE.end, 101)
+    rows = dict(zip([b.name for b in limited.bounds], limited.shown(MOVE, times), strict=True))
+    np.testing.assert_allclose(rows["u"], np.interp(times, t, signals["u"]), atol=1e-4)
+    np.testing.assert_allclose(rows["y"], np.interp(times, t, signals["y"]), atol=1e-5)
+    slope = np.interp(times, t, np.gradient(signals["u"], t))
+    np.testing.assert_allclose(rows["rate of u"][1:-1], slope[1:-1], atol=1e-3 * np.ptp(slope))
+    assert rows["RMS of u"][-1] == pytest.approx(math.sqrt(np.mean(signals["u"][t <= MOVE.end] ** 2)), rel=0.03)
+    if found is not None:
+        assert found.plot().axes.shape == (4, 1)
