@@ -8,6 +8,7 @@ Plan a move
     TrigSpline, PolySpline    one spline through all waypoints: trigonometric, polynomial (alpha = 0)
     PiecewiseSpline           one spline for each segment, continuous in the derivatives left free
     SCurve, Trapezoid, Step   moves with limited jerk, with limited acceleration, without limits
+    Clipped, MotionProfile    part of a plan; what a stop (``plan.stop``) consists of
     Shaper                    input shaping of any plan, against known modes or a measured spectrum
     residual_spectrum         vibration that a plan leaves in a mode, by frequency; residual_plot draws it
     stack                     plans of single axes as one plan
@@ -27,7 +28,12 @@ Build the loop
     create_source_iosystem    plan as a block with outputs y, y_d1, ...; source_samples: the same as arrays
     create_pid_iosystem       PID with limits and anti-windup
     create_saturation_iosystem, create_delay_iosystem    limits of an actuator, transport delay
+    flat_system               flat system of a plant, from its equations -> DerivedFlatSystem, NotFlatError
+    FlatSystem                flat system from maps of your own
+    flat_candidates           which outputs are flat -> FlatCandidate
+    check_flat                maps against the equations -> FlatCheck
     create_flat_iosystem      flat control of a flat plant; create_feedforward_iosystem: of a linear loop
+    fit_feedforward           feedforward gains and delay from a log -> FeedforwardFit
     sample_hold               discrete block in a continuous loop; expose_states: states among the outputs
     create_shaper_iosystem    input shaping of an operator's commands, also for a measured frequency
     create_command_filter_iosystem    filter with derivative outputs; command_filter_gains: its feedforward
@@ -76,6 +82,8 @@ __version__ = "0.2.0"
 _EXPORTS = {
     "traits": ("BlockTraits", "declare", "traits_of"),
     "trajectories": (
+        "Clipped",
+        "MotionProfile",
         "PiecewiseSpline",
         "PolySpline",
         "Retimed",
@@ -117,6 +125,7 @@ _EXPORTS = {
     ),
     "systems": (
         "AdmissibleSet",
+        "FeedforwardFit",
         "Law",
         "command_filter_gains",
         "command_lead",
@@ -132,6 +141,7 @@ _EXPORTS = {
         "create_source_iosystem",
         "create_time_scaling_iosystem",
         "expose_states",
+        "fit_feedforward",
         "flat_quantities",
         "plants",
         "sample_hold",
@@ -163,7 +173,16 @@ _EXPORTS = {
         "monte_carlo",
         "sweep",
     ),
-    "flatness": ("DerivedFlatSystem", "FlatSystem", "NotFlatError", "flat_system"),
+    "flatness": (
+        "DerivedFlatSystem",
+        "FlatCandidate",
+        "FlatCheck",
+        "FlatSystem",
+        "NotFlatError",
+        "check_flat",
+        "flat_candidates",
+        "flat_system",
+    ),
     "reports.explore": ("explore",),
     "reports.vibration_figures": ("residual_plot",),
 }

@@ -53,6 +53,12 @@ def pendulum():
     )  # fmt: skip
 
 
+def logged_move():
+    t = np.linspace(0.0, 1.0, 501)
+    jet = quintic().jet(t, 1)[:, 0]
+    return cp.read_log({"time": t, "u": 2.0 * jet[1], "y": 0.9 * jet[0]})
+
+
 MADE = {
     "AdmissibleSet": lambda: cp.AdmissibleSet(first_order(), {"u": (-1.0, 1.0)}, 0.1),
     "AlphaChoice": lambda: cp.choose_alpha(MOVE, "peak_jerk"),
@@ -60,19 +66,25 @@ MADE = {
     "Benefit": lambda: cp.benefit(comparison(), swept(5.0), alphas=[1.0], durations=[1.0]),
     "BlockTraits": lambda: cp.traits_of(cp.create_source_iosystem(quintic(), 2)),
     "Clearance": lambda: cp.clearance(cp.PolySpline(PLANE), [cp.Disc((10.0, 3.0), 1.0)], required=1.5),
+    "Clipped": lambda: cp.Clipped(quintic(), 0.0, 0.5),
     "Comparison": comparison,
     "Crane": cp.plants.Crane,
+    "DerivedFlatSystem": lambda: cp.flat_system(cp.plants.dc_motor(), "angle"),
     "Disc": lambda: cp.Disc((10.0, 0.0), 1.0),
     "Ensemble": lambda: cp.monte_carlo(swept, cp.draws(4, gain=(1.0, 9.0)), {"a": quintic()}, TIMES, progress=False),
     "Event": lambda: cp.Event("u", low=0.0),
     "Experiment": lambda: cp.Experiment(MOVE, TIMES, measures=["iae"]),
     "Fastest": lambda: cp.fastest(quintic(), {"y_d1": 0.5, "y_d2": 2.0}),
+    "FeedforwardFit": lambda: cp.fit_feedforward(logged_move(), quintic(), terms=["velocity", ("spring", np.sin)]),
+    "FlatCandidate": lambda: cp.flat_candidates(cp.plants.dc_motor())[0],
+    "FlatCheck": lambda: cp.check_flat(cp.plants.dc_motor()),
     "FlatSystem": lambda: cp.plants.Crane().flat_system(),
     "HalfPlane": lambda: cp.HalfPlane((0.0, 1.0), 2.0),
     "Limits": lambda: cp.Limits(high=1.0),
     "Margins": lambda: cp.margins(quintic(), {"y_d1": 1.0, "y_d2": (-5.0, 8.0)}),
     "Measure": lambda: cp.Measure("Error at the end", "{y}", "response", lambda seen: seen.error[:, -1]),
     "Occurrence": lambda: cp.Occurrence(1.5, "u", "above"),
+    "MotionProfile": lambda: cp.MotionProfile([0.0, 2.0], [[-0.5]], [[3.0], [1.0]], labels="x"),
     "Optimum": lambda: cp.optimize_waypoints([MOVE[0], cp.Waypoint(0.5, 2), MOVE[1]]),
     "PeakDerivative": lambda: cp.PeakDerivative(3),
     "PiecewiseSpline": lambda: cp.PiecewiseSpline([*MOVE, cp.Waypoint(3, 0, 0, 0)]),
@@ -99,7 +111,17 @@ MADE = {
 }  # fmt: skip
 """One object of each class."""
 
-PLANS = {"PiecewiseSpline", "PolySpline", "Retimed", "SCurve", "Step", "Trapezoid", "TrigSpline"}
+PLANS = {
+    "Clipped",
+    "MotionProfile",
+    "PiecewiseSpline",
+    "PolySpline",
+    "Retimed",
+    "SCurve",
+    "Step",
+    "Trapezoid",
+    "TrigSpline",
+}
 IN_JUPYTER = {
     "Waypoint",
     "Comparison",
@@ -111,7 +133,17 @@ IN_JUPYTER = {
     "Margins",
     "Clearance",
 }
-IN_JUPYTER |= {*PLANS, "Crane", "FlatSystem", "Avoidance", "Benefit", "SimulationResponse", "Experiment", "Shaper"}
+IN_JUPYTER |= {
+    *PLANS,
+    "Crane",
+    "FlatSystem",
+    "Avoidance",
+    "Benefit",
+    "SimulationResponse",
+    "Experiment",
+    "Shaper",
+    "FeedforwardFit",
+}
 DRAWN = {*PLANS, "Fastest", "Optimum", "AlphaChoice", "Avoidance"}
 
 every = pytest.mark.parametrize("name", sorted(MADE))

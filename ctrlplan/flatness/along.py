@@ -1,12 +1,12 @@
 """States and controls along a plan of the flat outputs.
 
 The states are followed along a grid of the plan, which depends on the plan only;
-between the nodes they are interpolated and refined, all times at once.
+between the nodes they are interpolated and refined, all times in one call.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,6 +20,12 @@ _INTERVALS = 48
 
 _PREDICTED = 3e-4
 """Error of the interpolation in scales above which an interval is halved."""
+
+_SINGULAR = 1e-7
+"""Smallest singular value of a scaled Jacobian below which it is singular."""
+
+_SEARCHES = 8
+"""Refinements of the search for a singular point."""
 
 _DEEPEST = 24
 """Number of halvings of an interval."""
@@ -96,14 +102,14 @@ def grid_of(maps: FlatMaps, plan: Trajectory, p: Array, start: Array | None, nam
     states = [z]
     flags = flag_at(plan, maps.orders, nodes)[0]
 
-    def way(t: float) -> Array:
+    def path(t: float) -> Array:
         return flag_at(plan, maps.orders, np.array([t]))[0][:, 0]
 
     for k, (a, b) in enumerate(zip(nodes[:-1].tolist(), nodes[1:].tolist(), strict=True)):
         near = maps.followed_simply(states[-1], flags[:, k], flags[:, k + 1], p)
         if near is None:
             try:
-                near = maps.followed(states[-1], way, p, a, b)
+                near = maps.followed(states[-1], path, p, a, b)
             except SingularError as error:
                 raise ValueError(
                     f"states of {name} must be determined along the plan, but {error} at {error.position:.6g} s"
@@ -113,20 +119,44 @@ def grid_of(maps: FlatMaps, plan: Trajectory, p: Array, start: Array | None, nam
 
 
 def connected(maps: FlatMaps, flag: Array, p: Array, start: Array | None, name: str, time: float) -> Array:
-    """State of a flag, connected with the operating point or a given state by a straight line of flags."""
+    """State of a flag, connected with the operating point or a given state by regular flags.
+
+    The path is a straight line or, where that passes a singular point (a vehicle
+    that turns round), the first of a fixed list of detours.
+    """
     z = maps.start if start is None else start
-    origin = maps.flags(z, p)
-
-    def way(s: float) -> Array:
-        return origin + s * (flag - origin) if s < 1.0 else flag
-
     try:
-        return maps.followed(z, way, p)
+        return _straight(maps, z, flag, p)
     except SingularError as error:
+        for detour in _detours(maps.orders, maps.flags(z, p), flag):
+            try:
+                return _straight(maps, _straight(maps, z, detour, p), flag, p)
+            except SingularError:
+                continue
         raise ValueError(
-            f"states of {name} at {time:.6g} s must be connected with the operating point, but {error}, "
-            f"{100.0 * error.position:.3g} % of the way; give start= or another operating point at="
+            f"states of {name} at {time:.6g} s must be connected with the operating point, but {error}; give start= or "
+            "another operating point at="
         ) from None
+
+
+def _straight(maps: FlatMaps, z: Array, flag: Array, p: Array) -> Array:
+    """State of a flag, connected with a state by a straight line of flags."""
+    origin = maps.flags(z, p)
+    return maps.followed(z, lambda s: origin + s * (flag - origin) if s < 1.0 else flag, p)
+
+
+def _detours(orders: tuple[int, ...], origin: Array, goal: Array) -> Iterator[Array]:
+    """Flags between two others, off the straight line by their distance in one derivative of one flat output."""
+    order = np.concatenate([np.arange(r) for r in orders])
+    distance = np.abs(goal - origin)
+    for nu in range(1, max(orders)):
+        rows = np.flatnonzero(order == nu)
+        size = float(distance[rows].max(initial=0.0))
+        for row in rows:
+            for sign in (1.0, -1.0):
+                detour = 0.5 * (origin + goal)
+                detour[row] += sign * size
+                yield detour
 
 
 def _rates(maps: FlatMaps, z: Array, above: Array, p: Array) -> Array:
@@ -146,7 +176,9 @@ def _halved(maps: FlatMaps, plan: Trajectory, p: Array, times: Array, states: Ar
         error = np.max(np.abs(found - predicted) / scale, axis=0)
         split = ~good | ~(error <= _PREDICTED)
         if not split.any():
-            return Grid(times, states, rates, before, inverses(maps.slopes(states, p)))
+            grid = Grid(times, states, rates, before, inverses(maps.slopes(states, p)))
+            _check_regular(maps, grid, p, name)
+            return grid
         new = np.flatnonzero(split)
         extra = found[:, new]
         for i in np.flatnonzero(~good[new]):
@@ -159,6 +191,30 @@ def _halved(maps: FlatMaps, plan: Trajectory, p: Array, times: Array, states: Ar
         f"states of {name} must be determined along the plan, but they change without bound near "
         f"{float(middle[new[0]]):.6g} s"
     )
+
+
+def _check_regular(maps: FlatMaps, grid: Grid, p: Array, name: str) -> None:
+    """Raise if the states pass a singular point between nodes, also one where the determinant keeps its sign."""
+    times = grid.times
+    for _ in range(_SEARCHES):
+        z = grid.interpolated(times)[0]
+        size = _regularities(maps, z, p)
+        k = int(np.argmin(size))
+        if size[k] < _SINGULAR:
+            weak = maps.weakest(z[:, k], p)
+            raise ValueError(
+                f"states of {name} must be determined along the plan, but {weak} is not determined by the flat outputs "
+                f"at {float(times[k]):.6g} s"
+            )
+        low, high = times[max(k - 1, 0)], times[min(k + 1, times.size - 1)]
+        times = np.linspace(low, high, 17)
+
+
+def _regularities(maps: FlatMaps, z: Array, p: Array) -> Array:
+    """Smallest singular values of the scaled Jacobians, relative to the rows, (n,)."""
+    matrices = np.moveaxis(maps.slopes(z, p), -1, 0) * maps.scales
+    matrices = matrices / np.maximum(np.abs(matrices).max(axis=2, keepdims=True), 1e-300)
+    return np.asarray(np.linalg.svd(matrices, compute_uv=False)[:, -1], dtype=float)
 
 
 def _middle(maps: FlatMaps, plan: Trajectory, p: Array, a: float, b: float, z: Array, name: str) -> Array:
@@ -222,9 +278,8 @@ def _followed_from_grid(
     """State at a time that interpolation does not reach: before the start, after the end, or near a singular point."""
     k = int(np.clip(np.searchsorted(grid.times, t) - 1, 0, grid.times.size - 1))
     z = grid.states[:, k] if t < grid.times[-1] else grid.states[:, -1]
-    origin = maps.flags(z, p)
     try:
-        return maps.followed(z, lambda s: origin + s * (flag - origin) if s < 1.0 else flag, p)
+        return _straight(maps, z, flag, p)
     except SingularError as error:
         raise ValueError(f"states of {name} must be determined along the plan, but {error} at {t:.6g} s") from None
 

@@ -65,13 +65,13 @@ def _regularity(matrix: Array) -> float:
 
 
 def _forward(analysis: Analysis) -> ca.SX:
-    """Flags with the controls constant, up to the order of each flat output."""
+    """Flags with the controls constant, all up to the highest order."""
     equations = analysis.equations
     rows = []
-    for entry, order in zip(ca.vertsplit(equations.flat), analysis.structure.orders, strict=True):
+    for entry in ca.vertsplit(equations.flat):
         value = entry
         rows.append(value)
-        for _ in range(order):
+        for _ in range(max(analysis.structure.orders)):
             value = ca.cse(ca.jtimes(value, equations.x, equations.rates))
             rows.append(value)
     return ca.vertcat(*rows)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
-from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,18 +16,15 @@ from ctrlplan._types import Array, Params, Value
 from ctrlplan.flatness.along import Grid, check_branch, connected, grid_of, rows_of, states_along
 from ctrlplan.flatness.maps import FlatMaps
 from ctrlplan.flatness.system import FlatSystem
-from ctrlplan.symbolic.tape import NUMPY, Tape
+from ctrlplan.symbolic.tape import Tape
 from ctrlplan.trajectories import Trajectory
 
 if TYPE_CHECKING:
     from ctrlplan.flatness.analysis import Analysis
 
-_NEAR = 0.3
-"""Distance in scales between states of two flags that are taken for neighbours."""
-
 
 class DerivedFlatSystem(FlatSystem):
-    """Flat system whose maps follow from its equations; returned by `flat_system`.
+    """Flat system whose maps follow from its equations.
 
     Attributes
     ----------
@@ -152,13 +148,16 @@ class DerivedFlatSystem(FlatSystem):
     def _values(self, params: Mapping[str, float] | None) -> Array:
         """Parameters in the order of the maps."""
         given = {**self.params, **(params or {})}
+        for name in given:
+            if name not in self._names:
+                known = ", ".join(self._names) or "none"
+                raise ValueError(f"params must be among the parameters of {self.name} ({known}), got {name!r}")
         return np.array([checked_finite(given[name], f"params[{name!r}]") for name in self._names], dtype=float)
 
     def _forward(self, x: ArrayLike, u: ArrayLike, params: Mapping[str, float] | None = None) -> list[Array]:
-        """Flags of states and constant inputs."""
+        """Flags of states and constant inputs, all up to the highest order, as python-control requires."""
         rows = self.maps.forward(np.asarray(x, dtype=float), np.asarray(u, dtype=float), self._values(params))
-        ends = np.cumsum([0, *(r + 1 for r in self.orders)])
-        return [rows[a:b] for a, b in pairwise(ends)]
+        return list(np.split(rows, len(self.orders)))
 
     def _reverse(self, flag: Sequence[ArrayLike], params: Mapping[str, float] | None = None) -> tuple[Array, Array]:
         """States and inputs of flags, connected with the operating point."""
@@ -176,19 +175,15 @@ class DerivedFlatSystem(FlatSystem):
         """Extended states (nz, n) of flags (nz, n): the first from the operating point, then neighbour by neighbour."""
         maps = self.maps
         z = np.full(flags.shape, np.nan)
-        if not flags.shape[1]:
-            return z
-        left = np.arange(flags.shape[1])
-        near = maps.start
+        near, left = maps.start, np.arange(flags.shape[1])
         while left.size:
-            k = int(left[0])
-            near = connected(maps, flags[:, k], p, near, str(self.name), np.nan)
-            z[:, k] = near
-            left = left[1:]
             trial, found = maps.refined(np.repeat(near[:, None], left.size, axis=1), flags[:, left], p)
-            close = found & (np.max(np.abs(trial - near[:, None]) / maps.scales[:, None], axis=0) < _NEAR)
-            z[:, left[close]] = trial[:, close]
-            left = left[~close]
+            z[:, left[found]] = trial[:, found]
+            left = left[~found]
+            if left.size:
+                k = int(left[0])
+                near = z[:, k] = connected(maps, flags[:, k], p, near, str(self.name), np.nan)
+                left = left[1:]
         return z
 
     def _extended(self, state: Array, plan: Trajectory, p: Array) -> Array:
@@ -209,5 +204,4 @@ class DerivedFlatSystem(FlatSystem):
 
 def _evaluated(tape: Tape, names: Sequence[str], t: float, x: Value, u: Value, params: Params) -> Value:
     """Result of a tape as a function of a block, of numbers or symbols."""
-    values = tape.evaluated((x, u, [params[name] for name in names]), NUMPY)
-    return np.array([values[k] if k >= 0 else 0.0 for k in tape.results])
+    return np.array(tape.at((x, u, [params[name] for name in names])))

@@ -29,7 +29,7 @@ def flat_system(
     scales: Mapping[str, float] | None = None,
     name: str | None = None,
 ) -> DerivedFlatSystem:
-    r"""Flat system of a plant, derived from its equations and the names of its flat outputs.
+    """Flat system derived from the equations of a plant.
 
     The flat outputs are differentiated along the motion until the inputs appear;
     where these appear in too few independent combinations, a combination becomes
@@ -84,7 +84,7 @@ def flat_system(
 
     Examples
     --------
-    A planar vehicle that is driven by two thrusts, with its centre of oscillation as
+    A planar vehicle with two thrusts, with its centre of oscillation as
     flat output:
 
     >>> import control as ct

@@ -143,7 +143,7 @@ class Point:
                 except (ZeroDivisionError, ValueError) as error:
                     raise ArithmeticError(str(error)) from error
                 n, m = tape.shape
-                results = [values[k] if k >= 0 else mpmath.mpf(0) for k in tape.results]
+                results = [values[k] if k >= 0 else mpmath.mpf(0) for k in tape.results.tolist()]
                 copies.append([[results[i + n * j] for j in range(m)] for i in range(n)])
         exact_matrix, changed_matrix = copies
         n, m = tape.shape

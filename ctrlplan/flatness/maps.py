@@ -1,6 +1,6 @@
 """Maps of a flat plant from its structure: states and controls of a flag by Newton's method, connected with a start.
 
-Evaluated by numpy for many flags at once, without CasADi.
+Evaluated by numpy for arrays of flags, without CasADi.
 """
 
 from __future__ import annotations
@@ -16,10 +16,13 @@ from ctrlplan._types import Array
 from ctrlplan.symbolic.tape import Tape
 
 _SHORTEST = 2.0**-25
-"""Smallest part of a way, or of an interval, that is tried."""
+"""Smallest step, relative to the length of a path."""
 
 _MOVED = 0.3
 """Distance in scales that a corrector may move."""
+
+_CONTRACTION = 0.5
+"""Ratio of successive Newton steps below which states are taken for those of neighbouring flags."""
 
 _ITERATIONS = 12
 _CONVERGED = 1e-13
@@ -32,7 +35,7 @@ class SingularError(ValueError):
     Attributes
     ----------
     position : float
-        Place on the way, as far as states were found.
+        Parameter of the path at which the search ended.
     """
 
     def __init__(self, message: str, position: float) -> None:
@@ -59,7 +62,7 @@ class FlatMaps:
     rates : Tape
         z' as functions of (z, mu, p).
     forward : Tape
-        Flags of (x, u, p) with u constant, up to the order r_j.
+        Flags of (x, u, p) with u constant, all up to the highest order.
     held : Tape
         States of the extension as functions of (x, u, p) with u constant.
     sides : Tape
@@ -115,54 +118,57 @@ class FlatMaps:
         """States z (nz, n) of flags (nz, n) from states near them, and whether they were found.
 
         `inverse`, (nz, nz, n), are the inverses of the slopes there, or near them.
+        Only states to which the steps contract from the first one are found.
         """
         with np.errstate(all="ignore"):
             inverse = inverses(self.slopes(z, p)) if inverse is None else inverse
             scale = self.scales[:, None]
             before = np.full(z.shape[1], np.inf)
+            near = np.ones(z.shape[1], dtype=bool)
             for k in range(_ITERATIONS):
                 step = np.einsum("ijn,jn->in", inverse, flag - self.flags(z, p))
                 z = z + step
                 size = np.max(np.abs(step) / (scale + np.abs(z)), axis=0)
+                near &= (size < _CONTRACTION * before) | (size < 1e-9)
                 if (size < _CONVERGED).all() or (k > 4 and (size >= 0.5 * before).all()):
                     break
                 if k % 5 == 4:  # slow: the slopes have changed
                     inverse = inverses(self.slopes(z, p))
                 before = size
-            found = np.isfinite(size) & (size < 1e-9)
+            found = np.isfinite(size) & (size < 1e-9) & near
         return z, found
 
     def followed(
-        self, z: Array, way: Callable[[float], Array], p: Array, first: float = 0.0, last: float = 1.0
+        self, z: Array, path: Callable[[float], Array], p: Array, first: float = 0.0, last: float = 1.0
     ) -> Array:
-        """State at the end of a way of flags, connected with the state at its start.
+        """State at the end of a path of flags, connected with the state at its start.
 
         Parameters
         ----------
         z : ndarray, shape (nz,)
             State at the start.
-        way : callable
-            Flag (nz,) at a place between `first` and `last`.
+        path : callable
+            Flag (nz,) at a parameter between `first` and `last`.
         p : ndarray
             Parameters.
 
         Raises
         ------
         SingularError
-            If the states are not determined somewhere on the way.
+            If the states are not determined at some point of the path.
         """
         place, step = first, last - first
-        flag = way(first)
+        flag = path(first)
         slopes = self.slopes(z, p)
         sign = np.linalg.slogdet(slopes)[0]
         while place < last:
             step = min(step, last - place)
-            goal = way(place + step)
+            goal = path(place + step)
             found = self._stepped(z, goal, flag, slopes, sign, p)
             if found is None:
                 step *= 0.5
                 if step < _SHORTEST * (last - first):
-                    raise self._singular(z, slopes, place)
+                    raise self._singular(z, place, p)
                 continue
             z, slopes = found
             flag = goal
@@ -190,7 +196,8 @@ class FlatMaps:
                     found = found + step
                     if not np.isfinite(found).all() or self._distance(found, predicted) > _MOVED:
                         return None
-                    if self._distance(step, 0.0) < _CONVERGED or (k > 3 and self._distance(step, 0.0) < 1e-11):
+                    size = self._distance(found, found - step)
+                    if size < _CONVERGED or (k > 3 and size < 1e-11):
                         break
                 else:
                     return None
@@ -200,16 +207,20 @@ class FlatMaps:
             same = np.linalg.slogdet(now)[0] == sign and self._distance(predicted, z) < 10.0 * _MOVED
         return (found, now) if same else None
 
-    def _distance(self, z: Array, other: Array | float) -> float:
-        return float(np.max(np.abs(z - other) / self.scales))
+    def _distance(self, z: Array, other: Array) -> float:
+        """Largest difference of two states, in scales or in magnitudes where these are larger."""
+        return float(np.max(np.abs(z - other) / np.maximum(self.scales, np.maximum(np.abs(z), np.abs(other)))))
 
-    def _singular(self, z: Array, slopes: Array, place: float) -> SingularError:
+    def _singular(self, z: Array, place: float, p: Array) -> SingularError:
         """Error that names the entry of z that is not determined."""
-        scaled = slopes * self.scales
+        return SingularError(f"{self.weakest(z, p)} is not determined by the flat outputs there", place)
+
+    def weakest(self, z: Array, p: Array) -> str:
+        """Name of the entry of z that the flags determine worst."""
+        scaled = self.slopes(z, p) * self.scales
         scaled = scaled / np.maximum(np.abs(scaled).max(axis=1, keepdims=True), 1e-300)
         weak = np.linalg.svd(scaled)[2][-1] if np.isfinite(scaled).all() else np.abs(z) / self.scales
-        name = self.names[int(np.argmax(np.abs(weak)))]
-        return SingularError(f"{name} is not determined by the flat outputs there", place)
+        return self.names[int(np.argmax(np.abs(weak)))]
 
 
 def _solved(matrix: Array, right: Array) -> Array:

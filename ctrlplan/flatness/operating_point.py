@@ -121,7 +121,7 @@ def _starts(start: Array, free: NDArray[np.bool_], unit: Array) -> Iterator[Arra
 def _equilibrium(
     at: Callable[[Array], tuple[Array, Array] | None], values: Array, free: NDArray[np.bool_], unit: Array
 ) -> tuple[Array | None, float]:
-    """Point of smallest rates by least-norm Newton steps from a start, and their size, 0 for an equilibrium."""
+    """Point of smallest rates by Newton steps of minimum norm from a start, and their size, 0 for an equilibrium."""
     found = at(values)
     if found is None:
         return None, np.inf

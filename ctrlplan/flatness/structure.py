@@ -24,7 +24,7 @@ from ctrlplan.flatness.generic import Copies, Point
 from ctrlplan.symbolic.taping import tape_of
 
 _LEAST_VARIATION = 0.02
-"""Variation of a pivot's determinant above which the smaller region is not looked at."""
+"""Variation of a pivot's determinant above which no smaller region is tried."""
 
 
 @dataclass(frozen=True, eq=False)

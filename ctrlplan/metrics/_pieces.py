@@ -102,7 +102,8 @@ class Pieces:
         cuts = self.cuts()
         values = self.at_cuts(cuts)
         low, high = cuts[:-1], cuts[1:]
-        zeros = np.where(np.sign(values[:-1]) * np.sign(values[1:]) < 0, self.crossing(0.0, low, high), low)
+        zeros, at = low.copy(), np.nonzero(np.sign(values[:-1]) * np.sign(values[1:]) < 0)
+        zeros[at] = self[at[1]].crossing(0.0, low[at], high[at])
         return np.concatenate([np.stack([low, zeros], axis=1).reshape(6, -1), cuts[-1:]])
 
     def crossing(self, level: float | Array, low: Array, high: Array) -> Array:

@@ -554,15 +554,8 @@ def _moved(task: _Task, build: Build, vias: _Vias, margin: float) -> _Vias:
 
     @lru_cache(maxsize=1)
     def slopes(key: bytes) -> Array:
-        x, steps = np.frombuffer(key), _STEP * np.eye(3 * count + 1)
         try:
-            here = jets(x)
-            # The axes of a plan are independent: one plan gives the derivatives along both.
-            both = np.stack([jets(x + steps[i] + steps[count + i]) for i in range(count)], axis=2)
-            along = np.repeat(here[:, :, None], 2 * count, axis=2)
-            along[:, 0, :count], along[:, 1, count:] = both[:, 0], both[:, 1]
-            later = np.stack([jets(x + steps[2 * count + i]) for i in range(count)], axis=2)
-            moved = valued(np.concatenate([along, later], axis=2))
+            moved = valued(_varied(jets, np.frombuffer(key), count))
         except ValueError:
             return np.zeros((measured(key).size, 3 * count))
         return (moved - measured(key)[:, None]) / _STEP
@@ -586,6 +579,17 @@ def _moved(task: _Task, build: Build, vias: _Vias, margin: float) -> _Vias:
         options={"maxiter": 40, "ftol": 1e-5},
     )
     return _decoded(task, vias, found.x)
+
+
+def _varied(jets: Callable[[Array], Array], x: Array, count: int) -> Array:
+    """Jets after a step along each unknown of `_moved` but the violation, shape (order + 1, 2, 3 count, ntime)."""
+    here, steps = jets(x), _STEP * np.eye(x.size)
+    # The axes of a plan are independent: one plan gives the derivatives along both.
+    both = np.stack([jets(x + steps[i] + steps[count + i]) for i in range(count)], axis=2)
+    along = np.repeat(here[:, :, None], 2 * count, axis=2)
+    along[:, 0, :count], along[:, 1, count:] = both[:, 0], both[:, 1]
+    later = np.stack([jets(x + steps[2 * count + i]) for i in range(count)], axis=2)
+    return np.concatenate([along, later], axis=2)
 
 
 def _decoded(task: _Task, vias: _Vias, x: Array) -> _Vias:

@@ -61,9 +61,7 @@ class Naming:
 
     def _of_both(self, limits: Mapping[str, object]) -> Iterator[Bound]:
         """Bounds from limits of plan and loop apart."""
-        others = [
-            name for name, limit in limits.items() if name not in ("plan", "loop") or not isinstance(limit, Mapping)
-        ]
+        others = [name for name in limits if name not in ("plan", "loop")]
         if others:
             raise ValueError(
                 f'limits must be by name, or {{"plan": limits by name, "loop": limits by name}}, got {others[0]!r}'

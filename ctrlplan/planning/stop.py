@@ -129,7 +129,12 @@ def stop_limits(plan: Trajectory, limits: Mapping[str, object]) -> StopLimits:
     acceleration = np.full((plan.naxes, 2), np.nan)
     jerk = np.full(plan.naxes, np.nan)
     for bound in bounds:
-        axis = -1 if bound.axis is None else bound.axis
+        axis = bound.axis
+        if axis is None or bound.kind != "value" or not bound.is_constant:
+            raise ValueError(
+                f"limits of a stop must be constant ones of acceleration and jerk, velocity or position, got "
+                f"{bound.name} {bound.range}"
+            )
         if bound.order > 3:
             raise ValueError(
                 f"limits must be those of position, velocity, acceleration and jerk, got {bound.name}, which is "
@@ -138,11 +143,12 @@ def stop_limits(plan: Trajectory, limits: Mapping[str, object]) -> StopLimits:
         if bound.order == 2:
             if not bound.low < 0.0 < bound.high:
                 raise ValueError(f"limits of {bound.name} must be below and above 0, got {bound.range}")
-            acceleration[axis] = bound.low, bound.high
+            # Of several limits of an axis all apply.
+            acceleration[axis] = np.fmax(acceleration[axis, 0], bound.low), np.fmin(acceleration[axis, 1], bound.high)
         if bound.order == 3:
             if bound.low != -bound.high:
                 raise ValueError(f"limits of {bound.name} must be one number, its maximum magnitude, got {bound.range}")
-            jerk[axis] = bound.high
+            jerk[axis] = np.fmin(jerk[axis], bound.high)
     for name, rows in (("acceleration", acceleration[:, 0]), ("jerk", jerk)):
         for label, value in zip(plan.labels, rows.tolist(), strict=True):
             if math.isnan(value):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from functools import singledispatch
 
@@ -47,6 +48,7 @@ from ctrlplan.studies.sections import (
     Curves,
     DrawTable,
     FastestMove,
+    FittedGains,
     LoopBlocks,
     Paths,
     PlanCurves,
@@ -113,6 +115,24 @@ def _(section: Paths, study: Study) -> Part:
 def _(section: Curves, study: Study) -> Part:
     caption = section.caption or f"{section.y_label} versus {section.x_label}."
     return Part([Picture(section.key, plot_curves(section), caption)])
+
+
+@draw.register
+def _(section: FittedGains, study: Study) -> Part:
+    rows = [
+        [name, term, *map(number, (gain, fit.standard_errors[term], *fit.intervals[term]))]
+        for name, fit in section.fits.items()
+        for term, gain in fit.gains.items()
+    ]
+    rows += [
+        [name, "delay [s]", *map(number, (fit.delay, fit.delay_error, math.nan, math.nan))]
+        for name, fit in section.fits.items()
+    ]
+    heads = [Head("log"), Head("term"), Head("gain"), Head("standard error"), Head("95 % from"), Head("to")]
+    notes = tuple(f"{name}: {note}" for name, fit in section.fits.items() for note in fit.notes)
+    words = section.caption or "Feedforward of the control by least squares; the delay is that from control to motion."
+    blocks: list[Block] = [Text(words, hint=True), Table(heads, rows, "gains"), Items(notes)]
+    return Part(blocks, heading="Feedforward fitted to the log", below=True)
 
 
 # Sweeps and draws

@@ -140,7 +140,14 @@ def _(study: Study, taken: Sequence[str]) -> Shown:
     folds = [
         Fold("Findings", _words(study)),
         *(Fold(part.heading, tuple(part.blocks)) for part in parts if part.heading and not part.below),
-        Fold(title, (Text(f"{_SIGNS} Click a column heading to sort.", hint=True), metrics_of(comparison))),
+        Fold(
+            title,
+            (
+                Text(f"{_SIGNS} Click a column heading to sort.", hint=True),
+                metrics_of(comparison),
+                *_definitions(comparison),
+            ),
+        ),
         Fold("All figures", tuple(block for part in parts if not part.heading for block in part.blocks)),
         *(Fold(part.heading, tuple(part.blocks)) for part in parts if part.heading and part.below),
         Fold("Limits", _limits(comparison)),
@@ -199,6 +206,14 @@ def _failed_draws(sections: Iterable[Section | Benefit]) -> str:
             failed = len({one.draw for one in section.ensemble.failures})
             return f" Of {section.ensemble.finished} draws, {failed} failed."
     return ""
+
+
+def _definitions(comparison: Comparison) -> tuple[Block, ...]:
+    """Definitions of the metrics that a comparison has, each once."""
+    known = {name for row in comparison.metrics.values() for name in row}
+    said = dict.fromkeys(one.definition for name, one in comparison.measures.items() if name in known)
+    found = [definition for definition in said if definition]
+    return (Items(found),) if found else ()
 
 
 def _words(study: Study) -> tuple[Block, ...]:

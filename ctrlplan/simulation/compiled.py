@@ -78,6 +78,7 @@ class Compiled:
         self.symbols = frozenset(key for _, key in self._places)
         self._defaults = [(key, network.blocks[i].params.get(key)) for i, key in self._places]
         n, nd = network.nstates, network.time_rows.size
+        self.moving = network.moving
         t, x, d, p = (ca.SX.sym(name, size) for name, size in (("t", 1), ("x", n), ("d", nd), ("p", len(self._places))))
         own = self._own_parameters(p)
         every = np.ones(network.nsignals, dtype=bool)
@@ -85,7 +86,9 @@ class Compiled:
         rates = _rates(network, traces, own, t, x, w)
         self._rates = ca.Function("rates", [t, x, d, p], [rates])
         self._functions = {"rates": self._rates}
-        self._jacobian = ca.Function("jacobian", [t, x, d, p], [ca.densify(ca.jacobian(rates, x))])
+        moving = self.moving.tolist()
+        slopes = ca.jacobian(rates[moving], x)[:, moving] if moving else ca.SX(0, 0)
+        self._jacobian = ca.Function("jacobian", [t, x, d, p], [ca.densify(slopes)])
         self._functions["jacobian"] = self._jacobian
         w = _signals(network, traces, own, network.schedule(feeds, every), t, x, d)
         self._functions["signals"] = ca.Function("signals", [t, x, d, p], [ca.densify(w)])
@@ -120,7 +123,7 @@ class Compiled:
         return self._at_many("rates", t, x, time_values, p)
 
     def slopes(self, t: Array, x: Array, time_values: Array, p: Array) -> Array:
-        """Jacobian by the states at many times, column by column, (nstates**2, ntime)."""
+        """Jacobian of the integrated states at many times, column by column, (nmoving**2, ntime)."""
         return self._at_many("jacobian", t, x, time_values, p)
 
     def signals(self, t: Array, x: Array, time_values: Array, p: Array) -> Array:
@@ -183,7 +186,7 @@ class Compiled:
 
     def fastest_decay(self, t: float, x: Array, time_values: Array, p: Array) -> float:
         """Largest decay rate [1/s] of the equations linearised at a state."""
-        jacobian = _called(self._jacobian, (np.array([t]), x, time_values, p), x.size)
+        jacobian = _called(self._jacobian, (np.array([t]), x, time_values, p), self.moving.size)
         return float(-np.linalg.eigvals(jacobian).real.min()) if np.isfinite(jacobian).all() else np.inf
 
     def integrator(
@@ -216,12 +219,18 @@ class Compiled:
         return _called(at_all, (t, x, time_values, np.repeat(p[:, None], t.size, axis=1)), function.numel_out(0))
 
     def _segment_equations(self, width: int) -> dict[str, ca.SX]:
-        """Equations of scaled states over s in [0, 1], with functions of time as Chebyshev series of given width."""
+        """Equations of scaled states over s in [0, 1], with functions of time as Chebyshev series of given width.
+
+        The states of sampled blocks, which are constant, are among the parameters.
+        """
         if width not in self._equations:
             nx, nd, np_ = (self._rates.numel_in(k) for k in (1, 2, 3))
-            shapes = {"s": (1,), "z": (nx,), "p": (np_,), "c": (nd, width), "bounds": (nd, 2)}
-            shapes |= {"span": (6,), "shift": (nx,), "scale": (nx,)}
-            s, z, p, c, bounds, span, shift, scale = (ca.SX.sym(name, *shape) for name, shape in shapes.items())
+            moving = self.moving.tolist()
+            shapes = {"s": (1,), "z": (len(moving),), "p": (np_,), "c": (nd, width), "bounds": (nd, 2)}
+            shapes |= {"span": (6,), "shift": (len(moving),), "scale": (len(moving),), "start": (nx,)}
+            s, z, p, c, bounds, span, shift, scale, start = (ca.SX.sym(name, *shape) for name, shape in shapes.items())
+            x = ca.SX(start)
+            x[moving] = shift + scale * z
             left, length, first, last, earliest, latest = (span[k] for k in range(6))
             t = ca.fmin(ca.fmax(left + s * length, earliest), latest)
             time_values = _series(c, (2.0 * t - first - last) / (last - first))
@@ -231,8 +240,8 @@ class Compiled:
             self._equations[width] = {
                 "t": s,
                 "x": z,
-                "p": ca.vertcat(p, ca.vec(c), ca.vec(bounds), span, shift, scale),
-                "ode": length * self._rates(t, shift + scale * z, time_values, p) / scale,
+                "p": ca.vertcat(p, ca.vec(c), ca.vec(bounds), span, shift, scale, start),
+                "ode": length * self._rates(t, x, time_values, p)[moving] / scale,
             }
         return self._equations[width]
 
@@ -273,6 +282,11 @@ class CompiledSolver:
         self.switches: list[float] = []
         self._report = self._count if equations.compared.is_expected else None
 
+    @property
+    def moving(self) -> NDArray[np.intp]:
+        """Indices of the states that are integrated."""
+        return self.form.moving
+
     def perturbed(self, states: Array) -> Array:
         """States (nstates, ntime) moved by the tolerance of a step, up and down in turn."""
         return self._scales.perturbed(states, *self._tolerances)
@@ -286,8 +300,8 @@ class CompiledSolver:
         return self.form.outputs(times, states, time_values, self._p)
 
     def slopes(self, times: Array, states: Array, time_values: Array) -> Array:
-        """Jacobian of the derivatives by the states, (ntime, nstates, nstates)."""
-        n = len(states)
+        """Jacobian of the integrated states, (ntime, nmoving, nmoving)."""
+        n = self.form.moving.size
         return self.form.slopes(times, states, time_values, self._p).reshape(n, n, times.size).transpose(2, 1, 0)
 
     def rates(self, times: Array, states: Array, time_values: Array) -> Array:
@@ -313,8 +327,10 @@ class CompiledSolver:
 
     def advance(self, series: Series, left: float, grid: Array, state: Array) -> Array:
         """States (nstates, ngrid) at times of a segment; the last is its end."""
-        if not state.size:
-            return np.zeros((0, grid.size))
+        moving = self.form.moving
+        out = np.repeat(state[:, None], grid.size, axis=1)
+        if not moving.size:
+            return out
         right = float(grid[-1])
         relative = (grid - left) / (right - left)
         if grid.size <= _FEW:  # rounding errors of time must not require a new integrator for every short segment
@@ -324,10 +340,10 @@ class CompiledSolver:
             self._longest, self._stiff = right - left, decay * (right - left) > _STIFF
         width = series.coefficients.shape[1]
         span = [left, right - left, series.left, series.right, *within(left, right, self.switches)]
-        scales, max_steps = self._scales, self._max_steps
-        known = [series.coefficients.ravel(order="F"), series.low, series.high, span, scales.shift, scales.scale]
+        shift, scale, max_steps = self._scales.shift[moving], self._scales.scale[moving], self._max_steps
+        known = [series.coefficients.ravel(order="F"), series.low, series.high, span, shift, scale, state]
         p = np.concatenate([self._p, *known])
-        start = (state - scales.shift) / scales.scale
+        start = (state[moving] - shift) / scale
         # Equations that depend on time are evaluated at least once per sample, so that no pulse is skipped.
         longest = round(float(np.diff(relative, prepend=0.0).max()), 6) if self.form.depends_on_time else 0.0
         # A diverging solution exhausts the steps: few in the first attempt, then more, with closer outputs.
@@ -337,9 +353,9 @@ class CompiledSolver:
             integrator = self.form.integrator(*settings)
             try:
                 with _passing_interruptions():
-                    found = _called(integrator, (start, np.empty(0), p), state.size, self._report)
-                outputs_at_grid = found[:, np.searchsorted(outputs, relative)]
-                return scales.shift[:, None] + scales.scale[:, None] * outputs_at_grid
+                    found = _called(integrator, (start, np.empty(0), p), moving.size, self._report)
+                out[moving] = shift[:, None] + scale[:, None] * found[:, np.searchsorted(outputs, relative)]
+                return out
             except RuntimeError as error:
                 code = re.search(r"CV_\w+", str(error))
                 flag = code.group() if code else ""

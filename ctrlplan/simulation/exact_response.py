@@ -209,6 +209,13 @@ class ExactResponse(LoopResponse):
             total += max(0.0, length - reached) * final**2
         return math.sqrt(total / length)
 
+    def values(self, weights: Mapping[str, float], times: Array, *, rate: bool = False) -> Array:
+        """Weighted sum of signals during the plan; see `LoopResponse`."""
+        rows = self._sum(weights)
+        if rate:
+            rows = rate_rows(self._motion.form, rows, self._motion.plan, " + ".join(weights))
+        return self._motion.cells(rows).at(times - self._start)[0]
+
     def ends(self, weights: Mapping[str, float]) -> tuple[float, float]:
         """Values before the plan and in steady state after it; see `LoopResponse`."""
         rows, motion = self._sum(weights), self._motion

@@ -14,6 +14,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 from scipy.integrate import BDF, LSODA, RK45, OdeSolver
+from scipy.linalg import block_diag
 
 from ctrlplan._types import Array, BlockMap, Params
 from ctrlplan.simulation.budget import check
@@ -96,7 +97,7 @@ class Interpreted:
         self._for_rates = self._steps(self._outputs, network.signals_of_inputs(), self.feeds)
         self._for_all = self._steps(self._outputs, np.ones(network.nsignals, dtype=bool), self.feeds)
         self._for_samples: dict[tuple[int, ...], list[Call]] = {}
-        self._a, self._b, self._linear_columns, self._moving = _merged_linear(network)
+        self._a, self._b, self._linear_states, self._linear_columns, self._moving = _merged_linear(network)
 
     def rates(self, t: float, x: Array, time_values: Array) -> Array:
         """Derivatives of all states, from the values of the functions of time."""
@@ -107,7 +108,8 @@ class Interpreted:
 
     def rates_of(self, t: float, x: Array, w: Array) -> Array:
         """The same from all signals; for a discrete system the next states."""
-        dx = self._a @ x + self._b @ w[self._linear_columns]
+        dx = np.zeros(x.size)
+        dx[self._linear_states] = self._a @ x[self._linear_states] + self._b @ w[self._linear_columns]
         for i in self._moving:
             place = self.network.states[i]
             with _named(self.network.blocks[i].name, t):
@@ -290,9 +292,15 @@ class InterpretedSolver:
     def __init__(self, equations: Interpreted, tolerances: Tolerances, scales: Scales) -> None:
         self._equations, self._scales = equations, scales
         self._rtol, self._atol = np.maximum(tolerances.rtol, _MIN_RTOL), tolerances.atol
+        self._moving = equations.network.moving
         self._bounded = any(b.changes_unseen and b.depends_on_time for b in equations.network.blocks)
         self._segments, self._next = 0, 0
         self.switches: list[float] = []
+
+    @property
+    def moving(self) -> NDArray[np.intp]:
+        """Indices of the states that are integrated."""
+        return self._moving
 
     @property
     def evaluations(self) -> int:
@@ -302,10 +310,16 @@ class InterpretedSolver:
     def count(self) -> None:
         """Start counting evaluations; here they are always counted."""
 
-    def scaled_rates(self, t: float, z: Array, time_values: Array) -> Array:
-        """Derivatives of the scaled states."""
-        scales = self._scales
-        return np.asarray(self._equations.rates(t, scales.shift + scales.scale * z, time_values) / scales.scale)
+    def scaled_rates(self, t: float, z: Array, time_values: Array, start: Array) -> Array:
+        """Derivatives of the scaled integrated states; the others are those at the start of the segment."""
+        found = self._equations.rates(t, self.states_of(z, start), time_values)
+        return np.asarray(found[self._moving] / self._scales.scale[self._moving])
+
+    def states_of(self, z: Array, start: Array) -> Array:
+        """All states for scaled integrated states."""
+        scales, x = self._scales, start.copy()
+        x[self._moving] = scales.shift[self._moving] + scales.scale[self._moving] * z
+        return x
 
     def perturbed(self, states: Array) -> Array:
         """States (nstates, ntime) moved by the tolerance of a step, up and down in turn."""
@@ -320,15 +334,15 @@ class InterpretedSolver:
         return self._equations.network.to_outputs(self.signals(times, states, time_values))
 
     def slopes(self, times: Array, states: Array, time_values: Array) -> Array:
-        """Jacobian by the states, by finite differences, (ntime, nstates, nstates)."""
-        n = len(states)
+        """Jacobian of the integrated states, by finite differences, (ntime, nmoving, nmoving)."""
+        n = self._moving.size
         steps = 1e-7 * np.maximum(self._scales.scale, np.abs(states).max(axis=1, initial=0.0))
         plain = self.rates(times, states, time_values)
         found = np.empty((times.size, n, n))
-        for j in range(n):
+        for j, row in enumerate(self._moving.tolist()):
             near = states.copy()
-            near[j] += steps[j]
-            found[:, :, j] = ((self.rates(times, near, time_values) - plain) / steps[j]).T
+            near[row] += steps[row]
+            found[:, :, j] = ((self.rates(times, near, time_values) - plain)[self._moving] / steps[row]).T
         return found
 
     def rates(self, times: Array, states: Array, time_values: Array) -> Array:
@@ -338,20 +352,22 @@ class InterpretedSolver:
 
     def advance(self, series: Series, left: float, grid: Array, state: Array) -> Array:
         """States (nstates, ngrid) at times of a segment; the last is its end."""
-        if not state.size:
-            return np.zeros((0, grid.size))
-        shift, scale = self._scales.shift, self._scales.scale
+        moving, all_states = self._moving, np.repeat(state[:, None], grid.size, axis=1)
+        if not moving.size:
+            return all_states
+        shift, scale = self._scales.shift[moving], self._scales.scale[moving]
         right = float(grid[-1])
         self._segments += 1
-        rates = _Watched(self, series, left, right)
-        out = np.empty((state.size, grid.size))
-        t, z = left, (state - shift) / scale
+        rates = _Watched(self, series, left, right, state)
+        out = np.empty((moving.size, grid.size))
+        t, z = left, (state[moving] - shift) / scale
         with np.errstate(over="ignore", invalid="ignore"):  # infinite states end the run with an error
             for _ in range(_PASSES):
                 with _implicit() as kind:
                     t, z, why = self._marched(kind, rates, t, z, grid, out)
                 if t >= right:
-                    return np.asarray(shift[:, None] + scale[:, None] * out)
+                    all_states[moving] = shift[:, None] + scale[:, None] * out
+                    return all_states
                 # An explicit step may pass where an implicit one fails: a state that stops at a discontinuity.
                 passed, z, _ = self._marched(RK45, rates, t, z, grid, out)
                 if passed - t < _PASSED * (right - left):
@@ -391,7 +407,7 @@ class InterpretedSolver:
         rates.begin(_PASSING if kind is RK45 else _CALLS)
         # Equations that depend on time are evaluated at least once per sample: no longer pulse is skipped.
         longest = float(np.diff(grid, prepend=rates.left).max()) if self._bounded else math.inf
-        solver = kind(rates, t, z, right, rtol=self._rtol, atol=self._atol, max_step=longest)
+        solver = kind(rates, t, z, right, rtol=self._rtol[self._moving], atol=self._atol, max_step=longest)
         if isinstance(solver, LSODA):
             _raise_failures(solver)
         while solver.status == "running":
@@ -413,7 +429,7 @@ class InterpretedSolver:
         return float(solver.t), np.asarray(solver.y), ""
 
     def _cause(self, rates: _Watched, t: float, z: Array) -> str:
-        equations, x = self._equations, self._scales.shift + self._scales.scale * z
+        equations, x = self._equations, self.states_of(z, rates.start)
         time_values = rates.series(t)
         try:
             w = equations.signals(t, x, time_values)
@@ -460,18 +476,25 @@ class _named:  # noqa: N801 (a context, of which a run opens thousands)
             error.add_note(f"in block {self._name} at {self._t:g} s")
 
 
-def _merged_linear(network: Network) -> tuple[Array, Array, NDArray[np.intp], list[int]]:
-    """All linear blocks as one, a x + b w, with the indices of the signals w; and the other blocks with states."""
-    a = np.zeros((network.nstates, network.nstates))
-    b = np.zeros((network.nstates, network.nsignals))
-    moving = []
-    for i, (block, rows) in enumerate(zip(network.blocks, network.states, strict=True)):
-        if block.linear:
-            a[rows, rows] = block.system.A
-            b[rows] = np.asarray(block.system.B) @ network.wire[network.inputs[i]]
-        elif rows.stop > rows.start:
-            moving.append(i)
-    return a, *_used(b), moving
+def _merged_linear(network: Network) -> tuple[Array, Array, NDArray[np.intp], NDArray[np.intp], list[int]]:
+    """All linear blocks as one, a x + b w, with the indices of its states x and signals w; and the other blocks.
+
+    The other blocks are those with states that are not sampled.
+    """
+    linear = [i for i, block in enumerate(network.blocks) if block.linear]
+    states = np.concatenate([np.zeros(0, dtype=np.intp), *(np.r_[network.states[i]] for i in linear)]).astype(np.intp)
+    a = block_diag(*(np.asarray(network.blocks[i].system.A, dtype=float) for i in linear))[: states.size, : states.size]
+    b = np.zeros((states.size, network.nsignals))
+    if linear:
+        inputs = [np.asarray(network.blocks[i].system.B) @ network.wire[network.inputs[i]] for i in linear]
+        b = np.concatenate([part.reshape(-1, network.nsignals) for part in inputs])
+    others = [
+        i
+        for i, (block, rows) in enumerate(zip(network.blocks, network.states, strict=True))
+        if not block.linear and block.period is None and rows.stop > rows.start
+    ]
+    used, columns = _used(b)
+    return a, used, states, columns, others
 
 
 def _used(matrix: Array) -> tuple[Array, NDArray[np.intp]]:
@@ -556,8 +579,8 @@ def _raise_failures(solver: LSODA) -> None:
 class _Watched:
     """Right-hand side of scaled states over a segment, which raises if a solver stalls."""
 
-    def __init__(self, solver: InterpretedSolver, series: Series, left: float, right: float) -> None:
-        self._solver, self.series, self.left, self.right = solver, series, left, right
+    def __init__(self, solver: InterpretedSolver, series: Series, left: float, right: float, start: Array) -> None:
+        self._solver, self.series, self.left, self.right, self.start = solver, series, left, right, start
         self.defined, self._within = left, within(left, right, solver.switches)
         self.begin(_CALLS)
 
@@ -573,7 +596,7 @@ class _Watched:
             raise _StalledError("the solution cannot be continued")
         self._solver.review(self, t, z)
         inside = min(max(t, self._within[0]), self._within[1])
-        rates = self._solver.scaled_rates(inside, z, self.series(inside))
+        rates = self._solver.scaled_rates(inside, z, self.series(inside), self.start)
         if t > self.defined and math.isfinite(rates.sum()):
             self.defined = t
         return rates

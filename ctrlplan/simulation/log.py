@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -274,11 +275,11 @@ def _time_column(table: Columns, time: Column) -> int:
         raise TypeError(f"time must be the name or the number of a column, got {time!r:.80}")
     if table.header is None and time == _TIME:
         return 0
-    similar = table.named_like_times()
+    similar = [name for name in table.header or () if re.fullmatch(r"t(ime)?([\W_].*)?", name, re.IGNORECASE)]
     if table.header is not None and isinstance(time, str) and time not in table.header and similar:
         raise ValueError(
             f"{table.title} must have the column {time!r} of times, got {', '.join(table.header)}; pass "
-            f"time={similar[0]!r}"
+            f"time={similar[0]!r}, with units= unless it is in s"
         )
     return table.column(time)
 

@@ -237,6 +237,16 @@ class Network:
         return _slices([b.system.nstates or 0 for b in self.blocks], 0)
 
     @cached_property
+    def moving(self) -> NDArray[np.intp]:
+        """Indices of the states that are integrated: those of blocks that are not sampled."""
+        parts = [
+            np.arange(place.start, place.stop)
+            for block, place in zip(self.blocks, self.states, strict=True)
+            if block.period is None
+        ]
+        return np.concatenate([np.zeros(0, dtype=np.intp), *parts])
+
+    @cached_property
     def inputs(self) -> list[slice]:
         """Indices of the inputs of each block among the rows of `wire`."""
         return _slices([b.system.ninputs or 0 for b in self.blocks], 0)

@@ -53,6 +53,10 @@ class NumericalSolver(Solver, Protocol):
         """Evaluations of the right-hand side so far, if they are counted."""
 
     @property
+    def moving(self) -> NDArray[np.intp]:
+        """Indices of the states that are integrated: those of blocks that are not sampled."""
+
+    @property
     def calls_blocks(self) -> bool:
         """Whether functions of blocks are called, which may raise outside their domain."""
 
@@ -70,7 +74,7 @@ class NumericalSolver(Solver, Protocol):
         """Derivatives (nstates, ntime) of the states."""
 
     def slopes(self, times: Array, states: Array, time_values: Array) -> Array:
-        """Jacobian by the states, (ntime, nstates, nstates)."""
+        """Jacobian of the integrated states, (ntime, nmoving, nmoving)."""
 
 
 S = TypeVar("S", bound=NumericalSolver)
@@ -153,7 +157,9 @@ def _with_closer_states(attempt: Attempt[S], fresh: Job) -> Attempt[S]:
         again.solver.count()
         again.go()
     except SolverError:
-        attempt.drift = attempt.scales.uncertainty(attempt.run.states, attempt.job.rtol) @ attempt.effects.T
+        own = attempt.scales.uncertainty(attempt.run.states, attempt.job.rtol)
+        attempt.drift = np.zeros(own.size)
+        attempt.drift[attempt.moving] = own[attempt.moving] @ attempt.effects.T
         return attempt
     _, first, second = np.intersect1d(attempt.run.times, again.run.times, return_indices=True)
     apart = np.abs(attempt.run.states[:, first] - again.run.states[:, second]).max(axis=1, initial=0.0)
@@ -225,29 +231,38 @@ class Attempt(Generic[S]):
 
     def loose(self) -> NDArray[np.bool_]:
         """States (nstates,) whose tolerances are too large for the accuracy of other states."""
-        states, scales = self.run.states, self.scales
-        if len(states) < 2 or not np.isfinite(states).all():
-            return np.zeros(len(states), dtype=bool)
-        error = scales.uncertainty(states, self.job.rtol)
+        states, scales, moving = self.run.states, self.scales, self.moving
+        loose = np.zeros(len(states), dtype=bool)
+        if moving.size < 2 or not np.isfinite(states).all():
+            return loose
+        error = scales.uncertainty(states, self.job.rtol)[moving]
         allowed = max(_UNCERTAIN, 100.0 * self.job.rtol) * np.ptp(states, axis=1) + 10.0 * scales.atol * scales.scale
+        allowed = allowed[moving]
         found = self.effects * error > allowed[:, None]
         if found.any() and self.job.blocks.blocks_with("period"):
             # Feedback through samples is not in the Jacobian: only strongly nonlinear dependence counts.
             t, x, time_values = self.visited()
             size, rates = np.abs(states - scales.shift[:, None]).max(axis=1), self.solver.rates(t, x, time_values)
+            size, rates = size[moving], rates[moving]
             found &= np.abs(self._slopes[: t.size]).max(axis=0) * size > _STEEP * np.abs(rates).max(
                 axis=1, keepdims=True
             )
-        return np.asarray(found.any(axis=0))
+        loose[moving] = found.any(axis=0)
+        return loose
+
+    @property
+    def moving(self) -> NDArray[np.intp]:
+        """Indices of the states that are integrated."""
+        return self.solver.moving
 
     @cached_property
     def effects(self) -> Array:
-        """Largest displacement of each state by a unit error of another, shape (nstates, nstates)."""
+        """Largest displacement of each integrated state by a unit error of another, shape (nmoving, nmoving)."""
         return effects(self._slopes, float(self.run.times[-1] - self.run.times[0]))
 
     @cached_property
     def _slopes(self) -> Array:
-        """Jacobians by the states, (nplaces, nstates, nstates), first at the visited times."""
+        """Jacobians of the integrated states, (nplaces, nmoving, nmoving), first at the visited times."""
         t, x, time_values = self.visited()
         some = slice(None, None, VISITED // _DISPLACED)
         # At samples that are full turns of an angle apart, the slope of its sine is the same and may be 0.
@@ -257,7 +272,7 @@ class Attempt(Generic[S]):
             np.append(x, displaced, axis=1),
             np.append(time_values, time_values[:, some], axis=1),
         )
-        return self.on_trial(self.solver.slopes, *places, (-1, len(x), len(x)))
+        return self.on_trial(self.solver.slopes, *places, (-1, self.moving.size, self.moving.size))
 
     def on_trial(
         self,
@@ -367,7 +382,7 @@ def _accuracy_note(attempt: Attempt[S]) -> str:
     own = scales.uncertainty(run.states, job.rtol) * attempt.growth / attempt.tighter
     uncertainty, count = own + attempt.drift, len(job.prepared.output_labels)
     worst, ranges = output_uncertainty(
-        lambda near: attempt.on_trial(solver.outputs, t, near, time_values, (count, -1)), x, uncertainty
+        lambda near: attempt.on_trial(solver.outputs, t, near, time_values, (count, -1)), x, uncertainty, attempt.moving
     )
     allowed = max(_UNCERTAIN, 100.0 * job.rtol) * ranges
     uncertain = (ranges > 0.0) & (worst > allowed)

@@ -172,7 +172,9 @@ def rounding_of(rates: Callable[[Array], Array], states: Array) -> Array:
     return np.asarray(found)
 
 
-def output_uncertainty(outputs: Callable[[Array], Array], states: Array, uncertainty: Array) -> tuple[Array, Array]:
+def output_uncertainty(
+    outputs: Callable[[Array], Array], states: Array, uncertainty: Array, moving: NDArray[np.intp]
+) -> tuple[Array, Array]:
     """Uncertainty of outputs from that of the states, and the outputs' ranges, shapes (noutputs,).
 
     Parameters
@@ -183,16 +185,22 @@ def output_uncertainty(outputs: Callable[[Array], Array], states: Array, uncerta
         States at these times.
     uncertainty : ndarray, shape (nstates,)
         Uncertainty of the states.
+    moving : ndarray of int
+        States whose effects are added; those of all others, the memories of
+        sampled blocks, are found together.
     """
     plain = outputs(states)
     total = np.zeros(plain.shape)
+    others = np.delete(np.arange(len(states)), moving)
     with np.errstate(all="ignore"):
-        for i, error in enumerate(uncertainty.tolist()):
-            # A step large compared with rounding and small compared with the curvature of the outputs.
-            step = max(error, 1e-7 * float(np.abs(states[i]).max(initial=0.0))) or 1.0
+        for rows in [*moving[:, None], *([others] if others.size else [])]:
+            error = uncertainty[rows]
+            # Steps large compared with rounding and small compared with the curvature of the outputs.
+            large = 1e-7 * np.abs(states[rows]).max(axis=1, initial=0.0)
+            factor = float(np.max(large / error, initial=1.0, where=error > 0.0))
             near = states.copy()
-            near[i] += step
-            total += np.abs(outputs(near) - plain) * (error / step)
+            near[rows] += factor * error[:, None]
+            total += np.abs(outputs(near) - plain) / factor
     worst = np.where(np.isfinite(total), total, 0.0).max(axis=1, initial=0.0)
     return worst, np.ptp(plain, axis=1) if plain.shape[1] else np.zeros(len(plain))
 

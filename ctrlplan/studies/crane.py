@@ -292,17 +292,43 @@ def _limited_error(plan: Trajectory, options: _Loop, timepts: Array) -> float:
 def _limits_note(found: Comparison) -> str:
     """Peak forces of the plans, and their tracking errors with the limits of the step run."""
     names = ("polynomial", "trigonometric", "piecewise")
-    peaks = ", ".join(f"{name} {1e-3 * found.metrics[name]['force_peak']:.3g} kN" for name in names)
+    times = {name: _time_of_peak(found, name) for name in names}
+    peaks = ", ".join(
+        f"{name} {1e-3 * found.metrics[name]['force_peak']:.3g} kN at {times[name]:.3g} s" for name in names
+    )
     limited = {name: found.metrics[name]["error_limited"] for name in names}
     errors = ", ".join(
         f"{name} {'not defined (slack rope)' if np.isnan(error) else f'{error:.2g} m'}"
         for name, error in limited.items()
     )
     return (
-        f"Only the step run has limited drives. The peak trolley forces of the plans are: {peaks}. They occur mainly "
-        "at the start and at the end, where acceleration or velocity of a plan is discontinuous. With the limits of "
-        f"the step run (30 kN) the peak tracking errors are: {errors}."
+        f"Only the step run has limited drives. The peak trolley forces of the plans are: {peaks}. "
+        f"{_discontinuities(found, times)}With the limits of the step run (30 kN) the peak tracking errors are: "
+        f"{errors}."
     )
+
+
+def _time_of_peak(found: Comparison, name: str) -> float:
+    """Time of the peak trolley force [s]."""
+    response = found.responses[name]
+    return float(response.time[np.abs(signals_of(response)["F"]).argmax()])
+
+
+_AFTER = 0.5
+"""Time after a discontinuity of a plan within which a peak is attributed to it [s]."""
+
+
+def _discontinuities(found: Comparison, times: Mapping[str, float]) -> str:
+    """Which discontinuities of the plans the peaks at these times follow, in a sentence; empty for none."""
+    said: dict[str, list[str]] = {}
+    for name, time in times.items():
+        before = [jump for jump in found.plans[name].jumps(3) if 0.0 <= time - jump.time <= _AFTER]
+        if before:
+            jump = min(before, key=lambda one: one.order)
+            derivative = ("position", "velocity", "acceleration", "jerk")[jump.order]
+            said.setdefault(f"of the {derivative} at {jump.time:.3g} s", []).append(name)
+    listed = "; ".join(f"{what} ({', '.join(names)})" for what, names in said.items())
+    return f"They follow a discontinuity of the plan: {listed}. " if said else ""
 
 
 def _parameters(t_end: float) -> dict[str, object]:

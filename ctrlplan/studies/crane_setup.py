@@ -32,12 +32,17 @@ WALL = ((7.0, 13.0), (6.5, 12.0))
 SLACK = Event("T", low=0.0, stop=True, name="rope tension")
 """Event at which the model is no longer valid: the rope tension must stay positive."""
 
+_LOAD = (
+    "Peak tracking errors: distance of the load from its planned position in the plane, up to the last waypoint and "
+    "after it; with limited drives, over the whole run with the limits of the step run. Residual sway: peak angle of "
+    "the rope after the last waypoint."
+)
 CRANE_MEASURES = {
-    "error_travel": Measure("Peak tracking error during the move", "m"),
-    "error_after": Measure("Peak tracking error after the move (residual)", "m"),
-    "sway_after": Measure("Residual sway", "rad"),
+    "error_travel": Measure("Peak tracking error during the move", "m", definition=_LOAD),
+    "error_after": Measure("Peak tracking error after the move (residual)", "m", definition=_LOAD),
+    "sway_after": Measure("Residual sway", "rad", definition=_LOAD),
     "force_peak": Measure("Peak trolley force", "N"),
-    "error_limited": Measure("Peak tracking error with limited drives", "m"),
+    "error_limited": Measure("Peak tracking error with limited drives", "m", definition=_LOAD),
     "slack_time": Measure("Time with slack rope", "s"),
     "path_length": Measure("Path length of the plan", "m"),
     "load_path": Measure("Path length of the load", "m"),
@@ -133,7 +138,9 @@ def marked_slack(found: Comparison) -> Comparison:
         if any(event.name == SLACK.name and event.stop for event in found.responses[name].events)
     }
     found = found.marked(ended)
-    slack = {name: values["slack_time"] for name, values in found.metrics.items() if values["slack_time"] > 0.0}
+    slack = {
+        name: values["slack_time"] for name, values in found.metrics.items() if values.get("slack_time", 0.0) > 0.0
+    }
     return found.marked(
         {
             name: f"the rope is slack for {time:.2g} s, and the model is not valid for a slack rope"

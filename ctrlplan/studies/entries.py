@@ -86,29 +86,35 @@ class Number(Kind):
 
     Attributes
     ----------
-    minimum, above : float
-        Range: at least `minimum`, and above `above`.
+    minimum, above, below : float
+        Range: at least `minimum`, above `above`, and below `below`.
     finite : bool
         Whether nan and infinities are excluded.
     """
 
     minimum: float = -math.inf
     above: float = -math.inf
+    below: float = math.inf
     finite: bool = True
 
     def must(self, place: str) -> str:
         """A finite number and its range."""
         size = f", {self.minimum:g} or more" if self.minimum > -math.inf else ""
-        return f"a {'finite ' * self.finite}number{f' above {self.above:g}' if self.above > -math.inf else size}"
+        size = f" above {self.above:g}" if self.above > -math.inf else size
+        most = f"{' and' if size else ''} below {self.below:g}" if self.below < math.inf else ""
+        return f"a {'finite ' * self.finite}number{size}{most}"
 
     def fits(self, value: Value) -> bool:
         """Whether it is a number in the range."""
-        return is_number(value, self.finite) and not (value < self.minimum or value <= self.above > -math.inf)
+        if not is_number(value, self.finite):
+            return False
+        return not (value < self.minimum or value <= self.above > -math.inf or value >= self.below < math.inf)
 
     def schema(self) -> Data:
         """Number with its range."""
         low = {} if self.minimum == -math.inf else {"minimum": self.minimum}
-        return {"type": "number"} | low | ({} if self.above == -math.inf else {"exclusiveMinimum": self.above})
+        low |= {} if self.above == -math.inf else {"exclusiveMinimum": self.above}
+        return {"type": "number"} | low | ({} if self.below == math.inf else {"exclusiveMaximum": self.below})
 
     def read(self, value: Value, place: str, reader: Reader) -> Value:
         """Number as a float."""

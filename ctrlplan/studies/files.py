@@ -67,6 +67,10 @@ Further entries and tables, each optional:
     family = "polynomial"
     fastest = "shape"         # minimum duration under the limits; or "waypoints", "path"
     avoid = true              # around the obstacles; plans of two axes
+    [[plans.shaper]]          # input shaper of the finished plan, one table for each mode
+    kind = "zvd"              # zv, zvd, mzv, ei, two_hump_ei, three_hump_ei
+    frequency = 6.0           # [rad/s]
+    damping = 0.05            # and tolerance = 0.05 of the ei kinds
     [[obstacles]]             # shapes: disc, rectangle (x, z), half_plane (normal, offset)
     shape = "disc"
     centre = [10.0, 5.0]
@@ -81,6 +85,15 @@ Further entries and tables, each optional:
     [draws]                   # comparison over random numbers of [loop]
     count = 100
     parameters = {gain = [2.0, 8.0]}
+    [measured]                # logs of the machine by plan, as ctrlplan.read_log has them
+    trigonometric = "log.csv" # or a table:
+    [measured.step]
+    log = "step.csv"
+    time = "t_ms"
+    signals = {y = "pos_act", u = "torque"}
+    units = {time = 1e-3}
+    align = "auto"            # or a signal, seconds, false
+    fit = true                # feedforward from the log, or {terms = ["static", "velocity"], from = "plan"}
 
 A sweep varies the plant and its law together. Draws of a crane vary the plant
 alone, whose law has the numbers of [loop]. With a function of a module the
@@ -122,6 +135,7 @@ from ctrlplan.studies.entries import (
     Whole,
 )
 from ctrlplan.studies.experiment import Experiment
+from ctrlplan.studies.logged import MEASURED, check_measured, compared_with, fitted, read_logs
 from ctrlplan.studies.loops import LOOP, build_loop, loop_kind
 from ctrlplan.studies.planned import AVOID, LIMITS, OBSTACLES, PLANS, Planned, planned
 from ctrlplan.studies.reading import Reader, StudyError
@@ -164,6 +178,8 @@ class StudyFile:
         The table [experiment]: further fields of `Experiment` by name.
     sweep, draws : dict or None
         The tables [sweep] and [draws].
+    measured : dict
+        The table [measured]: logs by plan.
     author : str
         Author of the report.
     text : tuple of str
@@ -184,6 +200,7 @@ class StudyFile:
     experiment: Data = field(default_factory=dict)
     sweep: Data | None = None
     draws: Data | None = None
+    measured: Data = field(default_factory=dict)
     author: str = ""
     text: tuple[str, ...] = ()
 
@@ -203,6 +220,7 @@ class StudyFile:
             If the loop does not fit the plans.
         """
         kind, reader = loop_kind(self.loop), Reader(self.path)
+        logs = read_logs(self.measured, reader)
         loop = kind.build(self.loop, self.path)
         fields_of, choices = kind.experiment(self.loop, self.waypoints, self.experiment, self.path)
         found_sections: list[Section] = [
@@ -229,6 +247,9 @@ class StudyFile:
                     choices = replace(choices, alpha=next(alphas, 1.0), limits=self.planned.limits or choices.limits)
                     benefit = benefit_of(experiment, loop, choices, units=self.units)
                     comparison = comparison.with_benefit(benefit)
+                comparison = compared_with(comparison, logs, reader)
+                gains = fitted(comparison, logs, reader)
+                found_sections += [gains] if gains is not None else []
         except StudyError:
             raise
         except (ValueError, TypeError, RuntimeError) as error:
@@ -344,6 +365,7 @@ STUDY = Table(
         "experiment": Entry(_EXPERIMENT, "further fields of ctrlplan.Experiment"),
         "sweep": Entry(SWEEP, "comparison over values of a parameter"),
         "draws": Entry(DRAWS, "comparison over random parameters"),
+        "measured": Entry(MEASURED, "logs of the machine by plan: a path, or a table with the columns"),
     }
 )
 """Entries of a study file: names, types, ranges and meaning."""
@@ -386,6 +408,7 @@ def load_study(path: str | os.PathLike[str], *, status: Callable[[str], object] 
     for name, plan in found.plans.items():
         if plan.end >= t_end:
             raise reader.error("t_end", f"must be after the end of the plan {name} at {plan.end:g} s, got {t_end:g}")
+    check_measured(data.get("measured", {}), found.plans, reader)
     _check_memory(data["samples"], len(found.plans), benefit, f"{source}: samples")
     experiment = reader.experiment(data.get("experiment", {}), found.plans, (waypoints[0].time, t_end))
     return StudyFile(
@@ -403,6 +426,7 @@ def load_study(path: str | os.PathLike[str], *, status: Callable[[str], object] 
         experiment=experiment,
         sweep=data.get("sweep"),
         draws=data.get("draws"),
+        measured=data.get("measured", {}),
         author=data.get("author", ""),
         text=(text,) if isinstance(text := data.get("text", []), str) else tuple(text),
     )

@@ -75,6 +75,14 @@ class MeasuredRun:
     left_out: tuple[str, ...] = ()
     failures: dict[str, str] = field(default_factory=dict)
 
+    @property
+    def aligned(self) -> SimulationResponse:
+        """The log with its own samples in the time of the plan."""
+        signals = signals_of(self.log)
+        t = np.asarray(self.log.time) - self.offset
+        reason = f"{t.size} samples, {self.offset:.6g} s earlier than logged"
+        return measured_response(t, np.array([*signals.values()]), list(signals), reason, f"Measured with {self.plan}")
+
     def sentences(self) -> Iterator[str]:
         """What a reader of the metrics must know."""
         yield self.resampling
@@ -82,9 +90,9 @@ class MeasuredRun:
             yield f"its time is {abs(self.offset):.6g} s {self._order} than that of the plan, as given"
         else:
             size, error = 1e3 * abs(self.offset), 1e3 * self.standard_error
-            digits = min(max(1 - math.floor(math.log10(error)), 0), 6)
+            digits = min(max(1 - math.floor(math.log10(error)), 0), 4)
             yield (
-                f"its time is {size:.{digits}f} ± {error:.{digits}f} ms (standard error) {self._order} than that of "
+                f"its time is {size:.{digits}f} ± {error:.2g} ms (standard error) {self._order} than that of "
                 f"the plan, found from the {self.by} {', '.join(self.signals)} compared with {self.compared}"
             )
         if self.by in ("output", "control"):

@@ -201,6 +201,9 @@ class Measure(Displayed):
         values: metrics that share their computation.
     name : str
         Key of the metric in a comparison; by default, the title.
+    definition : str
+        What is computed, with unit and normalisation, in a sentence or two for
+        the page; a text that several metrics have is shown once.
 
     Examples
     --------
@@ -221,6 +224,7 @@ class Measure(Displayed):
     of: Kind = ""
     function: Function | None = None
     name: str = ""
+    definition: str = ""
 
     def __post_init__(self) -> None:
         if self.of not in get_args(Kind):
@@ -236,6 +240,7 @@ class Measure(Displayed):
                 ("unit", self.unit.replace("{y}", "[output]").replace("{u}", "[control]")),
                 ("of", self.of),
                 ("function", getattr(self.function, "__name__", "") if self.function else ""),
+                ("definition", self.definition),
             ]
         )
 
@@ -245,12 +250,39 @@ def _of_path(metric: Callable[[Array, Array, Array], float | Array]) -> Callable
     return lambda seen: np.nan if seen.steps else metric(seen.t, seen.path, seen.points)
 
 
+_SETTLING = (
+    "Settling times: from the start of the plans to the last entry of the output into the band around its final value, "
+    "or around the reference for the tracking error. The band is relative to the range of the plan on the axis, "
+    "maximum minus minimum; for a move without reversals this is the planned change."
+)
+_PERCENT = (
+    "Overshoot and lag: maximum by which the output is ahead of, and behind, the reference or the final value, in the "
+    "direction of the move, in percent of the range of the plan on the axis."
+)
+_ERROR = (
+    "IAE, ISE and ITAE: integrals of the absolute error, of its square, and of the absolute error times the time since "
+    "the start, over the simulated time; in the unit of the output times s, its square times s, and times s²."
+)
+_CONTROL = (
+    "Control effort: integral of the square of the control, in its unit squared times s. Total variation: sum of its "
+    "rises and falls, jumps included, in its unit."
+)
+_PATH = (
+    "Excess path length: length of the planned path divided by that of the polyline through the waypoints, minus 1. "
+    "Excess total variation: rises and falls of the axes beyond those of the waypoints, relative to these. Extra "
+    "reversals: changes of direction of the axes beyond those of the waypoints. All three have no unit."
+)
+_JERK = (
+    "Integral of the squared jerk: summed over the axes, in the unit of the plan squared per s⁵; infinite if position, "
+    "velocity or acceleration is discontinuous."
+)
 MEASURES = {
     "settling_time": Measure(
         "Settling time",
         "s",
         "response",
         lambda seen: metrics.settling_time(seen.t, seen.y, seen.final, seen.origin, band=seen.band, start=seen.start),
+        definition=_SETTLING,
     ),
     "tracking_settling_time": Measure(
         "Settling time of the tracking error",
@@ -259,58 +291,96 @@ MEASURES = {
         lambda seen: metrics.tracking_settling_time(
             seen.t, seen.y, seen.reference, seen.final, seen.origin, band=seen.band, start=seen.start
         ),
+        definition=_SETTLING,
     ),
     "overshoot_error": Measure(
         "Overshoot on the tracking error",
         "%",
         "response",
         lambda seen: metrics.overshoot(seen.t, seen.y, seen.final, seen.origin, reference=seen.reference),
+        definition=_PERCENT,
     ),
     "overshoot_final": Measure(
         "Overshoot on the final value",
         "%",
         "response",
         lambda seen: metrics.overshoot(seen.t, seen.y, seen.final, seen.origin),
+        definition=_PERCENT,
     ),
     "lag_error": Measure(
         "Peak lag behind the reference",
         "%",
         "response",
         lambda seen: metrics.lag(seen.t, seen.y, seen.final, seen.origin, reference=seen.reference),
+        definition=_PERCENT,
     ),
-    "iae": Measure("IAE of the tracking error", "{y} s", "response", lambda seen: metrics.iae(seen.t, seen.error)),
-    "ise": Measure("ISE of the tracking error", "{y}^2 s", "response", lambda seen: metrics.ise(seen.t, seen.error)),
+    "iae": Measure(
+        "IAE of the tracking error",
+        "{y} s",
+        "response",
+        lambda seen: metrics.iae(seen.t, seen.error),
+        definition=_ERROR,
+    ),
+    "ise": Measure(
+        "ISE of the tracking error",
+        "{y}^2 s",
+        "response",
+        lambda seen: metrics.ise(seen.t, seen.error),
+        definition=_ERROR,
+    ),
     "itae": Measure(
         "ITAE of the tracking error",
         "{y} s^2",
         "response",
         lambda seen: metrics.itae(seen.t, seen.error, start=seen.start),
+        definition=_ERROR,
     ),
     "iae_final": Measure(
-        "IAE relative to the final value", "{y} s", "response", lambda seen: metrics.iae(seen.t, seen.remainder)
+        "IAE relative to the final value",
+        "{y} s",
+        "response",
+        lambda seen: metrics.iae(seen.t, seen.remainder),
+        definition=_ERROR,
     ),
     "ise_final": Measure(
-        "ISE relative to the final value", "{y}^2 s", "response", lambda seen: metrics.ise(seen.t, seen.remainder)
+        "ISE relative to the final value",
+        "{y}^2 s",
+        "response",
+        lambda seen: metrics.ise(seen.t, seen.remainder),
+        definition=_ERROR,
     ),
     "itae_final": Measure(
         "ITAE relative to the final value",
         "{y} s^2",
         "response",
         lambda seen: metrics.itae(seen.t, seen.remainder, start=seen.start),
+        definition=_ERROR,
     ),
     "control_peak": Measure("Peak control", "{u}", "control", lambda seen: metrics.peak(seen.t, seen.u)),
-    "control_effort": Measure("Control effort", "{u}^2 s", "control", lambda seen: metrics.effort(seen.t, seen.u)),
-    "control_variation": Measure(
-        "Total variation of the control", "{u}", "control", lambda seen: metrics.total_variation(seen.t, seen.u)
+    "control_effort": Measure(
+        "Control effort", "{u}^2 s", "control", lambda seen: metrics.effort(seen.t, seen.u), definition=_CONTROL
     ),
-    "wandering": Measure("Excess path length", "", "path", _of_path(metrics.wandering)),
-    "excess_variation": Measure("Excess total variation", "", "path", _of_path(metrics.excess_variation)),
-    "turning_points": Measure("Extra reversals", "", "path", _of_path(metrics.turning_points)),
+    "control_variation": Measure(
+        "Total variation of the control",
+        "{u}",
+        "control",
+        lambda seen: metrics.total_variation(seen.t, seen.u),
+        definition=_CONTROL,
+    ),
+    "wandering": Measure("Excess path length", "", "path", _of_path(metrics.wandering), definition=_PATH),
+    "excess_variation": Measure(
+        "Excess total variation", "", "path", _of_path(metrics.excess_variation), definition=_PATH
+    ),
+    "turning_points": Measure("Extra reversals", "", "path", _of_path(metrics.turning_points), definition=_PATH),
     "outside_box": Measure(
         "Peak distance outside the waypoints' bounding box", "{y}", "path", _of_path(metrics.outside_box)
     ),
     "reference_jerk": Measure(
-        "Integral of the squared jerk of the reference", "{y}^2/s^5", "path", lambda seen: jerk_cost(seen.plan)
+        "Integral of the squared jerk of the reference",
+        "{y}^2/s^5",
+        "path",
+        lambda seen: jerk_cost(seen.plan),
+        definition=_JERK,
     ),
 }
 """The metrics of a comparison by name, in the order of the tables."""

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cache
 
 import control as ct
 import numpy as np
@@ -14,20 +13,28 @@ from ctrlplan import metrics
 from ctrlplan.planning import fastest, margins
 from ctrlplan.simulation import simulate
 from ctrlplan.studies.comparison import Comparison, compare
+from ctrlplan.studies.crane_governor import (
+    FILTER,
+    LAGS,
+    LAW,
+    PERIOD,
+    START,
+    AtLoadMotion,
+    filtered_loop,
+    governor_check,
+)
 from ctrlplan.studies.crane_setup import CRANE, TORQUE_LIMITS, UNITS, DriveLimits, nominal_waypoints
 from ctrlplan.studies.measures import Measure, Run, signals_of
-from ctrlplan.studies.sections import AnimatedCrane, CraneOnline, Curves
+from ctrlplan.studies.sections import AnimatedCrane, CraneOnline
 from ctrlplan.studies.study import Study
 from ctrlplan.systems import (
-    AdmissibleSet,
-    create_command_filter_iosystem,
     create_governor_iosystem,
     create_replanner_iosystem,
     create_source_iosystem,
     create_time_scaling_iosystem,
     expose_states,
 )
-from ctrlplan.systems.plants import LoadFeedbackLaw, crane_loop
+from ctrlplan.systems.plants import crane_loop
 from ctrlplan.trajectories import PiecewiseSpline, PolySpline, Step, Trajectory, TrigSpline, Waypoint, stack
 
 Array = NDArray[np.float64]
@@ -46,11 +53,8 @@ ONLINE_MEASURES = {
     "limited_time": Measure("Time with the force at its limit", "s"),
 }
 
-START = nominal_waypoints(1)[0].position
-_LAW = LoadFeedbackLaw(load_bandwidth=0.5)
-_FILTER, _LAGS = 0.8, 5
-"""Bandwidth [rad/s] and order of the filter after the governor, so that the trolley force is continuous."""
-_PERIODS = {"replanned": 0.25, "governed": 0.5}
+_REPLANNED = 0.25
+"""Period of the replanner [s]."""
 
 
 @dataclass(frozen=True)
@@ -223,21 +227,20 @@ def _off_line(scenario: Scenario, limits: DriveLimits) -> ct.InterconnectedSyste
 
 
 def _load_feedback(scenario: Scenario, limits: DriveLimits) -> ct.InterconnectedSystem:
-    return crane_loop(CRANE, scenario.off_line, _LAW, wind=scenario.wind, **limits)
+    return crane_loop(CRANE, scenario.off_line, LAW, wind=scenario.wind, **limits)
 
 
 def _replanned(scenario: Scenario, limits: DriveLimits) -> ct.InterconnectedSystem:
     """Flat map with replanning: from the reference for a new goal, from the load after a deviation."""
-    period = _PERIODS["replanned"]
     if scenario.goal.start > scenario.plan.start:
         replanner = create_replanner_iosystem(
-            scenario.plan, period, order=4, derivatives=2, goal_derivatives=0, trigger="goal", suffix="_ref"
+            scenario.plan, _REPLANNED, order=4, derivatives=2, goal_derivatives=0, trigger="goal", suffix="_ref"
         )
         reference = [replanner, create_source_iosystem(scenario.goal, name="goal", suffix="_goal")]
     else:
         replanner = create_replanner_iosystem(
             scenario.plan,
-            period,
+            _REPLANNED,
             horizon=6.0,
             alpha=1.0,
             measured=1,
@@ -251,8 +254,8 @@ def _replanned(scenario: Scenario, limits: DriveLimits) -> ct.InterconnectedSyst
 
 def _governed(scenario: Scenario, limits: DriveLimits) -> ct.InterconnectedSystem:
     """Goal through a reference governor and a filter, without a plan."""
-    core = _filtered_loop(scenario.wind, limits)
-    governor = create_governor_iosystem(_admissible(scenario.force), initial=START[:1])
+    core = filtered_loop(scenario.wind, limits)
+    governor = create_governor_iosystem(AtLoadMotion(scenario.force), PERIOD, initial=START[:1])
     goal = stack([scenario.goal], labels=["x_command_cmd", "z_command"])
     exposed = expose_states(core)
     unread = set(exposed.output_labels) - {*governor.input_labels, *core.output_labels}
@@ -267,7 +270,7 @@ def _governed(scenario: Scenario, limits: DriveLimits) -> ct.InterconnectedSyste
 
 def _slowed(scenario: Scenario, limits: DriveLimits) -> ct.InterconnectedSystem:
     scaling = create_time_scaling_iosystem(scenario.off_line, errors={"x": (0.05, 0.5)}, suffix="_ref")
-    return crane_loop(CRANE, scenario.off_line, _LAW, reference=[scaling], wind=scenario.wind, **limits)
+    return crane_loop(CRANE, scenario.off_line, LAW, reference=[scaling], wind=scenario.wind, **limits)
 
 
 WAYS: dict[str, Callable[[Scenario, DriveLimits], ct.InterconnectedSystem]] = {
@@ -277,124 +280,6 @@ WAYS: dict[str, Callable[[Scenario, DriveLimits], ct.InterconnectedSystem]] = {
     "governed": _governed,
     "slowed": _slowed,
 }
-
-
-def _filtered_loop(wind: Trajectory | None = None, limits: DriveLimits | None = None) -> ct.InterconnectedSystem:
-    """Crane with load feedback and with filters for the commands x_command and z_command."""
-    filters = [
-        create_command_filter_iosystem(
-            _FILTER, 2, _LAGS, initial=start, inputs=f"{axis}_command", outputs=f"{axis}_ref"
-        )
-        for axis, start in zip(("x", "z"), START.tolist(), strict=True)
-    ]
-    inputs = ["x_command", "z_command"]
-    return crane_loop(
-        CRANE, _constant_start(), _LAW, reference=filters, inputs=inputs, wind=wind, **(limits or DriveLimits())
-    )
-
-
-_SHARE, _SWAY = 0.9, 0.2
-"""Limits of the governor: share of the force limit, and sway [rad]."""
-
-
-@cache
-def _horizontal() -> tuple[ct.StateSpace, Array]:
-    """Horizontal motion linearised at the mean depth, and the equilibrium there in its states."""
-    loop = _filtered_loop()
-    rest = np.array(loop.initial_state)
-    middle = 0.5 * (START[1] + 11.0)
-    rest[loop.nstates - 6 :] = CRANE.equilibrium(0.0, middle)[0]
-    rest[_LAGS] = middle
-    linear = ct.linearize(loop, rest, [0.0, middle])
-    across = ("x_ref", "trolley", "crane_D", "crane_theta")
-    rows = [k for k, label in enumerate(loop.state_labels) if label.startswith(across)]
-    outputs = [loop.output_labels.index(label) for label in ("F", "theta")]
-    a, b, c = (np.asarray(matrix) for matrix in (linear.A, linear.B, linear.C))
-    model = ct.ss(
-        a[np.ix_(rows, rows)],
-        b[rows, :1],
-        c[np.ix_(outputs, rows)],
-        np.zeros((2, 1)),
-        inputs=["x_command"],
-        outputs=["F", "theta"],
-        states=[loop.state_labels[k] for k in rows],
-    )
-    return model, rest[rows]
-
-
-@cache
-def _admissible(force: float) -> AdmissibleSet:
-    """Admissible set for 90 % of a force limit, of the horizontal motion linearised at the mean depth."""
-    model, rest = _horizontal()
-    limit = _SHARE * force
-    limits = {"F": (-limit, limit), "theta": (-_SWAY, _SWAY)}
-    return AdmissibleSet(model, limits, _PERIODS["governed"], margin=0.05, origin=(rest, 0.0))
-
-
-def governor_check(response: ct.TimeResponseData, force: float) -> tuple[tuple[str, ...], Curves]:
-    """Whether the reference that a governor holds is admissible, and the force that its model predicts.
-
-    The model of the governor is evaluated at the simulated states. Where it
-    predicts a force beyond the limit and the simulated force satisfies it, no
-    reference is found although the reference held is admissible.
-
-    Parameters
-    ----------
-    response : control.TimeResponseData
-        Of the governed crane.
-    force : float
-        Limit of the trolley force [N].
-
-    Returns
-    -------
-    notes : tuple of str
-        The result in words; empty if a reference was found at every sample.
-    curves : Curves
-        Simulated and predicted force, and the limit of the governor.
-    """
-    model, rest = _horizontal()
-    t, signals, limit = np.asarray(response.time), signals_of(response), _SHARE * force
-    labels = list(response.state_labels)
-    rows = [_row(labels, state) for state in model.state_labels]
-    states = np.asarray(response.states)
-    predicted = np.asarray(model.C)[0] @ (states[rows] - rest[:, None])
-    curves = Curves(
-        "time [s]",
-        "trolley force [kN]",
-        t,
-        {
-            "simulated": signals["F"] / 1e3,
-            "predicted by the linear model": predicted / 1e3,
-            "limit of the governor": np.full(t.size, limit / 1e3),
-            "negative limit of the governor": np.full(t.size, -limit / 1e3),
-        },
-        key="governor-force",
-        caption="Governed crane: simulated trolley force, and the force that the linear model of the governor predicts "
-        "for the simulated states. No admissible reference is found while the prediction is beyond the limit.",
-    )
-    infeasible = states[_row(labels, "governor_infeasible")] > 0.5
-    if not infeasible.any():
-        return (), curves
-    after = t >= t[infeasible][0]
-    peaks = np.abs(signals["F"][after]).max(), np.abs(signals["theta"][after]).max()
-    held = peaks[0] <= limit and peaks[1] <= _SWAY
-    verdict = (
-        "the reference held at these times is admissible" if held else "the reference held violates a limit of the set"
-    )
-    return (
-        f"The governor finds no admissible reference for {100.0 * infeasible.mean():.0f} % of the time, first at "
-        f"{t[infeasible][0]:.3g} s, and holds the previous one. The cause is its model: the force feedback of the load "
-        "velocity is proportional to the rope length, and the model is linearised at the mean depth of 10.5 m. While "
-        f"the depth differs, the model predicts a force of up to {np.abs(predicted[after]).max() / 1e3:.3g} kN for the "
-        f"measured state (figure). In the simulation {verdict}: from then on the peak force is "
-        f"{peaks[0] / 1e3:.3g} kN with a limit of {limit / 1e3:.3g} kN, and the peak sway {peaks[1]:.2g} rad with a "
-        f"limit of {_SWAY:g} rad.",
-    ), curves
-
-
-def _row(labels: Sequence[str], state: str) -> int:
-    """Row of the state of a block by the end of its label, which the block's name precedes."""
-    return next(k for k, label in enumerate(labels) if label.endswith(state))
 
 
 def _compared(scenario: Scenario, title: str, what: str) -> Comparison:
@@ -430,7 +315,7 @@ def _compared(scenario: Scenario, title: str, what: str) -> Comparison:
             "the fourth derivative; otherwise a plan of 6 s from the measured load after a deviation of 0.2 m; checked "
             "every 0.25 s",
             "governed": f"no plan: the goal through a reference governor (period 0.5 s, linear model, 90 % of the "
-            f"force limit, sway limit 0.2 rad) and a filter ({_LAGS} first-order lags, {_FILTER:g} rad/s); load "
+            f"force limit, sway limit 0.2 rad) and a filter ({LAGS} first-order lags, {FILTER:g} rad/s); load "
             "feedback",
             "slowed": "the plan with time scaling, slowed from 0.05 m to 0.5 m of tracking error in x; load feedback",
             "simulated time": f"{timepts[-1]:g} s",
@@ -441,7 +326,7 @@ def _compared(scenario: Scenario, title: str, what: str) -> Comparison:
 def _in_time_note(limit: float) -> str:
     """Result of a plan that takes the force limit into account from the start."""
     seconds = float(np.ceil(10.0 * fastest(_move(), {"F": limit}, CRANE).duration)) / 10.0
-    loop = crane_loop(CRANE, _move().retime(seconds), _LAW, force_limits=(-limit, limit), torque_limits=TORQUE_LIMITS)
+    loop = crane_loop(CRANE, _move().retime(seconds), LAW, force_limits=(-limit, limit), torque_limits=TORQUE_LIMITS)
     found = online_metrics(_fixed_goal().final, limit, simulate(loop, np.linspace(0.0, 50.0, 2501)))
     return (
         f"A plan that takes the limit into account from the start gives the best result: with a duration of "
@@ -467,10 +352,6 @@ def _fixed_goal() -> Step:
     """A goal that does not change."""
     first, last = nominal_waypoints(1)
     return Step(last.position, first.position, labels=["x", "z"])
-
-
-def _constant_start() -> Step:
-    return Step(START, START, labels=["x", "z"])
 
 
 def _peak_force() -> float:

@@ -44,7 +44,7 @@ from ctrlplan.studies.entries import (
 from ctrlplan.studies.plans import standard_plans
 from ctrlplan.studies.reading import Reader, StudyError, got, named_in_module, one_line, reference
 from ctrlplan.systems.plants import Crane
-from ctrlplan.trajectories import Trajectory, Waypoint
+from ctrlplan.trajectories import Shaper, Trajectory, Waypoint
 from ctrlplan.trajectories.waypoint import ENTRIES
 from ctrlplan.trajectories.waypoint_spline import FromWaypoints, families, family_name
 
@@ -126,7 +126,7 @@ def planned(
             status(f"planning {name} in minimum time")
             found[name] = task.fastest(plan, table["fastest"], bool(table.get("avoid")), place)
             plan = found[name].plan
-        plans[name] = plan
+        plans[name] = _shaped(plan, table.get("shaper", []), f"{place}.shaper", reader)
     plans = plans or standard_plans(waypoints)
     moving = {name: plan for name, plan in plans.items() if plan.duration}
     return Planned(plans, found, task.margins(moving, found), task.clearances(moving), task.obstacles, task.limits)
@@ -179,6 +179,28 @@ def _strings(annotation: object) -> tuple[str, ...]:
     return tuple(string for value in inner for string in _strings(value))
 
 
+_SHAPERS: dict[str, Callable[..., Shaper]] = {
+    "zv": Shaper.zv,
+    "zvd": Shaper.zvd,
+    "mzv": Shaper.mzv,
+    "ei": Shaper.ei,
+    "two_hump_ei": Shaper.two_hump_ei,
+    "three_hump_ei": Shaper.three_hump_ei,
+}
+SHAPERS = Tables(
+    Table(
+        {
+            "kind": Entry(Text(tuple(_SHAPERS)), "kind of the input shaper", required=True),
+            "frequency": Entry(Number(above=0.0), "undamped natural frequency of the mode [rad/s]", required=True),
+            "damping": Entry(Number(minimum=0.0, below=1.0), "damping ratio of the mode; default: 0"),
+            "tolerance": Entry(
+                Number(above=0.0, below=1.0), "residual vibration tolerated by the ei kinds; default: 0.05"
+            ),
+        }
+    )
+)
+"""Tables [[plans.shaper]], one for each mode."""
+
 _COMMON: dict[str, Entry] = {
     "name": Entry(Text(), "name of the plan in tables and figures; default: the family"),
     "avoid": Entry(Flag(), "lead the plan around the obstacles", default=False),
@@ -186,6 +208,7 @@ _COMMON: dict[str, Entry] = {
         Text(get_args(Hold)),
         "minimum duration under [limits], at fixed shape, fixed derivatives at the waypoints, or fixed path",
     ),
+    "shaper": Entry(SHAPERS, "input shapers of the finished plan, one for each mode"),
 }
 
 PLANS = Tables(
@@ -223,6 +246,19 @@ def _plan(table: Data, waypoints: tuple[Waypoint, ...], place: str, reader: Read
         raise reader.error(place, error) from None
     except Exception as error:  # of a user's own class
         raise reader.error(place, f"construction must not fail, got {type(error).__name__}: {error}") from error
+
+
+def _shaped(plan: Trajectory, tables: Sequence[Data], place: str, reader: Reader) -> Trajectory:
+    """Plan after its input shapers."""
+    for i, table in enumerate(tables):
+        kind, options = table["kind"], {name: value for name, value in table.items() if name != "kind"}
+        if "tolerance" in options and not kind.endswith("ei"):
+            raise reader.error(f"{place}[{i}].tolerance", f"must be given for an ei kind, got {got(kind)}")
+        try:
+            plan = _SHAPERS[kind](**options)(plan)
+        except ValueError as error:
+            raise reader.error(f"{place}[{i}]", error) from None
+    return plan
 
 
 def _kind_of_module(family: str, path: Path, place: str) -> type[FromWaypoints]:
@@ -353,7 +389,11 @@ class _Task:
         found = {}
         for name, plan in plans.items() if self.limits else ():
             try:
-                found[name] = known[name].margins if name in known else margins(plan, self.limits, self.crane)
+                own = known.get(name)
+                if own is not None and own.plan is plan:  # a shaped plan has margins of its own
+                    found[name] = own.margins
+                else:
+                    found[name] = margins(plan, self.limits, self.crane)
             except (ValueError, TypeError, RuntimeError) as error:
                 raise self.reader.error("limits", f"{error} (plan {name})") from None
         return found

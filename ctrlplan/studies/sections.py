@@ -20,6 +20,7 @@ if TYPE_CHECKING:  # comparisons and ensembles make studies of themselves for th
     from ctrlplan.studies.ensemble import Ensemble
     from ctrlplan.studies.grids import Grid
     from ctrlplan.studies.sweep import Sweep
+    from ctrlplan.systems import FeedforwardFit
 
 Wall: TypeAlias = tuple[tuple[float, float], tuple[float, float]] | None
 """Obstacle of a crane: limits in x and in z (down) [m]; None for no obstacle."""
@@ -128,6 +129,23 @@ class Curves(Section):
     log: bool = False
     paired: bool = False
     key: str = "curves"
+
+
+@dataclass(frozen=True)
+class FittedGains(Section):
+    """Feedforward fitted to the logs of measured runs.
+
+    Attributes
+    ----------
+    fits : dict of str to FeedforwardFit
+        Fits by the name of the measured run.
+    """
+
+    fits: Mapping[str, FeedforwardFit]
+
+    def results(self) -> dict[str, object]:
+        """Gains, their intervals and the delay of each fit."""
+        return {"feedforward": {name: fit.results() for name, fit in self.fits.items()}}
 
 
 # Sweeps and draws

@@ -140,7 +140,9 @@ def listed_measures(
             if name in values:
                 values[name] = np.nan
         for label, unit in separate.items() if measure.of != "path" else ():
-            listed[f"{name}_{label}"] = Measure(f"{measure.title} ({label})", in_units(measure.unit, unit, unit))
+            listed[f"{name}_{label}"] = Measure(
+                f"{measure.title} ({label})", in_units(measure.unit, unit, unit), definition=measure.definition
+            )
     return listed
 
 

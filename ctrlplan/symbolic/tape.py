@@ -1,15 +1,19 @@
-"""Instruction lists of CasADi functions, evaluated by numpy for many points at once, or by mpmath.
+"""Instruction lists of CasADi functions, evaluated by numpy for arrays of points, or by mpmath.
 
 A tape needs no CasADi to be evaluated, and can be pickled.
 """
 
 from __future__ import annotations
 
+import math
+import operator
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ctrlplan._types import Array, Value
 
@@ -27,18 +31,22 @@ class Instruction:
     last_reads: tuple[int, ...] = ()
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Tape:
     """Instruction list of a function with one dense column or matrix as result.
 
+    Stored as arrays, so that it is small for what reads all data of a block.
+
     Attributes
     ----------
-    sizes : tuple of int
-        Number of entries of each argument.
-    instructions : tuple of Instruction
-        In the order of evaluation; places of arguments are positions in this
-        list, for inputs argument and entry.
-    results : tuple of int
+    operations : tuple of str
+        Names of the operations.
+    code : ndarray of int, shape (n, 3)
+        Of each instruction the operation, and the places of its arguments: positions
+        in this list, for inputs argument and entry; -1 for none.
+    constants : ndarray, shape (n,)
+        Constants.
+    results : ndarray of int
         Position of each entry of the result, column by column; -1 for 0.
     shape : tuple of int
         Rows and columns of the result.
@@ -46,25 +54,50 @@ class Tape:
         Whether a result of one column keeps its second axis.
     """
 
-    sizes: tuple[int, ...]
-    instructions: tuple[Instruction, ...]
-    results: tuple[int, ...]
+    operations: tuple[str, ...]
+    code: NDArray[np.int32]
+    constants: Array
+    results: NDArray[np.int32]
     shape: tuple[int, int]
     matrix: bool = False
+
+    @classmethod
+    def of(
+        cls, instructions: Sequence[Instruction], results: Sequence[int], shape: tuple[int, int], matrix: bool
+    ) -> Tape:
+        """Tape of a list of instructions."""
+        names = tuple(dict.fromkeys(step.operation for step in instructions))
+        code = np.full((len(instructions), 3), -1, dtype=np.int32)
+        for k, step in enumerate(instructions):
+            code[k, 0] = names.index(step.operation)
+            code[k, 1 : 1 + len(step.arguments)] = step.arguments
+        constants = np.array([step.constant for step in instructions])
+        for array in (code, constants, found := np.array(results, dtype=np.int32)):
+            array.flags.writeable = False
+        return cls(names, code, constants, found, shape, matrix)
 
     def __call__(self, *arguments: ArrayLike) -> Array:
         """Result for arguments (entries, ...): shape (rows, columns, ...), or (rows, ...) of a column."""
         given = [np.asarray(value, dtype=float) for value in arguments]
         trailing = np.broadcast_shapes(*(value.shape[1:] for value in given))
-        out = np.zeros((len(self.results), *trailing))
-        with np.errstate(all="ignore"):
-            values = self.evaluated(given, NUMPY)
-        for k, place in enumerate(self.results):
-            if place >= 0:
-                out[k] = values[place]
+        out = np.zeros((self.results.size, *trailing))
+        rows = self.at(given) if trailing else self.at([value.tolist() for value in given])
+        for k, row in enumerate(rows):
+            out[k] = row
         if self.shape[1] == 1 and not self.matrix:
             return out
         return out.reshape(self.shape[1], self.shape[0], *trailing).swapaxes(0, 1)
+
+    def at(self, arguments: Sequence[Value]) -> list[Value]:
+        """Entries of the result, column by column, for arguments of numbers, symbols or arrays."""
+        values: list[Value] | None = None
+        if all(type(entry) is float for argument in arguments for entry in argument):
+            with suppress(ArithmeticError, ValueError, KeyError):  # outside of the domain numpy gives nan
+                values = self.evaluated(arguments, _PYTHON)
+        if values is None:
+            with np.errstate(all="ignore"):
+                values = self.evaluated(arguments, NUMPY)
+        return [values[k] if k >= 0 else 0.0 for k in self.results.tolist()]
 
     def evaluated(
         self,
@@ -84,7 +117,7 @@ class Tape:
             Number of a constant.
         """
         values: list[Value] = []
-        for step in self.instructions:
+        for step in instructions_of(self):
             if step.operation == "INPUT":
                 argument, entry = step.arguments
                 values.append(arguments[argument][entry])
@@ -95,6 +128,23 @@ class Tape:
                 for place in step.last_reads:  # their memory is used again
                     values[place] = None
         return values
+
+
+@lru_cache(maxsize=512)
+def instructions_of(tape: Tape) -> tuple[Instruction, ...]:
+    """Instructions of a tape, with the places that each reads last."""
+    seen = set(tape.results.tolist())
+    out: list[Instruction] = []
+    for row, constant in zip(tape.code[::-1].tolist(), tape.constants[::-1].tolist(), strict=True):
+        name = tape.operations[row[0]]
+        places = tuple(place for place in row[1:] if place >= 0)
+        if name in ("INPUT", "CONST"):
+            out.append(Instruction(name, places, constant))
+            continue
+        new = tuple(sorted(set(places) - seen))
+        seen.update(new)
+        out.append(Instruction(name, places, constant, new))
+    return tuple(reversed(out))
 
 
 NUMPY: Operations = {
@@ -146,3 +196,20 @@ NUMPY: Operations = {
     "IF_ELSE_ZERO": lambda condition, value: np.where(condition != 0.0, value, 0.0),
 }
 """Operations on numbers and arrays."""
+
+_PYTHON: Operations = {
+    "ASSIGN": lambda x: x,
+    "ADD": operator.add,
+    "SUB": operator.sub,
+    "MUL": operator.mul,
+    "DIV": operator.truediv,
+    "NEG": operator.neg,
+    "POW": math.pow,
+    "CONSTPOW": math.pow,
+    "SQ": lambda x: x * x,
+    "TWICE": lambda x: x + x,
+    "INV": lambda x: 1.0 / x,
+    **{name.upper(): getattr(math, name) for name in str.split("exp log sqrt sin cos tan asin acos atan atan2 hypot")},
+    **{name.upper(): getattr(math, name) for name in str.split("sinh cosh tanh asinh acosh atanh log1p expm1 fabs")},
+}
+"""Smooth operations on Python's numbers, which raise outside of their domain."""

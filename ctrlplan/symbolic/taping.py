@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from functools import cache
 
 import casadi as ca
@@ -30,8 +29,7 @@ def tape_of(arguments: Sequence[ca.SX], result: ca.SX, *, matrix: bool = False) 
             found = Instruction(operation, given if operation == "INPUT" else tuple(place[g] for g in given))
         instructions.append(found)
         place[target[0]] = len(instructions) - 1
-    sizes = tuple(function.numel_in(i) for i in range(function.n_in()))
-    return Tape(sizes, _with_last_reads(instructions, set(results)), tuple(results), function.size_out(0), matrix)
+    return Tape.of(instructions, results, function.size_out(0), matrix)
 
 
 def operations_of(function: ca.Function) -> Iterator[tuple[int, str, tuple[int, ...], tuple[int, ...]]]:
@@ -46,17 +44,3 @@ def operations_of(function: ca.Function) -> Iterator[tuple[int, str, tuple[int, 
 def _operation_names() -> dict[int, str]:
     """Names of CasADi's operations by their numbers."""
     return {getattr(ca, name): name[3:] for name in dir(ca) if name.startswith("OP_")}
-
-
-def _with_last_reads(instructions: list[Instruction], results: set[int]) -> tuple[Instruction, ...]:
-    """Instructions with the places that they read last."""
-    seen = set(results)
-    out: list[Instruction] = []
-    for step in reversed(instructions):
-        if step.operation in ("INPUT", "CONST"):
-            out.append(step)
-            continue
-        new = tuple(sorted(set(step.arguments) - seen))
-        seen.update(new)
-        out.append(replace(step, last_reads=new))
-    return tuple(reversed(out))

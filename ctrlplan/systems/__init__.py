@@ -57,6 +57,7 @@ from ctrlplan.systems.admissible import AdmissibleSet
 from ctrlplan.systems.command_filter import command_filter_gains, command_lead, create_command_filter_iosystem
 from ctrlplan.systems.exposed import expose_states, state_signals
 from ctrlplan.systems.feedforward import create_feedforward_iosystem
+from ctrlplan.systems.feedforward_fit import FeedforwardFit, fit_feedforward
 from ctrlplan.systems.flat import create_flat_iosystem
 from ctrlplan.systems.governor import Admission, Governor, create_governor_iosystem
 from ctrlplan.systems.hybrid import Delay, SampleHold, create_delay_iosystem, sample_hold
@@ -73,6 +74,7 @@ __all__ = [
     "AdmissibleSet",
     "Admission",
     "Delay",
+    "FeedforwardFit",
     "Governor",
     "Law",
     "PlanSource",
@@ -92,6 +94,7 @@ __all__ = [
     "create_source_iosystem",
     "create_time_scaling_iosystem",
     "expose_states",
+    "fit_feedforward",
     "flat_quantities",
     "hurwitz_coefficients",
     "plants",

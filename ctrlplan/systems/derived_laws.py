@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from ctrlplan._checks import check_signals, checked_range, finite_vector
 from ctrlplan._types import Array, Params, Value
 from ctrlplan.flatness.derived import DerivedFlatSystem
-from ctrlplan.symbolic.tape import NUMPY, Tape
+from ctrlplan.symbolic.tape import Tape
 from ctrlplan.systems.poles import checked_gains
 from ctrlplan.traits import declare
 from ctrlplan.trajectories import derivative_name
@@ -91,13 +91,13 @@ def _block(
     def arguments(x: Value, u: Value) -> tuple[Value, Value, Value, Value, Value]:
         # Blocks are first evaluated with all inputs zero, where many plants are singular: then the law is evaluated at
         # a regular point and multiplied by 0. Without a branch, so that it can be traced.
-        idles = math.prod(value == 0.0 for value in u)
-        given = [value + idles * at for value, at in zip([*u, *x], regular, strict=True)]
+        idles = math.prod(_number(value) == 0.0 for value in u)
+        given = [_number(value) + idles * at for value, at in zip([*u, *x], regular, strict=True)]
         return given[:count], given[count : count + len(states)], given[count + len(states) :], p, 1.0 - idles
 
     def applied(x: Value, u: Value) -> tuple[list[Value], tuple[Value, Value, Value, Value, Value]]:
         given = arguments(x, u)
-        values = _results(control, given[:4])
+        values = control.at(given[:4])
         if bounds is not None:
             values = [
                 np.minimum(np.maximum(value, low), high) for value, low, high in zip(values, *bounds, strict=True)
@@ -110,7 +110,7 @@ def _block(
 
     def update(t: float, x: Value, u: Value, params: Params) -> Value:
         values, given = applied(x, u)
-        return [value * given[4] for value in _results(rates, (*given[:4], values))]
+        return [value * given[4] for value in rates.at((*given[:4], values))]
 
     own = [f"{name}_w{k + 1}" for k in range(extension)]
     own += [f"{name}_{label}_integral" for label in labels] if integral else []
@@ -126,10 +126,9 @@ def _block(
     return declare(block, initial_state=initial) if own else block
 
 
-def _results(tape: Tape, arguments: Sequence[Value]) -> list[Value]:
-    with np.errstate(all="ignore"):
-        values = tape.evaluated(arguments, NUMPY)
-    return [values[k] if k >= 0 else 0.0 for k in tape.results]
+def _number(value: Value) -> Value:
+    """Python's number in place of numpy's, which is slower; symbols as they are."""
+    return float(value) if isinstance(value, np.floating) else value
 
 
 def _regular_arguments(flat: DerivedFlatSystem, count: int, extension: int, own: int) -> list[float]:

@@ -4,7 +4,8 @@
 ``plan.extrema(nu)`` and ``plan.peak(nu)`` the extrema between samples too,
 ``plan.plot()`` a figure that ``plt.show()`` shows (``ax=drawn.axes`` overlays a
 second plan). Plans are added, scaled, shifted (``shift``), retimed
-(``retime``), joined (``then``), stacked (`stack`) and split (``select``);
+(``retime``), joined (``then``), stacked (`stack`) and split (``select``), and
+stopped (``stop``) or brought to a constant velocity (``to_velocity``) in minimum time;
 ``plan.save(path)`` writes JSON that `load_trajectory` restores exactly.
 
 Before its start a plan holds its first position, after its end the last, with

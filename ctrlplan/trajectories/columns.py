@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import math
 import os
-import re
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,8 +15,6 @@ from ctrlplan._types import Array
 
 Column = str | int
 """A column by its name in the header, or by its number from 0."""
-
-_TIME_NAME = re.compile(r"t(ime)?(\W.*|_s)?", re.IGNORECASE)
 
 
 class Columns(ABC):
@@ -68,10 +65,6 @@ class Columns(ABC):
         if column not in self.header:
             raise ValueError(f"{self.title} must have a column {column!r}, got {', '.join(self.header)}")
         return self.header.index(column)
-
-    def named_like_times(self) -> list[str]:
-        """Names of columns that look like times: t, time, Time [s]."""
-        return [name for name in self.header or () if _TIME_NAME.fullmatch(name)]
 
     def increasing(self, column: int, hint: str = "") -> Array:
         """Times of the rows.

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
+    from ctrlplan._types import Array
     from ctrlplan.trajectories.trajectory import Trajectory
 
 
@@ -42,16 +43,30 @@ def find_jumps(plan: Trajectory, order: int) -> tuple[Jump, ...]:
     """
     before = plan.jet(plan.breakpoints, order, left=True)
     after = plan.jet(plan.breakpoints, order)
+    inside = plan.breakpoints[:-1, None] + np.diff(plan.breakpoints)[:, None] * _INSIDE
+    samples = np.concatenate([before[:, :, 1:], after, plan.jet(inside.ravel(), order)], axis=-1)
     after[:, :, -1] = 0.0
     after[0, :, -1] = plan.final
     size = after - before
-    position, eps = plan.extrema(), float(np.finfo(float).eps)
-    # Relative to the range: a distant origin of the positions hides no jump.
-    farthest = np.maximum(np.abs(position.minimum), np.abs(position.maximum))
-    slack = [1e-9 * (position.maximum - position.minimum) + 8.0 * eps * farthest]
-    slack += [1e-9 * plan.peak(k) for k in range(1, order + 1)]
-    found = np.argwhere(np.abs(size) > np.maximum(slack, np.finfo(float).tiny)[:, :, None])
+    slack = [_slack(k, rows.min(axis=-1), rows.max(axis=-1)) for k, rows in enumerate(samples)]
+    # Extrema of samples are nearer to 0 than those of the plan, which are computed for orders that may jump alone.
+    for k in np.flatnonzero((np.abs(size) > np.array(slack)[:, :, None]).any(axis=(1, 2))).tolist():
+        exact = plan.extrema(k)
+        slack[k] = _slack(k, exact.minimum, exact.maximum)
+    found = np.argwhere(np.abs(size) > np.array(slack)[:, :, None])
     return tuple(
         Jump(int(k), float(plan.breakpoints[i]), plan.labels[a], float(size[k, a, i]))
         for k, a, i in sorted(found.tolist(), key=lambda entry: (entry[0], entry[2], entry[1]))
     )
+
+
+_INSIDE = np.array([0.1, 0.3, 0.45, 0.65, 0.85])
+"""Parts of a segment at which a plan is sampled."""
+
+
+def _slack(order: int, minimum: Array, maximum: Array) -> Array:
+    """Size of a difference that is rounding, for the extrema of a derivative, shape (naxes,)."""
+    peak = np.maximum(np.abs(minimum), np.abs(maximum))
+    # Relative to the range: a distant origin of the positions hides no jump.
+    found = 1e-9 * peak if order else 1e-9 * (maximum - minimum) + 8.0 * np.finfo(float).eps * peak
+    return np.maximum(found, np.finfo(float).tiny)

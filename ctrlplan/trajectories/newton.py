@@ -185,6 +185,18 @@ class NewtonSystem(Fields):
         found[0] += offset
         return found
 
+    def coefficients_of(self, taylor_data: NDArray[Any]) -> Array:
+        """The same for entries of a complete jet at each waypoint, with the digits of extended numbers."""
+        if taylor_data.dtype == np.float64 or self._spread is not None:
+            return self.coefficients(taylor_data.astype(float, copy=False))
+        offset = taylor_data[self._anchor] * self._positions[self._anchor]
+        found = taylor_data - self._positions * offset
+        triangle = self._triangle.astype(found.dtype)
+        for n in range(len(triangle)):
+            found[n] = (found[n] - triangle[n, :n] @ found[:n]) / triangle[n, n]
+        found[0] += offset
+        return found.astype(float)
+
     def fitted(self, values: Array, times: Sequence[float], duration: float, taylor_data: Array) -> Array:
         """Coefficients from prescribed derivatives at times [s], with an error below `MAXIMUM_LOSS`.
 
@@ -280,6 +292,20 @@ class NewtonSystem(Fields):
         if self._fold:
             columns = [[*column, self._fold * column[-1]] for column in columns]
         return [newton_series(factors, column, order) for column in columns]
+
+    def jet_at(self, coefficients: Array, u: float, order: int) -> list[list[Value]]:
+        """Taylor series of each axis at one normalised time, a number, of a polynomial."""
+        nodes = self._pair
+        if nodes is None:
+            return self.series(coefficients, u, order)
+        left, right = u - nodes[0], u - nodes[1]
+        return [_two_point_series(left, right, column, order) for column in coefficients.T.tolist()]
+
+    @cached_property
+    def _pair(self) -> tuple[float, float] | None:
+        """The two nodes of a polynomial, if they alternate."""
+        nodes = set(zip(self._first.tolist(), self._second.tolist(), strict=True))
+        return nodes.pop() if len(nodes) == 1 and not self.alpha else None
 
     def _across(self, times: Sequence[float], duration: float) -> float:
         """Minimum distance on the circle from a waypoint near the end to one near the start, without the two ends."""
@@ -378,6 +404,20 @@ def newton_series(factors: Sequence[Pair], column: Sequence[Value], order: int) 
         (qq, qc), weight = factors[j], column[2 * j + 1]
         found = [sum(map(mul, qq, found[k::-1]), weight * qc[k]) for k in orders]
         found[0] = found[0] + column[2 * j]
+    return found
+
+
+def _two_point_series(left: float, right: float, column: Sequence[float], order: int) -> list[Value]:
+    """Same as `newton_series` for polynomials with two nodes, at distances `left` and `right`."""
+    product, total, pairs = left * right, left + right, len(column) // 2
+    found = [column[-1] if len(column) % 2 else 0.0] + [0.0] * order
+    for j in range(2 * pairs - 2, -1, -2):
+        weight = column[j + 1]
+        for k in range(order, 1, -1):
+            found[k] = product * found[k] + total * found[k - 1] + found[k - 2]
+        if order:
+            found[1] = product * found[1] + total * found[0] + weight
+        found[0] = product * found[0] + weight * left + column[j]
     return found
 
 

@@ -176,7 +176,8 @@ class NewtonSpline(WaypointSpline):
             remedy = "use PiecewiseSpline, one polynomial per segment"
             if self.alpha:
                 remedy = f"lower alpha from {self.alpha:.6g} (choose_alpha finds the best one) or {remedy}"
-            warn_of_swing(values, self.waypoints, self.end, self.labels, remedy)
+            table, _ = given_entries(self.waypoints)
+            warn_of_swing(values, np.array(self._times), table, self.end, self.labels, remedy)
 
     def resolved(self, table: NDArray[Any], digits: int) -> Self:
         """Plan with coefficients from decimal entries, where possible.

@@ -2,40 +2,43 @@
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections.abc import Iterable, Sequence
-from typing import Any, Literal, NamedTuple, Self
+from collections.abc import Iterable, Mapping, Sequence
+from functools import cached_property
+from typing import Any, Literal, Self
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from ctrlplan._checks import checked_labels
+from ctrlplan._checks import checked_count, checked_finite, checked_labels, real_array
 from ctrlplan._display import number
 from ctrlplan._renamed import FormerAttribute
 from ctrlplan._types import Data, Value
-from ctrlplan.trajectories.chosen import chosen_alpha
-from ctrlplan.trajectories.common import FACTORIALS, Array, mapped_time, readonly, times_powers
-from ctrlplan.trajectories.conjugate_digits import Ends, conjugate_digits
-from ctrlplan.trajectories.newton import NEARLY_CLOSED, NewtonSystem
-from ctrlplan.trajectories.newton_spline import NewtonSpline, given_entries
+from ctrlplan.trajectories.chosen import checked_alpha, chosen_alpha
+from ctrlplan.trajectories.common import Array, derivative_scale, mapped_time, readonly
+from ctrlplan.trajectories.conjugate import FreeEntries, Kind, kinds_of, rounded
+from ctrlplan.trajectories.newton_spline import NewtonSpline
+from ctrlplan.trajectories.pieces import Pieces, fitted, scales
 from ctrlplan.trajectories.polynomial import PolySpline
-from ctrlplan.trajectories.swing import warn_of_swing
+from ctrlplan.trajectories.swing import MAXIMUM_SWING, warn_of_swing
 from ctrlplan.trajectories.trigonometric import TrigSpline
-from ctrlplan.trajectories.waypoint import Waypoint
-from ctrlplan.trajectories.waypoint_spline import WaypointSpline, checked_waypoints, same_axes, same_times
+from ctrlplan.trajectories.waypoint import Entries, Waypoint
+from ctrlplan.trajectories.waypoint_spline import (
+    WaypointSpline,
+    checked_waypoints,
+    increasing,
+    same_axes,
+    same_times,
+)
 
-_ACCURATE = 1e-12
-"""Estimated relative error of the free entries above which decimal arithmetic is used."""
-
-_SINGULAR = 1e13
-"""Condition number of their equations, for equal durations, above which they are not determined."""
-
-_SHORT = 0.02
-"""Duration relative to the longest segment below which entries are computed in decimal arithmetic."""
-
-_WITHIN = np.linspace(0.0, 1.0, 13)
+_WITHIN = readonly(np.linspace(0.0, 1.0, 13))
 """Relative times in a segment at which its range is measured."""
+
+_EXTREME = 200.0
+"""Decimal exponent of powers of a duration above which each segment is evaluated with a check of overflow."""
+
+_FEW, _MANY = 16, 1000
+"""Number of segments up to which each is evaluated by itself, and number of times in each above which it is."""
 
 
 class PiecewiseSpline(WaypointSpline):
@@ -84,8 +87,12 @@ class PiecewiseSpline(WaypointSpline):
     options = ("alpha",)
 
     alpha: float
-    segments: tuple[NewtonSpline, ...]
     _warn: bool
+    _period: float | None
+    _entries: Entries
+    _filled: Array  # entries with the free ones of inner waypoints, of a closed plan with the return to the first
+    _free: dict[bytes, FreeEntries]  # by pattern of prescribed entries
+    _pieces: tuple[Pieces, ...]
 
     def __init__(
         self,
@@ -97,37 +104,188 @@ class PiecewiseSpline(WaypointSpline):
     ) -> None:
         points = checked_waypoints(waypoints)
         shape = chosen_alpha(alpha, points, type(self), labels=labels)
-        names = checked_labels(labels or points[0].labels, points[0].naxes)
-        filled, decimals = _filled(points, shape)
-        segments: list[NewtonSpline] = [
-            TrigSpline(pair, alpha=shape, labels=names, warn=False)
-            if shape
-            else PolySpline(pair, labels=names, warn=False)
-            for pair in itertools.pairwise(filled)
-        ]
-        if decimals is not None:
-            _resolve(segments, decimals)
-        self._set_fields(
-            waypoints=points,
-            alpha=shape,
-            labels=names,
-            segments=tuple(segments),
-            breakpoints=readonly(np.array([p.time for p in points])),
-            _warn=warn,
-        )
+        self._fit(Entries.of(points), shape, labels, warn)
+        self._set_fields(waypoints=points)
         self._check_swing()
+
+    @classmethod
+    def from_arrays(
+        cls,
+        times: ArrayLike,
+        values: ArrayLike,
+        *,
+        derivatives: Mapping[int, ArrayLike] | None = None,
+        alpha: float | Literal["auto"] = 0.0,
+        labels: Sequence[str] | None = None,
+        warn: bool = True,
+    ) -> Self:
+        """Piecewise spline through many waypoints, given as arrays.
+
+        Parameters
+        ----------
+        times : array_like, shape (nwaypoints,)
+            Times [s], strictly increasing.
+        values : array_like, shape (naxes, nwaypoints), or (nwaypoints,) for one axis
+            Positions; nan is a free entry.
+        derivatives : mapping of int to array_like, optional
+            Derivatives by order, 1 or higher, each of the shape of `values`, or
+            (nwaypoints,) or a number for all axes; nan is a free entry.
+        alpha, labels, warn
+            As for `PiecewiseSpline`.
+
+        Raises
+        ------
+        TypeError
+            If an array does not contain real numbers.
+        ValueError
+            If shapes differ, times do not increase, an entry is infinite, or an
+            order is below 1; otherwise as `PiecewiseSpline`.
+
+        Examples
+        --------
+        Minimum jerk through a thousand points, from rest to rest:
+
+        >>> import numpy as np
+        >>> import ctrlplan as cp
+        >>> times = np.linspace(0.0, 10.0, 1000)
+        >>> rest = np.full(1000, np.nan)
+        >>> rest[[0, -1]] = 0.0
+        >>> plan = cp.PiecewiseSpline.from_arrays(times, np.sin(times) ** 3, derivatives={1: rest, 2: rest})
+        >>> float(np.abs(plan(times) - np.sin(times) ** 3).max()) < 1e-14, plan.breakpoints.size
+        (True, 1000)
+        """
+        entries = _entries_of(times, values, derivatives)
+        points = entries.waypoints() if isinstance(alpha, str) else ()
+        plan = cls.__new__(cls)
+        plan._fit(entries, chosen_alpha(alpha, points, cls, labels=labels), labels, warn)
+        plan._check_swing()
+        return plan
+
+    @classmethod
+    def cyclic(
+        cls,
+        waypoints: Iterable[Waypoint],
+        period: float,
+        *,
+        alpha: float = 0.0,
+        labels: Sequence[str] | None = None,
+        warn: bool = True,
+    ) -> Self:
+        """Periodic plan, which leads back to its first waypoint.
+
+        The plan starts at the first waypoint, lasts one period and ends with the
+        initial jet. Free entries of all waypoints, also of the first, are
+        continuous together with their conjugates. `then` appends further periods.
+
+        Parameters
+        ----------
+        waypoints : iterable of Waypoint
+            Two or more, all within one period, without the return to the first.
+        period : float
+            Period [s].
+        alpha, labels, warn
+            As for `PiecewiseSpline`.
+
+        Raises
+        ------
+        ValueError
+            If the waypoints do not fit into one period; otherwise as
+            `PiecewiseSpline`.
+
+        Examples
+        --------
+        >>> import ctrlplan as cp
+        >>> points = [cp.Waypoint(0, 0, None, None), cp.Waypoint(1, 1, None, None), cp.Waypoint(3, -1, None, None)]
+        >>> cam = cp.PiecewiseSpline.cyclic(points, 4.0)
+        >>> cam.end, bool(abs(cam.jet(4.0, 2) - cam.jet(0.0, 2)).max() < 1e-12)
+        (4.0, True)
+        """
+        points = checked_waypoints(waypoints)
+        duration = checked_finite(period, "period", above=0.0)
+        plan = cls.__new__(cls)
+        plan._fit(Entries.of(points), checked_alpha(alpha), labels, warn, period=duration)
+        plan._set_fields(waypoints=points)
+        plan._check_swing()
+        return plan
+
+    def _fit(
+        self,
+        entries: Entries,
+        alpha: float,
+        labels: Sequence[str] | None,
+        warn: bool,
+        period: float | None = None,
+        donor: PiecewiseSpline | None = None,
+    ) -> None:
+        """Set all fields but the waypoints; equations of a `donor` at the same times are reused."""
+        times = entries.times
+        if period is not None and times[-1] >= times[0] + period:
+            raise ValueError(
+                f"waypoints of a cyclic plan must lie within one period of {period:g} s from the first, "
+                f"got waypoints[{times.size - 1}].time = {times[-1]}"
+            )
+        with np.errstate(over="ignore"):
+            far = np.flatnonzero(~np.isfinite(np.diff(times)))
+        if far.size:
+            start, end = times[far[0] : far[0] + 2].tolist()
+            raise ValueError(f"duration must be finite and above 0, got {end} s after {start} s")
+        breakpoints = times if period is None else readonly(np.append(times, times[0] + period))
+        free = {} if donor is None else dict(donor._free)
+        filled, pieces = _fitted(entries, alpha, period, breakpoints, free)
+        self._set_fields(
+            alpha=alpha,
+            labels=checked_labels(labels or entries.labels, entries.table.shape[2]),
+            breakpoints=breakpoints,
+            _warn=warn,
+            _period=period,
+            _entries=entries,
+            _filled=filled,
+            _free=free,
+            _pieces=pieces,
+        )
+
+    @cached_property
+    def waypoints(self) -> tuple[Waypoint, ...]:  # type: ignore[override]  # a field of the base class
+        """Prescribed positions and derivatives."""
+        return self._entries.waypoints()
+
+    @cached_property
+    def segments(self) -> tuple[NewtonSpline, ...]:
+        """Splines of the segments, with all entries filled in."""
+        return tuple(self._segment(k) for k in range(self.breakpoints.size - 1))
 
     legs = FormerAttribute("segments")
 
-    def with_values(self, waypoints: Iterable[Waypoint]) -> Self:
+    def with_values(
+        self, waypoints: Iterable[Waypoint] | Array, *, derivatives: Mapping[int, ArrayLike] | None = None
+    ) -> Self:
         """Plan with the same times and shape through new values.
+
+        The factorised equations of the free entries are reused.
+
+        Parameters
+        ----------
+        waypoints : iterable of Waypoint, or ndarray
+            As many as before and at the same times; or their positions as an array,
+            as for `from_arrays`.
+        derivatives : mapping of int to array_like, optional
+            With an array of positions: derivatives, as for `from_arrays`.
 
         Raises
         ------
         ValueError
             If a time differs.
         """
-        plan = self._again(same_times(waypoints, self.waypoints), self._warn)
+        if isinstance(waypoints, np.ndarray):
+            entries = _entries_of(self._entries.times, waypoints, derivatives)
+            if entries.table.shape[2] != self.naxes:
+                raise ValueError(f"values must keep the number of axes, {self.naxes}, got {entries.table.shape[2]}")
+            plan = self._again(entries, self._warn, self)
+        else:
+            if derivatives is not None:
+                raise TypeError("derivatives must be given with an array of positions, got waypoints")
+            points = increasing(same_times(waypoints, self.waypoints))
+            plan = self._again(Entries.of(points), self._warn, self)._with_fields(waypoints=points)
         plan._check_swing()
         return plan
 
@@ -139,177 +297,253 @@ class PiecewiseSpline(WaypointSpline):
         ValueError
             As the constructor.
         """
-        plan = self._again(same_axes(checked_waypoints(waypoints), self.naxes), self._warn)
+        points = same_axes(checked_waypoints(waypoints), self.naxes)
+        plan = self._again(Entries.of(points), self._warn)._with_fields(waypoints=points)
         plan._check_swing()
         return plan
 
     def to_dict(self) -> Data:
         """Plain data that `trajectory_from_dict` reads."""
-        return {
+        data: Data = {
             "type": "PiecewiseSpline",
             "waypoints": [w.to_dict() for w in self.waypoints],
             "alpha": self.alpha,
             "labels": list(self.labels),
         }
+        return data if self._period is None else data | {"period": self._period}
 
     @classmethod
     def from_dict(cls, data: Data) -> Self:
         """Trajectory from the plain data of `to_dict`."""
         points = [Waypoint.from_dict(w) for w in data["waypoints"]]
-        plan = cls(points, alpha=data["alpha"], labels=data["labels"], warn=False)
+        options = {"alpha": data["alpha"], "labels": data["labels"], "warn": False}
+        plan = cls.cyclic(points, data["period"], **options) if "period" in data else cls(points, **options)
         return plan._with_fields(_warn=True)  # for plans that are derived from it
 
     def map_time(self, origin: float, target: float, rate: float) -> Self:
         """Same path at other times; as `Trajectory.map_time`."""
-        moved = [w.scaled(mapped_time(w.time, origin, target, rate), rate) for w in self.waypoints]
-        return self._again(moved, self._warn)
-
-    def _again(self, points: Iterable[Waypoint], warn: bool) -> Self:
-        """Plan of the same shape through other waypoints, without a warning."""
-        plan = type(self)(points, alpha=self.alpha, labels=self.labels, warn=False)
-        return plan._with_fields(_warn=warn)
+        times = np.array([mapped_time(t, origin, target, rate) for t in self._entries.times.tolist()])
+        period = None if self._period is None else self._period / rate
+        return self._again(self._entries.scaled(times, rate), self._warn, period=period)
 
     def quiet(self) -> Self:
         """The same plan without warnings of `through` and `with_values`."""
-        return self._again(self.waypoints, False)
+        return self._with_fields(_warn=False)
+
+    def _again(
+        self, entries: Entries, warn: bool, donor: PiecewiseSpline | None = None, period: float | None = None
+    ) -> Self:
+        """Plan of the same shape through other waypoints, without a warning."""
+        plan = type(self).__new__(type(self))
+        plan._fit(entries, self.alpha, self.labels, warn, self._period if period is None else period, donor)
+        return plan
 
     def _check_swing(self) -> None:
         """Warn, unless disabled, if the plan swings far beyond its waypoints."""
         if self._warn:
-            values = [segment.segment_jet(0, segment.duration * _WITHIN, 0)[0] for segment in self.segments]
+            if self._stays_near():
+                return
+            values = np.empty((self.naxes, self.breakpoints.size - 1, _WITHIN.size))
+            for pieces in self._pieces:
+                for run in pieces.runs:
+                    functions = run.system.taylor(_WITHIN, 0)[:, 0]
+                    values[list(pieces.axes), run.first : run.last] = run.coefficients.transpose(2, 1, 0) @ functions
             remedy = f"lower alpha from {self.alpha:.6g}" if self.alpha else "prescribe velocities at inner waypoints"
-            warn_of_swing(np.concatenate(values, axis=1), self.waypoints, self.end, self.labels, remedy)
+            table = self._entries.table
+            warn_of_swing(values.reshape(self.naxes, -1), self._entries.times, table, self.end, self.labels, remedy)
+
+    def _stays_near(self) -> bool:
+        """Whether a bound of the coefficients excludes a swing: products of both distances are at most 1/4."""
+        positions = self._entries.table[:, 0]
+        with np.errstate(over="ignore", invalid="ignore"):
+            allowed = (MAXIMUM_SWING - 1.0) * (positions.max(axis=0) - positions.min(axis=0))
+            for pieces in self._pieces if not self.alpha else ():
+                reach = np.zeros(len(pieces.axes))
+                for run in pieces.runs:
+                    weights = 0.25 ** (np.arange(run.system.size) // 2)
+                    own = np.tensordot(weights[2:], np.abs(run.coefficients[2:]), 1)
+                    reach = np.maximum(reach, 2.0 * own.max(axis=0, initial=0.0))
+                if not (run.system.hermite and (reach <= allowed[list(pieces.axes)]).all()):
+                    return False
+        return not self.alpha
 
     def segment_jet(self, segment: int, s: Array, order: int) -> Array:
         """Derivatives of a segment; as `Trajectory.segment_jet`."""
-        return self.segments[segment].segment_jet(0, s, order)
+        if s.size == 1 and not self.alpha:  # as `_sample`
+            return self._at(segment, float(s[0]), order)[:, :, None]
+        duration = float(self.breakpoints[segment + 1] - self.breakpoints[segment])
+        u, scale = s / duration, derivative_scale(duration, order)[:, None, None]
+        if len(self._pieces) == 1:
+            return self._pieces[0].jet(segment, u, order) * scale
+        out = np.empty((order + 1, self.naxes, u.size))
+        for pieces in self._pieces:
+            out[:, list(pieces.axes)] = pieces.jet(segment, u, order) * scale
+        return out
+
+    def _sample(self, t: Array, low: int, high: int, left: bool) -> Array:
+        if t.size == 1 and not self.alpha and self._holds(float(t[0]), left):
+            place = int(self.breakpoints.searchsorted(t[0], side="left" if left else "right"))
+            segment = min(place, self.breakpoints.size - 1) - 1
+            with np.errstate(over="ignore", invalid="ignore"):
+                found = self._at(segment, float(t[0] - self.breakpoints[segment]), high)[low:, :, None]
+            if math.isfinite(found.sum()):
+                return found
+        times, last = self.breakpoints, self.breakpoints.size - 2
+        segments = np.searchsorted(times, t, side="left" if left else "right") - 1
+        if not left:
+            segments[t == times[-1]] = last
+        inside = (segments >= 0) & (segments <= last)
+        extreme = max(abs(math.log10(self._durations.min())), abs(math.log10(self._durations.max()))) * high > _EXTREME
+        touched = min(int(np.count_nonzero(np.diff(segments))) + 1, last + 1)
+        if touched <= _FEW or t.size > _MANY * touched or extreme or not inside.all():
+            return super()._sample(t, low, high, left)
+        h = self._durations[segments]
+        u = (t - times[segments]) / h
+        out = np.empty((high - low + 1, self.naxes, t.size))
+        with np.errstate(over="ignore", invalid="ignore"):
+            scale = scales(h, high)[low:, None]
+            for pieces in self._pieces:
+                own = pieces.jets(segments, u, high)[low:] * scale
+                if len(self._pieces) == 1:
+                    out = own
+                else:
+                    out[:, list(pieces.axes)] = own
+        return out if np.isfinite(out.sum()) else super()._sample(t, low, high, left)
+
+    def _holds(self, t: float, left: bool) -> bool:
+        """Whether a time is that of a segment."""
+        return bool(self.breakpoints[0] <= t <= self.breakpoints[-1]) and not (left and t == self.breakpoints[0])
+
+    def _at(self, segment: int, s: float, order: int) -> Array:
+        """Jet (order + 1, naxes) at one time in a segment."""
+        duration = float(self.breakpoints[segment + 1] - self.breakpoints[segment])
+        scale = derivative_scale(duration, order)[:, None]
+        if len(self._pieces) == 1:
+            return np.array(self._pieces[0].jet_at(segment, s / duration, order)).T * scale
+        found = np.empty((order + 1, self.naxes))
+        for pieces in self._pieces:
+            found[:, pieces.axes] = np.array(pieces.jet_at(segment, s / duration, order)).T
+        return found * scale
+
+    @cached_property
+    def _durations(self) -> Array:
+        return readonly(np.diff(self.breakpoints))
 
     def segment_series(self, segment: int, s: Value, order: int) -> list[list[Value]]:
         """Taylor series of a segment; as `Trajectory.segment_series`."""
-        return self.segments[segment].segment_series(0, s, order)
+        duration = float(self.breakpoints[segment + 1] - self.breakpoints[segment])
+        found: list[list[Value]] = [[]] * self.naxes
+        for pieces in self._pieces:
+            for axis, row in zip(pieces.axes, pieces.at(segment, s / duration, order), strict=True):
+                found[axis] = [value / duration**k for k, value in enumerate(row)]
+        return found
+
+    def _segment(self, segment: int) -> NewtonSpline:
+        """Spline of one segment."""
+        pair = [
+            Waypoint.from_array(float(self.breakpoints[k]), self._filled[k].copy(), None)
+            for k in (segment, segment + 1)
+        ]
+        spline: NewtonSpline = (
+            TrigSpline(pair, alpha=self.alpha, labels=self.labels, warn=False)
+            if self.alpha
+            else PolySpline(pair, labels=self.labels, warn=False)
+        )
+        return spline._with_fields(_parts=[(p.axes, *p.of_segment(segment)) for p in self._pieces])
 
     def _facts(self) -> list[tuple[str, str]]:
-        return [*super()._facts(), ("alpha", f"{number(self.alpha)} rad" if self.alpha else "")]
+        alpha = ("alpha", f"{number(self.alpha)} rad" if self.alpha else "")
+        return [*super()._facts(), alpha, ("period", "" if self._period is None else f"{number(self._period)} s")]
 
 
-def _filled(points: tuple[Waypoint, ...], alpha: float) -> tuple[list[Waypoint], NDArray[np.object_] | None]:
-    """Waypoints with all free entries of inner ones filled in; and as decimals, where needed."""
-    table, patterns = given_entries(points)
-    filled = table.copy()
-    decimals: NDArray[np.object_] | None = None
-    for pattern in dict.fromkeys(patterns):
-        axes = [a for a, p in enumerate(patterns) if p == pattern]
-        size = 1 + max((k for given in pattern for k in given), default=0)
-        free = [(i, k) for i, g in enumerate(pattern[1:-1], 1) for k in range(size) if k not in g]
-        if free:
-            where = tuple(np.array(free).T)
-            found = _conjugate(points, pattern, size, free, table[:, :size, axes], alpha)
-            filled[where[0][:, None], where[1][:, None], axes] = found.astype(float)
-            if found.dtype == object:
-                decimals = filled.astype(object) if decimals is None else decimals
-                decimals[where[0][:, None], where[1][:, None], axes] = found
-            elif decimals is not None:
-                decimals[where[0][:, None], where[1][:, None], axes] = found
-    return [Waypoint.from_array(p.time, jet, None) for p, jet in zip(points, filled, strict=True)], decimals
+def _fitted(
+    entries: Entries, alpha: float, period: float | None, breakpoints: Array, free: dict[bytes, FreeEntries]
+) -> tuple[Array, tuple[Pieces, ...]]:
+    """Entries with the free ones of inner waypoints filled in, and the functions of all segments."""
+    table, closed = entries.table, period is not None
+    known = ~np.isnan(table)
+    if known.all() and not closed:
+        kinds = kinds_of(known[:, :, 0], closed)
+        return table, (fitted(alpha, range(table.shape[2]), kinds, table, breakpoints),)
+    filled = np.concatenate([table, table[:1]]) if closed else table.copy()
+    groups: dict[tuple[object, ...], list[tuple[int, ...]]] = {}
+    found: dict[tuple[int, ...], tuple[NDArray[Any], NDArray[np.object_] | None]] = {}
+    of_group: dict[tuple[object, ...], list[Kind]] = {}
+    for axes in _alike(known):
+        size = 1 + int(np.flatnonzero(known[:, :, axes[0]].any(axis=0)).max(initial=0))
+        given = known[:, :size, axes[0]]
+        own: NDArray[Any] = table[:, :size, axes]
+        decimals: NDArray[np.object_] | None = None
+        if not given[slice(None) if closed else slice(1, -1)].all():
+            key = given.tobytes()
+            if key not in free:
+                free[key] = FreeEntries(alpha, entries.times, period, given)
+            values = free[key].solve(own)
+            where = free[key].nodes, free[key].orders
+            if values.dtype == object:
+                decimals = own.astype(object)
+                decimals[where] = values
+                values = rounded(values, alpha)
+            own = own.astype(values.dtype)
+            own[where] = values
+        if closed:
+            own = np.concatenate([own, own[:1]])
+        filled[:, :size, axes] = own
+        own_kinds = kinds_of(given, closed)
+        alone = axes if decimals is not None or own.dtype != float else None
+        group: tuple[object, ...] = (size, tuple((kind.ends, kind.first) for kind in own_kinds), alone)
+        groups.setdefault(group, []).append(axes)
+        found[axes], of_group[group] = (own, decimals), own_kinds
+    pieces = []
+    for key_of, members in groups.items():
+        tables = [found[axes][0] for axes in members]
+        whole = tables[0] if len(tables) == 1 else np.concatenate(tables, axis=2)
+        every = [axis for axes in members for axis in axes]
+        pieces.append(fitted(alpha, every, of_group[key_of], whole, breakpoints, found[members[0]][1]))
+    return filled, tuple(pieces)
 
 
-def _resolve(segments: list[NewtonSpline], decimals: NDArray[np.object_]) -> None:
-    """Replace short segments, whose higher derivatives are sensitive to rounding of the entries at their ends."""
-    durations = [segment.duration for segment in segments]
-    longest = max(durations)
-    for k, duration in enumerate(durations):
-        if duration < _SHORT * longest:
-            digits = math.ceil(2 * decimals.shape[1] * math.log10(longest / duration))
-            segments[k] = segments[k].resolved(decimals[k : k + 2], digits)
+def _alike(known: NDArray[np.bool_]) -> list[tuple[int, ...]]:
+    """Axes with the same pattern of prescribed entries."""
+    naxes = known.shape[2]
+    if naxes == 1 or (known == known[:, :, :1]).all():
+        return [tuple(range(naxes))]
+    patterns: dict[bytes, tuple[int, ...]] = {}
+    for axis in range(naxes):
+        key = known[:, :, axis].tobytes()
+        patterns[key] = (*patterns.get(key, ()), axis)
+    return list(patterns.values())
 
 
-def _conjugate(
-    points: tuple[Waypoint, ...],
-    pattern: tuple[tuple[int, ...], ...],
-    size: int,
-    free: list[tuple[int, int]],
-    table: Array,
-    alpha: float,
-) -> NDArray[Any]:
-    """Free entries (nfree, naxes) for continuous conjugate derivatives: floats, or decimals."""
-    last = len(points) - 1
-    ends: list[Ends] = []
-    for segment in range(last):
-        start, end = (pattern[i] if i in (0, last) else tuple(range(size)) for i in (segment, segment + 1))
-        if not (start or end):
-            raise ValueError(
-                f"waypoints must prescribe an entry of every segment, got none from {segment} to {segment + 1}"
-            )
-        ends.append((start, end))
-    times = np.array([p.time for p in points])
-    unit = float(times[-1] - times[0]) / last
-    durations = np.diff(times)
-    orders = np.array([k for _, k in free])
-    equations = None
-    if durations.min() >= _SHORT * durations.max():
-        equations = _jumps(durations / unit, ends, free, times_powers(table, unit, np.arange(size)[:, None]), alpha)
-    if equations is not None and equations.loss <= _ACCURATE:
-        entries: NDArray[Any] = np.linalg.solve(equations.matrix, -equations.known)
-        return times_powers(entries, 1.0 / unit, orders[:, None])
-    # Whether the data determine the entries does not depend on the times, which may be uneven.
-    even = _jumps(np.ones(last), ends, free, table, alpha)
-    solution = None
-    if even is None or even.condition <= _SINGULAR or alpha > NEARLY_CLOSED:
-        solution = conjugate_digits(alpha, times.tolist(), ends, free, table)
-    if solution is None:
-        raise ValueError("free entries at inner waypoints must be determined by the prescribed ones; prescribe more")
-    finite = np.isfinite(solution.astype(float))
-    if not finite.all():
-        i, k = free[int(np.argwhere(~finite)[0, 0])]
+def _entries_of(times: ArrayLike, values: ArrayLike, derivatives: Mapping[int, ArrayLike] | None) -> Entries:
+    """Checked entries from arrays."""
+    moments, positions = real_array(times, "times"), real_array(values, "values")
+    if moments.ndim != 1 or moments.size < 2 or not np.isfinite(moments).all():
+        raise ValueError(f"times must be two or more finite times, got shape {moments.shape}: {times!r:.60}")
+    wrong = np.flatnonzero(~(np.diff(moments) > 0.0))
+    if wrong.size:
+        i = int(wrong[0]) + 1
         raise ValueError(
-            f"derivatives at inner waypoints must stay within floating point, got an overflow of derivative {k} at "
-            f"waypoints[{i}]; increase the time between neighbouring waypoints"
+            f"times must increase strictly, got times[{i}] = {moments[i]} after times[{i - 1}] = {moments[i - 1]}"
         )
-    return solution
-
-
-class _Equations(NamedTuple):
-    """Equations of the free entries: matrix (nfree, nfree), right-hand sides (nfree, naxes)."""
-
-    matrix: Array
-    known: Array
-    condition: float
-    loss: float  # estimated relative error of their solution
-
-
-def _jumps(
-    durations: Array, ends: list[Ends], free: list[tuple[int, int]], table: Array, alpha: float
-) -> _Equations | None:
-    """Jumps of the conjugate derivatives, scaled by rows; None on overflow.
-
-    The segments are linear in their data: each free entry is an additional axis
-    with a unit value. Times are in units of the mean segment.
-    """
-    last, size, naxes = durations.size, table.shape[1], table.shape[2]
-    columns = np.concatenate([np.nan_to_num(table), np.zeros((last + 1, size, len(free)))], axis=2)
-    for n, (i, k) in enumerate(free):
-        columns[i, k, naxes + n] = 1.0
-    jump = np.zeros((last + 1, 2 * size, columns.shape[2]))  # right limit minus left, at each waypoint
-    amplification = 1.0
-    for segment, duration in enumerate(durations.tolist()):
-        system = NewtonSystem(alpha, np.array([0.0, 1.0]), ends[segment])
-        amplification = max(amplification, system.amplification)
-        orders = system.order_index
-        with np.errstate(all="ignore"):
-            scale = duration**orders / FACTORIALS[orders]
-            coefficients = system.coefficients(columns[segment + system.waypoint_index, orders] * scale[:, None])
-            taylor = system.taylor(np.array([0.0, 1.0]), 2 * size - 1)
-            jets = np.einsum("mkt,ma->tka", taylor, coefficients)
-            jets *= (FACTORIALS[: 2 * size] / duration ** np.arange(2 * size))[:, None]
-        jump[segment] += jets[0]
-        jump[segment + 1] -= jets[1]
-    rows = np.array([jump[i, 2 * size - 1 - k] for i, k in free])
-    if not np.isfinite(rows).all():
-        return None
-    size_of = np.abs(rows[:, naxes:]).max(axis=1, keepdims=True)
-    rows /= np.where(size_of > 0.0, size_of, 1.0)
-    matrix = rows[:, naxes:]
-    # Columns are scaled, so that the units of the entries do not matter.
-    size_of = size_of[:, 0] * np.abs(matrix).max(axis=0)
-    condition = float(np.linalg.cond(matrix / np.abs(matrix).max(axis=0))) if size_of.min() > 0.0 else np.inf
-    return _Equations(matrix, rows[:, :naxes], condition, np.finfo(float).eps * condition * amplification)
+    rows = positions[None] if positions.ndim == 1 else positions
+    if rows.ndim != 2 or rows.shape[1] != moments.size or not len(rows):
+        raise ValueError(
+            f"values must have shape (naxes, {moments.size}) or ({moments.size},) as times, got {positions.shape}"
+        )
+    orders = {checked_count(k, "order of derivatives", 1): v for k, v in (derivatives or {}).items()}
+    table = np.full((moments.size, 1 + max(orders, default=0), len(rows)), np.nan)
+    table[:, 0] = rows.T
+    for order, given in orders.items():
+        row = real_array(given, f"derivatives[{order}]")
+        if row.shape not in ((), moments.shape, positions.shape):
+            raise ValueError(
+                f"derivatives[{order}] must be a number or have shape {moments.shape} or {positions.shape} as values, "
+                f"got {row.shape}"
+            )
+        table[:, order] = row[..., None] if row.ndim < 2 else row.T
+    if np.isinf(table).any():
+        i, order, axis = np.argwhere(np.isinf(table))[0].tolist()
+        name = f"derivatives[{order}]" if order else "values"
+        raise ValueError(f"{name} must be finite or nan (free), got {table[i, order, axis]} at times[{i}], axis {axis}")
+    return Entries(readonly(moments.copy()), readonly(table), np.full(moments.size, table.shape[1]), None)

@@ -206,7 +206,10 @@ class _Profile(Trajectory, FromWaypoints):
         if self._motion is not None:
             return self._motion.segment_jet(segment, s, order)
         anchor, series = self._law(segment, s, order)
-        law = np.array([np.broadcast_to(row, s.shape) for row in series]) * FACTORIALS[: order + 1, None]
+        law = np.empty((order + 1, s.size))
+        for row, coefficient in zip(law, series, strict=True):
+            row[:] = coefficient
+        law *= FACTORIALS[: order + 1, None]
         out: Array = self._change[:, None] * law[:, None]
         out[0] += anchor[:, None]
         return out

@@ -89,7 +89,8 @@ class ShaperFactor:
         if samples < 1.0 - 1e-9:
             raise ValueError(
                 f"dt must be at most {self.delay:.6g} s, the delay of the {self.kind} shaper for {self.frequency:g} "
-                f"rad/s (half a period of the mode; three eighths for MZV), got {dt:g} s: use a shorter cycle time"
+                f"rad/s (half a period of the mode, its Nyquist limit; for MZV three eighths), got {dt:g} s; use a "
+                "shorter cycle time"
             )
         k = int(samples * (1.0 + _DROPPED))
         step = self.angle / samples

@@ -365,9 +365,11 @@ class Shaper(Displayed, Fields):
 
         Each delay of the design is replaced by three impulses at 0, k dt and
         (k + 1) dt with the same effect on the mode, k dt <= delay < (k + 1) dt.
-        Residual vibrations at the design modes are unchanged, zeros of any order
-        remain, and no weight is negative. The duration grows by at most one period
-        for each delay.
+        Every design mode is left with the same vibration as by the shaper, zeros of
+        any order remain, and no weight is negative. The duration grows by at most one
+        period for each delay; `residual`, the vibration at the last impulse, is
+        smaller by the decay of the mode over that time. In a shaper for several
+        modes, parts with a tolerance (EI) change as the other parts do at their mode.
 
         Parameters
         ----------

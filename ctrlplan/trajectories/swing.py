@@ -9,7 +9,6 @@ from collections.abc import Sequence
 import numpy as np
 
 from ctrlplan.trajectories.common import FACTORIALS, Array
-from ctrlplan.trajectories.waypoint import Waypoint
 
 MAXIMUM_SWING = 3.0
 """Range of a plan relative to that of its data above which a warning is issued.
@@ -20,15 +19,17 @@ spline swings by powers of ten.
 """
 
 
-def warn_of_swing(values: Array, points: Sequence[Waypoint], end: float, labels: Sequence[str], remedy: str) -> None:
+def warn_of_swing(values: Array, times: Array, table: Array, end: float, labels: Sequence[str], remedy: str) -> None:
     """Warn of the axis with the largest relative range, at the line of the caller's caller.
 
     Parameters
     ----------
     values : ndarray, shape (naxes, ntime)
         Positions of the plan on a grid that resolves it.
-    points : sequence of Waypoint
-        Waypoints of the plan.
+    times : ndarray, shape (nwaypoints,)
+        Times of the waypoints [s].
+    table : ndarray, shape (nwaypoints, order + 1, naxes)
+        Their prescribed derivatives, nan where free.
     end : float
         End of the plan [s], which may lie beyond the last waypoint.
     labels : sequence of str
@@ -38,10 +39,10 @@ def warn_of_swing(values: Array, points: Sequence[Waypoint], end: float, labels:
     """
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         plan = values.max(axis=1) - values.min(axis=1)
-        positions = np.array([p.jet[0] for p in points])
+        positions = table[:, 0]
         if (plan <= MAXIMUM_SWING * (positions.max(axis=0) - positions.min(axis=0))).all():
             return  # the common case, before derivatives are evaluated
-        low, high = _data_range(points, end)
+        low, high = _data_range(times, table, end)
         # If the range is only rounding of the positions, the ratio has no meaning.
         counts = plan > 1e-9 * np.abs(values).max(axis=1)
         swing = np.where(counts, plan / (high - low), 0.0)
@@ -55,17 +56,14 @@ def warn_of_swing(values: Array, points: Sequence[Waypoint], end: float, labels:
         )
 
 
-def _data_range(points: Sequence[Waypoint], end: float) -> tuple[Array, Array]:
+def _data_range(times: Array, table: Array, end: float) -> tuple[Array, Array]:
     """Minimum and maximum (naxes,) of positions and of the extrapolated derivatives over half a segment."""
-    gaps = np.diff([p.time for p in points], append=max(end, points[-1].time))
+    gaps = np.diff(times, append=max(end, float(times[-1])))
     if not gaps[-1]:
         gaps = gaps[:-1]
         reach = 0.5 * np.maximum(np.append(gaps, 0.0), np.append(0.0, gaps))
     else:  # a cyclic plan returns to the first waypoint
         reach = 0.5 * np.maximum(gaps, np.roll(gaps, 1))
-    table = np.full((len(points), max(len(p.jet) for p in points), points[0].naxes), np.nan)
-    for row, point in zip(table, points, strict=True):
-        row[: len(point.jet)] = point.jet
     orders = np.arange(table.shape[1])
     with np.errstate(over="ignore", invalid="ignore"):
         size = np.abs(np.nan_to_num(table)) * (reach[:, None] ** orders / FACTORIALS[orders])[:, :, None]

@@ -928,15 +928,14 @@ class Trajectory(Displayed, Fields, ABC):
             segments[t == self.breakpoints[-1]] = nsegments - 1
         out = np.zeros((high - low + 1, self.naxes, t.size))
         in_order = bool(np.all(segments[1:] >= segments[:-1]))
-        for segment in range(-1, nsegments + 1):
+        touched = segments[np.flatnonzero(np.diff(segments, prepend=-2))] if in_order else np.unique(segments)
+        for segment in touched.tolist():
             where: slice | NDArray[np.intp]
             if in_order:
                 begin, end = np.searchsorted(segments, [segment, segment + 1]).tolist()
                 where = slice(begin, end)
             else:
                 where = np.flatnonzero(segments == segment)
-            if not t[where].size:
-                continue
             if 0 <= segment < nsegments:
                 out[:, :, where] = self._sample_segment(segment, t[where] - self.breakpoints[segment], low, high)
             elif low == 0:

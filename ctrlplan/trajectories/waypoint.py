@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ctrlplan._checks import checked_finite, default_labels, new_numbers
 from ctrlplan._display import Displayed, Part, Table, counted, number, shortened
@@ -219,6 +220,68 @@ class Waypoint(Displayed, Fields):
         yield f"Waypoint at {self.time:.6g} s"
         rows = [[entry_name(k), *map(_prescribed, row)] for k, row in enumerate(self.jet.tolist())]
         yield Table("Prescribed values", ("", *(self.labels or default_labels(self.naxes))), rows)
+
+
+@dataclass(frozen=True, eq=False)
+class Entries:
+    """Waypoints as arrays.
+
+    Attributes
+    ----------
+    times : ndarray, shape (nwaypoints,)
+        Times [s], increasing.
+    table : ndarray, shape (nwaypoints, order + 1, naxes)
+        Prescribed derivatives, nan where free.
+    counts : ndarray of int, shape (nwaypoints,)
+        Number of orders of each waypoint, at most order + 1.
+    labels : tuple of str or None
+        Names of the axes.
+    """
+
+    times: Array
+    table: Array
+    counts: NDArray[np.intp]
+    labels: tuple[str, ...] | None
+
+    @classmethod
+    def of(cls, waypoints: Sequence[Waypoint]) -> Entries:
+        """Entries of waypoints with equal axes."""
+        jets = [point.jet for point in waypoints]
+        counts = np.array([len(jet) for jet in jets])
+        rows, naxes = int(counts.max()), jets[0].shape[1]
+        joined = np.concatenate(jets)
+        if counts.min() == rows:
+            table = joined.reshape(-1, rows, naxes)
+        else:
+            table = np.full((len(jets), rows, naxes), np.nan)
+            table[np.arange(rows) < counts[:, None]] = joined
+        times = readonly(np.array([point.time for point in waypoints]))
+        return cls(times, readonly(table), counts, waypoints[0].labels)
+
+    def scaled(self, times: Array, rate: float) -> Entries:
+        """Same points at other times, with scaled derivatives.
+
+        Raises
+        ------
+        ValueError
+            If a time or a derivative overflows, or times do not increase.
+        """
+        if not np.isfinite(times).all():
+            raise ValueError(f"time must be finite, got {times[~np.isfinite(times)][0]}")
+        wrong = np.flatnonzero(~(np.diff(times) > 0.0))
+        if wrong.size:
+            i = int(wrong[0]) + 1
+            raise ValueError(
+                f"times must increase strictly, got waypoints[{i}].time = {times[i]} "
+                f"after waypoints[{i - 1}].time = {times[i - 1]}"
+            )
+        table = times_powers(self.table, rate, np.arange(self.table.shape[1])[:, None])
+        return Entries(readonly(times), readonly(table), self.counts, self.labels)
+
+    def waypoints(self) -> tuple[Waypoint, ...]:
+        """The waypoints as objects."""
+        rows = zip(self.times.tolist(), self.table, self.counts.tolist(), strict=True)
+        return tuple(Waypoint.from_array(t, jet[:count].copy(), self.labels) for t, jet, count in rows)
 
 
 def waypoint_table(waypoints: Sequence[Waypoint], labels: Sequence[str]) -> Table:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 from collections.abc import Sequence
 
 import numpy as np
@@ -108,7 +109,7 @@ def _time_column(table: CsvColumns, time: Column | None, timed: bool) -> int | N
         return None if timed else 0
     if time in table.header:
         return table.header.index(time)
-    similar = table.named_like_times()
+    similar = [name for name in table.header if re.fullmatch(r"t(ime)?(\W.*|_s)?", name, re.IGNORECASE)]
     if time != _TIME or similar:
         found = f", got {', '.join(table.header)}"
         hint = f"; pass time={similar[0]!r}" if similar else "; pass time=None where there is none"

@@ -10,8 +10,9 @@ from time import perf_counter
 import numpy as np
 import pytest
 from scipy.interpolate import BPoly, PPoly
+from scipy.signal import czt
 
-from ctrlplan.trajectories import TrigSpline, Waypoint
+from ctrlplan.trajectories import TrigSpline, Waypoint, residual_spectrum
 
 RNG = np.random.default_rng(0)
 JETS = RNG.normal(size=(4, 3, 2))
@@ -129,3 +130,20 @@ def test_position_and_two_derivatives_at_a_million_times(beside, name, alpha):
     assert (np.abs(many[:, :, some] - few).max(axis=2) <= 1e-12 * np.abs(few).max(axis=2)).all()
     np.testing.assert_allclose([p(TIMES[:-1]) for p in pieces], JETS[:-1].transpose(1, 0, 2), atol=1e-12)
     beside(lambda times: plan.jet(times, 2), lambda times: [p(times) for p in pieces], [t] * 7)
+
+
+def test_residual_spectrum_beside_a_transform_of_samples(beside):
+    """2001 frequencies to 1000 over the duration; the peer is scipy's chirp transform of 16,385 samples."""
+    omega, count = np.linspace(0.0, 100.0, 2001), 2**14 + 1
+
+    def transformed(plan):
+        t = np.linspace(plan.start, plan.end, count)
+        step = t[1] - t[0]
+        return step * np.abs(czt(plan(t, 1), 2001, np.exp(-1j * (omega[1] - omega[0]) * step), 1.0, axis=-1))
+
+    plans = [TrigSpline(points(times), alpha=ALPHA, warn=False) for times in new_times(10)]
+    for plan in plans[:2]:
+        # The trapezoidal rule of a velocity that is not 0 at the ends: error (w h)^2/12 of the path, 3e-4.
+        size = np.abs(plan(np.linspace(0.0, 10.0, 2001), 1)).mean() * 10.0
+        np.testing.assert_allclose(transformed(plan), residual_spectrum(plan, omega), rtol=0, atol=1e-3 * size)
+    beside(lambda plan: residual_spectrum(plan, omega), transformed, plans)

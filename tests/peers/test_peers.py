@@ -100,7 +100,8 @@ def run(folder, *arguments, **environment):
             "PYCONTROL_TEST_EXAMPLES": "1",
         }
     )
-    options = ["-p", "plugin", "-p", "no:cacheprovider", "-q", "--tb=short", "-c", os.devnull, "--rootdir", str(folder)]
+    options = ["-p", "plugin", "-p", "no:cacheprovider", "--assert=plain", "-q", "--tb=short"]
+    options += ["-c", os.devnull, "--rootdir", str(folder)]
     command = [sys.executable, "-m", "pytest", *options, *map(str, arguments)]
     done = subprocess.run(command, env=environment, cwd=folder, capture_output=True, text=True, check=False)
     assert done.returncode in (0, 1), done.stdout[-3000:] + done.stderr[-3000:]

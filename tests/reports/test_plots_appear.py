@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_hex, to_rgb
+from repetitions import one_in
 
 import ctrlplan as cp
 from ctrlplan.planning import AlphaChoice
@@ -125,7 +126,11 @@ SAME = {
     "plot_limits",
     "plot_shaper",
 }  # as a method's
-every = pytest.mark.parametrize("name", PLOTS)
+
+
+def every(first):
+    """Parametrise a test by all plots, of which a third is everyday: each plot in a third of the tests."""
+    return pytest.mark.parametrize("name", one_in(3, PLOTS, first))
 
 
 def test_every_plot_is_tested_here():
@@ -156,7 +161,7 @@ def test_every_plot_is_tested_here():
 # Shown
 
 
-@every
+@every(0)
 def test_a_plot_is_known_to_pyplot_and_current(name):
     draw, shape = PLOTS[name]
     drawn = draw()
@@ -172,7 +177,7 @@ def test_a_plot_is_known_to_pyplot_and_current(name):
     assert again.figure is not drawn.figure
 
 
-@pytest.mark.parametrize("name", [name for name in PLOTS if name.endswith(".plot")])
+@pytest.mark.parametrize("name", one_in(3, [name for name in PLOTS if name.endswith(".plot")]))
 def test_a_plot_is_what_savefig_writes(name, tmp_path):
     drawn = PLOTS[name][0]()
     plt.savefig(tmp_path / "it.png", dpi=50)
@@ -247,7 +252,7 @@ def grid(shape):
     return plt.subplots(*shape, squeeze=False)
 
 
-@every
+@every(1)
 def test_a_plot_is_drawn_in_the_axes_given(name):
     draw, shape = PLOTS[name]
     figure, axes = grid(shape)
@@ -260,7 +265,7 @@ def test_a_plot_is_drawn_in_the_axes_given(name):
     assert all(a.get_visible() for a in axes.flat)
 
 
-@every
+@every(2)
 def test_rows_and_columns_of_axes_are_as_good_as_a_column(name):
     draw, shape = PLOTS[name]
     if min(shape) > 1:
@@ -302,7 +307,7 @@ def test_the_error_names_what_each_axes_shows():
         (True, "bool"),
     ],
 )
-@every
+@every(0)
 def test_what_is_no_axes_is_an_error(name, given, got):
     with pytest.raises(TypeError, match=f"ax must be matplotlib axes or an array of them, got {got}"):
         PLOTS[name][0](ax=given)
@@ -361,7 +366,7 @@ def test_a_part_of_a_figure_can_be_drawn_in():
 # Overlaid
 
 
-@every
+@every(1)
 def test_a_plot_can_be_drawn_over_itself(name):
     draw, shape = PLOTS[name]
     first = draw()
@@ -431,7 +436,7 @@ def test_a_plan_beside_a_response_has_a_figure_of_its_own():
 # As the user has set it
 
 
-@pytest.mark.parametrize("name", [name for name in PLOTS if name not in DRAWINGS])
+@pytest.mark.parametrize("name", one_in(3, [name for name in PLOTS if name not in DRAWINGS]))
 def test_the_users_settings_are_obeyed(name):
     mine = {
         "lines.linewidth": 4.0,
@@ -485,7 +490,7 @@ def test_nothing_is_invisible_on_a_dark_background():
     assert to_hex(step.get_color()) == "#ffffff"
 
 
-@every
+@every(2)
 def test_settings_are_the_same_after_a_plot(name):
     before = dict(mpl.rcParams)
     PLOTS[name][0]()
@@ -506,7 +511,7 @@ def test_texts_for_tex_hold_no_commands_of_a_user():
     assert as_text("y_d1 $x$") == r"y_d1 \$x\$"
 
 
-@pytest.mark.parametrize("name", [name for name in PLOTS if name not in SAME])
+@pytest.mark.parametrize("name", one_in(3, [name for name in PLOTS if name not in SAME], 1))
 def test_legend_and_axes_do_not_run_into_each_other(name):
     drawn = PLOTS[name][0]()
     drawn.figure.canvas.draw()
@@ -522,7 +527,7 @@ def test_legend_and_axes_do_not_run_into_each_other(name):
 # Pages
 
 
-@every
+@every(0)
 def test_a_figure_of_a_page_is_unknown_to_pyplot_and_in_its_own_style(name):
     with mpl.rc_context({"lines.linewidth": 9.0, "figure.figsize": (2.0, 2.0)}), page_style():
         drawn = PLOTS[name][0]()

@@ -1,5 +1,6 @@
 """Sampled blocks and delays in continuous loops, and discrete loops, compared with steps computed by hand."""
 
+import functools
 import math
 from itertools import pairwise
 
@@ -620,3 +621,28 @@ def test_times_between_the_samples(times, at, method):
 def test_a_discrete_system_is_not_compiled():
     with pytest.raises(ValueError, match=r'method "compiled" .*is discrete \(dt = 0\.1\)'):
         cp.simulate(HELD, [0.0, 0.1], 1.0, method="compiled")
+
+
+@pytest.mark.parametrize("method", ["compiled", "python"])
+def test_the_memory_of_a_sampled_block_is_not_integrated(method, monkeypatch):
+    """A delay line of 400 samples before an integrator: the equations that are integrated have one state."""
+    from ctrlplan.simulation.numerical import Attempt
+
+    shapes = []
+    slopes = Attempt.__dict__["_slopes"].func
+    recorded = functools.cached_property(lambda self: shapes.append(found := slopes(self)) or found)
+    recorded.__set_name__(Attempt, "_slopes")
+    monkeypatch.setattr(Attempt, "_slopes", recorded)
+    line = ct.ss(np.eye(400, k=-1), np.eye(400, 1), np.eye(1, 400, 399), [[0.0]], 0.01, inputs="r", outputs="late")
+
+    def rates(t, x, u, params):
+        return [u[0] - x[0] ** 3]
+
+    plant = ct.nlsys(rates, lambda t, x, u, params: x[0], inputs="late", outputs="y", states=1, name="plant")
+    loop = ct.interconnect([cp.sample_hold(line, 0.01, name="line"), plant], inputs="r", outputs=["y", "late"])
+    t = np.array([0.0, 3.99, 4.0, 6.0])
+    found = cp.simulate(loop, t, cp.Step(1.0), method=method)
+    np.testing.assert_array_equal(found.outputs[1], [0.0, 0.0, 1.0, 1.0])
+    wanted = cp.simulate(ct.interconnect([plant], inputs="late", outputs="y"), [0.0, 2.0], cp.Step(1.0))
+    assert float(found.outputs[0, -1]) == pytest.approx(float(np.ravel(wanted.outputs)[-1]), abs=1e-7)
+    assert {found.shape[1:] for found in shapes} == {(1, 1)}

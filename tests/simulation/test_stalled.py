@@ -4,6 +4,7 @@ import control as ct
 import mpmath as mp
 import numpy as np
 import pytest
+from repetitions import one_in
 
 import ctrlplan as cp
 from ctrlplan.simulation.compiled import CompiledSolver
@@ -75,7 +76,7 @@ def test_a_solution_that_stays_at_a_jump_names_block_and_time(case, method):
         assert arrival - 1e-3 < reached < 20.0
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", one_in(2, METHODS))
 def test_an_infinite_slope_names_its_block(method):
     """x' = -cbrt(x) is at 0 after 3/2 s, and there it is not defined how to go on for an integrator."""
     block, count = counted(lambda t, x, u: [-np.cbrt(x[0])], name="root")
@@ -111,7 +112,7 @@ def test_a_block_that_answers_twice_differently_is_named(kind, method):
         cp.simulate(loop, np.linspace(0, 10, 11), 0.0, method=method)
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", one_in(2, METHODS, 1))
 def test_noise_as_a_function_of_time_is_found(method):
     def rates(t, x, u):
         return [float(int(abs(np.sin(12345.678 * t)) * 1e8) % 1000) / 1000 - x[0]]

@@ -5,6 +5,7 @@ import re
 import tomllib
 
 import pytest
+from repetitions import one_in
 from study_schema import is_json, schema_errors, structure_error
 from study_text import Verbatim, to_toml, valid
 
@@ -404,7 +405,7 @@ def test_report_refuses_it_in_one_line(name, wrong, capsys, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("name", LOADED)
+@pytest.mark.parametrize("name", one_in(3, LOADED))  # all in a report, above
 def test_plan_refuses_it_too(name, wrong, capsys, tmp_path):
     path, _ = wrong(name)
     line = refused(["plan", path, "--out", tmp_path / "out" / "plan.csv"], capsys)
@@ -413,7 +414,7 @@ def test_plan_refuses_it_too(name, wrong, capsys, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("name", WRONG)
+@pytest.mark.parametrize("name", one_in(3, WRONG, 1))
 def test_the_schema_rejects_what_is_wrong_in_structure(name, wrong):
     """And nothing that the reader accepts; numbers that JSON does not have are left to the reader."""
     path, _ = wrong(name)

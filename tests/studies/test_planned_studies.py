@@ -342,3 +342,44 @@ def test_a_sweep_with_a_plan_without_metrics_has_a_figure_and_null(loaded, tmp_p
     assert np.isnan(section.sweep.column("step", "settling_time")).all()
     lines = section.sweep.plot(("settling_time",)).axes[0, 0].get_lines()
     assert sum(np.isfinite(line.get_ydata()).any() for line in lines) == 1
+
+
+# Input shapers
+
+
+ZVD = {"kind": "zvd", "frequency": 3.0, "damping": 0.1}
+
+
+def test_a_plan_is_shaped(loaded):
+    ei = {"kind": "ei", "frequency": 7.0, "tolerance": 0.1}
+    found = loaded(plans=[quintic(), quintic(name="shaped", shaper=[ZVD, ei])]).plans
+    shaper = cp.Shaper.zvd(3.0, 0.1).then(cp.Shaper.ei(7.0, 0.0, 0.1))
+    t = np.linspace(0.0, 20.0, 201)
+    np.testing.assert_allclose(found["shaped"](t), shaper(found["polynomial"])(t), rtol=0, atol=1e-12)
+    assert found["shaped"].duration == pytest.approx(16.0 + shaper.duration, rel=1e-14)
+
+
+def test_a_plan_is_shaped_after_its_duration_is_found(loaded):
+    """The limits hold for the shaped plan as well, with a margin: each is a mean of delayed plans."""
+    study = loaded(plans=[quintic(fastest="shape", shaper=[ZVD])], limits={"velocity": 2.0})
+    shaper = cp.Shaper.zvd(3.0, 0.1)
+    assert study.plans["polynomial"].duration == pytest.approx(15 / 8 * 20 / 2 + shaper.duration, rel=1e-9)
+    wanted = cp.margins(study.plans["polynomial"], {"velocity": 2.0}).active.fraction
+    assert study.planned.margins["polynomial"].active.fraction == pytest.approx(wanted, rel=1e-12)
+    assert wanted > 0.0
+
+
+@pytest.mark.parametrize(
+    ("shaper", "message"),
+    [
+        ([{"kind": "zvd"}], r"plans\[0\].shaper\[0\].frequency: must be a finite number above 0, got none"),
+        ([ZVD | {"frequency": 0.0}], r"shaper\[0\].frequency: must be a finite number above 0, got 0"),
+        ([ZVD | {"damping": 1.0}], r"shaper\[0\].damping: must be a finite number, 0 or more and below 1, got 1"),
+        ([ZVD | {"damping": -0.1}], r"shaper\[0\].damping: must be a finite number, 0 or more and below 1, got -0.1"),
+        ([ZVD, ZVD | {"kind": "zzz"}], r"shaper\[1\].kind: must be .*zv.*zvd.*mzv.*ei.* got 'zzz'"),
+        ([ZVD | {"tolerance": 0.1}], r"shaper\[0\].tolerance: must be given for an ei kind, got 'zvd'"),
+    ],
+)
+def test_shapers_that_are_rejected(shaper, message, loaded):
+    with pytest.raises(StudyError, match=message):
+        loaded(plans=[quintic(shaper=shaper)])

@@ -9,6 +9,7 @@ import control as ct
 import numpy as np
 import pytest
 from natural import NaturalCubic
+from repetitions import one_in
 from study_text import VALID, Verbatim, to_toml, valid
 
 import ctrlplan as cp
@@ -208,7 +209,7 @@ def test_choices_reach_the_plan(stated):
     np.testing.assert_array_equal(found["long"](np.arange(17.0)), expected(np.arange(17.0)))
 
 
-@pytest.mark.parametrize("family", ["trigonometric", "piecewise"])
+@pytest.mark.parametrize("family", one_in(2, ["trigonometric", "piecewise"]))
 def test_alpha_can_be_left_to_be_chosen(family, stated):
     """The shortest path, of all that a scan finds; from then on alpha is a number."""
     stated_file = stated(valid(plans=[{"family": family, "alpha": "auto"}]))

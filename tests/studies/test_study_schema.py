@@ -46,6 +46,9 @@ CHANGES = {
             "events": [{"signal": "u", "high": 3, "stop": True}],
         }
     },
+    "measured": {
+        "measured": {"poly": {"log": "log.csv", "signals": {"y": 1}, "align": False, "fit": True}, "step": "a.mat"}
+    },
     "text": {"author": "A. Engineer", "text": ["One.", "Two."]},
 }
 

@@ -265,6 +265,7 @@ def test_pages_mark_the_measured_run(base, names, tmp_path):
     assert "quintic (measured).r" in header
 
 
+@pytest.mark.slow
 def test_cranes_are_drawn_with_what_was_logged(tmp_path):
     crane = cp.plants.Crane()
     ends = [cp.Waypoint.from_jets(t, x=[x, 0, 0], z=[z, 0, 0]) for t, x, z in ((0, 0, 10), (10, 5, 9))]

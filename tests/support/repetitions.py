@@ -1,5 +1,6 @@
-"""Numbers of examples of a hypothesis test: all of them in a run of the whole suite, fewer in the everyday run."""
+"""Numbers of examples and cases of one kind: all of them in a run of the whole suite, fewer in the everyday run."""
 
+import pytest
 from hypothesis import settings
 
 settings.register_profile("whole", deadline=None, derandomize=True, print_blob=True, max_examples=100)
@@ -14,3 +15,11 @@ def load(everyday):
 def examples(number):
     """Settings of a test with so many examples in the whole suite, and in the everyday run a quarter, at least 5."""
     return settings(max_examples=min(number, max(5, number * settings.default.max_examples // 100)))
+
+
+def one_in(number, cases, first=0):
+    """Cases of one kind for `pytest.mark.parametrize`: one in so many is everyday, the others slow."""
+    return [
+        case if k % number == first % number else pytest.param(case, marks=pytest.mark.slow)
+        for k, case in enumerate(cases)
+    ]

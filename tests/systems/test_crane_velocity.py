@@ -174,10 +174,12 @@ def test_hoisting_with_a_measured_rope(seconds, drive):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", [cp.Shaper.zvd, cp.Shaper.mzv, cp.Shaper.ei])
-def test_hoisting_with_other_kinds(kind):
-    """Measured, their sway is below that of the same kind for 10 m, for which the mode leaves the band."""
+@pytest.mark.parametrize(
+    ("kind", "share"), [(cp.Shaper.zvd, 0.2), (cp.Shaper.mzv, 0.2), (cp.Shaper.two_hump_ei, 0.2), (cp.Shaper.ei, 0.5)]
+)
+def test_hoisting_with_other_kinds(kind, share):
+    """A fifth of the sway of the same kind for 10 m; EI, which leaves its tolerance, half of it."""
     frequency = math.sqrt(CRANE.gravity / 10.0)
     command = DRIVES["pulse of 8 s"]
     left = residual_sway(kind(frequency), 10.0, command, measured=True)
-    assert left <= 0.5 * residual_sway(kind(frequency), 10.0, command)
+    assert left <= share * residual_sway(kind(frequency), 10.0, command)

@@ -13,10 +13,11 @@ from repetitions import examples
 from scipy.linalg import expm
 
 import ctrlplan as cp
-from ctrlplan.systems.flat import create_flat_iosystem, hurwitz_coefficients
+from ctrlplan.systems.flat import create_flat_iosystem
 from ctrlplan.systems.plants.dc_motor import dc_motor
 from ctrlplan.systems.plants.flexible_joint import flexible_joint
 from ctrlplan.systems.plants.integrator_chain import integrator_chain
+from ctrlplan.systems.poles import hurwitz_coefficients
 
 G = 9.81
 

@@ -83,6 +83,14 @@ def test_jumps_shift_with_time_and_scale_with_the_plan(shift, duration, factor):
     assert (first.size, last.size) == pytest.approx((size, -size), rel=1e-6)
 
 
+@pytest.mark.parametrize("factor", [0.93, 0.99, 1.01, 1.1])
+def test_rounding_is_relative_to_the_peak_of_the_derivative(factor):
+    """The peak acceleration of minimum jerk, 10/sqrt(3), is between simple parts of the duration."""
+    first = factor * 1e-9 * 10 / math.sqrt(3)
+    found = listed(quintic(0.0, 1.0, first=(0.0, 0.0, first)), 2)
+    assert found == ([(2, "y", 0.0)] if factor > 1.0 else [])
+
+
 @pytest.mark.parametrize("order", [-1, 1.5, math.nan])
 def test_order_must_be_a_count(order):
     with pytest.raises((ValueError, TypeError), match="order"):

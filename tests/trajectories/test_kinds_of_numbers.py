@@ -20,6 +20,7 @@ from ctrlplan.trajectories import (
     Trapezoid,
     TrigSpline,
     Waypoint,
+    residual_spectrum,
 )
 
 
@@ -66,6 +67,11 @@ SCALARS = {
     "multiplication": lambda x: MOVE * x,
     "division": lambda x: MOVE / x,
     "Shaper.frequency": Shaper.zv,
+    "Shaper.damping": lambda x: Shaper.mzv(1.0, x),
+    "Shaper.tolerance": lambda x: Shaper.ei(1.0, 0.0, x),
+    "Shaper.on_grid": Shaper.zv(1.0).on_grid,
+    "fit.tolerance": lambda x: Shaper.fit([1.0], [1.0], tolerance=x),
+    "fit.damping": lambda x: Shaper.fit([1.0], [1.0], damping=x),
     "Shaper.derivatives": lambda x: Shaper.zvd(1.0, 0.0, x),
     "Transition.order": lambda x: Transition(x, 1.0),
     "Transition.horizon": lambda x: Transition(2, x),
@@ -88,6 +94,10 @@ ARRAYS = {
     "Shaper.weights": lambda x: Shaper([0.0, 1.0], x),
     "residual": lambda x: Shaper.zv(1.0).residual(x),
     "damping": lambda x: Shaper.zv(1.0).residual(1.0, x),
+    "fit.frequencies": lambda x: Shaper.fit(x, [1.0, 1.0]),
+    "fit.response": lambda x: Shaper.fit([1.0, 2.0], x),
+    "spectrum.frequencies": lambda x: residual_spectrum(MOVE, x),
+    "spectrum.damping": lambda x: residual_spectrum(MOVE, [1.0, 2.0], x),
 }
 SEVERAL = [
     [True, False],

@@ -262,7 +262,7 @@ def test_on_a_grid_for_several_modes():
         (
             Shaper.zv(10.0),
             0.32,
-            r"dt must be at most 0.314159 s, .* the ZV shaper for 10 rad/s .half a period of the mode.*got 0.32 s",
+            r"dt must be at most 0.314159 s, .* 10 rad/s .half a period of the mode, its Nyquist.*got 0.32 s",
         ),
         (Shaper.mzv(10.0), 0.25, "dt must be at most 0.235619 s"),
         (Shaper.zv(1.0).then(Shaper.ei(100.0)), 0.04, "dt must be at most 0.0314159 s, the delay of the EI shaper"),

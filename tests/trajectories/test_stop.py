@@ -500,6 +500,8 @@ def test_phases_that_times_do_not_resolve_are_reported():
         {"acceleration": cp.Limits(-4.0, 4.0), "jerk": cp.Limits(-25.0, 25.0)},
         {"x_d2": 4.0, "z_d2": (-4.0, 4.0), "x_d3": 25.0, "z_d3": 25.0},
         {"acceleration": 4.0, "jerk": 25.0, "velocity": 99.0, "x": (-99.0, 99.0)},
+        {"acceleration": cp.Limits(-4.0, 4.0, rate=25.0)},
+        {"x_d2": 4.0, "acceleration": 9.0, "z_d2": 4.0, "jerk": 25.0, "x_d3": 99.0},  # all apply
     ],
 )
 def test_forms_of_limits(limits):
@@ -548,6 +550,19 @@ def test_an_acceleration_without_limit_on_one_side():
             {**LIMITS, "snap": 3.0},
             {},
             "limits must be those of position, velocity, acceleration and jerk, got x_d4",
+        ),
+        (2.0, {**LIMITS, "x_d1": cp.Limits(rms=3.0)}, {}, "limits of a stop must be constant ones .*, got RMS of x_d1"),
+        (
+            2.0,
+            {"acceleration": cp.Limits(-1.0, 1.0, during=(0.0, 1.0)), "jerk": 2.0},
+            {},
+            "limits of a stop must be constant ones .*, got x_d2 within ±1 between 0 and 1 s",
+        ),
+        (
+            2.0,
+            {**LIMITS, "both": cp.Region(("x_d1", "x_d2"), [(9, 0), (0, 9), (-9, 0), (0, -9)])},
+            {},
+            "limits of a stop must be constant ones .*, got both: ",
         ),
         (2.0, {**LIMITS, "force": 3.0}, {}, "limits must name derivatives of an axis .*, got 'force'"),
         (2.0, LIMITS, {"synchronize": "phase"}, 'synchronize must be "time", "path" or None, got \'phase\''),

@@ -1,0 +1,199 @@
+"""Functions of all segments of a piecewise spline, in one batch."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctrlplan._types import Value
+from ctrlplan.trajectories.common import FACTORIALS, Array, derivative_scale, readonly
+from ctrlplan.trajectories.conjugate import SHORT, Kind, segment_system
+from ctrlplan.trajectories.fields import Fields
+from ctrlplan.trajectories.newton import NEARLY_CLOSED, NewtonSystem
+
+_AMPLIFIED = 1e4
+"""Amplification of rounding errors above which each segment is fitted with a check of its accuracy."""
+
+_SMALLEST = 1e-290
+"""Smallest power of a duration."""
+
+_CHUNK = 4104
+"""Number of times that are evaluated together."""
+
+
+class Run(Fields):
+    """Consecutive segments in the same Newton form.
+
+    Attributes
+    ----------
+    system : NewtonSystem
+        Collocation on the unit segment.
+    first, last : int
+        First segment, and the one after the last.
+    coefficients : ndarray, shape (size, nsegments, naxes)
+        Of the segments of this run.
+    """
+
+    system: NewtonSystem
+    first: int
+    last: int
+    coefficients: Array
+
+    def __init__(self, system: NewtonSystem, first: int, coefficients: Array) -> None:
+        last = first + coefficients.shape[1]
+        self._set_fields(system=system, first=first, last=last, coefficients=readonly(coefficients))
+
+
+class Pieces(Fields):
+    """Functions of some axes on all segments.
+
+    Attributes
+    ----------
+    axes : tuple of int
+        The axes.
+    runs : tuple of Run
+        Their segments: one run, or the first, the inner and the last.
+    """
+
+    axes: tuple[int, ...]
+    runs: tuple[Run, ...]
+
+    def __init__(self, axes: Sequence[int], runs: Sequence[Run]) -> None:
+        self._set_fields(axes=tuple(axes), runs=tuple(runs))
+
+    def run(self, segment: int) -> Run:
+        """Run that contains a segment."""
+        return next(run for run in self.runs if segment < run.last)
+
+    def of_segment(self, segment: int) -> tuple[NewtonSystem, Array]:
+        """Newton form of a segment, and its coefficients (size, naxes)."""
+        run = self.run(segment)
+        return run.system, run.coefficients[:, segment - run.first]
+
+    def jet(self, segment: int, u: Array, order: int) -> Array:
+        """Derivatives (order + 1, naxes, ntime) by the relative time in a segment."""
+        system, coefficients = self.of_segment(segment)
+        values = coefficients.T @ system.taylor(u, order).reshape(system.size, -1)
+        return values.reshape(len(self.axes), order + 1, u.size).transpose(1, 0, 2)
+
+    def jets(self, segments: NDArray[np.intp], u: Array, order: int) -> Array:
+        """Taylor coefficients (order + 1, naxes, ntime) by the relative time, each time in its own segment."""
+        out = np.empty((order + 1, len(self.axes), u.size))
+        for begin in range(0, u.size, _CHUNK):
+            part = slice(begin, begin + _CHUNK)
+            inside, own = segments[part], u[part]
+            for run in self.runs:
+                if len(self.runs) == 1:
+                    out[..., part] = _gathered(run, inside, own, order)
+                    break
+                where = np.flatnonzero((inside >= run.first) & (inside < run.last))
+                if where.size:
+                    out[..., begin + where] = _gathered(run, inside[where], own[where], order)
+        return out
+
+    def jet_at(self, segment: int, u: float, order: int) -> list[list[Value]]:
+        """Taylor coefficients by axis at one relative time, of polynomials."""
+        system, coefficients = self.of_segment(segment)
+        return system.jet_at(coefficients, u, order)
+
+    def at(self, segment: int, u: Value, order: int) -> list[list[Value]]:
+        """Taylor series by axis at one relative time, a number or a symbol."""
+        system, coefficients = self.of_segment(segment)
+        return system.series(coefficients, u, order)
+
+
+def fitted(
+    alpha: float,
+    axes: Sequence[int],
+    kinds: Sequence[Kind],
+    table: NDArray[Any],
+    times: Array,
+    decimals: NDArray[np.object_] | None = None,
+) -> Pieces:
+    """Functions through complete entries (nsegments + 1, size, naxes), of doubles or extended numbers.
+
+    Segments much shorter than the longest get all digits of entries in decimals.
+    """
+    runs, durations = [], np.diff(times.astype(table.dtype))
+    for kind in kinds:
+        system = segment_system(alpha, kind.ends)
+        data = _taylor_data(system, kind, table, durations[kind.segments])
+        with np.errstate(over="ignore", invalid="ignore"):
+            if alpha > NEARLY_CLOSED or system.amplification > _AMPLIFIED:
+                found = _carefully_solved(system, kind, table.astype(float), data.astype(float), times)
+            else:
+                found = system.coefficients_of(data.reshape(len(data), -1)).reshape(system.size, *data.shape[1:])
+        if not np.isfinite(found.sum()) and not np.isfinite(found).all():
+            wrong = ~np.isfinite(found).all(axis=(0, 2))
+            raise ValueError(
+                "coefficients must stay within floating point, got an overflow from waypoint entries of up to "
+                f"{np.abs(table[kind.first : kind.last + 1]).max():g} over {durations[kind.segments][wrong][0]:g} s"
+            )
+        if decimals is not None and system.hermite:
+            _resolve(system, kind, found, decimals, durations, times)
+        runs.append(Run(system, kind.first, found))
+    return Pieces(axes, runs)
+
+
+def _taylor_data(system: NewtonSystem, kind: Kind, table: NDArray[Any], durations: NDArray[Any]) -> NDArray[Any]:
+    """Taylor data (nentries, nsegments, naxes) in relative time, in the order of a system."""
+    count, powers = durations.size, [np.ones_like(durations)]
+    with np.errstate(over="ignore", under="ignore"):
+        while len(powers) <= system.order_index.max():
+            powers.append(powers[-1] * durations)
+    if not (powers[-1].min() > _SMALLEST and powers[-1].max() < np.inf):
+        wrong = durations[~((powers[-1] > _SMALLEST) & (powers[-1] < np.inf))]
+        raise ValueError(
+            f"powers of the duration must stay within floating point, got {wrong[0]:g} s to the power "
+            f"{len(powers) - 1}; choose another unit of time"
+        )
+    data = np.empty((system.order_index.size, count, table.shape[2]), dtype=durations.dtype)
+    for row, waypoint, order in zip(data, system.waypoint_index.tolist(), system.order_index.tolist(), strict=True):
+        first = kind.first + waypoint
+        np.multiply(table[first : first + count, order], (powers[order] / FACTORIALS[order])[:, None], out=row)
+    return data
+
+
+def _carefully_solved(system: NewtonSystem, kind: Kind, table: Array, data: Array, times: Array) -> Array:
+    """Coefficients (size, nsegments, naxes), each segment with a check of the rounding errors."""
+    found = []
+    for k in range(kind.first, kind.last):
+        values, moments = table[k + system.waypoint_index, system.order_index], times[k : k + 2].tolist()
+        found.append(system.fitted(values, moments, moments[1] - moments[0], data[:, k - kind.first]))
+    return np.stack(found, axis=1)
+
+
+def _gathered(run: Run, segments: NDArray[np.intp], u: Array, order: int) -> Array:
+    taylor = run.system.taylor(u, order)
+    return np.asarray(np.einsum("mkt,mta->kat", taylor, run.coefficients[:, segments - run.first]))
+
+
+def _resolve(
+    system: NewtonSystem,
+    kind: Kind,
+    found: Array,
+    decimals: NDArray[np.object_],
+    durations: NDArray[Any],
+    times: Array,
+) -> None:
+    """Replace the coefficients of short segments, which are sensitive to rounding of the entries at their ends."""
+    longest = float(durations.max())
+    for k in range(kind.first, kind.last):
+        duration = float(times[k + 1] - times[k])
+        if duration < SHORT * longest:
+            digits = math.ceil(2 * decimals.shape[1] * math.log10(longest / duration))
+            values = decimals[k + system.waypoint_index, system.order_index]
+            found[:, k - kind.first] = system.resolved(values, times[k : k + 2].tolist(), duration, digits)
+
+
+def scales(durations: Array, order: int) -> Array:
+    """Factors (order + 1, ntime) from Taylor coefficients in relative time to derivatives."""
+    if durations.size == 1:
+        return derivative_scale(float(durations[0]), order)[:, None]
+    with np.errstate(over="ignore", divide="ignore", under="ignore"):
+        found: Array = FACTORIALS[: order + 1, None] / durations ** np.arange(order + 1)[:, None]
+    return found

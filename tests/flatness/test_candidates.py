@@ -1,0 +1,78 @@
+"""Which outputs are flat, and maps of others against their dynamics."""
+
+import control as ct
+import control.flatsys as fs
+import numpy as np
+import pytest
+
+pytest.importorskip("casadi")
+
+from flat_plants import CASES, car, cart, huygens, machine, pvtol, quadrotor, two_mass
+
+import ctrlplan as cp
+
+
+def test_candidates_of_a_car_and_of_a_machine():
+    found = cp.flat_candidates(car, at={"v": 1.0})
+    assert found[0] == cp.FlatCandidate(("x", "y"), (2, 2), 1)
+    assert all(set(one.outputs) <= {"x", "y", "th"} for one in found)
+    sets = {one.outputs: one.orders for one in cp.flat_candidates(machine, at={"iq": 1.0})}
+    assert sets["th", "id"] == (3, 1)
+    assert cp.flat_candidates(cart) == ()
+
+
+def test_candidates_of_one_input():
+    assert [one.outputs for one in cp.flat_candidates(two_mass(0.0))] == [("x2",)]
+    assert cp.flat_candidates(cp.plants.Crane().iosystem(wind=True), inputs=["F", "C"], at={"R": 10.0})[0].outputs == (
+        "x",
+        "z",
+    )
+    with pytest.raises(ValueError, match="at most 500 sets"):
+        cp.flat_candidates(quadrotor, inputs=["thrust", "tx", "ty", "tz"], at={})
+
+
+@pytest.mark.parametrize("flat", [cp.plants.Crane().flat_system(), cp.plants.dc_motor(), cp.plants.flexible_joint()])
+def test_maps_of_the_package_agree_with_their_equations(flat):
+    assert cp.check_flat(flat).residual < 1e-9
+
+
+def test_derived_maps_agree_with_their_equations():
+    assert cp.check_flat(cp.flat_system(pvtol, huygens)).residual < 1e-8
+    assert cp.check_flat(cp.flat_system(CASES["machine"].plant, ["th", "id"])).residual < 1e-8
+
+
+def kinematic_car(division):
+    """The car of python-control's manual: flag and its inverse."""
+    b = 3.0
+
+    def forward(x, u, params={}):  # noqa: B006 - the signature of python-control
+        turning = u[0] / b * np.tan(u[1])
+        return [
+            np.array([x[0], u[0] * np.cos(x[2]), -u[0] * turning * np.sin(x[2])]),
+            np.array([x[1], u[0] * np.sin(x[2]), u[0] * turning * np.cos(x[2])]),
+        ]
+
+    def reverse(flag, params={}):  # noqa: B006
+        th = np.arctan2(flag[1][1], flag[0][1])
+        speed = flag[0][1] * np.cos(th) + flag[1][1] * np.sin(th)
+        across = flag[1][2] * np.cos(th) - flag[0][2] * np.sin(th)
+        return np.array([flag[0][0], flag[1][0], th]), np.array([speed, np.arctan2(across, division(speed, b))])
+
+    def update(t, x, u, params):
+        return np.array([u[0] * np.cos(x[2]), u[0] * np.sin(x[2]), u[0] / b * np.tan(u[1])])
+
+    return fs.FlatSystem(forward, reverse, update, None, inputs=2, outputs=3, states=3, name="kincar")
+
+
+def test_the_car_of_the_manual_fails_and_its_example_passes():
+    """The page on flat systems divides by u[0]/b, the example kincar by u[0]**2/b."""
+    assert cp.check_flat(kinematic_car(lambda speed, b: speed**2 / b)).passed
+    found = cp.check_flat(kinematic_car(lambda speed, b: speed / b))
+    assert not found.passed
+    assert found.signal == "x[2]"
+    assert set(found.where) == {"x[0]", "x[1]", "x[2]", "u[0]", "u[1]"}
+
+
+def test_what_is_no_flat_system():
+    with pytest.raises(TypeError, match="FlatSystem"):
+        cp.check_flat(ct.ss([[0.0]], [[1.0]], [[1.0]], 0.0))

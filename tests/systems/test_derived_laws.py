@@ -1,0 +1,201 @@
+"""Tracking laws derived from equations: error equations in closed form, and the crane's law written by hand."""
+
+import control as ct
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+pytest.importorskip("casadi")
+
+from flat_plants import ARM, CASES, INERTIA, MASS, huygens, pvtol, quadrotor, two_mass
+
+import ctrlplan as cp
+
+FAST, SLOW = [-2.0, -2.5, -3.0, -3.5], [-2.0, -3.0]
+
+
+def move(labels, ends, starts, order=4, duration=3.0):
+    jets = [{label: [p, *[0.0] * order] for label, p in zip(labels, row, strict=True)} for row in (starts, ends)]
+    return cp.PolySpline([cp.Waypoint.from_jets(t, **jet) for t, jet in zip((0.0, duration), jets, strict=True)])
+
+
+def error(poles, first, t):
+    """Solution of the error equation from the derivatives `first` at time 0."""
+    n = len(poles)
+    matrix = np.zeros((n, n))
+    matrix[:-1, 1:] = np.eye(n - 1)
+    matrix[-1] = -np.real(np.poly(poles))[:0:-1]
+    return np.array([(expm(matrix * s) @ np.array(first))[0] for s in t])
+
+
+def run(plant, flat, law, plan, start, t, params=None, **options):
+    source = cp.create_source_iosystem(plan, max(flat.orders), suffix="_ref")
+    names = [*plant.output_labels, *flat.input_labels]
+    loop = ct.interconnect([source, law, plant], inputs=0, outputs=names, name="loop")
+    own = cp.traits_of(law).initial_state
+    return cp.simulate(loop, t, initial_state=[*(own if law.nstates else []), *start], params=params, **options)
+
+
+CRANE = cp.plants.Crane()
+T = np.linspace(0.0, 6.0, 61)
+
+
+def crane_case():
+    flat = cp.flat_system(CRANE.iosystem(), ["x", "z"], at={"R": 10.0})
+    plan = move(["x", "z"], [5.0, 10.5], [0.0, 10.0], duration=5.0)
+    start = CRANE.equilibrium(0.3, 10.2)[0]
+    return CRANE.iosystem(), flat, plan, start, [0.3, 0.2], lambda found: (found.outputs["x"], found.outputs["z"])
+
+
+def pvtol_case():
+    a = INERTIA / (MASS * ARM)
+    flat = cp.flat_system(pvtol, huygens)
+    plan = move(["y1", "y2"], [4.0, 1.0], [0.0, a])
+
+    def read(found):
+        return huygens([found.outputs[name] for name in pvtol.output_labels], None, None)
+
+    return pvtol, flat, plan, [0.1, 0.05, 0.0, 0.0, 0.0, 0.0], [0.1, 0.05], read
+
+
+def quadrotor_case():
+    labels = ["px", "py", "pz", "yaw"]
+    flat = cp.flat_system(quadrotor, labels)
+    plan = move(labels, [3.0, 1.0, 1.0, 1.2], [0.0] * 4)
+    start = np.zeros(12)
+    start[:3] = 0.1, -0.05, 0.05
+    return quadrotor, flat, plan, start, [0.1, -0.05, 0.05, 0.0], lambda found: [found.outputs[n] for n in labels]
+
+
+def one_output():
+    flat = cp.flat_system(two_mass(0.0), "x2")
+    plan = move(["x2"], [1.0], [0.0], order=5)
+    return two_mass(0.0), flat, plan, [0.1, 0.0, 0.1, 0.0], [0.1], lambda found: [found.outputs["x2"]]
+
+
+QUICK = {
+    "crane": (crane_case, False, [FAST, FAST]),
+    "crane, quasi-static": (crane_case, True, [FAST, SLOW]),
+    "pvtol, quasi-static": (pvtol_case, True, [FAST, SLOW]),
+    "two masses": (one_output, False, [FAST]),
+}
+SLOWER = {
+    "pvtol": (pvtol_case, False, [FAST, FAST]),
+    "quadrotor": (quadrotor_case, False, [FAST, FAST, FAST, SLOW]),
+    "quadrotor, quasi-static": (quadrotor_case, True, [FAST, FAST, SLOW, SLOW]),
+}
+
+
+@pytest.mark.parametrize(
+    ("make", "quasi_static", "poles"),
+    [*QUICK.values(), *(pytest.param(*case, marks=pytest.mark.slow) for case in SLOWER.values())],
+    ids=[*QUICK, *SLOWER],
+)
+def test_errors_decay_with_the_poles(make, quasi_static, poles):
+    """From rest beside the start of the plan: the states of the extension are those of rest."""
+    plant, flat, plan, start, first, read = make()
+    law = cp.create_flat_iosystem(flat, poles, quasi_static=quasi_static)
+    assert law.nstates == (0 if quasi_static else flat.extension)
+    found = run(plant, flat, law, plan, start, T, method="compiled", rtol=1e-10)
+    for row, wanted, e0, roots in zip(read(found), np.atleast_2d(plan(T)), first, poles, strict=True):
+        expected = error(roots, [e0, *[0.0] * (len(roots) - 1)], T)
+        np.testing.assert_allclose(row - wanted, expected, atol=1e-7)
+
+
+def test_number_of_poles_is_stated():
+    flat = cp.flat_system(CRANE.iosystem(), ["x", "z"], at={"R": 10.0})
+    with pytest.raises(ValueError, match=r"poles\[1\]") as raised:
+        cp.create_flat_iosystem(flat, [FAST, FAST], quasi_static=True)
+    assert "2" in str(raised.value)
+    for poles in ([[-1.0] * 3, FAST], [FAST], [[-1.0, -2.0, -3.0, 0.5], FAST], [[-1.0, -2.0, -3.0, -1 + 1j], FAST]):
+        with pytest.raises(ValueError, match="poles"):
+            cp.create_flat_iosystem(flat, poles)
+
+
+def test_the_law_is_that_of_the_crane_written_by_hand():
+    """From corresponding starts, tension m g at rest: the same controls along a plan, from an error."""
+    plant, flat, plan, start, _, _ = crane_case()
+    derived = cp.create_flat_iosystem(flat, [FAST, FAST])
+    by_hand = cp.plants.create_dynamic_law_iosystem(CRANE, FAST)
+    found = run(plant, flat, derived, plan, start, T, method="compiled", rtol=1e-10)
+    source = cp.create_source_iosystem(plan, 4, suffix="_ref")
+    names = [*plant.output_labels, "F", "C"]
+    loop = ct.interconnect([source, by_hand, CRANE.iosystem()], inputs=0, outputs=names, name="by_hand")
+    known = cp.simulate(loop, T, initial_state=[0.0, 0.0, *start], method="compiled", rtol=1e-10)
+    for name in ("x", "z", "F", "C", "T"):
+        size = np.ptp(known.outputs[name])
+        np.testing.assert_allclose(found.outputs[name] / size, known.outputs[name] / size, atol=1e-7)
+
+
+@pytest.mark.parametrize("quasi_static", [False, True])
+def test_integral_action_leaves_no_steady_offset(quasi_static):
+    """Payload 10 % heavier than the law knows: with the integral the load reaches its place."""
+    plant, flat, plan, start, _, _ = crane_case()
+    t = np.linspace(0.0, 25.0, 26)
+    offsets = {}
+    for integral in (False, True):
+        poles = [FAST + [-1.5] * integral, (SLOW if quasi_static else FAST) + [-1.5] * integral]
+        law = cp.create_flat_iosystem(flat, poles, quasi_static=quasi_static, integral=integral)
+        heavy = {"load_mass": 1.1 * CRANE.load_mass}
+        found = run(plant, flat, law, plan, start, t, params=heavy, method="compiled")
+        offsets[integral] = abs(found.outputs["z"][-1] - 10.5)
+    assert offsets[False] > 0.05
+    assert offsets[True] < 1e-6
+
+
+def test_the_extension_starts_where_it_is_told_to():
+    flat = cp.flat_system(CRANE.iosystem(), ["x", "z"], at={"R": 10.0})
+    law = cp.create_flat_iosystem(flat, [FAST, FAST], start=[600.0, 3.0])
+    np.testing.assert_array_equal(cp.traits_of(law).initial_state, [600.0, 3.0])
+    for wrong in ([1.0], [1.0, np.nan], [[1.0, 2.0]]):
+        with pytest.raises(ValueError, match="start"):
+            cp.create_flat_iosystem(flat, [FAST, FAST], start=wrong)
+
+
+def test_labels_and_suffix_name_the_references():
+    flat = cp.flat_system(two_mass(0.0), "x2")
+    law = cp.create_flat_iosystem(flat, FAST, labels="load", suffix="_d")
+    assert law.input_labels == ["load_d", *(f"load_d_d{k}" for k in range(1, 5)), "x1", "v1", "x2", "v2"]
+    with pytest.raises(ValueError, match="names of states"):
+        cp.create_flat_iosystem(flat, FAST, suffix="")
+
+
+def test_python_control_simulates_the_loop_as_well():
+    """It evaluates all blocks with zero signals first, where the maps are singular."""
+    plant, flat, plan, start, _, _ = crane_case()
+    law = cp.create_flat_iosystem(flat, [FAST, SLOW], quasi_static=True)
+    source = cp.create_source_iosystem(plan, 4, suffix="_ref")
+    loop = ct.interconnect([source, law, plant], inputs=0, outputs=plant.output_labels, name="loop")
+    t = np.linspace(0.0, 0.5, 3)
+    ours = cp.simulate(loop, t, initial_state=start)
+    theirs = ct.input_output_response(loop, t, 0.0, start, solve_ivp_kwargs={"rtol": 1e-8, "atol": 1e-8})
+    np.testing.assert_allclose(ours.outputs["x"], theirs.outputs[0], atol=1e-6)
+
+
+def test_no_quasi_static_law_where_a_control_is_prolonged():
+    coupled = ct.nlsys(
+        lambda t, x, u, p: [
+            x[3],
+            x[4],
+            x[5],
+            -np.sin(x[2]) * (u[0] ** 2 + u[1] ** 2 + 0.1 * u[0] * u[1]),
+            np.cos(x[2]) * (u[0] ** 2 + u[1] ** 2 + 0.1 * u[0] * u[1]) - 9.81,
+            5.0 * (u[1] ** 2 - u[0] ** 2),
+        ],
+        None,
+        states=["x", "z", "th", "vx", "vz", "w"],
+        inputs=["left", "right"],
+        outputs=["x", "z", "th", "vx", "vz", "w"],
+        name="coupled",
+    )
+    flat = cp.flat_system(coupled, ["x", "z"], at={"th": 0.0})
+    assert (flat.orders, flat.extension) == ((5, 5), 4)
+    with pytest.raises(ValueError, match="quasi_static must be False"):
+        cp.create_flat_iosystem(flat, [FAST, SLOW], quasi_static=True)
+
+
+def test_every_plant_of_the_table_has_a_law():
+    for name in ("levitation, voltage", "flexible joint", "two-link arm", "car"):
+        flat = cp.flat_system(CASES[name].plant, CASES[name].outputs, at=CASES[name].at)
+        law = cp.create_flat_iosystem(flat, [[-1.0 - 0.5 * k for k in range(r)] for r in flat.orders])
+        assert law.noutputs == flat.ninputs

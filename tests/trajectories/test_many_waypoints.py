@@ -1,0 +1,355 @@
+"""Piecewise splines through many waypoints: the splines of scipy, from arrays, with memory that grows linearly."""
+
+import itertools
+import tracemalloc
+
+import mpmath
+import numpy as np
+import pytest
+from scipy.interpolate import CubicSpline, make_interp_spline
+
+from ctrlplan.trajectories import PiecewiseSpline, Waypoint, load_trajectory
+
+pytestmark = pytest.mark.filterwarnings("ignore:the plan swings")
+
+FREE = np.nan
+
+
+def data(n, naxes=3, spread=1.0, seed=0):
+    rng = np.random.default_rng(seed)
+    return np.cumsum(np.exp(rng.uniform(-spread, spread, n))), rng.normal(size=(naxes, n))
+
+
+def ends_only(n, value=0.0):
+    row = np.full(n, FREE)
+    row[[0, -1]] = value
+    return row
+
+
+def at_rest(n, highest):
+    return {k: ends_only(n) for k in range(1, highest + 1)}
+
+
+@pytest.mark.parametrize(("degree", "n"), [(3, 1000), (5, 17), (5, 1000), (7, 300)])
+def test_free_entries_give_the_spline_of_scipy(degree, n):
+    highest = degree // 2
+    times, values = data(n, spread=0.5)
+    plan = PiecewiseSpline.from_arrays(times, values, derivatives=at_rest(n, highest))
+    ends = [(k, np.zeros(3)) for k in range(1, highest + 1)]
+    spline = make_interp_spline(times, values.T, k=degree, bc_type=(ends, ends))
+    t = np.sort(np.random.default_rng(1).uniform(times[0], times[-1], 5000))
+    for nu in range(highest + 1):
+        wanted = spline(t, nu).T
+        assert np.abs(plan(t, nu) - wanted).max() <= 1e-12 * np.abs(wanted).max()
+
+
+def test_a_prescribed_velocity_separates_two_splines():
+    times, values = data(500, 2)
+    velocity = ends_only(500)
+    velocity[250] = 0.7
+    plan = PiecewiseSpline.from_arrays(times, values, derivatives={1: velocity})
+    t = np.linspace(times[0], times[-1], 4001)
+    for part, bounds in ((slice(0, 251), ((1, 0.0), (1, 0.7))), (slice(250, 500), ((1, 0.7), (1, 0.0)))):
+        inside = t[(t >= times[part][0]) & (t < times[part][-1])]
+        for axis in range(2):
+            wanted = CubicSpline(times[part], values[axis, part], bc_type=bounds)(inside)
+            assert np.abs(plan(inside)[axis] - wanted).max() <= 1e-12 * np.abs(wanted).max()
+
+
+def test_arrays_and_waypoints_give_the_same_plan():
+    times, values = data(60, 2)
+    velocity, acceleration = ends_only(60), ends_only(60, 0.5)
+    velocity[7] = 1.0
+    velocity = np.stack([velocity, velocity])
+    velocity[1, 30] = -2.0  # free entries that differ between the axes
+    plan = PiecewiseSpline.from_arrays(
+        times, values, derivatives={2: acceleration, 1: velocity}, labels=["x", "z"], alpha=0.5
+    )
+    points = [Waypoint(t, y, v, [a, a]) for t, y, v, a in zip(times, values.T, velocity.T, acceleration, strict=True)]
+    other = PiecewiseSpline(points, labels=["x", "z"], alpha=0.5)
+    t = np.linspace(times[0], times[-1], 777)
+    np.testing.assert_array_equal(plan.jet(t, 4), other.jet(t, 4))
+    assert plan.labels == ("x", "z")
+    assert len(plan.waypoints) == 60
+    assert plan.waypoints[7].velocity.tolist() == [1.0, 1.0]
+    assert np.isnan(plan.waypoints[30].velocity[0])
+    assert plan.waypoints[30].velocity[1] == -2.0
+
+
+def test_all_entries_given_are_quintics():
+    times, values = data(400)
+    rng = np.random.default_rng(3)
+    v, a = rng.normal(size=(2, 3, 400))
+    plan = PiecewiseSpline.from_arrays(times, values, derivatives={1: v, 2: a})
+    # Hermite quintic in the middle of a segment, in closed form.
+    h = np.diff(times)
+    before, after = (slice(None), slice(None, -1)), (slice(None), slice(1, None))
+    terms = [
+        values[before] / 2,
+        values[after] / 2,
+        5 * h * v[before] / 32,
+        -5 * h * v[after] / 32,
+        h**2 * a[before] / 64,
+        h**2 * a[after] / 64,
+    ]
+    got = np.stack([plan.segment_jet(k, h[k : k + 1] / 2, 0)[0, :, 0] for k in range(399)], axis=1)
+    size = np.abs(terms).sum(axis=0)
+    assert (np.abs(got - sum(terms)) <= 32 * np.finfo(float).eps * size).all()
+
+
+def exact_spline(times, values, size):
+    """Entries (n, size) of the spline of minimum int (y^(size))^2 from rest to rest, in 60 digits, by its own band.
+
+    Unknown: all derivatives below order 2 size at the start of each segment; equations: Taylor polynomials meet.
+    """
+    n, m = len(times), 2 * size
+    with mpmath.workdps(60):
+        # Response of the chain x^(m) = 0 over a segment, from its start; boundary values by shooting on blocks is
+        # unstable, so that the equations of the free entries are assembled by the energy's Hessian instead.
+        gram = mpmath.zeros((n - 2) * (size - 1))
+        right = mpmath.zeros((n - 2) * (size - 1), 1)
+        for i, (t0, t1) in enumerate(itertools.pairwise(times)):
+            h = mpmath.mpf(float(t1)) - mpmath.mpf(float(t0))
+            hermite = mpmath.zeros(m)
+            for k in range(size):
+                hermite[k, k] = mpmath.factorial(k)
+                for j in range(k, m):
+                    hermite[size + k, j] = mpmath.ff(j, k) * h ** (j - k)
+            inverse = hermite**-1
+            energy = mpmath.zeros(m)
+            for p in range(size, m):
+                for q in range(size, m):
+                    power = p + q - 2 * size + 1
+                    energy[p, q] = mpmath.ff(p, size) * mpmath.ff(q, size) * h**power / power
+            own = inverse.T * energy * inverse
+            known = [mpmath.mpf(float(values[i + e])) if k == 0 else mpmath.mpf(0) for e in (0, 1) for k in range(size)]
+            place = [
+                (i + e - 1) * (size - 1) + k - 1 if k and 0 < i + e < n - 1 else -1 for e in (0, 1) for k in range(size)
+            ]
+            for a, r in enumerate(place):
+                for b, c in enumerate(place):
+                    if r >= 0 and c >= 0:
+                        gram[r, c] += own[a, b]
+                    elif r >= 0:
+                        right[r] -= own[a, b] * known[b]
+        solved = mpmath.lu_solve(gram, right)
+        found = np.zeros((n, size))
+        found[:, 0] = values
+        for i in range(1, n - 1):
+            found[i, 1:] = [float(solved[(i - 1) * (size - 1) + k]) for k in range(size - 1)]
+    return found
+
+
+@pytest.mark.parametrize("ratio", [1e-1, 1e-4, 1e-8])
+def test_segments_of_very_different_durations_keep_their_digits(ratio, monkeypatch):
+    """Extended precision, which long plans use, against 60 digits."""
+    monkeypatch.setattr("ctrlplan.trajectories.conjugate._DECIMALS", 0)
+    rng = np.random.default_rng(2)
+    times = np.cumsum(np.where(rng.uniform(size=24) < 0.3, ratio, 1.0))
+    values = rng.normal(size=24)
+    plan = PiecewiseSpline.from_arrays(times, values, derivatives=at_rest(24, 2))
+    exact = exact_spline(times, values, 3)
+    got = plan.jet(times, 2)[:, 0].T
+    local = np.minimum(np.append(np.inf, np.diff(times)), np.append(np.diff(times), np.inf))
+    for k in range(3):
+        # To the peak of each derivative; and at each waypoint to the size nearby, as far as the positions determine it.
+        assert np.abs(got[:, k] - exact[:, k]).max() <= 1e-13 * np.abs(exact[:, k]).max()
+        near = np.abs(np.pad(exact[:, k], 1, mode="edge"))
+        near = np.maximum(np.maximum(near[:-2], near[2:]), near[1:-1])
+        slack = 1e-13 * near + 1e-14 * np.abs(values).max() / local**k
+        assert (np.abs(got[:, k] - exact[:, k]) <= slack).all()
+    right, left = plan.jet(times[1:-1], 4), plan.jet(times[1:-1], 4, left=True)
+    assert (np.abs(right - left) <= 1e-12 * np.abs(right).max(axis=2, keepdims=True)).all()
+
+
+def test_random_times_of_thirty_points_are_determined():
+    """Three of fifty such sets counted as undetermined where all segments had one unit of time."""
+    for seed in range(50):
+        rng = np.random.default_rng(seed)
+        times = np.sort(rng.uniform(size=30))
+        plan = PiecewiseSpline.from_arrays(times, rng.normal(size=30), derivatives=at_rest(30, 3))
+        size = np.abs(plan.jet(times, 6)).max(axis=2, keepdims=True)
+        jump = np.abs(plan.jet(times[1:-1], 6) - plan.jet(times[1:-1], 6, left=True))
+        assert (jump <= 1e-11 * size).all()
+
+
+def test_trigonometric_segments_meet_their_conditions():
+    times, values = data(300, 2)
+    plan = PiecewiseSpline.from_arrays(times, values, derivatives=at_rest(300, 2), alpha=2.0)
+    assert np.abs(plan(times) - values).max() <= 1e-14 * np.abs(values).max()
+    right, left = plan.jet(times[1:-1], 4), plan.jet(times[1:-1], 4, left=True)
+    assert (np.abs(right - left) <= 1e-11 * np.abs(right).max(axis=2, keepdims=True)).all()
+
+
+def grown(build, few, many):
+    """Ratio of the peak memory of two sizes."""
+    peaks = []
+    for n in (few, many):
+        build(n)  # tables that depend on no data
+        tracemalloc.start()
+        build(n)
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    return peaks[1] / peaks[0]
+
+
+def test_memory_grows_linearly():
+    def build(n):
+        times, values = data(n)
+        return PiecewiseSpline.from_arrays(times, values, derivatives=at_rest(n, 2))
+
+    assert grown(build, 200, 2000) <= 11.0
+
+
+def test_one_time_touches_one_segment(monkeypatch):
+    times, values = data(2000)
+    plan = PiecewiseSpline.from_arrays(times, values, derivatives=at_rest(2000, 2))
+    touched = []
+    before = type(plan)._at
+    monkeypatch.setattr(type(plan), "_at", lambda self, k, s, order: touched.append(k) or before(self, k, s, order))
+    jet = plan.jet(0.5 * (times[700] + times[701]), 2)
+    assert touched == [700]
+    many = plan.jet(np.array([0.5 * (times[700] + times[701]), times[3]]), 2)
+    assert np.abs(many[..., 0] - jet).max() <= 1e-14 * np.abs(jet).max()
+
+
+@pytest.mark.parametrize("alpha", [0.0, 1.5])
+@pytest.mark.parametrize("order", ["sorted", "random"])
+def test_many_times_are_those_of_the_segments(alpha, order):
+    times, values = data(400, 2)
+    given = at_rest(400, 2)
+    given[1] = np.stack([given[1], given[1]])
+    given[1][0, 5] = 1.0  # two patterns
+    plan = PiecewiseSpline.from_arrays(times, values, derivatives=given, alpha=alpha)
+    t = np.random.default_rng(0).uniform(times[0] - 1.0, times[-1] + 1.0, 3000)
+    t[:400] = times
+    t = np.sort(t) if order == "sorted" else t
+    found = plan.jet(t, 3)
+    singly = np.stack([plan.jet(x, 3) for x in t.tolist()], axis=2)
+    assert (np.abs(found - singly) <= 1e-13 * np.abs(singly).max(axis=2, keepdims=True)).all()
+    assert np.array_equal(plan.jet(t, 3, left=True)[:, :, t < times[0]], found[:, :, t < times[0]])
+
+
+def test_new_values_reuse_the_equations(monkeypatch):
+    times, values = data(200)
+    given = at_rest(200, 2)
+    plan = PiecewiseSpline.from_arrays(times, values, derivatives=given)
+    other = np.random.default_rng(9).normal(size=values.shape)
+    wanted = PiecewiseSpline.from_arrays(times, other, derivatives=given)
+    monkeypatch.setattr("ctrlplan.trajectories.conjugate._Banded", None)
+    t = np.linspace(times[0], times[-1], 500)
+    np.testing.assert_array_equal(plan.with_values(other, derivatives=given).jet(t, 3), wanted.jet(t, 3))
+    np.testing.assert_array_equal(plan.with_values(wanted.waypoints).jet(t, 3), wanted.jet(t, 3))
+
+
+def test_a_closed_spline_is_the_periodic_one_of_scipy():
+    times, values = data(40, 2, spread=0.5)
+    period = float(times[-1] - times[0] + 0.8)
+    points = [Waypoint(t, y, None) for t, y in zip(times, values.T, strict=True)]
+    # An order that no waypoint prescribes is not continuous: one of them has the velocity of the periodic spline.
+    whole, closed = np.append(times, times[0] + period), np.column_stack([values, values[:, :1]])
+    spline = CubicSpline(whole, closed.T, bc_type="periodic")
+    points[11] = Waypoint(times[11], values[:, 11], spline(times[11], 1))
+    plan = PiecewiseSpline.cyclic(points, period)
+    t = np.linspace(whole[0], whole[-1], 901)
+    for nu in range(3):
+        wanted = spline(t, nu).T
+        assert np.abs(plan(t, nu) - wanted).max() <= 1e-11 * np.abs(wanted).max()
+    assert (plan.end, plan.breakpoints.size) == (whole[-1], 41)
+
+
+@pytest.mark.parametrize("alpha", [0.0, 1.0])
+@pytest.mark.parametrize("n", [2, 3, 6, 7])
+def test_a_cam_closes_with_all_free_derivatives(n, alpha):
+    times, values = data(n, 1, seed=n)
+    points = [Waypoint(t, y, None, None) for t, y in zip(times, values[0], strict=True)]
+    points[0] = Waypoint(times[0], values[0, 0], 0.3, -1.0)
+    plan = PiecewiseSpline.cyclic(points, float(times[-1] - times[0] + 1.1), alpha=alpha)
+    size = np.abs(plan.jet(np.linspace(plan.start, plan.end, 301), 4)).max(axis=2)[:, 0]
+    ends = np.abs(plan.jet(plan.end, 4) - plan.jet(plan.start, 4))[:, 0]
+    assert (ends[:3] <= 1e-12 * size[:3]).all()  # the first waypoint prescribes all three
+    inner = np.abs(plan.jet(times[1:], 4) - plan.jet(times[1:], 4, left=True))[:, 0]
+    assert (inner <= 1e-11 * size[:, None]).all()
+    twice = plan.then(plan)
+    assert twice(plan.end + 0.4) == pytest.approx(plan(plan.start + 0.4), abs=1e-13)
+
+
+def test_a_closed_plan_is_saved_and_retimed(tmp_path):
+    points = [Waypoint(0.0, 0.0, 0.0), Waypoint(1.0, 1.0), Waypoint(2.5, -1.0)]
+    plan = PiecewiseSpline.cyclic(points, 4.0)
+    plan.save(tmp_path / "cam.json")
+    t = np.linspace(0.0, 4.0, 57)
+    np.testing.assert_array_equal(load_trajectory(tmp_path / "cam.json").jet(t, 3), plan.jet(t, 3))
+    slow = plan.retime(8.0)
+    assert slow.end == 8.0
+    np.testing.assert_allclose(slow(2.0 * t, 1), plan(t, 1) / 2.0, rtol=0, atol=1e-14 * plan.peak(1).max())
+    again = plan.with_values([Waypoint(p.time, 2.0 * p.position, p.velocity) for p in plan.waypoints])
+    np.testing.assert_allclose(again(t), 2.0 * plan(t), rtol=0, atol=1e-14)
+    assert "period" in str(plan)
+
+
+WRONG = [
+    ({"times": [0.0, 1.0, 1.0]}, ValueError, r"times must increase strictly, got times\[2\] = 1.0 after times\[1\]"),
+    ({"times": [0.0, 2.0, 1.0]}, ValueError, "times must increase strictly"),
+    ({"times": [0.0, np.nan, 1.0]}, ValueError, "times must be two or more finite times"),
+    ({"times": [0.0]}, ValueError, "times must be two or more finite times"),
+    ({"times": ["a", "b", "c"]}, TypeError, "times must be real numbers"),
+    ({"values": [0.0, 1.0]}, ValueError, r"values must have shape \(naxes, 3\) or \(3,\) as times, got \(2,\)"),
+    ({"values": np.zeros((0, 3))}, ValueError, "values must have shape"),
+    ({"values": [0.0, np.inf, 1.0]}, ValueError, r"values must be finite or nan \(free\), got inf at times\[1\]"),
+    ({"values": [0.0, "x", 1.0]}, TypeError, "values must be real numbers"),
+    ({"derivatives": {1: [0.0, 1.0]}}, ValueError, r"derivatives\[1\] must be a number or have shape \(3,\)"),
+    ({"derivatives": {0: 0.0}}, ValueError, "order of derivatives must be an integer of at least 1"),
+    ({"derivatives": {"v": 0.0}}, TypeError, "order of derivatives must be an integer"),
+    ({"derivatives": {2: [0.0, -np.inf, 1.0]}}, ValueError, r"derivatives\[2\] must be finite or nan"),
+    ({"alpha": 7.0}, ValueError, r"alpha must lie in \[0, 2 pi\)"),
+    ({"labels": ["a", "b"]}, ValueError, "labels must be one per axis"),
+]
+
+
+@pytest.mark.parametrize(("change", "error", "message"), WRONG)
+def test_wrong_arrays_are_rejected(change, error, message):
+    arguments = {"times": [0.0, 1.0, 2.0], "values": [0.0, 1.0, 0.0], "derivatives": {1: 0.0}} | change
+    times, values = arguments.pop("times"), arguments.pop("values")
+    with pytest.raises(error, match=message):
+        PiecewiseSpline.from_arrays(times, values, **arguments)
+
+
+def test_new_values_of_another_shape_are_rejected():
+    plan = PiecewiseSpline.from_arrays([0.0, 1.0, 2.0], np.zeros((2, 3)), derivatives={1: 0.0})
+    with pytest.raises(ValueError, match="values must keep the number of axes, 2, got 1"):
+        plan.with_values(np.zeros(3))
+    with pytest.raises(ValueError, match="values must have shape"):
+        plan.with_values(np.zeros((2, 4)))
+    with pytest.raises(TypeError, match="derivatives must be given with an array of positions"):
+        plan.with_values(plan.waypoints, derivatives={1: 0.0})
+
+
+def test_the_arrays_are_copied():
+    times, values, rest = np.arange(4.0), np.zeros(4), np.zeros(4)
+    plan = PiecewiseSpline.from_arrays(times, values, derivatives={1: rest})
+    times[1], values[:], rest[:] = 9.0, 7.0, 5.0
+    assert plan.breakpoints.tolist() == [0.0, 1.0, 2.0, 3.0]
+    assert not plan(np.linspace(0, 3, 7)).any()
+
+
+@pytest.mark.parametrize("period", [1.0, 0.5])
+def test_a_period_shorter_than_the_waypoints_is_rejected(period):
+    with pytest.raises(ValueError, match="waypoints of a cyclic plan must lie within one period"):
+        PiecewiseSpline.cyclic([Waypoint(0.0, 0.0), Waypoint(1.0, 1.0)], period)
+
+
+def test_a_closed_plan_with_undetermined_entries_is_rejected():
+    with pytest.raises(ValueError, match="must be determined by the prescribed ones"):
+        PiecewiseSpline.cyclic([Waypoint(0.0, np.nan, 1.0), Waypoint(1.0, np.nan, 1.0)], 2.0)
+    with pytest.raises(ValueError, match=r"alpha must be a number in \[0, 2 pi\) here"):
+        PiecewiseSpline.cyclic([Waypoint(0.0, 0.0), Waypoint(1.0, 1.0)], 2.0, alpha="auto")
+
+
+def test_a_swing_between_many_points_warns():
+    times = np.arange(600.0)
+    times[300] = times[299] + 0.03
+    values = np.zeros(600)
+    values[300] = 1.0
+    with pytest.warns(UserWarning, match="the plan swings over"):
+        PiecewiseSpline.from_arrays(times, values, derivatives=at_rest(600, 1))
