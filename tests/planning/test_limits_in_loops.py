@@ -190,6 +190,20 @@ def test_the_fastest_move_keeps_every_kind(hold):
     assert exact.margins.note == "exact, at all times"
 
 
+def test_a_cyclic_plan_is_in_its_periodic_steady_state():
+    """The response of the servo to each harmonic, by its transfer function from r with the derivative."""
+    points = [Waypoint(0, 0), Waypoint(0.5, 1), Waypoint(1.0, 0), Waypoint(1.5, -1)]
+    cycle = cp.TrigSpline.cyclic(points, 2.0)
+    t = np.linspace(0, 2, 4000, endpoint=False)
+    bins = np.fft.rfft(cycle(t)) / t.size
+    s = 2j * np.pi * np.arange(bins.size) / 2.0
+    gain = np.array([C[1] @ np.linalg.solve(z * np.eye(2) - A, B @ [1.0, z]) + D[1] @ [1.0, z] for z in s[:200]])
+    power = np.abs(gain * bins[:200]) ** 2
+    expected = math.sqrt(power[0] + 2.0 * power[1:].sum())
+    for loop in (LINEAR, WRITTEN):
+        assert only(margins(cycle, {"u": Limits(rms=50.0)}, loop)).value == pytest.approx(expected, rel=1e-5)
+
+
 # Sampled loops
 
 
