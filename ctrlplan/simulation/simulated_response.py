@@ -457,7 +457,7 @@ def _peak(times: Array, values: Array, smooth: bool) -> tuple[float, float]:
             shift = 0.5 * (left - right) / (left + right)
             # A kink is no parabola: its neighbours fall by different amounts.
             if abs(left - right) <= 0.9 * (left + right):
-                best, at = best + 0.125 * (left - right) ** 2 / (left + right), at + float(shift * before)
+                best, at = best + float(0.125 * (left - right) ** 2 / (left + right)), at + float(shift * before)
     return best, at
 
 
