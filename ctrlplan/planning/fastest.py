@@ -312,7 +312,7 @@ def _fastest_in_loop(
     shortest, searched = problem.shortest(span, minimum)
     found = _satisfying(limited, plan.retime, shortest)
     feasible = ((found.duration, found.duration),)
-    statement = problem.statement(*searched)
+    statement = problem.statement(*searched, minimum)
     return Fastest(found, limited.margins(found), feasible, "shape", limited, "", searched, statement)
 
 

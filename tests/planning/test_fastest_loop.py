@@ -221,6 +221,9 @@ def test_limits_of_plan_and_loop_together():
     loose = cp.fastest(QUINTIC, {"loop": {"y": (None, 1.5)}, "plan": {"velocity": 2.0}}, SERVO)
     assert loose.duration == pytest.approx(15 / 16, rel=1e-12)
     assert loose.active.bound.name == "y_d1"
+    assert loose.statement == "every shorter one violates a limit of the plan"
+    given = cp.fastest(QUINTIC, {"y": (None, 1.01)}, SERVO, durations=(0.36, 0.4))
+    assert (given.duration, given.statement) == (0.36, "shorter ones not searched")
     tight = cp.fastest(QUINTIC, {"loop": {"y": (None, 1.01)}, "plan": {"velocity": 6.0}}, SERVO)
     assert tight.duration == pytest.approx(cp.fastest(QUINTIC, {"y": (None, 1.01)}, SERVO).duration, rel=1e-9)
 
