@@ -29,6 +29,7 @@ from ctrlplan.studies.measures import (
     wanted_measures,
 )
 from ctrlplan.studies.plans import references_of, waypoints_given
+from ctrlplan.studies.progress import each_plan
 from ctrlplan.studies.running import Builder, System, check_has_inputs, is_builder, run_plan
 from ctrlplan.trajectories import Trajectory, Waypoint
 
@@ -369,7 +370,7 @@ def _each(
     """Results by plan, and reasons of failures; if all fail, the first exception is raised."""
     results: dict[str, tuple[Run, dict[str, float]]] = {}
     errors: dict[str, Exception] = {}
-    for name in names:
+    for name in each_plan(names):
         try:
             results[name] = measured(name)
         except Exception as error:  # of the loop with this plan
