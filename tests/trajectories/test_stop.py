@@ -50,6 +50,7 @@ KINDS = {
     "joined": PolySpline(POINTS).then(TrigSpline(BACK, alpha=1.0)),
     "retimed": Retimed(SLOW, Trapezoid(5.0, velocity=1.5, acceleration=1.0)),
     "shaped": Shaper.zvd(0.7, 0.05)(PolySpline(POINTS)),
+    "cyclic": TrigSpline.cyclic(POINTS, 4.0, warn=False),
     "user-written": NaturalCubic(POINTS, labels=["x", "z"]),
     "stopped": MOVE.stop(1.5, {"acceleration": 3.0, "jerk": 10.0}),
 }
@@ -484,8 +485,8 @@ def test_rest_is_a_velocity():
 
 
 def test_phases_that_times_do_not_resolve_are_reported():
-    with pytest.warns(UserWarning, match="x_d3 .* floating-point times do not resolve its phases; use a time origin"):
-        MOVE.shift(1e6).stop(1e6 + 2.0, {"acceleration": 1e6, "jerk": 1e11})
+    with pytest.warns(UserWarning, match="x_d2 .* floating-point times do not resolve its phases; use a time origin"):
+        MOVE.shift(1e6).stop(1e6 + 2.0, {"acceleration": 1e6, "jerk": 1e12})
 
 
 # Forms of limits
@@ -533,7 +534,7 @@ def test_an_acceleration_without_limit_on_one_side():
         (math.nan, LIMITS, {}, "time must be finite, got nan"),
         (2.0, {"acceleration": 1.0}, {}, "limits must contain acceleration and jerk, got no jerk of x; add 'jerk'"),
         (2.0, {"jerk": 1.0}, {}, "got no acceleration of x; add 'acceleration' for all axes, or 'x_d2'"),
-        (2.0, {}, {}, "limits must name at least one signal, got none"),
+        (2.0, {}, {}, "limits must contain acceleration and jerk, got no acceleration of x"),
         (2.0, {"acceleration": 1.0, "jerk": (-1.0, 2.0)}, {}, "limits of x_d3 must be one number"),
         (
             2.0,
