@@ -26,6 +26,9 @@ _TOLERANCE = 1e-9
 _NEGLIGIBLE = 1e-13
 """Duration of a phase, as a fraction of the whole, that is a rounding error."""
 
+_RESOLUTION = 1e-5
+"""Excess that the rounding of times may cause, and that tighter limits compensate."""
+
 _TRIALS = 6
 """Number of profiles with tighter limits that are tried if the rounding of late times exceeds the limits."""
 
@@ -288,9 +291,13 @@ def _shortest(problem: Problem) -> list[Phases]:
         except _UnsolvedError as reason:
             reasons.append(str(reason))
     for _, phases in sorted(found, key=lambda pair: pair[0]):
-        profile = profile_of_phases(0.0, phases, problem.start, problem.end, problem.labels)
+        try:
+            profile = profile_of_phases(0.0, phases, problem.start, problem.end, problem.labels)
+        except ValueError as reason:
+            reasons.append(str(reason))
+            continue
         excess, words = (0.0, "") if profile is None else _excess(profile, problem.ranges)
-        if excess <= _TOLERANCE:
+        if excess <= _RESOLUTION:
             return phases
         reasons.append(words)
     raise RuntimeError(f"ruckig must find a profile within the limits, got none: {'; '.join(dict.fromkeys(reasons))}")

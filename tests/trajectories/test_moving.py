@@ -585,6 +585,18 @@ def test_without_a_valid_profile_it_is_an_error(monkeypatch):
         wrong(start_velocity=0.5)
 
 
+def test_long_cruises_between_short_ramps():
+    """Ramps of 1e-3 s around a cruise of 1e5 s: rounding of times is compensated; where it is too large, an error."""
+    limits = {"velocity": (-0.015, 0.028), "acceleration": (-0.02, 0.016), "jerk": 33.7}
+    plan = SCurve(4895.0, **limits, start_velocity=0.0094, end_velocity=-0.0031)
+    assert plan.duration == pytest.approx(4895.0 / 0.028, rel=1e-4)
+    for (low, high), found in zip((limits["velocity"], limits["acceleration"]), exact_extrema(plan), strict=False):
+        assert low * (1 + 2e-9) <= found[0]
+        assert found[1] <= high * (1 + 2e-9)
+    with pytest.raises(RuntimeError, match="ruckig must find a profile within the limits, got none: "):
+        Trapezoid(1e12, velocity=1e-3, acceleration=1e3, start_velocity=0.5e-3, end_velocity=-0.3e-3)
+
+
 class Failing:
     """A solver that finds nothing."""
 
