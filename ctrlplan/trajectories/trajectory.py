@@ -673,6 +673,10 @@ class Trajectory(Displayed, Fields, ABC):
         >>> slow = move.to_velocity(2.0, 1.0, {"acceleration": 5.0, "jerk": 20.0}, hold=1.0)
         >>> slow(slow.end, 1)
         array(1.)
+        >>> limits = {"velocity": 3.0, "acceleration": 2.0, "jerk": 10.0}
+        >>> on = slow.then(cp.SCurve(20.0, slow.final, start_velocity=1.0, **limits))
+        >>> on.final, on.jumps(2)
+        (array([20.]), ())
         """
         from ctrlplan.trajectories.chosen import at_velocity
 
