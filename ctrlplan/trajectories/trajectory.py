@@ -494,7 +494,8 @@ class Trajectory(Displayed, Fields, ABC):
         The start and the values and derivatives of waypoints do not change. The
         duration between waypoints is rounded up to whole cycles. A plan without
         waypoints, such as a profile, is retimed as a whole; each part of a joined
-        plan is treated separately.
+        plan is treated separately, except where parts without waypoints join in
+        motion, as in a plan that is stopped.
 
         Parameters
         ----------

@@ -609,6 +609,34 @@ def test_velocities_that_are_rejected(velocity, limits, options, message):
         MOVE.to_velocity(2.0, velocity, limits, **options)
 
 
+# On a drive's cycle, and in a loop
+
+
+def test_a_stopped_plan_on_a_cycle_remains_continuous():
+    """Its parts are retimed together: apart, the velocity would jump where the stop begins."""
+    for plan in (MOVE.stop(1.9, LIMITS), MOVE.to_velocity(1.9, 1.0, LIMITS, hold=0.3)):
+        cycled = plan.on_cycle(0.004)
+        assert cycled.end / 0.004 == pytest.approx(round(cycled.end / 0.004), abs=1e-9)
+        assert plan.end <= cycled.end < plan.end + 0.004
+        assert [j for j in cycled.jumps(2) if cycled.start < j.time < cycled.end] == []
+        assert cycled.peak(1) <= plan.peak(1)
+    there = MOVE.then(SCurve(3.0, 10.0, velocity=1.5, acceleration=2.0, jerk=9.0, labels="x"))
+    assert [type(part).__name__ for part in there.on_cycle(0.3).parts] == ["PolySpline", "SCurve"]  # each on its own
+
+
+@pytest.mark.parametrize("synchronize", ["time", "path"])
+def test_a_stopped_plan_in_a_loop(synchronize):
+    """Simulated exactly as by Python, integrated from breakpoint to breakpoint."""
+    control = pytest.importorskip("control")
+    stopped = MOVE.stop(2.0, LIMITS, synchronize=synchronize)
+    lag = control.ss([[-3.0]], [[3.0]], [[1.0]], 0, inputs="x", outputs="y", name="lag")
+    loop = control.interconnect([cp.create_source_iosystem(stopped), lag], inputs=[], outputs=["y"])
+    t = np.linspace(0.0, 6.0, 601)
+    exact, python = (cp.simulate(loop, t, method=method, rtol=1e-10) for method in ("exact", "python"))
+    assert np.abs(exact.outputs - python.outputs).max() <= 1e-7
+    assert np.asarray(exact.outputs).ravel()[-1] == pytest.approx(stopped.final[0], rel=1e-3)
+
+
 # The parts of a stopped plan
 
 
