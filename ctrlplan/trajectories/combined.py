@@ -10,6 +10,7 @@ from typing import Any, Self
 import numpy as np
 
 from ctrlplan._checks import checked_finite, checked_labels, default_labels
+from ctrlplan._display import counted
 from ctrlplan._types import Data, Value
 from ctrlplan.trajectories.common import Array, readonly
 from ctrlplan.trajectories.files import trajectory_from_dict
@@ -125,6 +126,10 @@ class Sum(_Combined):
         terms = _checked_parts(parts)
         self._set_fields(shaped=shaped)
         self._set(terms, terms[0].labels)
+
+    def _facts(self) -> list[tuple[str, str]]:
+        shaper = [("input shaper", counted(len(self.parts), "impulse"))] if self.shaped else []
+        return [*super()._facts(), *shaper]
 
     def to_dict(self) -> Data:
         """Plain data that `trajectory_from_dict` reads."""
