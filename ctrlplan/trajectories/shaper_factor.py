@@ -115,8 +115,9 @@ class ShaperFactor:
     def taps(self, phases: Array, amplitudes: ArrayLike = 1.0) -> Array:
         r"""Weights of three commands in place of the delay.
 
-        They are those of the commands now, k and k + 1 samples ago. With :math:`z_k` the factor of the mode over k samples, backwards in time, and T
-        that over the delay, :math:`\gamma + \alpha + \beta = 1` and
+        They are those of the commands now, k and k + 1 samples ago. With :math:`z_k`
+        the factor of the mode over k samples, backwards in time, and T that over the
+        delay, :math:`\gamma + \alpha + \beta = 1` and
         :math:`\gamma + \alpha z_k + \beta z_{k+1} = T`.
 
         Parameters
