@@ -145,7 +145,8 @@ class Sum(_Combined):
         if self.shaped and not is_unit_rate(rate):
             raise ValueError(
                 f"a shaped plan must keep its duration of {self.duration:g} s, got {self.duration / rate:g} s: the "
-                f"delays of the shaper would change with it; retime the plan first, then shape it"
+                f"delays of the shaper would change with it; retime the plan first, then shape it, for the cycle of a "
+                "controller by shaper.on_grid(dt)"
             )
         return super().map_time(origin, target, rate)._with_fields(shaped=self.shaped)
 
