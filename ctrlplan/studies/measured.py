@@ -297,7 +297,7 @@ class _Alongside:
             inside = (k >= 0) & (k < common.size)
             apart[inside] = np.minimum(apart[inside], np.abs(own - np.take(common, k, mode="clip"))[inside])
         where = (
-            f"measured: {own.size} of {self.t.size} samples, every {1e3 * step:.4g} ms, and linear interpolation at "
+            f"resampled: {own.size} of {self.t.size} samples, every {1e3 * step:.4g} ms, and linear interpolation at "
             f"the {common.size} times of the simulation from {first:.6g} to {last:.6g} s"
         )
         if first > given[0] or last < given[-1]:
