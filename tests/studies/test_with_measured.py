@@ -258,7 +258,7 @@ def test_pages_mark_the_measured_run(base, names, tmp_path):
     found = base.with_measured(logs)
     text = found.report(tmp_path / "page.html").read_text(encoding="utf-8")
     assert "quintic (measured)†" in re.sub(r"<[^>]*>", "", text)
-    assert "† quintic (measured): resampled: 3001 of 4000 samples, every 1 ms" in text
+    assert re.search(r"† quintic \(measured\): resampled: 300\d of 4000 samples, every 1 ms", text)
     assert "found from the command r" in text
     found.export(tmp_path / "runs.csv")
     header = (tmp_path / "runs.csv").read_text(encoding="utf-8").split("\n")[0]
