@@ -330,6 +330,21 @@ def test_a_log_without_the_move_cannot_be_aligned(base):
     assert "quintic (measured)" in base.with_measured({"quintic": still}, align=None).metrics
 
 
+def test_a_command_in_other_units_is_an_error(base):
+    log = cp.read_log({"time": LOGGED, "y": PLAN(LOGGED).ravel(), "r": 1e3 * PLAN(LOGGED).ravel()})
+    with pytest.raises(ValueError, match=r"command r of logs\['quintic'\] must follow the plan, .* give its units="):
+        base.with_measured({"quintic": log})
+    run = base.with_measured({"quintic": log}, align="y").measured["quintic (measured)"]
+    assert abs(run.offset) < 1e-9
+
+
+def test_what_remains_after_alignment_is_stated(base):
+    found = base.with_measured({"quintic": machine(noise=0.01)})
+    residual = found.measured["quintic (measured)"].residual
+    assert residual == pytest.approx(0.01, rel=0.1)
+    assert f"is then {100.0 * residual:.2g} % of the range" in str(found).replace("\n", " ")
+
+
 def test_two_axes_need_a_command_that_names_its_axis():
     plan = cp.stack([PLAN, 2.0 * PLAN], labels=["x", "z"])
     base = cp.compare(planar(), {"move": plan}, TIMES)
