@@ -96,12 +96,14 @@ class MeasuredRun:
         if self.by == "given":
             yield f"its time is {abs(self.offset):.6g} s {self._order} than that of the plan, as given"
         else:
-            size, error = 1e3 * abs(self.offset), 1e3 * self.standard_error
-            digits = min(max(1 - math.floor(math.log10(error)), 0), 4)
-            by, rms = f"{self.by} {', '.join(self.signals)}", f"{100.0 * self.residual:.2g} % of the range"
+            error = max(1e3 * self.standard_error, 1e-4)
+            digits = max(1 - math.floor(math.log10(error)), 0)
+            size = f"{1e3 * abs(self.offset):.{digits}f} ± {error:.2g} ms (standard error)"
+            rms = max(100.0 * self.residual, 1e-3)
             yield (
-                f"its time is {size:.{digits}f} ± {error:.2g} ms (standard error) {self._order} than that of the plan, "
-                f"found from the {by} compared with {self.compared} (the rms of the difference is then {rms})"
+                f"its time is {size} {self._order} than that of the plan, found from the {self.by} "
+                f"{', '.join(self.signals)} compared with {self.compared} (the rms of the difference is then {rms:.2g} "
+                "% of the range)"
             )
         if self.by in ("output", "control"):
             yield f"offset and plant delay cannot be told apart by the {self.by}; log the command to separate them"
