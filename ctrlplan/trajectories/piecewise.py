@@ -429,6 +429,18 @@ class PiecewiseSpline(WaypointSpline):
     def _durations(self) -> Array:
         return readonly(np.diff(self.breakpoints))
 
+    def derivative_bounds(self, nu: int) -> tuple[Array, Array] | None:
+        """Bounds of a derivative on each segment; as `Trajectory.derivative_bounds`."""
+        if self.alpha or self.breakpoints.size <= _FEW:
+            return None
+        low, high = np.empty((2, self.naxes, self.breakpoints.size - 1))
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore", under="ignore"):
+            scale = self._durations**-nu
+            for pieces in self._pieces:
+                own = pieces.derivative_bounds(nu)
+                low[list(pieces.axes)], high[list(pieces.axes)] = own[0] * scale, own[1] * scale
+        return (low, high) if np.isfinite(low).all() and np.isfinite(high).all() else None
+
     def segment_series(self, segment: int, s: Value, order: int) -> list[list[Value]]:
         """Taylor series of a segment; as `Trajectory.segment_series`."""
         duration = float(self.breakpoints[segment + 1] - self.breakpoints[segment])
