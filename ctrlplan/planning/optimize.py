@@ -34,6 +34,7 @@ from ctrlplan._display import Displayed, Facts, Figure, Part, counted, number, t
 from ctrlplan.trajectories import Joined, PiecewiseSpline, PolySpline, Trajectory, TrigSpline, Waypoint
 from ctrlplan.trajectories.chosen import checked_alpha
 from ctrlplan.trajectories.common import FACTORIALS, Array, readonly
+from ctrlplan.trajectories.conjugate import FreeEntries
 from ctrlplan.trajectories.newton import NewtonSystem
 from ctrlplan.trajectories.newton_spline import given_entries
 from ctrlplan.trajectories.waypoint import entry_name, waypoint_table
@@ -303,6 +304,8 @@ class _Segments:
     def __init__(self, times: Array, alpha: float, order: int, derivative: int) -> None:
         self.root = _segment_root(alpha, order, derivative)
         self.derivative = derivative
+        self.times = times
+        self.minimal = not alpha and order == derivative - 1  # then the optimum is a spline of continuous conjugates
         self.durations = np.diff(times)[:, None]
         self.orders = np.tile(np.arange(order + 1), 2)
 
@@ -319,11 +322,11 @@ class _Segments:
 
         powers = self.durations**self.orders
         ends = np.concatenate([right[:-1], left[1:]], axis=1)
-        samples = np.zeros((len(ends), len(self.root), fixed.size))
-        np.put_along_axis(samples, ends[:, None, :], self.root * powers[:, None, :], axis=2)
-        matrix = samples.reshape(-1, fixed.size)
-        weight = np.repeat(self.durations.ravel() ** (0.5 - self.derivative), len(self.root))
-        entries[~fixed], unique = _least_squares(matrix[:, ~fixed], -matrix @ entries, weight)
+        found = self._banded(known, table) if self.minimal and not apart.any() else None
+        if found is not None:
+            entries[~fixed], unique = found, True
+        else:
+            entries[~fixed], unique = self._dense(entries, fixed, ends, powers)
 
         data = entries[ends] * powers[:, :, None]
         value, change = self.root @ data, self.root @ (data * self.orders[:, None])
@@ -333,6 +336,27 @@ class _Segments:
         rounding = (self.durations**power * _rounding(value, np.abs(self.root) @ np.abs(data)).sum(axis=1)).sum(axis=0)
         rounding += 16.0 * _EPS * np.abs(slope).sum(axis=0)  # of the times
         return _Solution(entries[[left, right]], (self.durations**power * square).sum(axis=0), slope, unique, rounding)
+
+    def _banded(self, known: NDArray[np.bool_], table: Array) -> Array | None:
+        """Free entries in linear time; None where they are not unique."""
+        if known.all():
+            return np.zeros((0, table.shape[2]))
+        try:
+            free = FreeEntries(0.0, self.times, None, known, natural=True)
+            found = free.solve(table)
+        except ValueError:  # a minimum-norm solution is found by the dense equations
+            return None
+        return found.astype(float)
+
+    def _dense(
+        self, entries: Array, fixed: NDArray[np.bool_], ends: NDArray[np.intp], powers: Array
+    ) -> tuple[Array, bool]:
+        """Free entries by least squares, and whether they are unique."""
+        samples = np.zeros((len(ends), len(self.root), fixed.size))
+        np.put_along_axis(samples, ends[:, None, :], self.root * powers[:, None, :], axis=2)
+        matrix = samples.reshape(-1, fixed.size)
+        weight = np.repeat(self.durations.ravel() ** (0.5 - self.derivative), len(self.root))
+        return _least_squares(matrix[:, ~fixed], -matrix @ entries, weight)
 
 
 class _Whole:

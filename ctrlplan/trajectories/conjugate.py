@@ -37,6 +37,9 @@ _SINGULAR = 1e13
 _UNEVEN = 1e3
 """Ratio of durations, to the power of the number of orders, above which rounding of the entries matters."""
 
+_SUSPECT = 1e8
+"""Condition number above which equations may not determine the entries."""
+
 SHORT = 0.02
 """Duration relative to the longest segment below which entries and coefficients are computed with more digits."""
 
@@ -116,15 +119,27 @@ class FreeEntries:
         waypoint.
     given : ndarray of bool, shape (nwaypoints, size)
         Prescribed entries by order.
+    natural : bool, optional
+        Whether the free entries of both ends are unknown as well, with conjugate
+        derivatives of 0; otherwise they lower the degree of the first and last
+        segment.
     """
 
-    def __init__(self, alpha: float, times: Array, period: float | None, given: NDArray[np.bool_]) -> None:
+    def __init__(
+        self,
+        alpha: float,
+        times: Array,
+        period: float | None,
+        given: NDArray[np.bool_],
+        natural: bool = False,
+    ) -> None:
         self._alpha, self._times, self._period, self._given = alpha, times, period, given
+        self._open = period is None and not natural
         self._moments = np.append(times, [] if period is None else times[0] + period)
         self._count, self._size = given.shape
-        self.kinds = kinds_of(given, period is not None)
+        self.kinds = kinds_of(np.ones_like(given) if natural else given, period is not None)
         free = ~given
-        if period is None:
+        if self._open:
             free[[0, -1]] = False
         self._number = np.full(given.shape, -1, dtype=np.intp)  # of each unknown, in the order of the equations
         rank = np.argsort(_folded(self._count)) if period is not None else np.arange(self._count)
@@ -148,7 +163,7 @@ class FreeEntries:
         """
         ratio = float(self._durations.max() / self._durations.min())
         uneven = math.log(ratio) * self._size > math.log(_UNEVEN)
-        open_, few = self._period is None, self.nodes.size <= _DECIMALS
+        open_, few = self._open, self.nodes.size <= _DECIMALS
         if open_ and few and ratio * SHORT > 1.0:
             return self._decimal(table)
         equations = self._equations
@@ -156,15 +171,25 @@ class FreeEntries:
             extended = _EXTENDED and not self._alpha
             if equations.loss <= _ACCURATE and not (uneven and extended):
                 return self._checked(self._plain(equations, table))
-            if extended:
+            if extended and self._determined(equations):
                 found = self._refined(equations, table)
                 if found is not None:
                     return self._checked(found)
-            elif equations.loss <= _ACCEPTED and not (open_ and few):
+            elif not extended and equations.loss <= _ACCEPTED and not (open_ and few):
                 return self._checked(self._plain(equations, table))
         if open_:
             return self._decimal(table)
         raise ValueError("free entries at waypoints must be determined by the prescribed ones; prescribe more")
+
+    def _determined(self, equations: _Banded) -> bool:
+        """Whether the prescribed entries determine the free ones."""
+        even = self._even if equations.condition > _SUSPECT else equations
+        return even is None or even.condition <= _SINGULAR
+
+    @cached_property
+    def _even(self) -> _Banded | None:
+        """Equations for equal durations: whether entries are determined does not depend on the times."""
+        return self._assembled(np.ones_like(self._durations), np.ones(self._count))
 
     @cached_property
     def _equations(self) -> _Banded | None:
@@ -202,8 +227,7 @@ class FreeEntries:
 
     def _decimal(self, table: Array) -> NDArray[np.object_]:
         """Solution in decimal arithmetic."""
-        # Whether the data determine the entries does not depend on the times, which may be uneven.
-        even = self._assembled(np.ones_like(self._durations), np.ones(self._count))
+        even = self._even
         solution = None
         if even is None or even.condition <= _SINGULAR or self._alpha > NEARLY_CLOSED:
             ends = [kind.ends for kind in self.kinds for _ in range(kind.first, kind.last)]

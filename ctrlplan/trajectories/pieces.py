@@ -162,10 +162,11 @@ def _taylor_data(system: NewtonSystem, kind: Kind, table: NDArray[Any], duration
             f"powers of the duration must stay within floating point, got {wrong[0]:g} s to the power "
             f"{len(powers) - 1}; choose another unit of time"
         )
+    factors = [(power / factorial)[:, None] for power, factorial in zip(powers, FACTORIALS.tolist(), strict=False)]
     data = np.empty((system.order_index.size, count, table.shape[2]), dtype=durations.dtype)
     for row, waypoint, order in zip(data, system.waypoint_index.tolist(), system.order_index.tolist(), strict=True):
         first = kind.first + waypoint
-        np.multiply(table[first : first + count, order], (powers[order] / FACTORIALS[order])[:, None], out=row)
+        np.multiply(table[first : first + count, order], factors[order], out=row)
     return data
 
 

@@ -360,8 +360,9 @@ class PiecewiseSpline(WaypointSpline):
             for pieces in self._pieces if not self.alpha else ():
                 reach = np.zeros(len(pieces.axes))
                 for run in pieces.runs:
-                    weights = 0.25 ** (np.arange(run.system.size) // 2)
-                    own = np.tensordot(weights[2:], np.abs(run.coefficients[2:]), 1)
+                    own = np.zeros(run.coefficients.shape[1:])
+                    for j, row in enumerate(run.coefficients[2:], 2):
+                        own += 0.25 ** (j // 2) * np.abs(row)
                     reach = np.maximum(reach, 2.0 * own.max(axis=0, initial=0.0))
                 if not (run.system.hermite and (reach <= allowed[list(pieces.axes)]).all()):
                     return False
