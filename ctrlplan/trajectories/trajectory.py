@@ -976,6 +976,13 @@ class Trajectory(Displayed, Fields, ABC):
                 f"of {np.abs(self.segment_jet(segment, np.zeros(1), 0)).max():g}"
             )
 
+    def derivative_bounds(self, nu: int) -> tuple[Array, Array] | None:
+        """Lower and upper bounds (naxes, nsegments) of a derivative on each segment, None if they are not known.
+
+        With them `extrema` searches only segments that can contain one.
+        """
+        return None
+
     def segment_jet_at(self, moment: float, origin: float, s: Array, order: int) -> Array:
         """Jet at origin + s of the function of the segment at `moment`.
 
