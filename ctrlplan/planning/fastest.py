@@ -31,6 +31,9 @@ if TYPE_CHECKING:
 _COARSE = 1e-4
 """Resolution of local minima of the violation by simulated responses, relative to the duration."""
 
+_DOUBLINGS_IN_LOOP = 6
+"""Maximum number of times by which the duration of a plan is doubled where its responses are slow."""
+
 _EDGE = 1e-7
 """Resolution of a minimum duration by simulated responses, relative to the duration."""
 
@@ -417,8 +420,8 @@ def _first_feasible(family: _InLoop, span: tuple[float, float], hold: Hold) -> F
             found = _exact_edge(exact, family.excess, float(durations[inside]), outside, resolution)
             if found is not None:
                 statement = (
-                    f"violate a limit at {family.per_octave} durations per octave from {span[0]:.4g} s on, and where "
-                    "the violation is least between them"
+                    f"violate a limit at {family.per_octave} durations per octave from {span[0]:.4g} s on, and "
+                    "at the local minima of the violation between them"
                 )
                 plan, feasible = family.plan(found), ((found, found),)
                 return Fastest(plan, limited.margins(plan), feasible, hold, limited, "", (span[0], found), statement)
@@ -487,12 +490,17 @@ def _around(duration: float) -> tuple[float, float]:
 def _span(scaled: _Scaled | _InLoop, duration: float, minimum: float) -> tuple[float, float]:
     """Interval of durations of the search, from violated to satisfied limits."""
     excess, high = scaled.excess, max(duration, minimum)
-    for _ in range(60):
+    for _ in range(_DOUBLINGS_IN_LOOP if isinstance(scaled, _InLoop) else 60):
         if excess(high) <= 0.0 and scaled.limited.exact_excess(scaled.plan(1.01 * high)) <= 0.0:
             break
         high *= 2.0
     else:
-        raise ValueError(f"limits must be satisfied for some duration, got none up to {high:.3g} s")
+        if isinstance(scaled, _InLoop) and math.isinf(excess(high)):
+            scaled.limited.margins(scaled.plan(high))  # raises the reason
+        raise ValueError(
+            f"limits must be satisfied for some duration, got none up to {high:.3g} s; for a wider search pass "
+            "durations=(low, high)"
+        )
     low = high / 64.0
     while low > minimum and excess(low) <= 0.0:
         low /= 64.0

@@ -32,6 +32,9 @@ _COARSE = 1e-8
 _SAMPLES = 1000
 """Number of samples over the duration of a plan."""
 
+_LONG = 8
+"""Maximum number of samples of an interval, in those of a plan."""
+
 _FINE = 33
 """Number of samples between the neighbours of a sample near an extremum."""
 
@@ -243,8 +246,9 @@ class SimulatedResponse(LoopResponse):
             dt = float(self._prepared.dt)
             count = math.ceil((self._last - self.plan.start) / dt)
             return self._run(np.array(self.plan.start + dt * np.arange(count + 1), dtype=float))
-        count = math.ceil(_SAMPLES * (self._last - self.plan.start) / self.plan.duration)
-        even = np.linspace(self.plan.start, self._last, count + 1)
+        even = np.linspace(self.plan.start, self.plan.end, _SAMPLES + 1)
+        if self._last > self.plan.end:
+            even = np.append(even, np.linspace(self.plan.end, self._last, self._count(self._last - self.plan.end))[1:])
         edges, spacing = self._edges, float(even[1] - even[0])
         apart = np.abs(even - edges[np.searchsorted(0.5 * (edges[1:] + edges[:-1]), even)])
         aside = _ASIDE * self.plan.duration
@@ -257,6 +261,10 @@ class SimulatedResponse(LoopResponse):
         aside = _ASIDE * self.plan.duration
         ends = np.unique(np.append(self._edges[self._edges < self._last], self._last)).tolist()
         return [(left + aside, right - aside) for left, right in pairwise(ends)]
+
+    def _count(self, length: float) -> int:
+        """Number of samples of an interval [s]."""
+        return min(8 + math.ceil(_SAMPLES * length / self.plan.duration), _LONG * _SAMPLES)
 
     def _run(self, times: Array) -> tuple[Array, Array]:
         """Signals (nsignals, ntime) at times, the start included if there are fewer than two."""
@@ -300,10 +308,7 @@ class SimulatedResponse(LoopResponse):
                 f"a signal with a limited rate must be continuous, got {' + '.join(weights)} that jumps by "
                 f"{jumps[k]:.4g} at {inner[k]:.6g} s"
             )
-        grids = [
-            np.linspace(left, right, 8 + math.ceil(_SAMPLES * (right - left) / self.plan.duration))
-            for left, right in self._pieces
-        ]
+        grids = [np.linspace(left, right, self._count(right - left)) for left, right in self._pieces]
         fine, values = self._run(np.unique(np.concatenate(grids)))
         row = self._sum(weights, values)
         slopes = [
@@ -457,7 +462,7 @@ def _peak(times: Array, values: Array, smooth: bool) -> tuple[float, float]:
             shift = 0.5 * (left - right) / (left + right)
             # A kink is no parabola: its neighbours fall by different amounts.
             if abs(left - right) <= 0.9 * (left + right):
-                best, at = best + 0.125 * (left - right) ** 2 / (left + right), at + float(shift * before)
+                best, at = best + float(0.125 * (left - right) ** 2 / (left + right)), at + float(shift * before)
     return best, at
 
 

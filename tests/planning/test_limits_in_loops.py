@@ -73,6 +73,16 @@ def test_a_label_that_is_another_signal_of_the_loop_must_be_told():
     assert only(margins(derivative, {"r_d1": 4.0}, LINEAR)).value == pytest.approx(3.75, rel=1e-9)
 
 
+def test_a_default_label_is_never_meant():
+    unnamed = ct.tf([25.0], [1.0, 5.0, 25.0])
+    with pytest.raises(
+        ValueError, match=r"signals of the loop \(y\[0\], u\[0\]\), .* got 'y'; for the axis of the plan"
+    ):
+        margins(MOVE, {"y": 4.0}, unnamed)
+    assert len(margins(MOVE, {"plan": {"y": 4.0}, "loop": {"y[0]": 4.0}}, unnamed)) == 2
+    assert margins(MOVE, {"y_d1": 4.0, "y[0]": 4.0}, unnamed).satisfied
+
+
 def test_inputs_in_another_order_than_the_labels():
     loop = ct.ss(-np.eye(2), np.eye(2), np.eye(2), np.zeros((2, 2)), inputs=["a", "b"], outputs=["p", "q"])
     pair = [Waypoint(0, [0, 0], 0, 0), Waypoint(1, [1, 2], 0, 0)]
@@ -188,6 +198,20 @@ def test_the_fastest_move_keeps_every_kind(hold):
     assert "simulated at tolerance 1e-10, over the move and a tail as long as the plan" in str(simulated)
     assert simulated.margins.note.startswith("simulated")
     assert exact.margins.note == "exact, at all times"
+
+
+def test_a_cyclic_plan_is_in_its_periodic_steady_state():
+    """The response of the servo to each harmonic, by its transfer function from r with the derivative."""
+    points = [Waypoint(0, 0), Waypoint(0.5, 1), Waypoint(1.0, 0), Waypoint(1.5, -1)]
+    cycle = cp.TrigSpline.cyclic(points, 2.0)
+    t = np.linspace(0, 2, 4000, endpoint=False)
+    bins = np.fft.rfft(cycle(t)) / t.size
+    s = 2j * np.pi * np.arange(bins.size) / 2.0
+    gain = np.array([C[1] @ np.linalg.solve(z * np.eye(2) - A, B @ [1.0, z]) + D[1] @ [1.0, z] for z in s[:200]])
+    power = np.abs(gain * bins[:200]) ** 2
+    expected = math.sqrt(power[0] + 2.0 * power[1:].sum())
+    for loop in (LINEAR, WRITTEN):
+        assert only(margins(cycle, {"u": Limits(rms=50.0)}, loop)).value == pytest.approx(expected, rel=1e-5)
 
 
 # Sampled loops
@@ -320,6 +344,21 @@ def test_loops_without_a_known_start():
     open_loop = ct.nlsys(lambda t, x, u, p: np.array([1.0 + u[0] ** 2]), None, inputs=1, outputs=1, states=1)
     with pytest.raises(ValueError, match="the loop must be at rest at the first position of the plan"):
         margins(TRACK, {"y[0]": 1.0}, open_loop)
+
+
+def test_a_loop_that_diverges():
+    runaway = ct.nlsys(
+        lambda t, x, u, p: np.array([x[0] ** 3 + x[0] + u[0]]), None, inputs="r", outputs="y", states=1, name="runaway"
+    )
+    for function in (margins, fastest):
+        with pytest.raises(RuntimeError, match="the solver must reach .* the solution cannot be continued"):
+            function(TRACK, {"y": 3.0}, runaway)
+
+
+def test_a_tail_that_is_far_longer_than_the_plan():
+    quick = MOVE.retime(1e-3)
+    exact, simulated = (only(margins(quick, {"y": (0.0, 6.0)}, loop, tail=3.0)).value for loop in (LINEAR, WRITTEN))
+    assert simulated == pytest.approx(exact, abs=3e-6)
 
 
 def test_the_tail_is_checked():
