@@ -19,9 +19,9 @@ Plan a move
 Choose what is left free
     choose_alpha              shape by an objective: PeakDerivative, SquaredDerivative -> AlphaChoice
     optimize_waypoints        derivatives and times at via points, by minimum jerk or snap -> Optimum
-    fastest                   minimum duration under limits -> Fastest, with a time law Retimed
+    fastest                   minimum duration under limits, of a loop's signals too -> Fastest, Retimed
     Limits, Region            limits on one side, of a rate, of an RMS, over time; a region of two signals
-    margins                   how near a plan is to its limits, and when -> Margins
+    margins                   how near a plan is to its limits, and when, for which parameters -> Margins
     loop_quantities           signals of a loop along a plan, for limits on them
     avoid, clearance          around Rectangle, Disc, HalfPlane -> Avoidance, Clearance: certified
 Build the loop

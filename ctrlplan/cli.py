@@ -160,23 +160,27 @@ def _online(options: argparse.Namespace) -> list[Path]:
 
 def _all_of(studies: Mapping[str, Callable[..., Study]], folder: Path, title: str) -> list[Path]:
     from ctrlplan.reports import write_report
+    from ctrlplan.studies.progress import bars_over_plans
 
     found = []
     for i, (name, study) in enumerate(studies.items()):
         _print_status(f"running study {name} ({i + 1} of {len(studies)})")
-        found.append(study(progress=sys.stderr.isatty()))
+        with bars_over_plans(sys.stderr.isatty()):
+            found.append(study(progress=sys.stderr.isatty()))
     _print_status("writing the report")
     return write_report(found, folder, title)
 
 
 def _report(options: argparse.Namespace) -> list[Path]:
     from ctrlplan.reports import write_report
+    from ctrlplan.studies.progress import bars_over_plans
 
     study_file = _loaded(options.study)
     _checked_folder(options.out)
     plans = len(study_file.plans)
     _print_status(f"running study {study_file.name} ({plans} plan{'s' * (plans > 1)})")
-    study = study_file.run(progress=sys.stderr.isatty(), status=_print_status)
+    with bars_over_plans(sys.stderr.isatty()):
+        study = study_file.run(progress=sys.stderr.isatty(), status=_print_status)
     _print_status("writing the report")
     return write_report([study], options.out, study_file.title, study_file.author)
 

@@ -392,7 +392,7 @@ def test_a_plan_that_fails_is_a_row_with_its_reason_beside_the_others(failing, t
     assert list(found["plans"]) == ["polynomial"]
     assert list(found["failures"]) == ["far <b>"]
     page = (tmp_path / "out" / "index.html").read_text(encoding="utf-8")
-    (row,) = re.findall(r'<th scope="row">far &lt;b&gt;</th><td class="words"[^>]*>(.*?)</td>', page)
+    (row,) = re.findall(r'<th scope="row" class="short">far &lt;b&gt;</th><td class="words"[^>]*>(.*?)</td>', page)
     assert html.unescape(row) == found["failures"]["far <b>"] != ""
 
 

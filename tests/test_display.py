@@ -376,6 +376,7 @@ def test_steps_show_when_they_jump():
     assert ["position jumps at", "2 s"] in rows(str(cp.Step(1.0, time=2.0)))
     shaped = rows(str(cp.Shaper.zv(2.0)(cp.Step(1.0))))
     assert ["position jumps at", f"0 s, {math.pi / 2:.6g} s"] in shaped
+    assert ["input shaper", "2 impulses"] in shaped
 
 
 def test_many_waypoints_are_shortened_and_their_peaks_left_out(monkeypatch):

@@ -100,9 +100,9 @@ def test_it_is_in_the_words_of_the_field(notebook):
     assert not found
 
 
-def test_the_first_is_six_cells():
+def test_the_first_is_seven_cells():
     assert NOTEBOOKS[0].name == "00_your_loop.ipynb"
-    assert len(code_cells(nbformat.read(NOTEBOOKS[0], as_version=4))) == 6
+    assert len(code_cells(nbformat.read(NOTEBOOKS[0], as_version=4))) == 7
 
 
 # That it runs

@@ -8,13 +8,17 @@ Limits are satisfied over the whole interval, not only at samples. In the order 
 `optimize_waypoints`
     Free derivatives at via points, and their times, by minimum jerk or snap.
 `fastest`
-    Minimum duration under limits on derivatives and on quantities of a plant.
-    ``hold`` selects what is preserved: the shape, with all times in proportion;
-    the derivatives at the waypoints, where feasibility is not monotone in the
-    duration and the feasible set is reported; or only the path. Limits that
-    no duration satisfies raise an error with the reason.
+    Minimum duration under limits on derivatives, on quantities of a plant, or on
+    signals of a loop. ``hold`` selects what is preserved: the shape, with all
+    times in proportion; the derivatives at the waypoints, where feasibility is
+    not monotone in the duration and the feasible set is reported; or only the
+    path. Limits that no duration satisfies raise an error with the reason.
 `margins`
-    Margin of a given plan to each limit, and its time.
+    Margin of a given plan to each limit, and its time. Both also for the worst
+    case over ranges of parameters.
+`Limits`, `Region`
+    Limits on one side, of a rate, of a root mean square, in an interval of time
+    or as a function of time; convex regions of two signals.
 `avoid`, `clearance`
     Paths around obstacles, and the certified distance to them. The rope of a
     crane is inclined where the load accelerates: check its clearance again

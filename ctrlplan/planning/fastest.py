@@ -28,6 +28,18 @@ if TYPE_CHECKING:
 
     from ctrlplan.reports.style import AxesLike
 
+_COARSE = 1e-4
+"""Resolution of local minima of the violation by simulated responses, relative to the duration."""
+
+_DOUBLINGS_IN_LOOP = 6
+"""Maximum number of times by which the duration of a plan is doubled where its responses are slow."""
+
+_EDGE = 1e-7
+"""Resolution of a minimum duration by simulated responses, relative to the duration."""
+
+_ROUNDING = 1e-14
+"""The same by exact responses."""
+
 Hold = Literal["shape", "waypoints", "path"]
 """Property of a plan that `fastest` preserves."""
 
@@ -96,6 +108,7 @@ class Fastest(Displayed):
                 ("feasible durations", "" if self.statement else f"{sets}, the end of the search" if cut else sets),
                 ("shorter durations", self.statement),
                 ("shorter plans rejected", self.rejection),
+                ("signals of the loop", self.margins.note),
                 ("ranges of parameters", self.margins.coverage),
             ]
         )
@@ -214,9 +227,10 @@ def fastest(
     `Fastest.statement` says; longer durations are not searched.
 
     With hold="waypoints", and for other loops, limits on signals of a loop are
-    evaluated by its response at 12 durations per octave, with the same refinement
-    as those of quantities. A feasible interval that is shorter than these, and is
-    not preceded by a decrease of the violation, may be missed.
+    evaluated by its response at 12 durations per octave, and local minima of the
+    violation are refined, up to the first feasible duration. A feasible interval
+    that is shorter than these, and is not preceded by a decrease of the violation,
+    may be missed.
 
     With fixed path the plan is not exactly time-optimal. The rate of the time law
     is a spline with 16 knots in the time of the given plan, not along its path, so
@@ -293,12 +307,12 @@ def _fastest_in_loop(
     shapes = shapes_given(limited.loop)
     if shapes is None or hold == "waypoints" or not bounds_of_values(limited):
         family = _InLoop(_Scaled(plan, limited) if hold == "shape" else _Replanned(plan, limited))
-        return _searched(family, span or _span(family, plan.duration, minimum), hold, endless=False)
+        return _first_feasible(family, span or _span(family, plan.duration, minimum), hold)
     problem = LoopProblem(plan, limited, shapes, resolution)
     shortest, searched = problem.shortest(span, minimum)
     found = _satisfying(limited, plan.retime, shortest)
     feasible = ((found.duration, found.duration),)
-    statement = problem.statement(*searched)
+    statement = problem.statement(*searched, minimum)
     return Fastest(found, limited.margins(found), feasible, "shape", limited, "", searched, statement)
 
 
@@ -383,10 +397,57 @@ class _InLoop:
 
     def __init__(self, family: _Scaled | _Replanned) -> None:
         self.plan, self.limited, self._own = family.plan, family.limited, family.excess
+        self.excess = cache(self._excess)
 
-    def excess(self, duration: float) -> float:
+    def _excess(self, duration: float) -> float:
         own = self._own(duration)
         return own if math.isinf(own) and own > 0.0 else max(own, self.limited.loop_excess(self.plan(duration)))
+
+
+def _first_feasible(family: _InLoop, span: tuple[float, float], hold: Hold) -> Fastest:
+    """Plan of minimum duration under limits of a loop whose runs are slow: the search ends at the first duration."""
+    limited = family.limited
+    resolution = _EDGE if shapes_given(limited.loop) is None else _ROUNDING
+    exact = cache(lambda duration: limited.exact_excess(family.plan(duration)))
+    count = max(9, math.ceil(family.per_octave * math.log2(span[1] / span[0])))
+    grid, known = np.geomspace(*span, count), 0
+    for k, duration in enumerate(grid.tolist()):
+        if family.excess(duration) > 0.0 and k + 1 < count:
+            continue
+        durations, excess = scan(family.excess, grid[known : k + 1], 0.0, _COARSE)
+        for inside in np.flatnonzero(excess <= 0.0).tolist():
+            outside = float(durations[inside - 1]) if inside else 0.0
+            found = _exact_edge(exact, family.excess, float(durations[inside]), outside, resolution)
+            if found is not None:
+                statement = (
+                    f"violate a limit at {family.per_octave} durations per octave from {span[0]:.4g} s on, and "
+                    "at the local minima of the violation between them"
+                )
+                plan, feasible = family.plan(found), ((found, found),)
+                return Fastest(plan, limited.margins(plan), feasible, hold, limited, "", (span[0], found), statement)
+        known = k
+    excess = np.array([family.excess(duration) for duration in grid.tolist()])
+    return _reject(family, grid, excess)
+
+
+def _exact_edge(
+    exact: Callable[[float], float],
+    sampled: Callable[[float], float],
+    inside: float,
+    outside: float,
+    resolution: float,
+) -> float | None:
+    """Shortest feasible duration near one that is feasible at samples; None if none is near it."""
+    if outside > 0.0 and sampled(outside) > 0.0:
+        inside, outside = bisected(lambda duration: sampled(duration) <= 0.0, inside, outside, 0.0, 1e-4)
+    good, step = inside, 1e-6 * inside
+    while exact(good) > 0.0:  # violated between samples, or by less than these resolve
+        outside, good, step = good, good + step, 8.0 * step
+        if step > 0.1 * inside:
+            return None
+    if outside <= 0.0 or exact(outside) <= 0.0:
+        return good
+    return bisected(lambda duration: exact(duration) <= 0.0, good, outside, 0.0, resolution)[0]
 
 
 def _check_rest(plan: Trajectory, limited: Limited) -> None:
@@ -429,12 +490,17 @@ def _around(duration: float) -> tuple[float, float]:
 def _span(scaled: _Scaled | _InLoop, duration: float, minimum: float) -> tuple[float, float]:
     """Interval of durations of the search, from violated to satisfied limits."""
     excess, high = scaled.excess, max(duration, minimum)
-    for _ in range(60):
+    for _ in range(_DOUBLINGS_IN_LOOP if isinstance(scaled, _InLoop) else 60):
         if excess(high) <= 0.0 and scaled.limited.exact_excess(scaled.plan(1.01 * high)) <= 0.0:
             break
         high *= 2.0
     else:
-        raise ValueError(f"limits must be satisfied for some duration, got none up to {high:.3g} s")
+        if isinstance(scaled, _InLoop) and math.isinf(excess(high)):
+            scaled.limited.margins(scaled.plan(high))  # raises the reason
+        raise ValueError(
+            f"limits must be satisfied for some duration, got none up to {high:.3g} s; for a wider search pass "
+            "durations=(low, high)"
+        )
     low = high / 64.0
     while low > minimum and excess(low) <= 0.0:
         low /= 64.0

@@ -449,9 +449,13 @@ class Limited:
     def shown(self, plan: Trajectory, times: Array) -> Array:
         """Limited signals (nbounds, ntime) over a plan for a figure; of a root mean square that up to each time."""
         rows = self.values(plan.jet(times, self.order)).copy()
+        response = None if self.loop is None or not self.loop_bounds else self.loop.quantities_of(plan)
         for row, b in zip(rows, self.bounds, strict=True):
+            if b.in_loop and response is not None:
+                row[:] = response.values(b.weights, times, rate=b.kind == "rate")
             if b.kind == "rms":
                 steps = np.diff(times, prepend=times[0])
+                steps[times > plan.start + (b.period or plan.duration)] = 0.0
                 row[:] = np.sqrt(np.cumsum(steps * row**2) / (b.period or plan.duration))
         return rows
 
@@ -489,11 +493,16 @@ class Limited:
         """Raise for limits of a loop that are violated before the plan or in steady state, whatever its duration."""
         if self.loop is None:
             return
+        self.loop.quantities_of(plan.retime(1.25 * plan.duration))  # raises for a source inside, at its own times
         response = self.loop.quantities_of(plan)
         for b in self.loop_bounds:
             if b.kind != "value" or not b.is_constant:
                 continue
-            pairs = zip(("at the start", "in steady state"), response.ends(b.weights), strict=True)
+            try:
+                ends = response.ends(b.weights)
+            except RuntimeError:  # a loop that cannot be simulated at this duration
+                return
+            pairs = zip(("at the start", "in steady state"), ends, strict=True)
             for when, value in pairs:
                 if b.excess(np.array([value]))[0] > 1e-9:
                     raise ValueError(

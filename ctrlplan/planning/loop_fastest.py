@@ -47,8 +47,10 @@ class LoopProblem:
         self._search = DurationSearch(self._family, self._sides, resolution, self._excess_of_others if others else None)
         self._resolution = resolution
 
-    def statement(self, low: float, shortest: float) -> str:
-        """What is known of durations below the shortest one that was found."""
+    def statement(self, low: float, shortest: float, minimum: float) -> str:
+        """What is known of durations below the shortest one that was found; `minimum` as for `shortest`."""
+        if shortest <= (1.0 + 1e-9) * low:
+            return "every shorter one violates a limit of the plan" if low <= minimum else "shorter ones not searched"
         found = (
             f"no duration from {low:.4g} s to {shortest:.6g} s satisfies every limit with a margin above "
             f"{self._resolution:g} of its range"

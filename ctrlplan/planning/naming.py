@@ -61,9 +61,7 @@ class Naming:
 
     def _of_both(self, limits: Mapping[str, object]) -> Iterator[Bound]:
         """Bounds from limits of plan and loop apart."""
-        others = [
-            name for name, limit in limits.items() if name not in ("plan", "loop") or not isinstance(limit, Mapping)
-        ]
+        others = [name for name in limits if name not in ("plan", "loop")]
         if others:
             raise ValueError(
                 f'limits must be by name, or {{"plan": limits by name, "loop": limits by name}}, got {others[0]!r}'
@@ -101,7 +99,8 @@ class Naming:
             signals = f"signals of the loop ({', '.join(self.loop.names)})"
             if find == self._of_loop:
                 raise ValueError(f"limits must name {signals}, got {name!r}")
-            raise ValueError(f"limits must name {signals}, {derivatives}, got {name!r}")
+            default = f"; for the axis of the plan {_BOTH}" if name in self.plan.labels else ""
+            raise ValueError(f"limits must name {signals}, {derivatives}, got {name!r}{default}")
         plain = [quantity for quantity in self._orders if "_d" not in quantity]
         known = (
             f", or quantities ({', '.join(plain)}, ...)"
@@ -112,10 +111,12 @@ class Naming:
 
     def _named(self, name: str) -> Signal | None:
         """Signal of a name: of the loop if there is one with that name."""
-        if self.loop is None or name not in self.loop.names:
+        meant, unnamed = self._derivatives.get(name), self.plan.labels == default_labels(self.plan.naxes)
+        if self.loop is None:
             return self._of_plan(name)
-        meant = self._derivatives.get(name)
-        if meant is not None and self.plan.labels != default_labels(self.plan.naxes):
+        if name not in self.loop.names:  # such as y, the default label, with a loop whose output is y[0]
+            return None if unnamed and meant is not None and not meant.order else self._of_plan(name)
+        if meant is not None and not unnamed:
             inputs = list(self.loop.inputs)
             in_order = len(inputs) == self.plan.naxes and set(inputs) != set(self.plan.labels)
             fed = name in inputs and (not in_order or (not meant.order and inputs[meant.axis or 0] == name))

@@ -34,9 +34,10 @@ from ctrlplan._display import Displayed, Facts, Figure, Part, counted, number, t
 from ctrlplan.trajectories import Joined, PiecewiseSpline, PolySpline, Trajectory, TrigSpline, Waypoint
 from ctrlplan.trajectories.chosen import checked_alpha
 from ctrlplan.trajectories.common import FACTORIALS, Array, readonly
+from ctrlplan.trajectories.conjugate import FreeEntries
 from ctrlplan.trajectories.newton import NewtonSystem
-from ctrlplan.trajectories.newton_spline import given_entries
-from ctrlplan.trajectories.waypoint import entry_name, waypoint_table
+from ctrlplan.trajectories.piecewise import alike
+from ctrlplan.trajectories.waypoint import Entries, entry_name, waypoint_table
 from ctrlplan.trajectories.waypoint_spline import checked_waypoints
 
 _EPS = float(np.finfo(float).eps)
@@ -178,19 +179,20 @@ def optimize_waypoints(
     2.0
     """
     points = checked_waypoints(waypoints)
+    given = Entries.of(points)
     derivative = checked_count(derivative, "derivative", 1)
     alpha = checked_alpha(alpha)
     naxes = points[0].naxes
     names = points[0].labels if labels is None else checked_labels(labels, naxes)
-    order, continuity = _checked_orders(points, derivative, order, continuity, single)
+    order, continuity = _checked_orders(given.table, derivative, order, continuity, single)
     factors = _checked_weights(weights, naxes)
 
-    times = np.array([p.time for p in points])
+    times = given.times
     start, duration = points[0].time, checked_finite(points[-1].time - points[0].time, "duration", above=0.0)
     relative = (times - start) / duration
     table = np.full((len(points), order + 1, naxes), np.nan)
-    given, _ = given_entries(points)
-    table[:, : given.shape[1]] = given[:, : order + 1]
+    rows = min(order + 1, given.table.shape[1])
+    table[:, :rows] = given.table[:, :rows]
     if np.isnan(table).all(axis=(0, 1)).any():
         raise ValueError("every axis must have a prescribed entry, got an axis with none")
     unit = duration ** np.arange(order + 1)[:, None]
@@ -205,19 +207,17 @@ def optimize_waypoints(
     _check_digits(problem, found, times)
 
     sides = np.where(np.isnan(table), found.sides / unit, table)  # prescribed entries are exact
-    before, after = (
-        [Waypoint.from_array(t, jet.copy(), names) for t, jet in zip(times.tolist(), side, strict=True)]
-        for side in sides
-    )
-    parts = [after] if single else [list(pair) for pair in zip(after[:-1], before[1:], strict=True)]
-    split = problem.split()
+    split, count = problem.split(), np.full(len(points), order + 1)
+    before, after = (Entries(times, readonly(side), count, names) for side in sides)
     plan: Trajectory
     if single or split.any():
+        left, right = before.waypoints(), after.waypoints()
+        parts = [right] if single else list(zip(right[:-1], left[1:], strict=True))
         # The range of joined segments was compared with their own ends only.
         splines = [TrigSpline(p, alpha=alpha, warn=single) if alpha else PolySpline(p, warn=single) for p in parts]
         plan = splines[0] if single else Joined.without_shift(splines)
     else:
-        plan = PiecewiseSpline(after, alpha=alpha)
+        plan = PiecewiseSpline.of_entries(after, alpha)
     shared = zip(times.tolist(), np.where(split, np.nan, sides[1]), strict=True)
     chosen_points = tuple(Waypoint.from_array(t, jet.copy(), names) for t, jet in shared)
     cost = float(found.cost @ factors) * duration ** (1 - 2 * derivative)
@@ -269,8 +269,7 @@ class _Problem:
         self.loose = np.zeros(table.shape[:2], dtype=bool)  # need not be continuous if free
         self.loose[1:-1, continuity + 1 :] = not single
         known = ~np.isnan(table)
-        patterns, which = np.unique(known.reshape(-1, table.shape[2]), axis=1, return_inverse=True)
-        self.groups = [(p.reshape(known.shape[:2]), np.flatnonzero(which == i)) for i, p in enumerate(patterns.T)]
+        self.groups = [(known[:, :, axes[0]], np.array(axes)) for axes in alike(known)]
 
     def split(self) -> NDArray[np.bool_]:
         """Entries that are free on each side separately, shape (nwaypoints, order + 1, naxes)."""
@@ -303,6 +302,8 @@ class _Segments:
     def __init__(self, times: Array, alpha: float, order: int, derivative: int) -> None:
         self.root = _segment_root(alpha, order, derivative)
         self.derivative = derivative
+        self.times = times
+        self.minimal = not alpha and order == derivative - 1  # then the optimum is a spline of continuous conjugates
         self.durations = np.diff(times)[:, None]
         self.orders = np.tile(np.arange(order + 1), 2)
 
@@ -319,11 +320,11 @@ class _Segments:
 
         powers = self.durations**self.orders
         ends = np.concatenate([right[:-1], left[1:]], axis=1)
-        samples = np.zeros((len(ends), len(self.root), fixed.size))
-        np.put_along_axis(samples, ends[:, None, :], self.root * powers[:, None, :], axis=2)
-        matrix = samples.reshape(-1, fixed.size)
-        weight = np.repeat(self.durations.ravel() ** (0.5 - self.derivative), len(self.root))
-        entries[~fixed], unique = _least_squares(matrix[:, ~fixed], -matrix @ entries, weight)
+        found = self._banded(known, table) if self.minimal and not apart.any() else None
+        if found is not None:
+            entries[~fixed], unique = found, True
+        else:
+            entries[~fixed], unique = self._dense(entries, fixed, ends, powers)
 
         data = entries[ends] * powers[:, :, None]
         value, change = self.root @ data, self.root @ (data * self.orders[:, None])
@@ -333,6 +334,27 @@ class _Segments:
         rounding = (self.durations**power * _rounding(value, np.abs(self.root) @ np.abs(data)).sum(axis=1)).sum(axis=0)
         rounding += 16.0 * _EPS * np.abs(slope).sum(axis=0)  # of the times
         return _Solution(entries[[left, right]], (self.durations**power * square).sum(axis=0), slope, unique, rounding)
+
+    def _banded(self, known: NDArray[np.bool_], table: Array) -> Array | None:
+        """Free entries in linear time; None where they are not unique."""
+        if known.all():
+            return np.zeros((0, table.shape[2]))
+        try:
+            free = FreeEntries(0.0, self.times, None, known, natural=True)
+            found = free.solve(table)
+        except ValueError:  # a minimum-norm solution is found by the dense equations
+            return None
+        return found.astype(float)
+
+    def _dense(
+        self, entries: Array, fixed: NDArray[np.bool_], ends: NDArray[np.intp], powers: Array
+    ) -> tuple[Array, bool]:
+        """Free entries by least squares, and whether they are unique."""
+        samples = np.zeros((len(ends), len(self.root), fixed.size))
+        np.put_along_axis(samples, ends[:, None, :], self.root * powers[:, None, :], axis=2)
+        matrix = samples.reshape(-1, fixed.size)
+        weight = np.repeat(self.durations.ravel() ** (0.5 - self.derivative), len(self.root))
+        return _least_squares(matrix[:, ~fixed], -matrix @ entries, weight)
 
 
 class _Whole:
@@ -467,15 +489,14 @@ def _times(durations: Array) -> Array:
 
 
 def _checked_orders(
-    points: tuple[Waypoint, ...], derivative: int, order: int | None, continuity: int | None, single: bool
+    table: Array, derivative: int, order: int | None, continuity: int | None, single: bool
 ) -> tuple[int, int]:
     """Highest order of the entries, and of the continuous ones."""
     if single and continuity is not None:
         raise ValueError(f"continuity must not be given for a single plan, which is smooth, got {continuity}")
     shared = 0 if continuity is None else checked_count(continuity, "continuity")
     highest_order = max(derivative - 1, shared) if order is None else checked_count(order, "order")
-    prescribed = [int(np.flatnonzero(~np.isnan(p.jet).all(axis=1)).max(initial=0)) for p in points]
-    highest = max(highest_order, *prescribed)
+    highest = max(highest_order, int(np.flatnonzero(~np.isnan(table).all(axis=(0, 2))).max(initial=0)))
     if shared > highest:
         raise ValueError(f"order must be at least the continuity {shared}, got {highest}")
     return highest, highest if continuity is None else shared

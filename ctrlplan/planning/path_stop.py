@@ -28,6 +28,8 @@ _STEPS = (0.025, 0.00625)
 """Steps of the fractions near the best one."""
 _DELAYS = np.arange(1, 16) / 16.0
 """Delays as fractions of the remaining time, in addition to the breakpoints of the plan."""
+_BREAKPOINTS = 16
+"""Number of breakpoints after the beginning of a stop up to which it may be delayed."""
 _SCANNED = np.geomspace(1.0 / 512.0, 32.0, 113)
 """Durations T relative to the remaining time, eight per octave."""
 _REFINED = np.linspace(0.0, 1.0, 65)[1:]
@@ -136,6 +138,8 @@ class _Search:
         """Law of minimum total time below a given one that satisfies the limits at samples."""
         best: _Law | None = None
         for delay in self._delays():
+            if delay >= (total if best is None else best.total):
+                break
             for fraction in _FRACTIONS.tolist():
                 best = self._better(delay, fraction, total, best)
         return None if best is None else self._refined(best, total)
@@ -166,8 +170,8 @@ class _Search:
     def _delays(self) -> Iterator[float]:
         """Delays, increasing, during which the plan satisfies the limits at samples."""
         yield 0.0
-        edges = self._plan.breakpoints - self._time
-        for delay in np.unique([*edges[(edges > 0.0) & (edges < self._left)], *self._left * _DELAYS]).tolist():
+        edges = self._plan.breakpoints_between(np.nextafter(self._time, math.inf), self._plan.end)[:_BREAKPOINTS]
+        for delay in np.unique([*(edges - self._time), *self._left * _DELAYS]).tolist():
             times = self._time + delay * _SAMPLES
             jets = np.concatenate([self._plan.jet(times[:-1], 3), self._plan.jet(times[1:], 3, left=True)], axis=2)
             if self._excess(jets[:, :, None]).max() > _TOLERANCE:

@@ -32,6 +32,9 @@ class Response(Protocol):
     def ends(self, weights: Mapping[str, float]) -> tuple[float, float]:
         """Values at rest before the plan and in steady state after it; nan if not known."""
 
+    def values(self, weights: Mapping[str, float], times: Array, *, rate: bool = False) -> Array:
+        """Weighted sum of signals at times during the plan."""
+
 
 class Extremes(Protocol):
     """Minimum and maximum, and their times [s]."""

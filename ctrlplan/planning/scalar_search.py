@@ -11,7 +11,9 @@ from scipy.optimize import minimize_scalar
 from ctrlplan.trajectories.common import Array
 
 
-def scan(function: Callable[[float], float], grid: Array, target: float | None = None) -> tuple[Array, Array]:
+def scan(
+    function: Callable[[float], float], grid: Array, target: float | None = None, rtol: float = 1e-7
+) -> tuple[Array, Array]:
     """Samples of a function that include its relevant local minima.
 
     Parameters
@@ -23,6 +25,8 @@ def scan(function: Callable[[float], float], grid: Array, target: float | None =
     target : float, optional
         Local minima that cannot be below it are not refined; default: the minimum
         on the grid.
+    rtol : float, optional
+        Tolerance of the places of local minima, relative to them.
 
     Returns
     -------
@@ -34,7 +38,7 @@ def scan(function: Callable[[float], float], grid: Array, target: float | None =
     # Between a value and inf the search compares finite numbers.
     wall = float(finite.max() + np.ptp(finite) + 1.0) if finite.size else math.inf
     found = [
-        _bottom(lambda x: min(function(x), wall), grid, k)
+        _bottom(lambda x: min(function(x), wall), grid, k, rtol)
         for k in _valleys(values, values.min() if target is None else target)
     ]
     found = [(x, v) for x, v in found if v < wall]
@@ -79,8 +83,8 @@ def _valleys(values: Array, target: float) -> list[int]:
         return np.flatnonzero(low & ~(here - 1.25 * rise > target)).tolist()
 
 
-def _bottom(function: Callable[[float], float], grid: Array, k: int) -> tuple[float, float]:
+def _bottom(function: Callable[[float], float], grid: Array, k: int, rtol: float) -> tuple[float, float]:
     """Minimum between the neighbours of a grid point."""
     low, high = float(grid[max(k - 1, 0)]), float(grid[min(k + 1, grid.size - 1)])
-    found = minimize_scalar(function, bounds=(low, high), method="bounded", options={"xatol": 1e-7 * (high + low)})
+    found = minimize_scalar(function, bounds=(low, high), method="bounded", options={"xatol": rtol * (high + low)})
     return float(found.x), float(found.fun)

@@ -10,10 +10,10 @@ from typing import Literal, NamedTuple, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ctrlplan._checks import checked_finite, checked_vector
+from ctrlplan._checks import check_kind, checked_finite, checked_vector
 from ctrlplan._renamed import outside_stacklevel
 from ctrlplan.planning.bounds import Bound
-from ctrlplan.planning.limits import Limited
+from ctrlplan.planning.naming import Naming
 from ctrlplan.planning.path_stop import stopped_on_path
 from ctrlplan.trajectories import Clipped, Joined, MotionProfile, Step, Trajectory
 from ctrlplan.trajectories.common import Array
@@ -23,6 +23,9 @@ from ctrlplan.trajectories.waypoint import ENTRIES
 
 Synchronize = Literal["time", "path"]
 """Relation of the axes during a stop."""
+
+_EXCESS, _UNRESOLVED = 1e-9, 1e-6
+"""Excess over a limit, as a fraction of its scale, that is reported; of a jerk by the rounding of times."""
 
 _ROUNDING = 1e-13
 """Velocities and accelerations below this fraction of those of the plan are rounding errors."""
@@ -121,11 +124,8 @@ def stop_limits(plan: Trajectory, limits: Mapping[str, object]) -> StopLimits:
     ValueError
         If a limit is missing or of another kind.
     """
-    ends = [plan.initial, 0.0 * plan.initial]
-    carrier = (
-        plan if plan.duration else MotionProfile([0.0, 1.0], 0.0 * plan.initial[:, None], ends, labels=plan.labels)
-    )
-    bounds = Limited(carrier, limits).bounds
+    check_kind(limits, "limits", Mapping, "a mapping of names to limits")
+    bounds = tuple(Naming(plan).bounds(limits))
     acceleration = np.full((plan.naxes, 2), np.nan)
     jerk = np.full(plan.naxes, np.nan)
     for bound in bounds:
@@ -253,10 +253,13 @@ def _excesses(tail: Trajectory, bounds: tuple[Bound, ...]) -> Iterator[str]:
             for values, times in ((found.minimum, found.time_min), (found.maximum, found.time_max))
         ]
         value, time = max(sides, key=lambda side: float(bound.excess(np.array([side[0]]))[0]))
-        if bound.excess(np.array([value]))[0] > 1e-9:
+        rounded = isinstance(tail, MotionProfile) and (
+            bound.order == 3 or (bound.order == 2 and value != tail.start_state[2, axis])
+        )
+        if bound.excess(np.array([value]))[0] > (_UNRESOLVED if rounded else _EXCESS):
             limit = bound.high if value > bound.high else bound.low
             reason = f"from the state at {tail.start:.6g} s this is unavoidable"
-            if bound.order == 3 and isinstance(tail, MotionProfile):
+            if rounded:
                 reason = "floating-point times do not resolve its phases; use a time origin nearer to the plan"
             yield (
                 f"the limits of the stop are exceeded: {bound.name} must be {bound.range}, got {value:.6g} at "

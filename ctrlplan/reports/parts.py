@@ -301,6 +301,9 @@ SHORT = 30
 _DENSE = frozenset({"grid", "baselines"})
 """Kinds of tables in small type."""
 
+_BOLD = 1.12
+"""Width of bold letters, relative to others."""
+
 _STEP = 4
 WIDTHS = range(48, 76, _STEP)
 """Widths of a page [rem] below which tables have their cells below each other."""
@@ -314,10 +317,11 @@ def _layout(kind: str, names: Sequence[str], heads: Sequence[str], columns: Sequ
 
     Headings, and names of rows, break between words.
     """
-    letter, padding = (0.53, 0.65) if kind in _DENSE else (0.58, 1.25)
+    letter, padding = (0.53, 0.65) if kind in _DENSE else (0.56, 1.25)
     whole = [name for name in names if kind == "leading" and len(name) <= SHORT]
     letters = [max([14.0, *map(_letters, whole), *(_letters(word) for name in names for word in name.split())])]
-    letters += [max(map(_letters, [*head.split(), *cells])) for head, cells in zip(heads, columns, strict=True)]
+    for head, cells in zip(heads, columns, strict=True):
+        letters.append(max([_BOLD * _letters(word) for word in head.split()] + [_letters(cell) for cell in cells]))
     steps = math.ceil(sum(letter * count + padding for count in letters) / _STEP)
     width = "stacked" if steps > WIDTHS[-1] // _STEP else f"w{max(_STEP * steps, WIDTHS[0])}"
     longest = max(len(head) + max(map(len, cells), default=0) for head, cells in zip(heads, columns, strict=True))
@@ -326,7 +330,7 @@ def _layout(kind: str, names: Sequence[str], heads: Sequence[str], columns: Sequ
 
 def _letters(text: str) -> float:
     """Length of a text, in wide letters."""
-    return len(text) - 0.5 * sum(letter in " .,:;'|()[]ijltfr" for letter in text)
+    return len(text) - 0.5 * sum(letter in " .,:;'|()[]ijltfr·⁻⁰¹²³⁴⁵⁶⁷⁸⁹" for letter in text)
 
 
 Block: TypeAlias = Picture | Svg | Text | Items | Pairs | Panels | Animation | Table | MetricsTable

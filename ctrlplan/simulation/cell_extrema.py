@@ -51,6 +51,13 @@ class Cells:
         basis = np.cos(np.arange(len(self.series))[:, None] * np.arccos(np.clip(x, -1.0, 1.0)))
         return np.asarray(np.einsum("jrk,jk->rk", self.series, basis))
 
+    def at(self, times: Array) -> Array:
+        """Values (nrows, ntime) at times [s] within the cells."""
+        by = np.argsort(self.starts, kind="stable")
+        own = by[np.maximum(np.searchsorted(self.starts[by], times, side="right") - 1, 0)]
+        found = Cells(self.starts[own], self.lengths[own], self.series[..., own], self.low[own], self.high[own])
+        return found.values(2.0 * (times - found.starts) / found.lengths - 1.0)
+
     def without_line(self, start: float, slope: float) -> Cells:
         """Signals minus start + slope t."""
         series = self.series.copy()

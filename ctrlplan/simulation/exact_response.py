@@ -23,6 +23,9 @@ from ctrlplan.trajectories.chebyshev import transform
 _REST = 1e-12
 """Bound of what follows the evaluated part of the tail, relative to the range of a signal."""
 
+_FEW = 32
+"""Number of equal steps below which they are computed one after the other."""
+
 _FIRST = 16
 """Number of cells of the tail that are evaluated first; then twice as many, and so on."""
 
@@ -206,6 +209,22 @@ class ExactResponse(LoopResponse):
             total += max(0.0, length - reached) * final**2
         return math.sqrt(total / length)
 
+    def values(self, weights: Mapping[str, float], times: Array, *, rate: bool = False) -> Array:
+        """Weighted sum of signals; see `LoopResponse`."""
+        rows, motion, since = self._sum(weights), self._motion, times - self._start
+        if rate:
+            rows = rate_rows(motion.form, rows, motion.plan, " + ".join(weights))
+        found = np.full(times.shape, float(rows.static(motion.plan.final, motion.settled)[0]))
+        along = since <= motion.duration
+        found[along] = motion.cells(rows).at(since[along])[0]
+        for cells, _ in motion.tail(rows) if not along.all() else ():
+            inside = (since > motion.duration) & (since >= cells.starts.min())
+            inside &= since <= float((cells.starts + cells.lengths).max())
+            found[inside] = cells.at(since[inside])[0]
+            if not np.any(since > float((cells.starts + cells.lengths).max())):
+                break
+        return found
+
     def ends(self, weights: Mapping[str, float]) -> tuple[float, float]:
         """Values before the plan and in steady state after it; see `LoopResponse`."""
         rows, motion = self._sum(weights), self._motion
@@ -342,12 +361,45 @@ def _marched(
     """States (ncells + 1, nstates, ...) at the starts of cells and at the end of the last."""
     found = np.empty((levels.size + 1, *state.shape))
     found[0] = state
-    for k, level in enumerate(levels.tolist()):
-        change = changes[level] @ state
-        if forced is not None:
-            change += forced[k]
-        state = found[k + 1] = state + change
+    first = 0
+    for last in [*(np.flatnonzero(np.diff(levels)) + 1).tolist(), levels.size]:
+        change, own = changes[int(levels[first])], None if forced is None else forced[first:last]
+        if last - first < _FEW:
+            for k in range(first, last):
+                moved = change @ found[k]
+                found[k + 1] = found[k] + (moved if forced is None else moved + forced[k])
+        else:
+            found[first + 1 : last + 1] = _repeated(found[first], change, own, last - first)
+        first = last
     return found
+
+
+def _repeated(state: Array, change: Array, forced: Array | None, count: int) -> Array:
+    """States (count, nstates, ...) after each of many equal steps x + change x + forced.
+
+    In about sqrt(count) blocks: the responses of all blocks from zero are computed
+    together, then the state from block to block.
+    """
+    per = math.isqrt(count - 1) + 1
+    nblocks, n = -(-count // per), len(change)
+    inner = np.zeros((nblocks, per, *state.shape))
+    powers = np.empty((per, n, n))
+    powers[0] = change
+    for j in range(1, per):
+        powers[j] = powers[j - 1] + change + change @ powers[j - 1]
+    if forced is not None:
+        steps = np.zeros_like(inner)
+        steps.reshape(-1, *state.shape)[:count] = forced
+        inner[:, 0] = steps[:, 0]
+        for j in range(1, per):
+            inner[:, j] = inner[:, j - 1] + inner[:, j - 1] @ change.T + steps[:, j]
+    starts = np.empty((nblocks, *state.shape))
+    for k in range(nblocks):
+        starts[k] = state
+        state = state + (powers[-1] @ state + inner[k, -1])
+    columns = starts.reshape(nblocks, n, -1)
+    moved = np.einsum("jab,kbc->kjac", powers, columns).reshape(inner.shape)
+    return (starts[:, None] + moved + inner).reshape(-1, *state.shape)[:count]
 
 
 def _states_at_nodes(form: LoopForm, c: Array, part: _Part) -> Array:

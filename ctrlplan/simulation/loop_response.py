@@ -6,6 +6,8 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from ctrlplan._types import Array
+
 
 @dataclass(frozen=True)
 class Extremes:
@@ -29,8 +31,8 @@ class Extremes:
 class LoopResponse(ABC):
     """Signals of a loop along one plan; returned by `LoopQuantities.quantities_of`.
 
-    A new kind of response must define `extremes`, `rms` and `ends`, and have the
-    attributes.
+    A new kind of response must define `extremes`, `rms`, `ends` and `values`, and
+    have the attributes.
 
     Attributes
     ----------
@@ -106,4 +108,23 @@ class LoopResponse(ABC):
         -------
         (float, float)
             In the unit of the sum; nan where the steady state is not known.
+        """
+
+    @abstractmethod
+    def values(self, weights: Mapping[str, float], times: Array, *, rate: bool = False) -> Array:
+        """Weighted sum of signals from the start of the plan on, for figures.
+
+        Parameters
+        ----------
+        weights : mapping of str to float
+            Factors by the name of a signal.
+        times : ndarray, shape (ntime,)
+            Times [s], from the start of the plan on; a simulated response is constant
+            after its last time.
+        rate : bool, optional
+            Of the time derivative of the sum instead.
+
+        Returns
+        -------
+        ndarray, shape (ntime,)
         """

@@ -19,7 +19,7 @@ from ctrlplan.simulation.interpreted import Interpreted, SolverError
 from ctrlplan.simulation.job import Job, Record, fresh_job, with_event_times
 from ctrlplan.simulation.network import Network
 from ctrlplan.simulation.scales import PASSES, Scales, Tolerances, effects, output_uncertainty, remaining, rounding_of
-from ctrlplan.simulation.segments import Run, Solver, integrate, known_before
+from ctrlplan.simulation.segments import NetworkRun, Solver, integrate, known_before
 from ctrlplan.simulation.signals import TimeSignal, breakpoints_of, signal_values
 from ctrlplan.symbolic.isolation import untouched
 
@@ -198,7 +198,7 @@ class Attempt(Generic[S]):
     equations: Interpreted | None = field(init=False)
     copies: Network = field(init=False)
     solver: S = field(init=False)
-    run: Run = field(init=False)
+    run: NetworkRun = field(init=False)
 
     def __post_init__(self) -> None:
         job, network = self.job, self.job.blocks

@@ -132,7 +132,7 @@ class DelayedSignal:
 
 
 @dataclass(frozen=True, eq=False)
-class Run:
+class NetworkRun:
     """Result of a run.
 
     Attributes
@@ -165,7 +165,7 @@ def integrate(
     marks: Sequence[float] = (),
     stops_after: Callable[[Array, Array], bool] | None = None,
     course: Course | None = None,
-) -> Run:
+) -> NetworkRun:
     """Run a network over increasing times.
 
     Parameters
@@ -251,7 +251,7 @@ def integrate(
         if stops_after is not None and stops_after(np.append(segments[-1][0], grid), np.column_stack([before, found])):
             break
     known.append((np.array([left]), x[:, None]))
-    return Run(np.concatenate([t for t, _ in known]), np.concatenate([s for _, s in known], axis=1), segments)
+    return NetworkRun(np.concatenate([t for t, _ in known]), np.concatenate([s for _, s in known], axis=1), segments)
 
 
 class Course:

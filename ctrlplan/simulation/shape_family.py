@@ -23,11 +23,14 @@ _SAMPLES = 256
 _PER_SEGMENT = 36
 """Minimum number of samples of a segment: fewer are not propagated together for all durations."""
 
-_TAIL_CELLS = 40
-"""Number of cells after the plan in which samples are taken."""
+_PHASE = 0.35
+"""Distance of samples after the plan, in the phase of a mode [rad]."""
 
-_PER_CELL = 16
-"""Number of intervals of such a cell between samples."""
+_PER_MODE = 250
+"""Maximum number of samples for a mode."""
+
+_DECAYED = 12.0
+"""Exponent from which on a mode is not sampled."""
 
 _STEP_PARTS = 4
 """Maximum number of parts of the response to a step that are evaluated."""
@@ -229,20 +232,32 @@ class ShapeFamily:
     @cached_property
     def _tail(self) -> tuple[Array, Array]:
         """Times after the plan of samples, and the matrix (nsignals * nsamples, nstates) of their deviations."""
-        n, count = self.form.nstates, 0
-        moments, tables = [np.zeros(0)], [np.zeros((len(self.chosen), 0, n))]
-        x = np.cos(np.pi * np.arange(_PER_CELL, -1, -1) / _PER_CELL)
+        n, times = self.form.nstates, self._moments
+        tables, done = [np.zeros((len(self.chosen), 0, n))], 0
         for cells, _ in free_cells(self.form, self.rows.c, np.eye(n)):
-            basis = np.cos(np.arange(len(cells.series)) * np.arccos(x)[:, None])
-            values = np.tensordot(basis, cells.series, axes=1)
-            values = values.reshape(x.size, -1, n, cells.starts.size).transpose(1, 3, 0, 2)
-            tables.append(values.reshape(len(self.chosen), -1, n))
-            moments.append((cells.starts[:, None] + 0.5 * (1.0 + x) * cells.lengths[:, None]).ravel())
-            count += cells.starts.size
-            if count >= _TAIL_CELLS:
+            by = np.argsort(cells.starts)
+            starts, lengths, series = cells.starts[by], cells.lengths[by], cells.series[:, :, by]
+            count = int(np.searchsorted(times, starts[-1] + lengths[-1], side="right"))
+            own, done = times[done:count], count
+            where = np.searchsorted(starts, own, side="right") - 1
+            angles = np.arccos(np.clip(2.0 * (own - starts[where]) / lengths[where] - 1.0, -1.0, 1.0))
+            basis = np.cos(np.arange(len(series))[:, None] * angles)
+            values = np.einsum("jrk,jk->rk", series[:, :, where], basis)
+            tables.append(values.reshape(len(self.chosen), n, -1).transpose(0, 2, 1))
+            if count == times.size:
                 break
-        times = np.concatenate(moments)
-        return times, np.concatenate(tables, axis=1).reshape(len(self.chosen) * times.size, n)
+        table = np.concatenate(tables, axis=1)
+        return times[: table.shape[1]], table.reshape(-1, n) if n else np.zeros((0, 0))
+
+    @property
+    def _moments(self) -> Array:
+        """Times after the plan of samples: several in each oscillation of each mode, until it has decayed."""
+        found = [np.zeros(1)]
+        for pole in self.form.poles[np.abs(self.form.poles.real) > 0.0]:
+            step = _PHASE / abs(pole)
+            count = min(_PER_MODE, math.ceil(_DECAYED / abs(pole.real) / step))
+            found.append(step * np.arange(1, count + 1))
+        return np.unique(np.concatenate(found)) if self.form.nstates > self.form.integrators else np.zeros(0)
 
 
 @dataclass(frozen=True, eq=False)

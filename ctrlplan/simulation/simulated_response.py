@@ -26,8 +26,14 @@ from ctrlplan.trajectories import Step, Trajectory
 _RTOL = 1e-10
 """Relative tolerance of the runs."""
 
+_COARSE = 1e-8
+"""Relative tolerance without refinement."""
+
 _SAMPLES = 1000
 """Number of samples over the duration of a plan."""
+
+_LONG = 8
+"""Maximum number of samples of an interval, in those of a plan."""
 
 _FINE = 33
 """Number of samples between the neighbours of a sample near an extremum."""
@@ -35,8 +41,8 @@ _FINE = 33
 _MOST = 24
 """Maximum number of samples near which an extremum is refined."""
 
-_BEFORE = 1e-9
-"""Time before a jump at which a signal is sampled, relative to the duration of the plan."""
+_ASIDE = 1e-9
+"""Distance from a jump at which a signal is sampled on both sides, relative to the duration of the plan."""
 
 _PERIODS = (2, 4, 8, 16, 32, 64)
 """Numbers of periods of a cyclic plan, until its last two have the same mean square."""
@@ -124,6 +130,7 @@ class SimulatedResponse(LoopResponse):
 
     def __init__(self, prepared: Prepared, plan: Trajectory, tail: float | None, refined: bool = True) -> None:
         self._prepared, self.plan, self._refined = prepared, plan, refined
+        self._rtol = _RTOL if refined else _COARSE
         outputs = prepared.output_labels
         self.names = (*outputs, *(label for label in prepared.input_labels if label not in outputs))
         self._last = plan.end + (plan.duration if tail is None else tail)
@@ -166,7 +173,8 @@ class SimulatedResponse(LoopResponse):
         times, row = times[inside], row[inside]
         if not row.size:
             raise ValueError(f"an interval of limits must contain a sample of the loop, got {first:g} to {last:g} s")
-        low, high = _peak(times, -row), _peak(times, row)
+        smooth = not self._prepared.is_discrete and not (rate and self._held_blocks(weights))
+        low, high = _peak(times, -row, smooth), _peak(times, row, smooth)
         return Extremes(-low[0], high[0], low[1], high[1])
 
     def rms(self, name: str, period: float | None = None) -> float:
@@ -176,6 +184,11 @@ class SimulatedResponse(LoopResponse):
             return self._cyclic_rms(name)
         return self._rms({name: 1.0}, self.plan.start, self.plan.start + (period or self.plan.duration))
 
+    def values(self, weights: Mapping[str, float], times: Array, *, rate: bool = False) -> Array:
+        """Weighted sum of signals during the plan; see `LoopResponse`."""
+        t, row = self._rate(weights) if rate else (self._samples[0], self._sum(weights, self._samples[1]))
+        return np.asarray(np.interp(times, t, row))
+
     def ends(self, weights: Mapping[str, float]) -> tuple[float, float]:
         """Values at rest before the plan and in steady state after it; see `LoopResponse`."""
         before = float(self._sum(weights, self._samples[1][:, :1])[0])
@@ -183,7 +196,7 @@ class SimulatedResponse(LoopResponse):
             return before, math.nan
         step = float(self._prepared.dt) if self._prepared.is_discrete else 1e-2 * self.plan.duration
         times, held = self.plan.end + step * np.arange(2), self._inputs.final
-        response = simulate(self._prepared, times, held.tolist() or None, self._final, rtol=_RTOL, events=())
+        response = simulate(self._prepared, times, held.tolist() or None, self._final, rtol=self._rtol, events=())
         return before, float(self._sum(weights, self._signals(response.y[..., :1], held[:, None]))[0])
 
     @cached_property
@@ -223,7 +236,7 @@ class SimulatedResponse(LoopResponse):
                 first = start + float(block.traits.offset or 0.0)
                 edges.append(np.arange(first, self._last, block.period))
         found = np.unique(np.concatenate(edges))
-        apart = np.concatenate([[True], np.diff(found) > 4.0 * _BEFORE * self.plan.duration])
+        apart = np.concatenate([[True], np.diff(found) > 4.0 * _ASIDE * self.plan.duration])
         return found[apart & (found <= self._last)]
 
     @cached_property
@@ -233,18 +246,32 @@ class SimulatedResponse(LoopResponse):
             dt = float(self._prepared.dt)
             count = math.ceil((self._last - self.plan.start) / dt)
             return self._run(np.array(self.plan.start + dt * np.arange(count + 1), dtype=float))
-        count = math.ceil(_SAMPLES * (self._last - self.plan.start) / self.plan.duration)
-        even = np.linspace(self.plan.start, self._last, count + 1)
-        before = self._edges[1:] - _BEFORE * self.plan.duration
-        times = np.unique(np.concatenate([even, self._edges, before]))
-        return self._run(times)
+        even = np.linspace(self.plan.start, self.plan.end, _SAMPLES + 1)
+        if self._last > self.plan.end:
+            even = np.append(even, np.linspace(self.plan.end, self._last, self._count(self._last - self.plan.end))[1:])
+        edges, spacing = self._edges, float(even[1] - even[0])
+        apart = np.abs(even - edges[np.searchsorted(0.5 * (edges[1:] + edges[:-1]), even)])
+        aside = _ASIDE * self.plan.duration
+        both = np.concatenate([edges[1:] - aside, edges[edges < self._last] + aside])
+        return self._run(np.union1d(even[apart > 0.05 * spacing], np.append(both, [self.plan.start, self._last])))
+
+    @property
+    def _pieces(self) -> list[tuple[float, float]]:
+        """Intervals without jumps."""
+        aside = _ASIDE * self.plan.duration
+        ends = np.unique(np.append(self._edges[self._edges < self._last], self._last)).tolist()
+        return [(left + aside, right - aside) for left, right in pairwise(ends)]
+
+    def _count(self, length: float) -> int:
+        """Number of samples of an interval [s]."""
+        return min(8 + math.ceil(_SAMPLES * length / self.plan.duration), _LONG * _SAMPLES)
 
     def _run(self, times: Array) -> tuple[Array, Array]:
         """Signals (nsignals, ntime) at times, the start included if there are fewer than two."""
         start = self.plan.start
         wanted = times if times[0] <= start and times.size > 1 else np.union1d(times, [start, self._last])
         inputs = self._inputs if self._prepared.ninputs else None
-        response = simulate(self._prepared, wanted, inputs, self._start, rtol=_RTOL, events=())
+        response = simulate(self._prepared, wanted, inputs, self._start, rtol=self._rtol, events=())
         return response.t, self._signals(response.y, self._inputs.jet(response.t, 0)[0])
 
     def _signals(self, outputs: Array, inputs: Array) -> Array:
@@ -263,25 +290,25 @@ class SimulatedResponse(LoopResponse):
 
     def _rate(self, weights: Mapping[str, float]) -> tuple[Array, Array]:
         """Times and time derivative of a sum of signals; of a held one the change over the period."""
-        period = self._period_of(weights)
-        if period is not None:
-            times, row = self._samples[0], self._sum(weights, self._samples[1])
-            count = math.ceil((self._last - self.plan.start) / period - 1e-9)
-            instants = self.plan.start + self._offset_of(weights) + period * np.arange(count)
-            at = np.minimum(np.searchsorted(times, instants - 1e-6 * period), times.size - 1)
-            return times[at[1:]], np.diff(row[at]) / period
         times, row = self._samples[0], self._sum(weights, self._samples[1])
-        at = np.searchsorted(times, self._edges[1:])
+        if self._prepared.is_discrete:
+            return times[1:], np.diff(row) / float(self._prepared.dt)
+        held = set(self._held_blocks(weights))
+        if len(held) == 1:
+            ((period, offset),) = held
+            instants = np.arange(self.plan.start + offset, self._last, period)
+            at = np.searchsorted(times, instants + 0.5 * _ASIDE * self.plan.duration)
+            return instants[1:], np.diff(row[at]) / period
+        inner = self._edges[(self._edges > self.plan.start) & (self._edges < self._last)]
+        at = np.searchsorted(times, inner)
         jumps = row[at] - row[at - 1]
         if at.size and np.abs(jumps).max() > 1e-6 * np.ptp(row):
             k = int(np.abs(jumps).argmax())
             raise ValueError(
                 f"a signal with a limited rate must be continuous, got {' + '.join(weights)} that jumps by "
-                f"{jumps[k]:.4g} at {self._edges[1 + k]:.6g} s"
+                f"{jumps[k]:.4g} at {inner[k]:.6g} s"
             )
-        grids = []
-        for left, right in pairwise(np.unique([*self._edges.tolist(), self._last]).tolist()):
-            grids.append(np.linspace(left, right, 8 + math.ceil(_SAMPLES * (right - left) / self.plan.duration)))
+        grids = [np.linspace(left, right, self._count(right - left)) for left, right in self._pieces]
         fine, values = self._run(np.unique(np.concatenate(grids)))
         row = self._sum(weights, values)
         slopes = [
@@ -307,16 +334,6 @@ class SimulatedResponse(LoopResponse):
                 return []
         return found
 
-    def _period_of(self, weights: Mapping[str, float]) -> float | None:
-        """Sampling period of a held sum of signals; None for a continuous one."""
-        if self._prepared.is_discrete:
-            return float(self._prepared.dt)
-        found = set(self._held_blocks(weights))
-        return next(iter(found))[0] if len(found) == 1 else None
-
-    def _offset_of(self, weights: Mapping[str, float]) -> float:
-        return 0.0 if self._prepared.is_discrete else self._held_blocks(weights)[0][1]
-
     def _rms(self, weights: Mapping[str, float], first: float, last: float) -> float:
         """Root of the mean square between two times, with the last value after the simulation."""
         times, row = self._samples[0], self._sum(weights, self._samples[1])
@@ -324,13 +341,18 @@ class SimulatedResponse(LoopResponse):
             dt = float(self._prepared.dt)
             held = row[times < last - 1e-9 * dt]
             return float(np.sqrt(np.mean(held[: max(1, round((last - first) / dt))] ** 2)))
-        end = min(last, self._last)
-        total = 0.0
-        for left, right in pairwise(np.unique([first, *self._edges[self._edges < end].tolist(), end]).tolist()):
-            inside = (times >= left) & (times < right)
-            t = np.append(times[inside], right)
-            at_end = row[np.flatnonzero(inside)[-1]] if right in self._edges else np.interp(right, times, row)
-            total += _integral(t, np.append(row[inside], at_end) ** 2)
+        end, total = min(last, self._last), 0.0
+        for left, right in self._pieces:
+            left, right = max(left, first), min(right, end)
+            if left >= right:
+                continue
+            inside = (times > left) & (times < right)
+            own = (times >= left - 1e-12 * self.plan.duration) & (times <= right + 1e-12 * self.plan.duration)
+            known = np.interp([left, right], times, row)
+            if np.count_nonzero(own) > 3:
+                known = CubicSpline(times[own], row[own])([left, right])
+            t = np.concatenate([[left], times[inside], [right]])
+            total += _integral(t, np.concatenate([known[:1], row[inside], known[1:]]) ** 2)
         total += max(0.0, last - end) * row[-1] ** 2
         return math.sqrt(total / (last - first))
 
@@ -416,30 +438,31 @@ def _check_sources(prepared: Prepared, plan: Trajectory) -> None:
 
 def _near_peak(times: Array, values: Array, inside: NDArray[np.bool_]) -> Array:
     """Times between the neighbours of samples near which the maximum may lie."""
-    padded = np.concatenate([values[:1], np.where(inside, values, -np.inf), values[-1:]])
-    here, left, right = padded[1:-1], padded[:-2], padded[2:]
+    here = np.where(inside, values, values[inside].min() if inside.any() else 0.0)
+    padded = np.concatenate([here[:1], here, here[-1:]])
+    left, right = padded[:-2], padded[2:]
     local = np.flatnonzero(inside & (here >= left) & (here >= right))
     if not local.size:
         return np.empty(0)
-    steps = np.where(np.isfinite(left), here - left, 0.0) + np.where(np.isfinite(right), here - right, 0.0)
+    steps = 2.0 * here - left - right
     likely = local[here[local] + steps[local] >= here[local].max()]
     likely = likely[np.argsort(-here[likely])[:_MOST]]
     spans = [(times[max(k - 1, 0)], times[min(k + 1, times.size - 1)]) for k in likely.tolist()]
     return np.concatenate([np.linspace(low, high, _FINE) for low, high in spans])
 
 
-def _peak(times: Array, values: Array) -> tuple[float, float]:
-    """Maximum and its time, by a parabola through three samples where these are evenly spaced."""
+def _peak(times: Array, values: Array, smooth: bool) -> tuple[float, float]:
+    """Maximum and its time; of a smooth signal by a parabola through three evenly spaced samples."""
     k = int(values.argmax())
     best, at = float(values[k]), float(times[k])
-    if 0 < k < values.size - 1:
+    if smooth and 0 < k < values.size - 1:
         before, after = times[k] - times[k - 1], times[k + 1] - times[k]
         left, right = values[k] - values[k - 1], values[k] - values[k + 1]
         if abs(before - after) <= 1e-6 * before and left + right > 0.0 and min(left, right) >= 0.0:
             shift = 0.5 * (left - right) / (left + right)
             # A kink is no parabola: its neighbours fall by different amounts.
             if abs(left - right) <= 0.9 * (left + right):
-                best, at = best + 0.125 * (left - right) ** 2 / (left + right), at + float(shift * before)
+                best, at = best + float(0.125 * (left - right) ** 2 / (left + right)), at + float(shift * before)
     return best, at
 
 

@@ -162,10 +162,11 @@ def derivative_limits(plan: Trajectory, limits: Mapping[str, object]) -> Limits:
     found = np.full((3, plan.naxes), np.inf)
     known = {name: limit for name, limit in limits.items() if name in _names(plan)}
     for bound in Limited(plan, known).bounds if known else ():
-        if bound.axis is not None:
+        if bound.axis is not None and bound.is_constant and bound.order <= len(found):
             # If only one sign is permitted, the limit of that sign.
             sides = [side for side in (bound.high, -bound.low) if side > 0.0]
-            found[bound.order - 1, bound.axis] = min(sides, default=np.inf)
+            before = found[bound.order - 1, bound.axis]
+            found[bound.order - 1, bound.axis] = min(sides, default=before)
     return found[0], found[1], found[2]
 
 

@@ -18,10 +18,9 @@ from types import FrameType
 from typing import Any, Generic, Protocol, TypeVar
 from uuid import uuid4
 
-from tqdm import tqdm
-
 from ctrlplan._lru import Lru
 from ctrlplan.simulation.budget import time_limit
+from ctrlplan.studies.progress import bar
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -197,7 +196,7 @@ def gathered(
         Whether a progress bar is shown on stderr.
     """
     account: Account[R] = Account()
-    with _counting_interruptions() as pressed, _bar(count, label, progress) as advance:
+    with _counting_interruptions() as pressed, bar(count, label, progress) as advance:
         try:
             for k, outcome in outcomes:
                 account.found[k] = outcome
@@ -258,7 +257,7 @@ def executed(
     account: Account[R] = Account()
     futures: dict[int, Future[R | Failed]] = {}
     try:
-        with _counting_interruptions() as pressed, _bar(len(tasks), label, progress) as advance:
+        with _counting_interruptions() as pressed, bar(len(tasks), label, progress) as advance:
             try:
                 rejected = _submit(partial(tried, run, timeout=timeout), tasks, executor, futures)
                 for k, outcome in _completed(futures):
@@ -357,15 +356,6 @@ def _counting_interruptions() -> Iterator[Sequence[int]]:
 def _raise_if_pressed() -> None:
     if _PRESSED.get():
         raise KeyboardInterrupt
-
-
-@contextmanager
-def _bar(count: int, label: str, progress: bool) -> Iterator[Callable[[], object]]:
-    bar = tqdm(total=count, desc=label, disable=not progress, leave=False)
-    try:
-        yield bar.update
-    finally:
-        bar.close()
 
 
 def _submit(

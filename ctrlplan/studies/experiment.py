@@ -19,8 +19,8 @@ from ctrlplan.studies.alike import Linear, numbers_of, outputs_together
 from ctrlplan.studies.measures import (
     Chosen,
     Measure,
-    Record,
     Run,
+    SignalRecord,
     checked_measures,
     move_end,
     path_metrics,
@@ -29,6 +29,7 @@ from ctrlplan.studies.measures import (
     wanted_measures,
 )
 from ctrlplan.studies.plans import references_of, waypoints_given
+from ctrlplan.studies.progress import each_plan
 from ctrlplan.studies.running import Builder, System, check_has_inputs, is_builder, run_plan
 from ctrlplan.trajectories import Trajectory, Waypoint
 
@@ -313,7 +314,7 @@ class Experiment(Displayed):
         found: list[Metrics] = [{} for _ in alike]
         for name, plan in self.plans.items():
             y, u = np.split(signals.pop(name), [len(tracked)], axis=1)
-            record = Record(self.timepts, y, u, self.axes, acting, unstable)
+            record = SignalRecord(self.timepts, y, u, self.axes, acting, unstable)
             values = signal_metrics(record, plan, self.since, self.band, wanted)
             of_path = path_metrics(plan, self.waypoints, wanted)
             for i, metrics in enumerate(found):
@@ -343,7 +344,7 @@ class Experiment(Displayed):
         if np.count_nonzero(run.t >= self.since) >= 2:  # otherwise it ended before the interval of the metrics
             unstable = np.array([run.is_unstable])
             y, u = run.rows(run.outputs)[None], run.rows(run.controls)[None]
-            record = Record(run.t, y, u, axes, run.controls, unstable)
+            record = SignalRecord(run.t, y, u, axes, run.controls, unstable)
             plan = run.plan if axes == run.plan.labels or not axes else run.plan.select(axes)
             found = signal_metrics(record, plan, self.since, self.band, wanted)
             for kind, held, every in (("response", axes, self.axes), ("control", run.controls, controls)):
@@ -369,7 +370,7 @@ def _each(
     """Results by plan, and reasons of failures; if all fail, the first exception is raised."""
     results: dict[str, tuple[Run, dict[str, float]]] = {}
     errors: dict[str, Exception] = {}
-    for name in names:
+    for name in each_plan(names):
         try:
             results[name] = measured(name)
         except Exception as error:  # of the loop with this plan

@@ -32,6 +32,9 @@ Align: TypeAlias = Literal["auto"] | str | float | None
 """How a log is aligned with its plan."""
 
 _SUFFIXES = ("_ref", "_cmd", "_set", "_d", "_des")
+_UNLIKE = 0.2
+"""Difference of a command from the plan, relative to its range, from which it is not that of the plan."""
+
 _COMMANDS = ("r", "r_cmd", "ref", "reference", "cmd", "command", "setpoint")
 """Names of a command in a log: a label with a suffix, or for one axis one of these."""
 
@@ -56,6 +59,9 @@ class MeasuredRun:
         What these signals are.
     compared : str
         What they were compared with: "the plan" or "the simulated one".
+    residual : float
+        Root mean square of the differences that remain after alignment, relative
+        to the range of the signals; 0 if the offset was given.
     resampling : str
         How the log was resampled, in a sentence.
     left_out : tuple of str
@@ -71,6 +77,7 @@ class MeasuredRun:
     signals: tuple[str, ...]
     by: str
     compared: str
+    residual: float
     resampling: str
     left_out: tuple[str, ...] = ()
     failures: dict[str, str] = field(default_factory=dict)
@@ -89,11 +96,14 @@ class MeasuredRun:
         if self.by == "given":
             yield f"its time is {abs(self.offset):.6g} s {self._order} than that of the plan, as given"
         else:
-            size, error = 1e3 * abs(self.offset), 1e3 * self.standard_error
-            digits = min(max(1 - math.floor(math.log10(error)), 0), 4)
+            error = max(1e3 * self.standard_error, 1e-4)
+            digits = max(1 - math.floor(math.log10(error)), 0)
+            size = f"{1e3 * abs(self.offset):.{digits}f} ± {error:.2g} ms (standard error)"
+            rms = max(100.0 * self.residual, 1e-3)
             yield (
-                f"its time is {size:.{digits}f} ± {error:.2g} ms (standard error) {self._order} than that of "
-                f"the plan, found from the {self.by} {', '.join(self.signals)} compared with {self.compared}"
+                f"its time is {size} {self._order} than that of the plan, found from the {self.by} "
+                f"{', '.join(self.signals)} compared with {self.compared} (the rms of the difference is then {rms:.2g} "
+                "% of the range)"
             )
         if self.by in ("output", "control"):
             yield f"offset and plant delay cannot be told apart by the {self.by}; log the command to separate them"
@@ -170,6 +180,7 @@ class _Alongside:
             names,
             by,
             compared,
+            offset.residual,
             where,
             self.left_out,
             failures,
@@ -213,6 +224,12 @@ class _Alongside:
             raise ValueError(
                 f"logs[{self.plan!r}] must contain the move of the plan for its offset to be found, but "
                 f"{', '.join(names)} is constant or does not follow it; give align= in seconds, or None"
+            )
+        if by == "command" and offset.residual > _UNLIKE:
+            raise ValueError(
+                f"command {', '.join(names)} of logs[{self.plan!r}] must follow the plan, got an rms difference of "
+                f"{100.0 * offset.residual:.2g} % of its range; give its units= to read_log, the name of another "
+                "signal by align=, or the offset in seconds"
             )
         simulated = any(isinstance(pair.known, OfSamples) for pair in pairs.values())
         return offset, by, names, "the simulated one" if simulated else "the plan"
@@ -297,7 +314,7 @@ class _Alongside:
             inside = (k >= 0) & (k < common.size)
             apart[inside] = np.minimum(apart[inside], np.abs(own - np.take(common, k, mode="clip"))[inside])
         where = (
-            f"measured: {own.size} of {self.t.size} samples, every {1e3 * step:.4g} ms, and linear interpolation at "
+            f"resampled: {own.size} of {self.t.size} samples, every {1e3 * step:.4g} ms, and linear interpolation at "
             f"the {common.size} times of the simulation from {first:.6g} to {last:.6g} s"
         )
         if first > given[0] or last < given[-1]:

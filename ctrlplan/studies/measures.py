@@ -445,7 +445,7 @@ def signals_of(response: ct.TimeResponseData) -> dict[str, Array]:
 
 
 @dataclass(frozen=True)
-class Record:
+class SignalRecord:
     """Signals of one loop with a plan, or of several loops.
 
     Attributes
@@ -469,7 +469,7 @@ class Record:
 
 
 def signal_metrics(
-    record: Record, plan: Trajectory, start: float, band: float, measures: Mapping[str, Measure]
+    record: SignalRecord, plan: Trajectory, start: float, band: float, measures: Mapping[str, Measure]
 ) -> dict[str, Array]:
     """Metrics of responses and controls.
 
@@ -478,7 +478,7 @@ def signal_metrics(
 
     Parameters
     ----------
-    record : Record
+    record : SignalRecord
         The signals.
     plan : Trajectory
         Reference of the outputs.

@@ -405,7 +405,7 @@ class _Data:
         jet = motion.jet(t)
         speed, acceleration = (float(np.max(np.abs(row))) for row in jet[1:3])
         if not speed > 0.0:
-            raise ValueError("log must contain a motion, got none; with a plan, align the log with it: with_measured")
+            raise ValueError("log must contain a motion, got none; align it with the plan, as with_measured does")
         self.threshold = _THRESHOLD * speed
         self.longest = min(_LONGEST_DELAY, 0.1 * float(t[-1] - t[0]))
         self._dt = float(np.median(np.diff(t)))
@@ -492,13 +492,19 @@ class _Data:
 
     @property
     def _minimum(self) -> int:
-        return 10 * (len(self._names) + 1)
+        """Minimum number of samples; filtered ones are independent of each other."""
+        return (3 if isinstance(self._motion, SampledMotion) else 10) * (len(self._names) + 1)
 
     def _too_short(self) -> ValueError:
-        return ValueError(
-            f"log must have at least {self._minimum} samples with a speed above {self.threshold:.4g}, which is 2 % of "
-            "its peak, got fewer; with a plan, align the log with it: with_measured"
+        must = (
+            f"log must have at least {self._minimum} samples with a speed above {self.threshold:.4g}, 2 % of its peak"
         )
+        if isinstance(self._motion, SampledMotion):
+            return ValueError(
+                f"{must}, got fewer at the rate of the low-pass filter of {self._motion.cutoff:.3g} Hz that the noise "
+                "of the position requires; give a plan, whose derivatives have no noise, or a longer log"
+            )
+        return ValueError(f"{must}, got fewer; align the log with the plan, as with_measured does")
 
 
 # Notes

@@ -108,9 +108,10 @@ def _cutoff(position: Array, rate: float, order: int) -> float:
     deviation = float(np.sqrt(np.mean(steps**2) / 70.0))  # 1, 4, 6, 4, 1 squared
     frequencies = np.geomspace(max(2.0 * rate / position.size, 1e-3 * rate), 0.2 * rate, 32)[::-1]
     for cutoff in frequencies.tolist():
-        filtered = _low_passed(position, cutoff, rate)
-        derivative = make_interp_spline(np.arange(position.size) / rate, filtered, k=5).derivative(order)
-        power = float(np.var(derivative(np.arange(position.size) / rate)))
+        derivative = _low_passed(position, cutoff, rate)
+        for _ in range(order):
+            derivative = np.gradient(derivative, 1.0 / rate)
+        power = float(np.var(derivative))
         noise = deviation**2 * (2.0 / rate) * (2.0 * np.pi * cutoff) ** (2 * order) * cutoff / (2 * order + 1)
         if noise <= _NOISE * power:
             return cutoff

@@ -13,7 +13,6 @@ from ctrlplan._types import Array, Params, Value
 from ctrlplan.systems.hybrid import SampledBlock
 from ctrlplan.traits import declare
 from ctrlplan.trajectories import Shaper, ShaperFactor
-from ctrlplan.trajectories.shaper_factor import replaced_delay
 
 _SLOWEST = 0.5
 """Lowest frequency of a measured mode, relative to that of the design: it bounds the memory of the block."""
@@ -232,6 +231,5 @@ def _delayed(factor: ShaperFactor, frequency: Array, phase: Array, weights: Arra
         places = np.array([lag, k, k + 1])
         # A change of velocity excites a sway proportional to the root of 1/frequency at its time.
         amplitudes = np.sqrt(frequency[places[1:]] / frequency[lag])
-        taps = replaced_delay(factor.growth * (phase[places[1:]] - phase[lag]), factor.target, amplitudes)
-        np.add.at(following, places, weights[lag] * taps)
+        np.add.at(following, places, weights[lag] * factor.taps(phase[places[1:]] - phase[lag], amplitudes))
     return following

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from itertools import pairwise
 from typing import Any, Literal
 
 import numpy as np
@@ -18,6 +19,7 @@ from ctrlplan.trajectories.common import Array
 from ctrlplan.trajectories.cycle import knots_of, moved
 from ctrlplan.trajectories.trajectory import Trajectory
 from ctrlplan.trajectories.waypoint import Waypoint
+from ctrlplan.trajectories.waypoint_spline import WaypointSpline
 
 
 def chosen_alpha(
@@ -46,7 +48,7 @@ def checked_alpha(alpha: float | str) -> float:
 def on_cycle(plan: Trajectory, dt: float, limits: Mapping[str, object] | None = None) -> Trajectory:
     """Plan whose duration and waypoints are on a cycle; as `Trajectory.on_cycle`."""
     dt = checked_finite(dt, "dt", above=0.0)
-    if isinstance(plan, Joined):
+    if isinstance(plan, Joined) and not _joined_in_motion(plan):
         parts: list[Trajectory] = []
         for k, part in enumerate(plan.parts):
             try:
@@ -67,6 +69,16 @@ def on_cycle(plan: Trajectory, dt: float, limits: Mapping[str, object] | None = 
     from ctrlplan.planning.cycle import lengthened
 
     return lengthened(plan, dt, counts, limits)
+
+
+def _joined_in_motion(plan: Joined) -> bool:
+    """Whether parts join in motion of which one has no waypoints: retimed apart, their velocities would differ."""
+    for before, after in pairwise(plan.parts):
+        if not (isinstance(before, WaypointSpline) and isinstance(after, WaypointSpline)) and before.duration:
+            velocity = before.jet(before.end, 1, left=True)[1]
+            if (np.abs(velocity) > 1e-9 * before.peak(1)).any():
+                return True
+    return False
 
 
 def stopped(plan: Trajectory, time: float, limits: Mapping[str, object], synchronize: Any) -> Trajectory:

@@ -10,6 +10,7 @@ from typing import Any, Self
 import numpy as np
 
 from ctrlplan._checks import checked_finite, checked_labels, default_labels
+from ctrlplan._display import counted
 from ctrlplan._types import Data, Value
 from ctrlplan.trajectories.common import Array, readonly
 from ctrlplan.trajectories.files import trajectory_from_dict
@@ -126,6 +127,10 @@ class Sum(_Combined):
         self._set_fields(shaped=shaped)
         self._set(terms, terms[0].labels)
 
+    def _facts(self) -> list[tuple[str, str]]:
+        shaper = [("input shaper", counted(len(self.parts), "impulse"))] if self.shaped else []
+        return [*super()._facts(), *shaper]
+
     def to_dict(self) -> Data:
         """Plain data that `trajectory_from_dict` reads."""
         return super().to_dict() | ({"shaped": True} if self.shaped else {})
@@ -140,7 +145,8 @@ class Sum(_Combined):
         if self.shaped and not is_unit_rate(rate):
             raise ValueError(
                 f"a shaped plan must keep its duration of {self.duration:g} s, got {self.duration / rate:g} s: the "
-                f"delays of the shaper would change with it; retime the plan first, then shape it"
+                f"delays of the shaper would change with it; retime the plan first, then shape it, for the cycle of a "
+                "controller by shaper.on_grid(dt)"
             )
         return super().map_time(origin, target, rate)._with_fields(shaped=self.shaped)
 

@@ -37,6 +37,9 @@ _SINGULAR = 1e13
 _UNEVEN = 1e3
 """Ratio of durations, to the power of the number of orders, above which rounding of the entries matters."""
 
+_SUSPECT = 1e8
+"""Condition number above which equations may not determine the entries."""
+
 SHORT = 0.02
 """Duration relative to the longest segment below which entries and coefficients are computed with more digits."""
 
@@ -116,15 +119,27 @@ class FreeEntries:
         waypoint.
     given : ndarray of bool, shape (nwaypoints, size)
         Prescribed entries by order.
+    natural : bool, optional
+        Whether the free entries of both ends are unknown as well, with conjugate
+        derivatives of 0; otherwise they lower the degree of the first and last
+        segment.
     """
 
-    def __init__(self, alpha: float, times: Array, period: float | None, given: NDArray[np.bool_]) -> None:
+    def __init__(
+        self,
+        alpha: float,
+        times: Array,
+        period: float | None,
+        given: NDArray[np.bool_],
+        natural: bool = False,
+    ) -> None:
         self._alpha, self._times, self._period, self._given = alpha, times, period, given
+        self._open = period is None and not natural
         self._moments = np.append(times, [] if period is None else times[0] + period)
         self._count, self._size = given.shape
-        self.kinds = kinds_of(given, period is not None)
+        self.kinds = kinds_of(np.ones_like(given) if natural else given, period is not None)
         free = ~given
-        if period is None:
+        if self._open:
             free[[0, -1]] = False
         self._number = np.full(given.shape, -1, dtype=np.intp)  # of each unknown, in the order of the equations
         rank = np.argsort(_folded(self._count)) if period is not None else np.arange(self._count)
@@ -148,7 +163,7 @@ class FreeEntries:
         """
         ratio = float(self._durations.max() / self._durations.min())
         uneven = math.log(ratio) * self._size > math.log(_UNEVEN)
-        open_, few = self._period is None, self.nodes.size <= _DECIMALS
+        open_, few = self._open, self.nodes.size <= _DECIMALS
         if open_ and few and ratio * SHORT > 1.0:
             return self._decimal(table)
         equations = self._equations
@@ -156,15 +171,25 @@ class FreeEntries:
             extended = _EXTENDED and not self._alpha
             if equations.loss <= _ACCURATE and not (uneven and extended):
                 return self._checked(self._plain(equations, table))
-            if extended:
+            if extended and self._determined(equations):
                 found = self._refined(equations, table)
                 if found is not None:
                     return self._checked(found)
-            elif equations.loss <= _ACCEPTED and not (open_ and few):
+            elif not extended and equations.loss <= _ACCEPTED and not (open_ and few):
                 return self._checked(self._plain(equations, table))
         if open_:
             return self._decimal(table)
         raise ValueError("free entries at waypoints must be determined by the prescribed ones; prescribe more")
+
+    def _determined(self, equations: _Banded) -> bool:
+        """Whether the prescribed entries determine the free ones."""
+        even = self._even if equations.condition > _SUSPECT else equations
+        return even is None or even.condition <= _SINGULAR
+
+    @cached_property
+    def _even(self) -> _Banded | None:
+        """Equations for equal durations: whether entries are determined does not depend on the times."""
+        return self._assembled(np.ones_like(self._durations), np.ones(self._count))
 
     @cached_property
     def _equations(self) -> _Banded | None:
@@ -176,7 +201,7 @@ class FreeEntries:
         shifted = table.copy()
         shifted[:, 0] -= offset
         with np.errstate(all="ignore"):
-            found = equations.solve(-self._jumps(self._data(shifted), self._durations, self._units))
+            found = equations.solve(-self._jumps(self._data(shifted), self._terms))
             return self._restored(found, offset)
 
     def _refined(self, equations: _Banded, table: Array) -> NDArray[np.longdouble] | None:
@@ -187,10 +212,10 @@ class FreeEntries:
         shifted[:, 0] -= offset
         durations, units = np.diff(self._moments.astype(long)), self._units.astype(long)
         with np.errstate(all="ignore"):
-            data = self._data(shifted)
+            data, terms = self._data(shifted), self._terms_of(durations, units)
             found = np.zeros((self.nodes.size, table.shape[2]), dtype=long)
             for _ in range(_REFINEMENTS):
-                change = equations.solve(-self._jumps(data, durations, units).astype(float))
+                change = equations.solve(-self._jumps(data, terms).astype(float))
                 found += change
                 data[self.nodes, self.orders] = found
                 size = np.abs(found)
@@ -202,8 +227,7 @@ class FreeEntries:
 
     def _decimal(self, table: Array) -> NDArray[np.object_]:
         """Solution in decimal arithmetic."""
-        # Whether the data determine the entries does not depend on the times, which may be uneven.
-        even = self._assembled(np.ones_like(self._durations), np.ones(self._count))
+        even = self._even
         solution = None
         if even is None or even.condition <= _SINGULAR or self._alpha > NEARLY_CLOSED:
             ends = [kind.ends for kind in self.kinds for _ in range(kind.first, kind.last)]
@@ -233,12 +257,12 @@ class FreeEntries:
 
     def _data(self, table: NDArray[Any]) -> NDArray[Any]:
         """Prescribed entries in the units of the waypoints, 0 where free."""
-        powers = self._units.astype(table.dtype)[:, None] ** np.arange(self._size)
-        return np.asarray(np.where(self._given[:, :, None], table, 0.0) * powers[:, :, None])
+        powers = _powers(self._units.astype(table.dtype), self._size - 1)
+        return np.asarray(np.where(self._given[:, :, None], table, 0.0) * powers.T[:, :, None])
 
     def _restored(self, found: NDArray[Any], offset: Array) -> NDArray[Any]:
         """Entries from those in the units of the waypoints."""
-        entries = found / (self._units.astype(found.dtype)[self.nodes] ** self.orders)[:, None]
+        entries = found / _powers(self._units.astype(found.dtype), self._size - 1)[self.orders, self.nodes, None]
         entries[self.orders == 0] += offset
         return np.asarray(entries)
 
@@ -250,25 +274,34 @@ class FreeEntries:
         weights = segment_weights(self._alpha, kind.ends, self._size)[:, conjugate] / np.abs(own)[:, None]
         return np.asarray(weights * np.array([1.0, -1.0])[:, None, None], dtype=dtype)
 
+    @cached_property
+    def _terms(self) -> list[tuple[NDArray[Any], ...]]:
+        """Weights and factors of each kind of segment."""
+        with np.errstate(all="ignore"):
+            return self._terms_of(self._durations, self._units)
+
+    def _terms_of(self, durations: NDArray[Any], units: NDArray[Any]) -> list[tuple[NDArray[Any], ...]]:
+        return [(self._weights(kind, durations.dtype), *self._factors(kind, durations, units)) for kind in self.kinds]
+
     def _factors(self, kind: Kind, durations: NDArray[Any], units: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
         """Factors of rows (2, nrows, nsegments) and entries (nentries, nsegments): jumps are in units of waypoints."""
         h = durations[kind.segments]
         at = np.stack([units[end] for end in self._ends_of(kind)])
         conjugate = 2 * self._size - 1 - self._free_orders
-        return (at / h)[:, None] ** conjugate[:, None], (h / at)[kind.sides] ** kind.orders[:, None]
+        rows, columns = _powers(at / h, 2 * self._size - 1), _powers(h / at, self._size - 1)
+        return rows[conjugate].swapaxes(0, 1), columns[kind.orders, kind.sides]
 
     def _ends_of(self, kind: Kind) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Waypoints at both ends of the segments of a kind."""
         first = np.arange(kind.first, kind.last)
         return first, (first + 1) % self._count
 
-    def _jumps(self, data: NDArray[Any], durations: NDArray[Any], units: NDArray[Any]) -> NDArray[Any]:
+    def _jumps(self, data: NDArray[Any], terms_of: list[tuple[NDArray[Any], ...]]) -> NDArray[Any]:
         """Jumps (nfree, naxes) of the conjugate derivatives of piecewise functions with given entries."""
         naxes = data.shape[2]
         jumps = np.zeros((self._free_orders.size, self._count, naxes), dtype=data.dtype)
-        for kind in self.kinds:
+        for kind, (weights, rows, columns) in zip(self.kinds, terms_of, strict=True):
             ends = self._ends_of(kind)
-            rows, columns = self._factors(kind, durations, units)
             entries = np.stack([data[ends[side], k] for side, k in zip(kind.sides, kind.orders, strict=True)])
             # Positions relative to the start of each segment, whose functions include the constants.
             places = np.flatnonzero(kind.orders == 0)
@@ -276,7 +309,6 @@ class FreeEntries:
                 entries[places[1]] -= entries[places[0]]
                 entries[places[0]] = 0.0
             entries *= columns[..., None]
-            weights = self._weights(kind, data.dtype)
             terms = weights.reshape(-1, len(entries)) @ entries.reshape(len(entries), -1)
             terms = terms.reshape(2, -1, len(ends[0]), naxes) * rows[..., None]
             jumps[:, ends[0]] += terms[0]
@@ -286,11 +318,10 @@ class FreeEntries:
     def _assembled(self, durations: Array, units: Array) -> _Banded | None:
         """Band matrix of the equations, factorised; None on overflow."""
         found: list[tuple[Array, ...]] = []
-        for kind in self.kinds:
+        with np.errstate(all="ignore"):
+            terms = self._terms if durations is self._durations else self._terms_of(durations, units)
+        for kind, (weights, rows, columns) in zip(self.kinds, terms, strict=True):
             ends = self._ends_of(kind)
-            with np.errstate(all="ignore"):
-                rows, columns = self._factors(kind, durations, units)
-            weights = self._weights(kind, float)
             number = [self._number[end[:, None], self._free_orders].T for end in ends]
             for side, r in itertools.product((0, 1), range(self._free_orders.size)):
                 for entry, (other, order) in enumerate(zip(kind.sides, kind.orders, strict=True)):
@@ -412,6 +443,14 @@ def segment_system(alpha: float, ends: Ends) -> NewtonSystem:
 
 def _amplification(alpha: float, ends: Ends) -> float:
     return max(1.0, segment_system(alpha, ends).amplification)
+
+
+def _powers(base: NDArray[Any], highest: int) -> NDArray[Any]:
+    """Powers 0, ..., highest, along a new first axis."""
+    found = np.ones((highest + 1, *base.shape), dtype=base.dtype)
+    for k in range(highest):
+        np.multiply(found[k], base, out=found[k + 1])
+    return found
 
 
 def _folded(count: int) -> NDArray[np.intp]:

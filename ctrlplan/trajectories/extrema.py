@@ -24,6 +24,9 @@ TOLERANCE = 1e-9
 
 _SAMPLES = 8192  # minimum number of times at which such a function is evaluated
 
+_TOGETHER = 16
+"""Number of segments that are searched before bounds are compared again."""
+
 _MAX_PIECES = 20_000
 _CHUNK = 256  # pieces that are evaluated together
 _FIT = 32  # degree of an interpolant
@@ -89,15 +92,47 @@ def _derivative_extrema(plan: Trajectory, nu: int) -> Extrema:
     if nu == 0 or plan.breakpoints.size == 1:
         held = np.zeros((2, plan.naxes)) if nu else np.stack([plan.initial, plan.final])
         found.add(np.array([plan.start, plan.end]), held.T, (plan.start, plan.end))
-    for segment, (_, duration) in enumerate(_segments(plan)):
-
-        def jet(t: Array, order: int, segment: int = segment) -> Array:
-            return plan.segment_jet(segment, t, order)
-
-        t = stationary_times(jet, duration, nu)
-        times, ends = _placed(plan, segment, t)
-        found.add(times, jet(t, nu)[nu], ends)
+    bounds = plan.derivative_bounds(nu)
+    if bounds is None:
+        for segment in range(plan.breakpoints.size - 1):
+            _search(plan, nu, segment, found)
+    else:
+        _search_bounded(plan, nu, *bounds, found)
     return found.extrema()
+
+
+def _search(plan: Trajectory, nu: int, segment: int, found: _Candidates) -> Array:
+    """Add the candidates of a segment; return their values."""
+
+    def jet(t: Array, order: int) -> Array:
+        return plan.segment_jet(segment, t, order)
+
+    t = stationary_times(jet, float(plan.breakpoints[segment + 1] - plan.breakpoints[segment]), nu)
+    times, ends = _placed(plan, segment, t)
+    values = jet(t, nu)[nu]
+    found.add(times, values, ends)
+    return values
+
+
+def _search_bounded(plan: Trajectory, nu: int, low: Array, high: Array, found: _Candidates) -> None:
+    """Add candidates of the segments whose bounds (naxes, nsegments) exceed the extrema found so far."""
+    breakpoints = plan.breakpoints
+    sides = [plan.jet(breakpoints[:-1], nu)[nu], plan.jet(breakpoints[1:], nu, left=True)[nu]]
+    found.add_ends(np.append(breakpoints[:-1], breakpoints[1:]), np.concatenate(sides, axis=1))
+    least, largest = np.concatenate(sides, axis=1).min(axis=1), np.concatenate(sides, axis=1).max(axis=1)
+    waiting = np.ones(breakpoints.size - 1, dtype=bool)
+    while True:
+        size = np.maximum(np.maximum(np.abs(least), np.abs(largest)), _TINY)[:, None]
+        with np.errstate(over="ignore"):
+            beyond = np.maximum(high - largest[:, None], least[:, None] - low) / size
+        excess = beyond.max(axis=0)
+        rest = np.flatnonzero(waiting & (excess >= -2.0 * _ROUNDING))  # ties as well, of which the earliest counts
+        if not rest.size:
+            return
+        for segment in rest[np.argsort(-excess[rest], kind="stable")[:_TOGETHER]].tolist():
+            values = _search(plan, nu, segment, found)
+            least, largest = np.minimum(least, values.min(axis=1)), np.maximum(largest, values.max(axis=1))
+            waiting[segment] = False
 
 
 def stationary_times(jet: Callable[[Array, int], Array], duration: float, nu: int) -> Array:
@@ -397,6 +432,12 @@ class _Candidates:
         self.times.append(t)
         self.values.append(values)
         self.ends.append(np.where((t == ends[0]) | (t == ends[1]), 1.0, 0.0))
+
+    def add_ends(self, t: Array, values: Array) -> None:
+        """Add values (naxes, ntime) at ends of segments."""
+        self.times.append(t)
+        self.values.append(values)
+        self.ends.append(np.ones(t.size))
 
     def extrema(self) -> Extrema:
         t, values, ends = np.concatenate(self.times), np.concatenate(self.values, axis=1), np.concatenate(self.ends)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -25,6 +25,12 @@ _TOLERANCE = 1e-9
 
 _NEGLIGIBLE = 1e-13
 """Duration of a phase, as a fraction of the whole, that is a rounding error."""
+
+_RESOLUTION = 1e-5
+"""Excess that the rounding of times may cause, and that tighter limits compensate."""
+
+_TRIALS = 6
+"""Number of profiles with tighter limits that are tried if the rounding of late times exceeds the limits."""
 
 _LINE = 1e-12
 """Relative deviation from a straight line that is a rounding error."""
@@ -112,15 +118,54 @@ def fastest_motion(problem: Problem, time: float, synchronize: Synchronize | Non
     """
     for word in _unavoidable(problem):
         raise ValueError(word)
+    if (problem.start == problem.end).all():
+        raise ValueError(f"the end must differ from the start, got the state {problem.end.tolist()} at both")
+    words, used, share = "", problem, 0.0
+    for _ in range(_TRIALS):
+        phases = _phases_of(used, synchronize)
+        try:
+            found = profile_of_phases(time, phases, problem.start, problem.end, problem.labels)
+        except ValueError as reason:  # beyond what a correction of rounding errors allows
+            words = str(reason)
+            break
+        if found is None:
+            raise ValueError(
+                f"the end must differ from the start by a motion that times near {time:g} s resolve, got none"
+            )
+        excess, words = _excess(found, problem.ranges)
+        if excess <= _TOLERANCE:
+            return found
+        share = max(3.0 * excess, 4.0 * share)
+        used = _tightened(problem, share)
+    raise RuntimeError(
+        f"the profile must satisfy its limits, got {words}; use a time origin nearer to 0 than {time:g} s"
+    )
+
+
+def _phases_of(problem: Problem, synchronize: Synchronize | None) -> list[Phases]:
+    """Phases of all axes."""
     on_line = synchronize == "phase" and len(problem.labels) > 1
-    phases = _on_line(problem) if on_line else _apart(problem, synchronize)
-    found = profile_of_phases(time, phases, problem.start, problem.end, problem.labels)
-    if found is None:
-        raise ValueError(f"the end must differ from the start by a motion that times near {time:g} s resolve, got none")
-    excess, words = _excess(found, problem.ranges)
-    if excess > _TOLERANCE:
-        raise RuntimeError(f"the profile must satisfy its limits, got {words}; use a time origin nearer to 0")
-    return found
+    return _on_line(problem) if on_line else _apart(problem, synchronize)
+
+
+def _tightened(problem: Problem, share: float) -> Problem:
+    """Problem with slightly tighter limits, such that the rounding of times does not exceed the given ones."""
+    peaks = np.zeros((2, *problem.ranges.low.shape))
+    for states, sign in ((problem.start, 1.0), (problem.end, -1.0)):
+        for k, axis in np.ndindex(problem.order - 1, len(problem.labels)):
+            values = _peaks(states[1:, axis], sign, problem.ranges.high[-1, axis] * (1.0 - share))[k]
+            peaks[:, k, axis] = min(peaks[0, k, axis], *values), max(peaks[1, k, axis], *values)
+    tighter = (side * (1.0 - share) for side in problem.ranges)
+    low, high = (pick(side, peak) for pick, side, peak in zip((np.minimum, np.maximum), tighter, peaks, strict=True))
+    return replace(problem, ranges=Ranges(low, high))
+
+
+def _peaks(state: Array, sign: float, jerk: float) -> list[list[float]]:
+    """Velocities and accelerations that a state makes unavoidable, afterwards (sign 1) or before (-1)."""
+    if len(state) == 1:
+        return [state.tolist()]
+    velocity, acceleration = state.tolist()
+    return [[velocity, velocity + sign * acceleration * abs(acceleration) / (2.0 * jerk)], [acceleration]]
 
 
 def _unavoidable(problem: Problem) -> Iterator[str]:
@@ -129,16 +174,21 @@ def _unavoidable(problem: Problem) -> Iterator[str]:
     for name, states, sign in (("start", problem.start, 1.0), ("end", problem.end, -1.0)):
         for axis, label in enumerate(problem.labels):
             state = states[1:, axis]
-            peaks = [state[0]]
-            if problem.order == 3:
-                yield from _beyond(f"{name}_acceleration", label, state[1:], low[1, axis], high[1, axis], "")
-                peaks.append(state[0] + sign * state[1] * abs(state[1]) / (2.0 * high[2, axis]))
-            when = f" {'after' if sign > 0.0 else 'before'} the {name} with the maximum jerk" if state[1:].any() else ""
-            yield from _beyond(f"{name}_velocity", label, np.array(peaks), low[0, axis], high[0, axis], when)
+            peaks = _peaks(state, sign, float(high[-1, axis]))
+            for k in reversed(range(problem.order - 1)):
+                kind = ("velocity", "acceleration")[k]
+                when = (
+                    f" {'after' if sign > 0.0 else 'before'} the {name} with the maximum jerk"
+                    if state[1:].any()
+                    else ""
+                )
+                yield from _beyond(
+                    f"{name}_{kind}", label, peaks[k], float(low[k, axis]), float(high[k, axis]), "" if k else when
+                )
 
 
-def _beyond(name: str, label: str, values: Array, low: float, high: float, when: str) -> Iterator[str]:
-    worst = float(max(values, key=lambda value: max(value - high, low - value)))
+def _beyond(name: str, label: str, values: list[float], low: float, high: float, when: str) -> Iterator[str]:
+    worst = max(values, key=lambda value: max(value - high, low - value))
     excess = max(worst - high, low - worst)
     if excess > _LINE * (high - low):
         yield (
@@ -204,6 +254,8 @@ def _apart(problem: Problem, synchronize: Synchronize | None) -> list[Phases]:
 
 def _one_axis(problem: Problem) -> Phases:
     """Phases of one axis in minimum time."""
+    if (problem.start == problem.end).all():
+        return (), ()
     if not problem.is_rest_to_rest:
         return _shortest(problem)[0]
     change = float(problem.end[0, 0] - problem.start[0, 0])
@@ -239,9 +291,13 @@ def _shortest(problem: Problem) -> list[Phases]:
         except _UnsolvedError as reason:
             reasons.append(str(reason))
     for _, phases in sorted(found, key=lambda pair: pair[0]):
-        profile = profile_of_phases(0.0, phases, problem.start, problem.end, problem.labels)
+        try:
+            profile = profile_of_phases(0.0, phases, problem.start, problem.end, problem.labels)
+        except ValueError as reason:
+            reasons.append(str(reason))
+            continue
         excess, words = (0.0, "") if profile is None else _excess(profile, problem.ranges)
-        if excess <= _TOLERANCE:
+        if excess <= _RESOLUTION:
             return phases
         reasons.append(words)
     raise RuntimeError(f"ruckig must find a profile within the limits, got none: {'; '.join(dict.fromkeys(reasons))}")
@@ -339,7 +395,5 @@ def _excess(profile: MotionProfile, ranges: Ranges) -> tuple[float, str]:
         if excess[axis] > worst:
             name = ("velocity", "acceleration", "jerk")[nu - 1]
             worst = float(excess[axis])
-            words = (
-                f"a {name} of {profile.labels[axis]} beyond {low[axis]:g} to {high[axis]:g} by {100.0 * worst:.2g} %"
-            )
+            words = f"{name} of {profile.labels[axis]} beyond {low[axis]:g} to {high[axis]:g} by {100.0 * worst:.2g} %"
     return worst, words

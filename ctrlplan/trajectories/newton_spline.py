@@ -23,7 +23,7 @@ Kind = tuple[Given, float | None, bool]
 """Entries prescribed at each waypoint, gamma, and whether the ends coincide."""
 
 
-class Options(NamedTuple):
+class SplineOptions(NamedTuple):
     """Options of a spline in addition to its waypoints and alpha."""
 
     labels: Sequence[str] | None = None
@@ -52,7 +52,7 @@ class NewtonSpline(WaypointSpline):
     """
 
     alpha: float
-    _options: Options
+    _options: SplineOptions
     _times: list[float]
     _relative: Array
     _apart: Array | None
@@ -102,7 +102,7 @@ class NewtonSpline(WaypointSpline):
         self,
         waypoints: tuple[Waypoint, ...],
         alpha: float,
-        options: Options,
+        options: SplineOptions,
         donor: NewtonSpline | None = None,
     ) -> None:
         """Set all attributes; the factorised systems of a `donor` of the same pattern are reused."""
@@ -156,7 +156,7 @@ class NewtonSpline(WaypointSpline):
             _parts=parts,
         )
 
-    def _again(self, waypoints: tuple[Waypoint, ...], options: Options) -> Self:
+    def _again(self, waypoints: tuple[Waypoint, ...], options: SplineOptions) -> Self:
         """Plan of this kind through other waypoints; reuses the factorised systems."""
         plan = type(self).__new__(type(self))
         plan._fit(increasing(waypoints), self.alpha, options, self)

@@ -34,7 +34,7 @@ class Run(Fields):
         Collocation on the unit segment.
     first, last : int
         First segment, and the one after the last.
-    coefficients : ndarray, shape (size, nsegments, naxes)
+    coefficients : ndarray, shape (size, naxes, nsegments)
         Of the segments of this run.
     """
 
@@ -44,7 +44,7 @@ class Run(Fields):
     coefficients: Array
 
     def __init__(self, system: NewtonSystem, first: int, coefficients: Array) -> None:
-        last = first + coefficients.shape[1]
+        last = first + coefficients.shape[2]
         self._set_fields(system=system, first=first, last=last, coefficients=readonly(coefficients))
 
 
@@ -72,7 +72,7 @@ class Pieces(Fields):
     def of_segment(self, segment: int) -> tuple[NewtonSystem, Array]:
         """Newton form of a segment, and its coefficients (size, naxes)."""
         run = self.run(segment)
-        return run.system, run.coefficients[:, segment - run.first]
+        return run.system, np.asfortranarray(run.coefficients[:, :, segment - run.first])
 
     def jet(self, segment: int, u: Array, order: int) -> Array:
         """Derivatives (order + 1, naxes, ntime) by the relative time in a segment."""
@@ -100,6 +100,17 @@ class Pieces(Fields):
         system, coefficients = self.of_segment(segment)
         return system.jet_at(coefficients, u, order)
 
+    def derivative_bounds(self, nu: int) -> tuple[Array, Array]:
+        """Bounds (naxes, nsegments) of the nu-th derivative of polynomials by relative time."""
+        bounds = []
+        for run in self.runs:
+            matrix = _bernstein(run.system, nu)
+            values = np.tensordot(matrix, run.coefficients, 1)
+            rounding = 8.0 * np.finfo(float).eps * np.tensordot(np.abs(matrix), np.abs(run.coefficients), 1).max(axis=0)
+            bounds.append((values.min(axis=0) - rounding, values.max(axis=0) + rounding))
+        low, high = (np.concatenate(rows, axis=1) for rows in zip(*bounds, strict=True))
+        return low, high
+
     def at(self, segment: int, u: Value, order: int) -> list[list[Value]]:
         """Taylor series by axis at one relative time, a number or a symbol."""
         system, coefficients = self.of_segment(segment)
@@ -126,9 +137,10 @@ def fitted(
             if alpha > NEARLY_CLOSED or system.amplification > _AMPLIFIED:
                 found = _carefully_solved(system, kind, table.astype(float), data.astype(float), times)
             else:
-                found = system.coefficients_of(data.reshape(len(data), -1)).reshape(system.size, *data.shape[1:])
+                found = system.coefficients_of(data.reshape(len(data), -1))
+                found = np.ascontiguousarray(found).reshape(system.size, *data.shape[1:])
         if not np.isfinite(found.sum()) and not np.isfinite(found).all():
-            wrong = ~np.isfinite(found).all(axis=(0, 2))
+            wrong = ~np.isfinite(found).all(axis=(0, 1))
             raise ValueError(
                 "coefficients must stay within floating point, got an overflow from waypoint entries of up to "
                 f"{np.abs(table[kind.first : kind.last + 1]).max():g} over {durations[kind.segments][wrong][0]:g} s"
@@ -140,7 +152,7 @@ def fitted(
 
 
 def _taylor_data(system: NewtonSystem, kind: Kind, table: NDArray[Any], durations: NDArray[Any]) -> NDArray[Any]:
-    """Taylor data (nentries, nsegments, naxes) in relative time, in the order of a system."""
+    """Taylor data (nentries, naxes, nsegments) in relative time, in the order of a system."""
     count, powers = durations.size, [np.ones_like(durations)]
     with np.errstate(over="ignore", under="ignore"):
         while len(powers) <= system.order_index.max():
@@ -151,25 +163,42 @@ def _taylor_data(system: NewtonSystem, kind: Kind, table: NDArray[Any], duration
             f"powers of the duration must stay within floating point, got {wrong[0]:g} s to the power "
             f"{len(powers) - 1}; choose another unit of time"
         )
-    data = np.empty((system.order_index.size, count, table.shape[2]), dtype=durations.dtype)
+    factors = [power / factorial for power, factorial in zip(powers, FACTORIALS.tolist(), strict=False)]
+    rows = np.ascontiguousarray(table.transpose(1, 2, 0))  # operations along rows are faster
+    data = np.empty((system.order_index.size, table.shape[2], count), dtype=durations.dtype)
     for row, waypoint, order in zip(data, system.waypoint_index.tolist(), system.order_index.tolist(), strict=True):
         first = kind.first + waypoint
-        np.multiply(table[first : first + count, order], (powers[order] / FACTORIALS[order])[:, None], out=row)
+        np.multiply(rows[order, :, first : first + count], factors[order], out=row)
     return data
 
 
 def _carefully_solved(system: NewtonSystem, kind: Kind, table: Array, data: Array, times: Array) -> Array:
-    """Coefficients (size, nsegments, naxes), each segment with a check of the rounding errors."""
+    """Coefficients (size, naxes, nsegments), each segment with a check of the rounding errors."""
     found = []
     for k in range(kind.first, kind.last):
         values, moments = table[k + system.waypoint_index, system.order_index], times[k : k + 2].tolist()
-        found.append(system.fitted(values, moments, moments[1] - moments[0], data[:, k - kind.first]))
-    return np.stack(found, axis=1)
+        found.append(system.fitted(values, moments, moments[1] - moments[0], data[:, :, k - kind.first]))
+    return np.stack(found, axis=2)
+
+
+def _bernstein(system: NewtonSystem, nu: int) -> Array:
+    """Bernstein coefficients (degree + 1, size) on the unit segment of a derivative of the basis, a polynomial."""
+    order = system.size - 1
+    powers = system.taylor(np.zeros(1), order)[:, :, 0].T  # coefficient of each power
+    derived = powers[nu:] * (FACTORIALS[nu : order + 1] / FACTORIALS[: max(order + 1 - nu, 0)])[:, None]
+    degree = max(order - nu, 0)
+    if not len(derived):
+        return np.zeros((1, system.size))
+    shares = [
+        [math.comb(i, k) / math.comb(degree, k) if k <= i else 0.0 for k in range(degree + 1)]
+        for i in range(degree + 1)
+    ]
+    return np.array(shares) @ derived
 
 
 def _gathered(run: Run, segments: NDArray[np.intp], u: Array, order: int) -> Array:
     taylor = run.system.taylor(u, order)
-    return np.asarray(np.einsum("mkt,mta->kat", taylor, run.coefficients[:, segments - run.first]))
+    return np.asarray(np.einsum("mkt,mat->kat", taylor, run.coefficients[:, :, segments - run.first]))
 
 
 def _resolve(
@@ -187,7 +216,7 @@ def _resolve(
         if duration < SHORT * longest:
             digits = math.ceil(2 * decimals.shape[1] * math.log10(longest / duration))
             values = decimals[k + system.waypoint_index, system.order_index]
-            found[:, k - kind.first] = system.resolved(values, times[k : k + 2].tolist(), duration, digits)
+            found[:, :, k - kind.first] = system.resolved(values, times[k : k + 2].tolist(), duration, digits)
 
 
 def scales(durations: Array, order: int) -> Array:

@@ -162,6 +162,16 @@ class PiecewiseSpline(WaypointSpline):
         return plan
 
     @classmethod
+    def of_entries(
+        cls, entries: Entries, alpha: float = 0.0, labels: Sequence[str] | None = None, warn: bool = True
+    ) -> Self:
+        """Piecewise spline through checked entries."""
+        plan = cls.__new__(cls)
+        plan._fit(entries, alpha, labels, warn)
+        plan._check_swing()
+        return plan
+
+    @classmethod
     def cyclic(
         cls,
         waypoints: Iterable[Waypoint],
@@ -343,27 +353,29 @@ class PiecewiseSpline(WaypointSpline):
         if self._warn:
             if self._stays_near():
                 return
-            values = np.empty((self.naxes, self.breakpoints.size - 1, _WITHIN.size))
+            values = np.empty((self.naxes, _WITHIN.size, self.breakpoints.size - 1))
             for pieces in self._pieces:
                 for run in pieces.runs:
-                    functions = run.system.taylor(_WITHIN, 0)[:, 0]
-                    values[list(pieces.axes), run.first : run.last] = run.coefficients.transpose(2, 1, 0) @ functions
+                    functions, flat = run.system.taylor(_WITHIN, 0)[:, 0], run.coefficients.reshape(run.system.size, -1)
+                    found = (functions.T @ flat).reshape(_WITHIN.size, len(pieces.axes), -1)
+                    values[list(pieces.axes), :, run.first : run.last] = found.transpose(1, 0, 2)
             remedy = f"lower alpha from {self.alpha:.6g}" if self.alpha else "prescribe velocities at inner waypoints"
             table = self._entries.table
             warn_of_swing(values.reshape(self.naxes, -1), self._entries.times, table, self.end, self.labels, remedy)
 
     def _stays_near(self) -> bool:
         """Whether a bound of the coefficients excludes a swing: products of both distances are at most 1/4."""
-        positions = self._entries.table[:, 0]
+        positions = np.ascontiguousarray(self._entries.table[:, 0].T)  # extrema of long rows are faster
         with np.errstate(over="ignore", invalid="ignore"):
-            allowed = (MAXIMUM_SWING - 1.0) * (positions.max(axis=0) - positions.min(axis=0))
+            allowed = (MAXIMUM_SWING - 1.0) * (positions.max(axis=1) - positions.min(axis=1))
             for pieces in self._pieces if not self.alpha else ():
                 reach = np.zeros(len(pieces.axes))
-                for run in pieces.runs:
-                    weights = 0.25 ** (np.arange(run.system.size) // 2)
-                    own = np.tensordot(weights[2:], np.abs(run.coefficients[2:]), 1)
-                    reach = np.maximum(reach, 2.0 * own.max(axis=0, initial=0.0))
-                if not (run.system.hermite and (reach <= allowed[list(pieces.axes)]).all()):
+                for run in (run for run in pieces.runs if run.system.size > 2):
+                    weights = 0.25 ** (np.arange(2, run.system.size) // 2)
+                    sizes = np.abs(run.coefficients[2:]).reshape(weights.size, -1)
+                    own = (weights @ sizes).reshape(reach.size, -1)
+                    reach = np.maximum(reach, 2.0 * own.max(axis=1))
+                if not (all(run.system.hermite for run in pieces.runs) and (reach <= allowed[list(pieces.axes)]).all()):
                     return False
         return not self.alpha
 
@@ -429,6 +441,18 @@ class PiecewiseSpline(WaypointSpline):
     def _durations(self) -> Array:
         return readonly(np.diff(self.breakpoints))
 
+    def derivative_bounds(self, nu: int) -> tuple[Array, Array] | None:
+        """Bounds of a derivative on each segment; as `Trajectory.derivative_bounds`."""
+        if self.alpha or self.breakpoints.size <= _FEW:
+            return None
+        low, high = np.empty((2, self.naxes, self.breakpoints.size - 1))
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore", under="ignore"):
+            scale = self._durations**-nu
+            for pieces in self._pieces:
+                own = pieces.derivative_bounds(nu)
+                low[list(pieces.axes)], high[list(pieces.axes)] = own[0] * scale, own[1] * scale
+        return (low, high) if np.isfinite(low).all() and np.isfinite(high).all() else None
+
     def segment_series(self, segment: int, s: Value, order: int) -> list[list[Value]]:
         """Taylor series of a segment; as `Trajectory.segment_series`."""
         duration = float(self.breakpoints[segment + 1] - self.breakpoints[segment])
@@ -469,7 +493,7 @@ def _fitted(
     groups: dict[tuple[object, ...], list[tuple[int, ...]]] = {}
     found: dict[tuple[int, ...], tuple[NDArray[Any], NDArray[np.object_] | None]] = {}
     of_group: dict[tuple[object, ...], list[Kind]] = {}
-    for axes in _alike(known):
+    for axes in alike(known):
         size = 1 + int(np.flatnonzero(known[:, :, axes[0]].any(axis=0)).max(initial=0))
         given = known[:, :size, axes[0]]
         own: NDArray[Any] = table[:, :size, axes]
@@ -503,7 +527,7 @@ def _fitted(
     return filled, tuple(pieces)
 
 
-def _alike(known: NDArray[np.bool_]) -> list[tuple[int, ...]]:
+def alike(known: NDArray[np.bool_]) -> list[tuple[int, ...]]:
     """Axes with the same pattern of prescribed entries."""
     naxes = known.shape[2]
     if naxes == 1 or (known == known[:, :, :1]).all():

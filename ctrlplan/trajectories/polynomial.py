@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from typing import Self
 
 from ctrlplan._types import Data
-from ctrlplan.trajectories.newton_spline import NewtonSpline, Options, checked_degree
+from ctrlplan.trajectories.newton_spline import NewtonSpline, SplineOptions, checked_degree
 from ctrlplan.trajectories.waypoint import Waypoint
 from ctrlplan.trajectories.waypoint_spline import checked_waypoints
 
@@ -67,7 +67,7 @@ class PolySpline(NewtonSpline):
         smooth: int = 3,
         warn: bool = True,
     ) -> None:
-        chosen = Options(labels, None, *checked_degree(degree, smooth), warn=warn)
+        chosen = SplineOptions(labels, None, *checked_degree(degree, smooth), warn=warn)
         self._fit(checked_waypoints(waypoints), 0.0, chosen)
         self._check_swing()
 

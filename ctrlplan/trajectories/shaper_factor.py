@@ -12,10 +12,16 @@ from numpy.typing import ArrayLike
 from scipy.special import comb
 
 from ctrlplan._checks import checked_count, checked_finite, finite_vector, new_numbers, one_number
-from ctrlplan.trajectories.common import Array, ComplexArray, readonly
+from ctrlplan.trajectories.common import Array, readonly
 
 _DROPPED = 4.0 * np.finfo(float).eps
 """Relative rounding of weights and delays on a grid."""
+
+_SAME = 1e-13
+"""Relative difference of phases that is rounding: the delay is then a number of samples."""
+
+_HEAVY = 50.0
+"""Exponent of a mode per phase [1/rad] above which it is limited, so that powers do not overflow."""
 
 _RESOLUTION = 1e-7
 """Relative resolution of the periods that the fit to a spectrum searches."""
@@ -62,7 +68,8 @@ class ShaperFactor:
 
         .. math:: \frac{\zeta}{\sqrt{1 - \zeta^2}} + i
         """
-        return complex(self.damping / math.sqrt(1.0 - self.damping**2), 1.0)
+        # A mode that decays by exp(-100) over a delay is left with no vibration whatever the impulses.
+        return complex(min(self.damping / math.sqrt(1.0 - self.damping**2), _HEAVY), 1.0)
 
     def on_grid(self, dt: float) -> Array:
         """Weights on a grid with the same effect on the mode.
@@ -86,16 +93,15 @@ class ShaperFactor:
             If the period is longer than the delay, or weights would be negative.
         """
         samples = self.delay / dt
-        if samples < 1.0 - 1e-9:
+        if samples < 1.0 - _DROPPED:
             raise ValueError(
                 f"dt must be at most {self.delay:.6g} s, the delay of the {self.kind} shaper for {self.frequency:g} "
                 f"rad/s (half a period of the mode, its Nyquist limit; for MZV three eighths), got {dt:g} s; use a "
                 "shorter cycle time"
             )
-        k = int(samples * (1.0 + _DROPPED))
-        step = self.angle / samples
+        k = max(int(samples * (1.0 + _DROPPED)), 1)
         taps = np.zeros(k + 2)
-        taps[[0, k, k + 1]] = replaced_delay(self.growth * np.array([k * step, (k + 1) * step]), self.target)
+        taps[[0, k, k + 1]] = self.taps(self.angle / samples * np.array([k, k + 1]))
         found = composed_weights(self.weights, taps)
         if found.min() < -1e-13:
             raise ValueError(
@@ -106,39 +112,37 @@ class ShaperFactor:
         found = np.where(found < _DROPPED * min(self.weights), 0.0, found)
         return found / found.sum()
 
-    @property
-    def target(self) -> complex:
-        """Factor of the mode over one delay, backwards in time."""
-        return complex(np.exp(self.growth * self.angle))
+    def taps(self, phases: Array, amplitudes: ArrayLike = 1.0) -> Array:
+        r"""Weights of three commands in place of the delay.
 
+        They are those of the commands now, k and k + 1 samples ago. With :math:`z_k`
+        the factor of the mode over k samples, backwards in time, and T that over the
+        delay, :math:`\gamma + \alpha + \beta = 1` and
+        :math:`\gamma + \alpha z_k + \beta z_{k+1} = T`.
 
-def replaced_delay(exponents: ComplexArray, target: complex, amplitudes: ArrayLike = 1.0) -> Array:
-    r"""Weights of impulses now, k and k + 1 samples ago that act on a mode like a delay.
+        Parameters
+        ----------
+        phases : ndarray, shape (2,)
+            Phases [rad] by which the mode advances in k and in k + 1 samples.
+        amplitudes : array_like, shape (2,), optional
+            Vibration that an impulse now excites, relative to one k and k + 1 samples
+            ago.
 
-    They solve :math:`\gamma + \alpha + \beta = 1`,
-    :math:`\gamma + \alpha z_k + \beta z_{k+1} = T`.
-
-    Parameters
-    ----------
-    exponents : ndarray of complex, shape (2,)
-        Exponents of z_k and z_{k+1}.
-    target : complex
-        T, the effect of the delay.
-    amplitudes : array_like, optional
-        Factors of z_k and z_{k+1}: amplitude of an impulse now relative to one then.
-
-    Returns
-    -------
-    ndarray, shape (3,)
-        gamma, alpha, beta.
-    """
-    first, second = (np.asarray(amplitudes) * np.exp(exponents) - 1.0).tolist()
-    wanted = target - 1.0
-    # Cramer's rule for the real and the imaginary part.
-    scale = first.real * second.imag - first.imag * second.real
-    alpha = (wanted.real * second.imag - wanted.imag * second.real) / scale
-    beta = (first.real * wanted.imag - first.imag * wanted.real) / scale
-    return np.array([1.0 - alpha - beta, alpha, beta])
+        Returns
+        -------
+        ndarray, shape (3,)
+            gamma, alpha, beta.
+        """
+        same = np.abs(phases - self.angle) <= _SAME * self.angle
+        if same.any() and np.all(np.asarray(amplitudes) == 1.0):
+            return np.concatenate([[0.0], same.astype(float)])
+        first, second = (np.asarray(amplitudes) * np.exp(self.growth * phases) - 1.0).tolist()
+        wanted = complex(np.exp(self.growth * self.angle)) - 1.0
+        # Cramer's rule for the real and the imaginary part.
+        scale = first.real * second.imag - first.imag * second.real
+        alpha = (wanted.real * second.imag - wanted.imag * second.real) / scale
+        beta = (first.real * wanted.imag - first.imag * wanted.real) / scale
+        return np.array([1.0 - alpha - beta, alpha, beta])
 
 
 def composed_weights(weights: tuple[float, ...], taps: Array) -> Array:

@@ -494,7 +494,8 @@ class Trajectory(Displayed, Fields, ABC):
         The start and the values and derivatives of waypoints do not change. The
         duration between waypoints is rounded up to whole cycles. A plan without
         waypoints, such as a profile, is retimed as a whole; each part of a joined
-        plan is treated separately.
+        plan is treated separately, except where parts without waypoints join in
+        motion, as in a plan that is stopped.
 
         Parameters
         ----------
@@ -673,6 +674,10 @@ class Trajectory(Displayed, Fields, ABC):
         >>> slow = move.to_velocity(2.0, 1.0, {"acceleration": 5.0, "jerk": 20.0}, hold=1.0)
         >>> slow(slow.end, 1)
         array(1.)
+        >>> limits = {"velocity": 3.0, "acceleration": 2.0, "jerk": 10.0}
+        >>> on = slow.then(cp.SCurve(20.0, slow.final, start_velocity=1.0, **limits))
+        >>> on.final, on.jumps(2)
+        (array([20.]), ())
         """
         from ctrlplan.trajectories.chosen import at_velocity
 
@@ -970,6 +975,13 @@ class Trajectory(Displayed, Fields, ABC):
                 f"derivative {high} must stay within floating point, got a duration of {duration:g} s and a position "
                 f"of {np.abs(self.segment_jet(segment, np.zeros(1), 0)).max():g}"
             )
+
+    def derivative_bounds(self, nu: int) -> tuple[Array, Array] | None:
+        """Lower and upper bounds (naxes, nsegments) of a derivative on each segment, None if they are not known.
+
+        With them `extrema` searches only segments that can contain one.
+        """
+        return None
 
     def segment_jet_at(self, moment: float, origin: float, s: Array, order: int) -> Array:
         """Jet at origin + s of the function of the segment at `moment`.

@@ -14,7 +14,7 @@ from ctrlplan._types import Data
 from ctrlplan.trajectories.chosen import chosen_alpha
 from ctrlplan.trajectories.common import Array
 from ctrlplan.trajectories.newton import NewtonSystem
-from ctrlplan.trajectories.newton_spline import NewtonSpline, Options, checked_degree
+from ctrlplan.trajectories.newton_spline import NewtonSpline, SplineOptions, checked_degree
 from ctrlplan.trajectories.waypoint import Waypoint
 from ctrlplan.trajectories.waypoint_spline import checked_waypoints
 
@@ -89,7 +89,9 @@ class TrigSpline(NewtonSpline):
         warn: bool = True,
     ) -> None:
         points = checked_waypoints(waypoints)
-        chosen = Options(labels, _checked_gamma(gamma, points[0].naxes), *checked_degree(degree, smooth), warn=warn)
+        chosen = SplineOptions(
+            labels, _checked_gamma(gamma, points[0].naxes), *checked_degree(degree, smooth), warn=warn
+        )
         self._fit(points, chosen_alpha(alpha, points, type(self), **chosen.given()), chosen)
         self._check_swing()
 
@@ -127,7 +129,7 @@ class TrigSpline(NewtonSpline):
         """
         points = checked_waypoints(waypoints, minimum=1)
         duration = checked_finite(period, "period", above=0.0)
-        chosen = Options(
+        chosen = SplineOptions(
             labels, _checked_gamma(gamma, points[0].naxes), *checked_degree(degree, smooth), duration, warn
         )
         plan = cls.__new__(cls)

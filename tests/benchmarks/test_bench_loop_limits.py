@@ -13,6 +13,7 @@ import control as ct
 import numpy as np
 import pytest
 from loop_oracle import QUINTIC, random_loop, system_of
+from scipy.linalg import block_diag
 
 import ctrlplan as cp
 from ctrlplan import Waypoint
@@ -99,3 +100,24 @@ def test_weakly_damped(against, seed):
     against(lambda: cp.fastest(QUINTIC, limits, system), lambda: cp.simulate(system, times, found.plan), 40, 0.1)
     assert found.margins.satisfied
     assert math.isfinite(found.duration)
+
+
+@pytest.mark.benchmark(group="loop limits")
+def test_slow_move_of_a_weakly_damped_mode(against):
+    """A slow loop with a mode of 100 rad/s and damping 0.005: largest pole times duration is 1e4."""
+
+    def mode(w, damping):
+        im = w * math.sqrt(1.0 - damping**2)
+        return np.array([[-damping * w, im], [-im, -damping * w]])
+
+    a, b = block_diag(mode(0.12, 0.4), mode(100.0, 0.005)), np.array([[0.0], [1.0], [0.0], [1.0]])
+    c = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]])
+    c = c / -(c @ np.linalg.solve(a, b))
+    system = ct.ss(a, b, np.vstack([c[0] + 0.3 * c[1], c[1]]) / [[1.3], [1.0]], np.zeros((2, 1)), inputs="r")
+    names = system.output_labels
+    limits = {names[0]: (-0.02, 1.02), names[1]: (-0.5, 1.5)}
+    found = cp.fastest(QUINTIC, limits, system)
+    times = np.linspace(0.0, found.duration + 28.0 / 0.048, 2001)
+    against(lambda: cp.fastest(QUINTIC, limits, system), lambda: cp.simulate(system, times, found.plan), 40, 0.1)
+    assert found.margins.satisfied
+    assert 9e3 < 100.0 * found.duration < 1.2e4

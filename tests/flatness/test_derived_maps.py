@@ -9,8 +9,9 @@ import control as ct
 import control.flatsys as fs
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from repetitions import examples
 
 pytest.importorskip("casadi")
 
@@ -199,7 +200,7 @@ def fs_two_mass():
     return quantities
 
 
-@settings(max_examples=20, deadline=None)
+@examples(20)
 @given(st.lists(st.floats(0.0, 20.0), min_size=1, max_size=6), st.integers(0, 2**31))
 def test_the_result_does_not_depend_on_the_other_times_of_a_call(times, seed):
     alone = np.array([TURNING.states_and_inputs(AROUND, t)[0] for t in times]).T

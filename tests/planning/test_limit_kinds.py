@@ -4,8 +4,9 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from repetitions import examples
 
 import ctrlplan as cp
 from ctrlplan import Limits, Region, Waypoint, fastest, margins
@@ -279,7 +280,7 @@ def test_several_limits_of_one_signal():
 # Limits over time
 
 
-@settings(max_examples=40, deadline=None)
+@examples(40)
 @given(
     st.lists(st.floats(0.5, 3.0), min_size=4, max_size=4),
     st.lists(st.floats(-3.0, -0.5), min_size=4, max_size=4),

@@ -113,7 +113,7 @@ SECTIONS = {
     "CraneOnline": lambda swept, spread, crane: sections.CraneOnline(),
 }
 BASES = (sections.Section, sections.CraneScene)
-WITHOUT_FIGURE = {"AnimatedCrane", "ClaimTable", "DrawTable", "PlanMargins"}
+WITHOUT_FIGURE = {"AnimatedCrane", "ClaimTable", "DrawTable", "FittedGains", "PlanMargins"}
 
 
 def test_every_type_of_section_is_drawn_here():

@@ -425,7 +425,8 @@ def test_a_plan_that_takes_its_time_loses_and_is_reported_so(tmp_path):
     found = cp.compare(loop(1000.0), {"step": cp.Step(1.0), "planned": slow}, np.linspace(0, 30, 6001))
     verdict = next(v for v in verdicts(found) if v.key == "settling_time")
     assert (verdict.best, verdict.worst) == (("step",), ("planned",))
-    row = found.report(tmp_path).read_text(encoding="utf-8").partition('<th scope="row">Settling time [s]')[2]
+    page = found.report(tmp_path).read_text(encoding="utf-8")
+    row = page.partition('<th scope="row" class="short">Settling time [s]')[2]
     cells = re.findall(r'<td class="(\w+)" data-head="(\w+)">', row.partition("</tr>")[0])
     assert cells[:2] == [("better", "step"), ("worse", "planned")]
 

@@ -419,7 +419,7 @@ def test_an_interruption_returns_every_value_that_was_finished(build, k):
 @pytest.mark.parametrize("k", [1, 2, 5])
 def test_an_interruption_between_two_results_loses_none(build, k, monkeypatch):
     """As in the progress bar: what is measured together with the last one is ready too."""
-    from ctrlplan.studies import executing
+    from ctrlplan.studies import progress
 
     class Bar:
         def __init__(self, **settings):
@@ -433,7 +433,7 @@ def test_an_interruption_between_two_results_loses_none(build, k, monkeypatch):
         def close(self):
             pass
 
-    monkeypatch.setattr(executing, "tqdm", Bar)
+    monkeypatch.setattr(progress, "tqdm", Bar)
     with pytest.warns(UserWarning, match="interrupted"):
         found = swept(build)
     assert found.interrupted

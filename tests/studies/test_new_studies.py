@@ -2,13 +2,17 @@
 
 import json
 import re
+import sys
 import tomllib
 
+import numpy as np
 import pytest
 from study_schema import schema_errors
 
+import ctrlplan as cp
 from ctrlplan.cli import main
 from ctrlplan.studies.new import study_kinds, study_purpose
+from ctrlplan.studies.progress import bars_over_plans
 
 
 @pytest.fixture
@@ -123,6 +127,32 @@ def test_progress_says_what_runs(written, capsys):
         "ctrlplan: running study mine (3 plans)",
         "ctrlplan: writing the report",
     ]
+
+
+@pytest.mark.usefixtures("blank_drawings")
+def test_progress_counts_the_plans_on_a_terminal(written, capsys, monkeypatch):
+    written("fastest")
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    monkeypatch.setenv("TQDM_MININTERVAL", "0")
+    assert main(["report", "mine.toml", "--out", "out"]) == 0
+    said = capsys.readouterr().err.replace("\r", "\n")
+    running = re.findall(r"plans: +\d+%.* (\d)/3 .*?, (?:[^,\]]*/[^,\]]*, )?(\w[^\]]*)\]", said)
+    assert {int(done) for done, _ in running} >= {0, 1, 2}
+    assert len({name for _, name in running}) == 3
+
+
+def test_a_bar_over_runs_has_none_over_their_plans(capsys):
+    move = [cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1, 0, 0)]
+    events = [cp.Event("y", high=2.0)]  # loops with events run one by one
+    with bars_over_plans(True):
+        cp.sweep(cp.plants.integrator_lag_loop, [1, 2], move, np.linspace(0, 5, 51), events=events, parameter="gain")
+        said = capsys.readouterr().err
+        assert "gain" in said
+        assert "plans" not in said
+        cp.compare(cp.plants.integrator_lag_loop(1.0), move, np.linspace(0, 5, 51))
+        assert "plans" in capsys.readouterr().err
+    cp.compare(cp.plants.integrator_lag_loop(1.0), move, np.linspace(0, 5, 51))
+    assert capsys.readouterr().err == ""
 
 
 @pytest.mark.usefixtures("blank_drawings")

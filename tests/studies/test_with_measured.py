@@ -258,7 +258,7 @@ def test_pages_mark_the_measured_run(base, names, tmp_path):
     found = base.with_measured(logs)
     text = found.report(tmp_path / "page.html").read_text(encoding="utf-8")
     assert "quintic (measured)†" in re.sub(r"<[^>]*>", "", text)
-    assert "† quintic (measured): measured:" in text
+    assert re.search(r"† quintic \(measured\): resampled: 300\d of 4000 samples, every 1 ms", text)
     assert "found from the command r" in text
     found.export(tmp_path / "runs.csv")
     header = (tmp_path / "runs.csv").read_text(encoding="utf-8").split("\n")[0]
@@ -328,6 +328,21 @@ def test_a_log_without_the_move_cannot_be_aligned(base):
     with pytest.raises(ValueError, match=r"must contain the move .* y is constant or does not follow it; give align="):
         base.with_measured({"quintic": still})
     assert "quintic (measured)" in base.with_measured({"quintic": still}, align=None).metrics
+
+
+def test_a_command_in_other_units_is_an_error(base):
+    log = cp.read_log({"time": LOGGED, "y": PLAN(LOGGED).ravel(), "r": 1e3 * PLAN(LOGGED).ravel()})
+    with pytest.raises(ValueError, match=r"command r of logs\['quintic'\] must follow the plan, .* give its units="):
+        base.with_measured({"quintic": log})
+    run = base.with_measured({"quintic": log}, align="y").measured["quintic (measured)"]
+    assert abs(run.offset) < 1e-9
+
+
+def test_what_remains_after_alignment_is_stated(base):
+    found = base.with_measured({"quintic": machine(noise=0.01)})
+    residual = found.measured["quintic (measured)"].residual
+    assert residual == pytest.approx(0.01, rel=0.1)
+    assert f"is then {100.0 * residual:.2g} % of the range" in str(found).replace("\n", " ")
 
 
 def test_two_axes_need_a_command_that_names_its_axis():

@@ -126,6 +126,7 @@ def test_methods_agree(method):
         ({"drive_lag": math.nan}, "drive_lag must be finite and above 0, got nan"),
         ({"law": "dynamic"}, "law must have the outputs D_ref and R_ref with drive='velocity', got 'dynamic'"),
         ({"law": "feedforward"}, "law must have the outputs D_ref and R_ref with drive='velocity'"),
+        ({"law": "load_feedback"}, "law must not feed back the load with drive='velocity', .* which reads x, x_d1"),
         ({"force_limits": 1e4}, "force_limits must be given with drive='force', .* limit v_cmd by create_saturation"),
     ],
 )

@@ -264,7 +264,7 @@ def test_the_block_stops_the_integrator_where_the_velocity_changes_its_sign():
         ({"terms": ["static", "static"]}, ValueError, "terms must differ from each other"),
         ({"terms": [("static", np.sin)]}, ValueError, "terms must have names of their own"),
         ({"terms": [("spring", 3.0)]}, TypeError, r"terms must be names or \(name, function of the position\)"),
-        ({"plan": PLAN.shift(100.0)}, ValueError, "log must contain a motion, got none; with a plan, align the log"),
+        ({"plan": PLAN.shift(100.0)}, ValueError, "log must contain a motion, got none; align it with the plan"),
     ],
 )
 def test_bad_arguments(options, error, message):
@@ -279,6 +279,11 @@ def test_bad_logs():
     short = cp.read_log({"time": TIMES[:35], "u": np.zeros(35)})
     with pytest.raises(ValueError, match="log must have at least 40 samples with a speed above"):
         cp.fit_feedforward(short, PLAN)
+    noisy = logged(seed=0, position=0.3)
+    with pytest.raises(
+        ValueError, match=r"low-pass filter of .* Hz that the noise of the position requires; give a plan"
+    ):
+        cp.fit_feedforward(noisy)
     still = cp.read_log({"time": TIMES, "u": np.zeros(TIMES.size), "y": np.zeros(TIMES.size)})
     with pytest.raises(ValueError, match="log must contain a motion, got none"):
         cp.fit_feedforward(still)

@@ -64,6 +64,16 @@ def test_at_another_constant_frequency_it_is_the_shaper_for_that(kind):
         np.testing.assert_allclose(rows(found)[0], wanted, rtol=0, atol=1e-12)
 
 
+@kinds
+def test_a_delay_of_whole_samples(kind):
+    shaper = KINDS[kind](2.0, 0.03)
+    for samples in (1, 3):
+        block = cp.create_shaper_iosystem(shaper, shaper.delays[1] / samples, frequency_input="w")
+        times = shaper.delays[1] / samples * np.arange(40)
+        found = cp.simulate(alone(block), times, {"r_cmd": PLAN, "w": 2.0})
+        np.testing.assert_allclose(rows(found)[0], shaper(PLAN)(times), rtol=0, atol=1e-12)
+
+
 def test_for_several_modes():
     shaper = cp.Shaper.zv(2.0, 0.1).then(cp.Shaper.ei(5.0))
     t = DT * np.arange(120)

@@ -353,3 +353,47 @@ def test_a_swing_between_many_points_warns():
     values[300] = 1.0
     with pytest.warns(UserWarning, match="the plan swings over"):
         PiecewiseSpline.from_arrays(times, values, derivatives=at_rest(600, 1))
+
+
+@pytest.mark.parametrize("nu", range(7))
+def test_extrema_of_many_segments_are_those_of_each(nu):
+    times, values = data(120, 2, spread=0.5)
+    given = at_rest(120, 2)
+    given[2] = np.stack([given[2], given[2]])
+    given[2][1, 40] = 30.0
+    plan = PiecewiseSpline.from_arrays(times, values, derivatives=given)
+    found = plan.extrema(nu)
+    low, high = plan.derivative_bounds(nu)
+    for k in range(119):
+        t = np.linspace(0.0, times[k + 1] - times[k], 401)
+        inside = plan.segment_jet(k, t, nu)[nu]
+        assert (inside.min(axis=1) >= low[:, k]).all()
+        assert (inside.max(axis=1) <= high[:, k]).all()
+        slack = 1e-12 * np.abs(inside).max(axis=1)
+        assert (inside.max(axis=1) <= found.maximum + slack).all()
+        assert (inside.min(axis=1) >= found.minimum - slack).all()
+    for axis in range(2):
+        for value, time in ((found.minimum[axis], found.time_min[axis]), (found.maximum[axis], found.time_max[axis])):
+            sides = [plan.jet(time, nu, left=left)[nu, axis] for left in (False, True)]
+            assert min(abs(side - value) for side in sides) <= 1e-9 * max(abs(value), 1e-300)
+
+
+def test_equal_extrema_are_found_at_the_earliest_time():
+    times = np.arange(101.0)
+    plan = PiecewiseSpline.from_arrays(times, times % 2.0, derivatives={1: 0.0, 2: 0.0})
+    found = plan.extrema(1)
+    assert (found.time_max[0], found.time_min[0]) == (0.5, 1.5)
+    assert found.maximum[0] == pytest.approx(15.0 / 8.0, rel=1e-14)
+    assert plan.extrema(0).time_max[0] == 1.0
+
+
+def test_only_segments_that_can_hold_an_extremum_are_searched(monkeypatch):
+    times, values = data(1000, 1)
+    plan = PiecewiseSpline.from_arrays(times, values, derivatives=at_rest(1000, 2))
+    searched = []
+    before = PiecewiseSpline.segment_jet
+    monkeypatch.setattr(
+        PiecewiseSpline, "segment_jet", lambda self, k, s, order: searched.append(k) or before(self, k, s, order)
+    )
+    plan.extrema(1)
+    assert len(set(searched)) <= 50

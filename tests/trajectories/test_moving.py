@@ -4,6 +4,7 @@ import json
 import math
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from scipy.sparse import bmat, diags, eye
 from strict import WARNINGS
 
 import ctrlplan as cp
-from ctrlplan.trajectories import MotionProfile, SCurve, Trapezoid, trajectory_from_dict
+from ctrlplan.trajectories import MotionProfile, SCurve, Trapezoid, moving, trajectory_from_dict
 
 ruckig = pytest.importorskip("ruckig")
 
@@ -24,18 +25,21 @@ class Case:
         self.start, self.end, self.jerk = np.array(start), np.array(end), jerk
         self.velocity, self.acceleration = tuple(velocity), tuple(acceleration)
 
+    def arguments(self):
+        return {
+            "final": self.end[0],
+            "initial": self.start[0],
+            "velocity": self.velocity,
+            "acceleration": self.acceleration,
+            "jerk": self.jerk,
+            "start_velocity": self.start[1],
+            "start_acceleration": self.start[2],
+            "end_velocity": self.end[1],
+            "end_acceleration": self.end[2],
+        }
+
     def profile(self):
-        return SCurve(
-            self.end[0],
-            self.start[0],
-            velocity=self.velocity,
-            acceleration=self.acceleration,
-            jerk=self.jerk,
-            start_velocity=self.start[1],
-            start_acceleration=self.start[2],
-            end_velocity=self.end[1],
-            end_acceleration=self.end[2],
-        )
+        return SCurve(**self.arguments())
 
     def mirrored(self):
         swapped = ([-high, -low] for low, high in (self.velocity, self.acceleration))
@@ -512,6 +516,13 @@ def test_an_axis_that_ends_early_must_end_at_rest():
     with pytest.raises(ValueError, match='synchronize must be "time", got None with an end in motion of y2 after'):
         SCurve([9.0, 1.0], **limits, end_velocity=[0.0, 0.5], synchronize=None)
     assert SCurve([9.0, 1.0], **limits, end_velocity=[0.5, 0.0], synchronize=None).final[1] == 1.0
+    # An axis that is in its final state already, in motion, and returns to it together with the other.
+    states = {"start_velocity": [0.0, 0.5], "end_velocity": [0.0, 0.5]}
+    with pytest.raises(ValueError, match="got None with an end in motion of y2 after 0 s"):
+        SCurve([9.0, 0.0], **limits, **states, synchronize=None)
+    both = SCurve([9.0, 0.0], **limits, **states, synchronize="time")
+    assert both.duration >= SCurve(9.0, **limits).duration * (1 - 1e-12)
+    np.testing.assert_allclose(both.jet(both.end, 1)[:, 1], [0.0, 0.5], rtol=0, atol=1e-14)
 
 
 def test_without_the_extra():
@@ -540,3 +551,101 @@ for wrong in (dict(start_velocity=0.5), dict(velocity=(-1.0, 2.0))):
 """
     done = subprocess.run([sys.executable, *WARNINGS, "-c", code], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+def doubled(solved):
+    """The solution of a problem with twice the velocity and acceleration."""
+
+    def found(problem, scale):
+        ranges = moving.Ranges(*(np.array([[2.0], [2.0], [1.0]]) * side for side in problem.ranges))
+        return solved(replace(problem, ranges=ranges), scale)
+
+    return found
+
+
+@pytest.mark.parametrize("valid", range(3))
+def test_a_profile_beyond_its_limits_is_not_taken(monkeypatch, valid):
+    """Although it is shorter: of several time scales only that with a valid profile counts."""
+    wanted, solved, calls = wrong(start_velocity=0.5), moving._solved, []
+
+    def mixed(problem, scale):
+        calls.append(scale)
+        return (solved if len(calls) == valid + 1 else doubled(solved))(problem, scale)
+
+    monkeypatch.setattr(moving, "_solved", mixed)
+    assert wrong(start_velocity=0.5).duration == pytest.approx(wanted.duration, rel=1e-12)
+    assert len(calls) == 3
+
+
+def test_without_a_valid_profile_it_is_an_error(monkeypatch):
+    monkeypatch.setattr(moving, "_solved", doubled(moving._solved))
+    with pytest.raises(
+        RuntimeError, match=r"ruckig must find a profile within the limits, got none: .* of y beyond -1 to"
+    ):
+        wrong(start_velocity=0.5)
+
+
+def test_long_cruises_between_short_ramps():
+    """Ramps of 1e-3 s around a cruise of 1e5 s: rounding of times is compensated; where it is too large, an error."""
+    limits = {"velocity": (-0.015, 0.028), "acceleration": (-0.02, 0.016), "jerk": 33.7}
+    plan = SCurve(4895.0, **limits, start_velocity=0.0094, end_velocity=-0.0031)
+    assert plan.duration == pytest.approx(4895.0 / 0.028, rel=1e-4)
+    for (low, high), found in zip((limits["velocity"], limits["acceleration"]), exact_extrema(plan), strict=False):
+        assert low * (1 + 2e-9) <= found[0]
+        assert found[1] <= high * (1 + 2e-9)
+    with pytest.raises(RuntimeError, match="ruckig must find a profile within the limits, got none: "):
+        Trapezoid(1e12, velocity=1e-3, acceleration=1e3, start_velocity=0.5e-3, end_velocity=-0.3e-3)
+
+
+class Failing:
+    """A solver that finds nothing."""
+
+    def __init__(self, *_):
+        pass
+
+    def calculate(self, *_):
+        raise ruckig.RuckigError("error in step 1\nof many lines")
+
+
+class Undecided(Failing):
+    def calculate(self, *_):
+        return ruckig.Result.Error
+
+
+def test_what_the_library_cannot_solve_is_an_error(monkeypatch):
+    for kind, message in ((Failing, "got none: .*error in step 1$"), (Undecided, "got none: .*Error")):
+        monkeypatch.setattr(ruckig, "Ruckig", kind)
+        with pytest.raises(RuntimeError, match=message):
+            wrong(start_velocity=0.5)
+    monkeypatch.setitem(sys.modules, "ruckig", None)
+    with pytest.raises(ImportError, match=r'require ruckig; install it with pip install "ctrlplan\[otg\]"'):
+        wrong(start_velocity=0.5)
+
+
+@pytest.mark.parametrize("time", [1e6, 1.7e9, -3e9])
+def test_late_times(time):
+    """Such as seconds since 1970: limits and ends hold, and the duration is longer by no more than the rounding."""
+    for k, case in enumerate(cases(40, 8)):
+        plan = SCurve(**case.arguments(), time=time)
+        near = case.profile()
+        tick = np.spacing(abs(time)) / np.diff(near.breakpoints).min()
+        if tick > 1e-5:
+            continue
+        assert plan.duration == pytest.approx(near.duration, rel=1e-9 + 100.0 * tick), k
+        for (low, high), found in zip((case.velocity, case.acceleration), exact_extrema(plan), strict=False):
+            assert low - 1e-9 * (high - low) <= found[0]
+            assert found[1] <= high + 1e-9 * (high - low)
+        assert plan.peak(3)[0] <= case.jerk * (1 + 2e-9)
+        np.testing.assert_array_equal(plan.jet(plan.end, 2)[:, 0], case.end)
+
+
+def test_times_that_do_not_resolve_a_profile():
+    limits = {"velocity": 1.3, "acceleration": 0.7, "jerk": 2.1, "start_velocity": 0.33, "end_velocity": 0.1}
+    with pytest.raises(
+        RuntimeError, match=r"the profile must satisfy its limits, got .* origin nearer to 0 than 1e\+12"
+    ):
+        wrong(**limits, time=1e12)
+    with pytest.raises(ValueError, match=r"by a motion that times near 1e[+]18 s resolve, got none"):
+        wrong(start_velocity=0.5, time=1e18)
+    with pytest.raises(ValueError, match="the end must differ from the start"):
+        wrong(final=1.0, initial=1.0, start_velocity=0.5, end_velocity=0.5)

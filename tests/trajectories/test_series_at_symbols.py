@@ -12,7 +12,9 @@ from trajectory_oracle import Direct, waypoints
 
 from ctrlplan import trajectories
 from ctrlplan.trajectories import (
+    Clipped,
     Joined,
+    MotionProfile,
     PiecewiseSpline,
     PolySpline,
     Retimed,
@@ -61,6 +63,8 @@ PLANS = {
     "Trapezoid": Trapezoid([3.0, 1.0], 0.5, velocity=1.0, acceleration=0.7, time=-1.0),
     "SCurve": SCurve([3.0, 1.0], 0.5, velocity=1.0, acceleration=0.7, jerk=2.0, time=-1.0),
     "Retimed": Retimed(PiecewiseSpline(POINTS), PolySpline([Waypoint(3.0, -1.0, 0.5), Waypoint(7.0, 2.0, 0.4)])),
+    "Clipped": Clipped(PiecewiseSpline(POINTS), -0.6, 1.1),
+    "MotionProfile": MotionProfile([-0.5, 1.0, 3.0], [[2.0, -1.0], [0.0, 0.5]], [[1.0, 2.0], [0.5, -0.3], [0.1, 0.0]]),
     # kinds with options
     "of a higher degree": PolySpline(POINTS, degree=9),
     "trigonometric of a higher degree": TrigSpline(POINTS, alpha=2.0, degree=7),
@@ -70,6 +74,8 @@ PLANS = {
     "piecewise, trigonometric": PiecewiseSpline(POINTS, alpha=4.0),
     "at a late start": rest((1e5, 0.0), (1e5 + 2, 3.0)),
     "retimed and shifted": TrigSpline(POINTS, alpha=1.3).retime(7.0).shift(2.5),
+    "stopped": POLY.stop(1.2, {"acceleration": 9.0, "jerk": 40.0}),
+    "stopped on its path": POLY.stop(-0.3, {"acceleration": 40.0, "jerk": 400.0}, synchronize="path"),
     # one made of another
     "joined of scaled": (2.0 * POLY).then(2.0 * TRIG),
     "joined of stacked": stack([rest((0, 0), (1, 1)), rest((0, 2), (3, 1))]).then(

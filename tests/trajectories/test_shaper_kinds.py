@@ -209,6 +209,28 @@ def test_on_a_grid_the_residual_at_the_mode_is_unchanged(kind):
         assert found.duration <= shaper.duration + count * dt * (1.0 + 1e-9)
 
 
+@kinds
+@pytest.mark.parametrize("damping", [0.99, 0.9999, 1.0 - 1e-9, np.nextafter(1.0, 0.0)])
+def test_heavily_damped_modes(kind, damping):
+    """Powers of the decay neither overflow nor lose the sum of the weights."""
+    shaper = KINDS[kind](2.0, damping)
+    for dt in (shaper.delays[1], 0.3 * shaper.delays[1], shaper.delays[1] / 71.5):
+        found = shaper.on_grid(dt)
+        assert (found.weights > 0.0).all()
+        assert math.fsum(found.weights) == pytest.approx(1.0, abs=1e-15)
+        # Where the other weights underflow, one impulse is left, after which the mode has not decayed yet.
+        assert found.delays.size == 1 or found.residual(2.0, damping) <= 0.05
+
+
+@kinds
+def test_on_the_coarsest_grid(kind):
+    """One sample a delay: rounding of the period does not change the number of samples."""
+    for omega in (0.7, 3.0, 47.0):
+        shaper = KINDS[kind](omega, 0.02)
+        for dt in (shaper.delays[1], np.nextafter(shaper.delays[1], 0.0), np.nextafter(shaper.delays[1], np.inf)):
+            np.testing.assert_allclose(shaper.on_grid(dt).weights, shaper.weights, rtol=1e-12)
+
+
 def test_on_a_grid_zeros_keep_their_order():
     for derivatives in range(3):
         shaper = Shaper.zvd(6.0, 0.1, derivatives).on_grid(0.037)

@@ -14,7 +14,7 @@ from ctrlplan.simulation.interpreted import SolverError
 from ctrlplan.simulation.job import Job, Record, fresh_job
 from ctrlplan.simulation.numerical import VISITED, Attempt, equations_of, numerical
 from ctrlplan.simulation.prepared import Prepared
-from ctrlplan.simulation.segments import Run
+from ctrlplan.simulation.segments import NetworkRun
 from ctrlplan.simulation.signals import signal_values
 from ctrlplan.symbolic import missing_casadi
 from ctrlplan.symbolic.comparison import telling_states
@@ -97,7 +97,7 @@ def _disagreement(attempt: Attempt[CompiledSolver], solver: CompiledSolver) -> s
     return form.disagreement(attempt.copies, job.params, t[places], x[:, places], w[:, places])
 
 
-def _closer(run: Run, solver: CompiledSolver) -> tuple[Array, Array]:
+def _closer(run: NetworkRun, solver: CompiledSolver) -> tuple[Array, Array]:
     """Times and states of a run, with further ones in between if there are few."""
     times, states = [run.times], [run.states]
     marks = np.unique(np.linspace(0, run.times.size - 1, _STRETCHES + 1).astype(int))

@@ -105,8 +105,8 @@ def crane_loop(
         If the law is unknown or has no such option, the crane cannot follow the
         plan, or a derivative that must be continuous for the law jumps; the
         message gives the derivative and the time. With velocity drive, if the
-        law's outputs are force and torque, force limits are given, or the lag is
-        not above 0.
+        law's outputs are force and torque or it feeds back the load, force limits
+        are given, or the lag is not above 0.
 
     Examples
     --------
@@ -145,6 +145,12 @@ def crane_loop(
     blocks = [*sources, law_block]
     by_velocity = model.checked_drive(drive, drive_lag) is not None
     _check_limits(chosen, by_velocity, force_limits, torque_limits)
+    measured = [label for label in law_block.input_labels if label in model.OUTPUTS]
+    if by_velocity and measured:
+        raise ValueError(
+            f"law must not feed back the load with drive='velocity', where the plan does not command the trolley, got "
+            f"{chosen.name!r}, which reads {', '.join(measured)}; use 'generator' or 'setpoint'"
+        )
     if chosen.outputs != _ACTUATED:
         if not by_velocity:
             blocks.append(linear.trolley_pid(crane, bandwidth, tf, limits=force_limits))
