@@ -102,7 +102,7 @@ class DerivedFlatSystem(FlatSystem):
     def states_and_inputs(
         self, plan: Trajectory, timepts: ArrayLike, *, start: ArrayLike | None = None
     ) -> tuple[Array, Array]:
-        """States and inputs along a plan of the flat outputs; see `FlatSystem.states_and_inputs`.
+        """States and inputs along a plan; see `FlatSystem`.
 
         The states are connected with the operating point, or with `start` at the
         plan's start, and followed along the plan, also through points where a
@@ -117,25 +117,31 @@ class DerivedFlatSystem(FlatSystem):
         return z[:n].reshape(n, *times.shape), u.reshape(-1, *times.shape)
 
     def extension_along(self, plan: Trajectory, time: float) -> Array:
-        """States of the extension along a plan at one time, (extension,)."""
+        """States of the extension (extension,) at a time of a plan."""
         plan, times = self._along(plan, time, None)
         p = self.parameter_values()
         z = states_along(self.maps, partial(self._grid, plan, p, None), plan, times.ravel(), p, str(self.name))[0]
         return z[self.maps.nstates :, 0]
 
     def linearised(self, x: ArrayLike, u: ArrayLike) -> tuple[Array, Array]:
-        """Jacobians of the rates by states and inputs, (nstates, nstates) and (nstates, ninputs)."""
+        """Jacobians of the rates.
+
+        Returns
+        -------
+        tuple of ndarray, shapes (nstates, nstates) and (nstates, ninputs)
+            By states and by inputs.
+        """
         n = self.maps.nstates
         found = self._slopes(np.asarray(x, dtype=float), np.asarray(u, dtype=float), self.parameter_values())
         return found[:, :n], found[:, n:]
 
     @property
     def flat_map(self) -> Callable[..., Sequence[Value]]:
-        """Flat outputs as a function of (t, x, u, params), of numbers or symbols."""
+        """Flat outputs as a function of (t, x, u, params)."""
         return partial(_evaluated, self._flat, self._names)
 
     def quantities(self, jet: ArrayLike) -> dict[str, Array]:
-        """States, inputs and outputs of the plant by name; see `FlatSystem.quantities`."""
+        """States, inputs and outputs by name; see `FlatSystem`."""
         values, known = self._checked_jet(jet)
         below, _, last = rows_of(values, self.orders)
         p = self._values(self.params)

@@ -239,7 +239,7 @@ class FlatSystem(Displayed, fs.FlatSystem):  # type: ignore[misc]
 
     @property
     def flat_map(self) -> Callable[..., Sequence[Value]]:
-        """Flat outputs as a function of (t, x, u, params), such as an output function of a block."""
+        """Flat outputs as a function of (t, x, u, params)."""
         forward = self.forward
         return lambda t, x, u, params: [row[0] for row in forward(x, u, params)]
 

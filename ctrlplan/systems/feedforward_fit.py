@@ -72,7 +72,7 @@ _OTHER_MOVE = "moves over a wider range of positions, in both directions and at 
 
 @dataclass(frozen=True, repr=False)
 class FeedforwardFit(Displayed):
-    """Feedforward gains with their uncertainty, as returned by `fit_feedforward`.
+    """Feedforward gains with their uncertainty.
 
     Attributes
     ----------

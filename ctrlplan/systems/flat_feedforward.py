@@ -85,7 +85,7 @@ def create_flat_feedforward_iosystem(
 def reference_window(
     plan: Trajectory, time: float, dt: float, count: int, *, flat: FlatSystem | None = None, order: int = 2
 ) -> tuple[Array, Array] | Array:
-    """Reference over a horizon from any time, as a model predictive controller requires it.
+    """Reference over a horizon from any time, for predictive control.
 
     Before its start and after its end the plan rests.
 

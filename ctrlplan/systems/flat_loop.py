@@ -69,7 +69,7 @@ class FlatLaw(Displayed):
 
 @dataclass(frozen=True)
 class Feedforward:
-    """Inputs along the plan without feedback, as a law for `flat_loop`."""
+    """Inputs along the plan without feedback."""
 
     def create(self, flat: FlatSystem, plan: Trajectory, limits: InputLimits | None) -> ct.NonlinearIOSystem:
         """Block of the inputs as functions of time."""
@@ -84,7 +84,7 @@ class Feedforward:
 
 @dataclass(frozen=True, repr=False, eq=False)
 class TVLQR(Displayed):
-    r"""Time-varying linear quadratic regulator along a plan, as a law for `flat_loop`.
+    r"""Time-varying linear quadratic regulator along a plan.
 
     The control is u_d - R^-1 B' P (x - x_d), with
 
@@ -115,7 +115,9 @@ class TVLQR(Displayed):
         )
 
     def gains(self, flat: FlatSystem, plan: Trajectory) -> tuple[Value, Array]:
-        """Gain (ninputs, nstates) as a function of time within the plan, and the gain after its end.
+        """Gain within the plan as a function of time, and after its end.
+
+        Both (ninputs, nstates).
 
         Raises
         ------
