@@ -14,7 +14,7 @@ Plan a move
     stack                     plans of single axes as one plan
     waypoints_from_csv        waypoints from a table, with times or at a speed
     load_trajectory, trajectory_from_dict    stored plans
-    Trajectory                what all plans have: values, derivatives, extrema, plot, save, export, algebra
+    Trajectory                what all plans have: values, derivatives, extrema, stop, plot, export, algebra
     WaypointSpline            base class of a spline of your own
 Choose what is left free
     choose_alpha              shape by an objective: PeakDerivative, SquaredDerivative -> AlphaChoice
