@@ -351,7 +351,7 @@ def test_a_loop_that_diverges():
         lambda t, x, u, p: np.array([x[0] ** 3 + x[0] + u[0]]), None, inputs="r", outputs="y", states=1, name="runaway"
     )
     for function in (margins, fastest):
-        with pytest.raises(RuntimeError, match="the solver must reach .* the solution cannot be continued"):
+        with pytest.raises(RuntimeError, match=r"the solver must reach .* the solution cannot be continued"):
             function(TRACK, {"y": 3.0}, runaway)
 
 
