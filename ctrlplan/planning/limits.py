@@ -455,6 +455,7 @@ class Limited:
                 row[:] = response.values(b.weights, times, rate=b.kind == "rate")
             if b.kind == "rms":
                 steps = np.diff(times, prepend=times[0])
+                steps[times > plan.start + (b.period or plan.duration)] = 0.0
                 row[:] = np.sqrt(np.cumsum(steps * row**2) / (b.period or plan.duration))
         return rows
 

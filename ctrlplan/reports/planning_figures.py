@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 import numpy as np
@@ -76,7 +77,8 @@ def plot_limits(
     Parameters
     ----------
     plan : Trajectory
-        The plan, drawn from its start to its end.
+        The plan, drawn from its start to its end, and further to extrema of
+        signals of a loop after it.
     limited : Limited
         Its limits.
     units : mapping of str to str, optional
@@ -92,13 +94,14 @@ def plot_limits(
     """
     bounds = limited.bounds
     drawing = Drawing(ax, (len(bounds), 1), (6.4, 0.9 + 1.5 * len(bounds)), rows=[bound.name for bound in bounds])
-    t = np.linspace(plan.start, plan.end, 2001)
     rows = list(limited.margins(plan))
+    after = [row.time + 0.1 * plan.duration for row in rows if row.bound.in_loop and math.isfinite(row.time)]
+    t = np.linspace(plan.start, max([plan.end, *after]), 2001)
     for axes, bound, row in zip(drawing.column, bounds, limited.shown(plan, t), strict=True):
         (style,) = axis_styles((bound.name,), axes).values()
         axes.plot(t, row, **style)
         margin = next(found for found in rows if found.of(bound))
-        if margin.time <= plan.end:
+        if margin.time <= t[-1]:
             axes.plot(margin.time, margin.value, "o", color=_LIMIT, markersize=marker_size(5))
         span = float(np.ptp(row)) or abs(float(row[0])) or 1.0
         for side in limited.sides(bound, plan, t):

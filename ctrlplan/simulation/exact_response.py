@@ -210,11 +210,20 @@ class ExactResponse(LoopResponse):
         return math.sqrt(total / length)
 
     def values(self, weights: Mapping[str, float], times: Array, *, rate: bool = False) -> Array:
-        """Weighted sum of signals during the plan; see `LoopResponse`."""
-        rows = self._sum(weights)
+        """Weighted sum of signals; see `LoopResponse`."""
+        rows, motion, since = self._sum(weights), self._motion, times - self._start
         if rate:
-            rows = rate_rows(self._motion.form, rows, self._motion.plan, " + ".join(weights))
-        return self._motion.cells(rows).at(times - self._start)[0]
+            rows = rate_rows(motion.form, rows, motion.plan, " + ".join(weights))
+        found = np.full(times.shape, float(rows.static(motion.plan.final, motion.settled)[0]))
+        along = since <= motion.duration
+        found[along] = motion.cells(rows).at(since[along])[0]
+        for cells, _ in motion.tail(rows) if not along.all() else ():
+            inside = (since > motion.duration) & (since >= cells.starts.min())
+            inside &= since <= float((cells.starts + cells.lengths).max())
+            found[inside] = cells.at(since[inside])[0]
+            if not np.any(since > float((cells.starts + cells.lengths).max())):
+                break
+        return found
 
     def ends(self, weights: Mapping[str, float]) -> tuple[float, float]:
         """Values before the plan and in steady state after it; see `LoopResponse`."""

@@ -112,14 +112,15 @@ class LoopResponse(ABC):
 
     @abstractmethod
     def values(self, weights: Mapping[str, float], times: Array, *, rate: bool = False) -> Array:
-        """Weighted sum of signals during the plan, for figures.
+        """Weighted sum of signals from the start of the plan on, for figures.
 
         Parameters
         ----------
         weights : mapping of str to float
             Factors by the name of a signal.
         times : ndarray, shape (ntime,)
-            Times [s], from the start to the end of the plan.
+            Times [s], from the start of the plan on; a simulated response is constant
+            after its last time.
         rate : bool, optional
             Of the time derivative of the sum instead.
 

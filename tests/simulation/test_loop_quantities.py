@@ -260,6 +260,18 @@ def test_axes_by_name_and_other_inputs_are_zero():
         along(mixed, QUINTIC)
 
 
+def test_values_for_figures():
+    """Along the plan and after it they are those of the simulation, rates included."""
+    plan = QUINTIC.retime(0.36).shift(2.0)
+    times = np.linspace(2.0, 12.0, 5001)
+    y = cp.simulate(SERVO, times, plan).outputs
+    response = along(SERVO, plan)
+    np.testing.assert_allclose(response.values({"y": 1.0}, times), y, rtol=0, atol=1e-12)
+    slopes = np.gradient(np.asarray(y), times, edge_order=2)
+    np.testing.assert_allclose(response.values({"y": 1.0}, times, rate=True), slopes, rtol=0, atol=1e-2)
+    assert response.values({"y": 1.0}, np.array([1e6]))[0] == pytest.approx(1.0, abs=1e-12)
+
+
 def test_exposed_states_are_signals():
     loop = cp.expose_states(SERVO)
     plan = QUINTIC.retime(0.36)
