@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import KW_ONLY, dataclass, replace
+from dataclasses import KW_ONLY, dataclass, fields, replace
 from numbers import Real
 from typing import Any, Literal, TypeGuard
 
@@ -23,7 +23,7 @@ Kind = Literal["value", "rate", "rms"]
 """What a `Bound` limits: the signal, its time derivative, or its root mean square."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Limits:
     """Limits of one signal, for `fastest` and `margins`.
 
@@ -106,6 +106,10 @@ class Limits:
         elif bounded or (self.rate is None and self.rms is None):
             low, high, _ = checked_limits(_sides(self.low, self.high), "Limits")
             self._set(low=None if math.isinf(low) else low, high=None if math.isinf(high) else high)
+
+    def __repr__(self) -> str:
+        given = {own.name: getattr(self, own.name) for own in fields(self)}
+        return f"Limits({', '.join(f'{name}={value!r}' for name, value in given.items() if value is not None)})"
 
     def _set(self, **values: object) -> None:
         for name, value in values.items():

@@ -266,9 +266,12 @@ def fastest(
     from ctrlplan.planning.parameters import Family
     from ctrlplan.planning.robust import fastest_over
 
+    family = Family.of(chosen, params)
+    if not family.ranges:
+        return fastest_under(plan, family.limited(plan, limits, (), tail), hold, span, spare)
     if hold == "path":
         raise ValueError('hold must be "shape" or "waypoints" with ranges of parameters, got "path"')
-    return fastest_over(plan, limits, Family.of(chosen, params), hold, span, tail, spare)
+    return fastest_over(plan, limits, family, hold, span, tail, spare)
 
 
 def fastest_under(

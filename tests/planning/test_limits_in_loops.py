@@ -350,9 +350,9 @@ def test_a_loop_that_diverges():
     runaway = ct.nlsys(
         lambda t, x, u, p: np.array([x[0] ** 3 + x[0] + u[0]]), None, inputs="r", outputs="y", states=1, name="runaway"
     )
-    for function in (margins, fastest):
+    for search in ({}, {"durations": (0.9, 1.1)}):
         with pytest.raises(RuntimeError, match=r"the solver must reach .* the solution cannot be continued"):
-            function(TRACK, {"y": 3.0}, runaway)
+            (fastest if search else margins)(TRACK, {"y": 3.0}, runaway, **search)
 
 
 def test_a_tail_that_is_far_longer_than_the_plan():

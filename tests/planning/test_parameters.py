@@ -259,6 +259,8 @@ def test_fixed_values_alone():
     plain = margins(LIFT, {"F": 6e3}, cp.plants.Crane(load_mass=700.0))
     assert fixed.active.fraction == plain.active.fraction
     assert (fixed.coverage, fixed.active.parameters) == ("", {})
+    quick = fastest(LIFT, {"F": 6e3}, cp.plants.Crane(), params={"load_mass": 700})
+    assert quick.duration == fastest(LIFT, {"F": 6e3}, cp.plants.Crane(load_mass=700.0)).duration
     waypoints = fastest(MOVE, {"force": 4.0}, mass, hold="waypoints", params={"load": (0.8, 1.3), "friction": 0.0})
     assert waypoints.duration == pytest.approx(math.sqrt(1.3 * 10 / math.sqrt(3) / 4.0), rel=1e-8)
 
