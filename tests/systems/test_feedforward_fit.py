@@ -78,6 +78,8 @@ def test_with_the_plan_gains_to_two_percent_and_the_delay_to_a_fifth_of_a_millis
 def test_with_measured_positions_gains_to_five_percent(seed):
     fit = cp.fit_feedforward(logged(seed=seed, position=1e-4))
     assert max(errors(fit).values()) <= 0.05
+    for name, gain in GAINS.items():
+        assert abs(fit.gains[name] - gain) <= 4.0 * fit.standard_errors[name]
     assert "low-pass filter" in fit.notes[0]
 
 
@@ -104,6 +106,18 @@ def test_intervals_contain_the_true_gain_as_often_as_they_say(rho):
             low <= gain <= high for gain, (low, high) in zip(GAINS.values(), fit.intervals.values(), strict=True)
         ]
     assert ((inside >= 0.88 * 200) & (inside <= 0.99 * 200)).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("rho", [0.0, 0.9])
+def test_intervals_from_positions_contain_the_true_gain_at_least_as_often(rho):
+    inside = np.zeros(len(GAINS))
+    for seed in range(100):
+        fit = cp.fit_feedforward(logged(seed=seed, position=1e-4, rho=rho))
+        inside += [
+            low <= gain <= high for gain, (low, high) in zip(GAINS.values(), fit.intervals.values(), strict=True)
+        ]
+    assert (inside >= 88).all()
 
 
 ALL = {"static": -0.4, "velocity": 0.3, "acceleration": 0.05, "jerk": 2e-3, "gravity": 1.7, "spring": -0.8}
