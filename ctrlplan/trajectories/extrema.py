@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, NoReturn
 from weakref import WeakKeyDictionary
@@ -80,12 +80,12 @@ _KNOWN: WeakKeyDictionary[Trajectory, dict[int, Extrema]] = WeakKeyDictionary()
 
 
 def derivative_extrema(plan: Trajectory, nu: int) -> Extrema:
-    """Extrema of the nu-th derivative, axis by axis."""
+    """Extrema of the nu-th derivative, axis by axis; computed once for a plan, returned as the caller's own."""
     known = _KNOWN.setdefault(plan, {})
     if nu not in known:
         known[nu] = _derivative_extrema(plan, nu)
-    found = known[nu]
-    return Extrema(*(np.copy(getattr(found, field.name)) for field in fields(found)))  # the caller's own
+    own = known[nu]
+    return Extrema(own.minimum.copy(), own.maximum.copy(), own.time_min.copy(), own.time_max.copy())
 
 
 def _derivative_extrema(plan: Trajectory, nu: int) -> Extrema:
@@ -446,7 +446,7 @@ class _Candidates:
         t, values, ends = t[by_time], values[:, by_time], ends[by_time]
         low, high = (self._first(sign * values, ends) for sign in (1.0, -1.0))
         rows = np.arange(len(values))
-        return Extrema(*map(readonly, (values[rows, low], values[rows, high], t[low], t[high])))
+        return Extrema(values[rows, low], values[rows, high], t[low], t[high])
 
     @staticmethod
     def _first(values: Array, ends: Array) -> NDArray[np.intp]:

@@ -479,11 +479,14 @@ def test_a_short_segment_before_a_long_one_is_searched_as_closely():
     assert found.maximum[0] == pytest.approx(1.0, rel=1e-9)
 
 
-def test_extrema_are_computed_once_and_cannot_be_changed():
+def test_extrema_are_computed_once_and_are_the_callers_own(monkeypatch):
     plan = TrigSpline([Waypoint(0, 0, 0, 0), Waypoint(2, 1, 0, 0)], alpha=1.0)
     found = plan.extrema(1)
-    assert plan.extrema(1) is found
+    expected = found.maximum.copy()
+    found.maximum[:] = np.nan
+    evaluated = []
+    segment_jet = TrigSpline.segment_jet
+    monkeypatch.setattr(TrigSpline, "segment_jet", lambda *given: evaluated.append(given) or segment_jet(*given))
+    np.testing.assert_array_equal(plan.extrema(1).maximum, expected)
+    assert evaluated == []
     assert plan.peak(1) == pytest.approx(np.abs(plan(np.linspace(0, 2, 20001), 1)).max(), rel=1e-7)
-    for values in (found.minimum, found.maximum, found.time_min, found.time_max):
-        with pytest.raises(ValueError, match="read-only"):
-            values[0] = 0.0
