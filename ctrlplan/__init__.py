@@ -14,7 +14,7 @@ Plan a move
     stack                     plans of single axes as one plan
     waypoints_from_csv        waypoints from a table, with times or at a speed
     load_trajectory, trajectory_from_dict    stored plans
-    Trajectory                what all plans have: values, derivatives, extrema, plot, save, export, algebra
+    Trajectory                what all plans have: values, derivatives, extrema, stop, plot, export, algebra
     WaypointSpline            base class of a spline of your own
 Choose what is left free
     choose_alpha              shape by an objective: PeakDerivative, SquaredDerivative -> AlphaChoice
@@ -32,6 +32,9 @@ Build the loop
     FlatSystem                flat system from maps of your own
     flat_candidates           which outputs are flat -> FlatCandidate
     check_flat                maps against the equations -> FlatCheck
+    flat_loop                 plan, law and flat plant as one loop; laws: FlatLaw, TVLQR, Feedforward
+    create_flat_feedforward_iosystem    states and inputs along a plan, for a controller of your own
+    reference_window          states and inputs ahead, for model predictive control
     create_flat_iosystem      flat control of a flat plant; create_feedforward_iosystem: of a linear loop
     fit_feedforward           feedforward gains and delay from a log -> FeedforwardFit
     sample_hold               discrete block in a continuous loop; expose_states: states among the outputs
@@ -132,7 +135,13 @@ _EXPORTS = {
         "create_command_filter_iosystem",
         "create_delay_iosystem",
         "create_feedforward_iosystem",
+        "TVLQR",
+        "Feedforward",
+        "FlatLaw",
+        "create_flat_feedforward_iosystem",
         "create_flat_iosystem",
+        "flat_loop",
+        "reference_window",
         "create_governor_iosystem",
         "create_pid_iosystem",
         "create_replanner_iosystem",

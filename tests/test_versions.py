@@ -51,5 +51,5 @@ def test_the_matrix_pins_the_declared_minima():
     matrix = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(matrix)
     pins = dict(pin.split("==") for pin in matrix.minima())
-    assert set(pins) == {"control", "numpy", "scipy", "matplotlib", "jinja2", "tqdm", "casadi"}
+    assert set(pins) == {"control", "numpy", "scipy", "matplotlib", "jinja2", "tqdm", "casadi", "mpmath"}
     assert all(re.fullmatch(r"\d+(\.\d+)+", pin) for pin in pins.values())

@@ -53,7 +53,7 @@ class FlatCandidate(Displayed):
 
 @dataclass(frozen=True, repr=False)
 class FlatCheck(Displayed):
-    """Maps of a flat system compared with its dynamics, as found by `check_flat`.
+    """Maps of a flat system compared with its dynamics.
 
     Attributes
     ----------
@@ -89,7 +89,7 @@ def flat_candidates(
     at: At = None,
     params: Params | None = None,
 ) -> tuple[FlatCandidate, ...]:
-    """Sets of outputs and states that are flat outputs, simplest first.
+    """Sets of outputs and states that are flat, simplest first.
 
     Parameters
     ----------

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -40,7 +40,7 @@ class DerivedFlatSystem(FlatSystem):
     def __init__(
         self,
         maps: FlatMaps,
-        equations: tuple[Tape, Tape],
+        equations: tuple[Tape, Tape, Tape, Tape],
         analysis: Analysis,
         *,
         flat_labels: Sequence[str],
@@ -52,7 +52,7 @@ class DerivedFlatSystem(FlatSystem):
         notes: Sequence[str],
         name: str,
     ) -> None:
-        rates, measured = equations
+        rates, measured, flat, slopes = equations
         self._names = tuple(params)
         super().__init__(
             self._forward,
@@ -68,7 +68,7 @@ class DerivedFlatSystem(FlatSystem):
             params=params,
         )
         self.maps = maps
-        self._outputs = measured
+        self._outputs, self._flat, self._slopes = measured, flat, slopes
         self._analysis: Analysis | None = analysis
         self.operating_point = dict(operating_point)
         self.notes = tuple(notes)
@@ -102,7 +102,7 @@ class DerivedFlatSystem(FlatSystem):
     def states_and_inputs(
         self, plan: Trajectory, timepts: ArrayLike, *, start: ArrayLike | None = None
     ) -> tuple[Array, Array]:
-        """States and inputs along a plan of the flat outputs; see `FlatSystem.states_and_inputs`.
+        """States and inputs along a plan; see `FlatSystem`.
 
         The states are connected with the operating point, or with `start` at the
         plan's start, and followed along the plan, also through points where a
@@ -116,8 +116,32 @@ class DerivedFlatSystem(FlatSystem):
         n = self.maps.nstates
         return z[:n].reshape(n, *times.shape), u.reshape(-1, *times.shape)
 
+    def extension_along(self, plan: Trajectory, time: float) -> Array:
+        """States of the extension (extension,) at a time of a plan."""
+        plan, times = self._along(plan, time, None)
+        p = self.parameter_values()
+        z = states_along(self.maps, partial(self._grid, plan, p, None), plan, times.ravel(), p, str(self.name))[0]
+        return z[self.maps.nstates :, 0]
+
+    def linearised(self, x: ArrayLike, u: ArrayLike) -> tuple[Array, Array]:
+        """Jacobians of the rates.
+
+        Returns
+        -------
+        tuple of ndarray, shapes (nstates, nstates) and (nstates, ninputs)
+            By states and by inputs.
+        """
+        n = self.maps.nstates
+        found = self._slopes(np.asarray(x, dtype=float), np.asarray(u, dtype=float), self.parameter_values())
+        return found[:, :n], found[:, n:]
+
+    @property
+    def flat_map(self) -> Callable[..., Sequence[Value]]:
+        """Flat outputs as a function of (t, x, u, params)."""
+        return partial(_evaluated, self._flat, self._names)
+
     def quantities(self, jet: ArrayLike) -> dict[str, Array]:
-        """States, inputs and outputs of the plant by name; see `FlatSystem.quantities`."""
+        """States, inputs and outputs by name; see `FlatSystem`."""
         values, known = self._checked_jet(jet)
         below, _, last = rows_of(values, self.orders)
         p = self._values(self.params)

@@ -113,13 +113,21 @@ def flat_system(
 
 def derived_system(analysis: Analysis, original: Equations, name: str) -> DerivedFlatSystem:
     """Flat system of an analysed plant."""
+    import casadi as ca
+
     from ctrlplan.flatness.building import maps_of
     from ctrlplan.symbolic.taping import tape_of
 
     equations = analysis.equations
     maps = maps_of(analysis)
     point = [*analysis.point.x.tolist(), *analysis.point.u.tolist()]
-    tapes = tape_of(original.variables, original.rates), tape_of(original.variables, original.outputs)
+    variables, both = original.variables, ca.vertcat(original.x, original.u)
+    tapes = (
+        tape_of(variables, original.rates),
+        tape_of(variables, original.outputs),
+        tape_of(variables, original.flat),
+        tape_of(equations.variables, ca.jacobian(equations.rates, both), matrix=True),
+    )
     return DerivedFlatSystem(
         maps,
         tapes,

@@ -28,7 +28,7 @@ class LawExpressions:
     control : Tape
         Controls of the plant, of (references, x, own states, p).
     rates : Tape
-        Rates of the law's states, of the same arguments and the controls applied, u.
+        Rates of the law's states, of the same arguments.
     counts : tuple of int
         Number of poles of each flat output, integral action not counted.
     extension : int
@@ -68,9 +68,7 @@ def pole_counts(analysis: Analysis, quasi_static: bool, name: str) -> tuple[int,
     return _closed(analysis, name)[0]
 
 
-def law_with_states(
-    analysis: Analysis, gains: Sequence[Sequence[float]], integral: bool, recover: float | None
-) -> LawExpressions:
+def law_with_states(analysis: Analysis, gains: Sequence[Sequence[float]], integral: bool) -> LawExpressions:
     """Law whose states are those of the extension.
 
     Parameters
@@ -81,9 +79,6 @@ def law_with_states(
         Coefficients of the error polynomial of each flat output, lowest order first.
     integral : bool
         Whether each polynomial has one more coefficient, of the integral of the error.
-    recover : float, optional
-        Time constant [s] with which the extension tracks the controls applied while
-        these differ from those of the law.
     """
     structure = analysis.structure
     reference = _Reference(analysis, structure.extension, integral)
@@ -95,12 +90,7 @@ def law_with_states(
     mu = _controls(analysis, z, ca.vertcat(*wanted))
     u = _at(structure.controls, analysis, z, mu)
     rates = _at(structure.rates, analysis, z, mu)[structure.nstates :]
-    applied = ca.SX.sym("applied", u.numel())
-    if recover is not None and structure.extension:
-        held = ca.substitute(structure.held, analysis.equations.u, applied)
-        differs = ca.logic_not(ca.eq(ca.sumsqr(applied - u), 0.0))
-        rates = rates + ca.if_else(differs, (held - reference.w) / recover, 0.0)
-    return _tapes(analysis, reference, u, rates, applied, structure.orders, structure.extension)
+    return _tapes(analysis, reference, u, rates, structure.orders, structure.extension)
 
 
 def law_without_states(
@@ -137,7 +127,7 @@ def law_without_states(
     v = ca.vertcat(*(derivative(j, r) for j, r in enumerate(structure.orders)))
     mu = _controls(analysis, known, v)
     u = _at(structure.controls, analysis, known, mu)
-    return _tapes(analysis, reference, u, ca.SX(0, 1), ca.SX.sym("applied", u.numel()), counts, 0)
+    return _tapes(analysis, reference, u, ca.SX(0, 1), counts, 0)
 
 
 def _tapes(
@@ -145,7 +135,6 @@ def _tapes(
     reference: _Reference,
     u: ca.SX,
     rates: ca.SX,
-    applied: ca.SX,
     counts: tuple[int, ...],
     extension: int,
 ) -> LawExpressions:
@@ -154,9 +143,7 @@ def _tapes(
     errors = ca.SX(0, 1)
     if reference.integrals.numel():
         errors = equations.flat - ca.vertcat(*(row[0] for row in reference.rows))
-    return LawExpressions(
-        tape_of(arguments, u), tape_of((*arguments, applied), ca.vertcat(rates, errors)), counts, extension
-    )
+    return LawExpressions(tape_of(arguments, u), tape_of(arguments, ca.vertcat(rates, errors)), counts, extension)
 
 
 def _closing(reference: _Reference, j: int, measured: ca.SX, gains: list[float], integral: bool) -> ca.SX:

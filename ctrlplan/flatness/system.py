@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from ctrlplan._checks import check_kind, checked_labels, checked_timepts, default_labels, real_array
 from ctrlplan._display import Displayed, Facts, Part
-from ctrlplan._types import Array
+from ctrlplan._types import Array, Value
 from ctrlplan.trajectories import Trajectory
 
 Params = Mapping[str, float] | None
@@ -227,7 +227,7 @@ class FlatSystem(Displayed, fs.FlatSystem):  # type: ignore[misc]
 
     def _along(self, plan: Trajectory, timepts: ArrayLike, start: ArrayLike | None) -> tuple[Trajectory, Array]:
         """Plan in the order of the flat outputs, and times, checked."""
-        plan = self._matched(plan)
+        plan = self.matched(plan)
         times = checked_timepts(timepts)
         if not np.isfinite(times).all():
             raise ValueError("timepts must be finite, got inf")
@@ -237,8 +237,20 @@ class FlatSystem(Displayed, fs.FlatSystem):  # type: ignore[misc]
             self._check_smooth(plan, float(times.min()), float(times.max()))
         return plan, times
 
-    def _matched(self, plan: Trajectory) -> Trajectory:
-        """Plan with the axes in the order of the flat outputs."""
+    @property
+    def flat_map(self) -> Callable[..., Sequence[Value]]:
+        """Flat outputs as a function of (t, x, u, params)."""
+        forward = self.forward
+        return lambda t, x, u, params: [row[0] for row in forward(x, u, params)]
+
+    def matched(self, plan: Trajectory) -> Trajectory:
+        """Plan with the axes in the order of the flat outputs.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If `plan` is not a trajectory, or has other axes.
+        """
         check_kind(plan, "plan", Trajectory)
         if plan.labels in (self.flat_labels, default_labels(len(self.flat_labels))):
             return plan

@@ -241,7 +241,7 @@ class DurationSearch:
         """End of the interval of feasible durations below a feasible one."""
         while True:
             outside = block.durations[(block.durations < feasible) & (block.tops > 0.0)].tolist()
-            outside += [d for d in self._exact if d < feasible and self.worst(d) > 0.0]
+            outside += [d for d in self._exact if block.durations[0] <= d < feasible and self.worst(d) > 0.0]
             low = max(outside, default=feasible)
             if low == feasible or self.worst(low) <= 0.0:
                 return min(low, feasible)

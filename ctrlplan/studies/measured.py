@@ -317,7 +317,7 @@ class _Alongside:
             f"resampled: {own.size} of {self.t.size} samples, every {1e3 * step:.4g} ms, and linear interpolation at "
             f"the {common.size} times of the simulation from {first:.6g} to {last:.6g} s"
         )
-        if first > given[0] or last < given[-1]:
+        if first > given[0] + step or last < given[-1] - step:
             where += f"; metrics cover this time only, of {given[0]:.6g} to {given[-1]:.6g} s"
         return np.union1d(common, own[apart > 1e-6 * step]), where
 

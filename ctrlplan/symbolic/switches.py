@@ -108,6 +108,11 @@ def _difference(x: ca.SX, y: ca.SX) -> ca.SX:
     return x - y
 
 
+def _distance(x: ca.SX, y: ca.SX) -> ca.SX:
+    """Positive where x and y differ: a zero crossing of x - y does not switch their equality for any time."""
+    return ca.fabs(x - y)
+
+
 def _first(x: ca.SX, *_: ca.SX) -> ca.SX:
     return x
 
@@ -119,7 +124,8 @@ def _whole(x: ca.SX, *_: ca.SX) -> ca.SX:
 _BENDS = (ca.OP_FMIN, ca.OP_FMAX, ca.OP_FABS)
 
 _SWITCHES = {
-    **dict.fromkeys((ca.OP_LT, ca.OP_LE, ca.OP_EQ, ca.OP_NE, ca.OP_FMIN, ca.OP_FMAX), _difference),
+    **dict.fromkeys((ca.OP_LT, ca.OP_LE, ca.OP_FMIN, ca.OP_FMAX), _difference),
+    **dict.fromkeys((ca.OP_EQ, ca.OP_NE), _distance),
     **dict.fromkeys((ca.OP_FABS, ca.OP_SIGN, ca.OP_NOT, ca.OP_IF_ELSE_ZERO), _first),
     **dict.fromkeys((ca.OP_FLOOR, ca.OP_CEIL), _whole),
     **dict.fromkeys((ca.OP_AND, ca.OP_OR), lambda x, y: x + y - 1.5),

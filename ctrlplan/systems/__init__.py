@@ -59,6 +59,8 @@ from ctrlplan.systems.exposed import expose_states, state_signals
 from ctrlplan.systems.feedforward import create_feedforward_iosystem
 from ctrlplan.systems.feedforward_fit import FeedforwardFit, fit_feedforward
 from ctrlplan.systems.flat import create_flat_iosystem
+from ctrlplan.systems.flat_feedforward import create_flat_feedforward_iosystem, reference_window
+from ctrlplan.systems.flat_loop import TVLQR, Feedforward, FlatLaw, flat_loop
 from ctrlplan.systems.governor import Admission, Governor, create_governor_iosystem
 from ctrlplan.systems.hybrid import Delay, SampleHold, create_delay_iosystem, sample_hold
 from ctrlplan.systems.pid import create_pid_iosystem
@@ -71,10 +73,13 @@ from ctrlplan.systems.source import PlanSource, create_source_iosystem, source_s
 from ctrlplan.systems.time_scaling import create_time_scaling_iosystem
 
 __all__ = [
+    "TVLQR",
     "AdmissibleSet",
     "Admission",
     "Delay",
+    "Feedforward",
     "FeedforwardFit",
+    "FlatLaw",
     "Governor",
     "Law",
     "PlanSource",
@@ -85,6 +90,7 @@ __all__ = [
     "create_command_filter_iosystem",
     "create_delay_iosystem",
     "create_feedforward_iosystem",
+    "create_flat_feedforward_iosystem",
     "create_flat_iosystem",
     "create_governor_iosystem",
     "create_pid_iosystem",
@@ -95,9 +101,11 @@ __all__ = [
     "create_time_scaling_iosystem",
     "expose_states",
     "fit_feedforward",
+    "flat_loop",
     "flat_quantities",
     "hurwitz_coefficients",
     "plants",
+    "reference_window",
     "sample_hold",
     "source_samples",
     "state_signals",

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from ctrlplan._checks import check_signals, checked_range, finite_vector
 from ctrlplan._types import Array, Params, Value
-from ctrlplan.flatness.derived import DerivedFlatSystem
+from ctrlplan.flatness import DerivedFlatSystem, FlatSystem
 from ctrlplan.symbolic.tape import Tape
 from ctrlplan.systems.poles import checked_gains
 from ctrlplan.traits import declare
@@ -19,9 +19,6 @@ from ctrlplan.trajectories import derivative_name
 
 InputLimits = Mapping[str, tuple[float, float]]
 """Lower and upper limits of inputs of a plant by name."""
-
-_RECOVERY = 0.1
-"""Time constant with which the extension follows saturated inputs, in those of the fastest pole."""
 
 
 def create_derived_law(
@@ -42,14 +39,16 @@ def create_derived_law(
     analysis = flat.analysis
     counts = pole_counts(analysis, quasi_static, str(flat.name))
     gains = checked_gains(poles, [count + int(integral) for count in counts])
-    bounds = _bounds(limits, flat)
+    bounds = input_bounds(limits, flat)
+    if bounds is not None and not quasi_static and flat.extension:
+        raise ValueError(
+            f"limits must be None for a law with the states of an extension, as that of {flat.name} has: these states "
+            "would not follow saturated inputs; use quasi_static=True"
+        )
     if quasi_static:
         law = law_without_states(analysis, gains, integral, str(flat.name))
     else:
-        recover = (
-            None if bounds is None else _RECOVERY / float(np.abs(np.concatenate(list(map(np.ravel, poles)))).max())
-        )
-        law = law_with_states(analysis, gains, integral, recover)
+        law = law_with_states(analysis, gains, integral)
     first = _initial(flat, start, law.extension)
     return _block(
         flat,
@@ -95,22 +94,16 @@ def _block(
         given = [_number(value) + idles * at for value, at in zip([*u, *x], regular, strict=True)]
         return given[:count], given[count : count + len(states)], given[count + len(states) :], p, 1.0 - idles
 
-    def applied(x: Value, u: Value) -> tuple[list[Value], tuple[Value, Value, Value, Value, Value]]:
+    def output(t: float, x: Value, u: Value, params: Params) -> Value:
         given = arguments(x, u)
         values = control.at(given[:4])
         if bounds is not None:
-            values = [
-                np.minimum(np.maximum(value, low), high) for value, low, high in zip(values, *bounds, strict=True)
-            ]
-        return values, given
-
-    def output(t: float, x: Value, u: Value, params: Params) -> Value:
-        values, given = applied(x, u)
+            values = [np.minimum(np.maximum(v, low), high) for v, low, high in zip(values, *bounds, strict=True)]
         return [value * given[4] for value in values]
 
     def update(t: float, x: Value, u: Value, params: Params) -> Value:
-        values, given = applied(x, u)
-        return [value * given[4] for value in rates.at((*given[:4], values))]
+        given = arguments(x, u)
+        return [value * given[4] for value in rates.at(given[:4])]
 
     own = [f"{name}_w{k + 1}" for k in range(extension)]
     own += [f"{name}_{label}_integral" for label in labels] if integral else []
@@ -153,7 +146,8 @@ def _initial(flat: DerivedFlatSystem, start: ArrayLike | None, extension: int) -
     return found
 
 
-def _bounds(limits: InputLimits | None, flat: DerivedFlatSystem) -> tuple[Array, Array] | None:
+def input_bounds(limits: InputLimits | None, flat: FlatSystem) -> tuple[Array, Array] | None:
+    """Lower and upper limits of the inputs of a plant, infinite where none is given."""
     if limits is None:
         return None
     names = list(flat.input_labels)

@@ -72,7 +72,7 @@ _OTHER_MOVE = "moves over a wider range of positions, in both directions and at 
 
 @dataclass(frozen=True, repr=False)
 class FeedforwardFit(Displayed):
-    """Feedforward gains with their uncertainty, as returned by `fit_feedforward`.
+    """Feedforward gains with their uncertainty.
 
     Attributes
     ----------
@@ -418,7 +418,8 @@ class _Data:
             # Minimum of the neighbourhood that the filter mixes.
             reach = round(_REACH / motion.cutoff / self._dt)
             self._moving = t, minimum_filter1d(np.abs(jet[1]), 2 * reach + 1, mode="nearest")
-            quiet = np.where(np.abs(jet[1]) > self.threshold, jet, 0.0 * jet)
+            moves = np.abs(jet[1]) > max(4.0 * motion.velocity_noise, 0.05 * self.threshold)
+            quiet = np.where(moves, jet, 0.0 * jet)  # without the sign of the noise at standstill
             for name in names:
                 if name in _FILTERED or name in functions:
                     values = _term(name, functions, quiet if name in _FILTERED else jet)

@@ -156,7 +156,7 @@ def create_flat_iosystem(
     >>> bool(abs(found.outputs - plan(found.time)).max() < 1e-7)
     True
     """
-    derived = _derived(flat, quasi_static or integral)
+    derived = derived_system_of(flat, quasi_static or integral)
     if derived is not None:
         names = derived.flat_labels if labels is None else checked_labels(labels, len(derived.flat_labels))
         return create_derived_law(
@@ -221,7 +221,7 @@ def create_flat_iosystem(
     )
 
 
-def _derived(flat: fs.FlatSystem, options: bool) -> DerivedFlatSystem | None:
+def derived_system_of(flat: fs.FlatSystem, options: bool) -> DerivedFlatSystem | None:
     """Flat system for which the law is derived from equations; None for static maps of its own."""
     if isinstance(flat, DerivedFlatSystem):
         return flat

@@ -72,11 +72,14 @@ class SampledMotion(Motion):
     ----------
     cutoff : float
         Cutoff frequency [Hz].
+    velocity_noise : float
+        Standard deviation of the noise of the velocity.
     """
 
     def __init__(self, t: Array, position: Array, order: int) -> None:
         self._rate = 1.0 / float(np.median(np.diff(t)))
         self.cutoff = _cutoff(position, self._rate, order)
+        self.velocity_noise = math.sqrt(_noise(position, self._rate, self.cutoff, 1))
         margin = 0.5 / self.cutoff  # of samples that the ends affect
         self.start, self.end = float(t[0]) + margin, float(t[-1]) - margin
         curve = make_interp_spline(t, self.smooth(position), k=5)
@@ -104,18 +107,21 @@ class FilteredColumn:
 
 def _cutoff(position: Array, rate: float, order: int) -> float:
     """Highest cutoff frequency [Hz] with which the highest derivative is above the noise."""
-    steps = np.diff(position, 4)
-    deviation = float(np.sqrt(np.mean(steps**2) / 70.0))  # 1, 4, 6, 4, 1 squared
     frequencies = np.geomspace(max(2.0 * rate / position.size, 1e-3 * rate), 0.2 * rate, 32)[::-1]
     for cutoff in frequencies.tolist():
         derivative = _low_passed(position, cutoff, rate)
         for _ in range(order):
             derivative = np.gradient(derivative, 1.0 / rate)
         power = float(np.var(derivative))
-        noise = deviation**2 * (2.0 / rate) * (2.0 * np.pi * cutoff) ** (2 * order) * cutoff / (2 * order + 1)
-        if noise <= _NOISE * power:
+        if _noise(position, rate, cutoff, order) <= _NOISE * power:
             return cutoff
     return float(frequencies[-1])
+
+
+def _noise(position: Array, rate: float, cutoff: float, order: int) -> float:
+    """Variance of the noise in a derivative after the filter, for white noise of the position."""
+    variance = float(np.mean(np.diff(position, 4) ** 2)) / 70.0  # 70: the sum of squares of 1, 4, 6, 4, 1
+    return variance * (2.0 / rate) * (2.0 * np.pi * cutoff) ** (2 * order) * cutoff / (2 * order + 1)
 
 
 def _low_passed(values: Array, cutoff: float, rate: float) -> Array:

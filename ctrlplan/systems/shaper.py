@@ -74,7 +74,10 @@ class ShaperBlock(SampledBlock):
         )
 
     def sample(self, t: float, x: Array, u: Array, params: Params) -> Array:
-        """States after a sample: past commands, past frequencies, held outputs."""
+        """States after a sample.
+
+        Past commands, past frequencies, held outputs.
+        """
         count = self._width * self._length
         past, command = x[:count].reshape(self._width, self._length), np.asarray(u[: self._width], dtype=float)
         following = [np.column_stack([command, past[:, :-1]]).ravel()]

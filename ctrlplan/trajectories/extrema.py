@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import lru_cache
 from typing import TYPE_CHECKING, NoReturn
 from weakref import WeakKeyDictionary
@@ -84,7 +84,8 @@ def derivative_extrema(plan: Trajectory, nu: int) -> Extrema:
     known = _KNOWN.setdefault(plan, {})
     if nu not in known:
         known[nu] = _derivative_extrema(plan, nu)
-    return known[nu]
+    found = known[nu]
+    return Extrema(*(np.copy(getattr(found, field.name)) for field in fields(found)))  # the caller's own
 
 
 def _derivative_extrema(plan: Trajectory, nu: int) -> Extrema:

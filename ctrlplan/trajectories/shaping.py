@@ -394,7 +394,7 @@ class Shaper(Displayed, Fields):
         ([0.0, 15.0, 16.0], True)
         """
         period = checked_finite(dt, "dt", above=0.0)
-        self._check_factors("on_grid")
+        self._check_modes_known("on_grid")
         taps = reduce(np.convolve, [factor.on_grid(period) for factor in self.factors])
         kept = np.flatnonzero(taps)
         return Shaper(period * kept, taps[kept])._with_fields(factors=self.factors)
@@ -480,11 +480,11 @@ class Shaper(Displayed, Fields):
         delays = factor.delay * np.arange(len(factor.weights))
         return cls(delays, factor.weights)._with_fields(factors=(factor,))
 
-    def _check_factors(self, name: str) -> None:
+    def _check_modes_known(self, method: str) -> None:
         """Raise if the modes for which the shaper is designed are not known."""
         if not self.factors:
             raise ValueError(
-                f"{name} must be called on a shaper whose modes are known, got one of given impulses; use Shaper.zv, "
+                f"{method} must be called on a shaper whose modes are known, got one of given impulses; use Shaper.zv, "
                 "zvd, mzv, ei, two_hump_ei, three_hump_ei or fit, joined by then"
             )
 

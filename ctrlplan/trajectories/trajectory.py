@@ -977,7 +977,7 @@ class Trajectory(Displayed, Fields, ABC):
             )
 
     def derivative_bounds(self, nu: int) -> tuple[Array, Array] | None:
-        """Lower and upper bounds (naxes, nsegments) of a derivative on each segment, None if they are not known.
+        """Bounds of a derivative on each segment, or None.
 
         With them `extrema` searches only segments that can contain one.
         """

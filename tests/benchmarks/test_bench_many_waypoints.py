@@ -174,6 +174,33 @@ def test_reading_waypoints(benchmark, capsys):
 
 
 @pytest.mark.benchmark
+@pytest.mark.parametrize("derivative", [3, 4])
+def test_optimum_waypoints_beside_make_interp_spline(derivative, benchmark, capsys):
+    times, sizes = [], (10, 100, 1000)
+    for n in sizes:
+        t, y, _, _ = data(n)
+        rest = [np.zeros(3)] * (derivative - 1)
+        points = [
+            cp.Waypoint(moment, position, *(rest if i in (0, n - 1) else []))
+            for i, (moment, position) in enumerate(zip(t.tolist(), y.T, strict=True))
+        ]
+        ends = [(k, np.zeros(3)) for k in range(1, derivative)]
+
+        def ours(points=points):
+            return cp.optimize_waypoints(points, derivative=derivative)
+
+        def peer(t=t, y=y, ends=ends):
+            return make_interp_spline(t, y.T, k=2 * derivative - 1, bc_type=(ends, ends))
+
+        at = np.linspace(t[0], t[-1], 1001)
+        assert np.abs(ours().plan(at) - peer()(at).T).max() <= 1e-11 * np.abs(peer()(at)).max()
+        times.append(seconds((ours, peer), max(1, 300 // n)))
+    benchmark.pedantic(ours, rounds=5, warmup_rounds=1)
+    degree = 2 * derivative - 1
+    report(capsys, benchmark, f"optimize_waypoints({derivative}) next to make_interp_spline(k={degree})", times, sizes)
+
+
+@pytest.mark.benchmark
 def test_growth_of_what_uses_a_plan(benchmark, capsys, tmp_path):
     """Two decades of segments: each of these is to grow by about a hundred, and memory as well."""
     lag = ct.tf([1.0], [1.0, 1.0], inputs="u", outputs="y")

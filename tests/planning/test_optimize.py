@@ -796,3 +796,70 @@ def test_a_single_spline_through_near_points_is_inaccurate_as_well():
     points = [Waypoint(t, math.sin(9.0 * t), 9.0 * math.cos(9.0 * t), 0.0) for t in (0.0, 0.5, 0.5 + 1e-6, 1.0)]
     with pytest.raises(ValueError, match="the cost must be resolved in double precision, got an estimated relative"):
         optimize_waypoints(points, single=True)
+
+
+def clamped(n, derivative, seed=0):
+    """Times, positions of three axes, waypoints at rest at both ends, and scipy's spline of the same problem."""
+    rng = np.random.default_rng(seed)
+    times, positions = np.cumsum(rng.uniform(0.5, 1.5, n)), rng.normal(size=(n, 3))
+    rest = [np.zeros(3)] * (derivative - 1)
+    points = [
+        Waypoint(t, y, *(rest if i in (0, n - 1) else []))
+        for i, (t, y) in enumerate(zip(times.tolist(), positions, strict=True))
+    ]
+    ends = [(k, np.zeros(3)) for k in range(1, derivative)]
+    return times, points, make_interp_spline(times, positions, k=2 * derivative - 1, bc_type=(ends, ends))
+
+
+def squared_cost(spline, times, derivative):
+    """Integral of the squared derivative, a polynomial on each segment, by Gauss-Legendre points."""
+    nodes, weights = np.polynomial.legendre.leggauss(derivative + 1)
+    h = np.diff(times)
+    values = spline(times[:-1, None] + 0.5 * h[:, None] * (nodes + 1.0), derivative)
+    return float(0.5 * h @ ((values**2).sum(axis=2) @ weights))
+
+
+@pytest.mark.parametrize("derivative", [2, 3, 4])
+@pytest.mark.parametrize("n", [3, 40, 1000])
+def test_many_waypoints_have_the_cost_of_the_clamped_spline(n, derivative):
+    times, points, spline = clamped(n, derivative)
+    found = optimize_waypoints(points, derivative=derivative)
+    assert found.unique
+    assert found.cost == pytest.approx(squared_cost(spline, times, derivative), rel=1e-11)
+    t = np.linspace(times[0], times[-1], 2001)
+    assert np.abs(found.plan(t) - spline(t).T).max() <= 1e-11 * np.abs(spline(t)).max()
+
+
+def test_free_ends_of_many_waypoints_are_natural():
+    """Nothing but positions: derivatives 3 to 5 vanish at both ends of the minimum-jerk plan."""
+    times, points, _ = clamped(300, 3)
+    points = [Waypoint(p.time, p.position) for p in points]
+    found = optimize_waypoints(points)
+    natural = [(k, np.zeros(3)) for k in (3, 4)]
+    positions = np.array([p.position for p in points])
+    spline = make_interp_spline(times, positions, k=5, bc_type=(natural, natural))
+    t = np.linspace(times[0], times[-1], 1001)
+    assert np.abs(found.plan(t) - spline(t).T).max() <= 1e-10 * np.abs(spline(t)).max()
+    assert found.cost == pytest.approx(squared_cost(spline, times, 3), rel=1e-10)
+    assert found.unique
+
+
+def test_many_waypoints_without_dense_equations(monkeypatch):
+    monkeypatch.setattr("ctrlplan.planning.optimize._least_squares", None)
+    _, points, _ = clamped(200, 4)
+    assert optimize_waypoints(points, derivative=4).unique
+
+
+def test_free_times_of_many_waypoints_lower_the_cost():
+    times, points, _ = clamped(60, 3)
+    fixed, free = optimize_waypoints(points), optimize_waypoints(points, free_times=True)
+    assert free.cost < 0.8 * fixed.cost
+    chosen = np.array([p.time for p in free.waypoints])
+    assert (chosen[[0, -1]] == times[[0, -1]]).all()
+    # Stationary: moving a waypoint either way costs more.
+    for i in (7, 30):
+        for change in (-1e-3, 1e-3):
+            moved = [
+                Waypoint(t + change * (k == i), *p.jet) for k, (t, p) in enumerate(zip(chosen, points, strict=True))
+            ]
+            assert optimize_waypoints(moved).cost > free.cost

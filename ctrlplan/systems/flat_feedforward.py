@@ -1,0 +1,155 @@
+"""States and inputs along a plan, for controllers of other kinds: as a block, and as a window ahead."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+
+import control as ct
+import numpy as np
+
+from ctrlplan._checks import check_kind, checked_count, checked_finite, checked_labels
+from ctrlplan._types import Array, Params, Value
+from ctrlplan.flatness import DerivedFlatSystem, FlatSystem
+from ctrlplan.systems.derived_laws import references
+from ctrlplan.trajectories import Trajectory
+
+
+def create_flat_feedforward_iosystem(
+    flat: FlatSystem,
+    *,
+    states: bool = True,
+    labels: Sequence[str] | str | None = None,
+    suffix: str = "_ref",
+    name: str = "flat_feedforward",
+) -> ct.NonlinearIOSystem:
+    """States and inputs along a plan of the flat outputs, as a block.
+
+    No states. Inputs: for each flat output y its references y_ref, y_ref_d1, ...
+    up to its order, as `create_source_iosystem` names its outputs with
+    ``suffix="_ref"``. Outputs: the states xd[0], xd[1], ... and the inputs ud[0],
+    ..., the names that `control.create_statefbk_iosystem` gives its inputs.
+
+    Parameters
+    ----------
+    flat : FlatSystem
+        The plant.
+    states : bool, optional
+        Whether the states are outputs, too. Default True.
+    labels : sequence of str or str, optional
+        Names of the flat outputs. Default: those of `flat`.
+    suffix : str, optional
+        Appended to each label in the names of the references.
+    name : str, optional
+        Name of the block.
+
+    Returns
+    -------
+    control.NonlinearIOSystem
+        Static, of any time base. Maps by formulas can be compiled; those derived from
+        equations run in Python, connected with the operating point at each call.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If `flat` is not a `FlatSystem`, or labels are wrong.
+
+    Examples
+    --------
+    >>> import control as ct
+    >>> import ctrlplan as cp
+    >>> motor = cp.plants.dc_motor()
+    >>> block = cp.create_flat_feedforward_iosystem(motor)
+    >>> block.input_labels, block.output_labels
+    (['angle_ref', 'angle_ref_d1', 'angle_ref_d2', 'angle_ref_d3'], ['xd[0]', 'xd[1]', 'xd[2]', 'ud[0]'])
+    """
+    check_kind(flat, "flat", FlatSystem)
+    names = flat.flat_labels if labels is None else checked_labels(labels, len(flat.flat_labels))
+    wanted = references(names, flat.orders, suffix)
+    ends = np.cumsum([0, *(r + 1 for r in flat.orders)]).tolist()
+    regular = _regular_flag(flat)
+
+    def output(t: float, x: Value, u: Value, params: Params) -> Value:
+        # Blocks are first evaluated with all inputs zero, where the maps of many plants are singular.
+        idles = math.prod(value == 0.0 for value in u)
+        given = np.array([value + idles * at for value, at in zip(u, regular, strict=True)])
+        found, inputs = flat.reverse([given[a:b] for a, b in pairwise(ends)], flat.params)
+        return [value * (1.0 - idles) for value in ([*found, *inputs] if states else inputs)]
+
+    outputs = [f"xd[{k}]" for k in range(flat.nstates)] if states else []
+    outputs += [f"ud[{k}]" for k in range(flat.ninputs)]
+    return ct.nlsys(None, output, inputs=wanted, outputs=outputs, dt=None, name=name)
+
+
+def reference_window(
+    plan: Trajectory, time: float, dt: float, count: int, *, flat: FlatSystem | None = None, order: int = 2
+) -> tuple[Array, Array] | Array:
+    """Reference over a horizon from any time, for predictive control.
+
+    Before its start and after its end the plan rests.
+
+    Parameters
+    ----------
+    plan : Trajectory
+        The plan; of the flat outputs if `flat` is given.
+    time : float
+        Begin of the horizon [s].
+    dt : float
+        Time between its samples [s], above 0.
+    count : int
+        Number of steps.
+    flat : FlatSystem, optional
+        The plant.
+    order : int, optional
+        Highest derivative without `flat`. Default 2.
+
+    Returns
+    -------
+    x : ndarray, shape (nstates, count + 1)
+        States at the samples.
+    u : ndarray, shape (ninputs, count)
+        Inputs at the samples without the last one.
+    jet : ndarray, shape (order + 1, naxes, count + 1)
+        Without `flat`, in place of both: positions and derivatives.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If arguments are wrong, or states are not determined.
+
+    Examples
+    --------
+    >>> import ctrlplan as cp
+    >>> motor = cp.plants.dc_motor()
+    >>> plan = cp.PolySpline([cp.Waypoint(0, 0, 0, 0, 0), cp.Waypoint(1, 2, 0, 0, 0)], labels="angle")
+    >>> x, u = cp.reference_window(plan, 0.95, 0.02, 5, flat=motor)
+    >>> x.shape, u.shape, x[0].round(4).tolist()
+    ((3, 6), (1, 5), [1.9999, 2.0, 2.0, 2.0, 2.0, 2.0])
+    """
+    check_kind(plan, "plan", Trajectory)
+    steps = checked_count(count, "count", 1)
+    begin, spacing = checked_finite(time, "time"), checked_finite(dt, "dt", above=0.0)
+    times = begin + spacing * np.arange(steps + 1)
+    if flat is None:
+        return plan.jet(times, checked_count(order, "order"))
+    check_kind(flat, "flat", FlatSystem)
+    x, u = flat.states_and_inputs(plan, times)
+    return x, u[:, :-1]
+
+
+def _regular_flag(flat: FlatSystem) -> list[float]:
+    """Flags at which the maps are regular, one after the other."""
+    if isinstance(flat, DerivedFlatSystem):
+        below = flat.maps.flags(flat.maps.start, flat.parameter_values()).tolist()
+    else:
+        below = [0.0] * sum(flat.orders)
+        with np.errstate(all="ignore"):
+            x, u = flat.reverse([np.zeros(r + 1) for r in flat.orders], flat.params)
+            if not (np.isfinite(x).all() and np.isfinite(u).all()):
+                below = np.random.default_rng(0).uniform(0.5, 1.0, sum(flat.orders)).tolist()
+    rows, first = [], 0
+    for r in flat.orders:
+        rows += [*below[first : first + r], 0.0]
+        first += r
+    return rows

@@ -1,0 +1,346 @@
+"""Loops of flat plants: the plan, a law as a value, and the plant."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import control as ct
+import control.flatsys as fs
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.integrate import solve_ivp
+from scipy.linalg import solve_continuous_are
+
+from ctrlplan._checks import check_kind, check_signals, checked_vector, real_array
+from ctrlplan._display import Displayed, Facts, Part
+from ctrlplan._types import Array, Params, Value
+from ctrlplan.flatness import DerivedFlatSystem, FlatSystem
+from ctrlplan.systems.derived_laws import InputLimits, create_derived_law, input_bounds
+from ctrlplan.systems.flat import create_flat_iosystem, derived_system_of
+from ctrlplan.systems.source import create_source_iosystem
+from ctrlplan.traits import declare, traits_of
+from ctrlplan.trajectories import Trajectory
+
+_SETTLED = 1e-9
+"""Size of the rates at the end of a plan, relative to their terms, below which the plant rests there."""
+
+
+@dataclass(frozen=True, repr=False)
+class FlatLaw(Displayed):
+    """Flat tracking law as a value; see `create_flat_iosystem`.
+
+    Attributes
+    ----------
+    poles : sequence of sequences of complex
+        Poles [rad/s] of the tracking error of each flat output.
+    quasi_static : bool
+        Whether the law has no states of the extension.
+    integral : bool
+        Whether the law contains the integral of each error.
+    """
+
+    poles: Sequence[Value]
+    quasi_static: bool = False
+    integral: bool = False
+
+    def create(self, flat: FlatSystem, plan: Trajectory, limits: InputLimits | None) -> ct.NonlinearIOSystem:
+        """Block of the law, its extension at the start of the plan."""
+        derived = derived_system_of(flat, self.quasi_static or self.integral or limits is not None)
+        if derived is None:
+            return create_flat_iosystem(flat, self.poles, labels=flat.flat_labels, name="law")
+        start = None if self.quasi_static else derived.extension_along(plan, plan.start)
+        return create_derived_law(
+            derived,
+            self.poles,
+            quasi_static=self.quasi_static,
+            integral=self.integral,
+            start=start if derived.extension else None,
+            labels=derived.flat_labels,
+            suffix="_ref",
+            name="law",
+            limits=limits,
+        )
+
+    def _describe(self) -> Iterator[Part]:
+        yield f"FlatLaw with the poles {', '.join(map(str, self.poles))}"
+        yield Facts([("quasi-static", str(self.quasi_static)), ("integral action", str(self.integral))])
+
+
+@dataclass(frozen=True)
+class Feedforward:
+    """Inputs along the plan without feedback."""
+
+    def create(self, flat: FlatSystem, plan: Trajectory, limits: InputLimits | None) -> ct.NonlinearIOSystem:
+        """Block of the inputs as functions of time."""
+
+        def output(t: float, x: Value, u: Value, params: Params) -> Value:
+            return clipped(flat.states_and_inputs(plan, t)[1])
+
+        clipped = _clipping(flat, limits)
+        block = ct.nlsys(None, output, inputs=0, outputs=list(flat.input_labels), name="law")
+        return declare(block, breakpoints=plan.breakpoints)
+
+
+@dataclass(frozen=True, repr=False, eq=False)
+class TVLQR(Displayed):
+    r"""Time-varying linear quadratic regulator along a plan.
+
+    The control is u_d - R^-1 B' P (x - x_d), with
+
+    .. math:: -P' = A'P + P A - P B R^{-1} B' P + Q, \quad P(T) = P_T
+
+    and A, B the linearisation along the plan. For the linearised plant it minimises
+    the integral of e'Q e + v'R v, v the feedback, plus e'P_T e at the end. After the
+    end of the plan the stationary gain there is used.
+
+    Attributes
+    ----------
+    Q, R : array_like, shapes (nstates, nstates) and (ninputs, ninputs)
+        Weights of errors and of feedback.
+    final : array_like, shape (nstates, nstates), optional
+        P_T. Default: the stationary solution at the end of the plan, where one
+        exists; a vehicle at rest has none.
+    """
+
+    Q: ArrayLike
+    R: ArrayLike
+    final: ArrayLike | None = None
+
+    def _describe(self) -> Iterator[Part]:
+        yield "TVLQR: gains from a Riccati equation along the plan"
+        final = "stationary" if self.final is None else "given"
+        yield Facts(
+            [("Q", str(np.asarray(self.Q).tolist())), ("R", str(np.asarray(self.R).tolist())), ("final", final)]
+        )
+
+    def gains(self, flat: FlatSystem, plan: Trajectory) -> tuple[Value, Array]:
+        """Gain within the plan as a function of time, and after its end.
+
+        Both (ninputs, nstates).
+
+        Raises
+        ------
+        TypeError
+            If the flat system is not derived from equations.
+        ValueError
+            If weights have wrong shapes or are not positive, or `final` is required.
+        """
+        if not isinstance(flat, DerivedFlatSystem):
+            raise TypeError(f"flat must be a flat system from equations for TVLQR, got {type(flat).__name__}")
+        n, m = flat.nstates, flat.ninputs
+        q, r = _weight(self.Q, "Q", n, strict=False), _weight(self.R, "R", m, strict=True)
+        inverse = np.linalg.inv(r)
+
+        def slopes(t: float) -> tuple[Array, Array]:
+            x, u = flat.states_and_inputs(plan, t)
+            return flat.linearised(x, u)
+
+        a, b = slopes(plan.end)
+        stationary = _stationary(a, b, q, r) if self._rests(flat, plan) else None
+        last = stationary if self.final is None else _weight(self.final, "final", n, strict=False)
+        if last is None:
+            raise ValueError(
+                f"final must be given for {flat.name}: there is no stationary gain at the end of the plan, since the "
+                "plant is not at rest there or not stabilisable"
+            )
+
+        def rate(t: float, flat_p: Array) -> Array:
+            a, b = slopes(t)
+            p = flat_p.reshape(n, n)
+            found = a.T @ p + p @ a - p @ b @ inverse @ b.T @ p + q
+            return np.asarray(-found.ravel(), dtype=float)
+
+        solution = solve_ivp(
+            rate,
+            (plan.end, plan.start),
+            np.ravel(last),
+            rtol=1e-8,
+            atol=1e-10 * max(1.0, float(np.abs(last).max())),
+            dense_output=True,
+            method="LSODA",
+        )
+        if not solution.success:
+            raise ValueError(
+                f"the Riccati equation of {flat.name} must have a solution along the plan: {solution.message}"
+            )
+
+        def gain(t: float) -> Array:
+            p = solution.sol(t).reshape(n, n)
+            return np.asarray(inverse @ slopes(t)[1].T @ p, dtype=float)
+
+        after = np.zeros((m, n)) if stationary is None else inverse @ b.T @ stationary
+        return gain, after
+
+    def create(self, flat: FlatSystem, plan: Trajectory, limits: InputLimits | None) -> ct.NonlinearIOSystem:
+        """Block of the law."""
+        gain, after = self.gains(flat, plan)
+        clipped = _clipping(flat, limits)
+
+        def output(t: float, x: Value, u: Value, params: Params) -> Value:
+            states, inputs = flat.states_and_inputs(plan, t)
+            k = after if t > plan.end else gain(max(t, plan.start))
+            return clipped(inputs - k @ (np.asarray(u) - states))
+
+        states = list(flat.state_labels)
+        block = ct.nlsys(None, output, inputs=states, outputs=list(flat.input_labels), name="law")
+        return declare(block, breakpoints=plan.breakpoints)
+
+    def _rests(self, flat: DerivedFlatSystem, plan: Trajectory) -> bool:
+        """Whether the plant is at rest at the end of the plan."""
+        x, u = flat.states_and_inputs(plan, plan.end)
+        rates = np.abs(np.asarray(flat.dynamics(0.0, x, u), dtype=float))
+        a, b = flat.linearised(x, u)
+        terms = np.abs(a) @ (np.abs(x) + flat.maps.scales[: flat.nstates]) + np.abs(b) @ (np.abs(u) + 1.0)
+        return bool((rates <= _SETTLED * terms).all())
+
+
+FlatLoopLaw = FlatLaw | Feedforward | TVLQR
+"""Laws of `flat_loop`."""
+
+
+def flat_loop(
+    flat: fs.FlatSystem,
+    plan: Trajectory,
+    *,
+    poles: Sequence[Value] | None = None,
+    law: FlatLoopLaw | None = None,
+    limits: InputLimits | None = None,
+    initial_state: ArrayLike | None = None,
+    disturbances: Sequence[str] | str | None = None,
+) -> ct.InterconnectedSystem:
+    """Loop of a flat plant that follows a plan of its flat outputs.
+
+    Parameters
+    ----------
+    flat : FlatSystem
+        The plant.
+    plan : Trajectory
+        Plan of the flat outputs.
+    poles : sequence of sequences of complex, optional
+        Short form of ``law=FlatLaw(poles)``.
+    law : FlatLaw, Feedforward or TVLQR, optional
+        The law. One of `poles` and `law` is required.
+    limits : mapping of str to pair of float, optional
+        Limits of inputs of the plant by name: they are saturated. Not for a
+        `FlatLaw` with the states of an extension.
+    initial_state : array_like, shape (nstates,), optional
+        Initial state of the plant. Default: that of the plan at its start.
+    disturbances : sequence of str or str, optional
+        Parameters of the plant, such as inputs that are constant for the maps
+        (wind), that become inputs of the loop. Only with flat systems from equations.
+
+    Returns
+    -------
+    control.InterconnectedSystem
+        Outputs: the flat outputs, the states, the outputs and the inputs of the
+        plant. The initial state is declared.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If arguments are wrong, or the states along the plan are not determined.
+
+    Examples
+    --------
+    >>> import ctrlplan as cp
+    >>> motor = cp.plants.dc_motor()
+    >>> plan = cp.PolySpline([cp.Waypoint(0, 0, 0, 0, 0), cp.Waypoint(1, 2, 0, 0, 0)], labels="angle")
+    >>> loop = cp.flat_loop(motor, plan, poles=[-20, -25, -30])
+    >>> found = cp.simulate(loop, [0.0, 0.5, 1.0])
+    >>> found.outputs["angle"].round(6).tolist()
+    [0.0, 1.0, 2.0]
+    """
+    check_kind(flat, "flat", FlatSystem)
+    check_kind(plan, "plan", Trajectory)
+    if (poles is None) == (law is None):
+        raise TypeError("one of poles and law must be given, got " + ("neither" if law is None else "both"))
+    chosen = FlatLaw(poles) if poles is not None else law
+    if not isinstance(chosen, FlatLaw | Feedforward | TVLQR):
+        raise TypeError(f"law must be a FlatLaw, Feedforward or TVLQR, got {type(chosen).__name__}")
+    axes = flat.matched(plan)
+    plant = _plant(flat, disturbances)
+    controller = chosen.create(flat, axes, limits)
+    blocks = [controller, plant]
+    if isinstance(chosen, FlatLaw):
+        source = create_source_iosystem(axes, max(flat.orders), suffix="_ref", name="plan")
+        blocks.insert(0, source)
+    names = [*plant.output_labels, *flat.input_labels]
+    loop = ct.interconnect(
+        blocks,
+        inputs=list(plant.input_labels)[flat.ninputs :] or 0,
+        outputs=list(dict.fromkeys(names)),
+        name=f"{flat.name}_loop",
+    )
+    first = flat.states_and_inputs(axes, plan.start)[0] if initial_state is None else initial_state
+    own = traits_of(controller).initial_state if controller.nstates else None
+    start = checked_vector(first, "initial_state", flat.nstates) if np.ndim(first) else _wrong_state(first, flat)
+    return declare(loop, initial_state=np.concatenate([np.zeros(0) if own is None else own, start]))
+
+
+def _wrong_state(given: Value, flat: FlatSystem) -> Array:
+    raise ValueError(f"initial_state must have the shape ({flat.nstates},), got {given!r:.40}")
+
+
+def _clipping(flat: FlatSystem, limits: InputLimits | None) -> Callable[[Array], Array]:
+    """Function that limits the inputs of a plant."""
+    bounds = input_bounds(limits, flat)
+    return (lambda values: values) if bounds is None else (lambda values: np.clip(values, *bounds))
+
+
+def _plant(flat: FlatSystem, disturbances: Sequence[str] | str | None) -> ct.NonlinearIOSystem:
+    """The plant with its flat outputs and states among its outputs, and disturbances among its inputs."""
+    wanted = [disturbances] if isinstance(disturbances, str) else list(disturbances or [])
+    if wanted:
+        check_signals(wanted, "disturbances", tuple(flat.params), "parameter")
+    labels, states, measured = flat.flat_labels, list(flat.state_labels), list(flat.output_labels)
+    names = list(dict.fromkeys([*labels, *states, *measured]))
+    # Functions and numbers only: a block that refers to other objects cannot be compiled.
+    count, known_params, rates, outputs, flat_map = (
+        flat.ninputs,
+        dict(flat.params),
+        flat.updfcn,
+        flat.outfcn,
+        flat.flat_map,
+    )
+
+    def own(u: Value, params: Params) -> dict[str, Value]:
+        return {**known_params, **params, **dict(zip(wanted, u[count:], strict=True))}
+
+    def update(t: float, x: Value, u: Value, params: Params) -> Value:
+        return rates(t, x, u[:count], own(u, params))
+
+    def output(t: float, x: Value, u: Value, params: Params) -> Value:
+        given = own(u, params)
+        known = dict(zip(states, x, strict=True))
+        known |= dict(zip(measured, outputs(t, x, u[:count], given), strict=True))
+        if not set(labels) <= set(known):
+            known |= dict(zip(labels, flat_map(t, x, u[:count], given), strict=True))
+        return [known[name] for name in names]
+
+    return ct.nlsys(
+        update, output, states=states, inputs=[*flat.input_labels, *wanted], outputs=names, name=str(flat.name)
+    )
+
+
+def _weight(matrix: ArrayLike, name: str, size: int, *, strict: bool) -> Array:
+    """Symmetric weight, positive definite if `strict`, otherwise semidefinite."""
+    found = real_array(matrix, name)
+    if found.shape != (size, size) or not np.isfinite(found).all() or not np.allclose(found, found.T, rtol=1e-9):
+        raise ValueError(f"{name} must be a symmetric matrix of shape ({size}, {size}), got shape {found.shape}")
+    smallest = float(np.linalg.eigvalsh(found)[0])
+    if smallest < 0.0 - 1e-12 * float(np.abs(found).max()) or (strict and smallest <= 0.0):
+        raise ValueError(
+            f"{name} must be positive {'definite' if strict else 'semidefinite'}, got eigenvalue {smallest:.4g}"
+        )
+    return found
+
+
+def _stationary(a: Array, b: Array, q: Array, r: Array) -> Array | None:
+    """Stationary solution of the Riccati equation; None if there is none."""
+    try:
+        found = np.asarray(solve_continuous_are(a, b, q, r), dtype=float)
+    except (np.linalg.LinAlgError, ValueError):
+        return None
+    closed = np.linalg.eigvals(a - b @ np.linalg.solve(r, b.T @ found))
+    return found if np.isfinite(found).all() and (closed.real < 0.0).all() else None

@@ -1,0 +1,183 @@
+"""Loops of flat plants from a plan and a law; states and inputs for controllers of other kinds."""
+
+import control as ct
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+pytest.importorskip("casadi")
+
+from flat_plants import CASES, car, system
+
+import ctrlplan as cp
+
+FAST, SLOW = [-2.0, -2.5, -3.0, -3.5], [-2.0, -3.0]
+LANE = cp.PolySpline(
+    [cp.Waypoint.from_jets(0.0, x=[0, 10, 0], y=[0, 0, 0]), cp.Waypoint.from_jets(4.0, x=[40, 10, 0], y=[3.5, 0, 0])]
+)
+CAR = cp.flat_system(car, ["x", "y"], at={"v": 1.0})
+MOTOR = cp.plants.dc_motor()
+TURN = cp.PolySpline([cp.Waypoint(0, 0, 0, 0, 0), cp.Waypoint(1, 2, 0, 0, 0)], labels="angle")
+
+
+def crane(**options):
+    return cp.flat_system(
+        cp.plants.Crane().iosystem(wind=True), ["x", "z"], inputs=["F", "C"], at={"R": 10.0}, **options
+    )
+
+
+def lift():
+    rest = [0.0] * 4
+    ends = [(0.0, [0.0, *rest], [10.0, *rest]), (15.0, [20.0, *rest], [11.0, *rest])]
+    return cp.PolySpline([cp.Waypoint.from_jets(t, x=x, z=z) for t, x, z in ends])
+
+
+def test_the_loop_starts_on_the_plan_and_stays_on_it():
+    plan, t = lift(), np.linspace(0.0, 17.0, 18)
+    loop = cp.flat_loop(crane(), plan, poles=[FAST, FAST], disturbances="wind")
+    assert loop.input_labels == ["wind"]
+    assert {"x", "z", "R", "theta", "T", "F", "C"} <= set(loop.output_labels)
+    found = cp.simulate(loop, t, np.zeros((1, t.size)))
+    for name, row in zip(("x", "z"), plan(t), strict=True):
+        np.testing.assert_allclose(found.outputs[name], row, atol=1e-6)
+    windy = cp.simulate(loop, t, np.full((1, t.size), 50.0))
+    assert abs(windy.outputs["x"][-1] - 20.0) > 1e-3  # a constant force leaves an error without integral action
+
+
+def test_a_plant_with_maps_of_its_own():
+    loop = cp.flat_loop(MOTOR, TURN, poles=[-20, -25, -30])
+    t = np.linspace(0.0, 1.2, 13)
+    np.testing.assert_allclose(cp.simulate(loop, t).outputs["angle"], TURN(t), atol=1e-7)
+    limited = cp.flat_loop(MOTOR, TURN, law=cp.FlatLaw([-20, -25, -30]), limits={"voltage": 3.0})
+    assert np.abs(cp.simulate(limited, t).outputs["voltage"]).max() <= 3.0
+
+
+def test_feedforward_alone_follows_the_plan_from_its_start():
+    loop = cp.flat_loop(CAR, LANE, law=cp.Feedforward())
+    t = np.linspace(0.0, 4.0, 21)
+    found = cp.simulate(loop, t)
+    np.testing.assert_allclose([found.outputs["x"], found.outputs["y"]], LANE(t), atol=1e-5)
+
+
+def test_riccati_gains_minimise_the_cost_of_the_linearised_plant():
+    """The cost of a run of the linearised plant is e0' P(0) e0, and larger with other gains."""
+    q, r, final = np.diag([1.0, 1.0, 10.0]), np.diag([1.0, 10.0]), np.diag([1.0, 1.0, 10.0])
+    gain, _ = cp.TVLQR(q, r, final).gains(CAR, LANE)
+    e0 = np.array([0.1, -0.2, 0.03])
+
+    def slopes(t):
+        """Jacobians of the car by hand."""
+        x, (v, delta) = CAR.states_and_inputs(LANE, t)
+        th = x[2]
+        a = np.array([[0, 0, -v * np.sin(th)], [0, 0, v * np.cos(th)], [0, 0, 0]])
+        b = [[np.cos(th), 0.0], [np.sin(th), 0.0], [np.tan(delta) / 3.0, v / 3.0 / np.cos(delta) ** 2]]
+        return a, np.array(b)
+
+    def cost(factor):
+        def rate(t, state):
+            e = state[:3]
+            a, b = slopes(t)
+            v = -factor * gain(t) @ e
+            return [*(a @ e + b @ v), e @ q @ e + v @ r @ v]
+
+        end = solve_ivp(rate, (0.0, 4.0), [*e0, 0.0], rtol=1e-6, atol=1e-9).y[:, -1]
+        return end[3] + end[:3] @ final @ end[:3]
+
+    def riccati(t, p):
+        a, b = slopes(t)
+        p = p.reshape(3, 3)
+        return -(a.T @ p + p @ a - p @ b @ np.linalg.inv(r) @ b.T @ p + q).ravel()
+
+    first = solve_ivp(riccati, (4.0, 0.0), final.ravel(), rtol=1e-7, atol=1e-9).y[:, -1].reshape(3, 3)
+    best = cost(1.0)
+    assert best == pytest.approx(e0 @ first @ e0, rel=1e-4)
+    assert best < min(cost(0.8), cost(1.2))
+
+
+def test_riccati_law_returns_a_car_to_its_lane():
+    law = cp.TVLQR(np.diag([1.0, 1.0, 10.0]), np.diag([1.0, 10.0]), final=np.diag([1.0, 1.0, 10.0]))
+    loop = cp.flat_loop(CAR, LANE, law=law, initial_state=[0.0, 0.3, 0.0])
+    t = np.linspace(0.0, 4.0, 21)
+    off = np.abs(cp.simulate(loop, t).outputs["y"] - LANE(t)[1])
+    assert off[-1] < 0.02 * off[0]
+    with pytest.raises(ValueError, match="final must be given for car"):
+        cp.flat_loop(CAR, LANE, law=cp.TVLQR(np.eye(3), np.eye(2)))
+    for wrong in (
+        cp.TVLQR(np.eye(2), np.eye(2)),
+        cp.TVLQR(np.eye(3), np.zeros((2, 2))),
+        cp.TVLQR(-np.eye(3), np.eye(2)),
+    ):
+        with pytest.raises(ValueError, match=r"(Q|R) must"):
+            cp.flat_loop(CAR, LANE, law=wrong)
+    with pytest.raises(TypeError, match="from equations"):
+        cp.flat_loop(MOTOR, TURN, law=cp.TVLQR(np.eye(3), np.eye(1)))
+
+
+def test_after_the_end_the_stationary_gain_is_used():
+    case = CASES["two masses"]
+    flat = cp.flat_system(case.plant, "x2")
+    plan = cp.PolySpline([cp.Waypoint(0, 0, 0, 0, 0, 0), cp.Waypoint(2, 1, 0, 0, 0, 0)], labels="x2")
+    _, after = cp.TVLQR(np.eye(4), np.eye(1)).gains(flat, plan)
+    a, b = flat.linearised(*flat.states_and_inputs(plan, 5.0))
+    np.testing.assert_allclose(after, ct.lqr(a, b, np.eye(4), np.eye(1))[0], rtol=1e-8)
+
+
+def test_states_and_inputs_for_a_state_feedback_of_python_control():
+    """The car with gains by python-control's create_statefbk_iosystem, from a start beside the lane."""
+    block = cp.create_flat_feedforward_iosystem(CAR)
+    plant = ct.nlsys(car.updfcn, None, states=car.state_labels, inputs=car.input_labels, outputs=3, name="car")
+    x, u = CAR.states_and_inputs(LANE, 0.0)
+    gain = ct.lqr(*CAR.linearised(x, u), np.diag([1.0, 1.0, 10.0]), np.diag([1.0, 10.0]))[0]
+    controller, _ = ct.create_statefbk_iosystem(plant, gain, xd_labels="xd[{i}]", ud_labels="ud[{i}]")
+    source = cp.create_source_iosystem(LANE, 2, suffix="_ref")
+    loop = ct.interconnect([source, block, controller, plant], inputs=0, outputs=plant.output_labels, name="loop")
+    t = np.linspace(0.0, 4.0, 21)
+    found = cp.simulate(loop, t, initial_state=[0.0, 0.0, 0.0])
+    np.testing.assert_allclose(found.outputs[:2], LANE(t), atol=1e-5)
+    beside = cp.simulate(loop, t, initial_state=[0.0, 0.3, 0.0])
+    assert abs(beside.outputs[1, -1] - LANE(4.0)[1]) < 0.02
+
+
+def test_a_window_ahead():
+    x, u = cp.reference_window(LANE, 0.5, 0.1, 10, flat=CAR)
+    assert (x.shape, u.shape) == ((3, 11), (2, 10))
+    known = CAR.states_and_inputs(LANE, 0.5 + 0.1 * np.arange(11))
+    np.testing.assert_array_equal(x, known[0])
+    np.testing.assert_array_equal(u, known[1][:, :-1])
+    np.testing.assert_array_equal(cp.reference_window(LANE, 3.9, 0.1, 3), LANE.jet(3.9 + 0.1 * np.arange(4), 2))
+    after, _ = cp.reference_window(TURN, 0.95, 0.1, 3, flat=MOTOR)
+    np.testing.assert_allclose(after[0, 1:], 2.0, rtol=1e-12)
+    for wrong in ({"dt": 0.0}, {"count": 0}, {"time": np.nan}):
+        with pytest.raises(ValueError, match=next(iter(wrong))):
+            cp.reference_window(LANE, **{"time": 0.0, "dt": 0.1, "count": 3, **wrong})
+
+
+def test_bad_arguments_of_a_loop():
+    with pytest.raises(TypeError, match="one of poles and law"):
+        cp.flat_loop(MOTOR, TURN)
+    with pytest.raises(TypeError, match="one of poles and law"):
+        cp.flat_loop(MOTOR, TURN, poles=[-1, -2, -3], law=cp.Feedforward())
+    with pytest.raises(TypeError, match="law must be"):
+        cp.flat_loop(MOTOR, TURN, law="lqr")
+    with pytest.raises(ValueError, match="initial_state"):
+        cp.flat_loop(MOTOR, TURN, poles=[-1, -2, -3], initial_state=[0.0])
+    with pytest.raises(ValueError, match="disturbances must be among"):
+        cp.flat_loop(crane(), lift(), poles=[FAST, FAST], disturbances="rain")
+    with pytest.raises(ValueError, match="quasi_static=True"):
+        cp.flat_loop(crane(), lift(), poles=[FAST, FAST], limits={"F": 4000.0})
+    with pytest.raises(ValueError, match="axes"):
+        cp.flat_loop(MOTOR, cp.PolySpline(TURN.waypoints, labels="speed"), poles=[-1, -2, -3])
+    with pytest.raises(ValueError, match="limits must"):
+        cp.flat_loop(MOTOR, TURN, poles=[-20, -25, -30], limits={"i": 1.0})
+
+
+def test_equality_with_zero_is_no_switch():
+    """A law evaluates elsewhere where all its inputs are 0: this makes no breakpoints where one of them crosses 0."""
+    flat = crane()
+    loop = cp.flat_loop(flat, lift(), poles=[FAST, FAST])
+    short = cp.simulate(loop, [0.0, 0.1], method="compiled")
+    np.testing.assert_allclose(short.outputs["x"], lift()([0.0, 0.1])[0], atol=1e-9)
+    toggled = system("toggled", "x", "u", lambda x, u: [np.where(u == 0.0, 1.0, 0.0) - x])
+    t = np.linspace(-1.0, 1.0, 21)
+    found = cp.simulate(toggled, t, t, method="compiled")
+    np.testing.assert_allclose(found.outputs[0], 0.0, atol=1e-7)
