@@ -452,34 +452,49 @@ def _near_peak(times: Array, values: Array, inside: NDArray[np.bool_]) -> Array:
 
 
 def _peak(times: Array, values: Array, smooth: bool) -> tuple[float, float]:
-    """Maximum and its time; of a smooth signal by a parabola through three evenly spaced samples."""
+    """Maximum and its time; of a smooth signal between samples, by polynomials through three and five of them."""
     k = int(values.argmax())
     best, at = float(values[k]), float(times[k])
-    if smooth and 0 < k < values.size - 1:
-        before, after = times[k] - times[k - 1], times[k + 1] - times[k]
-        left, right = values[k] - values[k - 1], values[k] - values[k + 1]
-        if abs(before - after) <= 1e-6 * before and left + right > 0.0 and min(left, right) >= 0.0:
-            shift = 0.5 * (left - right) / (left + right)
-            # A kink is no parabola: its neighbours fall by different amounts.
-            if abs(left - right) <= 0.9 * (left + right):
-                best, at = best + float(0.125 * (left - right) ** 2 / (left + right)), at + float(shift * before)
-    return best, at
+    if not smooth or not 1 < k < values.size - 2:
+        return best, at
+    own, steps = values[k - 2 : k + 3], np.diff(times[k - 2 : k + 3])
+    if np.ptp(steps) > 1e-6 * steps[0]:
+        return best, at
+    parabola = float(np.max(_BASES[0] @ own[1:4]))
+    quartic = _BASES[1] @ own
+    j = int(quartic.argmax())
+    # At a kink the two differ by as much as they rise.
+    if abs(float(quartic[j]) - parabola) > 0.25 * (parabola - best) + 1e-15 * abs(best):
+        return best, at
+    return max(best, float(quartic[j])), at + float(_BETWEEN[j] * steps[0])
+
+
+_BETWEEN = np.linspace(-1.0, 1.0, 1025)
+"""Times about a sample, in distances of samples."""
+
+_BASES = tuple(
+    np.linalg.solve(
+        np.vander(np.arange(-n, n + 1.0), increasing=True).T, np.vander(_BETWEEN, 2 * n + 1, increasing=True).T
+    ).T
+    for n in (1, 2)
+)
+"""Values there of the polynomials through three and five samples."""
 
 
 def _slopes(values: Array, step: float) -> Array:
-    """Derivative of evenly spaced samples (five or more), of order 4."""
+    """Derivative of evenly spaced samples, eight or more, by polynomials of degree 6 through seven of them."""
     found = np.empty_like(values)
-    found[2:-2] = (values[:-4] - 8.0 * values[1:-3] + 8.0 * values[3:-1] - values[4:]) / 12.0
-    for end, sign in ((values, 1.0), (values[::-1], -1.0)):
-        edge = sign * np.array([
-            (-25.0 * end[0] + 48.0 * end[1] - 36.0 * end[2] + 16.0 * end[3] - 3.0 * end[4]) / 12.0,
-            (-3.0 * end[0] - 10.0 * end[1] + 18.0 * end[2] - 6.0 * end[3] + end[4]) / 12.0,
-        ])  # fmt: skip
-        if sign > 0.0:
-            found[:2] = edge
-        else:
-            found[:-3:-1] = edge
+    found[3:-3] = np.convolve(values, _DIFFERENCES[3][::-1], "valid")
+    found[:3] = _DIFFERENCES[:3] @ values[:7]
+    found[-3:] = _DIFFERENCES[4:] @ values[-7:]
     return found / step
+
+
+_DIFFERENCES = np.linalg.solve(
+    np.vander(np.arange(7.0), increasing=True).T,
+    np.array([[k * float(x) ** (k - 1) if k else 0.0 for x in range(7)] for k in range(7)]),
+).T
+"""Derivative at each of seven points of unit distance, of the polynomial through them."""
 
 
 def _integral(times: Array, values: Array) -> float:

@@ -168,6 +168,23 @@ def test_an_interval_and_a_table(loop):
     assert table.bound.high == pytest.approx(np.interp(table.time, times, high), rel=1e-6)
 
 
+@pytest.mark.parametrize(("w", "zeta"), [(3.5, 0.01), (38.3, 0.02), (77.1, 0.005), (156.8, 0.9)])
+def test_simulated_extremes_of_oscillating_loops(w, zeta):
+    """Values to 1e-8 of their range, where 1e-6 is stated, and rates to 1e-7."""
+    a, b = np.array([[0, 1], [-w * w, -2 * zeta * w]]), np.array([[0, 0], [w * w, zeta * w]])
+    c, d = np.array([[1, 0], [-5.0, -0.1]]), np.array([[0, 0], [5.0, 0.2]])
+    names = {"inputs": ["r", "r_d1"], "outputs": ["y", "u"]}
+    written = ct.nlsys(lambda t, x, u, p: a @ x + b @ u, lambda t, x, u, p: c @ x + d @ u, states=2, **names)
+    plan = cp.PolySpline([Waypoint(0, 0, 0, 0), Waypoint(0.4, 0.3), Waypoint(1, 1, 0, 0)])
+    exact = cp.loop_quantities(ct.ss(a, b, c, d, **names)).quantities_of(plan)
+    simulated = cp.loop_quantities(written, tail=1.0).quantities_of(plan)
+    for name in ("y", "u"):
+        for rate, error in ((False, 1e-8), (True, 1e-7)):
+            own, other = (r.extremes({name: 1.0}, during=(0.0, 2.0), rate=rate) for r in (exact, simulated))
+            assert max(abs(own.low - other.low), abs(own.high - other.high)) <= error * (own.high - own.low)
+        assert simulated.rms(name) == pytest.approx(exact.rms(name), rel=1e-8)
+
+
 def test_the_dwell_counts_in_a_loop():
     signals = dense(MOVE, tail=3.0)[1]
     exact, simulated = (
