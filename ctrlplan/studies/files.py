@@ -62,7 +62,8 @@ Further entries and tables, each optional:
     [limits]                  # as for ctrlplan.margins
     velocity = 2.0            # of every axis; [2.0, 0.5] by axis
     x_d2 = [-1.0, 0.5]        # of one signal: minimum and maximum
-    F = {high = 8e3}          # of a quantity of the crane
+    F = {high = 8e3}          # of a quantity of the crane, or of a signal of another loop
+    u = {high = 24.0, rate = 500.0}   # also rms, period (of rms) and during = [begin, end]
     [[plans]]
     family = "polynomial"
     fastest = "shape"         # minimum duration under the limits; or "waypoints", "path"
@@ -244,7 +245,7 @@ class StudyFile:
                 if self.benefit:
                     status("running the baselines")
                     alphas = (plan.alpha for plan in comparison.plans.values() if isinstance(plan, TrigSpline))
-                    choices = replace(choices, alpha=next(alphas, 1.0), limits=self.planned.limits or choices.limits)
+                    choices = replace(choices, alpha=next(alphas, 1.0), limits=self.planned.local or choices.limits)
                     benefit = benefit_of(experiment, loop, choices, units=self.units)
                     comparison = comparison.with_benefit(benefit)
                 comparison = compared_with(comparison, logs, reader)
@@ -404,7 +405,7 @@ def load_study(path: str | os.PathLike[str], *, status: Callable[[str], object] 
     benefit = reader.benefit(data)
     if kind.signals is not None:
         reader.check_units(data.get("units", {}), [*(waypoints[0].labels or ()), *kind.signals])
-    found = planned(data, waypoints, kind.crane(loop, source), reader, status)
+    found = planned(data, waypoints, kind.crane(loop, source), kind.limited(loop, source), reader, status)
     for name, plan in found.plans.items():
         if plan.end >= t_end:
             raise reader.error("t_end", f"must be after the end of the plan {name} at {plan.end:g} s, got {t_end:g}")

@@ -7,6 +7,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import fields, replace
+from functools import partial
 from pathlib import Path
 from types import UnionType
 from typing import ClassVar, TypeAlias, Union, get_args, get_origin
@@ -61,6 +62,10 @@ class LoopKind(ABC):
         """Crane of the loop, if it is the loop of one."""
         return None
 
+    def limited(self, table: Data, path: Path) -> Callable[[], System] | None:
+        """Function that returns the loop whose signals may be limited; None if there is none before the run."""
+        return None
+
     def check_parameter(self, parameter: str, place: str, reader: Reader) -> None:
         """Raise if there is no such parameter for [sweep] and [draws], as far as is known before the run."""
         known = [key for key, entry in self.entries.items() if isinstance(entry.kind, Number)]
@@ -104,6 +109,10 @@ class LinearLoop(LoopKind):
             return unity_feedback_loop(table["num"], table["den"], table.get("gain", 1.0), outputs=("y", "u"))
         except (ValueError, TypeError) as error:
             raise StudyError(f"{path}: loop: {error}") from None
+
+    def limited(self, table: Data, path: Path) -> Callable[[], System]:
+        """The loop."""
+        return partial(self.build, table, path)
 
 
 class CraneLoop(LoopKind):
@@ -204,6 +213,10 @@ class LoopOfModule(LoopKind):
         values = dict(table)
         del values["kind"]
         return self._returned(table, self._function(table, path), path, **values)
+
+    def limited(self, table: Data, path: Path) -> Callable[[], System]:
+        """The loop that the function returns."""
+        return partial(self._returned, table, self._function(table, path), path)
 
     def check_parameter(self, parameter: str, place: str, reader: Reader) -> None:
         """Nothing is known before the function is."""

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import inspect
+import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Literal, get_args, get_origin, get_type_hints
 
-from ctrlplan._types import Data
+from ctrlplan._checks import default_labels
+from ctrlplan._types import Data, System
 from ctrlplan.planning import (
     Clearance,
     Disc,
@@ -67,6 +69,8 @@ class Planned:
         The obstacles.
     limits : dict of str to object
         The limits, as for `margins`.
+    local : dict of str to object
+        Those that are not on signals of the loop.
     """
 
     plans: dict[str, Trajectory]
@@ -75,12 +79,14 @@ class Planned:
     clearances: dict[str, Clearance]
     obstacles: tuple[Obstacle, ...]
     limits: dict[str, object]
+    local: dict[str, object]
 
 
 def planned(
     data: Data,
     waypoints: tuple[Waypoint, ...],
     crane: Crane | None,
+    loop: Callable[[], System] | None,
     reader: Reader,
     status: Callable[[str], object],
 ) -> Planned:
@@ -95,6 +101,8 @@ def planned(
     crane : Crane or None
         Crane of the loop: its quantities may be limited, and its rope must have
         the clearance.
+    loop : callable or None
+        Returns the loop, where its signals may be limited.
     reader : Reader
         For messages.
     status : callable
@@ -110,6 +118,7 @@ def planned(
         _obstacles(data.get("obstacles", []), reader),
         data.get("avoid", {}),
         crane,
+        loop,
         reader,
     )
     plans: dict[str, Trajectory] = {}
@@ -129,7 +138,15 @@ def planned(
         plans[name] = _shaped(plan, table.get("shaper", []), f"{place}.shaper", reader)
     plans = plans or standard_plans(waypoints)
     moving = {name: plan for name, plan in plans.items() if plan.duration}
-    return Planned(plans, found, task.margins(moving, found), task.clearances(moving), task.obstacles, task.limits)
+    return Planned(
+        plans,
+        found,
+        task.margins(moving, found),
+        task.clearances(moving),
+        task.obstacles,
+        task.limits,
+        task.local(waypoints),
+    )
 
 
 # Families
@@ -283,6 +300,10 @@ _SIDES = Table(
     {
         "low": Entry(Number(), "minimum; without it there is none"),
         "high": Entry(Number(), "maximum; without it there is none"),
+        "rate": Entry(Number(above=0.0), "maximum rate of change"),
+        "rms": Entry(Number(above=0.0), "maximum root mean square over the plan, or over period"),
+        "period": Entry(Number(above=0.0), "time from the start of the plan over which rms is taken [s]"),
+        "during": Entry(Listed(Number(), "two numbers", 2), "begin and end of the interval of the limits [s]"),
     }
 )
 LIMITS = Table({}, OneOf((Number(above=0.0), Listed(Number(), "a list of finite numbers"), _SIDES)))
@@ -330,12 +351,17 @@ def _limits(table: Data, reader: Reader) -> dict[str, object]:
     for name, value in table.items():
         if isinstance(value, dict):
             try:
-                found[name] = Limits(value.get("low"), value.get("high"))
+                found[name] = Limits(**value)
             except ValueError as error:
                 raise reader.error(f"limits.{name}", error) from None
         else:
             found[name] = tuple(value) if isinstance(value, list) and name not in ENTRIES else value
     return found
+
+
+def _of_plan(name: str, labels: Sequence[str]) -> bool:
+    """Whether a name is one of the derivatives of all axes or of one axis."""
+    return name in ENTRIES or any(re.fullmatch(rf"{re.escape(label)}_d\d+", name) for label in labels)
 
 
 def _obstacles(tables: Sequence[Data], reader: Reader) -> tuple[Obstacle, ...]:
@@ -357,6 +383,7 @@ class _Task:
     obstacles: tuple[Obstacle, ...]
     avoid: Data
     crane: Crane | None
+    loop: Callable[[], System] | None
     reader: Reader
 
     def around(self, plan: Trajectory, place: str) -> Trajectory:
@@ -380,7 +407,7 @@ class _Task:
                 'must be "shape" or "path" with avoid, which fixes the path, got "waypoints"',
             )
         try:
-            return fastest(plan, self.limits, self.crane, hold=hold)
+            return fastest(plan, self.limits, self._limited(plan.labels), hold=hold)
         except (ValueError, TypeError, RuntimeError) as error:
             raise self.reader.error(f"{place}.fastest", error) from None
 
@@ -393,7 +420,7 @@ class _Task:
                 if own is not None and own.plan is plan:  # a shaped plan has margins of its own
                     found[name] = own.margins
                 else:
-                    found[name] = margins(plan, self.limits, self.crane)
+                    found[name] = margins(plan, self.limits, self._limited(plan.labels))
             except (ValueError, TypeError, RuntimeError) as error:
                 raise self.reader.error("limits", f"{error} (plan {name})") from None
         return found
@@ -407,6 +434,19 @@ class _Task:
             except (ValueError, TypeError, RuntimeError) as error:
                 raise self.reader.error("obstacles", f"{error} (plan {name})") from None
         return found
+
+    def local(self, waypoints: Sequence[Waypoint]) -> dict[str, object]:
+        """Limits that are not on signals of the loop."""
+        labels = waypoints[0].labels or default_labels(waypoints[0].naxes)
+        if self.crane is not None or self.loop is None:
+            return self.limits
+        return {name: limit for name, limit in self.limits.items() if _of_plan(name, labels)}
+
+    def _limited(self, labels: Sequence[str]) -> Crane | System | None:
+        """What has the limited signals: the crane or, if a name is not one of the plan, the loop."""
+        if self.crane is not None or self.loop is None:
+            return self.crane
+        return None if all(_of_plan(name, labels) for name in self.limits) else self.loop()
 
     @property
     def _load(self) -> float:

@@ -3,6 +3,7 @@
 import re
 from dataclasses import replace
 
+import control as ct
 import numpy as np
 import pytest
 from study_text import to_toml, valid
@@ -58,6 +59,39 @@ def test_a_plan_has_the_minimum_duration_under_the_limits(limits, duration, load
     found = loaded(plans=[quintic(fastest="shape")], limits=limits)
     assert found.plans["polynomial"].duration == pytest.approx(duration, rel=1e-9)
     assert found.planned.margins["polynomial"].active.fraction == pytest.approx(0.0, abs=1e-9)
+
+
+LAG = {"kind": "linear", "num": [5.0], "den": [1.0, 1.0, 0.0]}  # 5/(s^2 + s) in unity feedback
+
+
+def test_limits_on_signals_of_the_loop(loaded):
+    """u = r - y of the loop: the plan of minimum duration, and its largest control by python-control."""
+    study = loaded(loop=LAG, plans=[quintic(fastest="shape")], limits={"u": {"high": 12.0, "low": -12.0}}, t_end=60.0)
+    plan = study.plans["polynomial"]
+    t = np.linspace(plan.start, plan.end + 20.0, 20001)
+    response = ct.forced_response(ct.ss(ct.tf([1.0, 1.0, 0.0], [1.0, 1.0, 5.0])), t, plan(t))  # from r to u = r - y
+    peak = np.abs(response.outputs).max()
+    assert peak == pytest.approx(12.0, rel=1e-3)
+    assert study.planned.margins["polynomial"].satisfied
+    assert study.planned.local == {}
+
+
+def test_kinds_of_limits_on_signals_of_the_loop(loaded):
+    limits = {"u": {"rate": 200.0, "rms": 30.0, "period": 50.0}, "velocity": 20.0}
+    study = loaded(loop=LAG, plans=[quintic()], limits=limits, t_end=60.0, benefit=True, samples=41)
+    kinds = {row.bound.kind for row in study.planned.margins["polynomial"]}
+    assert kinds == {"rate", "rms", "value"}
+    assert study.planned.local == {"velocity": 20.0}
+    assert study.run().comparison.benefit is not None
+
+
+def test_bad_limits_on_signals_of_the_loop(loaded):
+    with pytest.raises(StudyError, match=r"limits: limits must name signals of the loop .*got 'w'"):
+        loaded(loop=LAG, plans=[quintic()], limits={"w": 1.0}, t_end=60.0)
+    with pytest.raises(StudyError, match="path"):
+        loaded(loop=LAG, plans=[quintic(fastest="path")], limits={"u": 12.0}, t_end=60.0)
+    with pytest.raises(StudyError, match=r"limits\.u"):
+        loaded(loop=LAG, plans=[quintic()], limits={"u": {"rms": 1.0, "low": 2.0, "high": 1.0}}, t_end=60.0)
 
 
 def test_limits_of_each_axis_are_a_list(loaded):
