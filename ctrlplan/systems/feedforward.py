@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import control as ct
 import numpy as np
@@ -25,9 +26,9 @@ def create_feedforward_iosystem(
     suffix: str = "_ref",
     name: str = "feedforward",
 ) -> ct.StateSpace:
-    r"""Exact inverse of a linear loop without finite zeros.
+    r"""Exact inverse of a linear loop whose zeros are in the left half plane.
 
-    The output y of such a loop is flat. With the transfer function
+    The output y of a loop without zeros is flat. With the transfer function
     g/(s^n + a_(n-1) s^(n-1) + ... + a_0) from its input to y, the command
 
     .. math:: r = \frac1g \Bigl(y_d^{(n)} + \sum_{k=0}^{n-1} a_k\, y_d^{(k)}\Bigr)
@@ -36,21 +37,27 @@ def create_feedforward_iosystem(
     feedback it is y_d + (y_d'' + y_d')/k. Errors decay with the poles of the
     loop.
 
+    A loop with zeros, such as any with a PI, PD or PID controller, has internal
+    dynamics whose poles are the zeros: the block computes them, with as many
+    states. Loops of several inputs and as many outputs are inverted output by output.
+
     The inverse of a plant alone is the feedforward of velocity, acceleration and
     higher derivatives. Its output is added to that of the controller, whose zeros
     then do not matter: y = y_d if the error is 0 at the start.
 
-    No states. Inputs: y_ref, y_ref_d1, ... up to order n, with y the output of
-    the loop, as `create_source_iosystem` names its outputs with
-    ``suffix="_ref"``. Outputs: the input r of the loop, under its name.
+    States: the internal dynamics, as many as zeros, 0 at the start: the plan starts at
+    0, or at an equilibrium that the initial state must give. Inputs: y_ref, y_ref_d1, ... up to
+    the relative degree of y, with y an output of the loop, as
+    `create_source_iosystem` names its outputs with ``suffix="_ref"``. Outputs:
+    the inputs of the loop, under their names.
 
     Parameters
     ----------
     loop : control.StateSpace or control.TransferFunction
-        The loop, or a plant: linear and continuous-time, with one input and one output;
-        interconnections of linear blocks are accepted.
+        The loop, or a plant: linear and continuous-time, with as many inputs as
+        outputs; interconnections of linear blocks are accepted.
     labels : sequence of str or str, optional
-        Name of the plan's axis, by default that of the output of the loop.
+        Names of the plan's axes, by default those of the outputs of the loop.
     suffix : str, optional
         Appended to the label.
     name : str, optional
@@ -59,17 +66,18 @@ def create_feedforward_iosystem(
     Returns
     -------
     control.StateSpace
-        Static gain with n + 1 inputs and one output, of any time base.
+        In continuous time; without zeros a static gain, of any time base.
 
     Raises
     ------
     TypeError
         If the loop is not linear.
     ValueError
-        If it is discrete, has more than one input or output, a transfer function
-        of 0, or finite zeros (the message lists them; the inverse is then not a
-        sum of derivatives); or if the label with the suffix is a signal of the
-        loop.
+        If it is discrete, has another number of inputs than outputs, a transfer
+        function of 0, highest derivatives that depend on the inputs in fewer
+        combinations than outputs, or zeros that are not in the left half plane (the
+        message lists them: the command would grow without bound); or if a label
+        with the suffix is a signal of the loop.
 
     Examples
     --------
@@ -87,15 +95,17 @@ def create_feedforward_iosystem(
     True
     """
     system = _checked_loop(loop)
-    given, reached = loop.input_labels[0], loop.output_labels[0]
-    label = checked_labels([reached] if labels is None else labels, 1)[0] + suffix
-    if label in (given, reached):
+    given, reached = list(loop.input_labels), list(loop.output_labels)
+    axes = [label + suffix for label in checked_labels(reached if labels is None else labels, len(reached))]
+    if shared := sorted(set(axes) & {*given, *reached}):
         raise ValueError(
-            f"labels and suffix must not name a signal of the loop, to which it would be added, got {label!r}"
+            f"labels and suffix must not name a signal of the loop, to which it would be added, got {shared[0]!r}"
         )
-    gains = _inverse(*(np.asarray(m, dtype=float) for m in (system.A, system.B, system.C, system.D)))
-    names = [derivative_name(label, k) for k in range(gains.size)]
-    return ct.ss([], [], [], [gains], inputs=names, outputs=[given], dt=None, name=name)
+    a, b, c, d = (np.asarray(m, dtype=float) for m in (system.A, system.B, system.C, system.D))
+    orders, inverse = _inverse(a, b, c, d, reached)
+    names = [derivative_name(axis, k) for axis, r in zip(axes, orders, strict=True) for k in range(r + 1)]
+    states = len(inverse[0])
+    return ct.ss(*inverse, inputs=names, outputs=given, dt=0 if states else None, name=name)
 
 
 def _checked_loop(loop: ct.StateSpace | ct.TransferFunction) -> ct.StateSpace:
@@ -103,9 +113,11 @@ def _checked_loop(loop: ct.StateSpace | ct.TransferFunction) -> ct.StateSpace:
         raise TypeError(f"loop must be linear, a StateSpace or TransferFunction, got {type(loop).__name__}")
     if loop.dt not in (None, 0):
         raise ValueError(f"loop must be in continuous time, got dt = {loop.dt}")
-    if (loop.ninputs, loop.noutputs) != (1, 1):
-        raise ValueError(f"loop must have one input and one output, got {loop.ninputs} and {loop.noutputs}")
+    if loop.ninputs != loop.noutputs or not loop.ninputs:
+        raise ValueError(f"loop must have as many inputs as outputs, got {loop.ninputs} and {loop.noutputs}")
     fraction = isinstance(loop, ct.TransferFunction)
+    if fraction and loop.ninputs > 1:
+        raise TypeError("loop with several inputs must be a StateSpace, got a TransferFunction; use control.ss")
     given = (loop.num[0][0], loop.den[0][0]) if fraction else (loop.A, loop.B, loop.C, loop.D)
     if not all(np.isfinite(numbers).all() for numbers in given):
         raise ValueError(f"loop must have finite coefficients, got {' and '.join(str(n.tolist()) for n in given)}")
@@ -114,33 +126,96 @@ def _checked_loop(loop: ct.StateSpace | ct.TransferFunction) -> ct.StateSpace:
     return ct.ss(loop)
 
 
-def _inverse(a: Array, b: Array, c: Array, d: Array) -> Array:
-    """Gains of y, y', ..., y^(n) whose weighted sum is the input.
+def _inverse(a: Array, b: Array, c: Array, d: Array, names: Sequence[str]) -> tuple[list[int], tuple[Array, ...]]:
+    """Orders of the derivatives of the outputs, and the state-space matrices of the inverse.
 
-    y^(k) = c A^k x until the input appears, y^(n) = c A^n x + g r. The zeros are
-    the eigenvalues of the motion with y and its first n - 1 derivatives equal
-    to 0; they do not affect the input, or there are none, if c A^n is a linear
-    combination of the rows before it.
+    Each output is differentiated until an input appears: y^(r) = c A^r x + e u. The
+    zeros are the eigenvalues of the motion with all outputs and their first r - 1
+    derivatives equal to 0; they do not affect the inputs, or there are none, if each
+    c A^r is a linear combination of the rows before.
     """
-    rows = [c[0]]
+    chains = [_chain(a, b, row, through) for row, through in zip(c, d, strict=True)]
+    for chain, name in zip(chains, names, strict=True):
+        if chain is None:
+            what = "" if len(names) == 1 else f" to {name}"
+            raise ValueError(f"the transfer function of loop{what} must not be 0, got 0")
+    known = [chain for chain in chains if chain is not None]
+    orders = [len(chain.rows) for chain in known]
+    last, influence = np.array([chain.last for chain in known]), np.array([chain.influence for chain in known])
+    inverse = _inverse_of(influence, names)
+    rows = np.reshape([row for chain in known for row in chain.rows], (sum(orders), len(a)))
+    norms = np.linalg.norm(rows, axis=1)
+    basis = rows / norms[:, None]
+    parts = np.linalg.lstsq(basis.T, last.T, rcond=None)[0].T
+    rest = np.linalg.norm(last - parts @ basis, axis=1)
+    if (rest <= _SMALL * (np.linalg.norm(last, axis=1) + np.abs(parts).sum(axis=1))).all():
+        empty = np.zeros((0, 0))
+        gains = inverse @ _columns(-parts / norms, np.eye(len(names)), orders) + 0.0  # no -0
+        return orders, (empty, np.zeros((0, gains.shape[1])), np.zeros((len(names), 0)), gains)
+    hidden = null_space(basis) if sum(orders) else np.eye(len(a))
+    motion = a - b @ inverse @ last
+    zeros = np.linalg.eigvals(hidden.T @ motion @ hidden)
+    _check_zeros(zeros, a)
+    # x from the derivatives of the outputs, in norms, and from the hidden coordinates.
+    from_rows = np.linalg.pinv(basis)
+    return orders, (
+        hidden.T @ motion @ hidden,
+        _columns(hidden.T @ motion @ from_rows / norms, hidden.T @ b @ inverse, orders),
+        -inverse @ last @ hidden,
+        _columns(-inverse @ last @ from_rows / norms, inverse, orders),
+    )
+
+
+class _Chain(NamedTuple):
+    """Rows of an output and its derivatives below the order at which an input appears, and that order's rows."""
+
+    rows: list[Array]
+    last: Array
+    influence: Array
+
+
+def _chain(a: Array, b: Array, row: Array, through: Array) -> _Chain | None:
+    """Chain of one output; None if no input has an effect on it."""
+    if np.any(through != 0.0):
+        return _Chain([], row, through)
+    rows = [row]
     for _ in range(len(a)):
+        influence = rows[-1] @ b
+        sizes = np.linalg.norm(rows[-1]) * np.linalg.norm(b, axis=0)
+        if (np.abs(influence) > _SMALL * sizes).any():
+            return _Chain(rows, rows[-1] @ a, influence)
         rows.append(rows[-1] @ a)
-    markov = [float(d[0, 0]), *(float(row @ b[:, 0]) for row in rows[:-1])]
-    sizes = [0.0, *(float(np.linalg.norm(row) * np.linalg.norm(b)) for row in rows[:-1])]
-    seen = [abs(value) > _SMALL * size for value, size in zip(markov, sizes, strict=True)]
-    if not any(seen):
-        raise ValueError("the transfer function of loop must not be 0, got 0")
-    order = seen.index(True)
-    gain, last = markov[order], rows[order]
-    norms = np.array([np.linalg.norm(row) for row in rows[:order]])
-    basis = np.reshape(rows[:order], (order, len(a))) / norms[:, None]
-    parts = np.linalg.lstsq(basis.T, last, rcond=None)[0]
-    if np.linalg.norm(last - parts @ basis) > _SMALL * (np.linalg.norm(last) + np.abs(parts).sum()):
-        hidden = null_space(basis) if order else np.eye(len(a))
-        zeros = np.linalg.eigvals(hidden.T @ (a - np.outer(b, last) / gain) @ hidden)
-        got = ", ".join(f"{zero:.4g}" for zero in np.real_if_close(np.sort_complex(zeros)))
+    return None
+
+
+def _inverse_of(influence: Array, names: Sequence[str]) -> Array:
+    """Inverse of the influence of the inputs on the highest derivatives."""
+    scaled = influence / np.abs(influence).max(axis=1, keepdims=True)
+    sizes = np.abs(scaled).max(axis=0)
+    if not sizes.all() or np.linalg.svd(scaled / sizes, compute_uv=False)[-1] < _SMALL:
         raise ValueError(
-            f"loop must have no finite zeros for its inverse to be a sum of derivatives, got {got}; if they are those "
-            "of the controller, give the plant alone and add the output of the block to that of the controller"
+            f"the highest derivatives of the outputs of loop, {', '.join(names)}, must depend on its inputs "
+            "independently, got a singular matrix"
         )
-    return np.append(-parts / norms, 1.0) / gain + 0.0  # no -0
+    return np.asarray(np.linalg.inv(influence), dtype=float) if len(names) > 1 else 1.0 / influence
+
+
+def _columns(below: Array, highest: Array, orders: Sequence[int]) -> Array:
+    """Columns for y, y', ..., y^(r) of each output from those of derivatives below r, and of the highest ones."""
+    parts, first = [], 0
+    for j, r in enumerate(orders):
+        parts += [below[:, first : first + r], highest[:, j : j + 1]]
+        first += r
+    return np.hstack(parts)
+
+
+def _check_zeros(zeros: Array, a: Array) -> None:
+    """Raise unless all zeros are in the left half plane."""
+    size = float(np.abs(np.linalg.eigvals(a)).max(initial=0.0))
+    if (zeros.real < -1e-8 * max(size, float(np.abs(zeros).max()))).all():
+        return
+    got = ", ".join(f"{zero:.4g}" for zero in np.real_if_close(np.sort_complex(zeros)))
+    raise ValueError(
+        f"loop must have its zeros in the left half plane, got {got}: the command would grow without bound; if these "
+        "are zeros of the controller, give the plant alone and add the output of the block to that of the controller"
+    )
