@@ -163,4 +163,4 @@ def test_html_is_compared_by_its_words():
 
 def test_the_folder_is_that_of_the_repository():
     assert Path(__file__).parents[1] / "notebooks" == FOLDER
-    assert len(NOTEBOOKS) == 6
+    assert len(NOTEBOOKS) == 7

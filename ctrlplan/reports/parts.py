@@ -321,7 +321,8 @@ def _layout(kind: str, names: Sequence[str], heads: Sequence[str], columns: Sequ
     whole = [name for name in names if kind == "leading" and len(name) <= SHORT]
     letters = [max([14.0, *map(_letters, whole), *(_letters(word) for name in names for word in name.split())])]
     for head, cells in zip(heads, columns, strict=True):
-        letters.append(max([_BOLD * _letters(word) for word in head.split()] + [_letters(cell) for cell in cells]))
+        words = [_BOLD * _letters(word) for word in head.split()]
+        letters.append(max([*words, *map(_letters, cells)], default=0.0))
     steps = math.ceil(sum(letter * count + padding for count in letters) / _STEP)
     width = "stacked" if steps > WIDTHS[-1] // _STEP else f"w{max(_STEP * steps, WIDTHS[0])}"
     longest = max(len(head) + max(map(len, cells), default=0) for head, cells in zip(heads, columns, strict=True))
