@@ -325,8 +325,8 @@ def _layout(kind: str, names: Sequence[str], heads: Sequence[str], columns: Sequ
         letters.append(max([*words, *map(_letters, cells)], default=0.0))
     steps = math.ceil(sum(letter * count + padding for count in letters) / _STEP)
     width = "stacked" if steps > WIDTHS[-1] // _STEP else f"w{max(_STEP * steps, WIDTHS[0])}"
-    longest = max(len(head) + max(map(len, cells), default=0) for head, cells in zip(heads, columns, strict=True))
-    return f"{width}{' listed' * (longest > _PAIR)}{' many' * (len(names) > _MANY)}"
+    pairs = [len(head) + max(map(len, cells), default=0) for head, cells in zip(heads, columns, strict=True)]
+    return f"{width}{' listed' * (max(pairs, default=0) > _PAIR)}{' many' * (len(names) > _MANY)}"
 
 
 def _letters(text: str) -> float:
