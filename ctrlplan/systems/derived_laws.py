@@ -87,23 +87,35 @@ def _block(
     count, extension = len(wanted), initial.size - len(labels) * integral
     regular = _regular_arguments(flat, count, extension, initial.size)
 
-    def arguments(x: Value, u: Value) -> tuple[Value, Value, Value, Value, Value]:
-        # Blocks are first evaluated with all inputs zero, where many plants are singular: then the law is evaluated at
-        # a regular point and multiplied by 0. Without a branch, so that it can be traced.
-        idles = math.prod(_number(value) == 0.0 for value in u)
+    def divided(values: Value) -> tuple[Value, Value, Value, Value]:
+        return values[:count], values[count : count + len(states)], values[count + len(states) :], p
+
+    def is_finite(own: Value) -> bool:
+        given = divided([0.0] * (count + len(states)) + list(own))
+        return bool(np.isfinite([*control.at(given), *rates.at(given)]).all())
+
+    # Blocks are first evaluated with all inputs zero, where many plants are singular.
+    guarded = not is_finite(initial.tolist())
+    guarded_at_zero = not (guarded or is_finite([0.0] * initial.size))
+
+    def arguments(x: Value, u: Value) -> tuple[tuple[Value, Value, Value, Value], Value]:
+        # Where zero is singular the law is evaluated at a regular point and multiplied by 0. Without a branch, so that
+        # it can be traced.
+        zeros = [*u, *x] if guarded_at_zero else u if guarded else [1.0]
+        idles = math.prod(_number(value) == 0.0 for value in zeros)
         given = [_number(value) + idles * at for value, at in zip([*u, *x], regular, strict=True)]
-        return given[:count], given[count : count + len(states)], given[count + len(states) :], p, 1.0 - idles
+        return divided(given), 1.0 - idles
 
     def output(t: float, x: Value, u: Value, params: Params) -> Value:
-        given = arguments(x, u)
-        values = control.at(given[:4])
+        given, factor = arguments(x, u)
+        values = control.at(given)
         if bounds is not None:
             values = [np.minimum(np.maximum(v, low), high) for v, low, high in zip(values, *bounds, strict=True)]
-        return [value * given[4] for value in values]
+        return [value * factor for value in values]
 
     def update(t: float, x: Value, u: Value, params: Params) -> Value:
-        given = arguments(x, u)
-        return [value * given[4] for value in rates.at(given[:4])]
+        given, factor = arguments(x, u)
+        return [value * factor for value in rates.at(given)]
 
     own = [f"{name}_w{k + 1}" for k in range(extension)]
     own += [f"{name}_{label}_integral" for label in labels] if integral else []

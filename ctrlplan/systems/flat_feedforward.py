@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 
 import control as ct
@@ -68,18 +68,27 @@ def create_flat_feedforward_iosystem(
     names = flat.flat_labels if labels is None else checked_labels(labels, len(flat.flat_labels))
     wanted = references(names, flat.orders, suffix)
     ends = np.cumsum([0, *(r + 1 for r in flat.orders)]).tolist()
-    regular = _regular_flag(flat)
+
+    def values_of(given: Value) -> list[Value]:
+        found, inputs = flat.reverse([given[a:b] for a, b in pairwise(ends)], flat.params)
+        return [*found, *inputs] if states else [*inputs]
 
     def output(t: float, x: Value, u: Value, params: Params) -> Value:
-        # Blocks are first evaluated with all inputs zero, where the maps of many plants are singular.
+        return values_of(np.asarray(u))
+
+    regular = _regular_flag(flat)
+
+    def output_off_zero(t: float, x: Value, u: Value, params: Params) -> Value:
+        # Blocks are first evaluated with all inputs zero, where the maps of this plant are singular.
         idles = math.prod(value == 0.0 for value in u)
         given = np.array([value + idles * at for value, at in zip(u, regular, strict=True)])
-        found, inputs = flat.reverse([given[a:b] for a, b in pairwise(ends)], flat.params)
-        return [value * (1.0 - idles) for value in ([*found, *inputs] if states else inputs)]
+        return [value * (1.0 - idles) for value in values_of(given)]
 
     outputs = [f"xd[{k}]" for k in range(flat.nstates)] if states else []
     outputs += [f"ud[{k}]" for k in range(flat.ninputs)]
-    return ct.nlsys(None, output, inputs=wanted, outputs=outputs, dt=None, name=name)
+    regular_at_zero = _is_finite(values_of, len(wanted))
+    function = output if regular_at_zero else output_off_zero
+    return ct.nlsys(None, function, inputs=wanted, outputs=outputs, dt=None, name=name)
 
 
 def reference_window(
@@ -136,6 +145,15 @@ def reference_window(
     check_kind(flat, "flat", FlatSystem)
     x, u = flat.states_and_inputs(plan, times)
     return x, u[:, :-1]
+
+
+def _is_finite(function: Callable[[Value], list[Value]], size: int) -> bool:
+    """Whether a function of a vector is finite at 0."""
+    with np.errstate(all="ignore"):
+        try:
+            return bool(np.isfinite(np.array(function(np.zeros(size)), dtype=float)).all())
+        except (ValueError, ArithmeticError):
+            return False
 
 
 def _regular_flag(flat: FlatSystem) -> list[float]:

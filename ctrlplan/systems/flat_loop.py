@@ -56,7 +56,7 @@ class FlatLaw(Displayed):
             quasi_static=self.quasi_static,
             integral=self.integral,
             start=start if derived.extension else None,
-            labels=derived.flat_labels,
+            labels=flat.flat_labels,
             suffix="_ref",
             name="law",
             limits=limits,
@@ -262,15 +262,18 @@ def flat_loop(
     plant = _plant(flat, disturbances)
     controller = chosen.create(flat, axes, limits)
     blocks = [controller, plant]
+    unused: list[str] = []
     if isinstance(chosen, FlatLaw):
-        source = create_source_iosystem(axes, max(flat.orders), suffix="_ref", name="plan")
+        source = create_source_iosystem(axes, max(flat.orders), labels=flat.flat_labels, suffix="_ref", name="plan")
         blocks.insert(0, source)
+        unused = [f"plan.{label}" for label in source.output_labels if label not in controller.input_labels]
     names = [*plant.output_labels, *flat.input_labels]
     loop = ct.interconnect(
         blocks,
         inputs=list(plant.input_labels)[flat.ninputs :] or 0,
         outputs=list(dict.fromkeys(names)),
         name=f"{flat.name}_loop",
+        ignore_outputs=unused,
     )
     first = flat.states_and_inputs(axes, plan.start)[0] if initial_state is None else initial_state
     own = traits_of(controller).initial_state if controller.nstates else None

@@ -31,7 +31,8 @@ def error(poles, first, t):
 def run(plant, flat, law, plan, start, t, params=None, **options):
     source = cp.create_source_iosystem(plan, max(flat.orders), suffix="_ref")
     names = [*plant.output_labels, *flat.input_labels]
-    loop = ct.interconnect([source, law, plant], inputs=0, outputs=names, name="loop")
+    unused = [f"plan.{label}" for label in source.output_labels if label not in law.input_labels]
+    loop = ct.interconnect([source, law, plant], inputs=0, outputs=names, name="loop", ignore_outputs=unused)
     own = cp.traits_of(law).initial_state
     return cp.simulate(loop, t, initial_state=[*(own if law.nstates else []), *start], params=params, **options)
 
@@ -199,3 +200,47 @@ def test_every_plant_of_the_table_has_a_law():
         flat = cp.flat_system(CASES[name].plant, CASES[name].outputs, at=CASES[name].at)
         law = cp.create_flat_iosystem(flat, [[-1.0 - 0.5 * k for k in range(r)] for r in flat.orders])
         assert law.noutputs == flat.ninputs
+
+
+def test_references_and_states_all_zero_need_their_input_too():
+    """A lift at height 0, and a vehicle that hovers at the origin: their weight is carried there as well."""
+    lift = ct.nlsys(lambda t, x, u, p: [x[1], u[0] - 9.81], None, states=["h", "v"], inputs=["a"], name="lift")
+    flat = cp.flat_system(lift, "h")
+    for integral in (False, True):
+        law = cp.create_flat_iosystem(flat, [-1.0, -2.0, -3.0][: 2 + integral], integral=integral)
+        own = np.zeros(law.nstates or 0)
+        assert law.output(0.0, own, np.zeros(law.ninputs)).tolist() == [9.81]
+    block = cp.create_flat_feedforward_iosystem(flat)
+    assert block.output(0.0, np.zeros(0), np.zeros(3)).tolist() == [0.0, 0.0, 9.81]
+    states = ["x", "z", "th", "vx", "vz", "w"]
+    hover = ct.nlsys(
+        lambda t, x, u, p: [x[3], x[4], x[5], -np.sin(x[2]) * u[0], np.cos(x[2]) * u[0] - 9.81, u[1]],
+        None,
+        states=states,
+        inputs=["lift", "turn"],
+        outputs=states,
+        name="hover",
+    )
+    flat = cp.flat_system(hover, ["x", "z"])
+    for quasi_static in (False, True):
+        law = cp.create_flat_iosystem(flat, [FAST, SLOW if quasi_static else FAST], quasi_static=quasi_static)
+        own = cp.traits_of(law).initial_state if law.nstates else np.zeros(0)
+        np.testing.assert_allclose(law.output(0.0, own, np.zeros(law.ninputs)), [9.81, 0.0], atol=1e-14)
+
+
+def test_a_plan_with_the_default_labels_reaches_the_law():
+    flat = cp.flat_system(two_mass(0.0), "x2")
+    plan = cp.PolySpline([cp.Waypoint(0, 0, *[0] * 4), cp.Waypoint(1, 2, *[0] * 4)])
+    loop = cp.flat_loop(flat, plan, poles=[-2.0, -3.0, -4.0, -5.0])
+    found = cp.simulate(loop, [0.0, 0.5, 1.0], rtol=1e-10)
+    np.testing.assert_allclose(found.outputs["x2"], plan(found.time), atol=1e-7)
+
+
+def test_flat_outputs_of_different_orders_give_a_loop_without_warnings():
+    motors = ct.nlsys(
+        lambda t, x, u, p: [x[1], u[0], u[1]], None, states=["a", "va", "b"], inputs=["ua", "ub"], name="motors"
+    )
+    flat = cp.flat_system(motors, ["a", "b"])
+    assert flat.orders == (2, 1)
+    loop = cp.flat_loop(flat, move(["a", "b"], [1.0, 2.0], [0.0, 0.0]), poles=[[-1.0, -2.0], [-3.0]])
+    assert cp.simulate(loop, [0.0, 3.0]).outputs["b"][-1] == pytest.approx(2.0, abs=1e-6)
