@@ -30,6 +30,7 @@ Build the loop
     create_saturation_iosystem, create_delay_iosystem    limits of an actuator, transport delay
     flat_system               flat system of a plant, from its equations -> DerivedFlatSystem, NotFlatError
     FlatSystem                flat system from maps of your own
+    TrigFamily                trigonometric basis for control.flatsys
     flat_candidates           which outputs are flat -> FlatCandidate
     check_flat                maps against the equations -> FlatCheck
     flat_loop                 plan, law and flat plant as one loop; laws: FlatLaw, TVLQR, Feedforward
@@ -188,6 +189,7 @@ _EXPORTS = {
         "FlatCheck",
         "FlatSystem",
         "NotFlatError",
+        "TrigFamily",
         "check_flat",
         "flat_candidates",
         "flat_system",

@@ -109,6 +109,7 @@ MADE = {
     "Transition": lambda: cp.Transition(2, 1.0),
     "TVLQR": lambda: cp.TVLQR([[1.0]], [[1.0]]),
     "Trapezoid": lambda: cp.Trapezoid(1.0, velocity=1.0, acceleration=2.0),
+    "TrigFamily": lambda: cp.TrigFamily(6, 2.0, alpha=3.0),
     "TrigSpline": lambda: cp.TrigSpline(PLANE, alpha=1.0, labels=["x", "z"]),
     "Waypoint": lambda: cp.Waypoint.from_jets(6.0, x=[5.0, 1.0], z=[None, 0.5]),
 }  # fmt: skip

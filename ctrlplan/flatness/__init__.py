@@ -1,5 +1,6 @@
 """Differential flatness: states and inputs as functions of flat outputs."""
 
+from ctrlplan.flatness.basis import TrigFamily
 from ctrlplan.flatness.candidates import FlatCandidate, FlatCheck, check_flat, flat_candidates
 from ctrlplan.flatness.derived import DerivedFlatSystem
 from ctrlplan.flatness.deriving import flat_system
@@ -12,6 +13,7 @@ __all__ = [
     "FlatCheck",
     "FlatSystem",
     "NotFlatError",
+    "TrigFamily",
     "check_flat",
     "flat_candidates",
     "flat_system",
