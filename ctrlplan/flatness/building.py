@@ -40,6 +40,7 @@ def maps_of(analysis: Analysis) -> FlatMaps:
         start=start,
         scales=structure.scales[:nz],
         mu=structure.point[nz:],
+        mu_scales=structure.scales[nz:],
         affine=not ca.depends_on(influence, mu),
     )
 

@@ -114,6 +114,8 @@ class DerivedFlatSystem(FlatSystem):
         first = None if start is None else self._extended(real_array(start, "start"), plan, p)
         z, u = states_along(self.maps, partial(self._grid, plan, p, first), plan, times.ravel(), p, str(self.name))
         n = self.maps.nstates
+        for label, row in zip(self.input_labels, u, strict=True):
+            self._check_regular(row, label, times.ravel())
         return z[:n].reshape(n, *times.shape), u.reshape(-1, *times.shape)
 
     def extension_along(self, plan: Trajectory, time: float) -> Array:

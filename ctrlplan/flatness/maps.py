@@ -77,6 +77,8 @@ class FlatMaps:
         Scales of z.
     mu : ndarray
         Controls of the extended plant at the start.
+    mu_scales : ndarray
+        Their scales.
     affine : bool
         Whether `last` is affine in mu.
     """
@@ -96,6 +98,7 @@ class FlatMaps:
     start: Array
     scales: Array
     mu: Array
+    mu_scales: Array
     affine: bool
 
     def flag_of(self, z: Array, p: Array) -> Array:
@@ -103,16 +106,52 @@ class FlatMaps:
         return self.flags(z, p)
 
     def inputs_of(self, z: Array, last: Array, p: Array) -> tuple[Array, Array]:
-        """Controls of the extended plant and of the plant for the highest derivatives, (m, ...)."""
-        m = self.mu.size
-        mu = np.broadcast_to(self.mu.reshape(-1, *(1,) * (z.ndim - 1)), (m, *z.shape[1:])).copy()
-        for _ in range(1 if self.affine else _ITERATIONS):
+        """Controls of the extended plant and of the plant for the highest derivatives, (m, ...); nan for none."""
+        m, trailing = self.mu.size, z.shape[1:]
+        z, last = z.reshape(len(z), -1), last.reshape(m, -1)
+        mu = np.broadcast_to(self.mu[:, None], last.shape).copy()
+        if self.affine:
             rows = self.last(z, mu, p)
-            step = _solved(rows[:, 1:], last - rows[:, 0])
-            mu += step
-            if not step.size or np.nanmax(np.abs(step) / (1e-300 + np.abs(mu)), initial=0.0) < 1e-14:
-                break
-        return mu, self.controls(z, mu, p)
+            mu += _solved(rows[:, 1:], last - rows[:, 0])
+        else:
+            mu = self._connected_controls(z, mu, last, p)
+        return mu.reshape(m, *trailing), self.controls(z, mu, p).reshape(-1, *trailing)
+
+    def _connected_controls(self, z: Array, mu: Array, last: Array, p: Array) -> Array:
+        """Controls (m, n) for the highest derivatives, connected with given ones along straight lines; nan without."""
+        origin = self.last(z, mu, p)[:, 0]
+        place, step = np.zeros(last.shape[1]), np.ones(last.shape[1])
+        while (todo := np.flatnonzero((place < 1.0) & (step > _SHORTEST))).size:
+            goal = np.minimum(place[todo] + step[todo], 1.0)
+            wanted = np.where(goal < 1.0, origin[:, todo] + goal * (last[:, todo] - origin[:, todo]), last[:, todo])
+            found, good = self._nearby_controls(z[:, todo], mu[:, todo], wanted, p)
+            mu[:, todo[good]] = found[:, good]
+            place[todo[good]] = goal[good]
+            step[todo] *= np.where(good, 2.0, 0.5)
+        mu[:, place < 1.0] = np.nan
+        return mu
+
+    def _nearby_controls(self, z: Array, mu: Array, last: Array, p: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """Controls (m, n) for the highest derivatives by Newton's method, and whether they are near given ones."""
+
+        def distance(first: Array, second: Array) -> Array:
+            size = np.maximum(self.mu_scales[:, None], np.maximum(np.abs(first), np.abs(second)))
+            return np.asarray(np.max(np.abs(first - second) / size, axis=0))
+
+        with np.errstate(all="ignore"):
+            rows = self.last(z, mu, p)
+            sign = np.linalg.slogdet(np.moveaxis(rows[:, 1:], -1, 0))[0]
+            predicted = found = mu + _solved(rows[:, 1:], last - rows[:, 0])
+            for _ in range(_ITERATIONS):
+                rows = self.last(z, found, p)
+                step = _solved(rows[:, 1:], last - rows[:, 0])
+                found = found + step
+                size = distance(found, found - step)
+                if (size < _CONVERGED).all():
+                    break
+            same = np.linalg.slogdet(np.moveaxis(self.last(z, found, p)[:, 1:], -1, 0))[0] == sign
+            near = (distance(found, predicted) <= _MOVED) & (distance(predicted, mu) <= 10.0 * _MOVED)
+            return found, (size < 1e-11) & near & same
 
     def refined(self, z: Array, flag: Array, p: Array, inverse: Array | None = None) -> tuple[Array, NDArray[np.bool_]]:
         """States z (nz, n) of flags (nz, n) from states near them, and whether they were found.
