@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ctrlplan._types import Array
 from ctrlplan.flatness.maps import FlatMaps, SingularError, inverses
@@ -137,7 +138,7 @@ def connected(maps: FlatMaps, flag: Array, p: Array, start: Array | None, name: 
             except SingularError:
                 continue
         raise ValueError(
-            f"states of {name} at {time:.6g} s must be connected with the operating point, but {error}; give start= or "
+            f"states of {name}{_when(time)} must be connected with the operating point, but {error}; give start= or "
             "another operating point at="
         ) from None
 
@@ -334,13 +335,23 @@ def _followed_from_grid(
 
 def check_branch(maps: FlatMaps, x: Array, u: Array, p: Array, t: Array, name: str) -> None:
     """Raise if an operation that is not smooth leaves the branch of the operating point."""
-    if not maps.notes:
-        return
-    sides = maps.sides(x, u, p)
-    wrong = ~(sides > 0.0)
+    wrong = ~on_branch(maps, x, u, p)
     if wrong.any():
-        row, k = (int(v) for v in np.argwhere(wrong)[0])
+        k = int(wrong.argmax())
+        note = maps.notes[int((~(maps.sides(x[:, k], u[:, k], p) > 0.0)).argmax())]
         raise ValueError(
-            f"equations of {name} must stay on the branch of the operating point ({maps.notes[row]}), got another one "
-            f"at {float(t[k]):.6g} s"
+            f"equations of {name} must stay on the branch of the operating point ({note}), got another one"
+            f"{_when(float(t[k]))}; derive the flat system with at= on that branch, or choose another plan"
         )
+
+
+def on_branch(maps: FlatMaps, x: Array, u: Array, p: Array) -> NDArray[np.bool_]:
+    """Whether states (nstates, n) and controls (m, n) are on the branch of the operating point, (n,)."""
+    if not maps.notes:
+        return np.ones(x.shape[1], dtype=bool)
+    return np.asarray((maps.sides(x, u, p) > 0.0).all(axis=0))
+
+
+def _when(time: float) -> str:
+    """Time in a message; nothing for flags without one, which is nan."""
+    return "" if np.isnan(time) else f" at {time:.6g} s"

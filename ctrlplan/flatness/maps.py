@@ -24,6 +24,12 @@ _MOVED = 0.3
 _CONTRACTION = 0.5
 """Ratio of successive Newton steps below which states are taken for those of neighbouring flags."""
 
+_LONGEST = 10.0
+"""Predicted change of a state in scales, or in its magnitude, above which a step is too long."""
+
+SINGULAR = 1e-8
+"""Smallest singular value of scaled slopes at a start below which they count as singular."""
+
 _ITERATIONS = 12
 _CONVERGED = 1e-13
 """Newton step in scales after which one more step reaches rounding."""
@@ -243,7 +249,9 @@ class FlatMaps:
             except np.linalg.LinAlgError:
                 return None
             now = self.slopes(found, p)
-            same = np.linalg.slogdet(now)[0] == sign and self._distance(predicted, z) < 10.0 * _MOVED
+            same = np.linalg.slogdet(now)[0] == sign and bool(
+                (np.abs(predicted - z) < _LONGEST * np.maximum(self.scales, np.abs(z))).all()
+            )
         return (found, now) if same else None
 
     def _distance(self, z: Array, other: Array) -> float:
@@ -281,3 +289,13 @@ def inverses(matrices: Array) -> Array:
             with suppress(np.linalg.LinAlgError):
                 out[k] = np.linalg.inv(matrix)
         return np.moveaxis(out, 0, -1)
+
+
+def regularity(matrix: Array, peaks: Array | float = 0.0) -> float:
+    """Smallest singular value relative to the largest entries of rows, at least `peaks`; 0 if not finite."""
+    if not np.isfinite(matrix).all():
+        return 0.0
+    largest = np.maximum(np.abs(matrix).max(axis=1), peaks)[:, None]
+    if not largest.all():
+        return 0.0
+    return float(np.linalg.svd(matrix / largest, compute_uv=False)[-1])

@@ -422,3 +422,28 @@ def test_a_stop_between_nodes_is_found_on_a_straight_line_with_another_slow_poin
     slow = speed + 1e-5
     found = flat.states_and_inputs(straight(slow), [0.0, stop, 1.0])[1][0]
     np.testing.assert_allclose(found, slow(np.array([0.0, stop, 1.0])), rtol=1e-9)
+
+
+def test_starts_that_the_flat_outputs_do_not_determine_are_rejected():
+    """A start across the direction of travel leaves only the speed 0 for it."""
+    flat = derived(CASES["unicycle"])
+    plan = rest_to_rest(["x", "y"], [2, 2], [2.0, 0.0], 2.0)
+    moving = cp.PolySpline([cp.Waypoint.from_jets(t, x=[t, 1, 0, 0], y=[0.0] * 4) for t in (0.0, 2.0)])
+    for heading in (math.pi / 2, -math.pi / 2):
+        with pytest.raises(ValueError, match="start must be a state of unicycle that the flat outputs determine"):
+            flat.states_and_inputs(moving, 0.0, start=[0.0, 0.0, heading])
+    with pytest.raises(ValueError, match="start must be"):
+        flat.states_and_inputs(moving, 0.0, start=[0.0, np.nan, 0.0])
+    with pytest.raises(ValueError, match=r"states of unicycle at 0 s must be connected"):
+        flat.states_and_inputs(plan, 0.0)
+
+
+def test_signals_on_another_branch_of_the_equations_are_not_determined():
+    """Drag |v| v, derived for v > 0."""
+    drag = one_input(lambda t, x, u, p: [x[1], u[0] - 0.5 * abs(x[1]) * x[1]], ["x", "v"], "drag")
+    flat = cp.flat_system(drag, "x", at={"v": 1.0})
+    jet = np.array([[0.0, 0.0], [2.0, -2.0], [1.0, 1.0]])[:, None, :]
+    found = flat.quantities(jet)
+    np.testing.assert_allclose(found["u"], [3.0, np.nan])
+    with pytest.raises(ValueError, match=r"equations of drag must stay on the branch .*got another one; derive"):
+        flat.reverse([jet[:, 0, 1]])
