@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ctrlplan._types import Array
 from ctrlplan.flatness.maps import FlatMaps, SingularError, inverses
@@ -26,6 +27,9 @@ _SINGULAR = 1e-7
 
 _SEARCHES = 8
 """Refinements of the search for a singular point."""
+
+_MINIMA = 8
+"""Local minima at the nodes among which a singular point is searched for."""
 
 _DEEPEST = 24
 """Number of halvings of an interval."""
@@ -134,7 +138,7 @@ def connected(maps: FlatMaps, flag: Array, p: Array, start: Array | None, name: 
             except SingularError:
                 continue
         raise ValueError(
-            f"states of {name} at {time:.6g} s must be connected with the operating point, but {error}; give start= or "
+            f"states of {name}{_when(time)} must be connected with the operating point, but {error}; give start= or "
             "another operating point at="
         ) from None
 
@@ -177,7 +181,8 @@ def _halved(maps: FlatMaps, plan: Trajectory, p: Array, times: Array, states: Ar
         split = ~good | ~(error <= _PREDICTED)
         if not split.any():
             grid = Grid(times, states, rates, before, inverses(maps.slopes(states, p)))
-            _check_regular(maps, grid, p, name)
+            _check_regular(maps, plan, grid, p, name)
+            _check_inputs(maps, plan, grid, p, name)
             return grid
         new = np.flatnonzero(split)
         extra = found[:, new]
@@ -193,28 +198,72 @@ def _halved(maps: FlatMaps, plan: Trajectory, p: Array, times: Array, states: Ar
     )
 
 
-def _check_regular(maps: FlatMaps, grid: Grid, p: Array, name: str) -> None:
-    """Raise if the states pass a singular point between nodes, also one where the determinant keeps its sign."""
-    times = grid.times
+def _check_regular(maps: FlatMaps, plan: Trajectory, grid: Grid, p: Array, name: str) -> None:
+    """Raise if the states or the controls pass a singular point, also between nodes and without a change of sign."""
+
+    def matrices(times: Array) -> tuple[Array, Array]:
+        below, _, last = flag_at(plan, maps.orders, times)
+        near, slopes = grid.interpolated(times)
+        refined, found = maps.refined(near, below, p, slopes)
+        z = np.where(found, refined, near)
+        mu = np.broadcast_to(maps.mu[:, None], last.shape) if maps.affine else maps.inputs_of(z, last, p)[0]
+        return _stacked(maps.slopes(z, p), maps.scales), _stacked(maps.last(z, mu, p)[:, 1:], maps.mu_scales)
+
+    peaks = [np.abs(part).max(axis=(0, 2), initial=1e-300)[:, None] for part in matrices(grid.times)]
+
+    def sizes(times: Array) -> Array:
+        both = zip(matrices(times), peaks, strict=True)
+        return np.array([np.linalg.svd(part / peak, compute_uv=False)[:, -1] for part, peak in both])
+
+    time, size = _lowest(lambda times: np.asarray(sizes(times).min(axis=0)), grid.times)
+    if size >= _SINGULAR:
+        return
+    of_states, of_controls = sizes(np.array([time]))[:, 0].tolist()
+    if of_states <= of_controls:
+        weak = maps.weakest(grid.interpolated(np.array([time]))[0][:, 0], p)
+        raise ValueError(
+            f"states of {name} must be determined along the plan, but {weak} is not determined by the flat outputs at "
+            f"{time:.6g} s"
+        )
+    raise ValueError(
+        f"inputs of {name} must be determined along the plan, but their influence on the highest derivatives of the "
+        f"flat outputs is singular at {time:.6g} s; choose a plan that does not pass this point"
+    )
+
+
+def _check_inputs(maps: FlatMaps, plan: Trajectory, grid: Grid, p: Array, name: str) -> None:
+    """Raise if controls at the nodes are not finite, or on another branch of the equations."""
+    u = maps.inputs_of(grid.states, flag_at(plan, maps.orders, grid.times)[2], p)[1]
+    wrong = ~np.isfinite(u).all(axis=0)
+    if wrong.any():
+        raise ValueError(
+            f"inputs of {name} must be determined along the plan, got none with its highest derivatives at "
+            f"{float(grid.times[int(wrong.argmax())]):.6g} s; choose another plan, or another operating point at="
+        )
+    check_branch(maps, grid.states[: maps.nstates], u, p, grid.times, name)
+
+
+def _stacked(matrices: Array, scales: Array) -> Array:
+    """Matrices (n, rows, columns) with scaled columns, of matrices (rows, columns, n); 0 where they are not finite."""
+    found = np.moveaxis(matrices, -1, 0) * scales
+    return np.where(np.isfinite(found).all(axis=(1, 2), keepdims=True), found, 0.0)
+
+
+def _lowest(size: Callable[[Array], Array], times: Array) -> tuple[float, float]:
+    """Time and value of the smallest value of a function, from its local minima at given times."""
+    found = size(times)
+    padded = np.concatenate([[np.inf], found, [np.inf]])
+    minima = np.flatnonzero((padded[1:-1] <= padded[:-2]) & (padded[1:-1] <= padded[2:]))
+    minima = minima[np.argsort(found[minima], kind="stable")[:_MINIMA]]
+    low, high = times[np.maximum(minima - 1, 0)], times[np.minimum(minima + 1, times.size - 1)]
+    columns = np.arange(minima.size)
     for _ in range(_SEARCHES):
-        z = grid.interpolated(times)[0]
-        size = _regularities(maps, z, p)
-        k = int(np.argmin(size))
-        if size[k] < _SINGULAR:
-            weak = maps.weakest(z[:, k], p)
-            raise ValueError(
-                f"states of {name} must be determined along the plan, but {weak} is not determined by the flat outputs "
-                f"at {float(times[k]):.6g} s"
-            )
-        low, high = times[max(k - 1, 0)], times[min(k + 1, times.size - 1)]
-        times = np.linspace(low, high, 17)
-
-
-def _regularities(maps: FlatMaps, z: Array, p: Array) -> Array:
-    """Smallest singular values of the scaled Jacobians, relative to the rows, (n,)."""
-    matrices = np.moveaxis(maps.slopes(z, p), -1, 0) * maps.scales
-    matrices = matrices / np.maximum(np.abs(matrices).max(axis=2, keepdims=True), 1e-300)
-    return np.asarray(np.linalg.svd(matrices, compute_uv=False)[:, -1], dtype=float)
+        fine = np.linspace(low, high, 17)
+        values = size(fine.ravel()).reshape(fine.shape)
+        k = np.argmin(values, axis=0)
+        low, high = fine[np.maximum(k - 1, 0), columns], fine[np.minimum(k + 1, 16), columns]
+    best = int(np.argmin(values[k, columns]))
+    return float(fine[k[best], best]), float(values[k[best], best])
 
 
 def _middle(maps: FlatMaps, plan: Trajectory, p: Array, a: float, b: float, z: Array, name: str) -> Array:
@@ -286,13 +335,23 @@ def _followed_from_grid(
 
 def check_branch(maps: FlatMaps, x: Array, u: Array, p: Array, t: Array, name: str) -> None:
     """Raise if an operation that is not smooth leaves the branch of the operating point."""
-    if not maps.notes:
-        return
-    sides = maps.sides(x, u, p)
-    wrong = ~(sides > 0.0)
+    wrong = ~on_branch(maps, x, u, p)
     if wrong.any():
-        row, k = (int(v) for v in np.argwhere(wrong)[0])
+        k = int(wrong.argmax())
+        note = maps.notes[int((~(maps.sides(x[:, k], u[:, k], p) > 0.0)).argmax())]
         raise ValueError(
-            f"equations of {name} must stay on the branch of the operating point ({maps.notes[row]}), got another one "
-            f"at {float(t[k]):.6g} s"
+            f"equations of {name} must stay on the branch of the operating point ({note}), got another one"
+            f"{_when(float(t[k]))}; derive the flat system with at= on that branch, or choose another plan"
         )
+
+
+def on_branch(maps: FlatMaps, x: Array, u: Array, p: Array) -> NDArray[np.bool_]:
+    """Whether states (nstates, n) and controls (m, n) are on the branch of the operating point, (n,)."""
+    if not maps.notes:
+        return np.ones(x.shape[1], dtype=bool)
+    return np.asarray((maps.sides(x, u, p) > 0.0).all(axis=0))
+
+
+def _when(time: float) -> str:
+    """Time in a message; nothing for flags without one, which is nan."""
+    return "" if np.isnan(time) else f" at {time:.6g} s"

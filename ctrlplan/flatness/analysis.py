@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import casadi as ca
 import numpy as np
 
+from ctrlplan._checks import check_signals
 from ctrlplan._types import Array, Params, System
 from ctrlplan.flatness.branches import Replacement, branch_at, replaced_input
 from ctrlplan.flatness.equations import Equations, FlatOutputs, equations_of
@@ -68,6 +69,8 @@ def analysed(
     """
     known = given_values(at, system.state_labels or (), system.input_labels or (), str(system.name))
     equations = equations_of(system, flat_outputs, inputs, params, known)
+    if scales:
+        check_signals(tuple(scales), "scales", equations.names, "state or control")
     point = found_point(equations, {k: v for k, v in known.items() if k in equations.names}, scales)
     branch = branch_at(
         (equations.rates, equations.outputs, equations.flat),

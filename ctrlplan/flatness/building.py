@@ -7,12 +7,9 @@ import numpy as np
 
 from ctrlplan._types import Array
 from ctrlplan.flatness.analysis import Analysis
-from ctrlplan.flatness.maps import FlatMaps
+from ctrlplan.flatness.maps import SINGULAR, FlatMaps, regularity
 from ctrlplan.symbolic.tape import Tape
 from ctrlplan.symbolic.taping import tape_of
-
-_SINGULAR = 1e-8
-"""Smallest singular value of scaled slopes below which they count as singular."""
 
 
 def maps_of(analysis: Analysis) -> FlatMaps:
@@ -40,6 +37,7 @@ def maps_of(analysis: Analysis) -> FlatMaps:
         start=start,
         scales=structure.scales[:nz],
         mu=structure.point[nz:],
+        mu_scales=structure.scales[nz:],
         affine=not ca.depends_on(influence, mu),
     )
 
@@ -50,18 +48,8 @@ def _regular(point: Array, scales: Array, nstates: int, slopes: Tape, p: Array) 
     trials = [point]
     trials += [point + scales * (np.arange(point.size) == k) for k in range(nstates, point.size)]
     trials += [point + 0.2 * scales * rng.uniform(-1.0, 1.0, point.size) for _ in range(20)]
-    sizes = [_regularity(slopes(trial, p) * scales) for trial in trials]
-    return trials[0] if sizes[0] > _SINGULAR else trials[int(np.argmax(sizes))]
-
-
-def _regularity(matrix: Array) -> float:
-    """Smallest singular value after scaling of the rows; 0 if entries are not finite."""
-    if not np.isfinite(matrix).all():
-        return 0.0
-    largest = np.abs(matrix).max(axis=1, keepdims=True)
-    if not largest.all():
-        return 0.0
-    return float(np.linalg.svd(matrix / largest, compute_uv=False)[-1])
+    sizes = [regularity(slopes(trial, p) * scales) for trial in trials]
+    return trials[0] if sizes[0] > SINGULAR else trials[int(np.argmax(sizes))]
 
 
 def _forward(analysis: Analysis) -> ca.SX:

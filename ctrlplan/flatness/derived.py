@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ctrlplan._checks import checked_finite, real_array
+from ctrlplan._checks import checked_finite, finite_vector
 from ctrlplan._display import Facts, Part
 from ctrlplan._lru import Lru
 from ctrlplan._types import Array, Params, Value
-from ctrlplan.flatness.along import Grid, check_branch, connected, grid_of, rows_of, states_along
-from ctrlplan.flatness.maps import FlatMaps
+from ctrlplan.flatness.along import Grid, check_branch, connected, grid_of, on_branch, rows_of, states_along
+from ctrlplan.flatness.maps import SINGULAR, FlatMaps, regularity
 from ctrlplan.flatness.system import FlatSystem
 from ctrlplan.symbolic.tape import Tape
 from ctrlplan.trajectories import Trajectory
@@ -111,9 +111,11 @@ class DerivedFlatSystem(FlatSystem):
         """
         plan, times = self._along(plan, timepts, start)
         p = self._values(self.params)
-        first = None if start is None else self._extended(real_array(start, "start"), plan, p)
+        first = None if start is None else self._extended(finite_vector(start, "start", str(self.nstates)), plan, p)
         z, u = states_along(self.maps, partial(self._grid, plan, p, first), plan, times.ravel(), p, str(self.name))
         n = self.maps.nstates
+        for label, row in zip(self.input_labels, u, strict=True):
+            self._check_regular(row, label, times.ravel())
         return z[:n].reshape(n, *times.shape), u.reshape(-1, *times.shape)
 
     def extension_along(self, plan: Trajectory, time: float) -> Array:
@@ -151,6 +153,8 @@ class DerivedFlatSystem(FlatSystem):
         found = {name: row.reshape(trailing) for name, row in zip(self.state_labels, z[:n], strict=True)}
         if known:
             u = self.maps.inputs_of(z, last.reshape(len(last), -1), p)[1]
+            # Another branch of operations that are not smooth: not determined by the maps.
+            u[:, ~on_branch(self.maps, z[:n], u, p)] = np.nan
             found |= {name: row.reshape(trailing) for name, row in zip(self.input_labels, u, strict=True)}
             rows = self._outputs(z[:n], u, p[:, None])
             found |= {
@@ -223,6 +227,12 @@ class DerivedFlatSystem(FlatSystem):
             z[maps.nstates :] += step
             if not step.size or np.max(np.abs(step) / (maps.scales[maps.nstates :])) < 1e-12:
                 break
+        peaks = np.abs(maps.slopes(maps.start, p) * maps.scales).max(axis=1)
+        if regularity(maps.slopes(z, p) * maps.scales, peaks) < SINGULAR:
+            raise ValueError(
+                f"start must be a state of {self.name} that the flat outputs determine, got one where "
+                f"{maps.weakest(z, p)} is not determined; give the state at the plan's start"
+            )
         return z
 
 

@@ -44,9 +44,10 @@ def flat_system(
         use functions of numpy. Transfer functions must have one input and one output.
     flat_outputs : sequence of str, str or callable, optional
         As many as inputs: names of outputs or states, or a function
-        ``h(x, u, params)`` that returns them, named y, or y1, y2, .... Optional for
-        a linear system: its outputs if they are as many as its inputs and flat,
-        otherwise flat outputs of its controllability form.
+        ``h(x, u, params)`` that returns them, named y, or y1, y2, ...; flat_y, ... where
+        another signal of the plant has this name. Optional for a linear system: its
+        outputs if they are as many as its inputs and flat, otherwise flat outputs of
+        its controllability form.
     inputs : sequence of str or str, optional
         The inputs that are controls. The others, such as wind, are constant at
         their values in `at`, or 0. Default: all inputs.

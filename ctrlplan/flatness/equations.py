@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from numbers import Real
 
 import casadi as ca
 import control as ct
 import numpy as np
 
-from ctrlplan._checks import check_signals, checked_names
+from ctrlplan._checks import check_signals, checked_names, default_labels
 from ctrlplan._types import Array, BlockMap, Params, System, Value
 from ctrlplan.symbolic.symbols import Symbol, column_of, symbol_array
 from ctrlplan.symbolic.tracing import Trace, traced
@@ -112,7 +113,9 @@ def equations_of(
     expressions = _Expressions(params, guess)
     x, every = ca.vertcat(*map(ca.SX.sym, states)), ca.vertcat(*map(ca.SX.sym, all_inputs))
     outputs, rates = expressions.of(system, x, every, {})
-    labels, flat = _flat(system, flat_outputs, x, every, outputs, expressions.symbols | dict(params))
+    constants = {**(system.params or {}), **params, **expressions.symbols}
+    labels, flat = _flat(system, flat_outputs, x, every, outputs, constants)
+    expressions.check_used(ca.vertcat(rates, outputs, flat), str(system.name))
     controls = [all_inputs.index(name) for name in chosen]
     held = [k for k in range(count) if k not in controls]
     if flat.numel() != len(controls):
@@ -146,14 +149,25 @@ def _flat(
     """Names and expressions of the flat outputs."""
     if callable(flat_outputs):
         column = column_of(flat_outputs(symbol_array(x), symbol_array(u), params))
-        count = column.numel()
-        return tuple(f"y{k + 1}" for k in range(count)) if count > 1 else ("y",), column
+        return _labels(system, column, x, u, outputs), column
     names = tuple(checked_names(flat_outputs, "flat_outputs"))
     known = dict(zip(system.state_labels, ca.vertsplit(x), strict=True))
     if system.noutputs:
         known |= dict(zip(system.output_labels, ca.vertsplit(outputs), strict=True))
     check_signals(names, "flat_outputs", tuple(known), "outputs and state")
     return names, ca.vertcat(*(known[name] for name in names))
+
+
+def _labels(system: System, column: ca.SX, x: ca.SX, u: ca.SX, outputs: ca.SX) -> tuple[str, ...]:
+    """Names of flat outputs given by a function, which no other signal of the plant has."""
+    count = column.numel()
+    labels = default_labels(count)
+    names = (*system.state_labels, *system.input_labels, *(system.output_labels if system.noutputs else ()))
+    signals = dict(zip(names, ca.vertsplit(ca.vertcat(x, u, outputs)), strict=True))
+    entries = zip(labels, ca.vertsplit(column), strict=True)
+    if all(ca.is_equal(signals.get(label, entry), entry, 100) for label, entry in entries):
+        return labels
+    return tuple(f"flat_{label}" for label in labels)
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,9 +214,19 @@ class _Expressions:
         self._params, self._guess = params, guess
         self.symbols: dict[str, Symbol] = {}
         self.values: dict[str, float] = {}
+        self._declared: set[str] = set()
+
+    def check_used(self, expressions: ca.SX, name: str) -> None:
+        """Raise for a parameter that no block declares and on which no expression depends."""
+        for given, value in self._params.items():
+            used = given in self.symbols and ca.depends_on(expressions, self.symbols[given].sx)
+            if not (used or given in self._declared) and isinstance(value, Real):
+                known = ", ".join(sorted(self._declared)) or "none"
+                raise ValueError(f"params must be among the parameters of {name} ({known}), got {given!r}")
 
     def of(self, system: System, x: ca.SX, u: ca.SX, outer: Params) -> tuple[ca.SX, ca.SX]:
         """Outputs and rates of a system."""
+        self._declared |= set(getattr(system, "params", None) or {})
         if isinstance(system, ct.InterconnectedSystem):
             return self._of_interconnection(system, x, u, {**system.params, **outer})
         traits = traits_of(system)
@@ -265,9 +289,7 @@ def _resolved(signals: ca.SX, outputs: ca.SX, system: System) -> ca.SX:
             )
         constant = ca.substitute(outputs, signals, ca.SX.zeros(signals.numel()))
         return ca.solve(ca.SX.eye(signals.numel()) - through, constant)
-    for _ in range(len(system.syslist) + 1):
-        if not ca.depends_on(outputs, signals):
-            break
+    while ca.depends_on(outputs, signals):  # the paths through signals become half as long
         outputs = ca.substitute(outputs, signals, outputs)
     return outputs
 

@@ -24,6 +24,12 @@ _MOVED = 0.3
 _CONTRACTION = 0.5
 """Ratio of successive Newton steps below which states are taken for those of neighbouring flags."""
 
+_LONGEST = 10.0
+"""Predicted change of a state in scales, or in its magnitude, above which a step is too long."""
+
+SINGULAR = 1e-8
+"""Smallest singular value of scaled slopes at a start below which they count as singular."""
+
 _ITERATIONS = 12
 _CONVERGED = 1e-13
 """Newton step in scales after which one more step reaches rounding."""
@@ -77,6 +83,8 @@ class FlatMaps:
         Scales of z.
     mu : ndarray
         Controls of the extended plant at the start.
+    mu_scales : ndarray
+        Their scales.
     affine : bool
         Whether `last` is affine in mu.
     """
@@ -96,6 +104,7 @@ class FlatMaps:
     start: Array
     scales: Array
     mu: Array
+    mu_scales: Array
     affine: bool
 
     def flag_of(self, z: Array, p: Array) -> Array:
@@ -103,16 +112,52 @@ class FlatMaps:
         return self.flags(z, p)
 
     def inputs_of(self, z: Array, last: Array, p: Array) -> tuple[Array, Array]:
-        """Controls of the extended plant and of the plant for the highest derivatives, (m, ...)."""
-        m = self.mu.size
-        mu = np.broadcast_to(self.mu.reshape(-1, *(1,) * (z.ndim - 1)), (m, *z.shape[1:])).copy()
-        for _ in range(1 if self.affine else _ITERATIONS):
+        """Controls of the extended plant and of the plant for the highest derivatives, (m, ...); nan for none."""
+        m, trailing = self.mu.size, z.shape[1:]
+        z, last = z.reshape(len(z), -1), last.reshape(m, -1)
+        mu = np.broadcast_to(self.mu[:, None], last.shape).copy()
+        if self.affine:
             rows = self.last(z, mu, p)
-            step = _solved(rows[:, 1:], last - rows[:, 0])
-            mu += step
-            if not step.size or np.nanmax(np.abs(step) / (1e-300 + np.abs(mu)), initial=0.0) < 1e-14:
-                break
-        return mu, self.controls(z, mu, p)
+            mu += _solved(rows[:, 1:], last - rows[:, 0])
+        else:
+            mu = self._connected_controls(z, mu, last, p)
+        return mu.reshape(m, *trailing), self.controls(z, mu, p).reshape(-1, *trailing)
+
+    def _connected_controls(self, z: Array, mu: Array, last: Array, p: Array) -> Array:
+        """Controls (m, n) for the highest derivatives, connected with given ones along straight lines; nan without."""
+        origin = self.last(z, mu, p)[:, 0]
+        place, step = np.zeros(last.shape[1]), np.ones(last.shape[1])
+        while (todo := np.flatnonzero((place < 1.0) & (step > _SHORTEST))).size:
+            goal = np.minimum(place[todo] + step[todo], 1.0)
+            wanted = np.where(goal < 1.0, origin[:, todo] + goal * (last[:, todo] - origin[:, todo]), last[:, todo])
+            found, good = self._nearby_controls(z[:, todo], mu[:, todo], wanted, p)
+            mu[:, todo[good]] = found[:, good]
+            place[todo[good]] = goal[good]
+            step[todo] *= np.where(good, 2.0, 0.5)
+        mu[:, place < 1.0] = np.nan
+        return mu
+
+    def _nearby_controls(self, z: Array, mu: Array, last: Array, p: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """Controls (m, n) for the highest derivatives by Newton's method, and whether they are near given ones."""
+
+        def distance(first: Array, second: Array) -> Array:
+            size = np.maximum(self.mu_scales[:, None], np.maximum(np.abs(first), np.abs(second)))
+            return np.asarray(np.max(np.abs(first - second) / size, axis=0))
+
+        with np.errstate(all="ignore"):
+            rows = self.last(z, mu, p)
+            sign = np.linalg.slogdet(np.moveaxis(rows[:, 1:], -1, 0))[0]
+            predicted = found = mu + _solved(rows[:, 1:], last - rows[:, 0])
+            for _ in range(_ITERATIONS):
+                rows = self.last(z, found, p)
+                step = _solved(rows[:, 1:], last - rows[:, 0])
+                found = found + step
+                size = distance(found, found - step)
+                if (size < _CONVERGED).all():
+                    break
+            same = np.linalg.slogdet(np.moveaxis(self.last(z, found, p)[:, 1:], -1, 0))[0] == sign
+            near = (distance(found, predicted) <= _MOVED) & (distance(predicted, mu) <= 10.0 * _MOVED)
+            return found, (size < 1e-11) & near & same
 
     def refined(self, z: Array, flag: Array, p: Array, inverse: Array | None = None) -> tuple[Array, NDArray[np.bool_]]:
         """States z (nz, n) of flags (nz, n) from states near them, and whether they were found.
@@ -204,7 +249,9 @@ class FlatMaps:
             except np.linalg.LinAlgError:
                 return None
             now = self.slopes(found, p)
-            same = np.linalg.slogdet(now)[0] == sign and self._distance(predicted, z) < 10.0 * _MOVED
+            same = np.linalg.slogdet(now)[0] == sign and bool(
+                (np.abs(predicted - z) < _LONGEST * np.maximum(self.scales, np.abs(z))).all()
+            )
         return (found, now) if same else None
 
     def _distance(self, z: Array, other: Array) -> float:
@@ -242,3 +289,13 @@ def inverses(matrices: Array) -> Array:
             with suppress(np.linalg.LinAlgError):
                 out[k] = np.linalg.inv(matrix)
         return np.moveaxis(out, 0, -1)
+
+
+def regularity(matrix: Array, peaks: Array | float = 0.0) -> float:
+    """Smallest singular value relative to the largest entries of rows, at least `peaks`; 0 if not finite."""
+    if not np.isfinite(matrix).all():
+        return 0.0
+    largest = np.maximum(np.abs(matrix).max(axis=1), peaks)[:, None]
+    if not largest.all():
+        return 0.0
+    return float(np.linalg.svd(matrix / largest, compute_uv=False)[-1])

@@ -161,7 +161,7 @@ NUMPY: Operations = {
     "SQRT": np.sqrt,
     "SQ": np.square,
     "TWICE": lambda x: x + x,
-    "INV": lambda x: 1.0 / x,
+    "INV": lambda x: np.divide(1.0, x),
     "SIN": np.sin,
     "COS": np.cos,
     "TAN": np.tan,

@@ -367,3 +367,83 @@ def test_flags_and_states_agree(plant):
     again = flat.reverse(flat.forward(x, u))
     np.testing.assert_allclose(again[0], x, atol=1e-12)
     np.testing.assert_allclose(again[1], u, atol=1e-10)
+
+
+def one_input(update, states, name="plant"):
+    return ct.nlsys(update, None, states=states, inputs=["u"], name=name)
+
+
+def test_inputs_that_enter_by_several_terms_are_found_for_any_demand():
+    """x' = u + u^3, and x' = sin u on two of its branches."""
+    plan = rest_to_rest(["x"], [3], [1e3], 1.0)
+    t = np.linspace(0.0, 1.0, 11)
+    cubic = cp.flat_system(one_input(lambda t, x, u, p: [u[0] + u[0] ** 3], ["x"]), "x")
+    u = cubic.states_and_inputs(plan, t)[1][0]
+    wanted = plan.jet(t, 1)[1, 0]
+    np.testing.assert_allclose(u + u**3, wanted, rtol=1e-13, atol=1e-13 * wanted.max())
+    slow = rest_to_rest(["x"], [3], [1.0], 2.2)
+    for at, sign, turn in ((0.0, 1.0, 0.0), (3.0, -1.0, math.pi), (-6.0, 1.0, -math.tau)):
+        sine = cp.flat_system(one_input(lambda t, x, u, p: [np.sin(u[0])], ["x"]), "x", at={"u": at})
+        found = sine.states_and_inputs(slow, 2.2 * t)[1][0]
+        np.testing.assert_allclose(found, sign * np.arcsin(slow.jet(2.2 * t, 1)[1, 0]) + turn, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("update", "states", "at", "ends", "times"),
+    [
+        (lambda t, x, u, p: [np.sin(u[0])], ["x"], {}, (0.0, 1.0), [0.0, 1.0]),  # faster than possible
+        (lambda t, x, u, p: [x[1], x[0] * u[0]], ["x", "v"], {"x": -1.0}, (-1.0, 1.0), [0.0, 0.2]),
+        (lambda t, x, u, p: [x[1], u[0] ** 3], ["x", "v"], {"u": 1.0}, (0.0, 1.0), [0.2]),
+        (lambda t, x, u, p: [x[1], u[0] ** 2], ["x", "v"], {"u": 1.0}, (0.0, 1.0), [0.2]),  # only v' > 0
+    ],
+)
+def test_inputs_that_are_not_determined_are_errors_over_the_whole_plan(update, states, at, ends, times):
+    flat = cp.flat_system(one_input(update, states), "x", at=at)
+    with pytest.raises(ValueError, match=r"(inputs|u) of plant must be determined.* s"):
+        flat.states_and_inputs(rest_to_rest(["x"], [3], [ends[1]], 1.0, [ends[0]]), times)
+
+
+def straight(speed):
+    """Plan along x with a speed that is a polynomial of time, from 0 to 1 s."""
+    way = speed.integ()
+    jets = [[float(way.deriv(k)(t)) if k else float(way(t)) for k in range(6)] for t in (0.0, 1.0)]
+    points = [cp.Waypoint.from_jets(t, x=jet, y=[0.0] * 6) for t, jet in zip((0.0, 1.0), jets, strict=True)]
+    return cp.PolySpline(points)
+
+
+def test_a_stop_between_nodes_is_found_on_a_straight_line_with_another_slow_point():
+    """Speed (t - t_1)^2 ((t - 3/4)^2 + 1e-5): it is 0 at t_1, and small at a node of the grid."""
+    stop = 0.37113
+    speed = np.polynomial.Polynomial([-stop, 1.0]) ** 2 * (np.polynomial.Polynomial([-0.75, 1.0]) ** 2 + 1e-5)
+    flat = derived(CASES["unicycle"])
+    with pytest.raises(ValueError, match=r"states of unicycle .* at 0\.371"):
+        flat.states_and_inputs(straight(speed), [0.0, 1.0])
+    # A point that is slow only, at 1e-4 of the highest speed, is passed.
+    slow = speed + 1e-5
+    found = flat.states_and_inputs(straight(slow), [0.0, stop, 1.0])[1][0]
+    np.testing.assert_allclose(found, slow(np.array([0.0, stop, 1.0])), rtol=1e-9)
+
+
+def test_starts_that_the_flat_outputs_do_not_determine_are_rejected():
+    """A start across the direction of travel leaves only the speed 0 for it."""
+    flat = derived(CASES["unicycle"])
+    plan = rest_to_rest(["x", "y"], [2, 2], [2.0, 0.0], 2.0)
+    moving = cp.PolySpline([cp.Waypoint.from_jets(t, x=[t, 1, 0, 0], y=[0.0] * 4) for t in (0.0, 2.0)])
+    for heading in (math.pi / 2, -math.pi / 2):
+        with pytest.raises(ValueError, match="start must be a state of unicycle that the flat outputs determine"):
+            flat.states_and_inputs(moving, 0.0, start=[0.0, 0.0, heading])
+    with pytest.raises(ValueError, match="start must be"):
+        flat.states_and_inputs(moving, 0.0, start=[0.0, np.nan, 0.0])
+    with pytest.raises(ValueError, match=r"states of unicycle at 0 s must be connected"):
+        flat.states_and_inputs(plan, 0.0)
+
+
+def test_signals_on_another_branch_of_the_equations_are_not_determined():
+    """Drag |v| v, derived for v > 0."""
+    drag = one_input(lambda t, x, u, p: [x[1], u[0] - 0.5 * abs(x[1]) * x[1]], ["x", "v"], "drag")
+    flat = cp.flat_system(drag, "x", at={"v": 1.0})
+    jet = np.array([[0.0, 0.0], [2.0, -2.0], [1.0, 1.0]])[:, None, :]
+    found = flat.quantities(jet)
+    np.testing.assert_allclose(found["u"], [3.0, np.nan])
+    with pytest.raises(ValueError, match=r"equations of drag must stay on the branch .*got another one; derive"):
+        flat.reverse([jet[:, 0, 1]])

@@ -229,3 +229,63 @@ def test_inputs_that_are_not_controls_are_parameters():
     assert any("wind is constant" in note for note in flat.notes)
     with pytest.raises(ValueError, match="name the controls with inputs="):
         cp.flat_system(windy, ["x", "z"], at={"R": 10.0})
+
+
+def test_equations_that_divide_by_a_state_start_away_from_zero():
+    """CasADi has an operation of its own for 1/x."""
+    plant = ct.nlsys(
+        lambda t, x, u, p: [x[1], 1.0 / x[0] + u[0] / x[0]], None, states=["gap", "v"], inputs=["u"], name="plant"
+    )
+    flat = cp.flat_system(plant, "gap")
+    assert flat.orders == (2,)
+    assert flat.operating_point["gap"] != 0.0
+    assert flat.operating_point["u"] == pytest.approx(-1.0)
+
+
+def test_names_of_parameters_and_scales_are_checked():
+    plant = ct.nlsys(
+        lambda t, x, u, p: [p["a"] * u[0] * p.get("b", 1.0)], None, states=1, inputs=1, params={"a": 2.0}, name="plant"
+    )
+    assert cp.flat_system(plant, "x[0]", params={"b": 3.0}).params == {"a": 2.0, "b": 3.0}
+    with pytest.raises(ValueError, match=r"params must be among the parameters of plant \(a\), got 'c'"):
+        cp.flat_system(plant, "x[0]", params={"c": 3.0})
+    with pytest.raises(ValueError, match="scales"):
+        cp.flat_system(plant, "x[0]", scales={"x": 3.0})
+
+
+def test_functions_of_flat_outputs_follow_the_parameters():
+    plant = ct.nlsys(
+        lambda t, x, u, p: [p["a"] * x[1], u[0]], None, states=2, inputs=1, params={"a": 1.0, "b": 5.0}, name="plant"
+    )
+    flat = cp.flat_system(plant, lambda x, u, p: [p["a"] * p["b"] * x[0]], params={"a": 2.0})
+    for a in (2.0, 3.0):
+        found = flat.forward([1.0, 1.0], [1.0], {"a": a})[0]
+        np.testing.assert_allclose(found, [5.0 * a, 5.0 * a * a, 5.0 * a * a], rtol=1e-15)
+
+
+def test_signals_that_pass_a_block_many_times():
+    """Forty channels of one block in series: a chain without a loop."""
+    count = 40
+    amplifier = ct.nlsys(None, lambda t, x, u, p: u, inputs=count, outputs=count, name="A")
+    plant = ct.nlsys(lambda t, x, u, p: [u[0]], None, states=["x"], inputs=["u"], outputs=["x"], name="P")
+    chain = [[f"A.u[{k + 1}]", f"A.y[{k}]"] for k in range(count - 1)]
+    system = ct.interconnect(
+        [amplifier, plant],
+        connections=[*chain, ["P.u", f"A.y[{count - 1}]"]],
+        inplist=["A.u[0]"],
+        inputs=["u"],
+        outlist=["P.x"],
+        outputs=["x"],
+    )
+    assert cp.flat_system(system, "x").orders == (1,)
+
+
+def test_flat_outputs_do_not_take_the_name_of_another_signal():
+    plant = ct.nlsys(lambda t, x, u, p: [x[1], u[0]], None, states=["y", "v"], inputs=["u"], name="plant")
+    assert cp.flat_system(plant, lambda x, u, p: [x[0]]).flat_labels == ("y",)
+    flat = cp.flat_system(plant, lambda x, u, p: [2.0 * x[0]])
+    assert flat.flat_labels == ("flat_y",)
+    plan = cp.PolySpline([cp.Waypoint(0.0, 0.0, 0.0, 0.0), cp.Waypoint(1.0, 2.0, 0.0, 0.0)])
+    found = cp.simulate(cp.flat_loop(flat, plan, poles=[-3.0, -4.0]), [0.0, 1.0])
+    assert found.outputs["flat_y"][-1] == pytest.approx(2.0)
+    assert found.outputs["y"][-1] == pytest.approx(1.0)
