@@ -21,7 +21,7 @@ from ctrlplan.flatness.verify import FlatPlant, checked_plant, finite_rows, rand
 if TYPE_CHECKING:
     from ctrlplan.flatness.operating_point import At
 
-_MOST = 500
+_MOST = 300
 """Maximum number of sets that are analysed."""
 
 _STEP = 2e-4
@@ -107,7 +107,7 @@ def flat_candidates(
     Raises
     ------
     ImportError, TypeError, ValueError
-        As `flat_system`; also for more than 500 sets.
+        As `flat_system`; also for more than 300 sets.
 
     Examples
     --------

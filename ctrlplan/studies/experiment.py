@@ -345,7 +345,8 @@ class Experiment(Displayed):
             unstable = np.array([run.is_unstable])
             y, u = run.rows(run.outputs)[None], run.rows(run.controls)[None]
             record = SignalRecord(run.t, y, u, axes, run.controls, unstable)
-            plan = run.plan if axes == run.plan.labels or not axes else run.plan.select(axes)
+            # Of all axes, which another plan may name otherwise, or of those that a log holds.
+            plan = run.plan if len(axes) in (0, run.plan.naxes) else run.plan.select(axes)
             found = signal_metrics(record, plan, self.since, self.band, wanted)
             for kind, held, every in (("response", axes, self.axes), ("control", run.controls, controls)):
                 if len(held) < len(every):

@@ -63,6 +63,11 @@ def create_flat_feedforward_iosystem(
     >>> block = cp.create_flat_feedforward_iosystem(motor)
     >>> block.input_labels, block.output_labels
     (['angle_ref', 'angle_ref_d1', 'angle_ref_d2', 'angle_ref_d3'], ['xd[0]', 'xd[1]', 'xd[2]', 'ud[0]'])
+    >>> plan = cp.PolySpline([cp.Waypoint(0, 0, 0, 0, 0), cp.Waypoint(1, 2, 0, 0, 0)], labels="angle")
+    >>> source = cp.create_source_iosystem(plan, 3, suffix="_ref")
+    >>> wanted = ct.interconnect([source, block], inputs=0, outputs=block.output_labels)
+    >>> cp.simulate(wanted, [0.0, 0.5, 1.0]).outputs[0].round(6).tolist()
+    [0.0, 1.0, 2.0]
     """
     check_kind(flat, "flat", FlatSystem)
     names = flat.flat_labels if labels is None else checked_labels(labels, len(flat.flat_labels))
@@ -134,7 +139,7 @@ def reference_window(
     >>> plan = cp.PolySpline([cp.Waypoint(0, 0, 0, 0, 0), cp.Waypoint(1, 2, 0, 0, 0)], labels="angle")
     >>> x, u = cp.reference_window(plan, 0.95, 0.02, 5, flat=motor)
     >>> x.shape, u.shape, x[0].round(4).tolist()
-    ((3, 6), (1, 5), [1.9999, 2.0, 2.0, 2.0, 2.0, 2.0])
+    ((3, 6), (1, 5), [1.9996, 1.9999, 2.0, 2.0, 2.0, 2.0])
     """
     check_kind(plan, "plan", Trajectory)
     steps = checked_count(count, "count", 1)

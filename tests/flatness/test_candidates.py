@@ -27,7 +27,7 @@ def test_candidates_of_one_input():
         "x",
         "z",
     )
-    with pytest.raises(ValueError, match="at most 500 sets"):
+    with pytest.raises(ValueError, match="at most 300 sets"):
         cp.flat_candidates(ct.ss(-np.eye(40), np.ones((40, 2)), np.eye(40), np.zeros((40, 2))))
 
 

@@ -153,7 +153,7 @@ x = ca.SX.sym("x")
 y = ca.SX.sym("y")
 SWITCHED = {
     "less": (x < y, lambda x, y: x - y),
-    "equal": (ca.eq(x, y), lambda x, y: x - y),
+    "equal": (ca.eq(x, y), lambda x, y: np.abs(x - y)),
     "abs": (ca.fabs(x), lambda x, y: x),
     "sign": (ca.sign(x - 2.0 * y), lambda x, y: x - 2.0 * y),
     "fmax": (ca.fmax(x, y), lambda x, y: x - y),
