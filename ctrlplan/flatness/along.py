@@ -6,6 +6,7 @@ between the nodes they are interpolated and refined, all times in one call.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
@@ -134,7 +135,7 @@ def connected(maps: FlatMaps, flag: Array, p: Array, start: Array | None, name: 
             except SingularError:
                 continue
         raise ValueError(
-            f"states of {name} at {time:.6g} s must be connected with the operating point, but {error}; give start= or "
+            f"states of {name}{_at(time)} must be connected with the operating point, but {error}; give start= or "
             "another operating point at="
         ) from None
 
@@ -293,6 +294,11 @@ def check_branch(maps: FlatMaps, x: Array, u: Array, p: Array, t: Array, name: s
     if wrong.any():
         row, k = (int(v) for v in np.argwhere(wrong)[0])
         raise ValueError(
-            f"equations of {name} must stay on the branch of the operating point ({maps.notes[row]}), got another one "
-            f"at {float(t[k]):.6g} s"
+            f"equations of {name} must stay on the branch of the operating point ({maps.notes[row]}), got another "
+            f"one{_at(float(t[k]))}"
         )
+
+
+def _at(time: float) -> str:
+    """Time in a message; empty if it is nan, as for flags without times."""
+    return "" if math.isnan(time) else f" at {time:.6g} s"

@@ -68,6 +68,12 @@ def analysed(
     """
     known = given_values(at, system.state_labels or (), system.input_labels or (), str(system.name))
     equations = equations_of(system, flat_outputs, inputs, params, known)
+    for key in scales:
+        if key not in equations.names:
+            raise ValueError(
+                f"scales must have names of states and controls of {system.name}, {', '.join(equations.names)}, "
+                f"got {key!r}"
+            )
     point = found_point(equations, {k: v for k, v in known.items() if k in equations.names}, scales)
     branch = branch_at(
         (equations.rates, equations.outputs, equations.flat),

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import control as ct
 import numpy as np
 
+from ctrlplan._checks import check_kind
 from ctrlplan._types import Array, Params, System
 from ctrlplan.flatness.derived import DerivedFlatSystem
 from ctrlplan.flatness.linear import brunovsky_outputs
@@ -82,6 +84,11 @@ def flat_system(
         traced, depend on time, contain samples or delays or a nonlinear algebraic
         loop; if names are unknown or numbers differ; or if there is no equilibrium.
 
+    Warns
+    -----
+    UserWarning
+        If one of `params` has no effect on the equations.
+
     Examples
     --------
     A planar vehicle with two thrusts, with its centre of oscillation as
@@ -108,7 +115,18 @@ def flat_system(
     analysis, original = analysed(
         plant, outputs, inputs=inputs, at=at, params=dict(params or {}), scales=dict(scales or {})
     )
+    _warn_of_unread(params or {}, original)
     return derived_system(analysis, original, name or str(system.name))
+
+
+def _warn_of_unread(params: Params, equations: Equations) -> None:
+    """Warn of parameters that have no effect, such as misspelled ones."""
+    import casadi as ca
+
+    everything = ca.vertcat(equations.rates, equations.outputs, equations.flat)
+    for k, name in enumerate(equations.parameters):
+        if name in params and not ca.depends_on(everything, equations.p[k]):
+            warnings.warn(f"params {name!r} has no effect on the equations of {equations.name}", stacklevel=3)
 
 
 def derived_system(analysis: Analysis, original: Equations, name: str) -> DerivedFlatSystem:
@@ -171,6 +189,7 @@ def _with_outputs(
     if flat_outputs is not None:
         return system, flat_outputs
     if not isinstance(system, ct.StateSpace):
+        check_kind(system, "system", ct.NonlinearIOSystem, "a python-control system")
         raise TypeError(
             "flat_outputs must be given for a nonlinear system: names of outputs or states, or a function h(x, u, "
             "params); see flat_candidates"
