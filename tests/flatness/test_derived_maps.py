@@ -232,6 +232,8 @@ def test_singular_points_are_named_with_time_and_quantity():
     stop = rest_to_rest(["x", "y"], [2, 2], [4.0, 1.0])
     with pytest.raises(ValueError, match=r"states of car.*w1 is not determined"):
         flat.states_and_inputs(stop, [1.5])
+    with pytest.raises(ValueError, match=r"^states of car must be connected with the operating point, but w1 is not"):
+        cp.margins(stop, {flat.input_labels[0]: 20.0}, flat)
     there = cp.PolySpline(
         [cp.Waypoint.from_jets(t, x=[p, v], y=[0.3 * p, 0.3 * v]) for t, p, v in ((0, 0, 1), (2, 1, 0), (4, 0, -1))]
     )
@@ -447,3 +449,14 @@ def test_signals_on_another_branch_of_the_equations_are_not_determined():
     np.testing.assert_allclose(found["u"], [3.0, np.nan])
     with pytest.raises(ValueError, match=r"equations of drag must stay on the branch .*got another one; derive"):
         flat.reverse([jet[:, 0, 1]])
+
+
+def test_misspelled_parameters_and_scales_are_named():
+    plant = ct.nlsys(lambda t, x, u, p: [u[0] / p.get("m", 2.0)], None, states=["v"], inputs=["F"], name="mass")
+    with pytest.raises(ValueError, match=r"params must be among the parameters of mass \(none\), got 'mas'"):
+        cp.flat_system(plant, "v", params={"mas": 3.0})
+    assert cp.flat_system(plant, "v", params={"m": 3.0}).params["m"] == 3.0
+    with pytest.raises(ValueError, match="scales must be among .*v, F, got 'f'"):
+        cp.flat_system(plant, "v", scales={"f": 1.0})
+    with pytest.raises(TypeError, match="system must be a python-control system, got int"):
+        cp.flat_system(5)
