@@ -23,6 +23,9 @@ _MAXIMUM = 256
 _LARGEST = 1024
 """Degree at which a velocity is considered resolved: what remains is its rounding."""
 
+_LONGEST = 1e8
+"""Largest phase |p| T [rad] of a mode over a plan: 1e5 parts, about ten seconds for one mode."""
+
 _ENTRIES = 1 << 20
 """Numbers in a table of exponentials: 16 MB."""
 
@@ -60,8 +63,8 @@ def residual_spectrum(plan: Trajectory, frequencies: ArrayLike, damping: ArrayLi
     TypeError
         If `plan` is not a trajectory.
     ValueError
-        If a frequency is negative or not finite, or a damping ratio is out of
-        range.
+        If a frequency is negative, not finite, or above 1e8 rad over the duration
+        of the plan, or a damping ratio is out of range.
 
     References
     ----------
@@ -83,6 +86,12 @@ def residual_spectrum(plan: Trajectory, frequencies: ArrayLike, damping: ArrayLi
     """
     check_kind(plan, "plan", Trajectory)
     omega, zeta = checked_modes(frequencies, damping)
+    highest = float(omega.max())
+    if highest * plan.duration > _LONGEST:
+        raise ValueError(
+            f"frequencies must be at most {_LONGEST / plan.duration:.3g} rad/s for a plan of {plan.duration:.6g} s, "
+            f"got {highest:.3g}; give frequencies in rad/s and times in s"
+        )
     modes = omega * (zeta + 1j * np.sqrt(1.0 - zeta**2))
     total = np.zeros((plan.naxes, omega.size), dtype=complex)
     cuts = plan.breakpoints
