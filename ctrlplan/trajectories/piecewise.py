@@ -185,7 +185,9 @@ class PiecewiseSpline(WaypointSpline):
 
         The plan starts at the first waypoint, lasts one period and ends with the
         initial jet. Free entries of all waypoints, also of the first, are
-        continuous together with their conjugates. `then` appends further periods.
+        continuous together with their conjugates, up to the highest order that a
+        waypoint prescribes. With positions only the plan is piecewise linear.
+        `then` appends further periods.
 
         Parameters
         ----------
@@ -204,11 +206,14 @@ class PiecewiseSpline(WaypointSpline):
 
         Examples
         --------
+        A cam that is at rest for a moment at its first waypoint; velocity and
+        acceleration are continuous at all waypoints, and so are jerk and snap where
+        they are free:
+
         >>> import ctrlplan as cp
-        >>> points = [cp.Waypoint(0, 0, None, None), cp.Waypoint(1, 1, None, None), cp.Waypoint(3, -1, None, None)]
-        >>> cam = cp.PiecewiseSpline.cyclic(points, 4.0)
-        >>> cam.end, bool(abs(cam.jet(4.0, 2) - cam.jet(0.0, 2)).max() < 1e-12)
-        (4.0, True)
+        >>> cam = cp.PiecewiseSpline.cyclic([cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1), cp.Waypoint(3, -1)], 4.0)
+        >>> cam.end, cam.jumps(2), bool(abs(cam.jet(4.0, 2) - cam.jet(0.0, 2)).max() < 1e-12)
+        (4.0, (), True)
         """
         points = checked_waypoints(waypoints)
         duration = checked_finite(period, "period", above=0.0)
@@ -555,6 +560,8 @@ def _entries_of(times: ArrayLike, values: ArrayLike, derivatives: Mapping[int, A
         raise ValueError(
             f"values must have shape (naxes, {moments.size}) or ({moments.size},) as times, got {positions.shape}"
         )
+    if derivatives is not None and not isinstance(derivatives, Mapping):
+        raise TypeError(f"derivatives must be a mapping of orders to arrays, got {derivatives!r:.80}")
     orders = {checked_count(k, "order of derivatives", 1): v for k, v in (derivatives or {}).items()}
     table = np.full((moments.size, 1 + max(orders, default=0), len(rows)), np.nan)
     table[:, 0] = rows.T

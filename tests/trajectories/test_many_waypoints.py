@@ -346,6 +346,11 @@ def test_a_closed_plan_with_undetermined_entries_is_rejected():
         PiecewiseSpline.cyclic([Waypoint(0.0, 0.0), Waypoint(1.0, 1.0)], 2.0, alpha="auto")
 
 
+def test_derivatives_that_are_no_mapping_are_rejected():
+    with pytest.raises(TypeError, match="derivatives must be a mapping of orders to arrays, got 5"):
+        PiecewiseSpline.from_arrays([0.0, 1.0], [0.0, 1.0], derivatives=5)
+
+
 def test_a_swing_between_many_points_warns():
     times = np.arange(600.0)
     times[300] = times[299] + 0.03
