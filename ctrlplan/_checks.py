@@ -198,7 +198,9 @@ def finite_vector(values: ArrayLike, name: str, size: str, scalar: bool = False)
         forms = f"a scalar or of shape ({size},)" if scalar else f"of shape ({size},)"
         raise ValueError(f"{name} must be {forms}, got shape {found.shape}")
     if not np.isfinite(found).all():
-        raise ValueError(f"{name} must be finite, got {found.tolist()}")
+        wrong = int((~np.isfinite(found)).argmax())
+        entry = f"[{wrong}] = {found[wrong]}" if found.ndim else f" = {found}"
+        raise ValueError(f"{name} must be finite, got {name}{entry}")
     return np.atleast_1d(found)
 
 

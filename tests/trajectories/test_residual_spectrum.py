@@ -174,10 +174,12 @@ def test_a_mode_that_starts_from_rest_in_closed_form():
     ("arguments", "message"),
     [
         ((QUINTIC, [1.0, -1.0]), r"frequencies must be at least 0, got frequencies\[1\] = -1.0"),
-        ((QUINTIC, [1.0, math.nan]), "frequencies must be finite"),
+        ((QUINTIC, [1.0, math.nan]), r"frequencies must be finite, got frequencies\[1\] = nan$"),
+        ((QUINTIC, [math.inf] * 400), r"frequencies must be finite, got frequencies\[0\] = inf$"),
         ((QUINTIC, [1.0, math.inf]), "frequencies must be finite"),
         ((QUINTIC, []), "frequencies must be a scalar or of shape"),
         ((QUINTIC, [[1.0]]), "frequencies must be a scalar or of shape"),
+        ((QUINTIC, [1.0, 1e12]), "frequencies must be at most 1e[+]08 rad/s for a plan of 1 s, got 1e[+]12"),
         ((QUINTIC, 1.0, 1.0), r"damping must lie in \[0, 1\), got 1.0"),
         ((QUINTIC, 1.0, -0.1), r"damping must lie in \[0, 1\), got -0.1"),
         ((QUINTIC, 1.0, math.nan), r"damping must lie in \[0, 1\), got nan"),
