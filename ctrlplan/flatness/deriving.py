@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import control as ct
 import numpy as np
 
+from ctrlplan._checks import check_kind
 from ctrlplan._types import Array, Params, System
 from ctrlplan.flatness.derived import DerivedFlatSystem
 from ctrlplan.flatness.linear import brunovsky_outputs
@@ -172,6 +173,7 @@ def _with_outputs(
     if flat_outputs is not None:
         return system, flat_outputs
     if not isinstance(system, ct.StateSpace):
+        check_kind(system, "system", ct.NonlinearIOSystem, "a python-control system")
         raise TypeError(
             "flat_outputs must be given for a nonlinear system: names of outputs or states, or a function h(x, u, "
             "params); see flat_candidates"

@@ -447,3 +447,8 @@ def test_signals_on_another_branch_of_the_equations_are_not_determined():
     np.testing.assert_allclose(found["u"], [3.0, np.nan])
     with pytest.raises(ValueError, match=r"equations of drag must stay on the branch .*got another one; derive"):
         flat.reverse([jet[:, 0, 1]])
+
+
+def test_what_is_no_system_is_named_first():
+    with pytest.raises(TypeError, match="system must be a python-control system, got int"):
+        cp.flat_system(5)
