@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter1d
 from scipy.optimize import brentq
 
-from ctrlplan._checks import check_kind, checked_labels, checked_names
+from ctrlplan._checks import check_kind, checked_labels, checked_names, real_array
 from ctrlplan._display import Displayed, Facts, Part, Table, number
 from ctrlplan._types import Array, Params, Value
 from ctrlplan.systems.motion import FilteredColumn, Motion, PlannedMotion, SampledMotion
@@ -395,6 +395,18 @@ def _term(name: str, functions: Mapping[str, Function], jet: Value) -> Value:
     return jet[_ORDERS[name]]
 
 
+def _check_function(function: Function, name: str, position: Array) -> None:
+    """Raise unless a function of the user gives one finite number per position, or one for all."""
+    values = real_array(function(position), f"term {name!r}")
+    if values.shape not in ((), position.shape):
+        raise ValueError(
+            f"term {name!r} must return one value per position, shape {position.shape}, got shape {values.shape}"
+        )
+    if not np.isfinite(values).all():
+        where = int((~np.isfinite(np.broadcast_to(values, position.shape))).argmax())
+        raise ValueError(f"term {name!r} must be finite, got nan or inf at position {position[where]:.6g}")
+
+
 class _Data:
     """Control and regressors of a log, as functions of the delay."""
 
@@ -406,6 +418,8 @@ class _Data:
         speed, acceleration = (float(np.max(np.abs(row))) for row in jet[1:3])
         if not speed > 0.0:
             raise ValueError("log must contain a motion, got none; align it with the plan, as with_measured does")
+        for name, function in functions.items():
+            _check_function(function, name, jet[0])
         self.threshold = _THRESHOLD * speed
         self.longest = min(_LONGEST_DELAY, 0.1 * float(t[-1] - t[0]))
         self._dt = float(np.median(np.diff(t)))

@@ -301,3 +301,22 @@ def test_bad_logs():
     still = cp.read_log({"time": TIMES, "u": np.zeros(TIMES.size), "y": np.zeros(TIMES.size)})
     with pytest.raises(ValueError, match="log must contain a motion, got none"):
         cp.fit_feedforward(still)
+
+
+@pytest.mark.parametrize(
+    ("function", "error", "message"),
+    [
+        (
+            lambda y: np.where(y > 0.5, np.nan, y),
+            ValueError,
+            "term 'spring' must be finite, got nan or inf at position",
+        ),
+        (lambda y: y[:3], ValueError, r"term 'spring' must return one value per position, shape .*, got shape \(3,\)"),
+        (lambda y: "stiff", TypeError, "term 'spring' must be real numbers, got 'stiff'"),
+    ],
+)
+@pytest.mark.parametrize("plan", [PLAN, None])
+def test_functions_of_the_position_return_finite_numbers(function, error, message, plan):
+    log = logged(seed=0, position=1e-5)
+    with pytest.raises(error, match=message):
+        cp.fit_feedforward(log, plan, terms=("velocity", ("spring", function)))
