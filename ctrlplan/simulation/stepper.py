@@ -83,10 +83,20 @@ class Stepper(Displayed):
     """
 
     def __init__(self, prepared: Prepared, grid: Grid, steps: Steps) -> None:
-        self.dt, self.name, self._grid = float(grid.dt), prepared.name, grid
+        self._name, self._grid = prepared.name, grid
         self.input_labels, self.output_labels = list(prepared.input_labels), list(prepared.output_labels)
         self.state_labels = list(prepared.state_labels)
         self._shape, self._steps = (len(self.input_labels),), steps
+
+    @property
+    def dt(self) -> float:
+        """Length of a step [s]."""
+        return float(self._grid.dt)
+
+    @property
+    def name(self) -> str:
+        """Name of the system."""
+        return self._name
 
     @property
     def time(self) -> float:

@@ -369,6 +369,15 @@ def test_the_step_of_a_discrete_system_is_a_multiple_of_its_period():
     assert (stepper.time, stepper.state.tolist()) == (0.25, [1.0])
 
 
+def test_the_length_of_a_step_cannot_be_changed():
+    stepper = cp.prepare(ct.ss([[-1.0]], [[1.0]], [[1.0]], 0, name="lag")).start(0.1)
+    for name in ("dt", "name", "time"):
+        with pytest.raises(AttributeError):
+            setattr(stepper, name, 0.2)
+    stepper.step(1.0)
+    assert (stepper.dt, stepper.name, stepper.time) == (0.1, "lag", 0.1)
+
+
 def test_a_block_that_only_python_control_runs_cannot_be_stepped():
     class Odd(ct.NonlinearIOSystem):
         def _rhs(self, t, x, u, params=None):
