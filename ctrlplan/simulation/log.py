@@ -292,7 +292,13 @@ def _chosen(table: Columns, when: int, signals: Mapping[str, Column] | None) -> 
         sizes = table.sizes if isinstance(table, _Arrays) else [1] * table.width
         found = {name: k for k, name in enumerate(table.header) if k != when and sizes[k] == sizes[when]}
         if not found:
-            raise ValueError(f"{table.title} must have a column of a signal, got one of times only")
+            others = ", ".join(f"{name} with {sizes[k]}" for k, name in enumerate(table.header) if k != when)
+            if not others:
+                raise ValueError(f"{table.title} must have a column of a signal, got one of times only")
+            raise ValueError(
+                f"{table.title} must have a column of a signal with {sizes[when]} values, as many as times, got "
+                f"{others}"
+            )
         return found
     if not isinstance(signals, Mapping):
         raise TypeError(f"signals must be a mapping of labels to columns, got {signals!r:.80}")

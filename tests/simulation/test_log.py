@@ -175,6 +175,7 @@ def test_gaps_in_time_are_errors(written):
         (pd.DataFrame(TABLE).astype({"force": "Int64"}).replace({"force": {30: pd.NA}}), "row 2: column 'force'"),
         (pd.DataFrame([[0, 1], [1, 2]], columns=["time", "time"]), "different names, got time, time"),
         ({"time": TIMES}, "the table must have a column of a signal"),
+        ({"time": [0.0, 1.0], "y": [1.0, 2.0, 3.0]}, "a signal with 2 values, as many as times, got y with 3"),
         ({"time": 1.0, "y": 2.0}, "the table: column 'time' must be a vector"),
     ],
 )  # fmt: skip
