@@ -213,7 +213,8 @@ def loop_quantities(loop: System | Prepared, *, tail: float | None = None) -> Lo
     TypeError
         If `loop` is not a control system.
     ValueError
-        If `tail` is negative, or a discrete loop has no sampling time.
+        If `tail` is negative, a discrete loop has no sampling time, or a linear
+        discrete loop is unstable.
 
     Examples
     --------

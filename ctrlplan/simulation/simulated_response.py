@@ -8,6 +8,7 @@ from functools import cached_property, reduce
 from itertools import pairwise
 from typing import NoReturn, Self
 
+import control as ct
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
@@ -74,6 +75,7 @@ class SimulatedQuantities(Displayed):
         self.name = self._prepared.name
         if self._prepared.dt is True:
             raise ValueError(f"loop must have a sampling time for limits on its signals, got {self.name} with dt=True")
+        _check_stable(self._prepared)
         outputs = self._prepared.output_labels
         self.inputs = tuple(self._prepared.input_labels)
         self.names = (*outputs, *(label for label in self.inputs if label not in outputs))
@@ -111,6 +113,22 @@ class SimulatedQuantities(Displayed):
         """
         check_kind(plan, "plan", Trajectory)
         return SimulatedResponse(self._prepared, plan, self._tail, refined)
+
+
+def _check_stable(prepared: Prepared) -> None:
+    """Raise for a linear discrete loop with a pole outside of the unit circle, as for a continuous one."""
+    if not (prepared.is_discrete and isinstance(prepared.system, ct.StateSpace) and prepared.nstates):
+        return
+    poles = np.linalg.eigvals(prepared.system.A).astype(complex)
+    # Rounding moves the poles of several integrators, at 1.
+    unstable = poles[(np.abs(poles) > 1.0 + 1e-9) & (np.abs(poles - 1.0) > 1e-4)]
+    if unstable.size:
+        worst = complex(unstable[np.abs(unstable).argmax()])
+        at = f"{worst.real:.4g}" + (f" ± {abs(worst.imag):.4g}j" if worst.imag else "")
+        raise ValueError(
+            f"the loop must be stable for limits on its signals, got {prepared.name} with a pole at {at} outside of "
+            "the unit circle: its response grows without bound"
+        )
 
 
 class SimulatedResponse(LoopResponse):

@@ -329,8 +329,17 @@ def _plant(flat: FlatSystem, disturbances: Sequence[str] | str | None) -> ct.Non
 def _weight(matrix: ArrayLike, name: str, size: int, *, strict: bool) -> Array:
     """Symmetric weight, positive definite if `strict`, otherwise semidefinite."""
     found = real_array(matrix, name)
-    if found.shape != (size, size) or not np.isfinite(found).all() or not np.allclose(found, found.T, rtol=1e-9):
+    if found.shape != (size, size):
         raise ValueError(f"{name} must be a symmetric matrix of shape ({size}, {size}), got shape {found.shape}")
+    if not np.isfinite(found).all():
+        raise ValueError(f"{name} must be finite, got nan or inf")
+    excess = np.abs(found - found.T) - 1e-9 * np.abs(found).max()
+    if (excess > 0.0).any():
+        i, j = divmod(int(excess.argmax()), size)
+        raise ValueError(
+            f"{name} must be symmetric, got {found[i, j]:.6g} at [{i}, {j}] and {found[j, i]:.6g} at [{j}, {i}]; give "
+            f"({name} + {name}.T) / 2"
+        )
     smallest = float(np.linalg.eigvalsh(found)[0])
     if smallest < 0.0 - 1e-12 * float(np.abs(found).max()) or (strict and smallest <= 0.0):
         raise ValueError(

@@ -456,7 +456,10 @@ def test_misspelled_parameters_and_scales_are_named():
     with pytest.raises(ValueError, match=r"params must be among the parameters of mass \(none\), got 'mas'"):
         cp.flat_system(plant, "v", params={"mas": 3.0})
     assert cp.flat_system(plant, "v", params={"m": 3.0}).params["m"] == 3.0
-    with pytest.raises(ValueError, match="scales must be among .*v, F, got 'f'"):
+    with pytest.raises(ValueError, match=r"scales must be among .*v, F, got 'f'"):
         cp.flat_system(plant, "v", scales={"f": 1.0})
+
+
+def test_what_is_no_system_is_named_first():
     with pytest.raises(TypeError, match="system must be a python-control system, got int"):
         cp.flat_system(5)

@@ -294,6 +294,31 @@ def test_a_discrete_loop_is_evaluated_at_its_samples():
     assert abs(rate.value) == pytest.approx(np.abs(steps).max(), abs=1e-7)
 
 
+@pytest.mark.parametrize(
+    ("poles", "message"),
+    [
+        ([1.1, 0.5], r"pole at 1\.1 outside of the unit circle"),
+        ([0.9 + 0.9j, 0.9 - 0.9j], r"pole at 0\.9 ± 0\.9j outside of the unit circle"),
+        ([-1.01, 0.2], r"pole at -1\.01 outside of the unit circle"),
+    ],
+)
+def test_an_unstable_discrete_loop_is_rejected_as_a_continuous_one(poles, message):
+    den = np.poly(poles).real
+    loop = ct.ss(ct.tf([den.sum()], den, 0.1), inputs="r", outputs="y")
+    for function in (margins, fastest):
+        with pytest.raises(ValueError, match=message):
+            function(TRACK, {"y": 5.0}, loop)
+
+
+def test_discrete_integrators_are_no_unstable_poles():
+    """Three integrators, whose poles rounding moves by the cube root of its size."""
+    turn = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
+    a, b, c = turn @ (np.eye(3) + np.eye(3, k=1)) @ turn.T, turn @ [[0.0], [0.0], [1.0]], [[1.0, 0.0, 0.0]] @ turn.T
+    chain = ct.ss(a, b, c, 0, 0.1, inputs="r", outputs="y")
+    assert np.abs(np.linalg.eigvals(chain.A)).max() > 1.0 + 1e-9
+    assert margins(TRACK, {"y": (-1e6, 1e6)}, chain).satisfied
+
+
 # Nonlinear loops
 
 

@@ -181,3 +181,20 @@ def test_equality_with_zero_is_no_switch():
     t = np.linspace(-1.0, 1.0, 21)
     found = cp.simulate(toggled, t, t, method="compiled")
     np.testing.assert_allclose(found.outputs[0], 0.0, atol=1e-7)
+
+
+@pytest.mark.parametrize("size", [1.0, 1e-12])
+@pytest.mark.parametrize(
+    ("q", "message"),
+    [
+        ([[1.0, 1.0], [0.0, 1.0]], r"Q must be symmetric, got .* at \[0, 1\] and 0 at \[1, 0\]"),
+        ([[1.0, np.nan], [np.nan, 1.0]], "Q must be finite, got nan or inf"),
+        (np.eye(3), r"Q must be a symmetric matrix of shape \(2, 2\), got shape \(3, 3\)"),
+    ],
+)
+def test_weights_that_are_not_symmetric_or_finite(q, message, size):
+    plant = ct.ss([[0, 1], [0, 0]], [[0], [1]], [[1, 0]], 0, inputs="F", outputs="y", states=["p", "v"], name="cart")
+    plan = cp.PolySpline([cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1, 0, 0)], labels=["p"])
+    law = cp.TVLQR(size * np.asarray(q), [[1.0]])
+    with pytest.raises(ValueError, match=message):
+        cp.flat_loop(cp.flat_system(plant, "p"), plan, law=law)
