@@ -72,6 +72,7 @@ class DerivedFlatSystem(FlatSystem):
         self._analysis: Analysis | None = analysis
         self.operating_point = dict(operating_point)
         self.notes = tuple(notes)
+        self._plans: Lru[int, tuple[Trajectory, Trajectory]] = Lru(8)
         self._grids: Lru[tuple[int, bytes, bytes], tuple[Trajectory, Grid]] = Lru(8)
 
     def __getstate__(self) -> dict[str, object]:
@@ -98,6 +99,10 @@ class DerivedFlatSystem(FlatSystem):
         yield from super()._describe()
         at = ", ".join(f"{name} = {value:.6g}" for name, value in self.operating_point.items())
         yield Facts([("operating point", at), *(("note", note) for note in self.notes)])
+
+    def matched(self, plan: Trajectory) -> Trajectory:
+        """Plan with the axes in the order of the flat outputs; the same object at each call."""
+        return self._plans.get(id(plan), lambda: (plan, super(DerivedFlatSystem, self).matched(plan)))[1]
 
     def states_and_inputs(
         self, plan: Trajectory, timepts: ArrayLike, *, start: ArrayLike | None = None

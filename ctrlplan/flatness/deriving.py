@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from typing import TYPE_CHECKING
 
 import control as ct
@@ -11,6 +12,7 @@ import numpy as np
 from ctrlplan._checks import check_kind
 from ctrlplan._types import Array, Params, System
 from ctrlplan.flatness.derived import DerivedFlatSystem
+from ctrlplan.flatness.errors import NotFlatError
 from ctrlplan.flatness.linear import brunovsky_outputs
 from ctrlplan.symbolic import missing_casadi
 
@@ -106,11 +108,21 @@ def flat_system(
         raise ImportError(f"flat_system requires CasADi: {missing}")
     from ctrlplan.flatness.analysis import analysed
 
-    plant, outputs = _with_outputs(_state_space(system), flat_outputs, inputs)
-    analysis, original = analysed(
-        plant, outputs, inputs=inputs, at=at, params=dict(params or {}), scales=dict(scales or {})
-    )
-    return derived_system(analysis, original, name or str(system.name))
+    plant = _state_space(system)
+
+    def derived(outputs: FlatOutputs) -> DerivedFlatSystem:
+        analysis, original = analysed(
+            plant, outputs, inputs=inputs, at=at, params=dict(params or {}), scales=dict(scales or {})
+        )
+        return derived_system(analysis, original, name or str(system.name))
+
+    if flat_outputs is not None:
+        return derived(flat_outputs)
+    rows = _rows(plant, inputs)
+    if plant.noutputs == len(rows):
+        with suppress(NotFlatError):  # as of a system with zeros
+            return derived(list(plant.output_labels))
+    return derived(lambda x, u, params: rows @ x)
 
 
 def derived_system(analysis: Analysis, original: Equations, name: str) -> DerivedFlatSystem:
@@ -166,12 +178,8 @@ def _state_space(system: System) -> System:
         ) from error
 
 
-def _with_outputs(
-    system: System, flat_outputs: FlatOutputs | None, inputs: Sequence[str] | str | None
-) -> tuple[System, FlatOutputs]:
-    """The system and its flat outputs, chosen for a linear one."""
-    if flat_outputs is not None:
-        return system, flat_outputs
+def _rows(system: System, inputs: Sequence[str] | str | None) -> Array:
+    """Flat outputs of a linear system as functions of its states, from its controllability form."""
     if not isinstance(system, ct.StateSpace):
         check_kind(system, "system", ct.NonlinearIOSystem, "a python-control system")
         raise TypeError(
@@ -179,6 +187,6 @@ def _with_outputs(
             "params); see flat_candidates"
         )
     chosen = list(system.input_labels) if inputs is None else [inputs] if isinstance(inputs, str) else list(inputs)
-    columns = [list(system.input_labels).index(label) for label in chosen if label in system.input_labels]
-    rows, own = brunovsky_outputs(system, columns)
-    return system, list(system.output_labels) if own else lambda x, u, params: rows @ x
+    return brunovsky_outputs(
+        system, [list(system.input_labels).index(label) for label in chosen if label in system.input_labels]
+    )

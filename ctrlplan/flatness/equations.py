@@ -123,6 +123,11 @@ def equations_of(
             f"flat_outputs must be as many as the controls of {system.name}, {', '.join(chosen)}, got "
             f"{', '.join(labels)}; name the controls with inputs= if others are disturbances"
         )
+    if shared := [all_inputs[k] for k in held if all_inputs[k] in expressions.symbols]:
+        raise ValueError(
+            f"inputs that are no controls must not have names of parameters, got {', '.join(shared)} of {system.name}; "
+            "rename them, or add them to inputs="
+        )
     parameters = tuple(expressions.symbols) + tuple(all_inputs[k] for k in held)
     values = [expressions.values[name] for name in expressions.symbols]
     return Equations(

@@ -144,8 +144,8 @@ def _floats(rows: Matrix) -> Array:
     return np.array([[float(value) for value in row] for row in rows])
 
 
-def brunovsky_outputs(system: System, columns: Sequence[int]) -> tuple[Array, bool]:
-    """Flat outputs of a linear system, and whether its own outputs are flat.
+def brunovsky_outputs(system: System, columns: Sequence[int]) -> Array:
+    """Flat outputs of a linear system.
 
     Parameters
     ----------
@@ -158,9 +158,6 @@ def brunovsky_outputs(system: System, columns: Sequence[int]) -> tuple[Array, bo
     -------
     rows : ndarray, shape (ncontrols, nstates)
         Flat outputs as functions of the states, from the controllability indices.
-    own : bool
-        Whether the outputs of the system are as many as controls and without
-        invariant zeros: then they are flat themselves.
 
     Raises
     ------
@@ -194,7 +191,7 @@ def brunovsky_outputs(system: System, columns: Sequence[int]) -> tuple[Array, bo
         last += len(block)
         right = [Fraction(int(k == last)) for k in range(n)]
         rows.append(_solution(ordered, right, str(system.name)))
-    return _floats(rows), _has_no_zeros(system, columns)
+    return _floats(rows)
 
 
 def _rank(vectors: Matrix) -> int:
@@ -211,40 +208,3 @@ def _rank(vectors: Matrix) -> int:
                 rows[i] = [value - factor * other for value, other in zip(rows[i], rows[rank], strict=True)]
         rank += 1
     return rank
-
-
-def _has_no_zeros(system: System, columns: Sequence[int]) -> bool:
-    """Whether a square system has no finite invariant zeros, generically: the determinant of its pencil is constant."""
-    a, c = (np.asarray(part, dtype=float) for part in (system.A, system.C))
-    b, d = (np.asarray(part, dtype=float)[:, list(columns)] for part in (system.B, system.D))
-    if len(c) != len(columns):
-        return False
-    n = len(a)
-    left = _fractions(np.block([[a, b], [c, d]]))
-    size = n + len(c)
-
-    def determinant(s: int) -> Fraction:
-        rows = [[value - s * int(i == j and i < n) for j, value in enumerate(row)] for i, row in enumerate(left)]
-        return _determinant(rows, size)
-
-    # A polynomial of degree at most n is constant where n + 1 of its values are equal.
-    values = [determinant(s) for s in range(n + 1)]
-    scale = max(map(abs, values))
-    return bool(scale) and all(abs(value - values[0]) <= _NOTHING * scale for value in values)
-
-
-def _determinant(matrix: Matrix, size: int) -> Fraction:
-    rows = [list(row) for row in matrix]
-    value = Fraction(1)
-    for k in range(size):
-        pivot = next((i for i in range(k, size) if rows[i][k]), None)
-        if pivot is None:
-            return Fraction(0)
-        if pivot != k:
-            rows[k], rows[pivot], value = rows[pivot], rows[k], -value
-        value *= rows[k][k]
-        for i in range(k + 1, size):
-            if rows[i][k]:
-                factor = rows[i][k] / rows[k][k]
-                rows[i] = [entry - factor * other for entry, other in zip(rows[i], rows[k], strict=True)]
-    return value

@@ -463,3 +463,22 @@ def test_misspelled_parameters_and_scales_are_named():
 def test_what_is_no_system_is_named_first():
     with pytest.raises(TypeError, match="system must be a python-control system, got int"):
         cp.flat_system(5)
+
+
+@pytest.mark.parametrize("unit", [1e-12, 1.0, 1e9])
+def test_zeros_of_linear_plants_in_any_unit_of_time(unit):
+    """(1 + T s)/(1 + 1.1 T s + T^2 s^2) has a zero, so its output is not flat; without it the output is."""
+    rows, right = [[0.0, 1.0 / unit], [-1.0 / unit, -1.1 / unit]], [[0.0], [1.0 / unit]]
+    for zero in (0.0, 1.0, 1e-11):
+        flat = cp.flat_system(ct.ss(rows, right, [[1.0, zero]], 0.0, outputs="speed"))
+        assert flat.orders == (2,)
+        assert flat.flat_labels == (("y",) if zero else ("speed",))
+
+
+def test_grids_of_plans_with_axes_in_another_order_are_kept():
+    flat = derived(CASES["unicycle"])
+    plan = cp.PolySpline([cp.Waypoint.from_jets(t, y=[0.0] * 4, x=[t, 1, 0, 0]) for t in (0.0, 2.0)], labels=["y", "x"])
+    x, _ = flat.states_and_inputs(plan, 1.0)
+    np.testing.assert_allclose(x, [1.0, 0.0, 0.0], atol=1e-14)
+    assert flat.matched(plan) is flat.matched(plan)
+    assert plan.labels == ("y", "x")

@@ -289,3 +289,16 @@ def test_flat_outputs_do_not_take_the_name_of_another_signal():
     found = cp.simulate(cp.flat_loop(flat, plan, poles=[-3.0, -4.0]), [0.0, 1.0])
     assert found.outputs["flat_y"][-1] == pytest.approx(2.0)
     assert found.outputs["y"][-1] == pytest.approx(1.0)
+
+
+def test_inputs_that_are_not_controls_and_parameters_have_different_names():
+    plant = ct.nlsys(
+        lambda t, x, u, p: [u[0] + p["wind"] * u[1]],
+        None,
+        states=["v"],
+        inputs=["F", "wind"],
+        params={"wind": 3.0},
+        name="plant",
+    )
+    with pytest.raises(ValueError, match="names of parameters, got wind of plant"):
+        cp.flat_system(plant, "v", inputs="F")
