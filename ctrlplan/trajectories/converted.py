@@ -55,6 +55,7 @@ def as_trajectory(
     `control.flatsys.SystemTrajectory`               flat outputs, exact
     the same with `signals`                          states and inputs, interpolated
     `control.optimal.OptimalControlResult`           states and inputs, interpolated
+    `Trajectory`                                     itself, or some of its axes
     ================================================ =================================
 
     Where signals are interpolated, the attribute `deviation` of the trajectory states
@@ -119,7 +120,12 @@ def as_trajectory(
     begins = None if start is None else checked_finite(start, "start")
     finish = None if end is None else checked_finite(end, "end")
     names = None if signals is None else checked_names(signals, "signals")
-    if _has(obj, "system", "basis", "coeffs", "flaglen", "eval"):
+    if names == []:
+        raise ValueError("signals must name at least one signal, got none")
+    plan: Trajectory
+    if isinstance(obj, Trajectory):
+        plan = obj if names is None else obj.select(names)
+    elif _has(obj, "system", "basis", "coeffs", "flaglen", "eval"):
         plan = _of_flat(obj, begins, finish, names)
     elif _has(obj, "problem", "time", "states", "inputs"):
         plan = _of_optimal(obj, names)
@@ -131,6 +137,8 @@ def as_trajectory(
 
 def _part(obj: object, known: tuple[float, float], start: float | None, end: float | None) -> tuple[float, float]:
     """Times given, or else those of an object, within which they must lie to rounding."""
+    if start is None and end is None:
+        return known
     near = 4.0 * float(np.spacing(np.abs(known).max()))
     first = known[0] if start is None or abs(start - known[0]) <= near else start
     last = known[1] if end is None or abs(end - known[1]) <= near else end

@@ -77,6 +77,13 @@ def test_saved_and_pickled_are_equal(name, tmp_path):
         assert again.to_dict() == plan.to_dict()
 
 
+def test_trajectory_is_itself():
+    plan, step = cp.as_trajectory(SPLINES["PPoly"], signals=["x", "z"]), cp.Step(1.0)
+    assert cp.as_trajectory(plan) is plan
+    assert cp.as_trajectory(step) is step
+    assert cp.as_trajectory(plan, 1.0, 2.0, signals="z").labels == ("z",)
+
+
 # Flat plans
 
 
@@ -302,6 +309,7 @@ CASES = {
         ValueError,
         "polynomials, B-splines or a TrigFamily, got Exponentials",
     ),
+    "no signal": (lambda: cp.as_trajectory(move(BASES["TrigFamily"]), signals=[]), ValueError, "at least one signal"),
     "unknown signal": (
         lambda: cp.as_trajectory(move(BASES["TrigFamily"]), signals="torque"),
         ValueError,
