@@ -13,6 +13,7 @@ Plan a move
     residual_spectrum         vibration that a plan leaves in a mode, by frequency; residual_plot draws it
     stack                     plans of single axes as one plan
     waypoints_from_csv        waypoints from a table, with times or at a speed
+    as_trajectory             plans from splines of scipy and from results of python-control
     load_trajectory, trajectory_from_dict    stored plans
     Trajectory                what all plans have: values, derivatives, extrema, stop, plot, export, algebra
     WaypointSpline            base class of a spline of your own
@@ -100,6 +101,7 @@ _EXPORTS = {
         "TrigSpline",
         "Waypoint",
         "WaypointSpline",
+        "as_trajectory",
         "load_trajectory",
         "residual_spectrum",
         "stack",

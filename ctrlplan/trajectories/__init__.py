@@ -15,10 +15,12 @@ all derivatives zero. Times are in seconds, signals are (channel, time).
 from ctrlplan.trajectories.clipped import Clipped
 from ctrlplan.trajectories.combined import Joined, Scaled, Selected, Stacked, Sum, stack
 from ctrlplan.trajectories.continuity import Jump
+from ctrlplan.trajectories.converted import as_trajectory
 from ctrlplan.trajectories.extrema import Bounds, Extrema
 from ctrlplan.trajectories.files import derivative_name, load_trajectory, trajectory_from_dict
 from ctrlplan.trajectories.motion_profile import MotionProfile
 from ctrlplan.trajectories.piecewise import PiecewiseSpline
+from ctrlplan.trajectories.piecewise_polynomial import PiecewisePolynomial
 from ctrlplan.trajectories.polynomial import PolySpline
 from ctrlplan.trajectories.profiles import SCurve, Trapezoid
 from ctrlplan.trajectories.residual import residual_spectrum
@@ -41,6 +43,7 @@ __all__ = [
     "Joined",
     "Jump",
     "MotionProfile",
+    "PiecewisePolynomial",
     "PiecewiseSpline",
     "PolySpline",
     "Retimed",
@@ -58,6 +61,7 @@ __all__ = [
     "TrigSpline",
     "Waypoint",
     "WaypointSpline",
+    "as_trajectory",
     "derivative_name",
     "load_trajectory",
     "residual_spectrum",

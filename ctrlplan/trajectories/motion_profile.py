@@ -151,7 +151,7 @@ class MotionProfile(Trajectory):
         """Derivatives of a segment; as `Trajectory.segment_jet`."""
         x = s - self._anchors[:, segment, None]
         found = np.zeros((order + 1, *x.shape))
-        rows = _shifted(self._jets[:, :, segment, None], x)[: order + 1]
+        rows = shifted(self._jets[:, :, segment, None], x)[: order + 1]
         found[: len(rows)] = rows
         return found
 
@@ -159,12 +159,12 @@ class MotionProfile(Trajectory):
         """Taylor series of a segment; as `Trajectory.segment_series`."""
         found = []
         for jet, anchor in zip(self._jets[:, :, segment].T.tolist(), self._anchors[:, segment].tolist(), strict=True):
-            rows: list[Value] = [value / FACTORIALS[k] for k, value in enumerate(_shifted(jet, s - anchor))]
+            rows: list[Value] = [value / FACTORIALS[k] for k, value in enumerate(shifted(jet, s - anchor))]
             found.append([*rows, *[0.0] * order][: order + 1])
         return found
 
 
-def _shifted(jet: Value, x: Value) -> list[Value]:
+def shifted(jet: Value, x: Value) -> list[Value]:
     """Derivatives at x of the polynomial with given derivatives at 0."""
     rows = []
     for low in range(len(jet)):
@@ -179,7 +179,7 @@ def _states(first: Array, values: Array, durations: Array) -> Array:
     """States (order, naxes, nsegments + 1) at the ends of segments with given highest derivatives."""
     states = [first]
     for value, duration in zip(values.T, durations.tolist(), strict=True):
-        states.append(np.array(_shifted([*states[-1], value], duration)[:-1]))
+        states.append(np.array(shifted([*states[-1], value], duration)[:-1]))
     return np.stack(states, axis=2)
 
 

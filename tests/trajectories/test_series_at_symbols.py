@@ -15,6 +15,7 @@ from ctrlplan.trajectories import (
     Clipped,
     Joined,
     MotionProfile,
+    PiecewisePolynomial,
     PiecewiseSpline,
     PolySpline,
     Retimed,
@@ -65,6 +66,7 @@ PLANS = {
     "Retimed": Retimed(PiecewiseSpline(POINTS), PolySpline([Waypoint(3.0, -1.0, 0.5), Waypoint(7.0, 2.0, 0.4)])),
     "Clipped": Clipped(PiecewiseSpline(POINTS), -0.6, 1.1),
     "MotionProfile": MotionProfile([-0.5, 1.0, 3.0], [[2.0, -1.0], [0.0, 0.5]], [[1.0, 2.0], [0.5, -0.3], [0.1, 0.0]]),
+    "PiecewisePolynomial": PiecewisePolynomial([-0.5, 1.0, 3.0], [[[2.0, 0.3], [0.0, 0.5]], [[1.0, 2.0], [0.5, -0.3]]]),
     # kinds with options
     "of a higher degree": PolySpline(POINTS, degree=9),
     "trigonometric of a higher degree": TrigSpline(POINTS, alpha=2.0, degree=7),

@@ -45,6 +45,7 @@ ARGUMENTS = {
     "start": lambda: -0.7,
     "end": lambda: 1.2,
     "breakpoints": lambda: [0.5, 1.25, 2.0],
+    "coefficients": lambda: [[[0.5, -1.0], [1 / 3, 2.0]], [[2.0, 0.0], [-1.0, 1.0]], [[1.0, -3.0], [2.0, 0.7]]],
     "values": lambda: [[1.0, -3.0], [0.5, 0.0]],
     "start_state": lambda: [[1.0, 2.0], [0.5, -1.0], [0.1, 0.0]],
     "law": lambda: trajectories.PolySpline([Waypoint(3.0, -1.0, 0.7), Waypoint(4.0, 0.1), Waypoint(7.5, 2.0, 0.3)]),
