@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import control.flatsys as fs
 import numpy as np
+from scipy.linalg import matrix_balance
 
 from ctrlplan._display import Displayed, Facts, Part
 from ctrlplan._types import Array, Params, System
@@ -25,7 +26,7 @@ _MOST = 300
 """Maximum number of sets that are analysed."""
 
 _STEP = 2e-4
-"""Step of the differences along a jet, relative to its time."""
+"""Step of the differences along a jet, relative to the time constant of the plant."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -194,10 +195,15 @@ def _differences(
     """Relative differences along random jets, with the state and the point."""
     rng = np.random.default_rng(3)
     found = 0
+    rates = (1.0, _rate(plant, centre))
     for trial in range(60):
-        size = 1.0 if trial % 2 else 0.1
-        jets = [np.pad(row, (0, 4)) + size * rng.normal(size=row.size + 4) for row in centre]
-        rows = _along(plant, jets, orders)
+        size, rate = 1.0 if trial % 2 else 0.1, rates[trial // 2 % 2]
+        powers = [rate ** np.arange(row.size + 4) for row in centre]
+        jets = [
+            np.pad(row, (0, 4)) + size * power * rng.normal(size=power.size)
+            for row, power in zip(centre, powers, strict=True)
+        ]
+        rows = _along(plant, jets, orders, rate)
         if rows is None:
             continue
         found += 1
@@ -208,8 +214,25 @@ def _differences(
         raise ValueError(f"reverse of {plant.system.name} must be finite along some of the random jets, got none")
 
 
+def _rate(plant: FlatPlant, centre: Sequence[Array]) -> float:
+    """Largest magnitude of an eigenvalue [1/s] of the plant near a flag, by differences; 1 where it is 0."""
+    known = finite_rows(plant.reverse, list(centre)) or finite_rows(plant.reverse, [row + 0.1 for row in centre])
+    if known is None:
+        return 1.0
+    x, u = known
+    steps = 1e-6 * np.maximum(np.abs(x), 1e-3) * np.eye(x.size)
+    around = [finite_rows(plant.rates, x + sign * step, u) for step in steps for sign in (1.0, -1.0)]
+    values = np.array([np.full(x.size, np.nan) if row is None else row[0] for row in around])
+    slopes = ((values[::2] - values[1::2]) / (2.0 * steps.diagonal()[:, None])).T
+    if not np.isfinite(slopes).all():
+        return 1.0
+    balanced = matrix_balance(slopes)[0]  # entries in comparable units
+    largest = float(np.abs(np.linalg.eigvals(balanced)).max())
+    return largest if 1e-6 * float(np.abs(balanced).max()) < largest else 1.0
+
+
 def _along(
-    plant: FlatPlant, jets: list[Array], orders: Sequence[int]
+    plant: FlatPlant, jets: list[Array], orders: Sequence[int], rate: float
 ) -> list[tuple[float, str, dict[str, float]]] | None:
     """Differences at the middle of a jet; None outside of the domain."""
 
@@ -222,22 +245,28 @@ def _along(
         return finite_rows(plant.reverse, flags)
 
     weights = {-3: -1 / 60, -2: 3 / 20, -1: -3 / 4, 1: 3 / 4, 2: -3 / 20, 3: 1 / 60}
-    points = {k: at(k * _STEP) for k in (0, *weights)}
-    if any(point is None for point in points.values()):
-        return None
-    known = {k: point for k, point in points.items() if point is not None}
+    step = _STEP / rate
+    known: dict[int, list[Array]] = {}
+    for k in (0, *weights):
+        point = at(k * step)
+        if point is None:  # the search for a state that does not exist takes long
+            return None
+        known[k] = point
     x, u = known[0]
     rates = finite_rows(plant.rates, x, u)
     if rates is None:
         return None
-    derivative = np.sum([weight * known[k][0] for k, weight in weights.items()], axis=0) / _STEP
+    derivative = np.sum([weight * known[k][0] for k, weight in weights.items()], axis=0) / step
     spread = max(float(np.abs(known[k][0] - x).max() / (1.0 + np.abs(x).max())) for k in weights)
     if spread > 0.05:  # another branch between the points, or too fast for differences
         return None
     names = [*plant.system.state_labels, *plant.system.input_labels]
     where = dict(zip(names, [*x.tolist(), *u.tolist()], strict=True))
-    floor = 1e-3 * max(1.0, float(np.abs(rates[0]).max()))
-    size = np.abs(derivative) + np.abs(rates[0]) + floor
+    floor = 1e-3 * max(min(1.0, rate), float(np.abs(rates[0]).max()))
+    # Rates are differences of terms that can be larger: their change for states that are changed by 1e-8.
+    changed = finite_rows(plant.rates, x * (1.0 + 1e-8 * np.cos(np.arange(x.size))), u)
+    rounding = 0.0 if changed is None else np.abs(changed[0] - rates[0])
+    size = np.abs(derivative) + np.abs(rates[0]) + floor + rounding
     return [
         (float(abs(a - b) / s), str(name), where)
         for a, b, s, name in zip(derivative, rates[0], size, plant.system.state_labels, strict=True)

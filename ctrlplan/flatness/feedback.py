@@ -179,7 +179,7 @@ def _controls(analysis: Analysis, z: ca.SX, last: ca.SX) -> ca.SX:
     if ca.depends_on(influence, structure.mu):
         raise ValueError(
             f"{analysis.equations.name} must have highest derivatives that are affine in its controls, or in a "
-            "function of each, for a tracking law; give the law of your own"
+            "function of each, for a FlatLaw; use TVLQR, or states_and_inputs with a law of your own"
         )
     idle = ca.substitute(structure.last, structure.mu, ca.SX.zeros(structure.mu.numel()))
     matrix, drift = (ca.substitute(part, structure.z, z) for part in (influence, idle))

@@ -76,3 +76,26 @@ def test_the_car_of_the_manual_fails_and_its_example_passes():
 def test_what_is_no_flat_system():
     with pytest.raises(TypeError, match="FlatSystem"):
         cp.check_flat(ct.ss([[0.0]], [[1.0]], [[1.0]], 0.0))
+
+
+@pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
+def test_maps_of_fast_and_slow_plants_are_checked_in_their_time(unit):
+    """Correct maps pass in any unit of time; those with an input that is 1 % wrong fail."""
+
+    def rates(t, x, u, params):
+        spring = -x[0] - 0.1 * unit * x[1] + 0.3 * np.sin(x[2])
+        return [x[1], spring / unit**2, (u[0] - x[2]) / unit]
+
+    names = ["x", "v", "angle"]
+    plant = ct.nlsys(rates, None, states=names, inputs=["u"], outputs=names, name="plant")
+    flat = cp.flat_system(plant, "x")
+    assert cp.check_flat(flat).passed
+    if unit > 1.0:  # maps by hand state no operating point with slow motion
+        return
+
+    def wrong(flag, params):
+        x, u = flat.reverse(flag)
+        return x, 1.01 * u
+
+    by_hand = fs.FlatSystem(flat.forward, wrong, rates, None, states=names, inputs=["u"], name="by_hand")
+    assert not cp.check_flat(by_hand).passed
