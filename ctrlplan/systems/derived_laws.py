@@ -90,19 +90,16 @@ def _block(
     def divided(values: Value) -> tuple[Value, Value, Value, Value]:
         return values[:count], values[count : count + len(states)], values[count + len(states) :], p
 
-    def is_finite(own: Value) -> bool:
-        given = divided([0.0] * (count + len(states)) + list(own))
-        return bool(np.isfinite([*control.at(given), *rates.at(given)]).all())
-
     # Blocks are first evaluated with all inputs zero, where many plants are singular.
-    guarded = not is_finite(initial.tolist())
-    guarded_at_zero = not (guarded or is_finite([0.0] * initial.size))
+    zeros = [0.0] * (count + len(states))
+    guarded = not _is_finite((control, rates), divided([*zeros, *initial.tolist()]))
+    guarded_at_zero = not (guarded or _is_finite((control, rates), divided([0.0] * len(regular))))
 
     def arguments(x: Value, u: Value) -> tuple[tuple[Value, Value, Value, Value], Value]:
         # Where zero is singular the law is evaluated at a regular point and multiplied by 0. Without a branch, so that
         # it can be traced.
-        zeros = [*u, *x] if guarded_at_zero else u if guarded else [1.0]
-        idles = math.prod(_number(value) == 0.0 for value in zeros)
+        signals = [*u, *x] if guarded_at_zero else u if guarded else [1.0]
+        idles = math.prod(_number(value) == 0.0 for value in signals)
         given = [_number(value) + idles * at for value, at in zip([*u, *x], regular, strict=True)]
         return divided(given), 1.0 - idles
 
@@ -129,6 +126,11 @@ def _block(
         name=name,
     )
     return declare(block, initial_state=initial) if own else block
+
+
+def _is_finite(tapes: Sequence[Tape], given: Sequence[Value]) -> bool:
+    """Whether the results of tapes are finite numbers."""
+    return bool(np.isfinite([value for tape in tapes for value in tape.at(given)]).all())
 
 
 def _number(value: Value) -> Value:
