@@ -666,6 +666,12 @@ class Limited:
 
     def _scaled(self, bound: Bound) -> Bound:
         """Bound with the scale of limits over time."""
+        if bound.in_loop and bound.interval is not None and bound.interval[1] <= self._start:
+            first, last = bound.interval
+            raise ValueError(
+                f"limits of {bound.name} must apply after the start of the plan at {self._start:.10g} s, got an "
+                f"interval from {first:.10g} to {last:.10g} s; give times of the plan"
+            )
         if bound.profile is None:
             if bound.interval is not None and not bound.in_loop:
                 first, last = bound.interval

@@ -76,7 +76,16 @@ class Naming:
     def _bounds(self, limits: Mapping[str, object], find: Callable[[str], Signal | None]) -> Iterator[Bound]:
         for name, limit in limits.items():
             if isinstance(limit, Region):
-                yield from limit.bounds(name, [self._known(own, find) for own in limit.signals])
+                pair = [self._known(own, find) for own in limit.signals]
+                inside = [signal.loop for signal in pair]
+                if len(set(inside)) > 1:
+                    outer = pair[inside.index(False)].name
+                    raise ValueError(
+                        f"signals of the region {name} must both be of the loop or both of the plan, got "
+                        f"{pair[inside.index(True)].name} of the loop and {outer} of the plan; make {outer} an output "
+                        "of the loop"
+                    )
+                yield from limit.bounds(name, pair)
                 continue
             if name in ENTRIES and find(name) is None and find != self._of_loop:
                 order = ENTRIES.index(name)

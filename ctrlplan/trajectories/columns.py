@@ -103,6 +103,11 @@ class CsvColumns(Columns):
         rows = self._rows(Path(path))
         if not rows:
             raise ValueError(f"{self.title} must have lines of numbers, got none")
+        line, first = rows[0]
+        if len(first) == 1 and "\t" in first[0]:
+            raise ValueError(
+                f"{self.title}, line {line}: cells must be separated by semicolons or commas, got tabs; replace them"
+            )
         self.header = self._header(*rows[0])
         self.width = len(rows[0][1])
         self._cells = rows[self.header is not None :]

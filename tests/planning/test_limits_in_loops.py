@@ -319,6 +319,25 @@ def test_discrete_integrators_are_no_unstable_poles():
     assert margins(TRACK, {"y": (-1e6, 1e6)}, chain).satisfied
 
 
+@pytest.mark.parametrize(
+    "limit", [Limits(-1.0, 2.0, during=(0.0, 0.5)), Limits([-1.0, -1.0], [2.0, 2.0], along=[0.0, 0.5])]
+)
+@pytest.mark.parametrize("dt", [0, 0.1])
+def test_an_interval_before_the_plan_is_rejected(limit, dt):
+    late = cp.PolySpline([Waypoint(100.0, 0.0, 0.0, 0.0), Waypoint(101.0, 1.0, 0.0, 0.0)], labels=["r"])
+    lag = ct.ss([[0.0 if dt else -1.0]], [[1.0]], [[1.0]], 0, dt, inputs="r", outputs="y", name="lag")
+    with pytest.raises(ValueError, match=r"y must apply after the start of the plan at 100 s, got .* to 0\.5 s"):
+        margins(late, {"y": limit}, lag)
+
+
+def test_a_region_of_the_loop_and_the_plan_is_rejected():
+    lag = ct.ss([[-1.0]], [[1.0]], [[1.0]], 0, inputs="r", outputs="y", name="lag")
+    plan = cp.PolySpline([Waypoint(0.0, 0.0, 0.0, 0.0), Waypoint(1.0, 1.0, 0.0, 0.0)], labels=["r"])
+    corners = [(2.0, 0.0), (0.0, 3.0), (-2.0, 0.0), (0.0, -3.0)]
+    with pytest.raises(ValueError, match=r"region motor must .*, got y of the loop and r_d1 of the plan"):
+        margins(plan, {"motor": Region(("y", "r_d1"), corners)}, lag)
+
+
 # Nonlinear loops
 
 

@@ -139,6 +139,8 @@ def test_columns_that_are_not_chosen_may_be_text(written):
         ("t_s,y\n0,1\n1,2\n", "must have the column 'time' of times, got t_s, y; pass time='t_s'"),
         ("n,y\n0,1\n1,2\n", "must have a column 'time', got n, y"),
         ("time\n0\n1\n", "must have a column of a signal, got one of times only"),
+        ("# log\ntime\ty\n0\t1\n1\t2\n", "line 2: cells must be separated by semicolons or commas, got tabs"),
+        ("0\t1\n1\t2\n", "line 1: cells must be separated by semicolons or commas, got tabs; replace them"),
     ],
 )
 def test_bad_texts_have_a_line(content, message, written):
