@@ -19,6 +19,9 @@ import numpy as np
 from ctrlplan._types import Array
 from ctrlplan.symbolic.taping import operations_of
 
+Inverse = Callable[[ca.SX], ca.SX]
+"""Inverse of a function of one variable."""
+
 
 @dataclass(frozen=True, eq=False)
 class Branch:
@@ -72,27 +75,27 @@ class _Tracer:
         """Result of a function with its branches replaced."""
         work: dict[int, ca.SX] = {}
         out = ca.SX(function.numel_out(0), 1)
-        for k, operation, given, target in operations_of(function):
-            if operation == "OUTPUT":
+        for k, kind, given, target in operations_of(function):
+            if kind == ca.OP_OUTPUT:
                 out[target[1]] = work[given[0]]
-            elif operation == "INPUT":
+            elif kind == ca.OP_INPUT:
                 work[target[0]] = self._entries[given[0]][given[1]]
-            elif operation == "CONST":
+            elif kind == ca.OP_CONST:
                 work[target[0]] = ca.SX(function.instruction_constant(k))
             else:
                 values = [work[place] for place in given]
-                work[target[0]] = self._of(operation, function.instruction_id(k), values)
+                work[target[0]] = self._of(kind, values)
         return out
 
-    def _of(self, operation: str, kind: int, values: list[ca.SX]) -> ca.SX:
-        if operation not in _NOT_SMOOTH or all(value.is_constant() for value in values):
+    def _of(self, kind: int, values: list[ca.SX]) -> ca.SX:
+        if kind not in _NOT_SMOOTH or all(value.is_constant() for value in values):
             return ca.SX.unary(kind, *values) if len(values) == 1 else ca.SX.binary(kind, *values)
-        if operation == "FMOD":
+        if kind == ca.OP_FMOD:
             raise ValueError(
                 f"equations of {self.name} must be smooth near the operating point, got a remainder of "
                 f"{_short(values[0])}; write them without it"
             )
-        return _NOT_SMOOTH[operation](self, values)
+        return _NOT_SMOOTH[kind](self, values)
 
     def side(self, argument: ca.SX, operation: str, shown: ca.SX) -> bool:
         """Whether an argument is positive at the operating point, noted as a condition of the branch."""
@@ -160,23 +163,23 @@ def _selected(tracer: _Tracer, values: list[ca.SX]) -> ca.SX:
     return value if float(condition) else ca.SX(0)
 
 
-_NOT_SMOOTH: dict[str, Callable[[_Tracer, list[ca.SX]], ca.SX]] = {
-    "FABS": _absolute,
-    "SIGN": _sign,
-    "FMIN": _chosen(smaller=True),
-    "FMAX": _chosen(smaller=False),
-    "LT": _compared("comparison"),
-    "LE": _compared("comparison"),
-    "EQ": _compared("comparison", 0.0),
-    "NE": _compared("comparison", 1.0),
-    "FLOOR": lambda tracer, values: _whole(tracer, values, False),
-    "CEIL": lambda tracer, values: _whole(tracer, values, True),
-    "COPYSIGN": _copied,
-    "NOT": _logical,
-    "AND": _logical,
-    "OR": _logical,
-    "IF_ELSE_ZERO": _selected,
-    "FMOD": _logical,
+_NOT_SMOOTH: dict[int, Callable[[_Tracer, list[ca.SX]], ca.SX]] = {
+    ca.OP_FABS: _absolute,
+    ca.OP_SIGN: _sign,
+    ca.OP_FMIN: _chosen(smaller=True),
+    ca.OP_FMAX: _chosen(smaller=False),
+    ca.OP_LT: _compared("comparison"),
+    ca.OP_LE: _compared("comparison"),
+    ca.OP_EQ: _compared("comparison", 0.0),
+    ca.OP_NE: _compared("comparison", 1.0),
+    ca.OP_FLOOR: lambda tracer, values: _whole(tracer, values, False),
+    ca.OP_CEIL: lambda tracer, values: _whole(tracer, values, True),
+    ca.OP_COPYSIGN: _copied,
+    ca.OP_NOT: _logical,
+    ca.OP_AND: _logical,
+    ca.OP_OR: _logical,
+    ca.OP_IF_ELSE_ZERO: _selected,
+    ca.OP_FMOD: _logical,
 }
 """Operations that are not smooth; conditions of them are constants once their comparisons are replaced."""
 
@@ -232,34 +235,34 @@ def replaced_input(
     )
     position = len(variables)
     work: dict[int, ca.SX] = {}
-    uses: dict[int, list[tuple[str, int, tuple[int, ...]]]] = {}
+    uses: dict[int, list[tuple[int, tuple[int, ...]]]] = {}
     place: dict[int, int] = {}  # work register -> instruction
-    steps: list[tuple[str, int, tuple[int, ...], float]] = []
+    steps: list[tuple[int, tuple[int, ...], float]] = []
     outputs: list[tuple[int, int]] = []
-    for k, operation, arguments, target in operations_of(function):
-        if operation == "OUTPUT":
+    for k, kind, arguments, target in operations_of(function):
+        if kind == ca.OP_OUTPUT:
             outputs.append((target[1], place[arguments[0]]))
-            uses.setdefault(place[arguments[0]], []).append((operation, -1, ()))
+            uses.setdefault(place[arguments[0]], []).append((-1, ()))
             continue
-        sources = arguments if operation == "INPUT" else tuple(place[a] for a in arguments)
-        constant = float(function.instruction_constant(k)) if operation == "CONST" else 0.0
-        steps.append((operation, function.instruction_id(k), sources, constant))
+        sources = arguments if kind == ca.OP_INPUT else tuple(place[a] for a in arguments)
+        constant = float(function.instruction_constant(k)) if kind == ca.OP_CONST else 0.0
+        steps.append((kind, sources, constant))
         place[target[0]] = len(steps) - 1
-        if operation != "INPUT":
+        if kind != ca.OP_INPUT:
             for source in set(sources):
-                uses.setdefault(source, []).append((operation, len(steps) - 1, sources))
+                uses.setdefault(source, []).append((len(steps) - 1, sources))
     found = _chain(steps, uses, position, at)
     if found is None:
         return None
     node, chain = found
     symbol = ca.SX.sym(f"{given.name()}_function")
     entries = [ca.vertsplit(column) if column.numel() else [] for column in [*variables, given]]
-    for k, (operation, kind, sources, constant) in enumerate(steps):
+    for k, (kind, sources, constant) in enumerate(steps):
         if k == node:
             work[k] = symbol
-        elif operation == "INPUT":
+        elif kind == ca.OP_INPUT:
             work[k] = entries[sources[0]][sources[1]]
-        elif operation == "CONST":
+        elif kind == ca.OP_CONST:
             work[k] = ca.SX(constant)
         else:
             values = [work[s] for s in sources]
@@ -285,24 +288,24 @@ class _Link:
 
 
 def _chain(
-    steps: list[tuple[str, int, tuple[int, ...], float]],
-    uses: dict[int, list[tuple[str, int, tuple[int, ...]]]],
+    steps: list[tuple[int, tuple[int, ...], float]],
+    uses: dict[int, list[tuple[int, tuple[int, ...]]]],
     position: int,
     at: float,
 ) -> tuple[int, list[_Link]] | None:
     """Last instruction and operations of the function through which alone an input enters."""
-    node = next((k for k, step in enumerate(steps) if step[0] == "INPUT" and step[2][0] == position), None)
+    node = next((k for k, step in enumerate(steps) if step[0] == ca.OP_INPUT and step[1][0] == position), None)
     links: list[_Link] = []
     found: tuple[int, list[_Link]] | None = None
     value = at
     while node is not None and len(following := uses.get(node, [])) == 1:
-        operation, after, sources = following[0]
+        after, sources = following[0]
         if after < 0:
             break
         others = [s for s in sources if s != node]
-        if any(steps[s][0] != "CONST" for s in others):
+        if any(steps[s][0] != ca.OP_CONST for s in others):
             break
-        link = _link(operation, steps[after][1], [steps[s][3] for s in others], sources.index(node), value)
+        link = _link(steps[after][0], [steps[s][2] for s in others], sources.index(node), value)
         if link is None:
             break
         links.append(link)
@@ -313,29 +316,40 @@ def _chain(
     return found
 
 
-def _link(operation: str, kind: int, constants: list[float], position: int, value: float) -> _Link | None:
+def _link(kind: int, constants: list[float], position: int, value: float) -> _Link | None:
     """Operation on a scalar with its inverse near a value, or None."""
     if constants:
-        c = constants[0]
-        if operation in ("ADD", "SUB", "MUL", "DIV"):
-            forward = _binary(kind, c, position)
-            inverses: dict[str, Callable[[ca.SX], ca.SX] | None] = {
-                "ADD": lambda y: y - c,
-                "SUB": (lambda y: y + c) if position == 0 else (lambda y: c - y),
-                "MUL": (lambda y: y / c) if c else None,
-                "DIV": (lambda y: y * c) if position == 0 else (lambda y: c / y),
-            }
-            inverse = inverses[operation]
-            if inverse is None or (operation == "DIV" and position == 1 and not (c and value)):
-                return None
-            return _Link(forward, inverse, not (operation == "DIV" and position == 1))
-        if operation in ("POW", "CONSTPOW") and position == 0 and value > 0.0:
-            return _Link(_binary(kind, c, 0), lambda y: ca.power(y, 1.0 / c), False) if c else None
+        make = _WITH_CONSTANTS.get(kind)
+        inverse = None if make is None else make(constants[0], position == 0, value)
+        linear = kind in _LINEAR and not (kind == ca.OP_DIV and position == 1)
+        return None if inverse is None else _Link(_binary(kind, constants[0], position), inverse, linear)
+    known = _INVERSES.get(kind)
+    if known is None or (kind == ca.OP_SQ and value == 0.0):
         return None
-    known = _INVERSES.get(operation)
-    if known is None or (operation == "SQ" and value == 0.0) or (operation == "MUL"):
-        return None
-    return _Link(lambda x: ca.SX.unary(kind, x), known(value), operation in _LINEAR)
+    return _Link(lambda x: ca.SX.unary(kind, x), known(value), kind in _LINEAR)
+
+
+def _divided(c: float, first: bool, value: float) -> Inverse | None:
+    """Inverse of x/c, or of c/x."""
+    if first:
+        return lambda y: y * c
+    return (lambda y: c / y) if c and value else None
+
+
+def _raised(c: float, first: bool, value: float) -> Inverse | None:
+    """Inverse of x to the power of c."""
+    return (lambda y: ca.power(y, 1.0 / c)) if first and c and value > 0.0 else None
+
+
+_WITH_CONSTANTS: dict[int, Callable[[float, bool, float], Inverse | None]] = {
+    ca.OP_ADD: lambda c, first, value: lambda y: y - c,
+    ca.OP_SUB: lambda c, first, value: (lambda y: y + c) if first else (lambda y: c - y),
+    ca.OP_MUL: lambda c, first, value: (lambda y: y / c) if c else None,
+    ca.OP_DIV: _divided,
+    ca.OP_POW: _raised,
+    ca.OP_CONSTPOW: _raised,
+}
+"""Inverse of an operation with a constant c, which is the second argument if `first`, near a value."""
 
 
 def _binary(kind: int, constant: float, position: int) -> Callable[[ca.SX], ca.SX]:
@@ -344,23 +358,23 @@ def _binary(kind: int, constant: float, position: int) -> Callable[[ca.SX], ca.S
     return lambda x: ca.SX.binary(kind, ca.SX(constant), x)
 
 
-_LINEAR = ("NEG", "TWICE", "ASSIGN")
+_LINEAR = (ca.OP_NEG, ca.OP_TWICE, ca.OP_ASSIGN, ca.OP_ADD, ca.OP_SUB, ca.OP_MUL, ca.OP_DIV)
 
-_INVERSES: dict[str, Callable[[float], Callable[[ca.SX], ca.SX]]] = {
-    "NEG": lambda value: lambda y: -y,
-    "TWICE": lambda value: lambda y: 0.5 * y,
-    "ASSIGN": lambda value: lambda y: y,
-    "SQ": lambda value: (lambda y: ca.sqrt(y)) if value > 0.0 else (lambda y: -ca.sqrt(y)),
-    "SQRT": lambda value: lambda y: y * y,
-    "EXP": lambda value: ca.log,
-    "LOG": lambda value: ca.exp,
-    "SINH": lambda value: ca.asinh,
-    "TANH": lambda value: ca.atanh,
-    "ATAN": lambda value: ca.tan,
-    "ASINH": lambda value: ca.sinh,
-    "EXPM1": lambda value: ca.log1p,
-    "LOG1P": lambda value: ca.expm1,
-    "TAN": lambda value: lambda y: ca.atan(y) + np.pi * np.round(value / np.pi),
-    "INV": lambda value: lambda y: 1.0 / y,
+_INVERSES: dict[int, Callable[[float], Inverse]] = {
+    ca.OP_NEG: lambda value: lambda y: -y,
+    ca.OP_TWICE: lambda value: lambda y: 0.5 * y,
+    ca.OP_ASSIGN: lambda value: lambda y: y,
+    ca.OP_SQ: lambda value: (lambda y: ca.sqrt(y)) if value > 0.0 else (lambda y: -ca.sqrt(y)),
+    ca.OP_SQRT: lambda value: lambda y: y * y,
+    ca.OP_EXP: lambda value: ca.log,
+    ca.OP_LOG: lambda value: ca.exp,
+    ca.OP_SINH: lambda value: ca.asinh,
+    ca.OP_TANH: lambda value: ca.atanh,
+    ca.OP_ATAN: lambda value: ca.tan,
+    ca.OP_ASINH: lambda value: ca.sinh,
+    ca.OP_EXPM1: lambda value: ca.log1p,
+    ca.OP_LOG1P: lambda value: ca.expm1,
+    ca.OP_TAN: lambda value: lambda y: ca.atan(y) + np.pi * np.round(value / np.pi),
+    ca.OP_INV: lambda value: lambda y: 1.0 / y,
 }
 """Inverse of each operation on the branch of a value."""

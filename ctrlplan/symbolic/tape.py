@@ -21,6 +21,10 @@ Operations = Mapping[str, Callable[..., Value]]
 """Functions of numbers by the name of an operation of CasADi."""
 
 
+INPUT, CONSTANT = "INPUT", "CONST"
+"""Instructions that are no operation: an entry of an argument, a constant."""
+
+
 @dataclass(frozen=True)
 class Instruction:
     """Operation, places of its arguments, its constant, and the places that no later instruction reads."""
@@ -118,10 +122,10 @@ class Tape:
         """
         values: list[Value] = []
         for step in instructions_of(self):
-            if step.operation == "INPUT":
+            if step.operation == INPUT:
                 argument, entry = step.arguments
                 values.append(arguments[argument][entry])
-            elif step.operation == "CONST":
+            elif step.operation == CONSTANT:
                 values.append(constant(step.constant))
             else:
                 values.append(operations[step.operation](*[values[place] for place in step.arguments]))
@@ -138,7 +142,7 @@ def instructions_of(tape: Tape) -> tuple[Instruction, ...]:
     for row, constant in zip(tape.code[::-1].tolist(), tape.constants[::-1].tolist(), strict=True):
         name = tape.operations[row[0]]
         places = tuple(place for place in row[1:] if place >= 0)
-        if name in ("INPUT", "CONST"):
+        if name in (INPUT, CONSTANT):
             out.append(Instruction(name, places, constant))
             continue
         new = tuple(sorted(set(places) - seen))

@@ -7,7 +7,7 @@ from functools import cache
 
 import casadi as ca
 
-from ctrlplan.symbolic.tape import Instruction, Tape
+from ctrlplan.symbolic.tape import CONSTANT, INPUT, NUMPY, Instruction, Tape
 
 
 def tape_of(arguments: Sequence[ca.SX], result: ca.SX, *, matrix: bool = False) -> Tape:
@@ -19,28 +19,34 @@ def tape_of(arguments: Sequence[ca.SX], result: ca.SX, *, matrix: bool = False) 
     place: dict[int, int] = {}
     instructions: list[Instruction] = []
     results = [-1] * function.numel_out(0)
-    for k, operation, given, target in operations_of(function):
-        if operation == "OUTPUT":
+    names = _operation_names()
+    for k, kind, given, target in operations_of(function):
+        if kind == ca.OP_OUTPUT:
             results[target[1]] = place[given[0]]
             continue
-        if operation == "CONST":
-            found = Instruction(operation, (), float(function.instruction_constant(k)))
+        if kind == ca.OP_CONST:
+            found = Instruction(CONSTANT, (), float(function.instruction_constant(k)))
+        elif kind == ca.OP_INPUT:
+            found = Instruction(INPUT, given)
         else:
-            found = Instruction(operation, given if operation == "INPUT" else tuple(place[g] for g in given))
+            found = Instruction(names[kind], tuple(place[g] for g in given))
         instructions.append(found)
         place[target[0]] = len(instructions) - 1
     return Tape.of(instructions, results, function.size_out(0), matrix)
 
 
-def operations_of(function: ca.Function) -> Iterator[tuple[int, str, tuple[int, ...], tuple[int, ...]]]:
-    """Number, name, arguments and places of the result of each instruction of a function of SX symbols."""
-    names = _operation_names()
+def operations_of(function: ca.Function) -> Iterator[tuple[int, int, tuple[int, ...], tuple[int, ...]]]:
+    """Number, kind, arguments and places of the result of each instruction of a function of SX symbols."""
     for k in range(function.n_instructions()):
-        name = names[function.instruction_id(k)]
-        yield k, name, tuple(function.instruction_input(k)), tuple(function.instruction_output(k))
+        kind, given, target = (
+            function.instruction_id(k),
+            function.instruction_input(k),
+            function.instruction_output(k),
+        )
+        yield k, kind, tuple(given), tuple(target)
 
 
 @cache
 def _operation_names() -> dict[int, str]:
-    """Names of CasADi's operations by their numbers."""
-    return {getattr(ca, name): name[3:] for name in dir(ca) if name.startswith("OP_")}
+    """Names of CasADi's operations by their kinds."""
+    return {getattr(ca, f"OP_{name}"): name for name in NUMPY}

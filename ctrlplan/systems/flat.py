@@ -171,6 +171,13 @@ def create_flat_iosystem(
         )
     if start is not None:
         raise ValueError(f"start must be None for {flat.name}, whose law has no states of an extension")
+    return _static_law(flat, poles, labels, suffix, name)
+
+
+def _static_law(
+    flat: fs.FlatSystem, poles: Sequence[Value], labels: Sequence[str] | str | None, suffix: str, name: str
+) -> ct.NonlinearIOSystem:
+    """Law of a plant that static feedback linearises, by its own maps."""
     plant = checked_plant(flat, "flat")
     if labels is None:
         warn_of_output(flat)
