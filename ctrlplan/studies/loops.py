@@ -215,8 +215,8 @@ class LoopOfModule(LoopKind):
         return self._returned(table, self._function(table, path), path, **values)
 
     def limited(self, table: Data, path: Path) -> Callable[[], System]:
-        """The loop that the function returns."""
-        return partial(self._returned, table, self._function(table, path), path)
+        """The loop that the function returns; the module is imported by the call only."""
+        return lambda: self._returned(table, self._function(table, path), path)
 
     def check_parameter(self, parameter: str, place: str, reader: Reader) -> None:
         """Nothing is known before the function is."""
