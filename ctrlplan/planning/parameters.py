@@ -29,6 +29,9 @@ _STARTS = 6
 _STEPS = (0.15, 0.075, 0.0375, 0.01875, 0.009375, 0.005)
 """Steps of the pattern search, relative to the ranges."""
 
+_PROVED = "proved"
+"""Coverage of ranges whose worst case is at a corner, by the operations of the quantity."""
+
 _EXACT = 3
 """Number of points at which the margin of a limit is evaluated exactly."""
 
@@ -216,10 +219,10 @@ class _Search:
         rows = []
         for k, bound in enumerate(bounds):
             if _of_plan(bound):
-                rows.append(replace(self._exact(self._family.centre)[k], parameters={}, coverage="proved"))
+                rows.append(replace(self._exact(self._family.centre)[k], parameters={}, coverage=_PROVED))
             elif proved[k]:
                 found = min((self._exact(point)[k] for point in self._family.corners), key=lambda row: row.fraction)
-                rows.append(replace(found, coverage="proved"))
+                rows.append(replace(found, coverage=_PROVED))
         if open_ones:
             self._sample()
         for k in open_ones:
@@ -230,7 +233,7 @@ class _Search:
             found = min((self._exact(point)[k] for point in by), key=lambda row: row.fraction)
             rows.append(replace(found, coverage=f"sampled, {count} points, corners and interior"))
         own = {row.coverage for row in rows}
-        coverage = "proved" if own == {"proved"} else next(iter(own - {"proved"}))
+        coverage = next(iter(own - {_PROVED}), _PROVED)
         note = (
             "" if not any(bound.in_loop for bound in bounds) or self._nominal.loop is None else self._nominal.loop.note
         )

@@ -197,12 +197,7 @@ def integrate(
     first, last = float(times[0]), float(times[-1])
     ends = course is None
     if course is None:
-        course = Course(network, solver, time_signals, (first, last), resolution)
-        endless = equations is not None and network.delays_feed_delays(equations.feeds)
-        hops = _MARKS if endless else _HOPS
-        marks = [*breakpoints_of(time_signals), *network.breakpoints, *marks]
-        course.prolong(_fixed(marks, first, last, course.memory.delays, hops), first, last)
-        course.add_rounding(np.union1d(np.linspace(first, last, 257), course.schedule.marks))
+        course = _new_course(network, equations, solver, time_signals, (first, last), resolution, marks)
     else:
         course.prolong(apart([first, *marks, last])[1:-1], first, last)
     memory, schedule, rounding = course.memory, course.schedule, course.rounding
@@ -298,6 +293,24 @@ class Course:
         """Return to an earlier state."""
         self.schedule.samples = state[0].copy()
         self.memory.shorten(state[1])
+
+
+def _new_course(
+    network: Network,
+    equations: Interpreted | None,
+    solver: Solver,
+    time_signals: Sequence[TimeSignal],
+    span: tuple[float, float],
+    resolution: float,
+    marks: Sequence[float],
+) -> Course:
+    """Course of a run that continues none."""
+    course = Course(network, solver, time_signals, span, resolution)
+    endless = equations is not None and network.delays_feed_delays(equations.feeds)
+    everything = [*breakpoints_of(time_signals), *network.breakpoints, *marks]
+    course.prolong(_fixed(everything, *span, course.memory.delays, _MARKS if endless else _HOPS), *span)
+    course.add_rounding(np.union1d(np.linspace(*span, 257), course.schedule.marks))
+    return course
 
 
 def _longest(network: Network, delays: list[float], duration: float) -> float:

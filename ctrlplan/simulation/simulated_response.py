@@ -155,7 +155,7 @@ class SimulatedResponse(LoopResponse):
         self.note = f"simulated at tolerance {_RTOL:g}, until {self._last - plan.end:.4g} s after the plan"
         _check_sources(prepared, plan)
         self._inputs = _Inputs(plan, fed_signals(prepared.input_labels, plan, prepared.name))
-        self._start = self._at_rest(plan.start, "first")
+        self._start = self._at_rest(plan.start, first=True)
 
     def extremes(
         self,
@@ -222,22 +222,22 @@ class SimulatedResponse(LoopResponse):
         if any(block.plan is not None for block in self._blocks()):
             return None  # a source inside is evaluated at its own time
         try:
-            return self._at_rest(self.plan.end, "last")
+            return self._at_rest(self.plan.end, first=False)
         except ValueError:  # such as an integrator, or a sampled block that is not linear
             return None
 
     def _blocks(self) -> Sequence[Block]:
         return () if self._prepared.network is None else self._prepared.network.blocks
 
-    def _at_rest(self, time: float, which: str) -> Array:
+    def _at_rest(self, time: float, *, first: bool) -> Array:
         """Equilibrium at the first or last position of the plan."""
-        first = which == "first"
         held = (self._inputs.initial if first else self._inputs.final).tolist()
         place = self.plan.initial if first else self.plan.final
         rows = tracked(self._prepared.output_labels, self.plan.labels)
         state, doubt = equilibrium_at(self._prepared, Step(place, place, time=time), time, rows, held=held)
         if doubt:
             position = ", ".join(f"{a} = {x:.4g}" for a, x in zip(self.plan.labels, place.tolist(), strict=True))
+            which = "first" if first else "last"
             raise ValueError(
                 f"the loop must be at rest at the {which} position of the plan, got {self._prepared.name} without a "
                 f"known equilibrium at {position}: {doubt}; declare the initial state of its blocks (cp.declare)"

@@ -35,6 +35,9 @@ _SUFFIXES = ("_ref", "_cmd", "_set", "_d", "_des")
 _UNLIKE = 0.2
 """Difference of a command from the plan, relative to its range, from which it is not that of the plan."""
 
+AlignedBy = Literal["command", "output", "control", "given"]
+"""By what the time of a log was aligned."""
+
 _COMMANDS = ("r", "r_cmd", "ref", "reference", "cmd", "command", "setpoint")
 """Names of a command in a log: a label with a suffix, or for one axis one of these."""
 
@@ -75,7 +78,7 @@ class MeasuredRun:
     offset: float
     standard_error: float
     signals: tuple[str, ...]
-    by: str
+    by: AlignedBy
     compared: str
     residual: float
     resampling: str
@@ -208,7 +211,7 @@ class _Alongside:
 
     # Alignment
 
-    def _offset(self, align: Align) -> tuple[Offset, str, tuple[str, ...], str]:
+    def _offset(self, align: Align) -> tuple[Offset, AlignedBy, tuple[str, ...], str]:
         """Offset, by what it was found, the signals, and what they were compared with."""
         if align is None:
             return Offset(0.0, math.nan, 0.0), "given", (), ""
@@ -234,7 +237,7 @@ class _Alongside:
         simulated = any(isinstance(pair.known, OfSamples) for pair in pairs.values())
         return offset, by, names, "the simulated one" if simulated else "the plan"
 
-    def _choices(self, align: str) -> tuple[str, list[dict[str, Pair]]]:
+    def _choices(self, align: str) -> tuple[AlignedBy, list[dict[str, Pair]]]:
         """By what the log is aligned, and alternative sets of logged signals with the known ones."""
         commands = self._commands(None if align == "auto" else align)
         if commands:

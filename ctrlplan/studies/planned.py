@@ -265,11 +265,15 @@ def _plan(table: Data, waypoints: tuple[Waypoint, ...], place: str, reader: Read
         raise reader.error(place, f"construction must not fail, got {type(error).__name__}: {error}") from error
 
 
+_TOLERANT = ("ei", "two_hump_ei", "three_hump_ei")
+"""Kinds of shapers that leave a residual of a given tolerance."""
+
+
 def _shaped(plan: Trajectory, tables: Sequence[Data], place: str, reader: Reader) -> Trajectory:
     """Plan after its input shapers."""
     for i, table in enumerate(tables):
         kind, options = table["kind"], {name: value for name, value in table.items() if name != "kind"}
-        if "tolerance" in options and not kind.endswith("ei"):
+        if "tolerance" in options and kind not in _TOLERANT:
             raise reader.error(f"{place}[{i}].tolerance", f"must be given for an ei kind, got {got(kind)}")
         try:
             plan = _SHAPERS[kind](**options)(plan)

@@ -388,11 +388,14 @@ def _term(name: str, functions: Mapping[str, Function], jet: Value) -> Value:
     """Regressor of a term."""
     if name in functions:
         return functions[name](jet[0])
-    if name == "static":
-        return np.sign(jet[1])
-    if name == "gravity":
-        return 1.0 + 0.0 * jet[0]
-    return jet[_ORDERS[name]]
+    return _OTHER_TERMS[name](jet) if name in _OTHER_TERMS else jet[_ORDERS[name]]
+
+
+_OTHER_TERMS: dict[str, Function] = {
+    "static": lambda jet: np.sign(jet[1]),
+    "gravity": lambda jet: 1.0 + 0.0 * jet[0],
+}
+"""Regressors that are no derivative, as functions of the jet."""
 
 
 def _check_function(function: Function, name: str, position: Array) -> None:
