@@ -201,10 +201,7 @@ def integrate(
     else:
         course.prolong(apart([first, *marks, last])[1:-1], first, last)
     memory, schedule, rounding = course.memory, course.schedule, course.rounding
-    longest = _longest(network, memory.delays, last - first)
-    if stops_after is not None:
-        longest = min(longest, (last - first) / 64.0)
-    shortest = 1e-9 * (last - first) if stops_after is not None else np.inf
+    shortest, longest = _lengths(network, memory.delays, last - first, stops_after is not None)
     known: list[tuple[Array, Array]] = []  # times and states of each segment, without its end
     segments: list[tuple[float, Series]] = []
     span: list[Series] = []
@@ -215,11 +212,9 @@ def integrate(
         right = schedule.following(left)
         right = schedule.on(times, right) if right - left <= reach * (1.0 + 1e-9) else left + reach
         if memory.delays or not (span and span[-1].right >= right):
-            until = right if memory.delays else schedule.fixed_after(left)
-            accuracy = resolution if memory.delays else RESOLVED
-            span = _resolved(
-                time_signals, 0.5 * (left + right), left, until, accuracy, np.maximum(rounding, memory.rounding)
-            )
+            until, accuracy = (right, resolution) if memory.delays else (schedule.fixed_after(left), RESOLVED)
+            error = np.maximum(rounding, memory.rounding)
+            span = _resolved(time_signals, 0.5 * (left + right), left, until, accuracy, error)
         series = next(s for s in span if left < s.right)
         right = min(right, series.right)
         inside = times[slice(*np.searchsorted(times, [left, right]))]
@@ -311,6 +306,12 @@ def _new_course(
     course.prolong(_fixed(everything, *span, course.memory.delays, _MARKS if endless else _HOPS), *span)
     course.add_rounding(np.union1d(np.linspace(*span, 257), course.schedule.marks))
     return course
+
+
+def _lengths(network: Network, delays: list[float], duration: float, stops: bool) -> tuple[float, float]:
+    """Length [s] below which a segment that fails is not halved, and maximum length; short if the run may stop."""
+    longest = _longest(network, delays, duration)
+    return (1e-9 * duration, min(longest, duration / 64.0)) if stops else (np.inf, longest)
 
 
 def _longest(network: Network, delays: list[float], duration: float) -> float:
