@@ -21,12 +21,15 @@ def test_candidates_of_a_car_and_of_a_machine():
     assert cp.flat_candidates(cart) == ()
 
 
+@pytest.mark.slow
+def test_candidates_of_the_crane():
+    """120 sets of two of its outputs and states, with a wind that is no control."""
+    found = cp.flat_candidates(cp.plants.Crane().iosystem(wind=True), inputs=["F", "C"], at={"R": 10.0})
+    assert found[0].outputs == ("x", "z")
+
+
 def test_candidates_of_one_input():
     assert [one.outputs for one in cp.flat_candidates(two_mass(0.0))] == [("x2",)]
-    assert cp.flat_candidates(cp.plants.Crane().iosystem(wind=True), inputs=["F", "C"], at={"R": 10.0})[0].outputs == (
-        "x",
-        "z",
-    )
     with pytest.raises(ValueError, match="at most 300 sets"):
         cp.flat_candidates(ct.ss(-np.eye(40), np.ones((40, 2)), np.eye(40), np.zeros((40, 2))))
 
@@ -78,7 +81,7 @@ def test_what_is_no_flat_system():
         cp.check_flat(ct.ss([[0.0]], [[1.0]], [[1.0]], 0.0))
 
 
-@pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
+@pytest.mark.parametrize("unit", [pytest.param(1e-6, marks=pytest.mark.slow), 1.0, 1e6])
 def test_maps_of_fast_and_slow_plants_are_checked_in_their_time(unit):
     """Correct maps pass in any unit of time; those with an input that is 1 % wrong fail."""
 

@@ -65,7 +65,7 @@ def scaled(case, states, inputs, outputs, time):
 
 
 @pytest.mark.parametrize("name", ["crane", "car", "trailer", "pvtol", "levitation, voltage", "machine"])
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_verdict_in_other_units(name, seed):
     check_units(name, seed)
 

@@ -128,7 +128,7 @@ def test_the_law_is_that_of_the_crane_written_by_hand():
         np.testing.assert_allclose(found.outputs[name] / size, known.outputs[name] / size, atol=1e-7)
 
 
-@pytest.mark.parametrize("quasi_static", [False, True])
+@pytest.mark.parametrize("quasi_static", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_integral_action_leaves_no_steady_offset(quasi_static):
     """Payload 10 % heavier than the law knows: with the integral the load reaches its place."""
     plant, flat, plan, start, _, _ = crane_case()
