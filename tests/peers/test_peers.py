@@ -85,7 +85,8 @@ def run(folder, *arguments, **environment):
     """Calls by test, and those that differ, of a separate process of pytest."""
     record = folder / "record"
     record.mkdir()
-    paths = [str(HERE), str(Path(cp.__file__).parent.parent), os.environ.get("PYTHONPATH", "")]
+    support = str(HERE.parent / "support")  # without the project's settings: what conftest.py imports
+    paths = [str(HERE), support, str(Path(cp.__file__).parent.parent), os.environ.get("PYTHONPATH", "")]
     environment = (
         os.environ
         | environment
