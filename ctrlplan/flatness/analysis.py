@@ -91,7 +91,7 @@ def _with_functions(
 ) -> tuple[Plant, tuple[str, ...]]:
     """Plant with each input that enters through one function of it replaced by that function."""
     rates, flat = equations.rates, equations.flat
-    mu, controls, functions = (list(ca.vertsplit(equations.u)) for _ in range(3))
+    mu, controls = (list(ca.vertsplit(equations.u)) for _ in range(2))
     replaced: list[str] = []
     n = len(equations.states)
     centre, sizes = np.concatenate([point.x, point.u]), sizes.copy()
@@ -100,7 +100,6 @@ def _with_functions(
         found = replaced_input((rates, flat), (equations.x, others, equations.p), mu[k], float(point.u[k]))
         if found is not None:
             (rates, flat), replacement = found
-            functions[k] = replacement.value
             _replace(replacement, k, n, mu, controls, centre, sizes)
             replaced.append(name)
     plant = Plant(
@@ -111,8 +110,6 @@ def _with_functions(
         rates=rates,
         flat=flat,
         controls=ca.vertcat(*controls),
-        functions=ca.vertcat(*functions),
-        u=equations.u,
         labels=equations.flat_labels,
         point=centre,
         scales=sizes,

@@ -51,14 +51,6 @@ class Copies:
             (self.shape[0], len(chosen)),
         )
 
-    def transposed(self) -> Copies:
-        """The transposed matrix."""
-        return Copies(
-            [list(column) for column in zip(*self.exact, strict=True)],
-            [list(column) for column in zip(*self.changed, strict=True)],
-            (self.shape[1], self.shape[0]),
-        )
-
     @property
     def nonzero(self) -> NDArray[np.bool_]:
         """Entries that are not 0."""

@@ -65,12 +65,8 @@ class FlatMaps:
         y_j^(r_j) as functions of (z, mu, p), and their Jacobian by mu: (m, 1 + m).
     controls : Tape
         Controls of the plant as functions of (z, mu, p).
-    rates : Tape
-        z' as functions of (z, mu, p).
     forward : Tape
         Flags of (x, u, p) with u constant, all up to the highest order.
-    held : Tape
-        States of the extension as functions of (x, u, p) with u constant.
     sides : Tape
         Functions of (x, u, p) that are positive on the branch of the equations.
     notes : tuple of str
@@ -95,9 +91,7 @@ class FlatMaps:
     slopes: Tape
     last: Tape
     controls: Tape
-    rates: Tape
     forward: Tape
-    held: Tape
     sides: Tape
     notes: tuple[str, ...]
     names: tuple[str, ...]

@@ -72,9 +72,6 @@ class Structure:
         y_j^(r_j), as functions of z and mu.
     controls : casadi.SX
         Controls of the plant as functions of z and mu.
-    held : casadi.SX
-        States of the extension as functions of the plant's states and controls,
-        these constant.
     rounds : tuple of Round
         The extensions.
     prolonged : bool
@@ -92,7 +89,6 @@ class Structure:
     flags: tuple[ca.SX, ...]
     last: ca.SX
     controls: ca.SX
-    held: ca.SX
     rounds: tuple[Round, ...]
     prolonged: bool
     nstates: int
@@ -122,10 +118,8 @@ class Plant:
         Columns of symbols of states, controls, parameters.
     rates, flat : casadi.SX
         Rates and flat outputs.
-    controls, functions : casadi.SX
-        Controls as functions of mu, and mu as functions of them.
-    u : casadi.SX
-        Symbols of the controls.
+    controls : casadi.SX
+        Controls as functions of mu.
     labels : tuple of str
         Names of the flat outputs.
     point, scales : ndarray
@@ -145,8 +139,6 @@ class Plant:
     rates: ca.SX
     flat: ca.SX
     controls: ca.SX
-    functions: ca.SX
-    u: ca.SX
     labels: tuple[str, ...]
     point: Array
     scales: Array
@@ -188,8 +180,6 @@ class _Algorithm:
         self.centre = plant.point.copy()
         self.scale = plant.scales.copy()
         self.n = n
-        self.held_states, self.held_controls = list(self.z), list(ca.vertsplit(plant.functions))
-        self.motion = ca.substitute(plant.rates, plant.mu, plant.functions)
         self.at = self._random_point()
 
     @property
@@ -281,22 +271,11 @@ class _Algorithm:
             count = len(self.z) - self.n
             old, new = self.mu[k], ca.SX.sym(f"w{count + 1}_d1")
             at = len(self.z) + k
-            self._append_held(self.held_controls[k], k)
             self.z.append(old)
             self.rates = ca.vertcat(self.rates, new)
             self.mu[k] = new
             self._move_scale(at, self.centre[at], self.scale[at])
         self.at = self._random_point()
-
-    def _held(self, combination: ca.SX) -> ca.SX:
-        """A function of the extended plant in terms of states and constant controls of the plant."""
-        now = ca.vertcat(self.column, self.inputs)
-        return ca.substitute(combination, now, ca.vertcat(*self.held_states, *self.held_controls))
-
-    def _append_held(self, value: ca.SX, control: int) -> None:
-        """Enter a new state with constant controls; its derivative replaces a control."""
-        self.held_states.append(value)
-        self.held_controls[control] = ca.jtimes(value, self.plant.z, self.motion)
 
     def _move_scale(self, control: int, centre: float, size: float) -> None:
         """Insert a new state's centre and scale; the control at its place becomes its derivative."""
@@ -330,9 +309,6 @@ class _Algorithm:
         exact = tape_of((self.column, self.inputs, self.plant.p), combination)(
             self.centre[:nz], self.centre[nz:], self.plant.values
         )
-        held = [self._held(combination[k]) for k in range(rank)]
-        for value, i in zip(held, pivots, strict=True):
-            self._append_held(value, i)
         self.rates = ca.vertcat(ca.substitute(self.rates, old, inverse), *derivatives)
         self.controls = ca.substitute(self.controls, old, inverse)
         replaced = idle + first @ w
@@ -419,7 +395,6 @@ class _Algorithm:
             flags=tuple(ca.vertcat(ca.SX(0, 1), *flag) for flag in self.flags),
             last=last,
             controls=self.controls,
-            held=ca.vertcat(ca.SX(0, 1), *self.held_states[self.n :]),
             rounds=tuple(self.rounds),
             prolonged=self.prolonged,
             nstates=self.n,
