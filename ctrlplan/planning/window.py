@@ -5,13 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from itertools import pairwise
-from typing import NoReturn, Self
 
 import numpy as np
 
-from ctrlplan._types import Data
 from ctrlplan.trajectories import Trajectory
 from ctrlplan.trajectories.common import Array
+from ctrlplan.trajectories.internal import InternalTrajectory
 from ctrlplan.trajectories.quadrature import gauss
 
 _NODES = 16
@@ -20,7 +19,7 @@ _TOLERANCE = 1e-13
 _LEVELS = 14
 
 
-class _Window(Trajectory):
+class _Window(InternalTrajectory):
     """Part of a plan, constant outside of the plan, whose last axis is the time of another plan.
 
     Parameters
@@ -35,6 +34,7 @@ class _Window(Trajectory):
         Further breakpoints, of the plan.
     """
 
+    what = "a part of a plan"
     plan: Trajectory
     own_time: tuple[float, float]
 
@@ -64,23 +64,6 @@ class _Window(Trajectory):
         clock[0] = first + rate * (left - self.start + s)
         clock[1:2] = rate
         return np.concatenate([jet, clock], axis=1)
-
-    def map_time(self, origin: float, target: float, rate: float) -> Self:
-        """Not defined: only the plan itself is retimed."""
-        self._reject()
-
-    def to_dict(self) -> Data:
-        """Not defined: only the plan itself is saved."""
-        self._reject()
-
-    @classmethod
-    def from_dict(cls, data: Data) -> Trajectory:
-        """Not defined."""
-        cls._reject()
-
-    @classmethod
-    def _reject(cls) -> NoReturn:
-        raise TypeError("a part of a plan cannot be retimed or saved")
 
 
 def window(

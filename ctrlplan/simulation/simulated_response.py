@@ -6,7 +6,6 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property, reduce
 from itertools import pairwise
-from typing import NoReturn, Self
 
 import control as ct
 import numpy as np
@@ -15,7 +14,7 @@ from scipy.interpolate import CubicSpline
 
 from ctrlplan._checks import check_kind, checked_finite
 from ctrlplan._display import Displayed, Facts, Part
-from ctrlplan._types import Array, Data, System
+from ctrlplan._types import Array, System
 from ctrlplan.simulation.equilibrium import equilibrium_at
 from ctrlplan.simulation.loop_inputs import Fed, fed_signals, is_cyclic, same_axis, tracked
 from ctrlplan.simulation.loop_response import Extremes, LoopResponse
@@ -23,6 +22,7 @@ from ctrlplan.simulation.network import Block
 from ctrlplan.simulation.prepared import Prepared, prepared_form
 from ctrlplan.simulation.simulate import simulate
 from ctrlplan.trajectories import Step, Trajectory
+from ctrlplan.trajectories.internal import InternalTrajectory
 
 _RTOL = 1e-10
 """Relative tolerance of the runs."""
@@ -390,9 +390,10 @@ class SimulatedResponse(LoopResponse):
         )
 
 
-class _Inputs(Trajectory):
+class _Inputs(InternalTrajectory):
     """Inputs of a loop: axes of a plan, their derivatives, and 0."""
 
+    what = "inputs of a loop"
     plan: Trajectory
     fed: tuple[Fed | None, ...]
     initial: Array
@@ -419,23 +420,6 @@ class _Inputs(Trajectory):
             if f is not None:
                 found[:, row] = jet[f[1] : f[1] + order + 1, f[0]]
         return found
-
-    def map_time(self, origin: float, target: float, rate: float) -> Self:
-        """Not defined."""
-        self._reject()
-
-    def to_dict(self) -> Data:
-        """Not defined."""
-        self._reject()
-
-    @classmethod
-    def from_dict(cls, data: Data) -> Trajectory:
-        """Not defined."""
-        cls._reject()
-
-    @classmethod
-    def _reject(cls) -> NoReturn:
-        raise TypeError("inputs of a loop cannot be retimed or saved")
 
 
 def _check_sources(prepared: Prepared, plan: Trajectory) -> None:

@@ -93,7 +93,7 @@ SLOWER = {
     ids=[*QUICK, *SLOWER],
 )
 def test_errors_decay_with_the_poles(make, quasi_static, poles):
-    """From rest beside the start of the plan: the states of the extension are those of rest."""
+    """From rest near the start of the plan: the states of the extension are those of rest."""
     plant, flat, plan, start, first, read = make()
     law = cp.create_flat_iosystem(flat, poles, quasi_static=quasi_static)
     assert law.nstates == (0 if quasi_static else flat.extension)

@@ -123,7 +123,7 @@ def test_after_the_end_the_stationary_gain_is_used():
 
 
 def test_states_and_inputs_for_a_state_feedback_of_python_control():
-    """The car with gains by python-control's create_statefbk_iosystem, from a start beside the lane."""
+    """The car with gains by python-control's create_statefbk_iosystem, from a start off the lane."""
     block = cp.create_flat_feedforward_iosystem(CAR)
     plant = ct.nlsys(car.updfcn, None, states=car.state_labels, inputs=car.input_labels, outputs=3, name="car")
     x, u = CAR.states_and_inputs(LANE, 0.0)
@@ -134,8 +134,8 @@ def test_states_and_inputs_for_a_state_feedback_of_python_control():
     t = np.linspace(0.0, 4.0, 21)
     found = cp.simulate(loop, t, initial_state=[0.0, 0.0, 0.0])
     np.testing.assert_allclose(found.outputs[:2], LANE(t), atol=1e-5)
-    beside = cp.simulate(loop, t, initial_state=[0.0, 0.3, 0.0])
-    assert abs(beside.outputs[1, -1] - LANE(4.0)[1]) < 0.02
+    off = cp.simulate(loop, t, initial_state=[0.0, 0.3, 0.0])
+    assert abs(off.outputs[1, -1] - LANE(4.0)[1]) < 0.02
 
 
 def test_a_window_ahead():

@@ -115,12 +115,12 @@ def check(case, symmetries=True):
         assert (np.abs(plan.jet(time, 2)[:, 0] - state) <= 1e-12 * scales).all()
     inner = plan.breakpoints[1:-1]
     assert (np.abs(plan.jet(inner, 2) - plan.jet(inner, 2, left=True))[:, 0] <= 1e-12 * scales[:, None]).all()
-    for (low, high), (least, greatest) in zip(
+    for (low, high), (minimum, maximum) in zip(
         (case.velocity, case.acceleration, (-case.jerk, case.jerk)), exact_extrema(plan), strict=True
     ):
         slack = 1e-9 * (high - low)
-        assert low - slack <= least
-        assert greatest <= high + slack
+        assert low - slack <= minimum
+        assert maximum <= high + slack
     assert plan.duration == pytest.approx(by_ruckig(case), rel=1e-8)
     if symmetries:
         rng = np.random.default_rng(int(1e6 * abs(case.start[1])))
@@ -270,11 +270,11 @@ def test_trapezoids_by_cases():
         np.testing.assert_allclose(
             plan.jet([plan.start, plan.end], 1)[1, 0], [v0, v1], rtol=0, atol=1e-12 * velocity[1]
         )
-        (low, high), (least, greatest), _ = exact_extrema(plan)
+        (low, high), (minimum, maximum), _ = exact_extrema(plan)
         assert velocity[0] * (1 + 1e-9) <= low
         assert high <= velocity[1] * (1 + 1e-9)
-        assert acceleration[0] * (1 + 1e-9) <= least
-        assert greatest <= acceleration[1] * (1 + 1e-9)
+        assert acceleration[0] * (1 + 1e-9) <= minimum
+        assert maximum <= acceleration[1] * (1 + 1e-9)
 
 
 def test_from_rest_to_rest_with_pairs():
