@@ -25,11 +25,11 @@ def pytest_configure(config):
 
 @pytest.hookimpl(tryfirst=True)  # before -m selects
 def pytest_collection_modifyitems(items):
-    """Under ``each_value``, cases that are not needed to have each value of each parameter once are slow."""
+    """Of all combinations of several lists of cases, those not needed to have each case of each list once are slow."""
     families = {}
     for item in items:
-        if item.get_closest_marker("each_value") and not item.get_closest_marker("slow"):
-            values = {(name, id(value)) for name, value in item.callspec.params.items()}
+        if len(lists := list(item.iter_markers("parametrize"))) > 1 and not item.get_closest_marker("slow"):
+            values = {(names, _case(item, names)) for names in map(_names, lists)}
             families.setdefault(item.nodeid.partition("[")[0], []).append((item, values))
     for cases in families.values():
         known, chosen = set(), set()
@@ -41,6 +41,16 @@ def pytest_collection_modifyitems(items):
         for item, _ in cases:
             if item not in chosen:
                 item.add_marker("slow")
+
+
+def _names(mark):
+    """The parameters of one list of cases."""
+    return tuple(mark.args[0].replace(",", " ").split()) if isinstance(mark.args[0], str) else tuple(mark.args[0])
+
+
+def _case(item, names):
+    """The case of one list which a test takes."""
+    return tuple(id(item.callspec.params[name]) for name in names)
 
 
 # Imports and collected tests stay until the end: a third of the time of collection went into looking for garbage there.

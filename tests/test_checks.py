@@ -27,6 +27,7 @@ def test_the_parameters_of_every_check_are_value_and_name(check):
     assert list(inspect.signature(check).parameters)[1] == "name"
 
 
+@pytest.mark.slow
 def test_so_does_every_check_of_one_module_alone():
     """Also those of their own modules: no function that checks begins with what the value is called."""
     wrong = [

@@ -385,6 +385,7 @@ def failing(tmp_path, monkeypatch):
     return at
 
 
+@pytest.mark.slow
 def test_a_plan_that_fails_is_a_row_with_its_reason_beside_the_others(failing, tmp_path, capsys):
     assert failing(0.6) == 0
     assert len(capsys.readouterr().out.splitlines()) == 2

@@ -289,6 +289,7 @@ def test_ids_of_different_figures_differ():
     assert not set(first) & set(second)
 
 
+@pytest.mark.slow
 def test_threads_draw_as_one_does():
     names = ["PolySpline", "Comparison", "TrigSpline"] * 2
     alone = [html_of(name) for name in names]

@@ -34,7 +34,6 @@ ATTRIBUTES = {
 }
 
 
-@pytest.mark.each_value
 @pytest.mark.parametrize("name", [*ATTRIBUTES, "all"])
 @pytest.mark.parametrize("method", ["auto", "python"])
 def test_attributes_of_a_users_object_are_no_traits(name, method):

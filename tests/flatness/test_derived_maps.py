@@ -227,6 +227,7 @@ def test_the_branch_is_that_of_the_operating_point_or_the_start():
     np.testing.assert_allclose(turned[2], x[2] + math.pi, atol=1e-11)
 
 
+@pytest.mark.slow
 def test_singular_points_are_named_with_time_and_quantity():
     flat = derived(CASES["car"])
     stop = rest_to_rest(["x", "y"], [2, 2], [4.0, 1.0])

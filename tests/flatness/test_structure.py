@@ -143,6 +143,7 @@ def test_stability_of_the_internal_dynamics_is_stated():
         cp.flat_system(ahead, lambda x, u, params: [x[0] - x[1]])
 
 
+@pytest.mark.slow
 def test_seed_and_repetition_do_not_matter():
     first, second = (derived(CASES["crane"]) for _ in range(2))
     np.random.default_rng(7).random(100)

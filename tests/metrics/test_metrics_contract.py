@@ -133,7 +133,6 @@ def test_a_scalar_is_no_signal(name):
 INFINITE = [n for n in NAMES if n not in ("lag", "saturation_time", "turning_points")]
 
 
-@pytest.mark.each_value
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("place", range(7))
 def test_a_diverged_record_is_infinite_and_silent(name, place):

@@ -90,7 +90,6 @@ CASES = {
 }
 
 
-@pytest.mark.each_value
 @pytest.mark.parametrize("grid", [even, uneven])
 @pytest.mark.parametrize("name", CASES)
 def test_integrals_and_peaks_are_of_fourth_order(name, grid):

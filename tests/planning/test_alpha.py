@@ -190,6 +190,7 @@ def test_a_tie_minimises_the_jerk_among_the_minimisers():
     assert found.alpha == pytest.approx(2.0, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_a_tie_of_all_is_solved_for_the_minimum_jerk():
     # With four entries at the ends and a jerk at one of them the minimum is inside.
     waypoints = [Waypoint(0, 0, 0, 0, 0), Waypoint(1, 1, 0, 0, 40.0)]
@@ -199,6 +200,7 @@ def test_a_tie_of_all_is_solved_for_the_minimum_jerk():
     assert SquaredDerivative(3)(found.plan) == pytest.approx(jerk.value, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_a_constant_plan_has_no_path():
     found = cp.choose_alpha([Waypoint(0, [1, 2], 0), Waypoint(3, [1, 2], 0)])
     assert (found.alpha, found.value, found.tied) == (0.0, 0.0, True)

@@ -343,6 +343,7 @@ def test_feasible_set_is_that_of_a_scan(family):
     np.testing.assert_allclose(np.array(times) / found.duration, np.array([0, 6, 11, 16]) / 16, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_waypoints_held_without_derivatives_is_the_shape_held():
     points = [Waypoint(0, [0, 1]), Waypoint(2, [1, 3]), Waypoint(3, [4, 0]), Waypoint(5, [5, 5])]
     for plan in (cp.TrigSpline(points, alpha=2.0), cp.PolySpline(points)):
@@ -551,6 +552,7 @@ def test_a_plan_that_does_not_move(position, hold):
         fastest(still, {"velocity": 1.0, "acceleration": 1.0}, hold=hold)
 
 
+@pytest.mark.slow
 def test_a_search_that_ends_where_limits_come_nearer_says_so():
     far = cp.PolySpline([Waypoint(0, 0, 0.1), Waypoint(1, 20, 0.1)])
     with pytest.raises(ValueError, match=r"from 0.01562 to 64 s, got none.* for a wider search pass durations="):
@@ -613,6 +615,7 @@ def test_plans_of_every_kind_are_retimed(name):
     assert type(found.plan) is type(plan)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["s_curve", pytest.param("natural cubic", marks=pytest.mark.slow)])
 def test_a_time_law_is_found_for_plans_of_every_kind(name):
     plan = PROFILES[name]

@@ -116,6 +116,7 @@ def test_the_rate_of_a_quantity_is_that_of_its_closed_form():
     assert abs(found["rate of speed"].value) == pytest.approx(np.abs(v * a / np.hypot(v, 0.1)).max(), rel=1e-8)
 
 
+@pytest.mark.slow
 def test_the_rate_of_the_force_of_a_crane():
     crane = cp.plants.Crane()
     row = only(margins(CRANE_MOVE, {"F": Limits(rate=1e4)}, crane))

@@ -194,6 +194,7 @@ def test_the_dwell_counts_in_a_loop():
     assert simulated == pytest.approx(exact, rel=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("hold", ["shape", pytest.param("waypoints", marks=pytest.mark.slow)])
 def test_the_fastest_move_keeps_every_kind(hold):
     limits = {
@@ -407,6 +408,7 @@ def test_loops_without_a_known_start():
         margins(TRACK, {"y[0]": 1.0}, open_loop)
 
 
+@pytest.mark.slow
 def test_a_loop_that_diverges():
     runaway = ct.nlsys(
         lambda t, x, u, p: np.array([x[0] ** 3 + x[0] + u[0]]), None, inputs="r", outputs="y", states=1, name="runaway"

@@ -204,7 +204,6 @@ PROGRAMS = [
 ]
 
 
-@pytest.mark.each_value
 @pytest.mark.parametrize(("n", "k", "order", "continuity"), PROGRAMS)
 def test_quadratic_programs_are_solved(n, k, order, continuity):
     rng = np.random.default_rng(10 * n + k)

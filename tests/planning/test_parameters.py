@@ -64,6 +64,7 @@ def test_an_affine_force_is_worst_at_a_corner():
     assert "with load = 1.3, friction = 2" in str(found)
 
 
+@pytest.mark.slow
 def test_a_linear_fractional_current_is_proved_and_a_voltage_is_not():
     params = {"constant": (0.5, 4.0)}
     found = by_name(margins(MOVE, {"current": 20.0, "voltage": 40.0}, rotor, params=params))
@@ -176,6 +177,7 @@ def test_no_draw_is_worse_than_what_is_proved(count):
 # Sampled
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [200, pytest.param(10_000, marks=pytest.mark.slow)])
 def test_no_draw_is_worse_than_what_is_sampled_by_a_hundredth(count):
     """Quantities with their worst parameters inside of the ranges, against draws at dense samples."""
@@ -254,6 +256,7 @@ def test_the_fastest_move_of_a_closed_loop_over_its_parameters():
     assert found.duration >= alone.duration * (1 - 1e-9)
 
 
+@pytest.mark.slow
 def test_fixed_values_alone():
     fixed = margins(LIFT, {"F": 6e3}, cp.plants.Crane(), params={"load_mass": 700})
     plain = margins(LIFT, {"F": 6e3}, cp.plants.Crane(load_mass=700.0))

@@ -92,6 +92,7 @@ def test_the_path_is_the_same(name):
     np.testing.assert_allclose(points, expected, atol=1e-10 * np.abs(expected).max())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["obstacle", "there and back"])
 def test_the_time_law_is_increasing(name):
     law = law_of(found_on_path(name).plan)
@@ -180,6 +181,7 @@ def crane_force(plan):
     return 5000.0 * second + 20.0 * rate + 500.0 * x[2, 2:-2]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("force", [30e3, pytest.param(2e3, marks=pytest.mark.slow)])
 def test_crane_forces_are_within_limits_with_the_new_time_law(force):
     limits = {"F": force, "C": (-3e3, 1e3), "theta": 0.5}
@@ -221,6 +223,7 @@ def test_position_limits_stay_what_they_are():
         fastest(plan, {"x": (0, 19), "x_d1": 2.0}, hold="path")
 
 
+@pytest.mark.slow
 def test_the_plan_is_saved_with_its_time_law(tmp_path):
     found = found_on_path("nominal").plan
     found.save(tmp_path / "plan.json")

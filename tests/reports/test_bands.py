@@ -90,6 +90,7 @@ def outline(collection):
 # The figure
 
 
+@pytest.mark.slow
 def test_a_row_is_a_signal_and_a_column_a_plan(grid):
     assert [axes.get_title() for axes in grid[0]] == ["step", "ramp"]
     assert [row[0].get_ylabel() for row in grid] == ["y [m]", "error of y [m]", "u [N]"]
@@ -208,6 +209,7 @@ def numbers(cell):
     return [float(text) for text in re.findall(r"[\d.]+", cell.words())]
 
 
+@pytest.mark.slow
 def test_the_page_has_the_table_of_draws_before_that_of_the_loop(page):
     heads = [e.words() for e in page.all() if re.fullmatch("h[1-6]", e.tag)]
     assert heads[0] == "Lags & <draws>"

@@ -171,6 +171,7 @@ def test_figures_need_no_waypoints():
     assert json.loads(animation_data(found))["view"][2] > 20.0
 
 
+@pytest.mark.slow
 def test_axes_named_z_first_are_not_taken_for_x():
     """The same move, its labels the other way round: the same figures."""
     turned = points((0.0, 10.0), (8.0, 6.0), (20.0, 11.0), order=("z", "x"))
@@ -182,6 +183,7 @@ def test_axes_named_z_first_are_not_taken_for_x():
                 np.testing.assert_allclose(line.get_xydata(), again.get_xydata(), rtol=0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_move_that_starts_late_is_drawn_from_its_start():
     late = compared(points((0.0, 10.0), (8.0, 6.0), (20.0, 11.0), start=100.0))
     soon = compared(MOVE)
@@ -198,7 +200,6 @@ def test_a_move_that_starts_late_is_drawn_from_its_start():
 # Plans of any name
 
 
-@pytest.mark.each_value
 @pytest.mark.parametrize("kind", [sections.CranePaths, sections.CraneTime, sections.CraneMotion])
 @pytest.mark.parametrize("names", [("gentle",), ("a", "b", "c"), ("jump",), ("step",)])
 def test_plans_may_have_any_name(kind, names):
@@ -316,6 +317,7 @@ def test_a_crane_study_file_may_have_any_number_of_waypoints(inner, tmp_path):
     assert set(names) <= set(drawn_texts(page))
 
 
+@pytest.mark.slow
 def test_the_order_of_axes_in_a_study_file_does_not_change_what_is_measured(tmp_path):
     places = [(0.0, 10.0), (12.0, 11.0)]
     found = []

@@ -628,6 +628,7 @@ def test_settings_of_the_user_are_left_alone(compared, swept):
     assert dict(mpl.rcParams) == before
 
 
+@pytest.mark.slow
 def test_settings_of_the_user_do_not_change_a_page(compared):
     study = Study("it", "It", compared, sections=(sections.Responses(),))
     with plt.style.context("dark_background"):
@@ -645,6 +646,7 @@ def imports(path):
             yield from (f"{node.module}.{alias.name}" for alias in node.names)
 
 
+@pytest.mark.slow
 def test_only_reports_use_pyplot():
     root = Path(cp.__file__).parent
     users = {p.relative_to(root).parts[0] for p in root.rglob("*.py") if "matplotlib.pyplot" in set(imports(p))}

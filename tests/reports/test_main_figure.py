@@ -213,6 +213,7 @@ def test_a_figure_without_curves_has_no_read_out():
 # Limits and sweeps
 
 
+@pytest.mark.slow
 def test_limits_of_each_run_with_margins_and_the_active_one():
     """A PI loop that saturates for the step, and a gentle plan with a margin that is known."""
     pid = cp.create_pid_iosystem(2.0, 1.0, 0.0, 0.1, limits=(-1.0, 0.5), inputs=("r", "y"), outputs="u", name="pid")
@@ -237,6 +238,7 @@ def test_limits_of_each_run_with_margins_and_the_active_one():
     assert "−1.000 to 0.5000 V" in page
 
 
+@pytest.mark.slow
 def test_a_sweep_writes_its_page(tmp_path):
     def build(gain):
         if gain > 50.0:

@@ -538,6 +538,7 @@ def test_a_figure_of_a_page_is_unknown_to_pyplot_and_in_its_own_style(name):
     assert plt.get_fignums() == [1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("backend", ["agg", "module://recording_backend"])
 def test_a_page_of_many_figures_warns_of_none(backend, windows):
     plt.switch_backend(backend)

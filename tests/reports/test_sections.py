@@ -86,6 +86,7 @@ def own(compared, tmp_path_factory):
     return reports.write_report([study], tmp_path_factory.mktemp("own sections"), "Mine")
 
 
+@pytest.mark.slow
 def test_a_section_of_ones_own_is_on_the_page_in_its_place(own, read):
     page = read(own[0].read_text(encoding="utf-8"))
     assert heads(page) == [

@@ -99,6 +99,7 @@ def number(text):
 # The page
 
 
+@pytest.mark.slow
 def test_each_section_has_its_heading_once_and_at_one_level(page):
     assert [heads(page).count(title) for title in (FASTEST, WORTH, OPTIMAL)] == [1, 1, 1]
     levels = {e.tag for e in page.all() if e.words() in (FASTEST, WORTH, OPTIMAL, "Metrics") and e.tag[0] == "h"}

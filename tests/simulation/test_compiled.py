@@ -418,7 +418,6 @@ def test_flat_laws_follow_their_plans(case, method):
     assert np.abs(found.outputs.ravel() - plan(T)).max() <= 1e-7
 
 
-@pytest.mark.each_value
 @pytest.mark.parametrize("law", cp.plants.LAWS)
 @pytest.mark.parametrize("rope_wrap", [False, True])
 def test_every_law_of_the_crane_traces(law, rope_wrap):

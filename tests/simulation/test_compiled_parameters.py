@@ -172,7 +172,6 @@ def nested(inner=None, middle=None, outer=None):
     return ct.interconnect([first, further], inputs=0, outputs=["q"], **options)
 
 
-@pytest.mark.each_value
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize(
     ("levels", "run"),

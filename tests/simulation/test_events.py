@@ -69,7 +69,6 @@ def test_crossings_do_not_depend_on_the_samples(count, method):
     assert found.time.size == count
 
 
-@pytest.mark.each_value
 @pytest.mark.parametrize("gain", [1.0, 100.0])
 @pytest.mark.parametrize("method", METHODS)
 def test_the_settling_of_a_step(gain, method):

@@ -212,7 +212,6 @@ def test_one_loop_without_a_solution_among_others(bad):
 # An input between its samples
 
 
-@pytest.mark.each_value
 @pytest.mark.parametrize("seed", range(6))
 @pytest.mark.parametrize("even", [True, False])
 def test_random_samples_into_random_systems(even, seed):

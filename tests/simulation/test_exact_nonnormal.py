@@ -126,7 +126,6 @@ def reference(a, b, derivatives, duration, count, start, seed=0):
     return exact, 2.0 * len(a) * (moved.max() + table) + rounded(a, exact, duration)
 
 
-@pytest.mark.each_value
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("duration", [0.125, 16.0])
 def test_the_loss_of_digits_is_that_of_half_an_ulp_of_the_matrix(kind, duration):

@@ -38,7 +38,6 @@ def states_of(a, b, plan, times, initial=None):
 # Poles times duration far beyond 1e16
 
 
-@pytest.mark.each_value
 @pytest.mark.parametrize(("rate", "duration"), [(1e9, 1e4), (1e12, 1e4), (1e17, 1e-3), (1e17, 1e10), (1e150, 1.0)])
 @pytest.mark.parametrize("count", [2, 11, 33, 1001])
 def test_a_fast_lag_follows_whatever_the_duration(rate, duration, count):
@@ -59,7 +58,6 @@ def test_the_printed_case():
     assert np.abs(found).max() <= 1.000001e-12
 
 
-@pytest.mark.each_value
 @pytest.mark.parametrize("kind", STIFF)
 @pytest.mark.parametrize("fast", [1e8, 1e17, 1e60])
 def test_stiff_and_defective_systems_in_closed_form(kind, fast):
@@ -190,7 +188,6 @@ def test_signs_of_what_has_overflowed():
     assert (down[t > 8.0] == -np.inf).all()
 
 
-@pytest.mark.each_value
 @pytest.mark.parametrize(("rate", "count"), [(100.0, 3), (100.0, 51), (100.0, 401), (1e5, 26), (1e60, 51)])
 @pytest.mark.parametrize("method", ["plan", "number", "samples"])
 def test_outputs_that_do_not_see_an_overflowing_state_stay_finite(method, rate, count):
@@ -298,7 +295,6 @@ def test_nothing_is_said_of_stiff_systems_that_keep_their_digits(kind):
         cp.simulate(system, np.linspace(0.0, 1e4, 101), 1.0, rest)
 
 
-@pytest.mark.each_value
 @pytest.mark.parametrize("kind", ["step", "samples"])
 @pytest.mark.parametrize("seed", range(25))
 def test_random_chains_up_to_and_beyond_the_range_of_numbers(kind, seed, monkeypatch):

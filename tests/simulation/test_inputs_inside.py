@@ -42,7 +42,6 @@ def recorder(count):
     return ct.nlsys(rates, None, inputs=count, outputs="y", states="y", name="recorder"), seen
 
 
-@pytest.mark.each_value
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("value", [1.0, 0.1, -7.3e-9, 3.0, 1e300])
 def test_a_constant_next_to_a_signal_that_moves_is_exact(value, method):

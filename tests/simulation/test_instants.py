@@ -24,7 +24,6 @@ def first_seen(system, t, inputs, method):
     return int(np.flatnonzero(outputs)[0])
 
 
-@pytest.mark.each_value
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("shift", [-1e-15, 0.0, 4 * EPS, 1e-15, 1e-13])
 @pytest.mark.parametrize("instant", [3, 6, 7])

@@ -39,7 +39,6 @@ def alarm():
     signal.signal(signal.SIGALRM, before)
 
 
-@pytest.mark.each_value
 @pytest.mark.parametrize("method", ["compiled", "auto", "python"])
 @pytest.mark.parametrize("error", [KeyboardInterrupt, SystemExit(3)])
 def test_what_a_handler_raises_reaches_the_caller(error, method, alarm, capfd):
@@ -58,6 +57,7 @@ def test_what_a_handler_raises_reaches_the_caller(error, method, alarm, capfd):
     assert np.isfinite(found.outputs).all()
 
 
+@pytest.mark.slow
 def test_an_interruption_of_a_comparison_reaches_the_caller(alarm):
     system = ct.nlsys(
         lambda t, x, u, p: [x[1], -1e6 * np.sin(x[0]) + 0.0 * u[0]],
@@ -87,6 +87,7 @@ def test_a_signal_while_handlers_are_exchanged_reaches_the_caller_and_leaves_the
     assert signal.getsignal(signal.SIGALRM) is handler
 
 
+@pytest.mark.slow
 def test_a_handler_that_raises_nothing_is_called_and_the_run_goes_on(alarm):
     """A timer of a user's program: its handler runs during CVODES, and the result does not change."""
     system, calls = fast(), []

@@ -53,7 +53,6 @@ def around_exactly(through, x0):
 # Linear loops
 
 
-@pytest.mark.each_value
 @pytest.mark.parametrize("through", [0.5, -0.6, 1.0, 7.0, 1e6])
 @pytest.mark.parametrize("method", METHODS)
 def test_a_linear_loop(through, method):
@@ -246,6 +245,7 @@ def planned(t):
     return 0.2 + 2.8 * s**3 * (10 - 15 * s + 6 * s * s)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "function",
     [

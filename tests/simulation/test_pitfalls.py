@@ -15,6 +15,7 @@ MOVE = [cp.Waypoint(0, 0, 0, 0), cp.Waypoint(2, 1, 0, 0)]
 PLAN = cp.TrigSpline(MOVE, alpha=1.0, labels=["r"])
 
 
+@pytest.mark.slow
 def test_a_quantizer_by_python_is_no_end_of_the_solution():
     """Trial steps that a solver takes back say nothing about how far it is."""
     plant = ct.nlsys(
@@ -92,6 +93,7 @@ def stopping(events):
     return cp.compare(loop, {"gentle": PLAN, "violent": fast}, T, events=events)
 
 
+@pytest.mark.slow
 def test_a_plan_whose_run_is_ended_wins_nothing(tmp_path):
     found = stopping([cp.Event("u", high=15.0, stop=True)])
     assert found.responses["violent"].time[-1] < 1.0

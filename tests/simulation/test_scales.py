@@ -52,7 +52,6 @@ def stage_by_hand():
     return plan, t, y
 
 
-@pytest.mark.each_value
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("kind", ["tf", "ss"])
 @pytest.mark.parametrize("size", [1e-9, 1e-3, 1e6])
@@ -278,6 +277,7 @@ def test_a_lasting_displacement_through_frozen_equations():
     assert effects(slopes, duration) == pytest.approx(expected, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_a_plant_that_is_fed_by_the_phase_of_an_oscillator():
     """x' = cos(phase) - x with a rippling frequency, by Gauss quadrature of its impulse response."""
     mean, ripple, duration, start = 25.0, 1000.0, 10.0, 2e4

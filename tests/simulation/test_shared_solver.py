@@ -28,6 +28,7 @@ def test_runs_in_threads_do_not_disturb_each_other():
     assert max(np.abs(y - 1.0 / (1.0 + rate * T)).max() for rate, y in zip(rates, found, strict=True)) < 1e-6
 
 
+@pytest.mark.slow
 def test_a_run_inside_the_block_of_another_run():
     def rates(t, x, u, p):
         return [-run(1.0)[0, -1] * x[0]]

@@ -45,7 +45,6 @@ def check(matrices, plan, signals, times, initial=None, tolerance=SMALL):
     assert gap(found.outputs, outputs) <= tolerance
 
 
-@pytest.mark.each_value
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("alpha", ALPHAS)
 def test_random_plans_on_random_systems(alpha, seed):
@@ -113,7 +112,6 @@ def kinds(alpha):
     }  # fmt: skip
 
 
-@pytest.mark.each_value
 @pytest.mark.parametrize("alpha", ALPHAS[::2])
 @pytest.mark.parametrize("kind", sorted(kinds(1.0)))
 def test_plans_of_every_kind(kind, alpha):
@@ -123,7 +121,6 @@ def test_plans_of_every_kind(kind, alpha):
     check(system, plan, signals, odd_times(rng, -1.0, 7.0, plan.breakpoints), [0.5, -1.0, 2.0])
 
 
-@pytest.mark.each_value
 @pytest.mark.parametrize("alpha", [0.0, 1e-9, 1.0])
 @pytest.mark.parametrize("gain", [1e-3, 0.1, 0.25, 0.26, 1.0, 5.0, 1e3, 1e4, 1e6])
 def test_the_integrator_lag_loop_at_every_gain(gain, alpha):
@@ -188,7 +185,6 @@ def test_an_unstable_loop_that_leaves_the_range_of_numbers():
     assert np.all(found[t >= 7.5] == np.inf)
 
 
-@pytest.mark.each_value
 @pytest.mark.parametrize("stiffness", [1e3, 1e4, 1e6])
 @pytest.mark.parametrize("duration", [1.0, 10.0, 100.0])
 def test_a_slow_mode_next_to_a_fast_one(stiffness, duration):

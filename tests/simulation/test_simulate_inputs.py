@@ -149,6 +149,7 @@ def test_a_scalar_initial_state_is_for_all_states():
     assert gap(found.states, response(A, B, C, D, [constant(0.0)] * 2, T, [0.5, 0.5])[1]) <= 1e-11
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["compiled", "python"])
 @pytest.mark.parametrize("count", [301, pytest.param(1501, marks=pytest.mark.slow)])
 def test_many_samples_next_to_a_plan_that_comes_to_rest(count, method):

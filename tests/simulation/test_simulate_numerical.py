@@ -73,7 +73,6 @@ def of_linear_loop(each_segment, alpha):
     return response(*lag_loop(5.0), signals, T, [0.3, -0.2])
 
 
-@pytest.mark.each_value
 @pytest.mark.parametrize(("rtol", "allowed"), [(1e-8, 2e-7), (1e-11, 3e-10)])
 @pytest.mark.parametrize("alpha", [0.0, 1e-9, 1.0, 5.0])
 @pytest.mark.parametrize("each_segment", [False, True], ids=["one spline", "one a segment"])

@@ -68,7 +68,6 @@ def pair(name, method, squeeze=None):
     return found, peer, plan
 
 
-@pytest.mark.each_value
 @pytest.mark.parametrize("squeeze", [None, True, False])
 @pytest.mark.parametrize(("name", "method"), [(n, m) for n in SYSTEMS for m in METHODS[n]])
 def test_shapes(name, method, squeeze, monkeypatch):
@@ -95,7 +94,6 @@ def test_shapes(name, method, squeeze, monkeypatch):
         assert getattr(found, attribute) == getattr(peer, attribute), attribute
 
 
-@pytest.mark.each_value
 @pytest.mark.parametrize(("name", "method"), [(n, m) for n in SYSTEMS for m in METHODS[n]])
 def test_labels(name, method):
     found, peer, plan = pair(name, method)

@@ -21,7 +21,6 @@ def half_a_digit(printed):
     return 0.5000001 * 10.0 ** -len(printed.partition(".")[2])
 
 
-@pytest.mark.each_value
 @pytest.mark.parametrize("plan", NAMES)
 @pytest.mark.parametrize("gain", GAINS)
 def test_the_table_is_the_closed_form_to_every_digit(gain, plan):

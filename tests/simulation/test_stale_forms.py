@@ -414,7 +414,6 @@ def by_ten_levels_of_functions():
 WAYS = [way for name, way in sorted(globals().items()) if name.startswith("by_")]
 
 
-@pytest.mark.each_value
 @pytest.mark.parametrize("way", WAYS, ids=lambda way: way.__name__)
 @pytest.mark.parametrize("method", ["auto", "compiled"])
 def test_what_a_function_refers_to_may_change(way, method):

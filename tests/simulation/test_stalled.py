@@ -62,7 +62,6 @@ SLIDING = {
 }
 
 
-@pytest.mark.each_value
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("case", SLIDING)
 def test_a_solution_that_stays_at_a_jump_names_block_and_time(case, method):
@@ -76,6 +75,7 @@ def test_a_solution_that_stays_at_a_jump_names_block_and_time(case, method):
         assert arrival - 1e-3 < reached < 20.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", one_in(2, METHODS))
 def test_an_infinite_slope_names_its_block(method):
     """x' = -cbrt(x) is at 0 after 3/2 s, and there it is not defined how to go on for an integrator."""
@@ -112,6 +112,7 @@ def test_a_block_that_answers_twice_differently_is_named(kind, method):
         cp.simulate(loop, np.linspace(0, 10, 11), 0.0, method=method)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", one_in(2, METHODS, 1))
 def test_noise_as_a_function_of_time_is_found(method):
     def rates(t, x, u):
@@ -189,7 +190,6 @@ def method_of_steps(t):
         return float(sum((-1) ** k * (mp.mpf(t) - mp.mpf(k + 1) / 2) ** (k + 1) / mp.factorial(k + 1) for k in terms))
 
 
-@pytest.mark.each_value
 @pytest.mark.parametrize("method", ["compiled", "python"])
 @pytest.mark.parametrize(("offset", "height"), [(0.0, 1.0), (1e4, 1e-3)])
 def test_a_delayed_signal_that_dies_away_takes_no_more_segments(method, offset, height, monkeypatch):

@@ -35,7 +35,6 @@ FORMS = {
 }
 
 
-@pytest.mark.each_value
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize(("begin", "end"), [(50.0, 60.0), (33.3, 33.31), (7.0, 7.0 + 1e-6), (99.0, 99.9)])
 def test_a_pulse_of_any_width_where_the_block_is_compiled(form, begin, end):
@@ -44,7 +43,6 @@ def test_a_pulse_of_any_width_where_the_block_is_compiled(form, begin, end):
     assert np.abs(found.outputs[0] - after(t, begin, end)).max() < 1e-6 * (1.0 - np.exp(begin - end))
 
 
-@pytest.mark.each_value
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize(("begin", "end"), [(50.0, 60.0), (33.3, 33.55)])
 def test_a_pulse_longer_than_the_sample_spacing_by_python(form, begin, end):

@@ -197,6 +197,7 @@ def test_no_shaped_profile_where_the_shaper_takes_the_time_of_the_move():
 # The limits
 
 
+@pytest.mark.slow
 def test_unless_given_limits_are_what_the_polynomial_needs(stiff):
     assert stiff.limits == pytest.approx({"y_d1": 15 / 8, "y_d2": 10 / 3**0.5, "y_d3": 60.0}, rel=1e-12)
 
@@ -431,6 +432,7 @@ def test_a_loop_without_controls_has_a_table_of_settling_alone():
     assert [grid.title for grid in found.grids] == ["Settling time"]
 
 
+@pytest.mark.slow
 def test_a_move_there_and_back_is_settled_relative_to_its_range():
     """The end is the beginning: a step there is none, and has no figure; every other plan has a range."""
     points = [cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1), cp.Waypoint(2, 0, 0, 0)]
@@ -444,6 +446,7 @@ def test_a_move_there_and_back_is_settled_relative_to_its_range():
     assert found.grids[0].values[0, 1] == pytest.approx(t[last], abs=2e-4)
 
 
+@pytest.mark.slow
 def test_a_run_that_is_ended_loses():
     """At alpha = 3 the plan of 1 s asks for more than 15, every other for less."""
     ends = [cp.Event("u", high=15.0, stop=True)]
@@ -567,6 +570,7 @@ def test_what_is_infinite_or_undefined_is_null():
 # From a comparison
 
 
+@pytest.mark.slow
 def test_compare_asks_when_it_is_asked_to(stiff):
     compared = cp.compare(loop(100.0), MOVE, TIMES, units={"y": "m"})
     found = cp.benefit(compared, loop(100.0), alphas=(0.0, 1.0, 3.0), durations=(1.0, 1.5))
@@ -683,6 +687,7 @@ def test_further_baselines_are_compared_and_count():
     assert {"septic", "nonic"} <= {one.name for one in found.required_durations}
 
 
+@pytest.mark.slow
 def test_own_limits_are_said_to_be_so_and_given_ones_are_not():
     few = {"alphas": (1.0,), "factors": (1.0,), "decisive": ("settling_time",)}
     own = worth(loop(100.0), MOVE, TIMES, alpha=1.0, note="Mine.", **few)

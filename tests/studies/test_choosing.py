@@ -74,6 +74,7 @@ def cell(grid, end, alpha):
 # Length and squared jerk over alpha and end time
 
 
+@pytest.mark.slow
 def test_grids_are_of_length_and_squared_jerk(grids):
     assert [(grid.title, grid.unit) for grid in grids] == [
         ("Path length", "m"),

@@ -122,6 +122,7 @@ def test_where_the_trigonometric_path_is_longer_than_that_of_the_polynomial():
     assert polyline == pytest.approx(24.9, abs=0.05)
 
 
+@pytest.mark.slow
 def test_one_quintic_per_segment_is_the_shortest_of_the_figure():
     for end in (14.0, 16.0, 20.0):
         points = studies.obstacle_waypoints(end)
@@ -176,6 +177,7 @@ def test_the_sway_grows_because_of_the_integral_action():
 # Units and normalisations
 
 
+@pytest.mark.slow
 def test_each_unit_and_normalisation_is_explained_once():
     loop = cp.plants.integrator_lag_loop(5.0, outputs=("y", "u"))
     found = cp.compare(loop, [cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1, 0, 0)], T, units={"y": "m", "u": "N"})

@@ -476,6 +476,7 @@ def test_in_a_notebook_it_is_a_table_with_the_best_values_marked(standard):
     ]
 
 
+@pytest.mark.slow
 def test_names_are_escaped_wherever_they_are_shown(tmp_path):
     plans = {"<b>&": cp.Step(1.0), 'quo"te': cp.PolySpline(MOVE)}
     found = cp.compare(loop(5.0), plans, TIMES, title="<i>a & b</i>", parameters={"<u>": "<s>"})

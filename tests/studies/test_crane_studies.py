@@ -147,6 +147,7 @@ def test_linearised_loops_of_the_page_have_the_poles_of_the_nonlinear_loop():
     assert [block.name for block in linear_pendulum_loop(10.0).syslist] == ["trolley_pid", "trolley", "pendulum"]
 
 
+@pytest.mark.slow
 def test_a_step_ends_where_the_rope_goes_slack(nominal):
     """The first root of the tension, by an independent look at a run that goes on."""
     plan = nominal.plans["step"]

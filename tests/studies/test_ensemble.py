@@ -203,6 +203,7 @@ def test_waypoints_stand_for_the_standard_plans_even_from_a_generator():
     assert result.metrics["trigonometric"]["ise"][0] == pytest.approx(expected, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_waypoints_are_measured_against_as_in_a_comparison():
     move = [cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1, 0, 0)]
     result = run(lag(), {"tau": [0.5, 1.0]}, plans=move)
@@ -279,6 +280,7 @@ def crane_rate(plan, mass, friction):
     return rate
 
 
+@pytest.mark.slow
 def test_draws_of_the_crane_are_the_hand_written_right_hand_side():
     rest = [0.0, 0.0]
     points = [cp.Waypoint.from_jets(0, x=[0.0, *rest], z=[10.0, *rest])]
@@ -324,6 +326,7 @@ def test_draws_of_the_crane_are_the_hand_written_right_hand_side():
 # What it can be turned into
 
 
+@pytest.mark.slow
 def test_results_are_plain_and_null_where_nothing_is_known(exploded):
     data = json.loads(json.dumps(exploded.results(), allow_nan=False))
     assert data["params"] == {"k": [0.01, 0.05, 0.5, 0.09]}

@@ -49,6 +49,7 @@ def test_a_dask_cluster_finds_the_same_bits(found):
         assert list(ran.values()) == [True, True]  # both had some of it
 
 
+@pytest.mark.slow
 def test_failures_are_the_same_wherever_they_are_found(exploded):
     same_bits(exploded, run(exploding(), exploded.params, Elsewhere(), initial_state=[1.0]))
 
@@ -59,6 +60,7 @@ def test_a_few_draws_are_shared_out_too():
     assert len(elsewhere.tasks) > 1
 
 
+@pytest.mark.slow
 def test_submit_and_result_will_do_and_every_task_is_handed_out_before_the_first_is_waited_for(found):
     class Waits(Elsewhere):
         """Counts the tasks it has when first asked."""

@@ -178,7 +178,6 @@ def test_every_field_is_among_the_cases():
     assert list(CASES) == [entry.name for entry in dataclasses.fields(cp.Experiment)]
 
 
-@pytest.mark.each_value
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("field", CASES)
 def test_a_field_means_the_same_in_every_way(field, way, tmp_path):

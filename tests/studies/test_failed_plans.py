@@ -53,10 +53,12 @@ def headline_of(page):
     return line
 
 
+@pytest.mark.slow
 def test_the_headline_names_it(compared):
     assert "Failed, without values: far." in headline_of(render_page([Study("one", "One", compared)], "Page"))
 
 
+@pytest.mark.slow
 def test_the_headline_names_plans_whose_runs_an_event_ended():
     """Ramps from 0 to 1 pass 0.5 at half of their duration."""
     ramps = {f"in {t:g} s": cp.PolySpline([cp.Waypoint(0, 0), cp.Waypoint(t, 1.0)]) for t in (1.0, 2.0)}
@@ -75,6 +77,7 @@ def at_rate(rate):
     )
 
 
+@pytest.mark.slow
 def test_the_headline_of_a_sweep_and_of_draws_tells_how_many_failed(tmp_path):
     options = {"initial_state": [0.0], "progress": False}
     far = {"far": PLANS["far"]}
@@ -160,6 +163,7 @@ def test_an_interruption_reaches_the_caller(ended):
         cp.compare(builder(ended()), PLANS, TIMES, outputs=["out"])
 
 
+@pytest.mark.slow
 def test_a_value_of_a_sweep_at_which_a_plan_fails_is_a_failure_of_the_sweep():
     def build(rate):
         return ct.nlsys(

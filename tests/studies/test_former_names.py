@@ -50,6 +50,7 @@ def test_measure_is_a_measure_of_runs():
             cp.compare(LOOP, PLANS, TIMES, measure=wrong)
 
 
+@pytest.mark.slow
 def test_worth_is_the_benefit():
     few = {"alphas": (1.0,), "factors": (1.0,), "decisive": ("settling_time",)}
     with pytest.warns(FutureWarning, match=r"worth= of compare .* use benefit\(comparison, loop\)"):
@@ -92,6 +93,7 @@ def test_worth_that_cannot_be_asked(worth, kind):
         cp.compare(LOOP, {"step": cp.Step(1.0)}, TIMES, worth=worth)
 
 
+@pytest.mark.slow
 def test_sweep_with_params_is_monte_carlo():
     table = {"tau": [0.5, 1.0, 2.0]}
     with pytest.warns(FutureWarning, match=r"sweep with params= .* use monte_carlo\(loop, draws, plans, timepts\)"):

@@ -43,6 +43,7 @@ def write(folder, **changes):
     return path
 
 
+@pytest.mark.slow
 def test_logs_are_marked_columns_and_curves(folder, capsys):
     path = write(folder, measured={"poly": TABLE, "step": TABLE | {"log": "step.csv", "align": "r"}})
     assert main(["report", str(path), "--out", str(folder / "out")]) == 0
@@ -72,6 +73,7 @@ def test_alignment(align, offset, folder):
     assert found.measured["poly (measured)"].offset == pytest.approx(offset, abs=1e-9)
 
 
+@pytest.mark.slow
 def test_fitted_gains(folder, capsys):
     """u = y' + y'' of the plant 1/(s^2 + s), which is followed from its measured position."""
     terms = ["velocity", "acceleration"]

@@ -93,6 +93,7 @@ def governed(request):
     return force, found, found.states[rows]
 
 
+@pytest.mark.slow
 def test_the_governed_crane_always_finds_an_admissible_reference(governed):
     """Nothing disturbs: the governor holds no reference, the load arrives, and the limit is satisfied."""
     force, found, _ = governed

@@ -76,6 +76,7 @@ def test_limits_on_signals_of_the_loop(loaded):
     assert study.planned.local == {}
 
 
+@pytest.mark.slow
 def test_kinds_of_limits_on_signals_of_the_loop(loaded):
     limits = {"u": {"rate": 200.0, "rms": 30.0, "period": 50.0}, "velocity": 20.0}
     study = loaded(loop=LAG, plans=[quintic()], limits=limits, t_end=60.0, benefit=True, samples=41)
@@ -100,6 +101,7 @@ def test_limits_of_each_axis_are_a_list(loaded):
     assert found.plans["polynomial"].duration == pytest.approx(15 / 8 / 0.1, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_another_time_law_on_the_path_is_faster(loaded):
     """It takes 20/2 s at least."""
     plan = loaded(plans=[quintic(fastest="path")], limits={"velocity": 2.0}).plans["polynomial"]
@@ -237,6 +239,7 @@ def test_the_rope_of_a_crane_avoids_as_well(loaded):
     assert np.hypot(ways[:, 0] - 10.0, ways[:, 1] - 5.0).min() - 1.0 >= 0.2 - 1e-3
 
 
+@pytest.mark.slow
 def test_the_scenes_of_a_crane_show_a_wall_and_the_paths_all_obstacles(loaded):
     points = [{"time": 0.0, "x": REST, "z": [10.0, 0, 0]}, {"time": 16.0, "x": END, "z": [11.0, 0, 0]}]
     wall = {"shape": "rectangle", "x": [7.0, 13.0], "z": [12.0, 13.0]}
@@ -289,6 +292,7 @@ def test_draws_are_of_parameters_of_the_loop(loaded):
     assert table.ensemble is bands.ensemble
 
 
+@pytest.mark.slow
 def test_draws_of_a_crane_are_unknown_to_its_law(loaded):
     points = [{"time": 0.0, "x": REST, "z": [10.0, 0, 0]}, {"time": 4.0, "x": [2.0, 0, 0], "z": [10.5, 0, 0]}]
     study = loaded(
@@ -359,6 +363,7 @@ def test_a_crane_whose_rope_is_slack_at_once_is_measured(loaded):
     assert row["slack_time"] == 0.0
 
 
+@pytest.mark.slow
 def test_a_sweep_with_a_plan_without_metrics_has_a_figure_and_null(loaded, tmp_path):
     """The step's rope is slack from the first sample on: it has no settling time for any value."""
     points = [{"time": 0.0, "x": REST, "z": [10.0, 0, 0]}, {"time": 16.0, "x": END, "z": [11.0, 0, 0]}]

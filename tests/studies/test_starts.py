@@ -342,6 +342,7 @@ def test_a_discrete_block_that_remembers_is_not_called():
     assert "counting" in doubt
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("initial", [10.0, 0.0])
 def test_a_governor_holds_its_own_first_reference(initial):
     """The loop states nothing, the governor holds `initial`: at rest where that is the plan's first position."""

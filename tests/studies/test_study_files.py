@@ -499,6 +499,7 @@ def crane_study(**loop):
     }
 
 
+@pytest.mark.slow
 def test_a_crane_of_a_file_ends_at_the_slack_rope(stated):
     found = stated(crane_study()).run().comparison
     assert found.stopped == {"step": pytest.approx(5.866, abs=1e-3)}
@@ -506,6 +507,7 @@ def test_a_crane_of_a_file_ends_at_the_slack_rope(stated):
     assert "slack" in found.marks["step"]
 
 
+@pytest.mark.slow
 def test_the_old_name_of_a_law_is_read_with_a_notice(stated):
     with pytest.warns(FutureWarning, match='law "still" is deprecated.*use "setpoint"'):
         old = stated(crane_study(law="still")).run().comparison

@@ -196,7 +196,6 @@ def test_every_parameter_of_compare_is_among_the_choices():
     assert {entry.name for entry in dataclasses.fields(cp.Experiment)} <= known
 
 
-@pytest.mark.each_value
 @pytest.mark.parametrize(("name", "value"), [(name, value) for name, values in CHOICES.items() for value in values])
 def test_an_option_means_and_is_checked_the_same_however_loops_are_run(name, value):
     """As in a comparison of each loop by itself."""

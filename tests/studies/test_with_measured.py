@@ -252,6 +252,7 @@ def test_figures_show_the_measured_run_once(base):
     plt.close("all")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("names", [("y", "u"), ("y",), ("u",)])
 def test_pages_mark_the_measured_run(base, names, tmp_path):
     logs = {"quintic": machine(gain=20.0, names=names), "step": machine(cp.Step(1.0), names=names)}

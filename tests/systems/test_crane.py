@@ -117,6 +117,7 @@ STATES = st.tuples(
 INPUTS = st.tuples(st.floats(-3e4, 3e4), st.floats(-3e3, 1e3))
 
 
+@pytest.mark.slow
 @given(STATES, INPUTS)
 @examples(60)
 def test_with_the_rope_winding_motion_is_lagranges(lagrange, state, inputs):

@@ -32,7 +32,6 @@ def run(loop, t, state=None, **options):
     )
 
 
-@pytest.mark.each_value
 @BOTH
 @pytest.mark.parametrize("law", ["setpoint", "generator", "load_feedback", "dynamic"])
 def test_loops_are_the_hand_written_right_hand_side(law, wrap):

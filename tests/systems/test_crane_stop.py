@@ -45,6 +45,7 @@ def pendulum_sway(plan, time):
     return max(abs(j.size) for j in jumps) * length / g / np.sqrt(g * length)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "time", [6.0, pytest.param(4.0, marks=pytest.mark.slow), pytest.param(9.0, marks=pytest.mark.slow)]
 )
@@ -64,6 +65,7 @@ def test_a_stop_of_class_c4_leaves_no_sway(time):
     assert smooth.end < limited.end + 1.0
 
 
+@pytest.mark.slow
 def test_the_generator_requires_more_than_a_limited_jerk():
     """With the same reference generator the sway after the smooth stop is a third of that after the limited one."""
     limited = MOVE.stop(6.0, {"acceleration": [1.0, 0.5], "jerk": [2.0, 1.0]})

@@ -164,6 +164,7 @@ DRIVES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seconds", [10.0, 20.0])
 @pytest.mark.parametrize("drive", DRIVES)
 def test_hoisting_with_a_measured_rope(seconds, drive):

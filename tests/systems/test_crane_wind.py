@@ -285,7 +285,6 @@ def blown():
     return found
 
 
-@pytest.mark.each_value
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize(("wrap", "law"), CASES)
 def test_a_loop_in_the_wind_against_its_equations_by_hand(blown, wrap, law, method):
@@ -351,7 +350,6 @@ def test_a_wind_whose_axis_has_any_name_and_breakpoints_of_its_own():
 # References and initial states
 
 
-@pytest.mark.each_value
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("law", ["generator", "load_feedback", "dynamic", "feedforward", "setpoint"])
 def test_the_plans_source_as_the_reference_is_the_plain_loop(law, method):
@@ -377,6 +375,7 @@ def test_an_unhurried_time_scaling_as_the_reference_is_the_plain_loop(law):
     assert np.abs((first - second) / np.maximum(np.abs(second).max(axis=1, keepdims=True), 1e-3)).max() <= 1e-6
 
 
+@pytest.mark.slow
 def test_a_slowed_time_scaling_on_the_crane_keeps_the_path_and_the_load_nearer_its_reference():
     """A plan too fast for the actuators: with the time scaling the tracking error is less than half."""
     plan = move(2, ((0.0, 0.0, 10.0), (6.0, 20.0, 9.0)))
@@ -457,6 +456,7 @@ def test_an_initial_state_of_the_wrong_size_names_its_block():
         cp.declare(other, initial_state=[10.0, 0.0])
 
 
+@pytest.mark.slow
 def test_a_loop_in_the_wind_is_a_system_of_python_control():
     """Its own solver runs it: the same load at the end, to that solver's tolerance."""
     loop = crane_loop(Crane(), move(), wind=cp.PolySpline([cp.Waypoint(0, 0, 0), cp.Waypoint(6, 500, 0)]))

@@ -128,6 +128,7 @@ def test_the_law_is_that_of_the_crane_written_by_hand():
         np.testing.assert_allclose(found.outputs[name] / size, known.outputs[name] / size, atol=1e-7)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("quasi_static", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_integral_action_leaves_no_steady_offset(quasi_static):
     """Payload 10 % heavier than the law knows: with the integral the load reaches its place."""
@@ -161,6 +162,7 @@ def test_labels_and_suffix_name_the_references():
         cp.create_flat_iosystem(flat, FAST, suffix="")
 
 
+@pytest.mark.slow
 def test_python_control_simulates_the_loop_as_well():
     """It evaluates all blocks with zero signals first, where the maps are singular."""
     plant, flat, plan, start, _, _ = crane_case()

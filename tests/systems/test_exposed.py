@@ -67,7 +67,6 @@ def discrete_free(measured):
     return ct.ss([], [], [], [[1.0, -1.0]], inputs=["r", measured], outputs="u", name="law")
 
 
-@pytest.mark.each_value
 @pytest.mark.parametrize("name", SYSTEMS)
 @pytest.mark.parametrize("method", ["auto", "python"])
 def test_the_same_system_with_its_states(name, method):

@@ -32,6 +32,7 @@ def lift():
     return cp.PolySpline([cp.Waypoint.from_jets(t, x=x, z=z) for t, x, z in ends])
 
 
+@pytest.mark.slow
 def test_the_loop_starts_on_the_plan_and_stays_on_it():
     plan, t = lift(), np.linspace(0.0, 17.0, 18)
     loop = cp.flat_loop(crane(), plan, poles=[FAST, FAST], disturbances="wind")
@@ -59,6 +60,7 @@ def test_feedforward_alone_follows_the_plan_from_its_start():
     np.testing.assert_allclose([found.outputs["x"], found.outputs["y"]], LANE(t), atol=1e-5)
 
 
+@pytest.mark.slow
 def test_riccati_gains_minimise_the_cost_of_the_linearised_plant():
     """The cost of a run of the linearised plant is e0' P(0) e0, and larger with other gains."""
     q, r, final = np.diag([1.0, 1.0, 10.0]), np.diag([1.0, 10.0]), np.diag([1.0, 1.0, 10.0])
@@ -94,6 +96,7 @@ def test_riccati_gains_minimise_the_cost_of_the_linearised_plant():
     assert best < min(cost(0.8), cost(1.2))
 
 
+@pytest.mark.slow
 def test_riccati_law_returns_a_car_to_its_lane():
     law = cp.TVLQR(np.diag([1.0, 1.0, 10.0]), np.diag([1.0, 10.0]), final=np.diag([1.0, 1.0, 10.0]))
     loop = cp.flat_loop(CAR, LANE, law=law, initial_state=[0.0, 0.3, 0.0])
@@ -152,6 +155,7 @@ def test_a_window_ahead():
             cp.reference_window(LANE, **{"time": 0.0, "dt": 0.1, "count": 3, **wrong})
 
 
+@pytest.mark.slow
 def test_bad_arguments_of_a_loop():
     with pytest.raises(TypeError, match="one of poles and law"):
         cp.flat_loop(MOTOR, TURN)
@@ -171,6 +175,7 @@ def test_bad_arguments_of_a_loop():
         cp.flat_loop(MOTOR, TURN, poles=[-20, -25, -30], limits={"i": 1.0})
 
 
+@pytest.mark.slow
 def test_equality_with_zero_is_no_switch():
     """A law evaluates elsewhere where all its inputs are 0: this makes no breakpoints where one of them crosses 0."""
     flat = crane()

@@ -46,6 +46,7 @@ def jumps(rng, end, size, count=5):
     return sum(steps[1:], steps[0]) + cp.PolySpline(points)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [*range(2), *(pytest.param(k, marks=pytest.mark.slow) for k in range(2, 30))])
 def test_limits_hold_at_all_times(seed):
     rng = np.random.default_rng(seed)

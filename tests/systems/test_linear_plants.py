@@ -36,7 +36,6 @@ def agree(loop, num, den, gain):
     return all(np.all(np.abs(f - p) <= 1e-11 * size) for f, p, size in zip(found, (y, u, e), sizes, strict=True))
 
 
-@pytest.mark.each_value
 @pytest.mark.parametrize("gain", GAINS)
 @pytest.mark.parametrize("plant", PLANTS)
 def test_transfer_functions_of_the_loop(plant, gain):

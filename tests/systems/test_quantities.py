@@ -103,6 +103,7 @@ def test_a_flat_output_in_another_unit_is_said(lags):
     np.testing.assert_allclose(quantities(jet / gain)["u[0]"], u, rtol=1e-9, atol=1e-9 * np.abs(u).max())
 
 
+@pytest.mark.slow
 def test_the_fastest_move_of_such_a_plant():
     """90 with |u| <= 400: u is nearly y', whose peak is 2.1875 times the mean of the septic move."""
     flat = fs.LinearFlatSystem(lagged(0.02, 0.001)[0])
@@ -143,6 +144,7 @@ def test_maps_that_do_not_belong_together_give_no_limits():
 # One way: what planning takes as a system
 
 
+@pytest.mark.slow
 def test_a_crane_its_flat_system_and_its_map_are_one():
     crane, limits = cp.plants.Crane(), {"F": 20e3, "theta": 0.2, "D_d1": 3.0}
     load = cp.PolySpline(
@@ -262,6 +264,7 @@ def test_what_is_singular_at_rest_is_rejected_with_the_reason(steering, limits):
             call(FROM_REST, limits, car(steering))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("steering", one_in(2, ["two arguments", "quotient"]))
 def test_what_is_regular_at_rest_stays_limited(steering):
     found = cp.fastest(FROM_REST, {"v": 3.0}, car(steering))

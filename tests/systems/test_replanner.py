@@ -41,6 +41,7 @@ def rich():
     return t, {method: cp.simulate(loop, t, goal, state, method=method, rtol=1e-9, atol=1e-11) for method in METHODS}
 
 
+@pytest.mark.slow
 def test_compiled_and_python_agree(rich):
     _, runs = rich
     assert [runs[method].method for method in METHODS] == list(METHODS)

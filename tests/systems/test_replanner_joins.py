@@ -17,7 +17,6 @@ from ctrlplan import Waypoint
 # The plan that is made: against splines solved for directly
 
 
-@pytest.mark.each_value
 @pytest.mark.parametrize("alpha", [0.0, 1.0, 3.0, 5.0])
 @pytest.mark.parametrize("order", [0, 1, 2, 3, 4])
 def test_after_a_goal_and_a_deviation_it_is_the_plan_and_a_spline_between_two_jets(order, alpha):
@@ -59,7 +58,6 @@ def test_a_polynomial_plan_fitted_again_is_one_polynomial():
         assert np.abs(found.outputs[nu, later] - wanted).max() <= 1e-11
 
 
-@pytest.mark.each_value
 @pytest.mark.parametrize("horizon", ["shrinking", 2.0])
 @pytest.mark.parametrize("seed", range(2))
 def test_runs_are_those_of_a_replanner_of_the_peers_polynomials(seed, horizon):
@@ -93,7 +91,6 @@ def segments(edges, nodes=NODES):
     return np.array([0.5 * (a + b) + 0.5 * (b - a) * cosines for a, b in itertools.pairwise(edges)])
 
 
-@pytest.mark.each_value
 @pytest.mark.parametrize("horizon", ["shrinking", 1.5])
 @pytest.mark.parametrize("alpha", [0.0, 2.0])
 @pytest.mark.parametrize("order", [0, 1, 2, 3, 4])

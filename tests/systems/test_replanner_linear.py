@@ -54,7 +54,6 @@ def unit(order, horizon):
     return (-1.0) ** np.arange(order + 1) / horizon ** np.arange(order + 1)
 
 
-@pytest.mark.each_value
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize(("order", "horizon", "alpha"), LINEAR)
 def test_at_its_samples_the_loop_is_the_power_of_a_matrix(order, horizon, alpha, method):

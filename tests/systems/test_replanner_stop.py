@@ -117,6 +117,7 @@ def test_orders(order):
     assert np.abs(found.outputs[: order + 1, -1] - np.eye(order + 1)[0]).max() <= 1e-9
 
 
+@pytest.mark.slow
 def test_a_stop_before_the_start_and_after_the_end():
     early = run(TWO, {"stop": pressed(0.2, 0.6)})
     np.testing.assert_allclose(early.outputs[[0, 3], -1], [3.0, 3.0], rtol=1e-9)

@@ -19,7 +19,6 @@ TRIGGERS = {
 }
 
 
-@pytest.mark.each_value
 @pytest.mark.parametrize("trigger", TRIGGERS)
 @pytest.mark.parametrize("name", PLANS)
 def test_undisturbed_every_plan_is_followed_as_it_was_made(name, trigger):
@@ -43,7 +42,6 @@ def test_undisturbed_every_plan_is_followed_as_it_was_made(name, trigger):
         assert fits[-1] <= 1
 
 
-@pytest.mark.each_value
 @pytest.mark.parametrize("name", ["polynomial", "trigonometric, alpha 5", "piecewise", "joined"])
 @pytest.mark.parametrize("trigger", ["period", "period, goal", "goal"])
 def test_undisturbed_in_a_run(name, trigger):

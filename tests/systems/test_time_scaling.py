@@ -128,7 +128,6 @@ every_kind = pytest.mark.parametrize("kind", KINDS)
 TIMES = np.unique(np.append(np.linspace(-0.5, 6.0, 66), [1.0, 1.5, 2.0, 4.0]))
 
 
-@pytest.mark.each_value
 @pytest.mark.parametrize("derivatives", [0, 2, 4])
 @every_kind
 def test_at_the_zero_state_the_block_is_the_plan_at_the_time_and_goes_with_it(kind, derivatives):
@@ -304,7 +303,6 @@ def test_outputs_depend_on_the_input_through_states_alone(n):
     assert not np.array_equal(block.dynamics(1.0, state, [0.0]), block.dynamics(1.0, state, [1.0]))
 
 
-@pytest.mark.each_value
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("n", [1, 2, 4])
 def test_the_rate_stays_between_slowest_and_fastest(n, seed):

@@ -227,6 +227,7 @@ def test_a_free_mass_that_saturates_in_braking_is_spared_error_and_overshoot():
     assert found[0].max() - 4.0 < 0.8 * (plain[0].max() - 4.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [*(pytest.param(k, marks=pytest.mark.slow) for k in ("errors", "limits")), "both"])
 def test_python_and_compiled_agree(saturated, name):
     first, second = (np.asarray(saturated(name, method).outputs) for method in METHODS)

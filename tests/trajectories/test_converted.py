@@ -183,6 +183,7 @@ def test_flat_outputs_of_different_degrees(lane_change):
     assert plan.breakpoints.tolist() == [0.0, 5.0, 10.0]
 
 
+@pytest.mark.slow
 def test_states_and_inputs_within_the_deviation_stated(lane_change):
     plan = cp.as_trajectory(lane_change, signals=["theta", "delta"])
     assert plan.labels == ("theta", "delta")
@@ -246,6 +247,7 @@ def test_inputs_are_linear_between_samples():
     assert plan.deviation[1] > 0.0
 
 
+@pytest.mark.slow
 def test_result_of_python_control():
     system = ct.ss([[0, 1], [0, 0]], [[0], [1]], np.eye(2), 0, name="axle")
     cost = opt.quadratic_cost(system, np.zeros((2, 2)), 1.0)

@@ -102,6 +102,7 @@ def loaded_or_rejected(data):
     assert np.isfinite(values).all()
 
 
+@pytest.mark.slow
 @examples(400)
 @given(st.data())
 def test_one_entry_replaced_or_missing(data):
@@ -127,6 +128,7 @@ json_like = st.recursive(
 )
 
 
+@pytest.mark.slow
 @examples(300)
 @given(st.sampled_from(SAVED), json_like, st.data())
 def test_any_json_in_any_place(saved, value, data):

@@ -38,7 +38,6 @@ CLOSED = {
 }
 
 
-@pytest.mark.each_value
 @pytest.mark.parametrize("alpha", NEAR)
 @pytest.mark.parametrize("name", CLOSED)
 def test_ends_that_meet(name, alpha):

@@ -57,7 +57,6 @@ def exact_extrema(oracle, nu):
         return [float(v) for v in (values[low], values[high], times[low], times[high])]
 
 
-@pytest.mark.each_value
 @pytest.mark.parametrize("nu", range(4))
 @pytest.mark.parametrize("alpha", [0.0, 1.0, np.pi, 5.5])
 @pytest.mark.parametrize(
@@ -230,7 +229,6 @@ RISES = {
 }
 
 
-@pytest.mark.each_value
 @pytest.mark.parametrize("width", [1e-2, 1e-3, 1e-4])
 @pytest.mark.parametrize("name", RISES)
 def test_narrow_peaks_of_smooth_functions(name, width):

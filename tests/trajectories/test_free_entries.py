@@ -26,7 +26,6 @@ PATTERNS = {
 }
 
 
-@pytest.mark.each_value
 @pytest.mark.parametrize("alpha", ALPHAS)
 @pytest.mark.parametrize("pattern", PATTERNS)
 def test_birkhoff_data(pattern, alpha):
@@ -38,7 +37,6 @@ def test_birkhoff_data(pattern, alpha):
     assert plan.degree == ((oracle.m,) if alpha else (oracle.size - 1,))
 
 
-@pytest.mark.each_value
 @pytest.mark.parametrize("alpha", [0.0, 1e-4, 1.0, 4.0, 5.0])
 @pytest.mark.parametrize("count", [4, 6, 8, 10])
 def test_many_waypoints_without_velocity(count, alpha):

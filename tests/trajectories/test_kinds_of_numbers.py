@@ -117,7 +117,6 @@ SEVERAL = [
 ]
 
 
-@pytest.mark.each_value
 @pytest.mark.parametrize("value", WRONG, ids=repr)
 @pytest.mark.parametrize("place", SCALARS)
 def test_one_number(place, value):
@@ -127,7 +126,6 @@ def test_one_number(place, value):
         SCALARS[place](value)
 
 
-@pytest.mark.each_value
 @pytest.mark.parametrize("value", [*WRONG, *SEVERAL], ids=repr)
 @pytest.mark.parametrize("place", [place for place in ARRAYS if "from_jets" not in place])
 def test_several_numbers(place, value):

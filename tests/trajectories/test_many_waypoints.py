@@ -162,6 +162,7 @@ def test_segments_of_very_different_durations_keep_their_digits(ratio, monkeypat
     assert (np.abs(right - left) <= 1e-12 * np.abs(right).max(axis=2, keepdims=True)).all()
 
 
+@pytest.mark.slow
 def test_random_times_of_thirty_points_are_determined():
     """Three of fifty such sets counted as undetermined where all segments had one unit of time."""
     for seed in range(50):

@@ -131,6 +131,7 @@ def check(case, symmetries=True):
         assert scaled.duration == pytest.approx(plan.duration * time, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_random_cases():
     for case in cases(300, 1):
         check(case)
@@ -199,6 +200,7 @@ def check_by_linear_program(count, seed):
         assert not is_feasible(case, 0.99 * duration)
 
 
+@pytest.mark.slow
 def test_no_jerk_in_steps_is_faster():
     check_by_linear_program(3, 4)
 
@@ -317,6 +319,7 @@ def test_axes_end_together_or_alone():
                 assert max(-low, high) <= limit[axis] * (1 + 1e-9)
 
 
+@pytest.mark.slow
 def test_random_axes_together():
     rng = np.random.default_rng(7)
     for k in range(60):

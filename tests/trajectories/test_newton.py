@@ -86,7 +86,6 @@ def jets_for(lengths, seed=3):
     return [rng.normal(size=k).tolist() for k in lengths]
 
 
-@pytest.mark.each_value
 @pytest.mark.parametrize("alpha", [0.0, 1e-3, 0.3, 1.0, np.pi, 5.0, 6.28])
 @pytest.mark.parametrize("pattern", PATTERNS)
 def test_equation_3_solved_directly(pattern, alpha):
@@ -140,7 +139,6 @@ def test_fourier_has_a_row_for_every_axis():
     np.testing.assert_allclose(plan(t), [x, z], rtol=1e-14)
 
 
-@pytest.mark.each_value
 @pytest.mark.parametrize("gamma", [-2.0, 0.0, 0.4, 1.0, 50.0])
 @pytest.mark.parametrize("alpha", [0.5, 2.0, 5.5])
 @pytest.mark.parametrize("pattern", ["two points, N 2", "rest to rest, N 6", "uneven, N 12"])
@@ -187,7 +185,6 @@ def test_alpha_next_to_a_whole_turn(gap):
     assert error(plan, Direct(times, jets, alpha, digits=150)) <= 1e-12
 
 
-@pytest.mark.each_value
 @pytest.mark.parametrize("alpha", [0.0, 1e-4, 1.0, 5.5])
 @pytest.mark.parametrize("gap", [1e-3, 1e-6, 1e-9])
 def test_waypoints_close_together(gap, alpha):

@@ -57,7 +57,6 @@ def test_a_short_series_is_the_beginning_of_a_long_one(alpha, order):
         assert short == whole[: order + 1]
 
 
-@pytest.mark.each_value
 @pytest.mark.parametrize("size", [1, 2, 3, 5, 8])
 @pytest.mark.parametrize("alpha", ALPHAS)
 def test_a_combination_is_the_series_of_its_definition(alpha, size):

@@ -104,7 +104,6 @@ def short(gap, where, size, heights=(0.0, 1.0, 1.5, 2.0)):
     return times, [[heights[0], *rest], [heights[1]], [heights[2]], [heights[3], *rest]]
 
 
-@pytest.mark.each_value
 @pytest.mark.parametrize("gap", [1e-3, 1e-5, pytest.param(1e-7, marks=pytest.mark.slow), 1e-9])
 @pytest.mark.parametrize("size", [2, 3, 4])
 @pytest.mark.parametrize("alpha", [0.0, 2.0])

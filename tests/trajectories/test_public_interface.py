@@ -83,6 +83,7 @@ def test_it_is_made_again_through_other_waypoints_with_its_options():
         plan.through([Waypoint(0, 0), Waypoint(1, 1)])
 
 
+@pytest.mark.slow
 def test_functions_of_waypoint_splines_accept_it():
     found = cp.fastest(PLAN, {"velocity": 3.0}, hold="waypoints")
     assert type(found.plan) is NaturalCubic

@@ -59,7 +59,6 @@ def orders_of(plan, count, rng):
     return {"uniform": np.linspace(plan.start, plan.end, count), "sorted": np.sort(inside), "arbitrary": inside}
 
 
-@pytest.mark.each_value
 @pytest.mark.parametrize("alpha", ALPHAS)
 @pytest.mark.parametrize("size", [6, 12, 24, 40])
 def test_all_paths_agree_with_the_jets(size, alpha):
@@ -79,7 +78,6 @@ def test_all_paths_agree_where_taylor_terms_cancel(size):
             assert disagreement(plan, t) <= 1, (name, count)
 
 
-@pytest.mark.each_value
 @pytest.mark.parametrize("order", [0, 1, 3, 4])
 @pytest.mark.parametrize("alpha", [0.0, 2.0, 5.5])
 def test_other_orders_of_derivatives(alpha, order):
@@ -187,7 +185,6 @@ def test_axes_that_vanish_or_stand_still():
         assert (np.abs(jet - exact)[:, 2:] <= 1e-13 * size[:, 2:]).all()
 
 
-@pytest.mark.each_value
 @pytest.mark.parametrize("name", ["uniform", "sorted", "arbitrary"])
 @pytest.mark.parametrize("segments", [1, 3])
 def test_memory_is_a_small_multiple_of_the_result(segments, name):

@@ -145,7 +145,6 @@ def test_at_a_number_it_is_the_jet_over_factorials(name):
             assert np.abs(np.array(found) - wanted).max() <= 1e-15 * np.abs(wanted).max()
 
 
-@pytest.mark.each_value
 @both
 @every
 def test_at_a_symbol_it_is_the_same_in_every_segment_before_and_after(name, symbol):

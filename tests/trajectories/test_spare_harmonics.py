@@ -81,7 +81,6 @@ def cost(plan, smooth):
     return 0.5 * plan.duration * WEIGHTS @ plan(t, smooth) ** 2
 
 
-@pytest.mark.each_value
 @pytest.mark.parametrize("smooth", [1, 3])
 @pytest.mark.parametrize("alpha", [0.0, 2.0, 5.5])
 @pytest.mark.parametrize("data", DATA)

@@ -328,6 +328,7 @@ def check_paths(count, seed):
     return shares
 
 
+@pytest.mark.slow
 def test_no_law_of_the_same_kind_is_shorter():
     check_paths(1, 5)
 

@@ -112,6 +112,7 @@ def test_rounding_of_the_positions_is_no_range():
     TrigSpline([Waypoint(0, 5, 0, 0), Waypoint(1, np.nextafter(5, 6), 0, 0)], alpha=5.0)
 
 
+@pytest.mark.slow
 def test_choosing_alpha_warns_of_the_choice_only():
     found = cp.choose_alpha(REST, "peak_jerk")
     assert found.alpha < 3.0

@@ -322,7 +322,6 @@ def test_csv(plan, tmp_path):
     np.testing.assert_array_equal(values[1:], plan.jet(t, 1).transpose(1, 0, 2).reshape(-1, t.size))
 
 
-@pytest.mark.each_value
 @moving
 @pytest.mark.parametrize("ending", ENDINGS)
 def test_it_is_exported_to_every_format(plan, ending, tmp_path):

@@ -36,7 +36,6 @@ def to_rest(order, horizon, alpha, s, highest):
 # One transition
 
 
-@pytest.mark.each_value
 @pytest.mark.parametrize("alpha", ALPHAS)
 @pytest.mark.parametrize("order", [0, 1, 2, 3, 4])
 def test_the_plan_is_that_of_the_direct_solution(order, alpha):
@@ -183,7 +182,6 @@ def test_gains_of_polynomials_for_every_horizon(order, horizon):
     assert np.abs(Transition(order, horizon).gains() / wanted - 1.0).max() <= 1e-11
 
 
-@pytest.mark.each_value
 @pytest.mark.parametrize("alpha", [0.3, 1.0, 2.5, math.pi, 4.0, 5.5])
 @pytest.mark.parametrize("order", [0, 1, 2, 3, 4])
 def test_gains_of_trigonometric_plans(order, alpha):
