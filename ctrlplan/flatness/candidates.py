@@ -112,11 +112,15 @@ def flat_candidates(
 
     Examples
     --------
+    >>> import control as ct
     >>> import ctrlplan as cp
-    >>> crane = cp.plants.Crane().iosystem()
-    >>> best = cp.flat_candidates(crane, at={"R": 10.0})[0]
-    >>> best.outputs, best.orders
-    (('x', 'z'), (4, 4))
+    >>> import numpy as np
+    >>> def rates(t, x, u, params):
+    ...     return [u[0] * np.cos(x[2]), u[0] * np.sin(x[2]), u[1]]
+    >>> names = ["x", "y", "heading"]
+    >>> unicycle = ct.nlsys(rates, inputs=["speed", "turn"], states=names, outputs=names)
+    >>> [(flat.outputs, flat.orders) for flat in cp.flat_candidates(unicycle)]
+    [(('x', 'y'), (2, 2))]
     """
     states, outputs = list(system.state_labels or ()), list(system.output_labels or ())
     names = list(dict.fromkeys([*outputs, *states]))
