@@ -80,6 +80,11 @@ class DerivedFlatSystem(FlatSystem):
         return {**self.__dict__, "_analysis": None}
 
     @property
+    def derived(self) -> DerivedFlatSystem:
+        """The same object."""
+        return self
+
+    @property
     def analysis(self) -> Analysis:
         """Expressions of the maps.
 

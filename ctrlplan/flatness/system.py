@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import cached_property
+from typing import TYPE_CHECKING
 
 import control.flatsys as fs
 import numpy as np
@@ -12,6 +14,9 @@ from ctrlplan._checks import check_kind, checked_labels, checked_timepts, defaul
 from ctrlplan._display import Displayed, Facts, Part
 from ctrlplan._types import Array, Value
 from ctrlplan.trajectories import Trajectory
+
+if TYPE_CHECKING:
+    from ctrlplan.flatness.derived import DerivedFlatSystem
 
 Params = Mapping[str, float] | None
 Flag = Sequence[Array]
@@ -124,6 +129,19 @@ class FlatSystem(Displayed, fs.FlatSystem):  # type: ignore[misc]
             )
 
     __repr__ = fs.FlatSystem.__repr__
+
+    def __getstate__(self) -> dict[str, object]:
+        """State for a copy or a pickle: derived maps are derived again."""
+        return {name: value for name, value in self.__dict__.items() if name != "derived"}
+
+    @cached_property
+    def derived(self) -> DerivedFlatSystem:
+        """The plant with maps that follow from its equations, for laws and Jacobians (extra ``fast``)."""
+        from ctrlplan.flatness.deriving import flat_system
+
+        if set(self.flat_labels) <= {*self.output_labels, *self.state_labels}:
+            return flat_system(self, self.flat_labels)
+        return flat_system(self, lambda x, u, params: [row[0] for row in self.forward(x, u, params)])
 
     def _describe(self) -> Iterator[Part]:
         outputs = [f"{label} (derivatives up to {r})" for label, r in zip(self.flat_labels, self.orders, strict=True)]

@@ -92,8 +92,9 @@ def create_flat_iosystem(
     start : array_like, shape (extension,), optional
         Initial states of the extension. Default: those at the operating point.
     labels : sequence of str or str, optional
-        Names of the flat outputs. Default: the names of the plant's outputs if
-        these are the flat outputs and have names, otherwise y, or y1, y2, ...
+        Names of the flat outputs. Default: those that `flat` has or, for a flat
+        system of python-control, the names of its outputs if these are the flat
+        outputs, otherwise y, or y1, y2, ...
     suffix : str, optional
         Appended to each label in the names of the references.
     name : str, optional
@@ -181,6 +182,7 @@ def _static_law(
     plant = checked_plant(flat, "flat")
     if labels is None:
         warn_of_output(flat)
+        labels = flat.flat_labels if isinstance(flat, FlatSystem) else None
     probes = random_probes(plant)
     names = flat_labels(plant, probes, labels)
     check_linearises(plant, probes, names)
@@ -230,13 +232,9 @@ def _static_law(
 
 def derived_system_of(flat: fs.FlatSystem, options: bool) -> DerivedFlatSystem | None:
     """Flat system for which the law is derived from equations; None for static maps of its own."""
-    if isinstance(flat, DerivedFlatSystem):
-        return flat
-    extended = isinstance(flat, FlatSystem) and flat.extension > 0
-    if not (extended or options):
+    if isinstance(flat, FlatSystem) and (options or flat.extension > 0 or isinstance(flat, DerivedFlatSystem)):
+        return flat.derived
+    if not options:
         return None
     plant = checked_plant(flat, "flat")
-    names = flat.flat_labels if isinstance(flat, FlatSystem) else ()
-    if names and set(names) <= {*flat.output_labels, *flat.state_labels}:
-        return flat_system(flat, names)
     return flat_system(flat, lambda x, u, params: [row[0] for row in plant.forward(x, u)])

@@ -8,12 +8,17 @@ Entries may be arrays, numbers or symbols.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 
 import numpy as np
 
 from ctrlplan._types import Array, Value
 from ctrlplan.trajectories.common import FACTORIALS
+
+_WHOLE = np.array([math.factorial(k) for k in range(len(FACTORIALS))], dtype=object)
+_WHOLE.flags.writeable = False
+"""Factorials as whole numbers, which leave symbols exact."""
 
 Quantity = Value
 """Argument of the formulas of plants: a number, an array, a Taylor series or a symbol."""
@@ -84,9 +89,9 @@ def sincos(a: Array) -> tuple[Array, Array]:
 class Taylor:
     """Truncated Taylor series with arithmetic operators.
 
-    Supports numbers, arrays and other series as operands, and `numpy.sin` and
-    `numpy.cos`, so that the equations of a plant also give derivatives of their
-    results. A result has the order of its shorter argument.
+    Supports numbers, arrays and other series as operands, and `numpy.sin`,
+    `numpy.cos` and `numpy.tan`, so that the equations of a plant also give
+    derivatives of their results. A result has the order of its shorter argument.
 
     Attributes
     ----------
@@ -100,10 +105,15 @@ class Taylor:
         self.terms = terms
 
     @classmethod
+    def constant(cls, value: Value) -> Taylor:
+        """Series of order 0 of a number, an array or a symbol."""
+        return cls(_constant(value, np.shape(value) if _is_numeric(value) else ()))
+
+    @classmethod
     def integral(cls, start: Array, rate: Taylor) -> Taylor:
         """Series of the integral of a rate, with its initial value."""
         counts = np.arange(1, len(rate.terms) + 1).reshape(-1, *[1] * (rate.terms.ndim - 1))
-        return cls(np.concatenate([np.broadcast_to(start, rate.terms.shape[1:])[None], rate.terms / counts]))
+        return cls(np.concatenate([_constant(start, rate.terms.shape[1:]), rate.terms / counts]))
 
     def __add__(self, other: Operand) -> Taylor:
         n, terms = self._with(other)
@@ -136,6 +146,10 @@ class Taylor:
         """Cosine; called by `numpy.cos`."""
         return Taylor(sincos(self.terms)[1])
 
+    def tan(self) -> Taylor:
+        """Tangent; called by `numpy.tan`."""
+        return Taylor(divide(*sincos(self.terms)))
+
     __radd__ = __add__
     __rmul__ = __mul__
 
@@ -144,7 +158,7 @@ class Taylor:
         if isinstance(other, Taylor):
             n = min(len(self.terms), len(other.terms))
             return n, other.terms[:n]
-        constant = np.zeros(self.terms.shape)
+        constant = np.zeros(self.terms.shape, dtype=float if _is_numeric(other) else object)
         constant[0] = other
         return len(constant), constant
 
@@ -167,5 +181,15 @@ def _stacked(terms: list[Value]) -> Array:
     return out
 
 
+def _constant(value: Value, shape: tuple[int, ...]) -> Array:
+    """Series of order 0."""
+    return np.broadcast_to(value, shape)[None] if _is_numeric(value) else _stacked([value])
+
+
+def _is_numeric(value: Value) -> bool:
+    return isinstance(value, np.ndarray | np.generic | float | int)
+
+
 def _factorials(values: Array) -> Array:
-    return FACTORIALS[: len(values)].reshape(-1, *[1] * (values.ndim - 1))
+    known = FACTORIALS[: len(values)] if values.dtype != object else _WHOLE[: len(values)]
+    return known.reshape(-1, *[1] * (values.ndim - 1))

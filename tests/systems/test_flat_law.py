@@ -318,7 +318,7 @@ def test_the_linearised_joint_loop_has_the_poles_at_every_angle(angle):
 def test_it_agrees_with_python_controls_own_simulation():
     plant = flexible_joint()
     plan = smooth(4)
-    loop = closed(plan, create_flat_iosystem(plant, POLES), plant, 4)
+    loop = closed(plan, create_flat_iosystem(plant, POLES, labels="y"), plant, 4)
     t = np.linspace(0.5, 2.5, 21)
     start = array(0.1, 0.1, 0.0, 0.0)
     peer = ct.input_output_response(loop, t, 0, start, solve_ivp_kwargs={"rtol": 1e-9, "atol": 1e-9})

@@ -2,57 +2,110 @@
 
 from __future__ import annotations
 
-import numpy as np
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from types import SimpleNamespace
 
-from ctrlplan._checks import checked_finite
-from ctrlplan._types import Params, Value
+from ctrlplan._types import Value
 from ctrlplan.flatness import FlatSystem
-from ctrlplan.systems.plants.parameters import overridden
+from ctrlplan.systems.plants.parameters import parameter
+from ctrlplan.systems.plants.plant import Signals, StateSpacePlant
 
 
-def dc_motor(
-    *,
-    resistance: float = 1.0,
-    inductance: float = 0.5,
-    motor_constant: float = 0.01,
-    inertia: float = 0.01,
-    friction: float = 0.1,
-    name: str = "dc_motor",
-) -> FlatSystem:
-    r"""DC motor with armature inductance, a flat system of order 3.
+@dataclass(frozen=True, kw_only=True, repr=False)
+class DCMotor(StateSpacePlant):
+    r"""DC motor with armature inductance.
 
     .. math:: J \ddot\varphi + b \dot\varphi = K i, \qquad L \dot i + R i + K \dot\varphi = V
 
-    The states are also the outputs: angle [rad], speed [rad/s], current
-    [A]. Input: voltage [V]. Flat output: the angle.
-
-    Parameters given to a simulation under these names override those of the
-    plant, but not those of its flat maps.
+    States: angle [rad], speed [rad/s], current [A]. Input: voltage [V]. Flat output:
+    the angle, of order 3.
 
     Parameters
     ----------
-    resistance : float, optional
+    resistance : float
         R of the armature [ohm].
-    inductance : float, optional
+    inductance : float
         L of the armature [H].
-    motor_constant : float, optional
+    motor_constant : float
         K, the torque and back-EMF constant [N m/A = V s/rad].
-    inertia : float, optional
+    inertia : float
         J of rotor and load [kg m^2].
-    friction : float, optional
+    friction : float
         b, the viscous friction coefficient [N m s].
-    name : str, optional
-        Name of the block.
-
-    Returns
-    -------
-    ctrlplan.flatness.FlatSystem
-        A `control.flatsys.FlatSystem`.
 
     Raises
     ------
     ValueError
         If a parameter is not finite and positive (friction: non-negative).
+
+    Notes
+    -----
+    Source: the values are those of the Control Tutorials for MATLAB and Simulink,
+    University of Michigan, "DC motor position".
+
+    Examples
+    --------
+    >>> import ctrlplan as cp
+    >>> turn = cp.PolySpline([cp.Waypoint(0, 0, 0, 0, 0), cp.Waypoint(1, 2, 0, 0, 0)], labels="angle")
+    >>> loop = cp.flat_loop(cp.plants.DCMotor().flat_system(), turn, poles=[-20, -25, -30])
+    >>> cp.simulate(loop, [0.0, 0.5, 1.0]).outputs["angle"].round(6).tolist()
+    [0.0, 1.0, 2.0]
+    """
+
+    resistance: float = parameter(1.0, "ohm")
+    inductance: float = parameter(0.5, "H")
+    motor_constant: float = parameter(0.01, "N m/A")
+    inertia: float = parameter(0.01, "kg m^2")
+    friction: float = parameter(0.1, "N m s", zero=True)
+
+    title, name = "DC motor", "dc_motor"
+    signals = Signals(
+        states={"angle": "rad", "speed": "rad/s", "current": "A"},
+        inputs={"voltage": "V"},
+        flat_outputs=("angle",),
+        orders=(3,),
+    )
+
+    def rates(self, x: Value, u: Value, p: SimpleNamespace) -> Sequence[Value]:
+        """Derivatives of the states."""
+        return [
+            x[1],
+            (p.motor_constant * x[2] - p.friction * x[1]) / p.inertia,
+            (u[0] - p.resistance * x[2] - p.motor_constant * x[1]) / p.inductance,
+        ]
+
+    def reverse(
+        self, jet: Value, p: SimpleNamespace, at: Mapping[str, float]
+    ) -> tuple[Sequence[Value], Sequence[Value]]:
+        """States and input from the jet of the angle."""
+        ((angle, speed, second, third),) = jet
+        current = (p.inertia * second + p.friction * speed) / p.motor_constant
+        changing = p.inductance * (p.inertia * third + p.friction * second) / p.motor_constant
+        return [angle, speed, current], [changing + p.resistance * current + p.motor_constant * speed]
+
+
+def dc_motor(*, name: str = "dc_motor", **parameters: float) -> FlatSystem:
+    """DC motor as a flat system, short for ``DCMotor(...).flat_system()``.
+
+    Parameters
+    ----------
+    name : str, optional
+        Name of the system.
+    **parameters : float
+        Parameters of `DCMotor`: resistance, inductance, motor_constant, inertia,
+        friction.
+
+    Returns
+    -------
+    FlatSystem
+        A `control.flatsys.FlatSystem`.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If a parameter is unknown, or not finite and positive (friction:
+        non-negative).
 
     Examples
     --------
@@ -65,42 +118,4 @@ def dc_motor(
     >>> round(float(response.outputs[1, -1]), 4)  # K/(R b + K^2)
     0.0999
     """
-    parameters = {
-        "resistance": resistance,
-        "inductance": inductance,
-        "motor_constant": motor_constant,
-        "inertia": inertia,
-    }
-    for label, value in parameters.items():
-        checked_finite(value, label, above=0.0)
-    checked_finite(friction, "friction", minimum=0.0)
-    R, L, K, J, b = resistance, inductance, motor_constant, inertia, friction
-    own = {**parameters, "friction": friction}
-
-    def update(t: float, x: Value, u: Value, params: Params) -> Value:
-        R, L, K, J, b = overridden(own, params)
-        return np.array([x[1], (K * x[2] - b * x[1]) / J, (u[0] - R * x[2] - K * x[1]) / L])
-
-    def forward(x: Value, u: Value, params: Params | None = None) -> list[Value]:
-        _, second, current_rate = update(0.0, x, u, {})
-        return [np.array([x[0], x[1], second, (K * current_rate - b * second) / J])]
-
-    def reverse(flag: Value, params: Params | None = None) -> tuple[Value, Value]:
-        angle, speed, second, third = flag[0]
-        current = (J * second + b * speed) / K
-        voltage = L * (J * third + b * second) / K + R * current + K * speed
-        return np.array([angle, speed, current]), np.array([voltage])
-
-    states = ["angle", "speed", "current"]
-    return FlatSystem(
-        forward,
-        reverse,
-        update,
-        lambda t, x, u, params: x,
-        orders=(3,),
-        flat_labels=("angle",),
-        states=states,
-        inputs=["voltage"],
-        outputs=states,
-        name=name,
-    )
+    return DCMotor(**parameters).flat_system(name)

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from ctrlplan._display import Displayed, Facts, Part
+from ctrlplan._display import Facts, Part
 from ctrlplan.systems.plants.crane import flatness, linear, model, rope
-from ctrlplan.systems.plants.crane.parameters import FRICTIONS, POSITIVE, CraneParameters
+from ctrlplan.systems.plants.crane.parameters import CraneParameters
+from ctrlplan.systems.plants.parameters import parameters_of
+from ctrlplan.systems.plants.plant import Plant
 
-_UNITS = dict(zip((*POSITIVE, *FRICTIONS), ("kg", "kg", "kg m^2", "m", "m/s^2", "N s/m", "N m s"), strict=True))
 
-
-class Crane(CraneParameters, Displayed):
+class Crane(CraneParameters, Plant):
     """Crane with trolley, drum and a load on a rope.
 
     Equations, flat maps, linear models and PIDs are methods. z points down.
@@ -51,6 +51,9 @@ class Crane(CraneParameters, Displayed):
     [0.0, -1226.25]
     """
 
+    title, name = "Crane", "crane"
+    signals = model.SIGNALS
+
     # The nonlinear plant: model.py
     iosystem = model.iosystem
     equilibrium = model.equilibrium
@@ -58,7 +61,7 @@ class Crane(CraneParameters, Displayed):
     energy = model.energy
 
     # Flat maps and checks of a plan: flatness.py, rope.py
-    flat_system = flatness.flat_system
+    closed_form = flatness.closed_form
     quantities = flatness.quantities
     check = flatness.check
     rope = rope.rope
@@ -74,6 +77,9 @@ class Crane(CraneParameters, Displayed):
 
     def _describe(self) -> Iterator[Part]:
         yield f"Crane with a load of {self.load_mass:g} kg"
-        rows = [(name.replace("_", " "), f"{getattr(self, name):g} {unit}") for name, unit in _UNITS.items()]
+        rows = [
+            (entry.name.replace("_", " "), f"{getattr(self, entry.name):g} {entry.metadata['unit']}")
+            for entry in parameters_of(self)
+        ]
         yield Facts([*rows, ("rope winding with theta", "included" if self.rope_wrap else "neglected")])
         yield "Flat outputs: x and z of the load. Inputs: force F [N] of the trolley and torque C [N m] of the drum."

@@ -8,26 +8,31 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ctrlplan._types import Array
-from ctrlplan.flatness import FlatSystem
 from ctrlplan.systems import series
+from ctrlplan.systems.plants.closed_form import ClosedFormFlatSystem
 from ctrlplan.systems.plants.crane import model
 from ctrlplan.systems.plants.crane.parameters import CraneParameters, Numbers
 from ctrlplan.systems.plants.crane.rope import check_taut
+from ctrlplan.systems.plants.parameters import defaults_of
 from ctrlplan.systems.series import Taylor
 from ctrlplan.traits import declare
 from ctrlplan.trajectories import Extrema, Trajectory
 
-FLAT_LABELS = ("x", "z")
-ORDERS = (4, 4)
+if TYPE_CHECKING:
+    from ctrlplan.systems.plants.crane.crane import Crane
+
+FLAT_LABELS = model.SIGNALS.flat_outputs
+ORDERS = model.SIGNALS.orders
 
 
-def flat_system(crane: CraneParameters, name: str = "crane") -> FlatSystem:
-    """Crane as a flat system with the flat outputs x and z.
+def closed_form(crane: Crane, name: str, at: Mapping[str, float]) -> ClosedFormFlatSystem:
+    """Crane as a flat system with the flat outputs x and z, by (15a-d).
 
     States: D, R, theta, D_d1, R_d1, theta_d1. Inputs: F and C. Outputs: x, z, D,
     R, theta, x_d1, z_d1, D_d1, R_d1, theta_d1, T. The orders are (4, 4), with an
@@ -43,7 +48,8 @@ def flat_system(crane: CraneParameters, name: str = "crane") -> FlatSystem:
     >>> x[:2].tolist(), u.tolist()
     ([1.75, 10.0], [0.0, -1226.25])
     """
-    system = FlatSystem(
+    system = ClosedFormFlatSystem(
+        crane,
         partial(forward, crane),
         partial(reverse, crane),
         partial(model.update, crane),
@@ -54,6 +60,8 @@ def flat_system(crane: CraneParameters, name: str = "crane") -> FlatSystem:
         inputs=("F", "C"),
         outputs=model.OUTPUTS,
         name=name,
+        at=at,
+        params=defaults_of(crane),
         quantities=partial(quantities, crane),
     )
     return declare(system, feedthrough=model.feedthrough(model.OUTPUTS, 2))

@@ -18,7 +18,8 @@ from numpy.typing import ArrayLike, NDArray
 from ctrlplan._checks import checked_finite
 from ctrlplan._types import Array
 from ctrlplan.systems.plants.crane.parameters import CraneParameters, Numbers
-from ctrlplan.systems.plants.parameters import overridden
+from ctrlplan.systems.plants.parameters import defaults_of, overridden
+from ctrlplan.systems.plants.plant import Signals
 from ctrlplan.systems.series import Quantity
 from ctrlplan.traits import declare
 
@@ -28,6 +29,14 @@ Drive = Literal["force", "velocity"]
 
 STATES = ("D", "R", "theta", "D_d1", "R_d1", "theta_d1")
 OUTPUTS = ("x", "z", "D", "R", "theta", "x_d1", "z_d1", "D_d1", "R_d1", "theta_d1", "T")
+SIGNALS = Signals(
+    states=dict(zip(STATES, ("m", "m", "rad", "m/s", "m/s", "rad/s"), strict=True)),
+    inputs={"F": "N", "C": "N m"},
+    outputs={"x": "m", "z": "m", "x_d1": "m/s", "z_d1": "m/s", "T": "N"},
+    flat_outputs=("x", "z"),
+    orders=(4, 4),
+    at={"R": 10.0},
+)
 OF_VELOCITY_DRIVE = ("F", "sway_frequency")
 """Outputs of a crane with velocity drive in addition."""
 
@@ -92,6 +101,7 @@ def iosystem(
         inputs=["F" if lag is None else "v_cmd", "C", *(["wind"] if wind else [])],
         outputs=list(outputs),
         name=name,
+        params=defaults_of(crane),
     )
     return declare(block, feedthrough=feedthrough(outputs, 2 + wind))
 
