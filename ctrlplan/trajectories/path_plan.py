@@ -240,7 +240,8 @@ class PathPlan(Joined):
     def on_cycle(self, dt: float, limits: Mapping[str, object] | None = None) -> Trajectory:
         """Plan whose segments last whole cycles of a drive; as `Trajectory.on_cycle`."""
         found = super().on_cycle(dt, limits)
-        return self._through(found.parts, self.directions) if isinstance(found, Joined) else found
+        parts = [part for part in getattr(found, "parts", ()) if isinstance(part, Retimed)]
+        return self if found is self else self._through(parts, self.directions)
 
     def with_laws(self, laws: Sequence[Trajectory]) -> Self:
         """Same path with other time laws."""
@@ -302,8 +303,8 @@ def _checked_curves(segments: Iterable[Trajectory]) -> tuple[Trajectory, ...]:
         speed = curve.extrema_of(_tangent_length, 1)
         if not speed.minimum[0] > _SLOWEST * speed.maximum[0]:
             raise ValueError(
-                f"{name} must have abs(dp/ds) above 0, got {speed.minimum[0]:.3g} at s = {speed.time_min[0]:.6g} and up "
-                f"to {speed.maximum[0]:.3g}; prescribe the first derivative of the curve there"
+                f"{name} must have abs(dp/ds) above 0, got {speed.minimum[0]:.3g} at s = {speed.time_min[0]:.6g} and "
+                f"up to {speed.maximum[0]:.3g}; prescribe the first derivative of the curve there"
             )
     return curves
 
@@ -345,8 +346,7 @@ def _timed(
         rates = np.abs([own.jet(own.start, 1)[1, 0], own.jet(own.end, 1, left=True)[1, 0]])
         if (moving := rates > _SMALL * own.peak(1)).any():
             end = int(moving.argmax())
-            raise ValueError(
-                f"law[{k}] must be at rest at its ends, got the rate {rates[end]:.4g} at {(own.start, own.end)[end]:.6g} s"
-            )
+            time = (own.start, own.end)[end]
+            raise ValueError(f"law[{k}] must be at rest at its ends, got the rate {rates[end]:.4g} at {time:.6g} s")
         parts.append(part)
     return parts

@@ -115,7 +115,7 @@ class Retimed(Trajectory):
         return out
 
     def law_jet(self, segment: int, s: Array, order: int) -> tuple[Array, int]:
-        """Derivatives (order + 1, 1, ntime) of the time law in a segment, and the number of the plan's segment there."""
+        """Derivatives (order + 1, 1, ntime) of the law in a segment, and the number of the plan's segment there."""
         of_law, of_plan = self._segments[segment]
         return self.law.segment_jet(of_law, s + self._since(segment), order), of_plan
 
