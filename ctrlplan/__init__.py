@@ -8,6 +8,7 @@ Plan a move
     TrigSpline, PolySpline    one spline through all waypoints: trigonometric, polynomial (alpha = 0)
     PiecewiseSpline           one spline for each segment, continuous in the derivatives left free
     SCurve, Trapezoid, Step   moves with limited jerk, with limited acceleration, without limits
+    PathPlan                  path of a vehicle that stops and turns back: curves, directions, time laws
     Clipped, MotionProfile    part of a plan; what a stop (``plan.stop``) consists of
     Shaper                    input shaping of any plan, against known modes or a measured spectrum
     residual_spectrum         vibration that a plan leaves in a mode, by frequency; residual_plot draws it
@@ -89,6 +90,7 @@ _EXPORTS = {
     "trajectories": (
         "Clipped",
         "MotionProfile",
+        "PathPlan",
         "PiecewiseSpline",
         "PolySpline",
         "Retimed",

@@ -22,6 +22,7 @@ from ctrlplan._display import Displayed, Facts, Table, number, to_html, to_text
 from ctrlplan.studies import Study
 
 MOVE = [cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1, 0, 0)]
+LANE = [cp.Waypoint(0, [0, 0], [20, 0]), cp.Waypoint(1, [20, 3], [20, 0])]
 PLANE = [cp.Waypoint(0, [0, 0], 0, 0), cp.Waypoint(10, [20, 0], 0, 0)]
 TIMES = np.linspace(0, 10, 201)
 VOID = {"br", "img", "meta", "hr"}
@@ -88,6 +89,7 @@ MADE = {
     "Occurrence": lambda: cp.Occurrence(1.5, "u", "above"),
     "MotionProfile": lambda: cp.MotionProfile([0.0, 2.0], [[-0.5]], [[3.0], [1.0]], labels="x"),
     "Optimum": lambda: cp.optimize_waypoints([MOVE[0], cp.Waypoint(0.5, 2), MOVE[1]]),
+    "PathPlan": lambda: cp.PathPlan([cp.PolySpline(LANE)], [-1], cp.PolySpline([MOVE[0], cp.Waypoint(8, 1, 0, 0)])),
     "PeakDerivative": lambda: cp.PeakDerivative(3),
     "PiecewiseSpline": lambda: cp.PiecewiseSpline([*MOVE, cp.Waypoint(3, 0, 0, 0)]),
     "PolySpline": quintic,
@@ -118,6 +120,7 @@ MADE = {
 PLANS = {
     "Clipped",
     "MotionProfile",
+    "PathPlan",
     "PiecewiseSpline",
     "PolySpline",
     "Retimed",

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from ctrlplan._types import Array
 from ctrlplan.flatness.maps import FlatMaps, SingularError, inverses
+from ctrlplan.flatness.rest import ADVICE, note_of_rest
 from ctrlplan.trajectories import Trajectory
 
 _INTERVALS = 48
@@ -102,7 +103,10 @@ def grid_of(maps: FlatMaps, plan: Trajectory, p: Array, start: Array | None, nam
     if last <= first:  # a plan at rest
         last = first + 1.0
     nodes = np.union1d(np.linspace(first, last, _INTERVALS + 1), [t for t in plan.breakpoints if first < t < last])
-    z = connected(maps, flag_at(plan, maps.orders, nodes[:1])[0][:, 0], p, start, name, first)
+    try:
+        z = connected(maps, flag_at(plan, maps.orders, nodes[:1])[0][:, 0], p, start, name, first)
+    except ValueError as error:
+        raise ValueError(f"{error}{note_of_rest(plan, first)}") from None
     states = [z]
     flags = flag_at(plan, maps.orders, nodes)[0]
 
@@ -115,11 +119,17 @@ def grid_of(maps: FlatMaps, plan: Trajectory, p: Array, start: Array | None, nam
             try:
                 near = maps.followed(states[-1], path, p, a, b)
             except SingularError as error:
-                raise ValueError(
-                    f"states of {name} must be determined along the plan, but {error} at {error.position:.6g} s"
-                ) from None
+                raise _undetermined(name, error, plan) from None
         states.append(near)
     return _halved(maps, plan, p, nodes, np.array(states).T, name)
+
+
+def _undetermined(name: str, error: SingularError, plan: Trajectory) -> ValueError:
+    """Error for a plan that does not determine the states at a time."""
+    return ValueError(
+        f"states of {name} must be determined along the plan, but {error} at {error.position:.6g} s"
+        f"{note_of_rest(plan, error.position)}"
+    )
 
 
 def connected(maps: FlatMaps, flag: Array, p: Array, start: Array | None, name: str, time: float) -> Array:
@@ -223,7 +233,7 @@ def _check_regular(maps: FlatMaps, plan: Trajectory, grid: Grid, p: Array, name:
         weak = maps.weakest(grid.interpolated(np.array([time]))[0][:, 0], p)
         raise ValueError(
             f"states of {name} must be determined along the plan, but {weak} is not determined by the flat outputs at "
-            f"{time:.6g} s"
+            f"{time:.6g} s{note_of_rest(plan, time)}"
         )
     raise ValueError(
         f"inputs of {name} must be determined along the plan, but their influence on the highest derivatives of the "
@@ -270,9 +280,7 @@ def _middle(maps: FlatMaps, plan: Trajectory, p: Array, a: float, b: float, z: A
     try:
         return maps.followed(z, lambda t: flag_at(plan, maps.orders, np.array([t]))[0][:, 0], p, a, b)
     except SingularError as error:
-        raise ValueError(
-            f"states of {name} must be determined along the plan, but {error} at {error.position:.6g} s"
-        ) from None
+        raise _undetermined(name, error, plan) from None
 
 
 def _both_rates(maps: FlatMaps, plan: Trajectory, p: Array, times: Array, states: Array) -> tuple[Array, Array]:
@@ -298,39 +306,35 @@ def _hermite(t: Array, a: Array, b: Array, za: Array, zb: Array, ra: Array, rb: 
     )
 
 
-def states_along(
-    maps: FlatMaps, grid: Callable[[], Grid], plan: Trajectory, t: Array, p: Array, name: str
-) -> tuple[Array, Array]:
-    """Extended states (nz, n) and controls of the plant (m, n) at times (n,).
+def states_along(maps: FlatMaps, grid: Grid, jet: Array, t: Array, p: Array, name: str) -> tuple[Array, Array]:
+    """Extended states (nz, n) and controls of the plant (m, n) of a jet (order + 1, m, n) at times (n,).
 
     Raises
     ------
     ValueError
-        With the time at which states are not determined, or an operation that is
-        not smooth leaves its branch.
+        With the time at which states are not determined.
     """
-    below, _, last = flag_at(plan, maps.orders, t)
-    known = grid()
-    inside = np.clip(t, known.times[0], known.times[-1])
-    near, slopes = known.interpolated(inside)
+    below, _, last = rows_of(jet, maps.orders)
+    inside = np.clip(t, grid.times[0], grid.times[-1])
+    near, slopes = grid.interpolated(inside)
     z, found = maps.refined(near, below, p, slopes)
     for k in np.flatnonzero(~found):
-        z[:, k] = _followed_from_grid(maps, known, plan, p, float(t[k]), below[:, k], name)
-    u = maps.inputs_of(z, last, p)[1]
-    check_branch(maps, z[: maps.nstates], u, p, t, name)
-    return z, u
+        z[:, k] = _followed_from_grid(maps, grid, p, float(t[k]), below[:, k], name)
+    return z, maps.inputs_of(z, last, p)[1]
 
 
-def _followed_from_grid(
-    maps: FlatMaps, grid: Grid, plan: Trajectory, p: Array, t: float, flag: Array, name: str
-) -> Array:
+def _followed_from_grid(maps: FlatMaps, grid: Grid, p: Array, t: float, flag: Array, name: str) -> Array:
     """State at a time that interpolation does not reach: before the start, after the end, or near a singular point."""
     k = int(np.clip(np.searchsorted(grid.times, t) - 1, 0, grid.times.size - 1))
     z = grid.states[:, k] if t < grid.times[-1] else grid.states[:, -1]
     try:
         return _straight(maps, z, flag, p)
     except SingularError as error:
-        raise ValueError(f"states of {name} must be determined along the plan, but {error} at {t:.6g} s") from None
+        still = not flag[[k for k in range(flag.size) if k not in np.cumsum([0, *maps.orders])]].any()
+        raise ValueError(
+            f"states of {name} must be determined along the plan, but {error} at {t:.6g} s"
+            f"{f', where the plan is at rest; {ADVICE}' if still else ''}"
+        ) from None
 
 
 def check_branch(maps: FlatMaps, x: Array, u: Array, p: Array, t: Array, name: str) -> None:

@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ctrlplan._checks import checked_finite, finite_vector
+from ctrlplan._checks import checked_finite
 from ctrlplan._display import Facts, Part
 from ctrlplan._lru import Lru
 from ctrlplan._types import Array, Params, Value
 from ctrlplan.flatness.along import Grid, check_branch, connected, grid_of, on_branch, rows_of, states_along
 from ctrlplan.flatness.maps import SINGULAR, FlatMaps, regularity
+from ctrlplan.flatness.on_path import CurveMap
 from ctrlplan.flatness.system import FlatSystem
 from ctrlplan.symbolic.tape import Tape
 from ctrlplan.trajectories import Trajectory
@@ -109,30 +110,55 @@ class DerivedFlatSystem(FlatSystem):
         """Plan with the axes in the order of the flat outputs; the same object at each call."""
         return self._plans.get(id(plan), lambda: (plan, super(DerivedFlatSystem, self).matched(plan)))[1]
 
-    def states_and_inputs(
-        self, plan: Trajectory, timepts: ArrayLike, *, start: ArrayLike | None = None
-    ) -> tuple[Array, Array]:
-        """States and inputs along a plan; see `FlatSystem`.
+    def _states_and_inputs(self, plan: Trajectory, times: Array, start: Array | None) -> tuple[Array, Array]:
+        """States and inputs along a plan.
 
         The states are connected with the operating point, or with `start` at the
         plan's start, and followed along the plan, also through points where a
         map by formulas would need another branch (a car that turns round). The
         result does not depend on the other times of a call.
         """
-        plan, times = self._along(plan, timepts, start)
-        p = self._values(self.params)
-        first = None if start is None else self._extended(finite_vector(start, "start", str(self.nstates)), plan, p)
-        z, u = states_along(self.maps, partial(self._grid, plan, p, first), plan, times.ravel(), p, str(self.name))
-        n = self.maps.nstates
-        for label, row in zip(self.input_labels, u, strict=True):
-            self._check_regular(row, label, times.ravel())
-        return z[:n].reshape(n, *times.shape), u.reshape(-1, *times.shape)
+        p = self.parameter_values()
+        first = None if start is None else self._extended(start, plan, p)
+        jet = plan.jet(times, max(self.orders))
+        z, u = states_along(self.maps, self._grid(plan, p, first), jet, times, p, str(self.name))
+        self._check_determined(z[: self.maps.nstates], u, plan, times)
+        return z[: self.maps.nstates], u
+
+    def _points(self) -> list[tuple[Array, Array]]:
+        """States and inputs near the operating point."""
+        rng, maps = np.random.default_rng(0), self.maps
+        x = maps.start[: maps.nstates]
+        u = maps.controls(maps.start[:, None], maps.mu[:, None], self.parameter_values())[:, 0]
+        sizes = (maps.scales[: maps.nstates], np.maximum(np.abs(u), 1.0))
+        near = [rng.uniform(-0.2, 0.2, (2, size.size)) * size for size in sizes]
+        return [(x + dx, u + du) for dx, du in zip(*near, strict=True)]
+
+    def _curve_map(self, curve: Trajectory, direction: int, start: Array | None) -> tuple[CurveMap, int]:
+        """Map along a curve at unit pace, and that pace: followed along the curve, forward or backward by its start."""
+        p = self.parameter_values()
+        if start is None:
+            along, _ = super()._curve_map(curve, direction, None)
+            s = curve.breakpoints[:1]
+            start = along(curve.jet(s, max(self.orders)), s)[0][:, 0]
+        grid = self._grid(curve, p, self._extended(start, curve, p))
+
+        def along_grid(jet: Array, s: Array) -> tuple[Array, Array]:
+            z, u = states_along(self.maps, grid, jet, s, p, str(self.name))
+            return z[: self.maps.nstates], u
+
+        return along_grid, 1
+
+    def _check_determined(self, x: Array, u: Array, plan: Trajectory, times: Array) -> None:
+        super()._check_determined(x, u, plan, times)
+        check_branch(self.maps, x, u, self.parameter_values(), times, str(self.name))
 
     def extension_along(self, plan: Trajectory, time: float) -> Array:
         """States of the extension (extension,) at a time of a plan."""
         plan, times = self._along(plan, time, None)
-        p = self.parameter_values()
-        z = states_along(self.maps, partial(self._grid, plan, p, None), plan, times.ravel(), p, str(self.name))[0]
+        p, jet = self.parameter_values(), plan.jet(times.ravel(), max(self.orders))
+        z, u = states_along(self.maps, self._grid(plan, p, None), jet, times.ravel(), p, str(self.name))
+        self._check_determined(z[: self.maps.nstates], u, plan, times.ravel())
         return z[self.maps.nstates :, 0]
 
     def linearised(self, x: ArrayLike, u: ArrayLike) -> tuple[Array, Array]:

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from ctrlplan._renamed import warn_renamed
 from ctrlplan._types import Array
+from ctrlplan.flatness.rest import AT_REST
 from ctrlplan.flatness.system import FlatSystem
-from ctrlplan.flatness.verify import FlatPlant, check_maps, checked_plant, warn_of_output
+from ctrlplan.flatness.verify import check_maps, checked_plant, undetermined_at_rest, warn_of_output
 
 
 def flat_quantities(flat_system: fs.FlatSystem) -> Callable[[Array], dict[str, Array]]:
@@ -76,7 +77,7 @@ def quantities_of_flat_system(flat_system: fs.FlatSystem) -> Callable[[Array], d
     flag = plant.forward(0.1 * np.ones(len(states)), 0.1 * np.ones(len(inputs)))
     lengths = [len(row) for row in flag]
     longest = max(lengths)
-    undetermined = _undetermined_at_rest(plant, lengths)
+    undetermined = undetermined_at_rest(plant, lengths)
 
     def quantities(jet: Array) -> dict[str, Array]:
         if len(jet) < longest - 1 or jet.shape[1] != len(lengths):
@@ -94,35 +95,8 @@ def quantities_of_flat_system(flat_system: fs.FlatSystem) -> Callable[[Array], d
         rows = np.array(columns, dtype=float).T
         if undetermined.any():
             speed = np.abs(values[1]).max(axis=0)
-            # Nearer to rest a quotient of derivatives is one of rounding errors.
-            rows[np.ix_(undetermined, speed <= 1e-6 * speed.max())] = np.nan
+            rows[np.ix_(undetermined, speed <= AT_REST * speed.max())] = np.nan
         names = [*states, *inputs] if known else states
         return dict(zip(names, rows, strict=False))
 
     return quantities
-
-
-def _undetermined_at_rest(plant: FlatPlant, lengths: list[int]) -> NDArray[np.bool_]:
-    """Whether each state and input depends on derivatives in the limit of a slow plan."""
-
-    def found(flag: list[Array], pace: float) -> Array | None:
-        """States and inputs along a slower plan; None outside of their domain."""
-        slowed = [row * pace ** np.arange(row.size) for row in flag]
-        with np.errstate(all="ignore"):
-            try:
-                both = np.concatenate(plant.reverse(slowed)).astype(float)
-            except Exception:  # any exception of a trial call
-                return None
-        return both if np.isfinite(both).all() else None
-
-    rng = np.random.default_rng(0)
-    undetermined: NDArray[np.bool_] = np.zeros(plant.nstates + plant.ninputs, dtype=bool)
-    for _ in range(4):
-        flags = [[rng.normal(size=length) for length in lengths] for _ in range(2)]
-        for first, second in zip(*flags, strict=True):
-            second[0] = first[0]  # two motions through one position
-        rows = [row for pace in (1e-3, 1e-6) for flag in flags if (row := found(flag, pace)) is not None]
-        if len(rows) == 4:
-            apart, nearer = np.abs(rows[1] - rows[0]), np.abs(rows[3] - rows[2])
-            undetermined |= (nearer > 0.01 * apart) & (nearer > 1e-9 * (1.0 + np.abs(rows[2])))
-    return undetermined

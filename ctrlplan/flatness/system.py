@@ -10,10 +10,21 @@ import control.flatsys as fs
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ctrlplan._checks import check_kind, checked_labels, checked_timepts, default_labels, real_array
+from ctrlplan._checks import check_kind, checked_labels, checked_timepts, default_labels, finite_vector, real_array
 from ctrlplan._display import Displayed, Facts, Part
+from ctrlplan._lru import Lru
 from ctrlplan._types import Array, Value
-from ctrlplan.trajectories import Trajectory
+from ctrlplan.flatness.on_path import (
+    CurveMap,
+    PathMaps,
+    along_formulas,
+    pace_degrees,
+    reject_path,
+    states_on_path,
+)
+from ctrlplan.flatness.rest import ADVICE, note_of_rest, time_of_rest
+from ctrlplan.flatness.verify import checked_plant, random_probes, undetermined_at_rest
+from ctrlplan.trajectories import PathPlan, Trajectory
 
 if TYPE_CHECKING:
     from ctrlplan.flatness.derived import DerivedFlatSystem
@@ -121,6 +132,8 @@ class FlatSystem(Displayed, fs.FlatSystem):  # type: ignore[misc]
         self.extension = sum(self.orders) - len(states)
         self.flat_labels = checked_labels(flat_labels, len(inputs))
         self._own_quantities = quantities
+        self._paths: Lru[tuple[object, ...], tuple[object, PathMaps]] = Lru(8)
+        self._stops: Lru[tuple[int, float, float], tuple[Trajectory, float | None]] = Lru(8)
         if len(self.orders) != len(inputs) or min(self.orders) < 1:
             raise ValueError(f"orders must be one of at least 1 for each of {len(inputs)} inputs, got {self.orders}")
         if self.extension < 0:
@@ -195,12 +208,63 @@ class FlatSystem(Displayed, fs.FlatSystem):  # type: ignore[misc]
             maps are singular. The message states the signal and the time.
         """
         plan, times = self._along(plan, timepts, start)
+        given = None if start is None else finite_vector(start, "start", str(self.nstates))
+        if isinstance(plan, PathPlan):
+            x, u = states_on_path(self.path_maps(plan, given), plan, times.ravel())
+            self._check_determined(x, u, plan, times.ravel())
+        else:
+            x, u = self._states_and_inputs(plan, times.ravel(), given)
+        shapes = (self.nstates, *times.shape), (self.ninputs, *times.shape)
+        return np.asarray(x).reshape(shapes[0]), np.asarray(u).reshape(shapes[1])
+
+    def _states_and_inputs(self, plan: Trajectory, times: Array, start: Array | None) -> tuple[Array, Array]:
+        """States and inputs at times (n,) of a plan in time."""
         jet = plan.jet(times, max(self.orders))
         x, u = self.reverse([jet[: r + 1, j] for j, r in enumerate(self.orders)], self.params)
-        for labels, rows in ((self.state_labels, x), (self.input_labels, u)):
-            for label, row in zip(labels, rows, strict=True):
-                self._check_regular(row, label, times)
-        return np.asarray(x), np.asarray(u)
+        self._check_determined(x, u, plan, times)
+        self._check_moving(plan, times)
+        return x, u
+
+    def path_maps(self, plan: PathPlan, start: Array | None = None) -> PathMaps:
+        """States and inputs along the curves of a path, for any time law.
+
+        Raises
+        ------
+        ValueError
+            If the inputs of the system do not set its pace, or states are not
+            determined along a curve or not continuous at a stop.
+        """
+        if not self.pace_degrees:
+            reject_path(plan, str(self.name))
+        key = (
+            *map(id, plan.segments),
+            plan.directions,
+            *self.params.items(),
+            None if start is None else start.tobytes(),
+        )
+
+        def made() -> tuple[object, PathMaps]:
+            maps = PathMaps(plan, self._curve_map, self.pace_degrees, self.orders, self.state_labels, start)
+            return plan.segments, maps
+
+        return self._paths.get(key, made)[1]
+
+    @cached_property
+    def pace_degrees(self) -> tuple[int, ...]:
+        """Powers of the pace to which the inputs are proportional; empty if they do not set it."""
+        try:
+            points = self._points()
+        except ValueError:  # no point is known at which the maps are finite
+            return ()
+        return pace_degrees(lambda x, u: self.dynamics(0.0, x, u), points)
+
+    def _points(self) -> list[tuple[Array, Array]]:
+        """States and inputs at which the equations are finite."""
+        return [(probe.x, probe.u) for probe in random_probes(checked_plant(self))]
+
+    def _curve_map(self, curve: Trajectory, direction: int, start: Array | None) -> tuple[CurveMap, int]:
+        """Map along a curve at unit pace, and that pace; see `PathMaps`."""
+        return along_formulas(lambda flag: self.reverse(flag, self.params), self.orders, direction)
 
     def quantities(self, jet: ArrayLike) -> dict[str, Array]:
         """Signals of the plant by name, from the jet of the flat outputs.
@@ -251,7 +315,7 @@ class FlatSystem(Displayed, fs.FlatSystem):  # type: ignore[misc]
             raise ValueError("timepts must be finite, got inf")
         if start is not None and real_array(start, "start").shape != (self.nstates,):
             raise ValueError(f"start must have the shape ({self.nstates},), got {np.shape(start)}")
-        if times.size:
+        if times.size and not isinstance(plan, PathPlan):
             self._check_smooth(plan, float(times.min()), float(times.max()))
         return plan, times
 
@@ -292,12 +356,36 @@ class FlatSystem(Displayed, fs.FlatSystem):  # type: ignore[misc]
                     f"the times given, got one whose {what} jumps by {jump.size:.4g} at {jump.time:g} s"
                 )
 
-    def _check_regular(self, row: Array, label: str, times: Array) -> None:
-        """Raise for a signal that the plan does not determine."""
-        wrong = np.broadcast_to(~np.isfinite(row), times.shape)
-        if wrong.any():
-            k = np.unravel_index(int(wrong.argmax()), times.shape)
+    def _check_determined(self, x: Array, u: Array, plan: Trajectory, times: Array) -> None:
+        """Raise for states and inputs that the plan does not determine."""
+        for label, row in zip([*self.state_labels, *self.input_labels], [*x, *u], strict=True):
+            wrong = np.broadcast_to(~np.isfinite(row), times.shape)
+            if wrong.any():
+                k = int(wrong.argmax())
+                time, value = float(times[k]), float(np.broadcast_to(row, times.shape)[k])
+                raise ValueError(
+                    f"{label} of {self.name} must be determined by the plan, got {value:g} at {time:.6g} s: the maps "
+                    f"are singular there{note_of_rest(plan, time)}"
+                )
+
+    @cached_property
+    def _undetermined(self) -> tuple[str, ...]:
+        """States and inputs that the flat outputs do not determine at rest, although the maps may be finite there."""
+        try:
+            found = undetermined_at_rest(checked_plant(self), [r + 1 for r in self.orders])
+        except (TypeError, ValueError):  # not in continuous time, or without states
+            return ()
+        names = [*self.state_labels, *self.input_labels]
+        return tuple(name for name, wrong in zip(names, found, strict=True) if wrong)
+
+    def _check_moving(self, plan: Trajectory, times: Array) -> None:
+        """Raise if a plan stops between the times and the maps are singular at rest."""
+        if not (times.size and self._undetermined):
+            return
+        key = (id(plan), float(times.min()), float(times.max()))
+        time = self._stops.get(key, lambda: (plan, time_of_rest(plan, *key[1:])))[1]
+        if time is not None:
             raise ValueError(
-                f"{label} of {self.name} must be determined by the plan, got {np.asarray(row)[k]:g} at "
-                f"{float(times[k]):.6g} s: the maps are singular there"
+                f"{self._undetermined[0]} of {self.name} must be determined by the plan, got one that is at rest at "
+                f"{time:.6g} s: the maps are singular there; {ADVICE}"
             )

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import control.flatsys as fs
 import numpy as np
+from numpy.typing import NDArray
 
 from ctrlplan._checks import checked_labels, default_labels
 from ctrlplan._renamed import outside_stacklevel
@@ -138,6 +139,32 @@ def warn_of_output(flat_system: fs.FlatSystem) -> None:
         f"not of {name}; {at_rest}, and in motion {name} depends on the derivatives of z",
         stacklevel=outside_stacklevel(),
     )
+
+
+def undetermined_at_rest(plant: FlatPlant, lengths: Sequence[int]) -> NDArray[np.bool_]:
+    """Whether each state and input depends on derivatives in the limit of a slow plan."""
+
+    def found(flag: list[Array], pace: float) -> Array | None:
+        """States and inputs along a slower plan; None outside of their domain."""
+        slowed = [row * pace ** np.arange(row.size) for row in flag]
+        with np.errstate(all="ignore"):
+            try:
+                both = np.concatenate(plant.reverse(slowed)).astype(float)
+            except Exception:  # any exception of a trial call
+                return None
+        return both if np.isfinite(both).all() else None
+
+    rng = np.random.default_rng(0)
+    undetermined: NDArray[np.bool_] = np.zeros(plant.nstates + plant.ninputs, dtype=bool)
+    for _ in range(4):
+        flags = [[rng.normal(size=length) for length in lengths] for _ in range(2)]
+        for first, second in zip(*flags, strict=True):
+            second[0] = first[0]  # two motions through one position
+        rows = [row for pace in (1e-3, 1e-6) for flag in flags if (row := found(flag, pace)) is not None]
+        if len(rows) == 4:
+            apart, nearer = np.abs(rows[1] - rows[0]), np.abs(rows[3] - rows[2])
+            undetermined |= (nearer > 0.01 * apart) & (nearer > 1e-9 * (1.0 + np.abs(rows[2])))
+    return undetermined
 
 
 def finite_rows(function: Callable[..., Value], *args: Value) -> list[Array] | None:

@@ -19,6 +19,7 @@ from ctrlplan.trajectories.converted import as_trajectory
 from ctrlplan.trajectories.extrema import Bounds, Extrema
 from ctrlplan.trajectories.files import derivative_name, load_trajectory, trajectory_from_dict
 from ctrlplan.trajectories.motion_profile import MotionProfile
+from ctrlplan.trajectories.path_plan import PathPlan
 from ctrlplan.trajectories.piecewise import PiecewiseSpline
 from ctrlplan.trajectories.piecewise_polynomial import PiecewisePolynomial
 from ctrlplan.trajectories.polynomial import PolySpline
@@ -43,6 +44,7 @@ __all__ = [
     "Joined",
     "Jump",
     "MotionProfile",
+    "PathPlan",
     "PiecewisePolynomial",
     "PiecewiseSpline",
     "PolySpline",

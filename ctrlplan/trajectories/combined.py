@@ -250,7 +250,7 @@ class Joined(_OfParts):
         for i in range(1, len(members)):
             members[i] = members[i]._moved(members[i].start, members[i - 1].end, 1.0)
         for before, after in pairwise(_same_axes(tuple(members))):
-            _check_join(before, after)
+            check_join(before, after)
         self._set(tuple(members), members[0].labels)
 
     @classmethod
@@ -281,7 +281,7 @@ class Joined(_OfParts):
         """Trajectory from the plain data of `to_dict`."""
         parts = _checked_parts(trajectory_from_dict(part) for part in data["parts"])
         for before, after in pairwise(_same_axes(parts)):
-            _check_join(before, after)
+            check_join(before, after)
         return cls._of(parts, tuple(data["labels"]))
 
     def _sample(self, t: Array, low: int, high: int, left: bool) -> Array:
@@ -361,7 +361,7 @@ def _same_axes(parts: tuple[Trajectory, ...]) -> tuple[Trajectory, ...]:
     return parts
 
 
-def _check_join(before: Trajectory, after: Trajectory) -> None:
+def check_join(before: Trajectory, after: Trajectory) -> None:
     """Raise for a jump of position, or for a gap in time beyond the rounding of times."""
     if abs(after.start - before.end) > 1e-9 * (before.duration + after.duration):
         raise ValueError(f"parts must follow one another in time, got {after.start} s after {before.end} s")

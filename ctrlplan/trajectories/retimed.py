@@ -114,10 +114,14 @@ class Retimed(Trajectory):
             out[:, :, at_end] = _composed_jets(*jets)[low:]
         return out
 
+    def law_jet(self, segment: int, s: Array, order: int) -> tuple[Array, int]:
+        """Derivatives (order + 1, 1, ntime) of the law in a segment, and the number of the plan's segment there."""
+        of_law, of_plan = self._segments[segment]
+        return self.law.segment_jet(of_law, s + self._since(segment), order), of_plan
+
     def segment_jet(self, segment: int, s: Array, order: int) -> Array:
         """Derivatives of a segment; as `Trajectory.segment_jet`."""
-        of_law, of_plan = self._segments[segment]
-        inner = self.law.segment_jet(of_law, s + self._since(segment), order)
+        inner, of_plan = self.law_jet(segment, s, order)
         elapsed = inner[0, 0] - self.plan.breakpoints[of_plan]
         return _composed_jets(self.plan.segment_jet(of_plan, elapsed, order), inner)
 

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from repetitions import examples
 
 from ctrlplan.trajectories import (
+    PathPlan,
     PiecewiseSpline,
     PolySpline,
     Retimed,
@@ -47,6 +48,7 @@ SAVED = [
         MOVE.then(MOVE + Step(1.0, 1.0)),
         Shaper.zv(5.0)(MOVE),
         Retimed(MOVE, PolySpline([Waypoint(0, 0), Waypoint(3, 1)])),
+        PathPlan([PolySpline([Waypoint(0, [0, 0], [1, 0]), Waypoint(1, [1, 1], [1, 2])])], [1], MOVE),
     )
 ]
 HOSTILE = [

@@ -51,12 +51,25 @@ ARGUMENTS = {
     "law": lambda: trajectories.PolySpline([Waypoint(3.0, -1.0, 0.7), Waypoint(4.0, 0.1), Waypoint(7.5, 2.0, 0.3)]),
 }
 
+CURVES = [
+    trajectories.PolySpline([Waypoint(-1.0, [0, 0], [3, 0], [0, 0]), Waypoint(2.0, [6, 2], [2, 2])]),
+    trajectories.PiecewiseSpline([Waypoint(-1.0, [6, 2], [-1, -1]), Waypoint(0.5, [4, 0.5]), Waypoint(2.0, [3, -4])]),
+]
+OWN = {
+    "PathPlan": {
+        "segments": CURVES,
+        "directions": [1, -1],
+        "law": trajectories.PolySpline([Waypoint(3.0, -1.0, 0.0, 0.0), Waypoint(7.5, 2.0, 0.0, 0.0)]),
+    }
+}
+"""Arguments of one kind."""
+
 
 def build(kind):
     """An example from the names of the arguments that the constructor requires; labels where they may be given."""
-    given = {}
+    given = dict(OWN.get(kind.__name__, {}))
     for name, parameter in inspect.signature(kind).parameters.items():
-        if parameter.default is inspect.Parameter.empty:
+        if parameter.default is inspect.Parameter.empty and name not in given:
             assert name in ARGUMENTS, f"say in ARGUMENTS what the argument {name} of {kind.__name__} may be"
             given[name] = ARGUMENTS[name]()
     return kind(**given, labels=["p", "q", "r", "s"]) if kind is trajectories.Stacked else kind(**given)
