@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Iterable, Sequence
 from itertools import pairwise
+from operator import add
 from typing import Any, Self
 
 import numpy as np
@@ -86,6 +87,25 @@ class _Combined(_OfParts):
             out[:, :, at_end] = self._combine([part._sample(t[at_end], low, high, left) for part in self.parts])
         return out
 
+    def _rows(self, t: float, order: int, left: bool) -> list[list[float]] | None:
+        """Derivatives at one time; as `Trajectory._rows`."""
+        return None if t == self._moments[-1] else super()._rows(t, order, left)
+
+    def segment_rows(self, segment: int, s: float, order: int) -> list[list[float]] | None:
+        """Derivatives of a segment at one time; as `Trajectory.segment_rows`."""
+        origin, end = self._moments[segment : segment + 2]
+        moment, tables = 0.5 * (origin + end), []
+        for part in self.parts:
+            rows = part.segment_rows_at(moment, origin, s, order)
+            if rows is None:
+                return None
+            tables.append(rows)
+        return self._combine_rows(tables)
+
+    @abstractmethod
+    def _combine_rows(self, tables: list[list[list[float]]]) -> list[list[float]]:
+        """Derivatives by axis of the combination from those of the parts."""
+
     def segment_jet(self, segment: int, s: Array, order: int) -> Array:
         """Derivatives of a segment; as `Trajectory.segment_jet`."""
         origin, end = self.breakpoints[segment : segment + 2].tolist()
@@ -156,6 +176,12 @@ class Sum(_Combined):
     def _combine(self, values: list[Array]) -> Array:
         return np.add.reduce(values)
 
+    def _combine_rows(self, tables: list[list[list[float]]]) -> list[list[float]]:
+        found = tables[0]
+        for table in tables[1:]:
+            found = [list(map(add, *rows)) for rows in zip(found, table, strict=True)]
+        return found
+
 
 class Stacked(_Combined):
     """Stacked axes of several trajectories; returned by `stack`."""
@@ -171,6 +197,9 @@ class Stacked(_Combined):
 
     def _combine(self, values: list[Array]) -> Array:
         return np.concatenate(values, axis=0 if values[0].ndim == 1 else 1)
+
+    def _combine_rows(self, tables: list[list[list[float]]]) -> list[list[float]]:
+        return [row for table in tables for row in table]
 
 
 class Selected(_Combined):
@@ -191,6 +220,9 @@ class Selected(_Combined):
 
     def _combine(self, values: list[Array]) -> Array:
         return values[0].take(self._axes, axis=0 if values[0].ndim == 1 else 1)
+
+    def _combine_rows(self, tables: list[list[list[float]]]) -> list[list[float]]:
+        return [tables[0][axis] for axis in self._axes]
 
 
 class Scaled(_Combined):
@@ -225,6 +257,9 @@ class Scaled(_Combined):
 
     def _combine(self, values: list[Array]) -> Array:
         return self.factor * values[0]
+
+    def _combine_rows(self, tables: list[list[list[float]]]) -> list[list[float]]:
+        return [[self.factor * value for value in row] for row in tables[0]]
 
 
 class Joined(_OfParts):
@@ -289,6 +324,15 @@ class Joined(_OfParts):
         if low == 0 and not left and self.parts[-1].breakpoints.size == 1:
             out[0][:, t == self.end] = self.final[:, None]  # a step at the very end
         return out
+
+    def _rows(self, t: float, order: int, left: bool) -> list[list[float]] | None:
+        """Derivatives at one time; as `Trajectory._rows`."""
+        return None if t == self._moments[-1] else super()._rows(t, order, left)
+
+    def segment_rows(self, segment: int, s: float, order: int) -> list[list[float]] | None:
+        """Derivatives of a segment at one time; as `Trajectory.segment_rows`."""
+        part, own = self._segments[segment]
+        return part.segment_rows(own, s, order)
 
     def segment_jet(self, segment: int, s: Array, order: int) -> Array:
         """Derivatives of a segment; as `Trajectory.segment_jet`."""

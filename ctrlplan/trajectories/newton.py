@@ -27,8 +27,8 @@ w = u - (x_{2j-1} + x_{2j})/2, sigma = sin(alpha w)/alpha, kappa = cos(alpha w),
 
 where S(h) = sin(alpha h)/alpha and V(h) = 2 (1 - cos(alpha h))/alpha^2 do not
 depend on u: multiplying by them is one constant matrix for all times. At one
-time, which may be a symbol of a tracer, `newton_series` goes through the same
-products from the inside out.
+time, which may be a symbol of a tracer, the products are evaluated from the
+inside out (`one_time`).
 """
 
 from __future__ import annotations
@@ -36,7 +36,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import cached_property, lru_cache
-from operator import mul
 from typing import Any
 
 import numpy as np
@@ -47,6 +46,14 @@ from ctrlplan._types import Value
 from ctrlplan.trajectories.common import FACTORIALS, Array, readonly
 from ctrlplan.trajectories.digits import many_digits
 from ctrlplan.trajectories.fields import Fields
+from ctrlplan.trajectories.one_time import (
+    effective,
+    kernel_weights,
+    newton_series,
+    pair_series,
+    polynomial_series,
+    trigonometric_series,
+)
 from ctrlplan.trajectories.quadrature import gauss
 
 _MEET = 0.25
@@ -137,7 +144,7 @@ class NewtonSystem(Fields):
         if count == 0:
             raise ValueError("an axis must have at least one prescribed entry, got none")
         size = count if size is None else size
-        waypoints, orders, lead = _constraints(_effective(alpha), times, given, meet)
+        waypoints, orders, lead = _constraints(effective(alpha), times, given, meet)
         nodes = times[waypoints]
         mean = math.fsum(nodes) / count
         nodes = np.concatenate([nodes, _spare_nodes(mean, size - count)]) if size > count else nodes
@@ -229,7 +236,7 @@ class NewtonSystem(Fields):
         """
         digits += math.ceil(math.log10(min(self.amplification, 1e300)))
         constraints = self.waypoint_index, self.order_index
-        solved = many_digits(_effective(self.alpha), times, duration, constraints, values, self._fold, digits)
+        solved = many_digits(effective(self.alpha), times, duration, constraints, values, self._fold, digits)
         return solved if self._spread is None else self._spread @ solved
 
     def taylor(self, u: Array, order: int) -> Array:
@@ -250,7 +257,7 @@ class NewtonSystem(Fields):
 
     def _taylor(self, first: Array, second: Array, order: int) -> Array:
         """Taylor coefficients from the distances (npairs, ntime) to the nodes of each pair."""
-        alpha = _effective(self.alpha)
+        alpha = effective(self.alpha)
         half = 0.5 * alpha
         npairs, ntime = len(second), second.shape[1]
         out = np.empty((2 * npairs + 1, order + 1, ntime))
@@ -293,19 +300,25 @@ class NewtonSystem(Fields):
             columns = [[*column, self._fold * column[-1]] for column in columns]
         return [newton_series(factors, column, order) for column in columns]
 
-    def jet_at(self, coefficients: Array, u: float, order: int) -> list[list[Value]]:
-        """Taylor series of each axis at one normalised time, a number, of a polynomial."""
-        nodes = self._pair
-        if nodes is None:
-            return self.series(coefficients, u, order)
-        left, right = u - nodes[0], u - nodes[1]
-        return [_two_point_series(left, right, column, order) for column in coefficients.T.tolist()]
+    def series_at(self, columns: Sequence[Sequence[float]], u: float, order: int) -> list[list[float]]:
+        """Taylor series of each axis at one normalised time, a number, from the coefficients by axis."""
+        nodes, pairs, places = self._backwards
+        if not effective(self.alpha):
+            gaps = [u - node for node in nodes]
+            return [polynomial_series(gaps, column, order) for column in columns]
+        if self._fold:
+            columns = [[*column, self._fold * column[-1]] for column in columns]
+        distinct = [pair_series(self.alpha, u - first, u - second, max(order, 3)) for first, second in pairs]
+        factors = [distinct[place] for place in places]
+        return [trigonometric_series(factors, column, order) for column in columns]
 
     @cached_property
-    def _pair(self) -> tuple[float, float] | None:
-        """The two nodes of a polynomial, if they alternate."""
-        nodes = set(zip(self._first.tolist(), self._second.tolist(), strict=True))
-        return nodes.pop() if len(nodes) == 1 and not self.alpha else None
+    def _backwards(self) -> tuple[list[float], list[tuple[float, float]], list[int]]:
+        """Nodes of the products, the last one first; different pairs of nodes; the place of each pair among them."""
+        every = list(zip(self._first.tolist(), self._second.tolist(), strict=True))
+        nodes = [node for pair in every for node in pair][: self.size - 1]
+        pairs = list(dict.fromkeys(every))
+        return nodes[::-1], pairs, [pairs.index(pair) for pair in every[::-1]]
 
     def _across(self, times: Sequence[float], duration: float) -> float:
         """Minimum distance on the circle from a waypoint near the end to one near the start, without the two ends."""
@@ -371,68 +384,6 @@ def _taylor_scale(duration: float, orders: tuple[int, ...]) -> Array:
             f"{max(orders)}; choose another unit of time"
         )
     return readonly(scale)
-
-
-Pair = tuple[list[Value], list[Value]]
-"""Taylor series of q q and of q c, the factors of one pair of nodes."""
-
-
-def pair_series(alpha: float, left: Value, right: Value, order: int) -> Pair:
-    """Series of the factors of a pair about a point at distances `left` and `right` from its nodes."""
-    alpha = _effective(alpha)
-    if not alpha:
-        rest = [0.0] * order
-        return [left * right, left + right, 1.0, *rest][: order + 1], [left, 1.0, *rest][: order + 1]
-    half, middle = 0.5 * alpha, 0.5 * (left + right)
-    sin, cos = (math.sin, math.cos) if isinstance(middle, float) else (np.sin, np.cos)
-    q, sigma, kappa = sin(half * left) / half, sin(alpha * middle), cos(alpha * middle)
-    second = half * right
-    odd, even = (2.0 / alpha) * sigma, -half * sigma
-    qq, qc = [q * sin(second) / half], [q * cos(second)]
-    for k, weight in enumerate(_kernel_weights(alpha, order), 1):
-        qq.append((odd if k % 2 else kappa) * weight)
-        qc.append((kappa if k % 2 else even) * weight)
-    return qq, qc
-
-
-def newton_series(factors: Sequence[Pair], column: Sequence[Value], order: int) -> list[Value]:
-    """Series of a linear combination of the basis functions, evaluated from the last pair of factors to the first."""
-    orders = range(order + 1)
-    last = 2 * len(factors)
-    found = [column[last] if len(column) > last else 0.0, *[0.0] * order]
-    for j in range(len(factors) - 1, -1, -1):
-        (qq, qc), weight = factors[j], column[2 * j + 1]
-        found = [sum(map(mul, qq, found[k::-1]), weight * qc[k]) for k in orders]
-        found[0] = found[0] + column[2 * j]
-    return found
-
-
-def _two_point_series(left: float, right: float, column: Sequence[float], order: int) -> list[Value]:
-    """Same as `newton_series` for polynomials with two nodes, at distances `left` and `right`."""
-    product, total, pairs = left * right, left + right, len(column) // 2
-    found = [column[-1] if len(column) % 2 else 0.0] + [0.0] * order
-    for j in range(2 * pairs - 2, -1, -2):
-        weight = column[j + 1]
-        for k in range(order, 1, -1):
-            found[k] = product * found[k] + total * found[k - 1] + found[k - 2]
-        if order:
-            found[1] = product * found[1] + total * found[0] + weight
-        found[0] = product * found[0] + weight * left + column[j]
-    return found
-
-
-@lru_cache(maxsize=256)
-def _kernel_weights(alpha: float, order: int) -> tuple[float, ...]:
-    """Coefficients 1, 2, ...: odd ones of S(h), even ones of V(h)."""
-    return tuple(
-        (-1.0) ** (k // 2) * (alpha ** (k - 1) if k % 2 else -2.0 * alpha ** (k - 2)) / math.factorial(k)
-        for k in range(1, order + 1)
-    )
-
-
-def _effective(alpha: float) -> float:
-    """Alpha of the formulas: 0 where they would underflow, which is the limit to full precision."""
-    return alpha if alpha > 1e-100 else 0.0
 
 
 def _constraints(
@@ -563,7 +514,7 @@ def _factor(collocation: Array, hermite: bool, roughness: Array | None, lead: in
 def _kernel(alpha: float, order: int) -> Array:
     """Multiplication of a Taylor jet by 1, S(h) and V(h): shape (3 (order + 1), order + 1)."""
     n = order + 1
-    weights = np.array([0.0, *_kernel_weights(alpha, order)])
+    weights = np.array([0.0, *kernel_weights(alpha, order)])
     s, v = weights.copy(), weights
     s[::2] = v[1::2] = 0.0
     lag = np.subtract.outer(np.arange(n), np.arange(n))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Iterable, Sequence
+from functools import cached_property
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -14,6 +15,7 @@ from ctrlplan._display import number
 from ctrlplan._types import Data, Value
 from ctrlplan.trajectories.common import Array, derivative_scale, mapped_time, readonly
 from ctrlplan.trajectories.newton import NEARLY_CLOSED, NewtonSystem
+from ctrlplan.trajectories.one_time import derivatives, is_moderate
 from ctrlplan.trajectories.swing import warn_of_swing
 from ctrlplan.trajectories.waypoint import Waypoint
 from ctrlplan.trajectories.waypoint_spline import WaypointSpline, checked_waypoints, increasing, same_axes, same_times
@@ -210,6 +212,10 @@ class NewtonSpline(WaypointSpline):
 
     def segment_jet(self, segment: int, s: Array, order: int) -> Array:
         """Derivatives of a segment; as `Trajectory.segment_jet`."""
+        if s.size == 1:
+            rows = self.segment_rows(segment, float(s[0]), order)
+            if rows is not None:
+                return np.array(rows).T[:, :, None]
         u = s / self._duration
         scale = derivative_scale(self._duration, order)
         out = np.empty((order + 1, self.naxes, u.size))
@@ -221,6 +227,25 @@ class NewtonSpline(WaypointSpline):
                 return values
             out[:, list(axes)] = values
         return out
+
+    def segment_rows(self, segment: int, s: float, order: int) -> list[list[float]] | None:
+        """Derivatives of a segment at one time; as `Trajectory.segment_rows`."""
+        if not is_moderate(self._duration, order):
+            return None
+        parts, u = self._columns, s / self._duration
+        if len(parts) == 1:
+            _, system, columns = parts[0]
+            return derivatives(system.series_at(columns, u, order), self._duration)
+        found: list[list[float]] = [[]] * self.naxes
+        for axes, system, columns in parts:
+            for axis, row in zip(axes, derivatives(system.series_at(columns, u, order), self._duration), strict=True):
+                found[axis] = row
+        return found
+
+    @cached_property
+    def _columns(self) -> list[tuple[tuple[int, ...], NewtonSystem, list[list[float]]]]:
+        """Axes, their system, and the coefficients of each axis."""
+        return [(axes, system, coefficients.T.tolist()) for axes, system, coefficients in self._parts]
 
     def segment_series(self, segment: int, s: Value, order: int) -> list[list[Value]]:
         """Taylor series of a segment; as `Trajectory.segment_series`."""

@@ -95,10 +95,10 @@ class Pieces(Fields):
                     out[..., begin + where] = _gathered(run, inside[where], own[where], order)
         return out
 
-    def jet_at(self, segment: int, u: float, order: int) -> list[list[Value]]:
-        """Taylor coefficients by axis at one relative time, of polynomials."""
-        system, coefficients = self.of_segment(segment)
-        return system.jet_at(coefficients, u, order)
+    def series_at(self, segment: int, u: float, order: int) -> list[list[float]]:
+        """Taylor series by axis at one relative time, a number."""
+        run = self.runs[0] if len(self.runs) == 1 else self.run(segment)
+        return run.system.series_at(run.coefficients[:, :, segment - run.first].T.tolist(), u, order)
 
     def derivative_bounds(self, nu: int) -> tuple[Array, Array]:
         """Bounds (naxes, nsegments) of the nu-th derivative of polynomials by relative time."""

@@ -18,6 +18,7 @@ from ctrlplan.trajectories.chosen import checked_alpha, chosen_alpha
 from ctrlplan.trajectories.common import Array, derivative_scale, mapped_time, readonly
 from ctrlplan.trajectories.conjugate import FreeEntries, Kind, kinds_of, rounded
 from ctrlplan.trajectories.newton_spline import NewtonSpline
+from ctrlplan.trajectories.one_time import derivatives, is_moderate
 from ctrlplan.trajectories.pieces import Pieces, fitted, scales
 from ctrlplan.trajectories.polynomial import PolySpline
 from ctrlplan.trajectories.swing import MAXIMUM_SWING, warn_of_swing
@@ -386,8 +387,10 @@ class PiecewiseSpline(WaypointSpline):
 
     def segment_jet(self, segment: int, s: Array, order: int) -> Array:
         """Derivatives of a segment; as `Trajectory.segment_jet`."""
-        if s.size == 1 and not self.alpha:  # as `_sample`
-            return self._at(segment, float(s[0]), order)[:, :, None]
+        if s.size == 1:
+            rows = self.segment_rows(segment, float(s[0]), order)
+            if rows is not None:
+                return np.array(rows).T[:, :, None]
         duration = float(self.breakpoints[segment + 1] - self.breakpoints[segment])
         u, scale = s / duration, derivative_scale(duration, order)[:, None, None]
         if len(self._pieces) == 1:
@@ -398,13 +401,10 @@ class PiecewiseSpline(WaypointSpline):
         return out
 
     def _sample(self, t: Array, low: int, high: int, left: bool) -> Array:
-        if t.size == 1 and not self.alpha and self._holds(float(t[0]), left):
-            place = int(self.breakpoints.searchsorted(t[0], side="left" if left else "right"))
-            segment = min(place, self.breakpoints.size - 1) - 1
-            with np.errstate(over="ignore", invalid="ignore"):
-                found = self._at(segment, float(t[0] - self.breakpoints[segment]), high)[low:, :, None]
-            if math.isfinite(found.sum()):
-                return found
+        if t.size == 1:
+            rows = self._rows(float(t[0]), high, left)
+            if rows is not None:
+                return np.array(rows).T[low:, :, None]
         times, last = self.breakpoints, self.breakpoints.size - 2
         segments = np.searchsorted(times, t, side="left" if left else "right") - 1
         if not left:
@@ -427,20 +427,22 @@ class PiecewiseSpline(WaypointSpline):
                     out[:, list(pieces.axes)] = own
         return out if np.isfinite(out.sum()) else super()._sample(t, low, high, left)
 
-    def _holds(self, t: float, left: bool) -> bool:
-        """Whether a time is that of a segment."""
-        return bool(self.breakpoints[0] <= t <= self.breakpoints[-1]) and not (left and t == self.breakpoints[0])
+    _rows = WaypointSpline._rows  # `_sample` calls it
 
-    def _at(self, segment: int, s: float, order: int) -> Array:
-        """Jet (order + 1, naxes) at one time in a segment."""
-        duration = float(self.breakpoints[segment + 1] - self.breakpoints[segment])
-        scale = derivative_scale(duration, order)[:, None]
+    def segment_rows(self, segment: int, s: float, order: int) -> list[list[float]] | None:
+        """Derivatives of a segment at one time; as `Trajectory.segment_rows`."""
+        moments = self._moments
+        duration = moments[segment + 1] - moments[segment]
+        if not is_moderate(duration, order):
+            return None
         if len(self._pieces) == 1:
-            return np.array(self._pieces[0].jet_at(segment, s / duration, order)).T * scale
-        found = np.empty((order + 1, self.naxes))
+            return derivatives(self._pieces[0].series_at(segment, s / duration, order), duration)
+        found: list[list[float]] = [[]] * self.naxes
         for pieces in self._pieces:
-            found[:, pieces.axes] = np.array(pieces.jet_at(segment, s / duration, order)).T
-        return found * scale
+            rows = derivatives(pieces.series_at(segment, s / duration, order), duration)
+            for axis, row in zip(pieces.axes, rows, strict=True):
+                found[axis] = row
+        return found
 
     @cached_property
     def _durations(self) -> Array:

@@ -9,7 +9,6 @@ from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import comb
 
 from ctrlplan._checks import checked_count, checked_finite, finite_vector, new_numbers, one_number
 from ctrlplan.trajectories.common import Array, readonly
@@ -187,7 +186,7 @@ def zvd_factor(frequency: float, damping: float = 0.0, derivatives: int = 1) -> 
     count = checked_count(derivatives, "derivatives") + 1
     names = ("ZV", "ZVD", "ZVDD", "ZVDDD")
     kind = names[count - 1] if count <= len(names) else f"ZVD of order {count - 1}"
-    return _factor(kind, frequency, damping, math.pi, comb(count, np.arange(count + 1)) / 2.0**count)
+    return _factor(kind, frequency, damping, math.pi, [math.comb(count, k) / 2.0**count for k in range(count + 1)])
 
 
 def mzv_factor(frequency: float, damping: float = 0.0) -> ShaperFactor:

@@ -7,6 +7,7 @@ import math
 import os
 import warnings
 from abc import ABC, abstractmethod
+from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
 from numbers import Real
@@ -16,7 +17,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ctrlplan._checks import checked_count, checked_finite, checked_number, checked_timepts, one_number
+from ctrlplan._checks import MAXIMUM, checked_count, checked_finite, checked_number, checked_timepts, one_number
 from ctrlplan._display import MISSING, Displayed, Facts, Figure, Part, Table, number
 from ctrlplan._renamed import warn_renamed
 from ctrlplan._types import Data, Value
@@ -33,6 +34,10 @@ if TYPE_CHECKING:
     from ctrlplan.reports.style import AxesLike
     from ctrlplan.trajectories.export import FlatMaps
     from ctrlplan.trajectories.waypoint import Waypoint
+
+
+_FLOATS = (float, np.float64)
+"""Types of one time that requires no check of its kind; subclasses may have a unit."""
 
 
 class Trajectory(Displayed, Fields, ABC):
@@ -106,6 +111,10 @@ class Trajectory(Displayed, Fields, ABC):
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
+        # A method for many times that is overridden holds for one time as well.
+        for many, one in (("segment_jet", "segment_rows"), ("_sample", "_rows")):
+            if many in cls.__dict__ and one not in cls.__dict__:
+                setattr(cls, one, _no_rows)
         abstract = (getattr(f, "__isabstractmethod__", False) for f in (cls.segment_jet, cls.map_time, cls.from_dict))
         if cls.__name__.startswith("_") or any(abstract):
             return
@@ -192,6 +201,28 @@ class Trajectory(Displayed, Fields, ABC):
             "does not define segment_series"
         )
 
+    def segment_rows(self, segment: int, s: float, order: int) -> list[list[float]] | None:
+        """Derivatives of a segment at one time.
+
+        A class may define it in addition to `segment_jet`, which it must equal up to
+        rounding, for fast evaluation in a controller.
+
+        Parameters
+        ----------
+        segment : int
+            Number of the segment.
+        s : float
+            Time [s] since the start of the segment.
+        order : int
+            Highest derivative.
+
+        Returns
+        -------
+        list of list of float, naxes by (order + 1), or None
+            None if `segment_jet` is to be called.
+        """
+        return None
+
     @property
     def start(self) -> float:
         """Time of the first breakpoint [s]."""
@@ -276,6 +307,11 @@ class Trajectory(Displayed, Fields, ABC):
         ValueError
             If a time is nan or nu is negative.
         """
+        one: Any = t
+        if type(one) in _FLOATS and type(nu) is int and 0 <= nu <= MAXIMUM:
+            rows = self._rows(float(one), nu, False)
+            if rows is not None:
+                return np.array(rows[0][nu] if len(rows) == 1 else [row[nu] for row in rows])
         times = checked_timepts(t)
         derivative = checked_count(nu, "nu")
         values = self._sample(times.ravel(), derivative, derivative, False)[0]
@@ -303,6 +339,11 @@ class Trajectory(Displayed, Fields, ABC):
         ValueError
             If a time is nan or the order is negative.
         """
+        one: Any = t
+        if type(one) in _FLOATS and type(order) is int and 0 <= order <= MAXIMUM:
+            rows = self._rows(float(one), order, left)
+            if rows is not None:
+                return np.array(rows).T
         times = checked_timepts(t)
         highest = checked_count(order, "order")
         values = self._sample(times.ravel(), 0, highest, left)
@@ -922,6 +963,32 @@ class Trajectory(Displayed, Fields, ABC):
             warnings.warn(said, stacklevel=3)
         return moved
 
+    @cached_property
+    def _moments(self) -> list[float]:
+        """The breakpoints as floats."""
+        return self.breakpoints.tolist()
+
+    def _rows(self, t: float, order: int, left: bool) -> list[list[float]] | None:
+        """Derivatives at one time, a list for each axis; None where `_sample` is to be called."""
+        moments = self._moments
+        last = len(moments) - 2
+        segment = (bisect_left if left else bisect_right)(moments, t) - 1
+        if segment > last:
+            if t > moments[-1]:
+                return [[value, *[0.0] * order] for value in self.final.tolist()]
+            if t != moments[-1]:  # nan
+                return None
+            segment = last
+        if segment < 0:
+            return [[value, *[0.0] * order] for value in self.initial.tolist()] if t < moments[0] else None
+        rows = self.segment_rows(segment, t - moments[segment], order)
+        if rows is None:
+            return None
+        for row in rows:
+            if not math.isfinite(sum(row)):
+                return None
+        return rows
+
     def _sample(self, t: Array, low: int, high: int, left: bool) -> Array:
         """Derivatives low to high, shape (high - low + 1, naxes, ntime)."""
         nsegments = self.breakpoints.size - 1
@@ -1009,12 +1076,24 @@ class Trajectory(Displayed, Fields, ABC):
         held[0] = (self.initial if segment < 0 else self.final)[:, None]
         return held
 
+    def segment_rows_at(self, moment: float, origin: float, s: float, order: int) -> list[list[float]] | None:
+        """Derivatives by axis at one time; as `segment_jet_at`."""
+        moments = self._moments
+        segment = bisect_left(moments, moment) - 1
+        if 0 <= segment < len(moments) - 1:
+            return self.segment_rows(segment, s + (origin - moments[segment]), order)
+        return [[value, *[0.0] * order] for value in (self.initial if segment < 0 else self.final).tolist()]
+
     def segment_series_at(self, moment: float, origin: float, s: Value, order: int) -> list[list[Value]]:
         """Taylor series at a number or symbol s; as `segment_jet_at`."""
         segment = int(np.searchsorted(self.breakpoints, moment)) - 1
         if 0 <= segment < self.breakpoints.size - 1:
             return self.segment_series(segment, s + (origin - float(self.breakpoints[segment])), order)
         return [[value, *[0.0] * order] for value in (self.initial if segment < 0 else self.final).tolist()]
+
+
+def _no_rows(*_given: object) -> None:
+    """In place of a method for one time that would differ from the one for many times."""
 
 
 def _is_factor(value: object) -> bool:

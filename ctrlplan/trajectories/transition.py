@@ -15,7 +15,8 @@ from ctrlplan._types import Value
 from ctrlplan.trajectories.chosen import checked_alpha
 from ctrlplan.trajectories.common import FACTORIALS, Array, derivative_scale
 from ctrlplan.trajectories.fields import Fields
-from ctrlplan.trajectories.newton import NewtonSystem, newton_series, pair_series
+from ctrlplan.trajectories.newton import NewtonSystem
+from ctrlplan.trajectories.one_time import newton_series, pair_series
 
 
 class Transition(Displayed, Fields):

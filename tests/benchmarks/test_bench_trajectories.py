@@ -5,14 +5,14 @@
 
 import itertools
 from statistics import median
-from time import perf_counter
+from time import perf_counter, process_time
 
 import numpy as np
 import pytest
 from scipy.interpolate import BPoly, PPoly
 from scipy.signal import czt
 
-from ctrlplan.trajectories import TrigSpline, Waypoint, residual_spectrum
+from ctrlplan.trajectories import PiecewiseSpline, PolySpline, TrigSpline, Waypoint, residual_spectrum
 
 RNG = np.random.default_rng(0)
 JETS = RNG.normal(size=(4, 3, 2))
@@ -147,3 +147,62 @@ def test_residual_spectrum_beside_a_transform_of_samples(beside):
         size = np.abs(plan(np.linspace(0.0, 10.0, 2001), 1)).mean() * 10.0
         np.testing.assert_allclose(transformed(plan), residual_spectrum(plan, omega), rtol=0, atol=1e-3 * size)
     beside(lambda plan: residual_spectrum(plan, omega), transformed, plans)
+
+
+def horner(rows, start, duration):
+    """Position, velocity, acceleration and jerk of each axis by Horner's method, in Python, and without checks."""
+
+    def jet(t):
+        u, found = (t - start) / duration, []
+        for row in rows:
+            a = b = c = d = 0.0
+            for value in row:
+                d, c, b, a = d * u + c, c * u + b, b * u + a, a * u + value
+            found.append((a, b / duration, 2.0 * c / duration**2, 6.0 * d / duration**3))
+        return found
+
+    return jet
+
+
+KINDS = {
+    "trigonometric": lambda given: TrigSpline(given, alpha=ALPHA, warn=False),
+    "polynomial": lambda given: PolySpline(given, warn=False),
+    "piecewise": lambda given: PiecewiseSpline(given, warn=False),
+}
+
+
+@pytest.mark.benchmark(group="one time")
+@pytest.mark.parametrize("naxes", [1, 2, 3])
+@pytest.mark.parametrize("kind", KINDS)
+def test_one_time_next_to_horner(benchmark, capsys, kind, naxes):
+    """jet(t, 3) at a float; peer: Horner's method of as many coefficients, written by hand. Goal: at most 6."""
+    cells = []
+    for count in (2, 4):
+        jets = RNG.normal(size=(count, 3, naxes))
+        given = [Waypoint(float(i), *jet) for i, jet in enumerate(jets)]
+        fresh = [KINDS[kind](given) for _ in range(50)]
+        plan, size = fresh[0], 6 if kind == "piecewise" else 3 * count
+        peer = horner(RNG.normal(size=(naxes, size)).tolist(), 0.0, plan.duration)
+        exact = plan.jet(np.array([0.7, 0.2]), 3)[..., 0]
+        assert np.abs(plan.jet(0.7, 3) - exact).max() <= 1e-12 * np.abs(exact).max()
+        times = []
+        for _ in range(7):
+            row = []
+            for function in (plan.jet, peer):
+                arguments = (0.7, 3) if function is not peer else (0.7,)
+                begin = process_time()
+                for _ in range(1000):
+                    function(*arguments)
+                row.append((process_time() - begin) / 1000)
+            times.append(row)
+        begin = process_time()
+        for new in fresh[1:]:
+            new.jet(0.7, 3)
+        first = (process_time() - begin) / len(fresh[1:])
+        own, other = (1e6 * median(column) for column in zip(*times, strict=True))
+        ratio = median(a / b for a, b in times)
+        cells.append(f"{count} waypoints {own:.1f} / {other:.2f} us = {ratio:.1f}, first call {1e6 * first:.0f} us")
+    benchmark.extra_info["ratio"] = ratio
+    benchmark.pedantic(lambda: plan.jet(0.7, 3), rounds=5, iterations=100)
+    with capsys.disabled():
+        print(f"\none time, {kind}, {naxes} axes: " + "; ".join(cells))

@@ -4,7 +4,8 @@ import mpmath as mp
 import numpy as np
 import pytest
 
-from ctrlplan.trajectories.newton import NewtonSystem, newton_series, pair_series
+from ctrlplan.trajectories.newton import NewtonSystem
+from ctrlplan.trajectories.one_time import newton_series, pair_series
 
 ALPHAS = [0.0, 1e-150, 1e-9, 1e-3, 1.0, 3.3, 6.2]
 ORDER = 6
