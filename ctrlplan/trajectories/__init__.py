@@ -18,6 +18,7 @@ from ctrlplan.trajectories.continuity import Jump
 from ctrlplan.trajectories.converted import as_trajectory
 from ctrlplan.trajectories.extrema import Bounds, Extrema
 from ctrlplan.trajectories.files import derivative_name, load_trajectory, trajectory_from_dict
+from ctrlplan.trajectories.fitting import fit
 from ctrlplan.trajectories.motion_profile import MotionProfile
 from ctrlplan.trajectories.piecewise import PiecewiseSpline
 from ctrlplan.trajectories.piecewise_polynomial import PiecewisePolynomial
@@ -63,6 +64,7 @@ __all__ = [
     "WaypointSpline",
     "as_trajectory",
     "derivative_name",
+    "fit",
     "load_trajectory",
     "residual_spectrum",
     "stack",
