@@ -14,6 +14,7 @@ Plan a move
     residual_spectrum         vibration that a plan leaves in a mode, by frequency; residual_plot draws it
     stack                     plans of single axes as one plan
     waypoints_from_csv        waypoints from a table, with times or at a speed
+    fit                       plan through samples, within a tolerance or smoothed
     as_trajectory             plans from splines of scipy and from results of python-control
     load_trajectory, trajectory_from_dict    stored plans
     Trajectory                what all plans have: values, derivatives, extrema, stop, plot, export, algebra
@@ -104,6 +105,7 @@ _EXPORTS = {
         "Waypoint",
         "WaypointSpline",
         "as_trajectory",
+        "fit",
         "load_trajectory",
         "residual_spectrum",
         "stack",

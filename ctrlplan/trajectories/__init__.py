@@ -18,6 +18,7 @@ from ctrlplan.trajectories.continuity import Jump
 from ctrlplan.trajectories.converted import as_trajectory
 from ctrlplan.trajectories.extrema import Bounds, Extrema
 from ctrlplan.trajectories.files import derivative_name, load_trajectory, trajectory_from_dict
+from ctrlplan.trajectories.fitting import fit
 from ctrlplan.trajectories.motion_profile import MotionProfile
 from ctrlplan.trajectories.path_plan import PathPlan
 from ctrlplan.trajectories.piecewise import PiecewiseSpline
@@ -65,6 +66,7 @@ __all__ = [
     "WaypointSpline",
     "as_trajectory",
     "derivative_name",
+    "fit",
     "load_trajectory",
     "residual_spectrum",
     "stack",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -45,6 +46,19 @@ def derivative_scale(duration: float, order: int) -> Array:
 
 
 _TINY = float(np.finfo(float).tiny)
+
+
+@lru_cache(maxsize=128)
+def bernstein_of_powers(degree: int) -> Array:
+    """Matrix (degree + 1, degree + 1) from coefficients of powers to those of Bernstein polynomials on [0, 1].
+
+    The polynomial lies between the smallest and the largest of the latter.
+    """
+    shares = [
+        [math.comb(i, k) / math.comb(degree, k) if k <= i else 0.0 for k in range(degree + 1)]
+        for i in range(degree + 1)
+    ]
+    return readonly(np.array(shares))
 
 
 def mapped_time(time: float, origin: float, target: float, rate: float) -> float:

@@ -164,10 +164,10 @@ class MotionProfile(Trajectory):
         return found
 
 
-def shifted(jet: Value, x: Value) -> list[Value]:
-    """Derivatives at x of the polynomial with given derivatives at 0."""
+def shifted(jet: Value, x: Value, order: int | None = None) -> list[Value]:
+    """Derivatives at x, all or up to an order, of the polynomial with given derivatives at 0."""
     rows = []
-    for low in range(len(jet)):
+    for low in range(len(jet) if order is None else min(order + 1, len(jet))):
         value = jet[-1]
         for k in range(len(jet) - 2, low - 1, -1):
             value = jet[k] + value * x / (k - low + 1)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctrlplan._types import Value
-from ctrlplan.trajectories.common import FACTORIALS, Array, derivative_scale, readonly
+from ctrlplan.trajectories.common import FACTORIALS, Array, bernstein_of_powers, derivative_scale, readonly
 from ctrlplan.trajectories.conjugate import SHORT, Kind, segment_system
 from ctrlplan.trajectories.fields import Fields
 from ctrlplan.trajectories.newton import NEARLY_CLOSED, NewtonSystem
@@ -189,11 +189,7 @@ def _bernstein(system: NewtonSystem, nu: int) -> Array:
     degree = max(order - nu, 0)
     if not len(derived):
         return np.zeros((1, system.size))
-    shares = [
-        [math.comb(i, k) / math.comb(degree, k) if k <= i else 0.0 for k in range(degree + 1)]
-        for i in range(degree + 1)
-    ]
-    return np.array(shares) @ derived
+    return np.asarray(bernstein_of_powers(degree) @ derived)
 
 
 def _gathered(run: Run, segments: NDArray[np.intp], u: Array, order: int) -> Array:

@@ -10,9 +10,15 @@ from numpy.typing import ArrayLike
 
 from ctrlplan._checks import MAXIMUM, checked_labels, new_numbers
 from ctrlplan._types import Data, Value
-from ctrlplan.trajectories.common import FACTORIALS, Array, mapped_time, times_powers
+from ctrlplan.trajectories.common import FACTORIALS, Array, bernstein_of_powers, mapped_time, times_powers
 from ctrlplan.trajectories.motion_profile import shifted
 from ctrlplan.trajectories.trajectory import Trajectory
+
+_FEW, _MANY = 16, 1000
+"""Number of segments up to which each is evaluated by itself, and number of times in each above which it is."""
+
+_CHUNK = 4104
+"""Number of times that are evaluated together."""
 
 
 class PiecewisePolynomial(Trajectory):
@@ -113,9 +119,44 @@ class PiecewisePolynomial(Trajectory):
     def segment_jet(self, segment: int, s: Array, order: int) -> Array:
         """Derivatives of a segment; as `Trajectory.segment_jet`."""
         found = np.zeros((order + 1, self.naxes, s.size))
-        rows = shifted(self._jets[:, :, segment, None], s)[: order + 1]
+        rows = shifted(self._jets[:, :, segment, None], s, order)
         found[: len(rows)] = rows
         return found
+
+    def _sample(self, t: Array, low: int, high: int, left: bool) -> Array:
+        last = self.breakpoints.size - 2
+        segments = np.searchsorted(self.breakpoints, t, side="left" if left else "right") - 1
+        if not left:
+            segments[t == self.breakpoints[-1]] = last
+        touched = int(np.count_nonzero(np.diff(segments))) + 1
+        inside = t.size and segments.min() >= 0 and segments.max() <= last
+        if touched <= _FEW or t.size > _MANY * touched or not inside:
+            return super()._sample(t, low, high, left)
+        out = np.zeros((high - low + 1, self.naxes, t.size))
+        with np.errstate(over="ignore", invalid="ignore"):
+            for begin in range(0, t.size, _CHUNK):
+                part = slice(begin, begin + _CHUNK)
+                own = segments[part]
+                rows = shifted(self._jets[:, :, own], t[part] - self.breakpoints[own], high)[low:]
+                for k, row in enumerate(rows):
+                    out[k, :, part] = row
+        return out if np.isfinite(out.sum()) else super()._sample(t, low, high, left)
+
+    def derivative_bounds(self, nu: int) -> tuple[Array, Array] | None:
+        """Bounds of a derivative on each segment; as `Trajectory.derivative_bounds`."""
+        if nu >= len(self.coefficients):
+            zero = np.zeros((self.naxes, self.breakpoints.size - 1))
+            return zero, zero
+        degree = len(self.coefficients) - 1 - nu
+        matrix = bernstein_of_powers(degree)
+        with np.errstate(over="ignore", invalid="ignore", under="ignore"):
+            powers = (np.diff(self.breakpoints) ** np.arange(degree + 1)[:, None])[:, None]
+            terms = self._jets[nu:] / FACTORIALS[: degree + 1, None, None] * powers
+            values = np.tensordot(matrix, terms, 1)
+            # Sums of as many terms as powers, each with two rounded factors.
+            rounding = (degree + 4) * np.finfo(float).eps * np.abs(terms).sum(axis=0)
+            low, high = values.min(axis=0) - rounding, values.max(axis=0) + rounding
+        return (low, high) if np.isfinite(low).all() and np.isfinite(high).all() else None
 
     def segment_series(self, segment: int, s: Value, order: int) -> list[list[Value]]:
         """Taylor series of a segment; as `Trajectory.segment_series`."""

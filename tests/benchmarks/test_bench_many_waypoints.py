@@ -10,7 +10,7 @@ from time import process_time
 import control as ct
 import numpy as np
 import pytest
-from scipy.interpolate import BPoly, PPoly, make_interp_spline
+from scipy.interpolate import BPoly, PPoly, make_interp_spline, splrep
 
 import ctrlplan as cp
 from ctrlplan.trajectories.waypoint import Entries
@@ -198,6 +198,30 @@ def test_optimum_waypoints_beside_make_interp_spline(derivative, benchmark, caps
     benchmark.pedantic(ours, rounds=5, warmup_rounds=1)
     degree = 2 * derivative - 1
     report(capsys, benchmark, f"optimize_waypoints({derivative}) next to make_interp_spline(k={degree})", times, sizes)
+
+
+@pytest.mark.benchmark
+@pytest.mark.parametrize("option", ["tolerance", "smoothing"])
+def test_fit_beside_splrep(option, benchmark, capsys):
+    """Noise of 0.01: the peer is given the sum of squares that our plan has reached."""
+    times, sizes = [], (100, 1000, 10_000)
+    for n in sizes:
+        t = np.linspace(0.0, 10.0, n)
+        y = np.sin(3 * t) + 0.3 * np.sin(7 * t) + np.random.default_rng(0).normal(scale=0.01, size=n)
+        chosen = {"tolerance": 0.06} if option == "tolerance" else {"smoothing": 1.2e-4 * n}
+
+        def ours(t=t, y=y, chosen=chosen):
+            return cp.fit(t, y, **chosen)
+
+        reached = float(((ours()(t) - y) ** 2).sum())
+
+        def peer(t=t, y=y, reached=reached):
+            return splrep(t, y, s=reached)
+
+        assert ours().breakpoints.size <= 1.5 * peer()[0].size
+        times.append(seconds((ours, peer), max(1, 1000 // n)))
+    benchmark.pedantic(ours, rounds=3)
+    report(capsys, benchmark, f"fit({option}=) next to splrep of the same deviation", times, sizes)
 
 
 @pytest.mark.benchmark

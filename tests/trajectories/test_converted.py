@@ -46,6 +46,31 @@ def test_spline_has_the_values_and_derivatives_of_scipy(name):
     assert not plan.deviation.any()
 
 
+CONTINUITY = {
+    **dict.fromkeys(["CubicSpline", "CubicSpline along the last axis", "periodic", "PPoly of a B-spline"], 2),
+    **dict.fromkeys(["B-spline along the last axis", "B-spline, periodic", "B-spline, knots beyond"], 2),
+    **dict.fromkeys(["pchip", "Akima", "BPoly"], 1),
+    **{f"degree {k}": k - 1 for k in (1, 2, 3, 5)},
+    **dict.fromkeys(["PPoly", "B-spline, steps"], -1),
+    "B-spline, repeated knots": 0,
+}
+"""Highest continuous derivative: the degree less the multiplicity of the knots, Hermite data, or none."""
+
+
+@pytest.mark.parametrize("name", SPLINES)
+def test_continuity_is_that_of_the_spline(name):
+    plan, order = cp.as_trajectory(SPLINES[name]), CONTINUITY[name]
+    found = [jump for jump in plan.jumps(order + 1) if plan.start < jump.time < plan.end]
+    assert {jump.order for jump in found} == {order + 1}
+    assert {jump.time for jump in found} <= ({1.0} if name.endswith("repeated knots") else set(plan.breakpoints[1:-1]))
+
+
+def test_periodic_splines_close():
+    for name in ("periodic", "B-spline, periodic"):
+        jet = cp.as_trajectory(SPLINES[name]).jet([KNOTS[0], KNOTS[-1]], 2)[:, 0]
+        np.testing.assert_allclose(jet[:, 0], jet[:, 1], rtol=0, atol=1e-12 * np.abs(jet).max())
+
+
 def test_breakpoints_are_the_knots_within():
     assert cp.as_trajectory(SPLINES["CubicSpline"]).breakpoints.tolist() == KNOTS.tolist()
     assert cp.as_trajectory(SPLINES["B-spline, knots beyond"]).breakpoints.tolist() == [3.0, 4.0, 5.0, 6.0]
@@ -195,6 +220,7 @@ def test_states_and_inputs_within_the_deviation_stated(lane_change):
         assert error <= 2.0 * stated, name  # measured in the middle of the samples, where it is largest but at ends
     assert cp.trajectory_from_dict(plan.to_dict()).deviation.tolist() == plan.deviation.tolist()
     assert "deviation of theta" in str(plan)
+    assert [jump for jump in plan.jumps(0) if plan.start < jump.time < plan.end] == []
 
 
 def straight(*x):
@@ -236,6 +262,7 @@ def test_error_between_samples_is_below_the_deviation(count):
     error = np.abs(plan(t) - [np.sin(t), np.cos(t)]).max(axis=1)
     assert (error <= plan.deviation).all()
     assert (plan.deviation < 100 * error).all()
+    assert [jump for jump in plan.jumps(2) if plan.start < jump.time < plan.end] == []
 
 
 def test_inputs_are_linear_between_samples():
@@ -245,6 +272,8 @@ def test_inputs_are_linear_between_samples():
     np.testing.assert_allclose(plan(t)[0], np.interp(t, found.time, found.inputs), rtol=0, atol=1e-15)
     assert plan.deviation[0] == 0.0
     assert plan.deviation[1] > 0.0
+    inner = {(jump.order, jump.label) for jump in plan.jumps(2) if plan.start < jump.time < plan.end}
+    assert inner == {(1, "a")}  # the input is continuous, the state twice differentiable
 
 
 @pytest.mark.slow

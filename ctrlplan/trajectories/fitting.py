@@ -1,0 +1,220 @@
+"""Plans through sampled data, by the smoothing splines of scipy."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ctrlplan._checks import checked_count, checked_vector, real_array
+from ctrlplan.trajectories.common import FACTORIALS, Array
+from ctrlplan.trajectories.piecewise_polynomial import PiecewisePolynomial
+
+if TYPE_CHECKING:
+    from scipy.interpolate import BSpline
+
+_DEGREES = (1, 3, 3, 5, 5)
+"""Degree of the spline by the highest continuous derivative; even degrees are ill-conditioned."""
+
+_PARTS = 16
+"""Maximum number of parts into which an interval between knots is divided in one step."""
+
+
+def fit(
+    times: ArrayLike,
+    values: ArrayLike,
+    *,
+    tolerance: ArrayLike | None = None,
+    smoothing: ArrayLike | None = None,
+    continuity: int = 2,
+    labels: Sequence[str] | str | None = None,
+) -> PiecewisePolynomial:
+    """Plan through samples: an interpolating or smoothing spline.
+
+    By default the plan interpolates the samples (`scipy.interpolate.make_interp_spline`).
+    With `tolerance` it is a least-squares spline (`make_lsq_spline`) whose knots, the
+    same for all axes, are added where the deviation is larger. With `smoothing` it is,
+    axis by axis, the smoothing spline of FITPACK (`splrep`). Knots are sample times.
+
+    Parameters
+    ----------
+    times : array_like, shape (nsamples,)
+        Sample times [s], strictly increasing.
+    values : array_like, shape (naxes, nsamples), or (nsamples,) for one axis
+        Samples.
+    tolerance : float or array_like of shape (naxes,), optional
+        Maximum deviation from the samples [unit of the axis], above 0.
+    smoothing : float or array_like of shape (naxes,), optional
+        Maximum sum of the squared deviations of an axis, as the argument `s` of
+        `splrep`: about the number of samples times the variance of their noise.
+        0 interpolates.
+    continuity : int, optional
+        Highest derivative that is continuous, from 0 (linear between samples) to 4.
+    labels : sequence of str, optional
+        Names of the axes.
+
+    Returns
+    -------
+    PiecewisePolynomial
+        Its attribute `deviation` is the maximum deviation at the samples, by axis.
+        Peaks and extrema of its derivatives are those of the polynomials, between
+        the samples too.
+
+    Raises
+    ------
+    TypeError
+        If an argument does not contain real numbers.
+    ValueError
+        If shapes differ, a sample is not finite, times do not increase strictly, or
+        there are too few samples for the continuity; if `tolerance` and `smoothing`
+        are both given; if the tolerance would require more knots than samples.
+
+    Notes
+    -----
+    The plan starts and ends with the velocity of the data. `jumps` lists what differs
+    from rest.
+
+    Examples
+    --------
+    A noisy record of a move, within 2 mm of the samples:
+
+    >>> import numpy as np
+    >>> times = np.linspace(0.0, 4.0, 401)
+    >>> noise = np.random.default_rng(1).uniform(-1e-3, 1e-3, 401)
+    >>> plan = fit(times, np.sin(times) ** 2 + noise, tolerance=2e-3, labels="x")
+    >>> bool(plan.deviation[0] <= 2e-3), plan.breakpoints.size < 40, plan.peak(1).round(1)
+    (True, True, array([1.]))
+    """
+    degree = _DEGREES[_checked_continuity(continuity)]
+    moments, rows = _checked_samples(times, values, degree)
+    if tolerance is not None and smoothing is not None:
+        raise ValueError(f"tolerance and smoothing must not both be given, got {tolerance!r:.40} and {smoothing!r:.40}")
+    allowed = _checked_positive(tolerance, "tolerance", len(rows), zero=False)
+    sums = _checked_positive(smoothing, "smoothing", len(rows), zero=True)
+    if allowed is not None:
+        splines = [_within(moments, rows, degree, allowed)]
+    elif sums is not None:
+        splines = [_smooth(moments, row, degree, s) for row, s in zip(rows, sums.tolist(), strict=True)]
+    else:
+        splines = [_interpolating(moments, rows.T, degree)]
+    knots = np.unique(np.concatenate([spline.t for spline in splines]))
+    table = np.empty((degree + 1, knots.size - 1, len(rows)))
+    for k in range(degree + 1):
+        table[-1 - k] = np.concatenate([spline(knots[:-1], nu=k) for spline in splines], axis=1) / FACTORIALS[k]
+    deviation = np.abs(np.concatenate([spline(moments) for spline in splines], axis=1).T - rows).max(axis=1)
+    return PiecewisePolynomial(knots, table, labels=labels, deviation=deviation)
+
+
+def _checked_continuity(continuity: int) -> int:
+    highest = len(_DEGREES) - 1
+    order = checked_count(continuity, "continuity")
+    if order > highest:
+        raise ValueError(f"continuity must be from 0 to {highest}, got {continuity}")
+    return order
+
+
+def _checked_samples(times: ArrayLike, values: ArrayLike, degree: int) -> tuple[Array, Array]:
+    """Times (nsamples,) and values (naxes, nsamples), finite, as many as the degree requires."""
+    moments, given = real_array(times, "times"), real_array(values, "values")
+    if moments.ndim != 1:
+        raise ValueError(f"times must have shape (nsamples,), got {moments.shape}")
+    rows = given[None] if given.ndim == 1 else given
+    if rows.ndim != 2 or rows.shape[1] != moments.size or not len(rows):
+        raise ValueError(
+            f"values must have shape (naxes, {moments.size}) or ({moments.size},) as times, got {given.shape}"
+        )
+    for name, array in (("times", moments[None]), ("values", rows)):
+        if not np.isfinite(array).all():
+            axis, i = np.argwhere(~np.isfinite(array))[0].tolist()
+            place = f"[{i}]" if name == "times" or given.ndim == 1 else f"[{axis}, {i}]"
+            raise ValueError(f"{name} must be finite, got {name}{place} = {array[axis, i]}; remove such samples first")
+    wrong = np.flatnonzero(~(np.diff(moments) > 0.0))
+    if wrong.size:
+        i = int(wrong[0]) + 1
+        advice = "; average samples at the same time first" if moments[i] == moments[i - 1] else "; sort them first"
+        raise ValueError(
+            f"times must increase strictly, got times[{i}] = {moments[i]} after times[{i - 1}] = {moments[i - 1]}"
+            + advice
+        )
+    if moments.size <= degree:
+        raise ValueError(
+            f"times must be {degree + 1} or more for a spline of degree {degree}, got {moments.size}; lower continuity"
+        )
+    return moments, rows
+
+
+def _checked_positive(value: ArrayLike | None, name: str, naxes: int, *, zero: bool) -> Array | None:
+    """Numbers (naxes,) above 0, or of at least 0."""
+    if value is None:
+        return None
+    found = checked_vector(value, name, naxes)
+    if not (found >= 0.0 if zero else found > 0.0).all():
+        raise ValueError(f"{name} must be {'at least' if zero else 'above'} 0, got {value!r:.80}")
+    return found
+
+
+def _interpolating(times: Array, columns: Array, degree: int) -> BSpline:
+    from scipy.interpolate import make_interp_spline
+
+    return make_interp_spline(times, columns, k=degree)
+
+
+def _smooth(times: Array, row: Array, degree: int, total: float) -> BSpline:
+    """Smoothing spline of one axis whose sum of squared deviations is at most `total`."""
+    from scipy.interpolate import BSpline, splrep
+
+    if total == 0.0:
+        return _interpolating(times, row[:, None], degree)
+    # FITPACK reaches its sum to 1e-3; instead of its messages, the sum is measured.
+    (knots, coefficients, _), *_ = splrep(times, row, k=degree, s=total / 1.001, full_output=1, quiet=1)
+    spline = BSpline(knots, coefficients[: knots.size - degree - 1, None], degree)
+    found = ((spline(times)[:, 0] - row) ** 2).sum() <= total
+    return spline if found else _interpolating(times, row[:, None], degree)
+
+
+def _within(times: Array, rows: Array, degree: int, limits: Array) -> BSpline:
+    """Least-squares spline of all axes, with knots added where samples deviate by more than limits (naxes,)."""
+    from scipy.interpolate import make_lsq_spline
+
+    last = times.size - 1
+    chosen = np.array([0, last])
+    # As many coefficients as samples are those of the interpolating spline.
+    while chosen.size - 1 + degree < times.size:
+        knots = np.concatenate([times[[0] * degree], times[chosen], times[[last] * degree]])
+        try:
+            spline = make_lsq_spline(times, rows.T, knots, k=degree)
+        except np.linalg.LinAlgError:  # times that are spaced too unevenly for the normal equations
+            break
+        with np.errstate(over="ignore", invalid="ignore"):
+            excess = (np.abs(spline(times) - rows.T) / limits).max(axis=1)
+        if (excess <= 1.0).all():
+            return spline
+        if not np.isfinite(excess).all():
+            break
+        chosen = _divided(chosen, np.maximum.reduceat(excess[:-1], chosen[:-1]), degree)
+    spline = _interpolating(times, rows.T, degree)
+    left = np.abs(spline(times).T - rows).max(axis=1)
+    if (left > limits).any():
+        axis = int((left / limits).argmax())
+        raise ValueError(
+            f"tolerance must be at least {left[axis]:.3g}, the deviation by rounding of a spline through all samples "
+            f"of axis {axis}, got {limits[axis]:g}: it would require more knots than the {times.size} samples"
+        )
+    return spline
+
+
+def _divided(chosen: NDArray[np.intp], worst: Array, degree: int) -> NDArray[np.intp]:
+    """Numbers of the samples at knots, with more of them where the relative deviations exceed 1.
+
+    A deviation is proportional to the power degree + 1 of the length of an interval.
+    """
+    lengths = np.diff(chosen)
+    parts = np.where(worst > 1.0, np.ceil(worst ** (1.0 / (degree + 1))).clip(2.0, _PARTS), 1.0).astype(int)
+    while not (np.minimum(parts, lengths) > 1).any():  # a single sample between knots: divide the intervals next to it
+        parts = np.maximum(parts, np.maximum(np.append(parts[1:], 1), np.append(1, parts[:-1])))
+    parts = np.minimum(parts, lengths)
+    number = np.arange(parts.sum()) - np.repeat(np.cumsum(parts) - parts, parts)
+    inner = np.repeat(chosen[:-1], parts) + number * np.repeat(lengths, parts) // np.repeat(parts, parts)
+    return np.append(inner, chosen[-1])

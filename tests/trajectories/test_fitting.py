@@ -1,0 +1,178 @@
+"""Plans through samples, against the samples themselves, scipy's own splines and functions that a spline reproduces."""
+
+import re
+import warnings
+
+import numpy as np
+import pytest
+from scipy import interpolate as si
+
+import ctrlplan as cp
+
+RNG = np.random.default_rng(3)
+T = np.sort(np.append(RNG.uniform(0.0, 5.0, 298), [0.0, 5.0])) + 7.0
+WAVE = np.stack([np.sin(2.0 * T), 100.0 + 30.0 * np.cos(3.0 * T)])
+NOISY = WAVE + RNG.normal(size=WAVE.shape) * [[0.01], [1.0]]
+
+
+def deviation(plan, values):
+    return np.abs(plan(T).reshape(-1, T.size) - values).max(axis=1)
+
+
+@pytest.mark.parametrize("continuity", range(5))
+@pytest.mark.parametrize("noisy", [False, True])
+@pytest.mark.parametrize("share", [3.0, 0.5, 1e-3])
+def test_tolerance_is_met_at_every_sample(continuity, noisy, share):
+    values = NOISY if noisy else WAVE
+    limits = share * np.array([0.02, 2.0])
+    plan = cp.fit(T, values, tolerance=limits, continuity=continuity, labels=["x", "z"])
+    found = deviation(plan, values)
+    assert (found <= limits * (1 + 1e-12)).all()
+    assert (np.abs(plan.deviation - found) <= 1e-13 * np.abs(values).max(axis=1)).all()
+    assert [jump for jump in plan.jumps(continuity) if plan.start < jump.time < plan.end] == []
+    assert plan.breakpoints.size <= T.size
+    assert (plan.start, plan.end, plan.labels) == (T[0], T[-1], ("x", "z"))
+
+
+def test_knots_are_few_where_few_suffice():
+    """A cubic needs none; a smooth wave as many as the fourth root of its tolerance wants, within a factor."""
+    cubic = 1.0 - T + 0.3 * T**3
+    assert cp.fit(T, cubic, tolerance=1e-9).breakpoints.size == 2
+    sizes = [cp.fit(T, WAVE[0], tolerance=tolerance).breakpoints.size for tolerance in (1e-2, 1e-4)]
+    assert sizes[0] < 16
+    assert sizes[1] < 16 * 10**0.5 * 1.5
+    assert cp.fit(T, NOISY, tolerance=[0.05, 5.0]).breakpoints.size < 30
+
+
+def test_without_options_it_interpolates():
+    plan = cp.fit(T, NOISY)
+    wanted = si.make_interp_spline(T, NOISY.T, k=3)
+    s = np.linspace(T[0], T[-1], 1001)
+    for nu in range(3):
+        size = np.abs(wanted(s, nu=nu)).max(axis=0)
+        assert (np.abs(plan(s, nu) - wanted(s, nu=nu).T).max(axis=1) <= 1e-10 * size).all()
+    assert (plan.deviation <= 1e-12 * np.abs(NOISY).max(axis=1)).all()
+    assert cp.fit(T, NOISY, smoothing=0.0).breakpoints.tolist() == plan.breakpoints.tolist()
+
+
+def test_smoothing_is_that_of_splrep():
+    sums = T.size * np.array([0.01, 1.0]) ** 2
+    plan = cp.fit(T, NOISY, smoothing=sums, continuity=4)
+    assert (((plan(T) - NOISY) ** 2).sum(axis=1) <= sums).all()
+    for axis, (row, s) in enumerate(zip(NOISY, sums, strict=True)):
+        wanted = si.BSpline(*si.splrep(T, row, k=5, s=s / 1.001))
+        np.testing.assert_allclose(plan(T)[axis], wanted(T), rtol=0, atol=1e-10 * np.abs(row).max())
+    np.testing.assert_allclose(plan.deviation, deviation(plan, NOISY), rtol=1e-9)
+    true = np.stack([2.0 * np.cos(2.0 * T), -90.0 * np.sin(3.0 * T)])
+    inside = np.abs(T - 9.5) < 2.0
+    assert (np.abs(plan(T, 1) - true)[:, inside].max(axis=1) < [0.1, 10.0]).all()
+
+
+def test_peaks_hold_between_the_samples():
+    """Derivative bounds contain the derivatives on each segment; the peak is attained and exceeded nowhere."""
+    plan = cp.fit(T, NOISY, tolerance=[0.05, 5.0], continuity=4)
+    s = np.linspace(plan.start, plan.end, 20_001)
+    inside = np.searchsorted(plan.breakpoints[:-1], s, side="right") - 1
+    for nu in range(7):
+        low, high = plan.derivative_bounds(nu)
+        values = plan.jet(s, nu)[nu]
+        slack = 1e-9 * np.abs(values).max(axis=1, keepdims=True)
+        assert (values >= low[:, inside] - slack).all()
+        assert (values <= high[:, inside] + slack).all()
+        assert (np.abs(values).max(axis=1) <= plan.peak(nu) * (1 + 1e-12)).all()
+        assert (np.abs(values).max(axis=1) >= 0.98 * plan.peak(nu)).all()
+
+
+def test_many_times_are_those_one_by_one():
+    plan = cp.fit(T, NOISY, tolerance=[0.02, 2.0])
+    s = np.concatenate([RNG.uniform(plan.start, plan.end, 500), plan.breakpoints])
+    for left in (False, True):
+        many = plan.jet(s, 5, left=left)
+        np.testing.assert_array_equal(many, np.stack([plan.jet(t, 5, left=left) for t in s], axis=2))
+    beyond = plan.jet([T[0] - 1.0, *s, T[-1] + 1.0], 2)
+    np.testing.assert_array_equal(beyond[:, :, 1:-1], plan.jet(s, 2))
+    assert not beyond[1:, :, [0, -1]].any()
+
+
+def test_a_step_and_unevenly_spaced_samples():
+    t = np.cumsum(np.append(0.0, 10.0 ** RNG.uniform(-4, 0, 400)))
+    y = np.where(t > 0.4 * t[-1], 1.0, 0.0) + 1e-3 * np.sin(t)
+    for tolerance in (0.3, 1e-2, 1e-5):
+        plan = cp.fit(t, y, tolerance=tolerance)
+        assert np.abs(plan(t) - y).max() <= tolerance * (1 + 1e-12)
+
+
+def test_one_axis_and_its_round_trip(tmp_path):
+    plan = cp.fit(T, WAVE[0], tolerance=1e-3, labels="x")
+    assert plan([7.5, 8.0]).shape == (2,)
+    assert plan.deviation.shape == (1,)
+    plan.save(tmp_path / "plan.json")
+    assert cp.load_trajectory(tmp_path / "plan.json").to_dict() == plan.to_dict()
+    assert "deviation of x" in str(plan)
+
+
+def test_nothing_is_printed_where_fitpack_fails():
+    """A sum far below what FITPACK reaches is met by interpolation."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        plan = cp.fit(T, NOISY[0], smoothing=1e-26)
+    assert ((plan(T) - NOISY[0]) ** 2).sum() <= 1e-24
+
+
+def without(values, i, value):
+    found = np.array(values)
+    found[..., i] = value
+    return found
+
+
+BAD = {
+    "text": (lambda: cp.fit(["a", "b"], [1, 2]), TypeError, "times must be real numbers"),
+    "text in values": (lambda: cp.fit(T, ["x"] * T.size), TypeError, "values must be real numbers"),
+    "dates": (lambda: cp.fit(np.arange(9).astype("M8[s]"), np.zeros(9)), TypeError, r"plain numbers \(times in sec"),
+    "nan": (
+        lambda: cp.fit(T, without(WAVE, 4, np.nan)),
+        ValueError,
+        r"values must be finite, got values\[0, 4\] = nan",
+    ),
+    "nan time": (
+        lambda: cp.fit(without(T, 4, np.nan), WAVE),
+        ValueError,
+        r"times must be finite, got times\[4\] = nan",
+    ),
+    "inf": (lambda: cp.fit(T, without(WAVE[0], 2, np.inf)), ValueError, r"values\[2\] = inf; remove"),
+    "repeated": (lambda: cp.fit([0, 1, 1, 2, 3], range(5)), ValueError, r"times\[2\] = 1.0 after times\[1\] = 1.0; av"),
+    "unsorted": (lambda: cp.fit([0, 2, 1, 3, 4], range(5)), ValueError, r"got times\[2\] = 1.0 after .* = 2.0; sort"),
+    "lengths": (
+        lambda: cp.fit(T, WAVE[:, :-1]),
+        ValueError,
+        r"shape \(naxes, 300\) or \(300,\) as times, got \(2, 299",
+    ),
+    "transposed": (lambda: cp.fit(T, WAVE.T), ValueError, r"got \(300, 2\)"),
+    "scalar": (lambda: cp.fit(1.0, 2.0), ValueError, r"times must have shape \(nsamples,\), got \(\)"),
+    "few": (lambda: cp.fit([0, 1, 2], [0, 1, 0]), ValueError, "4 or more for a spline of degree 3, got 3; lower cont"),
+    "none": (lambda: cp.fit([], []), ValueError, "4 or more"),
+    "both": (lambda: cp.fit(T, WAVE, tolerance=1, smoothing=1), ValueError, "must not both be given, got 1 and 1"),
+    "zero": (lambda: cp.fit(T, WAVE, tolerance=0), ValueError, "tolerance must be above 0, got 0"),
+    "negative": (
+        lambda: cp.fit(T, WAVE, smoothing=[1, -1]),
+        ValueError,
+        r"smoothing must be at least 0, got \[1, -1\]",
+    ),
+    "nan tolerance": (lambda: cp.fit(T, WAVE, tolerance=np.nan), ValueError, "tolerance must be a finite number or 2"),
+    "three": (lambda: cp.fit(T, WAVE, tolerance=[1, 2, 3]), ValueError, "tolerance must be a finite number or 2"),
+    "knots": (
+        lambda: cp.fit(T, NOISY, tolerance=[1.0, 1e-19]),
+        ValueError,
+        "tolerance must be at least .* of axis 1, got 1e-19: it would require more knots than the 300 samples",
+    ),
+    "continuity": (lambda: cp.fit(T, WAVE, continuity=5), ValueError, "continuity must be from 0 to 4, got 5"),
+    "labels": (lambda: cp.fit(T, WAVE, labels="x"), ValueError, "labels must be one per axis, 2, got 1"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_input(name):
+    call, kind, message = BAD[name]
+    with pytest.raises(kind) as caught:
+        call()
+    assert re.search(message, str(caught.value)), str(caught.value)
