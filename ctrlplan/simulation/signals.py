@@ -15,7 +15,7 @@ from functools import lru_cache
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ctrlplan._checks import real_array
 from ctrlplan._types import Array
@@ -145,17 +145,15 @@ class PlanSignal:
 
 
 class SampledSignal:
-    """Signal given by samples, linear in between; its breakpoints are changes of slope."""
+    """Signal given by samples, linear in between; its breakpoints are changes of slope beyond rounding."""
 
     width = 1
 
     def __init__(self, times: Array, values: Array) -> None:
-        line = np.interp(times, times[[0, -1]], values[[0, -1]])
-        if np.abs(values - line).max() <= 4.0 * np.finfo(float).eps * np.abs(values).max():
-            times, values = times[[0, -1]], values[[0, -1]]  # one line up to rounding
         self.times, self.values = times, values
-        slope = np.diff(values) / np.diff(times)
-        self.breakpoints = times[1:-1][slope[1:] != slope[:-1]]
+        self._ends = _ends_of_lines(times, values)
+        self._knots = times[self._ends]
+        self.breakpoints = self._knots[1:-1]
 
     def analytic_at(self, moment: float, origin: float, s: Array) -> Array:
         """Values of the straight line that contains `moment`."""
@@ -174,10 +172,10 @@ class SampledSignal:
         found = np.interp(times, self.times, self.values)
         return np.clip(found, np.minimum(first, second), np.maximum(first, second))[None]
 
-    def _line(self, moment: float) -> slice:
+    def _line(self, moment: float) -> NDArray[np.intp]:
         """Indices of the samples at both ends of the line that contains `moment`."""
-        left = min(max(int(np.searchsorted(self.times, moment)) - 1, 0), self.times.size - 2)
-        return slice(left, left + 2)
+        left = min(max(int(np.searchsorted(self._knots, moment)) - 1, 0), self._knots.size - 2)
+        return self._ends[left : left + 2]
 
 
 def input_signals(labels: Sequence[str], inputs: Inputs, times: Array) -> list[TimeSignal]:
@@ -280,6 +278,31 @@ def chebyshev_coefficients(values: Array) -> Array:
     coefficients[constant] = 0.0
     coefficients[constant, 0] = values[constant, 0]
     return np.asarray(coefficients)
+
+
+def _ends_of_lines(times: Array, values: Array) -> NDArray[np.intp]:
+    """Indices of the samples at the ends of straight lines through all others, up to rounding.
+
+    Samples that are a change of slope larger than the rounding of the largest value
+    are ends. If the samples between two of them deviate from their line by more than
+    its own rounding, each change of slope between them is an end as well.
+    """
+    slope = np.diff(values) / np.diff(times)
+    bend = np.abs(np.diff(slope)) * np.minimum(np.diff(times)[1:], np.diff(times)[:-1])
+    certain = np.flatnonzero(bend > _rounding_of_lines(times, np.abs(values).max(), np.abs(slope).max())) + 1
+    ends = np.concatenate([[0], certain, [times.size - 1]])
+    line = np.repeat(np.arange(ends.size - 1), np.diff(ends))  # of each sample but the last
+    steepness = np.abs(np.diff(values[ends]) / np.diff(times[ends]))
+    size = np.maximum(np.abs(values[ends[:-1]]), np.abs(values[ends[1:]]))
+    deviation = np.abs(values - np.interp(times, times[ends], values[ends]))[:-1]
+    bent = np.unique(line[deviation > _rounding_of_lines(times, size, steepness)[line]])
+    inside = np.flatnonzero(slope[1:] != slope[:-1]) + 1
+    return np.union1d(ends, inside[np.isin(line[inside], bent)])
+
+
+def _rounding_of_lines(times: Array, size: Array | float, steepness: Array | float) -> Array:
+    """Rounding errors of samples of lines, by their values and by those of their times."""
+    return 4.0 * np.finfo(float).eps * (size + steepness * np.abs(times[[0, -1]]).max())
 
 
 def _unbounded(left: float, right: float, coefficients: Array) -> Series:

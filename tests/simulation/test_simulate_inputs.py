@@ -1,5 +1,7 @@
 """Inputs of a system: trajectories, numbers and samples, by name or all together."""
 
+from itertools import pairwise
+
 import control as ct
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ B = [[0.0, 0.5], [4.0, -1.0]]
 C = [[1.0, 0.0], [0.0, 1.0], [1.0, 1.0]]
 D = [[0.0, 0.0], [0.0, 0.3], [0.0, 0.0]]
 SYSTEM = ct.ss(A, B, C, D, inputs=["r", "d"], outputs=["y", "v", "w"], name="plant")
+EPS = np.finfo(float).eps
 T = np.linspace(0.0, 6.0, 121)
 PLAN, (R,) = both([0.4, 1.1, 2.7], [[[0.0, 0.0, 0.0], [1.0, -0.3], [0.5, 0.0, 0.0]]], 1.0)
 OTHER, (S,) = both([1.0, 3.3], [[[0.0, 0.0], [-2.0, 1.0]]])
@@ -176,6 +179,37 @@ def test_samples_on_a_line_do_not_bend_by_rounding():
     bent = np.where(t < t[2000], 1.0 + t / 3.0, 1.0 + t[2000] / 3.0 + (1 / 3 + 1e-9) * (t - t[2000]))
     assert t[2000] in SampledSignal(t, bent).breakpoints
     assert np.array_equal(SampledSignal(t, bent).at(t)[0], bent)
+
+
+@pytest.mark.parametrize("start", [0.0, -0.7, 1e5])
+@pytest.mark.parametrize("offset", [0.0, 1e6])
+def test_samples_of_straight_lines_bend_at_their_knots_alone(start, offset):
+    from ctrlplan.simulation.signals import SampledSignal
+
+    t = start + np.linspace(0.0, 30.0, 3001)
+    knots = t[::100]
+    values = np.interp(t, knots, offset + np.random.default_rng(3).normal(size=knots.size))
+    signal = SampledSignal(t, values)
+    assert np.array_equal(signal.breakpoints, knots[1:-1])
+    assert np.array_equal(signal.at(t)[0], values)
+    for left, right in pairwise(knots):
+        inside = (t >= left) & (t <= right)
+        found = signal.analytic_at(0.5 * (left + right), left, t[inside] - left)[0]
+        steep = np.ptp(values[inside]) / (right - left) * np.abs(t[[0, -1]]).max()
+        assert np.abs(found - values[inside]).max() <= 8 * EPS * (np.abs(values[inside]).max() + steep)
+
+
+@pytest.mark.parametrize("size", [1e-9, 1e-3, 1.0])
+def test_a_small_curve_next_to_a_large_jump_bends_at_every_sample(size):
+    from ctrlplan.simulation.signals import SampledSignal
+
+    t = np.linspace(0.0, 10.0, 1001)
+    curve = size * np.sin(t)
+    values = np.where(t > 8.0, 1e6, curve)
+    signal = SampledSignal(t, values)
+    early = t[(t > 0.0) & (t < 7.9)]
+    assert np.isin(early[np.abs(np.sin(early)) > 0.01], signal.breakpoints).all()
+    assert np.array_equal(signal.at(t)[0], values)
 
 
 def test_a_list_holds_what_each_input_takes():
