@@ -176,7 +176,7 @@ def variation(t: Array, f: Array) -> float:
     if diverged(f):
         return np.inf
     p = pieces(t, f)
-    return float(np.abs(np.diff(p.at_cuts(p.cuts()), axis=0)).sum())
+    return float(np.abs(np.diff(p.values, axis=0)).sum())
 
 
 def _saturated(t: Array, u: Array, low: float, high: float) -> float:
@@ -199,10 +199,10 @@ def _beyond(t: Array, g: Array, tolerance: float) -> float:
     free = np.ones(t.size - 1, dtype=np.bool_)
     free[stays] = free[enters] = free[leaves] = False
     p = pieces(t, g, np.flatnonzero(free))
-    values = p.at_cuts(p.cuts())
+    values = p.values
     mixed = (values.min(axis=0) < 0) & (values.max(axis=0) > 0)
     crossed = p[mixed]
-    cuts = crossed.splits()
+    cuts = crossed.splits
     above = crossed((cuts[:-1] + cuts[1:]) / 2) > 0
     time = np.sum(p.step[~mixed & (p.end >= -tolerance)]) + np.sum(crossed.step * np.diff(cuts, axis=0) * above)
     time += np.sum(t[stays + 1] - t[stays])

@@ -131,7 +131,7 @@ def squared(t: Array, f: Array) -> Value:
     values = np.empty(len(rows))
     with np.errstate(**QUIET):
         for some in blocks(rows):
-            values[some] = pieces(t, rows[some]).square()
+            values[some] = pieces(t, rows[some][0] if len(rows[some]) == 1 else rows[some]).square()
             values[some][[diverged(row) for row in rows[some]]] = np.inf
     return plain(values, f.shape[:-1])
 
@@ -140,11 +140,8 @@ def _absolute(t: Array, f: Array, since: float | None = None) -> float:
     """Return the integral of abs(f), weighted by the time after `since` if given."""
     if diverged(f):
         return np.inf
-    p = pieces(t, f)
-    values = p.at_cuts(p.cuts())
-    mixed = (values.min(axis=0) < 0) & (values.max(axis=0) > 0) & ~p.jump
-    plain, crossed = p[~mixed], p[mixed]
-    return _weighted(plain, plain.whole(), since) + _weighted(crossed, crossed.splits(), since)
+    plain, crossed = pieces(t, f).signed
+    return _weighted(plain, plain.whole(), since) + _weighted(crossed, crossed.splits, since)
 
 
 def _weighted(p: Pieces, cuts: Array, since: float | None) -> float:

@@ -285,7 +285,7 @@ def _length(t: Array, path: Array) -> float:
     if diverged(path):
         return np.inf
     curves = [pieces(t, p) for p in path]
-    cuts = np.sort(np.concatenate([p.cuts() for p in curves]), axis=0)
+    cuts = np.sort(np.concatenate([p.cuts for p in curves]), axis=0)
     turns = np.asarray(((cuts > 0) & (cuts < 1)).any(axis=0))
     return _arc([p[~turns] for p in curves], None) + _arc([p[turns] for p in curves], cuts[:, turns])
 

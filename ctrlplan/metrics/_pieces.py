@@ -17,7 +17,10 @@ from the extrapolated curvature alone, is therefore no overshoot of a response.
 """
 
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TypeVar
 
 import numpy as np
@@ -32,11 +35,14 @@ _CURVATURES = 0.5  # difference relative to the smaller curvature up to which tw
 _ASIDE = 0.25  # of the larger curvature: a smaller one of opposite sign is the smooth side of a kink
 _JUMP = 2.0  # multiple of both neighbouring slopes above which there is a jump
 _BLOCK = 2**15  # samples
+_LONG = 2**9  # samples, from which on one row costs more than the calls for it
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(4)
 _NODES, _WEIGHTS = (_NODES + 1) / 2, _WEIGHTS / 2
 
 
 NOWHERE = np.empty(0, dtype=np.intp)
+
+_known: ContextVar["dict[object, tuple[Array, Array, Pieces]] | None"] = ContextVar("_known", default=None)
 
 
 @dataclass(frozen=True)
@@ -83,24 +89,31 @@ class Pieces:
         """Return the two ends of each interval, shape (2, m)."""
         return np.stack([np.zeros_like(self.a), np.ones_like(self.a)])
 
+    @cached_property
     def cuts(self) -> Array:
         """Return 0, the stationary points and 1, shape (4, m): monotone in between."""
         inner = np.sqrt(self.c**2 - 3 * self.d * self.b)
         q = -(self.c + np.copysign(inner, self.c))
-        turns = np.stack([np.zeros_like(q), q / (3 * self.d), self.b / q, np.ones_like(q)])
-        turns[~np.isfinite(turns)] = 0.0
-        return np.sort(np.clip(turns, 0.0, 1.0), axis=0)
+        one, other = (np.clip(np.where(np.isfinite(s), s, 0.0), 0.0, 1.0) for s in (q / (3 * self.d), self.b / q))
+        return np.stack([np.zeros_like(q), np.minimum(one, other), np.maximum(one, other), np.ones_like(q)])
 
-    def at_cuts(self, cuts: Array) -> Array:
-        """Return the values at cuts, those of the samples at either end."""
-        values = self(cuts)
+    @cached_property
+    def values(self) -> Array:
+        """Return the values at the cuts, those of the samples at either end."""
+        values = self(self.cuts)
         values[0], values[-1] = self.a, self.end
         return values
 
+    @cached_property
+    def signed(self) -> "tuple[Pieces, Pieces]":
+        """Return the intervals of constant sign and those with a zero inside."""
+        mixed = (self.values.min(axis=0) < 0) & (self.values.max(axis=0) > 0) & ~self.jump
+        return self[~mixed], self[mixed]
+
+    @cached_property
     def splits(self) -> Array:
         """Return cuts and the zeros between them, shape (7, m): of constant sign in between."""
-        cuts = self.cuts()
-        values = self.at_cuts(cuts)
+        cuts, values = self.cuts, self.values
         low, high = cuts[:-1], cuts[1:]
         zeros, at = low.copy(), np.nonzero(np.sign(values[:-1]) * np.sign(values[1:]) < 0)
         zeros[at] = self[at[1]].crossing(0.0, low[at], high[at])
@@ -140,10 +153,20 @@ class Pieces:
         return total
 
 
+@contextmanager
+def shared() -> Iterator[None]:
+    """Compute the cubics of a signal once for all metrics of a block, in which no signal changes."""
+    token = _known.set({})
+    try:
+        yield
+    finally:
+        _known.reset(token)
+
+
 def pieces(t: Array, f: Array, chosen: NDArray[np.intp] | None = None, rows: NDArray[np.intp] | None = None) -> Pieces:
     """Return the cubics of a signal (ntime,) on all or some intervals; for several signals, each of its row."""
     if chosen is None:
-        return _cubics(t, f)
+        return _once(t, f)
     if rows is None:
         return _cubics(t, f)[chosen]
     # A cubic depends on the samples up to four intervals away: a few windows are faster than whole signals.
@@ -172,8 +195,8 @@ class Bulges:
 
 
 def blocks(f: Array) -> Iterator[slice]:
-    """Yield rows (nrows, ntime) in blocks that fit into the cache."""
-    count = max(1, _BLOCK // f.shape[1])
+    """Yield rows (nrows, ntime) in blocks that fit into the cache; long rows one by one, whose cubics may be shared."""
+    count = max(1, _BLOCK // f.shape[1]) if f.shape[1] < _LONG else 1
     return (slice(begin, begin + count) for begin in range(0, len(f), count))
 
 
@@ -191,7 +214,7 @@ def maxima(t: Array, f: Array, extrapolated: bool = True) -> Array:
     ]
     chosen, rows = gathered(near)
     p = pieces(t, f, chosen, rows)
-    inner = np.fmax.reduce(p(p.cuts()), axis=0)
+    inner = np.fmax.reduce(p(p.cuts), axis=0)
     np.fmax.at(top, rows, inner if extrapolated else np.where(p.begins, -np.inf, inner))
     return top
 
@@ -199,6 +222,18 @@ def maxima(t: Array, f: Array, extrapolated: bool = True) -> Array:
 def gathered(chosen: list[NDArray[np.intp]]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Return the chosen intervals of all rows in one array, and their rows."""
     return np.concatenate([NOWHERE, *chosen]), np.repeat(np.arange(len(chosen)), [k.size for k in chosen])
+
+
+def _once(t: Array, f: Array) -> Pieces:
+    """Return the cubics of a signal, those known if they are shared."""
+    known = _known.get()
+    if known is None:
+        return _cubics(t, f)
+    # Rows are new arrays each time: they are known by their memory, which lasts as long as the entry has them.
+    key = [(array.__array_interface__["data"][0], array.shape, array.strides) for array in (t, f)]
+    if (name := tuple(key)) not in known:
+        known[name] = (t, f, _cubics(t, f))
+    return known[name][2]
 
 
 def _cubics(t: Array, f: Array) -> Pieces:

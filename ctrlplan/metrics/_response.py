@@ -252,8 +252,7 @@ def _last_entries(t: Array, e: Array, edges: Array) -> Array:
         near.append(np.flatnonzero(~(reach <= edge)) + first)
     chosen, rows = gathered(near)
     p = pieces(t, e, chosen, rows)
-    cuts = p.cuts()
-    values = p.at_cuts(cuts)
+    cuts, values = p.cuts, p.values
     beyond = np.abs(values) > edges[rows]
     leaving = np.flatnonzero(beyond.any(axis=0))
     last = leaving[np.append(np.diff(rows[leaving]) > 0, True)[: leaving.size]]

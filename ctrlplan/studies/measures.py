@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from ctrlplan import metrics
 from ctrlplan._display import MISSING, ROWS, Displayed, Facts, Part, number
 from ctrlplan._types import Array
+from ctrlplan.metrics._pieces import shared
 from ctrlplan.planning import SquaredDerivative
 from ctrlplan.simulation import Occurrence, Prepared, SimulationResponse
 from ctrlplan.trajectories import Trajectory, Waypoint
@@ -491,6 +492,19 @@ def signal_metrics(
     -------
     dict of str to ndarray, shape (nloops,)
     """
+    if len(record.y) > _TOGETHER:
+        parts = [slice(k, k + _TOGETHER) for k in range(0, len(record.y), _TOGETHER)]
+        results = [
+            signal_metrics(
+                replace(record, y=record.y[part], u=record.u[part], unstable=record.unstable[part]),
+                plan,
+                start,
+                band,
+                measures,
+            )
+            for part in parts
+        ]
+        return {name: np.concatenate([part[name] for part in results]) for name in results[0]}
     known = slice(int(np.searchsorted(record.t, start)), None)  # no copy of the rows
     t, y, u = record.t[known], record.y[..., known], record.u[..., known]
     kinds: list[tuple[Kind, Sequence[Tracked | Acting], tuple[str, ...]]] = [
@@ -500,8 +514,10 @@ def signal_metrics(
     found: dict[str, Array] = {}
     for kind, seen, labels in kinds:
         tables = {}
-        for name, function in _functions(kind, measures) if labels else ():
-            tables[name] = _table(function, seen, len(y))
+        with shared():  # measures share the cubics of a signal
+            for name, function in _functions(kind, measures) if labels else ():
+                tables[name] = _table(function, seen, len(y))
+        for name in tables:
             if name in SETTLING_TIMES:
                 tables[name][record.unstable] = np.inf
         found |= {name: np.fmax.reduce(table, axis=1) for name, table in tables.items()}
@@ -509,6 +525,9 @@ def signal_metrics(
             found |= {f"{name}_{label}": row for label, row in zip(labels, table.T, strict=True)}
     return found
 
+
+_TOGETHER = 16
+"""Number of loops whose metrics are computed together; more would need more memory than they gain time."""
 
 SETTLING_TIMES = ("settling_time", "tracking_settling_time")
 """Metrics that are infinite for an unstable loop, and discontinuous along a parameter."""

@@ -7,6 +7,7 @@ import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
+from functools import lru_cache
 from pathlib import Path
 from typing import Literal, get_args, get_origin, get_type_hints
 
@@ -176,16 +177,22 @@ def is_shipped(kind: type) -> bool:
 
 def _option(kind: type[FromWaypoints], name: str) -> Entry:
     """Entry of an option: a number or a list, and the strings that the annotation of the argument has."""
-    argument = inspect.signature(kind).parameters.get(name)
-    try:
-        annotation = get_type_hints(kind.__init__).get(name)
-    except (NameError, TypeError):  # names of a user's own class that cannot be resolved
-        annotation = None
+    required, annotation = _argument(kind.__init__, name)
     strings = _strings(annotation)
     text = (Text(strings),) if strings else () if annotation is not None else (Text(),)
-    required = argument is not None and argument.default is inspect.Parameter.empty
     what = f"option {name} of ctrlplan.{kind.__name__}; a list has one number per axis"
     return Entry(OneOf((Number(), NUMBERS, *text)), what, required)
+
+
+@lru_cache(maxsize=256)
+def _argument(constructor: Callable[..., None], name: str) -> tuple[bool, object]:
+    """Whether an argument is required, and its annotation; None if there is none."""
+    argument = inspect.signature(constructor).parameters.get(name)
+    required = argument is not None and argument.default is inspect.Parameter.empty
+    try:
+        return required, get_type_hints(constructor).get(name)
+    except (NameError, TypeError):  # names of a user's own class that cannot be resolved
+        return required, None
 
 
 def _strings(annotation: object) -> tuple[str, ...]:
