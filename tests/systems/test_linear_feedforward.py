@@ -240,7 +240,7 @@ def test_loops_of_several_inputs(seed):
 
 def test_several_outputs_that_the_inputs_move_alike():
     loop = ct.ss(-np.eye(2), np.ones((2, 2)), np.eye(2), 0, outputs=["p", "q"])
-    with pytest.raises(ValueError, match=r"highest derivatives of the outputs of loop, p, q, must depend .*singular"):
+    with pytest.raises(ValueError, match=r"^the outputs of loop, p, q, must depend on its inputs .*singular"):
         create_feedforward_iosystem(loop)
 
 
@@ -257,7 +257,7 @@ def test_several_outputs_that_the_inputs_move_alike():
         (named([1, 1, -2], [1, 3, 3, 1]), "-2, 1"),
     ],
 )
-def test_zeros_that_are_not_stable_are_rejected_and_told(loop, zeros):
+def test_zeros_that_are_not_stable_require_a_plan(loop, zeros):
     with pytest.raises(ValueError, match=f"^loop must have its zeros in the left half plane, got {zeros}: the command"):
         create_feedforward_iosystem(loop)
 
@@ -294,8 +294,16 @@ def test_no_zero_is_missed(seed):
     [
         (named([0.0], [1, 1]), ValueError, "the transfer function of loop must not be 0, got 0"),
         (ct.ss([[-1.0]], [[0.0]], [[1.0]], 0), ValueError, "the transfer function of loop must not be 0, got 0"),
-        (ct.tf([1], [1, 0.5], 0.1), ValueError, "loop must be in continuous time, got dt = 0.1"),
-        (ct.tf([1], [1, 0.5], True), ValueError, "loop must be in continuous time, got dt = True"),
+        (
+            ct.tf([1], [1, 0.5], 0.1),
+            ValueError,
+            "loop must be in continuous time unless plan= is given, got dt = 0.1: ",
+        ),
+        (
+            ct.tf([1], [1, 0.5], True),
+            ValueError,
+            "loop must be in continuous time unless plan= is given, got dt = True: ",
+        ),
         (
             ct.ss(-np.eye(2), np.eye(2), np.ones((1, 2)), 0),
             ValueError,
