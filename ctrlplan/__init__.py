@@ -39,7 +39,8 @@ Build the loop
     flat_loop                 plan, law and flat plant as one loop; laws: FlatLaw, TVLQR, Feedforward
     create_flat_feedforward_iosystem    states and inputs along a plan, for a controller of your own
     reference_window          states and inputs ahead, for model predictive control
-    create_flat_iosystem      flat control of a flat plant; create_feedforward_iosystem: of a linear loop
+    create_flat_iosystem      flat control of a flat plant
+    create_feedforward_iosystem    command with which a linear loop follows a plan -> PlannedFeedforward
     fit_feedforward           feedforward gains and delay from a log -> FeedforwardFit
     sample_hold               discrete block in a continuous loop; expose_states: states among the outputs
     create_shaper_iosystem    input shaping of an operator's commands, also for a measured frequency
@@ -137,6 +138,7 @@ _EXPORTS = {
         "AdmissibleSet",
         "FeedforwardFit",
         "Law",
+        "PlannedFeedforward",
         "command_filter_gains",
         "command_lead",
         "create_command_filter_iosystem",

@@ -77,6 +77,12 @@ class BlockTraits(Displayed):
         Outputs of a delay until the first delayed input. Default 0.
     block : control system or None
         Inner system, whose changes are changes of this block.
+    start : float or None
+        Time [s] at which a feedforward command starts to move, `preview` before its
+        plan. A run from the declared initial state must begin there or earlier; a
+        discrete block must have a sample there. Default None.
+    preview : float or None
+        Time [s] by which a feedforward command starts before its plan. Default None.
     """
 
     breakpoints: tuple[float, ...] | None = None
@@ -93,6 +99,8 @@ class BlockTraits(Displayed):
     delay: float | None = None
     initial: ArrayLike = 0.0
     block: ct.InputOutputSystem | None = None
+    start: float | None = None
+    preview: float | None = None
 
     def _describe(self) -> Iterator[Part]:
         stated = {name: getattr(self, name) for name in _NAMES}
@@ -246,7 +254,7 @@ class DeclaredTrait(Generic[T]):
         declare(block, **{self._name: value})
 
 
-_OF_ANY_SYSTEM = frozenset({"initial_state"})
+_OF_ANY_SYSTEM = frozenset({"initial_state", "start", "preview"})
 """Traits that interconnections and linear systems have as well."""
 
 
@@ -347,6 +355,15 @@ def _offset(value: object, label: str, system: ct.InputOutputSystem) -> float:
     return found
 
 
+def _time(value: object, label: str, system: ct.InputOutputSystem) -> float | None:
+    if value is None:
+        return None
+    found = _seconds(value, label)
+    if not math.isfinite(found):
+        raise ValueError(f"{label} must be finite, got {value}")
+    return found
+
+
 def _function(value: object, label: str, system: ct.InputOutputSystem) -> object:
     if value is not None and not callable(value):
         raise TypeError(f"{label} must be a function of (t, x, u, params), got {value!r:.80}")
@@ -372,4 +389,6 @@ _CHECKS: dict[str, Callable[[Any, str, ct.InputOutputSystem], object]] = {
     "offset": _offset,
     "sample": _function,
     "delay": _positive,
+    "start": _time,
+    "preview": _time,
 }

@@ -93,6 +93,9 @@ MADE = {
     "PeakDerivative": lambda: cp.PeakDerivative(3),
     "PiecewiseSpline": lambda: cp.PiecewiseSpline([*MOVE, cp.Waypoint(3, 0, 0, 0)]),
     "PolySpline": quintic,
+    "PlannedFeedforward": lambda: cp.create_feedforward_iosystem(
+        ct.tf([-1, 1], [1, 2, 1], inputs="r", outputs="y", name="loop"), plan=quintic()
+    ),
     "Predictor": lambda: cp.Predictor(pendulum(), {"angle": (-1.0, 1.0)}, 10.0),
     "Stepper": lambda: cp.prepare(swept(5.0)).start(0.1),
     "Prepared": lambda: cp.prepare(swept(5.0)),

@@ -156,3 +156,41 @@ def test_traits_that_do_not_fit(traits, kind, message):
 def test_traits_without_effect_are_rejected(system, message):
     with pytest.raises(TypeError, match=message):
         cp.declare(system, breakpoints=[1.0])
+
+
+# Commands that start before their plans
+
+
+def early(**traits):
+    """A ramp from -2 s on, two seconds before a plan, at the input of a lag."""
+    ramp = ct.nlsys(
+        None, lambda t, x, u, params: np.maximum(t + 2.0, 0.0), inputs=0, outputs="u", name="ramp", **traits
+    )
+    return ct.interconnect([cp.declare(ramp, start=-2.0, preview=2.0, breakpoints=[-2.0]), lag()], outputs="y")
+
+
+def test_a_run_that_misses_the_start_of_a_command_is_rejected():
+    message = (
+        r"^timepts must begin at -2 s or earlier, where the command of block ramp starts, 2 s before its plan, got 0"
+    )
+    with pytest.raises(ValueError, match=message):
+        cp.simulate(early(), T)
+    with pytest.raises(ValueError, match=message):
+        cp.prepare(early()).start(0.1)
+
+
+def test_a_run_from_a_given_state_may_begin_later():
+    # x = (t + 2) - 1 + exp(-(t + 2))
+    found = cp.simulate(early(), T, initial_state=1.0 + np.exp(-2.0))
+    np.testing.assert_allclose(found.outputs[0], T + 1.0 + np.exp(-T - 2.0), atol=1e-7)
+    found = cp.simulate(early(), T - 2.5)
+    expected = np.maximum(T - 1.5 + np.exp(0.5 - T), 0.0) * (T > 0.5)
+    np.testing.assert_allclose(found.outputs[0], expected, atol=1e-7)
+
+
+@pytest.mark.parametrize("name", ["start", "preview"])
+def test_wrong_times_of_a_command(name):
+    with pytest.raises(TypeError, match=f"^{name} of lag must be a number of seconds, got 'soon'"):
+        cp.declare(lag(), **{name: "soon"})
+    with pytest.raises(ValueError, match=f"^{name} of lag must be finite, got inf"):
+        cp.declare(lag(), **{name: np.inf})

@@ -70,6 +70,7 @@ from ctrlplan.simulation.prepared import Prepared, prepare, prepared_form, state
 from ctrlplan.simulation.response import SimulationResponse, signal_table
 from ctrlplan.simulation.simulate import simulate
 from ctrlplan.simulation.simulated_response import SimulatedQuantities
+from ctrlplan.simulation.starts import check_begin
 from ctrlplan.simulation.stepper import Stepper
 
 __all__ = [
@@ -84,6 +85,7 @@ __all__ = [
     "SimulationResponse",
     "SolverError",
     "Stepper",
+    "check_begin",
     "equilibrium_at",
     "equilibrium_state",
     "loop_quantities",

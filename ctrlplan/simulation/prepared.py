@@ -20,6 +20,7 @@ from ctrlplan.simulation.linear import LinearForm, NotLinearError, linear_form
 from ctrlplan.simulation.network import Block, Network, UnsupportedError
 from ctrlplan.simulation.segments import DelayedSignal
 from ctrlplan.simulation.signals import PlanSignal, TimeSignal, signal_values
+from ctrlplan.simulation.starts import command_starts
 from ctrlplan.simulation.unread import is_read
 from ctrlplan.symbolic import missing_casadi
 from ctrlplan.symbolic.fingerprint import fingerprint, value_token
@@ -78,6 +79,7 @@ class Prepared(Displayed):
                 self.not_linear = f"block {block.name} {what}"
         self._sources = [PlanSignal(b.plan, b.traits.derivatives) for b in self._blocks() if b.plan is not None]
         self._built_forms = BuiltForms()
+        self.starts = command_starts(self._blocks())
 
     def _describe(self) -> Iterator[Part]:
         yield f"Prepared form of {self.name}: {counted(self.nstates, 'state')}"

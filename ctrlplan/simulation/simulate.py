@@ -25,6 +25,7 @@ from ctrlplan.simulation.methods import Method
 from ctrlplan.simulation.prepared import Prepared, prepared_form
 from ctrlplan.simulation.response import SimulationResponse
 from ctrlplan.simulation.signals import Inputs, input_signals
+from ctrlplan.simulation.starts import check_begin
 
 MethodName = Literal["auto", "exact", "compiled", "python"]
 """Names of the methods; "auto" chooses among them."""
@@ -192,6 +193,7 @@ def checked_job(
     prepared = prepared_form(system)
     signals = input_signals(prepared.input_labels, inputs, times)
     state = checked_state(prepared, initial_state)
+    check_begin(prepared.starts, float(times[0]), initial_state is None)
     return Job(prepared, times, signals, state, dict(params or {}), rtol, atol, events, prepared.network)
 
 

@@ -15,6 +15,7 @@ from ctrlplan.simulation.interpreted import SolverError
 from ctrlplan.simulation.prepared import Prepared
 from ctrlplan.simulation.segments import as_fraction
 from ctrlplan.simulation.simulate import checked_state, warn_of_timebase, warn_of_unread
+from ctrlplan.simulation.starts import check_begin
 
 _LONGEST = 1e12
 """Longest step [s]."""
@@ -208,6 +209,7 @@ def started(
     if first + 1e-3 * step == first or step > _LONGEST:
         raise ValueError(f"dt must be resolved by times about {first:g} s and at most {_LONGEST:g} s, got {step:g} s")
     state, given = checked_state(prepared, initial_state), dict(params or {})
+    check_begin(prepared.starts, first, initial_state is None)
     warn_of_unread(prepared, given)
     warn_of_timebase(prepared)
     grid = Grid(as_fraction(first), as_fraction(step))

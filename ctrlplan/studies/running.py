@@ -13,7 +13,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from ctrlplan._renamed import outside_stacklevel
 from ctrlplan._types import Array, Params
-from ctrlplan.simulation import Event, Prepared, equilibrium_at, prepared_form, simulate, state_space, unstable_poles
+from ctrlplan.simulation import (
+    Event,
+    Prepared,
+    check_begin,
+    equilibrium_at,
+    prepared_form,
+    simulate,
+    state_space,
+    unstable_poles,
+)
 from ctrlplan.studies.connections import check_reached
 from ctrlplan.studies.measures import Run, checked_names
 from ctrlplan.trajectories import Trajectory
@@ -68,6 +77,7 @@ def run_plan(
     check_reached(system, tracked, plan)
     state, doubt = initial_state, ""
     if state is None and times.ndim == 1 and times.size and np.isfinite(times).all():  # otherwise simulate raises
+        check_begin(prepared_form(system).starts, float(times[0]), True)
         rows = [system.output_labels.index(label) for label in tracked]
         state, why = equilibrium_at(system, plan, float(times[0]), rows, params)
         doubt = f"{name}: {_doubt(plan, times, state, why)}." if why else ""

@@ -3,30 +3,38 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Literal
 
 import control as ct
 import numpy as np
-from scipy.linalg import null_space
+from numpy.typing import NDArray
 
-from ctrlplan._checks import checked_labels
+from ctrlplan._checks import check_kind, checked_finite, checked_labels, checked_names
 from ctrlplan._renamed import former_signature
-from ctrlplan._types import Array
-from ctrlplan.trajectories import derivative_name
-
-_SMALL = 1e-9
-"""Relative size up to which numbers count as 0."""
+from ctrlplan._types import Array, System
+from ctrlplan.systems.feedforward_block import PlannedFeedforward
+from ctrlplan.systems.feedforward_discrete import discrete_feedforward
+from ctrlplan.systems.feedforward_inverse import loop_inverse
+from ctrlplan.systems.feedforward_planned import PlanOptions, planned_feedforward
+from ctrlplan.systems.feedforward_sampled import is_sampled, sampled_feedforward
+from ctrlplan.systems.feedforward_zeros import ON_AXIS, eigenvalues, zero_list
+from ctrlplan.trajectories import Trajectory, derivative_name
 
 
 @former_signature("label", "name", renamed={"label": "labels"}, implied={"label": {"suffix": ""}})
 def create_feedforward_iosystem(
-    loop: ct.StateSpace | ct.TransferFunction,
+    loop: ct.StateSpace | ct.TransferFunction | ct.InterconnectedSystem,
     *,
+    plan: Trajectory | None = None,
+    error: float = 1e-6,
+    preview: float | None = None,
+    method: Literal["exact", "zpetc"] = "exact",
+    finite: bool = False,
     labels: Sequence[str] | str | None = None,
     suffix: str = "_ref",
     name: str = "feedforward",
-) -> ct.StateSpace:
-    r"""Exact inverse of a linear loop whose zeros are in the left half plane.
+) -> ct.StateSpace | PlannedFeedforward:
+    r"""Exact inverse of a linear loop: the command with which it follows a plan.
 
     The output y of a loop without zeros is flat. With the transfer function
     g/(s^n + a_(n-1) s^(n-1) + ... + a_0) from its input to y, the command
@@ -34,8 +42,9 @@ def create_feedforward_iosystem(
     .. math:: r = \frac1g \Bigl(y_d^{(n)} + \sum_{k=0}^{n-1} a_k\, y_d^{(k)}\Bigr)
 
     gives y = y_d if the loop starts on the plan; for k/(s^2 + s) in unity
-    feedback it is y_d + (y_d'' + y_d')/k. Errors decay with the poles of the
-    loop.
+    feedback it is y_d + (y_d'' + y_d')/k. Errors evolve with the poles of the
+    loop: they decay in a stable loop, and grow in an unstable one, which follows
+    the plan only if it starts on it exactly.
 
     A loop with zeros, such as any with a PI, PD or PID controller, has internal
     dynamics whose poles are the zeros: the block computes them, with as many
@@ -45,46 +54,102 @@ def create_feedforward_iosystem(
     higher derivatives. Its output is added to that of the controller, whose zeros
     then do not matter: y = y_d if the error is 0 at the start.
 
+    Without `plan`, for continuous loops with zeros in the left half plane:
+
     States: the internal dynamics, as many as zeros, 0 at the start: the plan starts at
     0, or at an equilibrium that the initial state must give. Inputs: y_ref, y_ref_d1, ... up to
     the relative degree of y, with y an output of the loop, as
     `create_source_iosystem` names its outputs with ``suffix="_ref"``. Outputs:
     the inputs of the loop, under their names.
 
+    With `plan`, for all loops: States: the internal dynamics of the zeros that are
+    stable or on the stability boundary, at equilibrium at the start. No inputs.
+    Outputs: the inputs of the loop, under their names. See Notes.
+
     Parameters
     ----------
-    loop : control.StateSpace or control.TransferFunction
-        The loop, or a plant: linear and continuous-time, with as many inputs as
-        outputs; interconnections of linear blocks are accepted.
+    loop : control.StateSpace, control.TransferFunction or control.InterconnectedSystem
+        The loop, or a plant, with as many inputs as outputs; interconnections of
+        linear blocks are accepted. With `plan` it may be discrete, or a continuous
+        loop with `sample_hold` blocks of one period.
+    plan : Trajectory, optional
+        The plan, one axis for each output, with as many continuous derivatives as
+        the relative degree minus 1. It starts at any position that the loop can hold.
+    error : float, optional
+        Maximum tracking error by a limited preview, relative to the range of the plan
+        of each output. Default 1e-6.
+    preview : float, optional
+        Time [s] by which the command starts before the plan, in place of the one
+        that `error` requires.
+    method : {"exact", "zpetc"}, optional
+        For discrete loops with one input: "zpetc" does not cancel zeros that
+        "exact" rejects, see Notes.
+    finite : bool, optional
+        Accept a command that grows after the end of the plan, by zeros on the
+        imaginary axis or the unit circle. Default False.
     labels : sequence of str or str, optional
-        Names of the plan's axes, by default those of the outputs of the loop.
+        Names of the plan's axes, one for each output of the loop, by default those
+        of the outputs. With `plan`: axes of the plan, by default those named as the
+        outputs, or all in their order.
     suffix : str, optional
-        Appended to the label.
+        Appended to the labels of the inputs, without `plan`.
     name : str, optional
         Name of the block.
 
     Returns
     -------
-    control.StateSpace
-        In continuous time; without zeros a static gain, of any time base.
+    control.StateSpace or PlannedFeedforward
+        Without `plan` in continuous time; without zeros a static gain, of any time
+        base. With `plan` a block of the time base of the loop, which states
+        the preview, the start, errors and what remains after the plan.
 
     Raises
     ------
     TypeError
-        If the loop is not linear.
+        If the loop is not linear, or an argument has the wrong type.
     ValueError
-        If it is discrete, has another number of inputs than outputs, a transfer
-        function of 0, highest derivatives that depend on the inputs in fewer
-        combinations than outputs, or zeros that are not in the left half plane (the
-        message lists them: the command would grow without bound); or if a label
-        with the suffix is a signal of the loop.
+        If the loop has another number of inputs than outputs, a transfer function of
+        0, or no inverse; if a label with the suffix is a signal of the loop. Without
+        `plan` if it is discrete or has zeros that are not in the left half plane (the
+        message lists them: the command would grow without bound). With `plan`
+        if the loop cannot follow it, as the Notes say.
+
+    Notes
+    -----
+    *Zeros in the right half plane.* The bounded command starts before the plan
+    (pre-actuation). It starts `preview` seconds early, from rest, and omits what
+    came before; the tracking error is then the free response of the loop to the
+    omitted part, which sets the preview for a given `error`. Simulations begin at
+    ``plan.start - preview``, the attribute `start` of the block, or earlier. For an
+    unstable loop this error grows, and `preview` must be given: the run starts
+    from the attribute `loop_state`.
+
+    *Zeros on the imaginary axis.* A simple pair leaves the command oscillating
+    after the plan, with an amplitude that the block states. Zeros at 0: the loop
+    cannot hold an output other than 0, and the plan must end there. With q zeros at 0
+    the command stays bounded only if the integrals of t^i y_d(t) are 0 for i < q - 1.
+
+    *Discrete loops.* Tracking is exact at the samples. Zeros with abs(z) <= 0.9 are
+    cancelled, those with abs(z) >= 1/0.9 by pre-actuation. Those between make the command
+    ring from sample to sample and are rejected, unless they are slow: within 30
+    degrees of +1. "zpetc", zero phase error tracking control, leaves these and all
+    others outside 0.9 uncancelled and compensates their phase and static gain;
+    the remaining gain error is stated. Between the samples of `sample_hold` loops the
+    output deviates from the plan by a ripple, which is computed and stated.
+
+    References
+    ----------
+    Devasia, Chen and Paden, Nonlinear inversion-based output tracking, IEEE
+    Transactions on Automatic Control 41 (1996); Tomizuka, Zero phase error tracking
+    algorithm for digital control, Journal of Dynamic Systems 109 (1987).
 
     Examples
     --------
     >>> import control as ct
+    >>> import numpy as np
     >>> import ctrlplan as cp
     >>> loop = cp.plants.integrator_lag_loop(4.0)
-    >>> feedforward = create_feedforward_iosystem(loop)
+    >>> feedforward = cp.create_feedforward_iosystem(loop)
     >>> feedforward.input_labels, feedforward.D.tolist()
     (['y_ref', 'y_ref_d1', 'y_ref_d2'], [[1.0, 0.25, 0.25]])
     >>> plan = cp.PolySpline([cp.Waypoint(0, 0, 0, 0), cp.Waypoint(1, 1, 0, 0)])
@@ -93,26 +158,83 @@ def create_feedforward_iosystem(
     >>> found = cp.simulate(following, [0.0, 0.5, 1.0])
     >>> bool(abs(found.outputs - plan(found.time)).max() < 1e-12)
     True
+
+    A loop with a zero at 1 rad/s in the right half plane, whose output first moves
+    in the wrong direction after a step. The command starts 13.7 s before the plan:
+
+    >>> loop = ct.tf([-1, 1], [1, 2, 1], inputs="r", outputs="y", name="loop")
+    >>> feedforward = cp.create_feedforward_iosystem(loop, plan=plan)
+    >>> print(feedforward)
+    PlannedFeedforward of r from -13.7196 s
+      preview            13.7196 s before the plan
+      method             exact
+      zeros of the loop  1
+      error              1e-06 of the move
+    >>> following = ct.interconnect([feedforward, loop], inputs=0, outputs=["y", "r"])
+    >>> times = np.linspace(cp.traits_of(feedforward).start, 5.0, 1001)
+    >>> found = cp.simulate(following, times)
+    >>> bool(abs(found.outputs["y"] - plan(times)).max() < 1e-6)
+    True
     """
+    options = _checked_options(plan, error, preview, method, finite)
+    if plan is None:
+        return _block_of(loop, labels, suffix, name)
+    if is_sampled(loop):
+        return sampled_feedforward(loop, _matched(plan, labels, loop), options, name)
     system = _checked_loop(loop)
+    following = _matched(plan, labels, loop)
+    if system.dt in (None, 0):
+        return planned_feedforward(system, following, options, name)
+    return discrete_feedforward(system, following, options, name)
+
+
+def _checked_options(
+    plan: Trajectory | None, error: float, preview: float | None, method: str, finite: bool
+) -> PlanOptions:
+    """Arguments for a plan, checked."""
+    if plan is not None:
+        check_kind(plan, "plan", Trajectory)
+    if method not in ("exact", "zpetc"):
+        raise ValueError(f'method must be "exact" or "zpetc", got {method!r:.80}')
+    if not isinstance(finite, bool | np.bool_):
+        raise TypeError(f"finite must be True or False, got {finite!r:.80}")
+    limit = checked_finite(error, "error", above=0.0)
+    ahead = None if preview is None else checked_finite(preview, "preview", minimum=0.0)
+    options = PlanOptions(error=limit, preview=ahead, method=method, finite=bool(finite))
+    if plan is None and options != PlanOptions():
+        given = [key for key, value in vars(PlanOptions()).items() if getattr(options, key) != value]
+        raise ValueError(f"{', '.join(given)} must be given together with plan=, got no plan")
+    return options
+
+
+def _block_of(
+    loop: ct.StateSpace | ct.TransferFunction, labels: Sequence[str] | str | None, suffix: str, name: str
+) -> ct.StateSpace:
+    """Block for any plan, of a loop whose zeros are stable."""
+    if is_sampled(loop):
+        raise ValueError(f"loop {loop.name} with sampled blocks requires plan=: {_LATER}")
+    system = _checked_loop(loop)
+    if system.dt not in (None, 0):
+        raise ValueError(f"loop must be in continuous time unless plan= is given, got dt = {loop.dt}: {_LATER}")
     given, reached = list(loop.input_labels), list(loop.output_labels)
     axes = [label + suffix for label in checked_labels(reached if labels is None else labels, len(reached))]
     if shared := sorted(set(axes) & {*given, *reached}):
         raise ValueError(
             f"labels and suffix must not name a signal of the loop, to which it would be added, got {shared[0]!r}"
         )
-    a, b, c, d = (np.asarray(m, dtype=float) for m in (system.A, system.B, system.C, system.D))
-    orders, inverse = _inverse(a, b, c, d, reached)
-    names = [derivative_name(axis, k) for axis, r in zip(axes, orders, strict=True) for k in range(r + 1)]
-    states = len(inverse[0])
-    return ct.ss(*inverse, inputs=names, outputs=given, dt=0 if states else None, name=name)
+    inverse = loop_inverse(system)
+    _check_zeros(eigenvalues(inverse.z), system.A)
+    names = [derivative_name(axis, k) for axis, r in zip(axes, inverse.orders, strict=True) for k in range(r + 1)]
+    dt = 0 if inverse.z.size else None
+    return ct.ss(inverse.z, inverse.k, inverse.c, inverse.d, inputs=names, outputs=given, dt=dt, name=name)
+
+
+_LATER = "the command depends on later samples of the plan"
 
 
 def _checked_loop(loop: ct.StateSpace | ct.TransferFunction) -> ct.StateSpace:
     if not isinstance(loop, ct.StateSpace | ct.TransferFunction):
         raise TypeError(f"loop must be linear, a StateSpace or TransferFunction, got {type(loop).__name__}")
-    if loop.dt not in (None, 0):
-        raise ValueError(f"loop must be in continuous time, got dt = {loop.dt}")
     if loop.ninputs != loop.noutputs or not loop.ninputs:
         raise ValueError(f"loop must have as many inputs as outputs, got {loop.ninputs} and {loop.noutputs}")
     fraction = isinstance(loop, ct.TransferFunction)
@@ -123,99 +245,41 @@ def _checked_loop(loop: ct.StateSpace | ct.TransferFunction) -> ct.StateSpace:
         raise ValueError(f"loop must have finite coefficients, got {' and '.join(str(n.tolist()) for n in given)}")
     if fraction and given[0].size > given[1].size:
         raise ValueError("loop must be proper, got a numerator of higher degree than the denominator")
-    return ct.ss(loop)
+    return ct.ss(loop) if fraction else loop
 
 
-def _inverse(a: Array, b: Array, c: Array, d: Array, names: Sequence[str]) -> tuple[list[int], tuple[Array, ...]]:
-    """Orders of the derivatives of the outputs, and the state-space matrices of the inverse.
-
-    Each output is differentiated until an input appears: y^(r) = c A^r x + e u. The
-    zeros are the eigenvalues of the motion with all outputs and their first r - 1
-    derivatives equal to 0; they do not affect the inputs, or there are none, if each
-    c A^r is a linear combination of the rows before.
-    """
-    chains = [_chain(a, b, row, through) for row, through in zip(c, d, strict=True)]
-    for chain, name in zip(chains, names, strict=True):
-        if chain is None:
-            what = "" if len(names) == 1 else f" to {name}"
-            raise ValueError(f"the transfer function of loop{what} must not be 0, got 0")
-    known = [chain for chain in chains if chain is not None]
-    orders = [len(chain.rows) for chain in known]
-    last, influence = np.array([chain.last for chain in known]), np.array([chain.influence for chain in known])
-    inverse = _inverse_of(influence, names)
-    rows = np.reshape([row for chain in known for row in chain.rows], (sum(orders), len(a)))
-    norms = np.linalg.norm(rows, axis=1)
-    basis = rows / norms[:, None]
-    parts = np.linalg.lstsq(basis.T, last.T, rcond=None)[0].T
-    rest = np.linalg.norm(last - parts @ basis, axis=1)
-    if (rest <= _SMALL * (np.linalg.norm(last, axis=1) + np.abs(parts).sum(axis=1))).all():
-        empty = np.zeros((0, 0))
-        gains = inverse @ _columns(-parts / norms, np.eye(len(names)), orders) + 0.0  # no -0
-        return orders, (empty, np.zeros((0, gains.shape[1])), np.zeros((len(names), 0)), gains)
-    hidden = null_space(basis) if sum(orders) else np.eye(len(a))
-    motion = a - b @ inverse @ last
-    zeros = np.linalg.eigvals(hidden.T @ motion @ hidden)
-    _check_zeros(zeros, a)
-    # x from the derivatives of the outputs, in norms, and from the hidden coordinates.
-    from_rows = np.linalg.pinv(basis)
-    return orders, (
-        hidden.T @ motion @ hidden,
-        _columns(hidden.T @ motion @ from_rows / norms, hidden.T @ b @ inverse, orders),
-        -inverse @ last @ hidden,
-        _columns(-inverse @ last @ from_rows / norms, inverse, orders),
-    )
-
-
-class _Chain(NamedTuple):
-    """Rows of an output and its derivatives below the order at which an input appears, and that order's rows."""
-
-    rows: list[Array]
-    last: Array
-    influence: Array
-
-
-def _chain(a: Array, b: Array, row: Array, through: Array) -> _Chain | None:
-    """Chain of one output; None if no input has an effect on it."""
-    if np.any(through != 0.0):
-        return _Chain([], row, through)
-    rows = [row]
-    for _ in range(len(a)):
-        influence = rows[-1] @ b
-        sizes = np.linalg.norm(rows[-1]) * np.linalg.norm(b, axis=0)
-        if (np.abs(influence) > _SMALL * sizes).any():
-            return _Chain(rows, rows[-1] @ a, influence)
-        rows.append(rows[-1] @ a)
-    return None
-
-
-def _inverse_of(influence: Array, names: Sequence[str]) -> Array:
-    """Inverse of the influence of the inputs on the highest derivatives."""
-    scaled = influence / np.abs(influence).max(axis=1, keepdims=True)
-    sizes = np.abs(scaled).max(axis=0)
-    if not sizes.all() or np.linalg.svd(scaled / sizes, compute_uv=False)[-1] < _SMALL:
-        raise ValueError(
-            f"the highest derivatives of the outputs of loop, {', '.join(names)}, must depend on its inputs "
-            "independently, got a singular matrix"
-        )
-    return np.asarray(np.linalg.inv(influence), dtype=float) if len(names) > 1 else 1.0 / influence
-
-
-def _columns(below: Array, highest: Array, orders: Sequence[int]) -> Array:
-    """Columns for y, y', ..., y^(r) of each output from those of derivatives below r, and of the highest ones."""
-    parts, first = [], 0
-    for j, r in enumerate(orders):
-        parts += [below[:, first : first + r], highest[:, j : j + 1]]
-        first += r
-    return np.hstack(parts)
-
-
-def _check_zeros(zeros: Array, a: Array) -> None:
+def _check_zeros(zeros: NDArray[np.complex128], a: Array) -> None:
     """Raise unless all zeros are in the left half plane."""
-    size = float(np.abs(np.linalg.eigvals(a)).max(initial=0.0))
-    if (zeros.real < -1e-8 * max(size, float(np.abs(zeros).max()))).all():
+    size = float(np.abs(np.concatenate([eigenvalues(a), zeros])).max(initial=0.0))
+    if (zeros.real < -ON_AXIS * size).all():
         return
-    got = ", ".join(f"{zero:.4g}" for zero in np.real_if_close(np.sort_complex(zeros)))
     raise ValueError(
-        f"loop must have its zeros in the left half plane, got {got}: the command would grow without bound; if these "
-        "are zeros of the controller, give the plant alone and add the output of the block to that of the controller"
+        f"loop must have its zeros in the left half plane, got {zero_list(zeros)}: the command would grow without "
+        "bound. Give plan= for a bounded command of this plan; or, if these are zeros of the controller, give the "
+        "plant alone and add the output of the block to that of the controller"
     )
+
+
+def _matched(plan: Trajectory, labels: Sequence[str] | str | None, loop: System) -> Trajectory:
+    """Plan with one axis for each output of the loop, in their order."""
+    outputs = list(loop.output_labels)
+    if labels is not None:
+        axes = checked_names(labels, "labels", len(outputs))
+        for axis in axes:
+            if axis not in plan.labels:
+                raise ValueError(f"labels must be axes of plan, {', '.join(plan.labels)}, got {axis!r}")
+    elif set(outputs) <= set(plan.labels):
+        axes = outputs
+    elif plan.naxes != len(outputs):
+        raise ValueError(
+            f"plan must have one axis for each output of loop, {', '.join(outputs)}, got {', '.join(plan.labels)}; "
+            "choose axes by labels="
+        )
+    elif shared := set(outputs) & set(plan.labels):
+        raise ValueError(
+            f"axes of plan must be named as the outputs of loop, {', '.join(outputs)}, or all differently, got "
+            f"{', '.join(plan.labels)}, of which {', '.join(sorted(shared))} would follow by its position; give labels="
+        )
+    else:
+        axes = list(plan.labels)
+    return plan if tuple(axes) == plan.labels else plan.select(axes)
