@@ -11,6 +11,7 @@ from typing import ClassVar, Literal, get_args
 
 import control as ct
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ctrlplan._checks import checked_finite
 from ctrlplan._display import Displayed, Facts, Part
@@ -68,9 +69,9 @@ class Plant(Displayed, ABC):
     """Plant with parameters, equations of motion and flat outputs.
 
     All plants have this interface: `iosystem` returns the equations as a block,
-    `flat_system` the flat system that `ctrlplan.flat_loop`, `ctrlplan.fastest` and
-    `ctrlplan.margins` accept. A plant of your own in state-space form is derived
-    from `StateSpacePlant`.
+    `flat_system` the flat system that `ctrlplan.flat_loop` accepts; `ctrlplan.fastest`
+    and `ctrlplan.margins` accept the plant itself, with ranges of its parameters. A
+    plant of your own in state-space form is derived from `StateSpacePlant`.
     """
 
     title: ClassVar[str]
@@ -92,6 +93,10 @@ class Plant(Displayed, ABC):
     @abstractmethod
     def check(self, plan: Trajectory) -> None:
         """Raise for a plan of the flat outputs that the plant cannot follow."""
+
+    def quantities(self, jet: ArrayLike) -> dict[str, Array]:
+        """Signals of the plant by name, from the jet of the flat outputs; see `FlatSystem.quantities`."""
+        return self.flat_system().quantities(jet)
 
     @property
     def units(self) -> dict[str, str]:
@@ -164,6 +169,7 @@ class Plant(Displayed, ABC):
         yield f"Flat outputs: {', '.join(signals.flat_outputs)}. Inputs: {inputs}."
 
 
+@dataclass(frozen=True, kw_only=True, repr=False)
 class StateSpacePlant(Plant):
     """Plant in state-space form with closed-form flat maps.
 
