@@ -17,6 +17,7 @@ from ctrlplan._checks import checked_finite
 from ctrlplan._display import Displayed, Facts, Part
 from ctrlplan._types import Array, Params, Value
 from ctrlplan.flatness import DerivedFlatSystem, FlatSystem, flat_system
+from ctrlplan.flatness.rest import note_of_rest
 from ctrlplan.systems import series
 from ctrlplan.systems.plants.closed_form import ClosedFormFlatSystem
 from ctrlplan.systems.plants.parameters import check_parameters, defaults_of, parameters_of, values_of
@@ -300,6 +301,7 @@ class StateSpacePlant(Plant):
             if low <= _POSITIVE * max(abs(low), abs(high)):
                 raise ValueError(
                     f"{name} of {self.name} must be above 0 along the plan, got {float(low):.4g} at {float(time):.4g} s"
+                    f"{note_of_rest(plan, float(time))}"
                 )
 
 
