@@ -31,7 +31,8 @@ def is_at_rest(plan: Trajectory, time: float, tolerance: float = _NEAR) -> bool:
     """Whether the speed at a time is below a fraction of the peak."""
     if not plan.start <= time <= plan.end or not plan.duration:
         return True
-    sides = [plan.jet(time, 1, left=left)[1] for left in (False, True)]
+    limits = (False,) if time == plan.start else (False, True)  # from the left of the start it is at rest
+    sides = [plan.jet(time, 1, left=left)[1] for left in limits]
     return bool(np.hypot.reduce(sides, axis=1).min() <= tolerance * np.hypot.reduce(plan.peak(1)))
 
 

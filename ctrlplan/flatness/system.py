@@ -149,7 +149,10 @@ class FlatSystem(Displayed, fs.FlatSystem):  # type: ignore[misc]
 
     @cached_property
     def derived(self) -> DerivedFlatSystem:
-        """The plant with maps that follow from its equations, for laws and Jacobians (extra ``fast``)."""
+        """Flat system derived from the equations of this one.
+
+        For laws with a dynamic extension, and for Jacobians. Requires the extra ``fast``.
+        """
         from ctrlplan.flatness.deriving import flat_system
 
         if set(self.flat_labels) <= {*self.output_labels, *self.state_labels}:

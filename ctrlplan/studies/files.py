@@ -10,7 +10,7 @@ plan.csv`` writes only the trajectories, as ``.json`` or in a format of
     title = "Over the wall"
     author = "A. Engineer"    # optional
     text = "For the crane of hall 3."   # optional; a list has a paragraph each
-    t_end = 30.0
+    t_end = 30.0              # after the last waypoint, or at it if the plans end in motion
     samples = 4001            # optional
     benefit = true            # optional: compare with steps, profiles and minimum jerk, in the same time and limits
     [loop]
@@ -46,9 +46,17 @@ Kinds of loops:
   "generator", "load_feedback", "dynamic", "feedforward"), ``force_limits``,
   ``torque_limits``, and any parameter of `ctrlplan.plants.Crane`
   (``load_mass = 800.0``, ...).
+- ``"dc-motor"``, ``"flexible-joint"``, ``"kinematic-car"``,
+  ``"magnetic-levitation"``, ``"planar-quadrotor"``, ``"two-mass-drive"``: plants of
+  `ctrlplan.plants` with a flat law, as of `ctrlplan.flat_loop`. The axes are the
+  flat outputs; any parameter of the plant is an entry. ``poles = [[-2.0, -3.0],
+  [-2.0, -3.0]]``, a list for each flat output; optional: ``law`` ("flat",
+  "quasi_static", "feedforward"), ``integral``, ``input_limits = {voltage = [-24.0,
+  24.0]}``. A step is a set point of the law, approached from the first position.
 - ``"python:module:function"``: a function annotated to return a loop, ``def
-  build() -> control.InputOutputSystem``. Running such a study file
-  executes the module; ``ctrlplan plan`` does not.
+  build() -> control.InputOutputSystem``, or a `ctrlplan.FlatSystem`, with the
+  entries of the law as above. Running such a study file executes the module;
+  ``ctrlplan plan`` does so only for limits on its signals.
 
 Families of plans: trigonometric, polynomial, piecewise, step, s_curve,
 trapezoid, or ``"python:module:Class"``, a class derived from
@@ -97,7 +105,7 @@ Further entries and tables, each optional:
     fit = true                # feedforward from the log, or {terms = ["static", "velocity"], from = "plan"}
 
 A sweep varies the plant and its law together. Draws of a crane vary the plant
-alone, whose law has the numbers of [loop]. With a function of a module the
+alone, whose law has the numbers of [loop]; so do those of other plants. With a function of a module the
 parameter is an argument of the function, or, in draws, a parameter of a block.
 
 Editors complete and check study files by the JSON Schema
@@ -136,6 +144,7 @@ from ctrlplan.studies.entries import (
     Whole,
 )
 from ctrlplan.studies.experiment import Experiment
+from ctrlplan.studies.flat_loops import FlatLoops
 from ctrlplan.studies.logged import MEASURED, check_measured, compared_with, fitted, read_logs
 from ctrlplan.studies.loops import LOOP, build_loop, loop_kind
 from ctrlplan.studies.planned import AVOID, LIMITS, OBSTACLES, PLANS, Planned, planned
@@ -224,15 +233,22 @@ class StudyFile:
         logs = read_logs(self.measured, reader)
         loop = kind.build(self.loop, self.path)
         fields_of, choices = kind.experiment(self.loop, self.waypoints, self.experiment, self.path)
+        units = self.units
+        if isinstance(loop, FlatLoops):
+            fields_of, choices = loop.experiment(fields_of, choices)
+            units = loop.units | units
         found_sections: list[Section] = [
             FastestMove(found, caption=f"Plan {name}: limited signals, limits (dashed), and the active point (marker).")
             for name, found in self.planned.fastest.items()
         ]
         try:
+            if isinstance(loop, FlatLoops):
+                for name, plan in self.plans.items():
+                    loop.check_end(name, plan, self.t_end)
             experiment = Experiment(self.plans, self.timepts(loop), waypoints=self.waypoints, **fields_of)
             with np.errstate(over="ignore", invalid="ignore"):  # a diverging run is reported by the simulation
                 found = experiment.run(loop)
-                comparison = comparison_of(experiment, found, self.units, self.parameters(), self.title)
+                comparison = comparison_of(experiment, found, units, self.parameters(), self.title)
                 if self.sweep is not None:
                     shown = shown_metrics(self.sweep, comparison.metrics, reader)
                     status(f"running the sweep over {self.sweep['parameter']}")
@@ -246,7 +262,7 @@ class StudyFile:
                     status("running the baselines")
                     alphas = (plan.alpha for plan in comparison.plans.values() if isinstance(plan, TrigSpline))
                     choices = replace(choices, alpha=next(alphas, 1.0), limits=self.planned.local or choices.limits)
-                    benefit = benefit_of(experiment, loop, choices, units=self.units)
+                    benefit = benefit_of(experiment, loop, choices, units=units)
                     comparison = comparison.with_benefit(benefit)
                 comparison = compared_with(comparison, logs, reader)
                 gains = fitted(comparison, logs, reader)
@@ -398,16 +414,17 @@ def load_study(path: str | os.PathLike[str], *, status: Callable[[str], object] 
     kind = loop_kind(loop)
     waypoints = reader.waypoints(data["waypoints"], kind.axes)
     t_end = data["t_end"]
-    if not t_end > waypoints[-1].time:
+    moving = _ends_in_motion(waypoints)
+    if t_end < waypoints[-1].time or (t_end == waypoints[-1].time and not moving):
         raise reader.error("t_end", f"must be after the last waypoint at {waypoints[-1].time:g} s, got {t_end:g}")
     kind.check(loop, source)
     check_variations(data, kind, reader)
     benefit = reader.benefit(data)
     if kind.signals is not None:
         reader.check_units(data.get("units", {}), [*(waypoints[0].labels or ()), *kind.signals])
-    found = planned(data, waypoints, kind.crane(loop, source), kind.limited(loop, source), reader, status)
+    found = planned(data, waypoints, kind.plant(loop, source), kind.limited(loop, source), reader, status)
     for name, plan in found.plans.items():
-        if plan.end >= t_end:
+        if plan.end > t_end or (plan.end == t_end and not moving):
             raise reader.error("t_end", f"must be after the end of the plan {name} at {plan.end:g} s, got {t_end:g}")
     check_measured(data.get("measured", {}), found.plans, reader)
     _check_memory(data["samples"], len(found.plans), benefit, f"{source}: samples")
@@ -431,6 +448,12 @@ def load_study(path: str | os.PathLike[str], *, status: Callable[[str], object] 
         author=data.get("author", ""),
         text=(text,) if isinstance(text := data.get("text", []), str) else tuple(text),
     )
+
+
+def _ends_in_motion(waypoints: Sequence[Waypoint]) -> bool:
+    """Whether the last waypoint prescribes a velocity: a run then may end there."""
+    velocity = waypoints[-1].velocity
+    return velocity is not None and bool(np.any(np.nan_to_num(velocity) != 0.0))
 
 
 _MEMORY = 2.0**30

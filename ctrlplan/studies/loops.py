@@ -4,89 +4,44 @@ from __future__ import annotations
 
 import inspect
 import math
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
 from types import UnionType
-from typing import ClassVar, TypeAlias, Union, get_args, get_origin
+from typing import ClassVar, Union, get_args, get_origin
 
 import control as ct
 import numpy as np
 
 from ctrlplan._types import Data
+from ctrlplan.flatness import FlatSystem
 from ctrlplan.planning import Obstacle, Rectangle
 from ctrlplan.studies.baselines import smoother_polynomials
 from ctrlplan.studies.benefit import Choices
 from ctrlplan.studies.comparison import Comparison
 from ctrlplan.studies.crane_setup import CRANE_MEASURES, LOAD, SLACK, marked_slack
 from ctrlplan.studies.entries import NUMBERS, PAIR, Entries, Entry, Flag, Number, Table, Text, Variants
+from ctrlplan.studies.flat_loops import LAW, PlantLoop, flat_loops
+from ctrlplan.studies.loop_kind import LoopKind, Varied, of_parameters
 from ctrlplan.studies.reading import Reader, StudyError, got, named_in_module, one_line, reference
 from ctrlplan.studies.running import Builder, System
 from ctrlplan.studies.sections import AnimatedCrane, CraneMotion, CranePaths, CraneTime, Paths, PlanCurves, Wall
 from ctrlplan.studies.study import Study
-from ctrlplan.systems.plants import LAWS, Crane, crane_loop, unity_feedback_loop
+from ctrlplan.systems.plants import (
+    LAWS,
+    Crane,
+    DCMotor,
+    FlexibleJoint,
+    KinematicCar,
+    MagneticLevitation,
+    PlanarQuadrotor,
+    TwoMassDrive,
+    crane_loop,
+    unity_feedback_loop,
+)
 from ctrlplan.systems.plants.crane.laws import OLD_NAMES, as_law
 from ctrlplan.trajectories import Trajectory, Waypoint
-
-Varied: TypeAlias = "System | Builder | Callable[..., System | Builder]"
-"""A loop whose blocks read parameters, or a function of these that returns a loop."""
-
-
-class LoopKind(ABC):
-    """Kind of loop: entries of its table [loop], construction, and sections of its study.
-
-    Attributes
-    ----------
-    entries : mapping of str to Entry
-        Entries of [loop] in addition to ``kind``.
-    axes : tuple of str
-        Labels of waypoints that come first, in any order of the file.
-    signals : tuple of str or None
-        Signals that may have a unit, in addition to the axes; None for any name.
-    """
-
-    entries: ClassVar[Entries] = {}
-    axes: ClassVar[tuple[str, ...]] = ()
-    signals: ClassVar[tuple[str, ...] | None] = None
-
-    @abstractmethod
-    def build(self, table: Data, path: Path) -> System | Builder:
-        """Loop, or a function that builds a loop for each plan; StudyError if that is not possible."""
-
-    def check(self, table: Data, path: Path) -> None:  # noqa: B027 (nothing to check, unless a kind has more)
-        """Check what can be checked before planning, of a table that has been read; StudyError if it is wrong."""
-
-    def crane(self, table: Data, path: Path) -> Crane | None:
-        """Crane of the loop, if it is the loop of one."""
-        return None
-
-    def limited(self, table: Data, path: Path) -> Callable[[], System] | None:
-        """Function that returns the loop whose signals may be limited; None if there is none before the run."""
-        return None
-
-    def check_parameter(self, parameter: str, place: str, reader: Reader) -> None:
-        """Raise if there is no such parameter for [sweep] and [draws], as far as is known before the run."""
-        known = [key for key, entry in self.entries.items() if isinstance(entry.kind, Number)]
-        if parameter not in known:
-            raise reader.error(place, f"must be a number of [loop], one of {', '.join(known)}, got {parameter!r}")
-
-    def varied(self, names: Sequence[str], table: Data, path: Path) -> Varied:
-        """Function of parameters that returns a loop, or a loop whose blocks read them; for [draws]."""
-        return _of_parameters(names, lambda **values: self.build(table | values, path))
-
-    def experiment(self, table: Data, waypoints: Sequence[Waypoint], stated: Data, path: Path) -> tuple[Data, Choices]:
-        """Fields of the experiment, and options of the benefit of planning."""
-        return stated, Choices()
-
-    def parameters(self, table: Data) -> Data:
-        """Parameters of the loop, for the report."""
-        return dict(table)
-
-    def study(self, name: str, title: str, comparison: Comparison, obstacles: Sequence[Obstacle] = ()) -> Study:
-        """Study of the comparison, with the sections of this kind of loop and obstacles in its paths."""
-        return Study(name, title, comparison, notes=comparison.notes, sections=comparison.sections(obstacles))
 
 
 class LinearLoop(LoopKind):
@@ -138,7 +93,7 @@ class CraneLoop(LoopKind):
 
     def build(self, table: Data, path: Path) -> System | Builder:
         """Loop of each plan: steps, shaped or not, with the set-point law, all other plans with the given law."""
-        crane, law = self.crane(table, path), as_law(table.get("law", "generator"))
+        crane, law = self.plant(table, path), as_law(table.get("law", "generator"))
         limits = {key: table[key] for key in ("force_limits", "torque_limits") if key in table}
         for key, pair in limits.items():
             if not pair[0] < pair[1]:
@@ -154,7 +109,7 @@ class CraneLoop(LoopKind):
         labels = waypoints[0].labels or ()
         if set(labels) != set(self.axes):
             raise StudyError(f"{path}: waypoints: axes of a crane must be x and z (down), got {', '.join(labels)}")
-        crane = self.crane(table, path)
+        crane = self.plant(table, path)
         depth = float(np.mean([point.position[labels.index("z")] for point in waypoints]))
         measures = CRANE_MEASURES | {"load": LOAD}
         own = [replace(measure, name=name) for name, measure in measures.items()]
@@ -187,7 +142,7 @@ class CraneLoop(LoopKind):
         sections = (*scenes[:1], *further, *scenes[1:])
         return Study(name, title, marked_slack(comparison), notes=comparison.notes, sections=sections)
 
-    def crane(self, table: Data, path: Path) -> Crane:
+    def plant(self, table: Data, path: Path) -> Crane:
         """Crane with the parameters of the table."""
         try:
             return Crane(**{key: value for key, value in table.items() if key in _OF_CRANE})
@@ -206,16 +161,15 @@ _OF_CRANE = tuple(entry.name for entry in fields(Crane))
 
 
 class LoopOfModule(LoopKind):
-    """Loop returned by a function of a module, which must be annotated to return one."""
+    """Loop or flat system returned by a function of a module, which must be annotated to return one."""
 
     def build(self, table: Data, path: Path) -> System | Builder:
-        """Loop returned by the function, with parameters of a sweep as its arguments."""
-        values = dict(table)
-        del values["kind"]
-        return self._returned(table, self._function(table, path), path, **values)
+        """Loop of the function, with parameters of a sweep as its arguments."""
+        values = {name: value for name, value in table.items() if name != "kind" and name not in LAW}
+        return self._loop(table, self._function(table, path), path, **values)
 
     def limited(self, table: Data, path: Path) -> Callable[[], System]:
-        """The loop that the function returns; the module is imported by the call only."""
+        """The loop or flat system that the function returns; the module is imported by the call only."""
         return lambda: self._returned(table, self._function(table, path), path)
 
     def check_parameter(self, parameter: str, place: str, reader: Reader) -> None:
@@ -226,8 +180,8 @@ class LoopOfModule(LoopKind):
         function = self._function(table, path)
         known = inspect.signature(function).parameters
         if not all(name in known for name in names):
-            return self._returned(table, function, path)
-        return _of_parameters(names, lambda **values: self._returned(table, function, path, **values))
+            return self._loop(table, function, path)
+        return of_parameters(names, lambda **values: self._loop(table, function, path, **values))
 
     def _function(self, table: Data, path: Path) -> Callable[..., object]:
         try:
@@ -235,6 +189,19 @@ class LoopOfModule(LoopKind):
             return _checked_function(function)
         except (Exception, SystemExit) as error:  # of a user's own module
             raise self._wrong(table, path, error) from None
+
+    def _loop(self, table: Data, function: Callable[..., object], path: Path, **values: float) -> System | Builder:
+        """The loop that the function returns, or the loops of a flat system that it returns."""
+        found = self._returned(table, function, path, **values)
+        if isinstance(found, FlatSystem):
+            return flat_loops(found, table, path)
+        for entry in LAW:
+            if entry in table:
+                raise StudyError(
+                    f"{path}: loop.{entry}: must be given for a function that returns a ctrlplan.FlatSystem only, got "
+                    f"{got(table[entry])} for one that returns {type(found).__name__}"
+                )
+        return found
 
     def _returned(self, table: Data, function: Callable[..., object], path: Path, **values: float) -> System:
         try:
@@ -253,22 +220,25 @@ class LoopOfModule(LoopKind):
         return StudyError(f"{path}: loop.kind: {must}, got {table['kind']!r}: {reason}")
 
 
-LOOP_KINDS: dict[str, LoopKind] = {"linear": LinearLoop(), "crane": CraneLoop()}
+LOOP_KINDS: dict[str, LoopKind] = {
+    "linear": LinearLoop(),
+    "crane": CraneLoop(),
+    "dc-motor": PlantLoop(DCMotor),
+    "flexible-joint": PlantLoop(FlexibleJoint),
+    "kinematic-car": PlantLoop(KinematicCar),
+    "magnetic-levitation": PlantLoop(MagneticLevitation),
+    "planar-quadrotor": PlantLoop(PlanarQuadrotor),
+    "two-mass-drive": PlantLoop(TwoMassDrive),
+}
 """Kinds of loops by the entry ``kind``.
 
 A further kind is "python:module:function": a function without arguments, in a
 module next to the study file or in an installed package, whose return
-annotation is a control system: ``def build() -> control.InputOutputSystem``.
+annotation is a control system: ``def build() -> control.InputOutputSystem``. If
+it returns a `ctrlplan.FlatSystem`, the loop is that of `ctrlplan.flat_loop`.
 Running such a study file executes the module. The same is true of a family of
 plans "python:module:Class", a class derived from `WaypointSpline`.
 """
-
-
-def _of_parameters(names: Sequence[str], function: Callable[..., System | Builder]) -> Varied:
-    """Function with arguments of some names, by which `monte_carlo` knows it."""
-    keyword = inspect.Parameter.KEYWORD_ONLY
-    setattr(function, "__signature__", inspect.Signature([inspect.Parameter(name, keyword) for name in names]))  # noqa: B010
-    return function
 
 
 LOOP = Variants(
@@ -276,6 +246,7 @@ LOOP = Variants(
     lambda: {name: Table(kind.entries) for name, kind in LOOP_KINDS.items()},
     'kind of loop, or "python:module:function", a function annotated to return a control system',
     "function",
+    Table(LAW),
 )
 """Table [loop]."""
 

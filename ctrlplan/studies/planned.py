@@ -13,6 +13,7 @@ from typing import Literal, get_args, get_origin, get_type_hints
 
 from ctrlplan._checks import default_labels
 from ctrlplan._types import Data, System
+from ctrlplan.flatness import FlatSystem
 from ctrlplan.planning import (
     Clearance,
     Disc,
@@ -86,7 +87,7 @@ class Planned:
 def planned(
     data: Data,
     waypoints: tuple[Waypoint, ...],
-    crane: Crane | None,
+    plant: Crane | FlatSystem | None,
     loop: Callable[[], System] | None,
     reader: Reader,
     status: Callable[[str], object],
@@ -99,9 +100,9 @@ def planned(
         With the tables plans, limits, obstacles and avoid, if they are given.
     waypoints : tuple of Waypoint
         Waypoints of all plans.
-    crane : Crane or None
-        Crane of the loop: its quantities may be limited, and its rope must have
-        the clearance.
+    plant : Crane, FlatSystem or None
+        Plant of the loop: its quantities may be limited, and the rope of a crane
+        must have the clearance.
     loop : callable or None
         Returns the loop, where its signals may be limited.
     reader : Reader
@@ -118,7 +119,7 @@ def planned(
         _limits(data.get("limits", {}), reader),
         _obstacles(data.get("obstacles", []), reader),
         data.get("avoid", {}),
-        crane,
+        plant,
         loop,
         reader,
     )
@@ -393,7 +394,7 @@ class _Task:
     limits: dict[str, object]
     obstacles: tuple[Obstacle, ...]
     avoid: Data
-    crane: Crane | None
+    plant: Crane | FlatSystem | None
     loop: Callable[[], System] | None
     reader: Reader
 
@@ -449,14 +450,14 @@ class _Task:
     def local(self, waypoints: Sequence[Waypoint]) -> dict[str, object]:
         """Limits that are not on signals of the loop."""
         labels = waypoints[0].labels or default_labels(waypoints[0].naxes)
-        if self.crane is not None or self.loop is None:
+        if self.plant is not None or self.loop is None:
             return self.limits
         return {name: limit for name, limit in self.limits.items() if _of_plan(name, labels)}
 
-    def _limited(self, labels: Sequence[str]) -> Crane | System | None:
-        """What has the limited signals: the crane or, if a name is not one of the plan, the loop."""
-        if self.crane is not None or self.loop is None:
-            return self.crane
+    def _limited(self, labels: Sequence[str]) -> Crane | FlatSystem | System | None:
+        """What has the limited signals: the plant or, if a name is not one of the plan, the loop."""
+        if self.plant is not None or self.loop is None:
+            return self.plant
         return None if all(_of_plan(name, labels) for name in self.limits) else self.loop()
 
     @property
@@ -467,6 +468,6 @@ class _Task:
     def _rope(self) -> Rope | None:
         if not self.avoid.get("rope"):
             return None
-        if self.crane is None:
+        if not isinstance(self.plant, Crane):
             raise self.reader.error("avoid.rope", "must be given for the loop of a crane only, got true")
-        return self.crane.rope()
+        return self.plant.rope()

@@ -13,7 +13,7 @@ from ctrlplan.studies.draws import draws
 from ctrlplan.studies.ensemble import Ensemble
 from ctrlplan.studies.entries import NUMBERS, PAIR, TEXTS, Entry, Number, OneOf, Table, Text, Whole
 from ctrlplan.studies.experiment import Experiment, Metrics
-from ctrlplan.studies.loops import LoopKind
+from ctrlplan.studies.loop_kind import LoopKind
 from ctrlplan.studies.monte_carlo import monte_carlo
 from ctrlplan.studies.reading import Reader, got
 from ctrlplan.studies.sweep import Sweep, sweep

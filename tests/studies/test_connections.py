@@ -186,3 +186,52 @@ def test_a_gain_of_zero_is_connected():
     swept = cp.sweep(cp.plants.integrator_lag_loop, [0.0, 1.0, 5.0], {"step": cp.Step(1.0)}, T, progress=False)
     assert swept.failures == ()
     assert swept.metrics["step"]["iae"][0] == pytest.approx(4.0, rel=1e-9)
+
+
+# Labels of flat laws
+
+
+def labelled(flat, poles, plan):
+    """Plan, law with its default labels, and plant, connected by their names."""
+    law = cp.create_flat_iosystem(flat, poles)
+    source = cp.create_source_iosystem(plan, max(flat.orders), suffix="_ref")
+    return ct.interconnect([source, law, flat], inputs=0, outputs=list(flat.flat_labels), name="whole")
+
+
+FLAT = {
+    "motor": (
+        cp.plants.DCMotor().flat_system(),
+        [-20, -25, -30],
+        [cp.Waypoint(0, 0, 0, 0, 0), cp.Waypoint(1, 2, 0, 0, 0)],
+    ),
+    "joint": (
+        cp.plants.FlexibleJoint().flat_system(),
+        [-9, -10, -11, -12],
+        [cp.Waypoint(0, 0, 0, 0, 0, 0), cp.Waypoint(1, 2, 0, 0, 0, 0)],
+    ),
+    "crane": (
+        cp.plants.Crane().flat_system(),
+        [[-2, -2.5, -3, -3.5]] * 2,
+        [cp.Waypoint(0, [0, 10], 0, 0, 0, 0), cp.Waypoint(9, [2, 11], 0, 0, 0, 0)],
+    ),
+}
+
+
+@UNUSED
+@pytest.mark.parametrize("name", [*list(FLAT)[:2], pytest.param("crane", marks=pytest.mark.slow)])
+def test_default_labels_of_a_law_are_its_flat_outputs(name):
+    """A plan of the flat outputs, by name, follows; another one reaches nothing, which is an error."""
+    pytest.importorskip("casadi")
+    flat, poles, points = FLAT[name]
+    t = np.linspace(0.0, points[-1].time, 101)
+    plan = cp.PolySpline(points, labels=flat.flat_labels)
+    start = {"initial_state": None if name != "crane" else [0.0, 0.0, *flat.states_and_inputs(plan, 0.0)[0]]}
+    if name == "crane":
+        start["initial_state"][:2] = flat.derived.extension_along(plan, 0.0)
+    found = cp.compare(lambda _, plan: labelled(flat, poles, plan), {"move": plan}, t, **start)
+    assert found.metrics["move"]["iae"] < 1e-5
+    other = cp.PolySpline(points, labels=[f"{label}_load" for label in flat.flat_labels])
+    with pytest.raises(
+        ValueError, match=rf"references must be connected .* whole, got {other.labels[0]}.* of block plan"
+    ):
+        cp.compare(lambda _, plan: labelled(flat, poles, plan), {"move": other}, t)

@@ -327,12 +327,9 @@ def test_a_payload_that_the_law_does_not_know():
 @everyday("quadrotor")
 def test_margins_over_a_range_of_a_parameter(case):
     label = next(iter(case.plant.flat_system().params))
-    value, kind, signal = getattr(case.plant, label), type(case.plant), next(iter(case.plant.signals.inputs))
-
-    def system(**values):
-        return kind(**{**vars(case.plant), **values}).flat_system()
-
-    found = cp.margins(case.plan, {signal: (-1e6, 1e6)}, system, params={label: (0.9 * value, 1.1 * value)})
+    value, signal = getattr(case.plant, label), next(iter(case.plant.signals.inputs))
+    bounds = {label: (0.9 * value, 1.1 * value)}
+    found = cp.margins(case.plan, {signal: (-1e6, 1e6)}, case.plant, params=bounds)
     assert found.satisfied
 
 
@@ -476,3 +473,23 @@ def test_a_car_that_is_at_rest_after_its_plan():
 def test_what_is_wrong_is_named(make, kind, message):
     with pytest.raises(kind, match=message):
         make()
+
+
+# Paths with stops
+
+
+@pytest.mark.parametrize("steering", ["angle", "rate"])
+def test_closed_forms_follow_a_path_with_stops(steering):
+    """Forward round three quarters of a circle, and back the same way, with the heading and curvature of the circle."""
+    plant = cp.plants.KinematicCar(wheelbase=3.0, steering=steering)
+    circle = circles(0.75)
+    signs = (-1.0) ** np.arange(4)[:, None]
+    returned = [cp.Waypoint.from_array(circle.end - w.time, w.jet * signs, w.labels) for w in circle.waypoints[::-1]]
+    law = cp.TrigSpline([cp.Waypoint(0, 0.0, 0, 0, 0), cp.Waypoint(10, circle.end, 0, 0, 0)], alpha=1.0)
+    plan = cp.PathPlan([circle, cp.PiecewiseSpline(returned)], [1, -1], law)
+    t = np.linspace(0.0, 20.0, 41)
+    x, u = plant.flat_system().states_and_inputs(plan, t)
+    angle = 0.5 * np.where(t <= 10.0, law(t), circle.end - law(t - 10.0))
+    np.testing.assert_allclose(x[2], angle, atol=2e-3)
+    np.testing.assert_allclose(u[0], 10.0 * np.where(t <= 10.0, law(t, 1), -law(t - 10.0, 1)), atol=0.02)
+    np.testing.assert_allclose(x[3] if steering == "rate" else u[1], np.arctan(3.0 / 20.0), atol=5e-3)

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from ctrlplan._lru import Lru
 from ctrlplan._types import Array, Value
 from ctrlplan.flatness import DerivedFlatSystem, FlatSystem
+from ctrlplan.flatness.on_path import CurveMap
 from ctrlplan.trajectories import Trajectory
 
 if TYPE_CHECKING:
@@ -31,7 +32,7 @@ class ClosedFormFlatSystem(FlatSystem):
     """Flat system of a plant of `ctrlplan.plants`, with closed-form maps.
 
     The maps give angles in [-pi, pi]; `states_and_inputs` makes them continuous
-    along a plan. A plan is checked as a whole, also between the times given.
+    along a plan, which it checks as a whole, also between the times given.
 
     Parameters
     ----------
@@ -86,49 +87,48 @@ class ClosedFormFlatSystem(FlatSystem):
         self.plant = plant
         self.operating_point = dict(at or {})
         self._angles = [list(states).index(label) for label in angles]
-        self._plans: Lru[int, tuple[Trajectory, Trajectory, tuple[Array, Array]]] = Lru(8)
+        self._plans: Lru[int, tuple[Trajectory, Array, Array]] = Lru(8)
 
     @cached_property
     def derived(self) -> DerivedFlatSystem:
         """The same plant with maps derived from its equations, for laws (extra ``fast``)."""
         return self.plant.derived(str(self.name), self.operating_point)
 
-    def states_and_inputs(
-        self, plan: Trajectory, timepts: ArrayLike, *, start: ArrayLike | None = None
-    ) -> tuple[Array, Array]:
-        """States and inputs along a plan; see `FlatSystem`.
+    def _states_and_inputs(self, plan: Trajectory, times: Array, start: Array | None) -> tuple[Array, Array]:
+        """States and inputs along a plan, of which the whole is checked; angles are continuous.
 
-        Angles are continuous along the plan, from a value in [-pi, pi] at its start
-        or, with `start`, from the value nearest to that of `start`.
-
-        Raises
-        ------
-        TypeError, ValueError
-            As for `FlatSystem`, and if the maps are singular somewhere on the plan,
-            also between the times given.
+        They begin with a value in [-pi, pi] or, with `start`, nearest to that of `start`.
         """
-        known = self._plans.get(id(plan), lambda: self._followed(plan))
-        x, u = super().states_and_inputs(known[1], timepts, start=start)
-        nodes, turned = known[2]
-        for row, values in zip(self._angles, turned, strict=True):
-            near = np.interp(np.asarray(timepts, dtype=float), nodes, values)
-            if start is not None:
-                near = near + _nearest_turns(float(np.asarray(start, dtype=float)[row]) - values[0])
-            x[row] += _nearest_turns(near - x[row])
-        return x, u
+        _, nodes, angles = self._plans.get(id(plan), lambda: (plan, *self._followed(plan)))
+        x, u = super()._states_and_inputs(plan, times, start)
+        return self._turned(x, times, nodes, angles, start), u
 
-    def _followed(self, plan: Trajectory) -> tuple[Trajectory, Trajectory, tuple[Array, Array]]:
-        """A plan, itself with the axes in order, and its angles (nangles, n) at nodes (n,)."""
-        matched = self.matched(plan)
-        self.plant.check(matched)
-        if not (self._angles and matched.duration):
-            return plan, matched, (np.array([matched.start]), np.zeros((len(self._angles), 1)))
-        return plan, matched, self._turned(matched)
+    def _curve_map(self, curve: Trajectory, direction: int, start: Array | None) -> tuple[CurveMap, int]:
+        """Map along a curve at unit pace with continuous angles, and that pace."""
+        along, pace = super()._curve_map(curve, direction, start)
+        nodes, angles = self._continuous(curve, along)
 
-    def _turned(self, plan: Trajectory) -> tuple[Array, Array]:
+        def continuous(jet: Array, s: Array) -> tuple[Array, Array]:
+            x, u = along(jet, s)
+            return self._turned(x, s, nodes, angles, start), u
+
+        return continuous, pace
+
+    def _followed(self, plan: Trajectory) -> tuple[Array, Array]:
+        """Nodes (n,) of a plan and the continuous angles (nangles, n) there."""
+        self.plant.check(plan)
+        return self._continuous(plan, super()._curve_map(plan, 1, None)[0])
+
+    def _continuous(self, plan: Trajectory, along: CurveMap) -> tuple[Array, Array]:
         """Nodes between which no angle changes by more than an eighth of a turn, and the continuous angles there."""
+        if not (self._angles and plan.duration):
+            return np.array([plan.start]), np.zeros((len(self._angles), 1))
+
+        def angles(times: Array) -> Array:
+            return np.asarray(along(plan.jet(times, max(self.orders)), times)[0])[self._angles]
+
         nodes = np.unique([np.linspace(a, b, _INTERVALS + 1) for a, b in pairwise(plan.breakpoints)])
-        values = self._principal(plan, nodes)
+        values = angles(nodes)
         for _ in range(_HALVINGS):
             change = np.abs(_within_half_turn(np.diff(values, axis=1))).max(axis=0)
             split = np.flatnonzero(change > _TURN / 8.0)
@@ -136,15 +136,19 @@ class ClosedFormFlatSystem(FlatSystem):
                 break
             middle = 0.5 * (nodes[split] + nodes[split + 1])
             nodes = np.insert(nodes, split + 1, middle)
-            values = np.insert(values, split + 1, self._principal(plan, middle), axis=1)
+            values = np.insert(values, split + 1, angles(middle), axis=1)
         steps = _within_half_turn(np.diff(values, axis=1))
         return nodes, np.concatenate([values[:, :1], values[:, :1] + np.cumsum(steps, axis=1)], axis=1)
 
-    def _principal(self, plan: Trajectory, times: Array) -> Array:
-        """Angles (nangles, n) as the maps give them."""
-        jet = plan.jet(times, max(self.orders))
-        x, _ = self.reverse([jet[: r + 1, j] for j, r in enumerate(self.orders)], self.params)
-        return np.asarray(x)[self._angles]
+    def _turned(self, x: Array, times: Array, nodes: Array, angles: Array, start: Array | None) -> Array:
+        """States with angles near those at the nodes, which begin near those of a start."""
+        x = np.array(x)
+        for row, values in zip(self._angles, angles, strict=True):
+            near = np.interp(times, nodes, values)
+            if start is not None:
+                near = near + _nearest_turns(float(start[row]) - values[0])
+            x[row] += _nearest_turns(near - x[row])
+        return x
 
 
 def _nearest_turns(angle: Value) -> Value:

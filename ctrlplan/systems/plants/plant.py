@@ -11,11 +11,13 @@ from typing import ClassVar, Literal, get_args
 
 import control as ct
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ctrlplan._checks import checked_finite
 from ctrlplan._display import Displayed, Facts, Part
 from ctrlplan._types import Array, Params, Value
 from ctrlplan.flatness import DerivedFlatSystem, FlatSystem, flat_system
+from ctrlplan.flatness.rest import note_of_rest
 from ctrlplan.systems import series
 from ctrlplan.systems.plants.closed_form import ClosedFormFlatSystem
 from ctrlplan.systems.plants.parameters import check_parameters, defaults_of, parameters_of, values_of
@@ -68,9 +70,9 @@ class Plant(Displayed, ABC):
     """Plant with parameters, equations of motion and flat outputs.
 
     All plants have this interface: `iosystem` returns the equations as a block,
-    `flat_system` the flat system that `ctrlplan.flat_loop`, `ctrlplan.fastest` and
-    `ctrlplan.margins` accept. A plant of your own in state-space form is derived
-    from `StateSpacePlant`.
+    `flat_system` the flat system that `ctrlplan.flat_loop` accepts; `ctrlplan.fastest`
+    and `ctrlplan.margins` accept the plant itself, with ranges of its parameters. A
+    plant of your own in state-space form is derived from `StateSpacePlant`.
     """
 
     title: ClassVar[str]
@@ -92,6 +94,10 @@ class Plant(Displayed, ABC):
     @abstractmethod
     def check(self, plan: Trajectory) -> None:
         """Raise for a plan of the flat outputs that the plant cannot follow."""
+
+    def quantities(self, jet: ArrayLike) -> dict[str, Array]:
+        """Signals of the plant by name, from the jet of the flat outputs; see `FlatSystem.quantities`."""
+        return self.flat_system().quantities(jet)
 
     @property
     def units(self) -> dict[str, str]:
@@ -164,6 +170,7 @@ class Plant(Displayed, ABC):
         yield f"Flat outputs: {', '.join(signals.flat_outputs)}. Inputs: {inputs}."
 
 
+@dataclass(frozen=True, kw_only=True, repr=False)
 class StateSpacePlant(Plant):
     """Plant in state-space form with closed-form flat maps.
 
@@ -294,6 +301,7 @@ class StateSpacePlant(Plant):
             if low <= _POSITIVE * max(abs(low), abs(high)):
                 raise ValueError(
                     f"{name} of {self.name} must be above 0 along the plan, got {float(low):.4g} at {float(time):.4g} s"
+                    f"{note_of_rest(plan, float(time))}"
                 )
 
 
