@@ -15,7 +15,7 @@ from ctrlplan._lru import Lru
 from ctrlplan._types import Array, Params, Value
 from ctrlplan.flatness.along import Grid, check_branch, connected, grid_of, on_branch, rows_of, states_along
 from ctrlplan.flatness.maps import SINGULAR, FlatMaps, regularity
-from ctrlplan.flatness.on_path import CurveMap
+from ctrlplan.flatness.on_path import FORWARD, CurveMap
 from ctrlplan.flatness.system import FlatSystem
 from ctrlplan.symbolic.tape import Tape
 from ctrlplan.trajectories import Trajectory
@@ -37,6 +37,8 @@ class DerivedFlatSystem(FlatSystem):
         Operations that are not smooth, with the branch that was chosen, and
         what else was assumed.
     """
+
+    _paces = FORWARD  # in backward travel the inputs themselves change sign
 
     def __init__(
         self,
@@ -185,20 +187,20 @@ class DerivedFlatSystem(FlatSystem):
         p = self._values(self.params)
         trailing = below.shape[1:]
         z = self._states(below.reshape(len(below), -1), p)
-        n = self.maps.nstates
-        found = {name: row.reshape(trailing) for name, row in zip(self.state_labels, z[:n], strict=True)}
+        x = z[: self.maps.nstates]
         if known:
-            u = self.maps.inputs_of(z, last.reshape(len(last), -1), p)[1]
-            # Another branch of operations that are not smooth: not determined by the maps.
-            u[:, ~on_branch(self.maps, z[:n], u, p)] = np.nan
-            found |= {name: row.reshape(trailing) for name, row in zip(self.input_labels, u, strict=True)}
-            rows = self._outputs(z[:n], u, p[:, None])
-            found |= {
-                name: np.broadcast_to(row, z.shape[1:]).reshape(trailing)
-                for name, row in zip(self.output_labels, rows, strict=True)
-                if name not in found
-            }
-        return found
+            found = self.signals(x, self.maps.inputs_of(z, last.reshape(len(last), -1), p)[1])
+        else:
+            found = dict(zip(self.state_labels, x, strict=True))
+        return {name: row.reshape(trailing) for name, row in found.items()}
+
+    def signals(self, x: Array, u: Array) -> dict[str, Array]:
+        """States (nstates, n), inputs (ninputs, n) and outputs, by name."""
+        p = self.parameter_values()
+        # Another branch of operations that are not smooth: not determined by the maps.
+        u = np.where(on_branch(self.maps, x, u, p), u, np.nan)
+        outputs = np.broadcast_to(self._outputs(x, u, p[:, None]), (len(self.output_labels), x.shape[1]))
+        return dict(zip(self.output_labels, outputs, strict=True)) | super().signals(x, u)
 
     def _grid(self, plan: Trajectory, p: Array, start: Array | None) -> Grid:
         """Grid of a plan, kept for the next call."""

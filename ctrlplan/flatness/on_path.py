@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from itertools import product
 
 import numpy as np
@@ -22,21 +23,31 @@ from numpy.typing import NDArray
 
 from ctrlplan._types import Array
 from ctrlplan.trajectories import PathPlan, Trajectory
+from ctrlplan.trajectories.chebyshev import fit
+from ctrlplan.trajectories.path_coordinate import Pieces
 
 CurveMap = Callable[[Array, Array], tuple[Array, Array]]
 """Maps a jet of a curve (order + 1, 2, n) at parameters (n,) to states and inputs at unit pace."""
 
-_PACES = (0.0, 0.5, 2.0, -1.0)
+FORWARD = (0.0, 0.5, 2.0)
 """Factors of the pace at which the rates of a plant are compared."""
 
 _SAME = 1e-9
 """Difference of rates, relative to their maximum, that is rounding."""
 
+_DEGREE = 24
+"""Degree of the interpolants."""
+
+_DEEPEST = 12
+"""Number of halvings of a piece."""
+
 _CONTINUOUS = 1e-6
 """Difference of states at a stop, relative to their maximum, that counts as none."""
 
 
-def pace_degrees(rates: Callable[[Array, Array], Array], points: Sequence[tuple[Array, Array]]) -> tuple[int, ...]:
+def pace_degrees(
+    rates: Callable[[Array, Array], Array], points: Sequence[tuple[Array, Array]], paces: Sequence[float] = FORWARD
+) -> tuple[int, ...]:
     """Degrees d_j of the inputs of a plant; empty if its inputs do not set the pace.
 
     Parameters
@@ -45,6 +56,8 @@ def pace_degrees(rates: Callable[[Array, Array], Array], points: Sequence[tuple[
         f(x, u).
     points : sequence of (x, u)
         Where the rates are compared.
+    paces : sequence of float
+        Factors of the pace.
     """
 
     def finite(x: Array, u: Array) -> Array | None:
@@ -57,7 +70,7 @@ def pace_degrees(rates: Callable[[Array, Array], Array], points: Sequence[tuple[
         return ()
     size = np.max([np.abs(f) for _, _, f in known], axis=0)
     for degrees in product((1, 0), repeat=known[0][1].size):
-        pairs = ((finite(x, np.where(degrees, pace * u, u)), pace * f) for x, u, f in known for pace in _PACES)
+        pairs = ((finite(x, np.where(degrees, pace * u, u)), pace * f) for x, u, f in known for pace in paces)
         if all(f is not None and (np.abs(f - wanted) <= _SAME * size).all() for f, wanted in pairs):
             return degrees
     return ()
@@ -141,6 +154,68 @@ class PathMaps:
         number = self._pieces.number(k, 0 if side == 0 else curve.breakpoints.size - 2)
         s = curve.breakpoints[[side]]
         return np.asarray(self._maps[k][0](self._pieces.jet(np.array([number]), s, self._order), s)[0])[:, 0]
+
+
+class PathTable:
+    """States and inputs at ds/dt = 1 and their derivatives by s, by Chebyshev interpolants on parts of the pieces.
+
+    Parameters
+    ----------
+    maps : PathMaps
+        The maps.
+    pieces : Pieces
+        Pieces of the curves.
+
+    Raises
+    ------
+    RuntimeError
+        If they are not resolved.
+    """
+
+    def __init__(self, maps: PathMaps, pieces: Pieces) -> None:
+        parts: list[tuple[float, float, Array]] = []
+        for number, (first, last) in enumerate(pieces.intervals):
+            parts += _resolved(partial(_at_unit_pace, maps, number), first, last, float(pieces.offsets[number]))
+        self._begins, self._ends = (np.array([part[side] for part in parts]) for side in (0, 1))
+        self._coefficients = np.stack([found for _, _, found in parts], axis=-1)  # (rows, _DEGREE + 1, nparts)
+
+    def at(self, coordinate: Array) -> tuple[Array, Array]:
+        """Values and derivatives, both (nstates + ninputs, n), at values (n,) of the path coordinate."""
+        # The nearer part in a gap between two pieces.
+        part = np.searchsorted(0.5 * (self._ends[:-1] + self._begins[1:]), coordinate, side="right")
+        a, b = self._begins[part], self._ends[part]
+        u = (2.0 * coordinate - a - b) / (b - a)
+        basis, slopes = np.ones((2, _DEGREE + 1, u.size))
+        slopes[0], basis[1] = 0.0, u
+        for k in range(1, _DEGREE):
+            basis[k + 1] = 2.0 * u * basis[k] - basis[k - 1]
+            slopes[k + 1] = 2.0 * basis[k] + 2.0 * u * slopes[k] - slopes[k - 1]
+        own = self._coefficients[:, :, part]
+        values, rates = (np.einsum("rkn,kn->rn", own, rows) for rows in (basis, slopes * (2.0 / (b - a))))
+        return values, rates
+
+
+def _at_unit_pace(maps: PathMaps, number: int, s: Array) -> Array:
+    """States and inputs (nstates + ninputs, n) on a piece at ds/dt = 1."""
+    return np.concatenate(maps.at(np.full(s.size, number), s, np.ones(s.size)))
+
+
+def _resolved(
+    function: Callable[[Array], Array], first: float, last: float, offset: float, depth: int = 0
+) -> list[tuple[float, float, Array]]:
+    """Parts of an interval on which a function is resolved: their ends, shifted by an offset, and coefficients."""
+    found = fit(function, (first, last), _DEGREE)
+    size = np.abs(found)
+    if (size[:, -_DEGREE // 4 :].max(axis=1) <= 1e-12 * size.max(axis=1) + 1e-14).all():
+        return [(first + offset, last + offset, found)]
+    if depth == _DEEPEST:
+        raise RuntimeError(
+            f"states and inputs must be resolved along the path, but they change too fast at s = {first:.6g}"
+        )
+    middle = 0.5 * (first + last)
+    return [
+        part for ends in ((first, middle), (middle, last)) for part in _resolved(function, *ends, offset, depth + 1)
+    ]
 
 
 def states_on_path(maps: PathMaps, plan: PathPlan, times: Array) -> tuple[Array, Array]:

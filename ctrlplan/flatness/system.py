@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import control.flatsys as fs
 import numpy as np
@@ -15,6 +15,7 @@ from ctrlplan._display import Displayed, Facts, Part
 from ctrlplan._lru import Lru
 from ctrlplan._types import Array, Value
 from ctrlplan.flatness.on_path import (
+    FORWARD,
     CurveMap,
     PathMaps,
     along_formulas,
@@ -100,6 +101,8 @@ class FlatSystem(Displayed, fs.FlatSystem):  # type: ignore[misc]
     orders: tuple[int, ...]
     extension: int
     flat_labels: tuple[str, ...]
+
+    _paces: ClassVar[tuple[float, ...]] = (*FORWARD, -1.0)  # maps by formulas are those of forward travel
 
     def __init__(
         self,
@@ -259,7 +262,7 @@ class FlatSystem(Displayed, fs.FlatSystem):  # type: ignore[misc]
             points = self._points()
         except ValueError:  # no point is known at which the maps are finite
             return ()
-        return pace_degrees(lambda x, u: self.dynamics(0.0, x, u), points)
+        return pace_degrees(lambda x, u: self.dynamics(0.0, x, u), points, self._paces)
 
     def _points(self) -> list[tuple[Array, Array]]:
         """States and inputs at which the equations are finite."""
@@ -293,8 +296,12 @@ class FlatSystem(Displayed, fs.FlatSystem):  # type: ignore[misc]
             return self._own_quantities(jet)
         values, known = self._checked_jet(jet)
         x, u = self.reverse([values[: r + 1, j] for j, r in enumerate(self.orders)], self.params)
-        found = dict(zip(self.state_labels, np.asarray(x), strict=True))
-        return found | dict(zip(self.input_labels, np.asarray(u), strict=True)) if known else found
+        found = self.signals(np.asarray(x), np.asarray(u))
+        return found if known else {name: found[name] for name in self.state_labels}
+
+    def signals(self, x: Array, u: Array) -> dict[str, Array]:
+        """States (nstates, ...), inputs (ninputs, ...) and what depends on them, by name."""
+        return dict(zip([*self.state_labels, *self.input_labels], [*x, *u], strict=True))
 
     def _checked_jet(self, jet: ArrayLike) -> tuple[Array, bool]:
         """Jet up to the highest order, and whether its last derivatives are known; unknown ones are 0."""

@@ -20,7 +20,7 @@ from ctrlplan.planning.loop_fastest import LoopProblem, bounds_of_values
 from ctrlplan.planning.quantities import System, shapes_given, system_given
 from ctrlplan.planning.scalar_search import bisected, scan
 from ctrlplan.planning.time_law import with_fast_time_law
-from ctrlplan.trajectories import Trajectory, WaypointSpline
+from ctrlplan.trajectories import PathPlan, Retimed, Trajectory, WaypointSpline
 from ctrlplan.trajectories.common import Array
 
 if TYPE_CHECKING:
@@ -289,6 +289,8 @@ def fastest_under(
     if hold == "path":
         limited.check_constant('limits with hold="path"')
         _check_open(plan)
+        if isinstance(plan, PathPlan):
+            return _fastest_on_path(plan, limited, span)
     uniform = fastest_within(plan, limited, span)
     if hold == "shape":
         return uniform
@@ -296,6 +298,22 @@ def fastest_under(
     law = with_fast_time_law(uniform.plan.shift(-plan.start), limited).shift(plan.start)
     retimed = fastest_within(law, limited, span)
     return replace(min(retimed, uniform, key=lambda found: found.duration), hold=hold)
+
+
+def _fastest_on_path(plan: PathPlan, limited: Limited, span: tuple[float, float] | None) -> Fastest:
+    """Plan with a time law of minimum duration for each segment; the stops make them independent."""
+    laws: list[Trajectory] = []
+    for curve, direction, law in zip(plan.segments, plan.directions, plan.laws, strict=True):
+        part = PathPlan([curve], [direction], law.shift(-law.start), labels=plan.labels)
+        own = limited.of(part)
+        uniform = fastest_within(part, own)
+        scaled = part.laws[0].retime(uniform.duration)
+        fast = Retimed(scaled, with_fast_time_law(own.seen(part.with_laws([scaled])), own).law)
+        retimed = fastest_within(part.with_laws([fast]), own)
+        law, best = (fast, retimed) if retimed.duration < uniform.duration else (scaled, uniform)
+        laws.append(law.retime(best.duration))
+    found = fastest_within(plan.with_laws(laws), limited, span)
+    return replace(found, hold="path")
 
 
 def _fastest_in_loop(
@@ -466,10 +484,10 @@ def _check_rest(plan: Trajectory, limited: Limited) -> None:
 
 def _closed_form(plan: Trajectory, limited: Limited) -> float:
     """Minimum duration for limits of derivatives, T_0 max_k (peak_k/limit_k)^(1/k)."""
-    minimum = 0.0
+    minimum, seen = 0.0, limited.seen(plan)
     for bound in limited.bounds:
         if bound.axis is not None and bound.order and bound.is_constant:
-            extrema = plan.extrema(bound.order)
+            extrema = seen.extrema(bound.order)
             sides = (
                 (float(extrema.maximum[bound.axis]), bound.high, float(extrema.time_max[bound.axis])),
                 (-float(extrema.minimum[bound.axis]), -bound.low, float(extrema.time_min[bound.axis])),

@@ -15,9 +15,9 @@ from ctrlplan._display import Displayed, Facts, Part, Table, counted
 from ctrlplan._renamed import FormerAttribute
 from ctrlplan.planning.bounds import Bound
 from ctrlplan.planning.naming import Naming
-from ctrlplan.planning.quantities import Response, System, loop_of, quantities_of, system_given
+from ctrlplan.planning.quantities import Response, System, loop_of, path_quantities, quantities_of, system_given
 from ctrlplan.planning.window import mean_square, window
-from ctrlplan.trajectories import Trajectory, derivative_name
+from ctrlplan.trajectories import PathPlan, Trajectory, derivative_name
 from ctrlplan.trajectories.common import Array
 from ctrlplan.trajectories.extrema import Extrema, function_extrema
 
@@ -314,9 +314,11 @@ class Limited:
             raise ValueError("a plan under limits must have a duration, got a step")
         check_kind(limits, "limits", Mapping, "a mapping of names to limits")
         self._start, self._duration = plan.start, plan.duration
+        self._given = limits, system, tail
         self.loop = loop_of(system, tail)
-        self._quantities = None if self.loop is not None else quantities_of(system)
-        self.bounds = tuple(Naming(plan, self._quantities, self.loop).bounds(limits))
+        self._on_path = path_quantities(system, plan)
+        self._quantities = self._on_path or (None if self.loop is not None else quantities_of(system))
+        self.bounds = tuple(Naming(self.seen(plan), self._quantities, self.loop, plan.naxes).bounds(limits))
         if not self.bounds:
             raise ValueError("limits must name at least one signal, got none")
         self._local = [k for k, bound in enumerate(self.bounds) if not bound.in_loop]
@@ -325,6 +327,20 @@ class Limited:
         self.is_constant = all(bound.is_constant and not bound.in_loop for bound in self.bounds)
         self.bounds = tuple(self._scaled(bound) for bound in self.bounds)
         self.bounds = tuple(self._slackened(plan))
+
+    def of(self, plan: Trajectory) -> Limited:
+        """The same limits for plans of another path."""
+        limits, system, tail = self._given
+        return Limited(plan, limits, system, tail)
+
+    @property
+    def on_path(self) -> bool:
+        """Whether signals are evaluated through the path parameter."""
+        return self._on_path is not None
+
+    def seen(self, plan: Trajectory) -> Trajectory:
+        """Plan whose jet determines the limited signals: with its path parameter for a vehicle on a path."""
+        return plan.with_coordinate if self.on_path and isinstance(plan, PathPlan) else plan
 
     @property
     def loop_bounds(self) -> tuple[Bound, ...]:
@@ -351,6 +367,7 @@ class Limited:
 
     def sampled(self, plan: Trajectory) -> Sampled:
         """Samples of every segment, its ends included."""
+        plan = self.seen(plan)
         edges, inside = plan.breakpoints, np.linspace(0.0, 1.0, _SAMPLES)[1:-1]
         lengths = np.diff(edges)
         times = (edges[:-1, None] + lengths[:, None] * inside).ravel()
@@ -375,8 +392,8 @@ class Limited:
                 still = not jet[1:, :, int(np.isnan(row).argmax())].any()
                 raise UndeterminedError(
                     f"{b.name} must be determined by the plan, got nan{' where the plan is at rest' if still else ''}: "
-                    "the maps of the plant are singular there, as those of a car are at rest; limit it for plans "
-                    "that do not stop, or limit another signal"
+                    "the maps of the plant are singular there, as those of a car are at rest; give a PathPlan, or "
+                    "limit another signal"
                 )
         return rows
 
@@ -397,8 +414,10 @@ class Limited:
     def _signals(self, jet: Array) -> Mapping[str, Array]:
         return {} if self.derivatives_only or self._quantities is None else self._quantities(jet)
 
-    def _rates(self, jet: Array) -> dict[str, Array]:
-        """Time derivatives of the quantities, by central differences of order 8 along the tangent of the jet."""
+    def _rates(self, jet: Array) -> Mapping[str, Array]:
+        """Time derivatives of the quantities: known ones, or central differences of order 8 along the jet's tangent."""
+        if self._on_path is not None:
+            return self._on_path.rates(jet)
         low, up = jet[:-1], jet[1:]
         step = _RATE_STEP * _time_scale(jet)
         found: dict[str, Array] = {}
@@ -448,7 +467,7 @@ class Limited:
 
     def shown(self, plan: Trajectory, times: Array) -> Array:
         """Limited signals (nbounds, ntime) over a plan for a figure; of a root mean square that up to each time."""
-        rows = self.values(plan.jet(times, self.order)).copy()
+        rows = self.values(self.seen(plan).jet(times, self.order)).copy()
         response = None if self.loop is None or not self.loop_bounds else self.loop.quantities_of(plan)
         for row, b in zip(rows, self.bounds, strict=True):
             if b.in_loop and response is not None:
@@ -512,7 +531,7 @@ class Limited:
 
     def margins(self, plan: Trajectory) -> Margins:
         """Margins over a whole plan."""
-        rows = [*self._local_margins(plan), *self._loop_margins(plan)]
+        rows = [*self._local_margins(self.seen(plan)), *self._loop_margins(plan)]
         note = "" if self.loop is None or not self.loop_bounds else self.loop.note
         return Margins(tuple(sorted(rows, key=lambda row: row.fraction)), note)
 
@@ -632,6 +651,7 @@ class Limited:
         The plan is at rest before its start and after its end, except if its speed
         there is not 0: then it is the continuation of a motion.
         """
+        plan = self.seen(plan)
         moving = {t for t in (plan.start, plan.end) if plan.jet(t, 1, left=t > plan.start)[1].any()}
         for k in self._local:
             bound = self.bounds[k]
@@ -645,6 +665,25 @@ class Limited:
                         f"limits of {bound.name} require a plan that is continuous up to derivative {bound.order - 1} "
                         f"(and at rest before and after), got {what} that jumps by {jump.size:.4g} at {jump.time:g} s"
                     )
+        if self.on_path:
+            self._check_continuous(plan)
+
+    def _check_continuous(self, plan: Trajectory) -> None:
+        """Raise for a signal with a limited rate that jumps where curves or their pieces join."""
+        rated = [k for k in self._local if self.bounds[k].kind == "rate" and self.bounds[k].axis is None]
+        inner = plan.breakpoints[1:-1]
+        if not (rated and inner.size):
+            return
+        before, after = (self._signals(plan.jet(inner, self.order, left=left)) for left in (True, False))
+        for k in rated:
+            name, bound = self.bounds[k].terms[0][0].name, self.bounds[k]
+            jump = np.abs(after[name] - before[name])
+            if (wrong := jump > 1e-6 * np.maximum(1.0, np.abs(before[name]))).any():
+                at = int(wrong.argmax())
+                raise ValueError(
+                    f"limits of {bound.name} require a path on which {name} is continuous, got {before[name][at]:.6g} "
+                    f"before and {after[name][at]:.6g} after {inner[at]:.6g} s; give curves of equal curvature there"
+                )
 
     def at_rest(self, plan: Trajectory) -> Sampled:
         """Samples of the plan with zero derivatives."""
@@ -662,7 +701,7 @@ class Limited:
             excess = bound.excess(values, times)
             worst = int(excess.argmax())
             if excess[worst] > 0.0:
-                yield bound.at(float(times[worst])), float(values[worst]), still.jet[0, :, worst]
+                yield bound.at(float(times[worst])), float(values[worst]), still.jet[0, : plan.naxes, worst]
 
     def _scaled(self, bound: Bound) -> Bound:
         """Bound with the scale of limits over time."""

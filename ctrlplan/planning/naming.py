@@ -47,11 +47,15 @@ class Naming:
         Maps a jet to signals of a plant.
     loop : LoopNames or None
         Names of the signals of a loop.
+    naxes : int or None
+        Number of the first axes to which names of derivatives of all axes refer;
+        None for all.
     """
 
     plan: Trajectory
     quantities: Quantities | None = None
     loop: LoopNames | None = None
+    naxes: int | None = None
 
     def bounds(self, limits: Mapping[str, object]) -> Iterator[Bound]:
         """Bounds from limits by name."""
@@ -89,7 +93,7 @@ class Naming:
                 continue
             if name in ENTRIES and find(name) is None and find != self._of_loop:
                 order = ENTRIES.index(name)
-                for axis, own in enumerate(_by_axis(name, limit, self.plan.naxes)):
+                for axis, own in enumerate(_by_axis(name, limit, self.naxes or self.plan.naxes)):
                     signal = Signal(derivative_name(self.plan.labels[axis], order), order, axis)
                     yield from _of_signal(name, own, signal)
                 continue

@@ -314,7 +314,7 @@ def proved_bounds(plan: Trajectory, family: Family, limited: Limited) -> list[bo
     affine. Derivatives of the plan do not depend on parameters.
     """
     of_plan = [_of_plan(bound) for bound in limited.bounds]
-    if len(family.ranges) > _MOST_CORNERS or limited.loop is not None or all(of_plan):
+    if len(family.ranges) > _MOST_CORNERS or limited.loop is not None or limited.on_path or all(of_plan):
         return of_plan
     times = plan.start + plan.duration * np.array([0.0, 0.21, 0.5, 0.74, 1.0])
     jets = [plan.jet(times, limited.order), plan.jet(plan.start, limited.order)[..., None]]

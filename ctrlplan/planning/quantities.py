@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol
 
 from ctrlplan._renamed import renamed_argument
-from ctrlplan.trajectories import Trajectory
+from ctrlplan.trajectories import PathPlan, Trajectory
 from ctrlplan.trajectories.common import Array
 
 Quantities = Callable[[Array], Mapping[str, Array]]
@@ -117,6 +117,16 @@ class HasQuantities(Protocol):
         """Method or function from a jet to signals by name."""
 
 
+class HasRates(Protocol):
+    """Protocol of signals as functions of a jet that know their time derivatives."""
+
+    def __call__(self, jet: Array) -> Mapping[str, Array]:
+        """Signals (ntime,) by name of a jet (order + 1, naxes, ntime)."""
+
+    def rates(self, jet: Array) -> Mapping[str, Array]:
+        """Time derivatives (ntime,) of signals by name, of a jet with one order more."""
+
+
 System = Quantities | HasQuantities
 """Argument of `fastest` and `margins`; or a control.flatsys.FlatSystem."""
 
@@ -153,6 +163,30 @@ def quantities_of(system: Any) -> Quantities | None:
         "system must be a flat system, a plant with a method quantities (as Crane has), a loop, or a function of a "
         f"jet, got {system.__name__ if isinstance(system, type) else type(system).__name__}"
     )
+
+
+def path_quantities(system: Any, plan: Trajectory) -> HasRates | None:
+    """Function from the jet of `PathPlan.with_coordinate` to the signals of a vehicle; None for others.
+
+    Parameters
+    ----------
+    system : object
+        System of the limited signals.
+    plan : Trajectory
+        The plan; a `PathPlan` and a flat system are evaluated through the path
+        parameter, for any time law.
+
+    Raises
+    ------
+    ValueError
+        If the inputs of a flat system do not set its pace, or states are not
+        determined along the path.
+    """
+    if not isinstance(plan, PathPlan) or not (hasattr(system, "forward") and hasattr(system, "reverse")):
+        return None
+    from ctrlplan.flatness.quantities import QuantitiesOnPath
+
+    return QuantitiesOnPath(system, plan)
 
 
 def loop_of(system: Any, tail: float | None = None) -> Loop | None:

@@ -19,7 +19,7 @@ _ROUNDING = 1e-12
 """Violation attributed to rounding, as a fraction of a limit's scale, for position limits that the path attains."""
 
 
-def with_fast_time_law(plan: Trajectory, limited: Limited) -> Trajectory:
+def with_fast_time_law(plan: Trajectory, limited: Limited) -> Retimed:
     """Plan with a time law of minimum duration under limits at samples.
 
     The rate of the time law is a spline of degree 4 with positive coefficients,
@@ -39,8 +39,8 @@ def with_fast_time_law(plan: Trajectory, limited: Limited) -> Trajectory:
 
     Returns
     -------
-    Trajectory
-        A `Retimed` plan, which may slightly violate limits between samples.
+    Retimed
+        The plan, which may slightly violate limits between samples.
     """
     law = _Law(plan, limited)
     logs, reach = np.zeros(law.size), 0.5

@@ -13,12 +13,14 @@ from ctrlplan._checks import check_kind, checked_count, checked_finite, checked_
 from ctrlplan._types import Array, Params, Value
 from ctrlplan.flatness import DerivedFlatSystem, FlatSystem
 from ctrlplan.systems.derived_laws import references
+from ctrlplan.traits import declare
 from ctrlplan.trajectories import Trajectory
 
 
 def create_flat_feedforward_iosystem(
     flat: FlatSystem,
     *,
+    plan: Trajectory | None = None,
     states: bool = True,
     labels: Sequence[str] | str | None = None,
     suffix: str = "_ref",
@@ -35,6 +37,11 @@ def create_flat_feedforward_iosystem(
     ----------
     flat : FlatSystem
         The plant.
+    plan : Trajectory, optional
+        Plan of the flat outputs. The block then has no inputs and evaluates the
+        states and inputs along this plan as functions of time, as a `PathPlan`
+        requires, and faster for maps derived from equations. Default: references
+        from a source.
     states : bool, optional
         Whether the states are outputs, too. Default True.
     labels : sequence of str or str, optional
@@ -53,7 +60,8 @@ def create_flat_feedforward_iosystem(
     Raises
     ------
     TypeError, ValueError
-        If `flat` is not a `FlatSystem`, or labels are wrong.
+        If `flat` is not a `FlatSystem`, labels are wrong, or states are not
+        determined by `plan`.
 
     Examples
     --------
@@ -70,6 +78,10 @@ def create_flat_feedforward_iosystem(
     [0.0, 1.0, 2.0]
     """
     check_kind(flat, "flat", FlatSystem)
+    outputs = [f"xd[{k}]" for k in range(flat.nstates)] if states else []
+    outputs += [f"ud[{k}]" for k in range(flat.ninputs)]
+    if plan is not None:
+        return _along(flat, plan, outputs, name)
     names = flat.flat_labels if labels is None else checked_labels(labels, len(flat.flat_labels))
     wanted = references(names, flat.orders, suffix)
     ends = np.cumsum([0, *(r + 1 for r in flat.orders)]).tolist()
@@ -89,11 +101,20 @@ def create_flat_feedforward_iosystem(
         given = np.array([value + idles * at for value, at in zip(u, regular, strict=True)])
         return [value * (1.0 - idles) for value in values_of(given)]
 
-    outputs = [f"xd[{k}]" for k in range(flat.nstates)] if states else []
-    outputs += [f"ud[{k}]" for k in range(flat.ninputs)]
     regular_at_zero = _is_finite(values_of, len(wanted))
     function = output if regular_at_zero else output_off_zero
     return ct.nlsys(None, function, inputs=wanted, outputs=outputs, dt=None, name=name)
+
+
+def _along(flat: FlatSystem, plan: Trajectory, outputs: list[str], name: str) -> ct.NonlinearIOSystem:
+    """States and inputs along a plan as a source without inputs; the last of both as many as outputs."""
+    axes = flat.matched(plan)
+    flat.states_and_inputs(axes, plan.start)  # raises if they are not determined
+
+    def output(t: float, x: Value, u: Value, params: Params) -> Value:
+        return np.concatenate(flat.states_and_inputs(axes, t))[-len(outputs) :]
+
+    return declare(ct.nlsys(None, output, inputs=0, outputs=outputs, name=name), breakpoints=plan.breakpoints)
 
 
 def reference_window(

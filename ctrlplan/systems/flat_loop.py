@@ -20,7 +20,7 @@ from ctrlplan.systems.derived_laws import InputLimits, create_derived_law, input
 from ctrlplan.systems.flat import create_flat_iosystem, derived_system_of
 from ctrlplan.systems.source import create_source_iosystem
 from ctrlplan.traits import declare, traits_of
-from ctrlplan.trajectories import Trajectory
+from ctrlplan.trajectories import PathPlan, Trajectory
 
 _SETTLED = 1e-9
 """Size of the rates at the end of a plan, relative to their terms, below which the plant rests there."""
@@ -46,6 +46,12 @@ class FlatLaw(Displayed):
 
     def create(self, flat: FlatSystem, plan: Trajectory, limits: InputLimits | None) -> ct.NonlinearIOSystem:
         """Block of the law, its extension at the start of the plan."""
+        if isinstance(plan, PathPlan):
+            stops = ", ".join(f"{time:.6g} s" for time in plan.stops)
+            raise ValueError(
+                f"law must be a Feedforward or TVLQR for a PathPlan, got a FlatLaw: it computes inputs of {flat.name} "
+                f"from positions and their derivatives, which do not determine them at the stops, at {stops}"
+            )
         derived = derived_system_of(flat, self.quasi_static or self.integral or limits is not None)
         if derived is None:
             return create_flat_iosystem(flat, self.poles, labels=flat.flat_labels, name="law")

@@ -15,13 +15,17 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
+from ctrlplan.trajectories.combined import Stacked
 from ctrlplan.trajectories.common import Array, readonly
+from ctrlplan.trajectories.continuity import Jump
 from ctrlplan.trajectories.internal import InternalTrajectory
 from ctrlplan.trajectories.retimed import Retimed
 from ctrlplan.trajectories.trajectory import Trajectory
 
 LABEL = "path_parameter"
 """Name of the coordinate."""
+
+_LEFT, _RIGHT = slice(None, -1), slice(1, None)
 
 Numbers = NDArray[np.intp]
 
@@ -37,6 +41,8 @@ class Pieces:
         Number of the curve of each piece.
     segment : ndarray of int, shape (npieces,)
         Number of the piece within its curve.
+    intervals : list of (float, float)
+        First and last parameter of each piece.
     offsets : ndarray, shape (npieces,)
         Coordinate minus parameter on each piece.
     """
@@ -47,8 +53,9 @@ class Pieces:
         self.curve = np.repeat(np.arange(len(counts)), counts)
         self.segment = np.concatenate([np.arange(count) for count in counts])
         self._first = np.cumsum([0, *counts])
-        begins = np.concatenate([curve.breakpoints[:-1] for curve in curves])
-        lengths = np.concatenate([np.diff(curve.breakpoints) for curve in curves])
+        begins, ends = (np.concatenate([curve.breakpoints[part] for curve in curves]) for part in (_LEFT, _RIGHT))
+        self.intervals = list(zip(begins.tolist(), ends.tolist(), strict=True))
+        lengths = ends - begins
         gap = float(lengths.max())
         placed = begins[0] + np.concatenate([[0.0], np.cumsum(lengths[:-1] + gap)])
         self.offsets = readonly(placed - begins)
@@ -85,6 +92,17 @@ def path_coordinate(parts: Sequence[Retimed], pieces: Pieces) -> Trajectory:
         The pieces of the curves.
     """
     return _Coordinate(parts, pieces)
+
+
+def with_coordinate(plan: Trajectory, coordinate: Trajectory) -> Trajectory:
+    """Plan with its path coordinate as a further axis, for functions of the jet of both."""
+    return _WithCoordinate((plan, coordinate), (*plan.labels, LABEL))
+
+
+class _WithCoordinate(Stacked):
+    def jumps(self, order: int) -> tuple[Jump, ...]:
+        """Jumps of the derivatives; those of the coordinate itself are gaps between the pieces."""
+        return tuple(jump for jump in super().jumps(order) if jump.order or jump.label != LABEL)
 
 
 class _Coordinate(InternalTrajectory):

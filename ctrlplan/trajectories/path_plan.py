@@ -16,7 +16,7 @@ from ctrlplan._types import Data
 from ctrlplan.trajectories.combined import Joined, check_join
 from ctrlplan.trajectories.common import Array
 from ctrlplan.trajectories.files import trajectory_from_dict
-from ctrlplan.trajectories.path_coordinate import Pieces, path_coordinate
+from ctrlplan.trajectories.path_coordinate import Pieces, path_coordinate, with_coordinate
 from ctrlplan.trajectories.retimed import Retimed
 from ctrlplan.trajectories.trajectory import Trajectory
 
@@ -150,6 +150,11 @@ class PathPlan(Joined):
         """The path parameter over time, shifted piece by piece as `Pieces` says."""
         return path_coordinate(self.parts, self.pieces)
 
+    @cached_property
+    def with_coordinate(self) -> Trajectory:
+        """The plan with `coordinate` as a third axis, for functions of the jet of both."""
+        return with_coordinate(self, self.coordinate)
+
     def path_jet(self, t: ArrayLike, order: int, left: bool = False) -> tuple[Array, Array]:
         """Path parameter and position, with their derivatives.
 
@@ -263,7 +268,7 @@ class PathPlan(Joined):
         for k, (before, after) in enumerate(pairwise(self.segments)):
             ends = (before.jet(before.end, 1, left=True)[1], after.jet(after.start, 1)[1])
             last, first = (
-                math.atan2(*(direction * tangent[::-1]).tolist())
+                math.atan2(*(direction * tangent[::-1] + 0.0).tolist())
                 for direction, tangent in zip(self.directions[k : k + 2], ends, strict=True)
             )
             turn = abs(math.remainder(first - last, math.tau))

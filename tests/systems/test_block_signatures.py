@@ -170,7 +170,9 @@ def test_signals_are_renamed_and_nothing_else_changes(name):
         assert (named.input_labels, named.output_labels) == (inputs, results)
     else:
         crane = "crane" in parameters(name)
-        old = {"x": "a", "z": "b"} if crane else {"x": "a"} if next(iter(parameters(name))) == "plan" else {"y": "a"}
+        plan = parameters(name).get("plan")
+        planned = plan is not None and plan.default is plan.empty
+        old = {"x": "a", "z": "b"} if crane else {"x": "a"} if planned else {"y": "a"}
         suffix = parameters(name)["suffix"].default
         named = build(name, labels=list(old.values()), suffix="_q")
         side = "input_labels" if suffix else "output_labels"
