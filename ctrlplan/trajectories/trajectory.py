@@ -1109,6 +1109,18 @@ class Trajectory(Displayed, Fields, ABC):
         held[0] = (self.initial if segment < 0 else self.final)[:, None]
         return held
 
+    def segments_jet_at(self, moments: Array, origins: Array, s: Array, order: int) -> Array:
+        """Jets at many moments, each with its origin; as `segment_jet_at`."""
+        segments = np.searchsorted(self.breakpoints, moments) - 1
+        inside = (segments >= 0) & (segments < self.breakpoints.size - 1)
+        if inside.all():
+            return self.segments_jet(segments, s + (origins - self.breakpoints[segments]), order)
+        out = np.zeros((order + 1, self.naxes, s.size))
+        out[0] = np.where(segments < 0, self.initial[:, None], self.final[:, None])
+        own = segments[inside]
+        out[:, :, inside] = self.segments_jet(own, s[inside] + (origins[inside] - self.breakpoints[own]), order)
+        return out
+
     def segment_rows_at(self, moment: float, origin: float, s: float, order: int) -> list[list[float]] | None:
         """Derivatives by axis at one time; as `segment_jet_at`."""
         moments = self._moments

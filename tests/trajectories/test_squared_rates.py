@@ -176,6 +176,38 @@ def test_a_plan_with_the_law_is_the_composition_of_both():
     assert not outside[1].any()
 
 
+LAW_OF_A_PATH = TimeLaw(np.linspace(0.0, 2.0, 25), np.random.default_rng(3).uniform(0.5, 1.0, (3, 24)), 1.0)
+ON_A_PATH = Retimed(PiecewiseSpline([Waypoint(t, [math.sin(t), t]) for t in (0.0, 0.7, 1.1, 2.0)]), LAW_OF_A_PATH)
+COMBINED = {
+    "sum": ON_A_PATH + ON_A_PATH.shift(0.3),
+    "scaled": -2.0 * ON_A_PATH,
+    "selected": ON_A_PATH.select(["y2"]),
+    "stacked": cp.stack(
+        [ON_A_PATH, PolySpline([Waypoint(0.5, 0, 0, 0), Waypoint(2.5, 1, 0, 0)])], labels=["a", "b", "c"]
+    ),
+    "joined": PolySpline([Waypoint(0, [3, 1]), Waypoint(1, [0, 0])]).then(ON_A_PATH),
+    "clipped": cp.Clipped(ON_A_PATH, 1.3, 2.2),
+}
+
+
+@pytest.mark.parametrize("name", COMBINED)
+def test_combinations_are_evaluated_as_each_segment(name):
+    plan = COMBINED[name]
+    segments = np.random.default_rng(1).permutation(np.repeat(np.arange(plan.breakpoints.size - 1), 3))
+    s = np.random.default_rng(2).random(segments.size) * np.diff(plan.breakpoints)[segments]
+    single = [plan.segment_jet(segment, s[k : k + 1], 3)[:, :, 0] for k, segment in enumerate(segments.tolist())]
+    expected = np.stack(single, axis=-1)
+    scale = np.abs(expected).max(axis=(1, 2), keepdims=True)
+    np.testing.assert_allclose(plan.segments_jet(segments, s, 3) / scale, expected / scale, rtol=0, atol=1e-12)
+    t = np.linspace(plan.start, plan.end, 4001)[:-1]
+    for nu in (0, 1, 2):
+        found, samples = plan.extrema(nu), plan.jet(t, nu)[nu]
+        scale = np.abs(samples).max()
+        assert (found.maximum >= samples.max(axis=1) - 1e-12 * scale).all()
+        assert (found.minimum <= samples.min(axis=1) + 1e-12 * scale).all()
+        assert (found.maximum <= samples.max(axis=1) + 0.02 * scale).all()
+
+
 def test_a_shaped_plan_keeps_the_rate_one():
     shaped = Shaper.zv(5.0)(PolySpline([Waypoint(0, 0, 0, 0), Waypoint(1, 1, 0, 0)]))
     assert Retimed(shaped, TimeLaw([0.0, shaped.end], [[1.0], [1.0], [1.0]])).duration == pytest.approx(shaped.duration)
