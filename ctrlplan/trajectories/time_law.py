@@ -19,7 +19,7 @@ _SERIES = 12
 
 
 class TimeLaw(Trajectory):
-    r"""Time law whose squared rate is a piecewise quadratic function of the path.
+    r"""Time law with a piecewise quadratic squared rate.
 
     The path parameter s(t), the time of a plan, satisfies (ds/dt)^2 = b(s), where b
     is quadratic in each cell of s. In a cell s'' = b'/2 is linear in s, so that s is a
@@ -36,7 +36,7 @@ class TimeLaw(Trajectory):
     start : float, optional
         Start time [s].
     labels : sequence of str, optional
-        Name of the axis; default "time".
+        Name of the axis; default "s".
 
     Attributes
     ----------
@@ -115,7 +115,7 @@ class TimeLaw(Trajectory):
             breakpoints=readonly(moments),
             positions=readonly(places),
             squared_rates=readonly(table),
-            labels=checked_labels(["time"] if labels is None else labels, 1),
+            labels=checked_labels(["s"] if labels is None else labels, 1),
             _powers=readonly(powers),
         )
 
